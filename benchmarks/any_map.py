@@ -24,19 +24,19 @@ import cv2
 import numpy as np
 import torch
 
-from dsr.data.base import SceneSource
-from dsr.data.ddrnet import DDRNetFrames
+from dsr.data.ddrnet_frames import DDRNetFrames
 from dsr.data.eight_bit import EightBit
 from dsr.data.folder import Folder
-from dsr.data.formats.shared import read_picture
+from dsr.data.frame_files import read_picture
 from dsr.data.icl import ICL
+from dsr.data.rendered import SimGeo
 from dsr.data.rgbdd import RGBDD
-from dsr.data.simgeo import SimGeo
+from dsr.data.scene_source import SceneSource
 from dsr.degradation.downsampling import Downsampling, Kernel, Measured, make_sample
 from dsr.degradation.noise import GaussianMultiplicative, Kinect, TimeOfFlight
 from dsr.geometry.camera import Camera, RangeType
 from dsr.geometry.surface import angle_between, depth_to_normals
-from dsr.methods.networks.any_map import AnyMap, Edges
+from dsr.methods.networks.facets_method import AnyMap, Edges
 from dsr.methods.networks.weight_files import read_header
 from dsr.metrics.catalogue import PROTOCOLS, score_image
 from dsr.metrics.metric import WORST

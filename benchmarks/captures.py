@@ -17,16 +17,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.data.base import SceneSource
-from dsr.data.ddrnet import DDRNetFrames
+from dsr.data.ddrnet_frames import DDRNetFrames
 from dsr.data.folder import Folder
-from dsr.data.formats.shared import read_millimetres, read_numbers, read_picture, to_camera
+from dsr.data.frame_files import read_millimetres, read_picture, to_camera
 from dsr.data.rgbdd import RGBDD
+from dsr.data.scene_source import SceneSource
 from dsr.data.sunrgbd import SunRGBD, load_pair
 from dsr.degradation.downsampling import Downsampling, Kernel, Measured, make_sample
 from dsr.geometry.camera import Camera
 from dsr.geometry.surface import angle_between, depth_to_normals
 from dsr.inference import upsampler
+from dsr.io.images import read_numbers
 from dsr.methods.recipe import read_recipe
 from dsr.metrics.catalogue import PROTOCOLS, score_image
 from dsr.metrics.metric import WORST

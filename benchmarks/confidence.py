@@ -17,11 +17,11 @@ import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from dsr.data.base import SceneSource
 from dsr.data.folder import Folder
 from dsr.data.icl import ICL
-from dsr.data.simgeo import SimGeo
-from dsr.degradation.everything import Everything
+from dsr.data.rendered import SimGeo
+from dsr.data.scene_source import SceneSource
+from dsr.degradation.random_degradation import Everything
 from dsr.methods.recipe import Run, read_recipe
 from dsr.metrics.calibration import error_ratios, measured_errors, squared_error_share
 from dsr.sample import DepthSample

@@ -22,15 +22,15 @@ import torch
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
-from dsr.data.formats.files import read_camera, read_rgb
 from dsr.degradation.downsampling import Downsampling
 from dsr.degradation.hints import relative_error
 from dsr.geometry.camera import Camera, from_range
 from dsr.geometry.surface import depth_to_normals
-from dsr.methods.networks.any_map import AnyMap
+from dsr.io.images import read_camera, read_rgb
+from dsr.methods.networks.facets_method import AnyMap
 from dsr.methods.recipe import Run, read_recipe
 from dsr.sample import DepthSample
-from dsr.utils.devices import fast_precision
+from dsr.utils.compute_device import fast_precision
 
 CASES = ((0.005, 2.0, 5.0, 0.0), (0.005, 2.0, 5.0, 1.0), (0.003, 3.0, 10.0, 0.0), (0.01, 1.0, 3.0, 1.0))
 """Noise of level 2 in metres, that of levels 1 and 0 over it, and over how many pixels noise is smoothed."""

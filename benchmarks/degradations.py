@@ -25,12 +25,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from real_sensors import glasses
 
-from dsr.data.ddrnet import DDRNetFrames
-from dsr.data.formats.shared import read_16bit, read_picture
-from dsr.data.procedural import Procedural
+from dsr.data.ddrnet_frames import DDRNetFrames
+from dsr.data.frame_files import read_16bit, read_picture
+from dsr.data.rendered import Procedural
 from dsr.data.rgbdd import RGBDD
-from dsr.degradation.everything import Everything
 from dsr.degradation.glass import add_glass
+from dsr.degradation.random_degradation import Everything
 from dsr.degradation.random_noise import NOISES
 from dsr.geometry.camera import Camera
 from dsr.pictures.depth_views import rendering

@@ -34,7 +34,7 @@ from dsr.methods.networks.weight_choice import packaged_weights
 from dsr.metrics.classes import visual_metrics
 from dsr.metrics.functional import SurfacePair
 from dsr.sample import DepthSample, Scene
-from dsr.utils.devices import fast_precision
+from dsr.utils.compute_device import fast_precision
 
 BOX = Downsampling("box")
 NAMES = ("RMSE_d", "DSSIM_v", "RMSE_v", "BadPix_v_5")

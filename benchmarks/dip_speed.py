@@ -22,7 +22,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dsr.data.simgeo import SimGeo
+from dsr.data.rendered import SimGeo
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.methods.dip import skip_net
 from dsr.methods.dip.optimisation import PriorOptimisation
@@ -30,7 +30,7 @@ from dsr.methods.dip.upsampler import DeepImagePrior
 from dsr.metrics.classes import visual_metrics
 from dsr.metrics.functional import SurfacePair
 from dsr.sample import DepthSample
-from dsr.utils.devices import fast_precision
+from dsr.utils.compute_device import fast_precision
 
 BOX = Downsampling("box")
 WIDE = (128,) * 5

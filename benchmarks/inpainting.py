@@ -29,7 +29,7 @@ from dsr.geometry.surface import depth_to_normals
 from dsr.methods.recipe import Run, read_recipe
 from dsr.metrics.functional import SurfacePair, rmse_d, rmse_v
 from dsr.sample import DepthSample, Scene
-from dsr.utils.devices import fast_precision
+from dsr.utils.compute_device import fast_precision
 
 BOX = Downsampling("box")
 KINDS: dict[str, Holes] = {"blobs": Blobs(0.1, 12.0), "shadows": Shadows(0.2)}

@@ -27,7 +27,7 @@ from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera
 from dsr.methods.recipe import Run, read_recipe
 from dsr.sample import DepthSample, Scene
-from dsr.utils.devices import fast_precision
+from dsr.utils.compute_device import fast_precision
 
 _TYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 _SQUARE = 2048

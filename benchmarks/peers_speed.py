@@ -27,9 +27,8 @@ from unittest.mock import MagicMock
 import torch
 from torch import Tensor, nn
 
-from dsr.methods.networks.maps import normalise_imagenet
-from dsr.methods.networks.peers.base import PeerUpsampler
-from dsr.methods.networks.peers.files import read_tensors
+from dsr.methods.networks.normalisation import normalise_imagenet
+from dsr.methods.networks.peers.peer_network import PeerUpsampler, read_tensors
 from dsr.methods.recipe import Run, read_recipe
 
 TRAINING_ONLY = (

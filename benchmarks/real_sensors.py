@@ -38,7 +38,7 @@ from flatness import FLOORS, flatness, given
 from scipy.stats import mannwhitneyu
 from torch import Tensor
 
-from dsr.data.formats.shared import read_millimetres, read_picture
+from dsr.data.frame_files import read_millimetres, read_picture
 from dsr.geometry.camera import Camera
 from dsr.inference import upsample_surface
 from dsr.methods.base import Surface

@@ -27,7 +27,7 @@ from panel_grid import Panel, save_panels
 from scipy import ndimage, stats
 
 from dsr.data import sunrgbd
-from dsr.data.procedural import Procedural
+from dsr.data.rendered import Procedural
 from dsr.degradation.random_noise import NOISES
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import render_for_viewing

@@ -27,11 +27,11 @@ import torch
 from scipy.ndimage import uniform_filter
 from torch import Tensor
 
-from dsr.data.ddrnet import DDRNetFrames
+from dsr.data.ddrnet_frames import DDRNetFrames
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.degradation.noise import Kinect, Noise, TimeOfFlight
 from dsr.geometry.camera import Camera
-from dsr.geometry.poses import Matrix, relative
+from dsr.geometry.rigid_motion import Matrix, relative
 from dsr.geometry.shading import render as render_lights
 from dsr.geometry.surface import depth_to_normals
 from dsr.geometry.warping import warp_depth
@@ -41,9 +41,9 @@ from dsr.methods.base import Surface
 from dsr.metrics.functional import SurfacePair, rmse_v
 from dsr.metrics.sensor import SensorComparison
 from dsr.sample import Scene
-from dsr.synthetic.procedural.scenes import make_camera, random_scene, render
+from dsr.synthetic.procedural.random_scene import make_camera, random_scene, render
 from dsr.synthetic.raycast import shade
-from dsr.synthetic.simgeo.scenes import build_scene
+from dsr.synthetic.simgeo import build_scene
 
 NOISES: dict[str, Callable[[], Noise]] = {"kinect": Kinect, "tof": TimeOfFlight}
 SOLIDS = ("cube_no_texture", "cube_high_freq", "sphere_cylinder_low_freq", "sphere_cylinder_high_freq")

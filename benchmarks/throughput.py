@@ -40,8 +40,8 @@ def render(folder: Path) -> tuple[Path, Path]:
     from dsr.degradation.downsampling import Downsampling, make_sample  # noqa: PLC0415 - seconds to import
     from dsr.degradation.noise import Kinect  # noqa: PLC0415
     from dsr.sample import Scene  # noqa: PLC0415
-    from dsr.synthetic.procedural.scenes import make_camera, random_scene  # noqa: PLC0415
-    from dsr.synthetic.procedural.scenes import render as render_scene  # noqa: PLC0415
+    from dsr.synthetic.procedural.random_scene import make_camera, random_scene  # noqa: PLC0415
+    from dsr.synthetic.procedural.random_scene import render as render_scene  # noqa: PLC0415
 
     scene = random_scene(np.random.default_rng(5))
     made = render_scene(scene, 640)

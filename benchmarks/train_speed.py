@@ -34,10 +34,10 @@ from dsr.app.schema import TrainConfig, plain_config, register
 from dsr.app.train import _module, _network
 from dsr.app.trainer import FirstValidation, training_trainer
 from dsr.app.training_runs import training_data
-from dsr.data.simgeo import SimGeo
+from dsr.data.rendered import SimGeo
 from dsr.degradation.downsampling import Downsampling
-from dsr.methods.networks.base import Answer
 from dsr.methods.networks.msg_net import MSGNet
+from dsr.methods.networks.network import Answer
 from dsr.training.degradation import Batch, Degradation
 from dsr.training.objective import DepthObjective, Objective
 from dsr.training.patches import Patches

@@ -25,8 +25,8 @@ from dsr.evaluation.store import prediction_path, sample_path
 from dsr.geometry.camera import Camera
 from dsr.metrics.catalogue import catalogue, score_image
 from dsr.sample import Scene
+from dsr.utils.compute_device import pick_device
 from dsr.utils.console import ConsoleProgress, _ConsoleTask
-from dsr.utils.devices import pick_device
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 UNIT_TESTS = REPOSITORY / "tests" / "unit"

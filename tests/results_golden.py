@@ -29,19 +29,17 @@ from reference_metrics import Array
 from torch import Tensor
 
 import dsr
-from dsr.data.preparation.inpainting import inpaint_depth
-from dsr.data.preparation.resizing import fit
-from dsr.data.procedural import Procedural
-from dsr.data.simgeo import SimGeo
+from dsr.data.reference_depth import fit, inpaint_depth
+from dsr.data.rendered import Procedural, SimGeo
 from dsr.degradation import holes as of_holes
 from dsr.degradation import noise as of_noise
 from dsr.degradation.downsampling import Downsampling, make_sample
-from dsr.degradation.everything import Everything
-from dsr.degradation.random_holes import HOLES
+from dsr.degradation.holes import HOLES
+from dsr.degradation.random_degradation import Everything
 from dsr.degradation.random_noise import NOISES
 from dsr.geometry.camera import from_range, to_range
 from dsr.geometry.edges import find_edges
-from dsr.geometry.holes import distance_to_known, wide_holes
+from dsr.geometry.hole_size import distance_to_known, wide_holes
 from dsr.geometry.mesh import triangulate
 from dsr.geometry.registration import find_displacement, undo
 from dsr.geometry.resampling import pad_inverse_depth, resize_inverse_depth
@@ -49,14 +47,14 @@ from dsr.geometry.shading import render, render_for_viewing
 from dsr.geometry.surface import depth_to_normals
 from dsr.geometry.warping import warp_depth
 from dsr.inference.any_ratio import upsample_surface
-from dsr.inference.outliers import find_outliers, within_measured
+from dsr.inference.plausibility import find_outliers, within_measured
 from dsr.inference.sequences import View, fuse_views
 from dsr.inference.working_size import find_noise, find_sensor
 from dsr.methods.inpainting import inpaint
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.msg_net import MSGNet
 from dsr.methods.networks.weight_choice import packaged_names, packaged_weights
-from dsr.methods.noise import estimate_noise, estimate_sensor_noise
+from dsr.methods.noise_level import estimate_noise, estimate_sensor_noise
 from dsr.methods.recipe import Known, Run, list_methods, read_recipe
 from dsr.sample import Scene
 from dsr.training.degradation import Degradation, to_tensors
@@ -64,9 +62,8 @@ from dsr.training.module import SuperResolution
 from dsr.training.objective import DepthObjective, Objective, SurfaceObjective, balance_weight
 from dsr.training.patches import Patches
 from dsr.training.settings import PatchSettings
-from dsr.utils import devices
-from dsr.utils.hashing import file_hash
-from dsr.utils.versions import RESULTS, SCENES
+from dsr.utils import compute_device
+from dsr.utils.versions import RESULTS, SCENES, file_hash
 
 FILE = Path(__file__).resolve().parent / "golden" / "results.npz"
 TOLERANCE = 1e-4
@@ -501,7 +498,7 @@ def _numbers(values: Any) -> Tensor:
 def compute(jobs: Iterator[tuple[str, Job]]) -> dict[str, Array]:
     """Return the summary of each result, in float32 also where bfloat16 is faster."""
     found = {}
-    with mock.patch.object(devices, "_FAST_ON_CPU", ()):
+    with mock.patch.object(compute_device, "_FAST_ON_CPU", ()):
         for name, job in jobs:
             parts = job()
             for number, part in enumerate(parts if isinstance(parts, list) else [parts]):

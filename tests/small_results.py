@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from dsr.geometry.camera import Camera
-from dsr.io.input_files import write_input
+from dsr.io.exports import write_input
 
 SIZE = 64
 CAMERA = Camera(SIZE, SIZE, 80.0, 80.0, 31.0, 32.5)

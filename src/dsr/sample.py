@@ -18,9 +18,9 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera, to_range
-from dsr.utils.files import read_arrays, replacing
-from dsr.utils.limits import TooLargeError
-from dsr.utils.parsing import parse_json
+from dsr.utils.arrays import read_arrays
+from dsr.utils.files import replacing
+from dsr.utils.guards import TooLargeError, parse_json
 from dsr.utils.ratios import as_ratio, fits_ratio, round_ratio
 
 NEAREST, FARTHEST = 1e-6, 1e9

@@ -175,7 +175,7 @@ def _unpack(place: Place) -> None:
 
 
 def _verify(place: Place) -> None:
-    from dsr.data.download.collection import Collection, Item  # noqa: PLC0415
+    from dsr.data.download.collections import Collection, Item  # noqa: PLC0415
     from dsr.data.download.fetching import state, verify  # noqa: PLC0415
     from dsr.utils.progress import Progress  # noqa: PLC0415
 
@@ -195,7 +195,7 @@ def _weights(place: Place) -> None:
 
 def _published(*names: str) -> Callable[[Place], None]:
     def read(place: Place) -> None:
-        from dsr.methods.networks.published import load_msg_weights  # noqa: PLC0415
+        from dsr.methods.networks.trained import load_msg_weights  # noqa: PLC0415
 
         _each(place, names, lambda path: load_msg_weights(path, 2))
 
@@ -203,8 +203,8 @@ def _published(*names: str) -> Callable[[Place], None]:
 
 
 def _peers(place: Place) -> None:
-    from dsr.methods.networks.peers.files import load_peer  # noqa: PLC0415
-    from dsr.methods.networks.peers.svlrm import SVLRM  # noqa: PLC0415
+    from dsr.methods.networks.peers.local_filters import SVLRM  # noqa: PLC0415
+    from dsr.methods.networks.peers.peer_network import load_peer  # noqa: PLC0415
 
     _each(place, ("peer.pth", "peer_old.pth"), lambda path: load_peer(path, SVLRM, 4))
 

@@ -133,7 +133,7 @@ def study_table(folder: Path) -> None:
 
 def user_configuration(folder: Path) -> None:
     """Write a directory of configuration files with a method, a data set and a model."""
-    from dsr.utils.config_files import config_directories  # noqa: PLC0415
+    from dsr.utils.configuration import config_directories  # noqa: PLC0415
 
     own = config_directories()[0]
     for group, source, name in (("method", "tgv", "mine"), ("dataset", "folder", "ours"), ("model", "pdn", "net")):

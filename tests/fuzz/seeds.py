@@ -270,11 +270,11 @@ def dsr_weights(folder: Path) -> None:
 
 def torch_weights(folder: Path) -> None:
     """Write the authors' file of MSG-Net: of torch's present and earlier format."""
-    from dsr.methods.networks import published  # noqa: PLC0415
+    from dsr.methods.networks import trained  # noqa: PLC0415
     from dsr.methods.networks.msg_net import MSGNet  # noqa: PLC0415
 
-    theirs = zip(published._author_names(1), published._layer_names(1), strict=True)
-    ours = {f"{b}.{part}": f"{a}.{part}" for a, b in theirs for part in published.PARTS}
+    theirs = zip(trained._author_names(1), trained._layer_names(1), strict=True)
+    ours = {f"{b}.{part}": f"{a}.{part}" for a, b in theirs for part in trained.PARTS}
     state = {ours[name]: value for name, value in MSGNet(2, "voynov").state_dict().items() if name in ours}
     torch.save({"model_state_dict": state, "epoch": 3}, folder / "voynov.pth")
     torch.save({"model_state_dict": state}, folder / "earlier.pth", _use_new_zipfile_serialization=False)

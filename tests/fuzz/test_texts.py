@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 
 from dsr.app.entry import run_command
 from dsr.cli import main
-from dsr.data.formats.files import CameraFile, read_camera
 from dsr.geometry.camera import Camera
 from dsr.io.cameras import read_any_camera
-from dsr.io.poses import read_poses, read_transform
+from dsr.io.images import CameraFile, read_camera
 from dsr.io.reading import parse_unit
+from dsr.io.trajectories import read_poses, read_transform
 from dsr.utils.console import one_line
 from fuzz.values import NUMBERS
 

@@ -35,7 +35,7 @@ OUTSIDE = ("../" * 9 + "etc/passwd", "../../etc/passwd", "..\\..\\etc\\passwd", 
 TARGETS = (
     "os.system", "os.mkdir", "subprocess.run", "subprocess.Popen", "builtins.exec", "builtins.eval", "shutil.rmtree",
     "pathlib.Path", f"{MARK}.run", f"{MARK}", "dsr.cli.main", "dsr.methods", "dsr.nowhere.X", "..", "a b.c", ".x", "x.",
-    "json.loads", "dsr.utils.files.write_text", "dsr.utils.builder.load_object", "builtins.print", "torch.load",
+    "json.loads", "dsr.utils.files.write_text", "dsr.utils.configuration.load_object", "builtins.print", "torch.load",
 )  # fmt: skip
 
 

@@ -17,15 +17,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from dsr.data.base import SceneSource
-from dsr.data.ddrnet import DDRNetFrames
+from dsr.data.ddrnet_frames import DDRNetFrames
 from dsr.data.eight_bit import EightBit
 from dsr.data.rgbdd import RGBDD
+from dsr.data.scene_source import SceneSource
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import RangeType
 from dsr.methods.base import Method
-from dsr.methods.classical.cubic_convolution import CubicConvolution
-from dsr.methods.networks.peers.build import Peer
+from dsr.methods.classical.interpolation import CubicConvolution
+from dsr.methods.networks.peers.peer import Peer
 from dsr.metrics.catalogue import catalogue, score_image
 from dsr.metrics.formats import HEADLINES
 

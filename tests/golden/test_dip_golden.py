@@ -15,7 +15,7 @@ from dsr.methods.classical.interpolation import Interpolation
 from dsr.methods.dip.upsampler import DeepImagePrior
 from dsr.metrics.functional import SurfacePair, dssim_v, rmse_d, rmse_v
 from dsr.sample import DepthSample
-from dsr.utils.devices import fast_precision
+from dsr.utils.compute_device import fast_precision
 
 BOX = Downsampling("box")
 

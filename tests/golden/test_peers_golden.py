@@ -10,10 +10,10 @@ import pandas as pd
 import pytest
 import torch
 
-from dsr.data.base import SceneSource
 from dsr.data.eight_bit import EightBit
 from dsr.data.folder import Folder
 from dsr.data.rgbdd import RGBDD
+from dsr.data.scene_source import SceneSource
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import RangeType
 from dsr.methods.recipe import read_recipe

@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from dsr.data.folder import Folder
-from dsr.data.simgeo import SimGeo
+from dsr.data.rendered import SimGeo
 from dsr.degradation.downsampling import Downsampling, make_sample
-from dsr.methods.networks.base import NetworkUpsampler
+from dsr.methods.networks.network import NetworkUpsampler
 from dsr.methods.networks.trained import TrainedNetwork
 from dsr.methods.networks.weight_choice import packaged_weights
 from dsr.methods.recipe import read_recipe

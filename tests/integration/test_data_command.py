@@ -16,7 +16,7 @@ import pytest
 
 from dsr import cli
 from dsr.data.download import fetching
-from dsr.data.download.catalogue import Collection, Item
+from dsr.data.download.collections import Collection, Item
 
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(range(256)) * 1000
 NAMES = [f"middlebury2003/{scene}/{name}" for scene in ("cones", "teddy") for name in ("im2.png", "disp2.png")]
@@ -302,9 +302,9 @@ def test_help_has_examples(arguments, capsys):
 
 
 def test_doctor_exit_code_is_that_of_the_command(tmp_path, monkeypatch):
-    doctor = types.ModuleType("dsr.doctor")
+    doctor = types.ModuleType("dsr.doctor.examine")
     seen = []
     doctor.examine_directory = lambda *given: seen.append(given) or 3
-    monkeypatch.setitem(sys.modules, "dsr.doctor", doctor)
+    monkeypatch.setitem(sys.modules, "dsr.doctor.examine", doctor)
     assert cli.main(["doctor", str(tmp_path)]) == 3
     assert seen == [(tmp_path, None)]

@@ -8,7 +8,7 @@ import pytest
 from commands import run_python
 
 from dsr.cli import main
-from dsr.synthetic.simgeo.scenes import render_scene
+from dsr.synthetic.simgeo import render_scene
 
 
 def doctor(folder):

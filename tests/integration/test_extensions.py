@@ -14,7 +14,7 @@ from commands import run_python
 
 from dsr.app.metrics import extra_metrics
 from dsr.app.schema import MetricsConfig
-from dsr.utils.builder import ConfigError
+from dsr.utils.configuration import ConfigError
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 MODULE = '''

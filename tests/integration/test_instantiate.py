@@ -17,13 +17,12 @@ import dsr
 from dsr.app.schema import TrainConfig, plain_config
 from dsr.degradation.downsampling import Downsampling, Measured
 from dsr.methods.base import Method
-from dsr.methods.networks.base import DisparityNetwork
+from dsr.methods.networks.network import DisparityNetwork
 from dsr.methods.recipe import list_methods, read_recipe
 from dsr.training.module import SuperResolution
 from dsr.training.objective import Objective
 from dsr.training.settings import PatchSettings
-from dsr.utils.builder import build
-from dsr.utils.config_files import config_directories, list_choices
+from dsr.utils.configuration import build, config_directories, list_choices
 
 PEERS = [name for name in list_methods() if "weights_files" in read_recipe(name).node]
 

@@ -15,7 +15,7 @@ import pytest
 from dsr.app import slurm
 from dsr.app.entry import run_command
 from dsr.utils import interruption
-from dsr.utils.builder import ConfigError
+from dsr.utils.configuration import ConfigError
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 LOCAL = ("hydra/launcher=slurm", "hydra.launcher.cluster=local", "hydra.launcher.gpus_per_node=null")

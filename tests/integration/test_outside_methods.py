@@ -17,7 +17,7 @@ import torch
 from torch import nn
 
 from dsr.methods.base import Method
-from dsr.methods.networks.base import DisparityNetwork
+from dsr.methods.networks.network import DisparityNetwork
 
 
 class Constant(Method):

@@ -14,7 +14,7 @@ from PIL import Image
 from dsr.cli import main
 from dsr.geometry.camera import Camera
 from dsr.io.depth_files import read_depth_file, write_depth_file
-from dsr.synthetic.simgeo.scenes import render_scene
+from dsr.synthetic.simgeo import render_scene
 
 PARTS = {
     "depth": ("depth.png", "depth_metres.npy"),

@@ -9,7 +9,7 @@ from collections import Counter
 import pandas as pd
 import pytest
 
-from dsr.cli import study as command
+from dsr.cli.study import STUDY
 from dsr.evaluation.run_files import load_results
 from dsr.report.study.choice import Choice
 from dsr.report.study.key import read_key
@@ -105,7 +105,7 @@ class Visit:
 
 def run(*arguments):
     parser = argparse.ArgumentParser()
-    command.add(parser.add_subparsers())
+    STUDY.add(parser.add_subparsers())
     options = parser.parse_args(["study", *map(str, arguments)])
     return options.run(options, open_console(), None)
 

@@ -11,7 +11,7 @@ from small_results import waves, write_result
 
 from dsr.cli import main
 from dsr.geometry.camera import Camera
-from dsr.synthetic.simgeo.scenes import render_scene
+from dsr.synthetic.simgeo import render_scene
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from dsr.geometry.camera import Camera
-from dsr.inference.agreement import expect_errors
+from dsr.inference.plausibility import expect_errors
 
 CAMERA = Camera.from_fov(96, 64)
 

@@ -14,9 +14,9 @@ from torch.nn import functional
 
 from dsr.degradation.hints import FACTS
 from dsr.geometry.camera import Camera
-from dsr.methods.networks.any_map import CAUTION, AnyMap
-from dsr.methods.networks.base import Answer
+from dsr.methods.networks.facets_method import CAUTION, AnyMap
 from dsr.methods.networks.facets_unet import FacetsUNet
+from dsr.methods.networks.network import Answer
 from dsr.methods.networks.weight_files import files_of_weights, save_network
 from dsr.sample import DepthSample
 

@@ -11,8 +11,8 @@ import torch
 from hydra.utils import instantiate
 
 from dsr.app.schema import EvalConfig
-from dsr.utils.builder import ConfigError, build
-from dsr.utils.devices import pick_device
+from dsr.utils.compute_device import pick_device
+from dsr.utils.configuration import ConfigError, build
 
 Order = Literal["near", "far"]
 

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from dsr.evaluation import claims as claims_module
-from dsr.evaluation.claims import LOST, Claims
-from dsr.utils.temporary import birth, machine
+from dsr.evaluation import sharing as claims_module
+from dsr.evaluation.sharing import LOST, Claims
+from dsr.utils.files import birth, machine
 
 FORK = multiprocessing.get_context("fork")
 NAMES = list(map(str, range(40)))

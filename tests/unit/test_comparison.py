@@ -5,8 +5,7 @@ from __future__ import annotations
 import torch
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.comparison import comparison
-from dsr.geometry.shading import render
+from dsr.geometry.shading import comparison, render
 from dsr.geometry.surface import depth_to_normals
 
 CAMERA = Camera(width=160, height=144, fx=200.0, fy=200.0, cx=79.5, cy=71.5)

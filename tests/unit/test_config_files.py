@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from dsr.utils import config_files
-from dsr.utils.config_files import config_directories, list_choices, list_groups
+from dsr.utils import configuration
+from dsr.utils.configuration import config_directories, list_choices, list_groups
 
 CHECKOUT = Path(__file__).resolve().parents[2] / "conf"
 
@@ -17,7 +17,7 @@ def test_configuration_of_a_checkout_is_conf():
 def test_configuration_of_an_installed_package_comes_with_it(tmp_path, monkeypatch):
     (tmp_path / "conf").mkdir()
     (tmp_path / "conf" / "eval.yaml").touch()
-    monkeypatch.setattr(config_files, "_PLACES", (tmp_path / "conf", CHECKOUT))
+    monkeypatch.setattr(configuration, "_PLACES", (tmp_path / "conf", CHECKOUT))
     assert config_directories() == (tmp_path / "conf",)
 
 
@@ -40,6 +40,6 @@ def test_missing_directory_is_refused_by_name(tmp_path):
 
 
 def test_incomplete_installation_is_refused_by_name(tmp_path, monkeypatch):
-    monkeypatch.setattr(config_files, "_PLACES", (tmp_path / "conf",))
+    monkeypatch.setattr(configuration, "_PLACES", (tmp_path / "conf",))
     with pytest.raises(ValueError, match="the installation is incomplete"):
         config_directories()

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dsr.methods.classical.conjugate_gradients import conjugate_gradients
+from dsr.methods.classical.iterations import conjugate_gradients
 
 
 def _systems(batch: int, size: int) -> tuple[Tensor, Tensor]:

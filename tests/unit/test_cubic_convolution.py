@@ -9,7 +9,7 @@ from PIL import Image
 
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera, RangeType, from_range, to_range
-from dsr.methods.classical.cubic_convolution import CubicConvolution
+from dsr.methods.classical.interpolation import CubicConvolution
 from dsr.sample import DepthSample, Scene
 
 CAMERA = Camera(48, 40, 50.0, 50.0, 22.0, 21.0, baseline=0.3, doffs=4.0)

@@ -9,7 +9,7 @@ from dsr.data.folder import Folder
 from dsr.data.icl import FRAMES as ICL_FRAMES
 from dsr.data.icl import ICL
 from dsr.data.middlebury import EVALUATION_2014, TRAINING, Middlebury, MiddleburyLevels, MiddleburyTrain
-from dsr.data.simgeo import SimGeo
+from dsr.data.rendered import SimGeo
 from dsr.data.sintel import SEQUENCES, Sintel, sintel_frames
 from dsr.data.sunrgbd import FRAMES as SUN_FRAMES
 from dsr.data.sunrgbd import SunRGBD
@@ -18,11 +18,11 @@ from dsr.data.tofmark import ToFMark
 from dsr.degradation.downsampling import Downsampling
 from dsr.methods.recipe import read_recipe
 from dsr.report.paper import published_row
-from dsr.synthetic.simgeo.scenes import SCENES as SIMGEO_SCENES
+from dsr.synthetic.simgeo import SCENES as SIMGEO_SCENES
 from dsr.training.data_module import Part, PatchData
 from dsr.training.degradation import Degradation
 from dsr.training.settings import PatchSettings
-from dsr.utils.builder import ConfigError, build
+from dsr.utils.configuration import ConfigError, build
 
 CONF = Path(__file__).resolve().parents[2] / "conf" / "dataset"
 

@@ -14,7 +14,7 @@ from dsr.methods.dip.upsampler import DeepImagePrior
 from dsr.methods.recipe import read_recipe
 from dsr.training.module import SuperResolution
 from dsr.training.settings import PatchSettings
-from dsr.utils.builder import load_target
+from dsr.utils.configuration import load_target
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 GROUPS = ("method", "model", "noise", "holes", "downsampling", "dataset")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dsr.data.preparation.dequantization import smooth_levels
+from dsr.data.reference_depth import smooth_levels
 
 Y, X = np.mgrid[:120, :160].astype(float)
 

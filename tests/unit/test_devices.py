@@ -20,14 +20,14 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from dsr.degradation.downsampling import Downsampling, Holes, make_sample
-from dsr.degradation.everything import Everything
 from dsr.degradation.holes import Blobs, Shadows
 from dsr.degradation.noise import GaussianMultiplicative, Kinect, Noise, TimeOfFlight
+from dsr.degradation.random_degradation import Everything
 from dsr.inference import upsample_surface
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.msg_net import MSGNet
 from dsr.methods.networks.pdn import PrimalDualNetwork
-from dsr.methods.networks.peers.build import PEERS
+from dsr.methods.networks.peers.peer import PEERS
 from dsr.methods.recipe import Run, list_methods, read_recipe
 from dsr.metrics import losses
 from dsr.metrics.catalogue import PROTOCOLS, catalogue, score_image
@@ -41,8 +41,8 @@ from dsr.training.module import SuperResolution
 from dsr.training.objective import DepthObjective, SurfaceObjective
 from dsr.training.patches import Patches
 from dsr.training.settings import PatchSettings
-from dsr.utils.builder import ConfigError
-from dsr.utils.devices import fast_precision, pick_device
+from dsr.utils.compute_device import fast_precision, pick_device
+from dsr.utils.configuration import ConfigError
 
 SHORT: dict[str, dict[str, Any]] = {
     "dip": {"steps": 2},

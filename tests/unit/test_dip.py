@@ -17,7 +17,7 @@ from torch import Tensor
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.degradation.holes import Blobs
 from dsr.geometry.camera import Camera
-from dsr.methods.dip.callbacks import cost_of_step
+from dsr.methods.dip.optimisation import cost_of_step
 from dsr.methods.dip.upsampler import DeepImagePrior, WarmStarted
 from dsr.methods.networks.weight_choice import packaged_weights
 from dsr.metrics.classes import visual_metrics

@@ -13,7 +13,7 @@ from dsr.geometry.camera import Camera
 from dsr.geometry.surface import depth_to_normals
 from dsr.methods.dip.problem import ImageProblem, PriorObjective
 from dsr.methods.dip.stopping import Fixed, Oracle, Residual, Variance
-from dsr.methods.noise import estimate_noise, normal_noise_deg
+from dsr.methods.noise_level import estimate_noise, normal_noise_deg
 from dsr.metrics.functional import SurfacePair, rmse_v
 from dsr.metrics.losses import lap1
 from dsr.sample import DepthSample, Scene

@@ -10,9 +10,8 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from torch.utils.data import DataLoader
 
 from dsr.app.divergence import NOTE, expect_no_divergence, note_divergence
-from dsr.utils.builder import ConfigError
-from dsr.utils.checkpoints import Interruption
-from dsr.utils.divergence import Divergence, DivergenceError
+from dsr.utils.checkpoints import Divergence, DivergenceError, Interruption
+from dsr.utils.configuration import ConfigError
 from dsr.utils.lightning import fit, make_trainer
 
 NAN = math.nan

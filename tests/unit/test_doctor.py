@@ -11,18 +11,16 @@ import pytest
 import torch
 
 from dsr.data.folder import load_scene
-from dsr.data.formats.files import read_map, read_rgb
-from dsr.doctor import examine_directory
-from dsr.doctor.examine import CHECKS, examine
+from dsr.doctor.camera_checks import check_registration, plane_votes
+from dsr.doctor.depth_checks import find_rounding
+from dsr.doctor.examine import CHECKS, examine, examine_directory
 from dsr.doctor.finding import length, with_depth
-from dsr.doctor.planes import plane_votes
-from dsr.doctor.precision import find_rounding
-from dsr.doctor.registration import check_registration
 from dsr.geometry.camera import Camera, from_range, to_range
+from dsr.io.images import read_map, read_rgb
 from dsr.sample import Scene
-from dsr.synthetic.procedural.scenes import render_random_scene
-from dsr.synthetic.simgeo.scenes import render_scene
-from dsr.synthetic.surfaces import rotation
+from dsr.synthetic.procedural.random_scene import render_random_scene
+from dsr.synthetic.ray_surfaces import rotation
+from dsr.synthetic.simgeo import render_scene
 
 SIZE = 256
 CAMERA = Camera(SIZE, SIZE, 240.0, 240.0, 127.5, 127.5, baseline=0.2)

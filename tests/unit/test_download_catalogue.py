@@ -5,7 +5,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from dsr.data.download.catalogue import CATALOGUE, EVALUATION_2014, SCENES_2006, TRAINING_2014, find
+from dsr.data.download.collections import CATALOGUE, EVALUATION_2014, SCENES_2006, TRAINING_2014, find
 from dsr.data.middlebury import EVALUATION_2014 as EVALUATED
 from dsr.data.middlebury import SCENES
 

@@ -21,9 +21,9 @@ from dsr.degradation.downsampling import (
     scene_generator,
 )
 from dsr.degradation.noise import GaussianMultiplicative, no_noise
-from dsr.degradation.scales import SCALES
 from dsr.geometry.camera import RANGE_TYPES, Camera, RangeType, to_range
 from dsr.sample import DepthSample, Scene
+from dsr.utils.ratios import SCALES
 
 KERNELS: tuple[Kernel, ...] = get_args(Kernel)
 ASKED_AND_METHOD = [*((None, method) for method in RANGE_TYPES), ("perspective", "disparity")]

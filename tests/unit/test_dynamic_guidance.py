@@ -10,8 +10,15 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.methods.classical.finite_differences import box_mean, repeat_blocks, upsample_linear_border
-from dsr.methods.networks.analysis_filters import WIDTHS, influence, penalty, plane_free_basis, zero_mean_basis
-from dsr.methods.networks.dg import DynamicGuidance, Stage
+from dsr.methods.networks.dynamic_guidance import (
+    WIDTHS,
+    DynamicGuidance,
+    Stage,
+    influence,
+    penalty,
+    plane_free_basis,
+    zero_mean_basis,
+)
 
 SCALES = (2, 4, 8, 16)
 

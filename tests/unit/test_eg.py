@@ -13,8 +13,7 @@ from torch import Tensor
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.methods.base import NoSolutionError
-from dsr.methods.classical.eg.bilateral import bilateral_filter, find_reachable
-from dsr.methods.classical.eg.upsampler import EdgeGuided, prime_factors
+from dsr.methods.classical.edge_guided import EdgeGuided, bilateral_filter, find_reachable, prime_factors
 from dsr.methods.classical.interpolation import Interpolation
 from dsr.methods.classical.photo_guided import estimate_slopes
 from dsr.sample import DepthSample, Scene

@@ -11,16 +11,17 @@ from scipy import ndimage
 from torch import Tensor
 
 from dsr.methods.base import NoSolutionError
-from dsr.methods.classical.eg.belief_propagation import energy, label
-from dsr.methods.classical.eg.edge_map import detect_edges, predict_edge_map, thin
-from dsr.methods.classical.eg.patches import (
+from dsr.methods.classical.edge_map import detect_edges, predict_edge_map, thin
+from dsr.methods.classical.edge_patches import (
     PATCH,
     Patches,
     average_patches,
     deduplicate,
     edge_distances,
+    energy,
     find_nearest,
     find_overlaps,
+    label,
     orient,
 )
 

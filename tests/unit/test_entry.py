@@ -8,7 +8,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.plugins import Plugins
 
 from dsr.app.entry import run_command
-from dsr.utils.builder import ConfigError
+from dsr.utils.configuration import ConfigError
 
 
 @pytest.fixture

@@ -12,9 +12,9 @@ from torch.nn import functional
 
 from dsr.degradation import random_noise
 from dsr.degradation.downsampling import Downsampling
-from dsr.degradation.everything import Everything
 from dsr.degradation.hints import FACTS, KERNELS
-from dsr.degradation.random_scenes import add_folds, displace
+from dsr.degradation.random_degradation import Everything
+from dsr.degradation.random_fields import add_folds, displace
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
 from dsr.training.augmentation import soften

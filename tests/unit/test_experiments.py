@@ -13,8 +13,7 @@ from dsr.app.schema import EvalConfig, TrainConfig, plain_config
 from dsr.app.training_runs import training_data
 from dsr.methods.base import Method
 from dsr.methods.networks.weight_choice import packaged_names
-from dsr.utils.builder import ConfigError, build, load_target
-from dsr.utils.config_files import config_directories, list_choices
+from dsr.utils.configuration import ConfigError, build, config_directories, list_choices, load_target
 
 DIRECTORIES = config_directories()
 FOLDER = DIRECTORIES[0] / "experiment"

@@ -13,7 +13,6 @@ from torch.nn import functional
 from dsr.degradation.downsampling import Downsampling
 from dsr.degradation.hints import FACTS, KERNELS, encode_facts
 from dsr.methods.networks import facets_planes, facets_unet
-from dsr.methods.networks.base import Answer
 from dsr.methods.networks.facets import Facets
 from dsr.methods.networks.facets_layers import enlarge
 from dsr.methods.networks.facets_planes import (
@@ -24,6 +23,7 @@ from dsr.methods.networks.facets_planes import (
     spline_logits,
 )
 from dsr.methods.networks.facets_unet import FacetsUNet
+from dsr.methods.networks.network import Answer
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, save_network
 

@@ -10,15 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from dsr.utils import space, temporary
-from dsr.utils.files import replacing, replacing_folder, write_text
-from dsr.utils.space import FullDiskError, silence_threads
+from dsr.utils import files
+from dsr.utils.files import FullDiskError, replacing, replacing_folder, silence_threads, write_text
 
 
 @pytest.fixture(autouse=True)
 def fresh():
     """Look after abandoned files in every test, as in a process of its own."""
-    temporary.remove_abandoned.cache_clear()
+    files.remove_abandoned.cache_clear()
 
 
 def abandoned(folder: Path) -> Path:
@@ -41,8 +40,8 @@ def test_temporary_file_of_a_killed_process_is_removed_by_the_next_write(tmp_pat
 
 
 def test_temporary_files_of_running_processes_and_of_others_are_kept(tmp_path: Path) -> None:
-    machine = temporary.owner().partition("-")[0]
-    names = [f".a-{temporary.owner()}-abcdefgh.png", f".a-{machine}-1-abcdefgh", ".a-000000-99999999-abcdefgh.png",
+    machine = files.owner().partition("-")[0]
+    names = [f".a-{files.owner()}-abcdefgh.png", f".a-{machine}-1-abcdefgh", ".a-000000-99999999-abcdefgh.png",
              ".hidden", "a-b-c.png"]  # fmt: skip
     for name in names:
         (tmp_path / name).write_text("")
@@ -51,7 +50,7 @@ def test_temporary_files_of_running_processes_and_of_others_are_kept(tmp_path: P
 
 
 def test_temporary_directory_of_a_killed_process_is_removed(tmp_path: Path) -> None:
-    machine = temporary.owner().partition("-")[0]
+    machine = files.owner().partition("-")[0]
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
     (tmp_path / f".report-{machine}-{dead.pid}-abcdefgh" / "tables").mkdir(parents=True)
@@ -89,7 +88,7 @@ def test_full_disk_is_recognised_where_a_library_only_says_that_it_failed(tmp_pa
 
     with pytest.raises(RuntimeError):
         write()
-    monkeypatch.setattr(space, "_LITTLE", 1 << 62)
+    monkeypatch.setattr(files, "_LITTLE", 1 << 62)
     with pytest.raises(FullDiskError):
         write()
 

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dsr.data.ddrnet import CAMERA, DDRNetFrames, find_frames, load_frame
+from dsr.data.ddrnet_frames import CAMERA, DDRNetFrames, find_frames, load_frame
 
 ROWS, COLUMNS = np.mgrid[0:480, 0:640]
 TRUTH = (1000 + ROWS + 2 * COLUMNS).astype(np.uint16)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dsr.data.diml import DIML, find_frames
-from dsr.data.formats.shared import NO_CAMERA, load_pair
+from dsr.data.frame_files import NO_CAMERA, load_pair
 
 DEPTH = (1000 + 2 * np.arange(16)[:, None] + np.arange(28)).astype(np.uint16)
 

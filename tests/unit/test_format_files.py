@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dsr.data.formats.files import read_camera, read_map, read_mask, read_rgb
+from dsr.io.images import read_camera, read_map, read_mask, read_rgb
 
 VALUES = np.array([[1.0, 2.5, 3.25], [4.5, 5.0, 60000.0]])
 """Not symmetric under any flip, exact in float32."""

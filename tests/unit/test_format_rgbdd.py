@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dsr.data.formats.shared import NO_CAMERA, load_pair
+from dsr.data.frame_files import NO_CAMERA, load_pair
 from dsr.data.rgbdd import RGBDD, find_frames, load_measured_frame
 
 ROWS, COLUMNS = np.mgrid[0:384, 0:512]

@@ -9,7 +9,7 @@ import scipy.io
 import scipy.sparse
 import torch
 
-from dsr.data.formats.matlab import read_variables
+from dsr.data.matlab import read_variables
 from dsr.data.tofmark import block_means, find_frames, load_frame, read_matrices, read_samples
 
 INTRINSICS = (40.0, 40.0, 19.5, 9.5)

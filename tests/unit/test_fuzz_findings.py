@@ -22,17 +22,17 @@ from dsr.app.upsample.outputs import read_previous_run
 from dsr.data.download.fetching import unpack
 from dsr.data.tofmark import read_matrices
 from dsr.inference import upsampler
-from dsr.io.captures.arkitscenes import find_arkitscenes
+from dsr.io.captures.arkit import find_arkitscenes
 from dsr.io.captures.stray import find_stray
-from dsr.io.input_files import read_input, write_input
+from dsr.io.exports import read_input, write_input
 from dsr.io.photos import read_photo
 from dsr.methods.networks.weight_files import is_dsr_weights
 from dsr.methods.recipe import read_recipe
 from dsr.report.study.answers import files_of
 from dsr.report.study.study_table import read_study
 from dsr.report.surface_page import is_view
-from dsr.utils.builder import ConfigError
-from dsr.utils.files import open_array
+from dsr.utils.arrays import open_array
+from dsr.utils.configuration import ConfigError
 from dsr.utils.picture_headers import picture_size
 
 

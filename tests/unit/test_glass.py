@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from dsr.degradation.everything import SENSOR_NOISES, Everything
 from dsr.degradation.glass import KINDS, add_glass
 from dsr.degradation.glass_shapes import Pose, ball
+from dsr.degradation.random_degradation import SENSOR_NOISES, Everything
 from dsr.geometry.camera import Camera
 from dsr.sample import AllHolesError, DepthSample, Scene
 

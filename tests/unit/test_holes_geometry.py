@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from dsr.geometry.holes import degrees_per_pixel, distance_to_known, wide_holes
+from dsr.geometry.hole_size import degrees_per_pixel, distance_to_known, wide_holes
 
 
 def test_distance_is_that_of_the_nearest_known_pixel() -> None:

@@ -8,9 +8,9 @@ from module_graph import MODULES, SOURCE, import_graph, imports_of, within
 LAYERS = (
     ("dsr.utils", "dsr.geometry"),
     ("dsr.sample",),
-    ("dsr.degradation", "dsr.metrics", "dsr.synthetic"),
+    ("dsr.degradation", "dsr.metrics", "dsr.synthetic", "dsr.io"),
     ("dsr.data", "dsr.methods"),
-    ("dsr.training", "dsr.evaluation", "dsr.inference", "dsr.io"),
+    ("dsr.training", "dsr.evaluation", "dsr.inference"),
     ("dsr.pictures",),
     ("dsr.doctor", "dsr.report"),
     ("dsr.app",),
@@ -108,9 +108,9 @@ def test_modules_do_not_import_each_other_in_a_circle():
 @pytest.mark.parametrize(
     ("module", "text", "offence"),
     [
-        ("dsr.degradation.downsampling", "import dsr.data.formats.files", "dsr.data.formats.files"),
-        ("dsr.data.formats.files", "from dsr.methods.networks import msg_net", "dsr.methods.networks.msg_net"),
-        ("dsr.data.formats.files", "def f():\n    from ...metrics import lpips", "dsr.metrics.lpips"),
+        ("dsr.degradation.downsampling", "import dsr.data.folder", "dsr.data.folder"),
+        ("dsr.data.folder", "from dsr.methods.networks import msg_net", "dsr.methods.networks.msg_net"),
+        ("dsr.io.images", "def f():\n    from ..metrics import lpips", "dsr.metrics.lpips"),
         ("dsr.metrics.classes", "from dsr.synthetic import raycast", "dsr.synthetic.raycast"),
         ("dsr.report.tables", "from dsr.evaluation.score import score", "dsr.evaluation.score"),
         ("dsr.evaluation.predict", "from omegaconf.errors import X", "omegaconf.errors"),
@@ -126,7 +126,7 @@ def test_import_check_finds_a_forbidden_import(module, text, offence):
 
 def test_module_graph_finds_the_modules():
     assert {"dsr.sample", "dsr.app.entry", "dsr.data.folder"} <= MODULES.keys()
-    assert "dsr.data.base" in import_graph()["dsr.data.folder"]
+    assert "dsr.data.scene_source" in import_graph()["dsr.data.folder"]
 
 
 def test_package_root_holds_no_module_but_the_sample_and_the_command():

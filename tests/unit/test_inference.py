@@ -18,9 +18,9 @@ from dsr.geometry.camera import Camera
 from dsr.geometry.resampling import resize_inverse_depth
 from dsr.inference import Plan, plan_for, upsample_surface, upsampler
 from dsr.inference import api as people
-from dsr.inference.inspection import enlarged_by
 from dsr.inference.plans import OWN_SIZE
 from dsr.inference.resizing import resize_nearest
+from dsr.inference.working_size import enlarged_by
 from dsr.methods.recipe import list_methods, read_recipe
 
 
@@ -215,13 +215,14 @@ def test_arrays_and_tensors_give_the_same_result() -> None:
     np.testing.assert_allclose(floats, of_arrays, rtol=1e-4)
 
 
-def test_arrays_with_negative_strides_are_taken_as_they_read() -> None:
+def test_arrays_with_negative_strides_or_read_only_are_taken_as_they_read() -> None:
     camera = _camera(24, 32)
     photo = (_photo(24, 32).permute(1, 2, 0).numpy() * 255).astype(np.uint8)
     depth = _plane(12, 16, camera)[0].float().numpy()
     mask = np.ones_like(depth, dtype=bool)
     mask[2, 3] = False
     flipped = [np.flip(np.flip(each).copy()) for each in (photo, depth, mask)]
+    photo.flags.writeable = depth.flags.writeable = False
     assert all(min(each.strides) < 0 for each in flipped)
     plain, other = (dsr.upsample(rgb, z, camera, mask=m) for rgb, z, m in ((photo, depth, mask), flipped))
     np.testing.assert_array_equal(other, plain)

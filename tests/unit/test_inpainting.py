@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dsr.data.preparation.inpainting import inpaint_depth
+from dsr.data.reference_depth import inpaint_depth
 
 
 def inverse_plane(height=40, width=60):

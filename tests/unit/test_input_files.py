@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from dsr.io.input_files import LONGEST, read_input, write_input
-from dsr.utils.files import array_headers
+from dsr.io.exports import LONGEST, read_input, write_input
+from dsr.utils.arrays import array_headers
 
 
 @pytest.fixture

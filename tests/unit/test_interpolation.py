@@ -9,10 +9,10 @@ from scipy import ndimage
 from torch import Tensor
 
 from dsr.degradation.downsampling import Downsampling, Kernel, make_sample
-from dsr.degradation.scales import SCALES
 from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.methods.classical.interpolation import Interpolation, Order
 from dsr.sample import DepthSample, Scene
+from dsr.utils.ratios import SCALES
 
 CAMERA = Camera(width=48, height=32, fx=60.0, fy=55.0, cx=21.3, cy=17.9)
 ORDERS: tuple[Order, ...] = ("nearest", "bilinear", "bicubic")

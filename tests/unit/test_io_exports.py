@@ -13,8 +13,7 @@ from dsr.geometry.mesh import triangulate
 from dsr.geometry.shading import render
 from dsr.geometry.surface import depth_to_normals
 from dsr.io import exports
-from dsr.io.exports import Written, write_cloud, write_mesh, write_normals, write_renderings
-from dsr.io.model_files import write_glb
+from dsr.io.exports import Written, write_cloud, write_glb, write_mesh, write_normals, write_renderings
 from dsr.pictures import before_after
 from dsr.pictures.before_after import write_before_after
 

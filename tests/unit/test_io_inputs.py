@@ -8,10 +8,9 @@ import torch
 from PIL import Image
 
 from dsr.geometry.camera import Camera
-from dsr.io.inputs import read_picture
+from dsr.io.inputs import FolderUnits, read_picture
 from dsr.io.pairs import Pair
 from dsr.io.reading import CameraChoice, Reading
-from dsr.io.units import FolderUnits
 
 OWN = {"width": 16, "height": 12, "fx": 15.0, "fy": 15.0, "cx": 7.5, "cy": 5.5}
 

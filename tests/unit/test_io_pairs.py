@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from dsr.io.layouts import find_pairs_of_folder
-from dsr.io.names import key_of, role_of, time_of, words_of
-from dsr.io.pairs import find_pairs_of_lists
+from dsr.io.pairs import find_pairs_of_lists, key_of, role_of, time_of, words_of
 
 
 def touch(folder, *names):

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dsr.io.pairs import Pair
-from dsr.io.poses import read_poses, read_transform
+from dsr.io.trajectories import read_poses, read_transform
 
 TURN = Rotation.from_euler("xyz", (10, -20, 30), degrees=True)
 MATRIX = np.eye(4)

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera, from_range, to_range
+from dsr.methods.classical.bilateral import JointBilateral
 from dsr.methods.classical.interpolation import Interpolation
-from dsr.methods.classical.joint_bilateral import JointBilateral
 from dsr.sample import DepthSample, Scene
 
 

@@ -12,7 +12,7 @@ from dsr.app import gpus, slurm
 from dsr.app.multirun import LAUNCHERS, expect_launcher
 from dsr.app.slurm import SlurmSettings
 from dsr.utils import interruption
-from dsr.utils.builder import ConfigError
+from dsr.utils.configuration import ConfigError
 
 SLURM = {
     "cluster": "slurm", "partition": None, "account": None, "qos": None, "constraint": None, "gpus_per_node": 1,

@@ -18,15 +18,14 @@ import safetensors.torch
 import torch
 
 from dsr.app.upsample.scene import write_scene
-from dsr.data.formats.decoding import pixels_in_header
-from dsr.data.formats.files import read_mask, read_pixels
-from dsr.data.formats.matlab import read_variables
+from dsr.data.matlab import read_variables
 from dsr.evaluation.run_files import read_run
 from dsr.evaluation.store import load_prediction
-from dsr.io.captures import ros, video
+from dsr.io.captures import ros, stray
 from dsr.io.captures.record3d import find_record3d
 from dsr.io.depth_files import read_depth_file
-from dsr.io.input_files import read_input
+from dsr.io.exports import read_input
+from dsr.io.images import pixels_in_header, read_mask, read_pixels
 from dsr.io.inputs import read_picture
 from dsr.io.pairs import Pair
 from dsr.io.photos import read_photo
@@ -35,7 +34,7 @@ from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_choice import packaged_weights
 from dsr.methods.networks.weight_files import load_network, read_torch_file
 from dsr.sample import DepthSample
-from dsr.utils.limits import TooLargeError, bytes_of_archive, pixels_beside, pixels_of_file, read_limited, read_member
+from dsr.utils.guards import TooLargeError, bytes_of_archive, pixels_beside, pixels_of_file, read_limited, read_member
 from dsr.utils.picture_headers import picture_size
 
 MOST = 450 << 20
@@ -192,11 +191,11 @@ def test_video_of_too_large_frames_is_refused_when_it_is_opened(tmp_path, monkey
     writer = cv2.VideoWriter(path, cv2.VideoWriter_fourcc(*"MJPG"), 10, (64, 48))
     writer.write(np.zeros((48, 64, 3), np.uint8))
     writer.release()
-    assert video.VideoFrame(tmp_path / "x.avi", 0).read().shape == (48, 64, 3)
+    assert stray.VideoFrame(tmp_path / "x.avi", 0).read().shape == (48, 64, 3)
     (tmp_path / "x.avi").rename(tmp_path / "y.avi")
-    monkeypatch.setattr(video, "_LARGEST", 3000)
+    monkeypatch.setattr(stray, "_LARGEST", 3000)
     with pytest.raises(TooLargeError, match=r"y\.avi: expected at most 3000 pixels, got 64 x 48"):
-        video.VideoFrame(tmp_path / "y.avi", 0).read()
+        stray.VideoFrame(tmp_path / "y.avi", 0).read()
 
 
 @pytest.mark.parametrize("kind", [h5py.ExternalLink("other.h5", "/secret"), h5py.SoftLink("/other")])

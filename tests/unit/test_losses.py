@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.methods.networks.base import Answer
+from dsr.methods.networks.network import Answer
 from dsr.metrics.losses import l1, lap1, mse
 from dsr.training.degradation import Batch
 from dsr.training.objective import DepthLoss, DepthObjective

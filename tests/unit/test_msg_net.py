@@ -11,13 +11,12 @@ from PIL import Image
 from scipy import ndimage
 from torch import Tensor
 
-from dsr.degradation.scales import SCALES
 from dsr.geometry.camera import Camera, from_range, to_range
-from dsr.methods.networks.base import NetworkUpsampler
-from dsr.methods.networks.maps import mean3x3, normalise, upsample_bicubic
-from dsr.methods.networks.msg_guidance import VARIANTS, VariantName, guidance_map
-from dsr.methods.networks.msg_net import MSGNet, output_drift, upsample_disparity
+from dsr.methods.networks.msg_net import VARIANTS, MSGNet, VariantName, guidance_map, output_drift, upsample_disparity
+from dsr.methods.networks.network import NetworkUpsampler
+from dsr.methods.networks.normalisation import mean3x3, normalise, upsample_bicubic
 from dsr.sample import DepthSample
+from dsr.utils.ratios import SCALES
 
 
 def _net(scale: int, variant: VariantName = "voynov") -> MSGNet:

@@ -10,12 +10,12 @@ import pytest
 
 from dsr.app.view import find_results
 from dsr.cli import main
-from dsr.data import arkitscenes, ddrnet, diml, icl, rgbdd, sintel, sunrgbd, tartanair, tofmark
+from dsr.data import arkitscenes, ddrnet_frames, diml, icl, rgbdd, sintel, sunrgbd, tartanair, tofmark
 from dsr.data.folder import Folder
 from dsr.io.inputs import Reading, read_picture
 from dsr.io.layouts import find_pairs_of_folder
-from dsr.io.poses import read_poses
-from dsr.utils.paths import natural_key
+from dsr.io.trajectories import read_poses
+from dsr.utils.guards import natural_key
 
 FRAMES = 12
 NAMES = {
@@ -198,7 +198,7 @@ DATA_SETS = {
     "tartanair": (tartanair.find_frames, ("{}_left.png", "{}_left_depth.npy")),
     "sintel": (sintel.find_frames, ("final/a/frame_{}.png", "depth/a/frame_{}.dpt", "camdata_left/a/frame_{}.cam")),
     "tofmark": (tofmark.find_frames, ("a{}.bmp", "a{}_depth.bmp")),
-    "ddrnet": (ddrnet.find_frames, ("color_map/{}.png", "depth_map/{}.png", "high_quality_depth/{}.png")),
+    "ddrnet": (ddrnet_frames.find_frames, ("color_map/{}.png", "depth_map/{}.png", "high_quality_depth/{}.png")),
     "rgbdd": (rgbdd.find_frames, ("RGB/{}_RGB.jpg", "Depth/{}_HR_gt.png")),
     "arkitscenes": (arkitscenes.find_frames,
                     ("wide/7_{}.5.png", "highres_depth/7_{}.5.png", "lowres_depth/7_{}.5.png")),

@@ -9,10 +9,10 @@ import pytest
 import torch
 from small_scenes import maps, photos
 
-from dsr.methods.networks.base import DisparityNetwork, NetworkUpsampler, WindowedNetwork
 from dsr.methods.networks.ddrnet import DDRNet
-from dsr.methods.networks.dg import DynamicGuidance
+from dsr.methods.networks.dynamic_guidance import DynamicGuidance
 from dsr.methods.networks.facets import Facets
+from dsr.methods.networks.network import DisparityNetwork, NetworkUpsampler, WindowedNetwork
 from dsr.methods.networks.pdn import PrimalDualNetwork
 from dsr.methods.networks.sparse_to_dense import SparseToDense
 

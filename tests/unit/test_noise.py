@@ -17,7 +17,7 @@ from dsr.degradation.downsampling import Downsampling, Measured, make_sample, sc
 from dsr.degradation.noise import GaussianMultiplicative, Kinect, Noise, TimeOfFlight
 from dsr.geometry.camera import RANGE_TYPES, Camera, RangeType, from_range, to_range
 from dsr.sample import Scene
-from dsr.utils.builder import build
+from dsr.utils.configuration import build
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 CAMERA = Camera(8, 4, 10.0, 10.0, 3.5, 1.5, baseline=0.1, doffs=0.5)

@@ -15,9 +15,9 @@ from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import Tensor
 
-from dsr.data.procedural import Procedural
+from dsr.data.rendered import Procedural
 from dsr.degradation.downsampling import Downsampling
-from dsr.degradation.everything import Everything
+from dsr.degradation.random_degradation import Everything
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.msg_net import MSGNet
 from dsr.training.callbacks import Curves

@@ -10,7 +10,7 @@ import torch
 from dsr.app.requests import ExportRequest
 from dsr.cli import main
 from dsr.methods.networks.ddrnet import DDRNet
-from dsr.methods.networks.dg import DynamicGuidance
+from dsr.methods.networks.dynamic_guidance import DynamicGuidance
 from dsr.methods.networks.facets import Facets
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.msg_net import MSGNet

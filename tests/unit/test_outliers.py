@@ -7,7 +7,7 @@ import torch
 
 from dsr.geometry.camera import Camera
 from dsr.inference import upsample_surface
-from dsr.inference.outliers import count_patches, find_outliers, within_measured
+from dsr.inference.plausibility import count_patches, find_outliers, within_measured
 
 HEIGHT, WIDTH = 96, 640
 FRAMES = {

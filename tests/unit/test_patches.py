@@ -18,12 +18,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from dsr.data.base import SceneSource
+from dsr.data.scene_source import SceneSource
 from dsr.degradation.downsampling import Downsampling, Measured, make_sample
-from dsr.degradation.everything import Everything
 from dsr.degradation.noise import GaussianMultiplicative, Kinect
+from dsr.degradation.random_degradation import Everything
 from dsr.geometry.camera import Camera
-from dsr.methods.networks.maps import normalise
+from dsr.methods.networks.normalisation import normalise
 from dsr.sample import CENTIMETRES, Scene, Unit
 from dsr.training.data_module import Part, PatchData, WholeScenes
 from dsr.training.degradation import Batch, Degradation, to_tensors

@@ -13,7 +13,7 @@ from dsr.evaluation.run_files import load_results
 from dsr.evaluation.store import iterations_path, prediction_path, sample_path
 from dsr.io.layouts import find_pairs_of_folder
 from dsr.sample import DepthSample
-from dsr.utils.paths import OutsideError, path_within
+from dsr.utils.guards import OutsideError, path_within
 
 UP = "../private/x"
 OUTSIDE = (

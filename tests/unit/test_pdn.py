@@ -9,9 +9,9 @@ from small_scenes import plane_map
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.methods.networks.base import NetworkUpsampler
-from dsr.methods.networks.pdn import PrimalDualNetwork
-from dsr.methods.networks.primal_dual import (
+from dsr.methods.networks.network import NetworkUpsampler
+from dsr.methods.networks.pdn import (
+    PrimalDualNetwork,
     Step,
     UnrolledHuber,
     half_window,

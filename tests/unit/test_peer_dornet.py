@@ -8,9 +8,8 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from dsr.methods.networks.peers import deformable
-from dsr.methods.networks.peers.deformable import deformable_conv3x3
-from dsr.methods.networks.peers.dornet import DORNet
+from dsr.methods.networks.peers import dornet
+from dsr.methods.networks.peers.dornet import DORNet, deformable_conv3x3
 
 
 def random(*shape, seed=0):
@@ -63,7 +62,7 @@ def test_deformable_conv3x3_without_offsets_is_a_convolution() -> None:
 def test_deformable_conv3x3_does_not_depend_on_the_chunks(monkeypatch) -> None:
     inputs = make_inputs()
     whole = deformable_conv3x3(*inputs)
-    monkeypatch.setattr(deformable, "_CHUNK", 1)
+    monkeypatch.setattr(dornet, "_CHUNK", 1)
     torch.testing.assert_close(deformable_conv3x3(*inputs), whole)
 
 

@@ -17,16 +17,15 @@ from torch import Tensor, nn
 from dsr.geometry.camera import Camera, from_range
 from dsr.methods.base import Cost
 from dsr.methods.inpainting import inpaint
-from dsr.methods.networks.maps import resize_bicubic
-from dsr.methods.networks.peers.base import PeerNetwork, PeerUpsampler
-from dsr.methods.networks.peers.build import PEERS, Peer
-from dsr.methods.networks.peers.files import fold_batch_norm, load_peer
-from dsr.methods.networks.peers.svlrm import SVLRM
+from dsr.methods.networks.normalisation import resize_bicubic
+from dsr.methods.networks.peers.local_filters import SVLRM
+from dsr.methods.networks.peers.peer import PEERS, Peer
+from dsr.methods.networks.peers.peer_network import PeerNetwork, PeerUpsampler, fold_batch_norm, load_peer
 from dsr.methods.networks.weight_choice import WeightChoice, nearest_scale
 from dsr.methods.recipe import read_recipe
 from dsr.sample import DepthSample
-from dsr.utils.builder import ConfigError
-from dsr.utils.hashing import file_hash
+from dsr.utils.configuration import ConfigError
+from dsr.utils.versions import file_hash
 
 FILES = {"SVLRM_X4.pth": 4, "SVLRM_X8.pth": 8, "X8/model.pth": 8}
 

@@ -8,10 +8,9 @@ import pytest
 import torch
 from torch.nn import functional
 
-from dsr.methods.networks.peers import fdkn, pgsr
-from dsr.methods.networks.peers.fdkn import FDKN
+from dsr.methods.networks.peers import local_filters, pgsr
+from dsr.methods.networks.peers.local_filters import FDKN, SVLRM
 from dsr.methods.networks.peers.pgsr import PGSR
-from dsr.methods.networks.peers.svlrm import SVLRM
 
 _FOLDED = {SVLRM: 0, FDKN: 4 * (32 + 64 + 128), PGSR: 2 * (7 * 8 + 4)}
 """Parameters of the batch normalisations, which are merged into the convolutions."""
@@ -70,7 +69,7 @@ def test_fdkn_sums_the_map_at_deformed_positions_of_a_window() -> None:
                     window[None, None, ..., row, column], place.view(1, 1, 1, 2), align_corners=False
                 )
                 expected[row, column] += value.item() * weights[0, tap, row, column]
-    torch.testing.assert_close(fdkn._sample(values, weights, offsets)[0, 0], expected, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(local_filters._sample(values, weights, offsets)[0, 0], expected, rtol=1e-4, atol=1e-4)
 
 
 def test_fdkn_changes_a_constant_map_by_a_constant_at_the_border_only() -> None:

@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from dsr.degradation.downsampling import Downsampling, Kernel, make_sample
-from dsr.degradation.scales import SCALES
 from dsr.geometry.camera import Camera, from_range, to_range
+from dsr.methods.classical.bilateral import JointBilateral
 from dsr.methods.classical.fast_global_smoother import FastGlobalSmoother
 from dsr.methods.classical.guided_filter import GuidedFilter
-from dsr.methods.classical.joint_bilateral import JointBilateral
 from dsr.methods.classical.photo_guided import GuidedMethod, estimate_slopes
 from dsr.sample import DepthSample, Scene
+from dsr.utils.ratios import SCALES
 
 METHODS = (GuidedFilter, JointBilateral, FastGlobalSmoother)
 every_method = pytest.mark.parametrize("method", METHODS, ids=lambda method: method.__name__)

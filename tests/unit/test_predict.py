@@ -25,8 +25,8 @@ from dsr.geometry.camera import Camera
 from dsr.methods.base import Method, NoSolutionError
 from dsr.metrics.catalogue import catalogue, score_image
 from dsr.sample import DepthSample, Scene
+from dsr.utils.files import FullDiskError
 from dsr.utils.progress import SILENT, Progress
-from dsr.utils.space import FullDiskError
 
 SIZE, SCALE = 16, 2
 CAMERA = Camera(SIZE, SIZE, 20.0, 20.0, 7.5, 7.5)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-import dsr.data.preparation.dataset as module
-from dsr.data.preparation.dataset import Preparation, PreparedDataset, SceneRecord, make_records, rename_records
+import dsr.data.preparation as module
+from dsr.data.preparation import Preparation, PreparedDataset, SceneRecord, make_records, rename_records
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
 from dsr.synthetic.rendering import cache_directory

@@ -5,15 +5,15 @@ import functools
 import numpy as np
 import pytest
 
-from dsr.synthetic.procedural.layouts import LAYOUTS
+from dsr.synthetic.procedural.arrangements import LAYOUTS
+from dsr.synthetic.procedural.lighting import Tracer
+from dsr.synthetic.procedural.materials import PICTURES, palette, picture_paint
 from dsr.synthetic.procedural.paints import PAINTS
-from dsr.synthetic.procedural.pictures import PICTURES, palette, picture_paint
+from dsr.synthetic.procedural.photo import Viewpoint
+from dsr.synthetic.procedural.random_scene import make_camera, random_scene, render, render_random_scene
 from dsr.synthetic.procedural.reliefs import RELIEFS, relief
-from dsr.synthetic.procedural.scene_layout import Viewpoint
-from dsr.synthetic.procedural.scenes import make_camera, random_scene, render, render_random_scene
 from dsr.synthetic.procedural.shape import box, extrusion, merge, quad, rotation_about, surface
 from dsr.synthetic.procedural.solids import SOLIDS, ellipsoid, frustum, random_solid, rounded_box
-from dsr.synthetic.procedural.tracer import Tracer
 
 SIZE = 96
 ORIGIN = np.zeros(3)

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dsr.data import procedural as module
-from dsr.data.procedural import Procedural
-from dsr.synthetic.procedural.scenes import render_random_scene
+from dsr.data import rendered as module
+from dsr.data.rendered import Procedural
+from dsr.synthetic.procedural.random_scene import render_random_scene
 
 SIZE = 48
 

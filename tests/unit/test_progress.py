@@ -10,8 +10,7 @@ import pytest
 from rich.console import Console
 
 from dsr.utils.console import ConsoleProgress
-from dsr.utils.progress import SILENT, part_of
-from dsr.utils.units import clock, duration, megabytes
+from dsr.utils.progress import SILENT, clock, duration, megabytes, part_of
 
 
 class Clock:

@@ -10,10 +10,9 @@ from hydra.utils import instantiate
 
 from dsr.app.schema import plain_config, register
 from dsr.methods.classical.tgv import TotalGeneralisedVariation
-from dsr.methods.networks.base import NetworkUpsampler
+from dsr.methods.networks.network import NetworkUpsampler
 from dsr.methods.recipe import list_methods, read_recipe
-from dsr.utils.builder import ConfigError
-from dsr.utils.config_files import config_directories
+from dsr.utils.configuration import ConfigError, config_directories
 
 
 @pytest.mark.parametrize("scale", [4, 8])

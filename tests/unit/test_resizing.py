@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dsr.data.preparation.resizing import fit, resize, resize_depth
+from dsr.data.reference_depth import fit, resize, resize_depth
 from dsr.geometry.camera import Camera
 from dsr.geometry.surface import depth_to_normals
 from dsr.sample import Scene

@@ -19,10 +19,8 @@ from dsr.app.run_directory import (
     identity_of,
 )
 from dsr.app.schema import plain_config
-from dsr.utils.builder import ConfigError
-from dsr.utils.config_files import config_directories
-from dsr.utils.hashing import file_hash
-from dsr.utils.versions import package_versions, versions
+from dsr.utils.configuration import ConfigError, config_directories
+from dsr.utils.versions import file_hash, package_versions, versions
 
 CPU = torch.device("cpu")
 

@@ -9,11 +9,8 @@ import torch
 from PIL import Image
 
 from dsr.geometry.camera import Camera
-from dsr.io.scene_files.frame import Frame, parse_pose, to_millimetres
-from dsr.io.scene_files.nerfstudio import write_transforms
-from dsr.io.scene_files.open3d import write_open3d, write_rgbd
-from dsr.io.scene_files.rerun import write_rerun
-from dsr.io.scene_files.splatting import write_splatting
+from dsr.io.open3d import write_open3d, write_rgbd
+from dsr.io.scene_files import Frame, parse_pose, to_millimetres, write_rerun, write_splatting, write_transforms
 
 CAMERA = Camera(12, 8, 10.0, 11.0, 5.25, 3.5)
 POSE = torch.tensor(

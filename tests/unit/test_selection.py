@@ -16,7 +16,7 @@ from dsr.inference import AnyRatio, Selection, upsample_surface, upsampler
 from dsr.methods.base import Method, Surface
 from dsr.methods.recipe import Recipe, Run, read_recipe
 from dsr.sample import DepthSample
-from dsr.utils.builder import ConfigError
+from dsr.utils.configuration import ConfigError
 from dsr.utils.progress import Steps
 
 CAMERA = Camera(48, 36, 50.0, 50.0, 23.5, 17.5)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.methods.noise import estimate_noise, estimate_sensor_noise
+from dsr.methods.noise_level import estimate_noise, estimate_sensor_noise
 
 
 def _ramp() -> Tensor:

@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.poses import as_rigid
+from dsr.geometry.rigid_motion import as_rigid
 from dsr.inference.sequences import View, fuse_views
-from dsr.synthetic.surfaces import rotation
+from dsr.synthetic.ray_surfaces import rotation
 
 CAMERA = Camera.centred(96, 72, 90.0)
 

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from dsr.data import simgeo
-from dsr.data.simgeo import SimGeo
+from dsr.data import rendered
+from dsr.data.rendered import SimGeo
 from dsr.synthetic.rendering import cache_directory
-from dsr.synthetic.simgeo.scenes import SCENES, render_scene
+from dsr.synthetic.simgeo import SCENES, render_scene
 
 SIZE = 64
 NAME = "cube_no_texture"
@@ -31,7 +31,7 @@ def calls(monkeypatch):
         made.append((name, size))
         return render_scene(name, size)
 
-    monkeypatch.setattr(simgeo, "render_scene", counted)
+    monkeypatch.setattr(rendered, "render_scene", counted)
     return made
 
 

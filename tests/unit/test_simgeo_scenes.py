@@ -5,8 +5,8 @@ import functools
 import numpy as np
 import pytest
 
-from dsr.synthetic.implicit import Implicit
-from dsr.synthetic.simgeo.scenes import SCENES, WALL_Z, build_scene, render_scene
+from dsr.synthetic.raycast import Implicit
+from dsr.synthetic.simgeo import SCENES, WALL_Z, build_scene, render_scene
 
 SIZE = 64
 

@@ -8,8 +8,7 @@ import torch
 import trimesh
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.mesh import triangulate
-from dsr.geometry.simplification import project, select_points, simplify, thin
+from dsr.geometry.mesh import project, select_points, simplify, thin, triangulate
 from dsr.io.exports import Written, write_cloud, write_mesh
 
 CAMERA = Camera(40, 30, 45, 45, 19.5, 14.5)

@@ -16,9 +16,8 @@ from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera, from_range
 from dsr.geometry.surface import depth_to_normals
 from dsr.methods.classical.interpolation import Interpolation
-from dsr.methods.classical.srfs.admm import ShadingProblem, ShadingSolver, Slopes
-from dsr.methods.classical.srfs.shading import compute_shading, compute_surface
-from dsr.methods.classical.srfs.upsampler import ShapeFromShading
+from dsr.methods.classical.shape_from_shading import ShapeFromShading
+from dsr.methods.classical.srfs_admm import ShadingProblem, ShadingSolver, Slopes, compute_shading, compute_surface
 from dsr.sample import DepthSample, Scene
 
 LIGHT = ((0.35, -0.3, -0.55, 0.15), (0.3, -0.25, -0.5, 0.2), (0.25, -0.3, -0.5, 0.2))

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dsr.methods.classical.srfs.potts import BRIGHTEST, Regions, boundary_length, fit_albedo, fuse
+from dsr.methods.classical.potts import BRIGHTEST, Regions, boundary_length, fit_albedo, fuse
 
 
 def _energy(rgb: Tensor, shading: Tensor, regions: Regions, weight: float) -> float:

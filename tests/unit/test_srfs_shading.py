@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.surface import back_project, depth_to_normals
-from dsr.methods.classical.srfs.shading import (
+from dsr.methods.classical.srfs_admm import (
     chain_to_theta,
     compute_area,
     compute_shading,

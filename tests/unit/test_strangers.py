@@ -16,7 +16,7 @@ from dsr.app.run_directory import expect_free
 from dsr.app.upsample.stored import read_result
 from dsr.cli import main
 from dsr.data.download.fetching import unpack
-from dsr.geometry.poses import as_rigid, from_quaternion, is_rotation
+from dsr.geometry.rigid_motion import as_rigid, from_quaternion, is_rotation
 from dsr.io.photos import focal_in_exif
 from dsr.methods.recipe import read_recipe
 from dsr.report.study.study_table import read_study

@@ -18,22 +18,22 @@ from dsr.app.upsample.scene import _read_record
 from dsr.app.upsample.stored import read_result
 from dsr.data.download.fetching import Checksums
 from dsr.data.folder import Folder, load_scene
-from dsr.data.formats.files import read_camera
 from dsr.evaluation.run_files import load_results
 from dsr.evaluation.store import load_errors, load_prediction, prediction_path, sample_path
 from dsr.geometry.camera import Camera
 from dsr.io.cameras import read_any_camera
-from dsr.io.captures.polycam import find_polycam
+from dsr.io.captures.arkit import find_polycam
 from dsr.io.captures.record3d import find_record3d
-from dsr.io.poses import read_transform
-from dsr.methods.networks.peers.files import read_tensors
-from dsr.methods.networks.published import read_msg_weights
+from dsr.io.images import read_camera
+from dsr.io.trajectories import read_transform
+from dsr.methods.networks.peers.peer_network import read_tensors
+from dsr.methods.networks.trained import read_msg_weights
 from dsr.report.study.answers import read_all
 from dsr.report.study.key import Candidate, Key, Trial, read_key, write_key
 from dsr.sample import FARTHEST, NEAREST, DepthSample, Scene
-from dsr.utils.builder import ConfigError
+from dsr.utils.configuration import ConfigError
 from dsr.utils.console import one_line, print_error
-from dsr.utils.parsing import is_number, parse_json, readable
+from dsr.utils.guards import is_number, parse_json, readable
 
 HUGE = "1" + "0" * 400
 NO_NUMBERS = ("true", "Infinity", "-Infinity", "NaN", HUGE, "1e400", '"4"', "[]", "null", "{}")
@@ -369,7 +369,7 @@ def test_weights_without_plain_values_are_refused(tmp_path, tensor):
 RUN = {
     "names": {"model": "msg_v", "dataset": "simgeo", "downsampling": "box", "noise": "none"},
     "model": {"net": {"_target_": "dsr.methods.networks.msg_net.MSGNet"}},
-    "dataset": {"_target_": "dsr.data.simgeo.SimGeo"},
+    "dataset": {"_target_": "dsr.data.rendered.SimGeo"},
     "downsampling": {"_target_": "dsr.degradation.downsampling.Downsampling", "kernel": "box"},
     "noise": {"_target_": "dsr.degradation.noise.no_noise"},
     "scale": 4,

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from dsr.degradation.downsampling import Downsampling
 from dsr.geometry.camera import Camera
-from dsr.methods.networks.base import Answer
 from dsr.methods.networks.facets_unet import FacetsUNet
+from dsr.methods.networks.network import Answer
 from dsr.metrics.functional import SurfacePair
 from dsr.sample import Scene
 from dsr.training.degradation import Batch, Degradation, to_tensors

@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.camera import Camera, from_range, to_range
-from dsr.methods.networks.base import ENSEMBLES, DisparityNetwork, NetworkUpsampler, apply_dihedral, undo_dihedral
 from dsr.methods.networks.msg_net import MSGNet
+from dsr.methods.networks.network import ENSEMBLES, DisparityNetwork, NetworkUpsampler, apply_dihedral, undo_dihedral
 from dsr.sample import DepthSample
 
 

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera, from_range
-from dsr.methods.networks.base import DisparityNetwork, NetworkUpsampler
 from dsr.methods.networks.facets import Facets
 from dsr.methods.networks.msg_net import MSGNet
+from dsr.methods.networks.network import DisparityNetwork, NetworkUpsampler
 from dsr.methods.tiling import blend_tiles, split_axis
 from dsr.sample import DepthSample
 
@@ -122,8 +122,8 @@ def test_large_photo_is_tiled_automatically(monkeypatch: pytest.MonkeyPatch) -> 
     sample = DepthSample("test", "scene", rgb[0], from_range(coarse[0] / 4, low, "disparity"), camera, low, 4)
     parts: list[int] = []
     whole = method(sample, lambda done, total: parts.append(total))
-    monkeypatch.setattr("dsr.methods.networks.base.UNTILED", 1000)
-    monkeypatch.setattr("dsr.methods.networks.base.TILE", 24)
+    monkeypatch.setattr("dsr.methods.networks.network.UNTILED", 1000)
+    monkeypatch.setattr("dsr.methods.networks.network.TILE", 24)
     tiled = method(sample, lambda done, total: parts.append(total))
     assert parts == [1, *[4] * 4]
     torch.testing.assert_close(tiled, whole, rtol=1e-5, atol=0)

@@ -11,9 +11,9 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from dsr.methods.networks.base import DisparityNetwork
 from dsr.methods.networks.facets import Facets
 from dsr.methods.networks.msg_net import MSGNet
+from dsr.methods.networks.network import DisparityNetwork
 from dsr.methods.networks.sparse_to_dense import SparseToDense
 from dsr.methods.networks.trained import NETWORKS, TrainedNetwork
 from dsr.methods.networks.weight_choice import packaged_names, packaged_weights

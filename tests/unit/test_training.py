@@ -21,10 +21,10 @@ from torch.utils.data import DataLoader
 from dsr.app.trainer import has_idle_layers, seconds_per_step
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera
-from dsr.methods.networks.any_map import AnyMap
-from dsr.methods.networks.base import Answer
+from dsr.methods.networks.facets_method import AnyMap
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.msg_net import MSGNet, upsample_disparity
+from dsr.methods.networks.network import Answer
 from dsr.methods.networks.sparse_to_dense import SparseToDense
 from dsr.methods.recipe import read_recipe
 from dsr.metrics import functional as scores

@@ -8,7 +8,7 @@ from lightning.pytorch.plugins.environments import LightningEnvironment, SLURMEn
 from lightning.pytorch.utilities import rank_zero_only
 
 from dsr.app.devices import find_processes
-from dsr.utils.builder import ConfigError
+from dsr.utils.configuration import ConfigError
 
 CPU = torch.device("cpu")
 

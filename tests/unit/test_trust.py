@@ -10,13 +10,12 @@ import yaml
 
 from dsr.app.training_runs import read_config, studies_of_run
 from dsr.app.trust import Trust, _targets_in, expect_trusted
-from dsr.utils.builder import ConfigError, load_target
-from dsr.utils.config_files import config_directories
+from dsr.utils.configuration import ConfigError, config_directories, load_target
 
 CONFIG = {
     "names": {"model": "msg_v", "dataset": "procedural", "downsampling": "box", "noise": "none"},
     "model": {"net": {"_target_": "dsr.methods.networks.msg_net.MSGNet"}},
-    "dataset": {"_target_": "dsr.data.procedural.Procedural", "count": 6, "size": 64},
+    "dataset": {"_target_": "dsr.data.rendered.Procedural", "count": 6, "size": 64},
     "downsampling": {"_target_": "dsr.degradation.downsampling.Downsampling", "kernel": "box"},
     "noise": {"_target_": "dsr.degradation.noise.no_noise"},
     "scale": 4,

@@ -17,7 +17,7 @@ import torch
 from PIL import Image
 from scipy.stats import binomtest
 
-from dsr.cli import study as command
+from dsr.cli.study import STUDY
 from dsr.evaluation.run_files import load_results
 from dsr.geometry.camera import Camera
 from dsr.pictures.depth_views import rendering
@@ -511,7 +511,7 @@ class Commands:
 
     def __init__(self):
         self.parser = argparse.ArgumentParser()
-        command.add(self.parser.add_subparsers())
+        STUDY.add(self.parser.add_subparsers())
 
     def __call__(self, *arguments):
         options = self.parser.parse_args(["study", *map(str, arguments)])

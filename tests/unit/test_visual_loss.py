@@ -17,9 +17,9 @@ from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera
 from dsr.methods.dip.problem import ImageProblem, PriorObjective
 from dsr.methods.dip.upsampler import DeepImagePrior
-from dsr.methods.networks.base import Answer
-from dsr.methods.networks.maps import mean3x3
 from dsr.methods.networks.msg_net import MSGNet
+from dsr.methods.networks.network import Answer
+from dsr.methods.networks.normalisation import mean3x3
 from dsr.metrics.classes import visual_metrics
 from dsr.metrics.functional import SurfacePair, dssim_v, mse_v
 from dsr.metrics.lpips import LPIPS, lpips_v
@@ -27,7 +27,7 @@ from dsr.metrics.visual_loss import MSE_V, VisualLoss, VisualLossName, make_visu
 from dsr.sample import DepthSample, Scene
 from dsr.training.degradation import Batch, to_tensors
 from dsr.training.objective import DepthObjective, balance_weight
-from dsr.utils.builder import ConfigError
+from dsr.utils.configuration import ConfigError
 
 SIZE = 32
 CAMERA = Camera(SIZE, SIZE, 40.0, 40.0, 15.5, 15.5)

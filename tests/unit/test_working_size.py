@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dsr.data.procedural import Procedural
+from dsr.data.rendered import Procedural
 from dsr.geometry.camera import Camera
 from dsr.inference import upsample_surface
 from dsr.inference.working_size import find_noise, limit_to_noise, reduce_by_medians, working_size_of

@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from dsr.app.experiments import register_resolvers
 from dsr.app.schema import NAMED, register
-from dsr.utils.config_files import config_directories
+from dsr.utils.configuration import config_directories
 
 
 def compose(
@@ -22,7 +22,7 @@ def compose(
     Args:
         name: ``train`` or ``eval``.
         overrides: as on the command line.
-        directories: those of :func:`dsr.utils.config_files.config_directories`; None for the project's.
+        directories: those of :func:`dsr.utils.configuration.config_directories`; None for the project's.
         with_hydra: whether Hydra's own settings are there, too.
 
     """

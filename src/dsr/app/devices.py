@@ -22,7 +22,7 @@ from lightning.pytorch.plugins.environments import (
 from lightning.pytorch.utilities import rank_zero_only
 
 from dsr.utils import interruption
-from dsr.utils.builder import ConfigError
+from dsr.utils.configuration import ConfigError
 
 _OF_PROCESSES = ("LOCAL_RANK", "NODE_RANK", "MASTER_ADDR", "MASTER_PORT", "WORLD_SIZE")
 """Environment variables that Lightning sets where it starts processes."""

@@ -9,11 +9,10 @@ from typing import Any
 
 import torch
 
-from dsr.utils.builder import ConfigError
-from dsr.utils.divergence import DivergenceError
+from dsr.utils.checkpoints import DivergenceError
+from dsr.utils.configuration import ConfigError
 from dsr.utils.files import write_text
-from dsr.utils.limits import read_limited
-from dsr.utils.parsing import parse_json
+from dsr.utils.guards import parse_json, read_limited
 
 NOTE = "diverged.json"
 _ADVICE = (

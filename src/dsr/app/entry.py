@@ -30,10 +30,9 @@ from dsr.app.gpus import count_gpus, take_gpu
 from dsr.app.multirun import Check, JobResult, Plan, collected_jobs, expect_launcher, failure_summary, job_name
 from dsr.app.schema import SEVERAL, EvalConfig, TrainConfig, plain_config, register
 from dsr.utils import interruption
-from dsr.utils.builder import ConfigError
-from dsr.utils.config_files import config_directories, list_choices
+from dsr.utils.configuration import ConfigError, config_directories, list_choices
 from dsr.utils.console import USAGE_ERROR, one_line, print_error
-from dsr.utils.space import FullDiskError, silence_threads, space_for
+from dsr.utils.files import FullDiskError, silence_threads, space_for
 
 _LIST = re.compile(r"(^|,)\s*\[")
 """Where a list begins in the value of an argument, or in one of several that -m runs."""

@@ -23,10 +23,9 @@ from dsr.app import run_directory as rundir
 from dsr.app.metrics import check_metrics, chosen_metrics, metric_collection
 from dsr.app.multirun import Plan, runs_here
 from dsr.app.schema import EvalConfig, given_keys, plain_config, raw_group, user_directories
-from dsr.data.base import SceneSource, prepare_scenes
 from dsr.data.folder import Folder
+from dsr.data.scene_source import SceneSource, prepare_scenes
 from dsr.degradation.downsampling import Downsampling, Measured, make_sample
-from dsr.degradation.scales import NATIVE, match_ratio
 from dsr.evaluation.predict import Evaluation, Outcome, StalePredictionError, failure_line, predict
 from dsr.evaluation.run_files import read_run
 from dsr.evaluation.score import score
@@ -39,10 +38,11 @@ from dsr.methods.recipe import OF_RUN, Known, Recipe, Run
 from dsr.metrics.formats import HEADLINES, Formats
 from dsr.report.table_layouts import score_table
 from dsr.sample import DepthSample, slope
-from dsr.utils.builder import ConfigError
+from dsr.utils.compute_device import fast_precision, pick_device
+from dsr.utils.configuration import ConfigError
 from dsr.utils.console import ConsoleProgress, note_once, open_console, print_error, show
-from dsr.utils.devices import fast_precision, pick_device
-from dsr.utils.hashing import file_hash
+from dsr.utils.ratios import NATIVE, match_ratio
+from dsr.utils.versions import file_hash
 
 _OBJECTIVE = "RMSE_v"
 

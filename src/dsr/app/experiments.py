@@ -11,8 +11,7 @@ from pathlib import Path
 
 from omegaconf import OmegaConf
 
-from dsr.data.download.catalogue import CATALOGUE
-from dsr.data.download.location import data_root
+from dsr.data.download.collections import CATALOGUE, data_root
 from dsr.utils.console import note_once
 
 _KEY_OF_GROUP = re.compile(r"(\w+)\.[\w.]+=")

@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from dsr.app.composition import compose
 from dsr.app.multirun import LAUNCHERS
 from dsr.app.schema import MOVED, SEVERAL
-from dsr.utils.config_files import list_choices, list_groups
+from dsr.utils.configuration import list_choices, list_groups
 from dsr.utils.console import one_line
 
 _ALIASES = {"learning_rate": "lr", "batch_size": "batch", "steps": "max_steps"}

@@ -9,7 +9,7 @@ from dsr.app.requests import ExportRequest
 from dsr.methods.networks.onnx_export import OnnxGraph, write_onnx
 from dsr.methods.recipe import read_recipe
 from dsr.utils.console import show
-from dsr.utils.units import megabytes
+from dsr.utils.progress import megabytes
 
 
 def export_onnx(request: ExportRequest, console: Console) -> list[str]:

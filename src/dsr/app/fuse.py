@@ -12,11 +12,11 @@ from dsr.app.requests import FuseRequest
 from dsr.app.upsample.outputs import INFO
 from dsr.app.upsample.parts import ERRORS
 from dsr.app.upsample.stored import read_camera, read_depth, read_errors, read_info
-from dsr.geometry.poses import as_rigid
+from dsr.geometry.rigid_motion import as_rigid
 from dsr.geometry.tsdf import PosedMap, fuse_maps, suggest_voxel
-from dsr.io.model_files import write_ply
+from dsr.io.exports import write_ply
 from dsr.utils.console import one_line, show
-from dsr.utils.paths import natural_key
+from dsr.utils.guards import natural_key
 
 _GREY = 190
 _LEAST_ERROR = 1e-4

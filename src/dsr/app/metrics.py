@@ -14,7 +14,7 @@ import torch
 from dsr.app.schema import MetricsConfig
 from dsr.metrics.catalogue import PROTOCOLS, Metric, catalogue
 from dsr.metrics.lpips import GET_TRUNK, LPIPS, load_lpips
-from dsr.utils.builder import ConfigError, load_object
+from dsr.utils.configuration import ConfigError, load_object
 from dsr.utils.console import one_line
 
 if TYPE_CHECKING:

@@ -20,9 +20,9 @@ from hydra.types import HydraContext, RunMode, TaskFunction
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 
-from dsr.utils.builder import ConfigError, expect_library
+from dsr.utils.configuration import ConfigError, expect_library
 from dsr.utils.console import USAGE_ERROR, one_line, open_console, print_error, show
-from dsr.utils.units import duration
+from dsr.utils.progress import duration
 
 LAUNCHERS = {
     "basic": "hydra",

@@ -12,11 +12,10 @@ from rich.console import Console
 from dsr.app.composition import compose
 from dsr.app.explain import explain
 from dsr.app.schema import EvalConfig, plain_config
-from dsr.data.base import SceneSource, prepare_scenes
+from dsr.data.scene_source import SceneSource, prepare_scenes
 from dsr.pictures.sheets import save_contact_sheet
 from dsr.sample import Scene
-from dsr.utils.builder import ConfigError
-from dsr.utils.config_files import config_directories
+from dsr.utils.configuration import ConfigError, config_directories
 from dsr.utils.console import ConsoleProgress, one_line, show
 
 

@@ -13,13 +13,11 @@ from omegaconf import OmegaConf
 
 from dsr.app.run_names import NOT_IDENTITY, run_name
 from dsr.app.trust import imported
-from dsr.utils.builder import ConfigError, expand_home
+from dsr.utils.configuration import ConfigError, expand_home
 from dsr.utils.console import shorten
 from dsr.utils.files import write_text
-from dsr.utils.hashing import hash_outside_code
-from dsr.utils.limits import read_limited
-from dsr.utils.parsing import parse_json
-from dsr.utils.versions import RESULTS, SCENES, versions
+from dsr.utils.guards import parse_json, read_limited
+from dsr.utils.versions import RESULTS, SCENES, hash_outside_code, versions
 
 _RECORD = "versions.json"
 _NO_BITS = ("log_every_n_steps", "profiler", "detect_anomaly", "enable_progress_bar", "enable_model_summary")

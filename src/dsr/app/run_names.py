@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from dsr.app.composition import compose
 from dsr.app.schema import NAMED, given_keys, plain_config, user_directories
-from dsr.utils.config_files import config_directories, list_choices
+from dsr.utils.configuration import config_directories, list_choices
 from dsr.utils.ratios import round_ratio
 
 NOT_IDENTITY = (

@@ -12,9 +12,9 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import MISSING, DictConfig, OmegaConf
 
-from dsr.degradation.scales import NATIVE, check_scale
-from dsr.utils.builder import ConfigError, build, check_types
-from dsr.utils.parsing import is_number
+from dsr.utils.configuration import ConfigError, build, check_types
+from dsr.utils.guards import is_number
+from dsr.utils.ratios import NATIVE, check_scale
 
 STRATEGIES = ("auto", "ddp")
 KEPT = ("best", "last")
@@ -136,8 +136,8 @@ class RunConfig(Checked):
     """The configuration that all commands have.
 
     The groups (dataset, downsampling, noise, method, model) are nodes for ``hydra.utils.instantiate``, which
-    :func:`dsr.utils.builder.build` makes, too; it checks their keys against what the class or function that they name
-    takes. ``names`` has the choices of the groups.
+    :func:`dsr.utils.configuration.build` makes, too; it checks their keys against what the class or function that they
+    name takes. ``names`` has the choices of the groups.
     """
 
     names: dict[str, str] = field(default_factory=dict)
@@ -236,7 +236,9 @@ class TrainConfig(RunConfig):
     """The configuration of ``train.py``."""
 
     model: dict[str, Any] = MISSING
-    degradation: dict[str, Any] = field(default_factory=lambda: {"_target_": "dsr.degradation.everything.plain"})
+    degradation: dict[str, Any] = field(
+        default_factory=lambda: {"_target_": "dsr.degradation.random_degradation.plain"}
+    )
     trainer: dict[str, Any] = MISSING
     patches: dict[str, Any] = field(default_factory=lambda: {"_target_": "dsr.training.settings.PatchSettings"})
     start: StartConfig = field(default_factory=StartConfig)

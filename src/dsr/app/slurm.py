@@ -27,7 +27,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from dsr.app.multirun import JobResult
 from dsr.utils import interruption
-from dsr.utils.builder import ConfigError, check_types
+from dsr.utils.configuration import ConfigError, check_types
 from dsr.utils.console import ConsoleProgress, one_line, open_console
 
 _log = logging.getLogger(__name__)

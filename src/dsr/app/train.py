@@ -34,8 +34,8 @@ from dsr.app.trainer import (
     training_trainer,
 )
 from dsr.app.training_runs import WEIGHTS, keyed, read_config, training_data
-from dsr.data.base import SceneSource, prepare_scenes
-from dsr.methods.networks.base import DisparityNetwork
+from dsr.data.scene_source import SceneSource, prepare_scenes
+from dsr.methods.networks.network import DisparityNetwork
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, network_name, read_torch_file, save_network
 from dsr.training.data_module import PatchData
@@ -43,16 +43,14 @@ from dsr.training.loggers import RUN_IDS, expect_installed, log_config, log_layo
 from dsr.training.module import SuperResolution
 from dsr.training.settings import PatchSettings
 from dsr.utils import interruption
-from dsr.utils.builder import ConfigError, build, check
-from dsr.utils.checkpoints import CheckpointError
+from dsr.utils.checkpoints import CheckpointError, DivergenceError
+from dsr.utils.compute_device import fast_precision, pick_device
+from dsr.utils.configuration import ConfigError, build, check
 from dsr.utils.console import USAGE_ERROR, ConsoleProgress
-from dsr.utils.devices import fast_precision, pick_device
-from dsr.utils.divergence import DivergenceError
 from dsr.utils.files import replacing
+from dsr.utils.guards import expect_stored
 from dsr.utils.lightning import fit
-from dsr.utils.limits import expect_stored
-from dsr.utils.progress import SILENT, Progress
-from dsr.utils.units import duration
+from dsr.utils.progress import SILENT, Progress, duration
 
 _LARGEST_SEED = 2**32 - 1
 _FOLDERS = ("checkpoints", "tensorboard", "csv", "wandb", "mlruns")

@@ -14,12 +14,12 @@ from lightning.pytorch.utilities.seed import isolate_rng
 
 from dsr.app.devices import Processes
 from dsr.app.schema import TrainConfig
-from dsr.data.base import SceneSource, prepare_scenes, unprepared
+from dsr.data.scene_source import SceneSource, prepare_scenes, unprepared
 from dsr.training.data_module import PatchData
 from dsr.training.degradation import Batch
 from dsr.training.module import SuperResolution
-from dsr.utils.builder import build
 from dsr.utils.checkpoints import Interruption, OwnFiles
+from dsr.utils.configuration import build
 from dsr.utils.lightning import ListedScores, StepProgress, ValidationTable, make_trainer, without_chatter
 from dsr.utils.progress import SILENT, Progress
 

@@ -9,13 +9,13 @@ from typing import Any, get_type_hints
 
 from dsr.app.schema import RunConfig, TrainConfig, user_directories
 from dsr.app.trust import Trust, expect_trusted, read_plain_yaml
-from dsr.data.base import SceneSource, SceneSubset
+from dsr.data.scene_source import SceneSource, SceneSubset
 from dsr.degradation.downsampling import Downsampling
 from dsr.training.data_module import Part, PatchData
 from dsr.training.degradation import Degradation
 from dsr.training.settings import PatchSettings
-from dsr.utils.builder import ConfigError, build, check_types, load_target, with_key
-from dsr.utils.parsing import is_number
+from dsr.utils.configuration import ConfigError, build, check_types, load_target, with_key
+from dsr.utils.guards import is_number
 
 WEIGHTS = "weights.safetensors"
 _FROM_RUN = ("scale", "downsampling", "noise", "seed", "dataset")

@@ -17,10 +17,9 @@ from typing import Any
 import yaml
 from omegaconf import OmegaConf
 
-from dsr.utils.builder import ConfigError
-from dsr.utils.config_files import config_directories
+from dsr.utils.configuration import ConfigError, config_directories
 from dsr.utils.console import open_console, show
-from dsr.utils.limits import TooLargeError, read_limited
+from dsr.utils.guards import TooLargeError, read_limited
 
 _LARGEST = 1 << 18
 """Largest size of a run's configuration in bytes."""

@@ -14,7 +14,7 @@ from dsr.app.upsample.reporting import problem_line
 from dsr.app.upsample.stored import find_results, read_result
 from dsr.report.surface_page import Packed, is_view, pack_result, save_view
 from dsr.utils.console import ConsoleProgress, show
-from dsr.utils.units import megabytes
+from dsr.utils.progress import megabytes
 
 _WHOLE_PAGE = 6
 """The page has at most this many times the vertices of one surface."""

@@ -7,11 +7,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from dsr.cli import data, doctor, export, fuse, hydra_commands, report, study, upsample, view
-from dsr.data.download.catalogue import CATALOGUE, Collection
+from dsr.cli.commands import DOCTOR, EXPORT, FUSE, REPORT, UPSAMPLE, VIEW, add_data_command, add_hydra_commands
+from dsr.cli.study import STUDY
+from dsr.data.download.collections import CATALOGUE, Collection
 from dsr.utils import interruption
 from dsr.utils.console import USAGE_ERROR, one_line, open_console, print_error
-from dsr.utils.space import FullDiskError
+from dsr.utils.files import FullDiskError
 
 _EXAMPLES = """\
 examples:
@@ -30,15 +31,20 @@ examples:
 
 In a checkout of the project, `python eval.py` and `python train.py` are the same as `dsr eval` and `dsr train`.
 """
-_COMMANDS = (upsample, view, fuse, hydra_commands, report, study, data, doctor, export)
+_COMMANDS = (
+    *(command.add for command in (UPSAMPLE, VIEW, FUSE)),
+    add_hydra_commands,
+    *(command.add for command in (REPORT, STUDY)),
+    add_data_command,
+    *(command.add for command in (DOCTOR, EXPORT)),
+)
 
 
 def main(arguments: Sequence[str] | None = None, catalogue: Mapping[str, Collection] | None = None) -> int:
     """Run the command, and return its exit code: 0, 2 after an error, 130 or 143 when interrupted.
 
     Args:
-        arguments: command-line arguments; None for those of the process.
-        catalogue: the data sets to offer; None for :data:`dsr.data.download.catalogue.CATALOGUE`.
+        catalogue: the data sets to offer; None for :data:`dsr.data.download.collections.CATALOGUE`.
 
     """
     options = _parser().parse_args(arguments)
@@ -81,6 +87,6 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for command in _COMMANDS:
-        command.add(commands)
+    for add in _COMMANDS:
+        add(commands)
     return parser

@@ -10,11 +10,10 @@ from collections.abc import Mapping
 from rich.console import Console
 from rich.table import Table
 
-from dsr.data.download.catalogue import Collection, find
+from dsr.data.download.collections import Collection, data_root, find
 from dsr.data.download.fetching import absent, get, state, verify
-from dsr.data.download.location import data_root
 from dsr.utils.console import ConsoleProgress, show
-from dsr.utils.units import megabytes
+from dsr.utils.progress import megabytes
 
 
 def list_data_sets(_: argparse.Namespace, console: Console, catalogue: Mapping[str, Collection]) -> list[str]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from dsr.app.requests import AnswersRequest, StudyRequest
-from dsr.cli.command import Command, CommandGroup
+from dsr.cli.commands import Command, CommandGroup
 from dsr.utils.console import ConsoleProgress, show
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ def _print(console: Console, table: pd.DataFrame) -> None:
         console.print(each)
 
 
-add = CommandGroup(
+STUDY = CommandGroup(
     "study",
     "ask people which rendering looks most like the ground truth",
     (
@@ -102,4 +102,4 @@ add = CommandGroup(
         Command("collect", "turn the files that people saved into a table", AnswersRequest, _collect, _COLLECT_NOTES),
     ),
     _EXAMPLES,
-).add
+)

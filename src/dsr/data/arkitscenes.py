@@ -24,19 +24,18 @@ from typing import Literal
 import numpy as np
 import torch
 
-from dsr.data.base import SceneSelection
-from dsr.data.formats.files import read_levels
-from dsr.data.formats.shared import (
+from dsr.data.frame_files import (
     expect_size,
     find_beside,
     in_natural_order,
     read_millimetres,
-    read_numbers,
     read_picture,
     to_camera,
 )
-from dsr.data.preparation.dataset import Preparation, PreparedDataset, add_note, list_frames, make_records
+from dsr.data.preparation import Preparation, PreparedDataset, add_note, list_frames, make_records
+from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import ASSUMED_FOV, Camera
+from dsr.io.images import read_levels, read_numbers
 from dsr.sample import Scene
 
 Split = Literal["validation", "training"]
@@ -88,8 +87,6 @@ def load_frame(
         measured_path: lidar's depth.
         confidence_path: the lidar's confidence, None where there is none.
         intrinsics_path: ``.pincam`` file; None for 60 degrees of horizontal view.
-        dataset: of the scene returned.
-        name: the same.
         min_confidence: pixels of the lidar below this confidence become holes.
 
     Raises:

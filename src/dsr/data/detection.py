@@ -10,7 +10,7 @@ from typing import Any
 
 from dsr.data import (
     arkitscenes,
-    ddrnet,
+    ddrnet_frames,
     diml,
     eight_bit,
     icl,
@@ -23,9 +23,9 @@ from dsr.data import (
     tofmark,
 )
 from dsr.data.folder import load_scene
-from dsr.data.formats.shared import load_pair
+from dsr.data.frame_files import load_pair
 from dsr.sample import Scene
-from dsr.utils.paths import natural_key
+from dsr.utils.guards import natural_key
 
 Loader = Callable[[], Scene]
 _YEARS = {"view1.png": 2006, "im2.png": 2003, "im2.ppm": 2001}
@@ -35,7 +35,7 @@ _FRAMES: tuple[tuple[Callable[[Path], Mapping[str, tuple[Any, ...]]], Callable[.
     (tartanair.find_frames, tartanair.load_frame, "tartanair"),
     (sintel.find_frames, sintel.load_frame, "sintel"),
     (tofmark.find_frames, tofmark.load_frame, "tofmark"),
-    (ddrnet.find_frames, ddrnet.load_frame, "ddrnet"),
+    (ddrnet_frames.find_frames, ddrnet_frames.load_frame, "ddrnet"),
     (rgbdd.find_frames, load_pair, "rgbdd"),
     (nyu.find_files, nyu.load_files, "nyu"),
     (arkitscenes.find_frames, arkitscenes.load_frame, "arkitscenes"),

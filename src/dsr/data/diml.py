@@ -17,9 +17,9 @@ import re
 from pathlib import Path
 from typing import Literal, get_args
 
-from dsr.data.base import SceneSelection
-from dsr.data.formats.shared import NO_CAMERA, find_beside, in_natural_order, load_pair
-from dsr.data.preparation.dataset import Preparation, PreparedDataset, add_note, list_frames, make_records
+from dsr.data.frame_files import NO_CAMERA, find_beside, in_natural_order, load_pair
+from dsr.data.preparation import Preparation, PreparedDataset, add_note, list_frames, make_records
+from dsr.data.scene_source import SceneSelection
 
 Split = Literal["test", "train"]
 Resolution = Literal["HR", "LR"]

@@ -30,11 +30,11 @@ from typing import ClassVar, Literal
 
 import torch
 
-from dsr.data.base import SceneSelection
-from dsr.data.formats.files import read_levels
-from dsr.data.formats.shared import expect_size, find_beside, in_natural_order, read_picture
-from dsr.data.preparation.dataset import Preparation, PreparedDataset, add_note, list_frames, make_records
+from dsr.data.frame_files import expect_size, find_beside, in_natural_order, read_picture
+from dsr.data.preparation import Preparation, PreparedDataset, add_note, list_frames, make_records
+from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera, baseline_times_focal, from_range
+from dsr.io.images import read_levels
 from dsr.sample import Scene, Unit
 
 
@@ -104,7 +104,6 @@ def load_frame(rgb_path: Path, levels_path: Path, dataset: str, name: str) -> Sc
         rgb_path: photo.
         levels_path: map of 8 bits, in which 0 is a level and no hole.
         dataset: of the scene returned, a key of ``BENCHMARKS``, which says the camera.
-        name: of the scene returned.
 
     Raises:
         ValueError: a file is missing, damaged, or does not fit the other; the message names it.

@@ -8,7 +8,7 @@
                                              of view, disparity in its own pixels
               depth_lr4.*, disparity_lr4.*   the same, whose size has to be that of the factor in its name, here 4
 
-Depth and disparity follow ``camera.json``; see :func:`dsr.data.formats.files.read_camera` for its keys.
+Depth and disparity follow ``camera.json``; see :func:`dsr.io.images.read_camera` for its keys.
 """
 
 from __future__ import annotations
@@ -23,12 +23,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.data.base import SceneSelection, select_scenes
-from dsr.data.formats.files import MAP_SUFFIXES, CameraFile, read_camera, read_map, read_mask, read_rgb
+from dsr.data.scene_source import SceneSelection, select_scenes
 from dsr.geometry.camera import Camera, RangeType, from_range
+from dsr.io.images import MAP_SUFFIXES, CameraFile, read_camera, read_map, read_mask, read_rgb
 from dsr.sample import Scene, expect_distances
-from dsr.utils.limits import opened, pixels_beside
-from dsr.utils.paths import natural_key
+from dsr.utils.guards import natural_key, opened, pixels_beside
 from dsr.utils.ratios import fits_ratio, round_ratio
 
 _RGB_NAMES = ("rgb.png", "rgb.jpg", "rgb.jpeg")
@@ -66,7 +65,7 @@ class Folder:
         return list(self._scenes)
 
     def load(self, scene: str) -> Scene:
-        """Return one scene; see :class:`dsr.data.base.SceneSource`."""
+        """Return one scene; see :class:`dsr.data.scene_source.SceneSource`."""
         return load_scene(self._root / scene, self.name)
 
     def fingerprint(self, scene: str) -> str:

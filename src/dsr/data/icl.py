@@ -24,13 +24,14 @@ from types import MappingProxyType
 
 from torch import Tensor
 
-from dsr.data.base import SceneSelection
-from dsr.data.formats.shared import expect_size, name_of, read_16bit, read_numbers, read_picture, to_depth, walk
-from dsr.data.preparation.dataset import Preparation, PreparedDataset, list_frames, make_records, rename_records
-from dsr.geometry.camera import Camera, from_range
+from dsr.data.frame_files import expect_size, name_of, read_16bit, read_picture, to_depth, walk
+from dsr.data.preparation import Preparation, PreparedDataset, list_frames, make_records, rename_records
+from dsr.data.scene_source import SceneSelection
+from dsr.geometry.camera import from_range
+from dsr.io.depth_files import ICL_CAMERA as CAMERA
+from dsr.io.images import read_numbers
 from dsr.sample import Scene
 
-CAMERA = Camera(640, 480, 481.2, -480.0, 319.5, 239.5)
 FARTHEST = 100.0
 """Largest depth in metres; longer rays have hit nothing."""
 LEVELS = 5000
@@ -116,7 +117,7 @@ class ICL(PreparedDataset):
         root: directory of the folders of the trajectories.
         scenes: names of the scenes to use; None for the paper's six, ``found`` for every frame in ``root``.
         size: height and width in pixels; None for the original size.
-        crop: see :class:`dsr.data.preparation.dataset.Preparation`.
+        crop: see :class:`dsr.data.preparation.Preparation`.
         frames: frame of each of the paper's names.
 
     Raises:

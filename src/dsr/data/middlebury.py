@@ -32,16 +32,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.data.base import SceneSelection
-from dsr.data.download import catalogue
-from dsr.data.formats.files import read_levels, read_map
-from dsr.data.formats.shared import expect_size, read_picture
-from dsr.data.preparation.dataset import Preparation, PreparedDataset, SceneRecord
-from dsr.data.preparation.dequantization import smooth_levels
+from dsr.data.download import collections
+from dsr.data.frame_files import expect_size, read_picture
+from dsr.data.preparation import Preparation, PreparedDataset, SceneRecord
+from dsr.data.reference_depth import smooth_levels
+from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera, from_range
+from dsr.io.images import read_levels, read_map
 from dsr.sample import Scene
-from dsr.utils.limits import read_limited
-from dsr.utils.paths import natural_key
+from dsr.utils.guards import naming, natural_key, numbers_in, read_limited
 
 YEARS = (2001, 2003, 2005, 2006)
 _MATRIX = re.compile(r"\[\s*(\S+)\s+0\s+(\S+)\s*;\s*0\s+(\S+)\s+(\S+)\s*;\s*0\s+0\s+1\s*\]")
@@ -105,8 +104,6 @@ def load_2014(folder: Path, dataset: str, name: str, *, offset: bool = True) -> 
 
     Args:
         folder: with the files.
-        dataset: of the scene returned.
-        name: the same.
         offset: whether doffs of ``calib.txt`` counts, as it has to geometrically, or is taken for 0.
 
     Raises:
@@ -133,10 +130,8 @@ def load_levels(files: Files, dataset: str, name: str, year: int, *, smooth: boo
 
     Args:
         files: of the scene.
-        dataset: of the scene returned.
-        name: the same.
         year: that of the data set, which says how levels count.
-        smooth: whether the steps of the rounding are smoothed; see :mod:`dsr.data.preparation.dequantization`.
+        smooth: whether the steps of the rounding are smoothed; see :mod:`dsr.data.reference_depth`.
 
     Raises:
         ValueError: a file is missing, damaged, or does not fit the others; the message names it.
@@ -184,17 +179,12 @@ def read_calibration(path: Path) -> Camera:
     fx, cx, fy, cy = (_number(path, "cam0", text) for text in matrix.groups())
     keys = ("doffs", "baseline", "width", "height")
     doffs, baseline, width, height = (_number(path, key, entries.get(key, "nothing")) for key in keys)
-    try:
+    with naming(path):
         return Camera(int(width), int(height), fx, fy, cx, cy, baseline / 1000, doffs)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
 
 
 def _number(path: Path, key: str, text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = np.nan
+    value = next(iter(numbers_in([text])), np.nan)
     if not np.isfinite(value) or (key in ("width", "height") and not value.is_integer()):
         came = "".join(letter for letter in text if letter.isprintable())
         raise ValueError(f"{path}: {key}: expected a number, got {came:.40}")
@@ -246,14 +236,14 @@ def _names(folders: Sequence[str]) -> tuple[str, ...]:
     return tuple(name.casefold() for name in folders)
 
 
-EVALUATION_2014 = _names(catalogue.EVALUATION_2014)
+EVALUATION_2014 = _names(collections.EVALUATION_2014)
 SCENES = {
-    2001: _names(catalogue.SCENES_2001),
-    2003: _names(catalogue.SCENES_2003),
-    2005: _names(catalogue.SCENES_2005),
-    2006: _names(catalogue.SCENES_2006),
+    2001: _names(collections.SCENES_2001),
+    2003: _names(collections.SCENES_2003),
+    2005: _names(collections.SCENES_2005),
+    2006: _names(collections.SCENES_2006),
 }
-TRAINING_2014 = _names(catalogue.TRAINING_2014)
+TRAINING_2014 = _names(collections.TRAINING_2014)
 TRAINING = {2001: SCENES[2001], 2006: SCENES[2006], 2014: TRAINING_2014}
 """Scenes to train on by year."""
 _WITHOUT_OFFSET = "depth is not metric: the disparity offset is left out, as in the paper"
@@ -266,7 +256,7 @@ class Middlebury(PreparedDataset):
     Args:
         root: directory of folders such as ``Recycle-perfect`` or ``Recycle``.
         scenes: names of the scenes to use; None for the paper's seven, ``found`` for all in ``root``.
-        size, crop: see :class:`dsr.data.preparation.dataset.Preparation`.
+        size, crop: see :class:`dsr.data.preparation.Preparation`.
         fill: names of the scenes whose holes are inpainted.
         without_offset: names of the scenes whose disparity offset is replaced by 0, which makes their depth wrong. The
             paper does so with Vintage, but not with Recycle and Playroom.
@@ -296,10 +286,10 @@ class MiddleburyLevels(PreparedDataset):
         root: directory of the scenes.
         year: year of the data set.
         scenes: names of the scenes to use; None for all of the data set, ``found`` for all in ``root``.
-        size, crop: see :class:`dsr.data.preparation.dataset.Preparation`.
+        size, crop: see :class:`dsr.data.preparation.Preparation`.
         fill: names of the scenes whose holes are inpainted.
         smooth: whether the steps that rounding to whole levels makes are smoothed; see
-            :mod:`dsr.data.preparation.dequantization`.
+            :mod:`dsr.data.reference_depth`.
 
     Raises:
         ValueError: a scene is not on disk, or a value is out of range.

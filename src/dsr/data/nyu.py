@@ -33,13 +33,14 @@ import h5py
 import numpy as np
 import torch
 
-from dsr.data.base import SceneSelection
-from dsr.data.formats.files import read_map
-from dsr.data.formats.matlab import expect_own_values
-from dsr.data.formats.shared import expect_size, find_beside, in_natural_order, read_picture, to_depth
-from dsr.data.preparation.dataset import Preparation, PreparedDataset, SceneRecord, list_frames, make_records
+from dsr.data.frame_files import expect_size, find_beside, in_natural_order, read_picture, to_depth
+from dsr.data.matlab import expect_own_values
+from dsr.data.preparation import Preparation, PreparedDataset, SceneRecord, list_frames, make_records
+from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera
+from dsr.io.images import read_map
 from dsr.sample import Scene
+from dsr.utils.guards import refusing
 
 CAMERA = Camera(640, 480, 518.85790117450188, 519.46961112127485, 325.58244941119034 - 1, 253.73616633400465 - 1)
 BORDER = (44, 40, 427, 561)
@@ -74,8 +75,6 @@ def load_frame(path: Path, number: int, dataset: str, name: str, *, filled: bool
     Args:
         path: the labelled ``.mat`` file.
         number: of the frame, from 1.
-        dataset: of the scene returned.
-        name: the same.
         filled: take the authors' filled depth instead of the Kinect's with its holes.
         crop: cut off the border, which leaves 427 x 561 pixels.
 
@@ -88,10 +87,8 @@ def load_frame(path: Path, number: int, dataset: str, name: str, *, filled: bool
         count = len(arrays["images"])
         if not 1 <= number <= count:
             raise ValueError(f"{path}: expected a frame from 1 to {count}, got {number}")
-        try:
+        with refusing(f"{path}: expected frame {number} of {key} and images, got a damaged file", OSError):
             pixels, metres = arrays["images"][number - 1], arrays[key][number - 1]
-        except OSError as error:  # a damaged block
-            raise ValueError(f"{path}: expected frame {number} of {key} and images, got a damaged file") from error
     rgb = torch.from_numpy(pixels).permute(0, 2, 1).contiguous().float() / 255  # (3, 480, 640)
     depth, camera = to_depth(path, metres.T), CAMERA
     if crop:
@@ -149,12 +146,11 @@ def _opened(path: Path) -> Iterator[Mapping[str, h5py.Dataset]]:
 def _checked(path: Path, file: h5py.File, key: str) -> h5py.Dataset:
     """Return one of the arrays, if it has the shape and type of its frames and as many as the others."""
     shape, dtype = _FRAME[key]
-    try:
+    # damaged inside: h5py raises KeyError, RuntimeError, OSError, ...
+    with refusing(f"{path}: expected the array {key}, got a damaged or foreign file", Exception):
         array = file.get(key)
         came = (array.dtype, array.shape) if isinstance(array, h5py.Dataset) else None
         count = file["images"].shape[:1]
-    except Exception as error:  # damaged inside: h5py raises KeyError, RuntimeError, OSError, ...
-        raise ValueError(f"{path}: expected the array {key}, got a damaged or foreign file") from error
     if came is None:
         raise ValueError(f"{path}: expected the array {key}, got none of that name")
     try:
@@ -175,7 +171,7 @@ class NYU(PreparedDataset):
         scenes: names of the scenes to use, ``0001`` to ``1449``; None and ``found`` for all. With a split, None for all
             of it and ``found`` for those on disk.
         size: height and width in pixels; None for the original size without the white border.
-        crop: see :class:`dsr.data.preparation.dataset.Preparation`.
+        crop: see :class:`dsr.data.preparation.Preparation`.
         filled: whether the authors' inpainted depth is the true depth, in place of the sensor's.
         split: ``test``, the last 449 frames, to evaluate on, or ``train``, the first 1000, to train on, as in the
             literature on guided depth super-resolution: 640 x 480 pixels with the border and the inpainted depth,

@@ -26,8 +26,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar, Literal
 
-from dsr.data.base import SceneSelection
-from dsr.data.formats.shared import (
+from dsr.data.frame_files import (
     NO_CAMERA,
     expect_size,
     find_beside,
@@ -36,7 +35,8 @@ from dsr.data.formats.shared import (
     read_millimetres,
     walk,
 )
-from dsr.data.preparation.dataset import Preparation, PreparedDataset, add_note, list_frames, make_records
+from dsr.data.preparation import Preparation, PreparedDataset, add_note, list_frames, make_records
+from dsr.data.scene_source import SceneSelection
 from dsr.sample import Scene
 
 Split = Literal["test", "train"]
@@ -73,7 +73,7 @@ def find_frames(root: Path, split: Split | None = None, measured: bool = False) 
 
 
 def load_measured_frame(rgb_path: Path, depth_path: Path, measured_path: Path, dataset: str, name: str) -> Scene:
-    """Return one image as :func:`~dsr.data.formats.shared.load_pair` does, with the phone's depth as the measured map.
+    """Return one image as :func:`~dsr.data.frame_files.load_pair` does, with the phone's depth as the measured map.
 
     Raises:
         ValueError: a file is missing, damaged, or does not fit the others; the message names it.

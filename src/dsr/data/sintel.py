@@ -23,12 +23,12 @@ from typing import Literal
 import numpy as np
 from torch import Tensor
 
-from dsr.data.base import SceneSelection
-from dsr.data.formats.shared import expect_size, read_bytes, read_picture, to_camera, to_depth
-from dsr.data.preparation.dataset import Preparation, PreparedDataset, list_frames, make_records
+from dsr.data.frame_files import expect_size, read_bytes, read_picture, to_camera, to_depth
+from dsr.data.preparation import Preparation, PreparedDataset, list_frames, make_records
+from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
-from dsr.utils.paths import natural_key
+from dsr.utils.guards import natural_key
 
 SEQUENCES = MappingProxyType({
     "alley_1": 50, "alley_2": 50, "ambush_2": 21, "ambush_4": 33, "ambush_5": 50, "ambush_6": 20, "ambush_7": 50,

@@ -26,20 +26,18 @@ from types import MappingProxyType
 
 from torch import Tensor
 
-from dsr.data.base import SceneSelection
-from dsr.data.formats.shared import (
+from dsr.data.frame_files import (
     expect_size,
     given_camera,
     in_natural_order,
     name_of,
     read_16bit,
-    read_numbers,
     read_picture,
     to_camera,
     to_depth,
     walk,
 )
-from dsr.data.preparation.dataset import (
+from dsr.data.preparation import (
     Preparation,
     PreparedDataset,
     SceneRecord,
@@ -47,7 +45,9 @@ from dsr.data.preparation.dataset import (
     make_records,
     rename_records,
 )
+from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera
+from dsr.io.images import read_numbers
 from dsr.sample import Scene
 
 Intrinsics = tuple[float, float, float, float]
@@ -98,8 +98,6 @@ def load_frame(
 
     Args:
         folder: the scene's.
-        dataset: of the scene returned.
-        name: the same.
         refined: take ``depth_bfx``, the authors' filled depth, instead of ``depth``.
         intrinsics: for a folder without ``intrinsics.txt``.
 
@@ -175,7 +173,7 @@ class SunRGBD(PreparedDataset):
         root: directory of the scenes' folders, at any depth.
         scenes: names of the scenes to use; None for twelve, ``found`` for all in ``root``.
         size: height and width in pixels; None for the original size.
-        crop: see :class:`dsr.data.preparation.dataset.Preparation`.
+        crop: see :class:`dsr.data.preparation.Preparation`.
         refined: whether the authors' refined depth without holes is the true depth.
         frames: folder of each of the twelve names.
         intrinsics: fx, fy, cx, cy in pixels for folders without ``intrinsics.txt``.

@@ -16,13 +16,13 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from dsr.data.base import SceneSelection
-from dsr.data.formats.files import read_map
-from dsr.data.formats.shared import expect_size, name_of, read_picture, to_depth, walk
-from dsr.data.preparation.dataset import Preparation, PreparedDataset, list_frames, make_records
+from dsr.data.frame_files import expect_size, name_of, read_picture, to_depth, walk
+from dsr.data.preparation import Preparation, PreparedDataset, list_frames, make_records
+from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera
+from dsr.io.images import read_map
 from dsr.sample import Scene
-from dsr.utils.limits import opened
+from dsr.utils.guards import opened
 
 CAMERA = Camera(640, 480, 320.0, 320.0, 320.0, 240.0)
 FARTHEST = 1000.0
@@ -105,7 +105,7 @@ class TartanAir(PreparedDataset):
         root: directory of the trajectories.
         scenes: names of the scenes to use; None and ``found`` for all in ``root``.
         size: height and width in pixels; None for the original size.
-        crop: see :class:`dsr.data.preparation.dataset.Preparation`.
+        crop: see :class:`dsr.data.preparation.Preparation`.
         farthest: depth in metres beyond which pixels are sky, that is, missing.
 
     Raises:

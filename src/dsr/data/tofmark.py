@@ -31,11 +31,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.data.base import SceneSelection
-from dsr.data.formats.files import read_levels
-from dsr.data.formats.matlab import read_variables
-from dsr.data.formats.shared import expect_size, given_camera, in_natural_order, name_of, read_picture, to_depth, walk
-from dsr.data.preparation.dataset import Preparation, PreparedDataset, add_note, list_frames, make_records
+from dsr.data.frame_files import expect_size, given_camera, in_natural_order, name_of, read_picture, to_depth, walk
+from dsr.data.matlab import read_variables
+from dsr.data.preparation import Preparation, PreparedDataset, add_note, list_frames, make_records
+from dsr.data.scene_source import SceneSelection
+from dsr.io.images import read_levels
 from dsr.sample import Scene
 
 FACTORS = (4, 8)
@@ -90,8 +90,6 @@ def load_frame(
     Args:
         path: the ``.mat`` file, or the intensity picture.
         samples_path: ``*_depth.bmp``; None with a ``.mat`` file.
-        dataset: of the scene returned.
-        name: the same.
         intrinsics: (fx, fy, cx, cy) in pixels, pixel centres at integers; needed, as the files hold none.
         depth_range: metres of level 1 and of level 255 of ``samples_path``, which needs it.
         variables: names in the ``.mat`` file of "intensity", "depth" and "samples"; the others are found.

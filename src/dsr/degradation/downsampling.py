@@ -23,9 +23,10 @@ from torch import Tensor
 
 from dsr.degradation.holes import Holes
 from dsr.degradation.noise import Noise
-from dsr.degradation.scales import check_scale, match_ratio
 from dsr.geometry.camera import Camera, RangeType, from_range, to_range
 from dsr.sample import FARTHEST, NEAREST, DepthSample, Scene
+from dsr.utils.guards import naming
+from dsr.utils.ratios import check_scale, match_ratio
 
 Kernel = Literal["box", "nearest", "bilinear", "bicubic", "gaussian"]
 _LEAST_WEIGHT = 0.5
@@ -79,7 +80,6 @@ class Downsampling:
 
         Args:
             values: (..., H, W), NaN where unknown; H and W divisible by ``scale``.
-            scale: the factor.
 
         Returns:
             (..., H / scale, W / scale).
@@ -236,10 +236,8 @@ def _true_depth(scene: Scene) -> Tensor:
 
 def _match_measured(scene: Scene, scale: float | str) -> float:
     """Return the ratio of the scene's measured map that a scale names."""
-    try:
+    with naming(scene.name):
         return match_ratio(scale, scene.measured)
-    except ValueError as error:
-        raise ValueError(f"{scene.name}: {error}") from error
 
 
 def _crop_to_multiple(scene: Scene, factor: int) -> tuple[Scene, tuple[str, ...]]:

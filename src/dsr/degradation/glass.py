@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.degradation.draws import chance, draw, field_of, normal, power, uniform
 from dsr.degradation.glass_shapes import Body, Plate, Pose, ball, draw_box, draw_plate, draw_vessel
+from dsr.degradation.random_fields import chance, draw, field_of, normal, power, uniform
 from dsr.sample import Scene
 
 KINDS: Mapping[str, float] = {"vessel": 0.5, "ball": 0.06, "box": 0.1, "pane": 0.12, "mirror": 0.12, "gloss": 0.1}
@@ -43,7 +43,6 @@ def add_glass(scene: Scene, generator: torch.Generator, kinds: Mapping[str, floa
 
     Args:
         scene: a scene with a true depth.
-        generator: source of all random numbers.
         kinds: relative frequency of each kind of object, of those of ``KINDS``.
 
     Returns:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dsr.degradation.draws import chance, draw, normal, uniform
+from dsr.degradation.random_fields import chance, draw, normal, uniform
 
 
 class Pose(NamedTuple):
@@ -58,10 +58,8 @@ def draw_vessel(pose: Pose, radius: float, size: tuple[int, int], generator: tor
     """Return a random surface of revolution, open at the top.
 
     Args:
-        pose: its pose.
         radius: its largest one in pixels.
         size: height and width of the image.
-        generator: source of all random numbers.
 
     """
     kind = draw(_PROFILES, generator)
@@ -251,7 +249,6 @@ def draw_plate(size: tuple[int, int], focal: float, generator: torch.Generator) 
     Args:
         size: height and width of the image.
         focal: focal length in pixels.
-        generator: source of all random numbers.
 
     """
     half = [uniform(0.1, 0.4, generator) * min(size) for _ in range(2)]

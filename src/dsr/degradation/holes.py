@@ -1,4 +1,4 @@
-"""Holes of low-resolution depth maps, as sensors leave them: irregular blobs, and strips hidden from a second camera.
+"""Holes of low-resolution depth maps: blobs, strips hidden from a second camera, and those of training, at random.
 
 A kind of holes is a callable from a low-resolution map, its camera and a generator to a mask; see
 :func:`dsr.degradation.downsampling.make_sample`.
@@ -6,13 +6,14 @@ A kind of holes is a callable from a low-resolution map, its camera and a genera
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
+from dsr.degradation.random_fields import chance, field_of, near_steps, uniform
 from dsr.geometry.camera import Camera
 
 Holes = Callable[[Tensor, Camera, torch.Generator], Tensor]
@@ -106,3 +107,33 @@ def _blur(values: Tensor, sigma: float, axis: int) -> Tensor:
     kernel = (taps / taps.sum()).view(1, 1, *((-1, 1) if vertical else (1, -1)))
     padding = (0, 0, radius, radius) if vertical else (radius, radius, 0, 0)
     return functional.conv2d(functional.pad(values, padding, mode="replicate"), kernel)
+
+
+def _blobs(values: Tensor, _: Tensor, camera: object, generator: torch.Generator) -> Tensor:
+    blobs = Blobs(uniform(0.02, 0.25, generator), uniform(2, 12, generator))
+    return blobs(values.reciprocal(), camera, generator)  # type: ignore[arg-type]
+
+
+def _shadows(values: Tensor, _: Tensor, camera: object, generator: torch.Generator) -> Tensor:
+    side = -1 if chance(0.5, generator) else 1
+    return Shadows(side * uniform(0.03, 0.2, generator))(values.reciprocal(), camera, generator)  # type: ignore[arg-type]
+
+
+def _beside_steps(values: Tensor, _: Tensor, __: object, generator: torch.Generator) -> Tensor:
+    reach = 1 + int(torch.randint(2, (1,), generator=generator))
+    return near_steps(values, reach) & (torch.rand(values.shape, generator=generator) < uniform(0.3, 1, generator))
+
+
+def dark(values: Tensor, luma: Tensor, _: object, generator: torch.Generator) -> Tensor:
+    """Return the mask of the darkest pixels, most of them, (1, h, w)."""
+    limit = float(luma[:, ::3, ::3].flatten().quantile(uniform(0.02, 0.2, generator)))
+    return (luma < limit) & (field_of(values, 1, generator) > -0.3)
+
+
+def _pixels(values: Tensor, _: Tensor, __: object, generator: torch.Generator) -> Tensor:
+    return torch.rand(values.shape, generator=generator) < uniform(0.01, 0.4, generator)
+
+
+HOLES: Mapping[str, Callable[[Tensor, Tensor, object, torch.Generator], Tensor]] = {
+    "blobs": _blobs, "shadows": _shadows, "steps": _beside_steps, "dark": dark, "pixels": _pixels,
+}  # fmt: skip

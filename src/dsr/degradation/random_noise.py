@@ -9,9 +9,17 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.degradation.draws import chance, field_of, near_steps, power, uniform, waves_of, window_maxima, window_means
-from dsr.degradation.holes import occluded
-from dsr.degradation.random_holes import dark
+from dsr.degradation.holes import dark, occluded
+from dsr.degradation.random_fields import (
+    chance,
+    field_of,
+    near_steps,
+    power,
+    uniform,
+    waves_of,
+    window_maxima,
+    window_means,
+)
 
 
 def _white(values: Tensor, _: Tensor, generator: torch.Generator) -> Tensor:

@@ -364,7 +364,6 @@ def least_error(sensor: Sensor, depth: Tensor, constant: float | None = None) ->
     distance; the larger one.
 
     Args:
-        sensor: the sensor.
         depth: in metres, any shape.
         constant: f B over the step of disparity, in metres; None for that of its native width.
 

@@ -11,13 +11,9 @@ from rich.table import Table
 from rich.text import Text
 
 from dsr.data.detection import find_scenes
+from dsr.doctor.camera_checks import check_intrinsics, check_planes, check_registration, check_size
+from dsr.doctor.depth_checks import check_holes, check_precision, check_units
 from dsr.doctor.finding import LEVELS, Finding, Level, with_depth, worst
-from dsr.doctor.holes import check_holes
-from dsr.doctor.intrinsics import check_intrinsics, check_size
-from dsr.doctor.planes import check_planes
-from dsr.doctor.precision import check_precision
-from dsr.doctor.registration import check_registration
-from dsr.doctor.units import check_units
 from dsr.sample import Scene
 from dsr.utils.console import USAGE_ERROR, ConsoleProgress, one_line, open_console, print_error
 from dsr.utils.ratios import round_ratio

@@ -53,12 +53,7 @@ def with_depth(scene: Scene) -> Scene:
 
 
 def metres(scene: Scene) -> Array:
-    """Return a scene's high-resolution depth, (H, W) float64 in metres, NaN in holes.
-
-    Raises:
-        ValueError: the scene has none.
-
-    """
+    """Return a scene's high-resolution depth, (H, W) float64 in metres, NaN in holes."""
     if scene.depth is None:
         raise ValueError(f"{scene.name}: expected high-resolution depth, there is none; see with_depth")
     depth: Array = scene.depth[0].double().numpy()

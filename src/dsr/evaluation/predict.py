@@ -23,18 +23,18 @@ import numpy as np
 import pandas as pd
 import torch
 
-from dsr.data.base import SceneSource
+from dsr.data.scene_source import SceneSource
 from dsr.degradation.downsampling import Downsampling, Measured, make_sample
 from dsr.degradation.holes import Holes
 from dsr.degradation.noise import Noise
-from dsr.evaluation.claims import Claims
-from dsr.evaluation.sharing import ALONE, Workers, share
+from dsr.evaluation.sharing import ALONE, Claims, Workers, share
 from dsr.evaluation.store import iterations_path, prediction_path, sample_path
 from dsr.methods.base import Method, NoSolutionError, expect_some_depth
 from dsr.sample import DepthSample
+from dsr.utils.arrays import read_arrays
 from dsr.utils.console import one_line
-from dsr.utils.files import look_anew, read_arrays, replacing
-from dsr.utils.parsing import parse_json
+from dsr.utils.files import look_anew, replacing
+from dsr.utils.guards import parse_json
 from dsr.utils.pool import LOST
 from dsr.utils.progress import SILENT, Progress
 
@@ -142,7 +142,6 @@ def predict(
 
     Args:
         study: evaluation to run.
-        folder: directory of the run.
         progress: display of the completed scenes, and of the method's steps within a scene.
         overwrite: whether stored predictions are recomputed, but for those that another process stores meanwhile.
         workers: how many scenes are predicted at a time, each in a process of its own.

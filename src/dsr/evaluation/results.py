@@ -15,7 +15,7 @@ from dsr.evaluation.store import load_errors, load_prediction, prediction_path, 
 from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.metrics.formats import HEADLINES, MetricFormat, complete_formats, in_tables
 from dsr.sample import DepthSample
-from dsr.utils.files import array_headers
+from dsr.utils.arrays import array_headers
 
 METHOD_ORDER = (
     "Nearest", "Bilinear", "Bicubic", "Bilateral", "GF", "JBU", "FGS", "Diffusion", "TGV",

@@ -12,16 +12,15 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import pandas as pd
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field
 
 from dsr.evaluation.results import Results, Run, method_key, method_settings, problem_key
 from dsr.evaluation.store import expect_scene, prediction_path, sample_path
 from dsr.metrics.formats import MetricFormat
-from dsr.utils.files import array_headers
-from dsr.utils.limits import MOST_TABLE, TooLargeError, read_limited
-from dsr.utils.paths import OutsideError, natural_key
+from dsr.utils.arrays import array_headers
+from dsr.utils.guards import MOST_TABLE, OutsideError, TooLargeError, natural_key, read_limited
 from dsr.utils.ratios import as_ratio
-from dsr.utils.validation import Number, Whole, describe
+from dsr.utils.validation import Number, Whole, parse_model
 
 _SCORES, _SUMMARY, _VERSIONS = "scores.csv", "summary.json", "versions.json"
 _TEXT_COLUMNS = ("dataset", "scene", "downsampling", "method", "metric", "variant")
@@ -178,11 +177,10 @@ class _Versions(BaseModel, extra="allow"):
 def _read(kind: type[_Content], path: Path) -> _Content:
     """Read and check a JSON file of a run."""
     try:
-        return kind.model_validate_json(read_limited(path))
+        content = read_limited(path)
     except OSError as error:
         raise ValueError(f"{path}: expected a run's JSON, got {error.strerror or error}") from error
-    except ValidationError as error:
-        raise ValueError(f"{path}: {describe(error)}") from error
+    return parse_model(kind, content, path)
 
 
 def _read_scores(path: Path) -> pd.DataFrame:

@@ -12,9 +12,8 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from dsr.evaluation.claims import Claims
 from dsr.evaluation.predict import Evaluation, Outcome, failure_line
-from dsr.evaluation.sharing import ALONE, Workers, share
+from dsr.evaluation.sharing import ALONE, Claims, Workers, share
 from dsr.evaluation.store import load_prediction, prediction_path, sample_path
 from dsr.metrics.catalogue import Metric, score_image
 from dsr.metrics.formats import HEADLINES
@@ -54,10 +53,8 @@ def score(
 
     Args:
         study: the evaluation; its data set is not read.
-        folder: directory of the run.
         metrics: from :func:`dsr.metrics.catalogue.catalogue`.
         outcome: outcome of :func:`predict`; failures and scenes without true depth are added to it.
-        progress: display of the completed scenes.
         illustrate: function that draws a picture of a sample, the predicted depth and its worst-of-four scores.
         workers: how many scenes are scored at a time, each in a process of its own.
 

@@ -13,11 +13,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dsr.utils.files import read_arrays
-from dsr.utils.limits import TooLargeError
-from dsr.utils.paths import path_within
+from dsr.utils.arrays import read_arrays
+from dsr.utils.guards import TooLargeError, path_within
 
 _ERRORS = ("depth_error", "angle_error")
+_DAMAGED = "{}: expected a prediction, got a missing or damaged file"
 _PREDICTION, _SAMPLE = "predictions/{}.npz", "scenes/{}.npz"
 
 
@@ -58,17 +58,12 @@ def load_errors(path: Path) -> tuple[Tensor, Tensor] | None:
         ValueError: the file is missing or damaged.
 
     """
-    try:
-        arrays = read_arrays(path, _ERRORS)
-        if "depth_error" not in arrays:
-            return None
-        if any(array.ndim != 2 or array.dtype.kind != "f" for array in arrays.values()):
-            raise TypeError
-        depth, angle = (torch.from_numpy(arrays[name])[None].float() for name in _ERRORS)
-    except TooLargeError:
-        raise
-    except (OSError, KeyError, ValueError, TypeError) as error:
-        raise ValueError(f"{path}: expected a prediction, got a missing or damaged file") from error
+    maps = _read_maps(path, _ERRORS)
+    if "depth_error" not in maps:
+        return None
+    if len(maps) < len(_ERRORS):
+        raise ValueError(_DAMAGED.format(path))
+    depth, angle = (maps[name].float() for name in _ERRORS)
     return depth, angle
 
 
@@ -79,12 +74,20 @@ def load_prediction(path: Path) -> Tensor:
         ValueError: the file is missing or damaged, or its depth is no map of floating point numbers.
 
     """
+    maps = _read_maps(path, ("depth",))
+    if not maps:
+        raise ValueError(_DAMAGED.format(path))
+    return maps["depth"]
+
+
+def _read_maps(path: Path, names: tuple[str, ...]) -> dict[str, Tensor]:
+    """Return those of some maps of a prediction that there are, (1, H, W)."""
     try:
-        depth = read_arrays(path, ("depth",))["depth"]
-        if depth.ndim != 2 or depth.dtype.kind != "f":
+        arrays = read_arrays(path, names)
+        if any(array.ndim != 2 or array.dtype.kind != "f" for array in arrays.values()):
             raise TypeError
-        return torch.from_numpy(depth)[None]
+        return {name: torch.from_numpy(array)[None] for name, array in arrays.items()}
     except TooLargeError:
         raise
-    except (OSError, KeyError, ValueError, TypeError) as error:
-        raise ValueError(f"{path}: expected a prediction, got a missing or damaged file") from error
+    except (OSError, ValueError, TypeError) as error:
+        raise ValueError(_DAMAGED.format(path)) from error

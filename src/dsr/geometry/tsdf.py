@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from skimage.measure import marching_cubes
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.poses import Matrix, invert
+from dsr.geometry.rigid_motion import Matrix, invert
 
 _STEEPEST = 0.9
 """Largest change of the distance within a cell, in units of the truncation; at a surface it is at most 0.43."""

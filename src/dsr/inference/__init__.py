@@ -5,15 +5,14 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from dsr.inference.options import DEFAULT, WIDEST, Fill
+from dsr.inference.defaults import DEFAULT, WIDEST, Fill
 
 if TYPE_CHECKING:
     from dsr.inference.any_ratio import AnyRatio, upsample_surface, upsampler
     from dsr.inference.api import upsample, upsample_with_errors
-    from dsr.inference.inspection import enlarged_by
     from dsr.inference.plans import Plan, plan_for
     from dsr.inference.selection import Selection, select
-    from dsr.inference.working_size import find_sensor
+    from dsr.inference.working_size import enlarged_by, find_sensor
 
 __all__ = [
     "DEFAULT",
@@ -35,10 +34,9 @@ __all__ = [
 _NAMES = {
     "any_ratio": ("AnyRatio", "upsample_surface", "upsampler"),
     "api": ("upsample", "upsample_with_errors"),
-    "inspection": ("enlarged_by",),
     "plans": ("Plan", "plan_for"),
     "selection": ("Selection", "select"),
-    "working_size": ("find_sensor",),
+    "working_size": ("enlarged_by", "find_sensor"),
 }
 
 

@@ -15,15 +15,14 @@ from torch import Tensor
 from dsr.degradation.downsampling import Downsampling
 from dsr.degradation.sensors import Identified
 from dsr.geometry.camera import Camera
-from dsr.geometry.holes import degrees_per_pixel, wide_holes
+from dsr.geometry.hole_size import degrees_per_pixel, wide_holes
 from dsr.geometry.resampling import pad_inverse_depth
-from dsr.inference.agreement import expect_errors
-from dsr.inference.inspection import enlarged_by
-from dsr.inference.options import DEFAULT, SIZES, USUAL_SCALE, WIDEST, Fill
-from dsr.inference.outliers import count_patches, find_outliers, within_measured
+from dsr.inference.defaults import DEFAULT, SIZES, USUAL_SCALE, WIDEST, Fill
 from dsr.inference.plans import OWN_SIZE, Plan, plan_for, steps_of
+from dsr.inference.plausibility import count_patches, expect_errors, find_outliers, within_measured
 from dsr.inference.resizing import at_factors, at_ratio, padded, resize_nearest, size_of
 from dsr.inference.working_size import (
+    enlarged_by,
     find_noise,
     find_sensor,
     left_of,
@@ -35,8 +34,8 @@ from dsr.inference.working_size import (
 from dsr.methods.base import InverseSurface, Method, NoiseLaw, Surface, expect_some_depth
 from dsr.methods.recipe import Recipe, Run, read_recipe
 from dsr.sample import DepthSample, expect_distances
-from dsr.utils.builder import ConfigError
-from dsr.utils.devices import fast_precision, pick_device
+from dsr.utils.compute_device import fast_precision, pick_device
+from dsr.utils.configuration import ConfigError
 from dsr.utils.progress import Steps
 
 _DECIDED = MappingProxyType({"fill_holes": True, "validate_every": 0})
@@ -54,7 +53,7 @@ class AnyRatio(Method):
     of its valid pixels; if it was enlarged by repeating pixels, the repeated ones are dropped instead. The averages may
     cross depth steps, as in the networks' training.
     Patches that are far from everything around them are taken for holes, and the result stays within what is measured
-    around each pixel, see :mod:`dsr.inference.outliers`.
+    around each pixel, see :mod:`dsr.inference.plausibility`.
     (With a tenth of the map missing, RMSE_v on Lucy is 0.127, against 0.142 or more with means, medians or planes of
     one surface.)
 
@@ -139,8 +138,8 @@ class AnyRatio(Method):
     ) -> Surface:
         """Upsample a depth map to the photo's size, with the expected errors.
 
-        ``facets`` says them; for other methods they are estimated, see :mod:`dsr.inference.agreement`. The depth map is
-        registered to the photo: the same view and field of view, outer edge on outer edge.
+        ``facets`` says them; for other methods they are estimated, see :mod:`dsr.inference.plausibility`. The depth map
+        is registered to the photo: the same view and field of view, outer edge on outer edge.
 
         Args:
             rgb: (3, H, W) floating point, in [0, 1].
@@ -286,7 +285,6 @@ def upsampler(
         method: the name of one in ``conf/method``.
         scale: see :class:`AnyRatio`, also for ``fill``, ``max_hole`` and ``working_size``.
         settings: arguments of the method that differ from its file, by name.
-        directories: the user's configuration directories.
         device: ``auto`` for a GPU if there is one, or a device as torch names it.
         fill: see there.
         max_hole: see there.

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dsr.geometry.camera import Camera
 from dsr.inference.any_ratio import upsampler
-from dsr.inference.options import DEFAULT, WIDEST, Fill
+from dsr.inference.defaults import DEFAULT, WIDEST, Fill
 from dsr.methods.base import MapNoise
 from dsr.utils.progress import Steps
 
@@ -123,7 +123,7 @@ def upsample_with_errors(
     """Upsample a depth map as :func:`upsample` does, and return its expected errors, too; see there.
 
     They are the mean absolute errors of depth and normal that are to be expected at each pixel. ``facets`` says them;
-    for other methods they are estimated, see :mod:`dsr.inference.agreement`.
+    for other methods they are estimated, see :mod:`dsr.inference.plausibility`.
     """
     arrays = isinstance(rgb, np.ndarray)
     if isinstance(depth, np.ndarray) != arrays:
@@ -149,8 +149,8 @@ def upsample_with_errors(
 
 
 def _tensor(values: np.ndarray | Tensor) -> Tensor:
-    """Return an array as a tensor, also one that torch cannot share: a flipped view has negative strides."""
-    return torch.as_tensor(np.ascontiguousarray(values) if isinstance(values, np.ndarray) else values)
+    """Return an array as a tensor, also one that torch cannot share: flipped, with negative strides, or read-only."""
+    return torch.as_tensor(np.require(values, requirements=("C", "W")) if isinstance(values, np.ndarray) else values)
 
 
 def _photo(rgb: np.ndarray | Tensor) -> Tensor:

@@ -2,20 +2,8 @@
 
 Facets and filters take any ratio of the sizes. Other networks are trained for fixed factors. A low-resolution depth map
 is not resized: the photo is resized to a multiple of its size, and the network's result to the photo's size
-(:mod:`dsr.geometry.resampling`).
-RMSE_v and RMSE_d in mm of ``facets_box`` on Lucy and Plant, box averages at the given ratio, means of both scenes:
-
-| ratio | photo resized, x4 | x8 | depth resized instead, x4 | x8 | cubic spline |
-| --- | --- | --- | --- | --- | --- |
-| 2 | 0.103, 20 | | 0.155, 80 | 0.185, 79 | 0.218, 35 |
-| 3 | 0.119, 25 | | | | 0.245, 45 |
-| 5 | 0.148, 45 | 0.140, 30 | | | 0.278, 62 |
-| 6 | 0.162, 51 | 0.151, 33 | 0.251, 93 | 0.191, 75 | 0.294, 69 |
-| 7.5 | | 0.163, 37 | | | 0.305, 71 |
-
-The factor is therefore the smallest that reaches the photo's size. Larger ratios than 8 take two steps, x8 and then x4
-on the result averaged to a quarter of the photo's size: at ratio 16 RMSE_v is 0.215, against 0.222 for x8 with the
-result enlarged by 2.
+(:mod:`dsr.geometry.resampling`). The factor is the smallest that reaches the photo's size; larger ratios than 8 take
+two steps, x8 and then x4 on the result averaged to a quarter of the photo's size. docs/facets.md has the figures.
 """
 
 from __future__ import annotations
@@ -24,7 +12,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from dsr.inference.options import DEFAULT, USUAL_SCALE
+from dsr.inference.defaults import DEFAULT, USUAL_SCALE
 from dsr.methods.networks.weight_choice import SLACK, nearest_scale
 from dsr.methods.recipe import Recipe
 
@@ -87,7 +75,6 @@ def plan_for(
     from the low-resolution map that it was before.
 
     Args:
-        recipe: the method.
         photo_size: height and width.
         depth_size: height and width.
         scale: the factor; None to choose it by the sizes, 4 if they are equal.

@@ -29,11 +29,9 @@ def at_ratio(
     """Run a method of any ratio.
 
     Args:
-        method: the method.
         rgb: (3, H, W) the photo.
         inverse: (1, h, w) the map.
         camera: the photo's.
-        progress: is called with the steps done and their total.
         noise: of the map, where it is known.
 
     """
@@ -54,7 +52,6 @@ def at_factors(
         rgb: (3, H, W) the photo.
         inverse: (1, h, w) the map.
         camera: the photo's.
-        progress: is called with the steps done and their total.
 
     """
     size = size_of(rgb)

@@ -8,12 +8,12 @@ from pathlib import Path
 import torch
 
 from dsr.inference.any_ratio import AnyRatio
-from dsr.inference.options import Fill
+from dsr.inference.defaults import Fill
 from dsr.inference.plans import steps_of
 from dsr.methods.base import Method
 from dsr.methods.networks.weight_choice import WeightChoice
 from dsr.methods.recipe import Recipe, Run
-from dsr.utils.builder import ConfigError
+from dsr.utils.configuration import ConfigError
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,6 @@ def select(recipe: Recipe, scale: float, weights: Path | None = None, *, measure
     """Select how to run a method at a scale.
 
     Args:
-        recipe: the method.
         scale: ratio of the photo's width to the depth map's.
         weights: a file of weights, or a directory with published ones; None for those that the method names.
         measured: whether the maps are a sensor's own. Of a method without packaged weights for their ratio, those for

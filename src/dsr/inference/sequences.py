@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.poses import Matrix, as_rigid, relative
+from dsr.geometry.rigid_motion import Matrix, as_rigid, relative
 from dsr.geometry.warping import source_pixels, warp_depth
-from dsr.methods.noise import estimate_sensor_noise
+from dsr.methods.noise_level import estimate_sensor_noise
 
 _DEVIATIONS = 3.0
 """Difference of two readings of a surface, in standard deviations of the difference, beyond which they disagree."""

@@ -19,8 +19,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.degradation.sensors import Identified, identify
-from dsr.inference.options import SIZES
+from dsr.inference.defaults import SIZES
 from dsr.methods.base import MapNoise, NoiseLaw
+
+_LARGEST_BLOCK = 16
 
 T = TypeVar("T", float, Tensor)
 _NOISY = 0.4
@@ -55,6 +57,30 @@ _CALM, _UNSURE = 1.5, 4.0
 """Expected errors over their median up to which they are of noise, and from which on they are of something else."""
 _LARGE = 2**19
 """Pixels from which on a map is looked at in half its size."""
+
+
+def enlarged_by(values: Tensor) -> int:
+    """Return the factor by which a map, (..., H, W), was enlarged by repeating pixels; 1 for none."""
+    filled = values.nan_to_num(nan=-1.0)
+    if bool((filled == filled.flatten()[0]).all()):
+        return 1
+    for block in range(_LARGEST_BLOCK, 1, -1):
+        one = filled[..., ::block, ::block]
+        if all(
+            torch.equal(
+                filled[..., i::block, j::block],
+                one[..., : _count(filled, -2, i, block), : _count(filled, -1, j, block)],
+            )
+            for i in range(block)
+            for j in range(block)
+        ):
+            return block
+    return 1
+
+
+def _count(values: Tensor, dim: int, start: int, step: int) -> int:
+    """Return the length of ``values[start::step]`` along ``dim``."""
+    return len(range(start, values.shape[dim], step))
 
 
 class _Planes(NamedTuple):

@@ -1,22 +1,27 @@
-"""The camera of a photo: from a file, from numbers, from the photo's EXIF data, or assumed."""
+"""The cameras of a photo, and of a depth map of another camera: from files, numbers or EXIF data, or assumed."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, Field, ValidationError
+import torch
+from pydantic import BaseModel, Field
+from torch import Tensor
 
-from dsr.data.formats.files import CameraFile, Pixels, read_camera
 from dsr.geometry.camera import ASSUMED_FOV, Camera
+from dsr.geometry.rigid_motion import Matrix
+from dsr.geometry.warping import registered_camera, warp_depth
 from dsr.io.encoding import Assumption
+from dsr.io.images import CameraFile, Pixels, read_camera
 from dsr.io.photos import Size, focal_in_exif, same_aspect
-from dsr.io.reading import CameraChoice
-from dsr.utils.limits import read_limited
-from dsr.utils.validation import describe
+from dsr.io.reading import CameraChoice, RigFiles
+from dsr.io.trajectories import read_transform
+from dsr.utils.guards import numbers_in, read_limited
+from dsr.utils.validation import parse_model
 
 _FILM_DIAGONAL = math.hypot(36, 24)
 """Diagonal of 35 mm film in millimetres, to which equivalent focal lengths refer (CIPA DCG-001)."""
@@ -98,7 +103,6 @@ def scale_to_photo(path: Path, content: CameraFile, size: Size) -> tuple[CameraF
 
     Args:
         path: file that the camera comes from, for the message.
-        content: the camera.
         size: of the photo.
 
     Raises:
@@ -133,10 +137,7 @@ def _camera_of_matrix(path: Path, matrix: np.ndarray, size: Size, size_lr: Size)
 
 def _matrix(path: Path, text: str) -> np.ndarray:
     """Return the intrinsics (3, 3) that a text holds."""
-    try:
-        numbers = [float(word) for word in text.replace(",", " ").replace(";", " ").split()]
-    except ValueError:
-        numbers = []
+    numbers = numbers_in(text.replace(",", " ").replace(";", " ").split())
     if len(numbers) not in (9, 16):
         raise ValueError(f"{path}: expected JSON or a matrix of 3 x 3 or 4 x 4 numbers, got something else")
     side = math.isqrt(len(numbers))
@@ -153,10 +154,7 @@ class _Open3d(BaseModel, strict=True):
 
 def _open3d(path: Path, text: str) -> CameraFile:
     """Return the camera of Open3D's JSON."""
-    try:
-        stored = _Open3d.model_validate_json(text)
-    except ValidationError as error:
-        raise ValueError(f"{path}: {describe(error)}") from error
+    stored = parse_model(_Open3d, text, path)
     matrix = _check_matrix(path, np.array(stored.intrinsic_matrix).reshape(3, 3).T)
     return camera_only(Camera(stored.width, stored.height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
 
@@ -167,3 +165,64 @@ def _check_matrix(path: Path, matrix: np.ndarray) -> np.ndarray:
     if not upright or not np.allclose(matrix[2], (0, 0, 1)) or matrix[1, 0] != 0:
         raise ValueError(f"{path}: expected a matrix (fx 0 cx; 0 fy cy; 0 0 1), got {matrix.tolist()}")
     return matrix
+
+
+class Rig(NamedTuple):
+    """A depth camera, of the depth map's pixels, and the transform from its frame to the photo camera's, metres."""
+
+    camera: Camera
+    transform: Matrix
+
+
+def read_rig(files: RigFiles, size_lr: Size, baseline: float | None) -> Rig:
+    """Read the description of a rig.
+
+    Args:
+        size_lr: height and width of the depth map.
+        baseline: distance in metres between the two cameras of disparities, if the map has such.
+
+    Raises:
+        ValueError: a file is missing or damaged, or the camera is one of another aspect than the depth map.
+
+    """
+    height, width = size_lr
+    content = read_any_camera(files.camera)
+    if isinstance(content, np.ndarray):
+        camera = Camera(width, height, content[0, 0], content[1, 1], content[0, 2], content[1, 2], baseline)
+    else:
+        camera = content.camera
+        if not same_aspect((camera.height, camera.width), size_lr):
+            raise ValueError(
+                f"{files.camera}: the camera is of {camera.width} x {camera.height} pixels (width x height), the depth "
+                f"map has {width} x {height}, another aspect"
+            )
+        camera = camera.rescale(width, height)
+    own = camera.baseline if baseline is None else baseline
+    camera = Camera(width, height, camera.fx, camera.fy, camera.cx, camera.cy, own, camera.doffs)
+    return Rig(camera, read_transform(files.extrinsics))
+
+
+def to_photo(depth_lr: Tensor, rig: Rig, photo: Camera) -> tuple[Tensor, Assumption]:
+    """Return a depth camera's map as the photo's camera sees it, and a note.
+
+    Args:
+        depth_lr: (1, h, w) orthogonal depth in metres, NaN in holes.
+        rig: the depth camera.
+        photo: the photo's camera.
+
+    Returns:
+        (1, h', w') as fine as the depth map is, in the photo's field of view.
+
+    Raises:
+        ValueError: the photo shows nothing of the map.
+
+    """
+    target = registered_camera(rig.camera, photo)
+    warped = warp_depth(depth_lr[None], rig.camera, torch.from_numpy(rig.transform)[None], target)[0]
+    if not bool(warped.isfinite().any()):
+        raise ValueError(
+            "--extrinsics: expected the transform from the depth camera's frame to the photo camera's, in metres; with "
+            "this one the photo shows nothing of the depth map"
+        )
+    holes = f"{target.width} x {target.height}, {float(warped.isnan().float().mean()):.1%} holes"
+    return warped, Assumption("the depth map is warped into the photo's view", holes)

@@ -14,15 +14,15 @@ from typing import Any
 import cv2
 import numpy as np
 
-from dsr.data.formats.decoding import quiet_decoders
-from dsr.data.formats.files import expect_depth_values, read_array
-from dsr.data.formats.shared import read_numbers
-from dsr.data.icl import CAMERA as ICL_CAMERA
-from dsr.utils.files import array_headers, read_arrays, replacing
-from dsr.utils.limits import MOST_PIXELS, bytes_of_archive, expect_bytes, expect_pixels
+from dsr.geometry.camera import Camera
+from dsr.io.images import expect_depth_values, quiet_decoders, read_array, read_numbers
+from dsr.utils.arrays import array_headers, read_arrays
+from dsr.utils.files import replacing
+from dsr.utils.guards import MOST_PIXELS, bytes_of_archive, expect_bytes, expect_pixels, refusing
 
 DEPTH_SUFFIXES = (".png", ".tiff", ".tif", ".npy", ".npz", ".pfm", ".exr")
 """Of the formats that are read and written."""
+ICL_CAMERA = Camera(640, 480, 481.2, -480.0, 319.5, 239.5)
 ICL_SUFFIX = ".depth"
 """Of ICL-NUIM's text, distances along the rays in centimetres, :mod:`dsr.data.icl`."""
 READ_SUFFIXES = (*DEPTH_SUFFIXES, ICL_SUFFIX)
@@ -42,7 +42,6 @@ def read_depth_file(path: Path, most: int | None = None) -> np.ndarray:
     ``.npz`` file the array named depth, else the only one.
 
     Args:
-        path: the file.
         most: largest number of pixels; None for what the size of the file explains.
 
     Raises:
@@ -131,14 +130,13 @@ def _read_exr(path: Path, most: int | None) -> np.ndarray:
     import OpenEXR  # noqa: PLC0415 - only where somebody has such a file
 
     def read(*, header: bool) -> list[Any]:
-        try:  # damaged files print on both streams
+        # damaged files raise RuntimeError, ValueError, MemoryError, ..., and print on both streams
+        with refusing(f"{path}: expected an OpenEXR file, got a damaged or foreign one", Exception):
             quiet = contextlib.redirect_stdout(io.StringIO())
             with quiet_decoders(), quiet, OpenEXR.File(str(path), separate_channels=True, header_only=header) as file:
                 if header:
                     return [_exr_size(part.header) for part in file.parts]
                 return [(name, channel.pixels) for name, channel in file.channels().items()]
-        except Exception as error:  # RuntimeError, ValueError, MemoryError, ...
-            raise ValueError(f"{path}: expected an OpenEXR file, got a damaged or foreign one") from error
 
     sizes = read(header=True)
     for height, width, _ in sizes:

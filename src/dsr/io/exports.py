@@ -1,27 +1,126 @@
-"""What is written beside an upsampled depth map: renderings, the normal map, a coloured cloud and mesh."""
+"""What is written beside an upsampled depth map: renderings, normals, a cloud and a mesh, and the input.
+
+A PLY file has points in the camera frame: x right, y down, z forward. glTF has y up and +z towards the viewer (Khronos,
+glTF 2.0 specification, section 3.4), so y and z change their signs there, which is a rotation about x by 180 degrees.
+
+The input may be moved, and what was read of it (its unit, holes, registration) is not in the file alone. With a copy of
+the depth map as it was read, and of the photo, a result can be looked at anywhere.
+"""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import torch
+import trimesh
+from PIL import Image
 from torch import Tensor
+from trimesh.exchange.gltf import export_glb
+from trimesh.exchange.ply import export_ply
+from trimesh.visual.material import PBRMaterial
+from trimesh.visual.texture import TextureVisuals
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.lights import LIGHT_NAMES
-from dsr.geometry.mesh import LARGEST_STEP, Mesh, triangulate, vertex_normals
+from dsr.geometry.mesh import (
+    LARGEST_STEP,
+    QUADRIC,
+    Mesh,
+    project,
+    select_points,
+    simplify,
+    thin,
+    triangulate,
+    vertex_normals,
+)
 from dsr.geometry.shading import render
-from dsr.geometry.simplification import QUADRIC, project, select_points, simplify, thin
 from dsr.geometry.surface import depth_to_normals
-from dsr.io.model_files import write_glb, write_ply
+from dsr.io.images import decode_pixels
 from dsr.io.photos import write_png
-from dsr.utils.limits import MOST_FACES, MOST_POINTS
+from dsr.sample import expect_distances
+from dsr.utils.arrays import array_headers, read_arrays
+from dsr.utils.files import replacing
+from dsr.utils.guards import MOST_FACES, MOST_POINTS
+
+_TO_GLTF = np.array([1, -1, -1])
+_LARGEST_TEXTURE = 4096
+"""Largest side of a texture in pixels, which every viewer supports."""
+_LOSSLESS = 2**21
+"""Largest number of pixels of a texture that is stored without loss."""
+_FRAME = b"comment camera frame: x right, y down, z forward; metres\n"
 
 _STRIP = 1 << 20
 """Pixels whose normals are held in memory at a time."""
+
+INPUT = "input.npz"
+LONGEST = 2048
+"""Longest side of the stored photo in pixels."""
+_QUALITY = 90
+_MOST_BYTES = 64 << 20
+"""Largest photo that is decoded."""
+_MOST_PIXELS = 1 << 28
+
+
+def write_ply(
+    path: Path, points: np.ndarray, normals: np.ndarray, colours: np.ndarray, faces: np.ndarray | None = None
+) -> None:
+    """Write a binary PLY file atomically.
+
+    Args:
+        points: (N, 3) in metres, in the camera frame.
+        normals: (N, 3) unit vectors.
+        colours: (N, 3) uint8, sRGB.
+        faces: (M, 3) indices, counterclockwise from outside; None for a cloud.
+
+    """
+    corners = np.empty((0, 3), int) if faces is None else faces
+    model = trimesh.Trimesh(points, corners, vertex_normals=normals, vertex_colors=colours, process=False)
+    header, mark, content = export_ply(model, vertex_normal=True).partition(b"element vertex")
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        file.writelines((header, _FRAME, mark, content))
+
+
+def write_glb(
+    path: Path, points: np.ndarray, normals: np.ndarray, faces: np.ndarray, places: np.ndarray, photo: np.ndarray
+) -> None:
+    """Write a mesh as binary glTF atomically, with the photo as its texture, as sharp as it is.
+
+    The material is rough and lit from both sides, so that viewers show the shape as well as the photo.
+
+    Args:
+        points: (N, 3) in metres, in the camera frame.
+        normals: (N, 3) unit vectors.
+        faces: (M, 3) indices, counterclockwise from outside; one at least.
+        places: (N, 2) column and row of each point in the photo, pixel centres at integers.
+        photo: (H, W, 3) uint8, sRGB.
+
+    """
+    height, width = photo.shape[:2]
+    place = (places + 0.5) / (width, height)
+    visual = TextureVisuals(uv=np.stack((place[:, 0], 1 - place[:, 1]), axis=1), material=_material(photo))
+    model = trimesh.Trimesh(points * _TO_GLTF, faces, vertex_normals=normals * _TO_GLTF, visual=visual, process=False)
+    with replacing(path) as temporary:
+        temporary.write_bytes(export_glb(trimesh.Scene(model), include_normals=True))
+
+
+def _material(photo: np.ndarray) -> PBRMaterial:
+    """Return a material that looks like the photo."""
+    height, width = photo.shape[:2]
+    shrink = min(1.0, _LARGEST_TEXTURE / max(height, width))
+    if shrink < 1:
+        size = (round(width * shrink), round(height * shrink))
+        photo = cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
+    image = Image.fromarray(photo)
+    if image.width * image.height > _LOSSLESS:  # trimesh keeps the format that an image has
+        content = io.BytesIO()
+        image.save(content, format="JPEG", quality=95)
+        image = Image.open(content)
+    return PBRMaterial(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True)
 
 
 class Written(NamedTuple):
@@ -145,7 +244,7 @@ def write_mesh(
         depth: (1, H, W) orthogonal depth in metres, NaN in holes.
         camera: of these pixels.
         largest_step: see :func:`dsr.geometry.mesh.triangulate`.
-        most: triangles; a larger mesh is simplified, see :mod:`dsr.geometry.simplification`.
+        most: triangles; a larger mesh is simplified, see :mod:`dsr.geometry.mesh`.
 
     Returns:
         The numbers of triangles.
@@ -191,3 +290,62 @@ def _colours(rgb: Tensor, pixels: np.ndarray) -> np.ndarray:
 def _bytes(values: Tensor) -> np.ndarray:
     """Return values in [0, 1] as uint8; NaN becomes 0."""
     return (values.nan_to_num(0) * 255).round().clamp(0, 255).byte().cpu().numpy()
+
+
+def write_input(path: Path, rgb: Tensor, depth_lr: Tensor) -> None:
+    """Write the input atomically: ``depth_lr`` (h, w) float32 in metres, NaN in holes, and ``photo``, a JPEG's bytes.
+
+    Args:
+        path: an ``.npz`` file.
+        rgb: (3, H, W) in [0, 1]; stored with its longer side at most :data:`LONGEST` pixels.
+        depth_lr: (1, h, w) orthogonal depth in metres, NaN in holes.
+
+    """
+    pixels = (255 * rgb).round().clamp(0, 255).byte().permute(1, 2, 0).cpu().numpy()
+    photo = np.frombuffer(to_jpeg(pixels, LONGEST, _QUALITY), np.uint8)
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, depth_lr=depth_lr[0].float().cpu().numpy(), photo=photo)
+
+
+def read_input(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return the photo, (H, W, 3) uint8, and the depth map, (h, w) float32 in metres, NaN in holes.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        ValueError: the file is damaged, or something else, or a depth is out of range.
+
+    """
+    headers = array_headers(path)
+    dimensions = {name: len(shape) for name, (shape, _) in headers.items()}
+    types = {name: str(dtype) for name, (_, dtype) in headers.items()}
+    if dimensions != {"depth_lr": 2, "photo": 1} or types != {"depth_lr": "float32", "photo": "uint8"}:
+        raise ValueError(f"{path}: expected depth_lr (h, w) float32 and photo (n,) uint8, got {headers}")
+    (height, width), (length,) = headers["depth_lr"][0], headers["photo"][0]
+    if min(height, width) < 2 or height * width > _MOST_PIXELS or length > _MOST_BYTES:
+        raise ValueError(f"{path}: expected a depth map of 2 x 2 pixels or more and a photo, got {headers}")
+    arrays = read_arrays(path)
+    depth = arrays["depth_lr"]
+    expect_distances(str(path), torch.from_numpy(depth[np.isfinite(depth)]))
+    return _decode(path, arrays["photo"]), np.where(np.isfinite(depth), depth, np.float32(np.nan))
+
+
+def to_jpeg(pixels: np.ndarray, longest: int, quality: int) -> bytes:
+    """Encode a picture, (H, W, 3) uint8, as a JPEG, reduced if its longer side has more than ``longest`` pixels."""
+    height, width = pixels.shape[:2]
+    shrink = min(1.0, longest / max(height, width))
+    if shrink < 1:
+        size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
+        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
+    done, content = cv2.imencode(".jpg", np.ascontiguousarray(pixels[..., ::-1]), options)
+    if not done:
+        raise OSError(f"the picture of {pixels.shape} could not be encoded")
+    return content.tobytes()
+
+
+def _decode(path: Path, content: np.ndarray) -> np.ndarray:
+    """Decode the photo."""
+    picture = decode_pixels(path, content.tobytes(), cv2.IMREAD_COLOR, LONGEST**2)
+    if picture is None:
+        raise ValueError(f"{path}: expected the bytes of a JPEG as photo, got something else")
+    return picture[..., ::-1]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -9,24 +11,95 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.data.formats.files import CameraFile, read_mask
-from dsr.data.icl import CAMERA as ICL_CAMERA
 from dsr.geometry.camera import Camera, RangeType
-from dsr.io.cameras import camera_only, find_camera, scale_to_photo
-from dsr.io.confidence import SLACK
-from dsr.io.depth_files import ICL_SUFFIX
-from dsr.io.encoding import Assumption, Encoding, decode, find_holes, turn_back_bits
-from dsr.io.frames import Geometry
-from dsr.io.names import words_of
-from dsr.io.pairs import Pair
+from dsr.io.cameras import camera_only, find_camera, read_rig, scale_to_photo, to_photo
+from dsr.io.depth_files import ICL_CAMERA, ICL_SUFFIX, read_depth_file
+from dsr.io.encoding import Assumption, Encoding, decode, find_holes, guess_unit, turn_back_bits
+from dsr.io.frames import SLACK, Geometry
+from dsr.io.images import CameraFile, pixels_in_header, read_mask
+from dsr.io.pairs import Pair, words_of
 from dsr.io.photos import Size, model_in_exif, read_photo, same_aspect
 from dsr.io.reading import CameraChoice, Reading
-from dsr.io.rigs import read_rig, to_photo
-from dsr.io.units import FolderUnits, read_values_of
 from dsr.sample import FARTHEST, NEAREST
-from dsr.utils.limits import pixels_beside
+from dsr.utils.guards import natural_key, pixels_beside
+
+Kind = tuple[Path, str, str]
+"""Folder, suffix and type of value: maps alike in them have one unit."""
 
 _DISPARITY_WORDS = frozenset({"disparity", "disp"})
+
+
+class FolderUnits:
+    """Guesses the unit of each kind of map from the first by name that has a known pixel.
+
+    The guess depends on the pairs alone, not on their order, nor on which of them were read or finished before.
+
+    Args:
+        pairs: all pairs of the folder.
+
+    """
+
+    def __init__(self, pairs: Sequence[Pair] = ()) -> None:
+        self._pairs = pairs
+        self._units: dict[Kind, tuple[float, list[Assumption]]] = {}
+
+    def guess(
+        self, pair: Pair, stored: np.ndarray, holes: np.ndarray, hole_value: float | None
+    ) -> tuple[float, list[Assumption]]:
+        """Return metres per value of a map, and the assumptions.
+
+        Args:
+            pair: the map's pair.
+            stored: (h, w) its values.
+            holes: (h, w) bool, where they are missing.
+            hole_value: an additional value of holes, also in the other maps.
+
+        Raises:
+            ValueError: no usual unit makes the distances plausible.
+
+        """
+        kind = _kind(pair, stored)
+        if kind not in self._units:
+            path, first, missing = self._first(kind, hole_value) or (pair.depth, stored, holes)
+            self._units[kind] = guess_unit(str(path), first, missing)
+        return self._units[kind]
+
+    def _first(self, kind: Kind, hole_value: float | None) -> tuple[Path, np.ndarray, np.ndarray] | None:
+        """Return the first map of a kind that has a known pixel, and its holes."""
+        for pair in self._in_order:
+            if (pair.depth.parent, pair.depth.suffix.lower()) != kind[:2]:
+                continue
+            try:
+                stored = read_values_of(pair)
+            except ValueError:  # a damaged map is reported when its own turn comes
+                continue
+            holes = find_holes(stored, hole_value)[0]
+            if _kind(pair, stored) == kind and not holes.all():
+                return pair.depth, stored, holes
+        return None
+
+    @functools.cached_property
+    def _in_order(self) -> list[Pair]:
+        """All pairs by name."""
+        return sorted(self._pairs, key=lambda pair: (natural_key(pair.depth.name), natural_key(pair.name)))
+
+
+def read_values_of(pair: Pair) -> np.ndarray:
+    """Return the depth map of a pair as it is stored, (h, w).
+
+    Raises:
+        ValueError: it is missing or damaged.
+
+    """
+    if pair.capture is not None and pair.capture.depth is not None:
+        return pair.capture.depth.read()
+    photo = pixels_in_header(pair.rgb)
+    return read_depth_file(pair.depth, None if photo is None else pixels_beside(*photo))
+
+
+def _kind(pair: Pair, stored: np.ndarray) -> Kind:
+    """Return the kind of a map."""
+    return pair.depth.parent, pair.depth.suffix.lower(), str(stored.dtype)
 
 
 @dataclass(frozen=True)
@@ -60,7 +133,6 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     """Return a pair of files as tensors.
 
     Args:
-        pair: the files.
         reading: what the user says about them.
         units: guesses the unit for the whole folder; None to guess it from this map alone.
 

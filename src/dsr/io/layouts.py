@@ -1,4 +1,7 @@
-"""Pairs of photo and depth map in folders of any layout: of recording apps, data sets, or one's own."""
+"""Pairs of photo and depth map in folders of any layout: of recording apps, data sets, or one's own.
+
+Which app made a capture, by what lies in its folder.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +12,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from dsr.data.formats.files import read_pixels
-from dsr.io.captures.find import CAPTURE_FILES, find_capture
-from dsr.io.captures.open3d import add_trajectory
+from dsr.io.captures.arkit import find_arkitscenes, find_polycam
+from dsr.io.captures.record3d import find_record3d
+from dsr.io.captures.ros import find_ros
+from dsr.io.captures.stray import find_stray
 from dsr.io.depth_files import DEPTH_SUFFIXES
 from dsr.io.encoding import Assumption
-from dsr.io.names import match_times, role_of, role_of_words, words_of
+from dsr.io.images import read_pixels
+from dsr.io.open3d import add_trajectory
 from dsr.io.pairs import (
     Pair,
     PairingResult,
@@ -24,14 +29,21 @@ from dsr.io.pairs import (
     list_pictures,
     make_names_unique,
     match_pairs,
+    match_times,
+    role_of,
+    role_of_words,
+    words_of,
 )
-from dsr.utils.limits import MOST_TABLE, read_limited
-from dsr.utils.paths import natural_key, path_within
+from dsr.utils.guards import MOST_TABLE, natural_key, numbers_in, path_within, read_limited
 
 _DEPTH_LR = re.compile(r"(depth|disparity)_lr(\d+)")
 _TUM_UNIT = 1 / 5000
 _MAX_DEPTH = 3
 """Levels of subfolders that are searched."""
+
+CAPTURE_FILES = (".r3d", ".bag")
+"""Suffixes of captures that are a single file."""
+_LAYOUTS = (find_stray, find_record3d, find_polycam, find_arkitscenes, find_ros)
 
 
 def find_pairs_of_folder(folder: Path, leave: Path | None = None) -> PairingResult:
@@ -138,11 +150,10 @@ def _timed(path: Path) -> dict[Path, float]:
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
-        try:
-            time, name = float(words[0]), words[1]
-        except (IndexError, ValueError) as error:
-            raise ValueError(f"{path}: line {number}: expected a time and a file name, got {line!r:.60}") from error
-        times[path_within(path.parent, name, f"{path}: line {number}")] = time
+        time = numbers_in(words[:1])
+        if not time or len(words) < 2:
+            raise ValueError(f"{path}: line {number}: expected a time and a file name, got {line!r:.60}")
+        times[path_within(path.parent, words[1], f"{path}: line {number}")] = time[0]
     return times
 
 
@@ -181,3 +192,14 @@ def _is_depth_map(path: Path) -> bool:
     except ValueError:
         return False
     return pixels.ndim == 2 and pixels.dtype != np.uint8
+
+
+def find_capture(place: Path) -> PairingResult | None:
+    """Return the frames of a capture, a folder or a file with one of :data:`CAPTURE_FILES`; None if it is none.
+
+    Raises:
+        ValueError: it is a capture, and a file that all of its frames need is missing or damaged.
+
+    """
+    layouts = (find_record3d, find_ros) if place.is_file() else _LAYOUTS
+    return next((found for layout in layouts if (found := layout(place)) is not None), None)

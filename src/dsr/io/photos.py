@@ -10,8 +10,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from dsr.data.formats.files import read_pixels
 from dsr.io.encoding import Assumption
+from dsr.io.images import read_pixels
 from dsr.utils.files import replacing
 
 _MODEL, _ORIENTATION, _EXIF_IFD, _EXIF_FOCAL_35 = 0x0110, 0x0112, 0x8769, 0xA405
@@ -90,7 +90,6 @@ def write_png(path: Path, picture: np.ndarray, known: np.ndarray | None = None) 
     """Write a picture atomically.
 
     Args:
-        path: the file.
         picture: grey (H, W) or blue-green-red (H, W, 3), uint8 or uint16.
         known: (H, W) bool, an 8-bit picture is transparent elsewhere; None for everywhere.
 

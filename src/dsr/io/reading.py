@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -116,3 +117,37 @@ def parse_unit(text: str) -> float:
     if not 0 < unit <= _LARGEST_UNIT:
         raise ValueError(f"expected m, cm, mm or metres per value such as 0.0002 or 1/5000, or sunrgbd, got {text!r}")
     return unit
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One of the blocks into which frames are split, in their order and as equally as possible.
+
+    Args:
+        number: which one, from 1.
+        count: number of blocks.
+
+    """
+
+    number: int
+    count: int
+
+    def __str__(self) -> str:
+        return f"{self.number}/{self.count}"
+
+    def block(self, frames: int) -> range:
+        """Return the places of the block's frames among ``frames``; empty if there are fewer of them than blocks."""
+        return range((self.number - 1) * frames // self.count, self.number * frames // self.count)
+
+
+def parse_shard(text: str) -> Shard:
+    """Parse ``K/N``.
+
+    Raises:
+        ValueError: it is something else, or K is not from 1 to N.
+
+    """
+    match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text, re.ASCII)
+    if match is None or not 1 <= int(match[1]) <= int(match[2]):
+        raise ValueError(f"expected K/N with K from 1 to N, such as 3/16, got {text!r:.40}")
+    return Shard(int(match[1]), int(match[2]))

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 from torch import Tensor
 
-from dsr.degradation.scales import SCALES
 from dsr.geometry.camera import Camera, RangeType
 from dsr.methods.inpainting import inpaint
 from dsr.methods.tiling import TILE, UNTILED
 from dsr.sample import DepthSample
+from dsr.utils.configuration import Node
 from dsr.utils.progress import Steps
-from dsr.utils.ratios import round_ratio
+from dsr.utils.ratios import SCALES, round_ratio
 
 
 class NoSolutionError(ValueError):
@@ -199,7 +199,7 @@ class Method(abc.ABC):
     history: list[dict[str, float]] | None = None
 
     @classmethod
-    def abilities_of(cls, node: Mapping[str, Any]) -> Abilities:
+    def abilities_of(cls, node: Node) -> Abilities:
         """Return what the method can do that a node of the configuration describes."""
         return cls.abilities
 

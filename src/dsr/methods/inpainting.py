@@ -23,7 +23,6 @@ def inpaint(x: Tensor, photo: Tensor | None = None) -> Tensor:
     filled before others, so that values stop at the photo's edges. An image without a valid value stays unchanged.
 
     Args:
-        x: the maps.
         photo: (B, 3, H, W) in [0, 1], of any size.
 
     """

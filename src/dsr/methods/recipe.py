@@ -20,15 +20,13 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from dsr.degradation.downsampling import Downsampling
-from dsr.degradation.scales import SCALES
 from dsr.methods.base import Abilities, Method
-from dsr.methods.networks.base import DisparityNetwork
-from dsr.methods.networks.published import load_msg_weights
-from dsr.methods.networks.trained import NETWORKS
+from dsr.methods.networks.network import DisparityNetwork
+from dsr.methods.networks.trained import NETWORKS, load_msg_weights
 from dsr.methods.networks.weight_choice import WeightChoice
 from dsr.methods.networks.weight_files import is_dsr_weights, load_network, network_name, read_header
-from dsr.utils.builder import ConfigError, build, load_target
-from dsr.utils.config_files import config_directories, list_choices
+from dsr.utils.configuration import ConfigError, Node, build, config_directories, list_choices, load_target
+from dsr.utils.ratios import SCALES
 
 _NETWORK = "network"
 """Key of a method's node: the dotted path of the network's class, for a method whose weights come from a training."""
@@ -100,7 +98,7 @@ class Recipe:
     label: str | None = None
     _resolved: dict[float | None, dict[str, Any]] = field(default_factory=dict, init=False, repr=False)
 
-    def at(self, factor: float | None = None) -> Mapping[str, Any]:
+    def at(self, factor: float | None = None) -> Node:
         """Return the node for a factor, as plain values; None for the run's scale as it is named.
 
         Raises:
@@ -193,7 +191,6 @@ class Recipe:
         """Build the method for a factor.
 
         Args:
-            factor: the upsampling factor.
             run: what the run gives; None for what :class:`Run` has.
             **decided: arguments that the caller decides in place of the method's file, if the class names them.
 
@@ -266,12 +263,7 @@ class Recipe:
 
 
 def list_methods(directories: Sequence[Path] = ()) -> list[str]:
-    """Return the names of all methods.
-
-    Args:
-        directories: the user's configuration directories.
-
-    """
+    """Return the names of all methods."""
     return list_choices("method", config_directories(directories))
 
 
@@ -281,7 +273,6 @@ def read_recipe(name: str, settings: Mapping[str, Any] | None = None, directorie
     Args:
         name: the method's name.
         settings: arguments to change, by name.
-        directories: the user's configuration directories.
 
     Raises:
         ConfigError: there is no such method, or its file cannot be read.

@@ -91,8 +91,6 @@ def blend_tiles(
             scale * rows, scale * columns). It may leave out the last high-resolution row and column.
         rows: tiles along the rows, from :func:`split_axis`.
         columns: tiles along the columns.
-        scale: upsampling factor.
-        progress: called after each tile.
 
     Returns:
         (B, C, scale * h, scale * w), less the row and column that ``compute`` leaves out.

@@ -24,8 +24,8 @@ from dsr.metrics.formats import HEADLINES, LOOKS, MetricFormat, main_first
 from dsr.pictures.canvas import colours
 from dsr.pictures.depth_views import normals_seen_by, reduced
 from dsr.sample import DepthSample
+from dsr.utils.files import temporary_folder
 from dsr.utils.runs_table import list_run
-from dsr.utils.temporary import temporary_folder
 
 _EVENTS = "events.out.tfevents.*"
 _PANEL = 320

@@ -11,7 +11,7 @@ from dsr.evaluation.results import BenchmarkSetting, Results, Run
 from dsr.evaluation.store import sample_path
 from dsr.geometry.camera import Camera
 from dsr.sample import DepthSample
-from dsr.utils.files import array_headers
+from dsr.utils.arrays import array_headers
 
 _NOT_STORED = "no run has stored its photo and input"
 

@@ -16,8 +16,7 @@ import torch
 from dsr.geometry.camera import Camera
 from dsr.geometry.lights import VIEWING_LIGHT
 from dsr.geometry.shading import VIEWING_TONES, render_for_viewing
-from dsr.io.exports import normal_strips
-from dsr.io.input_files import to_jpeg
+from dsr.io.exports import normal_strips, to_jpeg
 from dsr.pictures.canvas import HOLE_COLOUR
 from dsr.pictures.depth_views import reduced
 from dsr.report.html_page import asset, block, fill, json_text, palette, policy
@@ -32,7 +31,7 @@ from dsr.report.surface_packing import (
     reduce_mask,
 )
 from dsr.utils.files import write_text
-from dsr.utils.limits import opened
+from dsr.utils.guards import opened
 
 MARK = '<meta name="generator" content="dsr view">'
 """What a page begins with that a new one may replace."""

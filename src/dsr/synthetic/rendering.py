@@ -16,8 +16,9 @@ from platformdirs import user_cache_path
 
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
-from dsr.utils.files import read_arrays, replacing
-from dsr.utils.parsing import parse_json
+from dsr.utils.arrays import read_arrays
+from dsr.utils.files import replacing
+from dsr.utils.guards import parse_json
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,9 @@ import lightning
 import torch
 from torch.utils.data import DataLoader, Dataset, default_collate
 
-from dsr.data.base import SceneSource, content_key
-from dsr.degradation.everything import Everything
+from dsr.data.scene_source import SceneSource, content_key
 from dsr.degradation.hints import FACTS, encode_facts
+from dsr.degradation.random_degradation import Everything
 from dsr.methods.classical.interpolation import Interpolation
 from dsr.sample import Scene, slope
 from dsr.training.degradation import Batch, Degradation, to_tensors

@@ -11,7 +11,7 @@ from torch import Tensor
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.degradation.noise import Noise
 from dsr.geometry.camera import baseline_times_focal
-from dsr.methods.networks.maps import compute_min_max
+from dsr.methods.networks.normalisation import compute_min_max
 from dsr.sample import DepthSample, Scene
 
 Batch = dict[str, Any]

@@ -15,7 +15,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from torch import Tensor
 
 from dsr.metrics.formats import main_first
-from dsr.utils.builder import expect_library
+from dsr.utils.configuration import expect_library
 from dsr.utils.files import write_text
 from dsr.utils.runs_table import list_run
 

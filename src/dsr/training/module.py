@@ -19,8 +19,8 @@ from torch import Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR, LRScheduler
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
-from dsr.geometry.comparison import comparison
-from dsr.methods.networks.base import DisparityNetwork
+from dsr.geometry.shading import comparison
+from dsr.methods.networks.network import DisparityNetwork
 from dsr.methods.networks.weight_files import read_torch_file
 from dsr.metrics.classes import compute_means, in_table_units, visual_metrics
 from dsr.metrics.functional import SurfacePair

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.surface import angle_between
-from dsr.methods.networks.base import Answer, DisparityNetwork
-from dsr.methods.networks.maps import compute_min_max, upsample_bicubic
+from dsr.methods.networks.network import Answer, DisparityNetwork
+from dsr.methods.networks.normalisation import compute_min_max, upsample_bicubic
 from dsr.metrics import losses
 from dsr.metrics.functional import SurfacePair, masked_mean, mse_v
 from dsr.metrics.visual_loss import MSE_V, VisualLoss, VisualLossName, make_visual_loss, match_weight
@@ -55,7 +55,7 @@ class Objective(abc.ABC):
         """Return ``loss`` and its terms, means over the images of the batch that have valid depth.
 
         Args:
-            answer: of :meth:`dsr.methods.networks.base.DisparityNetwork.answer_patches`.
+            answer: of :meth:`dsr.methods.networks.network.DisparityNetwork.answer_patches`.
             batch: tensors of :func:`dsr.training.degradation.to_tensors`.
 
         """

@@ -6,7 +6,7 @@ import functools
 from collections.abc import Mapping
 from typing import Any
 
-from dsr.utils.builder import load_object
+from dsr.utils.configuration import load_object
 
 _TRUSTED = ("dsr.", "torch.optim.")
 

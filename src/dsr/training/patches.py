@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from dsr.degradation.everything import Everything
+from dsr.degradation.random_degradation import Everything
 from dsr.geometry.camera import baseline_times_focal
-from dsr.methods.networks.maps import compute_min_max
+from dsr.methods.networks.normalisation import compute_min_max
 from dsr.sample import AllHolesError, DepthSample, Scene
 from dsr.training.augmentation import augment, soften
 from dsr.training.degradation import Batch, Degradation, to_tensors

@@ -19,8 +19,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from dsr.utils.progress import Item, Progress, Unit
-from dsr.utils.units import clock, megabytes
+from dsr.utils.progress import Item, Progress, Unit, clock, megabytes
 
 USAGE_ERROR = 2
 _OUTPUT = {errno.ENOSPC, errno.EPIPE}

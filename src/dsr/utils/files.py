@@ -1,22 +1,160 @@
-"""Atomic writing of files, and reading of archives of arrays."""
+"""Files written atomically, by temporary ones that name their process, and the error of a full disk."""
 
 from __future__ import annotations
 
 import contextlib
-import io
+import errno
+import functools
+import hashlib
 import os
-import struct
+import re
+import shutil
+import socket
 import tempfile
-import zipfile
-from collections.abc import Container, Iterator
+import threading
+from collections.abc import Iterator
 from pathlib import Path
-from typing import IO
+from typing import Any
 
-import numpy as np
+from dsr.utils.progress import megabytes
 
-from dsr.utils.limits import array_bytes, bytes_of_archive, expect_bytes, opened
-from dsr.utils.space import space_for
-from dsr.utils.temporary import owner, remove_abandoned, temporary_folder
+_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+_LITTLE = 1 << 16
+"""Free bytes of a device from which a failed writing is not blamed on it."""
+
+_TEMPORARY = re.compile(r"^\..*-(?P<machine>[0-9a-f]{6})-(?P<process>\d+)-[^-]{8}(\.[^.]*)?$")
+
+
+class FullDiskError(Exception):
+    """A file could not be written for want of space.
+
+    It is no OSError, so that it ends a run rather than being taken for a problem of one scene or picture.
+    """
+
+    def __init__(self, path: Path, needed: float | None = None) -> None:
+        space = "space" if needed is None else megabytes(needed)
+        super().__init__(f"{path}: expected {space} to write the file, got {_free_space(path)}")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Keep the message on the way from a worker process."""
+        return FullDiskError.__new__, (FullDiskError, str(self))
+
+
+@contextlib.contextmanager
+def space_for(path: Path) -> Iterator[None]:
+    """Raise FullDiskError for whatever goes wrong in this context for want of space."""
+    try:
+        yield
+    except Exception as error:
+        if not isinstance(error, FullDiskError) and _is_full(error, path):
+            raise FullDiskError(path) from error
+        raise
+
+
+def expect_space(path: Path, needed: float) -> None:
+    """Check that there is space for a number of bytes beside a file."""
+    if needed > shutil.disk_usage(path.parent).free:
+        raise FullDiskError(path, needed)
+
+
+def silence_threads() -> None:
+    """Let threads that write, such as TensorBoard's, print nothing at a full disk: the main thread meets it, too."""
+
+    def report(problem: Any) -> None:
+        if not isinstance(problem.exc_value, OSError) or problem.exc_value.errno not in _FULL:
+            threading.__excepthook__(problem)
+
+    threading.excepthook = report
+
+
+def _is_full(error: BaseException, path: Path) -> bool:
+    """Return whether a file could not be written for want of space, as the error or the device says.
+
+    Libraries that write through C report only that they failed.
+    """
+    each: BaseException | None = error
+    while each is not None:
+        if isinstance(each, OSError) and each.errno in _FULL:
+            return True
+        each = each.__cause__ or each.__context__
+    if isinstance(error, OSError) and error.errno is not None:
+        return False
+    try:
+        return shutil.disk_usage(path.parent).free < _LITTLE
+    except OSError:
+        return False
+
+
+def _free_space(path: Path) -> str:
+    """Return how much space is left where a file is."""
+    try:
+        return f"a device with {megabytes(shutil.disk_usage(path.parent).free)} left"
+    except OSError:
+        return "a full device"
+
+
+@contextlib.contextmanager
+def temporary_folder(folder: Path, name: str) -> Iterator[Path]:
+    """Yield a temporary directory in a folder, which is created if it does not exist; in the end it is deleted."""
+    with space_for(folder / name):
+        folder.mkdir(parents=True, exist_ok=True)
+        remove_abandoned(folder)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{name}-{owner()}-", dir=folder))
+    try:
+        with space_for(folder / name):
+            yield temporary
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+@functools.cache
+def remove_abandoned(folder: Path) -> None:
+    """Delete temporary files and directories in a folder whose process is gone; once per folder and process."""
+    for path in folder.iterdir():
+        found = _TEMPORARY.search(path.name)
+        if found and found["machine"] == machine() and not _is_running(int(found["process"])):
+            with contextlib.suppress(OSError):
+                shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
+
+
+def owner() -> str:
+    """Return this process as names of temporary files have it: the machine, and the process's number on it."""
+    return f"{machine()}-{os.getpid()}"
+
+
+@functools.cache
+def machine() -> str:
+    """Return a short name of what numbers processes: the machine, or the container on it."""
+    try:
+        numbering = str(Path("/proc/self/ns/pid").readlink())
+    except OSError:
+        numbering = ""
+    return hashlib.sha256(f"{socket.gethostname()} {numbering}".encode()).hexdigest()[:6]
+
+
+def birth(process: int) -> str | None:
+    """Return when a process of this machine was started, which tells it from a later one of its number.
+
+    Returns:
+        A text that the process keeps, empty where the system does not tell it; None if the process has ended.
+
+    """
+    try:
+        fields = Path(f"/proc/{process}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
+        return None if fields[0] in "ZX" else fields[19]
+    except (OSError, IndexError):
+        return "" if _is_running(process) else None
+
+
+def _is_running(process: int) -> bool:
+    """Return whether a process of this machine is there."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:  # another user's
+        return True
+    return True
 
 
 @contextlib.contextmanager
@@ -25,10 +163,6 @@ def replacing(path: Path) -> Iterator[Path]:
 
     The directory is created if it does not exist. After an error or an interruption the temporary file is deleted; one
     that a killed process has left is deleted the next time that a file is written in its directory.
-
-    Raises:
-        FullDiskError: there is no space for the file.
-
     """
     with space_for(path):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -47,12 +181,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def replacing_folder(path: Path) -> Iterator[Path]:
-    """Yield a temporary directory beside ``path`` that replaces it when the block ends without error.
-
-    Raises:
-        FullDiskError: there is no space for its files.
-
-    """
+    """Yield a temporary directory beside ``path`` that replaces it when the block ends without error."""
     with temporary_folder(path.parent, path.name) as temporary:
         yield temporary
         temporary.chmod(0o755)
@@ -60,97 +189,6 @@ def replacing_folder(path: Path) -> Iterator[Path]:
             if path.exists():
                 path.replace(old / path.name)
             temporary.replace(path)
-
-
-_LARGEST_HEADER = 1 << 14
-"""Largest size in bytes of the header of an array."""
-
-
-def read_arrays(path: Path, names: Container[str] | None = None, most: int | None = None) -> dict[str, np.ndarray]:
-    """Return the arrays of an ``.npz`` file.
-
-    Args:
-        path: the file.
-        names: of the arrays to read, of which it need not have all; None for all that it has.
-        most: largest number of bytes that they may have together; None for what the size of the file explains, see
-            :func:`dsr.utils.limits.bytes_of_archive`.
-
-    Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: the file is damaged or no archive of arrays, or they are too large, by what their headers say.
-
-    """
-    wanted = {name: header for name, header in array_headers(path).items() if names is None or name in names}
-    size = sum(array_bytes(shape, dtype.itemsize) for shape, dtype in wanted.values())
-    expect_bytes(path, size, bytes_of_archive(path.stat().st_size) if most is None else most)
-    with opened(path) as file:
-        try:
-            arrays = np.load(file)
-            return {name: arrays[name] for name in arrays.files if name in wanted}
-        except Exception as error:  # a damaged archive makes NumPy raise BadZipFile, EOFError, zlib.error, ...
-            raise ValueError(f"{path}: expected an archive of arrays, got a damaged or foreign file") from error
-
-
-def array_headers(path: Path) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
-    """Return shape and type of the arrays of an ``.npz`` file, without reading their values.
-
-    Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: the file is damaged or no archive of arrays, or an array is one of Python objects.
-
-    """
-    headers = {}
-    with opened(path) as file:
-        try:
-            with zipfile.ZipFile(file) as archive:
-                for name in archive.namelist():
-                    key = name.removesuffix(".npy")
-                    if key in headers:  # which of them NumPy reads is another matter
-                        raise ValueError(f"expected arrays of different names, got two named {key!r}")
-                    with archive.open(name) as member:
-                        headers[key] = read_array_header(member)
-        except Exception as error:  # as in read_arrays
-            raise ValueError(f"{path}: expected an archive of arrays, got a damaged or foreign file") from error
-    return headers
-
-
-def read_array_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
-    """Return shape and type in the header of an ``.npy`` file, and stay behind it.
-
-    Raises:
-        ValueError: it is no such header, or one of an array of Python objects.
-
-    """
-    version = np.lib.format.read_magic(file)
-    form = "<H" if version == (1, 0) else "<I"
-    length = file.read(struct.calcsize(form))
-    (size,) = struct.unpack(form, length)
-    expect_bytes("header", size, _LARGEST_HEADER)
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, dtype = read(io.BytesIO(length + file.read(size)))
-    if dtype.hasobject:
-        raise ValueError("expected an array of numbers, got one of Python objects")
-    if any(not 0 <= each < 1 << 62 for each in shape):
-        raise ValueError(f"expected the sizes of an array, got {shape}")
-    return shape, dtype
-
-
-def open_array(path: Path) -> np.ndarray:
-    """Return the array of an ``.npy`` file, mapped: its header and its size are checked, and values read when used.
-
-    Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: the file is damaged, or no array of numbers.
-
-    """
-    try:
-        with opened(path), np.errstate(over="ignore"):  # of sizes that no file has, which are refused
-            array: np.ndarray = np.lib.format.open_memmap(path, mode="r")
-    except FileNotFoundError:
-        raise
-    except Exception as error:  # a damaged header makes NumPy raise TokenError, SyntaxError, OverflowError, ...
-        raise ValueError(f"{path}: expected an array, got a damaged or foreign file") from error
-    return array
 
 
 def look_anew(folder: Path) -> None:

@@ -93,7 +93,6 @@ def start(module: str, function: str) -> NoReturn:
     """Import a function, call it, and end the process with its exit code, or with that of an interruption.
 
     Args:
-        module: dotted path of a module.
         function: name of its function; it takes no arguments, and returns an exit code, or None for 0.
 
     """
@@ -237,12 +236,7 @@ def starting_workers(*further: signal.Signals) -> Iterator[None]:
 
 
 def end_with(parent: int) -> None:
-    """End this process, a worker, once its parent is gone, and leave it to the parent to end it at Ctrl-C.
-
-    Args:
-        parent: number of the parent process.
-
-    """
+    """End this process, a worker, once its parent is gone, and leave it to the parent to end it at Ctrl-C."""
 
     def watch() -> None:
         while os.getppid() == parent:

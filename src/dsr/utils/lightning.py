@@ -18,12 +18,11 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.plugins.environments import ClusterEnvironment, LightningEnvironment
 
 from dsr.utils import interruption
-from dsr.utils.builder import ConfigError
 from dsr.utils.checkpoints import AtomicCheckpoints, CheckpointError, Interruption, Resumed
-from dsr.utils.files import replacing
+from dsr.utils.configuration import ConfigError
+from dsr.utils.files import FullDiskError, replacing, space_for
 from dsr.utils.progress import Progress, Task
 from dsr.utils.runs_table import SCORES, list_scores
-from dsr.utils.space import FullDiskError, space_for
 
 LOG_EVERY = 10
 """Steps between two values of a training in its log."""

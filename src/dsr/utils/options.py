@@ -116,7 +116,6 @@ def option(
 
     Args:
         default: the value where it is not given; ``...`` if it has to be given.
-        help: text for ``--help``.
         metavar: what stands for the value there.
         flags: its flags, such as ``"-o --output"``, of which errors name the first; or a name without dashes for an
             argument by its place. By default the name of the field.

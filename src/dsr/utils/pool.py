@@ -117,7 +117,6 @@ class Pool(Generic[_T, _R]):
         Several of these generators may be open at a time. What is not begun when one is closed is dropped.
 
         Args:
-            items: what to work on.
             ordered: whether they are returned in the order of ``items``, not as they come.
 
         """

@@ -1,8 +1,4 @@
-"""Progress of long-running work.
-
-Library code takes a :class:`Progress`, which by itself shows nothing; commands pass the console's, see
-:class:`dsr.utils.console.ConsoleProgress`. A method takes :data:`Steps`, a plain function; a :class:`Task` is one.
-"""
+"""Progress of long-running work, and times and sizes as text."""
 
 from __future__ import annotations
 
@@ -44,7 +40,6 @@ class Progress:
 
         Args:
             name: what is done, such as ``train``.
-            total: amount of all work; None if not yet known.
             done: amount of work done before.
             unit: what the amounts count.
 
@@ -63,8 +58,6 @@ class Progress:
         """Yield items, and show how many are done.
 
         Args:
-            items: things to work on, one after the other.
-            name: what is done to them, such as ``predict``.
             total: number of items; None where ``items`` can be counted.
             label: returns the name of an item.
             lines: whether each item gets a line if the output is not a terminal; False if the caller prints one.
@@ -107,16 +100,28 @@ class StepsProgress(Progress):
 
 
 def part_of(progress: Steps | None, before: int, total: int) -> Steps | None:
-    """Return a function to which one of several stages reports its steps.
-
-    Args:
-        progress: the function to which all stages are reported; None for no report.
-        before: number of steps of the stages before.
-        total: number of steps of all stages.
-
-    """
+    """Return a function to which one of several stages reports its steps."""
     return None if progress is None else lambda done, _: progress(before + done, total)
 
 
 def _ignore(done: int, total: int | None = None, remark: str | None = None) -> None:
     """Report nothing."""
+
+
+def duration(seconds: float) -> str:
+    """Return an estimated time: 40 s, 12 min, 3.5 h."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    minutes = seconds / 60
+    return f"{minutes:.0f} min" if minutes < 100 else f"{minutes / 60:.1f} h"
+
+
+def clock(seconds: float) -> str:
+    """Return a measured time in hours, minutes and seconds: 0:04:29."""
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes // 60}:{minutes % 60:02}:{rest:02}"
+
+
+def megabytes(size: float) -> str:
+    """Return a number of bytes: 3.2 MB, 45 MB, 1.3 GB."""
+    return f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.{0 if size >= 1e7 else 1}f} MB"

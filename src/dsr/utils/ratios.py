@@ -1,11 +1,16 @@
-"""Ratios of two resolutions: whole ones such as 4, and others, such as the 2.667 of some sensors' maps."""
+"""Ratios of two resolutions: the upsampling factors, and others, such as the 2.667 of some sensors' maps."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 _DECIMALS = 3
 _ASPECT = 0.02
+
+SCALES = (2, 4, 8, 16)
+NATIVE = "native"
+"""The scale that stands for the ratio of a scene's measured map, whatever it is."""
+_TOLERANCE = 0.01
 
 
 def as_ratio(value: float) -> float:
@@ -21,3 +26,33 @@ def round_ratio(value: float) -> float:
 def fits_ratio(size: Sequence[int], size_lr: Sequence[int], ratio: float) -> bool:
     """Return whether the sides of a photo are a ratio times those of a map, to within a pixel of the map or 2 %."""
     return all(abs(n / ratio - n_lr) <= max(1, _ASPECT * n_lr) for n, n_lr in zip(size, size_lr, strict=True))
+
+
+def check_scale(scale: float | str) -> None:
+    """Raise a ValueError for a factor that is none of ``SCALES``."""
+    if scale not in SCALES:
+        raise ValueError(f"scale: expected one of {', '.join(map(str, SCALES))}, got {scale}")
+
+
+def match_ratio(scale: float | str, measured: Collection[float]) -> float:
+    """Return the ratio of the measured map that a scale names.
+
+    Args:
+        scale: the ratio, to within 1 %, or ``native`` for the only one.
+
+    Raises:
+        ValueError: there is no such map, or there are several.
+
+    """
+    have = ", ".join(f"x{round_ratio(ratio)}" for ratio in sorted(measured)) or "none"
+    if isinstance(scale, str):
+        if len(measured) != 1:
+            several = f"one, the scene has {have}; give the scale of one of them" if measured else "one, there is none"
+            raise ValueError(f"downsampling=measured scale={scale} expects a low-resolution map, exactly {several}")
+        return next(iter(measured))
+    nearest = min(measured, key=lambda ratio: abs(ratio - scale), default=None)
+    if nearest is None or not abs(nearest - scale) <= _TOLERANCE * scale:
+        raise ValueError(
+            f"downsampling=measured expects a low-resolution map at x{round_ratio(scale)}, the scene has {have}"
+        )
+    return nearest

@@ -39,8 +39,6 @@ def list_run(writer: SummaryWriter, kind: Kind, settings: Mapping[str, Any], sco
     """Put a run into the table of runs.
 
     Args:
-        writer: of the run's log.
-        kind: of the run.
         settings: values by column; others are left out, and absent ones are a dash.
         scores: see :func:`list_scores`; empty if there are none yet.
 
@@ -54,14 +52,7 @@ def list_run(writer: SummaryWriter, kind: Kind, settings: Mapping[str, Any], sco
 
 
 def list_scores(writer: SummaryWriter, scores: Mapping[str, float], step: int = 0) -> None:
-    """Write the scores of a run that is in the table of runs, in place of those of earlier steps.
-
-    Args:
-        writer: of the run's log.
-        scores: by metric, in the units of tables.
-        step: of the training.
-
-    """
+    """Write the scores of a run that is in the table of runs, in place of those of earlier steps."""
     for name, value in scores.items():
         writer.add_scalar(f"score/{name}", value, step)
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
-from pydantic import BeforeValidator, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 
 
 def _whole(value: Any) -> Any:
@@ -20,11 +20,30 @@ Whole = Annotated[int, Field(strict=True, ge=-(2**63), lt=2**63), BeforeValidato
 """A whole number of a file that 64 bits hold, which may be written as 640.0; true and text are none."""
 
 
+Content = TypeVar("Content", bound=BaseModel)
+
+
+def parse_model(model: type[Content], content: str | bytes, place: object, expected: str = "") -> Content:
+    """Return what JSON holds as a model.
+
+    Args:
+        place: where it is from, for the message.
+        expected: what the message says after that, such as ``expected a camera; ``.
+
+    Raises:
+        ValueError: it is no JSON or does not fit the model; the message begins with ``place``.
+
+    """
+    try:
+        return model.model_validate_json(content)
+    except ValidationError as error:
+        raise ValueError(f"{place}: {expected}{describe(error, model.model_fields)}") from error
+
+
 def describe(error: ValidationError, known: Iterable[str] = ()) -> str:
     """Return the first thing that is wrong, such as ``trials.a1.scale: expected a valid integer, got 'x'``.
 
     Args:
-        error: what the validation raised.
         known: the keys to name where one is unknown.
 
     """

@@ -1,7 +1,9 @@
-"""The versions of what computes a result, for the files that are written beside it."""
+"""What identifies a result: versions of what computes it, and hashes of files and of code outside of the package."""
 
 from __future__ import annotations
 
+import hashlib
+import importlib.util
 import platform
 import subprocess
 from collections.abc import Iterable
@@ -10,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import dsr
+from dsr.utils.guards import opened
+from dsr.utils.progress import Task
 
 RESULTS = 1
 """Version of what predicts and trains, raised with each change of its results, so that older predictions are not used
@@ -20,6 +24,8 @@ _PACKAGES = (
     "dsr", "hydra-core", "lightning", "numpy", "omegaconf", "opencv-python-headless",
     "pandas", "scikit-image", "scipy", "torch", "torchmetrics",
 )  # fmt: skip
+
+_CHUNK = 1 << 20
 
 
 def package_versions(names: Iterable[str] = _PACKAGES) -> dict[str, str]:
@@ -55,3 +61,34 @@ def _git(*arguments: str) -> str | None:
         return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()  # noqa: S603
     except (OSError, subprocess.SubprocessError):
         return None
+
+
+def file_hash(path: Path, progress: Task = lambda *_: None) -> str:
+    """Return the SHA-256 of a file, 64 hexadecimal digits."""
+    digest, total = hashlib.sha256(), path.stat().st_size
+    with opened(path) as file:
+        while chunk := file.read(_CHUNK):
+            digest.update(chunk)
+            progress(file.tell(), total)
+    return digest.hexdigest()
+
+
+def hash_outside_code(targets: Iterable[str]) -> str | None:
+    """Return a hash of the modules outside of this package that classes and functions come from; None for no such.
+
+    A module in a package stands for all modules in its folder and the folders below.
+    """
+    own = __name__.partition(".")[0]
+    modules = sorted({target.rpartition(".")[0] for target in targets if target.partition(".")[0] != own})
+    digest = hashlib.sha256()
+    for name in modules:
+        try:
+            spec = importlib.util.find_spec(name)
+        except (ImportError, ValueError):  # what cannot be imported is refused where it is built
+            continue
+        if spec is None or spec.origin is None:
+            continue
+        path = Path(spec.origin)
+        for file in [path] if "." not in name else sorted(path.parent.rglob("*.py")):
+            digest.update(file.name.encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()[:16] if modules else None

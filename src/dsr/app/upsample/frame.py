@@ -28,11 +28,10 @@ from dsr.app.upsample.sequence import FrameSequence
 from dsr.degradation.sensors import Identified
 from dsr.inference import AnyRatio, Plan, enlarged_by, find_sensor
 from dsr.io.encoding import Assumption
-from dsr.io.inputs import Picture, read_picture
+from dsr.io.inputs import FolderUnits, Picture, read_picture
 from dsr.io.pairs import Pair
-from dsr.io.units import FolderUnits
 from dsr.methods.base import MapNoise, Outliers, Surface
-from dsr.utils.parsing import readable
+from dsr.utils.guards import readable
 from dsr.utils.progress import Progress
 from dsr.utils.versions import package_versions
 

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from dsr.app.upsample.request import FrameChoice, UpsampleRequest
 from dsr.io.layouts import find_pairs_of_folder
-from dsr.io.names import in_order
-from dsr.io.pairs import Pair, PairingResult, add_confidence, find_pairs_of_lists
+from dsr.io.pairs import Pair, PairingResult, add_confidence, find_pairs_of_lists, in_order
 
 
 @dataclass(frozen=True)

@@ -20,9 +20,9 @@ from dsr.io.encoding import Encoding
 from dsr.io.inputs import Picture
 from dsr.methods.base import Surface
 from dsr.sample import FARTHEST, NEAREST
-from dsr.utils.files import open_array, write_text
-from dsr.utils.limits import read_limited
-from dsr.utils.parsing import parse_json
+from dsr.utils.arrays import open_array
+from dsr.utils.files import write_text
+from dsr.utils.guards import parse_json, read_limited
 
 INFO = "info.json"
 _SHAPES = tuple(part.name for part in PARTS.values() if part.shape)

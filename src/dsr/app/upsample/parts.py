@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from dsr.geometry.lights import LIGHT_NAMES
-from dsr.utils.limits import MOST_FACES, MOST_POINTS
+from dsr.utils.guards import MOST_FACES, MOST_POINTS
 from dsr.utils.options import Options, Rule, at_least, one_of, option
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from dsr.io.encoding import Assumption, Encoding
     from dsr.io.exports import Written
     from dsr.io.inputs import Picture
-    from dsr.io.scene_files.frame import Frame
+    from dsr.io.scene_files import Frame
     from dsr.methods.base import Surface
 
 FORMATS = ("png", "tiff", "npy", "npz", "pfm", "exr")
@@ -206,38 +206,39 @@ def _confidence(folder: Path, result: Result) -> Output | None:
 
 
 def _input(folder: Path, result: Result) -> None:
-    from dsr.io.input_files import INPUT, write_input
+    from dsr.io.exports import INPUT, write_input
 
     write_input(folder / INPUT, result.picture.rgb, result.picture.depth_lr)
 
 
 def _rgbd(folder: Path, result: Result) -> Output:
-    from dsr.io.scene_files.open3d import RGBD, write_rgbd
+    from dsr.io.open3d import write_rgbd
+    from dsr.io.scene_files import RGBD
 
     notes = write_rgbd(folder / "rgbd", result.picture.rgb, result.surface.depth, result.picture.camera)
     return Output([f"rgbd/{name}" for name in RGBD], notes)
 
 
 def _open3d(path: Path, frames: Sequence[Frame]) -> list[Path]:
-    from dsr.io.scene_files.open3d import write_open3d
+    from dsr.io.open3d import write_open3d
 
     return write_open3d(path, frames)
 
 
 def _nerfstudio(path: Path, frames: Sequence[Frame]) -> list[Path]:
-    from dsr.io.scene_files.nerfstudio import write_transforms
+    from dsr.io.scene_files import write_transforms
 
     return write_transforms(path, frames)
 
 
 def _gaussian(path: Path, frames: Sequence[Frame]) -> list[Path]:
-    from dsr.io.scene_files.splatting import write_splatting
+    from dsr.io.scene_files import write_splatting
 
     return write_splatting(path, frames)
 
 
 def _rerun(path: Path, frames: Sequence[Frame]) -> list[Path]:
-    from dsr.io.scene_files.rerun import write_rerun
+    from dsr.io.scene_files import write_rerun
 
     return write_rerun(path, frames)
 

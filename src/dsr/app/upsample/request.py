@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from dsr.app.requests import check_method
 from dsr.app.upsample.parts import Results
-from dsr.inference.options import DEFAULT, WIDEST, Fill
-from dsr.io.reading import Reading
-from dsr.io.shards import Shard, parse_shard
-from dsr.utils.hashing import file_hash, hash_outside_code
+from dsr.inference.defaults import DEFAULT, WIDEST, Fill
+from dsr.io.reading import Reading, Shard, parse_shard
 from dsr.utils.options import OptionError, Options, Rule, group, option, positive, recorded
+from dsr.utils.versions import file_hash, hash_outside_code
 
 if TYPE_CHECKING:
     from dsr.inference import AnyRatio

@@ -14,7 +14,7 @@ from dsr.app.upsample.reporting import Reporter, listed
 from dsr.app.upsample.request import UpsampleRequest
 from dsr.app.upsample.scene import write_scene
 from dsr.app.upsample.workers import work_through
-from dsr.io.shards import Shard
+from dsr.io.reading import Shard
 from dsr.utils.console import ConsoleProgress, show
 from dsr.utils.files import write_text
 

@@ -10,12 +10,9 @@ from pathlib import Path
 from dsr.app.upsample.outputs import INFO
 from dsr.app.upsample.parts import METRES, Part
 from dsr.app.upsample.stored import DEPTHS, read_camera, read_info
-from dsr.io.scene_files.frame import Frame, parse_pose
-from dsr.io.scene_files.open3d import RGBD
+from dsr.io.scene_files import RGBD, Frame, parse_pose
 from dsr.utils.files import write_text
-from dsr.utils.limits import read_limited
-from dsr.utils.parsing import parse_json
-from dsr.utils.paths import path_within
+from dsr.utils.guards import parse_json, path_within, read_limited
 
 _RECORD = "exports.json"
 

@@ -15,7 +15,7 @@ from dsr.inference.sequences import View, fuse_views
 from dsr.io.encoding import Assumption
 from dsr.io.inputs import Picture
 from dsr.io.pairs import Pair
-from dsr.io.poses import read_poses
+from dsr.io.trajectories import read_poses
 
 _Frame = tuple[Tensor, Camera, np.ndarray | None]
 """Depth map, camera of its pixels, and pose."""

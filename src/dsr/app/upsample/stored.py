@@ -15,13 +15,11 @@ from dsr.app.upsample.outputs import INFO
 from dsr.app.upsample.parts import ERRORS, METRES, Results
 from dsr.evaluation.store import load_errors
 from dsr.geometry.camera import Camera
-from dsr.io.input_files import INPUT, read_input
+from dsr.io.exports import INPUT, read_input
 from dsr.report.surface_page import ViewedResult
 from dsr.sample import expect_distances
-from dsr.utils.files import array_headers, open_array
-from dsr.utils.limits import read_limited
-from dsr.utils.parsing import is_number, parse_json
-from dsr.utils.paths import natural_key
+from dsr.utils.arrays import array_headers, open_array
+from dsr.utils.guards import is_number, natural_key, parse_json, read_limited
 
 _DEEPEST = 6
 """Folders below the given one in which results are looked for."""

@@ -30,17 +30,12 @@ from requests.adapters import HTTPAdapter
 from urllib3 import Retry
 from urllib3.exceptions import HTTPError
 
-from dsr.data.download.collection import Collection, Item
+from dsr.data.download.collections import Collection, Item
 from dsr.utils.console import one_line
-from dsr.utils.files import write_text
-from dsr.utils.hashing import file_hash
-from dsr.utils.limits import opened, read_limited
-from dsr.utils.parsing import parse_json
-from dsr.utils.paths import leads_outside, natural_key
-from dsr.utils.progress import Progress, Task
-from dsr.utils.space import FullDiskError, expect_space, space_for
-from dsr.utils.temporary import temporary_folder
-from dsr.utils.units import megabytes
+from dsr.utils.files import FullDiskError, expect_space, space_for, temporary_folder, write_text
+from dsr.utils.guards import leads_outside, natural_key, opened, parse_json, read_limited, refusing
+from dsr.utils.progress import Progress, Task, megabytes
+from dsr.utils.versions import file_hash
 
 RETRIES = Retry(
     3,
@@ -149,13 +144,11 @@ def lock_directory(root: Path) -> Iterator[None]:
         ValueError: another command has locked it.
 
     """
-    try:
-        with (
-            FileLock(root / ".dsr-data.lock", blocking=False) if os.access(root, os.W_OK) else contextlib.nullcontext()
-        ):
-            yield
-    except Timeout as error:
-        raise ValueError(f"{root}: another `dsr data` command is writing there; wait for it to end") from error
+    with (
+        refusing(f"{root}: another `dsr data` command is writing there; wait for it to end", Timeout),
+        FileLock(root / ".dsr-data.lock", blocking=False) if os.access(root, os.W_OK) else contextlib.nullcontext(),
+    ):
+        yield
 
 
 def get(
@@ -173,8 +166,6 @@ def get(
 
     Args:
         items: what to fetch; a path that occurs twice is fetched once.
-        root: the directory of the data sets.
-        progress: shows what is done.
         mirror: address of a server to try first; it has each file under its path below the directory of the data sets.
         accept_changed: whether a file may have another checksum than recorded.
         keep_archives: whether archives stay after they were unpacked; those that were there before do anyway.
@@ -404,8 +395,6 @@ def unpack(archive: Path, target: Path, moved: Task, contains: Sequence[str] = (
     copies of the files that they lead to; those to directories are left out.
 
     Args:
-        archive: the file.
-        target: the directory.
         moved: is told how many bytes are unpacked, and of how many.
         contains: what the archive must have.
 
@@ -522,8 +511,6 @@ def verify(collection: Collection, root: Path, progress: Progress, *, accept_cha
 
     Args:
         collection: what to check.
-        root: the directory of the data sets.
-        progress: shows what is done.
         accept_changed: whether to record anew what differs.
 
     Returns:

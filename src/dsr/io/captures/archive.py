@@ -17,9 +17,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from dsr.data.formats.decoding import decode_pixels
 from dsr.io.frames import Record
-from dsr.utils.limits import read_limited, read_member
+from dsr.io.images import decode_pixels
+from dsr.utils.guards import read_limited, read_member, refusing
 
 PHOTO_LIMIT = 1 << 26
 """Largest size in bytes of an encoded photo."""
@@ -54,7 +54,6 @@ class Archive:
         """Return a member's content.
 
         Args:
-            name: its name.
             limit: largest number of bytes that it may have.
 
         Raises:
@@ -67,12 +66,10 @@ class Archive:
             raise ValueError(f"{place}: expected it in the capture, there is none")
         if size > limit:
             raise ValueError(f"{place}: expected at most {limit} bytes, the archive declares {size}")
-        try:
+        with refusing(f"{place}: expected a member of the archive, got a damaged one", *_DAMAGED):
             if self.path.is_dir():
                 return read_limited(place, limit)
             return read_member(_open(self.path, _state(self.path)), name)
-        except _DAMAGED as error:
-            raise ValueError(f"{place}: expected a member of the archive, got a damaged one") from error
 
     def _declared(self, name: str) -> int | None:
         """Return the size of a member, which an archive declares; None if there is no such member."""
@@ -153,14 +150,10 @@ def decode_lzfse(content: bytes, size: tuple[int, int], dtype: str) -> np.ndarra
             f"expected {size[1]} x {size[0]} values of {np.dtype(dtype)} ({expected} bytes), "
             f"got LZFSE data of {declared}"
         )
-    try:
+    with refusing("LZFSE data need the package lzfse: pip install 'dsr[captures]'", ImportError):
         import lzfse  # noqa: PLC0415 - an extra
-    except ImportError as error:
-        raise ValueError("LZFSE data need the package lzfse: pip install 'dsr[captures]'") from error
-    try:
+    with refusing("expected LZFSE data, got damaged ones", lzfse.error, MemoryError):
         values = lzfse.decompress(content)
-    except (lzfse.error, MemoryError) as error:
-        raise ValueError("expected LZFSE data, got damaged ones") from error
     if len(values) != expected:
         raise ValueError(f"expected LZFSE data of {expected} bytes, got {len(values)}")
     return np.frombuffer(values, dtype).reshape(size)
@@ -196,7 +189,5 @@ def _state(path: Path) -> tuple[int, int]:
 @functools.lru_cache(maxsize=1)
 def _open(path: Path, _: tuple[int, int]) -> zipfile.ZipFile:
     """Return the open archive."""
-    try:
+    with refusing(f"{path}: expected a ZIP archive, got a damaged, truncated or foreign file", *_DAMAGED):
         return zipfile.ZipFile(path)
-    except _DAMAGED as error:
-        raise ValueError(f"{path}: expected a ZIP archive, got a damaged, truncated or foreign file") from error

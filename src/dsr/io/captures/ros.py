@@ -1,12 +1,15 @@
 """Recordings of ROS 1 (``.bag``) and ROS 2 (a folder with ``metadata.yaml``), read by the package rosbags.
 
-Messages of sensor_msgs: Image, CompressedImage and CameraInfo, http://docs.ros.org/en/api/sensor_msgs/html/index-msg.html;
-depth is in millimetres as whole numbers and in metres as floats, https://ros.org/reps/rep-0118.html.
+Messages of sensor_msgs: Image, CompressedImage and CameraInfo,
+http://docs.ros.org/en/api/sensor_msgs/html/index-msg.html; depth is in millimetres as whole numbers and in metres as
+floats, https://ros.org/reps/rep-0118.html.
 
 Of the topics of depth one named *aligned* or *registered* is taken before others, then one with more messages, then the
 first by name; of those of colour one named *color*, *colour* or *rgb*, then the same. The photo's camera is that of the
 topic ``camera_info`` beside it. Photo and depth map are paired by the times in their headers, within 20 ms. Poses are
 not read.
+
+``compressedDepth`` is that of https://github.com/ros-perception/image_transport_plugins.
 """
 
 from __future__ import annotations
@@ -22,20 +25,33 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+import cv2
 import numpy as np
 
-from dsr.io.captures.poses import intrinsics_camera
-from dsr.io.captures.ros_images import COLOURS, DEPTHS, decode_message
+from dsr.io.captures.archive import PHOTO_LIMIT, decode_photo
 from dsr.io.encoding import Assumption
 from dsr.io.frames import CaptureFrame, Geometry, Record
-from dsr.io.names import match_times
-from dsr.io.pairs import Pair, PairingResult
-from dsr.utils.limits import MOST_TEXT, expect_bytes
-from dsr.utils.paths import natural_key, path_within
+from dsr.io.images import decode_pixels
+from dsr.io.pairs import Pair, PairingResult, match_times
+from dsr.io.trajectories import intrinsics_camera
+from dsr.utils.guards import MOST_TEXT, expect_bytes, naming, natural_key, path_within, refusing
 
 _IMAGE, _COMPRESSED, _INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
 _UNITS = {"u": 1e-3, "f": 1.0}
 _PREFERRED = {"depth": ("aligned", "registered"), "rgb": ("color", "colour", "rgb")}
+
+COLOURS = {
+    "rgb8": (3, cv2.COLOR_RGB2BGR),
+    "bgr8": (3, None),
+    "8UC3": (3, None),
+    "rgba8": (4, cv2.COLOR_RGBA2BGR),
+    "bgra8": (4, cv2.COLOR_BGRA2BGR),
+    "8UC4": (4, cv2.COLOR_BGRA2BGR),
+}
+"""Channels of encodings of colour, and OpenCV's conversion to BGR."""
+DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
+_CONFIG = struct.Struct("<iff")
+"""Header of compressedDepth: format, and two numbers of the quantisation of floats."""
 
 
 @dataclass(frozen=True)
@@ -254,11 +270,9 @@ def _close() -> None:
 
 def _open(path: Path) -> Any:
     """Open a recording."""
-    try:
+    with refusing(f"{path}: recordings of ROS need the package rosbags: pip install 'dsr[captures]'", ImportError):
         from rosbags.highlevel import AnyReader  # noqa: PLC0415 - an extra
         from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
-    except ImportError as error:
-        raise ValueError(f"{path}: recordings of ROS need the package rosbags: pip install 'dsr[captures]'") from error
     _limit_chunks()
     description = path / "metadata.yaml"
     if path.is_dir() and description.is_file():
@@ -295,3 +309,48 @@ def _limit_chunks() -> None:
     for table in (reader.decompressors, storage_mcap.DECOMPRESSORS):
         for name in kinds.keys() & table.keys():
             table[name] = functools.partial(bounded, kinds[name])
+
+
+def decode_message(place: str, message: Any) -> np.ndarray:
+    """Return the pixels of an Image or a CompressedImage: (H, W, 3) uint8 RGB, or (h, w) of depth as it is stored.
+
+    Raises:
+        ValueError: its size does not fit its data, or they are damaged; the message begins with ``place``.
+
+    """
+    data = np.asarray(message.data, np.uint8)
+    if not hasattr(message, "encoding"):
+        if "compresseddepth" in message.format.lower():
+            return _decode_compressed_depth(place, message.format, data)
+        if data.size > PHOTO_LIMIT:
+            raise ValueError(f"{place}: expected a photo of at most {PHOTO_LIMIT} bytes, got {data.size}")
+        with naming(place):
+            return decode_photo(data.tobytes())
+    channels, code = COLOURS.get(message.encoding, (1, None))
+    dtype = np.dtype(DEPTHS.get(message.encoding, "u1")).newbyteorder(">" if message.is_bigendian else "<")
+    height, width, step = message.height, message.width, message.step
+    if min(height, width) < 1 or step < width * channels * dtype.itemsize or data.size != height * step:
+        raise ValueError(
+            f"{place}: expected an image of {width} x {height} pixels in rows of {step} bytes, got {data.size} bytes"
+        )
+    rows = data.reshape(height, step)[:, : width * channels * dtype.itemsize]
+    values = np.ascontiguousarray(rows).view(dtype).reshape(height, width, *([channels] if channels > 1 else []))
+    if message.encoding in DEPTHS:
+        return values.astype(dtype.newbyteorder("="))
+    return cv2.cvtColor(values if code is None else cv2.cvtColor(values, code), cv2.COLOR_BGR2RGB)
+
+
+def _decode_compressed_depth(place: str, encoding: str, data: np.ndarray) -> np.ndarray:
+    """Return the map of a message of compressedDepth: a PNG of whole numbers, or of quantised inverse metres."""
+    pixels = None
+    if _CONFIG.size < data.size <= PHOTO_LIMIT:
+        pixels = decode_pixels(place, data[_CONFIG.size :].tobytes(), cv2.IMREAD_UNCHANGED)
+    if pixels is None or pixels.ndim != 2 or pixels.dtype != np.uint16:
+        raise ValueError(
+            f"{place}: expected depth as a 16-bit PNG (compressedDepth), got {data.size} bytes of another kind"
+        )
+    if "32fc1" not in encoding.lower():
+        return pixels
+    _, a, b = _CONFIG.unpack(data[: _CONFIG.size].tobytes())
+    with np.errstate(divide="ignore"):
+        return np.where(pixels > 0, a / (pixels - np.float32(b)), np.nan).astype(np.float32)

@@ -31,10 +31,10 @@ from torch.nn import functional
 
 from dsr.geometry.camera import from_range, to_range
 from dsr.methods.base import Abilities, Cost, Method, expect_limits, whole_scale
-from dsr.methods.classical.convergence import CHECK_EVERY, Movement, history_of
 from dsr.methods.classical.finite_differences import box_mean, extend_linearly, upsample_linear_border
+from dsr.methods.classical.iterations import CHECK_EVERY, Movement, history_of
 from dsr.methods.inpainting import inpaint
-from dsr.methods.networks.maps import compute_min_max, normalise
+from dsr.methods.networks.normalisation import compute_min_max, normalise
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 
@@ -98,7 +98,6 @@ class AnisotropicDiffusion(Method):
         """Return high-resolution depth without holes, (1, H, W) in metres on the sample's device.
 
         Args:
-            sample: the problem.
             progress: is called with the steps done and their maximum.
 
         """
@@ -116,7 +115,6 @@ class AnisotropicDiffusion(Method):
             rgb: (B, 3, H, W) in [0, 1].
             lr: (B, 1, H / scale, W / scale) float64, positive, NaN in holes.
             scale: upsampling factor; at 1, only holes are inpainted.
-            progress: as above.
 
         """
         start = inpaint(lr)

@@ -1,17 +1,32 @@
-"""The bilateral filter of a sensor's own depth map, without the photo: the baseline for noisy maps.
+"""Bilateral filters: of a sensor's own depth map without the photo, and joint bilateral upsampling with it.
 
-Tomasi and Manduchi, *Bilateral Filtering for Gray and Color Images*, ICCV 1998. A pixel becomes the mean of the pixels
-of a round window, weighted by Gaussians of their distance and of the difference of their depths: noise is averaged,
-while a depth step of several ``sigma_depth`` stays. Where the photo has more pixels than the map, the filtered map is
-then interpolated: bilinear means of the planes that its pixels stand for, see
-:mod:`dsr.methods.classical.photo_guided`.
+Without the photo, it is the baseline for noisy maps: Tomasi and Manduchi, *Bilateral Filtering for Gray and Color
+Images*, ICCV 1998. A pixel becomes the mean of the pixels of a round window, weighted by Gaussians of their distance
+and of the difference of their depths: noise is averaged, while a depth step of several ``sigma_depth`` stays. Where the
+photo has more pixels than the map, the filtered map is then interpolated: bilinear means of the planes that its pixels
+stand for, see :mod:`dsr.methods.classical.photo_guided`.
 
 Holes have no weight and stay holes; with ``fill_holes`` they are inpainted after filtering. OpenCV filters, in float32,
 with weights from a table of 4096 entries over the map's range of depth.
+
+Kopf, Cohen, Lischinski, Uyttendaele, *Joint Bilateral Upsampling*, SIGGRAPH 2007. The high-resolution value at pixel p
+is
+
+    S_p = 1 / k_p * sum over low-resolution pixels q of S_q f(|p - q|) g(|I_p - I_q|),
+
+with Gaussians f of the distance in low-resolution pixels and g of the colour difference, and the sum k_p of the
+weights; q runs over the (2 * radius + 1)^2 low-resolution pixels around p.
+
+What differs: I_q is the mean colour over the low-resolution pixel, as low-resolution depth is a mean; the paper takes a
+single pixel of the image. Low-resolution pixels that are holes have no weight. The weights of each pixel are scaled so
+that the largest is 1: a pixel unlike all around it takes the value of its most similar neighbours, without 0 / 0.
+
+Time grows as H * W * (2 * radius + 1)^2; memory peaks at about 20 maps of H * W float64 values, whatever the radius.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import cv2
@@ -74,7 +89,6 @@ def filter_bilateral(depth: Tensor, window: int, sigma_depth: float, sigma_space
     """Filter a depth map, (1, h, w) in metres, NaN in holes, which stay holes; see the module.
 
     Args:
-        depth: the map.
         window: diameter in pixels.
         sigma_depth: in metres.
         sigma_space: in pixels.
@@ -85,3 +99,81 @@ def filter_bilateral(depth: Tensor, window: int, sigma_depth: float, sigma_space
     outside = min(0.0, float(values[valid].min()) - _NO_WEIGHT * sigma_depth)
     filtered = cv2.bilateralFilter(np.where(valid, values, np.float32(outside)), window, sigma_depth, sigma_space)
     return torch.from_numpy(np.where(valid, filtered, np.nan))[None].to(depth)
+
+
+class JointBilateral(GuidedMethod):
+    """Joint bilateral upsampling of the low-resolution disparity.
+
+    Args:
+        radius: radius of the neighbourhood in low-resolution pixels.
+        sigma_space: standard deviation of the distance's Gaussian, in low-resolution pixels.
+        sigma_colour: standard deviation of the Gaussian of the Euclidean colour difference, colours in [0, 1].
+        fill_holes, slopes: see :class:`dsr.methods.classical.photo_guided.GuidedMethod`; a hole is filled by this
+            filter within the radius, and inpainted beyond it.
+
+    Raises:
+        ValueError: a value is not positive.
+
+    """
+
+    def __init__(
+        self,
+        radius: int = 2,
+        sigma_space: float = 0.5,
+        sigma_colour: float = 0.1,
+        *,
+        fill_holes: bool = False,
+        slopes: bool = True,
+    ) -> None:
+        super().__init__(fill_holes=fill_holes, slopes=slopes)
+        expect_positive("joint bilateral upsampling", radius=radius, sigma_space=sigma_space, sigma_colour=sigma_colour)
+        self._radius, self._sigma_space, self._sigma_colour = radius, sigma_space, sigma_colour
+
+    def filter_maps(self, guided: Guided) -> Tensor:
+        """Return the weighted means of the low-resolution maps, (N, H, W)."""
+        height, width = guided.valid.shape
+        rgb_lr = _block_means(guided)
+        nearest = guided.nearest()
+        largest = torch.full_like(guided.rgb[0], -torch.inf)
+        for exponent, _, _ in self._iterate_neighbours(guided, rgb_lr):
+            torch.maximum(largest, exponent, out=largest)
+        found = largest.isfinite()
+        largest = torch.where(found, largest, 0)
+        weights = torch.zeros_like(largest)
+        totals = largest.new_zeros((len(guided.maps), *largest.shape))
+        for exponent, i, j in self._iterate_neighbours(guided, rgb_lr):
+            weight = exponent.sub_(largest).exp_()
+            weights += weight
+            rows, columns = i.clamp(0, height - 1)[:, None], j.clamp(0, width - 1)
+            for total, values in zip(totals, guided.maps, strict=True):
+                total.addcmul_(weight, values[rows, columns])
+        around = guided.maps[:, nearest[0][:, None], nearest[1]]
+        return torch.where(found, totals / torch.where(found, weights, 1), around)
+
+    def _iterate_neighbours(self, guided: Guided, rgb_lr: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+        """Yield the exponents of the weights, (H, W), the rows, (H,), and the columns, (W,), of each neighbour.
+
+        The exponent is minus infinity where the neighbour is a hole or lies outside.
+        """
+        height, width = guided.valid.shape
+        i, j = guided.nearest()
+        for down in range(-self._radius, self._radius + 1):
+            for across in range(-self._radius, self._radius + 1):
+                rows, columns = i + down, j + across
+                kept_rows, kept_columns = rows.clamp(0, height - 1)[:, None], columns.clamp(0, width - 1)
+                squares = (guided.rows - rows).square()[:, None] + (guided.columns - columns).square()
+                exponent = squares / (-2 * self._sigma_space**2)
+                for channel, channel_lr in zip(guided.rgb, rgb_lr, strict=True):
+                    exponent -= (channel - channel_lr[kept_rows, kept_columns]).square() / (2 * self._sigma_colour**2)
+                inside = (rows == rows.clamp(0, height - 1))[:, None] & (columns == columns.clamp(0, width - 1))
+                counts = inside & (guided.valid[kept_rows, kept_columns] > 0)
+                yield exponent.masked_fill_(~counts, -torch.inf), rows, columns
+
+
+def _block_means(guided: Guided) -> Tensor:
+    """Return the mean colour over the high-resolution pixels nearest to each low-resolution one, (3, h, w)."""
+    matrices = []
+    for nearest, size in zip(guided.nearest(), guided.valid.shape, strict=True):
+        belongs = (nearest == torch.arange(size, device=nearest.device)[:, None]).double()
+        matrices.append(belongs / belongs.sum(dim=1, keepdim=True).clamp(min=1))
+    return matrices[0] @ guided.rgb @ matrices[1].T

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.methods.networks.maps import upsample_bicubic
+from dsr.methods.networks.normalisation import upsample_bicubic
 
 LUMA = (0.299, 0.587, 0.114)
 """Weights of red, green and blue in the luma (ITU-R BT.601)."""

@@ -35,7 +35,6 @@ from torch import Tensor
 
 from dsr.geometry.camera import from_range
 from dsr.methods.base import Abilities, Cost, Method, expect_limits, whole_scale
-from dsr.methods.classical.convergence import CHECK_EVERY, Movement, history_of
 from dsr.methods.classical.finite_differences import (
     box_mean,
     divergence,
@@ -45,9 +44,10 @@ from dsr.methods.classical.finite_differences import (
     sum_adjacent,
     upsample_linear_border,
 )
+from dsr.methods.classical.iterations import CHECK_EVERY, Movement, history_of
 from dsr.methods.inpainting import inpaint
-from dsr.methods.networks.maps import normalise
-from dsr.methods.noise import estimate_sensor_noise
+from dsr.methods.networks.normalisation import normalise
+from dsr.methods.noise_level import estimate_sensor_noise
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 
@@ -145,11 +145,6 @@ class TotalGeneralisedVariation(Method):
         """Return high-resolution depth without holes, (1, H, W) in metres on the sample's device.
 
         A disparity at or beyond infinity becomes NaN.
-
-        Args:
-            sample: the problem.
-            progress: is called with the iterations done and their maximum.
-
         """
         lr = sample.disparity_lr(torch.float64)[None]
         scaled = normalise(lr)
@@ -167,7 +162,6 @@ class TotalGeneralisedVariation(Method):
             rgb: (B, 3, H, W) in [0, 1].
             lr: (B, 1, H / scale, W / scale) of the same type, in [0, 1], NaN in holes.
             scale: upsampling factor; at 1, only holes are inpainted.
-            progress: as above.
 
         """
         start = inpaint(lr)

@@ -12,7 +12,7 @@ from dsr.degradation.downsampling import Downsampling, downsample_depth
 from dsr.geometry.camera import Camera, RangeType
 from dsr.methods.base import whole_scale
 from dsr.methods.classical.finite_differences import grey
-from dsr.methods.networks.maps import compute_min_max, mean3x3
+from dsr.methods.networks.normalisation import compute_min_max, mean3x3
 from dsr.metrics import losses
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.visual_loss import MSE_V, VisualLoss, match_weight
@@ -130,7 +130,6 @@ class PriorObjective:
         Args:
             depth: (1, 1, H, W) in metres.
             intensity: (1, 1, H, W) in [0, 1].
-            problem: the image.
 
         """
         depth_lr, depth_range = problem.downsample(depth), problem.depth_range

@@ -12,7 +12,7 @@ from typing import Literal, Protocol
 import torch
 from torch import Tensor
 
-from dsr.methods.noise import estimate_noise
+from dsr.methods.noise_level import estimate_noise
 
 StoppingName = Literal["fixed", "variance", "residual", "oracle"]
 _EVERY = 20
@@ -28,7 +28,6 @@ class Stopping(Protocol):
         """Take note of a step, counted from 1; return whether to stop after it.
 
         Args:
-            step: the step.
             depth: (1, 1, H, W) the network's answer at this step.
             average: (1, 1, H, W) the running average of the answers, this one included.
 

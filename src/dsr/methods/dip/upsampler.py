@@ -24,22 +24,19 @@ from torch.utils.data import DataLoader
 
 from dsr.degradation.downsampling import Downsampling, scene_generator
 from dsr.methods.base import WORKSPACE, Abilities, Cost, Method
-from dsr.methods.dip.callbacks import Provenance, checkpoint_of, cost_of_step
-from dsr.methods.dip.optimisation import PriorOptimisation, PriorSettings
+from dsr.methods.dip.optimisation import PriorOptimisation, PriorSettings, Provenance, checkpoint_of, cost_of_step
 from dsr.methods.dip.problem import DataLoss, ImageProblem, PriorObjective
 from dsr.methods.dip.skip_net import Padding
 from dsr.methods.dip.stopping import Fixed, Oracle, Residual, Stopping, StoppingName, Variance
-from dsr.methods.networks.base import DTYPES, Precision
+from dsr.methods.networks.network import DTYPES, Precision
 from dsr.methods.networks.trained import TrainedNetwork
-from dsr.methods.noise import estimate_noise, normal_noise_deg
+from dsr.methods.noise_level import estimate_noise, normal_noise_deg
 from dsr.metrics.visual_loss import VisualLossName, make_visual_loss
 from dsr.sample import DepthSample
-from dsr.utils.checkpoints import Interruption
-from dsr.utils.divergence import Divergence, DivergenceError
+from dsr.utils.checkpoints import Divergence, DivergenceError, Interruption
 from dsr.utils.lightning import ListedScores, StepProgress, ValidationTable, fit, make_trainer
-from dsr.utils.progress import Progress, Steps, StepsProgress
+from dsr.utils.progress import Progress, Steps, StepsProgress, duration
 from dsr.utils.runs_table import list_run
-from dsr.utils.units import duration
 
 _SECONDS_BETWEEN_CHECKPOINTS = 60.0
 _ADVICE = "a lower method.learning_rate may help"
@@ -151,7 +148,6 @@ class DeepImagePrior(Method):
         """Return the high-resolution orthogonal depth, (1, H, W) in metres on the sample's device; valid everywhere.
 
         Args:
-            sample: the problem.
             progress: called with the number of steps done and their total, unless there is a display.
 
         Raises:

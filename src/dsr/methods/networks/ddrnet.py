@@ -20,15 +20,14 @@ What differs from the original:
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dsr.degradation.scales import check_scale
 from dsr.methods.classical.finite_differences import grey, upsample_linear_border
-from dsr.methods.networks.base import Answer, NormalisedNetwork, expect_rgb_size
+from dsr.methods.networks.network import Answer, NormalisedNetwork, expect_rgb_size
+from dsr.utils.ratios import check_scale
 
 _HALVINGS = 2
 _BLOCKS = 2
@@ -67,10 +66,6 @@ class DDRNet(NormalisedNetwork):
         self.denoise = Denoising(denoising, self.halvings)
         self.refine = Refinement(refinement, self.halvings)
 
-    def arguments(self) -> dict[str, Any]:
-        """Return the constructor's arguments."""
-        return {"scale": self.scale, "denoising": self.denoising, "refinement": self.refinement}
-
     @property
     def receptive_field_radius(self) -> int:
         """Receptive-field radius in low-resolution pixels."""
@@ -85,19 +80,7 @@ class DDRNet(NormalisedNetwork):
         return Answer(refined.float(), stages=(denoised.float(),))
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
-        """Map an image and normalised low-resolution disparity to high-resolution disparity.
-
-        Args:
-            rgb: (B, 3, H, W).
-            values: (B, 1, h, w).
-
-        Returns:
-            (B, 1, H, W) in the dtype of ``values``.
-
-        Raises:
-            ValueError: the photo's size is not scale times the map's.
-
-        """
+        """Return normalised disparity (B, 1, H, W) for (B, 3, H, W) and (B, 1, h, w); see the base class."""
         return self._compute_stages(rgb, values)[-1]
 
     def _compute_stages(self, rgb: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:

@@ -29,7 +29,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -40,8 +40,7 @@ from dsr.degradation.hints import FACTS, KERNELS
 from dsr.methods.classical.finite_differences import repeat_blocks
 from dsr.methods.exportable import every, exporting, median_in_graph, quantiles_in_graph
 from dsr.methods.inpainting import inpaint
-from dsr.methods.networks.base import Answer, DisparityNetwork, expect_rgb_size
-from dsr.methods.networks.facets import Facets
+from dsr.methods.networks.facets import Facets, start_from_another_factor, start_from_facets
 from dsr.methods.networks.facets_layers import (
     HEAD,
     Context,
@@ -55,8 +54,8 @@ from dsr.methods.networks.facets_layers import (
     silence,
 )
 from dsr.methods.networks.facets_planes import NEIGHBOURS, Stencil, average_planes, mix_planes_apart, smooth, stencil
-from dsr.methods.networks.facets_start import start_from_another_factor, start_from_facets
-from dsr.methods.networks.maps import upsample_bicubic
+from dsr.methods.networks.network import Answer, DisparityNetwork, expect_rgb_size
+from dsr.methods.networks.normalisation import upsample_bicubic
 from dsr.utils.progress import Steps
 
 _SHARED = ("coarse", "hints", "modulation", "shares", "trunk", "wide", "planes", "blend")
@@ -119,7 +118,7 @@ class FacetsUNet(DisparityNetwork):
 
     of_inverse_depth = True
     states_errors = True
-    method = MappingProxyType({"_target_": "dsr.methods.networks.any_map.AnyMap"})
+    method = MappingProxyType({"_target_": "dsr.methods.networks.facets_method.AnyMap"})
 
     def __init__(self, scale: int = 4, width: int = 96, deep: int = 88, blocks: int = 6, facets: int = 2) -> None:
         super().__init__()
@@ -197,13 +196,8 @@ class FacetsUNet(DisparityNetwork):
                 parameter.copy_(theirs[name])
                 parameter.requires_grad_(False)
 
-    def arguments(self) -> dict[str, Any]:
-        """Return the constructor's arguments."""
-        sizes = {"scale": self.scale, "width": self.width, "deep": self.deep}
-        return {**sizes, "blocks": self.blocks, "facets": self.facets}
-
     def upsample(self, rgb: Tensor, disparity: Tensor, min_max: Tensor | None = None) -> Tensor:
-        """Return high-resolution disparity; see :meth:`~dsr.methods.networks.base.DisparityNetwork.upsample`."""
+        """Return high-resolution disparity; see :meth:`~dsr.methods.networks.network.DisparityNetwork.upsample`."""
         return self.answer(rgb, disparity).disparity
 
     def answer_patches(self, batch: Mapping[str, Tensor]) -> Answer:

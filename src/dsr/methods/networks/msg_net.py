@@ -1,4 +1,4 @@
-"""MSG-Net, the multi-scale guided depth super-resolution network, its inputs and its output.
+"""MSG-Net, the multi-scale guided depth super-resolution network: its variants, inputs, layers and output.
 
 Hui, Loy, Tang, *Depth Map Super-Resolution by Deep Multi-Scale Guidance*, ECCV 2016 (variant ``hui``), and the version
 that Voynov et al., *Perceptual Deep Depth Super-Resolution*, ICCV 2019, trained for renderings (variant ``voynov``);
@@ -12,19 +12,156 @@ work on any device and for any image size.
 from __future__ import annotations
 
 import math
-from typing import Any
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from dsr.degradation.downsampling import check_scale
+from dsr.methods.classical.finite_differences import LUMA
+from dsr.methods.exportable import exporting
 from dsr.methods.inpainting import inpaint
-from dsr.methods.networks.base import GlobalContext, WindowedNetwork
-from dsr.methods.networks.layers import ConvLayer, Level
-from dsr.methods.networks.maps import compute_min_max, mean3x3, normalise, upsample_bicubic
-from dsr.methods.networks.msg_guidance import VARIANTS, Traits, VariantName, guidance_map, intensity_of
+from dsr.methods.networks.network import GlobalContext, WindowedNetwork
+from dsr.methods.networks.normalisation import compute_min_max, mean3x3, normalise, upsample_bicubic
+
+VariantName = Literal["hui", "voynov", "dsr"]
 
 FEATURES = 32
+
+
+class ConvLayer(nn.Module):
+    """A convolution that keeps the size, or a transposed one that doubles it, followed by a PReLU."""
+
+    def __init__(self, conv: nn.Conv2d | nn.ConvTranspose2d, slopes: int) -> None:
+        """Append a PReLU with ``slopes`` parameters (1, one per channel, or 0 for no PReLU) to ``conv``."""
+        super().__init__()
+        self.conv = conv
+        self.activation = nn.PReLU(slopes) if slopes else nn.Identity()
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map (B, C_in, H, W) to (B, C_out, H', W')."""
+        x = self.conv(x)
+        if isinstance(self.activation, nn.PReLU) and self.activation.num_parameters == 1 and not exporting():
+            # In place, to save memory, but only in inference mode, where no gradient can be requested.
+            if torch.is_inference(x):
+                return functional.leaky_relu_(x, float(self.activation.weight))
+            if x.device.type == "cpu":
+                return _SharedPReLU.apply(x, self.activation.weight)
+        return self.activation(x)
+
+
+class _SharedPReLU(torch.autograd.Function):
+    """A PReLU with one slope, whose gradient on the CPU is several times as fast as the library's."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, slope: Tensor) -> Tensor:
+        """Return x if positive, else slope * x."""
+        ctx.save_for_backward(x)
+        ctx.slope = float(slope)
+        return functional.leaky_relu(x, ctx.slope)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the gradients of x and of the slope, (1,)."""
+        (x,) = ctx.saved_tensors
+        sum_type = torch.promote_types(x.dtype, torch.float32)
+        of_slope = (gradient * x.clamp(max=0)).sum(dtype=sum_type).reshape(1)
+        return torch.where(x > 0, gradient, ctx.slope * gradient), of_slope
+
+
+class Level(nn.Module):
+    """One doubling of the resolution: transposed convolution, fusion with the guidance, refinement."""
+
+    def __init__(self, up: ConvLayer, fuse: ConvLayer, refine: ConvLayer) -> None:
+        """Store the three layers."""
+        super().__init__()
+        self.up, self.fuse, self.refine = up, fuse, refine
+
+    def forward(self, depth: Tensor, guide: Tensor) -> Tensor:
+        """Map depth features (B, C, h, w) and guidance features (B, 32, H, W) to (B, 32, H, W), H about 2 h."""
+        return self.refine(self.fuse(torch.cat((guide, self.up(depth)), dim=1)))
+
+
+@dataclass(frozen=True)
+class MSGVariant:
+    """The differences between the published networks and dsr's, and between their inputs.
+
+    Args:
+        name: name of the variant.
+        shared_slopes: whether each PReLU has a single slope, else one per channel.
+        activate_output: whether a PReLU follows the reconstruction.
+        same_size: whether the output has scale * h rows, else scale * h - 1 (Caffe's transposed convolutions have no
+            output padding), and likewise columns; the guidance has the output's size.
+        rgb_weights, rgb_offset: intensity = weights . (R, G, B in 0..255) + offset, clipped to 0..255.
+        plain_guidance: whether the guidance is the intensity, -1..1, which does not depend on the rest of the image;
+            else see :func:`guidance_map`.
+        depth_gain, residual_gain: factors of the input depth and of the output residual. A small residual gain reduces
+            the effect of an optimiser step on smooth surfaces.
+        fill_holes: whether holes of the low-resolution map are inpainted; else they are set to the minimum disparity.
+        drift_compensation: whether the output's mean over a flat probe is subtracted from the output, see
+            :func:`dsr.methods.networks.msg_net.output_drift`.
+
+    """
+
+    name: VariantName
+    shared_slopes: bool
+    activate_output: bool
+    same_size: bool
+    rgb_weights: tuple[float, float, float]
+    rgb_offset: float
+    drift_compensation: bool
+    plain_guidance: bool = False
+    depth_gain: float = 1.0
+    residual_gain: float = 1.0
+    fill_holes: bool = False
+
+
+VARIANTS = MappingProxyType(
+    {
+        # BT.601 luma with its 16..235 range.
+        "hui": MSGVariant("hui", False, False, False, (65.481 / 255, 128.553 / 255, 24.966 / 255), 16.0, False),
+        # The released code uses the inverse YCbCr transform as the forward one; the weights were trained with it.
+        "voynov": MSGVariant("voynov", True, True, True, (1.0, -0.34414, -0.71414), 128 * (0.34414 + 0.71414), True),
+        # The variant that dsr trains: the graph of voynov, guided by luma, without drift compensation.
+        "dsr": MSGVariant("dsr", True, True, True, LUMA, 0.0, False, True, 10.0, 0.05, True),
+    }
+)
+
+
+class Traits(NamedTuple):
+    """The global values of an image that MSG-Net uses, besides the range of the disparity.
+
+    ``intensity`` and ``detail`` (B, 2, 1, 1): minimum and maximum of the intensity and of its difference to its 3 x 3
+    mean, None for plain guidance; ``drift`` (B, 1, 1, 1): see :func:`dsr.methods.networks.msg_net.output_drift`, None
+    without drift compensation.
+    """
+
+    intensity: Tensor | None
+    detail: Tensor | None
+    drift: Tensor | None
+
+
+def guidance_map(rgb: Tensor, variant: MSGVariant, traits: Traits | None = None) -> Tensor:
+    """Return the guidance map (B, 1, H, W) of an image (B, 3, H, W) in 0..1.
+
+    The intensity (see :class:`MSGVariant`) is normalised, its 3 x 3 mean is subtracted, and the result is normalised
+    again to 0..1. With plain guidance, the map is the intensity in -1..1. ``traits`` are those of the whole image if
+    ``rgb`` is a window.
+    """
+    intensity = intensity_of(rgb, variant)
+    if variant.plain_guidance:
+        return intensity / 127.5 - 1
+    intensity = normalise(intensity, traits and traits.intensity).values
+    return normalise(intensity - mean3x3(intensity), traits and traits.detail).values
+
+
+def intensity_of(rgb: Tensor, variant: MSGVariant) -> Tensor:
+    """Return the intensity of an image, (B, 1, H, W) in 0..255."""
+    weights = torch.tensor(variant.rgb_weights, dtype=rgb.dtype, device=rgb.device)[:, None, None]
+    return ((255 * rgb * weights).sum(-3, keepdim=True) + variant.rgb_offset).clip(0, 255)
 
 
 class MSGNet(WindowedNetwork):
@@ -219,10 +356,9 @@ def upsample_disparity(
     """Upsample disparity with a photo's guidance.
 
     Args:
-        net: the network.
         rgb: (B, 3, H, W) in 0..1, with H = scale * h and W = scale * w.
         disparity: (B, 1, h, w); non-finite values are holes.
-        min_max: see :meth:`dsr.methods.networks.base.DisparityNetwork.upsample`.
+        min_max: see :meth:`dsr.methods.networks.network.DisparityNetwork.upsample`.
         traits: traits of the image that this is a window of; None for those of ``rgb`` and ``disparity``.
         crop_drift: see :func:`output_drift`.
 

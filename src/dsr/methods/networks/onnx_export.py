@@ -23,9 +23,10 @@ import torch
 from torch import Tensor, nn
 
 from dsr.methods.exportable import pad_to_multiple
-from dsr.methods.networks.base import DisparityNetwork
 from dsr.methods.networks.facets_unet import FacetsUNet
+from dsr.methods.networks.network import DisparityNetwork
 from dsr.utils.files import replacing
+from dsr.utils.guards import refusing
 
 INPUTS = ("photo", "inverse_depth", "valid")
 RESULT = "inverse_depth_hr"
@@ -89,8 +90,6 @@ def write_onnx(path: Path, graph: OnnxGraph, facts: Mapping[str, Any]) -> float:
     """Write a network as an ONNX file, atomically, after checking that its results are the network's.
 
     Args:
-        path: the file.
-        graph: the network.
         facts: plain values that become the file's metadata.
 
     Returns:
@@ -203,7 +202,5 @@ def _compare(session: Any, graph: OnnxGraph) -> float:
 
 def _import(name: str) -> Any:
     """Return a library of the extra ``onnx``."""
-    try:
+    with refusing(f"--onnx: expected the library {name}, which `pip install dsr[onnx]` installs", ImportError):
         return importlib.import_module(name)
-    except ImportError as error:
-        raise ValueError(f"--onnx: expected the library {name}, which `pip install dsr[onnx]` installs") from error

@@ -3,7 +3,7 @@
 Riegler, Ferstl, Rüther and Bischof, *A Deep Primal-Dual Network for Guided Depth Super-Resolution*, BMVC 2016: ten
 3 x 3 convolutions look at the upsampled depth and the photo, and say by how much the former is wrong, and how different
 each pixel is from half of those in the window around it. The softmax of minus these becomes the weights of a non-local
-Huber model, :mod:`dsr.methods.networks.primal_dual`, whose primal-dual iteration makes the answer. The sizes that the
+Huber model, whose primal-dual iteration makes the answer. The sizes that the
 paper leaves open are those of the authors' code (github.com/griegler/primal-dual-networks, gdsr).
 
 What differs from the original:
@@ -21,27 +21,260 @@ What differs from the original:
 
 On a plane the weights do not count as long as its differences within the window stay below epsilon times the weights,
 and it is reproduced; a steeper one is bent where the weights vary.
+
+*The second stage* (their section on the non-local variational model). Given a map f and weights w, the map u minimises
+
+    E(u) = sum over pairs (i, i + d) of h(u[i + d] - u[i], w[i, d]) + data / 2 * sum (u - f)^2,
+
+with d half of the offsets of a square window, so that every pair counts once, and h the Huber function as in the
+authors' code, max over |p| <= w of p x - huber / 2 p^2:
+
+    h(x, w) = x^2 / (2 huber) where |x| <= huber w, else w |x| - huber / 2 w^2.
+
+So small differences are smoothed equally whatever the weights are, and across a step the force of a pair is at most its
+weight. The iteration is that of Chambolle and Pock (2011, algorithm 3: both terms are strongly convex),
+
+    p = clip((p + sigma K(u + theta (u - u_before))) / (1 + sigma huber), -w, w),
+    u = (u - tau K' p + tau data f) / (1 + tau data),
+
+with the differences K of the pairs and their adjoint K'; a fixed number of steps makes it a network.
+
+What differs in it: the original leaves out pairs that reach beyond the border, which bends planes there. Here f is
+extrapolated beyond the border and fixed there. The iteration starts from p = clip(K f / huber, -w, w) instead of K f,
+and works on u - f. Each step has its own step sizes; data and huber are shared by all steps, so that there is an
+energy. The original learns the factors of each step's sums separately.
 """
 
 from __future__ import annotations
 
 import itertools
-from typing import Any
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from dsr.degradation.downsampling import check_scale
 from dsr.methods.classical.finite_differences import extend_linearly, upsample_linear_border
-from dsr.methods.networks.base import NormalisedNetwork, expect_rgb_size
+from dsr.methods.exportable import apply
 from dsr.methods.networks.facets_planes import stencil
-from dsr.methods.networks.primal_dual import UnrolledHuber
+from dsr.methods.networks.network import NormalisedNetwork, expect_rgb_size
+
+Offset = tuple[int, int]
 
 _FAINT = 1e-3
 """A difference of normalised disparity that becomes about 1 in the network's input."""
 _INPUTS = 9
 _TINY = 1e-12
+
+
+class Step(NamedTuple):
+    """Sizes of an iteration's dual and primal step, and of the extrapolation after it; numbers or 0-d tensors."""
+
+    sigma: Tensor | float
+    tau: Tensor | float
+    theta: Tensor | float
+
+
+def half_window(window: int) -> list[Offset]:
+    """Return one (row, column) offset of each two opposite ones in a square window of odd size, at least 3.
+
+    Raises:
+        ValueError: the size is even or less than 3.
+
+    """
+    if window < 3 or window % 2 == 0:
+        raise ValueError(f"window: expected an odd number of at least 3, got {window}")
+    radius = window // 2
+    side = range(-radius, radius + 1)
+    return [(v, u) for v in range(-radius, 1) for u in side if (v, u) < (0, 0)]
+
+
+def pair_differences(x: Tensor, offsets: Sequence[Offset]) -> Tensor:
+    """Return x[i + d] - x[i] for each pixel i whose pair may touch the image, and each offset d.
+
+    Args:
+        x: (B, 1, H + 2 r, W + 4 r), the image, r rows above and below, 2 r columns on the left and the right; r is the
+            largest offset.
+        offsets: of :func:`half_window`.
+
+    Returns:
+        (B, len(offsets), H + r, W + 2 r): of the image, r rows below, r columns on either side.
+
+    """
+    r = _radius(offsets)
+    height, width = x.shape[-2] - r, x.shape[-1] - 2 * r
+    here = x[..., r:, r : r + width]
+    return torch.cat([x[..., r + v : r + v + height, r + u : r + u + width] - here for v, u in offsets], dim=1)
+
+
+def pair_sums(p: Tensor, offsets: Sequence[Offset]) -> Tensor:
+    """Return the adjoint of :func:`pair_differences` on the image: the sum of p[i - d] - p[i], (B, 1, H, W)."""
+    r = _radius(offsets)
+    height, width = p.shape[-2] - r, p.shape[-1] - 2 * r
+    total = -p[..., :height, r : r + width].sum(dim=1)
+    for k, (v, u) in enumerate(offsets):
+        total += p[:, k, -v : height - v, r - u : r - u + width]
+    return total[:, None]
+
+
+class _Differences(torch.autograd.Function):
+    """:func:`pair_differences` of an image with zeros beyond its border; the derivative is the adjoint."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, offsets: Sequence[Offset]) -> Tensor:
+        """Return the differences of (B, 1, H, W)."""
+        ctx.offsets = offsets
+        r = _radius(offsets)
+        return pair_differences(functional.pad(x, (2 * r, 2 * r, r, r)), offsets)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        """Return the adjoint of a gradient."""
+        return _Sums.apply(gradients[0], ctx.offsets), None
+
+
+class _DualStep(torch.autograd.Function):
+    """clip((p + sigma x) / (1 + sigma huber), -w, w); an explicit derivative is several times faster."""
+
+    @staticmethod
+    def forward(ctx: Any, p: Tensor, x: Tensor, sigma: Tensor, huber: Tensor, w: Tensor) -> Tensor:
+        """Return the dual variable after the step."""
+        fractions = torch.addcmul(p, x, sigma).div_(1 + sigma * huber).div_(w).clamp_(-1, 1)
+        ctx.save_for_backward(p, x, sigma, huber, fractions)
+        return fractions * w
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, ...]:
+        """Pass the gradient to p and x where nothing is clipped, and to w elsewhere."""
+        p, x, sigma, huber, fractions = ctx.saved_tensors
+        keep = 1 / (1 + sigma * huber)
+        within = torch.ops.aten.hardtanh_backward(gradients[0], fractions, -1.0, 1.0)
+        of_w = (gradients[0] - within).mul_(fractions)
+        of_p, of_x = (torch.dot(within.flatten(), each.flatten()) for each in (p, x))
+        numerator = of_p + sigma * of_x
+        of_sigma = keep * of_x - keep.square() * huber * numerator
+        within *= keep
+        return within, within * sigma, of_sigma, -keep.square() * sigma * numerator, of_w
+
+
+class _Sums(torch.autograd.Function):
+    """:func:`pair_sums`, likewise."""
+
+    @staticmethod
+    def forward(ctx: Any, p: Tensor, offsets: Sequence[Offset]) -> Tensor:
+        """Return the sums of (B, N, H + r, W + 2 r)."""
+        ctx.offsets = offsets
+        return pair_sums(p, offsets)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        """Return the adjoint of a gradient."""
+        return _Differences.apply(gradients[0], ctx.offsets), None
+
+
+def unroll(
+    slopes: Tensor, weights: Tensor, steps: Sequence[Step], data: Tensor | float, huber: Tensor | float, window: int
+) -> Tensor:
+    """Return u - f after a number of steps.
+
+    Args:
+        slopes: the :func:`pair_differences` of f, continued beyond the border, (B, N, H + r, W + 2 r).
+        weights: (B, N, H, W), positive; those at the border are repeated beyond it.
+        steps: step sizes of the iteration.
+        data: positive weight of the distance from f (lambda).
+        huber: positive limit of the quadratic part of the Huber function, relative to the weight (epsilon).
+        window: size of the window in pixels.
+
+    Returns:
+        (B, 1, H, W).
+
+    """
+    offsets = half_window(window)
+    r = _radius(offsets)
+    most = functional.pad(weights, (r, r, 0, r), mode="replicate")
+    huber = torch.as_tensor(huber, dtype=slopes.dtype, device=slopes.device)
+    p = (slopes / (huber * most)).clamp(-1, 1) * most
+    moved = ahead = slopes.new_zeros(weights.shape[0], 1, *weights.shape[-2:])
+    for k, step in enumerate(steps):
+        now = slopes if k == 0 else slopes + apply(_Differences, ahead, offsets)
+        p = apply(_DualStep, p, now, torch.as_tensor(step.sigma).to(huber), huber, most)
+        before, moved = moved, (moved - step.tau * apply(_Sums, p, offsets)) / (1 + step.tau * data)
+        ahead = moved + step.theta * (moved - before)
+    return moved
+
+
+def safe_step(data: float, huber: float, window: int) -> Step:
+    """Return the step sizes with which the iteration converges (Chambolle and Pock 2011, algorithm 3).
+
+    K has a norm of at most 2 sqrt(N): each of the N offsets' differences has one of at most 2.
+    """
+    norm = 2 * math.sqrt(len(half_window(window)))
+    mu = 2 * math.sqrt(data * huber) / norm
+    return Step(mu / (2 * huber), mu / (2 * data), 1 / (1 + mu))
+
+
+class UnrolledHuber(nn.Module):
+    """A fixed number of iterations with learned parameters, stored as logarithms so that they are positive.
+
+    They are initialised by :func:`safe_step`, with which more steps come closer to the minimum of E. After a short
+    training, which changed neither much, RMSE_v on procedural scenes was 0.194 for data = 10 and 0.206 for data = 100;
+    without the iteration it was 0.210.
+
+    Args:
+        window: size in pixels of the window that a pixel is compared within.
+        iterations: number of steps.
+        data: initial weight of the distance from f.
+        huber: initial epsilon.
+
+    Raises:
+        ValueError: a value is out of range.
+
+    """
+
+    def __init__(self, window: int = 5, iterations: int = 10, data: float = 10.0, huber: float = 1.0) -> None:
+        super().__init__()
+        self.offsets = half_window(window)
+        if iterations < 1:
+            raise ValueError(f"iterations: expected at least 1, got {iterations}")
+        self.window, self.iterations = window, iterations
+        self.log_data = nn.Parameter(torch.tensor(math.log(data)))
+        self.log_huber = nn.Parameter(torch.tensor(math.log(huber)))
+        first = torch.tensor(safe_step(data, huber, window)).log()
+        self.log_steps = nn.Parameter(first.repeat(iterations, 1))  # (iterations, 3): sigma, tau, theta
+
+    @property
+    def receptive_field_radius(self) -> int:
+        """Receptive-field radius in pixels."""
+        return self.iterations * (self.window // 2)
+
+    def steps(self, dtype: torch.dtype = torch.float32) -> list[Step]:
+        """Return the sizes of each step."""
+        return [Step(*row.unbind()) for row in self.log_steps.to(dtype).exp().unbind()]
+
+    def forward(self, first: Tensor, weights: Tensor) -> Tensor:
+        """Map f and weights to u - f.
+
+        Args:
+            first: f, (B, 1, H + 2 r, W + 4 r), continued beyond the border as :func:`pair_differences` takes it.
+            weights: (B, N, H, W), more than 0, in the dtype of the computation.
+
+        Returns:
+            (B, 1, H, W) in the dtype of the weights.
+
+        """
+        dtype = weights.dtype
+        slopes = pair_differences(first, self.offsets).to(dtype)
+        data, huber = self.log_data.to(dtype).exp(), self.log_huber.to(dtype).exp()
+        return unroll(slopes, weights, self.steps(dtype), data, huber, self.window)
+
+
+def _radius(offsets: Sequence[Offset]) -> int:
+    return -offsets[0][0]
 
 
 class PrimalDualNetwork(NormalisedNetwork):
@@ -82,11 +315,6 @@ class PrimalDualNetwork(NormalisedNetwork):
         self.head.bias.data.zero_()  # type: ignore[union-attr]
         self.log_strength = nn.Parameter(torch.zeros(()))
 
-    def arguments(self) -> dict[str, Any]:
-        """Return the constructor's arguments."""
-        sizes = {"scale": self.scale, "width": self.width, "layers": self.layers}
-        return {**sizes, "window": self.window, "iterations": self.iterations}
-
     @property
     def receptive_field_radius(self) -> int:
         """Receptive-field radius in low-resolution pixels.
@@ -98,16 +326,7 @@ class PrimalDualNetwork(NormalisedNetwork):
         return -(-radius_hr // self.scale) + 4
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
-        """Map an image and normalised low-resolution disparity to high-resolution disparity.
-
-        Args:
-            rgb: (B, 3, H, W).
-            values: (B, 1, h, w).
-
-        Returns:
-            (B, 1, H, W).
-
-        """
+        """Return normalised disparity (B, 1, H, W) for (B, 3, H, W) and (B, 1, h, w); see the base class."""
         expect_rgb_size(rgb, values, self.scale)
         hr = upsample_linear_border(values, self.scale)
         inputs, bend = self._inputs(rgb, values, hr)

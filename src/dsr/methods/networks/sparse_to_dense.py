@@ -22,15 +22,14 @@ What differs from the original:
 from __future__ import annotations
 
 import itertools
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dsr.degradation.scales import check_scale
 from dsr.methods.exportable import pad_to_multiple
-from dsr.methods.networks.base import RangeNetwork, expect_rgb_size
+from dsr.methods.networks.network import RangeNetwork, expect_rgb_size
+from dsr.utils.ratios import check_scale
 
 _STRIDE = 32
 """The photo's pixels, along an axis, for each pixel of the encoder's result."""
@@ -72,24 +71,8 @@ class SparseToDense(RangeNetwork):
                 nn.init.kaiming_normal_(layer.weight, mode="fan_out", nonlinearity="relu")
         nn.init.kaiming_normal_(self.head.weight, nonlinearity="linear")
 
-    def arguments(self) -> dict[str, Any]:
-        """Return the constructor's arguments."""
-        return {"scale": self.scale, "width": self.width}
-
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
-        """Map an image and normalised low-resolution disparity to high-resolution disparity.
-
-        Args:
-            rgb: (B, 3, H, W).
-            values: (B, 1, h, w).
-
-        Returns:
-            (B, 1, H, W) in the dtype of ``values``.
-
-        Raises:
-            ValueError: the photo's size is not scale times the map's.
-
-        """
+        """Return normalised disparity (B, 1, H, W) for (B, 3, H, W) and (B, 1, h, w); see the base class."""
         expect_rgb_size(rgb, values, self.scale)
         height, width = rgb.shape[-2:]
         factor = max(_STRIDE // self.scale, 1)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dsr.methods.networks.weight_files import is_dsr_weights, read_header
-from dsr.utils.builder import ConfigError
+from dsr.utils.configuration import ConfigError
 from dsr.utils.ratios import round_ratio
 
 SLACK = 1.05

@@ -13,9 +13,8 @@ import safetensors.torch
 import torch
 from torch import Tensor, nn
 
-from dsr.methods.networks.base import DisparityNetwork
-from dsr.utils.limits import expect_bytes, expect_stored, opened
-from dsr.utils.parsing import parse_json
+from dsr.methods.networks.network import DisparityNetwork
+from dsr.utils.guards import expect_bytes, expect_stored, opened, parse_json
 
 FORMAT = "dsr-network-1"
 _KEY = "dsr"
@@ -39,7 +38,6 @@ def save_network(
 
     Args:
         path: path of the file; the write is not atomic.
-        net: the network.
         model: name of the model in ``conf/model/``, such as ``msg_v``.
         facts: further plain values for readers of the file, such as data, steps and scores.
         half: whether to store the kernels of convolutions in half precision; biases and normalisations are not.
@@ -113,7 +111,6 @@ def load_network(
     """Load the network of a dsr weights file, in float32 on the CPU.
 
     Args:
-        path: path of the file.
         networks: network classes by name.
         scale: scale that the run requires, None for any.
         model: model that the run requires, None for any.
@@ -250,7 +247,6 @@ def load_parameters(net: nn.Module, tensors: Mapping[str, Tensor], path: Path, e
     """Check the tensors of a file and load them into a network.
 
     Args:
-        net: the network.
         tensors: tensors by parameter name.
         path: path of the file, for the message.
         expected: description of the expected network, for the message.

@@ -14,7 +14,7 @@ from dsr.evaluation.results import BenchmarkSetting, Results, Run
 from dsr.metrics.formats import Formats
 from dsr.report.paper import Place, SceneSet, average_of, paper_row
 from dsr.report.tables import FACTS, Row, in_shown_units
-from dsr.utils.paths import natural_key
+from dsr.utils.guards import natural_key
 
 _FOLDERS = {"tables": (".csv", ".md", ".tex"), "metrics": (".csv",), "figures": (".pdf",)}
 """Folders beside the page with files to link to, and their suffixes."""

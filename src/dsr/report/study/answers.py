@@ -14,8 +14,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, ValidationError, ValidationInfo
 
 from dsr.report.study.key import PAGE_VERSION, Key
-from dsr.utils.limits import read_limited
-from dsr.utils.paths import natural_key
+from dsr.utils.guards import natural_key, read_limited
 from dsr.utils.validation import Number, Whole, describe
 
 _LONGEST = 1e12

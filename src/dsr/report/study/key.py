@@ -11,7 +11,7 @@ from typing import Annotated
 from pydantic import BaseModel, Field, ValidationError
 
 from dsr.utils.files import write_text
-from dsr.utils.limits import read_limited
+from dsr.utils.guards import read_limited
 from dsr.utils.ratios import as_ratio
 from dsr.utils.validation import Number, Whole, describe
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import pandas as pd
 
-from dsr.utils.limits import MOST_TABLE, read_limited
+from dsr.utils.guards import MOST_TABLE, read_limited
 
 PERCENTAGES = {"user_first": "User 1st", "user_second": "User 2nd", "user_top2": "User Top 2"}
 """The paper's columns: percentage of answers with a method as most similar, second most similar, or either."""

@@ -11,7 +11,7 @@ from dsr.synthetic.procedural.organic import plant
 from dsr.synthetic.procedural.reliefs import blanket
 from dsr.synthetic.procedural.shape import Shape, box, extrusion, lathe, merge, rotation_about, tube
 from dsr.synthetic.procedural.solids import frustum, hollow, random_solid, rounded_box
-from dsr.synthetic.surfaces import Array
+from dsr.synthetic.ray_surfaces import Array
 
 Parts = list[Shape]
 

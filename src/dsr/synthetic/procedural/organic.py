@@ -9,7 +9,7 @@ from skimage.measure import marching_cubes
 
 from dsr.synthetic.procedural.shape import Shape, merge, rotation_about, surface, tube, unit
 from dsr.synthetic.procedural.solids import place_on_ground
-from dsr.synthetic.surfaces import Array
+from dsr.synthetic.ray_surfaces import Array
 
 
 @dataclass(frozen=True, eq=False)

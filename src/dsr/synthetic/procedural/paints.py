@@ -12,8 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from dsr.synthetic.procedural.shape import random_rotation
-from dsr.synthetic.surfaces import Array, rotation
-from dsr.synthetic.textures import noise
+from dsr.synthetic.ray_surfaces import Array, noise, rotation
 
 Paint = Callable[[Array, Array], Array]
 Palette = Array

@@ -13,7 +13,7 @@ from dsr.synthetic.procedural.photo import Body
 from dsr.synthetic.procedural.reliefs import RELIEFS, blanket, curtain, relief
 from dsr.synthetic.procedural.shape import Shape, box, merge, quad, rotation_about, surface
 from dsr.synthetic.procedural.solids import bowl, letter, random_solid, vase
-from dsr.synthetic.surfaces import Array
+from dsr.synthetic.ray_surfaces import Array
 
 
 def shell(rng: np.random.Generator, materials: MaterialSampler, size: Array) -> list[Body]:

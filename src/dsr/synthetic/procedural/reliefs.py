@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
 from dsr.synthetic.procedural.shape import Shape, surface
-from dsr.synthetic.surfaces import Array
+from dsr.synthetic.ray_surfaces import Array
 
 Heights = tuple[Array, Array, float]
 _FACE = cv2.FONT_HERSHEY_TRIPLEX
@@ -172,10 +172,6 @@ def relief(rng: np.random.Generator, maker: Maker, side: float, count: int = 300
     """Return a square relief of ``side`` metres: (x, y) in the middle of the origin, heights along z.
 
     Args:
-        rng: source of random numbers.
-        maker: one of :data:`RELIEFS`.
-        side: length of a side in metres.
-        count: number of grid points per side.
         bend: height of the middle above the edges along x as a fraction of the side.
 
     """

@@ -1,6 +1,6 @@
 """Triangle meshes with normals and paint coordinates, and general functions that make them.
 
-A shape stands for the curved surface that its vertex normals define (see :mod:`dsr.synthetic.procedural.tracer`), so
+A shape stands for the curved surface that its vertex normals define (see :mod:`dsr.synthetic.procedural.lighting`), so
 the vertices of sharp edges occur twice, with different normals. Local frames have z up; lengths are in metres.
 """
 
@@ -13,7 +13,7 @@ import mapbox_earcut
 import numpy as np
 from numpy.typing import NDArray
 
-from dsr.synthetic.surfaces import Array
+from dsr.synthetic.ray_surfaces import Array
 
 Index = NDArray[np.intp]
 
@@ -131,7 +131,6 @@ def lathe(sections: Sequence[Array], segments: int = 80) -> Shape:
 
     Args:
         sections: radius and height along the smooth pieces of the profile, (K, 2) each; edges between pieces are sharp.
-        segments: number of segments around the axis.
 
     """
     angle = np.linspace(0, 2 * np.pi, segments + 1)

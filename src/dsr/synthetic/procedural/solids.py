@@ -22,7 +22,7 @@ from dsr.synthetic.procedural.shape import (
     tube,
     unit,
 )
-from dsr.synthetic.surfaces import Array
+from dsr.synthetic.ray_surfaces import Array
 
 Maker = Callable[[np.random.Generator], Shape]
 _GLYPHS = "ABCDEFGHJKLMNPRSTUVXYZ23456789&QO"

@@ -20,9 +20,8 @@ from torch.nn import functional
 
 from dsr.methods.base import Cost
 from dsr.methods.networks.dct import dct2, idct2, laplacian_eigenvalues
-from dsr.methods.networks.maps import normalise_imagenet, resize_bicubic
-from dsr.methods.networks.peers.base import PeerNetwork
-from dsr.methods.networks.peers.files import rename
+from dsr.methods.networks.normalisation import normalise_imagenet, resize_bicubic
+from dsr.methods.networks.peers.peer_network import PeerNetwork, rename
 
 FEATURES = 64
 _LAYERS = 4

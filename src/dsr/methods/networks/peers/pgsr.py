@@ -20,9 +20,8 @@ from torch.nn import functional
 
 from dsr.methods.base import Cost
 from dsr.methods.classical.finite_differences import grey
-from dsr.methods.networks.maps import normalise_imagenet
-from dsr.methods.networks.peers.base import SWAPPED_LUMA, PeerNetwork
-from dsr.methods.networks.peers.files import fold_batch_norm, rename
+from dsr.methods.networks.normalisation import normalise_imagenet
+from dsr.methods.networks.peers.peer_network import SWAPPED_LUMA, PeerNetwork, fold_batch_norm, rename
 
 _FACTOR, _WIDTH, _SHARED, _LAST = 4, 32, 16, 64
 _ROUNDS, _GROUPS, _BLOCKS, _SQUEEZED = 3, 2, 2, 2

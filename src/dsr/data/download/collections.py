@@ -1,0 +1,424 @@
+"""The data sets that ``dsr data`` knows: who made them, on which terms, where they are, what they consist of."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+MIDDLEBURY = "Its owners permit using and publishing the images and disparity maps, and ask for the citation."
+RESEARCH = "Its owners state no licence: for research, see the homepage."
+CITE_2006 = "H. Hirschmüller, D. Scharstein: Evaluation of cost functions for stereo matching. CVPR 2007."
+CITE_2001 = (
+    "D. Scharstein, R. Szeliski: A taxonomy and evaluation of dense two-frame stereo correspondence algorithms. "
+    "IJCV 47, 2002."
+)
+
+_DDRNET = "https://github.com/neycyanshi/DDRNet"
+_DDRNET_FILES = "https://raw.githubusercontent.com/neycyanshi/DDRNet/28771990f22ad5b5a917f911058e1304b8d2697d/dataset"
+_DDRNET_FOLDERS = ("color_map", "depth_map", "high_quality_depth")
+_DCTNET = "https://github.com/Zhaozixiang1228/GDSR-DCTNet"
+_DCTNET_FILES = (
+    "https://raw.githubusercontent.com/Zhaozixiang1228/GDSR-DCTNet/5243875223398fd7996bca2e54dc2792bb96862a/RawDatasets"
+)
+"""Test images of the field, at the commit of which the files are known."""
+_RGBDD = "https://github.com/lingzhi96/RGB-D-D-Dataset"
+_RGBDD_TERMS = "For non-commercial research; its owners ask for a signed agreement."
+_CITE_RGBDD = (
+    "L. He, H. Zhu, F. Li, H. Bai, R. Cong, C. Zhang, C. Lin, M. Liu, Y. Zhao: Towards fast and accurate real-world "
+    "depth super-resolution: benchmark dataset and baseline. CVPR 2021."
+)
+_CITE_LU = "S. Lu, X. Ren, F. Liu: Depth enhancement via low-rank matrix completion. CVPR 2014."
+
+
+@dataclass(frozen=True)
+class Item:
+    """A file to fetch.
+
+    Args:
+        path: below the directory of the data sets, with slashes; a mirror has the file under the same path.
+        urls: where it is, tried in order; ``ADDRESS#NAME`` is the member NAME of a zip archive.
+        unpack_to: the directory, below that of the data sets, that the archive is unpacked into; None for a file that
+            stays as it is.
+        contains: what there must be in ``unpack_to`` afterwards, such as ``training/final``.
+        sha256: of the file, where it is known beforehand.
+
+    """
+
+    path: str
+    urls: tuple[str, ...]
+    unpack_to: str | None = None
+    contains: tuple[str, ...] = ()
+    sha256: str | None = None
+
+
+@dataclass(frozen=True)
+class Collection:
+    """Files that go together.
+
+    Args:
+        name: as it is typed.
+        title: what it is, a few words.
+        homepage: address of its page.
+        licence: its terms, as far as its owners state them.
+        citation: authors, title, venue, year.
+        folders: its directories below that of the data sets.
+        size: of the downloads in bytes, about; None where that is not known.
+        items: what is fetched; empty where nobody but the user can.
+        manual: how to get it by hand, with ``{folder}`` for its directory; None where ``items`` are all there is.
+        patterns: of the files that the user puts into the first of ``folders``, as for :meth:`pathlib.Path.glob`.
+
+    """
+
+    name: str
+    title: str
+    homepage: str
+    licence: str
+    citation: str
+    folders: tuple[str, ...]
+    size: float | None
+    items: tuple[Item, ...] = field(default=(), repr=False)
+    manual: str | None = None
+    patterns: tuple[str, ...] = ()
+
+    def instruction(self, root: Path) -> str:
+        """Return how to get it by hand."""
+        return (self.manual or "").format(folder=root / self.folders[0])
+
+
+def _levels(folder: str, source: str, names: Sequence[str], spelling: str) -> tuple[Item, ...]:
+    """Return the photos and maps of an 8-bit benchmark."""
+    paths = [path for name in names for path in (f"RGB/{name}_{spelling}_color.png", f"Depth/{name}_output_depth.png")]
+    return tuple(Item(f"{folder}/{path}", (f"{_DCTNET_FILES}/{source}/{path}",)) for path in paths)
+
+
+def _ddrnet() -> tuple[Item, ...]:
+    """Return the frames that DDRNet's authors publish."""
+    frames = [f"20170907/group1/{{}}/frame_{number:06d}.png" for number in range(1, 21)]
+    frames += [f"20170907/group2/{{}}/frame_{number:06d}.png" for number in range(1, 3)]
+    paths = [frame.format(folder) for frame in frames for folder in _DDRNET_FOLDERS]
+    return tuple(Item(f"ddrnet/{path}", (f"{_DDRNET_FILES}/{path}",)) for path in paths)
+
+
+FIELD = (
+    Collection(
+        "lu",
+        "Lu's six pairs of a structured-light sensor, 8 bits, as the field evaluates on them",
+        _DCTNET,
+        RESEARCH,
+        _CITE_LU,
+        ("lu",),
+        1.9e6,
+        _levels("lu", "Lu", [f"RGBD_{number:02d}" for number in range(1, 7)], "ouput"),
+    ),
+    Collection(
+        "middlebury8",
+        "Thirty pairs of Middlebury 2001 to 2006, 8 bits, as the field evaluates on them",
+        _DCTNET,
+        MIDDLEBURY,
+        f"{CITE_2001} {CITE_2006} {_CITE_LU}",
+        ("middlebury8",),
+        8.8e6,
+        _levels("middlebury8", "Middlebury", [f"Middlebury_{number:02d}" for number in range(1, 31)], "output"),
+    ),
+    Collection(
+        "ddrnet",
+        "22 frames of a structured-light camera with fused depth",
+        _DDRNET,
+        "MIT licence.",
+        "S. Yan, C. Wu, L. Wang, F. Xu, L. An, K. Guo, Y. Liu: DDRNet: depth map denoising and refinement for consumer "
+        "depth cameras using cascaded CNNs. ECCV 2018.",
+        ("ddrnet",),
+        12.3e6,
+        _ddrnet(),
+    ),
+    Collection(
+        "rgbdd",
+        "RGB-D-D, photos with a time-of-flight sensor's depth",
+        _RGBDD,
+        _RGBDD_TERMS,
+        _CITE_RGBDD,
+        ("rgbdd",),
+        None,
+        manual="get the set from its owners (an agreement has to be signed), or RawDatasets/RGBDD, the 405 test "
+        f"images, from {_DCTNET}, and put RGB and Depth, or models, plants and portraits, anywhere below {{folder}}",
+        patterns=("**/*_RGB.jpg", "**/*_HR_gt.png"),
+    ),
+    Collection(
+        "rgbdd_real",
+        "RGB-D-D, photos with a time-of-flight sensor's depth and a phone's",
+        _RGBDD,
+        _RGBDD_TERMS,
+        _CITE_RGBDD,
+        ("rgbdd_real",),
+        None,
+        manual="get the set from its owners (an agreement has to be signed), or RawDatasets/RGBDD_Test_Realscene, "
+        f"3 images of it, from {_DCTNET}, and put RGB, Depth and DepthLR, or models, plants and portraits, anywhere "
+        "below {folder}",
+        patterns=("**/*_RGB.jpg", "**/*_HR_gt.png", "**/*_LR_fill_depth.png"),
+    ),
+    Collection(
+        "arkitscenes",
+        "ARKitScenes, a tablet's lidar beside a laser scanner's depth",
+        "https://github.com/apple/ARKitScenes",
+        "Its owners' own licence, for non-commercial use: see the homepage.",
+        "G. Baruch, Z. Chen, A. Dehghan, T. Dimry, Y. Feigin, P. Fu, T. Gebauer, B. Joffe, D. Kurz, A. Schwartz, "
+        "E. Shulman: ARKitScenes: a diverse real-world dataset for 3D indoor scene understanding using mobile RGB-D "
+        "data. NeurIPS Datasets and Benchmarks 2021.",
+        ("arkitscenes",),
+        None,
+        manual="fetch videos with its download_data.py (data set upsampling) and put Training and Validation anywhere "
+        "below {folder}",
+        patterns=("**/highres_depth/*.png", "**/lowres_depth/*.png"),
+    ),
+    Collection(
+        "diml",
+        "DIML/CVL RGB-D, rooms before a Kinect v2",
+        "https://dimlrgbd.github.io/",
+        RESEARCH,
+        "J. Cho, D. Min, Y. Kim, K. Sohn: DIML/CVL RGB-D dataset: 2M RGB-D images of natural indoor and outdoor "
+        "scenes. arXiv 2110.11590, 2021.",
+        ("diml",),
+        None,
+        manual="fetch the indoor sample data from its homepage and put test and train, with HR or LR in each, anywhere "
+        "below {folder}",
+        patterns=("**/color/*_c.png", "**/depth_filled/*_depth_filled.png"),
+    ),
+)
+"""The collections."""
+
+
+def find(names: Iterable[str], catalogue: Mapping[str, Collection]) -> list[Collection]:
+    """Return the collections of these names, each once.
+
+    Raises:
+        ValueError: a name is unknown.
+
+    """
+    unknown = [name for name in names if name not in catalogue]
+    if unknown:
+        raise ValueError(f"{', '.join(unknown)}: unknown data set; expected some of {', '.join(catalogue)}")
+    return [catalogue[name] for name in dict.fromkeys(names)]
+
+
+_STEREO = "https://vision.middlebury.edu/stereo/data"
+
+EVALUATION_2014 = ("Vintage", "Recycle", "Umbrella", "Classroom1", "Playroom", "Backpack", "Jadeplant")
+"""The scenes of Middlebury 2014 that Voynov et al. (ICCV 2019) evaluate on."""
+TRAINING_2014 = (
+    "Adirondack", "Bicycle1", "Cable", "Couch", "Flowers", "Mask", "Motorcycle", "Piano", "Pipes", "Playtable",
+    "Shelves", "Shopvac", "Sticks", "Storage", "Sword1", "Sword2",
+)  # fmt: skip
+"""The others of Middlebury 2014 whose disparity is public."""
+SCENES_2006 = (
+    "Aloe", "Baby1", "Baby2", "Baby3", "Bowling1", "Bowling2", "Cloth1", "Cloth2", "Cloth3", "Cloth4", "Flowerpots",
+    "Lampshade1", "Lampshade2", "Midd1", "Midd2", "Monopoly", "Plastic", "Rocks1", "Rocks2", "Wood1", "Wood2",
+)  # fmt: skip
+SCENES_2005 = ("Art", "Books", "Dolls", "Laundry", "Moebius", "Reindeer")
+SCENES_2003 = ("cones", "teddy")
+SCENES_2001 = ("barn1", "barn2", "bull", "poster", "sawtooth", "venus")
+
+
+def _files(folder: str, scenes: Sequence[str], base: str, names: Sequence[str]) -> tuple[Item, ...]:
+    """Return single files, the same ones of each scene."""
+    return tuple(Item(f"{folder}/{scene}/{name}", (f"{base}/{scene}/{name}",)) for scene in scenes for name in names)
+
+
+def _full_size(folder: str, scenes: Sequence[str], base: str) -> tuple[Item, ...]:
+    """Return the files of scenes of 2005 or 2006, which the archives of two views have, too."""
+    return tuple(
+        Item(item.path, (*item.urls, f"{base}/zip-2views/{scene}-2views.zip#{scene}/{Path(item.path).name}"))
+        for scene in scenes
+        for item in _files(folder, (scene,), base, ("view1.png", "disp1.png", "dmin.txt"))
+    )
+
+
+def _perfect(scenes: Sequence[str]) -> tuple[Item, ...]:
+    """Return the files of scenes of 2014, of those with perfectly rectified cameras."""
+    folders = [f"{scene}-perfect" for scene in scenes]
+    return _files("middlebury2014", folders, f"{_STEREO}/scenes2014/datasets", ("im0.png", "calib.txt", "disp0.pfm"))
+
+
+_ITEMS_2006 = _full_size("middlebury2006", SCENES_2006, f"{_STEREO}/scenes2006/FullSize")
+_ITEMS_2001 = _files("middlebury2001", SCENES_2001, f"{_STEREO}/scenes2001/data", ("im2.ppm", "disp2.pgm"))
+_CITE_2014 = (
+    "D. Scharstein, H. Hirschmüller, Y. Kitajima, G. Krathwohl, N. Nešić, X. Wang, P. Westling: High-resolution stereo "
+    "datasets with subpixel-accurate ground truth. GCPR 2014."
+)
+
+
+def _icl(room: str, archive: str) -> tuple[Item, ...]:
+    """Return the four trajectories of a room; the office's archives do not say that they are the office's."""
+    return tuple(
+        Item(
+            f"icl_nuim/{room}_traj{number}_frei_png.tar.gz",
+            (f"https://www.doc.ic.ac.uk/~ahanda/{archive}traj{number}_frei_png.tar.gz",),
+            unpack_to=f"icl_nuim/{room}_traj{number}",
+            contains=("rgb", "depth"),
+        )
+        for number in range(4)
+    )
+
+
+def _sintel(path: str, contains: tuple[str, ...]) -> Item:
+    name = path.rpartition("/")[2]
+    hosts = ("https://files.is.tue.mpg.de", "http://files.is.tue.mpg.de")
+    return Item(f"sintel/{name}", tuple(f"{host}/{path}" for host in hosts), unpack_to="sintel", contains=contains)
+
+
+_COLLECTIONS = (
+    Collection(
+        "middlebury",
+        f"Middlebury 2014, the paper's {len(EVALUATION_2014)} evaluation scenes",
+        f"{_STEREO}/scenes2014/",
+        MIDDLEBURY,
+        _CITE_2014,
+        ("middlebury2014",),
+        0.25e9,
+        _perfect(EVALUATION_2014),
+    ),
+    Collection(
+        "middlebury_train",
+        "Middlebury 2014 (the other 16 scenes), 2006 and 2001",
+        f"{_STEREO}/",
+        MIDDLEBURY,
+        f"{_CITE_2014} {CITE_2006} {CITE_2001}",
+        ("middlebury2014", "middlebury2006", "middlebury2001"),
+        0.65e9,
+        _perfect(TRAINING_2014) + _ITEMS_2006 + _ITEMS_2001,
+    ),
+    Collection(
+        "middlebury2006",
+        f"Middlebury 2006, {len(SCENES_2006)} scenes",
+        f"{_STEREO}/scenes2006/",
+        MIDDLEBURY,
+        CITE_2006,
+        ("middlebury2006",),
+        50e6,
+        _ITEMS_2006,
+    ),
+    Collection(
+        "middlebury2005",
+        f"Middlebury 2005, {len(SCENES_2005)} scenes",
+        f"{_STEREO}/scenes2005/",
+        MIDDLEBURY,
+        f"D. Scharstein, C. Pal: Learning conditional random fields for stereo. CVPR 2007. {CITE_2006}",
+        ("middlebury2005",),
+        15e6,
+        _full_size("middlebury2005", SCENES_2005, f"{_STEREO}/scenes2005/FullSize"),
+    ),
+    Collection(
+        "middlebury2003",
+        "Middlebury 2003, cones and teddy",
+        f"{_STEREO}/scenes2003/",
+        MIDDLEBURY,
+        "D. Scharstein, R. Szeliski: High-accuracy stereo depth maps using structured light. CVPR 2003.",
+        ("middlebury2003",),
+        1e6,
+        _files("middlebury2003", SCENES_2003, f"{_STEREO}/scenes2003/newdata", ("im2.png", "disp2.png")),
+    ),
+    Collection(
+        "middlebury2001",
+        f"Middlebury 2001, {len(SCENES_2001)} planar scenes",
+        f"{_STEREO}/scenes2001/",
+        MIDDLEBURY,
+        CITE_2001,
+        ("middlebury2001",),
+        4e6,
+        _ITEMS_2001,
+    ),
+    Collection(
+        "icl",
+        "ICL-NUIM, rendered living room and office, 4 trajectories each",
+        "https://www.doc.ic.ac.uk/~ahanda/VaFRIC/iclnuim.html",
+        "Creative Commons Attribution 3.0 (CC BY 3.0).",
+        "A. Handa, T. Whelan, J. McDonald, A. J. Davison: A benchmark for RGB-D visual odometry, 3D reconstruction and "
+        "SLAM. ICRA 2014.",
+        ("icl_nuim",),
+        4.4e9,
+        _icl("living_room", "living_room_") + _icl("office_room", ""),
+    ),
+    Collection(
+        "sunrgbd",
+        "SUN RGB-D, four kinds of depth camera",
+        "https://rgbd.cs.princeton.edu/",
+        RESEARCH,
+        "S. Song, S. P. Lichtenberg, J. Xiao: SUN RGB-D: a RGB-D scene understanding benchmark suite. CVPR 2015. Parts "
+        "of it are NYU Depth v2, Berkeley B3DO and SUN3D: its homepage asks to cite these, too.",
+        ("sunrgbd",),
+        6.4e9,
+        (
+            Item(
+                "sunrgbd/SUNRGBD.zip",
+                ("https://rgbd.cs.princeton.edu/data/SUNRGBD.zip",),
+                unpack_to="sunrgbd",
+                contains=("SUNRGBD",),
+            ),
+        ),
+    ),
+    Collection(
+        "tofmark",
+        "ToFMark, time-of-flight depth with measured ground truth",
+        "https://rvlab.icg.tugraz.at/tofmark/",
+        RESEARCH,
+        "D. Ferstl, C. Reinbacher, R. Ranftl, M. Rüther, H. Bischof: Image guided depth upsampling using anisotropic "
+        "total generalized variation. ICCV 2013.",
+        ("tofmark",),
+        None,
+        manual="get the set from its homepage or its authors and put benchmarking_dataset_*.mat into {folder}",
+        patterns=("benchmarking_dataset_*.mat",),
+    ),
+    Collection(
+        "sintel",
+        "MPI Sintel, training images with depth and cameras",
+        "http://sintel.is.tue.mpg.de/",
+        "Made from the film Sintel, (c) Blender Foundation, CC BY 3.0; terms of the data set: see the homepage.",
+        "D. J. Butler, J. Wulff, G. B. Stanley, M. J. Black: A naturalistic open source movie for optical flow "
+        "evaluation. ECCV 2012. J. Wulff, D. J. Butler, G. B. Stanley, M. J. Black: Lessons and insights from creating "
+        "a synthetic optical flow benchmark. ECCV workshops 2012.",
+        ("sintel",),
+        3.4e9,
+        (
+            _sintel("sintel/MPI-Sintel-training_images.zip", ("training/final", "training/clean")),
+            _sintel(
+                "jwulff/sintel/MPI-Sintel-depth-training-20150305.zip", ("training/depth", "training/camdata_left")
+            ),
+        ),
+    ),
+    Collection(
+        "nyu",
+        "NYU Depth v2, the 1449 labelled frames",
+        "https://cs.nyu.edu/~fergus/datasets/nyu_depth_v2.html",
+        RESEARCH,
+        "N. Silberman, D. Hoiem, P. Kohli, R. Fergus: Indoor segmentation and support inference from RGBD images. "
+        "ECCV 2012.",
+        ("nyu_v2",),
+        2.8e9,
+        (
+            Item(
+                "nyu_v2/nyu_depth_v2_labeled.mat",
+                ("http://horatio.cs.nyu.edu/mit/silberman/nyu_depth_v2/nyu_depth_v2_labeled.mat",),
+            ),
+        ),
+    ),
+    Collection(
+        "tartanair",
+        "TartanAir, rendered flights through many scenes",
+        "https://theairlab.org/tartanair-dataset/",
+        "Its terms are on its homepage.",
+        "W. Wang, D. Zhu, X. Wang, Y. Hu, Y. Qiu, C. Wang, Y. Hu, A. Kapoor, S. Scherer: TartanAir: a dataset to push "
+        "the limits of visual SLAM. IROS 2020.",
+        ("tartanair",),
+        None,
+        manual="fetch any environment with the tool of its homepage and put its trajectories, such as "
+        "P000/image_left/*.png and P000/depth_left/*.npy, anywhere below {folder}",
+        patterns=("**/image_left/*.png", "**/depth_left/*.npy"),
+    ),
+)
+CATALOGUE: dict[str, Collection] = {collection.name: collection for collection in (*_COLLECTIONS, *FIELD)}
+
+
+def data_root() -> Path:
+    """Return the directory of the data sets' folders."""
+    return Path(os.environ.get("DSR_DATA") or "data").expanduser()

@@ -1,1 +1,0 @@
-"""Readers of the original formats of data sets, a module each; each reads a frame as a Scene."""

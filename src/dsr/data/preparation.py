@@ -1,0 +1,285 @@
+"""Data sets in their original formats, whose scenes are resized and cropped once and kept in the cache.
+
+The name of a cached file contains a hash of the scene's files, the settings, and :data:`dsr.utils.versions.SCENES`. So
+a change of any of them prepares the scene again.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from dsr.data.reference_depth import fit, inpaint_depth
+from dsr.data.scene_source import SceneSelection, select_scenes
+from dsr.sample import Scene
+from dsr.synthetic.rendering import Rendering, cache_directory, load_or_render
+from dsr.utils.progress import SILENT
+from dsr.utils.versions import SCENES, file_hash
+
+_MIN_SIZE = 32
+_MAX_LISTED = 30
+_MAX_HASHED = 1 << 28
+"""Largest size in bytes of files whose content is hashed."""
+
+
+@dataclass(frozen=True)
+class SceneRecord:
+    """A scene on disk.
+
+    Args:
+        files: files and folders that the scene is read from; a folder stands for all files in it.
+        load: function that reads the scene at its original size.
+        frame: part of the files that holds the scene, where they hold several.
+        settings: how the files are read.
+        note: remark for readers of the scene's scores; empty for none.
+
+    """
+
+    files: tuple[Path, ...]
+    load: Callable[[], Scene]
+    frame: str = ""
+    settings: str = ""
+    note: str = ""
+
+
+def list_frames(
+    find: Callable[..., Mapping[str, tuple[Any, ...]]], root: str, *arguments: Any
+) -> Mapping[str, tuple[Any, ...]]:
+    """Return the frames that a reader finds in the directory ``root``; none where there is no such directory."""
+    folder = Path(root).expanduser()
+    return find(folder, *arguments) if folder.is_dir() else {}
+
+
+def make_records(
+    frames: Mapping[str, tuple[Any, ...]], load: Callable[..., Scene], dataset: str, **settings: Any
+) -> dict[str, SceneRecord]:
+    """Return the records of frames on disk, by their names with _ in place of /.
+
+    Args:
+        frames: first arguments of ``load`` by name, as from :func:`list_frames`.
+        load: function that reads a frame, given these, the names of data set and scene, and ``settings``.
+        dataset: name of the data set.
+        settings: further arguments of ``load``.
+
+    """
+    records = {}
+    for frame, arguments in frames.items():
+        name = frame.replace("/", "_")
+        files = tuple(path for path in arguments if isinstance(path, Path))
+        which = json.dumps([each for each in arguments if not isinstance(each, Path)])
+        read = functools.partial(load, *arguments, dataset, name, **settings)
+        records[name] = SceneRecord(files, read, which, json.dumps(settings))
+    return records
+
+
+def add_note(records: Mapping[str, SceneRecord], note: str) -> dict[str, SceneRecord]:
+    """Return records with a remark for readers of the scenes' scores."""
+    return {name: replace(record, note=note) for name, record in records.items()}
+
+
+def _files_of(path: Path) -> list[Path]:
+    """Return a file, or the files of a folder and those below it."""
+    return [path] if not path.is_dir() else sorted(file for file in path.rglob("*") if file.is_file())
+
+
+def rename_records(records: Mapping[str, SceneRecord], names: Mapping[str, str]) -> dict[str, SceneRecord]:
+    """Return the records, some of them under other names.
+
+    Args:
+        records: records by name.
+        names: names of frames by their new names, with / or _; frames that are not in ``records`` are left out.
+
+    """
+    frames = {name: frame.replace("/", "_") for name, frame in names.items()}
+    new = {name: _with_scene_name(records[frame], name) for name, frame in frames.items() if frame in records}
+    replaced = new.keys() | set(frames.values())
+    return {**new, **{name: record for name, record in records.items() if name not in replaced}}
+
+
+def _with_scene_name(record: SceneRecord, name: str) -> SceneRecord:
+    """Return the record with another name for its scene."""
+    return replace(record, load=lambda: replace(record.load(), name=name))
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """Resizing, cropping and inpainting of scenes after they are read.
+
+    Args:
+        size: length of the shorter side in pixels; None for the original size.
+        crop: position of a square window along the longer side, from 0 (top or left) to 1 (bottom or right); None for
+            no window.
+        enlarge: whether smaller scenes are enlarged.
+        fill: names of the scenes whose holes are inpainted; see :mod:`dsr.data.reference_depth`.
+
+    Raises:
+        ValueError: a value is out of range.
+
+    """
+
+    size: int | None = 512
+    crop: float | None = 0.5
+    enlarge: bool = True
+    fill: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if self.size is not None and self.size < _MIN_SIZE:
+            raise ValueError(f"size: expected at least {_MIN_SIZE} pixels, or null, got {self.size}")
+        if self.crop is not None and not 0 <= self.crop <= 1:
+            raise ValueError(f"crop: expected a number from 0 to 1, or null, got {self.crop}")
+
+    def __call__(self, scene: Scene) -> Scene:
+        """Return the scene prepared."""
+        if self.size is not None:
+            scene = fit(scene, self.size, self.crop, enlarge=self.enlarge)
+        if scene.name in self.fill and scene.depth is not None:
+            scene = replace(scene, depth=inpaint_depth(scene.depth))
+        return scene
+
+
+class PreparedDataset:
+    """A data set in its original format; the base class of those in this package.
+
+    Args:
+        name: name in ``scores.csv`` and in ``dsr data get``.
+        root: directory of the data set.
+        found: records of the scenes on disk.
+        named: names of the scenes that belong to the data set; None for all that are on disk.
+        scenes: names of the scenes to use; None for those of ``named``, ``found`` for all that are on disk.
+        preparation: how scenes are resized, cropped and inpainted.
+        count: number of scenes that belong to the data set, where their names are not known; None otherwise.
+
+    Raises:
+        ValueError: a scene is not on disk; the message says how to get it.
+
+    """
+
+    evaluation = True
+
+    def __init__(
+        self,
+        name: str,
+        root: str,
+        found: Mapping[str, SceneRecord],
+        named: Sequence[str] | None,
+        scenes: SceneSelection,
+        preparation: Preparation,
+        count: int | None = None,
+    ) -> None:
+        self.name = name
+        folder, named = Path(root).expanduser(), tuple(found if named is None else named)
+        remedy = f"get it with: dsr data get {name}; or say where it is: dataset.root=DIR"
+        if not found:
+            there = "no scene of it" if folder.is_dir() else "no such directory"
+            raise ValueError(f"dataset={name}: expected its files in {folder}, got {there}; {remedy}")
+        if scenes is None:
+            missing, total = [scene for scene in named if scene not in found], count or len(named)
+            if missing or len(named) < total:
+                listed = ", ".join(missing[:_MAX_LISTED]) or "all scenes"
+                rest = f" and {len(missing) - _MAX_LISTED} more" if len(missing) > _MAX_LISTED else ""
+                raise ValueError(
+                    f"dataset={name}: expected {listed}{rest} in {folder}, got {len(named) - len(missing)} of {total} "
+                    f"scenes; {remedy}; or use what is there: dataset.scenes=found"
+                )
+            scenes = named
+        self._scenes = select_scenes(list(found), scenes)
+        unknown = [scene for scene in preparation.fill if scene not in (*named, *found)]
+        if unknown:
+            raise ValueError(f"fill: expected names of scenes, got {', '.join(unknown)}")
+        self._found, self._preparation = found, preparation
+
+    def scenes(self) -> list[str]:
+        """Return the names of the scenes, in order."""
+        return list(self._scenes)
+
+    def load(self, scene: str) -> Scene:
+        """Return one scene; see :class:`dsr.data.scene_source.SceneSource`."""
+        record = self._found[scene]
+        notes = (record.note,) if record.note else ()
+        if self._preparation.size is None and scene not in self._preparation.fill:
+            return replace(record.load(), notes=notes)
+        prepared = load_or_render(self._path(scene), lambda: _rendering(self._preparation(record.load())))
+        return replace(prepared.scene(self.name, scene), notes=notes)
+
+    def fingerprint(self, scene: str) -> str:
+        """Return the SHA-256 of the scene's files and of the settings that they are read and prepared with."""
+        plain = asdict(replace(self._preparation, fill=()))
+        settings = json.dumps([self._found[scene].settings, scene in self._preparation.fill, plain])
+        return hashlib.sha256(f"{settings}{self.content(scene)}".encode()).hexdigest()
+
+    def content(self, scene: str) -> str:
+        """Return the SHA-256 of the scene's files alone."""
+        record = self._found[scene]
+        digest = hashlib.sha256(record.frame.encode())
+        for path in record.files:
+            for file in _files_of(path):
+                digest.update(content_hash(file).encode())
+        return digest.hexdigest()
+
+    def unprepared(self, scenes: Sequence[str]) -> list[str]:
+        """Return those of some scenes that are not in the cache."""
+        return [scene for scene in scenes if not self._is_ready(scene)]
+
+    def prepare(self, scenes: Sequence[str], _: Callable[[str], None] = SILENT.say) -> Iterator[str]:
+        """Prepare scenes that are not in the cache, several at a time, and yield the name of each that is ready.
+
+        The name of a scene that fails is yielded, too; loading the scene raises the error.
+        """
+        with ThreadPoolExecutor(min(len(scenes), os.cpu_count() or 1) or 1) as pool:
+            missing = self.unprepared(scenes)
+            jobs = {pool.submit(self.load, scene): scene for scene in missing}
+            yield from (scene for scene in scenes if scene not in missing)
+            try:
+                for job in as_completed(jobs):
+                    yield jobs[job]
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+
+    def _is_ready(self, scene: str) -> bool:
+        try:
+            return self._preparation.size is None or (cache_directory() / self._path(scene)).is_file()
+        except (OSError, ValueError):  # loading the scene raises it again
+            return True
+
+    def _path(self, scene: str) -> Path:
+        key = hashlib.sha256(f"{self.fingerprint(scene)}{SCENES}".encode()).hexdigest()[:16]
+        return Path("prepared", self.name, f"{scene.replace('/', '_')}-{key}.npz")
+
+
+@functools.lru_cache(maxsize=4096)
+def _hash_of(path: Path, size: int, changed: int) -> str:
+    if size > _MAX_HASHED:
+        return f"{path.name} {size} {changed}"
+    return file_hash(path)
+
+
+def content_hash(path: Path) -> str:
+    """Return the SHA-256 of a file; of a file above 256 MiB, its name, size and time of the last change.
+
+    Raises:
+        ValueError: there is no such file.
+
+    """
+    if not path.is_file():
+        raise ValueError(f"{path}: expected a file, there is none")
+    status = path.stat()
+    return _hash_of(path, status.st_size, status.st_mtime_ns)
+
+
+def _rendering(scene: Scene) -> Rendering:
+    """Return a scene as it is cached, with its rgb in 8 bits."""
+    if scene.depth is None:
+        raise ValueError(f"{scene.name}: expected a high-resolution depth map, there is none")
+    photo = (scene.rgb * 255).round().to(torch.uint8).permute(1, 2, 0).numpy()
+    return Rendering(photo, scene.depth[0].double().numpy(), scene.camera)

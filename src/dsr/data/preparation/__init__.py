@@ -1,1 +1,0 @@
-"""Preparation of scenes: resizing, cropping, inpainting, dequantization."""

@@ -1,0 +1,144 @@
+"""``dataset=procedural``, random scenes to train on, and ``dataset=simgeo``, scenes like the paper's: rendered here.
+
+The paper's sixth scene, Lucy, replaces the statue where ``root/lucy`` holds it in the layout of
+:mod:`dsr.data.folder`. Renderings are cached, see :func:`dsr.synthetic.rendering.cache_directory`.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+from dsr.data.folder import Folder
+from dsr.data.scene_source import SceneSelection, select_scenes
+from dsr.sample import Scene
+from dsr.synthetic.procedural.random_scene import PROCEDURAL_VERSION, render_random_scene
+from dsr.synthetic.rendering import cache_directory, load_or_render
+from dsr.synthetic.simgeo import SCENES, SCENES_VERSION, render_scene
+from dsr.utils.pool import LOST, Pool
+from dsr.utils.progress import SILENT
+
+_WORTH_WORKERS = 5.0
+"""Seconds of rendering from which worker processes are used; they take some seconds to start."""
+
+
+class Procedural:
+    """Random scenes number 0 .. ``count`` - 1 of a seed, rendered once and kept in the cache.
+
+    Args:
+        count: number of scenes.
+        size: height and width in pixels.
+        seed: seed of the scenes; each is a pure function of seed, number and size.
+
+    Raises:
+        ValueError: a value is out of range.
+
+    """
+
+    name = "procedural"
+    evaluation = False
+
+    def __init__(self, count: int = 200, size: int = 512, seed: int = 0) -> None:
+        if count < 1 or size < 32 or seed < 0:
+            raise ValueError(
+                f"dataset: expected count at least 1, size at least 32, seed at least 0; got {count}, {size}, {seed}"
+            )
+        self._count, self._size, self._seed = count, size, seed
+
+    def scenes(self) -> list[str]:
+        """Return the names of the scenes: their numbers."""
+        return [f"{index:05d}" for index in range(self._count)]
+
+    def load(self, scene: str) -> Scene:
+        """Return one scene; see :class:`dsr.data.scene_source.SceneSource`."""
+        rendering = load_or_render(self._path(scene), lambda: render_random_scene(self._seed, int(scene), self._size))
+        return rendering.scene(self.name, scene)
+
+    def fingerprint(self, scene: str) -> str:
+        """Return the version, seed, size and number that determine the scene."""
+        return f"procedural-v{PROCEDURAL_VERSION}-{self._seed}-{self._size}-{scene}"
+
+    def unprepared(self, scenes: Sequence[str]) -> list[str]:
+        """Return those of some scenes that are not in the cache."""
+        return [scene for scene in scenes if not (cache_directory() / self._path(scene)).is_file()]
+
+    def prepare(self, scenes: Sequence[str], say: Callable[[str], None] = SILENT.say) -> Iterable[str]:
+        """Render scenes that are not in the cache, and yield the name of each that is ready.
+
+        Where it takes longer than a few seconds, all processors take part.
+
+        Raises:
+            ChildProcessError: two processes that render were ended at the same scene.
+
+        """
+        missing = self.unprepared(scenes)
+        yield from (scene for scene in scenes if scene not in missing)
+        begun = time.perf_counter()
+        for number, scene in enumerate(missing, start=1):
+            self._render(scene)
+            yield scene
+            rest = missing[number:]
+            if len(rest) * (time.perf_counter() - begun) / number > _WORTH_WORKERS:
+                with Pool(os.cpu_count() or 1, self._render, _lost, say, start="spawn") as pool:
+                    yield from (ready for ready, _ in pool.results(rest))
+                return
+
+    def _render(self, scene: str) -> bool:
+        """Render a scene into the cache unless it is there."""
+        load_or_render(self._path(scene), lambda: render_random_scene(self._seed, int(scene), self._size))
+        return True
+
+    def _path(self, scene: str) -> Path:
+        return Path(f"procedural-v{PROCEDURAL_VERSION}-{self._seed}-{self._size}", f"{scene}.npz")
+
+
+def _lost(scene: str) -> bool:
+    """Raise an error for a scene whose workers were ended."""
+    raise ChildProcessError(f"dataset=procedural: scene {scene}: {LOST}")
+
+
+class SimGeo:
+    """The SimGeo scenes.
+
+    Args:
+        root: directory that may hold ``lucy``; without it the statue is used.
+        scenes: names of the scenes to use; None for all.
+        size: height and width in pixels, 512 in the paper.
+
+    Raises:
+        ValueError: an unknown scene or a size below 32.
+
+    """
+
+    name = "simgeo"
+    evaluation = True
+
+    def __init__(self, root: str | None = None, scenes: SceneSelection = None, size: int = 512) -> None:
+        if size < 32:
+            raise ValueError(f"size: expected at least 32 pixels, got {size}")
+        self._size = size
+        self._lucy: Folder | None = None
+        available = list(SCENES)
+        if root is not None and (Path(root).expanduser() / "lucy").is_dir():
+            self._lucy = Folder(root, ["lucy"], self.name)
+            available[available.index("statue")] = "lucy"
+        self._scenes = select_scenes(available, scenes)
+
+    def scenes(self) -> list[str]:
+        """Return the names of the scenes, in order."""
+        return list(self._scenes)
+
+    def load(self, scene: str) -> Scene:
+        """Return one scene; see :class:`dsr.data.scene_source.SceneSource`."""
+        if scene == "lucy" and self._lucy is not None:
+            return self._lucy.load(scene)
+        path = Path(f"simgeo-v{SCENES_VERSION}-{self._size}", f"{scene}.npz")
+        return load_or_render(path, lambda: render_scene(scene, self._size)).scene(self.name, scene)
+
+    def fingerprint(self, scene: str) -> str:
+        """Return the version of the renderings, or the SHA-256 of Lucy's files."""
+        if scene == "lucy" and self._lucy is not None:
+            return self._lucy.fingerprint(scene)
+        return f"simgeo-v{SCENES_VERSION}-{self._size}-{scene}"

@@ -1,0 +1,226 @@
+"""Random degradations of all kinds: what cameras, files and sensors do to depth, drawn for each training patch.
+
+A degradation is drawn in three stages, each kind with its share:
+
+- a *kernel*: box, nearest, bilinear, bicubic, gaussian, or ``spread``, a wider gaussian, as of a sensor; after a small
+  displacement of depth against the photo in some cases, and after folds, and fine relief which the map shows only in
+  part, are added to the truth in some, and clear, mirroring and glossy objects, which sensors see wrongly;
+- *noise*: none, white, correlated, waves, or that of structured light, of time of flight, of a phone's lidar and of
+  stereo matching, which also lose pixels; some maps are rounded to the levels of a file;
+- *holes*: none, blobs, shadows, bands beside depth steps, dark surfaces, single pixels.
+
+All random numbers come from one generator. Maps are inverse depth, in which planes are linear, in 1/m.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from dsr.degradation.downsampling import Downsampling
+from dsr.degradation.glass import add_glass
+from dsr.degradation.hints import KERNELS, Hints, encode_facts, local_noise
+from dsr.degradation.holes import HOLES
+from dsr.degradation.random_fields import (
+    add_folds,
+    add_relief,
+    chance,
+    displace,
+    draw,
+    normal,
+    print_pattern,
+    round_values,
+    take_another_photo,
+    uniform,
+)
+from dsr.degradation.random_noise import NOISES
+from dsr.geometry.camera import Camera
+from dsr.sample import AllHolesError, DepthSample, Scene
+
+SENSOR_NOISES = ("waves", "structured", "flight", "lidar", "stereo")
+"""Kinds of noise that stand for a sensor, which does not see glass; the others stand for maps made of a surface."""
+
+
+@dataclass(frozen=True)
+class Everything:
+    """The distribution.
+
+    Args:
+        scales: relative frequency of each factor; None for that of the run.
+        kernels: that of each kernel.
+        noises: that of each kind of noise.
+        holes: that of each kind of holes.
+        folds: fraction of the truths whose surfaces get folds and dents of 2 to 24 pixels in places, as of cloth, which
+            the photo shows, more or less, as light and shade.
+        relief: fraction of the truths that get fine relief, or the steps of a file's levels, before downsampling; none
+            at factor 1, where it could not be told from noise.
+        displaced: fraction of the noisy maps that are displaced against the photo, by up to one low-resolution pixel.
+        rounded: fraction of the maps that are rounded to levels.
+        soft: fraction of the patches whose truth has soft depth steps: blurred, and where the scene is large enough for
+            it, at half its size.
+        photo: fraction of the photos with another exposure, colour balance, blur, noise and compression; half as many
+            of those whose map has no noise.
+        textured: fraction of the photos on which a pattern is printed, which is no relief.
+        clear: fraction of the sensors' maps, those whose kind of noise is one of ``SENSOR_NOISES``, in which clear,
+            mirroring or glossy objects stand. The truth is their surface, the map what a sensor sees. None if depth
+            steps are soft, as their edges are not.
+        told: fraction of the maps of which a hint tells the kernel, and the noise, and the steps, independently.
+
+    Raises:
+        ValueError: there is no such kind, or a frequency or a fraction is out of range.
+
+    """
+
+    scales: Mapping[Any, float] | None = None
+    kernels: Mapping[str, float] = field(
+        default_factory=lambda: {
+            "box": 0.45, "nearest": 0.08, "bilinear": 0.08, "bicubic": 0.25, "gaussian": 0.08, "spread": 0.06
+        }
+    )  # fmt: skip
+    noises: Mapping[str, float] = field(
+        default_factory=lambda: {
+            "none": 0.48, "white": 0.14, "correlated": 0.1, "waves": 0, "structured": 0.09, "flight": 0.08,
+            "lidar": 0.05, "stereo": 0.06,
+        }
+    )  # fmt: skip
+    holes: Mapping[str, float] = field(
+        default_factory=lambda: {"none": 0.6, "blobs": 0.1, "shadows": 0.1, "steps": 0.08, "dark": 0.06, "pixels": 0.06}
+    )
+    folds: float = 0.25
+    relief: float = 0.12
+    displaced: float = 0.2
+    rounded: float = 0.1
+    soft: float = 0.3
+    photo: float = 0.5
+    textured: float = 0.08
+    clear: float = 0
+    told: float = 0.6
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        known = {"kernels": (*KERNELS, "spread"), "noises": ("none", *NOISES), "holes": ("none", *HOLES)}
+        for name, kinds in known.items():
+            shares = getattr(self, name)
+            if wrong := [kind for kind in shares if kind not in kinds]:
+                raise ValueError(f"{name}: expected some of {', '.join(kinds)}, got {wrong[0]}")
+            if not all(share >= 0 for share in shares.values()) or not sum(shares.values()) > 0:
+                raise ValueError(f"{name}: expected frequencies of 0 or more, one of them positive, got {dict(shares)}")
+        for name in ("folds", "relief", "displaced", "rounded", "soft", "photo", "textured", "clear", "told"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name}: expected a fraction from 0 to 1, got {getattr(self, name)}")
+        scales = {} if self.scales is None else self.scales
+        if wrong := [scale for scale in scales if str(scale) not in ("1", "2", "4", "8", "16")]:
+            raise ValueError(f"scales: expected some of 1, 2, 4, 8, 16, got {wrong[0]}")
+
+    def draw_scale(self, scale: int, generator: torch.Generator) -> int:
+        """Return a random factor; ``scale`` where there is no choice."""
+        return (
+            scale
+            if self.scales is None
+            else int(draw({str(scale): share for scale, share in self.scales.items()}, generator))
+        )
+
+    def __call__(
+        self, scene: Scene, scale: int, generator: torch.Generator, *, soft: bool = False
+    ) -> tuple[DepthSample, Hints]:
+        """Return a scene with a low-resolution map, and hints.
+
+        Args:
+            scene: a scene or a patch with a true depth.
+            scale: the factor, which divides its size.
+            soft: whether its depth steps are soft, for the hint.
+
+        Raises:
+            AllHolesError: no pixel is left.
+
+        """
+        scene = self._change_surfaces(scene, scale, generator)
+        kernel, kind = self._draw_kinds(scale, generator)
+        seen = scene.depth
+        if (
+            self.clear and kind in SENSOR_NOISES and not soft and chance(self.clear, generator)
+        ):  # at 0, nothing is drawn
+            scene, seen = add_glass(scene, generator)
+        assert seen is not None  # noqa: S101 - for the type checker
+        clean, camera_lr = self._downsample(seen, scene.camera, scale, kernel, kind, generator)
+        size = clean.shape[-2], clean.shape[-1]
+        luma = functional.adaptive_avg_pool2d(scene.rgb.float().mean(dim=0, keepdim=True)[None], size)[0]
+        noisy = clean if kind == "none" else NOISES[kind](clean, luma, generator)
+        noisy = torch.where(
+            clean.isfinite(), noisy, torch.nan
+        )  # what is not known of the truth, or seen, stays unknown
+        if chance(self.rounded, generator):
+            noisy = round_values(noisy, generator)
+        holes = draw(self.holes, generator)
+        if holes != "none":
+            noisy = noisy.masked_fill(HOLES[holes](noisy, luma, camera_lr, generator), torch.nan)
+        noisy = torch.where(noisy > 0, noisy, torch.nan)
+        if not bool(noisy.isfinite().any()):
+            raise AllHolesError(scene.name)
+        rgb = self._change_photo(scene.rgb.float(), self.photo / (1 + (kind == "none")), generator)
+        sample = DepthSample(
+            scene.dataset, scene.name, rgb, noisy.reciprocal(), scene.camera, camera_lr, scale, scene.depth
+        )
+        return sample, self._hints(clean, noisy, kernel, generator, soft=soft)
+
+    def _change_surfaces(self, scene: Scene, scale: int, generator: torch.Generator) -> Scene:
+        """Return a scene with folds or relief, or as it is."""
+        if chance(self.folds, generator):
+            scene = add_folds(scene, generator)
+        if scale > 1 and chance(self.relief, generator):
+            scene = add_relief(scene, generator)
+        return scene
+
+    def _draw_kinds(self, scale: int, generator: torch.Generator) -> tuple[str, str]:
+        """Return a kernel and a kind of noise; at factor 1 a map has noise, if any kind is to be drawn."""
+        kernel = draw(self.kernels, generator) if scale > 1 else "nearest"
+        kind = draw(self.noises, generator)
+        others = {name: share for name, share in self.noises.items() if name != "none"}
+        if scale == 1 and kind == "none" and sum(others.values()) > 0:
+            kind = draw(others, generator)
+        return kernel, kind
+
+    def _downsample(
+        self, depth: Tensor, camera: Camera, scale: int, kernel: str, kind: str, generator: torch.Generator
+    ) -> tuple[Tensor, Camera]:
+        """Return a map without noise, inverse depth of (1, h, w), perhaps displaced, and its camera."""
+        values = depth.float().reciprocal()
+        if kind != "none" and chance(self.displaced, generator):
+            values = displace(values, scale, generator)
+        of_depth = kind == "flight" or chance(0.15, generator)
+        if scale == 1:
+            return values, camera
+        camera = Downsampling("nearest" if kernel == "nearest" else "box").camera(camera, scale)
+        model = (
+            Downsampling("gaussian", sigma=uniform(0.6, 1.1, generator)) if kernel == "spread" else Downsampling(kernel)  # type: ignore[arg-type]  # one of them
+        )
+        return (model(values.reciprocal(), scale).reciprocal() if of_depth else model(values, scale)), camera
+
+    def _change_photo(self, rgb: Tensor, share: float, generator: torch.Generator) -> Tensor:
+        """Return a photo with a pattern, or as another camera takes it with a probability of ``share``."""
+        if chance(self.textured, generator):
+            rgb = print_pattern(rgb, generator)
+        if chance(share, generator):
+            rgb = take_another_photo(rgb, generator)
+        return rgb.clamp(0, 1)
+
+    def _hints(self, clean: Tensor, noisy: Tensor, kernel: str, generator: torch.Generator, *, soft: bool) -> Hints:
+        """Return random hints on a map."""
+        named = "gaussian" if kernel == "spread" else kernel
+        of_kernel = named if chance(self.told, generator) else None
+        of_steps = soft if chance(self.told, generator) else None
+        noise, of_noise = torch.zeros_like(clean), chance(self.told, generator)
+        if of_noise:
+            noise = local_noise(noisy[None], clean[None])[0] * math.exp(0.15 * normal(generator))
+        return Hints(noise, encode_facts(of_kernel, of_steps, noise=of_noise))
+
+
+def plain() -> None:
+    """Return no distribution: maps are made by downsampling and noise alone; what ``degradation=plain`` names."""
+    return

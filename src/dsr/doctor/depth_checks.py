@@ -1,0 +1,340 @@
+"""Checks of the values of a depth map: the unit, missing pixels and values that mark them, and rounding.
+
+Rounded values are multiples of a unit, in depth, in inverse depth (as disparity) or in distance along the ray. Values
+may also be multiples of a unit by construction, such as those of the rows of a level floor. If they were rounded, the
+slope of a smooth surface changes by one unit from pixel to pixel. Values that were processed after rounding are no
+longer multiples, but along a slope they are still exactly equal for some pixels and then step.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy import ndimage
+
+from dsr.doctor.finding import Array, Finding, Level, length, metres
+from dsr.geometry.camera import baseline_times_focal
+from dsr.sample import Scene
+from dsr.utils.ratios import round_ratio
+
+_NEAREST, _FARTHEST = 0.05, 200.0
+"""Metres; depth entirely below or above is in another unit."""
+_NEAR, _FAR = 0.1, 30.0
+"""Metres; a median below suggests macro photography, one above outdoors, or another unit."""
+_TYPICAL = (0.4, 8.0)
+"""Metres; range of the median depth of a room or a table."""
+_FACTORS: tuple[tuple[float, str], ...] = (
+    (1e-3, "millimetres read as metres"),
+    (1e3, "metres read as millimetres"),
+    (1e-2, "centimetres read as metres"),
+    (1e2, "metres read as centimetres"),
+    (1 / 5000, "values of 1/5000 m, as ICL-NUIM and TUM store them, read as metres"),
+    (1 / 5, "values of 1/5000 m read as millimetres"),
+    (1 / 8, "SUN RGB-D's values read without turning them by three bits"),
+    (1 / 256, "values of 1/256 m, as KITTI stores them, read as metres"),
+)
+"""Most likely first."""
+_BASELINES = (1e-3, 5.0)
+"""Plausible range of baselines in metres."""
+_AGREEMENT = 1.25
+"""Largest ratio of measured and high-resolution depth."""
+
+_MANY, _MOST = 0.10, 0.40
+"""Fractions of missing pixels."""
+_MIN_FRACTION = 0.02
+"""Fraction of the valid pixels that a suspicious value has at least."""
+_GAP = 1.5
+"""Ratio of an extreme value and the next one above which it counts as separate."""
+_TINY = 0.011
+"""Metres; smaller depths are treated as marks."""
+_MARKS = (*(10.0, 20.0, 25.0, 50.0, 80.0, 100.0, 255.0, 1e3, 1e4), *(65535 * 10.0**-p for p in range(6)), 65535 / 5000)
+"""Values in metres that usually mark missing or too distant depth: round ones, and the largest of 16 bits."""
+_DIGITS = 6
+
+Quantity = Literal["depth", "inverse depth", "distance along the ray"]
+
+_JUMP = 0.03
+"""Relative difference of neighbouring pixels beyond which they are an edge."""
+_SAME = 3e-7
+"""Largest relative error of a conversion in single precision."""
+_LEVELS = 4
+"""Minimum number of gaps between values."""
+_MULTIPLES = 0.95
+"""Minimum fraction of the gaps between values that are multiples of the unit."""
+_JITTER, _OF_ALL = 0.01, 0.5
+"""Minimum fractions, of smooth pixels and of those whose slope changes, with a change of one or two units."""
+_TERRACED, _SPREAD = 0.2, 0.02
+"""Minimum fractions of terraced pixels, of the slopes and of all smooth pixels, if no unit is found."""
+_TILT, _STEEP = 3.0, 20.0
+"""Tilt of a normal by one step, in degrees, that becomes visible in renderings, and that dominates them."""
+_LEAST = 100
+"""Minimum number of pixels."""
+_REPEATED = (8, 6, 5, 4, 3, 2)
+
+
+def check_units(scene: Scene) -> list[Finding]:
+    """Check whether depth, baseline and measured maps are plausible in metres."""
+    depth = metres(scene)
+    low, middle, high = np.nanpercentile(depth, (1, 50, 99))
+    text = f"depth {length(low)} to {length(high)} (1st to 99th percentile), median {length(middle)}"
+    level: Level
+    level, remark = "ok", ""
+    if high < _NEAREST or low > _FARTHEST:
+        level, remark = "problem", f": {'nearer' if high < _NEAREST else 'farther'} than any room or table"
+    elif middle < _NEAR or middle > _FARTHEST:
+        level, remark = "warning", f": {'nearer' if middle < _NEAR else 'farther'} than most rooms and tables"
+    elif middle > _FAR:
+        level, remark = "note", ": too far for a room, plausible outdoors"
+    findings = [Finding("units", level, text + remark, "" if level == "ok" else _advise(scene, middle))]
+    return findings + _baseline(scene) + _measured(scene, depth)
+
+
+def _advise(scene: Scene, middle: float) -> str:
+    """Return the factors that make a median depth plausible."""
+    fitting = [(factor, why) for factor, why in _FACTORS if _TYPICAL[0] <= middle * factor <= _TYPICAL[1]]
+    if not fitting:
+        return "check the unit"
+    texts = [f"x {factor:g} would make the median {length(middle * factor)} ({why})" for factor, why in fitting[:2]]
+    where = 'set "depth_unit" in camera.json'
+    baseline = scene.camera.baseline
+    if baseline is not None and not _plausible_baseline(baseline) and _plausible_baseline(baseline * fitting[0][0]):
+        where = f'set "baseline_unit" in camera.json: the baseline of {length(baseline)} is off by the same factor'
+    return f"{', or '.join(texts)}; {where}"
+
+
+def _plausible_baseline(baseline: float) -> bool:
+    return _BASELINES[0] <= baseline <= _BASELINES[1]
+
+
+def _baseline(scene: Scene) -> list[Finding]:
+    """Check whether the baseline is plausible."""
+    baseline = scene.camera.baseline
+    if baseline is None or _plausible_baseline(baseline):
+        return []
+    low, high = (length(limit) for limit in _BASELINES)
+    message = f"baseline {length(baseline)}; {low} to {high} are usual"
+    advice = 'check "baseline_unit" in camera.json; keep it if depth computed from it is plausible'
+    return [Finding("units", "note", message, advice)]
+
+
+def _measured(scene: Scene, depth: Array) -> list[Finding]:
+    """Check the measured low-resolution maps against the high-resolution depth."""
+    findings = []
+    for factor, measured in sorted(scene.measured.items()):
+        depth_lr = measured[0].double().numpy()
+        rows, columns = (
+            np.minimum(((np.arange(n) + 0.5) * factor).astype(int), size - 1)
+            for n, size in zip(depth_lr.shape, depth.shape, strict=True)
+        )
+        subsampled = depth[rows[:, None], columns]
+        both = np.isfinite(subsampled) & np.isfinite(depth_lr)
+        if not both.any():
+            continue
+        ratio = float(np.median(depth_lr[both] / subsampled[both]))
+        if not 1 / _AGREEMENT <= ratio <= _AGREEMENT:
+            message = (
+                f"the measured map at x{round_ratio(factor)} is {ratio:.3g} times as far as the high-resolution depth"
+            )
+            advice = "use one unit for both; the disparity of a low-resolution map is in its own pixels"
+            findings.append(Finding("units", "problem", message, advice))
+    return findings
+
+
+def check_holes(scene: Scene) -> list[Finding]:
+    """Check the fraction of missing pixels, and whether a depth value seems to mark missing pixels."""
+    depth = metres(scene)
+    missing = float(np.isnan(depth).mean())
+    text = f"{1 - missing:.1%} of the pixels are valid"
+    level: Level
+    if missing > _MOST:
+        level, advice = (
+            "warning",
+            "results are unreliable where most depth is missing; inpaint the holes, or crop to the valid part",
+        )
+    elif missing > _MANY:
+        level, advice = "note", "scores ignore holes"
+    else:
+        level, advice = "ok", ""
+    return [Finding("holes", level, text, advice), *_marks(scene, depth)]
+
+
+def _marks(scene: Scene, depth: Array) -> list[Finding]:
+    """Return the extreme values that look like marks, of the depth or else of the distance along the ray."""
+    for values in (depth, depth * scene.camera.ray_lengths().numpy()):
+        rounded = _round(values)
+        levels, counts = np.unique(rounded[np.isfinite(rounded)], return_counts=True)
+        if levels.size == 1 and counts[0] > 1:
+            message = f"all valid pixels have the same value, {levels[0]:g} m"
+            return [Finding("holes", "warning", message, "check that this is the depth map")]
+        findings = []
+        for extreme, beside, count in ((levels[0], levels[1:2], counts[0]), (levels[-1], levels[-2:-1], counts[-1])):
+            if beside.size and count / counts.sum() > _MIN_FRACTION:
+                findings += _judge(rounded == extreme, float(extreme), float(beside[0]), count / counts.sum())
+        if findings:
+            return findings
+    return []
+
+
+def _round(values: Array) -> Array:
+    """Round values to six significant digits."""
+    with np.errstate(invalid="ignore"):
+        power = 10.0 ** (_DIGITS - 1 - np.floor(np.log10(values)))
+        rounded: Array = np.round(values * power) / power
+    return rounded
+
+
+def _judge(where: np.ndarray, value: float, beside: float, fraction: float) -> list[Finding]:
+    """Return a finding if an extreme value that many pixels have is, or may be, a mark."""
+    smallest = value < beside
+    apart = max(value, beside) / min(value, beside) > _GAP
+    mark = value < _TINY if smallest else bool(np.isclose(value, _MARKS, rtol=1e-5, atol=0).any())
+    if not apart and not mark:
+        return []
+    name = "smallest" if smallest else "largest"
+    message = f"{fraction:.1%} of the valid pixels have exactly the {name} value, {value:g} m"
+    if mark or _is_scattered(where):
+        advice = 'if it marks holes, set "hole_value" in camera.json, in the unit of the file, or add a mask.png'
+        return [Finding("holes", "warning", f"{message}, which looks like a mark of missing depth", advice)]
+    message += f"; the next value is {beside:g} m"
+    return [
+        Finding("holes", "note", message, 'correct for a flat wall; if it marks holes, set "hole_value" in camera.json')
+    ]
+
+
+def _is_scattered(where: np.ndarray) -> bool:
+    """Return whether pixels form many separate regions, which is typical of holes but not of a wall."""
+    labels, count = ndimage.label(where)
+    return count > 20 and np.bincount(labels.ravel())[1:].max() < 0.5 * where.sum()
+
+
+@dataclass(frozen=True)
+class Rounding:
+    """The rounding of a depth map.
+
+    Args:
+        quantity: quantity that was rounded.
+        step: rounding step in metres, of inverse depth in 1 / m.
+        relative: the step as a fraction of the median value.
+        tilt: tilt in degrees that one step causes on a surface that faces the camera at the median depth.
+
+    """
+
+    quantity: Quantity
+    step: float
+    relative: float
+    tilt: float
+
+
+def check_precision(scene: Scene) -> list[Finding]:
+    """Check whether the rounding of the depth is visible in renderings."""
+    depth = metres(scene)
+    factor = find_repetition(depth)
+    if factor > 1:
+        message = f"every value is repeated {factor} times across and down: an enlarged smaller map"
+        advice = f"provide the smaller map as depth_lr{factor}, or the original high-resolution map"
+        return [Finding("precision", "problem", message, advice)]
+    rounding = find_rounding(scene)
+    count = np.unique(depth[np.isfinite(depth)]).size
+    if rounding is None:
+        return [Finding("precision", "ok", f"{count} distinct values")]
+    source = f"{_source(scene, depth, rounding)}, {count} distinct values{' (8 bits hold 256)' if count <= 256 else ''}"
+    text = f"{source}; one step tilts a surface by {rounding.tilt:.2g} degrees"
+    if rounding.tilt <= _TILT:
+        return [Finding("precision", "ok", text)]
+    level: Level = "problem" if rounding.tilt > _STEEP else "warning"
+    advice = "use the unrounded map (float, or 16 bits of a smaller unit); normals and renderings of this map are wrong"
+    return [Finding("precision", level, f"{text}, visible as terraces in renderings", advice)]
+
+
+def find_rounding(scene: Scene) -> Rounding | None:
+    """Return the rounding of a scene's depth, or None if it does not look rounded."""
+    depth, camera = metres(scene), scene.camera
+    quantities: dict[Quantity, Array] = {
+        "depth": depth,
+        "inverse depth": 1 / depth,
+        "distance along the ray": depth * camera.ray_lengths().numpy(),
+    }
+    steps = ((quantity, _unit(values)) for quantity, values in quantities.items())
+    found = ((quantity, step) for quantity, step in steps if step and _jitters(quantities[quantity], step))
+    quantity, step = next(found, ("depth", _terrace(depth)))
+    if not step:
+        return None
+    relative = step / float(np.nanmedian(quantities[quantity]))
+    tilt = math.degrees(math.atan(relative * math.sqrt(camera.fx * camera.fy)))
+    return Rounding(quantity, step, relative, tilt)
+
+
+def find_repetition(depth: Array) -> int:
+    """Return the factor by which a map was enlarged by repeating pixels, 1 for a map that was not."""
+    for factor in _REPEATED:
+        if all(_in_phase(lines, factor) for lines in (depth, depth.T)):
+            return factor
+    return 1
+
+
+def _in_phase(lines: Array, factor: int) -> bool:
+    """Return whether values along the lines change only at every ``factor``-th pixel."""
+    change = np.diff(lines)
+    counts = (np.isfinite(change) & (change != 0)).sum(axis=0)
+    phases = np.bincount(np.arange(counts.size) % factor, counts, minlength=factor)
+    everywhere = np.count_nonzero(counts) > 0.5 * counts.size / factor
+    return bool(everywhere and phases.sum() >= _LEAST and phases.max() > 0.99 * phases.sum())
+
+
+def _unit(values: Array) -> float:
+    """Return the unit that all values are multiples of, up to an offset; 0 if there is none."""
+    levels = np.unique(values[np.isfinite(values)])
+    gaps = np.diff(levels)
+    gaps = gaps[gaps > _SAME * levels[1:]]
+    if gaps.size < _LEVELS:
+        return 0.0
+    unit = float(np.percentile(gaps, 5))
+    multiple = gaps / unit
+    even = np.abs(multiple - np.round(multiple)) < 0.05
+    return unit if even.mean() > _MULTIPLES else 0.0
+
+
+def _jitters(values: Array, unit: float) -> bool:
+    """Return whether most changes of slope between pixels are of one or two units."""
+    smooth = jitter = bent = 0
+    for lines in (values, values.T):
+        before, after = np.diff(lines[:, :-1]), np.diff(lines[:, 1:])
+        limit = np.maximum(_JUMP * lines[:, 1:-1], 1.5 * unit)
+        with np.errstate(invalid="ignore"):
+            near = np.maximum(np.abs(before), np.abs(after)) < limit
+        change = np.abs(after - before)[near] / unit
+        smooth += change.size
+        bent += int(np.count_nonzero(change > 0.5))
+        jitter += int(np.count_nonzero((change > 0.5) & (change < 2.5)))
+    return jitter >= _LEAST and jitter > _JITTER * smooth and jitter > _OF_ALL * bent
+
+
+def _terrace(depth: Array) -> float:
+    """Return the size of the smaller steps of terraced slopes; 0 if slopes are not terraced."""
+    steps, slopes, smooth = [], 0, 0
+    for lines in (depth, depth.T):
+        before, after = np.diff(lines[:, :-1]), np.diff(lines[:, 1:])
+        with np.errstate(invalid="ignore"):
+            near = np.maximum(np.abs(before), np.abs(after)) < _JUMP * lines[:, 1:-1]
+        steps.append(np.abs(before + after)[near & ((before == 0) != (after == 0))])
+        slopes += int(np.count_nonzero(near & ((before != 0) | (after != 0))))
+        smooth += int(np.count_nonzero(near))
+    step = np.concatenate(steps)
+    if step.size < max(_LEAST, _TERRACED * slopes, _SPREAD * smooth):
+        return 0.0
+    return float(np.percentile(step, 25))
+
+
+def _source(scene: Scene, depth: Array, rounding: Rounding) -> str:
+    """Describe the rounding: half precision, or the size of the steps."""
+    valid = depth[np.isfinite(depth)]
+    if valid.max() < 6e4 and np.array_equal(valid.astype(np.float16).astype(np.float64), valid):
+        return "values have half precision (float16)"
+    if rounding.quantity != "inverse depth":
+        return f"{rounding.quantity} comes in steps of {length(rounding.step)}"
+    if scene.camera.baseline is None:
+        return f"inverse depth comes in steps of {rounding.step:.2g} / m"
+    return f"disparity comes in steps of {rounding.step * baseline_times_focal(scene.camera):.2g} px"

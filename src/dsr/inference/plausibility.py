@@ -1,0 +1,270 @@
+"""What depth can be: outliers, results beyond what was measured, and errors expected by agreement with the input.
+
+Of methods that do not say any, errors are expected as follows. The result, averaged over low-resolution pixels, is
+compared with the input averaged over 3 x 3 pixels: they differ by the noise that the method has copied, by what it has
+smoothed, and at depth steps, where results are worst. In holes the expected error grows with the angular distance from
+the nearest measured pixel. This is a rough estimate, which sorts the pixels better than it states their errors.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from dsr.geometry.camera import Camera
+from dsr.geometry.hole_size import degrees_per_pixel, distance_to_known
+from dsr.geometry.surface import angle_between, depth_to_normals
+from dsr.methods.base import Outliers
+
+FAR = 4.0
+"""Ratio of two depths from which one is far from the other."""
+_APART = math.log(FAR)
+LARGEST = 20
+"""Rows and columns of the largest patch that is an outlier, in a map of :data:`_USUAL_WIDTH` pixels or more."""
+_USUAL_WIDTH = 640
+_NEAREST, _USUAL_DEPTH = 0.05, 0.2
+"""Depth in metres up to which a value is a sensor's end, in a map whose median is at least the second."""
+RADIUS = 24
+"""Pixels around each one from which what is measured there tells what may be: of the map for outliers, of the photo for
+a result."""
+_NEARBY, _ALIKE = 64, 1.5
+"""Pixels around a patch in which another surface explains it, and the ratio of their depths up to which it does."""
+_ROUNDING = 1e-3
+"""Relative excess that is left to a result, so that flat surfaces stay as a method rounds them."""
+_SPARSE = 1 / 16
+"""Share of measured pixels in a window, below which it says nothing of a hole."""
+
+_WINDOW = 5
+"""Low-resolution pixels over which differences are averaged."""
+_NEAR, _PER_DEGREE = 0.02, 0.03
+"""Relative error of depth in holes: beside measured pixels, and added per degree from them. With ``facets`` on
+Middlebury 2014 and ICL-NUIM, errors are 1.7 % at 0.3, 4.8 % at 0.85, 7.3 % at 2.5 and 11 % at 5 degrees."""
+_GUESSED = 45.0
+"""Degrees between the normals, in holes."""
+
+
+def find_outliers(depth: Tensor) -> Tensor:
+    """Return where a map's depth cannot be.
+
+    That is where it is nearer than 5 cm in a map of usual distances, and in connected patches of up to 20 x 20 pixels,
+    less in maps narrower than 640 pixels, that are at least 4 times as near or as far as all larger surfaces within 24
+    pixels. A patch is real, and not found, if it is part of a larger surface, however thin, if there is a larger
+    surface of its depth nearby, as behind a gap or where a chair leg is broken into pieces, or if it reaches into the
+    picture from the front.
+
+    Args:
+        depth: (1, h, w) in metres, NaN in holes.
+
+    Returns:
+        (1, h, w) bool.
+
+    """
+    known = depth.isfinite()
+    found = torch.zeros_like(known)
+    if not bool(known.any()):
+        return found
+    if float(depth[known].median()) >= _USUAL_DEPTH:
+        found = known & (depth < _NEAREST)
+        known = known & ~found
+    values = depth[0].masked_fill(~known[0], torch.nan).log().cpu().numpy().astype(np.float32)
+    largest = max(1, min(LARGEST, LARGEST * max(depth.shape[-2:]) // _USUAL_WIDTH))
+    return found | torch.from_numpy(_isolated(values, largest))[None].to(known.device)
+
+
+def count_patches(mask: Tensor) -> Outliers:
+    """Return the number of pixels of a mask, (1, h, w) bool, and of their patches, connected also at corners."""
+    pixels = int(mask.sum())
+    return Outliers(pixels, cv2.connectedComponents(_bytes(mask[0].cpu().numpy()))[0] - 1 if pixels else 0)
+
+
+def within_measured(result: Tensor, given: Tensor, radius: int = RADIUS) -> Tensor:
+    """Return inverse depth kept to what planes through the measured values around each pixel allow.
+
+    A plane's inverse depth is linear in the pixel, so that it leaves the values in a window, of which at least half
+    lies inside the map, by no more than half of their range. Holes are wider to cross: where one is further than a
+    third of the radius from measured pixels, the window is three times as large. No depth becomes more than twice as
+    far as all around it. Where no pixel in the window is measured, or too few to speak of a hole, nothing changes.
+
+    Args:
+        result: (1, H, W) inverse depth in 1/m, NaN in holes.
+        given: (1, h, w) the measured one, NaN in holes.
+        radius: of the square window, in pixels of the result.
+
+    Returns:
+        (1, H, W) in the dtype of ``result``.
+
+    """
+    given = given.to(result)
+    size = (result.shape[-2], result.shape[-1])
+    reach = max(2, math.ceil(radius * max(n / m for n, m in zip(given.shape[-2:], size, strict=True))))
+    known = given.isfinite()
+    low, high = _bounds(given, known, reach)
+    if not bool(known.all()):
+        away = distance_to_known(known)
+        silent = ~known & ((_share(known, reach) < _SPARSE) | (away > reach))
+        further = (away > reach / 3) & ~silent
+        if bool(further.any()):
+            wide = _bounds(given, known, 3 * reach)
+            low, high = (torch.where(further, a, b) for a, b in zip(wide, (low, high), strict=True))
+        low, high = low.masked_fill(silent, -torch.inf), high.masked_fill(silent, torch.inf)
+    low, high = (functional.interpolate(each[None], size, mode="nearest-exact")[0] for each in (low, high))
+    return result.clamp(low, high)
+
+
+def _bounds(given: Tensor, known: Tensor, reach: int) -> tuple[Tensor, Tensor]:
+    """Return the smallest and largest value that the windows allow, (1, h, w), infinite where none is known."""
+    high = _running_max(given.masked_fill(~known, -torch.inf), reach)
+    low = -_running_max((-given).masked_fill(~known, -torch.inf), reach)
+    margin = (high - low) / 2
+    lowest, highest = torch.maximum(low - margin, low / 2), high + margin
+    none = ~high.isfinite()
+    return (
+        ((1 - _ROUNDING) * lowest).masked_fill(none, -torch.inf),
+        ((1 + _ROUNDING) * highest).masked_fill(none, torch.inf),
+    )
+
+
+def _share(known: Tensor, reach: int) -> Tensor:
+    """Return the share of known pixels in the square windows, (1, h, w)."""
+    window = (2 * reach + 1, 2 * reach + 1)
+    found = cv2.boxFilter(known[0].cpu().numpy().astype(np.float32), -1, window, borderType=cv2.BORDER_REFLECT)
+    return torch.from_numpy(found)[None].to(known.device)
+
+
+def _running_max(values: Tensor, reach: int) -> Tensor:
+    """Return the largest value in the square windows of 2 reach + 1 pixels, (1, h, w)."""
+    for dim in (-2, -1):
+        size, width, done = values.shape[dim], 2 * reach + 1, 1
+        padding = (reach, reach) if dim == -1 else (0, 0, reach, reach)
+        values = functional.pad(values, padding, value=-torch.inf)
+        while done < width:  # the maximum of ``done`` pixels from each on
+            step = min(done, width - done)
+            length = values.shape[dim] - step
+            values = torch.maximum(values.narrow(dim, 0, length), values.narrow(dim, step, length))
+            done += step
+        values = values.narrow(dim, 0, size)
+    return values
+
+
+def _isolated(values: np.ndarray, largest: int) -> np.ndarray:
+    """Return where patches are far from all around them in the logarithm of depth, (h, w), NaN in holes."""
+    found = np.zeros(values.shape, bool)
+    small = _small_regions(values, largest)
+    if not small.any():
+        return found
+    surfaces = np.where(small, np.nan, values)
+    nearest, farthest = (sign * _largest_around(sign * surfaces) for sign in (-1, 1))
+    far = small & (((values <= nearest - _APART) & np.isfinite(nearest)) | (values >= farthest + _APART))
+    far &= np.isfinite(farthest)
+    count, labels, boxes, _ = cv2.connectedComponentsWithStats(_bytes(far), connectivity=8)
+    for label in range(1, count):
+        window = _around(boxes[label], 1)
+        patch = labels[window] == label
+        if boxes[label, 2:4].max() > largest or _touches(values[window], patch):
+            continue
+        middle = np.median(values[window][patch])
+        others = surfaces[_around(boxes[label], _NEARBY)] - middle
+        if not (np.abs(others) < math.log(_ALIKE)).any() and not _reaches_in(boxes[label], others, values.shape):
+            found[window] |= patch
+    return found
+
+
+def _largest_around(values: np.ndarray) -> np.ndarray:
+    """Return the largest value in the window around each pixel, (h, w), NaN in holes; minus infinity for none."""
+    filled = torch.from_numpy(np.nan_to_num(values, nan=-np.inf))[None]
+    return _running_max(filled, RADIUS)[0].numpy()
+
+
+def _around(box: np.ndarray, margin: int) -> tuple[slice, slice]:
+    """Return the rows and columns of a box of OpenCV with a margin."""
+    left, top, width, height = (int(each) for each in box[:4])
+    return (
+        slice(max(top - margin, 0), top + height + margin),
+        slice(max(left - margin, 0), left + width + margin),
+    )
+
+
+def _reaches_in(box: np.ndarray, others: np.ndarray, size: tuple[int, int]) -> bool:
+    """Return whether a patch lies at the border of a map, before what is around it."""
+    left, top, width, height = (int(each) for each in box[:4])
+    inside = left and top and left + width < size[1] and top + height < size[0]
+    return not inside and bool(np.nanmin(others) > 0)
+
+
+def _small_regions(values: np.ndarray, largest: int) -> np.ndarray:
+    """Return the pixels of the regions, connected along rows and columns, that fit into a square."""
+    known = ~np.isnan(values)
+    height, width = known.shape
+    grid = np.zeros((2 * height - 1, 2 * width - 1), np.uint8)  # pixels, and between them what connects them
+    grid[::2, ::2] = known
+    grid[1::2, ::2], grid[::2, 1::2] = (np.abs(np.diff(values, axis=axis)) < _APART for axis in (0, 1))
+    _, labels, boxes, _ = cv2.connectedComponentsWithStats(grid, connectivity=4)
+    small = boxes[:, cv2.CC_STAT_WIDTH : cv2.CC_STAT_HEIGHT + 1].max(axis=1) < 2 * largest
+    small[0] = False
+    return small[labels[::2, ::2]]
+
+
+def _touches(values: np.ndarray, patch: np.ndarray) -> bool:
+    """Return whether a pixel of a patch is near the depth of one outside, beside it or across a corner."""
+    for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        a = (slice(None, -down or None), slice(max(-right, 0), -right if right > 0 else None))
+        b = (slice(down, None), slice(max(right, 0), right if right < 0 else None))
+        border = patch[a] != patch[b]
+        if (np.abs(values[a] - values[b])[border] < _APART).any():
+            return True
+    return False
+
+
+def _bytes(mask: np.ndarray) -> np.ndarray:
+    """Return a mask as OpenCV takes it."""
+    return np.ascontiguousarray(mask, np.uint8)
+
+
+def expect_errors(inverse: Tensor, given: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Return the expected relative error of the depth and the expected error of the normal in degrees.
+
+    Args:
+        inverse: (1, H, W) the result: inverse depth in 1/m.
+        given: (1, h, w) inverse depth of the input, NaN in holes.
+        camera: the photo's, of H x W pixels.
+
+    Returns:
+        Two maps (1, H, W).
+
+    """
+    size, size_lr = (inverse.shape[-2], inverse.shape[-1]), (given.shape[-2], given.shape[-1])
+    camera_lr = camera.rescale(size_lr[1], size_lr[0])
+    known = given.isfinite()
+    weight = known[None].to(inverse)
+    smooth = _mean(given.nan_to_num(0)[None].to(inverse), weight, 3)
+    result = functional.adaptive_avg_pool2d(inverse[None], size_lr)
+    both = known[None] & (smooth > 0) & (result > 0)
+    off = torch.where(both, (result / smooth).log().abs(), 0)
+    rays = camera_lr.rays()[None].to(inverse.device)
+    depths = (torch.where(both, each, torch.nan).reciprocal().double() for each in (result, smooth))
+    angle = angle_between(*(depth_to_normals(depth, rays) for depth in depths)).to(inverse)
+    tilted = angle.isfinite().to(inverse)
+    angle = _mean(angle.nan_to_num(0), tilted, _WINDOW)
+    away = distance_to_known(known).to(inverse) * degrees_per_pixel(camera_lr.fx)
+    hole = ~known[None]
+    spread = _mean(off, weight, _WINDOW) + torch.where(hole, _NEAR + _PER_DEGREE * away, 0).clamp(max=1)
+    angle = torch.where(hole, angle.clamp(min=_GUESSED), angle)
+    return _enlarge(spread, size), _enlarge(angle, size)
+
+
+def _mean(values: Tensor, weight: Tensor, window: int) -> Tensor:
+    """Return the means of the valid values around each pixel; 0 where there is none."""
+    total, count = (
+        functional.avg_pool2d(each, window, stride=1, padding=window // 2) for each in (values * weight, weight)
+    )
+    return torch.where(count > 0, total / torch.where(count > 0, count, 1), 0)
+
+
+def _enlarge(values: Tensor, size: tuple[int, int]) -> Tensor:
+    """Return (1, *size), bilinear."""
+    return functional.interpolate(values, size, mode="bilinear", align_corners=False)[0]

@@ -1,0 +1,196 @@
+"""Captures of ARKit's lidar: videos of ARKitScenes and raw exports of Polycam.
+
+ARKitScenes; https://github.com/apple/ARKitScenes, DATA.md and raw/README.md.
+
+    41069021/lowres_wide/41069021_305.244.png                photo; ``wide`` (1920 x 1440) is taken where it is there
+    41069021/lowres_depth/41069021_305.244.png               16-bit millimetres, 256 x 192
+    41069021/confidence/41069021_305.244.png                 0 (low) to 2 (high)
+    41069021/lowres_wide_intrinsics/41069021_305.244.pincam  width height fx fy cx cy
+    41069021/lowres_wide.traj                                time, rotation (axis times angle), translation
+
+Rotation and translation of the trajectory lead from the world to the camera, whose axes are x right, y down, z forward
+(threedod/benchmark_scripts/utils/tenFpsDataLoader.py inverts them). The trajectory has ten poses a second; a frame
+takes that within 10 ms of it. Intrinsics may be a millisecond off.
+
+Polycam's raw export (developer mode); https://github.com/PolyCam/polyform describes it.
+
+    keyframes/images/TIME.jpg                 photos; the same without distortion in corrected_images/
+    keyframes/cameras/TIME.json               fx fy cx cy width height, t_00 .. t_23; optimised in corrected_cameras/
+    keyframes/depth/TIME.png                  16-bit millimetres, 256 x 192
+    keyframes/confidence/TIME.png             0 (low), 127 (medium) and 255 (high)
+
+t_ij are the rows of the pose from ARKit's camera (y up, looking along -z) to the world. The corrected photos and
+cameras are taken where a frame has both.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from pathlib import Path
+
+import numpy as np
+from pydantic import BaseModel
+from scipy.spatial.transform import Rotation
+
+from dsr.io.encoding import Assumption
+from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry
+from dsr.io.images import Pixels, read_numbers
+from dsr.io.pairs import Pair, PairingResult
+from dsr.io.trajectories import check_pose, describe_capture, intrinsics_camera, read_text
+from dsr.utils.guards import natural_key, numbers_in, read_limited
+from dsr.utils.validation import parse_model
+
+_ARKITSCENES = "ARKitScenes"
+_LARGEST_PINCAM = 1 << 16
+"""Largest file of a camera in bytes."""
+_PHOTOS = ("wide", "color", "lowres_wide")
+_MAX_GAP = 0.010
+"""Largest time in seconds between a frame and its pose."""
+_SHIFTS = (0.0, -1e-3, 1e-3)
+_Motion = tuple[float, ...]
+
+_POLYCAM = "Polycam"
+_LARGEST_JSON = 1 << 20
+"""Largest file of a camera in bytes."""
+_KINDS = ("corrected_images", "images")
+_CAMERAS = {"corrected_images": "corrected_cameras", "images": "cameras"}
+
+
+def find_arkitscenes(folder: Path) -> PairingResult | None:
+    """Return the frames of a video of ARKitScenes; None if the folder is none."""
+    depths = {path.stem: path for path in (folder / "lowres_depth").glob("*.png")}
+    kind = next((kind for kind in _PHOTOS if any((folder / kind).glob("*.png"))), None)
+    if not depths or kind is None:
+        return None
+    photos = {path.stem: path for path in sorted((folder / kind).glob("*.png"), key=natural_key)}
+    motions = _read_trajectory(folder / "lowres_wide.traj")
+    pairs = []
+    for stem in [stem for stem in photos if stem in depths]:
+        intrinsics, motion = _intrinsics(folder / f"{kind}_intrinsics", stem), _nearest(motions, stem)
+        place = f"{folder / 'lowres_wide.traj'}: frame {stem}"
+        geometry = functools.partial(_geometry, place, intrinsics, motion)
+        told = (b"" if intrinsics is None else read_limited(intrinsics, _LARGEST_PINCAM)) + repr(motion).encode()
+        frame = CaptureFrame(_ARKITSCENES, geometry, intrinsics or folder / "lowres_wide.traj", told)
+        path = folder / "confidence" / f"{stem}.png"
+        known = ConfidenceMap(path, HIGHEST_LEVEL) if path.is_file() else None
+        pairs.append(Pair(stem, photos[stem], depths[stem], unit=1e-3, capture=frame, confidence=known))
+    text = f"a video of {_ARKITSCENES}, photos of {kind}"
+    note = describe_capture(text, "millimetres", pairs, poses=bool(motions))
+    lone = [each[stem] for each in (photos, depths) for stem in each if not (stem in photos and stem in depths)]
+    return PairingResult(tuple(pairs), (note,), tuple(lone))
+
+
+def _read_trajectory(path: Path) -> dict[float, _Motion]:
+    """Return rotation and translation by time; empty without the file."""
+    motions: dict[float, _Motion] = {}
+    for number, line in enumerate(read_text(path).splitlines() if path.is_file() else (), 1):
+        values = numbers_in(line.split())
+        if len(values) != 7 or not math.isfinite(values[0]):
+            raise ValueError(f"{path}: line {number}: expected 7 numbers, got {line!r:.80}")
+        motions[values[0]] = tuple(values[1:])
+    return motions
+
+
+def _time(stem: str) -> float:
+    """Return the time in a frame's name, NaN if there is none."""
+    return next(iter(numbers_in([stem.rpartition("_")[2]])), math.nan)
+
+
+def _nearest(motions: dict[float, _Motion], stem: str) -> _Motion | None:
+    """Return the motion nearest in time to a frame."""
+    times = np.fromiter(motions, np.float64, len(motions))
+    gaps = np.abs(times - _time(stem))
+    if not len(gaps) or not (gaps <= _MAX_GAP).any():
+        return None
+    return motions[float(times[int(gaps.argmin())])]
+
+
+def _intrinsics(folder: Path, stem: str) -> Path | None:
+    """Return the file of a frame's intrinsics."""
+    video = stem.rpartition("_")[0]
+    names = [f"{stem}.pincam", *(f"{video}_{_time(stem) + shift:.3f}.pincam" for shift in _SHIFTS)]
+    return next((folder / name for name in names if (folder / name).is_file()), None)
+
+
+def _geometry(place: str, intrinsics: Path | None, motion: _Motion | None, _: tuple[int, int]) -> Geometry:
+    """Return camera and pose of a frame."""
+    camera, pose, notes = None, None, []
+    if intrinsics is not None:
+        width, height, *numbers = read_numbers(intrinsics, 6).tolist()
+        if not (width >= 1 and height >= 1 and float(width).is_integer() and float(height).is_integer()):
+            raise ValueError(f"{intrinsics}: expected a width and a height in pixels, got {width:g} and {height:g}")
+        camera = intrinsics_camera(str(intrinsics), (int(height), int(width)), numbers)
+    if motion is None:
+        notes.append(Assumption("no pose: lowres_wide.traj has none within 10 ms of the frame"))
+    elif not np.isfinite(motion).all():
+        raise ValueError(f"{place}: expected a rigid pose, got {' '.join(f'{value:g}' for value in motion)}")
+    else:
+        to_camera = np.eye(4)
+        to_camera[:3, :3] = Rotation.from_rotvec(motion[:3]).as_matrix()
+        to_camera[:3, 3] = motion[3:]
+        pose = check_pose(place, np.linalg.inv(to_camera))
+    return Geometry(camera, pose, tuple(notes))
+
+
+class _PolycamCamera(BaseModel, strict=True):
+    """A file of ``cameras``; numbers may be NaN here."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: Pixels
+    height: Pixels
+    t_00: float
+    t_01: float
+    t_02: float
+    t_03: float
+    t_10: float
+    t_11: float
+    t_12: float
+    t_13: float
+    t_20: float
+    t_21: float
+    t_22: float
+    t_23: float
+
+
+def find_polycam(folder: Path) -> PairingResult | None:
+    """Return the frames of a raw export, or of its folder ``keyframes``; None if there are none."""
+    frames = folder / "keyframes" if (folder / "keyframes").is_dir() else folder
+    cameras = [kind for kind in _KINDS if (frames / kind).is_dir() and any((frames / _CAMERAS[kind]).glob("*.json"))]
+    if not cameras or not (frames / "depth").is_dir():
+        return None
+    photos = {kind: {path.stem: path for path in (frames / kind).glob("*.jpg")} for kind in cameras}
+    pairs, unpaired = [], []
+    for depth in sorted((frames / "depth").glob("*.png"), key=natural_key):
+        kind = next((kind for kind in cameras if depth.stem in photos[kind] and _camera_of(frames, kind, depth)), None)
+        if kind is None:
+            unpaired.append(depth)
+            continue
+        path = frames / _CAMERAS[kind] / f"{depth.stem}.json"
+        frame = CaptureFrame(
+            _POLYCAM, functools.partial(_polycam_geometry, path), path, read_limited(path, _LARGEST_JSON)
+        )
+        confidence = frames / "confidence" / depth.name
+        known = ConfidenceMap(confidence, 255) if confidence.is_file() else None
+        pairs.append(Pair(depth.stem, photos[kind][depth.stem], depth, unit=1e-3, capture=frame, confidence=known))
+    notes = [describe_capture(f"a capture of {_POLYCAM}", "millimetres", pairs, poses=True)]
+    corrected = sum(pair.rgb.parent.name == _KINDS[0] for pair in pairs)
+    if corrected:
+        notes.append(Assumption("photos and cameras are the corrected ones", f"{corrected} of {len(pairs)}"))
+    return PairingResult(tuple(pairs), tuple(notes), tuple(unpaired))
+
+
+def _camera_of(frames: Path, kind: str, depth: Path) -> bool:
+    """Return whether a frame has a camera for a kind of photo."""
+    return (frames / _CAMERAS[kind] / f"{depth.stem}.json").is_file()
+
+
+def _polycam_geometry(path: Path, _: tuple[int, int]) -> Geometry:
+    """Return camera and pose of a frame."""
+    told = parse_model(_PolycamCamera, read_text(path, _LARGEST_JSON), path, f"expected {_POLYCAM}'s camera; ")
+    camera = intrinsics_camera(str(path), (told.height, told.width), (told.fx, told.fy, told.cx, told.cy))
+    rows = [[getattr(told, f"t_{row}{column}") for column in range(4)] for row in range(3)]
+    return Geometry(camera, check_pose(str(path), np.array([*rows, [0, 0, 0, 1]], dtype=np.float64), opengl=True))

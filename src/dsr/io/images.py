@@ -1,0 +1,349 @@
+"""Readers of pictures, range maps, numbers and cameras, which check sizes first and whose errors name the file."""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import re
+import threading
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import cv2
+import numpy as np
+from pydantic import BaseModel, BeforeValidator, Field
+
+from dsr.geometry.camera import Camera, RangeType
+from dsr.utils.arrays import read_array_header
+from dsr.utils.guards import (
+    MOST_FILE,
+    array_bytes,
+    expect_bytes,
+    expect_pixels,
+    naming,
+    numbers_in,
+    opened,
+    pixels_of_file,
+    read_limited,
+    refusing,
+)
+from dsr.utils.picture_headers import picture_size
+from dsr.utils.validation import Number, Whole, parse_model
+
+_BYTES_PER_PIXEL = 16
+"""Bytes in memory for each allowed pixel: four channels of float32."""
+
+MAP_SUFFIXES = (".npy", ".png", ".tiff", ".tif", ".pfm")
+_METRES = {"m": 1.0, "mm": 1e-3}
+_LONGEST = 40
+"""Largest number of bytes of a number and the blank behind it."""
+_TEXT = re.compile(rb"[-+.\deEnaifNAIF\s]*")
+
+
+def decode_pixels(place: str | Path, content: bytes, flags: int, most: int | None = None) -> np.ndarray | None:
+    """Return the pixels of an encoded picture as OpenCV decodes them; None if it is damaged or none.
+
+    Args:
+        place: its name, for messages.
+        content: a PNG, JPEG, TIFF, BMP, WebP or portable map.
+        most: largest number of pixels; None for what its length explains.
+
+    Raises:
+        ValueError: its header declares more.
+
+    """
+    header = picture_size(io.BytesIO(content))
+    if header is None:
+        return None
+    most = pixels_of_file(len(content)) if most is None else most
+    expect_pixels(place, header.height, header.width, most)
+    expect_bytes(
+        place, header.bytes_per_pixel * max(header.height * header.width, header.tile), _BYTES_PER_PIXEL * most
+    )
+    try:
+        with _QUIET_STDERR:
+            return cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+    except cv2.error:
+        return None
+
+
+def pixels_in_header(path: Path) -> tuple[int, int] | None:
+    """Return height and width that a picture file declares; None if it is missing, damaged or no picture."""
+    try:
+        with opened(path) as file:
+            header = picture_size(file)
+    except OSError:
+        return None
+    return None if header is None else (header.height, header.width)
+
+
+class _QuietStderr:
+    """A context in which stderr is discarded, so that messages of decoders (libpng, OpenCV) are not shown.
+
+    Threads may be in it at the same time: the first redirects stderr and the last restores it.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._within, self._kept = threading.Lock(), 0, -1
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if not self._within:
+                self._kept = os.dup(2)
+                with open(os.devnull, "wb") as nowhere:  # noqa: PTH123 - a device
+                    os.dup2(nowhere.fileno(), 2)
+            self._within += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._within -= 1
+            if not self._within:
+                os.dup2(self._kept, 2)
+                os.close(self._kept)
+
+
+_QUIET_STDERR = _QuietStderr()
+
+
+def quiet_decoders() -> _QuietStderr:
+    """Return a context in which messages of decoders about damaged files are not shown."""
+    return _QUIET_STDERR
+
+
+def read_rgb(path: Path) -> np.ndarray:
+    """Return a picture as uint8 RGB, (H, W, 3).
+
+    Raises:
+        ValueError: it is missing, damaged or no picture.
+
+    """
+    picture = read_pixels(path, cv2.IMREAD_COLOR)
+    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+
+
+def read_map(path: Path, most: int | None = None) -> np.ndarray:
+    """Return a one-channel map of floats, 16- or 32-bit whole numbers as float64, (H, W).
+
+    Args:
+        most: largest number of pixels; None for what the size of the file explains.
+
+    Raises:
+        ValueError: it is missing, damaged, of another shape, or has 8-bit values (too coarse for a surface).
+
+    """
+    with np.errstate(invalid="ignore"):  # a damaged file may hold signalling NaNs
+        return read_values(path, most).astype(np.float64)
+
+
+def read_values(path: Path, most: int | None = None) -> np.ndarray:
+    """Return a one-channel map in the type that it is stored in, (H, W); see :func:`read_map`.
+
+    Raises:
+        ValueError: as for :func:`read_map`.
+
+    """
+    return expect_depth_values(path, read_array(path, most))
+
+
+def read_array(path: Path, most: int | None = None) -> np.ndarray:
+    """Return the values of a map in the type and shape that it is stored in.
+
+    Args:
+        most: largest number of pixels; None for what the size of the file explains.
+
+    Raises:
+        ValueError: it is missing, damaged or too large.
+
+    """
+    readers = {".npy": _load_npy, ".pfm": _load_pfm}
+    reader = readers.get(path.suffix.lower())
+    return read_pixels(path, cv2.IMREAD_UNCHANGED, most) if reader is None else reader(path, most)
+
+
+def expect_depth_values(path: Path, values: np.ndarray) -> np.ndarray:
+    """Return the values of a depth file.
+
+    Raises:
+        ValueError: they are not (H, W), or no floats or whole numbers of 16 bits or more.
+
+    """
+    if values.ndim != 2:
+        raise ValueError(f"{path}: expected one channel (height x width), got shape {values.shape}")
+    if values.dtype.kind not in "fiu" or (values.dtype.kind in "iu" and values.dtype.itemsize == 1):
+        raise ValueError(f"{path}: expected 16-bit or floating point values, got {values.dtype} (too coarse for depth)")
+    return values
+
+
+def read_levels(path: Path) -> np.ndarray:
+    """Return an 8-bit one-channel picture as it is, (H, W) uint8: disparities of older benchmarks.
+
+    Raises:
+        ValueError: it is missing, damaged, or has other values.
+
+    """
+    levels = read_pixels(path, cv2.IMREAD_UNCHANGED)
+    if levels.ndim != 2 or levels.dtype != np.uint8:
+        raise ValueError(f"{path}: expected one channel of 8 bits, got {levels.dtype} of shape {levels.shape}")
+    return levels
+
+
+def read_mask(path: Path, most: int | None = None) -> np.ndarray:
+    """Return a mask, (H, W) bool: True where the picture is not 0.
+
+    Args:
+        most: largest number of pixels; None for what the size of the file explains.
+
+    Raises:
+        ValueError: it is missing, damaged or too large.
+
+    """
+    return read_pixels(path, cv2.IMREAD_GRAYSCALE, most) > 0
+
+
+def read_numbers(path: Path, count: int) -> np.ndarray:
+    """Return the numbers of a text file, separated by blanks or line ends, as float64 (count,).
+
+    Raises:
+        ValueError: it is missing, holds something else, or another number of them.
+
+    """
+    if not path.is_file():
+        raise ValueError(f"{path}: expected a text file of {count} numbers, there is none")
+    size = path.stat().st_size
+    if size > _LONGEST * count:
+        raise ValueError(f"{path}: expected {count} numbers, got {size} bytes, too many for that")
+    content = read_limited(path, size)
+    with refusing(f"{path}: expected {count} numbers, got text or bytes that are none", ValueError):
+        values = np.array(content.split() if _TEXT.fullmatch(content) else "", dtype=np.float64)
+    if values.size != count:
+        raise ValueError(f"{path}: expected {count} numbers, got {values.size}")
+    return values
+
+
+@dataclass(frozen=True)
+class CameraFile:
+    """What a ``camera.json`` says.
+
+    Args:
+        camera: in pixels and metres.
+        range_type: how the maps beside it count; None where it does not say.
+        depth_unit: metres per value in depth files; None where it does not say.
+        hole_value: the value that stands for a hole in files that cannot hold NaN; None for none.
+
+    """
+
+    camera: Camera
+    range_type: RangeType | None
+    depth_unit: float | None
+    hole_value: float | None
+
+
+def read_camera(path: Path) -> CameraFile:
+    """Return the content of a ``camera.json``.
+
+    Raises:
+        ValueError: it is missing or damaged, or a key is missing, unknown or out of range.
+
+    """
+    if not path.is_file():
+        raise ValueError(f"{path}: expected a camera file, there is none")
+    entries = parse_model(_CameraJson, read_limited(path), path).model_dump(exclude_unset=True, exclude_none=True)
+    if "baseline" in entries:
+        entries["baseline"] *= _METRES[entries.get("baseline_unit", "m")]
+    with naming(path):
+        camera = Camera(**{each.name: entries[each.name] for each in fields(Camera) if each.name in entries})
+    return CameraFile(camera, *map(entries.get, ("range_type", "depth_unit", "hole_value")))
+
+
+def _metres(unit: Any) -> Any:
+    """Return metres per value for the name of a unit, and anything else as it is."""
+    if not isinstance(unit, str):
+        return unit
+    if unit not in _METRES:
+        raise ValueError("m, mm or a positive number of metres per value")
+    return _METRES[unit]
+
+
+_Number = Annotated[Number, Field(ge=-1e12, le=1e12)]
+"""Beyond these limits, no number in a camera file means anything."""
+Pixels = Annotated[Whole, Field(ge=1, le=1e12)]
+"""A size in a camera file."""
+
+
+class _CameraJson(BaseModel, strict=True, extra="forbid"):
+    """A ``camera.json`` as it is stored; keys that it lacks do not get the defaults."""
+
+    width: Pixels
+    height: Pixels
+    fx: _Number
+    fy: _Number
+    cx: _Number
+    cy: _Number
+    range_type: RangeType | None = None
+    baseline: _Number | None = None
+    baseline_unit: Literal["m", "mm"] = "m"
+    doffs: _Number = 0.0
+    depth_unit: Annotated[_Number, Field(gt=0), BeforeValidator(_metres)] = 1.0
+    hole_value: _Number = 0.0
+
+
+def _content(path: Path) -> bytes:
+    """Return what is in a picture file."""
+    if not path.is_file():
+        raise ValueError(f"{path}: expected a picture, there is none")
+    return read_limited(path, MOST_FILE)
+
+
+def _load_pfm(path: Path, most: int | None) -> np.ndarray:
+    """Return a PFM file's values as they are, (H, W).
+
+    The header's scale says the byte order by its sign; its magnitude, which OpenCV multiplies by, is left alone, as the
+    stereo benchmarks do.
+    """
+    data = _content(path)
+    header = re.match(rb"(P[Ff])\s+(\d{1,9})\s+(\d{1,9})\s+([-+.\deE]{1,40})(?:\r\n|\s)", data)
+    if header is None:
+        raise ValueError(f"{path}: expected a PFM file, got something else")
+    if header[1] != b"Pf":
+        raise ValueError(f"{path}: expected one channel, got a PFM file with three")
+    width, height = int(header[2]), int(header[3])
+    scale = next(iter(numbers_in([header[4].decode()])), 0.0)
+    if most is not None:
+        expect_pixels(path, height, width, most)
+    pixels = memoryview(data)[header.end() :]
+    if not 0 < abs(scale) < math.inf or not width or not height or len(pixels) != 4 * width * height:
+        raise ValueError(f"{path}: expected a PFM file of {width} x {height} floats, got a damaged one")
+    return np.frombuffer(pixels, "<f4" if scale < 0 else ">f4").reshape(height, width)[::-1]
+
+
+def _load_npy(path: Path, most: int | None) -> np.ndarray:
+    if not path.is_file():
+        raise ValueError(f"{path}: expected a file, there is none")
+    try:
+        with path.open("rb") as file:
+            shape, dtype = read_array_header(file)
+            count = pixels_of_file(path.stat().st_size) if most is None else most
+            expect_bytes("the array", array_bytes(shape, dtype.itemsize), min(8 * count, path.stat().st_size))
+            file.seek(0)
+            return np.lib.format.read_array(file, allow_pickle=False)
+    except Exception as error:  # a damaged header makes NumPy raise OSError, MemoryError, TokenError, ...
+        raise ValueError(f"{path}: expected a NumPy array, got a damaged or foreign file ({error})") from error
+
+
+def read_pixels(path: Path, flags: int, most: int | None = None) -> np.ndarray:
+    """Return the pixels of a picture file as OpenCV decodes them.
+
+    Args:
+        most: largest number of pixels; None for what the size of the file explains.
+
+    Raises:
+        ValueError: it is missing, damaged, too large or no picture.
+
+    """
+    content = _content(path)
+    pixels = decode_pixels(path, content, flags, most)
+    if pixels is None:
+        raise ValueError(f"{path}: expected a picture, got a damaged or foreign file of {len(content)} bytes")
+    return pixels

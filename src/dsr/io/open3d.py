@@ -1,0 +1,154 @@
+"""Open3D's reconstruction system, read and written: two folders, intrinsics as JSON, and a trajectory.
+
+https://www.open3d.org/docs/release/tutorial/reconstruction_system/system_overview.html; the trajectory:
+http://redwood-data.org/indoor/fileformat.html.
+
+    color/000012.jpg, depth/000012.png     (or image/, rgb/) photos, and depth in 16-bit millimetres
+    camera_intrinsic.json                  or camera_primesense.json, intrinsic.json: width, height, intrinsic_matrix
+    scene/trajectory.log                   or trajectory.log: for each frame a line of three whole numbers, and the four
+                                           rows of the pose from camera (x right, y down, z forward) to world
+
+The n-th pose, by the first of the three numbers, is that of the n-th photo, by the numbers in the names.
+
+Depth is 16-bit PNG in millimetres, 0 in holes, which ``open3d.geometry.RGBDImage.create_from_color_and_depth`` takes
+with its default ``depth_scale=1000``; its ``depth_trunc`` leaves out what is beyond 3 m unless it is told otherwise.
+Intrinsics are those of ``open3d.io.read_pinhole_camera_intrinsic``: ``intrinsic_matrix`` column by column, with pixel
+centres at integers. ``trajectory.log`` has a line of three numbers and a camera-to-world matrix for each frame, of a
+camera with x right, y down, z forward, as in dsr (https://www.open3d.org/docs/release, file formats and the
+reconstruction system).
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from dsr.geometry.camera import Camera
+from dsr.io.encoding import Assumption
+from dsr.io.frames import CaptureFrame, Geometry
+from dsr.io.pairs import Pair, PairingResult
+from dsr.io.scene_files import RGBD, Frame, one_camera, to_millimetres, write_colour, write_sixteen_bits
+from dsr.io.trajectories import check_pose, order_of, read_text
+from dsr.utils.files import replacing, write_text
+from dsr.utils.guards import numbers_in
+
+_APP = "Open3D"
+_TRAJECTORIES = ("scene/trajectory.log", "trajectory.log")
+_Rows = tuple[str, ...]
+
+
+def add_trajectory(folder: Path, found: PairingResult) -> PairingResult:
+    """Return the pairs of a folder with the poses of its trajectory, if it has one that fits."""
+    path = next((folder / name for name in _TRAJECTORIES if (folder / name).is_file()), None)
+    if path is None or not found.pairs:
+        return found
+    entries = _read_entries(path)
+    if found.unpaired or len(entries) != len(found.pairs):
+        text = f"no poses: {path.name} has {len(entries)}, for {len(found.pairs)} pairs"
+        text += f" and {len(found.unpaired)} pictures without a partner" if found.unpaired else ""
+        return replace(found, assumptions=(*found.assumptions, Assumption(text)))
+    pairs: list[Pair] = []
+    for rank, (pair, rows) in enumerate(zip(found.pairs, entries, strict=True)):
+        geometry = functools.partial(_geometry, f"{path}: pose {rank}", rows)
+        pairs.append(replace(pair, capture=CaptureFrame(_APP, geometry, path, "\n".join(rows).encode())))
+    text = f"poses: {path.relative_to(folder).as_posix()} of {_APP}, one for each photo"
+    return replace(found, pairs=tuple(pairs), assumptions=(*found.assumptions, Assumption(text)))
+
+
+def _read_entries(path: Path) -> list[_Rows]:
+    """Return the four rows of each pose as text, in the order of the poses' numbers."""
+    lines = [line for line in read_text(path).splitlines() if line.strip()]
+    try:
+        if len(lines) % 5 or any(len(line.split()) != 3 for line in lines[::5]):
+            raise ValueError
+        order = order_of([int(line.split()[0]) for line in lines[::5]])
+    except ValueError:
+        raise ValueError(
+            f"{path}: expected a line of three whole numbers and four of a matrix for each pose, got {len(lines)} lines"
+        ) from None
+    return [tuple(lines[5 * place + 1 : 5 * place + 5]) for place in order]
+
+
+def _geometry(place: str, rows: _Rows, _: tuple[int, int]) -> Geometry:
+    """Return the pose of a frame; its camera is read from the file beside the pictures."""
+    values = [numbers_in(row.split()) for row in rows]
+    if [len(row) for row in values] != [4] * 4:
+        raise ValueError(f"{place}: expected a matrix of 4 x 4 numbers, got {' '.join(rows)!r:.80}")
+    return Geometry(None, check_pose(place, np.array(values)))
+
+
+def write_rgbd(folder: Path, rgb: Tensor, depth: Tensor, camera: Camera) -> list[Assumption]:
+    """Write colour, depth and intrinsics of one frame: ``color.png``, ``depth.png`` and ``intrinsic.json``.
+
+    Args:
+        folder: is created if it is missing.
+        rgb: (3, H, W) in [0, 1].
+        depth: (1, H, W) orthogonal depth in metres, NaN in holes.
+        camera: of these pixels.
+
+    Returns:
+        A note on pixels that are too far for 16-bit millimetres, if there are any.
+
+    """
+    millimetres, lost = to_millimetres(depth[0].cpu().numpy())
+    write_colour(folder / RGBD[0], (rgb * 255).round().clamp(0, 255).byte().permute(1, 2, 0).cpu().numpy())
+    write_sixteen_bits(folder / RGBD[1], millimetres)
+    _write_intrinsics(folder / RGBD[2], camera)
+    if not lost:
+        return []
+    return [Assumption(f"{folder.name}/{RGBD[1]}: what is beyond 65.5 m is written as a hole", f"{lost} pixels")]
+
+
+def write_open3d(folder: Path, frames: Sequence[Frame]) -> list[Path]:
+    """Write a folder as Open3D's reconstruction system expects it.
+
+    ``color/`` and ``depth/`` have a PNG for each frame, ``intrinsic.json`` is the camera, or ``intrinsics/`` that of
+    each frame if they differ. ``trajectory.log`` has the poses, if all frames have one.
+
+    Args:
+        folder: is created if it is missing.
+        frames: one at least.
+
+    Returns:
+        The files.
+
+    """
+    files = []
+    for frame in frames:
+        files += [folder / "color" / f"{frame.stem}.png", folder / "depth" / f"{frame.stem}.png"]
+        with replacing(files[-2]) as temporary:
+            shutil.copyfile(frame.colour, temporary)
+        write_sixteen_bits(files[-1], to_millimetres(frame.read_depth())[0])
+    camera = one_camera(frames)
+    named = {frame.stem: frame.camera for frame in frames} if camera is None else {}
+    intrinsics = {folder / "intrinsics" / f"{stem}.json": each for stem, each in named.items()}
+    if camera is not None:
+        intrinsics = {folder / RGBD[2]: camera}
+    for path, each in intrinsics.items():
+        _write_intrinsics(path, each)
+    files += intrinsics
+    if all(frame.pose is not None for frame in frames):
+        files.append(folder / "trajectory.log")
+        write_text(files[-1], "".join(_log_entry(number, frame) for number, frame in enumerate(frames)))
+    return files
+
+
+def _log_entry(number: int, frame: Frame) -> str:
+    """Return a frame's lines of ``trajectory.log``."""
+    rows = [] if frame.pose is None else frame.pose.tolist()
+    lines = [f"{number} {number} {number + 1}", *(" ".join(f"{value:.12g}" for value in row) for row in rows)]
+    return "\n".join(lines) + "\n"
+
+
+def _write_intrinsics(path: Path, camera: Camera) -> None:
+    """Write Open3D's JSON of a camera."""
+    matrix = [camera.fx, 0.0, 0.0, 0.0, camera.fy, 0.0, camera.cx, camera.cy, 1.0]
+    entries = {"width": camera.width, "height": camera.height, "intrinsic_matrix": matrix}
+    write_text(path, json.dumps(entries, indent=2) + "\n")

@@ -1,0 +1,350 @@
+"""Frames with one picture of colour and depth each, as other programs read them.
+
+``transforms.json`` with depth, as nerfstudio and the programs around instant-ngp read it.
+
+Axes of a camera are those of OpenGL, x right, y up, z backwards, so that the second and third column of dsr's
+camera-to-world transform change their signs; the world stays as it is. The principal point is counted from the corner
+of the image, half a pixel more than dsr's. ``depth_file_path`` is a 16-bit PNG in millimetres, 0 in holes, which is
+nerfstudio's default unit (https://docs.nerf.studio/quickstart/data_conventions.html).
+
+Inverse depth for 3D Gaussian Splatting, and its scene where the capture has poses.
+
+graphdeco's `train.py -d depths` reads ``depths/NAME.png`` of 16 bits beside ``images/NAME.*``, divides the values by
+65536, multiplies them by the ``scale`` of NAME in ``sparse/0/depth_params.json`` and adds its ``offset``; the result is
+compared with the rendered inverse depth, in the unit of the scene
+(https://github.com/graphdeco-inria/gaussian-splatting, "Depth regularization"). All frames have one scale here, since a
+frame whose scale is far from the others' is left out. The scene itself is COLMAP's text model
+(https://colmap.github.io/format.html): cameras, world-to-camera transforms with x right, y down, z forward, and points
+to start from. Its principal point is counted from the corner of the image.
+
+A recording for the viewer of rerun: colour, depth and poses on a timeline of frames.
+
+Axes are the camera's, x right, y down, z forward (``RDF`` in rerun), units are metres. The library is the extra
+``rerun``, https://rerun.io/docs.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from dsr.geometry.camera import Camera
+from dsr.geometry.rigid_motion import is_rotation
+from dsr.io.images import read_pixels
+from dsr.io.photos import write_png
+from dsr.utils.arrays import open_array
+from dsr.utils.files import replacing, write_text
+from dsr.utils.guards import pixels_beside, refusing
+
+RGBD = ("color.png", "depth.png", "intrinsic.json")
+MILLIMETRES = 1000
+MOST_MILLIMETRES = 65535
+_RIGID = 1e-3
+"""Largest difference of R R' from the identity."""
+
+_DIVISOR = 65536
+_LARGEST = 65535
+_POINTS = 100_000
+"""Points of all frames together that the optimisation starts from."""
+
+_TIMELINE = "frame"
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A photo and a depth map of one size.
+
+    Args:
+        name: the frame's, perhaps with folders: ``kitchen/000012``.
+        camera: of the pixels.
+        pose: (4, 4) float64 camera-to-world transform in metres, of a camera with x right, y down, z forward; None if
+            it is not known.
+        colour: an 8-bit PNG.
+        depth: an NPY of (H, W) orthogonal depth in metres, NaN in holes.
+
+    """
+
+    name: str
+    camera: Camera
+    pose: Tensor | None
+    colour: Path
+    depth: Path
+
+    @property
+    def stem(self) -> str:
+        """The name as that of a file."""
+        return self.name.replace("/", "_")
+
+    def read_depth(self) -> np.ndarray:
+        """Return the depth, (H, W) float32 in metres, NaN in holes.
+
+        Raises:
+            ValueError: the file is damaged, or not of the camera's size.
+
+        """
+        values = open_array(self.depth)
+        if values.shape != (self.camera.height, self.camera.width):
+            size = f"{self.camera.height} x {self.camera.width}"
+            raise ValueError(f"{self.depth}: expected depth of {size} pixels (height x width), got {values.shape}")
+        return np.array(values, np.float32)
+
+    def read_colour(self) -> np.ndarray:
+        """Return the photo, (H, W, 3) uint8, red first.
+
+        Raises:
+            ValueError: the file is damaged.
+
+        """
+        most = pixels_beside(self.camera.height, self.camera.width)
+        return read_pixels(self.colour, cv2.IMREAD_COLOR, most)[..., ::-1]
+
+
+def parse_pose(where: str, value: object) -> Tensor | None:
+    """Return a camera-to-world transform, (4, 4) float64, that a file holds as a list of lists; None for none.
+
+    Args:
+        where: the file and the key, for the message.
+        value: what the file holds there.
+
+    Raises:
+        ValueError: it is no rigid transform.
+
+    """
+    if value is None:
+        return None
+    try:
+        pose = torch.tensor(value, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError):
+        pose = torch.empty(0, dtype=torch.float64)
+    rigid = pose.shape == (4, 4) and bool(pose.isfinite().all()) and pose[3].tolist() == [0, 0, 0, 1]
+    if not rigid or not is_rotation(pose[:3, :3].numpy(), _RIGID):
+        raise ValueError(f"{where}: expected a rigid transform of 4 x 4 numbers, got {value}")
+    return pose
+
+
+def one_camera(frames: Sequence[Frame]) -> Camera | None:
+    """Return the camera of all frames, or None if they differ."""
+    cameras = {frame.camera for frame in frames}
+    return cameras.pop() if len(cameras) == 1 else None
+
+
+def write_colour(path: Path, rgb: np.ndarray) -> None:
+    """Write (H, W, 3) uint8, red first, as a PNG, atomically."""
+    write_png(path, np.ascontiguousarray(rgb[..., ::-1]))
+
+
+def write_sixteen_bits(path: Path, values: np.ndarray) -> None:
+    """Write (H, W) uint16 as a PNG, atomically."""
+    write_png(path, values)
+
+
+def to_millimetres(depth: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return depth in metres as whole millimetres, (H, W) uint16 with 0 in holes, and how many pixels are too far.
+
+    Depth of 65.535 m and more does not fit, and becomes a hole.
+    """
+    values = np.rint(depth.astype(np.float64) * MILLIMETRES)
+    fits = (values > 0) & (values <= MOST_MILLIMETRES)
+    return np.where(fits, values, 0).astype(np.uint16), int((values > MOST_MILLIMETRES).sum())
+
+
+def write_transforms(path: Path, frames: Sequence[Frame]) -> list[Path]:
+    """Write ``transforms.json`` for frames whose ``color.png`` and ``depth.png`` lie in one folder each.
+
+    Args:
+        path: the file; the frames' files are named relative to its folder.
+        frames: one at least; a single one without a pose stands at the origin.
+
+    Returns:
+        The file.
+
+    Raises:
+        ValueError: one of several frames has no pose.
+
+    """
+    missing = [frame.name for frame in frames if frame.pose is None]
+    if missing and len(frames) > 1:
+        raise ValueError(
+            f"nerfstudio: expected a pose of each frame, got none for {len(missing)} of {len(frames)}, such as "
+            f"{missing[0]}; the capture has to record them"
+        )
+    camera = one_camera(frames)
+    entries: dict[str, Any] = {"camera_model": "OPENCV", **({} if camera is None else _intrinsics(camera))}
+    entries["frames"] = [
+        {
+            "file_path": _relative(frame.colour, path),
+            "depth_file_path": _relative(frame.colour.with_name(RGBD[1]), path),
+            **({} if camera is not None else _intrinsics(frame.camera)),
+            "transform_matrix": _to_opengl(frame),
+        }
+        for frame in frames
+    ]
+    write_text(path, json.dumps(entries, indent=2) + "\n")
+    return [path]
+
+
+def _to_opengl(frame: Frame) -> list[list[float]]:
+    """Return the transform from OpenGL's camera frame to the world."""
+    pose = torch.eye(4, dtype=torch.float64) if frame.pose is None else frame.pose
+    matrix: list[list[float]] = (pose * pose.new_tensor([1, -1, -1, 1])).tolist()
+    return matrix
+
+
+def _intrinsics(camera: Camera) -> dict[str, float]:
+    """Return the camera's entries."""
+    return {
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "cx": camera.cx + 0.5,
+        "cy": camera.cy + 0.5,
+        **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
+    }
+
+
+def _relative(file: Path, path: Path) -> str:
+    """Return a file's path relative to the folder of another, with slashes."""
+    return Path(os.path.relpath(file, path.parent)).as_posix()
+
+
+def write_splatting(folder: Path, frames: Sequence[Frame]) -> list[Path]:
+    """Write ``images/``, ``depths/`` and ``sparse/0/`` of a scene.
+
+    Without poses ``sparse/0/`` has ``depth_params.json`` alone, whose scale holds for a scene in metres.
+
+    Args:
+        folder: is created if it is missing.
+        frames: one at least.
+
+    Returns:
+        The files.
+
+    Raises:
+        ValueError: no frame has any depth.
+
+    """
+    nearest = min((_nearest(frame) for frame in frames), default=np.inf)
+    if not np.isfinite(nearest):
+        raise ValueError("gaussian: expected some depth, got holes alone")
+    scale = _DIVISOR / _LARGEST / nearest
+    files = []
+    for frame in frames:
+        files += [folder / "images" / f"{frame.stem}.png", folder / "depths" / f"{frame.stem}.png"]
+        with replacing(files[-2]) as temporary:
+            shutil.copyfile(frame.colour, temporary)
+        inverse = _DIVISOR / (scale * frame.read_depth().astype(np.float64))
+        write_sixteen_bits(files[-1], np.nan_to_num(np.rint(inverse), nan=0, posinf=0).astype(np.uint16))
+    sparse = folder / "sparse" / "0"
+    texts = {"depth_params.json": _parameters(frames, scale)}
+    if all(frame.pose is not None for frame in frames):
+        texts |= {"cameras.txt": _cameras(frames), "images.txt": _images(frames), "points3D.txt": _points(frames)}
+    for name, text in texts.items():
+        write_text(sparse / name, text)
+    return [*files, *(sparse / name for name in texts)]
+
+
+def _nearest(frame: Frame) -> float:
+    """Return a frame's smallest depth in metres, infinity if it has none."""
+    depth = frame.read_depth()
+    return float(depth[np.isfinite(depth)].min(initial=np.inf))
+
+
+def _parameters(frames: Sequence[Frame], scale: float) -> str:
+    """Return ``depth_params.json``."""
+    return json.dumps({frame.stem: {"scale": scale, "offset": 0.0} for frame in frames}, indent=2) + "\n"
+
+
+def _cameras(frames: Sequence[Frame]) -> str:
+    """Return ``cameras.txt``, a camera for each frame."""
+    lines = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"]
+    for number, camera in enumerate((frame.camera for frame in frames), 1):
+        values = (camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5)
+        lines.append(f"{number} PINHOLE {camera.width} {camera.height} " + _numbers(values))
+    return "\n".join(lines) + "\n"
+
+
+def _images(frames: Sequence[Frame]) -> str:
+    """Return ``images.txt``: for each frame its pose, and an empty line for the points that it sees."""
+    lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"]
+    for number, frame in enumerate(frames, 1):
+        pose = _matrix(frame)
+        to_camera = pose[:3, :3].T
+        turn = Rotation.from_matrix(to_camera).as_quat(canonical=True)[[3, 0, 1, 2]]
+        lines += [f"{number} {_numbers((*turn, *(-to_camera @ pose[:3, 3])))} {number} {frame.stem}.png", ""]
+    return "\n".join(lines) + "\n"
+
+
+def _points(frames: Sequence[Frame]) -> str:
+    """Return ``points3D.txt``: points of all frames with their colours, on a grid of pixels."""
+    lines = ["# POINT3D_ID X Y Z R G B ERROR TRACK[]"]
+    for frame in frames:
+        camera, depth = frame.camera, frame.read_depth()
+        step = max(1, int(np.ceil(np.sqrt(depth.size * len(frames) / _POINTS))))
+        rows, columns = (each.ravel() for each in np.mgrid[0 : camera.height : step, 0 : camera.width : step])
+        z = depth[rows, columns].astype(np.float64)
+        rays = np.stack(((columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones(len(z))), axis=1)
+        pose = _matrix(frame)
+        points = (rays * z[:, None]) @ pose[:3, :3].T + pose[:3, 3]
+        colours = frame.read_colour()[rows, columns]
+        for point, colour in zip(points[np.isfinite(z)], colours[np.isfinite(z)], strict=True):
+            red, green, blue = colour
+            lines.append(f"{len(lines)} {_numbers(point)} {red} {green} {blue} 0")
+    return "\n".join(lines) + "\n"
+
+
+def _matrix(frame: Frame) -> np.ndarray:
+    """Return the pose of a frame that has one, (4, 4)."""
+    return np.eye(4) if frame.pose is None else frame.pose.numpy()
+
+
+def _numbers(values: Sequence[float] | np.ndarray) -> str:
+    """Return numbers between blanks."""
+    return " ".join(f"{value:.9g}" for value in values)
+
+
+def write_rerun(path: Path, frames: Sequence[Frame]) -> list[Path]:
+    """Write a recording ``.rrd``: for each frame the entities ``camera``, ``camera/rgb`` and ``camera/depth``.
+
+    Args:
+        frames: one at least; those without a pose stand at the origin.
+
+    Returns:
+        The file.
+
+    Raises:
+        ValueError: the library is not installed.
+
+    """
+    with refusing("rerun: expected the library rerun-sdk, which `pip install dsr[rerun]` installs", ImportError):
+        rerun = importlib.import_module("rerun")
+    recording = rerun.RecordingStream("dsr")
+    with replacing(path) as temporary:
+        recording.save(str(temporary))
+        recording.log("/", rerun.ViewCoordinates.RDF, static=True)
+        for number, frame in enumerate(frames):
+            camera = frame.camera
+            recording.set_time(_TIMELINE, sequence=number)
+            pose = np.eye(4) if frame.pose is None else frame.pose.numpy()
+            recording.log("camera", rerun.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
+            matrix = [[camera.fx, 0, camera.cx + 0.5], [0, camera.fy, camera.cy + 0.5], [0, 0, 1]]
+            size = [camera.width, camera.height]
+            view = rerun.Pinhole(image_from_camera=matrix, resolution=size, camera_xyz=rerun.ViewCoordinates.RDF)
+            recording.log("camera", view)
+            recording.log("camera/rgb", rerun.Image(frame.read_colour()).compress(jpeg_quality=95))
+            recording.log("camera/depth", rerun.DepthImage(np.nan_to_num(frame.read_depth()), meter=1.0))
+        recording.flush()
+        recording.disconnect()
+    return [path]

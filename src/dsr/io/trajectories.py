@@ -1,0 +1,282 @@
+"""Poses of frames and transforms between cameras: from text and JSON files, and from captures."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dsr.geometry.camera import Camera
+from dsr.geometry.rigid_motion import Matrix, as_rigid, from_quaternion, is_rotation
+from dsr.io.encoding import Assumption
+from dsr.io.pairs import Pair, time_of
+from dsr.utils.guards import naming, numbers_in, parse_json, read_limited, refusing
+
+_LARGEST_FILE = 256 << 20
+_MAX_GAP = 0.02
+"""Largest time in seconds between a frame and its pose."""
+_MOST_BETWEEN = 10.0
+"""Largest plausible distance in metres between the two cameras of a rig; more is taken for millimetres."""
+
+_TOLERANCE = 1e-3
+"""Largest deviation of a rotation's entries, and of a quaternion's length, from those of a rigid motion."""
+_ARKIT_TO_DSR = np.diag([1.0, -1.0, -1.0, 1.0])
+"""ARKit's and OpenGL's camera looks along -z with y up; dsr's along z with y down."""
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses in a file.
+
+    Args:
+        file: the file.
+        poses: camera to world, 4 x 4, metres, in order.
+        times: time of each in seconds, or its frame's number; None where the file has none.
+
+    """
+
+    file: Path
+    poses: tuple[Matrix, ...]
+    times: tuple[float, ...] | None = None
+
+    def assign(self, pairs: Sequence[Pair]) -> Mapping[str, Matrix]:
+        """Return the poses of frames by their names, without those of frames that have none.
+
+        Frames whose names are times get the pose nearest in time, within 20 ms; those whose names end in the number
+        that the file has for a time get that; others are taken in order.
+
+        Raises:
+            ValueError: the poses are to be taken in order, and there are not as many as frames.
+
+        """
+        taken = [time_of(pair.depth) or time_of(pair.rgb) for pair in pairs]
+        if self.times is not None:
+            times = np.array(self.times)
+            if all(time is not None for time in taken):
+                return self._nearest(pairs, np.array(taken, dtype=np.float64), times, _MAX_GAP)
+            numbers = [_number(pair) for pair in pairs]
+            known = set(self.times)
+            if all(number is not None for number in numbers) and known.intersection(numbers):
+                return self._nearest(pairs, np.array(numbers, dtype=np.float64), times, 0)
+        if len(self.poses) != len(pairs):
+            raise ValueError(
+                f"{self.file}: expected a pose for each of the {len(pairs)} frames, or times as in their names, got "
+                f"{len(self.poses)} poses"
+            )
+        return {pair.name: pose for pair, pose in zip(pairs, self.poses, strict=True)}
+
+    def _nearest(
+        self, pairs: Sequence[Pair], wanted: np.ndarray, times: np.ndarray, gap: float
+    ) -> Mapping[str, Matrix]:
+        """Return the poses nearest in time."""
+        order = np.argsort(times)
+        after = np.searchsorted(times[order], wanted).clip(1, max(len(order) - 1, 1))
+        candidates = order[np.stack((after - 1, np.minimum(after, len(order) - 1)))]  # (2, frames)
+        gaps = np.abs(times[candidates] - wanted)
+        best = candidates[gaps.argmin(0), np.arange(len(wanted))]
+        return {
+            pair.name: self.poses[number]
+            for pair, number, distance in zip(pairs, best, gaps.min(0), strict=True)
+            if distance <= gap
+        }
+
+
+def read_transform(path: Path) -> Matrix:
+    """Read a rigid transform from one camera to another, in metres.
+
+    Args:
+        path: text of 3 x 4 or 4 x 4 numbers; or JSON, nested lists of these, alone or as the only matrix of an object.
+
+    Raises:
+        ValueError: the file is missing or holds something else, or the transform is not rigid.
+
+    """
+    text = _text(path)
+    if path.suffix.lower() == ".json" or text.lstrip().startswith(("{", "[")):
+        matrix = as_rigid(_matrix_of_json(path, text), str(path))
+    else:
+        rows = _numbers(path, text)
+        if len(rows) == 1 and len(rows[0]) in (12, 16):
+            rows = np.reshape(rows[0], (-1, 4)).tolist()
+        if len({len(row) for row in rows}) > 1:
+            raise ValueError(f"{path}: expected a matrix of 3 x 4 or 4 x 4 numbers, got rows of different lengths")
+        matrix = as_rigid(rows, str(path))
+    distance = float(np.linalg.norm(matrix[:3, 3]))
+    if distance > _MOST_BETWEEN:
+        raise ValueError(f"{path}: expected a translation in metres, got one of {distance:g}; are these millimetres?")
+    return matrix
+
+
+def read_poses(path: Path) -> Trajectory:
+    """Read poses from camera to world, in metres.
+
+    The formats are that of TUM RGB-D (``timestamp tx ty tz qx qy qz qw`` in each line,
+    https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats); matrices of 12 or 16 numbers in each line, as
+    KITTI's odometry has them; and matrices of four lines each, as in Redwood's and Open3D's ``.log``, whose lines of
+    three whole numbers before each matrix number the poses. Lines that begin with ``#`` are comments.
+
+    Poses with times or numbers that differ are returned in the order of these, others in that of the file.
+
+    Raises:
+        ValueError: the file is missing or holds something else, or a pose is not rigid; the message names the line or
+            the pose.
+
+    """
+    content = _numbers(path, _text(path))
+    rows = [row for row in content if len(row) != 3]
+    lengths = {len(row) for row in rows}
+    if lengths == {8}:
+        poses = tuple(
+            from_quaternion(row[1:4], row[4:], f"{path}: pose {number}") for number, row in enumerate(rows, 1)
+        )
+        times = tuple(row[0] for row in rows)
+        if not all(map(math.isfinite, times)):
+            raise ValueError(f"{path}: expected finite times, got another")
+        order = order_of(times)
+        return Trajectory(path, tuple(poses[place] for place in order), tuple(times[place] for place in order))
+    if lengths == {4} and len(rows) % 4 == 0:
+        rows = np.reshape(rows, (-1, 16)).tolist()
+    elif lengths not in ({12}, {16}):
+        raise ValueError(
+            f"{path}: expected lines of 8 numbers (time, translation, quaternion), of 12 or 16 (a matrix), or four "
+            f"lines of 4 for each matrix, got lines of {', '.join(map(str, sorted(lengths))) or 'no'} numbers"
+        )
+    poses = tuple(as_rigid(np.reshape(row, (-1, 4)), f"{path}: pose {number}") for number, row in enumerate(rows, 1))
+    numbers = [row[0] for row in content if len(row) == 3]
+    return Trajectory(path, tuple(poses[place] for place in order_of(numbers)) if len(numbers) == len(poses) else poses)
+
+
+def order_of(numbers: Sequence[float]) -> list[int]:
+    """Return the places of poses in the order of their times or numbers; as they are if two are equal."""
+    places = range(len(numbers))
+    return sorted(places, key=numbers.__getitem__) if len(set(numbers)) == len(numbers) else list(places)
+
+
+def _text(path: Path) -> str:
+    """Return the text of a file of moderate size."""
+    if not path.is_file():
+        raise ValueError(f"{path}: expected a file, there is none")
+    return read_limited(path, _LARGEST_FILE).decode(errors="replace")
+
+
+def _numbers(path: Path, text: str) -> list[list[float]]:
+    """Return the numbers in each line that has any."""
+    rows = []
+    for number, line in enumerate(text.splitlines(), 1):
+        words = re.split(r"[\s,;]+", line.partition("#")[0].strip())
+        if words == [""]:
+            continue
+        if not (values := numbers_in(words)):
+            raise ValueError(f"{path}: line {number}: expected numbers, got {line!r:.60}")
+        rows.append(values)
+    return rows
+
+
+def _matrix_of_json(path: Path, text: str) -> list[list[float]]:
+    """Return the nested lists that JSON holds."""
+    with refusing(f"{path}: expected JSON or rows of numbers, got something else", ValueError):
+        content = parse_json(text)
+    if isinstance(content, dict):
+        lists = [value for value in content.values() if isinstance(value, list)]
+        content = lists[0] if len(lists) == 1 else None
+    if isinstance(content, list) and len(content) in (12, 16) and not any(isinstance(each, list) for each in content):
+        content = [content[start : start + 4] for start in range(0, len(content), 4)]
+    if not isinstance(content, list):
+        raise ValueError(f"{path}: expected a matrix of 3 x 4 or 4 x 4 numbers, got something else")
+    return content
+
+
+def _number(pair: Pair) -> float | None:
+    """Return the last number in a frame's name."""
+    numbers = re.findall(r"\d+", pair.depth.stem)
+    return float(numbers[-1]) if numbers and len(numbers[-1]) < 16 else None
+
+
+def pose_from_quaternion(
+    source: str, quaternion: Sequence[float], position: Sequence[float], *, opengl: bool = False
+) -> np.ndarray:
+    """Return the pose (4, 4) from camera to world, with the camera's axes x right, y down, z forward.
+
+    Args:
+        source: name of the file and the place in it, for the message.
+        quaternion: x, y, z, w of the rotation from camera to world.
+        position: of the camera, in metres.
+        opengl: whether the camera's axes are x right, y up, z backward, as ARKit and OpenGL have them.
+
+    Raises:
+        ValueError: a number is not finite, or the quaternion is not of length 1.
+
+    """
+    length = math.hypot(*quaternion)
+    if not math.isfinite(length) or abs(length - 1) > _TOLERANCE or not np.isfinite(position).all():
+        came = " ".join(f"{value:g}" for value in (*quaternion, *position))
+        raise ValueError(f"{source}: expected a rigid pose (a quaternion of length 1 and a position), got {came}")
+    pose = from_quaternion(position, quaternion, source)
+    return pose @ _ARKIT_TO_DSR if opengl else pose
+
+
+def check_pose(source: str, matrix: np.ndarray, *, opengl: bool = False) -> np.ndarray:
+    """Return a matrix (4, 4) from camera to world with the camera's axes x right, y down, z forward.
+
+    Args:
+        source: name of the file and the place in it, for the message.
+        matrix: (4, 4), in metres.
+        opengl: see :func:`pose_from_quaternion`.
+
+    Raises:
+        ValueError: it is no rigid motion.
+
+    """
+    rigid = (
+        bool(np.isfinite(matrix).all())
+        and is_rotation(matrix[:3, :3], _TOLERANCE)
+        and np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6)
+    )
+    if not rigid:
+        came = " ".join(f"{value:.4g}" for value in matrix.ravel())
+        raise ValueError(f"{source}: expected a rigid pose (a rotation and a position), got {came}")
+    return matrix @ _ARKIT_TO_DSR if opengl else matrix
+
+
+def intrinsics_camera(source: str, size: tuple[int, int], numbers: Sequence[float]) -> Camera:
+    """Return the camera of fx, fy, cx, cy in pixels of an image of (height, width).
+
+    Raises:
+        ValueError: they are those of no camera; the message begins with ``source``.
+
+    """
+    fx, fy, cx, cy = numbers
+    with naming(source):
+        if fy <= 0:
+            raise ValueError(f"camera fy: expected a positive number of pixels, got {fy!r}")
+        return Camera(size[1], size[0], fx, fy, cx, cy)
+
+
+def describe_capture(app: str, unit: str, pairs: Sequence[Pair], *, poses: bool) -> Assumption:
+    """Return what a capture says itself, as a line for the user.
+
+    Args:
+        app: what it is a capture of.
+        unit: of its depth maps.
+        poses: whether it has poses.
+
+    """
+    parts = ["intrinsics", *(["poses"] if poses else [])]
+    parts += ["confidence"] if any(pair.confidence is not None for pair in pairs) else []
+    return Assumption(f"{app}: depth in {unit}; from the capture: {', '.join(parts)}")
+
+
+def read_text(path: Path, limit: int = 1 << 26) -> str:
+    """Return the text of a file of a capture.
+
+    Raises:
+        ValueError: it is missing or larger than ``limit`` bytes.
+
+    """
+    if not path.is_file():
+        raise ValueError(f"{path}: expected a file of the capture, there is none")
+    return read_limited(path, limit).decode("utf-8-sig", errors="replace")

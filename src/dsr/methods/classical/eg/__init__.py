@@ -1,1 +1,0 @@
-"""EG: edge-guided super-resolution of depth alone (Xie et al. 2016)."""

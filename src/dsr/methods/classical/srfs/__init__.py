@@ -1,1 +1,0 @@
-"""SRfS: super-resolution by shape from shading (Haefner et al. 2018)."""

@@ -1,0 +1,253 @@
+"""The method around :class:`~dsr.methods.networks.facets_unet.FacetsUNet`: maps of any ratio, told or estimated noise.
+
+There are weights for maps whose size is the photo's over 1 and 2, over 4, over 8 and over 16. For any other ratio the
+photo is resized to a multiple of the map, and the result to the photo's size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from dsr.degradation.downsampling import Kernel
+from dsr.degradation.hints import encode_facts, local_noise, relative_error
+from dsr.geometry.hole_size import degrees_per_pixel, distance_to_known
+from dsr.geometry.resampling import pad_inverse_depth, resize_inverse_depth
+from dsr.methods.base import Abilities, Cost, InverseSample, InverseSurface, MapNoise, Method, NoiseLaw, Surface
+from dsr.methods.networks.facets_unet import FacetsUNet
+from dsr.methods.networks.network import DTYPES, Answer, DisparityNetwork, Precision
+from dsr.methods.networks.trained import NETWORKS
+from dsr.methods.networks.weight_files import clean_weights, load_network
+from dsr.sample import DepthSample
+from dsr.utils.progress import Steps
+
+Edges = Literal["auto", "sharp", "soft"]
+_TOLERANCE = 0.02
+"""A map is taken for one of the photo's own size up to this relative difference."""
+CAUTION = 1.1
+"""Measured errors over expected ones on rendered scenes that are not trained on, see ``benchmarks/confidence.py``."""
+_PER_DEGREE = 0.012
+"""Relative error of depth in holes that the network does not expect, per degree from the nearest measured pixel. On
+Middlebury 2014 and ICL-NUIM with holes cut into them it expects 2 % everywhere, and depth is off by 3 % at 0.5 to 1
+degree and by 4 % at 1 to 3 degrees."""
+_ROUNDED = 16
+"""A map with fewer different values than one per so many pixels is taken for a rounded one."""
+
+
+class AnyMap(Method):
+    """A method for maps of any ratio, kernel and noise.
+
+    Of maps that are told to be box means without noise, with sharp depth steps, the result is computed with the weights
+    for them, if the file of weights names one with such weights.
+
+    Args:
+        weights: file that ``train.py model=facets`` wrote, or a network, which is used as it is.
+        noise: standard deviation of the map's depth in metres, at 1 m if it grows; None if it is not known.
+        noise_growth: the noise grows with this power of the distance: 0 where it is the same everywhere, 2 for stereo.
+        smooth: 0 takes the map for free of noise, 2 its noise for twice as large as estimated; 1 is neutral.
+        edges: whether the result's depth steps are to be ``sharp`` or ``soft``, a pixel's value then being a mean over
+            its area; ``auto``: as the map shows.
+        kernel: of the downsampling that made the map, if it is known.
+        clean: whether the map is known to have no noise, unless ``noise`` or ``smooth`` say otherwise.
+        max_error: share of the depth; pixels that are expected to be further off are left as holes; None for no limit.
+        device: device of the computations.
+        model: name of the model that the file must contain.
+        precision: dtype of the convolutions, for a file.
+        networks: network classes by their names in weights files.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is damaged or of another model, or a value is out of range.
+
+    """
+
+    abilities = Abilities(
+        ratios="any", at_ratio=True, own_size=True, needs="network", tolerant=True, cost=Cost(250, 2.5)
+    )
+
+    def __init__(
+        self,
+        weights: Path | FacetsUNet,
+        noise: float | None = None,
+        smooth: float = 1.0,
+        edges: Edges = "auto",
+        kernel: Kernel | None = None,
+        clean: bool = False,
+        max_error: float | None = None,
+        device: torch.device | str = "cpu",
+        noise_growth: float = 0.0,
+        model: str = "facets",
+        precision: Precision = "float32",
+        networks: Mapping[str, type[DisparityNetwork]] = NETWORKS,
+    ) -> None:
+        cleanly = noise is None and clean and smooth == 1
+        if cleanly:
+            noise = 0.0
+        if edges not in get_args(Edges):
+            raise ValueError(f"edges: expected one of {', '.join(get_args(Edges))}, got {edges}")
+        if not 0 <= smooth <= 2:
+            raise ValueError(f"smooth: expected a number from 0 to 2, got {smooth}")
+        if noise is not None and not 0 <= noise < 1:
+            raise ValueError(f"noise: expected metres, 0 or more and less than 1, got {noise}")
+        if not 0 <= noise_growth <= 4:
+            raise ValueError(f"noise_growth: expected a power of the distance from 0 to 4, got {noise_growth}")
+        if noise_growth and noise is None:
+            raise ValueError(f"noise_growth: expected noise with it, got {noise_growth} and no noise")
+        if max_error is not None and not max_error > 0:
+            raise ValueError(f"max_error: expected a positive share of the depth, got {max_error}")
+        if isinstance(weights, str | Path):
+            for_clean = cleanly and (kernel, edges) == ("box", "sharp")
+            weights = _load(Path(weights), model, precision, networks, clean=for_clean)
+        self._max_error = max_error
+        self._net = weights.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs
+        self._device, self._smooth = torch.device(device), smooth
+        self._noise = None if noise is None else (noise, noise_growth)
+        self._facts = encode_facts(kernel, None if edges == "auto" else edges == "soft")[None]
+
+    @torch.no_grad()
+    def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
+        """Return the high-resolution depth, (1, H, W) in metres on the sample's device."""
+        return self.surface(sample, progress).depth
+
+    def surface(self, sample: DepthSample, progress: Steps | None = None) -> Surface:
+        """Return the high-resolution depth with its expected errors, and the noise of the low-resolution map."""
+        return self._upsample(sample, self._noise, progress)
+
+    def upsample_inverse(self, problem: InverseSample, progress: Steps | None = None) -> InverseSurface:
+        """Return the same as inverse depth, told the noise that is known of the map, unless the method was."""
+        return InverseSurface.of(self._upsample(problem.in_depth(), self._noise or problem.noise, progress))
+
+    @torch.no_grad()
+    def _upsample(self, sample: DepthSample, noise: NoiseLaw | None, progress: Steps | None) -> Surface:
+        """Return the result for a map of this noise; None for one that is not known."""
+        inverse = sample.depth_lr.to(self._device).reciprocal()[None]
+        size = sample.rgb.shape[-2:]
+        factor = self._factor(sample.scale)
+        rows, columns = inverse.shape[-2:]
+        rgb = _resize(sample.rgb.to(self._device).float()[None], (factor * rows, factor * columns)).clamp(0, 1)
+        padded = inverse
+        if factor == 1:  # in pairs
+            rgb = functional.pad(rgb, (0, columns % 2, 0, rows % 2), mode="replicate")
+            padded = pad_inverse_depth(inverse, 2)
+        level = None if noise is None else (noise[0] * padded ** (1 - noise[1])).nan_to_num(0)
+        passes = 1
+        if self._smooth != 1:
+            if level is None:
+                passes = 2
+                level = local_noise(padded, self._answer(rgb, padded, None, _half(progress, 0)).disparity)
+            level = self._smooth * level
+        answer = self._answer(rgb, padded, level, progress if passes == 1 else _half(progress, 1))
+        found = _describe_noise(padded, answer)
+        inside = (..., slice(factor * rows), slice(factor * columns))
+        result = resize_inverse_depth(answer.disparity[inside][0], (size[0], size[1]))
+        depth = torch.where(result > 0, result, torch.nan).reciprocal().to(sample.depth_lr.device)
+        errors = (_resize(each[inside], (size[0], size[1]))[0].to(depth) for each in (answer.spread, answer.angle))
+        spread, angle = (CAUTION * each for each in errors)
+        focal = sample.camera_lr.fx
+        more = (each.to(depth) for each in (*_rounding(inverse, focal), _guessing(inverse, focal)))
+        rounding, tilt, guessing = (_resize(each, (size[0], size[1]))[0] for each in more)
+        spread, angle = torch.maximum(spread, rounding) + guessing, torch.maximum(angle, tilt)
+        depth_error = spread * depth
+        if self._max_error is not None:
+            depth = depth.masked_fill(spread > self._max_error, torch.nan)
+        return Surface(depth, depth_error, torch.rad2deg(angle), found)
+
+    def _factor(self, ratio: float) -> int:
+        """Return the factor at which the network is run for a ratio of the sizes."""
+        return 1 if self._net.serves(self._net.scale, 1) and ratio <= 1 + _TOLERANCE else self._net.scale
+
+    def _answer(self, rgb: Tensor, inverse: Tensor, noise: Tensor | None, progress: Steps | None) -> Answer:
+        """Return the network's answer, told the noise if there is any to tell."""
+        facts = self._facts.to(self._device).clone()
+        facts[0, -1] = noise is not None
+        return self._net.answer(rgb, inverse, None if noise is None else noise.float(), facts, progress)
+
+
+def _load(
+    path: Path, model: str, precision: Precision, networks: Mapping[str, type[DisparityNetwork]], *, clean: bool
+) -> FacetsUNet:
+    """Return the network of a file, or of the one for clean maps of box means that the file names."""
+    path = (clean and clean_weights(path)) or path
+    net = load_network(path, networks, None, model)
+    if not isinstance(net, FacetsUNet):
+        raise ValueError(
+            f"{path}: expected weights of {FacetsUNet.__name__}, got those of {type(net).__name__}, which "
+            "method=facets_box takes"
+        )
+    return net.eval().requires_grad_(False).to(DTYPES[precision])
+
+
+def _half(progress: Steps | None, before: int) -> Steps | None:
+    """Return the progress of the first or the second of two passes of the same number of steps."""
+    return None if progress is None else lambda done, total: progress(before * total + done, 2 * total)
+
+
+def _describe_noise(given: Tensor, answer: Answer) -> MapNoise:
+    """Return the noise of a map, from its difference to the result where that is smooth."""
+    error, known = relative_error(given, answer.disparity)
+    scale = answer.disparity.shape[-1] // given.shape[-1]
+    calm = functional.avg_pool2d(answer.angle, scale)
+    known = known * (calm <= calm.flatten().median())
+    count = known.sum().clamp(min=1)
+    error = (error - (error * known).sum() / count) * known
+    variance = error.square().sum() / count
+    depth = given[given.isfinite()].median().reciprocal()
+    return MapNoise(float(variance.sqrt() * depth), _extent(error, known, float(variance)), float(depth))
+
+
+def _guessing(inverse: Tensor, focal: float) -> Tensor:
+    """Return the relative error of depth in holes beyond what the network expects, by distance, (B, 1, h, w)."""
+    known = inverse.isfinite()
+    if bool(known.all()):
+        return torch.zeros_like(inverse)
+    distance = torch.stack([distance_to_known(each) for each in known])
+    return (_PER_DEGREE * degrees_per_pixel(focal) * distance).clamp(max=1)
+
+
+def _rounding(inverse: Tensor, focal: float) -> tuple[Tensor, Tensor]:
+    """Return the expected errors of maps that are rounded to few values, where there is one value around a pixel.
+
+    That of depth is relative: a quarter of the step to the next value, the mean of errors that are equally likely up to
+    half a step. That of the normal, in radians, is the tilt of a surface that gains it up to the next other value. Both
+    are (B, 1, h, w), and 0 where the values around a pixel differ, from which the truth can be told more exactly.
+
+    """
+    known = inverse.isfinite()
+    values = inverse[known].unique()
+    if values.numel() < 2 or values.numel() * _ROUNDED >= known.sum():
+        return torch.zeros_like(inverse), torch.zeros_like(inverse)
+    gaps = values.diff()
+    step = torch.cat((gaps[:1], torch.minimum(gaps[:-1], gaps[1:]), gaps[-1:]))
+    filled = torch.where(known, inverse, values[0])
+    relative = (step / values)[torch.searchsorted(values, filled).clamp(max=len(values) - 1)] / 4
+    low, high = (
+        -functional.max_pool2d(-torch.where(known, inverse, torch.inf), 3, stride=1, padding=1),
+        functional.max_pool2d(torch.where(known, inverse, -torch.inf), 3, stride=1, padding=1),
+    )
+    flat = known & (low == high)
+    away = torch.stack([distance_to_known(each) for each in ~flat])
+    return torch.where(flat, relative, 0), torch.where(flat, torch.atan(focal * relative / (away + 1)), 0)
+
+
+def _extent(error: Tensor, known: Tensor, variance: float) -> float:
+    """Return the full width at half maximum of the correlation of neighbours, in pixels, 1 for white noise."""
+    before = 1.0
+    for step in range(1, min(16, error.shape[-1])):
+        both = (known[..., step:] * known[..., :-step]).sum().clamp(min=1)
+        now = float((error[..., step:] * error[..., :-step]).sum() / both) / max(variance, 1e-20)
+        if now < 0.5:
+            return max(1.0, 2 * (step - 1 + (before - 0.5) / max(before - now, 1e-6)))
+        before = now
+    return 2.0 * 16
+
+
+def _resize(x: Tensor, size: tuple[int, int]) -> Tensor:
+    """Return (B, C, *size), bilinear, antialiased where it shrinks."""
+    if tuple(x.shape[-2:]) == tuple(size):
+        return x
+    return functional.interpolate(x, size, mode="bilinear", align_corners=False, antialias=True)

@@ -1,0 +1,165 @@
+"""SVLRM and FDKN: networks that estimate a filter for each pixel.
+
+SVLRM, spatially variant linear representation models: Pan, Dong, Ren, Lin, Tang, Yang, *Spatially Variant Linear
+Representation Models for Joint Filtering*, CVPR 2019. The refined map is a linear function of the grey photo whose gain
+and offset, one of each per pixel, a plain convolutional network estimates from the enlarged map and the photo. Weights:
+github.com/sunny2109/SVLRM.
+
+FDKN, the fast deformable kernel network: Kim, Ponce, Ham, *Deformable Kernel Networks for Joint Image Filtering*, IJCV
+2021 (arXiv 1910.08373). For each pixel the network estimates nine positions around it and their weights, from the
+enlarged map and the photo, and adds the weighted sum of the map there. Weights: github.com/cvlab-yonsei/dkn (GPL-3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import pairwise
+from types import MappingProxyType
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from dsr.degradation.downsampling import cubic_kernel
+from dsr.methods.base import Cost
+from dsr.methods.classical.finite_differences import grey
+from dsr.methods.networks.normalisation import resize_bicubic
+from dsr.methods.networks.peers.peer_network import SWAPPED_LUMA, PeerNetwork, fold_batch_norm, rename
+
+_WIDTH, _DEPTH, _SLOPE = 64, 10, 0.1
+_CUBIC = -0.75
+"""Parameter of the cubic kernel."""
+
+_FACTOR, _TAPS, _RADIUS = 4, 3, 7
+_WIDTHS = (16, 32, 32, 64, 64, 128, 128)
+_NAMES = {
+    r"^ImageKernel\.": "rgb_kernel.",
+    r"^DepthKernel\.": "depth_kernel.",
+    **{rf"\.conv{index + 1}\.": f".layers.{index}." for index in range(len(_WIDTHS) - 1)},
+    r"\.conv_weight\.": ".weights.",
+    r"\.conv_offset\.": ".offsets.",
+}
+"""Regular expressions of the authors' names, and their replacements here."""
+
+
+class SVLRM(PeerNetwork):
+    """The network of :mod:`dsr.methods.networks.peers.local_filters`."""
+
+    title: ClassVar[str] = "SVLRM"
+    checksums: ClassVar[Mapping[str, float]] = MappingProxyType(
+        {"d0b47c00e5a8e074": 4, "a23c7cda0bccb284": 8, "77f6b973783a722d": 16}
+    )
+    receptive_field_radius: ClassVar[int | None] = _DEPTH + 2
+    cost: ClassVar[Cost] = Cost(800, 5)
+
+    def __init__(self, scale: float) -> None:
+        super().__init__(scale)
+        self.first_layer = nn.Conv2d(2, _WIDTH, 3, padding=1)
+        self.feature_block = nn.ModuleDict(
+            {str(2 * index): nn.Conv2d(_WIDTH, _WIDTH, 3, padding=1) for index in range(_DEPTH)}
+        )
+        self.final_layer = nn.Conv2d(_WIDTH, 2, 3, padding=1)
+
+    def enlarge(self, values_lr: Tensor, size: tuple[int, int]) -> Tensor:
+        """Enlarge a map by cubic interpolation, shifted to the left and upwards by (scale - 1) / 2 pixels.
+
+        The authors' training takes the last pixel of each block as the low-resolution value and enlarges the map as if
+        it were the middle one, so the network has learnt to undo such a shift.
+        """
+        for dim, new in ((-2, size[0]), (-1, size[1])):
+            values_lr = _resize(values_lr, dim, new, (self.scale - 1) / 2)
+        return values_lr
+
+    def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
+        """Refine an enlarged map; see :meth:`PeerNetwork.forward`."""
+        luma = grey(rgb)
+        x = functional.leaky_relu(self.first_layer(torch.cat((values, luma), dim=1)), _SLOPE)
+        for layer in self.feature_block.values():
+            x = functional.leaky_relu(layer(x), _SLOPE)
+        gain, offset = self.final_layer(x).split(1, dim=1)
+        return gain * luma + offset
+
+
+def _resize(values: Tensor, dim: int, new: int, shift: float) -> Tensor:
+    """Return cubic interpolation along a dimension, at positions further on by ``shift`` new pixels."""
+    old = values.shape[dim]
+    place = (torch.arange(new, dtype=torch.float64) + 0.5 + shift) * (old / new) - 0.5
+    first = place.floor()
+    index = first.long()[:, None] + torch.arange(-1, 3)
+    weight = cubic_kernel((place[:, None] - index).abs(), _CUBIC)
+    matrix = torch.zeros(new, old, dtype=torch.float64).scatter_add_(1, index.clamp(0, old - 1), weight).to(values)
+    return matrix @ values if dim == -2 else values @ matrix.T
+
+
+class FDKN(PeerNetwork):
+    """The network of :mod:`dsr.methods.networks.peers.local_filters`."""
+
+    title: ClassVar[str] = "FDKN"
+    checksums: ClassVar[Mapping[str, float]] = MappingProxyType({"036ec8f27eec624c": 8})
+    multiple: ClassVar[int] = _FACTOR
+    receptive_field_radius: ClassVar[int | None] = _FACTOR * len(_WIDTHS)
+    cost: ClassVar[Cost] = Cost(420, 1)
+
+    def __init__(self, scale: float) -> None:
+        super().__init__(scale)
+        self.rgb_kernel, self.depth_kernel = _Kernel(), _Kernel()
+
+    @classmethod
+    def convert(cls, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Merge the batch normalisations into the convolutions before them."""
+        for branch in ("ImageKernel", "DepthKernel"):
+            for index in (1, 3, 5):
+                fold_batch_norm(tensors, f"{branch}.conv{index}", f"{branch}.conv{index}_bn")
+        return rename(tensors, _NAMES)
+
+    def enlarge(self, values_lr: Tensor, size: tuple[int, int]) -> Tensor:
+        """Enlarge as Pillow's bicubic filter does."""
+        return resize_bicubic(values_lr, size)
+
+    def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
+        """Refine an enlarged map; see :meth:`PeerNetwork.forward`."""
+        branches = zip(self.rgb_kernel(grey(rgb, SWAPPED_LUMA)), self.depth_kernel(values), strict=True)
+        weights, offsets = (functional.pixel_shuffle(rgb * depth, _FACTOR).float() for rgb, depth in branches)
+        return values + _sample(values, weights - weights.mean(dim=1, keepdim=True), offsets)
+
+
+class _Kernel(nn.Module):
+    """The branch of one image, (B, 1, H, W): weights and offsets for each block of 4 x 4 pixels."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList(nn.Conv2d(before, after, 3, padding=1) for before, after in pairwise(_WIDTHS))
+        self.weights = nn.Conv2d(_WIDTHS[-1], _TAPS**2 * _FACTOR**2, 1)
+        self.offsets = nn.Conv2d(_WIDTHS[-1], 2 * _TAPS**2 * _FACTOR**2, 1)
+
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        x = functional.pixel_unshuffle(image, _FACTOR)
+        for layer in self.layers:
+            x = functional.relu_(layer(x))
+        return self.weights(x).sigmoid_(), self.offsets(x)
+
+
+def _sample(values: Tensor, weights: Tensor, offsets: Tensor) -> Tensor:
+    """Return the weighted sum of a map at nine positions around each pixel.
+
+    Each pixel sees a window of 15 x 15 pixels, interpolated bilinearly; outside of it and of the map, values are 0.
+    """
+    height, width = values.shape[-2:]
+    rows = torch.arange(height, device=values.device, dtype=values.dtype)[:, None]
+    columns = torch.arange(width, device=values.device, dtype=values.dtype)
+    total = torch.zeros_like(values)
+    for tap in range(_TAPS**2):
+        # The grid's first pixel is the window's middle one, less half a pixel, and its rows lie across.
+        across, down = (offsets[:, 2 * tap + axis] + place - 0.5 for axis, place in enumerate(divmod(tap, _TAPS)))
+        inside = _fraction_inside(across) * _fraction_inside(down)
+        x, y = (each.clamp(-_RADIUS, _RADIUS) + start for each, start in ((across, columns), (down, rows)))
+        grid = torch.stack((2 * x / max(width - 1, 1) - 1, 2 * y / max(height - 1, 1) - 1), dim=-1)
+        sampled = functional.grid_sample(values, grid, align_corners=True)
+        total += sampled * (weights[:, tap] * inside)[:, None]
+    return total
+
+
+def _fraction_inside(displacement: Tensor) -> Tensor:
+    """Return the weight that interpolation along an axis gives to pixels of the window."""
+    return (_RADIUS + 1 - displacement.abs()).clamp(0, 1)

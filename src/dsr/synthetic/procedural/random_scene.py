@@ -1,0 +1,124 @@
+"""Random scenes, one for each (seed, index): a layout, a camera, lights, a photo and its exact depth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dsr.geometry.camera import Camera
+from dsr.synthetic.procedural.arrangements import LAYOUTS
+from dsr.synthetic.procedural.lighting import Hits, Lighting, Tracer, random_lighting
+from dsr.synthetic.procedural.materials import MaterialSampler
+from dsr.synthetic.procedural.photo import SceneLayout, View, Viewpoint, develop, radiance
+from dsr.synthetic.rendering import Rendering
+
+PROCEDURAL_VERSION = 1
+"""Version of the scenes; it has to be increased whenever an image changes."""
+_PREVIEW_SIZE = 64
+_MIN_DEPTH, _MAX_MEDIAN_DEPTH = 0.25, 10.0
+_LAYOUT_TRIES, _CAMERA_TRIES = 6, 10
+
+
+@dataclass(frozen=True, eq=False)
+class RandomScene:
+    """A scene that can be rendered at any size.
+
+    Args:
+        layout_name: key of its layout in :data:`LAYOUTS`.
+        layout: bodies of the scene.
+        tracer: ray tracer of these bodies.
+        viewpoint: camera.
+        lighting: lights.
+        metres: metres per unit of length of the layout.
+        seed: seed of the camera's noise.
+
+    """
+
+    layout_name: str
+    layout: SceneLayout
+    tracer: Tracer
+    viewpoint: Viewpoint
+    lighting: Lighting
+    metres: float
+    seed: int
+
+
+def render_random_scene(seed: int, index: int, size: int = 512) -> Rendering:
+    """Return the scene number ``index`` of the endless series ``seed``; the view is the same at any size.
+
+    Args:
+        index: number of the scene in it, from 0. The scene is a function of these two numbers alone.
+        size: height and width in pixels.
+
+    Returns:
+        The photo and its depth in metres, which is more than 0.2 everywhere and exact for the surfaces that
+        :mod:`dsr.synthetic.procedural.lighting` describes.
+
+    Raises:
+        ValueError: a number is negative, or the size is not positive.
+
+    """
+    for name, value, least in (("seed", seed, 0), ("index", index, 0), ("size", size, 1)):
+        if value < least:
+            raise ValueError(f"{name}: expected at least {least}, got {value}")
+    return render(random_scene(np.random.default_rng(np.random.SeedSequence([seed, index]))), size)
+
+
+def random_scene(rng: np.random.Generator, layout_name: str | None = None) -> RandomScene:
+    """Return a random scene of the layout with this name in :data:`LAYOUTS`; None for a random layout."""
+    names = list(LAYOUTS)
+    weights = np.array([weight for _, weight in LAYOUTS.values()])
+    for _ in range(_LAYOUT_TRIES):
+        name = layout_name if layout_name is not None else names[rng.choice(len(names), p=weights / weights.sum())]
+        layout = LAYOUTS[name][0](rng, MaterialSampler(rng))
+        tracer = Tracer([body.shape for body in layout.bodies])
+        for _ in range(_CAMERA_TRIES):
+            viewpoint = layout.views(rng)
+            view = _view(viewpoint, make_camera(viewpoint, _PREVIEW_SIZE))
+            seen = tracer.trace(view.eye, view.rays.reshape(3, -1))
+            if _is_usable(seen):
+                lighting = random_lighting(rng, tracer, seen, layout.low, layout.high)
+                metres = _random_scale(rng, seen)
+                return RandomScene(name, layout, tracer, viewpoint, lighting, metres, int(rng.integers(1 << 31)))
+    raise RuntimeError("no view of the scene was usable")  # pragma: no cover
+
+
+def _is_usable(seen: Hits) -> bool:
+    """Return whether a preview has no gap, is neither too near nor too deep, and shows more than one object."""
+    if not np.isfinite(seen.depth).all():
+        return False
+    low, middle, high = np.quantile(seen.depth, [0.02, 0.5, 0.98])
+    fractions = np.bincount(seen.body) / seen.body.size
+    near = seen.depth.min() > 0.17 * middle
+    return bool(near and high < 6.2 * low and fractions.max() < 0.985 and np.sum(fractions > 0.004) >= 2)
+
+
+def _random_scale(rng: np.random.Generator, seen: Hits) -> float:
+    """Return a random scale, metres per unit, that keeps the depth within its limits."""
+    scale = np.exp(rng.normal(0, 0.3))
+    scale = min(scale, _MAX_MEDIAN_DEPTH / float(np.median(seen.depth)))
+    return float(max(scale, 1.5 * _MIN_DEPTH / float(seen.depth.min())))
+
+
+def make_camera(viewpoint: Viewpoint, size: int) -> Camera:
+    """Return the camera of ``size`` x ``size`` pixels."""
+    focal = viewpoint.focal * size
+    cx, cy = viewpoint.centre * size - 0.5
+    return Camera(size, size, focal, focal, float(cx), float(cy))
+
+
+def _view(viewpoint: Viewpoint, camera: Camera) -> View:
+    """Return the camera's rays in the frame of the layout."""
+    axes = viewpoint.axes()
+    rays = np.einsum("ik,ihw->khw", axes, camera.rays().numpy())
+    return View(viewpoint.eye, rays, axes[0] / camera.fx, axes[1] / camera.fy)
+
+
+def render(scene: RandomScene, size: int) -> Rendering:
+    """Return the photo and the depth of a scene."""
+    camera = make_camera(scene.viewpoint, size)
+    view = _view(scene.viewpoint, camera)
+    linear, depth = radiance(scene.tracer, scene.layout.bodies, view, scene.lighting)
+    rgb = develop(linear, np.random.default_rng(scene.seed))
+    return Rendering(rgb, scene.metres * depth, camera)

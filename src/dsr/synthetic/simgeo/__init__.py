@@ -1,1 +1,0 @@
-"""SimGeo: the paper's geometric scenes, and a statue."""

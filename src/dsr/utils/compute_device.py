@@ -1,0 +1,35 @@
+"""Devices to compute on."""
+
+from __future__ import annotations
+
+import os
+
+import torch
+
+from dsr.utils.configuration import ConfigError
+
+_FAST_ON_CPU = ("_is_avx512_bf16_supported", "_is_amx_tile_supported")
+"""What a CPU has where convolutions in bfloat16 are faster, also with gradients (``benchmarks/train_speed.py``)."""
+
+
+def fast_precision(device: torch.device) -> str:
+    """Return the precision that convolutions are fast in: bfloat16 on a GPU or CPU with instructions for it."""
+    if device.type == "cuda":
+        return "bfloat16" if torch.cuda.is_bf16_supported(including_emulation=False) else "float32"
+    flags = (getattr(torch.cpu, name, lambda: False) for name in _FAST_ON_CPU)
+    return "bfloat16" if device.type == "cpu" and any(flag() for flag in flags) else "float32"
+
+
+def pick_device(name: str) -> torch.device:
+    """Return the device of that name; ``auto`` is $DSR_DEVICE, else the first GPU where there is one, else the CPU."""
+    given_by = "device"
+    if name == "auto" and os.environ.get("DSR_DEVICE"):
+        given_by, name = "$DSR_DEVICE", os.environ["DSR_DEVICE"]
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device).item()
+    except (RuntimeError, AssertionError) as error:  # torch asserts that it was built for CUDA
+        raise ConfigError(f"{given_by}: expected auto, cpu or a device of this machine, got {name!r}") from error
+    return device
