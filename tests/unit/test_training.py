@@ -418,14 +418,17 @@ def test_gradient_is_clipped_as_the_trainer_says_and_its_norm_logged(
         assert float(found) == pytest.approx(1e-3, rel=1e-3)
 
 
-def test_non_finite_gradient_changes_nothing(tmp_path: Path) -> None:
-    module = _module()
+@pytest.mark.parametrize("fused", [False, True])
+def test_non_finite_gradient_changes_nothing(tmp_path: Path, fused: bool) -> None:
+    module = _module(optimizer=functools.partial(torch.optim.AdamW, weight_decay=0.1, fused=fused))
     before = copy.deepcopy(module.net.state_dict())
     [batch] = _one_batch()
     batch["depth"] = batch["depth"].clone()
     bad = {**batch, "bf": torch.full_like(batch["bf"], torch.inf)}
     _trainer(tmp_path, max_epochs=1).fit(module, DataLoader([bad], batch_size=None))
     assert all(torch.equal(before[name], value) for name, value in module.net.state_dict().items())
+    _trainer(tmp_path, max_epochs=1).fit(module, DataLoader([bad, batch], batch_size=None))
+    assert not all(torch.equal(before[name], value) for name, value in module.net.state_dict().items())
 
 
 @pytest.mark.parametrize("average", [1.0, -0.1, math.nan])

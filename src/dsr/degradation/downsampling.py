@@ -26,6 +26,7 @@ from dsr.degradation.noise import Noise
 from dsr.degradation.scales import check_scale, match_ratio
 from dsr.geometry.camera import Camera, RangeType, from_range, to_range
 from dsr.sample import FARTHEST, NEAREST, DepthSample, Scene
+from dsr.utils.devices import known_true
 
 Kernel = Literal["box", "nearest", "bilinear", "bicubic", "gaussian"]
 _LEAST_WEIGHT = 0.5
@@ -94,7 +95,7 @@ class Downsampling:
         if self.kernel == "nearest":
             return values[..., scale // 2 :: scale, scale // 2 :: scale]
         valid = values.isfinite()
-        if bool(valid.all()):
+        if known_true(valid):
             return self._apply(values, scale)
         complete, weight = torch.where(valid, values, 0), valid.to(values.dtype)
         mean, fraction = self._apply(complete, scale), self._apply(weight, scale)

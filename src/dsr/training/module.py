@@ -160,7 +160,9 @@ class SuperResolution(lightning.LightningModule):
         if gradient_clip_val is not None and not by_norm:
             nn.utils.clip_grad_value_(self.net.parameters(), gradient_clip_val)
         self.log("train/gradient_norm", norm.detach(), logger=False)
-        if not bool(norm.isfinite()):
+        if optimizer.defaults.get("fused"):  # such an optimiser drops a step by a flag, which nothing waits for
+            optimizer.found_inf = (~norm.isfinite()).float()  # type: ignore[attr-defined]
+        elif not bool(norm.isfinite()):
             optimizer.zero_grad(set_to_none=True)
 
     def optimizer_step(self, *arguments: Any, **named: Any) -> None:

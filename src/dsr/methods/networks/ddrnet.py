@@ -19,7 +19,6 @@ What differs from the original:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -28,7 +27,7 @@ from torch.nn import functional
 
 from dsr.degradation.scales import check_scale
 from dsr.methods.classical.finite_differences import grey, upsample_linear_border
-from dsr.methods.networks.base import Answer, NormalisedNetwork, expect_rgb_size
+from dsr.methods.networks.base import NormalisedNetwork, expect_rgb_size
 
 _HALVINGS = 2
 _BLOCKS = 2
@@ -77,13 +76,6 @@ class DDRNet(NormalisedNetwork):
         radius_hr = self.denoise.receptive_field_radius + self.refine.receptive_field_radius
         return -(-radius_hr // self.scale) + _UPSAMPLING
 
-    def answer_patches(self, batch: Mapping[str, Tensor]) -> Answer:
-        """Return the refined map, and the denoised one as a stage."""
-        denoised, refined = self.in_range(
-            batch["disparity_lr"], batch["min_max"], lambda values: self._compute_stages(batch["rgb"], values)
-        )
-        return Answer(refined.float(), stages=(denoised.float(),))
-
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
         """Map an image and normalised low-resolution disparity to high-resolution disparity.
 
@@ -98,9 +90,9 @@ class DDRNet(NormalisedNetwork):
             ValueError: the photo's size is not scale times the map's.
 
         """
-        return self._compute_stages(rgb, values)[-1]
+        return self.compute_stages(rgb, values)[-1]
 
-    def _compute_stages(self, rgb: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+    def compute_stages(self, rgb: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
         """Return the denoised and the refined map, (B, 1, H, W) each, normalised to 0..1."""
         expect_rgb_size(rgb, values, self.scale)
         weight = self.denoise.last.weight
