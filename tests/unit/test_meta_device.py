@@ -15,6 +15,7 @@ from unittest import mock
 import pytest
 import torch
 from lightning.fabric.utilities import move_data_to_device
+from small_lpips import random_lpips
 from small_scenes import sample_of, step
 from torch import Tensor
 from torch.utils.data import default_collate
@@ -31,14 +32,12 @@ from dsr.metrics.calibration import measured_errors
 from dsr.metrics.catalogue import PROTOCOLS, catalogue
 from dsr.metrics.classes import visual_metrics
 from dsr.metrics.functional import SurfacePair
-from dsr.metrics.lpips import LPIPS
 from dsr.metrics.visual_loss import VisualLoss
 from dsr.training.degradation import Batch, to_tensors
 from dsr.training.module import SuperResolution
 from dsr.training.objective import DepthObjective, SurfaceObjective
 
 META = torch.device("meta")
-TRUNK = {0: (64, 3, 11, 11), 3: (192, 64, 5, 5), 6: (384, 192, 3, 3), 8: (256, 384, 3, 3), 10: (256, 256, 3, 3)}
 METRICS = [metric for metrics in PROTOCOLS.values() for metric in metrics]
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*the `self.trainer` reference is not registered.*")
@@ -51,11 +50,6 @@ def _meta_is_not_autocast() -> Iterator[None]:
     named = lambda kind, *args, **more: contextlib.nullcontext() if kind == "meta" else real(kind, *args, **more)  # noqa: E731
     with mock.patch("torch.autocast", named):
         yield
-
-
-def _lpips() -> LPIPS:
-    weights = {f"features.{i}.weight": torch.zeros(shape) for i, shape in TRUNK.items()}
-    return LPIPS(weights | {f"features.{i}.bias": torch.zeros(shape[0]) for i, shape in TRUNK.items()})
 
 
 def _batch() -> Batch:
@@ -105,14 +99,14 @@ def test_training_step_reads_no_value(name: str) -> None:
 def test_loss_of_a_training_reads_no_value(depth_loss: Any, visual: Any) -> None:
     batch = _on_meta(_batch())
     disparity = torch.empty_like(batch["depth"], requires_grad=True)
-    loss = VisualLoss(visual, _lpips() if visual == "lpips" else None)
+    loss = VisualLoss(visual, random_lpips() if visual == "lpips" else None)
     DepthObjective(depth_loss, 1.0, loss, shading=0.1)(Answer(disparity, stages=(disparity,)), batch)["loss"].backward()
     assert disparity.grad is not None
 
 
 @pytest.mark.parametrize("metric", METRICS, ids=lambda metric: metric.name)
 def test_metric_reads_no_value(metric: Any) -> None:
-    [metric] = [each for each in catalogue(_lpips(), protocols=tuple(PROTOCOLS)) if each.name == metric.name]
+    [metric] = [each for each in catalogue(random_lpips(), protocols=tuple(PROTOCOLS)) if each.name == metric.name]
     pair = SurfacePair(*_maps(differentiable=True))
     for value in metric.variants(pair).values():
         assert value.shape == (2,)
@@ -120,7 +114,7 @@ def test_metric_reads_no_value(metric: Any) -> None:
 
 
 def test_collection_of_metrics_reads_no_value() -> None:
-    metrics = visual_metrics(_lpips(), protocols=tuple(PROTOCOLS)).to(META)
+    metrics = visual_metrics(random_lpips(), protocols=tuple(PROTOCOLS)).to(META)
     assert all(value.is_meta for value in metrics(*_maps()).values())
     assert all(value.is_meta for value in metrics.compute().values())
     assert all(value.is_meta for value in measured_errors(*_maps()))

@@ -14,10 +14,12 @@ import numpy as np
 import pytest
 import torch
 import torchmetrics
+from small_lpips import random_lpips
 from torch import Tensor, nn
 
 from dsr.geometry.camera import Camera
 from dsr.metrics import functional
+from dsr.metrics.catalogue import METRICS
 from dsr.metrics.classes import (
     BadPixD,
     BadPixV,
@@ -36,21 +38,12 @@ from dsr.metrics.lpips import LPIPS, lpips_v
 from dsr.sample import Unit
 
 CAMERA = Camera(width=40, height=36, fx=40.0, fy=40.0, cx=20.0, cy=18.0)
-NAMES = [
-    "RMSE_d",
-    *(f"BadPix_d_{percent}cm" for percent in (1, 5, 10)),
-    *(f"BadPix_d_{percent}pct" for percent in (1, 5, 10)),
-    *(f"BadPix_v_{level}" for level in (1, 5, 10)),
-    *("DSSIM_v", "LPIPS_v", "RMSE_v", "RMSE_v1", "Bumpiness_d"),
-]
+NAMES = [metric.name for metric in METRICS]
 
 
 @pytest.fixture(scope="module")
 def network() -> LPIPS:
-    random = torch.Generator().manual_seed(0)
-    shapes = {0: (64, 3, 11, 11), 3: (192, 64, 5, 5), 6: (384, 192, 3, 3), 8: (256, 384, 3, 3), 10: (256, 256, 3, 3)}
-    trunk = {f"features.{i}.weight": 0.1 * torch.randn(shape, generator=random) for i, shape in shapes.items()}
-    return LPIPS(trunk | {f"features.{i}.bias": torch.zeros(shape[0]) for i, shape in shapes.items()})
+    return random_lpips()
 
 
 def _pair(seed: int, batch: int = 1) -> SurfacePair:

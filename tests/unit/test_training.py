@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from lightning.pytorch.callbacks import Callback
+from small_lpips import random_lpips
 from torch import Tensor
 from torch.utils.data import DataLoader
 
@@ -526,10 +527,7 @@ def test_validation_starts_anew_each_time(tmp_path: Path) -> None:
 
 
 def test_checkpoint_holds_the_networks_tensors_alone_and_loads_as_plain_data(tmp_path: Path) -> None:
-    shapes = {0: (64, 3, 11, 11), 3: (192, 64, 5, 5), 6: (384, 192, 3, 3), 8: (256, 384, 3, 3), 10: (256, 256, 3, 3)}
-    trunk = {f"features.{i}.weight": 0.05 * torch.randn(shape) for i, shape in shapes.items()}
-    network = LPIPS(trunk | {f"features.{i}.bias": torch.zeros(shape[0]) for i, shape in shapes.items()})
-    module, trainer = _module(network), _trainer(tmp_path, max_steps=1)
+    module, trainer = _module(random_lpips()), _trainer(tmp_path, max_steps=1)
     loader = _loader(WholeScenes([_scene(3)], X2))
     trainer.fit(module, _one_batch(), loader)
     assert math.isfinite(trainer.callback_metrics["val/LPIPS_v"])
