@@ -217,11 +217,8 @@ class FacetsUNet(DisparityNetwork):
     def answer_patches(self, batch: Mapping[str, Any]) -> Answer:
         """Return inverse depth, times baseline and focal length, and its expected errors, told the hints if any."""
         batch = self.prepare(batch)
-        inverse, prepared = (
-            batch["disparity_lr"] + batch["doffs"],
-            {name: batch[name] for name in ("filled", "kernels")},
-        )
-        return self.answer(batch["rgb"], inverse, batch.get("noise"), batch.get("facts"), **prepared)
+        inverse, hints = batch["disparity_lr"] + batch["doffs"], (batch.get("noise"), batch.get("facts"))
+        return self.answer(batch["rgb"], inverse, *hints, filled=batch["filled"], kernels=batch["kernels"])
 
     def answer_scene(self, batch: Mapping[str, Tensor]) -> Tensor:
         """Return high-resolution disparity, told the hints if any."""
