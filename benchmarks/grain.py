@@ -38,7 +38,7 @@ def main() -> None:
     options = parser.parse_args()
     box = Downsampling("box")
     method = read_recipe(options.method).build(options.scale, Run(device=options.device, downsampling=box))
-    metrics = chosen_metrics(MetricsConfig(lpips_trunk=options.lpips_trunk), torch.device("cpu"))
+    metrics = chosen_metrics(MetricsConfig(lpips_trunk=options.lpips_trunk))
     print("| scene | grain | RMSE_v | DSSIM_v | LPIPS_v | RMSE_d, mm |\n| --- | --- | ---: | ---: | ---: | ---: |")
     for name in options.names.split(","):
         sample = make_sample(Folder(str(options.scenes), [name]).load(name), options.scale, box, method.range_type)

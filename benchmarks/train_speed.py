@@ -143,7 +143,7 @@ def profile(steps: int, device: torch.device, overrides: Sequence[str]) -> None:
     settings.precision = "float32" if settings.precision == "auto" else settings.precision
     times = StepTimes(device)
     data = training_data(settings)
-    module = _module(settings, _network(settings), data, functools.partial(metric_collection, settings.metrics, device))
+    module = _module(settings, _network(settings), data, functools.partial(metric_collection, settings.metrics))
     data.setup()
     processes = find_processes(device, 1, "auto")
     with tempfile.TemporaryDirectory() as folder:

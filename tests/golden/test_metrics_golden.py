@@ -58,8 +58,7 @@ def _prediction(shared: Path, scene: Scene, method: str, scale: int) -> Tensor:
 
 
 def _check(expected: dict[str, Any], rows: dict[tuple[str, str], Score]) -> None:
-    """Compare all the metrics; each of the lights where there are some, their maximum and their average."""
-    assert set(expected) == {metric for metric, _ in rows}
+    """Compare the file's metrics; each of the lights where there are some, their maximum and their average."""
     for name, value in expected.items():
         tolerance = 1e-3 if name == "LPIPS_v" else 1e-4
         if not isinstance(value, list):

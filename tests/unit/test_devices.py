@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from pretend_cuda import pretend_cuda
+from small_lpips import random_lpips
 from small_scenes import sample_of
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
@@ -33,7 +34,6 @@ from dsr.metrics import losses
 from dsr.metrics.catalogue import PROTOCOLS, catalogue, score_image
 from dsr.metrics.classes import compute_means, visual_metrics
 from dsr.metrics.functional import SurfacePair
-from dsr.metrics.lpips import LPIPS
 from dsr.metrics.visual_loss import VisualLoss
 from dsr.sample import CENTIMETRES, DepthSample, Scene
 from dsr.training.degradation import Degradation
@@ -55,7 +55,6 @@ SHORT: dict[str, dict[str, Any]] = {
 SLOW = {"eg", "srfs", "dip", "dip_v", "dip_v_warm"}
 METHODS = [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in list_methods()]
 CPU = torch.device("cpu")
-TRUNK = ((3, 64, 11), (64, 192, 5), (192, 384, 3), (384, 256, 3), (256, 256, 3))
 
 
 @pytest.fixture
@@ -162,17 +161,9 @@ def _pair(device: torch.device, *, holes: bool = True) -> SurfacePair:
     return SurfacePair(prediction.to(device), target.to(device), sample.camera.rays(device=device)[None])
 
 
-def _lpips() -> LPIPS:
-    """Return the network with a random trunk."""
-    torch.manual_seed(0)
-    layers = zip((0, 3, 6, 8, 10), TRUNK, strict=True)
-    modules = {f"features.{i}": nn.Conv2d(a, b, k) for i, (a, b, k) in layers}
-    return LPIPS({f"{key}.{name}": value for key, m in modules.items() for name, value in m.state_dict().items()})
-
-
 @pytest.mark.parametrize("holes", [False, True])
 def test_metrics_have_the_values_of_the_cpu(gpu: torch.device, holes: bool) -> None:
-    network = _lpips()
+    network = random_lpips()
     found = []
     for device in (CPU, gpu):
         pair, metrics = _pair(device, holes=holes), catalogue(network.to(device), (), tuple(PROTOCOLS))
@@ -194,7 +185,7 @@ LOSSES: dict[str, Callable[[], Callable[[SurfacePair], Tensor]]] = {
     **{each.__name__: partial(partial, _depth_loss, loss=each) for each in (losses.l1, losses.mse, losses.lap1)},
     "mse_v": VisualLoss,
     "dssim": lambda: VisualLoss("dssim"),
-    "lpips": lambda: VisualLoss("lpips", _lpips()),
+    "lpips": lambda: VisualLoss("lpips", random_lpips()),
 }
 
 

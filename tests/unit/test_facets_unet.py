@@ -277,6 +277,20 @@ def test_sizes_are_checked() -> None:
         FacetsUNet(4, blocks=2)
 
 
+def test_prepared_patches_have_the_answer_of_the_maps_and_the_hints() -> None:
+    net, generator = _net(), torch.Generator().manual_seed(5)
+    rgb, values = torch.rand((2, 3, 48, 40), generator=generator), 1 + torch.rand((2, 1, 12, 10), generator=generator)
+    values[1, :, 3:6, 2:5] = torch.nan
+    hints = {"noise": torch.full_like(values, 0.01), "facts": torch.stack([encode_facts("bicubic"), encode_facts()])}
+    batch = {"rgb": rgb, "disparity_lr": values, "doffs": torch.full((2, 1, 1, 1), 0.5), **hints}
+    prepared = net.prepare(batch)
+    assert prepared["kernels"] == ["bicubic", None]
+    for one, other in zip(
+        _maps(net.answer_patches(prepared)), _maps(net.answer(rgb, values + 0.5, *hints.values())), strict=True
+    ):
+        assert torch.equal(one, other)
+
+
 def test_images_of_a_batch_do_not_see_each_other() -> None:
     """With kernels of their own, one of them unknown, and holes in one."""
     net = _net()

@@ -17,6 +17,7 @@ import pytest
 import torch
 import torchmetrics.functional.image as heads_home
 from PIL import Image
+from small_lpips import random_lpips, random_trunk
 from torch import Tensor, nn
 
 from dsr.geometry.camera import Camera
@@ -26,22 +27,10 @@ from dsr.metrics import lpips
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS, TRUNK_FILE, TRUNK_HASH, TRUNK_URL, find_trunk, load_lpips, lpips_v
 
-SHAPES = {0: (64, 3, 11, 11), 3: (192, 64, 5, 5), 6: (384, 192, 3, 3), 8: (256, 384, 3, 3), 10: (256, 256, 3, 3)}
-
-
-def _trunk(seed: int = 0) -> dict[str, Tensor]:
-    random = torch.Generator().manual_seed(seed)
-    trunk = {}
-    for index, shape in SHAPES.items():
-        fan_in = shape[1] * shape[2] * shape[3]
-        trunk[f"features.{index}.weight"] = torch.randn(shape, generator=random) * (2 / fan_in) ** 0.5
-        trunk[f"features.{index}.bias"] = 0.1 * torch.randn(shape[0], generator=random)
-    return trunk
-
 
 @pytest.fixture(scope="module")
 def network() -> LPIPS:
-    return LPIPS(_trunk())
+    return random_lpips()
 
 
 def _images(seed: int, size: tuple[int, int] = (40, 47), batch: int = 1) -> Tensor:
@@ -119,14 +108,16 @@ def test_example_pairs_of_the_authors_have_the_published_distance(shared: Path, 
 @pytest.mark.parametrize("size", [(31, 31), (40, 47), (64, 33)])
 def test_distance_equals_that_of_alexnets_normalised_features(network: LPIPS, size: tuple[int, int]) -> None:
     first, second = _images(1, size, 2), _images(2, size, 2)
-    torch.testing.assert_close(network(first, second).double(), _reference(_trunk(), first, second), rtol=1e-4, atol=0)
+    torch.testing.assert_close(
+        network(first, second).double(), _reference(random_trunk(), first, second), rtol=1e-4, atol=0
+    )
 
 
 def test_masked_features_are_weighted_by_the_valid_fraction_of_their_pixels(network: LPIPS) -> None:
     first, second = _images(1, batch=2), _images(2, batch=2)
     mask = torch.rand(2, 1, 40, 47, generator=torch.Generator().manual_seed(3)) > 0.3
     mask[0, :, :20] = False
-    expected = _reference(_trunk(), first, second, mask)
+    expected = _reference(random_trunk(), first, second, mask)
     torch.testing.assert_close(network(first, second, mask).double(), expected, rtol=1e-4, atol=0)
 
 
@@ -150,9 +141,10 @@ def test_identical_images_have_distance_zero_and_a_finite_gradient(network: LPIP
 
 
 def test_features_that_are_all_zero_have_a_finite_gradient() -> None:
-    trunk = _trunk()
-    for index in SHAPES:
-        trunk[f"features.{index}.bias"] = torch.full((SHAPES[index][0],), -100.0)
+    trunk = random_trunk()
+    for name in trunk:
+        if name.endswith("bias"):
+            trunk[name] = torch.full_like(trunk[name], -100.0)
     first = _images(1).requires_grad_()
     distance = LPIPS(trunk)(first, _images(2))
     assert distance.item() == 0
@@ -197,7 +189,7 @@ def test_lpips_v_is_the_distance_of_each_lights_rendering_in_three_channels(netw
     assert values.shape == (1, 4)
     for light in range(4):
         first, second = (2 * maps[:, light : light + 1].expand(-1, 3, -1, -1) - 1 for maps in renderings)
-        expected = _reference(_trunk(), first, second, pair.normal_mask)
+        expected = _reference(random_trunk(), first, second, pair.normal_mask)
         torch.testing.assert_close(values[:, light].double(), expected, rtol=1e-4, atol=0)
 
 
@@ -220,22 +212,22 @@ def test_batch_of_complete_and_incomplete_pairs_equals_single_pairs(network: LPI
 
 
 def test_missing_or_misshapen_tensor_is_refused_by_name() -> None:
-    trunk = _trunk()
+    trunk = random_trunk()
     del trunk["features.8.bias"]
     with pytest.raises(ValueError, match=r"features.8.bias: expected a tensor of shape \(256,\), got nothing"):
         LPIPS(trunk)
     with pytest.raises(ValueError, match=r"features.0.weight: expected a tensor of shape \(64, 3, 11, 11\), got \(64,"):
-        LPIPS(_trunk() | {"features.0.weight": torch.zeros(64, 3, 7, 7)})
+        LPIPS(random_trunk() | {"features.0.weight": torch.zeros(64, 3, 7, 7)})
 
 
 def test_weights_file_may_hold_more_than_the_features(tmp_path: Path, network: LPIPS) -> None:
-    torch.save(_trunk() | {"classifier.1.weight": torch.zeros(3)}, tmp_path / "alexnet.pth")
+    torch.save(random_trunk() | {"classifier.1.weight": torch.zeros(3)}, tmp_path / "alexnet.pth")
     first, second = _images(1), _images(2)
     assert torch.equal(load_lpips(tmp_path / "alexnet.pth")(first, second), network(first, second))
 
 
 def test_network_construction_draws_no_random_number() -> None:
-    trunk = _trunk()
+    trunk = random_trunk()
     before = torch.get_rng_state()
     LPIPS(trunk)
     assert torch.equal(torch.get_rng_state(), before)
@@ -253,7 +245,7 @@ class _Trap:
 
 def _damaged(kind: str, folder: Path) -> bytes:
     buffer = io.BytesIO()
-    torch.save([1] if kind == "list" else _trunk() if kind == "cut" else {"state": torch.ones(2)}, buffer)
+    torch.save([1] if kind == "list" else random_trunk() if kind == "cut" else {"state": torch.ones(2)}, buffer)
     return {
         "empty": b"",
         "text": b"<html>404 not found</html>\nsecond line\n",

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from small_lpips import random_lpips
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
@@ -28,10 +29,7 @@ Row = tuple[str, str]
 
 @pytest.fixture(scope="module")
 def network() -> LPIPS:
-    random = torch.Generator().manual_seed(0)
-    shapes = {0: (64, 3, 11, 11), 3: (192, 64, 5, 5), 6: (384, 192, 3, 3), 8: (256, 384, 3, 3), 10: (256, 256, 3, 3)}
-    trunk = {f"features.{i}.weight": 0.1 * torch.randn(shape, generator=random) for i, shape in shapes.items()}
-    return LPIPS(trunk | {f"features.{i}.bias": torch.zeros(shape[0]) for i, shape in shapes.items()})
+    return random_lpips()
 
 
 def _maps(seed: int = 0) -> tuple[Tensor, Tensor]:

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import copy
 import math
+import pickle
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import lightning
 import numpy as np
 import pytest
 import torch
 import torchmetrics
+from small_lpips import random_lpips
 from torch import Tensor, nn
 
 from dsr.geometry.camera import Camera
 from dsr.metrics import functional
+from dsr.metrics.catalogue import METRICS
 from dsr.metrics.classes import (
     BadPixD,
     BadPixV,
@@ -25,27 +30,20 @@ from dsr.metrics.classes import (
     RMSEd,
     RMSEv,
     RMSEv1,
+    compute_means,
     visual_metrics,
 )
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS, lpips_v
+from dsr.sample import Unit
 
 CAMERA = Camera(width=40, height=36, fx=40.0, fy=40.0, cx=20.0, cy=18.0)
-NAMES = [
-    "RMSE_d",
-    *(f"BadPix_d_{percent}cm" for percent in (1, 5, 10)),
-    *(f"BadPix_d_{percent}pct" for percent in (1, 5, 10)),
-    *(f"BadPix_v_{level}" for level in (1, 5, 10)),
-    *("DSSIM_v", "LPIPS_v", "RMSE_v", "RMSE_v1", "Bumpiness_d"),
-]
+NAMES = [metric.name for metric in METRICS]
 
 
 @pytest.fixture(scope="module")
 def network() -> LPIPS:
-    random = torch.Generator().manual_seed(0)
-    shapes = {0: (64, 3, 11, 11), 3: (192, 64, 5, 5), 6: (384, 192, 3, 3), 8: (256, 384, 3, 3), 10: (256, 256, 3, 3)}
-    trunk = {f"features.{i}.weight": 0.1 * torch.randn(shape, generator=random) for i, shape in shapes.items()}
-    return LPIPS(trunk | {f"features.{i}.bias": torch.zeros(shape[0]) for i, shape in shapes.items()})
+    return random_lpips()
 
 
 def _pair(seed: int, batch: int = 1) -> SurfacePair:
@@ -55,6 +53,11 @@ def _pair(seed: int, batch: int = 1) -> SurfacePair:
     target = 2 + 0.004 * random.random((batch, 1, 36, 40))
     prediction = target + ramp * (1 + 0.02 * random.random((batch, 1, 36, 40)))
     return SurfacePair(torch.from_numpy(prediction), torch.from_numpy(target), CAMERA.rays()[None])
+
+
+def _maps(pair: SurfacePair) -> tuple[Tensor, Tensor, Camera]:
+    """Return what users of torchmetrics have."""
+    return pair.prediction, pair.target, CAMERA
 
 
 def _unknown() -> SurfacePair:
@@ -134,6 +137,36 @@ def test_mean_without_a_scored_image_is_nan() -> None:
     assert math.isnan(metric.compute())
 
 
+@pytest.mark.parametrize("name", [*SINGLE, *PER_LIGHT])
+def test_calls_with_maps_and_a_camera_give_the_values_of_pairs(name: str) -> None:
+    make, function = {**SINGLE, **PER_LIGHT}[name]
+    metric, total = make(), torch.zeros((), dtype=torch.float64)
+    for pair in (_pair(0), _pair(1)):
+        value = function(pair).max()
+        torch.testing.assert_close(metric(*_maps(pair)), value, rtol=1e-12, atol=0)
+        total += value
+    torch.testing.assert_close(metric.compute(), total / 2, rtol=1e-12, atol=0)
+
+
+def test_rays_stand_for_a_camera_and_arguments_have_names() -> None:
+    pair, metric = _pair(0, batch=2), RMSEv()
+    metric.update(preds=pair.prediction, target=pair.target, camera=pair.rays)
+    torch.testing.assert_close(metric.compute(), functional.rmse_v(pair).mean(), rtol=1e-12, atol=0)
+
+
+def test_masked_pixels_do_not_count() -> None:
+    pair = _pair(0)
+    mask = torch.rand(pair.target.shape, generator=torch.Generator().manual_seed(0)) < 0.5
+    expected = functional.rmse_d(SurfacePair(*pair.given, pair.rays, mask))
+    torch.testing.assert_close(RMSEd()(*_maps(pair), mask), expected[0], rtol=1e-12, atol=0)
+    assert not torch.allclose(expected, functional.rmse_d(pair), rtol=1e-3)
+
+
+def test_a_prediction_alone_is_refused() -> None:
+    with pytest.raises(ValueError, match="preds: expected a SurfacePair, or preds, target and camera"):
+        RMSEd().update(_pair(0).prediction)
+
+
 def test_reset_clears_the_state() -> None:
     metric, fresh = DSSIMv(), DSSIMv()
     metric.update(_pair(0))
@@ -143,12 +176,47 @@ def test_reset_clears_the_state() -> None:
     assert torch.equal(metric.compute(), fresh.compute())
 
 
-def test_states_of_two_processes_add_up() -> None:
-    metric = RMSEd()
-    assert {name: reduce.__name__ for name, reduce in metric._reductions.items()} == {  # type: ignore[union-attr]
-        "total": "dim_zero_sum",
-        "count": "dim_zero_sum",
-    }
+def test_states_of_two_processes_add_up_and_one_that_a_metric_is_for_suffices() -> None:
+    here, there = (visual_metrics(protocols=("paper", "field")) for _ in range(2))
+    levels = SurfacePair(*_pair(1).given, _pair(1).rays, unit=Unit("levels", inverse=True, factor=8.0))
+    here(_pair(0, batch=2))
+    there(levels)
+    for metric, other in zip(here.values(), there.values(), strict=True):
+        metric.merge_state(other)
+    means = compute_means(here)
+    assert {"RMSE_cm", "RMSE_levels"} < set(means)
+    both = torch.cat([functional.rmse_d(pair) for pair in (_pair(0, batch=2), levels)])
+    torch.testing.assert_close(means["RMSE_d"], both.mean(), rtol=1e-12, atol=0)
+    here.reset()
+    here(_pair(0))
+    assert "RMSE_levels" not in compute_means(here)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda metrics: pickle.loads(pickle.dumps(metrics))])
+def test_copies_go_on_from_the_state(copied: Callable[[Any], Any], network: LPIPS) -> None:
+    metrics = visual_metrics(network)
+    metrics.update(_pair(0))
+    other = copied(metrics)
+    for each in (metrics, other):
+        each.update(_pair(1))
+    assert other.compute() == metrics.compute()
+
+
+def test_the_perceptual_network_moves_along(network: LPIPS) -> None:
+    metric = copy.deepcopy(LPIPSv(network)).to("meta")
+    value = metric(*(each.to("meta") for each in _maps(_pair(0))[:2]), CAMERA)
+    assert value.device.type == metric.applied.device.type == "meta"
+    assert not metric.state_dict()
+    assert all(each.device.type == "cpu" for each in network.parameters())
+
+
+def test_compute_groups_keep_thresholds_apart_that_agree_at_first() -> None:
+    metrics = torchmetrics.MetricCollection({"1": BadPixD(1), "10": BadPixD(10)}, compute_groups=True)
+    pair = _pair(0)
+    metrics.update(pair.target, pair.target, CAMERA)
+    metrics.update(*_maps(pair))
+    for threshold, value in metrics.compute().items():
+        assert value.item() == functional.bad_pix_d(pair, int(threshold) / 100).item() / 2
 
 
 def test_update_keeps_no_graph() -> None:

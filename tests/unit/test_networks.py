@@ -13,6 +13,7 @@ from dsr.methods.networks.ddrnet import DDRNet
 from dsr.methods.networks.dynamic_guidance import DynamicGuidance
 from dsr.methods.networks.facets import Facets
 from dsr.methods.networks.network import DisparityNetwork, NetworkUpsampler, WindowedNetwork
+from dsr.methods.networks.normalisation import compute_min_max
 from dsr.methods.networks.pdn import PrimalDualNetwork
 from dsr.methods.networks.sparse_to_dense import SparseToDense
 
@@ -127,6 +128,14 @@ def test_tiles_equal_the_whole_image(build_windowed: Callable[..., WindowedNetwo
     torch.testing.assert_close(
         tiled.upsample_disparity(rgb, coarse), whole.upsample_disparity(rgb, coarse), rtol=0, atol=atol
     )
+
+
+def test_patches_get_the_answer_of_the_upsampling_prepared_or_not(net: DisparityNetwork) -> None:
+    rgb, coarse = photos(24, 28, 2), maps(6, 7, 2).float()
+    coarse[0, :, 2:4, 3] = torch.nan
+    batch = {"rgb": rgb, "disparity_lr": coarse, "min_max": compute_min_max(coarse)}
+    for each in (batch, net.prepare(batch)):
+        assert torch.equal(net.answer_patches(each).disparity, net.upsample(rgb, coarse))
 
 
 def test_photo_of_another_size_is_refused(net: DisparityNetwork) -> None:

@@ -11,7 +11,9 @@ from typing import Any
 import lightning
 import pytest
 import torch
+from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
+from small_scenes import sample_of, step
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import Tensor
 
@@ -61,6 +63,33 @@ def test_lines_of_the_documentation_train_a_network_and_score_it(
     score, shape = printed.split(maxsplit=1)
     assert 0 < float(score) < 2000
     assert shape == "torch.Size([1, 1, 64, 64])"
+
+
+def test_lines_of_the_documentation_compute_metrics() -> None:
+    [lines] = re.findall(r"^```python\n(from dsr.metrics.classes.*?)^```", PAGE.read_text(), re.MULTILINE | re.DOTALL)
+    sample = sample_of(*step())
+    names: dict[str, Any] = {"depth": 1.02 * sample.depth, "sample": sample}
+    exec(compile(lines, PAGE, "exec"), names)
+    means = names["metrics"].compute()
+    assert (float(means["BadPix_d_1pct"]), float(means["BadPix_d_5pct"])) == (1, 0)
+
+
+class _Batches(Callback):
+    """The batches of a training."""
+
+    def __init__(self) -> None:
+        self.seen: list[Any] = []
+
+    def on_train_batch_start(self, trainer: Any, pl_module: Any, batch: Any, batch_idx: int) -> None:
+        self.seen.append(batch)
+
+
+def test_loader_prepares_patches_for_the_network_of_the_module(tmp_path: Path) -> None:
+    batches, net = _Batches(), FacetsUNet(4, 8, 8, 4)
+    trainer = _trainer(tmp_path, max_steps=2, callbacks=[batches], limit_val_batches=0)
+    trainer.fit(SuperResolution(net, SurfaceObjective()), _data(everything=Everything()))
+    assert all(bool(batch["filled"].isfinite().all()) and len(batch["kernels"]) == 2 for batch in batches.seen)
+    assert len(batches.seen) == 2
 
 
 def test_stock_loggers_get_losses_scores_and_pictures(tmp_path: Path) -> None:

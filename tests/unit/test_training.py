@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from lightning.pytorch.callbacks import Callback
+from small_lpips import random_lpips
 from torch import Tensor
 from torch.utils.data import DataLoader
 
@@ -417,14 +418,17 @@ def test_gradient_is_clipped_as_the_trainer_says_and_its_norm_logged(
         assert float(found) == pytest.approx(1e-3, rel=1e-3)
 
 
-def test_non_finite_gradient_changes_nothing(tmp_path: Path) -> None:
-    module = _module()
+@pytest.mark.parametrize("fused", [False, True])
+def test_non_finite_gradient_changes_nothing(tmp_path: Path, fused: bool) -> None:
+    module = _module(optimizer=functools.partial(torch.optim.AdamW, weight_decay=0.1, fused=fused))
     before = copy.deepcopy(module.net.state_dict())
     [batch] = _one_batch()
     batch["depth"] = batch["depth"].clone()
     bad = {**batch, "bf": torch.full_like(batch["bf"], torch.inf)}
     _trainer(tmp_path, max_epochs=1).fit(module, DataLoader([bad], batch_size=None))
     assert all(torch.equal(before[name], value) for name, value in module.net.state_dict().items())
+    _trainer(tmp_path, max_epochs=1).fit(module, DataLoader([bad, batch], batch_size=None))
+    assert not all(torch.equal(before[name], value) for name, value in module.net.state_dict().items())
 
 
 @pytest.mark.parametrize("average", [1.0, -0.1, math.nan])
@@ -522,10 +526,7 @@ def test_validation_starts_anew_each_time(tmp_path: Path) -> None:
 
 
 def test_checkpoint_holds_the_networks_tensors_alone_and_loads_as_plain_data(tmp_path: Path) -> None:
-    shapes = {0: (64, 3, 11, 11), 3: (192, 64, 5, 5), 6: (384, 192, 3, 3), 8: (256, 384, 3, 3), 10: (256, 256, 3, 3)}
-    trunk = {f"features.{i}.weight": 0.05 * torch.randn(shape) for i, shape in shapes.items()}
-    network = LPIPS(trunk | {f"features.{i}.bias": torch.zeros(shape[0]) for i, shape in shapes.items()})
-    module, trainer = _module(network), _trainer(tmp_path, max_steps=1)
+    module, trainer = _module(random_lpips()), _trainer(tmp_path, max_steps=1)
     loader = _loader(WholeScenes([_scene(3)], X2))
     trainer.fit(module, _one_batch(), loader)
     assert math.isfinite(trainer.callback_metrics["val/LPIPS_v"])

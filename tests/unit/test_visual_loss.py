@@ -8,6 +8,7 @@ from typing import get_args
 
 import pytest
 import torch
+from small_lpips import random_lpips
 from torch import Tensor
 
 import dsr
@@ -36,11 +37,7 @@ NAMES: tuple[VisualLossName, ...] = get_args(VisualLossName)
 
 @pytest.fixture(scope="module")
 def network() -> LPIPS:
-    """LPIPS with a random trunk."""
-    random = torch.Generator().manual_seed(0)
-    shapes = {0: (64, 3, 11, 11), 3: (192, 64, 5, 5), 6: (384, 192, 3, 3), 8: (256, 384, 3, 3), 10: (256, 256, 3, 3)}
-    trunk = {f"features.{i}.weight": 0.1 * torch.randn(shape, generator=random) for i, shape in shapes.items()}
-    return LPIPS(trunk | {f"features.{i}.bias": torch.zeros(shape[0]) for i, shape in shapes.items()})
+    return random_lpips()
 
 
 def _loss(name: VisualLossName, network: LPIPS) -> VisualLoss:

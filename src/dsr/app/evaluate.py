@@ -144,7 +144,7 @@ def _prepare(plain: dict[str, Any], node: Any, source: SceneSource | None, *, he
         seed=settings.seed,
         downsampling=downsampling.assumed_model(),
         known=_known_of_maps(settings, downsampling, source),
-        metrics=functools.partial(metric_collection, settings.metrics, device),
+        metrics=functools.partial(metric_collection, settings.metrics),
         workspace=folder,
         display=progress,
         about={"method": label, "degradation": degradation},
@@ -220,7 +220,7 @@ def _run(prepared: _Prepared) -> pd.DataFrame:
         )
     except StalePredictionError as error:
         raise ConfigError(str(error)) from error
-    metrics = chosen_metrics(settings.metrics, study.device)
+    metrics = chosen_metrics(settings.metrics)
     formats = {metric.name: metric.format for metric in metrics}
     illustrate = functools.partial(_illustrate, folder, study.label, formats)
     scores = score(study, folder, metrics, outcome, progress, illustrate, workers=workers)

@@ -9,8 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import torch
-
 from dsr.app.schema import MetricsConfig
 from dsr.metrics.catalogue import PROTOCOLS, Metric, catalogue
 from dsr.metrics.lpips import GET_TRUNK, LPIPS, load_lpips
@@ -21,7 +19,7 @@ if TYPE_CHECKING:
     import torchmetrics
 
 
-def chosen_metrics(settings: MetricsConfig, device: torch.device) -> tuple[Metric, ...]:
+def chosen_metrics(settings: MetricsConfig) -> tuple[Metric, ...]:
     """Return the metrics to compute.
 
     Raises:
@@ -29,16 +27,16 @@ def chosen_metrics(settings: MetricsConfig, device: torch.device) -> tuple[Metri
 
     """
     extra = extra_metrics(settings)
-    return catalogue(_network_on(settings, extra, device), extra, settings.protocols)
+    return catalogue(_network(settings, extra), extra, settings.protocols)
 
 
-def metric_collection(settings: MetricsConfig, device: torch.device) -> torchmetrics.MetricCollection:
+def metric_collection(settings: MetricsConfig) -> torchmetrics.MetricCollection:
     """Return the same metrics as one collection, for a validation pass, which is always judged by the paper's too."""
     from dsr.metrics.classes import visual_metrics  # noqa: PLC0415 - torchmetrics takes seconds to import
 
     settings = replace(settings, protocols=list(dict.fromkeys((*settings.protocols, "paper"))))
     extra = extra_metrics(settings)
-    return visual_metrics(_network_on(settings, extra, device), extra, settings.protocols)
+    return visual_metrics(_network(settings, extra), extra, settings.protocols)
 
 
 def check_metrics(settings: MetricsConfig) -> None:
@@ -73,12 +71,11 @@ def extra_metrics(settings: MetricsConfig) -> tuple[Metric, ...]:
     return metrics
 
 
-def _network_on(settings: MetricsConfig, extra: Sequence[Metric], device: torch.device) -> LPIPS | None:
+def _network(settings: MetricsConfig, extra: Sequence[Metric]) -> LPIPS | None:
     """Return the LPIPS network; None if it is disabled, not used, or not available."""
     chosen = (*(metric for name in settings.protocols for metric in PROTOCOLS[name]), *extra)
     used = any(metric.perceptual for metric in chosen)
-    network = perceptual_network(settings.lpips_trunk) if settings.lpips and used else None
-    return None if network is None else network.to(device)
+    return perceptual_network(settings.lpips_trunk) if settings.lpips and used else None
 
 
 @functools.cache

@@ -181,7 +181,7 @@ def _prepare(plain: dict[str, Any], settings: TrainConfig, device: torch.device,
     identity = rundir.identity_of(plain, None, device)
     folder = rundir.folder_of(settings.output_dir or rundir.default_directory("train", plain, identity))
     last = folder / _LAST
-    metrics = functools.partial(metric_collection, settings.metrics, device)
+    metrics = functools.partial(metric_collection, settings.metrics)
     module = _module(settings, net, data, metrics)
     if last.parent.is_symlink():
         raise ConfigError(f"{last.parent}: expected a directory of the run's own, got a link")

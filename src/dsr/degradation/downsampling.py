@@ -25,6 +25,7 @@ from dsr.degradation.holes import Holes
 from dsr.degradation.noise import Noise
 from dsr.geometry.camera import Camera, RangeType, from_range, to_range
 from dsr.sample import FARTHEST, NEAREST, DepthSample, Scene
+from dsr.utils.compute_device import known_true
 from dsr.utils.guards import naming
 from dsr.utils.ratios import check_scale, match_ratio
 
@@ -94,7 +95,7 @@ class Downsampling:
         if self.kernel == "nearest":
             return values[..., scale // 2 :: scale, scale // 2 :: scale]
         valid = values.isfinite()
-        if bool(valid.all()):
+        if known_true(valid):
             return self._apply(values, scale)
         complete, weight = torch.where(valid, values, 0), valid.to(values.dtype)
         mean, fraction = self._apply(complete, scale), self._apply(weight, scale)

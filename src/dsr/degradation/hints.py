@@ -52,6 +52,12 @@ def encode_facts(kernel: str | None = None, soft: bool | None = None, *, noise: 
     return facts
 
 
+def told_kernels(facts: Tensor) -> list[str | None]:
+    """Return the kernel that the facts of each map tell, (B, ``FACTS``); None where they tell none."""
+    kernels = facts[:, : len(KERNELS)].tolist()
+    return [KERNELS[each.index(max(each))] if any(each) else None for each in kernels]
+
+
 def relative_error(given: Tensor, result: Tensor) -> tuple[Tensor, Tensor]:
     """Return the relative difference of maps to results of a multiple of their size, and a weight, 0 where unknown.
 

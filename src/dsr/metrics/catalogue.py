@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -125,16 +125,9 @@ def catalogue(
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f"{name}: expected metrics of different names, got two of this one")
-    return tuple(_with_network(metrics, network))
-
-
-def _with_network(metrics: Iterable[Metric], network: LPIPS | None) -> Iterator[Metric]:
-    """Yield the metrics with the network as an argument where they need one; leave these out if there is none."""
-    for metric in metrics:
-        if not metric.perceptual:
-            yield metric
-        elif network is not None:
-            yield replace(metric, function=partial(metric.function, network=network), perceptual=False)
+    if network is None:
+        return tuple(metric for metric in metrics if not metric.perceptual)
+    return tuple(replace(metric, network=network) if metric.perceptual else metric for metric in metrics)
 
 
 @dataclass(frozen=True)

@@ -1,21 +1,23 @@
 """torchmetrics classes of the paper's metrics: the mean over images, by default of the worst of four lights.
 
-    metrics = visual_metrics(network)                       # a MetricCollection
-    metrics.update(SurfacePair(prediction, target, rays))
-    metrics.compute()                                       # {"RMSE_d": ..., "DSSIM_v": ..., ...}
+    DSSIMv()(preds, target, camera)                     # the value of this batch
+    metrics = visual_metrics(network)                   # a MetricCollection
+    metrics.update(preds, target, camera)               # or a SurfacePair
+    metrics.compute()                                   # {"RMSE_d": ..., "DSSIM_v": ..., ...}
 
-Masks, normals and renderings are computed once for all the metrics of a collection, by the pair.
+Masks, normals and renderings are computed once for all the metrics of such a collection, by the pair.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Self
 
 import torch
 import torchmetrics
 from torch import Tensor
 
+from dsr.geometry.camera import Camera
 from dsr.metrics.catalogue import METRICS, catalogue
 from dsr.metrics.formats import MetricFormat
 from dsr.metrics.functional import SurfacePair
@@ -30,7 +32,7 @@ class PerImageMean(torchmetrics.Metric):
     NaN, so that a method that fails never looks better than one that does not.
 
     Attributes:
-        applied: whether the metric is for all benchmarks, or for that of a pair so far.
+        applied: () bool, whether the metric is for all benchmarks, or for that of a pair so far.
 
     Args:
         metric: from :func:`dsr.metrics.catalogue.catalogue`.
@@ -45,7 +47,7 @@ class PerImageMean(torchmetrics.Metric):
 
     is_differentiable = False
     full_state_update = False
-    total: Tensor
+    applied: Tensor
     count: Tensor
 
     def __init__(self, metric: Metric, variant: str = WORST, **settings: Any) -> None:
@@ -53,11 +55,12 @@ class PerImageMean(torchmetrics.Metric):
         if variant not in VARIANTS:
             raise ValueError(f"variant: expected one of {', '.join(VARIANTS)}, got {variant!r}")
         self._metric = metric
-        self.applied = metric.unit is None
         named = metric.worst if variant == WORST else variant
         self._variant = named if metric.per_light else ""
-        self.add_state("total", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
+        self._total = f"total_{metric.name}_{self._variant}"  # else compute groups merge metrics of equal first values
+        self.add_state(self._total, torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
         self.add_state("count", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
+        self.add_state("applied", torch.tensor(metric.unit is None), dist_reduce_fx="max")
 
     @property
     def format(self) -> MetricFormat:
@@ -75,19 +78,42 @@ class PerImageMean(torchmetrics.Metric):
         return self._metric.format.higher_is_better
 
     @torch.no_grad()
-    def update(self, pair: SurfacePair) -> None:
-        """Add a batch of pairs; those of another benchmark than the metric's are left out."""
+    def update(
+        self,
+        preds: SurfacePair | Tensor,
+        target: Tensor | None = None,
+        camera: Camera | Tensor | None = None,
+        mask: Tensor | None = None,
+    ) -> None:
+        """Add a batch, as for :meth:`dsr.metrics.functional.SurfacePair.of`.
+
+        Args:
+            preds: a pair, which is left out if it is of another benchmark than the metric's; or predicted depth.
+            target: true depth.
+            camera: the camera of these pixels, or their rays.
+            mask: the pixels to compare.
+
+        """
+        pair = SurfacePair.of(preds, target, camera, mask)
         if not self._metric.applies(pair):
             return
-        self.applied = True
+        self.applied = torch.ones_like(self.applied)
         values = self._metric.variants(pair)[self._variant]
         valid = pair.target_mask.flatten(1).any(dim=1)
-        self.total += torch.where(valid, values, 0).sum().to(self.total)
-        self.count += valid.sum().to(self.count)
+        setattr(self, self._total, getattr(self, self._total) + torch.where(valid, values, 0).sum().to(self.count))
+        self.count = self.count + valid.sum().to(self.count)
 
     def compute(self) -> Tensor:
         """Return the mean, NaN where no image could be scored."""
-        return self.total / self.count
+        total: Tensor = getattr(self, self._total)
+        return total / self.count
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], exclude_state: Sequence[str] = "") -> Self:
+        """Move the states, and the LPIPS network, which is no submodule, so that checkpoints do not contain it."""
+        super()._apply(fn, exclude_state)
+        if self._metric.network is not None:
+            self._metric.network.to(self.device)
+        return self
 
 
 def _named(name: str) -> Metric:
@@ -135,7 +161,7 @@ class LPIPSv(PerImageMean):
     """LPIPS_v.
 
     Args:
-        network: the LPIPS network, not registered as a submodule, so that checkpoints do not contain it.
+        network: the LPIPS network.
         variant: as for :class:`PerImageMean`.
         **settings: as for every torchmetrics class.
 
@@ -167,12 +193,22 @@ class BumpinessD(PerImageMean):
         super().__init__(_named("Bumpiness_d"), **settings)
 
 
+class SurfaceMetrics(torchmetrics.MetricCollection):
+    """A collection that makes one :class:`~dsr.metrics.functional.SurfacePair` of a batch for all of its metrics."""
+
+    def update(self, *batch: Any, **named: Any) -> None:
+        """Add a batch; arguments as for :meth:`dsr.metrics.functional.SurfacePair.of`."""
+        super().update(SurfacePair.of(*batch, **named))
+
+    def forward(self, *batch: Any, **named: Any) -> dict[str, Any]:
+        """Add a batch as :meth:`update` does, and return its own values by name."""
+        return super().forward(SurfacePair.of(*batch, **named))
+
+
 def visual_metrics(
     network: LPIPS | None = None, extra: Sequence[Metric] = (), protocols: Sequence[str] = ("paper",), **settings: Any
-) -> torchmetrics.MetricCollection:
+) -> SurfaceMetrics:
     """Return all metrics of some protocols, each of the worst of four lights, as one collection.
-
-    Compute groups stay off: they would merge metrics that differ only in a threshold.
 
     Args:
         network: for perceptual metrics; None leaves them out.
@@ -183,13 +219,18 @@ def visual_metrics(
     """
     chosen = catalogue(network, extra, protocols)
     metrics: dict[str, Any] = {metric.name: PerImageMean(metric, **settings) for metric in chosen}
-    return torchmetrics.MetricCollection(metrics, compute_groups=False)
+    return SurfaceMetrics(metrics, compute_groups=False)  # no two have the same states
 
 
 def compute_means(metrics: torchmetrics.MetricCollection) -> dict[str, Tensor]:
     """Return the means of a collection of :func:`visual_metrics` by name, without metrics of other benchmarks."""
-    applied = {name for name, metric in metrics.items() if getattr(metric, "applied", True)}
-    return {name: value for name, value in metrics.compute().items() if name in applied}
+    return {name: metric.compute() for name, metric in metrics.items() if _applies(metric)}
+
+
+def _applies(metric: Any) -> bool:
+    """Return whether a metric is for the benchmark of a pair of any process."""
+    with metric.sync_context():
+        return bool(getattr(metric, "applied", True))
 
 
 def in_table_units(metrics: torchmetrics.MetricCollection, means: Mapping[str, float]) -> dict[str, float]:

@@ -22,9 +22,11 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
+from dsr.geometry.camera import Camera
 from dsr.geometry.shading import lights, shade
 from dsr.geometry.surface import depth_to_normals, length, normal_mask
 from dsr.sample import CENTIMETRES, Unit
+from dsr.utils.compute_device import known_true
 
 _Derived = TypeVar("_Derived")
 SSIM_WINDOW = 7
@@ -77,7 +79,7 @@ class SurfacePair:
         if mask is not None:
             self.target_mask = self.target_mask & mask
         self.depth_mask = self.target_mask & prediction.isfinite() & (prediction > 0)
-        self.complete = bool(self.depth_mask.all())
+        self.complete = known_true(self.depth_mask)
         self.rays = rays.to(target.dtype)
         self.unit = unit
         self.image_dtype = image_dtype or target.dtype
@@ -87,6 +89,33 @@ class SurfacePair:
         if not self.complete:  # a finite stand-in keeps NaN out of sums and gradients
             self.prediction = torch.where(self.depth_mask, prediction, 1.0)
             self.target = torch.where(self.depth_mask, target, 1.0)
+
+    @classmethod
+    def of(
+        cls,
+        preds: SurfacePair | Tensor,
+        target: Tensor | None = None,
+        camera: Camera | Tensor | None = None,
+        mask: Tensor | None = None,
+    ) -> SurfacePair:
+        """Return a pair as it is, or that of a prediction, a target and their camera: what classes of metrics take.
+
+        Args:
+            preds: the pair, or (B, 1, H, W) predicted orthogonal depth in metres.
+            target: (B, 1, H, W) true depth.
+            camera: of these pixels, or their rays, (B or 1, 3, H, W).
+            mask: (B, 1, H, W) bool, the pixels to compare; None for all.
+
+        Raises:
+            ValueError: the target or the camera is missing, or shapes do not fit together.
+
+        """
+        if isinstance(preds, SurfacePair):
+            return preds
+        if target is None or camera is None:
+            raise ValueError("preds: expected a SurfacePair, or preds, target and camera; got a prediction alone")
+        rays = camera.rays(device=target.device)[None] if isinstance(camera, Camera) else camera
+        return cls(preds, target, rays, mask)
 
     def derive(self, make: Callable[[SurfacePair], _Derived]) -> _Derived:
         """Return ``make(self)``, which is called once: quantities of their own that several metrics share."""
@@ -233,7 +262,7 @@ def bumpiness_d(pair: SurfacePair) -> Tensor:
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
     """Return the mean over the last two axes of ``values`` (B, C, H, W) where ``mask`` (B, 1, H, W) is set, (B, C)."""
-    if bool(mask.all()):
+    if known_true(mask):
         return values.mean(dim=(-2, -1)) if values.is_floating_point() else values.double().mean(dim=(-2, -1))
     total = torch.where(mask, values, 0).sum(dim=(-2, -1), dtype=None if values.is_floating_point() else torch.float64)
     return total / mask.sum(dim=(-2, -1))

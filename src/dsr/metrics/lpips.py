@@ -128,9 +128,10 @@ def lpips_v(pair: SurfacePair, network: LPIPS) -> Tensor:
 
     Args:
         pair: the two surfaces.
-        network: on the pair's device.
+        network: it is moved to the pair's device.
 
     """
+    network.to(pair.target.device)
     batch, count, height, width = pair.renderings[0].shape
     as_images = [
         (2 * maps.to(network.mean.dtype) - 1).reshape(batch * count, 1, height, width).expand(-1, 3, -1, -1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -11,6 +11,7 @@ from torch import Tensor
 from dsr.geometry.lights import LIGHT_NAMES
 from dsr.metrics.formats import MetricFormat
 from dsr.metrics.functional import SurfacePair
+from dsr.metrics.lpips import LPIPS
 
 WORST, AVERAGE = "max", "avg"
 VARIANTS = (*LIGHT_NAMES, WORST, AVERAGE)
@@ -28,6 +29,7 @@ class Metric:
         per_light: whether there is a value for each of the lights e1..e4.
         min_size: smallest height and width in pixels that it is defined for.
         perceptual: whether the function takes an LPIPS network, ``network``.
+        network: that of a perceptual metric; :func:`dsr.metrics.catalogue.catalogue` sets it.
         unit: name of the unit of the benchmarks that it is for, see :class:`dsr.sample.Unit`; None for all of them.
         whole: whether it is computed of the whole image even where a method left out rows or columns at the border.
 
@@ -40,6 +42,7 @@ class Metric:
     per_light: bool = False
     min_size: int = 2
     perceptual: bool = False
+    network: LPIPS | None = field(default=None, repr=False, compare=False)
     unit: str | None = None
     whole: bool = False
 
@@ -70,7 +73,7 @@ class Metric:
 
     def _values(self, pair: SurfacePair) -> Tensor:
         """Return the function's values, of the right shape."""
-        values = self.function(pair)
+        values = self.function(pair, network=self.network) if self.perceptual else self.function(pair)
         expected = (len(pair.target), len(LIGHT_NAMES)) if self.per_light else (len(pair.target),)
         if tuple(values.shape) != expected:
             raise ValueError(f"{self.name}: expected values of shape {expected}, got {tuple(values.shape)}")

@@ -53,7 +53,7 @@ class VisualLoss:
             return mse_v(pair)
         if self.network is None:
             return dssim_v(pair).mean(dim=1)
-        return lpips_v(pair, self.network.to(pair.target.device)).mean(dim=1)
+        return lpips_v(pair, self.network).mean(dim=1)
 
     @property
     def title(self) -> str:

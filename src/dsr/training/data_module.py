@@ -7,7 +7,7 @@ import math
 import os
 import signal
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -215,12 +215,15 @@ class PatchData(lightning.LightningDataModule):
         that of the whole epoch, as Lightning subtracts the batches that were done before an interruption.
         """
         numbers = _PatchNumbers(self.trainer, self.patches.batch)
+        module: Any = getattr(self.trainer, "lightning_module", None)
+        prepare = getattr(getattr(module, "net", None), "prepare", None)
         workers: dict[str, Any] = {"num_workers": self.patches.workers}
         if self.patches.workers:
             workers["worker_init_fn"] = functools.partial(_begin_worker, os.getpid())
         pin = torch.cuda.is_available()
         patches = self._load_patches().select(0, sys.maxsize)
-        return _PatchLoader(patches, batch_sampler=numbers, pin_memory=pin, **workers)
+        collate = functools.partial(_collate_prepared, prepare) if prepare else None
+        return _PatchLoader(patches, batch_sampler=numbers, pin_memory=pin, collate_fn=collate, **workers)
 
     def val_dataloader(self) -> list[DataLoader[Batch]]:
         """Return a loader for each validation set, of whole scenes, one at a time.
@@ -307,6 +310,11 @@ class _PatchLoader(DataLoader[Batch]):
         """Start the workers."""
         with interruption.starting_workers(signal.SIGTERM):
             return super().__iter__()
+
+
+def _collate_prepared(prepare: Callable[[Batch], Batch], samples: list[Batch]) -> Batch:
+    """Return a batch of patches with what the network wants to have computed before a step."""
+    return prepare(default_collate(samples))
 
 
 def _begin_worker(parent: int, _: int) -> None:

@@ -166,7 +166,9 @@ class SuperResolution(lightning.LightningModule):
         if gradient_clip_val is not None and not by_norm:
             nn.utils.clip_grad_value_(self.net.parameters(), gradient_clip_val)
         self.log("train/gradient_norm", norm.detach(), logger=False)
-        if not bool(norm.isfinite()):
+        if optimizer.defaults.get("fused"):  # such an optimiser drops a step by a flag, which nothing waits for
+            optimizer.found_inf = (~norm.isfinite()).float()  # type: ignore[attr-defined]
+        elif not bool(norm.isfinite()):
             optimizer.zero_grad(set_to_none=True)
 
     def optimizer_step(self, *arguments: Any, **named: Any) -> None:
@@ -323,16 +325,12 @@ class SuperResolution(lightning.LightningModule):
         self.bicubic = {str(kind): {str(k): float(v) for k, v in each.items()} for kind, each in stored.items()}
 
     def _gather(self) -> None:
-        """Gather what torchmetrics does not: which metrics apply to the scenes of any device, and the pictures."""
+        """Gather the pictures of all devices."""
         if self.trainer.world_size == 1:
             return
-        collections: list[Any] = [*self.metrics, *self._bicubic_metrics]
-        metrics = [metric for each in collections for metric in each.values() if hasattr(metric, "applied")]
         all_devices: list[Any] = [None] * self.trainer.world_size
-        torch.distributed.all_gather_object(all_devices, ([metric.applied for metric in metrics], self._pictures))
-        for number, metric in enumerate(metrics):
-            metric.applied = any(applied[number] for applied, _ in all_devices)
-        self._pictures = {name: picture for _, pictures in all_devices for name, picture in pictures.items()}
+        torch.distributed.all_gather_object(all_devices, self._pictures)
+        self._pictures = {name: picture for pictures in all_devices for name, picture in pictures.items()}
 
     def configure_optimizers(self) -> Any:
         """Return the optimiser and, if there is one, its schedule, which is updated after every step."""

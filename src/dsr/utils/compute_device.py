@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 
 import torch
+from torch import Tensor
 
 from dsr.utils.configuration import ConfigError
 
@@ -18,6 +19,11 @@ def fast_precision(device: torch.device) -> str:
         return "bfloat16" if torch.cuda.is_bf16_supported(including_emulation=False) else "float32"
     flags = (getattr(torch.cpu, name, lambda: False) for name in _FAST_ON_CPU)
     return "bfloat16" if device.type == "cpu" and any(flag() for flag in flags) else "float32"
+
+
+def known_true(flags: Tensor) -> bool:
+    """Return whether all are set, as far as can be told without waiting for a device: false for those of a GPU."""
+    return flags.device.type == "cpu" and bool(flags.all())
 
 
 def pick_device(name: str) -> torch.device:

@@ -19,14 +19,12 @@ What differs from the original:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.methods.classical.finite_differences import grey, upsample_linear_border
-from dsr.methods.networks.network import Answer, NormalisedNetwork, expect_rgb_size
+from dsr.methods.networks.network import NormalisedNetwork, expect_rgb_size
 from dsr.utils.ratios import check_scale
 
 _HALVINGS = 2
@@ -72,18 +70,11 @@ class DDRNet(NormalisedNetwork):
         radius_hr = self.denoise.receptive_field_radius + self.refine.receptive_field_radius
         return -(-radius_hr // self.scale) + _UPSAMPLING
 
-    def answer_patches(self, batch: Mapping[str, Tensor]) -> Answer:
-        """Return the refined map, and the denoised one as a stage."""
-        denoised, refined = self.in_range(
-            batch["disparity_lr"], batch["min_max"], lambda values: self._compute_stages(batch["rgb"], values)
-        )
-        return Answer(refined.float(), stages=(denoised.float(),))
-
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
         """Return normalised disparity (B, 1, H, W) for (B, 3, H, W) and (B, 1, h, w); see the base class."""
-        return self._compute_stages(rgb, values)[-1]
+        return self.compute_stages(rgb, values)[-1]
 
-    def _compute_stages(self, rgb: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+    def compute_stages(self, rgb: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
         """Return the denoised and the refined map, (B, 1, H, W) each, normalised to 0..1."""
         expect_rgb_size(rgb, values, self.scale)
         weight = self.denoise.last.weight

@@ -27,16 +27,16 @@ Disparity is divided by its median, so that the result does not depend on the un
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.degradation.downsampling import Downsampling
-from dsr.degradation.hints import FACTS, KERNELS
+from dsr.degradation.hints import FACTS, told_kernels
 from dsr.methods.classical.finite_differences import repeat_blocks
 from dsr.methods.exportable import every, exporting, median_in_graph, quantiles_in_graph
 from dsr.methods.inpainting import inpaint
@@ -200,10 +200,19 @@ class FacetsUNet(DisparityNetwork):
         """Return high-resolution disparity; see :meth:`~dsr.methods.networks.network.DisparityNetwork.upsample`."""
         return self.answer(rgb, disparity).disparity
 
-    def answer_patches(self, batch: Mapping[str, Tensor]) -> Answer:
+    @staticmethod
+    def prepare(batch: Mapping[str, Any]) -> dict[str, Any]:
+        """Return patches with ``filled``, inverse depth without holes, and ``kernels``, those that are told."""
+        if "filled" in batch:
+            return dict(batch)
+        kernels = told_kernels(batch["facts"]) if "facts" in batch else None
+        return {**batch, "filled": inpaint(batch["disparity_lr"] + batch["doffs"], batch["rgb"]), "kernels": kernels}
+
+    def answer_patches(self, batch: Mapping[str, Any]) -> Answer:
         """Return inverse depth, times baseline and focal length, and its expected errors, told the hints if any."""
-        inverse = batch["disparity_lr"] + batch["doffs"]
-        return self.answer(batch["rgb"], inverse, batch.get("noise"), batch.get("facts"))
+        batch = self.prepare(batch)
+        inverse, hints = batch["disparity_lr"] + batch["doffs"], (batch.get("noise"), batch.get("facts"))
+        return self.answer(batch["rgb"], inverse, *hints, filled=batch["filled"], kernels=batch["kernels"])
 
     def answer_scene(self, batch: Mapping[str, Tensor]) -> Tensor:
         """Return high-resolution disparity, told the hints if any."""
@@ -216,6 +225,9 @@ class FacetsUNet(DisparityNetwork):
         noise: Tensor | None = None,
         hints: Tensor | None = None,
         progress: Steps | None = None,
+        *,
+        filled: Tensor | None = None,
+        kernels: Sequence[str | None] | None = None,
     ) -> Answer:
         """Return high-resolution disparity and its expected errors.
 
@@ -225,6 +237,8 @@ class FacetsUNet(DisparityNetwork):
             noise: (B, 1, h, w) standard deviation of the logarithm of disparity; None for not known.
             hints: (B, ``FACTS``) what is known of the maps; None for nothing.
             progress: called after each band of rows that is done.
+            filled: the disparity without holes; None to inpaint it.
+            kernels: those that the hints tell; None to read them.
 
         Raises:
             ValueError: the photo's size is not a multiple of the map's by a factor of the network.
@@ -233,13 +247,15 @@ class FacetsUNet(DisparityNetwork):
         expect_rgb_size(rgb, disparity, 1 if self.scale < 4 and rgb.shape[-1] == disparity.shape[-1] else self.scale)
         known = disparity.isfinite()
         unit = _median(disparity, known)
-        values = inpaint(disparity, rgb) / unit
+        values = (inpaint(disparity, rgb) if filled is None else filled) / unit
         batch = disparity.shape[0]
         if hints is None:
-            hints = disparity.new_zeros((batch, FACTS))
+            hints, kernels = disparity.new_zeros((batch, FACTS)), [None] * batch
+        if kernels is None:
+            kernels = told_kernels(hints)
         if noise is None:
             noise = torch.zeros_like(values)
-        result, errors = self(rgb, values, known, noise, hints, progress)
+        result, errors = self(rgb, values, known, noise, hints, kernels, progress)
         spread, angle = errors.clamp(-12, 4).exp().split(1, dim=1)
         return Answer(result * unit, spread, angle)
 
@@ -250,6 +266,7 @@ class FacetsUNet(DisparityNetwork):
         known: Tensor,
         noise: Tensor,
         hints: Tensor,
+        kernels: Sequence[str | None],
         progress: Steps | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Return high-resolution values, (B, 1, H, W), and the logarithms of both expected errors, (B, 2, H, W).
@@ -260,6 +277,7 @@ class FacetsUNet(DisparityNetwork):
             known: (B, 1, h, w) bool, false where a value was filled in.
             noise: (B, 1, h, w) standard deviation of the logarithm of the values, where that is known.
             hints: (B, ``FACTS``).
+            kernels: those that the hints tell.
             progress: called after each band of rows.
 
         """
@@ -299,7 +317,7 @@ class FacetsUNet(DisparityNetwork):
         result, errors, gate = (concatenate(each, dim=-2) for each in zip(*bits, strict=True))
         if given.shape == values.shape:  # not for a map of the photo's own size
             with torch.autocast(rgb.device.type, enabled=False):
-                result = _project(result, given, known, gate, hints)
+                result = _project(result, given, known, gate, kernels)
         return result, errors
 
     def _split(self, height: int, shape: torch.Size) -> list[_Band]:
@@ -389,21 +407,18 @@ def _lr_input(around: Stencil, smoothed: list[Stencil], weight: Tensor, noise: T
     return torch.cat(parts, dim=1)
 
 
-def _project(result: Tensor, values: Tensor, known: Tensor, gate: Tensor, hints: Tensor) -> Tensor:
+def _project(result: Tensor, values: Tensor, known: Tensor, gate: Tensor, kernels: Sequence[str | None]) -> Tensor:
     """Return results closer to what was measured, where the kernel is known."""
-    scale = result.shape[-1] // values.shape[-1]
-    told = hints[:, : len(KERNELS)]
-    if scale == 1 or exporting() or not bool(told.any()):  # an exported network is told no kernel
+    if not any(kernels):
         return result
-    parts = []
-    for i, hint in enumerate(told.tolist()):
+    scale, parts = result.shape[-1] // values.shape[-1], []
+    for i, kernel in enumerate(kernels):
         part = slice(i, i + 1)
         x = result[part]
-        if any(hint):
-            model = Downsampling(KERNELS[hint.index(max(hint))])  # type: ignore[arg-type]  # one of them
-            for _ in range(_PROJECTIONS):
-                residual = torch.where(known[part], values[part] - model(x, scale), 0)
-                x = x + gate[part].to(x.dtype) * upsample_bicubic(residual, scale)
+        for _ in range(_PROJECTIONS if kernel else 0):
+            coarse = Downsampling(kernel)(x, scale)  # type: ignore[arg-type]  # one of them
+            residual = torch.where(known[part], values[part] - coarse, 0)
+            x = x + gate[part].to(x.dtype) * upsample_bicubic(residual, scale)
         parts.append(x)
     return torch.cat(parts)
 

@@ -137,11 +137,16 @@ class DisparityNetwork(nn.Module, abc.ABC):
 
         """
 
-    def answer_patches(self, batch: Mapping[str, Tensor]) -> Answer:
+    @staticmethod
+    def prepare(batch: Mapping[str, Any]) -> dict[str, Any]:
+        """Return patches with what a step would have to wait for a GPU to compute; a training's loader calls it."""
+        return dict(batch)
+
+    def answer_patches(self, batch: Mapping[str, Any]) -> Answer:
         """Return what a training compares with the truth, in float32.
 
         Args:
-            batch: patches as of :func:`dsr.training.degradation.to_tensors`, with a batch axis.
+            batch: patches as of :func:`dsr.training.degradation.to_tensors`, with a batch axis, perhaps prepared.
 
         """
         return Answer(self.upsample(batch["rgb"], batch["disparity_lr"], batch["min_max"]).float())
@@ -181,17 +186,33 @@ class RangeNetwork(DisparityNetwork):
 
     def upsample(self, rgb: Tensor, disparity: Tensor, min_max: Tensor | None = None) -> Tensor:
         """Return high-resolution disparity; see :meth:`DisparityNetwork.upsample`."""
-        return self.in_range(disparity, min_max, lambda values: (self(rgb, values),))[0]
+        min_max = compute_min_max(disparity) if min_max is None else min_max
+        return self.in_range(inpaint(disparity), min_max, lambda values: (self(rgb, values),))[0]
+
+    @staticmethod
+    def prepare(batch: Mapping[str, Any]) -> dict[str, Any]:
+        """Return patches with ``filled``, the inpainted low-resolution disparity."""
+        return dict(batch) if "filled" in batch else {**batch, "filled": inpaint(batch["disparity_lr"])}
+
+    def answer_patches(self, batch: Mapping[str, Any]) -> Answer:
+        """Return what a training compares with the truth, in float32."""
+        filled = self.prepare(batch)["filled"]
+        stages = self.in_range(filled, batch["min_max"], lambda values: self.compute_stages(batch["rgb"], values))
+        return Answer(stages[-1].float(), stages=tuple(each.float() for each in stages[:-1]))
+
+    def compute_stages(self, rgb: Tensor, values: Tensor) -> tuple[Tensor, ...]:
+        """Return the maps of the network's stages, which a training compares with the truth; the result last."""
+        return (self(rgb, values),)
 
     @staticmethod
     def in_range(
-        disparity: Tensor, min_max: Tensor | None, compute: Callable[[Tensor], tuple[Tensor, ...]]
+        filled: Tensor, min_max: Tensor, compute: Callable[[Tensor], tuple[Tensor, ...]]
     ) -> tuple[Tensor, ...]:
-        """Return the maps that ``compute`` makes of inpainted, normalised disparity, in the unit of the disparity."""
-        _, minimum, value_range = normalise(disparity, min_max)
+        """Return the maps that ``compute`` makes of normalised disparity without holes, in the disparity's unit."""
+        _, minimum, value_range = normalise(filled, min_max)
         varies = value_range > 0
         value_range = torch.where(varies, value_range, 1)
-        values = (inpaint(disparity) - minimum) / value_range
+        values = (filled - minimum) / value_range
         return tuple(torch.where(varies, values * value_range, 0) + minimum for values in compute(values))
 
 

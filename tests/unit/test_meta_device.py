@@ -1,0 +1,138 @@
+"""Steps wait for no value of a GPU: networks, losses, metrics and whole steps on tensors without values.
+
+On the device ``meta`` a value that is read (``item``, ``bool``, ``tolist``, an index by a mask) is an error, and so is
+a tensor that was left on the CPU.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import fields, replace
+from typing import Any
+from unittest import mock
+
+import pytest
+import torch
+from lightning.fabric.utilities import move_data_to_device
+from small_lpips import random_lpips
+from small_scenes import sample_of, step
+from torch import Tensor
+from torch.utils.data import default_collate
+
+from dsr.degradation.downsampling import Downsampling
+from dsr.degradation.hints import encode_facts
+from dsr.methods.dip.problem import PriorObjective
+from dsr.methods.dip.stopping import Variance
+from dsr.methods.dip.upsampler import DeepImagePrior
+from dsr.methods.networks.network import Answer
+from dsr.methods.networks.peers.peer import PEERS
+from dsr.methods.networks.trained import NETWORKS
+from dsr.metrics.calibration import measured_errors
+from dsr.metrics.catalogue import PROTOCOLS, catalogue
+from dsr.metrics.classes import visual_metrics
+from dsr.metrics.functional import SurfacePair
+from dsr.metrics.visual_loss import VisualLoss
+from dsr.training.degradation import Batch, to_tensors
+from dsr.training.module import SuperResolution
+from dsr.training.objective import DepthObjective, SurfaceObjective
+
+META = torch.device("meta")
+METRICS = [metric for metrics in PROTOCOLS.values() for metric in metrics]
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*the `self.trainer` reference is not registered.*")
+
+
+@pytest.fixture(autouse=True)
+def _meta_is_not_autocast() -> Iterator[None]:
+    """``torch.autocast`` knows no such device."""
+    real = torch.autocast
+    named = lambda kind, *args, **more: contextlib.nullcontext() if kind == "meta" else real(kind, *args, **more)  # noqa: E731
+    with mock.patch("torch.autocast", named):
+        yield
+
+
+def _batch() -> Batch:
+    """Return two patches with holes on the CPU, of one of which the kernel is told."""
+    disparity, photo = step(64)
+    patch = to_tensors(sample_of(disparity, photo))
+    patch["disparity_lr"][0, 3:5, 4] = torch.nan
+    patch["depth"][0, 40, 9] = torch.nan
+    hints = {"noise": torch.zeros_like(patch["disparity_lr"]), "soft": torch.zeros(())}
+    return default_collate([{**patch, **hints, "facts": encode_facts(kernel)} for kernel in ("box", None)])
+
+
+def _on_meta(batch: Any) -> Any:
+    return move_data_to_device(batch, META)
+
+
+def _maps(*, differentiable: bool = False) -> tuple[Tensor, Tensor, Tensor]:
+    """Return a prediction, a target and rays of 40 x 40 pixels without values."""
+    prediction, target = (torch.empty(2, 1, 40, 40, dtype=torch.float64, device=META) for _ in range(2))
+    return prediction.requires_grad_(differentiable), target, torch.empty(1, 3, 40, 40, device=META)
+
+
+def test_a_value_that_is_read_is_an_error() -> None:
+    for read in (Tensor.item, Tensor.tolist, Tensor.nonzero, lambda x: bool(x.all()), lambda x: x[x > 0]):
+        with pytest.raises((RuntimeError, NotImplementedError)):
+            read(torch.empty(1, device=META))
+    with pytest.raises(RuntimeError):
+        torch.empty(2, device=META) + torch.empty(2)
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_training_step_reads_no_value(name: str) -> None:
+    net = NETWORKS[name](4)
+    objective = SurfaceObjective() if net.states_errors else DepthObjective("lap1", 0.1, shading=0.1)
+    module = SuperResolution(net, objective).to(META)
+    module.training_step(_on_meta(net.prepare(_batch()))).backward()
+    assert all(each.grad is not None for each in module.net.parameters())
+    optimizer = torch.optim.AdamW(module.net.parameters())
+    optimizer.defaults["fused"] = True  # as trainings have it; torch has no such kernel for tensors without values
+    module.configure_gradient_clipping(optimizer, 1.0, "norm")
+    del optimizer.found_inf  # type: ignore[attr-defined]
+    module.optimizer_step(0, 0, optimizer, lambda: None)
+
+
+@pytest.mark.parametrize("visual", ["mse_v", "dssim", "lpips"])
+@pytest.mark.parametrize("depth_loss", ["lap1", "l1", "mse"])
+def test_loss_of_a_training_reads_no_value(depth_loss: Any, visual: Any) -> None:
+    batch = _on_meta(_batch())
+    disparity = torch.empty_like(batch["depth"], requires_grad=True)
+    loss = VisualLoss(visual, random_lpips() if visual == "lpips" else None)
+    DepthObjective(depth_loss, 1.0, loss, shading=0.1)(Answer(disparity, stages=(disparity,)), batch)["loss"].backward()
+    assert disparity.grad is not None
+
+
+@pytest.mark.parametrize("metric", METRICS, ids=lambda metric: metric.name)
+def test_metric_reads_no_value(metric: Any) -> None:
+    [metric] = [each for each in catalogue(random_lpips(), protocols=tuple(PROTOCOLS)) if each.name == metric.name]
+    pair = SurfacePair(*_maps(differentiable=True))
+    for value in metric.variants(pair).values():
+        assert value.shape == (2,)
+    metric.valid_fraction(pair)
+
+
+def test_collection_of_metrics_reads_no_value() -> None:
+    metrics = visual_metrics(random_lpips(), protocols=tuple(PROTOCOLS)).to(META)
+    assert all(value.is_meta for value in metrics(*_maps()).values())
+    assert all(value.is_meta for value in metrics.compute().values())
+    assert all(value.is_meta for value in measured_errors(*_maps()))
+
+
+@pytest.mark.parametrize("name", PEERS)
+def test_peers_read_no_value(name: str) -> None:
+    net = PEERS[name](4).to(META)
+    net(torch.empty(1, 3, 64, 64, device=META), torch.empty(1, 1, 64, 64, device=META)).sum().backward()
+
+
+@pytest.mark.parametrize("objective", [PriorObjective(), PriorObjective("mse", w=0.0)])
+def test_step_of_a_deep_image_prior_reads_no_value(objective: PriorObjective) -> None:
+    module, _ = DeepImagePrior(scale=4, downsampling=Downsampling("box")).module(sample_of(*step(64)))
+    tensors = {each.name: getattr(module.problem, each.name) for each in fields(module.problem)}
+    module.problem = replace(module.problem, **_on_meta({k: v for k, v in tensors.items() if isinstance(v, Tensor)}))
+    module.to(META)
+    module.objective, module.stopping = objective, Variance(module.average, patience=20)
+    with mock.patch("torch.randn", lambda shape, **_: torch.empty(shape, device=META)):  # the generator is the CPU's
+        module.training_step(None, 0).backward()
+    assert all(each.grad is not None for each in module.net.parameters())
