@@ -333,7 +333,7 @@ READERS = (
     Reader("rgbdd", lambda folder: seeds.unit("test_format_rgbdd").image(folder, "20200509112638"),
            _dataset("rgbdd", "RGBDD", real=True, scenes="found"), 2),
     Reader("ddrnet", lambda folder: seeds.unit("test_format_ddrnet").frame(folder),
-           _dataset("ddrnet", "DDRNetFrames"), 1),
+           _dataset("ddrnet_frames", "DDRNetFrames"), 1),
     Reader("diml", lambda folder: seeds.unit("test_format_diml").frame(folder / "test/HR/12. Livingroom"),
            _dataset("diml", "DIML", scenes="found")),
     Reader("lu", lambda folder: seeds.unit("test_format_eight_bit").pair(folder),
