@@ -199,7 +199,7 @@ def test_config_yaml_is_the_resolved_configuration(default_run):
     text = (default_run[1] / "config.yaml").read_text()
     assert "${" not in text
     assert "hydra" not in text
-    for line in ("scale: 4", "  size: 64", "  name: bicubic", "seed: 0", "  lpips_trunk: null"):
+    for line in ("scale: 4", "  size: 64", "  method: bicubic", "seed: 0", "  lpips_trunk: null"):
         assert line in text.splitlines()
 
 
@@ -326,7 +326,7 @@ USAGE_ERRORS = {
     "a mistyped group": (["datset=folder"], "datset: unknown key; expected dataset=folder"),
     "a mistyped choice": (["method=bicubik"], "method=bicubik: unknown; expected one of anisotropic_diffusion, "),
     "a mistyped key": (["scal=8"], "scal: unknown key; expected scale=8"),
-    "an added key": (["+scal=8"], "scal: unknown key; expected dataset, "),
+    "an added key": (["+scal=8"], "scal: unknown key; expected names, dataset, "),
     "an added key of a group": (["+method.sharp=1"], "method.sharp: unknown key; method=bicubic takes order, "),
     "a group taken away": (["~method"], "method: missing; give it as method=..."),
     "a scale that is none": (["scale=3"], "scale: expected one of 2, 4, 8, 16, got 3; downsampling=measured takes "),
@@ -352,15 +352,15 @@ USAGE_ERRORS = {
         ["dataset.scenes=statue"],
         "dataset.scenes: expected a list of text, found or null, got",
     ),
-    "no weights": (["method=msg_v", "scale=16"], "weights: dsr comes with "),
+    "no weights": (["method=msg_v", "scale=16"], "weights: method=msg_v: dsr comes with "),
     "a mixture": (["dataset=mixture"], "dataset=mixture: several data sets are for training; name one of them"),
     "a noise that cannot be": (["noise=gaussian_multiplicative", "noise.std=2"], "noise.std: expected a number above"),
-    "missing weights": (["method=msg_v", "weights=no.pth"], "weights: expected a file of weights for method=msg_v"),
-    "a directory without": (["method=msg", "weights=empty"], "weights: expected a file of weights for method=msg, got"),
+    "missing weights": (["method=msg_v", "weights=no.pth"], "weights: method=msg_v: expected a file of weights"),
+    "a directory without": (["method=msg", "weights=empty"], "weights: method=msg: expected a file of weights, got"),
     "foreign weights": (["method=msg_v", "weights=file"], "file: expected "),
-    "authors' weights": (["method=pgsr"], "weights: method=pgsr at scale 4 needs weights=FILE, or a directory with"),
+    "authors' weights": (["method=pgsr"], "weights: method=pgsr: scale 4 needs weights=FILE, or a directory with"),
     "foreign authors' weights": (["method=svlrm", "weights=file"], "file: expected a torch file of plain tensors, got"),
-    "a directory without any": (["method=fdkn", "weights=empty"], "weights: expected a file of weights for"),
+    "a directory without any": (["method=fdkn", "weights=empty"], "weights: method=fdkn: expected a file of weights"),
     "a missing trunk": (["metrics.lpips_trunk=no"], "metrics.lpips_trunk: expected a file, got no"),
     "a foreign trunk": (["metrics.lpips_trunk=file"], "metrics.lpips_trunk: file: expected the weights"),
     "a file as directory": (["output_dir=file"], "output_dir: expected a directory, file is a file"),

@@ -50,7 +50,7 @@ def test_every_job_that_cannot_be_run_is_named(multirun, tmp_path):
     )
     assert (code, output) == (2, [])
     foreign = "output_dir: out/2 holds files of something else; another output_dir keeps them"
-    unfound = "weights: expected a file of weights for method=msg_v, got nowhere (no such file)"
+    unfound = "weights: method=msg_v: expected a file of weights, got nowhere (no such file)"
     assert [line for line in errors if line.startswith("error")] == [
         "error: 3 of 4 jobs cannot be run, so none is begun", f"error: method=bicubic seed=2: {foreign}",
         f"error: method=msg_v seed=1: {unfound}", f"error: method=msg_v seed=2: {unfound}",

@@ -70,6 +70,7 @@ USAGE_ERRORS = {
     "colour=8": f"colour: unknown key; expected {SETTINGS}",
     "dataset.rot=x": "dataset.rot: unknown key; expected dataset.root=x",
     "dataset.photo=x": "dataset.photo: unknown key; expected dataset.root, dataset.scenes, dataset.size",
+    "dataset.name=mine": "dataset.name: unknown key; expected names.dataset=mine",
     "metrics.lpip=false": "metrics.lpip: unknown key; expected metrics.lpips=false",
     "seed=four": "seed: Value 'four' of type 'str' could not be converted to Integer",
     "seed=1.5": "seed: Value '1.5' of type 'float' could not be converted to Integer",

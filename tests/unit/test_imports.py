@@ -1,23 +1,12 @@
-"""Imports run downward only; see the house's layers in the README."""
+"""Imports run downward only; see docs/architecture.md."""
 
-from pathlib import Path
+import importlib
+import re
 
 import pytest
-from module_graph import MODULES, SOURCE, import_graph, imports_of, within
+from module_graph import LAYERS, MODULES, SOURCE, drawing, import_graph, imports_of, within
 
-LAYERS = (
-    ("dsr.utils", "dsr.geometry"),
-    ("dsr.sample",),
-    ("dsr.degradation", "dsr.metrics", "dsr.synthetic", "dsr.io"),
-    ("dsr.data", "dsr.methods"),
-    ("dsr.training", "dsr.evaluation", "dsr.inference"),
-    ("dsr.pictures",),
-    ("dsr.doctor", "dsr.report"),
-    ("dsr.app",),
-    ("dsr.cli",),
-    ("dsr.__main__",),
-)
-"""From the lowest up. A package stands for all its modules; those in one line do not import each other."""
+ARCHITECTURE = SOURCE.parent / "docs" / "architecture.md"
 MORE_FORBIDDEN = {
     "dsr.data": ("dsr.metrics",),
     "dsr.methods.classical": ("dsr.metrics",),
@@ -78,7 +67,7 @@ def has_no_place(name):
 
 def test_modules_all_have_a_layer():
     homeless = [name for name in MODULES if has_no_place(name)]
-    assert not homeless, f"assign {', '.join(homeless)} to a layer in LAYERS of {Path(__file__).name}"
+    assert not homeless, f"assign {', '.join(homeless)} to a layer in LAYERS of module_graph.py"
 
 
 def test_modules_import_from_layers_below_and_their_own_group_alone():
@@ -131,3 +120,26 @@ def test_module_graph_finds_the_modules():
 
 def test_package_root_holds_no_module_but_the_sample_and_the_command():
     assert {path.name for path in (SOURCE / "dsr").glob("*.py")} == {"__init__.py", "__main__.py", "sample.py"}
+
+
+def test_documentation_shows_the_rooms_as_they_are():
+    assert f"```text\n{drawing()}```\n" in ARCHITECTURE.read_text(encoding="utf-8"), "run tests/module_graph.py"
+
+
+def test_what_the_page_of_the_architecture_names_is_there():
+    text = ARCHITECTURE.read_text(encoding="utf-8")
+    names = set(re.findall(r"`(dsr\.[\w.]+)`", text))
+    files = set(re.findall(r"`((?:src|conf|tests|docs|benchmarks)/[\w./]+)`", text))
+    assert len(names) > 20
+    for name in sorted(names):
+        module = next(part for part in accumulated(name) if part in MODULES)
+        found = importlib.import_module(module)
+        for part in name.removeprefix(module).strip(".").split(".") if name != module else ():
+            found = getattr(found, part)
+    assert sorted(file for file in files if not (SOURCE.parent / file).exists()) == []
+
+
+def accumulated(name):
+    """Return a dotted name and what stands before each of its dots, the longest first."""
+    parts = name.split(".")
+    return [".".join(parts[:count]) for count in range(len(parts), 0, -1)]

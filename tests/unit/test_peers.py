@@ -326,7 +326,7 @@ def test_directory_is_searched_for_the_authors_names(tmp_path: Path, monkeypatch
     recipe = read_recipe("svlrm")
     assert not WeightChoice.of(recipe.at(8)["weights"], 8).exists()
     message = (
-        r"weights: scale 8 needs weights=FILE, or a directory with SVLRM_X8.pth "
+        r"weights: method=svlrm: scale 8 needs weights=FILE, or a directory with SVLRM_X8.pth "
         r"\(from github.com/sunny2109/SVLRM, weights/\); its authors publish them, dsr does not come with them"
     )
     with pytest.raises(ConfigError, match=message):

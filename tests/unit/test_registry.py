@@ -73,9 +73,9 @@ def test_weights_are_those_given_or_named_or_packaged(tmp_path: Path) -> None:
     assert recipe.with_weights(file).weights(4) == file
     (tmp_path / "msg_v_x4_clean.pth").write_bytes(b"")
     assert recipe.with_weights(tmp_path).weights(4) == tmp_path / "msg_v_x4_clean.pth"
-    with pytest.raises(ConfigError, match=r"method=msg_v: weights: dsr comes with .*; scale 2 needs weights=FILE"):
+    with pytest.raises(ConfigError, match=r"weights: method=msg_v: dsr comes with .*; scale 2 needs weights=FILE"):
         recipe.weights(2)
-    with pytest.raises(ConfigError, match=r"method=msg_v: weights: expected a file of weights, got .*no such file"):
+    with pytest.raises(ConfigError, match=r"weights: method=msg_v: expected a file of weights, got .*no such file"):
         recipe.with_weights(tmp_path / "nowhere").weights(4)
     with pytest.raises(ConfigError, match=r"weights\.pack: unknown key; expected file, files, packaged"):
         read_recipe("msg_v", {"weights": {"pack": "x"}}).weights(4)

@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from dsr.app.composition import compose
 from dsr.app.multirun import LAUNCHERS
-from dsr.app.schema import MOVED, SEVERAL
+from dsr.app.schema import MOVED, NAMED, SEVERAL
 from dsr.utils.configuration import list_choices, list_groups
 from dsr.utils.console import one_line
 
@@ -118,6 +118,9 @@ def _explain_key(key: str, name: str, arguments: Sequence[str], directories: Seq
         return f"experiment: write +experiment=NAME, NAME one of {', '.join(list_choices(key, directories))}"
     values = (argument.partition("=") for argument in arguments)
     value = next((value for given, _, value in values if given.lstrip("+~") == key), "...")
+    group = key.removesuffix(".name")
+    if key == f"{group}.name" and group in NAMED:
+        return f"{key}: unknown key; expected names.{group}={value}"
     if name == "train" and key in MOVED:
         return f"{key}: unknown key; expected {MOVED[key]}={value}"
     config = _composed_for(key, name, arguments, directories)

@@ -66,6 +66,8 @@ class AnyRatio(Method):
         max_hole: width of the widest hole that counts as small, in degrees of view; one of 5 pixels always does.
         working_size: by what ``facets`` without a scale divides the size of the map first, 1, 2, 4, 8 or 16; None to
             choose it by the map's noise, see :mod:`dsr.inference.working_size`.
+        precision: dtype of the convolutions; None for the device's fast one where that costs no accuracy.
+        seed: of random numbers.
 
     Raises:
         ValueError: an option is not as above.
@@ -80,12 +82,15 @@ class AnyRatio(Method):
         fill: Fill = "all",
         max_hole: float = WIDEST,
         working_size: int | None = None,
+        *,
+        precision: str | None = None,
+        seed: int = 0,
     ) -> None:
         _check_options(fill, max_hole, working_size)
         self.recipe, self._scale, self._fill = recipe, scale, fill
         self._max_hole, self._working_size = max_hole, working_size
-        precision = fast_precision(device) if recipe.abilities.tolerant else "float32"
-        self._run = Run(device=device, precision=precision, downsampling=Downsampling("box"))
+        precision = precision or (fast_precision(device) if recipe.abilities.tolerant else "float32")
+        self._run = Run(device=device, precision=precision, seed=seed, downsampling=Downsampling("box"))
         self._methods: dict[int, Method] = {}
 
     @property

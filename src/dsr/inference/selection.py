@@ -52,7 +52,8 @@ class Selection:
             return self.recipe.build(self.scale, run)
         try:
             fill: Fill = "none" if self.recipe.at().get("fill_holes") is False else "all"
-            method = AnyRatio(self.recipe, torch.device(run.device), fill=fill)
+            device = torch.device(run.device)
+            method = AnyRatio(self.recipe, device, fill=fill, precision=run.precision, seed=run.seed)
             method.first()
         except ConfigError:
             raise

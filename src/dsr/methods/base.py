@@ -59,7 +59,6 @@ class Abilities:
 
     Args:
         ratios: of the samples that it takes.
-        at_ratio: whether ``dsr.upsample`` runs it at the ratio of the sizes, and does not resize photo and result.
         own_size: whether it takes a map of the photo's own size as it is.
         repeats: whether its result may be its input once more, for larger factors.
         needs: a file of ``weights``, or one of weights from which dsr loads a ``network``.
@@ -71,7 +70,6 @@ class Abilities:
     """
 
     ratios: Ratios = "factors"
-    at_ratio: bool = False
     own_size: bool = False
     repeats: bool = False
     needs: Literal["weights", "network"] | None = None
@@ -79,6 +77,11 @@ class Abilities:
     tolerant: bool = False
     assumes_downsampling: bool = False
     cost: Cost = Cost(1000)
+
+    @property
+    def at_ratio(self) -> bool:
+        """Whether it computes at any ratio; one whose file of weights is for a factor runs at that."""
+        return self.ratios == "any" and self.needs != "weights"
 
     def takes(self, ratio: float) -> bool:
         """Return whether it takes samples of a ratio itself."""

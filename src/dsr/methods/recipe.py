@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import os
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -181,7 +182,7 @@ class Recipe:
         try:
             return self._choice(factor).find()
         except ConfigError as error:
-            raise ConfigError(f"method={self.name}: {error}") from error
+            raise ConfigError(re.sub(r"^weights: ", f"weights: method={self.name}: ", str(error))) from error
 
     def _choice(self, factor: float) -> WeightChoice:
         """Return where the weights for a factor are."""

@@ -1,1 +1,1 @@
-"""Tables and pictures of results."""
+"""Tables, figures and pages of results: of runs, of the user study, of surfaces."""

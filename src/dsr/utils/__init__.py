@@ -1,1 +1,1 @@
-"""Utilities of the whole package: files, hashes, the console, Lightning."""
+"""What all rooms use: files and guards, configuration, options, progress, workers, Lightning."""

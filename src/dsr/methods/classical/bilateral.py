@@ -63,7 +63,7 @@ class Bilateral(GuidedMethod):
 
     """
 
-    abilities = Abilities(ratios="any", at_ratio=True, own_size=True, cost=Cost(150, 1))
+    abilities = Abilities(ratios="any", own_size=True, cost=Cost(150, 1))
     range_type: RangeType = "orthogonal"
 
     def __init__(

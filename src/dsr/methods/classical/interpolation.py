@@ -42,7 +42,7 @@ class Interpolation(Method):
 
     """
 
-    abilities = Abilities(ratios="any", at_ratio=True, cost=Cost(100))
+    abilities = Abilities(ratios="any", cost=Cost(100))
     range_type: RangeType = "perspective"
 
     def __init__(self, order: Order = "bicubic", *, fill_holes: bool = False) -> None:

@@ -66,9 +66,7 @@ class AnyMap(Method):
 
     """
 
-    abilities = Abilities(
-        ratios="any", at_ratio=True, own_size=True, needs="network", tolerant=True, cost=Cost(250, 2.5)
-    )
+    abilities = Abilities(ratios="any", own_size=True, needs="network", tolerant=True, cost=Cost(250, 2.5))
 
     def __init__(
         self,
