@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import io
 import math
 import os
 import sys
@@ -185,7 +186,8 @@ def _plans(configs: Iterator[DictConfig], check: Check) -> list[list[Plan]]:
     owners: dict[Path, Mapping[str, Any]] = {}
     for config in configs:
         overrides = OmegaConf.to_container(HydraConfig.get().overrides.task)
-        job = JobReturn(overrides, status=JobStatus.COMPLETED, _return_value=JobResult())  # type: ignore[arg-type]
+        job = JobReturn(overrides, status=JobStatus.COMPLETED)  # type: ignore[arg-type]
+        job.return_value = JobResult()
         results.append(job)
         try:
             plans.append(list(check(config)))
@@ -196,7 +198,7 @@ def _plans(configs: Iterator[DictConfig], check: Check) -> list[list[Plan]]:
                         "output_dir each has its own"
                     )
         except (ConfigError, OSError, OmegaConfBaseException) as error:
-            job._return_value = JobResult.failed(one_line(error))
+            job.return_value = JobResult.failed(one_line(error))
     summary = failure_summary(results, "cannot be run, so none is begun")
     for line in summary:
         print_error(line)
@@ -252,7 +254,8 @@ def failure_summary(jobs: Sequence[JobReturn], what: str = "failed") -> list[str
 
 def _problem(job: JobReturn) -> str:
     """Return why a job failed, one line; empty if it did not."""
-    if job.status == JobStatus.FAILED:
-        error = job._return_value
+    try:
+        with contextlib.redirect_stderr(io.StringIO()):  # Hydra's own line, which repeats the overrides
+            return getattr(job.return_value, "problem", "")
+    except Exception as error:  # of the job
         return f"{type(error).__name__}: {one_line(error)}"
-    return getattr(job.return_value, "problem", "")

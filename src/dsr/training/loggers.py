@@ -80,9 +80,7 @@ class WandbLog(WandbLogger):
     def finalize(self, status: str) -> None:
         """End the run, so that the next training of a multirun has one of its own."""
         super().finalize(status)
-        if self._experiment is not None:
-            self._experiment.finish(exit_code=0 if status == "success" else 1)
-            self._experiment = None
+        self.experiment.finish(exit_code=0 if status == "success" else 1)
 
 
 def wandb(
@@ -104,17 +102,19 @@ def wandb(
     folder = Path(save_dir)
     import wandb as client  # noqa: PLC0415 - optional
 
-    logger = WandbLog(
-        name=folder.name, save_dir=folder, project=project, entity=entity, mode=mode,
-        id=_read_number(folder, "wandb"), settings=client.Settings(silent=True, console="off"),
-    )  # fmt: skip
-    logger._wandb_init.pop("anonymous", None)  # of which wandb would warn
+    if getattr(rank_zero_only, "rank", 0):  # the first process logs
+        return WandbLog(project=project)
     try:
-        number = logger.experiment.id
+        run = client.init(
+            name=folder.name, dir=folder, project=project, entity=entity, mode=mode, resume="allow",
+            id=_read_number(folder, "wandb"), settings=client.Settings(silent=True, console="off"),
+        )  # fmt: skip
     except client.Error as error:
         raise ValueError(f"mode: wandb: {error}; wandb login, or logger.wandb.mode=offline for local files") from error
-    _write_number(folder, "wandb", number)
-    return logger
+    run.define_metric("trainer/global_step")
+    run.define_metric("*", step_metric="trainer/global_step", step_sync=True)
+    _write_number(folder, "wandb", run.id)
+    return WandbLog(project=project, experiment=run)
 
 
 def mlflow(save_dir: str | Path, experiment: str = "dsr", tracking_uri: str | None = None) -> Logger:
