@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import torch
 
+from dsr.app.schema import Identity
 from dsr.utils.checkpoints import DivergenceError
 from dsr.utils.configuration import ConfigError
 from dsr.utils.files import write_text
@@ -22,7 +21,7 @@ _ADVICE = (
 )
 
 
-def note_divergence(folder: Path, last: Path, identity: Mapping[str, Any], error: DivergenceError) -> ConfigError:
+def note_divergence(folder: Path, last: Path, identity: Identity, error: DivergenceError) -> ConfigError:
     """Write down that a training diverged, and return the error that says what is left and what may help.
 
     Args:
@@ -38,7 +37,7 @@ def note_divergence(folder: Path, last: Path, identity: Mapping[str, Any], error
     return ConfigError(f"{folder}: the training {error}; {kept}; {_ADVICE}")
 
 
-def expect_no_divergence(folder: Path, identity: Mapping[str, Any]) -> None:
+def expect_no_divergence(folder: Path, identity: Identity) -> None:
     """Refuse a training that diverged before with the same settings, code and device, as it would again.
 
     Raises:

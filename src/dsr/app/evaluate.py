@@ -22,7 +22,7 @@ from rich.console import Console
 from dsr.app import run_directory as rundir
 from dsr.app.metrics import check_metrics, chosen_metrics, metric_collection
 from dsr.app.multirun import Plan, runs_here
-from dsr.app.schema import EvalConfig, given_keys, plain_config, raw_group, user_directories
+from dsr.app.schema import Config, EvalConfig, Identity, given_keys, plain_config, raw_group, user_directories
 from dsr.data.folder import Folder
 from dsr.data.scene_source import SceneSource, prepare_scenes
 from dsr.degradation.downsampling import Downsampling, Measured, make_sample
@@ -110,15 +110,15 @@ class _Prepared:
     """An evaluation that can be run, in the directory of its run."""
 
     settings: EvalConfig
-    plain: Mapping[str, Any]
-    identity: Mapping[str, Any]
+    plain: Config
+    identity: Identity
     folder: Path
     study: Evaluation
     workers: Workers
     progress: ConsoleProgress
 
 
-def _prepare(plain: dict[str, Any], node: Any, source: SceneSource | None, *, here: bool = True) -> _Prepared:
+def _prepare(plain: Config, node: Any, source: SceneSource | None, *, here: bool = True) -> _Prepared:
     """Check and build all that an evaluation needs, and write nothing."""
     settings = EvalConfig.of(plain)
     device = pick_device(settings.device) if here else torch.device("cpu")

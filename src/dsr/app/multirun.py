@@ -21,6 +21,7 @@ from hydra.types import HydraContext, RunMode, TaskFunction
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 
+from dsr.app.schema import Identity
 from dsr.utils.configuration import ConfigError, expect_library
 from dsr.utils.console import USAGE_ERROR, one_line, open_console, print_error, show
 from dsr.utils.progress import duration
@@ -54,7 +55,7 @@ class Plan:
     """
 
     folder: Path
-    identity: Mapping[str, Any]
+    identity: Identity
     unit: str
     left: int
     done: int = 0

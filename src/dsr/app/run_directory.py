@@ -12,6 +12,7 @@ import torch
 from omegaconf import OmegaConf
 
 from dsr.app.run_names import NOT_IDENTITY, run_name
+from dsr.app.schema import Config, Identity
 from dsr.app.trust import imported
 from dsr.utils.configuration import ConfigError, expand_home
 from dsr.utils.console import shorten
@@ -25,7 +26,7 @@ _NO_BITS = ("log_every_n_steps", "profiler", "detect_anomaly", "enable_progress_
 
 
 def identity_of(
-    config: Mapping[str, Any], weights_hash: str | None, device: torch.device, targets: Iterable[str] = ()
+    config: Config, weights_hash: str | None, device: torch.device, targets: Iterable[str] = ()
 ) -> dict[str, Any]:
     """Return everything that a run's predictions depend on, as plain values: settings, weights, kind of device.
 
@@ -48,7 +49,7 @@ def identity_of(
     return {**kept, "device": device.type, "weights_sha256": weights_hash, **code, **more}
 
 
-def default_directory(kind: str, config: Mapping[str, Any], identity: Mapping[str, Any]) -> Path:
+def default_directory(kind: str, config: Config, identity: Identity) -> Path:
     """Return outputs/KIND/NAME, with the name of :func:`dsr.app.run_names.run_name`.
 
     The first eight digits of the identity's hash follow where the name does not say everything, or where the directory
@@ -60,7 +61,7 @@ def default_directory(kind: str, config: Mapping[str, Any], identity: Mapping[st
     return plain if complete and not marked.is_dir() and _may_hold(plain, identity) else marked
 
 
-def _hash_of(identity: Mapping[str, Any]) -> str:
+def _hash_of(identity: Identity) -> str:
     """Return the hash of an identity."""
     return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
 
@@ -70,7 +71,7 @@ def _identity_in(folder: Path) -> dict[str, Any]:
     return dict(parse_json(read_limited(folder / _RECORD), finite=False)["identity"])
 
 
-def _may_hold(folder: Path, identity: Mapping[str, Any]) -> bool:
+def _may_hold(folder: Path, identity: Identity) -> bool:
     """Return whether a directory does not exist yet, or is empty, or is that of a run of this identity."""
     try:
         if not folder.is_dir() or _is_unused(folder):
@@ -80,7 +81,7 @@ def _may_hold(folder: Path, identity: Mapping[str, Any]) -> bool:
         return False
 
 
-def degradation_of(config: Mapping[str, Any], *, assumes: bool = False) -> str:
+def degradation_of(config: Config, *, assumes: bool = False) -> str:
     """Return the name of a run's degradation, as in ``scores.csv``: box, or box+gaussian_multiplicative-0.003.
 
     ``assumes``: whether the run's method assumes a downsampling model.
@@ -119,9 +120,7 @@ def folder_of(output_dir: str | Path) -> Path:
     return folder
 
 
-def expect_free(
-    folder: Path, config: Mapping[str, Any], identity: Mapping[str, Any], tolerated: Sequence[str] = ()
-) -> list[str]:
+def expect_free(folder: Path, config: Config, identity: Identity, tolerated: Sequence[str] = ()) -> list[str]:
     """Check that ``folder`` can become the directory of this run; nothing is written.
 
     Args:
@@ -162,9 +161,7 @@ def _is_unused(folder: Path) -> bool:
     return all(path.name.startswith(f".{Path(_RECORD).stem}-") for path in folder.iterdir())
 
 
-def claim(
-    folder: Path, config: Mapping[str, Any], identity: Mapping[str, Any], tolerated: Sequence[str] = ()
-) -> list[str]:
+def claim(folder: Path, config: Config, identity: Identity, tolerated: Sequence[str] = ()) -> list[str]:
     """Make ``folder`` the directory of this run, with its ``config.yaml`` and ``versions.json``.
 
     Args:
@@ -190,7 +187,7 @@ def claim(
     return different
 
 
-def _changes(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = "") -> list[str]:
+def _changes(before: Config, now: Config, prefix: str = "") -> list[str]:
     """Return the dotted keys whose values differ."""
     changed = []
     for key in sorted(before.keys() | now.keys()):

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from omegaconf import DictConfig, OmegaConf
 
 from dsr.app.composition import compose
-from dsr.app.schema import NAMED, given_keys, plain_config, user_directories
+from dsr.app.schema import NAMED, Config, Identity, given_keys, plain_config, user_directories
 from dsr.utils.configuration import config_directories, list_choices
 from dsr.utils.ratios import round_ratio
 
@@ -42,7 +42,7 @@ _REFERENCE = re.compile(r"\$\{([a-z_][\w.]*)\}")
 _LONGEST, _LONGEST_VALUE = 100, 60
 
 
-def run_name(kind: str, config: Mapping[str, Any], identity: Mapping[str, Any]) -> tuple[str, bool]:
+def run_name(kind: str, config: Config, identity: Identity) -> tuple[str, bool]:
     """Return the name of a run, and whether it says everything that the configuration has.
 
     Args:
@@ -68,7 +68,7 @@ def run_name(kind: str, config: Mapping[str, Any], identity: Mapping[str, Any]) 
     return f"{name[:_LONGEST]}_seed{config['seed']}", complete
 
 
-def _defaults(kind: str, config: Mapping[str, Any]) -> tuple[dict[str, str], dict[str, Any], bool]:
+def _defaults(kind: str, config: Config) -> tuple[dict[str, str], dict[str, Any], bool]:
     """Return the default choices of groups, the defaults for this configuration's choices, and whether all have any."""
     places = config_directories(user_directories())
     listed: Any = OmegaConf.load(places[0] / f"{kind}.yaml")
@@ -86,7 +86,7 @@ def _compose(kind: str, overrides: tuple[str, ...], places: tuple[Path, ...]) ->
     return compose(kind, overrides, places)
 
 
-def _differing(config: Mapping[str, Any], defaults: Mapping[str, Any], head: str) -> dict[str, Any]:
+def _differing(config: Config, defaults: Config, head: str) -> dict[str, Any]:
     """Return the settings that differ from the defaults, by the last part of their keys if it is the only one."""
     skipped = (*_ELSEWHERE, head) if config.get("run") is not None else _ELSEWHERE
     groups = {group: node for group, node in config.items() if group not in skipped and isinstance(node, Mapping)}
@@ -102,7 +102,7 @@ def _differing(config: Mapping[str, Any], defaults: Mapping[str, Any], head: str
     }  # fmt: skip
 
 
-def _leaves(node: Mapping[str, Any]) -> dict[str, Any]:
+def _leaves(node: Config) -> dict[str, Any]:
     """Return the values of a node, and of the nodes in it, by their dotted keys."""
     found: dict[str, Any] = {}
     for key, value in node.items():
@@ -111,7 +111,7 @@ def _leaves(node: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-def _with_references(composed: DictConfig, config: Mapping[str, Any]) -> dict[str, Any]:
+def _with_references(composed: DictConfig, config: Config) -> dict[str, Any]:
     """Return the defaults as plain values, where those that are another key's have what ``config`` has for that key."""
     plain = plain_config(composed)
 

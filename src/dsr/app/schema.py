@@ -16,6 +16,10 @@ from dsr.utils.configuration import ConfigError, build, check_types
 from dsr.utils.guards import is_number
 from dsr.utils.ratios import NATIVE, check_scale
 
+Config = Mapping[str, Any]
+"""A composed configuration as plain values."""
+Identity = Mapping[str, Any]
+"""What the results of a run depend on: settings, weights, versions, the kind of device."""
 STRATEGIES = ("auto", "ddp")
 KEPT = ("best", "last")
 VISUAL = ("mse_v", "dssim", "lpips")
@@ -85,7 +89,7 @@ class Checked:
     """A dataclass of settings that is checked when it is made from a configuration."""
 
     @classmethod
-    def of(cls, plain: Mapping[str, Any]) -> Self:
+    def of(cls, plain: Config) -> Self:
         """Return the checked settings of a composed configuration.
 
         Raises:

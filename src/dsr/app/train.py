@@ -24,7 +24,7 @@ from dsr.app.devices import Processes, find_processes
 from dsr.app.divergence import NOTE, expect_no_divergence, note_divergence, step_of
 from dsr.app.metrics import check_metrics, metric_collection
 from dsr.app.multirun import Plan, runs_here
-from dsr.app.schema import TrainConfig, given_keys, plain_config
+from dsr.app.schema import Config, Identity, TrainConfig, given_keys, plain_config
 from dsr.app.trainer import (
     MONITOR,
     has_idle_layers,
@@ -156,13 +156,13 @@ class _Prepared:
     device: torch.device
     data: PatchData
     module: SuperResolution
-    identity: Mapping[str, Any]
+    identity: Identity
     folder: Path
     resume: Path | None
     tolerated: tuple[str, ...]
 
 
-def _prepare(plain: dict[str, Any], settings: TrainConfig, device: torch.device, devices: int) -> _Prepared:
+def _prepare(plain: Config, settings: TrainConfig, device: torch.device, devices: int) -> _Prepared:
     """Check and build all that a training on a number of devices needs, and write nothing."""
     if settings.seed > _LARGEST_SEED:
         raise ConfigError(f"seed: expected at most {_LARGEST_SEED}, got {settings.seed}")
@@ -190,7 +190,7 @@ def _prepare(plain: dict[str, Any], settings: TrainConfig, device: torch.device,
     return _Prepared(device, data, module, identity, folder, resume, tolerated)
 
 
-def _train(plain: dict[str, Any], settings: TrainConfig, device: torch.device, processes: Processes) -> float:
+def _train(plain: Config, settings: TrainConfig, device: torch.device, processes: Processes) -> float:
     """Train in one of the processes, and return the best score."""
     first = processes.first
     progress = ConsoleProgress(Console(quiet=not first))
@@ -231,15 +231,13 @@ def _train(plain: dict[str, Any], settings: TrainConfig, device: torch.device, p
     return math.nan if score is None else float(score)
 
 
-def _expect_trainable(
-    folder: Path, plain: Mapping[str, Any], identity: Mapping[str, Any], tolerated: Sequence[str]
-) -> None:
+def _expect_trainable(folder: Path, plain: Config, identity: Identity, tolerated: Sequence[str]) -> None:
     """Check that the directory is free or that of this training, which is neither complete nor diverges again."""
     rundir.expect_free(folder, plain, identity, tolerated)
     _expect_unfinished(folder, identity, overwrite=plain["overwrite"])
 
 
-def _expect_unfinished(folder: Path, identity: Mapping[str, Any], *, overwrite: bool) -> None:
+def _expect_unfinished(folder: Path, identity: Identity, *, overwrite: bool) -> None:
     """Check that a training is neither complete nor diverges again."""
     if overwrite:
         return
@@ -248,9 +246,7 @@ def _expect_unfinished(folder: Path, identity: Mapping[str, Any], *, overwrite: 
     expect_no_divergence(folder, identity)
 
 
-def _claim(
-    folder: Path, plain: Mapping[str, Any], identity: Mapping[str, Any], tolerated: Sequence[str], progress: Progress
-) -> bool:
+def _claim(folder: Path, plain: Config, identity: Identity, tolerated: Sequence[str], progress: Progress) -> bool:
     """Make the directory that of this training, without the files of one that it replaces; return whether it is new."""
     new = not folder.exists()
     for key in rundir.claim(folder, plain, identity, tolerated):
@@ -324,11 +320,9 @@ def _module(settings: TrainConfig, net: DisparityNetwork, data: PatchData, metri
             what = "a loss of its own" if w is None else "no visual loss, which model.objective.w=auto adds"
             raise ConfigError(f"loss.{key}: model={names['model']} has {what}; leave it out")
     given = {"net": net, "metrics": metrics, "validation_sets": data.validation_sets}
-    try:
+    with keyed():
         module = build("model", {key: value for key, value in node.items() if key not in given}, given, names["model"])
         module.objective.check(net, data.patches.patch, told=names["degradation"] != "plain")
-    except (ValueError, OSError) as error:
-        raise keyed(error) from error
     try:
         module.configure_optimizers()
     except (ValueError, TypeError) as error:
@@ -341,11 +335,9 @@ def _load(progress: Progress, module: SuperResolution, data: PatchData) -> None:
     """Prepare and load the scenes, and compute the weights of the loss that depend on them."""
     for source, names in data.used_scenes:
         prepare_scenes(source, names, progress)
-    try:
+    with keyed():
         data.setup()
         balanced = module.objective.balanced(data.first_patches)
-    except (ValueError, OSError) as error:
-        raise keyed(error) from error
     if balanced is not module.objective:
         module.objective = balanced
         progress.say(f"loss   {balanced.formula}")
@@ -398,11 +390,9 @@ def _costs(
     data, module = prepared.data, prepared.module.to(prepared.device)
     interval = settings.interval
     steps, validations = settings.steps - done, math.ceil(settings.steps / interval) - done // interval + (not done)
-    try:
+    with keyed():
         pairs = [seconds_to_prepare(source, names, progress) for source, names in sources]
         validation = seconds_per_validation(module, data) / devices
-    except (ValueError, OSError) as error:
-        raise keyed(error) from error
     step = seconds_per_step(module, data.example_batch(), settings.precision) * settings.accumulate
     parts = {
         f"{sum(count for _, count in pairs)} scenes that are not in the cache": sum(seconds for seconds, _ in pairs),
@@ -420,7 +410,7 @@ def _by_source(data: PatchData) -> list[tuple[SceneSource, list[str]]]:
     return list(sources.values())
 
 
-def _open_log(trainer: lightning.Trainer, plain: Mapping[str, Any], module: SuperResolution) -> None:
+def _open_log(trainer: lightning.Trainer, plain: Config, module: SuperResolution) -> None:
     """Write the configuration to the logs, and lay them out."""
     collections: Any = module.metrics
     for logger in trainer.loggers:
@@ -428,7 +418,7 @@ def _open_log(trainer: lightning.Trainer, plain: Mapping[str, Any], module: Supe
         log_layout(logger, {name: metric.chart_title for name, metric in collections[0].items()})
 
 
-def _describe(trainer: lightning.Trainer, plain: Mapping[str, Any], facts: Mapping[str, Any], *, resumed: bool) -> None:
+def _describe(trainer: lightning.Trainer, plain: Config, facts: Mapping[str, Any], *, resumed: bool) -> None:
     """Write the main settings and the resulting w to the logs."""
     listed = {**facts, "method": facts["model"], "degradation": rundir.degradation_of(plain)}
     loss = {**plain["loss"], "w": facts["w"]} if "w" in facts else {}
@@ -437,7 +427,7 @@ def _describe(trainer: lightning.Trainer, plain: Mapping[str, Any], facts: Mappi
             log_settings(logger, listed, {**plain, "loss": loss})
 
 
-def _facts(plain: Mapping[str, Any], module: SuperResolution, patches: PatchSettings) -> dict[str, Any]:
+def _facts(plain: Config, module: SuperResolution, patches: PatchSettings) -> dict[str, Any]:
     """Return the training's main settings, for the weights' header and the log."""
     groups = ("model", "dataset", "downsampling", "noise", "degradation", "trainer")
     return {

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from dsr.app.schema import RunConfig, TrainConfig, user_directories
+from dsr.app.schema import Config, RunConfig, TrainConfig, user_directories
 from dsr.app.trust import Trust, expect_trusted, read_plain_yaml
 from dsr.data.scene_source import SceneSource, SceneSubset
 from dsr.degradation.downsampling import Downsampling
@@ -71,9 +72,7 @@ def _check_types(file: Path, config: Mapping[Any, Any]) -> None:
         raise ConfigError(f"{file}: {error}") from error
 
 
-def studies_of_run(
-    plain: Mapping[str, Any], given: Sequence[str]
-) -> Iterator[tuple[dict[str, Any], SceneSource | None]]:
+def studies_of_run(plain: Config, given: Sequence[str]) -> Iterator[tuple[dict[str, Any], SceneSource | None]]:
     """Yield what ``eval.py run=RUN_DIR`` evaluates: configurations, with data sets (None for the configuration's own).
 
     Args:
@@ -121,7 +120,7 @@ def training_data(settings: TrainConfig, devices: int = 1) -> PatchData:
     everything = settings.build("degradation")
     validation = {name: build(f"validation.{name}", node) for name, node in settings.validation.items()}
     patches: PatchSettings = settings.build("patches")
-    try:
+    with keyed():
         return PatchData(
             _parts(settings),
             patches,
@@ -131,15 +130,17 @@ def training_data(settings: TrainConfig, devices: int = 1) -> PatchData:
             everything=everything,
             patches_per_step=patches.batch * settings.accumulate * devices,
         )
-    except ValueError as error:
-        raise keyed(error) from error
 
 
-def keyed(error: Exception) -> ConfigError:
-    """Return an error of a training's parts as a ConfigError that names the configuration key."""
+@contextlib.contextmanager
+def keyed() -> Iterator[None]:
+    """Turn an error of a training's parts into a ConfigError that names the configuration key."""
     names = [field.name for field in dataclasses.fields(PatchSettings)]
-    message = with_key(with_key(str(error), "patches", names), "model.objective", ["depth_loss", "shading"])
-    return ConfigError(with_key(message, "loss", ["visual"]))
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        message = with_key(with_key(str(error), "patches", names), "model.objective", ["depth_loss", "shading"])
+        raise ConfigError(with_key(message, "loss", ["visual"])) from error
 
 
 def _parts(settings: TrainConfig) -> list[Part]:

@@ -17,6 +17,7 @@ from typing import Any
 import yaml
 from omegaconf import OmegaConf
 
+from dsr.app.schema import Config
 from dsr.utils.configuration import ConfigError, config_directories
 from dsr.utils.console import open_console, show
 from dsr.utils.guards import TooLargeError, read_limited
@@ -107,7 +108,7 @@ def read_plain_yaml(path: Path) -> dict[str, Any]:
     return {str(key): value for key, value in content.items()}
 
 
-def expect_trusted(path: Path, config: Mapping[str, Any], trust: Trust) -> None:
+def expect_trusted(path: Path, config: Config, trust: Trust) -> None:
     """Check the targets and the names in a run's configuration; tell on the console which others are allowed.
 
     Args:
@@ -159,7 +160,7 @@ def _nodes(node: Any, above: _Key = ()) -> Iterator[tuple[_Key, Any]]:
         yield from _nodes(value, key)
 
 
-def imported(config: Mapping[str, Any]) -> Iterator[tuple[_Key, str]]:
+def imported(config: Config) -> Iterator[tuple[_Key, str]]:
     """Yield the key and the value of all entries that are imported."""
     for key, value in _nodes(config):
         metric = key[:2] == _EXTRA and not isinstance(value, list)
@@ -181,7 +182,7 @@ def _is_own(key: _Key, target: str) -> bool:
     return target in _targets_in(config_directories()[0]).get(_group_of(key), ())
 
 
-def _expect_names(path: Path, config: Mapping[str, Any]) -> None:
+def _expect_names(path: Path, config: Config) -> None:
     """Refuse names, which become those of files and folders, that would lead elsewhere."""
     for key, value in _nodes(config):
         names = [value] if key[0] == "names" and key[1:] else []

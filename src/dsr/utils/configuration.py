@@ -25,7 +25,7 @@ import yaml
 from dsr.utils.guards import TooLargeError, read_limited
 
 Node = Mapping[str, Any]
-"""A group of the configuration: ``name``, ``target``, perhaps ``label``, and arguments of the target."""
+"""A node of the configuration: ``_target_``, perhaps ``_partial_``, and arguments of the target."""
 _MISSING = "???"
 _TARGET, _PARTIAL = "_target_", "_partial_"
 _MANY = 20
