@@ -155,7 +155,7 @@ UNUSABLE = [
     ("file", " "),
     ("count", 10**23),
     ("share", 10**400),
-    ("root", "~nobody-here/x"),
+    ("root", "~no-one-at-all/x"),
 ]
 
 
