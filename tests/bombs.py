@@ -9,6 +9,7 @@ import struct
 import zipfile
 import zlib
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -213,3 +214,13 @@ def r3d(path: Path) -> None:
 def pipe(path: Path) -> None:
     """Make a named pipe that nobody writes to."""
     os.mkfifo(path)
+
+
+class Trap:
+    """Makes a folder where somebody unpickles it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mkdir, (str(self.path),)

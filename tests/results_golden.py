@@ -385,14 +385,10 @@ _FILES = [file for name in packaged_names() if (file := packaged_weights(name)) 
 WEIGHTS = hashlib.sha256("".join(map(file_hash, _FILES)).encode()).hexdigest()[:16]
 VERSIONS = {"RESULTS": RESULTS, "SCENES": SCENES, "WEIGHTS": WEIGHTS}
 GROUPS = {
-    "upsampling": ("RESULTS", upsampling),
-    "sensors": ("RESULTS", sensors),
-    "samples": ("RESULTS", samples),
-    "draws": ("RESULTS", draws),
-    "training": ("RESULTS", training),
-    "geometry": ("RESULTS", geometry),
+    "upsampling": ("RESULTS", upsampling), "sensors": ("RESULTS", sensors), "samples": ("RESULTS", samples),
+    "draws": ("RESULTS", draws), "training": ("RESULTS", training), "geometry": ("RESULTS", geometry),
     "scenes": ("SCENES", scenes),
-}
+}  # fmt: skip
 """Which version each group of results has."""
 
 

@@ -162,17 +162,10 @@ def _read_pdf(path: Path) -> bytes:
 
 
 _READERS: Mapping[str, Callable[[Path], Any]] = {
-    ".npz": _read_npz,
-    ".npy": _read_npy,
-    ".json": _read_json,
-    ".csv": _read_csv,
-    ".yaml": _read_yaml,
-    ".ckpt": _read_checkpoint,
-    ".safetensors": _read_safetensors,
-    ".ply": _read_ply,
-    ".html": _read_html,
+    ".npz": _read_npz, ".npy": _read_npy, ".json": _read_json, ".csv": _read_csv, ".yaml": _read_yaml,
+    ".ckpt": _read_checkpoint, ".safetensors": _read_safetensors, ".ply": _read_ply, ".html": _read_html,
     ".pdf": _read_pdf,
-}
+}  # fmt: skip
 
 
 def _events(folder: Path) -> dict[tuple[str, int], bytes]:

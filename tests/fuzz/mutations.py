@@ -29,18 +29,9 @@ _SPARSE = 2200 << 20
 """Size in bytes of files that take no room on the disk."""
 _ANOTHER = ("../../etc/passwd", "/etc/passwd", "/dev/zero", "/dev/stdin", "/proc/self/mem", ".", "nowhere")
 _NAMES = (
-    b"\xff\xfe%s",
-    b"-%s",
-    b" %s",
-    b"%s\n",
-    b"a" * 200 + b"%s",
-    b"\x1b[31m%s",
-    b"%s.txt",
-    b"=%s",
-    b"'%s'",
-    b"..%s",
+    b"\xff\xfe%s", b"-%s", b" %s", b"%s\n", b"a" * 200 + b"%s", b"\x1b[31m%s", b"%s.txt", b"=%s", b"'%s'", b"..%s",
     b"\xe2\x80\xae%s",
-)
+)  # fmt: skip
 
 
 def mutate(random: Random, place: Place, other: Callable[[], bytes]) -> list[str]:
@@ -204,20 +195,9 @@ def _replace_in_folder(random: Random, path: Path, place: Place) -> str:
 
 
 _PLACES = (
-    "missing",
-    "missing",
-    "directory",
-    "directory",
-    "loop",
-    "fifo",
-    "fifo",
-    "link",
-    "link",
-    "empty",
-    "name",
-    "name",
+    "missing", "missing", "directory", "directory", "loop", "fifo", "fifo", "link", "link", "empty", "name", "name",
     "sparse",
-)
+)  # fmt: skip
 
 
 def _change_hdf5(random: Random, path: Path) -> str:

@@ -31,14 +31,10 @@ from dsr.metrics.formats import HEADLINES
 
 FRAMES = ("frame_000001", "frame_000011")
 SENSOR_UNITS = {
-    "Sensor_covered": ("covered", 1),
-    "Sensor_offset": ("offset_mm", 1e3),
-    "Sensor_RMSE_d": ("RMSE_d_mm", 1e3),
-    "Sensor_RMSE_v": ("RMSE_v", 1),
-    "Sensor_DSSIM_v": ("DSSIM_v", 1),
-    "Sensor_angle_mean": ("angle_mean", 1),
+    "Sensor_covered": ("covered", 1), "Sensor_offset": ("offset_mm", 1e3), "Sensor_RMSE_d": ("RMSE_d_mm", 1e3),
+    "Sensor_RMSE_v": ("RMSE_v", 1), "Sensor_DSSIM_v": ("DSSIM_v", 1), "Sensor_angle_mean": ("angle_mean", 1),
     "Sensor_angle_median": ("angle_median", 1),
-}
+}  # fmt: skip
 IMAGES = {
     "Middlebury": ("Middlebury_01", "Middlebury_18"),
     "Lu": ("RGBD_03",),

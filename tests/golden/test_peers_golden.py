@@ -39,14 +39,9 @@ SETTINGS = [
 ]
 """Scene, method, scale and feed: each network, and each feed; all 46 take minutes."""
 COLUMNS = {
-    "RMSE_d_mm": ("RMSE_d", 1e3),
-    "RMSE_v": ("RMSE_v", 1),
-    "DSSIM_v": ("DSSIM_v", 1),
-    "BadPix_v_5": ("BadPix_v_5", 1),
-    "LPIPS_v": ("LPIPS_v", 1),
-    "Bumpiness_d": ("Bumpiness_d", 1),
-    "BadPix_d_5cm": ("BadPix_d_5cm", 1),
-}
+    "RMSE_d_mm": ("RMSE_d", 1e3), "RMSE_v": ("RMSE_v", 1), "DSSIM_v": ("DSSIM_v", 1), "BadPix_v_5": ("BadPix_v_5", 1),
+    "LPIPS_v": ("LPIPS_v", 1), "Bumpiness_d": ("Bumpiness_d", 1), "BadPix_d_5cm": ("BadPix_d_5cm", 1),
+}  # fmt: skip
 """Our metrics, and the factor to the unit of the column."""
 SLOW = ("LPIPS_v", "Bumpiness_d")
 """Metrics that are computed for Lucy and the default settings only."""

@@ -4,7 +4,6 @@ import os
 import pty
 import select
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -192,20 +191,6 @@ def test_file_found_nowhere_is_one_line_and_the_others_come(mirror, root, capsys
     assert lines[-1].split() == ["mine", "Mine", "3.0", "MB", "partial", "1", "of", "2"]
 
 
-def test_files_without_a_network_are_one_line_each(root, capsys, monkeypatch):
-    monkeypatch.setattr(fetching, "RETRIES", fetching.RETRIES.new(total=1, backoff_factor=0))
-    with socket.socket() as closed:
-        closed.bind(("127.0.0.1", 0))
-        host = f"127.0.0.1:{closed.getsockname()[1]}"
-        items = [Item(f"set/{number}.png", (f"http://{host}/{number}.png",)) for number in range(2)]
-        code, _, errors = in_process(capsys, "data", "get", "mine", catalogue=mine(*items))
-    assert code == 2
-    assert errors == [
-        f"error: set/{number}.png: http://{host}/{number}.png: no connection to {host}" for number in range(2)
-    ]
-    assert not list((root / "set").iterdir())
-
-
 def test_damaged_file_is_found_and_fetched_again(mirror, root, capsys):
     get = ("data", "get", "middlebury2003", "--mirror", mirror.url)
     assert in_process(capsys, *get)[0] == 0
@@ -280,15 +265,6 @@ def test_invalid_mirror_address_is_one_line(root, capsys):
         2,
         ["error: --mirror: expected an address that begins with http:// or https://, got '/mnt/data'"],
     )
-
-
-def test_damaged_records_are_one_line(root, capsys):
-    root.mkdir()
-    (root / "checksums.json").write_text("{")
-    for arguments in (("list",), ("get", "icl"), ("verify", "icl")):
-        code, _, errors = in_process(capsys, "data", *arguments)
-        assert (code, len(errors)) == (2, 1)
-        assert errors[0].startswith(f"error: {root / 'checksums.json'}: expected the checksums of the data sets")
 
 
 @pytest.mark.parametrize("arguments", [("--help",), ("data", "--help"), ("data", "get", "--help")])

@@ -145,17 +145,13 @@ def test_metric_that_nobody_describes_is_shown_raw_under_its_name(home, tmp_path
 @pytest.mark.parametrize(
     ("extra", "message"),
     [
-        ("outside.psnr", "metrics.extra: expected a dsr.metrics.catalogue.Metric, 'outside.psnr' is none"),
-        ("outside.NONE", "metrics.extra: cannot import 'outside.NONE' (module 'outside' has no attribute 'NONE')"),
-        ("psnr", "metrics.extra: expected module.name of a dsr.metrics.catalogue.Metric, got 'psnr'"),
-        (
-            "outside.PSNR,outside.PSNR",
-            "metrics.extra: PSNR_d: expected metrics of different names, got two of this one",
-        ),
+        ("outside.psnr", "expected a dsr.metrics.catalogue.Metric"),
+        ("outside.NONE", "cannot import 'outside.NONE'"),
+        ("psnr", "expected module.name of a "),
+        ("outside.PSNR,outside.PSNR", "PSNR_d: expected metrics of different names"),
     ],
 )
 def test_extra_metrics_refuse_what_is_no_metric_in_one_line(home, monkeypatch, extra, message):
     monkeypatch.syspath_prepend(str(home / "modules"))
-    with pytest.raises(ConfigError) as caught:
+    with pytest.raises(ConfigError, match=f"^metrics.extra: {message}"):
         extra_metrics(MetricsConfig(extra=extra.split(",")))
-    assert str(caught.value) == message

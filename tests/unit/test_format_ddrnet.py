@@ -1,18 +1,14 @@
 """DDRNet's frames: sensor's map at the photo's size, fused depth as the truth, every damage named."""
 
-import cv2
 import numpy as np
 import pytest
+from small_files import encoded_png as png
 
 from dsr.data.ddrnet_frames import CAMERA, DDRNetFrames, find_frames, load_frame
 
 ROWS, COLUMNS = np.mgrid[0:480, 0:640]
 TRUTH = (1000 + ROWS + 2 * COLUMNS).astype(np.uint16)
 """Millimetres, not symmetric under any flip."""
-
-
-def png(pixels):
-    return cv2.imencode(".png", pixels)[1].tobytes()
 
 
 def frame(root, name="frame_000001"):

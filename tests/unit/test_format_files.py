@@ -5,12 +5,13 @@ import json
 import os
 import re
 import struct
-import zlib
 from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
 import pytest
+from refusals import refused
+from small_files import png_by_its_specification as png
 
 from dsr.io.images import read_camera, read_map, read_mask, read_rgb
 
@@ -18,18 +19,6 @@ VALUES = np.array([[1.0, 2.5, 3.25], [4.5, 5.0, 60000.0]])
 """Not symmetric under any flip, exact in float32."""
 WHOLE = np.array([[1, 256, 3], [40000, 5, 65535]])
 INTRINSICS = {"width": 3, "height": 2, "fx": 3.0, "fy": 3.0, "cx": 1.0, "cy": 0.5}
-
-
-def png(values, depth, colour):
-    """Return a PNG file by its specification: values is (H, W) or (H, W, channels), big-endian samples."""
-
-    def chunk(kind, content):
-        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
-
-    samples = np.asarray(values).astype(">u2" if depth == 16 else "u1")
-    lines = b"".join(b"\0" + row.tobytes() for row in samples)
-    header = struct.pack(">IIBBBBB", samples.shape[1], samples.shape[0], depth, colour, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(lines)) + chunk(b"IEND", b"")
 
 
 def pfm(values, order, scale="1.0"):
@@ -68,15 +57,7 @@ def written(folder, name, content):
 
 
 def refusal(reader, path, capfd):
-    """Return the message of the refusal: one line that names the file, and nothing printed."""
-    with pytest.raises(ValueError) as caught:  # noqa: PT011 - the callers look at the message
-        reader(path)
-    assert capfd.readouterr() == ("", "")
-    message = str(caught.value)
-    assert message.startswith(f"{path}: ")
-    assert message.count(str(path)) == 1
-    assert "\n" not in message
-    return message.removeprefix(f"{path}: ")
+    return refused(lambda: reader(path), path, capfd)
 
 
 FORMATS = {

@@ -1,11 +1,11 @@
 """ICL-NUIM: known numbers in both forms of its frames, every damage refused by name, real walls flat."""
 
-import struct
-import zlib
-
 import numpy as np
 import pytest
 import torch
+from refusals import refused
+from small_files import png_by_its_specification as png
+from small_files import written
 
 from dsr.data.icl import CAMERA, find_frames, load_frame, read_depth
 
@@ -14,37 +14,13 @@ DISTANCES = 100.0 + ROWS + COLUMNS / 1000
 """Centimetres; not symmetric under any flip."""
 
 
-def png(values, depth=16, colour=0):
-    """Return a PNG file by its specification: big-endian samples, (H, W) or (H, W, channels)."""
-
-    def chunk(kind, content):
-        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
-
-    samples = np.asarray(values).astype(">u2" if depth == 16 else "u1")
-    lines = b"".join(b"\0" + row.tobytes() for row in samples)
-    header = struct.pack(">IIBBBBB", samples.shape[1], samples.shape[0], depth, colour, 0, 0, 0)
-    body = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(lines, 1)) + chunk(b"IEND", b"")
-    return b"\x89PNG\r\n\x1a\n" + body
-
-
 def text(values):
     return " ".join(f"{value:.6g}" for value in np.ravel(values)).encode() + b" "
 
 
-def written(path, content):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(content)
-    return path
-
-
 def refusal(path, capfd):
-    """Return the message of the refusal: one line that names the file, and nothing printed."""
-    with pytest.raises(ValueError) as caught:  # noqa: PT011 - the callers look at the message
-        read_depth(path)
-    assert capfd.readouterr() == ("", "")
-    message = str(caught.value)
-    assert message.startswith(f"{path}: expected ")
-    assert "\n" not in message
+    message = refused(lambda: read_depth(path), path, capfd)
+    assert message.startswith("expected ")
     return message
 
 
@@ -80,22 +56,13 @@ def test_depth_picture_has_5000_levels_a_metre_and_0_is_a_hole(tmp_path):
 @pytest.mark.parametrize(
     "damage",
     [
-        lambda whole: b"",
-        lambda whole: b" \n ",
-        lambda whole: whole[: len(whole) // 2],
-        lambda whole: whole.rpartition(b" ")[0].rpartition(b" ")[0],
-        lambda whole: whole + b"1.0",
-        lambda whole: whole + b"1.0 " * 5_000_000,
-        lambda whole: b"-1" + whole[3:],
-        lambda whole: b"nan" + whole[3:],
-        lambda whole: b"1_0" + whole[3:],
-        lambda whole: b"1.2.3" + whole[3:],
-        lambda whole: b"<html>" + whole[6:],
-        lambda whole: bytes(1000),
-        lambda whole: b"0 " * 307200,
-        lambda whole: b"1e30 " * 307200,
+        lambda whole: b"", lambda whole: b" \n ", lambda whole: whole[: len(whole) // 2],
+        lambda whole: whole.rpartition(b" ")[0].rpartition(b" ")[0], lambda whole: whole + b"1.0",
+        lambda whole: whole + b"1.0 " * 5_000_000, lambda whole: b"-1" + whole[3:], lambda whole: b"nan" + whole[3:],
+        lambda whole: b"1_0" + whole[3:], lambda whole: b"1.2.3" + whole[3:], lambda whole: b"<html>" + whole[6:],
+        lambda whole: bytes(1000), lambda whole: b"0 " * 307200, lambda whole: b"1e30 " * 307200,
     ],
-)
+)  # fmt: skip
 def test_damaged_text_of_distances_is_refused_in_one_line(tmp_path, capfd, distances, damage):
     refusal(written(tmp_path / "scene_00_0000.depth", damage(distances)), capfd)
 

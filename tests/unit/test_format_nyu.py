@@ -3,6 +3,7 @@
 import h5py
 import numpy as np
 import pytest
+from refusals import refused
 
 from dsr.data.nyu import CAMERA, find_frames, load_frame
 
@@ -34,14 +35,7 @@ def labelled(tmp_path_factory):
 
 
 def refusal(act, path, capfd):
-    """Return the message of the refusal: one line that names the file, and nothing printed."""
-    with pytest.raises(ValueError) as caught:  # noqa: PT011 - the callers look at the message
-        act(path)
-    assert capfd.readouterr() == ("", "")
-    message = str(caught.value)
-    assert message.startswith(f"{path}: ")
-    assert "\n" not in message
-    return message
+    return refused(lambda: act(path), path, capfd)
 
 
 def load(path):
@@ -83,15 +77,11 @@ def test_missing_frame_is_refused(labelled, capfd, number):
 @pytest.mark.parametrize(
     "damage",
     [
-        lambda whole: b"",
-        lambda whole: b"<html>not found</html>",
-        lambda whole: whole[:512],
-        lambda whole: whole[:1000],
-        lambda whole: whole[: len(whole) // 2],
-        lambda whole: whole[:600] + b"\xff" * 400 + whole[1000:],
-        lambda whole: b"MATLAB 5.0 MAT-file".ljust(4096),
+        lambda whole: b"", lambda whole: b"<html>not found</html>", lambda whole: whole[:512],
+        lambda whole: whole[:1000], lambda whole: whole[: len(whole) // 2],
+        lambda whole: whole[:600] + b"\xff" * 400 + whole[1000:], lambda whole: b"MATLAB 5.0 MAT-file".ljust(4096),
     ],
-)
+)  # fmt: skip
 def test_damaged_or_foreign_file_is_refused_in_one_line(labelled, tmp_path, capfd, damage):
     path = tmp_path / "nyu.mat"
     path.write_bytes(damage(labelled.read_bytes()))
@@ -106,16 +96,11 @@ def test_missing_file_is_refused(tmp_path, capfd):
 @pytest.mark.parametrize(
     "changes",
     [
-        {"images": None},
-        {"rawDepths": None},
-        {"images": IMAGES},
-        {"images": IMAGES.swapaxes(2, 3).astype(np.uint16)},
-        {"rawDepths": RAW},
-        {"rawDepths": RAW.swapaxes(1, 2)[:1]},
-        {"rawDepths": RAW.swapaxes(1, 2).astype(np.float64)},
-        {"depths": np.ones(5, np.float32)},
+        {"images": None}, {"rawDepths": None}, {"images": IMAGES}, {"images": IMAGES.swapaxes(2, 3).astype(np.uint16)},
+        {"rawDepths": RAW}, {"rawDepths": RAW.swapaxes(1, 2)[:1]},
+        {"rawDepths": RAW.swapaxes(1, 2).astype(np.float64)}, {"depths": np.ones(5, np.float32)},
     ],
-)
+)  # fmt: skip
 def test_file_of_other_arrays_is_refused_in_one_line(tmp_path, capfd, changes):
     (key,) = changes
     path = official(tmp_path / "nyu.mat", **changes)

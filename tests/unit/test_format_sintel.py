@@ -5,6 +5,8 @@ import struct
 import cv2
 import numpy as np
 import pytest
+from refusals import refused
+from small_files import written
 
 from dsr.data.sintel import SEQUENCES, find_frames, load_frame, read_camera, read_depth
 
@@ -23,20 +25,9 @@ def cam(intrinsics=INTRINSICS, tag=202021.25):
     return struct.pack("<f9d12d", tag, *intrinsics, *range(12))
 
 
-def written(path, content):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(content)
-    return path
-
-
 def refusal(capfd, act, path):
-    """Return the message of the refusal: one line that names the file, and nothing printed."""
-    with pytest.raises(ValueError) as caught:  # noqa: PT011 - the callers look at the message
-        act()
-    assert capfd.readouterr() == ("", "")
-    message = str(caught.value)
-    assert message.startswith(f"{path}: expected ")
-    assert "\n" not in message
+    message = refused(act, path, capfd)
+    assert message.startswith("expected ")
     return message
 
 
@@ -65,24 +56,15 @@ def test_infinite_depth_is_sky_and_0_is_a_hole(tmp_path):
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
-        (b"", "0 bytes"),
-        (dpt()[:4], "4 bytes"),
-        (dpt()[:12], "got 0 bytes"),
-        (dpt()[:20], "got 8 bytes"),
-        (dpt() + b"\0", "got 25 bytes"),
-        (dpt(tag=1.0), "tag 202021.25"),
-        (struct.pack(">f", 202021.25) + dpt()[4:], "tag 202021.25"),
-        (b"P5\n3 2\n255\nabcdef" * 3, "b'P5"),
-        (dpt(size=(2**31 - 1, 2**31 - 1)), "2147483647 x 2147483647"),
-        (dpt(size=(-2, -3)), "-2 x -3"),
-        (dpt(size=(0, 0)), "0 x 0"),
-        (dpt(size=(3, 3)), "3 x 3"),
-        (dpt(-VALUES), "got -1e+10"),
-        (dpt(np.array([[1.0, np.nan]])), "got NaN"),
-        (dpt(np.zeros((2, 3))), "all are holes"),
+        (b"", "0 bytes"), (dpt()[:4], "4 bytes"), (dpt()[:12], "got 0 bytes"), (dpt()[:20], "got 8 bytes"),
+        (dpt() + b"\0", "got 25 bytes"), (dpt(tag=1.0), "tag 202021.25"),
+        (struct.pack(">f", 202021.25) + dpt()[4:], "tag 202021.25"), (b"P5\n3 2\n255\nabcdef" * 3, "b'P5"),
+        (dpt(size=(2**31 - 1, 2**31 - 1)), "2147483647 x 2147483647"), (dpt(size=(-2, -3)), "-2 x -3"),
+        (dpt(size=(0, 0)), "0 x 0"), (dpt(size=(3, 3)), "3 x 3"), (dpt(-VALUES), "got -1e+10"),
+        (dpt(np.array([[1.0, np.nan]])), "got NaN"), (dpt(np.zeros((2, 3))), "all are holes"),
         (dpt(np.full((2, 3), 1e10)), "within 1000 m"),
     ],
-)
+)  # fmt: skip
 def test_damaged_depth_file_is_refused_in_one_line(tmp_path, capfd, content, reason):
     path = written(tmp_path / "frame_0001.dpt", content)
     assert reason in refusal(capfd, lambda: read_depth(path), path)

@@ -1,29 +1,17 @@
 """SUN RGB-D: turned millimetres, cameras from text, scene folders anywhere below a root, every damage named."""
 
-import struct
-import zlib
-
 import cv2
 import numpy as np
 import pytest
+from refusals import refused
+from small_files import png_by_its_specification as png
+from small_files import written
 
 from dsr.data.sunrgbd import find_frames, frame_files, load_frame, load_pair, read_depth, read_intrinsics
 
 MILLIMETRES = np.array([[0, 1, 640, 3783], [8000, 9870, 8191, 8192], [65535, 5, 6, 7]])
 """0 is a hole; more than 13 bits need the lowest three of a level."""
 MATRIX = "3.5 0 1.5\n0 3.25 1\n0 0 1\n"
-
-
-def png(values, depth=16):
-    """Return a grey PNG file by its specification."""
-
-    def chunk(kind, content):
-        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
-
-    samples = np.asarray(values).astype(">u2" if depth == 16 else "u1")
-    lines = b"".join(b"\0" + row.tobytes() for row in samples)
-    header = struct.pack(">IIBBBBB", samples.shape[1], samples.shape[0], depth, 0, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(lines)) + chunk(b"IEND", b"")
 
 
 def turned(millimetres):
@@ -33,12 +21,6 @@ def turned(millimetres):
 
 def jpg(shape=(3, 4)):
     return cv2.imencode(".jpg", np.full((*shape, 3), 128, np.uint8))[1].tobytes()
-
-
-def written(path, content):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(content)
-    return path
 
 
 @pytest.fixture
@@ -53,13 +35,8 @@ def scene(tmp_path):
 
 
 def refusal(capfd, act, named):
-    """Return the message of the refusal: one line that starts with a name, and nothing printed."""
-    with pytest.raises(ValueError) as caught:  # noqa: PT011 - the callers look at the message
-        act()
-    assert capfd.readouterr() == ("", "")
-    message = str(caught.value)
-    assert message.startswith(f"{named}: expected ")
-    assert "\n" not in message
+    message = refused(act, named, capfd)
+    assert message.startswith("expected ")
     return message
 
 

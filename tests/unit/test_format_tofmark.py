@@ -8,6 +8,8 @@ import pytest
 import scipy.io
 import scipy.sparse
 import torch
+from refusals import refused
+from small_files import written
 
 from dsr.data.matlab import read_variables
 from dsr.data.tofmark import block_means, find_frames, load_frame, read_matrices, read_samples
@@ -32,11 +34,6 @@ def bmp(levels):
     return header + info + palette + pixels
 
 
-def written(path, content):
-    path.write_bytes(content)
-    return path
-
-
 def old(path, variables, *, compress=False):
     scipy.io.savemat(path, variables, do_compression=compress)
     return path
@@ -50,17 +47,6 @@ def new(path, variables):
         file["#refs#/a"] = TRUTH.T
     path.write_bytes(b"MATLAB 7.3 MAT-file".ljust(512) + path.read_bytes()[512:])
     return path
-
-
-def refusal(act, named, capfd):
-    """Return the message of the refusal: one line that starts with a name, and nothing printed."""
-    with pytest.raises(ValueError) as caught:  # noqa: PT011 - the callers look at the message
-        act()
-    assert capfd.readouterr() == ("", "")
-    message = str(caught.value)
-    assert message.startswith(f"{named}: ")
-    assert "\n" not in message
-    return message.removeprefix(f"{named}: ")
 
 
 @pytest.fixture
@@ -93,20 +79,20 @@ def test_range_of_the_caller_converts_levels_to_metres(pictures):
 
 def test_pictures_without_a_range_or_a_camera_are_refused_with_the_reason(pictures, capfd):
     rgb, samples = pictures
-    message = refusal(lambda: load_frame(rgb, samples, "t", "b", intrinsics=INTRINSICS), samples, capfd)
+    message = refused(lambda: load_frame(rgb, samples, "t", "b", intrinsics=INTRINSICS), samples, capfd)
     assert "lost the metric scale" in message
-    assert "no camera" in refusal(lambda: load_frame(rgb, samples, "t", "b", depth_range=(0.5, 1)), rgb, capfd)
+    assert "no camera" in refused(lambda: load_frame(rgb, samples, "t", "b", depth_range=(0.5, 1)), rgb, capfd)
 
 
 @pytest.mark.parametrize("depth_range", [(1.0, 0.5), (0.0, 1.0), (1.0, 1.0), (0.5, np.inf), (np.nan, 1.0)])
 def test_invalid_range_is_refused(pictures, capfd, depth_range):
     act = lambda: load_frame(*pictures, "t", "b", intrinsics=INTRINSICS, depth_range=depth_range)  # noqa: E731
-    refusal(act, "depth_range", capfd)
+    refused(act, "depth_range", capfd)
 
 
 @pytest.mark.parametrize("factor", [0, -4, 23])
 def test_factor_that_does_not_divide_the_size_is_refused(capfd, factor):
-    refusal(lambda: block_means(torch.ones(1, *SIZE), factor), "factors", capfd)
+    refused(lambda: block_means(torch.ones(1, *SIZE), factor), "factors", capfd)
 
 
 @pytest.mark.parametrize(
@@ -116,7 +102,7 @@ def test_damaged_picture_of_samples_is_refused(pictures, capfd, content):
     rgb, samples = pictures
     written(samples, content)
     act = lambda: load_frame(rgb, samples, "t", "b", intrinsics=INTRINSICS, depth_range=(0.5, 1.0))  # noqa: E731
-    assert "expected" in refusal(act, samples, capfd)
+    assert "expected" in refused(act, samples, capfd)
 
 
 def test_depth_of_a_block_is_the_mean_of_its_samples_inverse_depths():
@@ -217,7 +203,7 @@ def test_truth_may_be_missing_and_holes_may_be_nan(tmp_path):
 )
 def test_file_of_other_variables_is_refused_with_their_names(tmp_path, capfd, variables, reason):
     path = old(tmp_path / "a.mat", variables)
-    assert reason in refusal(lambda: read_matrices(path), path, capfd)
+    assert reason in refused(lambda: read_matrices(path), path, capfd)
 
 
 @pytest.mark.parametrize(
@@ -229,46 +215,42 @@ def test_file_of_other_variables_is_refused_with_their_names(tmp_path, capfd, va
 )
 def test_wrong_variable_names_of_the_caller_are_refused(tmp_path, capfd, mapping, reason):
     path = old(tmp_path / "a.mat", {"intensity": GREY, "depth_gt": TRUTH, "small": TRUTH[:9]})
-    assert reason in refusal(lambda: read_matrices(path, mapping), path, capfd)
-    refusal(lambda: read_matrices(path, {"weights": "depth_gt"}), "variables", capfd)
+    assert reason in refused(lambda: read_matrices(path, mapping), path, capfd)
+    refused(lambda: read_matrices(path, {"weights": "depth_gt"}), "variables", capfd)
 
 
 @pytest.mark.parametrize("make", [old, new])
 @pytest.mark.parametrize(
     "damage",
     [
-        lambda whole: b"",
-        lambda whole: b"text, no matrix",
-        lambda whole: whole[:128],
-        lambda whole: whole[:600],
-        lambda whole: whole[: len(whole) // 2],
-        lambda whole: whole[:132] + b"\xff" * 800 + whole[932:],
+        lambda whole: b"", lambda whole: b"text, no matrix", lambda whole: whole[:128], lambda whole: whole[:600],
+        lambda whole: whole[: len(whole) // 2], lambda whole: whole[:132] + b"\xff" * 800 + whole[932:],
         lambda whole: bytes(5000),
     ],
-)
+)  # fmt: skip
 def test_damaged_mat_file_is_refused_in_one_line(tmp_path, capfd, make, damage):
     path = make(tmp_path / "a.mat", {"intensity": GREY, "depth_gt": TRUTH, "tof": SPARSE})
     written(path, damage(path.read_bytes()))
-    assert "expected" in refusal(lambda: read_matrices(path), path, capfd)
+    assert "expected" in refused(lambda: read_matrices(path), path, capfd)
 
 
 def test_matrix_larger_than_its_file_can_hold_is_refused_before_it_is_read(tmp_path, capfd):
     path = tmp_path / "a.mat"
     with h5py.File(path, "w") as file:
         file.create_dataset("intensity", shape=(10**6, 10**6), dtype="f8", chunks=(100, 100))
-    assert "intensity has 1000000000000, expected at most" in refusal(lambda: read_matrices(path), path, capfd)
+    assert "intensity has 1000000000000, expected at most" in refused(lambda: read_matrices(path), path, capfd)
     old(path, {"intensity": GREY})
     content = path.read_bytes()
     size = struct.pack("<ii", *SIZE)
     assert content.count(size) == 1
     written(path, content.replace(size, struct.pack("<ii", 10**6, 10**3)))
-    assert "cannot reshape" in refusal(lambda: read_matrices(path), path, capfd)
+    assert "cannot reshape" in refused(lambda: read_matrices(path), path, capfd)
 
 
 def test_missing_files_are_refused(tmp_path, capfd):
     path = tmp_path / "a.mat"
-    assert "there is none" in refusal(lambda: read_matrices(path), path, capfd)
-    assert "there is none" in refusal(lambda: read_samples(path), path, capfd)
+    assert "there is none" in refused(lambda: read_matrices(path), path, capfd)
+    assert "there is none" in refused(lambda: read_samples(path), path, capfd)
 
 
 def test_scenes_are_listed_once_with_the_metric_file_first(tmp_path):

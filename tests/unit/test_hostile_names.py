@@ -18,28 +18,9 @@ from dsr.report.tables import build_tables
 from dsr.utils.console import print_error
 
 NAMES = (
-    "=cmd|' /C calc'!A0",
-    "+1",
-    "-0.5",
-    "@SUM(A1)",
-    "\tx",
-    "\rx",
-    "x\r=y",
-    "\nx",
-    "'=x",
-    "''-x",
-    "'",
-    "'x",
-    "plain",
-    "",
-    "é=",
-    "<script>alert(1)</script>",
-    "\\input{/etc/passwd}",
-    "`id`",
-    "a|b",
-    "$\\frac$",
-    "[2pt]",
-)
+    "=cmd|' /C calc'!A0", "+1", "-0.5", "@SUM(A1)", "\tx", "\rx", "x\r=y", "\nx", "'=x", "''-x", "'", "'x", "plain",
+    "", "é=", "<script>alert(1)</script>", "\\input{/etc/passwd}", "`id`", "a|b", "$\\frac$", "[2pt]",
+)  # fmt: skip
 HOSTILE = "=cmd|' \\input{/etc/passwd} `id` <script>alert(1)</script> $\\frac$"
 
 

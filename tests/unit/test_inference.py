@@ -322,12 +322,6 @@ def test_settings_of_every_trained_network_are_checked_at_a_factor_that_has_weig
         upsampler(method, settings={"ensemble": 3}, device="cpu").first()
 
 
-def test_plan_states_the_time_of_slow_methods() -> None:
-    text = plan((1000, 1000), (250, 250), None, "tgv").text
-    assert text.endswith("by tgv x4, in about 1.1 GB of memory and about 60 s on two CPU cores")
-    assert plan((1000, 1000), (500, 500), None, "tgv").steps == (2,)
-
-
 def test_depth_almost_of_the_photos_size_counts_as_such() -> None:
     assert plan((480, 640), (int(480 / OWN_SIZE), int(640 / OWN_SIZE)), method="facets_box").coarsened == 4
     camera = _camera(40, 60)

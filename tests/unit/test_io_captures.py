@@ -46,14 +46,10 @@ def unpacked(folder):
 
 
 LAYOUTS = {
-    "stray video": captures.stray,
-    "stray files": lambda folder: captures.stray(folder, video=False),
-    "record3d": lambda folder: captures.record3d(folder / "scan.r3d").parent,
-    "record3d unpacked": unpacked,
-    "record3d export": write_export,
-    "polycam": captures.polycam,
-    "arkitscenes": captures.arkitscenes,
-}
+    "stray video": captures.stray, "stray files": lambda folder: captures.stray(folder, video=False),
+    "record3d": lambda folder: captures.record3d(folder / "scan.r3d").parent, "record3d unpacked": unpacked,
+    "record3d export": write_export, "polycam": captures.polycam, "arkitscenes": captures.arkitscenes,
+}  # fmt: skip
 
 
 def read_all(folder, **reading):

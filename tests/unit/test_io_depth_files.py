@@ -37,13 +37,9 @@ def read_exr(path):
 
 
 INDEPENDENT = {
-    "png": lambda path: np.asarray(Image.open(path)),
-    "tiff": lambda path: np.asarray(Image.open(path)),
-    "npy": np.load,
-    "npz": lambda path: np.load(path)["depth"],
-    "pfm": read_pfm,
-    "exr": read_exr,
-}
+    "png": lambda path: np.asarray(Image.open(path)), "tiff": lambda path: np.asarray(Image.open(path)),
+    "npy": np.load, "npz": lambda path: np.load(path)["depth"], "pfm": read_pfm, "exr": read_exr,
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(

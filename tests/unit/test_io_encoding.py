@@ -21,19 +21,12 @@ def guess(middle, dtype):
 @pytest.mark.parametrize(
     ("middle", "dtype", "unit", "word"),
     [
-        (2000, "u2", 1e-3, "millimetres"),
-        (51, "u2", 1e-3, "millimetres"),
-        (20_000, "u2", 1e-3, "millimetres"),
-        (100_000, "i4", 1e-4, "0.1 mm"),
-        (500_000, "i4", 1e-4, "0.1 mm"),
-        (3_000_000, "u4", 1e-6, "micrometres"),
-        (49, "u2", 1e-2, "centimetres"),
-        (4, "u2", None, None),
-        (2.0, "f4", 1.0, "metres"),
-        (150.0, "f8", 1.0, "metres"),
-        (1500.0, "f4", 1e-3, "millimetres"),
+        (2000, "u2", 1e-3, "millimetres"), (51, "u2", 1e-3, "millimetres"), (20_000, "u2", 1e-3, "millimetres"),
+        (100_000, "i4", 1e-4, "0.1 mm"), (500_000, "i4", 1e-4, "0.1 mm"), (3_000_000, "u4", 1e-6, "micrometres"),
+        (49, "u2", 1e-2, "centimetres"), (4, "u2", None, None), (2.0, "f4", 1.0, "metres"),
+        (150.0, "f8", 1.0, "metres"), (1500.0, "f4", 1e-3, "millimetres"),
     ],
-)
+)  # fmt: skip
 def test_unit_is_guessed_from_type_and_median_and_reported(middle, dtype, unit, word):
     if word is None:
         with pytest.raises(ValueError, match="no usual unit makes its median of 4 a distance; give one"):

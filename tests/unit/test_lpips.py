@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 import torchmetrics.functional.image as heads_home
+from bombs import Trap
 from PIL import Image
 from small_lpips import random_lpips, random_trunk
 from torch import Tensor, nn
@@ -233,16 +234,6 @@ def test_network_construction_draws_no_random_number() -> None:
     assert torch.equal(torch.get_rng_state(), before)
 
 
-class _Trap:
-    """Writes a file where somebody unpickles it."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return (Path.touch, (self.path,))
-
-
 def _damaged(kind: str, folder: Path) -> bytes:
     buffer = io.BytesIO()
     torch.save([1] if kind == "list" else random_trunk() if kind == "cut" else {"state": torch.ones(2)}, buffer)
@@ -252,7 +243,7 @@ def _damaged(kind: str, folder: Path) -> bytes:
         "cut": buffer.getvalue()[:-5000],
         "list": buffer.getvalue(),
         "other": buffer.getvalue(),
-        "trap": pickle.dumps(_Trap(folder / "sprung")),
+        "trap": pickle.dumps(Trap(folder / "sprung")),
     }[kind]
 
 

@@ -3,7 +3,6 @@
 import ast
 from pathlib import Path
 
-import pytest
 from module_graph import MODULES, within
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
@@ -33,16 +32,3 @@ def test_library_errors_name_arguments_rather_than_configuration_keys():
     found = {name: messages_with_keys(path.read_text(encoding="utf-8")) for name, path in library.items()}
     assert len(library) > 50
     assert {name: messages for name, messages in found.items() if messages} == {}
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ('raise ValueError(f"method.{name}: expected")', ["method."]),
-        ('raise ValueError("noise.std: " + "expected")', ["noise.std: "]),
-        ('raise ValueError(f"{name}: expected method.sharpness")', []),
-        ('raise ValueError(str(error).removeprefix("method."))', []),
-    ],
-)
-def test_message_that_begins_with_a_key_is_found(text, expected):
-    assert messages_with_keys(text) == expected

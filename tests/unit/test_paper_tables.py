@@ -247,19 +247,13 @@ def published_value(scene, method, scale=4, key="RMSE_d"):
 @pytest.mark.parametrize(
     "settings",
     [
-        {"downsampling": "nearest"},
-        {"range_type": "orthogonal"},
-        {"dataset": "sunrgbd"},
-        {"size": 64},
-        {"scale": 2},
-        {"method": "mine"},
-        {"dataset": "icl", "scene": "plant"},
-        {"scene": "cube_no_texture"},
+        {"downsampling": "nearest"}, {"range_type": "orthogonal"}, {"dataset": "sunrgbd"}, {"size": 64}, {"scale": 2},
+        {"method": "mine"}, {"dataset": "icl", "scene": "plant"}, {"scene": "cube_no_texture"},
         {"scene": "cube_no_texture", "dataset": "mine", "_target_": "dsr.data.folder.Folder"},
         {"scene": "vintage", "dataset": "middlebury", "without_offset": []},
     ],
     ids=str,
-)
+)  # fmt: skip
 def test_other_data_degradations_sizes_scales_and_methods_have_no_published_value(settings):
     scene = settings.get("scene", "lucy")
     given = {"method": "msg_v", **{key: value for key, value in settings.items() if key != "scene"}}

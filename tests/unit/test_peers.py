@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import pickle
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 import torch
+from bombs import Trap
 from PIL import Image
 from torch import Tensor, nn
 
@@ -263,23 +263,13 @@ def test_scale_is_recognised_by_the_content_before_the_name(tmp_path: Path, monk
         _build(path)
 
 
-class _Trap:
-    """Unpickled, it leaves a directory behind."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> tuple[object, tuple[str]]:
-        return os.mkdir, (str(self.path),)
-
-
 def _bad_files(folder: Path) -> Mapping[str, tuple[Path, str]]:
     """Return files that are refused, and the end of the message."""
     whole = _save(folder / "whole.pth", _state()).read_bytes()
     truncated, text, pickled = (folder / name for name in ("truncated.pth", "text.pth", "pickled.pth"))
     truncated.write_bytes(whole[: len(whole) // 2])
     text.write_text("no weights")
-    pickled.write_bytes(pickle.dumps(_Trap(folder / "sprung")))
+    pickled.write_bytes(pickle.dumps(Trap(folder / "sprung")))
     damaged = "expected a torch file of plain tensors, got one that is damaged or holds other Python objects"
     missing = {name: value for name, value in _state().items() if name != "final_layer.bias"}
     shape, infinite = _state() | {"final_layer.bias": torch.ones(3)}, _state()
@@ -290,7 +280,7 @@ def _bad_files(folder: Path) -> Mapping[str, tuple[Path, str]]:
         "truncated": (truncated, damaged),
         "text": (text, damaged),
         "pickle": (pickled, damaged),
-        "code": (_save(folder / "code.pth", {**_state(), "x": _Trap(folder / "sprung")}), damaged),
+        "code": (_save(folder / "code.pth", {**_state(), "x": Trap(folder / "sprung")}), damaged),
         "list": (_save(folder / "list.pth", [1, 2]), "expected a network's tensors by name, got list"),
         "steps": (_save(folder / "steps.pth", {"step": 3}), "expected a network's tensors by name, got step"),
         "missing": (_save(folder / "missing.pth", missing), f"{expected}final_layer.bias is missing"),

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from bombs import Trap
 from torch import Tensor
 
 from dsr.methods.networks.msg_net import MSGNet
@@ -153,27 +154,17 @@ def test_weights_of_the_other_variant_are_refused(tmp_path: Path) -> None:
     assert "expected weights of variant voynov, got those of variant hui" in _refusal(caffe, 4, "voynov")
 
 
-class _Trap:
-    """Unpickled, it leaves a file behind."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> tuple[object, tuple[str, str]]:
-        return open, (str(self.path), "w")
-
-
 @pytest.mark.parametrize("protocol", [0, 2, 4])
 def test_pickled_code_is_not_run(tmp_path: Path, protocol: int) -> None:
     mark = tmp_path / "trapped"
-    path = _write(tmp_path / "net.pth", pickle.dumps({"model_state_dict": _Trap(mark)}, protocol))
+    path = _write(tmp_path / "net.pth", pickle.dumps({"model_state_dict": Trap(mark)}, protocol))
     _refusal(path)
     assert not mark.exists()
 
 
 def test_code_in_a_torch_file_is_not_run(tmp_path: Path) -> None:
     mark = tmp_path / "trapped"
-    message = _refusal(_save(tmp_path / "net.pth", {"model_state_dict": _author_state(MSGNet(4)), "x": _Trap(mark)}))
+    message = _refusal(_save(tmp_path / "net.pth", {"model_state_dict": _author_state(MSGNet(4)), "x": Trap(mark)}))
     assert "which are never loaded" in message
     assert not mark.exists()
 

@@ -17,24 +17,14 @@ from dsr.report.table_layouts import score_table
 from dsr.report.tables import in_shown_units
 
 RAW = {
-    "RMSE_d": 0.0704,
-    "BadPix_d_5cm": 0.0670,
-    "BadPix_v_5": 0.495,
-    "DSSIM_v": 0.354,
-    "LPIPS_v": 0.424,
-    "Bumpiness_d": 1.39,
-    "RMSE_v": 0.274,
-}
+    "RMSE_d": 0.0704, "BadPix_d_5cm": 0.0670, "BadPix_v_5": 0.495, "DSSIM_v": 0.354, "LPIPS_v": 0.424,
+    "Bumpiness_d": 1.39, "RMSE_v": 0.274,
+}  # fmt: skip
 """Lucy x4 Bicubic as the protocol measures it, in raw units."""
 UNITS = {
-    "RMSE_d": 70.4,
-    "BadPix_d_5cm": 6.70,
-    "BadPix_v_5": 49.5,
-    "DSSIM_v": 354,
-    "LPIPS_v": 424,
-    "Bumpiness_d": 1.39,
+    "RMSE_d": 70.4, "BadPix_d_5cm": 6.70, "BadPix_v_5": 49.5, "DSSIM_v": 354, "LPIPS_v": 424, "Bumpiness_d": 1.39,
     "RMSE_v": 274,
-}
+}  # fmt: skip
 PER_LIGHT = ("BadPix_v_5", "DSSIM_v", "LPIPS_v")
 
 
@@ -78,10 +68,6 @@ def test_raw_scores_become_millimetres_percents_and_thousandths():
     table = in_shown_units(scores("lucy"), KNOWN_FORMATS)
     assert list(table.columns) == list(in_tables(KNOWN_FORMATS))
     assert table.loc["lucy"].to_dict() == pytest.approx(UNITS)
-
-
-def test_table_shows_the_worst_of_the_four_lights():
-    assert in_shown_units(scores("lucy"), KNOWN_FORMATS).loc["lucy", "DSSIM_v"] == pytest.approx(354)
 
 
 def test_empty_variants_are_recognised_after_a_file_was_read_back(tmp_path):
@@ -146,11 +132,6 @@ def test_published_values_stand_beside_the_papers_files_in_a_folder_at_their_own
     assert printed.count("paper") == (size == 512)
 
 
-def test_implementation_other_than_the_papers_is_named():
-    assert "PDN: dsr's own implementation" in text(scores("lucy"), "PDN")
-    assert "own implementation" not in text(scores("statue"), "PDN") + text(scores("lucy"), "MSG-V")
-
-
 @pytest.mark.parametrize("downsampling", ["nearest", "measured", "gaussian"])
 def test_published_values_are_hidden_under_another_downsampling(downsampling):
     printed = text(scores("lucy", "cube_no_texture", downsampling=downsampling))
@@ -190,8 +171,3 @@ def test_unknown_value_is_a_dash_and_left_out_of_the_mean():
 @pytest.mark.parametrize("scene", ["[bold]", "a[red]b", "ünï", "[/]"])
 def test_scene_name_is_printed_unchanged(scene):
     assert scene in text(scores(scene))
-
-
-def test_title_names_method_data_scale_and_downsampling():
-    title = text(scores("lucy", scale=8), "MSG-V").splitlines()[0]
-    assert title.strip() == "MSG-V on simgeo, x8, box downsampling - lower is better"

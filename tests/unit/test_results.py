@@ -106,15 +106,11 @@ def test_directory_named_twice_is_read_once(make_run, tmp_path):
 @pytest.mark.parametrize(
     ("name", "content"),
     [
-        ("summary.json", "{"),
-        ("summary.json", "[]"),
-        ("summary.json", "{}"),
-        ("versions.json", "x"),
-        ("scores.csv", "a,b\n1,2\n"),
-        ("scores.csv", ""),
+        ("summary.json", "{"), ("summary.json", "[]"), ("summary.json", "{}"), ("versions.json", "x"),
+        ("scores.csv", "a,b\n1,2\n"), ("scores.csv", ""),
         ("scores.csv", "dataset,scene,scale,downsampling,method,seed,metric,variant,value,valid_share\na,b,x,,,,,,,\n"),
     ],
-)
+)  # fmt: skip
 def test_damaged_run_is_left_out_and_the_others_are_read(make_run, tmp_path, name, content):
     make_run(tmp_path / "fine", scenes=("s",))
     make_run(tmp_path / "damaged", scenes=("s",), label="MSG")

@@ -184,13 +184,6 @@ def test_sample_at_a_ratio_that_is_not_whole_is_read_as_it_was_written(tmp_path:
     assert DepthSample.load(tmp_path / "hall.npz").scale == 16 / 6
 
 
-def test_records_are_immutable() -> None:
-    with pytest.raises(AttributeError):
-        _scene().name = "other"  # type: ignore[misc]
-    with pytest.raises(AttributeError):
-        _sample().scale = 4  # type: ignore[misc]
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("levels", [255, 65535, None])
 def test_sample_is_read_with_the_same_bits(tmp_path: Path, dtype: torch.dtype, levels: int | None) -> None:

@@ -35,21 +35,12 @@ def _sample(width: int, height: int, hole: bool = False) -> DepthSample:
 @pytest.mark.parametrize(
     ("name", "scales"),
     [
-        ("bicubic", (1, 1.5, 2, 3)),
-        ("guided_filter", (1, 1.5, 2, 3)),
-        ("joint_bilateral", (1, 1.5, 2, 3)),
-        ("fast_global_smoother", (1, 1.5, 2, 3)),
-        ("bilateral", (1, 1.5, 2, 3)),
-        ("dornet", (1, 1.5, 2, 3)),
-        ("tgv", (1, 2, 3)),
-        ("anisotropic_diffusion", (1, 2, 3)),
-        ("dip", (1, 2, 3)),
-        ("dip_v_warm", (2,)),
-        ("facets_box", (2,)),
-        ("srfs", (2,)),
-        ("eg", (2,)),
+        ("bicubic", (1, 1.5, 2, 3)), ("guided_filter", (1, 1.5, 2, 3)), ("joint_bilateral", (1, 1.5, 2, 3)),
+        ("fast_global_smoother", (1, 1.5, 2, 3)), ("bilateral", (1, 1.5, 2, 3)), ("dornet", (1, 1.5, 2, 3)),
+        ("tgv", (1, 2, 3)), ("anisotropic_diffusion", (1, 2, 3)), ("dip", (1, 2, 3)), ("dip_v_warm", (2,)),
+        ("facets_box", (2,)), ("srfs", (2,)), ("eg", (2,)),
     ],
-)
+)  # fmt: skip
 def test_methods_take_the_scales_that_they_are_made_for(name: str, scales: tuple[float, ...]) -> None:
     abilities = read_recipe(name).abilities
     assert tuple(scale for scale in (1, 1.5, 2, 3) if abilities.takes(scale)) == scales

@@ -78,16 +78,6 @@ def test_rows_keep_the_order_of_the_scenes(tmp_path):
         assert (panel(page, 0, row) == round(255 * shade)).all()
 
 
-def test_captions_have_name_size_field_of_view_range_and_fraction_of_holes(tmp_path, written):
-    scene = toy_scene(30, 40)
-    scene.depth[0, 0, 0] = 1.25
-    scene.depth[0, 5:8, :] = torch.nan
-    drawn(tmp_path, scene)
-    assert "toy" in written
-    expected = "set\n40 x 30 pixels\nfield of view 90 x 90 degrees\ndepth 1.25 to 2 m\nholes: 10 %"
-    assert expected in written
-
-
 def test_field_of_view_of_a_crop_is_that_of_the_crop(tmp_path, written):
     left_half = toy_scene().camera.crop(0, 0, 32, 16)
     drawn(tmp_path, toy_scene(32, 16, camera=left_half))
@@ -113,31 +103,14 @@ def test_scene_without_high_resolution_depth_shows_its_lowest_measured_map(tmp_p
     )
 
 
-def test_measured_map_beside_the_high_resolution_map_is_mentioned(tmp_path, written):
-    drawn(tmp_path, toy_scene(measured={4: torch.full((1, 8, 8), 2.0)}))
-    assert any("also measured: x4\ndepth 2 to 2 m" in text for text in written)
-
-
-@pytest.mark.parametrize(("count", "pages"), [(3, 2), (4, 2), (5, 3)])
-def test_many_scenes_make_numbered_pages(tmp_path, written, monkeypatch, count, pages):
-    monkeypatch.setattr("dsr.pictures.sheets._ROWS", 2)
-    path = tmp_path / "toys.png"
-    made = save_contact_sheet(path, (toy_scene(8, 8, f"scene {number}") for number in range(count)), "Toys")
-    assert made == [tmp_path / f"toys-{number + 1}.png" for number in range(pages)]
-    assert sorted(file.name for file in tmp_path.iterdir()) == sorted(file.name for file in made)
-    assert [text for text in written if text.startswith("scene ")] == [f"scene {number}" for number in range(count)]
-
-
-def test_scenes_are_loaded_one_at_a_time(tmp_path, monkeypatch):
-    monkeypatch.setattr("dsr.pictures.sheets._ROWS", 2)
-
+def test_many_scenes_make_numbered_pages_and_are_loaded_one_at_a_time(tmp_path, written):
     def scenes():
-        for number in range(4):
-            if number == 3:
-                assert (tmp_path / "toys-1.png").is_file()
-            yield toy_scene(8, 8)
+        for number in range(PAGE + 2):
+            assert (tmp_path / "toys-1.png").is_file() == (number > PAGE)
+            yield toy_scene(8, 8, f"scene {number}")
 
-    save_contact_sheet(tmp_path / "toys.png", scenes(), "Toys")
+    assert save_contact_sheet(tmp_path / "toys.png", scenes(), "Toys") == sorted(tmp_path.iterdir())
+    assert [text for text in written if text.startswith("scene ")] == [f"scene {n}" for n in range(PAGE + 2)]
 
 
 def test_full_page_needs_no_number(tmp_path):
@@ -167,7 +140,7 @@ def test_large_photo_is_averaged(tmp_path):
     assert np.abs(panel(page, 0).astype(int) - 127).max() <= 20
 
 
-@pytest.mark.parametrize("name", ["$\\foo$", "日本 a_b^c", "{} %d ünï $", "n" * 100, "a-b " * 20, " "])
+@pytest.mark.parametrize("name", ["$\\foo$ 日本 a_b^c", "{} %d ünï $", "n" * 100, " "])
 def test_any_name_and_title_are_written_unchanged(tmp_path, name):
     drawn(tmp_path, toy_scene(8, 8, name), title=name)
 

@@ -262,16 +262,10 @@ def test_iteration_stops_at_convergence_and_reports_progress() -> None:
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        ("iterations", 0),
-        ("tolerance", -1.0),
-        ("first", 0.0),
-        ("second", 0.0),
-        ("data_weight", 0.0),
-        ("sharpness", -1.0),
-        ("exponent", 0.0),
-        ("step_ratio", 0.0),
+        ("iterations", 0), ("tolerance", -1.0), ("first", 0.0), ("second", 0.0), ("data_weight", 0.0),
+        ("sharpness", -1.0), ("exponent", 0.0), ("step_ratio", 0.0),
     ],
-)
+)  # fmt: skip
 def test_value_out_of_range_is_refused_by_name(key: str, value: float) -> None:
     with pytest.raises(ValueError, match=rf"^{key}: expected .*, got {value}"):
         TotalGeneralisedVariation(**{key: value})  # type: ignore[arg-type]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import get_args
 
 import pytest
@@ -11,24 +10,18 @@ import torch
 from small_lpips import random_lpips
 from torch import Tensor
 
-import dsr
-from dsr.app.schema import TrainConfig, plain_config
-from dsr.app.train import _module
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera
 from dsr.methods.dip.problem import ImageProblem, PriorObjective
 from dsr.methods.dip.upsampler import DeepImagePrior
-from dsr.methods.networks.msg_net import MSGNet
 from dsr.methods.networks.network import Answer
 from dsr.methods.networks.normalisation import mean3x3
-from dsr.metrics.classes import visual_metrics
 from dsr.metrics.functional import SurfacePair, dssim_v, mse_v
 from dsr.metrics.lpips import LPIPS, lpips_v
 from dsr.metrics.visual_loss import MSE_V, VisualLoss, VisualLossName, make_visual_loss, match_weight
 from dsr.sample import DepthSample, Scene
 from dsr.training.degradation import Batch, to_tensors
 from dsr.training.objective import DepthObjective, balance_weight
-from dsr.utils.configuration import ConfigError
 
 SIZE = 32
 CAMERA = Camera(SIZE, SIZE, 40.0, 40.0, 15.5, 15.5)
@@ -182,22 +175,3 @@ def test_lpips_without_its_weights_is_one_line_that_says_what_to_do(tmp_path: Pa
         make_visual_loss("lpips", damaged)
     with pytest.raises(ValueError, match=r"^visual: expected a network for lpips, got none$"):
         VisualLoss("lpips")
-
-
-def test_training_refuses_a_visual_loss_that_it_cannot_use(tmp_path: Path) -> None:
-    def refused(*overrides: str, patch: int = 96) -> str:
-        trunk = f"metrics.lpips_trunk={tmp_path / 'none.pth'}"
-        data = SimpleNamespace(validation_sets=["val"], patches=SimpleNamespace(patch=patch))
-        plain = plain_config(dsr.compose("train", [*overrides, trunk]))
-        with pytest.raises(ConfigError) as caught:
-            _module(TrainConfig.of(plain), MSGNet(4), data, visual_metrics)  # type: ignore[arg-type]
-        return str(caught.value)
-
-    assert refused("model=msg", "loss.visual=dssim") == (
-        "loss.visual: model=msg has no visual loss, which model.objective.w=auto adds; leave it out"
-    )
-    assert refused("model=msg", "loss.w=1").startswith("loss.w: model=msg has no visual loss, which model.objective.w")
-    assert refused("loss.visual=ssim") == "loss.visual: expected one of mse_v, dssim, lpips, got 'ssim'"
-    assert refused("loss.visual=lpips").startswith("loss.visual: lpips needs AlexNet's weights: expected a file")
-    message = refused("loss.visual=dssim", patch=6)
-    assert message == "loss.visual: dssim expects maps of at least 7 x 7 pixels, got 6 x 6"

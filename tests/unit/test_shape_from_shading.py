@@ -321,16 +321,10 @@ def test_missing_damaged_empty_or_misfitting_mask_is_refused_by_name(tmp_path: P
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        ("iterations", 0),
-        ("tolerance", -1.0),
-        ("data_weight", 0.0),
-        ("area_weight", -1.0),
-        ("boundary_weight", 0.0),
-        ("penalty", 0.0),
-        ("growth", 0.9),
-        ("foreground", "/nowhere"),
+        ("iterations", 0), ("tolerance", -1.0), ("data_weight", 0.0), ("area_weight", -1.0), ("boundary_weight", 0.0),
+        ("penalty", 0.0), ("growth", 0.9), ("foreground", "/nowhere"),
     ],
-)
+)  # fmt: skip
 def test_value_out_of_range_is_refused_by_name(key: str, value: object) -> None:
     with pytest.raises(ValueError, match=rf"^{key}: expected .* {value}"):
         ShapeFromShading(**{key: value})  # type: ignore[arg-type]
