@@ -166,7 +166,9 @@ def test_configuration_of_anything_but_plain_values_is_refused(evil, text, messa
 
 
 @pytest.mark.parametrize("name", ["../../up", "/etc/x", "a\\b", "..", "", "a\nb", "x" * 200])
-@pytest.mark.parametrize("key", ["names__model", "names__dataset"])
+@pytest.mark.parametrize(
+    "key", ["names__model", "names__dataset", "logger__tensorboard__version", "logger__tensorboard__name"]
+)
 def test_name_that_leads_out_of_a_folder_is_refused(tmp_path, key, name):
     with pytest.raises(ConfigError, match="expected a name without folders"):
         read_config(write(tmp_path / "run", **{key: name}))
@@ -175,3 +177,8 @@ def test_name_that_leads_out_of_a_folder_is_refused(tmp_path, key, name):
 def test_validation_set_that_leads_out_of_a_folder_is_refused(tmp_path):
     with pytest.raises(ConfigError, match="expected a name without folders"):
         read_config(write(tmp_path / "run", validation={"../up": CONFIG["dataset"]}))
+
+
+def test_log_outside_of_the_run_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match=r"logger\.csv\.save_dir: expected no directory"):
+        read_config(write(tmp_path / "run", logger__csv__save_dir="/tmp/elsewhere"))

@@ -186,6 +186,11 @@ def _expect_names(path: Path, config: Config) -> None:
     """Refuse names, which become those of files and folders, that would lead elsewhere."""
     for key, value in _nodes(config):
         names = [value] if key[0] == "names" and key[1:] else []
+        names += [value] if key[0] == "logger" and key[-1] in ("name", "version") and value is not None else []
+        if key[0] == "logger" and key[-1] == "save_dir":
+            raise ConfigError(
+                f"{path}: {'.'.join(key)}: expected no directory, the log is in the run's; got {value!r:.60}"
+            )
         names += [key[-1]] if key[:-1] in (("validation",), ("dataset", "parts")) else []
         for name in map(str, names):
             leads = name in ("", ".", "..") or {*"/\\"} & {*name} or not name.isprintable()
