@@ -150,6 +150,19 @@ def test_example_of_a_network_trains(extension: Path, dsr_cache: Path) -> None:
     assert (extension / "outputs" / "train" / "tiny" / "weights.safetensors").is_file()
 
 
+def test_example_of_an_optimiser_and_a_callback_trains(extension: Path, dsr_cache: Path) -> None:
+    small = (
+        "trainer=smoke",
+        "dataset.size=64",
+        "dataset.count=8",
+        "metrics.lpips=false",
+        "device=cpu",
+        "output_dir=more",
+    )
+    run_example("optimizer=rprop", extension, *small)
+    assert "Rprop" in (extension / "more" / "config.yaml").read_text()
+
+
 def test_command_reference_has_every_command_and_option(hook: ModuleType, generated: dict[str, str]) -> None:
     page = generated["reference/commands.md"]
     parsers = list(hook.all_parsers(hook.command_parser()))

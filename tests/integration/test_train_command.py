@@ -372,6 +372,13 @@ USAGE_ERRORS = {
         "model.optimizer.momentum: unknown key; ",
     ),
     "a misspelt argument of the trainer": (["+trainer.max_step=3"], "trainer.max_step: unknown key; expected"),
+    "an argument of the trainer that dsr sets": (
+        ["+trainer.num_nodes=2"],
+        "trainer.num_nodes: unknown key; dsr sets it",
+    ),
+    "a trainer that Lightning refuses": (["+trainer.gradient_clip_algorithm=foo"], "trainer: "),
+    "a network in parts": (["+model.net._partial_=true"], "model.net._partial_: expected an object"),
+    "an optimiser that is a text": (["model.scheduler=x"], "model.scheduler: expected"),
     "an unknown argument of the trainer": (["+trainer.tpu_cores=3"], "trainer.tpu_cores: unknown key; trainer takes"),
     "a callback's unknown argument": (["+callbacks.curves.x=1"], "callbacks.curves.x: unknown key; "),
     "an assumed model": (["downsampling.assumed=nearest"], "downsampling.assumed: "),

@@ -163,7 +163,7 @@ def test_masked_pixels_do_not_count() -> None:
 
 
 def test_a_prediction_alone_is_refused() -> None:
-    with pytest.raises(ValueError, match="preds: expected a SurfacePair, or preds, target and camera"):
+    with pytest.raises(ValueError, match="target: expected preds, target and camera"):
         RMSEd().update(_pair(0).prediction)
 
 
@@ -320,3 +320,13 @@ def test_mean_is_nan_where_a_prediction_leaves_nothing_to_score() -> None:
     target = torch.full((1, 1, 36, 40), 2.0, dtype=torch.float64)
     metric.update(SurfacePair(-target, target, CAMERA.rays()[None]))
     assert math.isnan(metric.compute())
+
+
+def test_a_mask_beside_a_pair_is_refused_and_the_rays_of_one_camera_serve_a_batch() -> None:
+    depth = 2 + torch.rand(2, 1, 12, 16)
+    camera = Camera(width=16, height=12, fx=20.0, fy=20.0, cx=7.5, cy=5.5)
+    pair = SurfacePair.of(depth, depth * 1.01, camera)
+    with pytest.raises(ValueError, match=r"^preds: expected a SurfacePair alone"):
+        SurfacePair.of(pair, mask=depth > 2)
+    rays = SurfacePair.of(depth, depth * 1.01, camera.rays())
+    assert torch.equal(functional.rmse_d(rays), functional.rmse_d(pair))

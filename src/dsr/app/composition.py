@@ -7,7 +7,7 @@ from pathlib import Path
 
 import hydra
 from hydra.core.global_hydra import GlobalHydra
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, open_dict
 
 from dsr.app.experiments import register_resolvers
 from dsr.app.schema import NAMED, register
@@ -22,13 +22,14 @@ def compose(
     Args:
         name: ``train`` or ``eval``.
         overrides: as on the command line.
-        directories: those of :func:`dsr.utils.configuration.config_directories`; None for the project's.
+        directories: of configuration files of your own.
         with_hydra: whether Hydra's own settings are there, too.
 
     """
     register()
     register_resolvers()
-    directories = config_directories() if directories is None else directories
+    if directories is None or not (directories and (directories[0] / f"{name}.yaml").is_file()):
+        directories = config_directories(directories or ())
     places = ",".join(f'"file://{directory.resolve()}"' for directory in directories[1:])
     more = [f"hydra.searchpath=[{places}]"] if places else []
     running = GlobalHydra.instance().hydra
@@ -38,7 +39,8 @@ def compose(
             config = hydra.compose(name, [*overrides, *more], return_hydra_config=True)
             with open_dict(config):
                 choices = config.hydra.runtime.choices
-                config.names = OmegaConf.merge({each: choices[each] for each in NAMED if each in choices}, config.names)
+                given = {group: name for group, name in config.names.items() if name is not None}
+                config.names = {each: choices[each] for each in NAMED if each in choices} | given
                 if not with_hydra:
                     del config["hydra"]
             return config

@@ -56,6 +56,8 @@ def explain(error: Exception, name: str, arguments: Sequence[str], directories: 
     if isinstance(error, OverrideParseException):
         return _explain_syntax(error.override)
     text = " ".join(str(error).split())
+    if headless := re.match(r"In '((optimizer|scheduler)/\S+)': .*Key '\2' not in", text):
+        return f"{headless[1]}.yaml: expected the first line '# @package model.{headless[2]}'"
     several = re.match(r"Ambiguous value for argument '([^=]+)=(.*?)' 1\.", text)
     if several:
         key, values = several.groups()

@@ -20,6 +20,7 @@ Config = Mapping[str, Any]
 """A composed configuration as plain values."""
 Identity = Mapping[str, Any]
 """What the results of a run depend on: settings, weights, versions, the kind of device."""
+_LONGEST_NAME = 100
 STRATEGIES = ("auto", "ddp")
 KEPT = ("best", "last")
 VISUAL = ("mse_v", "dssim", "lpips")
@@ -46,12 +47,14 @@ MOVED = {
     "trainer.accelerator": "device",
     "trainer.logger": "logger",
     "trainer.callbacks": "callbacks",
-    "trainer.max_epochs": "trainer.max_steps",
     "model.depth_loss": "model.objective.depth_loss",
     "model.shading": "model.objective.shading",
     "model.visual": "model.objective.w",
 }  # fmt: skip
 """Keys by other names: what Lightning and torch have names for, and arguments of the trainer that have their own."""
+_SET_BY_DSR = ("plugins", "use_distributed_sampler", "num_nodes", "default_root_dir", "enable_checkpointing",
+               "barebones", "inference_mode", "max_epochs", "min_epochs", "max_time")  # fmt: skip
+"""Arguments of the trainer that dsr's trainings have values of their own for."""
 _GROUPS = (
     "dataset",
     "downsampling",
@@ -118,6 +121,18 @@ class Checked:
         """
 
 
+def expect_name(key: str, name: str) -> None:
+    """Refuse a name, which becomes that of files and folders, that would lead elsewhere.
+
+    Raises:
+        ConfigError: the name is such a one.
+
+    """
+    leads = name in ("", ".", "..") or {*"/\\"} & {*name} or not name.isprintable()
+    if leads or len(name) > _LONGEST_NAME:
+        raise ConfigError(f"{key}: expected a name without folders, got {name[:60]!r}")
+
+
 def _expect_factor(scale: Any, hint: str = "") -> None:
     """Raise ConfigError, with a hint, for a scale that downsampling models do not have."""
     try:
@@ -144,7 +159,7 @@ class RunConfig(Checked):
     name takes. ``names`` has the choices of the groups.
     """
 
-    names: dict[str, str] = field(default_factory=dict)
+    names: dict[str, Any] = field(default_factory=lambda: {"dataset": None})
     dataset: dict[str, Any] = MISSING
     downsampling: dict[str, Any] = MISSING
     noise: dict[str, Any] = MISSING
@@ -173,6 +188,8 @@ class RunConfig(Checked):
             ConfigError: a value is not one of its choices.
 
         """
+        for group, name in self.names.items():
+            expect_name(f"names.{group}", str(name))
         if self.precision not in PRECISIONS:
             raise ConfigError(f"precision: expected one of {', '.join(PRECISIONS)}, got {self.precision}")
         if self.seed < 0:
@@ -275,6 +292,13 @@ class TrainConfig(RunConfig):
         for key in (*(f"trainer.{each}" for each in self.trainer), *(f"model.{each}" for each in self.model)):
             if key in MOVED:
                 raise ConfigError(f"{key}: unknown key; expected {MOVED[key]}")
+        for key in self.trainer:
+            if key in _SET_BY_DSR:
+                raise ConfigError(f"trainer.{key}: unknown key; dsr sets it itself, a training has trainer.max_steps")
+        if isinstance(self.trainer.get("profiler"), str):
+            raise ConfigError(
+                "trainer.profiler: expected a node with _target_, dirpath and filename, which writes a file"
+            )
         self._check_trainer()
 
     def _check_trainer(self) -> None:
@@ -337,7 +361,9 @@ def plain_config(config: DictConfig) -> dict[str, Any]:
     named = {group: str(node["_target_"]).rpartition(".")[2] for group, node in nodes.items() if "_target_" in node}
     if HydraConfig.initialized():
         named |= {group: name for group, name in HydraConfig.get().runtime.choices.items() if group in NAMED}
-    plain["names"] = named | (plain.get("names") or {})
+    plain["names"] = named | {
+        group: str(name) for group, name in (plain.get("names") or {}).items() if name is not None
+    }
     return plain
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import fnmatch
 import functools
 import math
+import os
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
@@ -224,6 +226,8 @@ def _train(plain: Config, settings: TrainConfig, device: torch.device, processes
         raise KeyboardInterrupt(
             f"interrupted at step {trainer.global_step}; resume={folder} goes on from there"
         ) from None
+    if trainer.fast_dev_run:  # type: ignore[attr-defined]
+        return math.nan
     if first:
         _export(module, folder / _LAST.with_name(f"{settings.keep}.ckpt"), weights, facts)
     progress.say(f"weights: {weights}")
@@ -261,6 +265,9 @@ def _discard(trainer: lightning.Trainer | None, folder: Path) -> None:
     for logger in trainer.loggers if trainer is not None else ():
         logger.finalize("failed")
     shutil.rmtree(folder)
+    if folder.parent == Path("outputs", "train"):
+        with contextlib.suppress(OSError):  # others are in it
+            os.removedirs(folder.parent)
 
 
 def _resumed(plain: dict[str, Any]) -> dict[str, Any]:
@@ -322,6 +329,7 @@ def _module(settings: TrainConfig, net: DisparityNetwork, data: PatchData, metri
     given = {"net": net, "metrics": metrics, "validation_sets": data.validation_sets}
     with keyed():
         module = build("model", {key: value for key, value in node.items() if key not in given}, given, names["model"])
+        module.logs_curves = False  # a callback of the configuration does
         module.objective.check(net, data.patches.patch, told=names["degradation"] != "plain")
     try:
         module.configure_optimizers()

@@ -117,7 +117,7 @@ def training_trainer(
         strategy=f"ddp{varying}" if processes.count > 1 else "auto",
         precision="bf16-mixed" if config.precision == "bfloat16" else "32-true",
         default_root_dir=folder,
-        make=lambda **given: build("trainer", node, given),
+        make=lambda **given: build("trainer", node, {key: value for key, value in given.items() if key not in node}),
     )
     return trainer, best
 

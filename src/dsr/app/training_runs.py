@@ -119,7 +119,9 @@ def training_data(settings: TrainConfig, devices: int = 1) -> PatchData:
     degradation = Degradation(settings.scale, downsampling, settings.build("noise"))
     everything = settings.build("degradation")
     validation = {name: build(f"validation.{name}", node) for name, node in settings.validation.items()}
-    patches: PatchSettings = settings.build("patches")
+    patches = settings.build("patches")
+    if not isinstance(patches, PatchSettings):
+        raise ConfigError(f"patches._target_: expected {PatchSettings.__name__}, got {type(patches).__name__}")
     with keyed():
         return PatchData(
             _parts(settings),

@@ -17,7 +17,7 @@ from typing import Any
 import yaml
 from omegaconf import OmegaConf
 
-from dsr.app.schema import Config
+from dsr.app.schema import Config, expect_name
 from dsr.utils.configuration import ConfigError, config_directories
 from dsr.utils.console import open_console, show
 from dsr.utils.guards import TooLargeError, read_limited
@@ -36,7 +36,6 @@ _PARTS_OF_MODEL = ("optimizer", "scheduler")
 """Keys of a model that are groups of their own."""
 _TRAINED_MODULE = "dsr.training.module.SuperResolution"
 """What ``conf/train.yaml`` makes of each model."""
-_LONGEST_NAME = 100
 
 
 @dataclass(frozen=True)
@@ -186,16 +185,16 @@ def _expect_names(path: Path, config: Config) -> None:
     """Refuse names, which become those of files and folders, that would lead elsewhere."""
     for key, value in _nodes(config):
         names = [value] if key[0] == "names" and key[1:] else []
-        names += [value] if key[0] == "logger" and key[-1] in ("name", "version") and value is not None else []
+        names += (
+            [value] if key[0] == "logger" and key[-1] in ("name", "version", "sub_dir") and value is not None else []
+        )
         if key[0] == "logger" and key[-1] == "save_dir":
             raise ConfigError(
                 f"{path}: {'.'.join(key)}: expected no directory, the log is in the run's; got {value!r:.60}"
             )
         names += [key[-1]] if key[:-1] in (("validation",), ("dataset", "parts")) else []
         for name in map(str, names):
-            leads = name in ("", ".", "..") or {*"/\\"} & {*name} or not name.isprintable()
-            if leads or len(name) > _LONGEST_NAME:
-                raise ConfigError(f"{path}: {'.'.join(key)}: expected a name without folders, got {name[:60]!r}")
+            expect_name(f"{path}: {'.'.join(key)}", name)
 
 
 @functools.lru_cache(maxsize=8)

@@ -103,7 +103,7 @@ class SurfacePair:
         Args:
             preds: the pair, or (B, 1, H, W) predicted orthogonal depth in metres.
             target: (B, 1, H, W) true depth.
-            camera: of these pixels, or their rays, (B or 1, 3, H, W).
+            camera: of these pixels, or their rays, (3, H, W) or (B, 3, H, W).
             mask: (B, 1, H, W) bool, the pixels to compare; None for all.
 
         Raises:
@@ -111,10 +111,14 @@ class SurfacePair:
 
         """
         if isinstance(preds, SurfacePair):
+            if not (target is camera is mask is None):
+                raise ValueError("preds: expected a SurfacePair alone, got a target, a camera or a mask beside it")
             return preds
         if target is None or camera is None:
-            raise ValueError("preds: expected a SurfacePair, or preds, target and camera; got a prediction alone")
-        rays = camera.rays(device=target.device)[None] if isinstance(camera, Camera) else camera
+            lack = "target" if target is None else "camera"
+            raise ValueError(f"{lack}: expected preds, target and camera, or a SurfacePair alone; got none")
+        rays = camera.rays(device=target.device) if isinstance(camera, Camera) else camera
+        rays = rays[None] if rays.ndim == 3 else rays
         return cls(preds, target, rays, mask)
 
     def derive(self, make: Callable[[SurfacePair], _Derived]) -> _Derived:

@@ -94,6 +94,9 @@ class SuperResolution(lightning.LightningModule):
 
     """
 
+    logs_curves = True
+    """Whether it logs losses and speed where the trainer has no :class:`~dsr.training.callbacks.Curves`."""
+
     def __init__(
         self,
         net: DisparityNetwork,
@@ -126,7 +129,8 @@ class SuperResolution(lightning.LightningModule):
     def configure_callbacks(self) -> list[Callback]:
         """Return the callback that logs losses and speed, unless the trainer has one; Lightning would replace that."""
         callbacks: list[Callback] = self.trainer.callbacks  # type: ignore[attr-defined]
-        return [] if any(isinstance(each, Curves) for each in callbacks) else [Curves()]
+        there = not self.logs_curves or any(isinstance(each, Curves) for each in callbacks)
+        return [] if there else [Curves()]
 
     def forward(self, batch: Batch) -> Tensor:
         """Return high-resolution depth by the averaged weights, (B, 1, H, W) in metres; NaN where there is none.

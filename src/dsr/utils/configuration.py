@@ -15,7 +15,7 @@ import importlib
 import importlib.util
 import inspect
 import types
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -72,6 +72,10 @@ def build(group: str, node: Mapping[str, Any], given: Mapping[str, Any] | None =
         return target(**arguments)
     except (ValueError, OSError) as error:
         raise ConfigError(with_key(str(error), group, inspect.signature(target).parameters)) from error
+    except Exception as error:  # Lightning's own, which derives from none of these
+        if type(error).__name__ != "MisconfigurationException":
+            raise
+        raise ConfigError(f"{group}: {' '.join(str(error).split())}") from error
 
 
 def check(group: str, node: Mapping[str, Any], given: Mapping[str, Any] | None = None) -> None:
@@ -89,6 +93,8 @@ def _checked(
 ) -> tuple[Any, dict[str, Any]]:
     """Return what a node names, and its arguments, those that are given included."""
     target = load_target(group, node)
+    if node.get(_PARTIAL) and ("." not in group or group in ("model.net", "model.objective")):
+        raise ConfigError(f"{group}.{_PARTIAL}: expected an object, which a partial is not; leave it out")
     parameters = inspect.signature(target).parameters
     takes_any = any(each.kind is each.VAR_KEYWORD for each in parameters.values())
     hints = get_type_hints(target.__init__ if inspect.isclass(target) else target)
@@ -203,7 +209,7 @@ def _fits(value: Any, hint: Any) -> bool:
         return isinstance(value, Mapping) and all(_fits(item, get_args(hint)[1]) for item in value.values())
     accepted: Any = {float: (int, float), Path: str, Any: object}.get(hint, hint)
     if origin is not None or not isinstance(accepted, type | tuple):
-        return True  # another kind is its target's to check
+        return origin is not Callable  # which no plain value is; another kind is its target's to check
     return isinstance(value, accepted) and (hint in (bool, Any) or not isinstance(value, bool))
 
 
@@ -220,6 +226,8 @@ def _describe(hint: Any) -> str:
         return f"a list of {_describe(get_args(hint)[0])}"
     if origin is not None and issubclass(origin, Mapping):
         return f"keys, each with {_describe(get_args(hint)[1])}"
+    if origin is Callable:
+        return "a node with _target_"
     types_of = {float: "a number", int: "a whole number", str: "text", bool: "true or false", Any: "a value",
                 type(None): "null"}  # fmt: skip
     return types_of.get(hint, getattr(hint, "__name__", str(hint)))
