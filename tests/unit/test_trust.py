@@ -182,3 +182,13 @@ def test_validation_set_that_leads_out_of_a_folder_is_refused(tmp_path):
 def test_log_outside_of_the_run_is_refused(tmp_path):
     with pytest.raises(ConfigError, match=r"logger\.csv\.save_dir: expected no directory"):
         read_config(write(tmp_path / "run", logger__csv__save_dir="/tmp/elsewhere"))
+
+
+def test_address_to_send_the_log_to_needs_trust(tmp_path, monkeypatch):
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    folder = write(tmp_path / "run", logger__mlflow__tracking_uri="http://elsewhere")
+    with pytest.raises(ConfigError, match=r"logger\.mlflow\.tracking_uri: expected no address"):
+        read_config(folder)
+    assert read_config(folder, True)["logger"]["mlflow"]["tracking_uri"] == "http://elsewhere"
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://elsewhere")
+    assert read_config(folder)["seed"] == 0

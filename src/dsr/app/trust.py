@@ -120,6 +120,13 @@ def expect_trusted(path: Path, config: Config, trust: Trust) -> None:
 
     """
     _expect_names(path, config)
+    for key, value in _nodes(config):
+        known = (None, os.environ.get("MLFLOW_TRACKING_URI"))
+        if key[0] == "logger" and key[-1] == "tracking_uri" and value not in known and not trust.anything:
+            raise ConfigError(
+                f"{path}: {'.'.join(key)}: expected no address to send the log to, got {value!r:.60}; "
+                "if you trust it, trust=true or the same in $MLFLOW_TRACKING_URI allows it"
+            )
     others = [(key, target) for key, target in imported(config) if not _is_own(key, target)]
     refused = [(key, target) for key, target in others if not trust.allows(target)]
     if refused:
