@@ -76,7 +76,7 @@ def test_name_is_passed_to_a_target_that_takes_one(tmp_path):
 def test_nodes_among_the_arguments_are_built_first_and_a_partial_is_called_later():
     made = build("dataset", node(root="r", file={"_target_": "toy_home.no_arguments"}))
     assert made.values[-1] == "built"
-    made = build("model.optimizer", node(_partial_=True, root="r"))(count=7)
+    made = build("dataset", node(root="r", file=node(_partial_=True, root="r"))).values[-1](count=7)
     assert (made.values[0], made.values[3]) == ("r", 7)
     with pytest.raises(ConfigError, match=r"^dataset\.file\.x: unknown key; dataset\.file takes none"):
         build("dataset", node(root="r", file={"_target_": "toy_home.no_arguments", "x": 1}))

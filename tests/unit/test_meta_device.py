@@ -74,7 +74,7 @@ def _maps(*, differentiable: bool = False) -> tuple[Tensor, Tensor, Tensor]:
 
 def test_a_value_that_is_read_is_an_error() -> None:
     for read in (Tensor.item, Tensor.tolist, Tensor.nonzero, lambda x: bool(x.all()), lambda x: x[x > 0]):
-        with pytest.raises((RuntimeError, NotImplementedError)):
+        with pytest.raises(RuntimeError):
             read(torch.empty(1, device=META))
     with pytest.raises(RuntimeError):
         torch.empty(2, device=META) + torch.empty(2)

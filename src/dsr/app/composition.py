@@ -15,7 +15,7 @@ from dsr.utils.configuration import config_directories
 
 
 def compose(
-    name: str, overrides: Sequence[str] = (), directories: Sequence[Path] | None = None, *, with_hydra: bool = False
+    name: str, overrides: Sequence[str] = (), directories: Sequence[Path] = (), *, with_hydra: bool = False
 ) -> DictConfig:
     """Compose the configuration of a command, as in ``compose("train", ["model=msg_v", "scale=8"])``.
 
@@ -28,14 +28,13 @@ def compose(
     """
     register()
     register_resolvers()
-    if directories is None or not (directories and (directories[0] / f"{name}.yaml").is_file()):
-        directories = config_directories(directories or ())
-    places = ",".join(f'"file://{directory.resolve()}"' for directory in directories[1:])
+    project, *others = config_directories(directories)
+    places = ",".join(f'"file://{directory.resolve()}"' for directory in others)
     more = [f"hydra.searchpath=[{places}]"] if places else []
     running = GlobalHydra.instance().hydra
     GlobalHydra.instance().clear()
     try:
-        with hydra.initialize_config_dir(str(directories[0]), version_base="1.3"):
+        with hydra.initialize_config_dir(str(project), version_base="1.3"):
             config = hydra.compose(name, [*overrides, *more], return_hydra_config=True)
             with open_dict(config):
                 choices = config.hydra.runtime.choices

@@ -157,7 +157,7 @@ def _meant(key: str, value: str, name: str, config: DictConfig, directories: Seq
                     choices.setdefault(f"{group}.{place}={value} with {group}", []).append(choice)
     if choices:
         return [f"{place}={', '.join(names)}" for place, names in choices.items()]
-    there = key in _places(OmegaConf.to_container(compose(other, [], directories)))
+    there = key in _places(OmegaConf.to_container(compose(other, [], directories[1:])))
     return [f"{key}={value} of {other}.py"] if there else []
 
 
@@ -212,9 +212,9 @@ def _composed_for(key: str, name: str, arguments: Sequence[str], directories: Se
     overrides = [argument for argument in arguments if choice.fullmatch(argument)]
     with_hydra = key.startswith("hydra.")
     try:
-        return compose(name, overrides, directories, with_hydra=with_hydra)
+        return compose(name, overrides, directories[1:], with_hydra=with_hydra)
     except HydraException:  # one of these choices is invalid
-        return compose(name, [], directories, with_hydra=with_hydra)
+        return compose(name, [], directories[1:], with_hydra=with_hydra)
 
 
 def _innermost(config: DictConfig, key: str) -> tuple[str, DictConfig]:

@@ -54,7 +54,7 @@ def _source(name: str, overrides: Sequence[str], config_dirs: Sequence[Path]) ->
     directories = config_directories(config_dirs)
     arguments = [f"dataset={name}", *overrides]
     try:
-        plain = plain_config(compose("eval", arguments, directories))
+        plain = plain_config(compose("eval", arguments, config_dirs))
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(explain(error, "eval", arguments, directories)) from error
     if "parts" in plain["dataset"]:

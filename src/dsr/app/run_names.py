@@ -85,7 +85,7 @@ def _defaults(kind: str, config: Config) -> tuple[dict[str, str], dict[str, Any]
 @functools.lru_cache(maxsize=256)
 def _compose(kind: str, overrides: tuple[str, ...], places: tuple[Path, ...]) -> DictConfig:
     """Return a composed configuration, which is not to be changed; what it takes from the environment is read later."""
-    return compose(kind, overrides, places)
+    return compose(kind, overrides, places[1:])
 
 
 def _differing(config: Config, defaults: Config, head: str) -> dict[str, Any]:

@@ -303,6 +303,7 @@ class TrainConfig(RunConfig):
 
     def _check_trainer(self) -> None:
         """Check what dsr itself reads of the trainer's arguments, without Lightning, which takes seconds to import."""
+        self.trainer = {**_TRAINER, **self.trainer}
 
         def is_count(value: Any) -> bool:
             return isinstance(value, int) and not isinstance(value, bool) and value > 0
@@ -316,9 +317,14 @@ class TrainConfig(RunConfig):
             ("gradient_clip_val", lambda value: value is None or (is_number(value) and 0 < value < math.inf),
              "a positive number or null"),
         ):  # fmt: skip
-            value = self.trainer.setdefault(name, _TRAINER[name])
+            value = self.trainer[name]
             if not fits(value):
                 raise ConfigError(f"trainer.{name}: expected {expected}, got {value!r:.60}")
+
+    @property
+    def more_of_trainer(self) -> dict[str, Any]:
+        """The trainer's node without what dsr computes with; the limit of gradients is only checked here."""
+        return {key: value for key, value in self.trainer.items() if key not in _TRAINER or key == "gradient_clip_val"}
 
     @property
     def steps(self) -> int:

@@ -176,7 +176,7 @@ def _prepare(plain: Config, settings: TrainConfig, device: torch.device, devices
     check_metrics(settings.metrics)
     for name in settings.logger:
         expect_installed(name)
-    check("trainer", {key: value for key, value in settings.trainer.items() if key not in ("devices", "strategy")})
+    check("trainer", settings.more_of_trainer)
     for group in ("callbacks", "logger"):
         for name, node in getattr(settings, group).items():
             check(f"{group}.{name}", node)

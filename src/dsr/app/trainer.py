@@ -103,8 +103,7 @@ def training_trainer(
     with without_chatter():
         loggers = [build(f"logger.{name}", {"save_dir": str(folder), **node}) for name, node in config.logger.items()]
     varying = "_find_unused_parameters_true" if idle or config.degradation.get("scales") else ""  # layers of one factor
-    made = ("max_steps", "val_check_interval", "accumulate_grad_batches", "devices", "strategy")
-    node = {key: value for key, value in config.trainer.items() if key not in made}
+    node = config.more_of_trainer
     trainer = make_trainer(
         device,
         config.steps,

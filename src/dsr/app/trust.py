@@ -120,13 +120,7 @@ def expect_trusted(path: Path, config: Config, trust: Trust) -> None:
 
     """
     _expect_names(path, config)
-    for key, value in _nodes(config):
-        known = (None, os.environ.get("MLFLOW_TRACKING_URI"))
-        if key[0] == "logger" and key[-1] == "tracking_uri" and value not in known and not trust.anything:
-            raise ConfigError(
-                f"{path}: {'.'.join(key)}: expected no address to send the log to, got {value!r:.60}; "
-                "if you trust it, trust=true or the same in $MLFLOW_TRACKING_URI allows it"
-            )
+    _expect_own_log(path, config, trust)
     others = [(key, target) for key, target in imported(config) if not _is_own(key, target)]
     refused = [(key, target) for key, target in others if not trust.allows(target)]
     if refused:
@@ -192,16 +186,26 @@ def _expect_names(path: Path, config: Config) -> None:
     """Refuse names, which become those of files and folders, that would lead elsewhere."""
     for key, value in _nodes(config):
         names = [value] if key[0] == "names" and key[1:] else []
-        names += (
-            [value] if key[0] == "logger" and key[-1] in ("name", "version", "sub_dir") and value is not None else []
-        )
-        if key[0] == "logger" and key[-1] == "save_dir":
-            raise ConfigError(
-                f"{path}: {'.'.join(key)}: expected no directory, the log is in the run's; got {value!r:.60}"
-            )
         names += [key[-1]] if key[:-1] in (("validation",), ("dataset", "parts")) else []
         for name in map(str, names):
             expect_name(f"{path}: {'.'.join(key)}", name)
+
+
+def _expect_own_log(path: Path, config: Config, trust: Trust) -> None:
+    """Refuse a log that would be written outside of the run, or sent somewhere without trust."""
+    for key, value in _nodes(config):
+        place = f"{path}: {'.'.join(key)}"
+        if key[0] == "logger" and key[-1] == "save_dir":
+            raise ConfigError(f"{place}: expected no directory, the log is in the run's; got {value!r:.60}")
+        if key[0] != "logger" or value is None:
+            continue
+        if key[-1] in ("name", "version", "sub_dir"):
+            expect_name(place, str(value))
+        if key[-1] == "tracking_uri" and not trust.anything and value != os.environ.get("MLFLOW_TRACKING_URI"):
+            raise ConfigError(
+                f"{place}: expected no address to send the log to, got {value!r:.60}; "
+                "if you trust it, trust=true or the same in $MLFLOW_TRACKING_URI allows it"
+            )
 
 
 @functools.lru_cache(maxsize=8)

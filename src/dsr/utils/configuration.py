@@ -64,7 +64,13 @@ def build(group: str, node: Mapping[str, Any], given: Mapping[str, Any] | None =
         ConfigError: a key is unknown, missing or of another type, or the target rejects a value.
 
     """
-    target, arguments = _checked(group, node, given or {}, name)
+    _expect_whole(group, node)
+    return _make(group, node, given or {}, name)
+
+
+def _make(group: str, node: Mapping[str, Any], given: Mapping[str, Any], name: str | None = None) -> Any:
+    """Build the object, or the partial, that a node describes."""
+    target, arguments = _checked(group, node, given, name)
     arguments = {key: _built(f"{group}.{key}", value) for key, value in arguments.items()}
     if node.get(_PARTIAL):
         return functools.partial(target, **arguments)
@@ -85,7 +91,14 @@ def check(group: str, node: Mapping[str, Any], given: Mapping[str, Any] | None =
         ConfigError: it has not.
 
     """
+    _expect_whole(group, node)
     _checked(group, node, given or {}, None)
+
+
+def _expect_whole(group: str, node: Any) -> None:
+    """Refuse a partial where an object is needed; only the arguments of another node may be one."""
+    if isinstance(node, Mapping) and node.get(_PARTIAL):
+        raise ConfigError(f"{group}.{_PARTIAL}: expected an object, which a partial is not; leave it out")
 
 
 def _checked(
@@ -93,8 +106,6 @@ def _checked(
 ) -> tuple[Any, dict[str, Any]]:
     """Return what a node names, and its arguments, those that are given included."""
     target = load_target(group, node)
-    if node.get(_PARTIAL) and ("." not in group or group in ("model.net", "model.objective")):
-        raise ConfigError(f"{group}.{_PARTIAL}: expected an object, which a partial is not; leave it out")
     parameters = inspect.signature(target).parameters
     takes_any = any(each.kind is each.VAR_KEYWORD for each in parameters.values())
     hints = get_type_hints(target.__init__ if inspect.isclass(target) else target)
@@ -128,7 +139,7 @@ def _built(key: str, value: Any) -> Any:
     if isinstance(value, list):
         return [_built(f"{key}.{number}", each) for number, each in enumerate(value)]
     if _TARGET in value:
-        return build(key, value)
+        return _make(key, value, {})
     return {name: _built(f"{key}.{name}", each) for name, each in value.items()}
 
 
