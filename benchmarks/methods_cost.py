@@ -57,7 +57,7 @@ def measured(options: argparse.Namespace) -> dict[str, float]:
     recipe = read_recipe(name)
     if options.ensemble is not None and "ensemble" in recipe.at():
         recipe = read_recipe(name, {"ensemble": options.ensemble})
-    if "weights_packaged" not in recipe.at():
+    if not recipe.at().get("weights", {}).get("packaged"):
         recipe = recipe.with_weights(options.weights)
     method = recipe.build(scale, Run(device=device))
     scene = Folder(str(options.scenes), [options.scene]).load(options.scene)

@@ -207,9 +207,10 @@ def scores_of_clean(shared: Path, method: Method) -> dict[str, float]:
 def with_weights(folder: Path) -> str:
     """Add a method, facets with the weights of a folder, to ``folder/method``, and return its name."""
     node = yaml.safe_load((CONF / "method" / "facets.yaml").read_text())
-    packaged = {str(folder.resolve() / name): factor for name, factor in node["weights_packaged"].items()}
+    weights = node["method"]["weights"]
+    weights["packaged"] = {str(folder.resolve() / name): factor for name, factor in weights["packaged"].items()}
     (folder / "method").mkdir(exist_ok=True)
-    (folder / "method" / "trained.yaml").write_text(yaml.safe_dump({**node, "weights_packaged": packaged}))
+    (folder / "method" / "trained.yaml").write_text(f"# @package _global_\n{yaml.safe_dump(node)}")
     return "trained"
 
 
