@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
+from dsr.notes import LIMITS
+
 Array = NDArray[np.float64]
 
 JUMP = 0.03
@@ -22,7 +24,7 @@ WORKING_SIZE = 800
 """Longer side in pixels at which edges are compared."""
 MAX_SHIFT = 16 / 512
 """Largest shift as a fraction of the size."""
-SHIFT = 3
+SHIFT = LIMITS["edges-beside"].threshold
 """Shift between photo and depth that is reported, in working pixels."""
 APART = 4
 """Minimum distance in pixels of another shift from the best one."""

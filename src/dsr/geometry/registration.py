@@ -62,6 +62,7 @@ class Displacement:
         scale: about the middle c of the map.
         certain: whether photo and depth agree significantly better there than elsewhere, and than with no displacement.
         visible: whether it is at least a pixel of the depth map and one that the eye sees in the photo.
+        moved: how far it moves a corner of the map, in pixels of a photo at the size at which edges are compared.
 
     """
 
@@ -70,6 +71,7 @@ class Displacement:
     scale: float = 1.0
     certain: bool = False
     visible: bool = False
+    moved: float = 0.0
 
     def __str__(self) -> str:
         """Return the displacement of depth that is undone, for people."""
@@ -284,4 +286,4 @@ def _judge(comparison: _Comparison, found: tuple[float, float, float], radius: i
     )
     back = every / comparison.pixel
     visible = corner >= max(SHIFT, comparison.pixel)
-    return Displacement(right * back, down * back, scale, bool(certain), bool(certain and visible))
+    return Displacement(right * back, down * back, scale, bool(certain), bool(certain and visible), float(corner))

@@ -15,11 +15,11 @@ from torch import Tensor
 from dsr.geometry.camera import ASSUMED_FOV, Camera
 from dsr.geometry.rigid_motion import Matrix
 from dsr.geometry.warping import registered_camera, warp_depth
-from dsr.io.encoding import Assumption
 from dsr.io.images import CameraFile, Pixels, read_camera
 from dsr.io.photos import Size, focal_in_exif, same_aspect
 from dsr.io.reading import CameraChoice, RigFiles
 from dsr.io.trajectories import read_transform
+from dsr.notes import Assumption
 from dsr.utils.guards import numbers_in, read_limited
 from dsr.utils.validation import parse_model
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera, RangeType, from_range, to_range
+from dsr.notes import Assumption
 from dsr.sample import FARTHEST, NEAREST
 
 _MIN_MEDIAN, _MAX_MEDIAN = 0.05, 80.0
@@ -26,22 +26,6 @@ _FULL, _NEARLY_FULL = 65000, 50000
 up to it."""
 _FLOAT_MILLIMETRES = 200.0
 """Median above which floats are millimetres."""
-
-
-class Assumption(NamedTuple):
-    """Something that was assumed about the files, or found in them.
-
-    Attributes:
-        text: statement, equal for all pictures to which it applies.
-        detail: figures of a single picture.
-
-    """
-
-    text: str
-    detail: str = ""
-
-    def __str__(self) -> str:
-        return f"{self.text} ({self.detail})" if self.detail else self.text
 
 
 @dataclass(frozen=True)

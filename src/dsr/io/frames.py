@@ -13,8 +13,8 @@ import numpy as np
 
 from dsr.geometry.camera import Camera
 from dsr.io.depth_files import DEPTH_SUFFIXES, read_array_file
-from dsr.io.encoding import Assumption
 from dsr.io.images import read_pixels
+from dsr.notes import Assumption
 from dsr.utils.guards import pixels_beside
 
 Record = dict[str, str | int]

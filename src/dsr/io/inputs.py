@@ -14,12 +14,13 @@ from torch import Tensor
 from dsr.geometry.camera import Camera, RangeType
 from dsr.io.cameras import camera_only, find_camera, read_rig, scale_to_photo, to_photo
 from dsr.io.depth_files import ICL_CAMERA, ICL_SUFFIX, read_depth_file
-from dsr.io.encoding import Assumption, Encoding, decode, find_holes, guess_unit, turn_back_bits
+from dsr.io.encoding import Encoding, decode, find_holes, guess_unit, turn_back_bits
 from dsr.io.frames import SLACK, Geometry
 from dsr.io.images import CameraFile, pixels_in_header, read_mask
 from dsr.io.pairs import Pair, words_of
 from dsr.io.photos import Size, model_in_exif, read_photo, same_aspect
 from dsr.io.reading import CameraChoice, Reading
+from dsr.notes import Assumption
 from dsr.sample import FARTHEST, NEAREST
 from dsr.utils.guards import natural_key, pixels_beside
 

@@ -17,7 +17,6 @@ from dsr.io.captures.record3d import find_record3d
 from dsr.io.captures.ros import find_ros
 from dsr.io.captures.stray import find_stray
 from dsr.io.depth_files import DEPTH_SUFFIXES
-from dsr.io.encoding import Assumption
 from dsr.io.images import read_pixels
 from dsr.io.open3d import add_trajectory
 from dsr.io.pairs import (
@@ -34,6 +33,7 @@ from dsr.io.pairs import (
     role_of_words,
     words_of,
 )
+from dsr.notes import Assumption
 from dsr.utils.guards import MOST_TABLE, natural_key, numbers_in, path_within, read_limited
 
 _DEPTH_LR = re.compile(r"(depth|disparity)_lr(\d+)")

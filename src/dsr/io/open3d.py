@@ -31,11 +31,11 @@ import numpy as np
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.io.encoding import Assumption
 from dsr.io.frames import CaptureFrame, Geometry
 from dsr.io.pairs import Pair, PairingResult
 from dsr.io.scene_files import RGBD, Frame, one_camera, to_millimetres, write_colour, write_sixteen_bits
 from dsr.io.trajectories import check_pose, order_of, read_text
+from dsr.notes import Assumption
 from dsr.utils.files import replacing, write_text
 from dsr.utils.guards import numbers_in
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Literal
 
 from dsr.io.depth_files import READ_SUFFIXES
-from dsr.io.encoding import Assumption
 from dsr.io.frames import CONFIDENCE_SUFFIXES, CaptureFrame, ConfidenceMap, find_highest
+from dsr.notes import Assumption
 from dsr.utils.guards import natural_key
 
 Role = Literal["rgb", "depth", "other"]

@@ -10,8 +10,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from dsr.io.encoding import Assumption
 from dsr.io.images import read_pixels
+from dsr.notes import Assumption
 from dsr.utils.files import replacing
 
 _MODEL, _ORIENTATION, _EXIF_IFD, _EXIF_FOCAL_35 = 0x0110, 0x0112, 0x8769, 0xA405

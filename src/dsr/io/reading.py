@@ -76,6 +76,7 @@ class Reading(Options):
     rig: RigFiles | None = group()
     register: bool = option(False, "move the depth map to the photo's edges, if it lies beside them")
     hole_value: float | None = option(None, "another value that marks missing depth", "VALUE")
+    strict: bool = option(False, "refuse a picture with a warning; see docs/checks.md", recorded=False)
     min_confidence: float | None = option(
         None,
         "less confident pixels count as holes; levels 0, 1, 2 are 0, 0.5, 1",

@@ -12,8 +12,8 @@ import numpy as np
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.rigid_motion import Matrix, as_rigid, from_quaternion, is_rotation
-from dsr.io.encoding import Assumption
 from dsr.io.pairs import Pair, time_of
+from dsr.notes import Assumption
 from dsr.utils.guards import naming, numbers_in, parse_json, read_limited, refusing
 
 _LARGEST_FILE = 256 << 20

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from dsr.geometry.registration import Displacement, find_displacement, undo
-from dsr.io.encoding import Assumption
 from dsr.io.inputs import Picture
+from dsr.notes import Assumption
 
 
 def align(picture: Picture, *, register: bool) -> Picture:
@@ -27,7 +27,7 @@ def align(picture: Picture, *, register: bool) -> Picture:
     if found is None or not found.visible:
         return picture
     detail = f"{_where(found)}; --register moves the depth map"
-    warning = Assumption("warning: the photo's edges lie beside the depth edges", detail)
+    warning = Assumption("the photo's edges lie beside the depth edges", detail, "edges-beside", found.moved)
     return replace(picture, assumptions=(*picture.assumptions, warning))
 
 

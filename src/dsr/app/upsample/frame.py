@@ -27,10 +27,10 @@ from dsr.app.upsample.request import UpsampleRequest, Upsampling, files_of, inpu
 from dsr.app.upsample.sequence import FrameSequence
 from dsr.degradation.sensors import Identified
 from dsr.inference import AnyRatio, Plan, enlarged_by, find_sensor
-from dsr.io.encoding import Assumption
 from dsr.io.inputs import FolderUnits, Picture, read_picture
 from dsr.io.pairs import Pair
 from dsr.methods.base import MapNoise, Outliers, Surface
+from dsr.notes import Assumption, expect_no_warning
 from dsr.utils.guards import readable
 from dsr.utils.progress import Progress
 from dsr.utils.versions import package_versions
@@ -64,6 +64,7 @@ class FrameWork:
         job = _Job(request, pair, target, self._settings, depends_on, read_previous_run(target))
         job.expect_agreement()
         if job.is_done():
+            job.expect_no_warning(job.earlier.warnings if job.earlier is not None else ())
             reporter.say(f"{pair.name}: complete already, in {target}")
             return "complete already"
         picture = self._read(pair)
@@ -76,6 +77,7 @@ class FrameWork:
         size_lr = (picture.depth_lr.shape[-2], picture.depth_lr.shape[-1])
         size = (picture.camera.height, picture.camera.width)
         planned = self._upsampler.plan(size, size_lr)
+        job.expect_no_warning([each.message for each in picture.assumptions if each.code])
         reporter.facts(picture.assumptions)
         if wanted.dry_run:
             reporter.say(f"{pair.name}: {planned.text} -> {target}")
@@ -149,6 +151,11 @@ class _Job:
             changed = [name for name, value in self.settings.items() if earlier.settings.get(name) != value]
             what = "other settings: " + ", ".join(f"{name} {earlier.settings.get(name)}" for name in changed)
         raise ValueError(f"{self.target}: holds a result of {what}; take another -o, or --overwrite")
+
+    def expect_no_warning(self, messages: Sequence[str]) -> None:
+        """Raise ValueError if there is one, and that is not allowed."""
+        if self.request.reading.strict:
+            expect_no_warning(str(self.pair.depth), messages)
 
     def is_done(self) -> bool:
         """Return whether all requested parts exist."""
@@ -236,6 +243,7 @@ def _write(job: _Job, picture: Picture, surface: Surface, planned: Plan, seconds
         **described(picture, encoding),
         **counts,
         "assumptions": [str(fact) for fact in (*picture.assumptions, *facts)],
+        "warnings": [fact.record() for fact in (*picture.assumptions, *facts) if fact.code],
         "seconds": {"upsampling": round(seconds, 3), "writing": round(time.perf_counter() - started, 3)},
         "versions": {"python": platform.python_version(), **package_versions(_PACKAGES)},
     }

@@ -38,6 +38,7 @@ class PreviousRun:
         files: names of the files that it wrote.
         noise: that of its input, as JSON has it; None if it was not estimated.
         shapes: numbers of points and triangles of its cloud and mesh, and of its outliers.
+        warnings: that it gave, in words.
 
     """
 
@@ -47,6 +48,7 @@ class PreviousRun:
     files: tuple[str, ...]
     noise: Mapping[str, Any] | None = None
     shapes: Mapping[str, Any] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
 
 
 def output_encoding(encoding: Encoding, chosen: str | None) -> Encoding:
@@ -89,6 +91,7 @@ def read_previous_run(folder: Path) -> PreviousRun | None:
             tuple(files),
             None if noise is None else dict(noise),
             {name: entries[name] for name in (*_SHAPES, "outliers") if name in entries},
+            tuple(str(each["message"]) for each in entries.get("warnings", ())),
         )
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path}: expected a file of `dsr upsample`, got something else; take another -o") from error

@@ -18,11 +18,12 @@ from dsr.utils.options import Options, Rule, at_least, one_of, option
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from dsr.io.encoding import Assumption, Encoding
+    from dsr.io.encoding import Encoding
     from dsr.io.exports import Written
     from dsr.io.inputs import Picture
     from dsr.io.scene_files import Frame
     from dsr.methods.base import Surface
+    from dsr.notes import Assumption
 
 FORMATS = ("png", "tiff", "npy", "npz", "pfm", "exr")
 METRES = "depth_metres.npy"

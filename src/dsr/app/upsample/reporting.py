@@ -9,7 +9,7 @@ from typing import Protocol
 import torch
 from rich.console import Console
 
-from dsr.io.encoding import Assumption
+from dsr.notes import Assumption
 from dsr.utils.console import one_line, show
 
 _SHOWN = 5
@@ -65,9 +65,9 @@ class Reporter:
     def facts(self, facts: Sequence[Assumption]) -> None:
         """Show the notes that no earlier picture had."""
         for fact in facts:
-            if not self._counts[fact.text]:
+            if not self._counts[fact.statement]:
                 self.say(f"  {fact}")
-            self._counts[fact.text] += 1
+            self._counts[fact.statement] += 1
 
     def summary(self, pictures: int) -> None:
         """Show the notes that apply to some of the pictures only."""

@@ -12,10 +12,10 @@ from torch import Tensor
 
 from dsr.geometry.camera import Camera
 from dsr.inference.sequences import View, fuse_views
-from dsr.io.encoding import Assumption
 from dsr.io.inputs import Picture
 from dsr.io.pairs import Pair
 from dsr.io.trajectories import read_poses
+from dsr.notes import Assumption
 
 _Frame = tuple[Tensor, Camera, np.ndarray | None]
 """Depth map, camera of its pixels, and pose."""

@@ -33,11 +33,11 @@ import numpy as np
 from pydantic import BaseModel
 from scipy.spatial.transform import Rotation
 
-from dsr.io.encoding import Assumption
 from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry
 from dsr.io.images import Pixels, read_numbers
 from dsr.io.pairs import Pair, PairingResult
 from dsr.io.trajectories import check_pose, describe_capture, intrinsics_camera, read_text
+from dsr.notes import Assumption
 from dsr.utils.guards import natural_key, numbers_in, read_limited
 from dsr.utils.validation import parse_model
 

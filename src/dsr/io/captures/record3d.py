@@ -25,10 +25,10 @@ from typing import Annotated, Any
 from pydantic import BaseModel, Field, ValidationError
 
 from dsr.io.captures.archive import PHOTO_LIMIT, Archive, Member, decode_lzfse, decode_photo
-from dsr.io.encoding import Assumption
 from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry
 from dsr.io.pairs import Pair, PairingResult
 from dsr.io.trajectories import describe_capture, intrinsics_camera, pose_from_quaternion
+from dsr.notes import Assumption
 from dsr.utils.guards import natural_key
 from dsr.utils.validation import Whole, describe
 

@@ -1,0 +1,37 @@
+"""Warnings of input, and their limits."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from dsr.notes import LIMITS, Assumption, expect_no_warning
+
+CHECKS = Path(__file__).resolve().parents[2] / "docs" / "checks.md"
+
+
+def test_documentation_shows_every_limit() -> None:
+    table = [
+        f"| `{code}` | {limit.threshold:g} | {limit.quantity} | {limit.source} |"
+        for code, limit in sorted(LIMITS.items())
+    ]
+    shown = [line for line in CHECKS.read_text(encoding="utf-8").splitlines() if line.startswith("| `")]
+    assert shown[: len(table)] == table
+
+
+def test_warning_is_told_and_recorded_with_its_threshold() -> None:
+    warning = Assumption("edges apart", "6 px", "edges-beside", 6.0)
+    assert str(warning) == "warning: edges apart (6 px)"
+    assert warning.record() == {
+        "code": "edges-beside",
+        "message": "edges apart (6 px)",
+        "value": 6.0,
+        "threshold": LIMITS["edges-beside"].threshold,
+    }
+
+
+def test_strict_takes_a_warning_for_an_error() -> None:
+    expect_no_warning("a.png", [])
+    with pytest.raises(ValueError, match=r"a\.png: edges apart, and 1 more"):
+        expect_no_warning("a.png", ["edges apart", "another"])
