@@ -3,6 +3,7 @@
 # make unit  the unit tests alone, about a minute
 # make fuzz  10,000 damaged, foreign and malicious files for every reader (ARGS="--cases 1000 --seed 1")
 # make chaos commands that are killed, run out of space and run at once (ARGS="--kills 100 --seed 0")
+# make mistakes  inputs that can be computed with and are wrong: which are told (ARGS="--cases 500 --seed 0")
 # make docs  the documentation as a site in outputs/site
 # All of them set everything up in .venv first; they need Python >= 3.11 and nothing else.
 
@@ -15,7 +16,7 @@ ARGS ?=
 PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder --maxprocesses 8 \
 	--numprocesses $$(( $$(getconf _NPROCESSORS_ONLN) + 1 ))
 
-.PHONY: run test unit fuzz chaos lint docs benchmark clean
+.PHONY: run test unit fuzz chaos mistakes lint docs benchmark clean
 
 run: $(VENV)/installed
 	$(BIN)/python eval.py $(ARGS)
@@ -39,6 +40,9 @@ docs: $(VENV)/installed-dev
 
 chaos: $(VENV)/installed-dev
 	PYTHONPATH=tests $(BIN)/python -m chaos $(ARGS)
+
+mistakes: $(VENV)/installed-dev
+	OMP_NUM_THREADS=1 PYTHONPATH=tests $(BIN)/python -m mistakes $(ARGS)
 
 benchmark: $(VENV)/installed-dev
 	for file in benchmarks/*_speed.py; do $(BIN)/python $$file || exit 1; done
