@@ -185,8 +185,6 @@ def _prepare(plain: Config, settings: TrainConfig, device: torch.device, devices
     last = folder / _LAST
     metrics = functools.partial(metric_collection, settings.metrics)
     module = _module(settings, net, data, metrics)
-    if last.parent.is_symlink():
-        raise ConfigError(f"{last.parent}: expected a directory of the run's own, got a link")
     tolerated = ("results_version", "scenes_version", "device") if "resume" in given_keys() else ()
     resume = last if last.is_file() and not settings.overwrite else None
     return _Prepared(device, data, module, identity, folder, resume, tolerated)

@@ -32,7 +32,7 @@ from urllib3.exceptions import HTTPError
 
 from dsr.data.download.collections import Collection, Item
 from dsr.utils.console import one_line
-from dsr.utils.files import FullDiskError, expect_space, space_for, temporary_folder, write_text
+from dsr.utils.files import FullDiskError, expect_space, expect_target, space_for, temporary_folder, write_text
 from dsr.utils.guards import leads_outside, natural_key, opened, parse_json, read_limited, refusing
 from dsr.utils.progress import Progress, Task, megabytes
 from dsr.utils.versions import file_hash
@@ -248,6 +248,8 @@ class _Job:
         target = self.root / item.path
         address, _, member = url.partition("#")
         part = target.with_name(f"{target.name}{'.zip' * bool(member)}.part")
+        for path in (target, part):
+            expect_target(path)
         with self.progress.task(item.path, unit="bytes") as moved:
             _download(address, part, moved, 0.0 if item.unpack_to is None else _UNPACKED)
         new = part.with_suffix(".member") if member else part
