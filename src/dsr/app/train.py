@@ -48,7 +48,7 @@ from dsr.utils import interruption
 from dsr.utils.checkpoints import CheckpointError, DivergenceError
 from dsr.utils.compute_device import fast_precision, pick_device
 from dsr.utils.configuration import ConfigError, build, check
-from dsr.utils.console import USAGE_ERROR, ConsoleProgress
+from dsr.utils.console import USAGE_ERROR, ConsoleProgress, without_credentials
 from dsr.utils.files import replacing
 from dsr.utils.guards import expect_stored
 from dsr.utils.lightning import fit
@@ -174,8 +174,14 @@ def _prepare(plain: Config, settings: TrainConfig, device: torch.device, devices
     if settings.downsampling.get("assumed") is not None:
         raise ConfigError("downsampling.assumed: a training assumes no downsampling model; leave it out")
     check_metrics(settings.metrics)
-    for name in settings.logger:
+    for name, node in settings.logger.items():
         expect_installed(name)
+        for key, value in node.items():
+            if isinstance(value, str) and without_credentials(value) != value:
+                raise ConfigError(
+                    f"logger.{name}.{key}: expected an address without name and password, which the run's config.yaml "
+                    "would keep; the service reads them from the environment"
+                )
     check("trainer", settings.more_of_trainer)
     for group in ("callbacks", "logger"):
         for name, node in getattr(settings, group).items():

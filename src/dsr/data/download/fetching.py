@@ -22,7 +22,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import IO, Any, NamedTuple
-from urllib.parse import urlsplit
+from urllib.parse import unquote, urlsplit
 
 import requests
 from filelock import FileLock, Timeout
@@ -167,6 +167,7 @@ def get(
     Args:
         items: what to fetch; a path that occurs twice is fetched once.
         mirror: address of a server to try first; it has each file under its path below the directory of the data sets.
+            A name and a password in it, ``https://name:password@host``, are sent, and neither shown nor stored.
         accept_changed: whether a file may have another checksum than recorded.
         keep_archives: whether archives stay after they were unpacked; those that were there before do anyway.
 
@@ -174,13 +175,15 @@ def get(
         What could not be had and why, a line each; the others are there. A full disk ends it.
 
     Raises:
-        ValueError: ``checksums.json`` is damaged, or another command is writing into ``root``.
+        ValueError: ``checksums.json`` is damaged, another command is writing into ``root``, or the mirror is no
+            address.
 
     """
     problems: list[str] = []
+    server = None if mirror is None else Server.of(mirror)
     root.mkdir(parents=True, exist_ok=True)
     with lock_directory(root):
-        job = _Job(root, Checksums(root), progress, mirror, accept_changed, keep_archives)
+        job = _Job(root, Checksums(root), progress, server, accept_changed, keep_archives)
         for item in {item.path: item for item in items}.values():
             try:
                 job.get(item)
@@ -191,6 +194,35 @@ def get(
     return problems
 
 
+_Credentials = tuple[bytes, bytes] | None
+"""A name and a password, as they are sent."""
+
+
+class Server(NamedTuple):
+    """A server, and apart from its address the credentials, so that none is in a message or a file."""
+
+    address: str
+    credentials: _Credentials
+
+    @classmethod
+    def of(cls, given: str) -> Server:
+        """Return the server of an address, which may have a name and a password.
+
+        Raises:
+            ValueError: it is no address, or has an @ in its path; the message is without name and password.
+
+        """
+        scheme, _, rest = given.partition("://")
+        before, at, place = rest.rpartition("@")
+        address = f"{scheme}://{place}".rstrip("/") if place else given
+        if scheme.lower() not in ("http", "https") or not urlsplit(address).netloc:
+            raise ValueError(f"--mirror: expected an address that begins with http:// or https://, got {address!r}")
+        if "/" in before:
+            raise ValueError(f"--mirror: expected @ and / as %40 and %2F in an address with a password, got {place!r}")
+        name, _, password = before.partition(":")
+        return cls(address, (unquote(name).encode(), unquote(password).encode()) if at else None)
+
+
 @dataclass(frozen=True)
 class _Job:
     """Fetching, with the arguments of :func:`get`."""
@@ -198,7 +230,7 @@ class _Job:
     root: Path
     checksums: Checksums
     progress: Progress
-    mirror: str | None
+    mirror: Server | None
     accept_changed: bool
     keep_archives: bool
 
@@ -234,16 +266,18 @@ class _Job:
 
     def _fetch(self, item: Item) -> str:
         """Download a file from the first address that has it, and return its checksum."""
-        mirror = () if self.mirror is None else (f"{self.mirror.rstrip('/')}/{item.path}",)
+        sources: list[tuple[str, _Credentials]] = [(url, None) for url in item.urls]
+        if self.mirror is not None:
+            sources.insert(0, (f"{self.mirror.address}/{item.path}", self.mirror.credentials))
         problems = []
-        for url in (*mirror, *item.urls):
+        for url, credentials in sources:
             try:
-                return self._fetch_from(url, item)
+                return self._fetch_from(url, item, credentials)
             except ValueError as error:
                 problems.append(str(error))
         raise ValueError("; ".join(dict.fromkeys(problems)))
 
-    def _fetch_from(self, url: str, item: Item) -> str:
+    def _fetch_from(self, url: str, item: Item, credentials: _Credentials) -> str:
         """Download a file, check it, put it in place, and return its checksum."""
         target = self.root / item.path
         address, _, member = url.partition("#")
@@ -251,7 +285,7 @@ class _Job:
         for path in (target, part):
             expect_target(path)
         with self.progress.task(item.path, unit="bytes") as moved:
-            _download(address, part, moved, 0.0 if item.unpack_to is None else _UNPACKED)
+            _download(address, part, moved, 0.0 if item.unpack_to is None else _UNPACKED, credentials)
         new = part.with_suffix(".member") if member else part
         try:
             if member:
@@ -277,13 +311,14 @@ class _Job:
         return digest
 
 
-def _download(url: str, part: Path, moved: Task, room: float) -> None:
+def _download(url: str, part: Path, moved: Task, room: float, credentials: _Credentials = None) -> None:
     """Download a file, from where ``part`` ends on if the server can; a note beside it says of which version it is.
 
     ``room`` is how much more must be free on the disk afterwards, as a multiple of the file's size.
     """
     part.parent.mkdir(parents=True, exist_ok=True)
     with requests.Session() as session:
+        session.auth = credentials
         for scheme in ("http://", "https://"):
             session.mount(scheme, HTTPAdapter(max_retries=RETRIES))
         while True:
