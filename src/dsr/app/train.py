@@ -39,7 +39,7 @@ from dsr.app.training_runs import WEIGHTS, keyed, read_config, training_data
 from dsr.data.scene_source import SceneSource, prepare_scenes
 from dsr.methods.networks.network import DisparityNetwork
 from dsr.methods.networks.trained import NETWORKS
-from dsr.methods.networks.weight_files import load_network, network_name, read_torch_file, save_network
+from dsr.methods.networks.weight_files import load_network, network_name, save_network
 from dsr.training.data_module import PatchData
 from dsr.training.loggers import RUN_IDS, expect_installed, log_config, log_layout, log_settings
 from dsr.training.module import SuperResolution
@@ -53,6 +53,7 @@ from dsr.utils.files import replacing
 from dsr.utils.guards import expect_stored
 from dsr.utils.lightning import fit
 from dsr.utils.progress import SILENT, Progress, duration
+from dsr.utils.torch_files import read_torch_file
 
 _LARGEST_SEED = 2**32 - 1
 _FOLDERS = ("checkpoints", "tensorboard", "csv", "wandb", "mlruns")

@@ -16,6 +16,7 @@ from lightning.pytorch.callbacks import Callback
 from torch import Tensor, nn
 from torch.nn import functional
 
+from dsr.utils.torch_files import read_torch_file
 from dsr.geometry.shading import comparison
 from dsr.methods.dip.problem import ImageProblem, PriorObjective
 from dsr.methods.dip.skip_net import Padding, SkipNet, levels_for
@@ -264,7 +265,7 @@ def checkpoint_of(path: Path, origin: str) -> Path | None:
     if not path.is_file():
         return None
     try:
-        stored = torch.load(path, map_location="cpu", weights_only=True).get("origin")
-    except Exception:
+        stored = read_torch_file(path).get("origin")
+    except (ValueError, AttributeError, OSError):
         return None
     return path if stored == origin else None
