@@ -706,12 +706,12 @@ TAKEN = {
     "files of other names": lambda checkpoint: state_of(checkpoint, None).update(
         {"dirpath": "mine", "filename": "thesis.txt", "last_model_path": "mine/thesis.txt", "best_model_path": "mine"}
     ),
-    "parts": damage("hyper_parameters", value={"net": {"_target_": "os.mkdir", "path": "made"}, "best_model_path": "mine"}),
+    "parts": damage("hyper_parameters", value={"net": {"_target_": "os.mkdir", "path": "x"}, "best_model_path": "mine"}),
     "another number of steps": damage("global_step", value="x"),
     "a state of the data": damage("PatchData", value={"__dict__": 1, "patches": None}),
-    "methods of a schedule": lambda checkpoint: checkpoint["lr_schedulers"][0].update(get_lr="x", step="x", optimizer=1),
-    "methods of progress": lambda checkpoint: checkpoint["loops"]["fit_loop"]["epoch_progress"]["total"].update(reset=1),
-    "methods of a group": lambda checkpoint: checkpoint["optimizer_states"][0]["param_groups"][0].update(step="x"),
+    "methods of a schedule": lambda checkpoint: checkpoint["lr_schedulers"][0].update(get_lr="x", optimizer=1),
+    "methods of progress": damage("loops", "fit_loop", "epoch_progress", "total", "reset", value=1),
+    "methods of a group": damage("optimizer_states", 0, "param_groups", 0, "step", value="x"),
 }  # fmt: skip
 
 

@@ -7,6 +7,7 @@ import hashlib
 import io
 import json
 import os
+import re
 import shutil
 import socket
 import tarfile
@@ -826,3 +827,41 @@ def test_password_in_arguments_that_are_refused_is_not_repeated(tmp_path, monkey
 def test_password_is_in_no_shortened_message(capsys):
     print_error(f"{'x' * 730} https://name:{SECRET}@host/{'y' * 400}")
     assert SECRET[:3] not in capsys.readouterr().err
+
+
+def test_list_shows_which_checksums_are_pinned_noted_and_unknown(server, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("DSR_DATA", str(tmp_path))
+    server.files |= {"/b.png": PNG, "/c.png": PNG}
+    items = [replace(picture(server, f"/{name}.png", name=f"{name}.png"), sha256=digest)
+             for name, digest in (("a", sha256(PNG)), ("b", None), ("c", None))]  # fmt: skip
+
+    def of(items, name):
+        return Collection(name, "A set", "", "", "", ("set",), None, tuple(items))
+
+    catalogue = {name: of(some, name) for name, some in (("all", items), ("one", items[:1]), ("two", items[1:2]))}
+    catalogue["mine"] = replace(
+        catalogue["one"], items=(), manual="put it there", patterns=("*.png",), folders=("mine",)
+    )
+
+    def listed():
+        assert main(["data", "list"], catalogue) == 0
+        return [re.split(r" {2,}", line.strip())[-1] for line in capsys.readouterr().out.splitlines()[1:]]
+
+    assert listed() == ["1 pinned, 2 unknown", "pinned", "unknown", "unknown"]
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "x.png").write_bytes(PNG)
+    assert main(["data", "get", "two", "mine", "--yes"], catalogue) == 0
+    capsys.readouterr()
+    assert listed() == ["1 pinned, 1 noted, 1 unknown", "pinned", "noted", "noted"]
+
+
+def test_pinned_checksum_is_said_to_be_dsr_s_and_ends_with_2(server, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("DSR_DATA", str(tmp_path))
+    item = replace(picture(server), sha256=sha256(OTHER))
+    catalogue = {"set": Collection("set", "A set", "", "", "", ("set",), None, (item,))}
+    for more in ([], ["--accept-changed"]):
+        assert main(["data", "get", "set", "--yes", *more], catalogue) == 2
+        [line] = capsys.readouterr().err.splitlines()
+        assert f"expected sha256 {sha256(OTHER)}, which dsr knows, got {sha256(PNG)}" in line
+        assert "--accept-changed" not in line
+    assert left_in(tmp_path) == []

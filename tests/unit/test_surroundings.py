@@ -9,8 +9,8 @@ import captures
 import pytest
 
 SCRIPT = "from dsr.__main__ import main\nif __name__ == '__main__':\n    main()\n"
-MODULES = ("cv2", "json", "matplotlib", "multiprocessing", "numpy", "pickle", "pydantic", "rich", "sitecustomize", "torch",
-           "usercustomize", "yaml", "zlib")  # fmt: skip
+MODULES = ("cv2", "json", "matplotlib", "multiprocessing", "numpy", "pickle", "pydantic", "rich", "sitecustomize",
+           "torch", "usercustomize", "yaml", "zlib")  # fmt: skip
 LIBRARIES = ("libc.so.6", "libz.so.1", "libm.so.6", "libpcre2-8.so.0")
 SETTINGS = ("text.usetex: true\n", "axes.facecolor: blue\nno such line\n", b"\xff\xfe\x00")
 

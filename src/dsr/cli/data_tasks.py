@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from dsr.data.download.collections import Collection, data_root, find
-from dsr.data.download.fetching import Server, absent, get, state, verify
+from dsr.data.download.fetching import Server, absent, checksums_of, get, state, verify
 from dsr.utils.console import ConsoleProgress, show
 from dsr.utils.progress import megabytes
 
@@ -19,11 +19,12 @@ from dsr.utils.progress import megabytes
 def list_data_sets(_: argparse.Namespace, console: Console, catalogue: Mapping[str, Collection]) -> list[str]:
     """Show a table of the data sets."""
     table = Table(box=None, pad_edge=False)
-    for header in ("name", "what", "about", "here"):
+    for header in ("name", "what", "about", "here", "checksums"):
         table.add_column(header, overflow="fold", no_wrap=header != "what")
     for collection in catalogue.values():
         size = "" if collection.size is None else megabytes(collection.size)
-        table.add_row(collection.name, collection.title, size, state(collection, data_root()))
+        here, known = state(collection, data_root()), checksums_of(collection, data_root())
+        table.add_row(collection.name, collection.title, size, here, known)
     console.print(table, markup=False, highlight=False)
     return []
 

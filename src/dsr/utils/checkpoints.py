@@ -132,7 +132,7 @@ class Resumed(Callback):
     """Lets a training go on from a state of its own kind alone, and tells whether it has done a step since.
 
     Lightning and torch take over what a checkpoint has as attributes of their objects. Of what a new training has, a
-    checkpoint may have other numbers, and nothing else: what is unknown is left out. Kernels that update several tensors
+    checkpoint may have other numbers, and nothing else: what is unknown is left out. Kernels that update some tensors
     at once do not check sizes: they would write beyond averages that are smaller than their weights.
     """
 

@@ -17,6 +17,7 @@ import stat
 import tarfile
 import zipfile
 import zlib
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -305,7 +306,9 @@ class _Job:
         expected, digest = item.sha256 or (entry and entry.sha256), file_hash(path)
         if expected not in (None, digest):
             raise ValueError(
-                f"{source}: expected sha256 {expected} as recorded in {self.checksums.path}, got {digest}; "
+                f"{source}: expected sha256 {expected}, which dsr knows, got {digest}"
+                if item.sha256 is not None
+                else f"{source}: expected sha256 {expected} as recorded in {self.checksums.path}, got {digest}; "
                 "if the new one is right, --accept-changed takes it"
             )
         return digest
@@ -532,6 +535,27 @@ def state(collection: Collection, root: Path) -> str:
     if there in (0, len(collection.items)):
         return "complete" if there else "absent"
     return f"partial {there} of {len(collection.items)}"
+
+
+def checksums_of(collection: Collection, root: Path) -> str:
+    """Return where the checksums are from that a collection's files have to have.
+
+    Returns:
+        ``pinned`` for those that dsr knows, ``noted`` for those that were written down when the files first came,
+        ``unknown`` for those that will be, and how many there are of each where there are several kinds.
+
+    Raises:
+        ValueError: ``checksums.json`` is damaged.
+
+    """
+    recorded = {name for name, entry in Checksums(root).items() if entry.sha256 is not None}
+    if not collection.items:
+        return "noted" if any(name.startswith(f"{collection.folders[0]}/") for name in recorded) else "unknown"
+    kinds = Counter(
+        "pinned" if item.sha256 is not None else "noted" if item.path in recorded else "unknown"
+        for item in {item.path: item for item in collection.items}.values()
+    )
+    return next(iter(kinds)) if len(kinds) == 1 else ", ".join(f"{count} {kind}" for kind, count in kinds.items())
 
 
 def absent(items: Iterable[Item], root: Path) -> list[Item]:

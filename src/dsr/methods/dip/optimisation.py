@@ -16,13 +16,13 @@ from lightning.pytorch.callbacks import Callback
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dsr.utils.torch_files import read_torch_file
 from dsr.geometry.shading import comparison
 from dsr.methods.dip.problem import ImageProblem, PriorObjective
 from dsr.methods.dip.skip_net import Padding, SkipNet, levels_for
 from dsr.methods.dip.stopping import Stopping
 from dsr.metrics.classes import compute_means, in_table_units
 from dsr.metrics.functional import SurfacePair, rmse_v
+from dsr.utils.torch_files import read_torch_file
 
 _NOISE_CHANNELS = 32
 _LARGEST_RATE = 1e36
