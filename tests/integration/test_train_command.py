@@ -706,7 +706,7 @@ TAKEN = {
     "files of other names": lambda checkpoint: state_of(checkpoint, None).update(
         {"dirpath": "mine", "filename": "thesis.txt", "last_model_path": "mine/thesis.txt", "best_model_path": "mine"}
     ),
-    "parts": damage("hyper_parameters", value={"net": {"_target_": "os.mkdir", "path": "x"}, "best_model_path": "mine"}),
+    "parts": damage("hyper_parameters", value={"net": {"_target_": "os.mkdir", "path": "x"}}),
     "another number of steps": damage("global_step", value="x"),
     "a state of the data": damage("PatchData", value={"__dict__": 1, "patches": None}),
     "methods of a schedule": lambda checkpoint: checkpoint["lr_schedulers"][0].update(get_lr="x", optimizer=1),
