@@ -264,6 +264,40 @@ def _resume(place: Place) -> None:
     _hydra("train", f"resume={place.input / 'run'}", "device=cpu")
 
 
+def _checkpoint(place: Place) -> None:
+    from dsr.methods.dip.optimisation import checkpoint_of  # noqa: PLC0415
+    from dsr.training.module import SuperResolution  # noqa: PLC0415
+
+    path = place.input / "run" / "checkpoints" / "best.ckpt"
+    checkpoint_of(path, "0")
+    SuperResolution.load_from_checkpoint(path)
+
+
+def _claims(place: Place) -> None:
+    from dsr.evaluation.sharing import Claims  # noqa: PLC0415
+
+    with Claims(place.input / "run") as shared:
+        shared.record("room")
+        claim = shared.take("room")
+        if claim is not None:
+            claim.close()
+
+
+def _notes(place: Place) -> None:
+    from dsr.data.download.fetching import _read_note  # noqa: PLC0415
+    from dsr.training.loggers import CsvLog, _read_number  # noqa: PLC0415
+
+    _read_note(place.input / "a.png.part", "https://localhost/a.png")
+    _read_number(place.input, "wandb")
+    CsvLog(place.input)
+
+
+def _foreground(place: Place) -> None:
+    from dsr.methods.classical.shape_from_shading import read_foreground  # noqa: PLC0415
+
+    read_foreground(place.input / "mask.png", (48, 64))
+
+
 def _configured(place: Place) -> None:
     command("upsample", "--rgb", place.input / "photo.png", "--depth", place.input / "depth.png", "--config-dir",
             place.input / "conf", "--method", "more", "--set", "data_weight=30", "-o", place.out,
@@ -356,6 +390,11 @@ READERS = (
     Reader("eval again", run_seeds.evaluation, _eval_again, 1),
     Reader("eval run", run_seeds.training, _eval_run, 1),
     Reader("train resume", run_seeds.interrupted_training, _resume, 1),
+    Reader("train weights", run_seeds.training_without_weights, _resume, 1),
+    Reader("checkpoint", run_seeds.training, _checkpoint, 2),
+    Reader("claims", run_seeds.claims, _claims),
+    Reader("notes", run_seeds.notes, _notes),
+    Reader("foreground", lambda folder: seeds.photo(folder / "mask.png"), _foreground),
     Reader("view", run_seeds.results,
            lambda place: command("view", place.input / "out", "--no-open", "-o", place.out / "view.html")),
     Reader("fuse", run_seeds.results,

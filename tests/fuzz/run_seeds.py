@@ -10,6 +10,8 @@ import json
 import shutil
 import tempfile
 from pathlib import Path
+from typing import Any
+from unittest import mock
 
 import captures
 import numpy as np
@@ -17,7 +19,12 @@ import small_results
 from conftest import write_run
 
 from dsr.cli import main
+from dsr.evaluation.sharing import _digest
+from dsr.utils.files import machine
 from fuzz.seeds import CAMERA, photo, unit, written
+
+
+INTERRUPTED = 130
 
 
 def quietly(*arguments: object) -> None:
@@ -25,6 +32,8 @@ def quietly(*arguments: object) -> None:
     said = io.StringIO()
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
         code = main([str(each) for each in arguments])
+    if code == INTERRUPTED:
+        raise _InterruptedError
     assert code == 0, said.getvalue()
 
 
@@ -57,30 +66,67 @@ def evaluation_arguments(folder: Path, run: Path) -> list[str]:
 
 
 @functools.cache
-def _trained() -> Path:
-    """Return the directory of a training of two steps, which is made once."""
+def _trained(steps: int) -> Path:
+    """Return the directory of a training of two steps, which is made once; with fewer steps it was interrupted."""
+    from dsr.app import trainer  # noqa: PLC0415
+
+    class Interrupting(trainer.StepProgress):
+        """Ends the training like Ctrl-C."""
+
+        def on_train_batch_start(self, trainer: Any, *_: Any) -> None:
+            """Raise at the step."""
+            if trainer.global_step == steps:
+                raise KeyboardInterrupt
+
     place = Path(tempfile.mkdtemp(prefix="tmp-dsr-fuzz-training-"))
     atexit.register(shutil.rmtree, place, ignore_errors=True)
     _scenes(place / "scenes", "room", "hall", "shed")
     folder = place / "run"
-    quietly(
-        "train", "model=msg_v", "scale=2", "trainer=smoke", "dataset=folder", f"dataset.root={place / 'scenes'}",
-        "patches.scenes=2", "metrics.lpips=false", "device=cpu", "precision=float32", f"output_dir={folder}",
-    )  # fmt: skip
+    with mock.patch.object(trainer, "StepProgress", Interrupting), contextlib.suppress(_InterruptedError):
+        quietly(
+            "train", "model=msg_v", "scale=2", "trainer=smoke", "dataset=folder", f"dataset.root={place / 'scenes'}",
+            "trainer.max_steps=2", "trainer.val_check_interval=1", "patches.scenes=2", "metrics.lpips=false",
+            "device=cpu", "precision=float32", "logger=[tensorboard,csv]", f"output_dir={folder}",
+        )  # fmt: skip
     for log in (folder / "tensorboard").rglob("events*"):
         log.unlink()
     return folder
 
 
+class _InterruptedError(Exception):
+    """A command was interrupted."""
+
+
 def training(folder: Path) -> None:
     """Write the directory of a finished training."""
-    shutil.copytree(_trained(), folder / "run")
+    shutil.copytree(_trained(2), folder / "run")
 
 
-def interrupted_training(folder: Path) -> None:
+def training_without_weights(folder: Path) -> None:
     """Write the directory of a training that was interrupted before its weights were written."""
     training(folder)
     (folder / "run" / "weights.safetensors").unlink()
+
+
+def interrupted_training(folder: Path) -> None:
+    """Write the directory of a training that was interrupted after its first step, with the note of a divergence."""
+    shutil.copytree(_trained(1), folder / "run")
+    written(folder / "run" / "diverged.json", json.dumps({"what": "diverged at step 1", "identity": {"seed": 1}}))
+
+
+def claims(folder: Path) -> None:
+    """Write what a command that was killed leaves of its share of a run."""
+    owner = {"host": "there", "machine": machine(), "process": 1 << 22, "birth": "1"}
+    for name in ("member-there-1", f"{_digest('room')}.0", f"{_digest('room')}.1"):
+        written(folder / "run" / ".claims" / name, json.dumps(owner))
+    written(folder / "run" / ".claims" / f"{_digest('room')}-record.json", json.dumps({"seconds": 1.5}))
+
+
+def notes(folder: Path) -> None:
+    """Write what a training's services and an interrupted download leave."""
+    written(folder / "wandb_run.txt", "a1b2c3\n")
+    written(folder / "a.png.part.json", json.dumps({"url": "https://localhost/a.png", "mark": '"1"', "total": 100}))
+    written(folder / "csv" / "metrics.csv", "step,train/loss\n1,0.5\n2,0.25\n")
 
 
 def results(folder: Path) -> None:

@@ -644,17 +644,173 @@ def test_checkpoint_of_a_stranger_removes_nothing_outside_the_run(tmp_path, with
     assert line == f"note: {path} is not taken from the checkpoint, only files in out/checkpoints are"
 
 
-def test_link_in_place_of_the_checkpoints_is_refused(tmp_path, within, interrupt):
-    interrupt(3)
-    assert within(*FOUR)[0] == 130
-    interrupt(None)
-    (tmp_path / "out" / "checkpoints").rename(tmp_path / "mine")
-    (tmp_path / "out" / "checkpoints").symlink_to(tmp_path / "mine")
+EXPANDED = torch.zeros(1, dtype=torch.float64).expand(1 << 20, 1 << 20)  # 8 TB with a first sum
+
+
+def state_of(checkpoint, monitor):
+    [state] = [each for each in checkpoint["callbacks"].values() if each.get("monitor", "") == monitor]
+    return state
+
+
+def damage(*keys, value):
+    """Return what sets an entry of a checkpoint, given the keys that lead to it."""
+
+    def change(checkpoint):
+        for key in keys[:-1]:
+            checkpoint = checkpoint[key]
+        checkpoint[keys[-1]] = value
+
+    return change
+
+
+BATCHES = ("loops", "fit_loop", "epoch_loop.batch_progress")
+REFUSED = {
+    "no callbacks": lambda checkpoint: checkpoint.pop("callbacks"),
+    "callbacks without names": damage("callbacks", value=[1]),
+    "sums as text": damage("callbacks", "Curves", "sums", value={"train/loss": "x"}),
+    "sums that broadcast": damage("callbacks", "Curves", "sums", value={"train/loss": torch.zeros(3, 1000, 2)}),
+    "sums that repeat": damage("callbacks", "Curves", "sums", value={"train/loss": EXPANDED}),
+    "sums of other names": damage("callbacks", "Curves", "sums", value={"../../x": torch.zeros(2)}),
+    "a score as text": lambda checkpoint: state_of(checkpoint, "val/RMSE_v").update(
+        best_model_score="x", kth_value="x"
+    ),
+    "scores as text": lambda checkpoint: state_of(checkpoint, "val/RMSE_v").update(kth_value={"a": 1}),
+    "a schedule of methods": damage("lr_schedulers", 0, "base_lrs", value="x"),
+    "a schedule as text": damage("lr_schedulers", 0, "last_epoch", value="x"),
+    "a schedule of objects": damage("lr_schedulers", 0, "lr_lambdas", value=[{"__call__": 1}]),
+    "no schedule": damage("lr_schedulers", value=[]),
+    "a rate as text": damage("optimizer_states", 0, "param_groups", 0, "lr", value="x"),
+    "a rate without end": damage("optimizer_states", 0, "param_groups", 0, "lr", value=10**400),
+    "a rate of many": damage("optimizer_states", 0, "param_groups", 0, "lr", value=torch.zeros(9)),
+    "groups without end": damage("optimizer_states", 0, "param_groups", value=[{}] * 9),
+    "averages of another size": damage("optimizer_states", 0, "state", 0, "exp_avg", value=torch.zeros(7)),
+    "averages that repeat": damage("optimizer_states", 0, "state", 0, "exp_avg", value=EXPANDED),
+    "averages as text": damage("optimizer_states", 0, "state", value={0: "x"}),
+    "no optimiser": damage("optimizer_states", value=[]),
+    "steps as text": damage(*BATCHES, "total", "ready", value="x"),
+    "steps of another size": damage(*BATCHES, "current", "ready", value=torch.zeros(3)),
+    "no loops": damage("loops", value={}),
+    "no weights": damage("state_dict", value={}),
+    "weights that repeat": damage("state_dict", "net.guidance.0.conv.weight", value=EXPANDED),
+    "a version of no kind": damage("pytorch-lightning_version", value="\x1b[2J"),
+    "an earlier version": lambda checkpoint: checkpoint.update(
+        {"pytorch-lightning_version": "0.9.0", "checkpoint_callback_best_model_path": "mine/thesis.txt",
+         "checkpoint_callback_best": 0.1, "early_stop_callback_wait": 1, "early_stop_callback_patience": 1}
+    ),
+}  # fmt: skip
+TAKEN = {
+    "callbacks of other classes": lambda checkpoint: checkpoint["callbacks"].update(
+        {"OnExceptionCheckpoint": {"dirpath": "mine"}, "BasePredictionWriter": {"output_dir": "mine"},
+         "\x1b]0;evil\x07ModelCheckpoint": {"best_model_path": "mine/thesis.txt"}}
+    ),
+    "files of other names": lambda checkpoint: state_of(checkpoint, None).update(
+        {"dirpath": "mine", "filename": "thesis.txt", "last_model_path": "mine/thesis.txt", "best_model_path": "mine"}
+    ),
+    "parts": damage("hyper_parameters", value={"net": {"_target_": "os.mkdir", "path": "x"}}),
+    "another number of steps": damage("global_step", value="x"),
+    "a state of the data": damage("PatchData", value={"__dict__": 1, "patches": None}),
+    "methods of a schedule": lambda checkpoint: checkpoint["lr_schedulers"][0].update(get_lr="x", optimizer=1),
+    "methods of progress": damage("loops", "fit_loop", "epoch_progress", "total", "reset", value=1),
+    "methods of a group": damage("optimizer_states", 0, "param_groups", 0, "step", value="x"),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def stranger(tmp_path_factory, environment):
+    """The folder of a run that is interrupted after three steps of four."""
+    folder = tmp_path_factory.mktemp("stranger")
+    code = (
+        "import sys, dsr.app.trainer as made; from dsr.app.entry import run_train\n"
+        "class Interrupting(made.StepProgress):\n"
+        "    def on_train_batch_start(self, trainer, *_):\n"
+        "        if trainer.global_step == 3: raise KeyboardInterrupt\n"
+        "if __name__ == '__main__':\n"
+        "    made.StepProgress = Interrupting; run_train(sys.argv[1:])"
+    )
+    (folder / "interrupted.py").write_text(code)
+    done = run_python(str(folder / "interrupted.py"), *FOUR, cwd=folder, env=environment)
+    assert done.returncode == 130, done.stderr
+    return folder / "out"
+
+
+@pytest.fixture
+def crafted(stranger, tmp_path):
+    """Return what writes a copy of the run with a changed checkpoint, beside something precious."""
+
+    def write(change):
+        shutil.copytree(stranger, tmp_path / "out")
+        (tmp_path / "mine").mkdir()
+        (tmp_path / "mine" / "thesis.txt").write_text("precious")
+        last = tmp_path / "out" / "checkpoints" / "last.ckpt"
+        checkpoint = torch.load(last, weights_only=True)
+        change(checkpoint)
+        torch.save(checkpoint, last)
+
+    return write
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_state_that_is_none_of_the_training_is_refused_in_one_line(crafted, tmp_path, within, case):
+    crafted(REFUSED[case])
+    code, _, errors = within("resume=out")
+    line = "error: out/checkpoints/last.ckpt: expected a checkpoint of this training, got a damaged or foreign one"
+    assert (code, len(errors)) == (2, 1), errors
+    assert errors[0].startswith(line)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine", "out"]
+    assert tree(tmp_path / "mine") == ["thesis.txt"]
+
+
+@pytest.mark.parametrize("case", TAKEN)
+def test_state_that_is_not_the_training_s_has_no_say(crafted, tmp_path, within, case):
+    crafted(TAKEN[case])
+    code, output, errors = within("resume=out")
+    assert (code, errors) == (0, [])
+    assert "\x1b" not in output
+    assert last_step(tmp_path / "out") == 4
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine", "out"]
+    assert (tmp_path / "mine" / "thesis.txt").read_text() == "precious"
+
+
+LINKS = {
+    "checkpoints": "mine",
+    "tensorboard": "mine",
+    "csv": "mine",
+    "tensorboard/hparams.yaml": "mine/new.yaml",
+    "checkpoints/last.ckpt": "last.ckpt",
+    "checkpoints/best.ckpt": "mine/thesis.txt",
+    "validation.csv": "mine/thesis.txt",
+    "weights.safetensors": "nowhere",
+    "config.yaml": "config.yaml",
+}
+
+
+@pytest.mark.parametrize("name", LINKS)
+def test_link_out_of_the_run_is_refused_and_nothing_is_written(crafted, tmp_path, within, name):
+    crafted(lambda checkpoint: None)
+    path = tmp_path / "out" / name
+    if path.is_file() and LINKS[name] in ("last.ckpt", "config.yaml"):
+        path.rename(tmp_path / LINKS[name])
+    elif path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+    path.symlink_to(tmp_path / LINKS[name])
     before = tree(tmp_path)
-    line = "error: out/checkpoints: expected a directory of the run's own, got a link"
     for arguments in (["resume=out"], [*FOUR, "overwrite=true"]):
-        assert within(*arguments) == (2, "", [line])
+        code, output, errors = within(*arguments)
+        assert (code, output, len(errors)) == (2, "", 1)
+        assert f"out/{name}" in errors[0]
     assert tree(tmp_path) == before
+    assert (tmp_path / "mine" / "thesis.txt").read_text() == "precious"
+
+
+def test_run_in_a_folder_that_is_a_link_goes_on(crafted, tmp_path, within):
+    crafted(lambda checkpoint: None)
+    (tmp_path / "out").rename(tmp_path / "disk")
+    (tmp_path / "out").symlink_to("disk")
+    code, _, errors = within("resume=out")
+    assert (code, errors) == (0, [])
+    assert (tmp_path / "out").is_symlink()
 
 
 def test_training_that_lacks_only_its_weights_file_gets_it(smoke, tmp_path, within):

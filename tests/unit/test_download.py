@@ -1,24 +1,29 @@
 """Fetching data sets: from a server of its own that breaks off, lies, has changed or is not there at all."""
 
+import base64
 import contextlib
 import errno
 import hashlib
 import io
 import json
 import os
+import re
 import shutil
 import socket
 import tarfile
 import zipfile
 from collections import namedtuple
+from dataclasses import replace
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 
 import pytest
 
+from dsr.cli import main
 from dsr.data.download import fetching
-from dsr.data.download.collections import Collection, Item
+from dsr.data.download.collections import CATALOGUE, Collection, Item
 from dsr.data.download.fetching import Checksums, get, lock_directory, state, verify
+from dsr.utils.console import print_error
 from dsr.utils.progress import Progress
 
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(range(256)) * 1600
@@ -745,3 +750,118 @@ def test_second_command_is_refused_while_one_writes(server, tmp_path):
     with lock_directory(tmp_path), pytest.raises(ValueError, match="another `dsr data` command"):
         fetched(picture(server), tmp_path)
     assert fetched(picture(server), tmp_path) == []
+
+
+SECRET = "s%C3%A9cr%40t"
+MESSAGES = {
+    "nothing there": {},
+    "refused": {"states": [401]},
+    "an empty file": {"files": {"/mirror/set/a.png": b""}},
+    "a page": {"files": {"/mirror/set/a.png": PAGE}},
+    "compressed": {"files": {"/mirror/set/a.png": PNG}, "headers": {"Content-Encoding": "br"}},
+    "it breaks off": {"files": {"/mirror/set/a.png": PNG}, "cuts": [1000] * 9, "ranges": False},
+    "led to nowhere": {"headers": {"Location": "https://name:s%C3%A9cr%40t@127.0.0.1:1/x"}, "states": [302] * 9},
+    "led in a circle": {"headers": {"Location": "/mirror/set/a.png"}, "states": [302] * 99},
+    "led to no address": {"headers": {"Location": "http://name:s%C3%A9cr%40t@[::1"}, "states": [302] * 9},
+}
+
+
+@pytest.mark.parametrize("case", MESSAGES)
+def test_password_of_a_mirror_is_sent_but_neither_shown_nor_stored(server, tmp_path, monkeypatch, capfd, case):
+    sent = []
+
+    class Guarded(Handler):
+        def do_GET(self):
+            sent.append(self.headers.get("Authorization"))
+            super().do_GET()
+
+        def send_error(self, code, *rest):
+            if code == 302:
+                self.answer(code, self.server.headers, b"", None)
+            else:
+                super().send_error(code, *rest)
+
+    monkeypatch.setattr(server, "RequestHandlerClass", Guarded)
+    server.files = {}
+    for name, value in MESSAGES[case].items():
+        setattr(server, name, value)
+    if "files" not in MESSAGES[case]:
+        server.files = {"/mirror/set/a.png": PNG} if "states" in MESSAGES[case] else {}
+    address = f"{server.url}/mirror".replace("://", f"://name:{SECRET}@")
+    monkeypatch.setenv("DSR_DATA", str(tmp_path))
+    catalogue = {"set": Collection("set", "A set", "", "", "", ("set",), None, (Item("set/a.png", ()),))}
+    with contextlib.suppress(SystemExit):
+        assert main(["data", "get", "set", "--mirror", address, "--yes"], catalogue) == 2
+    captured = capfd.readouterr()
+    assert sent[0] == "Basic " + base64.b64encode("name:sécr@t".encode()).decode()
+    assert len(captured.err.splitlines()) == 1
+    stored = "".join(path.read_text(errors="replace") for path in tmp_path.rglob("*") if path.is_file())
+    for text in (captured.out, captured.err, stored, *map(str, tmp_path.rglob("*"))):
+        assert not any(secret in text for secret in (SECRET, "sécr@t", "name:"))
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("data", "get", "nyu", "--mirror", f"ftp://name:{SECRET}@host/x"),
+        ("data", "get", "nyu", "--mirror", f"https://name:{SECRET}@"),
+        ("data", "get", "nyu", "--mirror", f"https://na/me:{SECRET}@host/x"),
+        ("data", "get", "nyu", "--mirror", f"https://name:{SECRET}@host:port/x", "--yes"),
+        ("data", "get", f"https://name:{SECRET}@host/x"),
+        ("data", "get", "nyu", "--miror", f"https://name:{SECRET}@host/x"),
+        ("data", "list", f"https://name:{SECRET}@host/x"),
+        ("eval", f"dataset.root=https://name:{SECRET}@host/x", "method=nowhere"),
+        ("eval", f"https://name:{SECRET}@host/x"),
+    ],
+)
+def test_password_in_arguments_that_are_refused_is_not_repeated(tmp_path, monkeypatch, capfd, arguments):
+    monkeypatch.setenv("DSR_DATA", str(tmp_path))
+    monkeypatch.setattr(fetching, "RETRIES", 0)
+    with contextlib.suppress(SystemExit):
+        assert main(arguments, {**CATALOGUE, "nyu": replace(CATALOGUE["nyu"], items=(Item("nyu/a.png", ()),))}) == 2
+    captured = capfd.readouterr()
+    assert captured.err
+    assert SECRET not in captured.out + captured.err
+
+
+def test_password_is_in_no_shortened_message(capsys):
+    print_error(f"{'x' * 730} https://name:{SECRET}@host/{'y' * 400}")
+    assert SECRET[:3] not in capsys.readouterr().err
+
+
+def test_list_shows_which_checksums_are_pinned_noted_and_unknown(server, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("DSR_DATA", str(tmp_path))
+    server.files |= {"/b.png": PNG, "/c.png": PNG}
+    items = [replace(picture(server, f"/{name}.png", name=f"{name}.png"), sha256=digest)
+             for name, digest in (("a", sha256(PNG)), ("b", None), ("c", None))]  # fmt: skip
+
+    def of(items, name):
+        return Collection(name, "A set", "", "", "", ("set",), None, tuple(items))
+
+    catalogue = {name: of(some, name) for name, some in (("all", items), ("one", items[:1]), ("two", items[1:2]))}
+    catalogue["mine"] = replace(
+        catalogue["one"], items=(), manual="put it there", patterns=("*.png",), folders=("mine",)
+    )
+
+    def listed():
+        assert main(["data", "list"], catalogue) == 0
+        return [re.split(r" {2,}", line.strip())[-1] for line in capsys.readouterr().out.splitlines()[1:]]
+
+    assert listed() == ["1 pinned, 2 unknown", "pinned", "unknown", "unknown"]
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "x.png").write_bytes(PNG)
+    assert main(["data", "get", "two", "mine", "--yes"], catalogue) == 0
+    capsys.readouterr()
+    assert listed() == ["1 pinned, 1 noted, 1 unknown", "pinned", "noted", "noted"]
+
+
+def test_pinned_checksum_is_said_to_be_dsr_s_and_ends_with_2(server, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("DSR_DATA", str(tmp_path))
+    item = replace(picture(server), sha256=sha256(OTHER))
+    catalogue = {"set": Collection("set", "A set", "", "", "", ("set",), None, (item,))}
+    for more in ([], ["--accept-changed"]):
+        assert main(["data", "get", "set", "--yes", *more], catalogue) == 2
+        [line] = capsys.readouterr().err.splitlines()
+        assert f"expected sha256 {sha256(OTHER)}, which dsr knows, got {sha256(PNG)}" in line
+        assert "--accept-changed" not in line
+    assert left_in(tmp_path) == []

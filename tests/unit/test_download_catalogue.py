@@ -1,5 +1,6 @@
 """The catalogue of data sets: every entry can be fetched or says how to get it, and lies where its reader looks."""
 
+import hashlib
 from pathlib import Path, PurePosixPath
 from urllib.parse import urlsplit
 
@@ -45,6 +46,19 @@ def test_items_have_addresses_of_their_names_and_paths_below_the_root():
             assert name == PurePosixPath(item.path).name or item.unpack_to is not None
         assert (item.unpack_to is None) == (not item.path.endswith((".zip", ".tar.gz")))
         assert bool(item.contains) == (item.unpack_to is not None)
+
+
+def test_files_of_a_commit_are_pinned_and_the_shared_ones_are_these(shared):
+    pinned = {item.path: item.sha256 for item in ITEMS if item.sha256 is not None}
+    assert len(pinned) == 2 * 6 + 2 * 30 + 3 * 22
+    assert {path.split("/")[0] for path in pinned} == {"lu", "middlebury8", "ddrnet"}
+    for item in ITEMS:
+        assert (item.sha256 is not None) == ("raw.githubusercontent.com" in item.urls[0])
+    for ours, theirs in (("lu", "modern/Lu"), ("middlebury8", "modern/Middlebury")):
+        for path, digest in pinned.items():
+            folder, _, name = path.partition("/")
+            if folder == ours:
+                assert hashlib.sha256((shared / theirs / name).read_bytes()).hexdigest() == digest
 
 
 def test_item_is_the_same_in_all_collections():

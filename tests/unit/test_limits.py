@@ -32,10 +32,11 @@ from dsr.io.photos import read_photo
 from dsr.io.reading import Reading
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_choice import packaged_weights
-from dsr.methods.networks.weight_files import load_network, read_torch_file
+from dsr.methods.networks.weight_files import load_network
 from dsr.sample import DepthSample
 from dsr.utils.guards import TooLargeError, bytes_of_archive, pixels_beside, pixels_of_file, read_limited, read_member
 from dsr.utils.picture_headers import picture_size
+from dsr.utils.torch_files import read_torch_file
 
 MOST = 450 << 20
 """Largest growth of memory in bytes while a file is refused; MATLAB's old files take the most."""

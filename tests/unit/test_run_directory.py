@@ -223,7 +223,7 @@ def test_overwrite_claims_the_directory_of_another_run(tmp_path):
 
 def test_file_in_place_of_the_directory_is_refused(tmp_path):
     (tmp_path / "file").write_text("x")
-    with pytest.raises(ConfigError, match=r"^output_dir: expected a directory, .*file is a file"):
+    with pytest.raises(ConfigError, match=r"^output_dir: .*file: expected a folder .*, got a file"):
         claimed(tmp_path / "file", config())
 
 

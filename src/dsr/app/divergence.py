@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import torch
-
 from dsr.app.schema import Identity
 from dsr.utils.checkpoints import DivergenceError
 from dsr.utils.configuration import ConfigError
 from dsr.utils.files import write_text
 from dsr.utils.guards import parse_json, read_limited
+from dsr.utils.torch_files import read_torch_file
 
 NOTE = "diverged.json"
 _ADVICE = (
@@ -60,6 +59,6 @@ def expect_no_divergence(folder: Path, identity: Identity) -> None:
 def step_of(checkpoint: Path) -> int | None:
     """Return the step of a training's checkpoint, None if there is none."""
     try:
-        return int(torch.load(checkpoint, map_location="cpu", weights_only=True)["global_step"])
-    except Exception:  # torch names no set of errors for damaged files
+        return int(read_torch_file(checkpoint)["global_step"])
+    except (ValueError, KeyError, TypeError, OSError, OverflowError):
         return None

@@ -20,7 +20,7 @@ class ReportRequest(Options):
     """What the report contains, and where it goes."""
 
     runs: tuple[Path, ...] = option(..., "directories of runs, or with runs below them", "DIR", flags="runs")
-    output: Path = option(..., "where the report goes", "DIR", flags="-o --output")
+    output: Path = option(..., "where the report goes", "DIR", flags="-o --output", writes="folder")
     study: Path | None = option(None, "what `dsr study collect` wrote", "CSV")
     methods: tuple[str, ...] = option((), "these alone, as the tables name them", "NAME")
     datasets: tuple[str, ...] = option((), "these alone", "NAME")
@@ -59,6 +59,7 @@ class FuseRequest(Options):
         "FILE",
         flags="-o --output",
         rule=Rule("a file that ends in .ply", lambda path: path.suffix.lower() == ".ply"),
+        writes="file",
     )
     voxel: float | None = option(
         None,
@@ -79,7 +80,7 @@ class ViewRequest(Options):
     """What to look at."""
 
     output: Path = option(..., "a result of `dsr upsample`, or a folder of several", "OUT", flags="output")
-    page: Path | None = option(None, "the page (default: OUT/view.html)", "FILE", flags="-o --page")
+    page: Path | None = option(None, "the page (default: OUT/view.html)", "FILE", flags="-o --page", writes="file")
     open_page: bool = option(True, "only write the page", flags="--no-open")
     most: int = option(24, "show at most N results, taken at equal distances (24)", "N", rule=at_least(1))
     vertices: int = option(
@@ -94,7 +95,7 @@ class ViewRequest(Options):
 class ExportRequest(Options):
     """Which network to write, and where."""
 
-    path: Path = option(..., "the file to write", "FILE", flags="--onnx")
+    path: Path = option(..., "the file to write", "FILE", flags="--onnx", writes="file")
     method: str = option("facets", "facets (default), msg_v, pdn, ddrnet, ...", "NAME")
     scale: int = option(
         4, "upsampling factor (default: 4)", "N", rule=Rule("a factor of 1 or more", lambda factor: factor >= 1)
@@ -111,8 +112,6 @@ class ExportRequest(Options):
     def __post_init__(self) -> None:
         """Check the values, and that there is such a method."""
         super().__post_init__()
-        if self.path.is_dir():
-            raise OptionError("path", f"expected a file, got the folder {self.path}")
         check_method(self.method, self.directories)
 
 
@@ -146,7 +145,7 @@ class StudyRequest(Options):
     """The questions of a study, and where its page goes."""
 
     runs: tuple[Path, ...] = option(..., "runs, or directories with runs below", "RUNS", flags="runs")
-    output: Path = option(..., "where to", "DIR", flags="-o --output")
+    output: Path = option(..., "where to", "DIR", flags="-o --output", writes="folder")
     choice: Choice = group(Choice)
     overwrite: bool = option(False, "replace another study, whose answers can then no longer be collected")
 
@@ -157,4 +156,6 @@ class AnswersRequest(Options):
 
     study: Path = option(..., "the study's directory, with key.json", "DIR", flags="study")
     answers: tuple[Path, ...] = option(..., "files, or directories of them", "ANSWERS", flags="answers")
-    output: Path | None = option(None, "the table; DIR/study.csv by default", "FILE", flags="-o --output")
+    output: Path | None = option(
+        None, "the table; DIR/study.csv by default", "FILE", flags="-o --output", writes="file"
+    )

@@ -16,7 +16,7 @@ from dsr.app.schema import Config, Identity
 from dsr.app.trust import imported
 from dsr.utils.configuration import ConfigError, expand_home
 from dsr.utils.console import shorten
-from dsr.utils.files import write_text
+from dsr.utils.files import TargetError, expect_own, expect_target, write_text
 from dsr.utils.guards import parse_json, read_limited
 from dsr.utils.versions import RESULTS, SCENES, hash_outside_code, versions
 
@@ -133,11 +133,15 @@ def expect_free(folder: Path, config: Config, identity: Identity, tolerated: Seq
         The tolerated keys that differ.
 
     Raises:
-        ConfigError: something else is there already and ``overwrite`` is not set.
+        ConfigError: something else is there already and ``overwrite`` is not set, or a link leads out of the directory.
 
     """
-    if folder.exists() and not folder.is_dir():
-        raise ConfigError(f"output_dir: expected a directory, {folder} is a file")
+    try:
+        expect_target(folder, folder=True)
+        if folder.is_dir():
+            expect_own(folder)
+    except TargetError as error:
+        raise ConfigError(f"output_dir: {error}") from error
     if not folder.is_dir() or _is_unused(folder) or config["overwrite"]:
         return []
     try:

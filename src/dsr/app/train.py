@@ -39,7 +39,7 @@ from dsr.app.training_runs import WEIGHTS, keyed, read_config, training_data
 from dsr.data.scene_source import SceneSource, prepare_scenes
 from dsr.methods.networks.network import DisparityNetwork
 from dsr.methods.networks.trained import NETWORKS
-from dsr.methods.networks.weight_files import load_network, network_name, read_torch_file, save_network
+from dsr.methods.networks.weight_files import load_network, network_name, save_network
 from dsr.training.data_module import PatchData
 from dsr.training.loggers import RUN_IDS, expect_installed, log_config, log_layout, log_settings
 from dsr.training.module import SuperResolution
@@ -48,11 +48,12 @@ from dsr.utils import interruption
 from dsr.utils.checkpoints import CheckpointError, DivergenceError
 from dsr.utils.compute_device import fast_precision, pick_device
 from dsr.utils.configuration import ConfigError, build, check
-from dsr.utils.console import USAGE_ERROR, ConsoleProgress
+from dsr.utils.console import USAGE_ERROR, ConsoleProgress, without_credentials
 from dsr.utils.files import replacing
 from dsr.utils.guards import expect_stored
 from dsr.utils.lightning import fit
 from dsr.utils.progress import SILENT, Progress, duration
+from dsr.utils.torch_files import read_torch_file
 
 _LARGEST_SEED = 2**32 - 1
 _FOLDERS = ("checkpoints", "tensorboard", "csv", "wandb", "mlruns")
@@ -174,8 +175,14 @@ def _prepare(plain: Config, settings: TrainConfig, device: torch.device, devices
     if settings.downsampling.get("assumed") is not None:
         raise ConfigError("downsampling.assumed: a training assumes no downsampling model; leave it out")
     check_metrics(settings.metrics)
-    for name in settings.logger:
+    for name, node in settings.logger.items():
         expect_installed(name)
+        for key, value in node.items():
+            if isinstance(value, str) and without_credentials(value) != value:
+                raise ConfigError(
+                    f"logger.{name}.{key}: expected an address without name and password, which the run's config.yaml "
+                    "would keep; the service reads them from the environment"
+                )
     check("trainer", settings.more_of_trainer)
     for group in ("callbacks", "logger"):
         for name, node in getattr(settings, group).items():
@@ -185,8 +192,6 @@ def _prepare(plain: Config, settings: TrainConfig, device: torch.device, devices
     last = folder / _LAST
     metrics = functools.partial(metric_collection, settings.metrics)
     module = _module(settings, net, data, metrics)
-    if last.parent.is_symlink():
-        raise ConfigError(f"{last.parent}: expected a directory of the run's own, got a link")
     tolerated = ("results_version", "scenes_version", "device") if "resume" in given_keys() else ()
     resume = last if last.is_file() and not settings.overwrite else None
     return _Prepared(device, data, module, identity, folder, resume, tolerated)

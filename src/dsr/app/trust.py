@@ -19,7 +19,7 @@ from omegaconf import OmegaConf
 
 from dsr.app.schema import Config, expect_name
 from dsr.utils.configuration import ConfigError, config_directories
-from dsr.utils.console import open_console, show
+from dsr.utils.console import open_console, show, without_credentials
 from dsr.utils.guards import TooLargeError, read_limited
 
 _LARGEST = 1 << 18
@@ -203,7 +203,7 @@ def _expect_own_log(path: Path, config: Config, trust: Trust) -> None:
             expect_name(place, str(value))
         if key[-1] == "tracking_uri" and not trust.anything and value != os.environ.get("MLFLOW_TRACKING_URI"):
             raise ConfigError(
-                f"{place}: expected no address to send the log to, got {value!r:.60}; "
+                f"{place}: expected no address to send the log to, got {without_credentials(str(value))!r:.60}; "
                 "if you trust it, trust=true or the same in $MLFLOW_TRACKING_URI allows it"
             )
 

@@ -14,6 +14,7 @@ from dsr.app.upsample.reporting import problem_line
 from dsr.app.upsample.stored import find_results, read_result
 from dsr.report.surface_page import Packed, is_view, pack_result, save_view
 from dsr.utils.console import ConsoleProgress, show
+from dsr.utils.files import expect_target
 from dsr.utils.progress import megabytes
 
 _WHOLE_PAGE = 6
@@ -33,6 +34,7 @@ def view(request: ViewRequest, console: Console) -> list[str]:
 
     """
     page = request.page or request.output / "view.html"
+    expect_target(page)
     if page.exists() and not (page.is_file() and is_view(page)):
         raise ValueError(f"{page}: is there already and no page of `dsr view`; take another -o")
     folders = find_results(request.output)

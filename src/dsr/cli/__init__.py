@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from dsr.cli.commands import DOCTOR, EXPORT, FUSE, REPORT, UPSAMPLE, VIEW, add_data_command, add_hydra_commands
 from dsr.cli.study import STUDY
 from dsr.data.download.collections import CATALOGUE, Collection
 from dsr.utils import interruption
-from dsr.utils.console import USAGE_ERROR, one_line, open_console, print_error
+from dsr.utils.console import USAGE_ERROR, one_line, open_console, print_error, printable
 from dsr.utils.files import FullDiskError
 
 _EXAMPLES = """\
@@ -69,6 +69,10 @@ class _Parser(argparse.ArgumentParser):
     def __init__(self, *arguments: Any, **named: Any) -> None:
         super().__init__(*arguments, **named)
         self.register("type", Path, _path)
+
+    def error(self, message: str) -> NoReturn:
+        """End with the usage and what is wrong, which repeats arguments, without an address's password."""
+        super().error(printable(message))
 
 
 def _path(text: str) -> Path:

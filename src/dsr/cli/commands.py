@@ -238,7 +238,8 @@ All data sets are below one directory: $DSR_DATA, or ./data.
 _GET_NOTES = """\
 Run the same command again to continue an interrupted download.
 
-The SHA-256 of a file is written into checksums.json when it is first downloaded; later downloads have to match it.
+A file has to have the SHA-256 that dsr knows. Where it knows none, that of the first download is written into
+checksums.json, and later ones have to match it; `dsr data list` shows which.
 
 A mirror has every file under the same path as below the directory of the data sets, and every archive in the folder
 of its data set:

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from dsr.data.download.collections import Collection, data_root, find
-from dsr.data.download.fetching import absent, get, state, verify
+from dsr.data.download.fetching import Server, absent, checksums_of, get, state, verify
 from dsr.utils.console import ConsoleProgress, show
 from dsr.utils.progress import megabytes
 
@@ -19,11 +19,12 @@ from dsr.utils.progress import megabytes
 def list_data_sets(_: argparse.Namespace, console: Console, catalogue: Mapping[str, Collection]) -> list[str]:
     """Show a table of the data sets."""
     table = Table(box=None, pad_edge=False)
-    for header in ("name", "what", "about", "here"):
+    for header in ("name", "what", "about", "here", "checksums"):
         table.add_column(header, overflow="fold", no_wrap=header != "what")
     for collection in catalogue.values():
         size = "" if collection.size is None else megabytes(collection.size)
-        table.add_row(collection.name, collection.title, size, state(collection, data_root()))
+        here, known = state(collection, data_root()), checksums_of(collection, data_root())
+        table.add_row(collection.name, collection.title, size, here, known)
     console.print(table, markup=False, highlight=False)
     return []
 
@@ -43,8 +44,8 @@ def show_folders(options: argparse.Namespace, console: Console, catalogue: Mappi
 def get_data_sets(options: argparse.Namespace, console: Console, catalogue: Mapping[str, Collection]) -> list[str]:
     """Show what will be downloaded and its licence, ask for confirmation on a terminal, and download it."""
     collections = find(options.names, catalogue)
-    if options.mirror is not None and not options.mirror.startswith(("http://", "https://")):
-        raise ValueError(f"--mirror: expected an address that begins with http:// or https://, got {options.mirror!r}")
+    if options.mirror is not None:
+        Server.of(options.mirror)  # is checked before anything is shown
     root, progress = data_root(), ConsoleProgress(console)
     items = {item.path: item for collection in collections for item in collection.items}
     missing = len(absent(items.values(), root))

@@ -60,8 +60,10 @@ def _collect(request: AnswersRequest, console: Console, _: object) -> list[str]:
     from dsr.report.study.answers import files_of, read_all  # noqa: PLC0415
     from dsr.report.study.key import KEY_NAME, read_key  # noqa: PLC0415
     from dsr.report.study.percentages import collect, remarks  # noqa: PLC0415
-    from dsr.utils.files import write_text  # noqa: PLC0415 - pandas takes a second to import
+    from dsr.utils.files import expect_target, write_text  # noqa: PLC0415 - pandas takes a second to import
 
+    path = request.output or request.study / "study.csv"
+    expect_target(path)
     key = read_key(request.study / KEY_NAME)
     files = files_of(request.answers)
     answers, left_out = read_all(files, key)
@@ -74,7 +76,6 @@ def _collect(request: AnswersRequest, console: Console, _: object) -> list[str]:
     _print(console, table)
     for line in remarks(answers, key):
         show(console, line)
-    path = request.output or request.study / "study.csv"
     write_text(path, table.to_csv(index=False, float_format="%.6g"))
     show(console, f"{path}  {len(answers)} of {len(files)} files count{', see above' if left_out else ''}")
     return []

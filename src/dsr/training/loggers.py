@@ -95,11 +95,14 @@ def wandb(
         mode: ``offline`` for local files alone, which ``wandb sync`` uploads later.
 
     Raises:
-        ValueError: wandb is not installed, or refuses to begin a run, such as without a login.
+        ValueError: wandb is not installed, or refuses to begin a run, such as without a login; or the run's directory
+            has settings of it, which may be a stranger's, and send the log and the login elsewhere.
 
     """
     expect_installed("wandb")
     folder = Path(save_dir)
+    if os.path.lexists(folder / "wandb" / "settings"):
+        raise ValueError(f"save_dir: expected no settings of wandb in the run's directory, got {folder}/wandb/settings")
     import wandb as client  # noqa: PLC0415 - optional
 
     if getattr(rank_zero_only, "rank", 0):  # the first process logs

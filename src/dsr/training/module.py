@@ -21,7 +21,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from dsr.geometry.shading import comparison
 from dsr.methods.networks.network import DisparityNetwork
-from dsr.methods.networks.weight_files import read_torch_file
+from dsr.methods.networks.weight_files import make_network
 from dsr.metrics.classes import compute_means, in_table_units, visual_metrics
 from dsr.metrics.functional import SurfacePair
 from dsr.sample import Unit
@@ -30,6 +30,7 @@ from dsr.training.degradation import Batch
 from dsr.training.loggers import log_picture
 from dsr.training.objective import Objective, to_depth
 from dsr.training.parts import node_of, partial_node_of, read_node
+from dsr.utils.torch_files import read_torch_file
 
 _RENDERED_SCENES = 4
 """Number of scenes of each validation set that are rendered for TensorBoard."""
@@ -316,6 +317,8 @@ class SuperResolution(lightning.LightningModule):
             if name in stored:
                 found, arguments = read_node(name, stored[name], kind)
                 try:
+                    if name == "net":
+                        make_network(Path(checkpoint_path), found, arguments)  # is not larger than the file
                     parts[name] = make(found, **arguments)
                 except TypeError as error:
                     raise ValueError(f"{checkpoint_path}: {name}: {error}") from error

@@ -16,7 +16,7 @@ from typing import Any
 
 import lightning
 import torch
-from lightning.pytorch.callbacks import Callback, Checkpoint
+from lightning.pytorch.callbacks import Callback, Checkpoint, EarlyStopping, ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from lightning.pytorch.trainer.states import TrainerFn
 from torch import Tensor
@@ -25,11 +25,14 @@ from dsr.utils import interruption
 from dsr.utils.configuration import ConfigError
 from dsr.utils.console import one_line
 from dsr.utils.files import replacing
+from dsr.utils.torch_files import read_torch_file
 
 PATIENCE = 10
 """Steps in a row without a finite loss and gradient after which a training that leaves them out has diverged."""
 _LOSS, _NORM, _SCORE = "train/loss", "train/gradient_norm", "val/RMSE_d"
 
+_LIGHTNINGS = (ModelCheckpoint, EarlyStopping)
+"""Callbacks that do not check what they restore."""
 _FILES = ("best_model_path", "kth_best_model_path", "last_model_path")
 """What Lightning's callback that keeps checkpoints says of files, beside ``best_k_models``."""
 
@@ -126,14 +129,82 @@ class CheckpointError(ConfigError):
 
 
 class Resumed(Callback):
-    """Tells whether a training has begun, that is, whether what it goes on from has been read."""
+    """Lets a training go on from a state of its own kind alone, and tells whether it has done a step since.
+
+    Lightning and torch take over what a checkpoint has as attributes of their objects. Of what a new training has, a
+    checkpoint may have other numbers, and nothing else: what is unknown is left out. Kernels that update some tensors
+    at once do not check sizes: they would write beyond averages that are smaller than their weights.
+    """
 
     def __init__(self) -> None:
         self.begun = False
 
-    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Note that it begins."""
+    def on_load_checkpoint(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        """Check the states of callbacks, loops, optimisers and schedules, before any is restored.
+
+        Raises:
+            ValueError: one is not of the training's kind.
+
+        """
+        made: Any = pl_module.configure_optimizers()
+        optimizer, schedule = (made["optimizer"], made["lr_scheduler"]) if isinstance(made, Mapping) else (made, None)
+        schedules = [] if schedule is None else [schedule["scheduler"].state_dict()]
+        [averages] = checkpoint["optimizer_states"]
+        checkpoint["optimizer_states"] = [_fitting(averages, _stepped(optimizer), "optimizer_states")]
+        checkpoint["lr_schedulers"] = _fitting(checkpoint["lr_schedulers"], schedules, "lr_schedulers")
+        loop = trainer.fit_loop.state_dict()
+        checkpoint["loops"] = {"fit_loop": _fitting(checkpoint["loops"]["fit_loop"], loop, "fit_loop")}
+        states = checkpoint["callbacks"]
+        own = {each.state_key: each for each in trainer.callbacks if each.state_key in states}  # type: ignore[attr-defined]
+        checkpoint["callbacks"] = {
+            key: _fitting(states[key], each.state_dict(), key) if isinstance(each, _LIGHTNINGS) else states[key]
+            for key, each in own.items()
+        }
+
+    def on_train_batch_end(self, *_: Any) -> None:
+        """Note that there was a step."""
         self.begun = True
+
+
+def _fitting(value: Any, own: Any, place: str) -> Any:
+    """Return of a state what a training's own one has, too; ValueError where that is of another kind or size."""
+    if isinstance(own, Mapping) and isinstance(value, Mapping):
+        known = own or dict.fromkeys(value)  # of what is empty at first, there may be any numbers
+        return {key: _fitting(each, known[key], f"{place}.{key}") for key, each in value.items() if key in known}
+    if isinstance(own, list | tuple) and isinstance(value, list | tuple) and len(value) == len(own):
+        return type(own)(_fitting(*each, place) for each in zip(value, own, strict=True))
+    if isinstance(own, Tensor):
+        fits = isinstance(value, Tensor) and value.shape == own.shape
+        fits = fits and value.is_floating_point() == own.is_floating_point()
+    elif isinstance(own, bool | str):
+        fits = isinstance(value, type(own)) or value is None
+    else:
+        number = isinstance(value, float) or _is_whole(value) or (isinstance(value, Tensor) and not value.dim())
+        fits = number if isinstance(own, float | int) else own is None and (number or isinstance(value, str | None))
+    if not fits:
+        raise ValueError(f"{place}: expected what {type(own).__name__} stands for, got {type(value).__name__}")
+    return value.contiguous() if isinstance(value, Tensor) else value
+
+
+def _stepped(optimizer: torch.optim.Optimizer) -> dict[str, Any]:
+    """Return an optimiser's state after a step with gradients of zero; its weights stay as they are."""
+    weights = [each for group in optimizer.param_groups for each in group["params"]]
+    before = [each.detach().clone() for each in weights]
+    for each in weights:
+        each.grad = torch.zeros_like(each)
+    optimizer.step(lambda: 0.0)
+    with torch.no_grad():
+        for each, values in zip(weights, before, strict=True):
+            each.copy_(values)
+            each.grad = None
+    return optimizer.state_dict()
+
+
+def _is_whole(value: Any) -> bool:
+    """Return whether a value is a whole number that 64 bits hold."""
+    return isinstance(value, int) and -(2**63) <= value < 2**63
 
 
 class OwnFiles(Callback):
@@ -255,7 +326,19 @@ class Interruption(Checkpoint):
 
 
 class AtomicCheckpoints(TorchCheckpointIO):
-    """Writes checkpoints atomically, so that none is truncated."""
+    """Writes checkpoints atomically, so that none is truncated, and reads plain values and tensors alone."""
+
+    def load_checkpoint(self, path: Any, *_: Any, **__: Any) -> dict[str, Any]:
+        """Return a training's checkpoint, on the CPU.
+
+        Raises:
+            ValueError: the file is damaged, holds other Python objects, or is none of a training.
+
+        """
+        content = read_torch_file(Path(path))
+        if not isinstance(content, dict) or not isinstance(content.get("callbacks"), dict):
+            raise ValueError(f"{path}: expected a checkpoint of a training")
+        return content
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
         """Write a checkpoint."""

@@ -7,6 +7,7 @@ import errno
 import functools
 import io
 import os
+import re
 import sys
 import threading
 import time
@@ -40,6 +41,10 @@ _LONG = 2.0
 terminal."""
 
 
+_CREDENTIALS = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*://)\S*@")
+"""An address up to its host; a password may have a slash or an @ that should be written %2F and %40."""
+
+
 def open_console() -> Console:
     """Return a console on stdout, wide enough for tables if that is not a terminal.
 
@@ -58,14 +63,14 @@ def show(console: Console, line: str) -> None:
 
 def print_error(message: str) -> None:
     """Print one line on stderr; of a very long message the beginning, which names the file or key, and the end."""
-    text = printable(shorten(" ".join(message.split())))
+    text = shorten(printable(" ".join(message.split())))
     print(f"error: {text}", file=sys.stderr, flush=True)  # noqa: T201
 
 
 @functools.cache
 def note_once(note: str) -> None:
     """Print a note on stderr, once in a process."""
-    print(f"note: {note}", file=sys.stderr)  # noqa: T201
+    print(f"note: {printable(note)}", file=sys.stderr)  # noqa: T201
 
 
 def shorten(text: str, most: int = _LONGEST) -> str:
@@ -77,11 +82,20 @@ def shorten(text: str, most: int = _LONGEST) -> str:
 
 
 def printable(text: str) -> str:
-    """Return a text without the characters that control a terminal or turn text, which names of files may have."""
+    """Return a text as everything is shown that commands say.
+
+    It is without the characters that control a terminal or turn text, which names of files may have, and without the
+    names and passwords of addresses, see :func:`without_credentials`.
+    """
     return "".join(
         "\N{REPLACEMENT CHARACTER}" if (category(each) == "Cc" and each != "\n") or each in _TURNING else each
-        for each in text
+        for each in without_credentials(text)
     )
+
+
+def without_credentials(text: str) -> str:
+    """Return a text with its addresses as ``https://host/path`` instead of ``https://name:password@host/path``."""
+    return _CREDENTIALS.sub(r"\1", text)
 
 
 def one_line(error: BaseException) -> str:

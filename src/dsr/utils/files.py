@@ -1,4 +1,8 @@
-"""Files written atomically, by temporary ones that name their process, and the error of a full disk."""
+"""Files written atomically, by temporary ones that name their process, and the errors of a full disk and of a target.
+
+A target is a plain file, or none yet: a device, a pipe, a socket or a link is never replaced. New files and directories
+have the permissions that the umask leaves.
+"""
 
 from __future__ import annotations
 
@@ -8,14 +12,16 @@ import functools
 import hashlib
 import os
 import re
+import secrets
 import shutil
 import socket
-import tempfile
+import stat
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+from dsr.utils.guards import path_within
 from dsr.utils.progress import megabytes
 
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
@@ -23,6 +29,82 @@ _LITTLE = 1 << 16
 """Free bytes of a device from which a failed writing is not blamed on it."""
 
 _TEMPORARY = re.compile(r"^\..*-(?P<machine>[0-9a-f]{6})-(?P<process>\d+)-[^-]{8}(\.[^.]*)?$")
+
+
+_KINDS = {
+    stat.S_IFBLK: "a device", stat.S_IFCHR: "a device", stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket",
+    stat.S_IFDIR: "a folder", stat.S_IFREG: "a file",
+}  # fmt: skip
+"""What may be in the place of what is to be written."""
+
+
+class TargetError(OSError):
+    """What is to be written would replace what is not of its kind: a device, a pipe, a socket, a link, a folder."""
+
+
+def obstacle(path: Path, *, folder: bool = False) -> str | None:
+    """Return what is in the place of a file, or of a folder, that is to be written, such as ``a device``.
+
+    Args:
+        path: where it is to be.
+        folder: whether it is a folder, which may be a link to one.
+
+    Returns:
+        None where there is nothing, or a plain file, or a folder.
+
+    """
+    try:
+        mode = path.lstat().st_mode
+    except (OSError, ValueError):  # told by what writes
+        return None
+    if stat.S_ISLNK(mode):
+        return None if folder and path.is_dir() else f"a link to {path.readlink()}"
+    return None if stat.S_IFMT(mode) == (stat.S_IFDIR if folder else stat.S_IFREG) else _KINDS.get(stat.S_IFMT(mode))
+
+
+def expect_target(path: Path, *, folder: bool = False) -> None:
+    """Check that a file, or a folder, can be written without replacing what is of another kind.
+
+    Raises:
+        TargetError: there is something else, see :func:`obstacle`.
+
+    """
+    found = obstacle(path, folder=folder)
+    if found is not None:
+        raise TargetError(f"{path}: expected a {'folder' if folder else 'file'} to write, got {found}")
+
+
+def expect_targets(folder: Path, names: Iterable[str]) -> None:
+    """Check files that are to be written into a folder, or below it, before the work that they are made of.
+
+    The folder may be a link to one; what is in it may not lead out of it.
+
+    Raises:
+        TargetError: something else is in the place of one.
+        OutsideError: one would be outside of the folder.
+
+    """
+    expect_target(folder, folder=True)
+    for name in names:
+        path = folder / name
+        expect_target(path, folder=path.is_dir() and not path.is_symlink())
+        path_within(folder, name, folder)
+
+
+def expect_own(folder: Path) -> None:
+    """Check that nothing in a folder leads out of it, or is no file, as files in it will be replaced and removed.
+
+    Raises:
+        TargetError: there is a link out of it, a device, a pipe or a socket.
+
+    """
+    real = os.path.realpath(folder)
+    for place, folders, names in os.walk(folder):
+        for path in (Path(place, name) for name in (*folders, *names)):
+            found = obstacle(path)
+            within = path.is_symlink() and Path(os.path.realpath(path)).is_relative_to(real)
+            if found not in (None, "a folder") and not within:
+                raise TargetError(f"{path}: expected a file or a folder of the directory's own, got {found}")
 
 
 class FullDiskError(Exception):
@@ -99,12 +181,26 @@ def temporary_folder(folder: Path, name: str) -> Iterator[Path]:
     with space_for(folder / name):
         folder.mkdir(parents=True, exist_ok=True)
         remove_abandoned(folder)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{name}-{owner()}-", dir=folder))
+        temporary = _new(folder / f".{name}-{owner()}-", "", Path.mkdir)
     try:
         with space_for(folder / name):
             yield temporary
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _new(beginning: Path, suffix: str, make: Callable[[Path], object]) -> Path:
+    """Make a file or directory of a new name, with the permissions that the umask leaves, unlike :mod:`tempfile`."""
+    while True:
+        path = beginning.with_name(f"{beginning.name}{secrets.token_hex(4)}{suffix}")
+        with contextlib.suppress(FileExistsError):
+            make(path)
+            return path
+
+
+def _create(path: Path) -> None:
+    """Make an empty file where there is nothing."""
+    path.touch(exist_ok=False)
 
 
 @functools.cache
@@ -163,17 +259,20 @@ def replacing(path: Path) -> Iterator[Path]:
 
     The directory is created if it does not exist. After an error or an interruption the temporary file is deleted; one
     that a killed process has left is deleted the next time that a file is written in its directory.
+
+    Raises:
+        TargetError: ``path`` is a device, a pipe, a socket, a link or a folder.
+
     """
+    expect_target(path)
     with space_for(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         remove_abandoned(path.parent)
-        handle, name = tempfile.mkstemp(prefix=f".{path.stem}-{owner()}-", suffix=path.suffix, dir=path.parent)
-    os.close(handle)
-    temporary = Path(name)
+        temporary = _new(path.with_name(f".{path.stem}-{owner()}-"), path.suffix, _create)
     try:
         with space_for(path):
             yield temporary
-            temporary.chmod(0o644)
+            expect_target(path)  # what has come there meanwhile
             temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -181,10 +280,19 @@ def replacing(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def replacing_folder(path: Path) -> Iterator[Path]:
-    """Yield a temporary directory beside ``path`` that replaces it when the block ends without error."""
+    """Yield a temporary directory beside ``path`` that replaces it when the block ends without error.
+
+    Where ``path`` is a link to a directory, that one is replaced, and the link stays.
+
+    Raises:
+        TargetError: ``path`` is a file, a device, a pipe, a socket or a link to nothing.
+
+    """
+    expect_target(path, folder=True)
+    path = path.resolve()
     with temporary_folder(path.parent, path.name) as temporary:
         yield temporary
-        temporary.chmod(0o755)
+        expect_target(path, folder=True)
         with temporary_folder(path.parent, path.name) as old:
             if path.exists():
                 path.replace(old / path.name)

@@ -28,6 +28,8 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Any, NoReturn
 
+from dsr.utils import surroundings
+
 MESSAGE = "interrupted; what is finished is kept, the same command goes on from there"
 """The line of an interrupted command that has nothing more precise to say."""
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -92,11 +94,14 @@ class _State:
 def start(module: str, function: str) -> NoReturn:
     """Import a function, call it, and end the process with its exit code, or with that of an interruption.
 
+    The working directory has no say in what is imported, see :mod:`dsr.utils.surroundings`.
+
     Args:
         function: name of its function; it takes no arguments, and returns an exit code, or None for 0.
 
     """
     install()
+    surroundings.close()
     code: object = 0
     try:
         code = getattr(importlib.import_module(module), function)()

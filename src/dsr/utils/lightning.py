@@ -18,7 +18,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.plugins.environments import ClusterEnvironment, LightningEnvironment
 
 from dsr.utils import interruption
-from dsr.utils.checkpoints import AtomicCheckpoints, CheckpointError, Interruption, Resumed
+from dsr.utils.checkpoints import AtomicCheckpoints, CheckpointError, DivergenceError, Interruption, Resumed
 from dsr.utils.configuration import ConfigError
 from dsr.utils.files import FullDiskError, replacing, space_for
 from dsr.utils.progress import Progress, Task
@@ -30,6 +30,8 @@ _SECONDS_BETWEEN_LOSSES = 0.2
 """Between two losses that are fetched from the device to be shown, each of which waits for it."""
 
 
+_NOT_OF_A_CHECKPOINT = (OSError, FullDiskError, ConfigError, DivergenceError, MemoryError, torch.OutOfMemoryError)
+"""Errors of a training's first step that the checkpoint that it went on from has no part in."""
 _LOST = ("Connection closed", "Connection reset", "Broken pipe")
 """What gloo says when another process is gone."""
 
@@ -279,7 +281,7 @@ def fit(
             if any(each.requested for each in trainer.callbacks if isinstance(each, Interruption)):  # type: ignore[attr-defined]
                 raise KeyboardInterrupt from error  # the first process has saved the step
             raise LostProcessError(error) from error
-        if resume is None or resumed.begun or isinstance(error, OSError | FullDiskError):
+        if resume is None or resumed.begun or isinstance(error, _NOT_OF_A_CHECKPOINT):
             raise
         raise CheckpointError(resume, error) from error
     finally:
@@ -338,6 +340,7 @@ def without_chatter() -> Iterator[None]:
             for resumed in ("exists and is not empty", "that ended before the epoch ended", "dirpath has changed"):
                 warnings.filterwarnings("ignore", f".*{resumed}.*")
             warnings.filterwarnings("ignore", ".*`srun` command is available.*")  # a sweep's or a login node's Slurm
+            warnings.filterwarnings("ignore", ".*callbacks used to create the checkpoint.*")  # shows a stranger's names
             warnings.filterwarnings("ignore", ".*LeafSpec.*", FutureWarning)
             warnings.filterwarnings("ignore", ".*LeafSpec.*", DeprecationWarning)
             yield

@@ -26,8 +26,11 @@ import math
 from argparse import SUPPRESS, ArgumentParser, Namespace
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import MISSING, dataclass, field, fields
+from pathlib import Path
 from types import EllipsisType, NoneType
 from typing import Any, Literal, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
+
+from dsr.utils.files import obstacle
 
 _KEY = "option"
 
@@ -98,6 +101,7 @@ class _Option(NamedTuple):
     alone: str
     repeated: bool
     recorded: bool
+    writes: str
 
 
 def option(
@@ -111,6 +115,7 @@ def option(
     alone: str = "",
     repeated: bool = False,
     recorded: bool = True,
+    writes: Literal["", "file", "folder"] = "",
 ) -> Any:
     """Return a dataclass field that is an option.
 
@@ -124,9 +129,11 @@ def option(
         alone: options of a record with the same word here exclude each other.
         repeated: whether the option is given once for each value.
         recorded: whether results depend on it, see :func:`recorded`.
+        writes: what is written to the path that it is; nothing of another kind may be there, see
+            :func:`dsr.utils.files.obstacle`.
 
     """
-    metadata = {_KEY: _Option(help, metavar, flags, rule, parse, alone, repeated, recorded)}
+    metadata = {_KEY: _Option(help, metavar, flags, rule, parse, alone, repeated, recorded, writes)}
     return field(metadata=metadata) if isinstance(default, EllipsisType) else field(default=default, metadata=metadata)
 
 
@@ -214,7 +221,13 @@ class Options:
         """
         for each in _stated(type(self)):
             value, rule = getattr(self, each.name), each.rule
-            if rule is None or value is None:
+            if value is None:
+                continue
+            if each.option is not None and each.option.writes:
+                found = obstacle(Path(value).expanduser(), folder=each.option.writes == "folder")
+                if found is not None:
+                    raise OptionError(each.name, f"expected a {each.option.writes} to write, got {found}: {value}")
+            if rule is None:
                 continue
             for one in value if rule.each else (value,):
                 if not rule.holds(one):

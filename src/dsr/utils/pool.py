@@ -22,7 +22,7 @@ from typing import Any, Generic, Literal, Self, TypeVar, cast
 import cv2
 import torch
 
-from dsr.utils import interruption
+from dsr.utils import interruption, surroundings
 
 _T = TypeVar("_T")
 _R = TypeVar("_R")
@@ -225,6 +225,7 @@ def _serve(connection: Connection, parent: int, plan: tuple[Any, ...] | None) ->
     """Work on items in a worker, until it is terminated."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # a fork has its parent's handler
     interruption.end_with(parent)
+    surroundings.close_to_settings()
     with contextlib.suppress(EOFError):  # the parent was interrupted
         work, prepare, arguments, threads = connection.recv() if plan is None else plan
         if plan is None:

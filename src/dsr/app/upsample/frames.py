@@ -8,6 +8,7 @@ from pathlib import Path
 from dsr.app.upsample.request import FrameChoice, UpsampleRequest
 from dsr.io.layouts import find_pairs_of_folder
 from dsr.io.pairs import Pair, PairingResult, add_confidence, find_pairs_of_lists, in_order
+from dsr.utils.guards import path_within
 
 
 @dataclass(frozen=True)
@@ -26,8 +27,8 @@ class Frames:
     single: bool
 
     def target(self, output: Path, pair: Pair) -> Path:
-        """Return the folder of a frame's results."""
-        return output if self.single else output / pair.name
+        """Return the folder of a frame's results; OutsideError if a link leads it out of that of all."""
+        return output if self.single else path_within(output, pair.name, output)
 
 
 def find_frames(request: UpsampleRequest) -> Frames:

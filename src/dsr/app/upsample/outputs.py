@@ -21,7 +21,7 @@ from dsr.io.inputs import Picture
 from dsr.methods.base import Surface
 from dsr.sample import FARTHEST, NEAREST
 from dsr.utils.arrays import open_array
-from dsr.utils.files import write_text
+from dsr.utils.files import expect_targets, write_text
 from dsr.utils.guards import parse_json, read_limited
 
 INFO = "info.json"
@@ -98,7 +98,7 @@ def read_previous_run(folder: Path) -> PreviousRun | None:
 
 
 def expect_free(folder: Path, inputs: Iterable[Path], *, ours: bool) -> None:
-    """Check that a result would not overwrite its input, or files that no earlier run wrote.
+    """Check that a result would not overwrite its input, or files that no earlier run wrote, or what is no file.
 
     Args:
         folder: the result's folder.
@@ -106,9 +106,11 @@ def expect_free(folder: Path, inputs: Iterable[Path], *, ours: bool) -> None:
         ours: whether existing results may be replaced.
 
     Raises:
-        ValueError: it would overwrite one of them.
+        ValueError: it would overwrite one of them, or a file outside of the folder.
+        TargetError: a link, a device, a pipe or a socket is in the place of one.
 
     """
+    expect_targets(folder, (*FILES, INFO))
     there = [folder / name for name in (*FILES, INFO) if (folder / name).exists()]
     for path in there:
         if any(path.samefile(other) for other in inputs):

@@ -281,7 +281,7 @@ def _words(text: str) -> tuple[str, ...]:
 class Results(Options):
     """What is written, and where."""
 
-    output: Path = option(..., "folder of the results", "OUT", flags="-o --output", recorded=False)
+    output: Path = option(..., "folder of the results", "OUT", flags="-o --output", recorded=False, writes="folder")
     format: str | None = option(
         None, f"of the depth: {', '.join(FORMATS)} (the input's)", "FORMAT", rule=one_of(FORMATS)
     )

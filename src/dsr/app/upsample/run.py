@@ -12,11 +12,11 @@ from rich.console import Console
 from dsr.app.upsample.frames import Frames, find_frames
 from dsr.app.upsample.reporting import Reporter, listed
 from dsr.app.upsample.request import UpsampleRequest
-from dsr.app.upsample.scene import write_scene
+from dsr.app.upsample.scene import EXPORTS, write_scene
 from dsr.app.upsample.workers import work_through
 from dsr.io.reading import Shard
 from dsr.utils.console import ConsoleProgress, show
-from dsr.utils.files import write_text
+from dsr.utils.files import expect_targets, write_text
 
 
 def run(request: UpsampleRequest, console: Console) -> list[str]:
@@ -30,12 +30,15 @@ def run(request: UpsampleRequest, console: Console) -> list[str]:
         The problems, one line each; empty if there were none.
 
     Raises:
-        ValueError: the pairs cannot be determined.
+        ValueError: the pairs cannot be determined, or a file would be written outside of the folder of results.
+        TargetError: a link, a device, a pipe or a socket is in the place of a file.
 
     """
     frames, wanted, shard = find_frames(request), request.results, request.frames.shard
     started = time.perf_counter()
     found, single = frames.found, frames.single
+    of_all = [] if shard is not None else [*(name for part in wanted.of_all for name in part.files), EXPORTS]
+    expect_targets(wanted.output, of_all if shard is None else [_summary_of(shard)])
     _show_found(console, request, frames)
     reporter, progress = Reporter(console), ConsoleProgress(console)
     problems: dict[str, list[str]] = {}
@@ -72,7 +75,12 @@ def _write_summary(
     """Write how many frames of a shard have which outcome, and those that failed, into the folder of the results."""
     failed = [{"problem": problem, "frames": names} for problem, names in problems.items()]
     summary = {"shard": str(shard), "outcomes": outcomes, "failed": failed, "seconds": round(seconds, 3)}
-    write_text(output / f"shard-{shard.number}-of-{shard.count}.json", json.dumps(summary, indent=2) + "\n")
+    write_text(output / _summary_of(shard), json.dumps(summary, indent=2) + "\n")
+
+
+def _summary_of(shard: Shard) -> str:
+    """Return the name of the summary of a shard."""
+    return f"shard-{shard.number}-of-{shard.count}.json"
 
 
 def _show_found(console: Console, request: UpsampleRequest, frames: Frames) -> None:

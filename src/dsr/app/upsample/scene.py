@@ -14,7 +14,8 @@ from dsr.io.scene_files import RGBD, Frame, parse_pose
 from dsr.utils.files import write_text
 from dsr.utils.guards import parse_json, path_within, read_limited
 
-_RECORD = "exports.json"
+EXPORTS = "exports.json"
+"""The record of exports, in the folder of the results."""
 
 
 @dataclass
@@ -62,7 +63,7 @@ def write_scene(output: Path, folders: Mapping[str, Path], parts: Sequence[Part]
             if old.split("/")[0] == name:
                 (output / old).unlink(missing_ok=True)
         recorded[name] = sorted(file.relative_to(output).as_posix() for file in files)
-        write_text(output / _RECORD, json.dumps({"exports": recorded}, indent=2) + "\n")
+        write_text(output / EXPORTS, json.dumps({"exports": recorded}, indent=2) + "\n")
         result.files[part.name] = path
     return result
 
@@ -101,7 +102,7 @@ def expect_distinct(frames: Sequence[Frame]) -> None:
 
 def _read_record(output: Path) -> dict[str, list[str]]:
     """Return the exports of earlier runs, with their files."""
-    path = output / _RECORD
+    path = output / EXPORTS
     if not path.is_file():
         return {}
     try:

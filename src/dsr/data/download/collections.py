@@ -87,10 +87,22 @@ class Collection:
         return (self.manual or "").format(folder=root / self.folders[0])
 
 
+_PINNED = {
+    path: digest
+    for digest, _, path in (
+        line.partition("  ") for line in Path(__file__).with_name("pinned.sha256").read_text("utf-8").splitlines()
+    )
+}
+"""SHA-256 of files that never change, by their paths, as ``sha256sum`` writes them.
+
+Those are files of a commit of git, whose number vouches for their content; they were computed from these commits.
+"""
+
+
 def _levels(folder: str, source: str, names: Sequence[str], spelling: str) -> tuple[Item, ...]:
     """Return the photos and maps of an 8-bit benchmark."""
     paths = [path for name in names for path in (f"RGB/{name}_{spelling}_color.png", f"Depth/{name}_output_depth.png")]
-    return tuple(Item(f"{folder}/{path}", (f"{_DCTNET_FILES}/{source}/{path}",)) for path in paths)
+    return _of_commit(folder, f"{_DCTNET_FILES}/{source}", paths)
 
 
 def _ddrnet() -> tuple[Item, ...]:
@@ -98,7 +110,12 @@ def _ddrnet() -> tuple[Item, ...]:
     frames = [f"20170907/group1/{{}}/frame_{number:06d}.png" for number in range(1, 21)]
     frames += [f"20170907/group2/{{}}/frame_{number:06d}.png" for number in range(1, 3)]
     paths = [frame.format(folder) for frame in frames for folder in _DDRNET_FOLDERS]
-    return tuple(Item(f"ddrnet/{path}", (f"{_DDRNET_FILES}/{path}",)) for path in paths)
+    return _of_commit("ddrnet", _DDRNET_FILES, paths)
+
+
+def _of_commit(folder: str, base: str, paths: Sequence[str]) -> tuple[Item, ...]:
+    """Return files of a commit, whose checksums are pinned."""
+    return tuple(Item(f"{folder}/{path}", (f"{base}/{path}",), sha256=_PINNED[f"{folder}/{path}"]) for path in paths)
 
 
 FIELD = (

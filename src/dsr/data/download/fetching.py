@@ -17,12 +17,13 @@ import stat
 import tarfile
 import zipfile
 import zlib
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import IO, Any, NamedTuple
-from urllib.parse import urlsplit
+from urllib.parse import unquote, urlsplit
 
 import requests
 from filelock import FileLock, Timeout
@@ -32,7 +33,7 @@ from urllib3.exceptions import HTTPError
 
 from dsr.data.download.collections import Collection, Item
 from dsr.utils.console import one_line
-from dsr.utils.files import FullDiskError, expect_space, space_for, temporary_folder, write_text
+from dsr.utils.files import FullDiskError, expect_space, expect_target, space_for, temporary_folder, write_text
 from dsr.utils.guards import leads_outside, natural_key, opened, parse_json, read_limited, refusing
 from dsr.utils.progress import Progress, Task, megabytes
 from dsr.utils.versions import file_hash
@@ -167,6 +168,7 @@ def get(
     Args:
         items: what to fetch; a path that occurs twice is fetched once.
         mirror: address of a server to try first; it has each file under its path below the directory of the data sets.
+            A name and a password in it, ``https://name:password@host``, are sent, and neither shown nor stored.
         accept_changed: whether a file may have another checksum than recorded.
         keep_archives: whether archives stay after they were unpacked; those that were there before do anyway.
 
@@ -174,13 +176,15 @@ def get(
         What could not be had and why, a line each; the others are there. A full disk ends it.
 
     Raises:
-        ValueError: ``checksums.json`` is damaged, or another command is writing into ``root``.
+        ValueError: ``checksums.json`` is damaged, another command is writing into ``root``, or the mirror is no
+            address.
 
     """
     problems: list[str] = []
+    server = None if mirror is None else Server.of(mirror)
     root.mkdir(parents=True, exist_ok=True)
     with lock_directory(root):
-        job = _Job(root, Checksums(root), progress, mirror, accept_changed, keep_archives)
+        job = _Job(root, Checksums(root), progress, server, accept_changed, keep_archives)
         for item in {item.path: item for item in items}.values():
             try:
                 job.get(item)
@@ -191,6 +195,35 @@ def get(
     return problems
 
 
+_Credentials = tuple[bytes, bytes] | None
+"""A name and a password, as they are sent."""
+
+
+class Server(NamedTuple):
+    """A server, and apart from its address the credentials, so that none is in a message or a file."""
+
+    address: str
+    credentials: _Credentials
+
+    @classmethod
+    def of(cls, given: str) -> Server:
+        """Return the server of an address, which may have a name and a password.
+
+        Raises:
+            ValueError: it is no address, or has an @ in its path; the message is without name and password.
+
+        """
+        scheme, _, rest = given.partition("://")
+        before, at, place = rest.rpartition("@")
+        address = f"{scheme}://{place}".rstrip("/") if place else given
+        if scheme.lower() not in ("http", "https") or not urlsplit(address).netloc:
+            raise ValueError(f"--mirror: expected an address that begins with http:// or https://, got {address!r}")
+        if "/" in before:
+            raise ValueError(f"--mirror: expected @ and / as %40 and %2F in an address with a password, got {place!r}")
+        name, _, password = before.partition(":")
+        return cls(address, (unquote(name).encode(), unquote(password).encode()) if at else None)
+
+
 @dataclass(frozen=True)
 class _Job:
     """Fetching, with the arguments of :func:`get`."""
@@ -198,7 +231,7 @@ class _Job:
     root: Path
     checksums: Checksums
     progress: Progress
-    mirror: str | None
+    mirror: Server | None
     accept_changed: bool
     keep_archives: bool
 
@@ -234,22 +267,26 @@ class _Job:
 
     def _fetch(self, item: Item) -> str:
         """Download a file from the first address that has it, and return its checksum."""
-        mirror = () if self.mirror is None else (f"{self.mirror.rstrip('/')}/{item.path}",)
+        sources: list[tuple[str, _Credentials]] = [(url, None) for url in item.urls]
+        if self.mirror is not None:
+            sources.insert(0, (f"{self.mirror.address}/{item.path}", self.mirror.credentials))
         problems = []
-        for url in (*mirror, *item.urls):
+        for url, credentials in sources:
             try:
-                return self._fetch_from(url, item)
+                return self._fetch_from(url, item, credentials)
             except ValueError as error:
                 problems.append(str(error))
         raise ValueError("; ".join(dict.fromkeys(problems)))
 
-    def _fetch_from(self, url: str, item: Item) -> str:
+    def _fetch_from(self, url: str, item: Item, credentials: _Credentials) -> str:
         """Download a file, check it, put it in place, and return its checksum."""
         target = self.root / item.path
         address, _, member = url.partition("#")
         part = target.with_name(f"{target.name}{'.zip' * bool(member)}.part")
+        for path in (target, part):
+            expect_target(path)
         with self.progress.task(item.path, unit="bytes") as moved:
-            _download(address, part, moved, 0.0 if item.unpack_to is None else _UNPACKED)
+            _download(address, part, moved, 0.0 if item.unpack_to is None else _UNPACKED, credentials)
         new = part.with_suffix(".member") if member else part
         try:
             if member:
@@ -269,19 +306,22 @@ class _Job:
         expected, digest = item.sha256 or (entry and entry.sha256), file_hash(path)
         if expected not in (None, digest):
             raise ValueError(
-                f"{source}: expected sha256 {expected} as recorded in {self.checksums.path}, got {digest}; "
+                f"{source}: expected sha256 {expected}, which dsr knows, got {digest}"
+                if item.sha256 is not None
+                else f"{source}: expected sha256 {expected} as recorded in {self.checksums.path}, got {digest}; "
                 "if the new one is right, --accept-changed takes it"
             )
         return digest
 
 
-def _download(url: str, part: Path, moved: Task, room: float) -> None:
+def _download(url: str, part: Path, moved: Task, room: float, credentials: _Credentials = None) -> None:
     """Download a file, from where ``part`` ends on if the server can; a note beside it says of which version it is.
 
     ``room`` is how much more must be free on the disk afterwards, as a multiple of the file's size.
     """
     part.parent.mkdir(parents=True, exist_ok=True)
     with requests.Session() as session:
+        session.auth = credentials
         for scheme in ("http://", "https://"):
             session.mount(scheme, HTTPAdapter(max_retries=RETRIES))
         while True:
@@ -495,6 +535,27 @@ def state(collection: Collection, root: Path) -> str:
     if there in (0, len(collection.items)):
         return "complete" if there else "absent"
     return f"partial {there} of {len(collection.items)}"
+
+
+def checksums_of(collection: Collection, root: Path) -> str:
+    """Return where the checksums are from that a collection's files have to have.
+
+    Returns:
+        ``pinned`` for those that dsr knows, ``noted`` for those that were written down when the files first came,
+        ``unknown`` for those that will be, and how many there are of each where there are several kinds.
+
+    Raises:
+        ValueError: ``checksums.json`` is damaged.
+
+    """
+    recorded = {name for name, entry in Checksums(root).items() if entry.sha256 is not None}
+    if not collection.items:
+        return "noted" if any(name.startswith(f"{collection.folders[0]}/") for name in recorded) else "unknown"
+    kinds = Counter(
+        "pinned" if item.sha256 is not None else "noted" if item.path in recorded else "unknown"
+        for item in {item.path: item for item in collection.items}.values()
+    )
+    return next(iter(kinds)) if len(kinds) == 1 else ", ".join(f"{count} {kind}" for kind, count in kinds.items())
 
 
 def absent(items: Iterable[Item], root: Path) -> list[Item]:

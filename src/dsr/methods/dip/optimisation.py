@@ -22,6 +22,7 @@ from dsr.methods.dip.skip_net import Padding, SkipNet, levels_for
 from dsr.methods.dip.stopping import Stopping
 from dsr.metrics.classes import compute_means, in_table_units
 from dsr.metrics.functional import SurfacePair, rmse_v
+from dsr.utils.torch_files import read_torch_file
 
 _NOISE_CHANNELS = 32
 _LARGEST_RATE = 1e36
@@ -264,7 +265,7 @@ def checkpoint_of(path: Path, origin: str) -> Path | None:
     if not path.is_file():
         return None
     try:
-        stored = torch.load(path, map_location="cpu", weights_only=True).get("origin")
-    except Exception:
+        stored = read_torch_file(path).get("origin")
+    except (ValueError, AttributeError, OSError):
         return None
     return path if stored == origin else None

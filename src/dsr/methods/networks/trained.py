@@ -27,9 +27,10 @@ from dsr.methods.networks.msg_net import MSGNet, VariantName
 from dsr.methods.networks.network import DisparityNetwork, NetworkUpsampler, Precision
 from dsr.methods.networks.pdn import PrimalDualNetwork
 from dsr.methods.networks.sparse_to_dense import SparseToDense
-from dsr.methods.networks.weight_files import is_dsr_weights, load_network, load_parameters, read_torch_file
+from dsr.methods.networks.weight_files import is_dsr_weights, load_network, load_parameters
 from dsr.utils.guards import MOST_FILE, read_limited
 from dsr.utils.ratios import SCALES
+from dsr.utils.torch_files import read_torch_file
 
 TORCH_MAGIC = (b"PK\x03\x04", b"\x80")
 PARTS = ("conv.weight", "conv.bias", "activation.weight")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from dsr.methods.networks.network import DisparityNetwork
-from dsr.utils.guards import expect_bytes, expect_stored, opened, parse_json
+from dsr.utils.guards import expect_bytes, opened, parse_json
 
 FORMAT = "dsr-network-1"
 _KEY = "dsr"
@@ -128,7 +127,7 @@ def load_network(
         kind, arguments = networks[header["network"]], dict(header["arguments"])
         if scale is not None and kind.serves(arguments["scale"], scale):
             arguments["scale"] = scale
-        net = _make(path, kind, arguments, _beside(path, header, _SHARED))
+        net = make_network(path, kind, arguments, _beside(path, header, _SHARED))
     except (KeyError, TypeError, ValueError) as error:
         names = ", ".join(networks)
         raise ValueError(
@@ -181,10 +180,15 @@ def _beside(path: Path, header: Mapping[str, Any], key: str) -> Path | None:
     return other
 
 
-def _make(
-    path: Path, kind: type[DisparityNetwork], arguments: Mapping[str, Any], shared: Path | None
+def make_network(
+    path: Path, kind: type[DisparityNetwork], arguments: Mapping[str, Any], shared: Path | None = None
 ) -> DisparityNetwork:
-    """Return a network without values, or one of the user's with random ones, which may need them as it is made."""
+    """Return a network without values, or one of the user's with random ones, which may need them as it is made.
+
+    Raises:
+        ValueError: it would be larger than the file that names its arguments, with the one that it shares layers of.
+
+    """
     if any(isinstance(value, int) and abs(value) > _LARGEST_ARGUMENT for value in arguments.values()):
         raise ValueError(f"{path}: expected sizes of a network of at most {_LARGEST_ARGUMENT}")
     if kind.__module__.partition(".")[0] != __name__.partition(".")[0]:
@@ -203,44 +207,6 @@ def _read_tensors(path: Path) -> dict[str, Tensor]:
         return dict(safetensors.torch.load(path.read_bytes()))
     except Exception as error:  # the library names no set of errors for damaged files
         raise ValueError(f"{path}: expected a safetensors file, got a damaged one ({type(error).__name__})") from error
-
-
-def read_torch_file(path: Path) -> Any:
-    """Return the content of a torch file of plain values and tensors, on the CPU; no code in it is executed.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is damaged or holds other Python objects.
-
-    """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such weights file")
-    try:
-        expect_stored(path)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # on files that it then refuses
-            content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch names no set of errors for damaged files
-        raise ValueError(
-            f"{path}: expected a torch file of plain tensors, got one that is damaged or holds other Python objects, "
-            f"which are never loaded ({type(error).__name__})"
-        ) from error
-    _expect_plain_tensors(path, content)
-    return content
-
-
-def _expect_plain_tensors(path: Path, content: Any) -> None:
-    """Refuse a file with a tensor without values (of the device ``meta``), or one that is sparse or quantised."""
-    todo, seen = [content], set()
-    while todo:
-        value = todo.pop()
-        if isinstance(value, Tensor):
-            if value.is_meta or value.layout != torch.strided or value.is_quantized:
-                what = "one without values" if value.is_meta else f"one of {value.layout}, {value.dtype}"
-                raise ValueError(f"{path}: expected a torch file of plain tensors, got {what}")
-        elif isinstance(value, (Mapping, list, tuple)) and id(value) not in seen:
-            seen.add(id(value))
-            todo += value.values() if isinstance(value, Mapping) else value
 
 
 def load_parameters(net: nn.Module, tensors: Mapping[str, Tensor], path: Path, expected: str) -> None:

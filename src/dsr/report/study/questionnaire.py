@@ -21,7 +21,7 @@ from dsr.pictures.depth_views import rendering
 from dsr.report.html_page import asset, fill, json_text, policy
 from dsr.report.study.choice import Choice
 from dsr.report.study.key import KEY_NAME, PAGE_VERSION, Candidate, Key, Trial, read_key, write_key
-from dsr.utils.files import write_text
+from dsr.utils.files import expect_targets, write_text
 from dsr.utils.progress import SILENT, Progress
 from dsr.utils.ratios import as_ratio
 
@@ -88,9 +88,11 @@ def build_study(
     Raises:
         ValueError: nothing is left to compare, the choice names a value that no run has, a file is damaged, the title
             contains the name of a method, or the directory holds another study.
+        TargetError: a link, a device, a pipe or a socket is in the place of the key or the page.
 
     """
     choice = choice or Choice()
+    expect_targets(folder, (KEY_NAME, PAGE_NAME))
     questions, notes = _questions(results, choice)
     labels = {run.label for question in questions for run in question.runs}
     _expect_blind(choice, labels)

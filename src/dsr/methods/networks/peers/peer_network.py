@@ -26,10 +26,11 @@ from dsr.methods.classical.finite_differences import LUMA
 from dsr.methods.inpainting import inpaint
 from dsr.methods.networks.network import DTYPES, Precision
 from dsr.methods.networks.normalisation import compute_min_max, normalise
-from dsr.methods.networks.weight_files import load_parameters, read_torch_file
+from dsr.methods.networks.weight_files import load_parameters
 from dsr.methods.tiling import TILE, UNTILED, AxisTile, blend_tiles, split_axis
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
+from dsr.utils.torch_files import read_torch_file
 
 _PARALLEL = "module."
 """Prefix of the names in files of networks that were trained on several GPUs."""

@@ -1,0 +1,57 @@
+"""Torch's own files, of weights and checkpoints: plain values and tensors, and never more than the file holds."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dsr.utils.guards import expect_stored
+
+
+def read_torch_file(path: Path) -> Any:
+    """Return the content of a torch file of plain values and tensors, on the CPU; no code in it is executed.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is damaged or holds other Python objects.
+
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such weights file")
+    try:
+        expect_stored(path)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # on files that it then refuses
+            content = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch names no set of errors for damaged files
+        raise ValueError(
+            f"{path}: expected a torch file of plain tensors, got one that is damaged or holds other Python objects, "
+            f"which are never loaded ({type(error).__name__})"
+        ) from error
+    _expect_plain_tensors(path, content)
+    return content
+
+
+def _expect_plain_tensors(path: Path, content: Any) -> None:
+    """Refuse a file with a tensor without values of its own.
+
+    That is one of the device ``meta``, one that is sparse or quantised, or one that repeats values: a few bytes would
+    become gigabytes with the first sum.
+    """
+    todo, seen = [content], set()
+    while todo:
+        value = todo.pop()
+        if isinstance(value, Tensor):
+            if value.is_meta or value.layout != torch.strided or value.is_quantized:
+                what = "one without values" if value.is_meta else f"one of {value.layout}, {value.dtype}"
+                raise ValueError(f"{path}: expected a torch file of plain tensors, got {what}")
+            if value.numel() * value.element_size() > value.untyped_storage().nbytes():
+                raise ValueError(f"{path}: expected a torch file of plain tensors, got one that repeats values")
+        elif isinstance(value, (Mapping, list, tuple)) and id(value) not in seen:
+            seen.add(id(value))
+            todo += value.values() if isinstance(value, Mapping) else value
