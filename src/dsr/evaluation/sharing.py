@@ -1,11 +1,13 @@
 """The scenes of a run, worked through by several processes, each scene by one: of this command, and of others.
 
 ``.claims/`` in that directory exists while one of them is at work. Each command has a file of a member there, which
-says with which settings it works; those with others are refused until it has left or is gone. A claim is a file that only one process can create;
-it names the machine, the process and when that was started, and its time of modification is kept fresh. A claim is over
-when it is deleted, when its process is gone from the same machine, or when it has not been refreshed for :data:`LOST`
-seconds. It is then taken over by a claim of the next number, which again only one process can create, so that no
-deletion can meet a newer claim. What has been found out under a claim can be left for the others as a record.
+says with which settings it works; those with others are refused until it has left or is gone.
+
+A claim is a file that only one process can create; it names the machine, the process and when that was started, and its
+time of modification is kept fresh. A claim is over when it is deleted, when its process is gone from the same machine,
+or when it has not been refreshed for :data:`LOST` seconds. It is then taken over by a claim of the next number, which
+again only one process can create, so that no deletion can meet a newer claim. What has been found out under a claim can
+be left for the others as a record.
 
 All files are made by ``O_EXCL`` or renaming, and times are compared with those that the same file system gives. The
 time of a claim and what a directory contains are asked for anew, as clients of NFS remember both for up to a minute. So
@@ -31,6 +33,7 @@ from typing import Any, Self, TypeVar
 
 from dsr.utils.files import FullDiskError, birth, machine, space_for, write_text
 from dsr.utils.guards import parse_json, read_limited
+from dsr.utils.memory import free_memory
 from dsr.utils.pool import Pool, computing_threads
 from dsr.utils.progress import Progress
 
@@ -310,7 +313,7 @@ def choose_workers(workers: int | None, threads: int | None, scenes: int, cores:
     if threads is None:
         threads = max(1, cores // max(1, scenes)) if together else cores
     if workers is None:
-        workers = min(max(1, cores // threads), max(1, _free_memory() // _MEMORY)) if together else 1
+        workers = min(max(1, cores // threads), max(1, free_memory() // _MEMORY)) if together else 1
     return Workers(max(1, min(workers, scenes)), threads)
 
 
@@ -402,12 +405,3 @@ def _attempt(scene: str, claims: Claims, name: str, ready: Callable[[str], _R | 
 def _scene_of(pair: tuple[str, object]) -> str:
     """Return the scene of a scene and something about it."""
     return pair[0]
-
-
-def _free_memory() -> int:
-    """Return the bytes of memory that are free; where the system does not tell it, those of a large machine."""
-    try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
-    except (OSError, ValueError, StopIteration):
-        return 1 << 40

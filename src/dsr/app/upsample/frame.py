@@ -95,13 +95,13 @@ class FrameWork:
         expect_free(target, inputs, ours=wanted.overwrite or job.earlier is not None)
         errors = any(part.errors for part in wanted.of_frame)
         surface = kept_surface(target, picture.camera, errors=errors) if job.reusable else None
-        begin(target, job.settings, job.inputs, () if job.earlier is None else job.earlier.files)
         started = time.perf_counter()
         if surface is None:
             surface = self._upsample(picture, identified, progress)
             reporter.facts(_describe(surface.noise, given="noise" in how.arguments))
             reporter.facts([*_describe_outliers(surface.outliers), *_describe_holes(surface, how)])
         seconds = time.perf_counter() - started
+        begin(target, job.settings, job.inputs, () if job.earlier is None else job.earlier.files)
         facts = _write(job, picture, surface, planned, seconds)
         reporter.facts(facts)
         reporter.say(f"{pair.name}: {planned.text}, {seconds:.1f} s -> {target}")
