@@ -77,7 +77,7 @@ class Claims:
         settings: text that all commands at work there must have in common; None for one that leaves this to others.
 
     Raises:
-        InUseError: a command with other settings takes part.
+        InUseError: a command with other settings takes part, or one that is stopped has just come or is about to leave.
 
     """
 
@@ -91,7 +91,7 @@ class Claims:
     def __enter__(self) -> Self:
         """Take part."""
         self._made = [each for each in (self._run, *self._run.parents) if not each.exists()]
-        with self.wait(_MEMBERS):
+        with self._alone():
             if self._settings is not None:
                 self._expect_agreement()
             while not _create(self._member, self._settings):
@@ -163,6 +163,15 @@ class Claims:
                 return self._folder.stat().st_mtime
             except FileNotFoundError:  # the last command has just deleted it
                 self._folder.mkdir(parents=True, exist_ok=True)
+
+    def _alone(self) -> Claim:
+        """Claim that nobody else becomes a member meanwhile; raise InUseError if somebody is stopped right at that."""
+        try:
+            return self.wait(_MEMBERS, LOST)
+        except TimeoutError as error:
+            owners = [_owner(path) for path in self._files(f"{_digest(_MEMBERS)}.")]
+            named = [f"process {owner['process']} of {owner['host']}" for owner in owners if owner]
+            raise InUseError(self._run, ", ".join(named) or "another process") from error
 
     def _expect_agreement(self) -> None:
         """Raise InUseError if a command with other settings is at work."""
