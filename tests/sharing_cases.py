@@ -294,10 +294,10 @@ def test_forks_of_the_user_and_of_data_loaders_compute_where_several_threads_hav
     ],
 )
 def test_cores_are_shared_among_the_scenes(monkeypatch, given, scenes, cores, together, expected):
-    monkeypatch.setattr("dsr.evaluation.sharing._free_memory", lambda: 1 << 40)
+    monkeypatch.setattr("dsr.evaluation.sharing.free_memory", lambda: 1 << 40)
     assert choose_workers(*given, scenes, cores, together=together) == expected
 
 
 def test_little_memory_means_fewer_workers(monkeypatch):
-    monkeypatch.setattr("dsr.evaluation.sharing._free_memory", lambda: 3 << 30)
+    monkeypatch.setattr("dsr.evaluation.sharing.free_memory", lambda: 3 << 30)
     assert choose_workers(None, None, 100, 64, together=True) == Workers(3, 1)

@@ -30,6 +30,8 @@ class Scenario:
         needs: what it starts from: paths in its folder, and what makes them, or the scenario and the path in its
             results that they are copied from.
         complete: message of a command that has nothing left to do and ends with exit code 2; empty if there is none.
+        rivals: what the commands would do alone, if they have one folder and different settings: one of them has to be
+            refused, and the results have to be those of the other.
         kept: patterns of files that are never made again once they are there, ``info.json`` once it says ``complete``.
 
     """
@@ -38,6 +40,7 @@ class Scenario:
     commands: tuple[tuple[str, ...], ...]
     needs: Mapping[str, Callable[[Path], None] | tuple[str, str]] = field(default_factory=dict)
     complete: str = ""
+    rivals: tuple[Scenario, ...] = ()
     kept: tuple[str, ...] = ("cache/**/*.npz", "**/predictions/*.npz", "out/*/info.json")
 
     def arguments(self, number: int = 0) -> list[str]:
@@ -106,14 +109,21 @@ _FRAMES: Mapping[str, Callable[[Path], None]] = {"frames": make_frames, "poses.t
 _TRAINED = "is trained already"
 _TWO_RUNS = {"runs/facets": ("eval", "runs/facets"), "runs/bicubic": ("eval_bicubic", "runs/bicubic")}
 
+_TRAINING = Scenario("train", ((*_TRAIN, "output_dir=out"),), complete=_TRAINED)
+_EVALUATION = Scenario("eval", (_FACETS,))
+_UPSAMPLING = Scenario("upsample", (_UPSAMPLE,), _FRAMES)
+_OTHER_TRAINING = Scenario("train_x2", ((*_TRAIN, "output_dir=out", "scale=2", "logger=csv"),), complete=_TRAINED)
+_OTHER_EVALUATION = Scenario("eval_noise", ((*_FACETS, "noise=tof"),))
+_OTHER_UPSAMPLING = Scenario("upsample_fill", ((*_UPSAMPLE, "--fill", "all"),), _FRAMES)
+
 STRUCK = {
     each.name: each
     for each in (
-        Scenario("eval", (_FACETS,)),
+        _EVALUATION,
         Scenario("dip", (_DIP,)),
-        Scenario("train", ((*_TRAIN, "output_dir=out"),), complete=_TRAINED),
+        _TRAINING,
         Scenario("train_workers", ((*_TRAIN, "output_dir=out", "patches.workers=2"),), complete=_TRAINED),
-        Scenario("upsample", (_UPSAMPLE,), _FRAMES),
+        _UPSAMPLING,
         Scenario("upsample_workers", ((*_UPSAMPLE, "--workers", "2"),), _FRAMES),
         Scenario("report", (_REPORT,), _TWO_RUNS),
         Scenario("study_build", (_STUDY,), _TWO_RUNS),
@@ -140,6 +150,12 @@ AT_ONCE = {
         Scenario("two_reports", (_REPORT, _REPORT), _TWO_RUNS),
         Scenario("two_studies", (_STUDY, _STUDY), _TWO_RUNS),
         Scenario("two_preparations", STRUCK["prepare"].commands * 2),
+        Scenario("rival_trainings", (_TRAINING.commands[0], _OTHER_TRAINING.commands[0]),
+                 rivals=(_TRAINING, _OTHER_TRAINING)),
+        Scenario("rival_evaluations", (_EVALUATION.commands[0], _OTHER_EVALUATION.commands[0]),
+                 rivals=(_EVALUATION, _OTHER_EVALUATION)),
+        Scenario("rival_upsamples", (_UPSAMPLING.commands[0], _OTHER_UPSAMPLING.commands[0]), _FRAMES,
+                 rivals=(_UPSAMPLING, _OTHER_UPSAMPLING)),
         Scenario("report_while_evaluating", (_BICUBIC, _REPORT), {"runs/facets": ("eval", "runs/facets")}),
     )
 }  # fmt: skip

@@ -65,6 +65,13 @@ def test_two_commands_at_once_do_not_disturb_each_other(campaign):
     assert together.run_case(campaign, PairCase("pair", COLLECT, 0.0)) == []
 
 
+def test_rivals_that_both_have_their_way_are_found(tmp_path):
+    scripts = [Scenario(name, (("python", "-c", f"open('out', 'w').write('{name}')"),)) for name in ("one", "two")]
+    rivals = Scenario("rivals", tuple(each.commands[0] for each in scripts), rivals=tuple(scripts))
+    [line] = together.run_case(Campaign(tmp_path), PairCase("pair", rivals, 0.0))
+    assert line == "exit codes [0, 0], expected that one is refused"
+
+
 STUBBORN = "import signal, time\nfor n in (2, 15): signal.signal(n, lambda *_: None)\n"
 WAIT = "while time.process_time() < {}: pass\n"
 

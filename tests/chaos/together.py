@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from chaos.campaign import Campaign, undisturbed_problems
 from chaos.processes import Ended
 from chaos.scenarios import AT_ONCE, Scenario
-from chaos.trees import damaged
+from chaos.trees import damaged, differences
 
 _LIMIT = 300.0
 
@@ -33,17 +33,35 @@ def pair_cases(seed: int, repetitions: int = 1) -> list[PairCase]:
 
 def run_case(campaign: Campaign, case: PairCase) -> list[str]:
     """Run a case; return what is wrong."""
-    known = campaign.undisturbed(case.scenario)
-    campaign.begin(case.scenario)
-    first = campaign.start(case.scenario, 0)
-    first.wait_for(case.delay * known.computed[0])
-    second = campaign.start(case.scenario, 1)
-    while first.is_alive() and second.is_alive():
-        time.sleep(0.05)
-    problems = [line for each in (first, second) for line in end_problems(case.scenario, each.end(_LIMIT))]
+    if case.scenario.rivals:
+        return _run_rivals(campaign, case)
+    first, second = _run_both(campaign, case, campaign.undisturbed(case.scenario).computed[0])
+    problems = [line for end in (first, second) for line in end_problems(case.scenario, end)]
     problems += damaged(campaign.work)
     problems += campaign.finish(case.scenario)[0]
     return problems + campaign.compare(case.scenario)
+
+
+def _run_rivals(campaign: Campaign, case: PairCase) -> list[str]:
+    """Run two commands of different settings in one folder, which has to become that of one of them."""
+    known = [campaign.undisturbed(each) for each in case.scenario.rivals]
+    ends = _run_both(campaign, case, known[0].computed[0])
+    problems = [line for end in ends for line in end_problems(case.scenario, end)] + damaged(campaign.work)
+    codes = [end.code for end in ends]
+    if sorted(codes) != [0, 2]:
+        return [*problems, f"exit codes {codes}, expected that one is refused"]
+    return problems + differences(known[codes.index(0)].folder, campaign.work)
+
+
+def _run_both(campaign: Campaign, case: PairCase, computed: float) -> tuple[Ended, Ended]:
+    """Run both commands, of which the first computes so many seconds; return how they ended."""
+    campaign.begin(case.scenario)
+    first = campaign.start(case.scenario, 0)
+    first.wait_for(case.delay * computed)
+    second = campaign.start(case.scenario, 1)
+    while first.is_alive() and second.is_alive():
+        time.sleep(0.05)
+    return first.end(_LIMIT), second.end(_LIMIT)
 
 
 def end_problems(scenario: Scenario, end: Ended) -> list[str]:

@@ -9,8 +9,10 @@ import sys
 import cv2
 import numpy as np
 import pytest
+import tifffile
 from PIL import Image
 
+from dsr.app.upsample.frame import FrameWork
 from dsr.cli import main
 from dsr.geometry.camera import Camera
 from dsr.io.depth_files import read_depth_file, write_depth_file
@@ -190,6 +192,38 @@ def test_result_has_the_inputs_format_type_unit_and_holes(pair, tmp_path, suffix
     np.testing.assert_allclose(stored / factor, result, rtol=1e-6)
     assert np.isnan(stored[22:26, 14:22]).all()
     assert 0 < np.isnan(stored).mean() < 0.1
+
+
+@pytest.mark.parametrize("dtype", ["int64", "uint64"])
+def test_whole_numbers_of_64_bits_in_a_tiff_become_those_of_32(pair, tmp_path, dtype):
+    depth = tmp_path / "long.tif"
+    tifffile.imwrite(depth, pair[2].astype(dtype))
+    for file, folder in ((depth, "long"), (pair[1], "short")):
+        options = ("-o", tmp_path / folder, "--depth-unit", "mm", *DEPTH_ONLY)
+        assert upsample("--rgb", pair[0], "--depth", file, *options) == 0
+    stored = read_depth_file(tmp_path / "long" / "depth.tif")
+    assert str(stored.dtype) == dtype.replace("64", "32")
+    np.testing.assert_array_equal(stored, read_depth_file(tmp_path / "short" / "depth.png"))
+
+
+def test_refusal_leaves_nothing_behind(pair, tmp_path, capsys, monkeypatch):
+    def refuse(*_):
+        raise ValueError("photo: expected another")
+
+    monkeypatch.setattr(FrameWork, "_upsample", refuse)
+    assert "photo: expected another" in refused(capsys, of(pair, tmp_path / "new" / "out", *BICUBIC))
+    assert not (tmp_path / "new").exists()
+
+
+def test_expected_errors_of_far_depth_are_finite(pair, tmp_path, capfd):
+    far = tmp_path / "far.npy"
+    np.save(far, 5e8 * pair[2].clip(1000) / 1000)
+    options = ("-o", tmp_path / "out", "--depth-unit", "m", "--only", "depth,confidence")
+    assert upsample("--rgb", pair[0], "--depth", far, *options) == 0
+    assert capfd.readouterr().err == ""
+    with np.load(tmp_path / "out" / "confidence.npz") as errors:
+        assert all(not np.isinf(errors[name]).any() for name in errors)
+        assert errors["depth_error"].max() > 7e4
 
 
 def test_other_format_is_in_metres_or_whole_millimetres(pair, tmp_path):

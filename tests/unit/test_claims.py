@@ -1,5 +1,6 @@
 """A claim has one owner at a time, and is taken over when its owner is gone, but never before."""
 
+import contextlib
 import json
 import multiprocessing
 import os
@@ -11,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from dsr.evaluation import sharing as claims_module
-from dsr.evaluation.sharing import LOST, Claims
+from dsr.evaluation.sharing import LOST, Claims, InUseError
 from dsr.utils.files import birth, machine
 
 FORK = multiprocessing.get_context("fork")
@@ -21,18 +22,26 @@ NAMES = list(map(str, range(40)))
 class Command:
     """A process that takes part, and claims what it is asked for, until it is told to leave or is killed."""
 
-    def __init__(self, folder, host):
+    def __init__(self, folder, host, settings=None, begin=None):
         self._here, there = FORK.Pipe()
-        self.process = FORK.Process(target=self._run, args=(folder, host, there), daemon=True)
+        self.process = FORK.Process(target=self._run, args=(folder, host, settings, begin, there), daemon=True)
         self.process.start()
         there.close()
-        assert self._here.recv()
+        self.takes_part = self._here.recv() if begin is None else None
 
     @staticmethod
-    def _run(folder, host, connection):
+    def _run(folder, host, settings, begin, connection):
         claims_module.machine = lambda: host
         claims_module.BEAT = 0.02
-        with Claims(folder) as claims:
+        if begin is not None:
+            begin.wait(30)
+        try:
+            claims = Claims(folder, settings).__enter__()
+        except InUseError:
+            connection.send(False)
+            return
+        with contextlib.closing(contextlib.ExitStack()) as stack:
+            stack.push(claims)
             connection.send(True)
             while names := connection.recv():
                 taken = {name: claim for name in names if (claim := claims.take(name)) is not None}
@@ -67,8 +76,8 @@ def start(tmp_path):
     """Return a function that starts a process that takes part, on this machine or on another."""
     commands = []
 
-    def begin(host=None):
-        commands.append(Command(tmp_path, host or machine()))
+    def begin(host=None, settings=None, begin=None):
+        commands.append(Command(tmp_path / "run", host or machine(), settings, begin))
         return commands[-1]
 
     yield begin
@@ -92,7 +101,7 @@ def written_by(path, process, started):
 
 def test_claim_is_refused_until_it_is_given_back(tmp_path, start):
     other = start()
-    with Claims(tmp_path) as claims:
+    with Claims(tmp_path / "run") as claims:
         with claims.take("scene a"):
             assert claims.take("scene a") is None
             assert other.take("scene a", "scene b") == ["scene b"]
@@ -103,7 +112,7 @@ def test_claim_is_refused_until_it_is_given_back(tmp_path, start):
 def test_claim_of_a_killed_process_is_taken_over_at_once_by_one(tmp_path, start):
     killed, other = start(), start()
     assert killed.take("a") == ["a"]
-    with Claims(tmp_path) as claims:
+    with Claims(tmp_path / "run") as claims:
         killed.send(signal.SIGKILL)
         with claims.take("a"):
             assert claims.take("a") is None
@@ -115,18 +124,18 @@ def test_claim_of_a_process_that_is_stopped_is_its_own(tmp_path, start):
     stopped = start()
     stopped.take("a")
     stopped.send(signal.SIGSTOP)
-    with Claims(tmp_path) as claims:
-        make_old(claim_file(tmp_path))
+    with Claims(tmp_path / "run") as claims:
+        make_old(claim_file(tmp_path / "run"))
         assert claims.take("a") is None
 
 
 def test_claim_of_another_machine_is_its_own_while_it_is_kept_fresh(tmp_path, start):
     start("elsewhere").take("a")
-    make_old(path := claim_file(tmp_path))
+    make_old(path := claim_file(tmp_path / "run"))
     deadline = time.monotonic() + 30
     while path.stat().st_mtime < time.time() - LOST and time.monotonic() < deadline:
         time.sleep(0.01)
-    with Claims(tmp_path) as claims:
+    with Claims(tmp_path / "run") as claims:
         assert claims.take("a") is None
 
 
@@ -136,9 +145,9 @@ def test_claim_of_another_machine_is_taken_over_once_it_is_silent_for_long(tmp_p
     silent.take("a")
     silent.send(end)
     assert other.take("a") == []
-    make_old(claim_file(tmp_path), LOST - 30)
+    make_old(claim_file(tmp_path / "run"), LOST - 30)
     assert other.take("a") == []
-    make_old(claim_file(tmp_path))
+    make_old(claim_file(tmp_path / "run"))
     assert other.take("a") == ["a"]
 
 
@@ -146,20 +155,20 @@ def test_last_one_to_leave_deletes_claims_and_records(tmp_path, start):
     other, killed = start(), start()
     killed.take("b")
     killed.send(signal.SIGKILL)
-    with Claims(tmp_path) as claims:
+    with Claims(tmp_path / "run") as claims:
         claims.write_record("a", {"x": [0.1, float("nan")]})
         assert claims.record("a")["x"][0] == 0.1
         assert claims.record("b") is None
-    assert len(list((tmp_path / ".claims").glob("*-record.json"))) == 1
+    assert len(list((tmp_path / "run" / ".claims").glob("*-record.json"))) == 1
     other.leave()
-    assert list(tmp_path.iterdir()) == []
+    assert not (tmp_path / "run" / ".claims").exists()
 
 
 @pytest.mark.parametrize("case", ["number used again", "killed before it was written"])
 def test_claim_of_no_process_is_taken_over(tmp_path, case):
-    with Claims(tmp_path) as claims:
+    with Claims(tmp_path / "run") as claims:
         claims.take("a")
-        path = claim_file(tmp_path)
+        path = claim_file(tmp_path / "run")
         if case == "number used again":
             written_by(path, os.getppid(), "12")
         else:
@@ -175,8 +184,8 @@ def test_time_of_a_claim_is_not_one_that_was_remembered(tmp_path, start, monkeyp
     silent = start("elsewhere")
     silent.take("a")
     silent.send(signal.SIGSTOP)
-    with Claims(tmp_path) as claims:
-        make_old(path := claim_file(tmp_path))
+    with Claims(tmp_path / "run") as claims:
+        make_old(path := claim_file(tmp_path / "run"))
         remembered, stat = path.stat(), Path.stat
         make_old(path, 0)
         monkeypatch.setattr(Path, "stat", lambda each, **_: remembered if each == path else stat(each))  # as NFS does
@@ -190,6 +199,63 @@ def test_processes_that_race_for_claims_get_different_ones(start):
     for racer in racers:
         racer.ask(*NAMES)
     assert sorted((name for racer in racers for name in racer.answer()), key=int) == NAMES
+
+
+def test_directory_is_that_of_one_set_of_settings_while_somebody_is_at_work(tmp_path, start):
+    first, second = start(settings="a"), start(settings="a")
+    with pytest.raises(InUseError, match=f"process {first.process.pid} of |process {second.process.pid} of "):
+        Claims(tmp_path / "run", "b").__enter__()
+    with Claims(tmp_path / "run"):  # a part of a command that takes part
+        pass
+    first.leave()
+    assert not start(settings="b").takes_part
+    second.send(signal.SIGKILL)
+    assert start(settings="b").takes_part
+    assert not start(settings="a").takes_part
+
+
+def test_one_of_many_that_begin_at_once_has_the_directory(start):
+    for _ in range(5):
+        begin = FORK.Barrier(6)
+        rivals = [start(settings=str(number), begin=begin) for number in range(6)]
+        won = [rival for rival in rivals if rival.answer()]
+        assert len(won) == 1
+        won[0].leave()
+
+
+@pytest.mark.parametrize(("silent", "refused"), [("killed", False), ("stopped", False), ("at work", True)])
+def test_sign_of_life_of_another_machine_is_waited_for(start, monkeypatch, silent, refused):
+    monkeypatch.setattr(claims_module, "LOST", 1.0)
+    other = start("elsewhere", "a")
+    if silent != "at work":
+        other.send(signal.SIGKILL if silent == "killed" else signal.SIGSTOP)
+    assert start(settings="b").takes_part is not refused
+
+
+def test_stopped_process_of_this_machine_keeps_the_directory(tmp_path, start, monkeypatch):
+    monkeypatch.setattr(claims_module, "LOST", 0.1)
+    start(settings="a").send(signal.SIGSTOP)
+    assert not start(settings="b").takes_part
+
+
+def test_member_that_was_taken_for_lost_comes_back(tmp_path, start):
+    start(settings="a")
+    [member] = (tmp_path / "run" / ".claims").glob("member-*")
+    member.unlink()
+    deadline = time.monotonic() + 30
+    while not member.exists() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    time.sleep(0.1)  # until it is written
+    assert not start(settings="b").takes_part
+
+
+def test_directory_that_was_made_for_claims_is_gone_with_them_unless_it_is_used(tmp_path):
+    with Claims(tmp_path / "new" / "run", "a"):
+        assert (tmp_path / "new" / "run" / ".claims").is_dir()
+    assert list(tmp_path.iterdir()) == []
+    with Claims(tmp_path / "new" / "run", "a"):
+        (tmp_path / "new" / "run" / "file").touch()
+    assert [path.name for path in (tmp_path / "new" / "run").iterdir()] == ["file"]
 
 
 def test_birth_tells_an_ended_process_even_before_it_is_collected():

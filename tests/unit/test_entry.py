@@ -8,6 +8,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.plugins import Plugins
 
 from dsr.app.entry import run_command
+from dsr.app.schema import plain_config
 from dsr.utils.configuration import ConfigError
 
 
@@ -127,6 +128,34 @@ def test_configuration_error_of_the_job_is_one_line_and_exit_code_2(command):
         raise ConfigError("dataset.root: first\n   second")
 
     assert command(job=job)[:2] == (2, "error: dataset.root: first second\n")
+
+
+@pytest.mark.parametrize(
+    ("argument", "key"),
+    [
+        ("seed=${nope}", "seed"), ("seed=${oc.env:NO_SUCH_VARIABLE}", "seed"), ("seed=${nope:1}", "seed"),
+        ('seed=${oc.decode:"[1"}', "seed"), ("dataset.size=${..nope}", "dataset.size"), ("seed=${seed}", "seed"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("multirun", [(), ("-m",)])
+def test_interpolation_that_cannot_be_resolved_is_one_line_that_names_its_key(command, argument, key, multirun):
+    code, error, _ = command(*multirun, argument, job=plain_config)
+    lines = error.splitlines()
+    assert (code, len(lines)) == (2, 3 if multirun else 1)
+    assert f"{key}: expected a value that it can be resolved to, got: " in lines[0]
+    assert lines[0].startswith("error: ")
+
+
+@pytest.mark.parametrize(
+    "raised", [MemoryError(), RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried")]
+)
+def test_want_of_memory_is_one_line_and_exit_code_2(command, raised):
+    def job(config):
+        raise raised
+
+    code, error, _ = command(job=job)
+    assert (code, error.count("\n")) == (2, 1)
+    assert "memory" in error
 
 
 def test_interruption_is_one_line_and_exit_code_130(command):

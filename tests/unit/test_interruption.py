@@ -126,6 +126,58 @@ def test_exit_code_and_output_of_a_command_are_kept(tmp_path: Path) -> None:
     assert run(tmp_path, script)[:2] == (7, "")
 
 
+SPEAKING = """
+import sys
+def main():
+    import numpy
+    numpy.float32(1) * numpy.float64(1e308).astype(numpy.float32)  # warns
+    try:
+        for _ in range(3000): print("a line of what the command has to say")
+        sys.stdout.flush()
+    except OSError as error:
+        print("error:", error.strerror, file=sys.stderr)
+        return 2
+    if {problem}:
+        print("error: a problem", file=sys.stderr)
+        return 2
+    print("done", file=sys.stderr)
+"""
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize(
+    ("streams", "problem", "code", "errors"),
+    [
+        ("| true", False, 0, "done\n"),
+        ("| true", True, 2, "error: a problem\n"),
+        ("2>&1 | true", True, 2, ""),
+        (">/dev/null 2>/dev/full", False, 0, ""),
+        (">/dev/null 2>/dev/full", True, 2, ""),
+        (">/dev/full", False, 2, "error: No space left on device\n"),
+    ],
+)
+def test_what_nobody_reads_changes_no_exit_code(tmp_path, streams, problem, code, errors, unbuffered):
+    (tmp_path / "case.py").write_text(SPEAKING.format(problem=problem))
+    program = "from dsr.utils.interruption import start; start('case', 'main')"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path]),
+                   "PYTHONUNBUFFERED": unbuffered}  # fmt: skip
+    line = f"set -o pipefail; '{sys.executable}' -c \"{program}\" {streams}"
+    done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, env=environment, check=False)
+    assert (done.returncode, done.stderr) == (code, errors)
+
+
+def test_spawned_workers_do_not_get_ctrl_c_from_the_first_on(tmp_path: Path) -> None:
+    (tmp_path / "asked.py").write_text(
+        "import signal\ndef blocked(_): return signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())\n"
+    )
+    code = (
+        "import asked\nfrom dsr.utils.pool import Pool\n"
+        "with Pool(1, asked.blocked, asked.blocked, start='spawn') as pool: print(list(pool.results([0])))"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+    assert subprocess.check_output([sys.executable, "-c", code], text=True, env=environment) == "[(0, True)]\n"
+
+
 def test_signals_of_the_host_process_are_its_own_again_after_a_deferral() -> None:
     before = signal.getsignal(signal.SIGTERM)
     with interruption.deferred(lambda: "not shown") as noted:

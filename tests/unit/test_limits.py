@@ -19,6 +19,8 @@ import torch
 
 from dsr.app.upsample.scene import write_scene
 from dsr.data.matlab import read_variables
+from dsr.data.preparation import Preparation
+from dsr.data.rendered import Procedural, SimGeo
 from dsr.evaluation.run_files import read_run
 from dsr.evaluation.store import load_prediction
 from dsr.io.captures import ros, stray
@@ -30,10 +32,14 @@ from dsr.io.inputs import read_picture
 from dsr.io.pairs import Pair
 from dsr.io.photos import read_photo
 from dsr.io.reading import Reading
+from dsr.methods.classical.bilateral import Bilateral, JointBilateral
+from dsr.methods.classical.edge_guided import EdgeGuided
+from dsr.methods.classical.guided_filter import GuidedFilter
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_choice import packaged_weights
 from dsr.methods.networks.weight_files import load_network
 from dsr.sample import DepthSample
+from dsr.training.settings import PatchSettings
 from dsr.utils.guards import TooLargeError, bytes_of_archive, pixels_beside, pixels_of_file, read_limited, read_member
 from dsr.utils.picture_headers import picture_size
 from dsr.utils.torch_files import read_torch_file
@@ -270,3 +276,17 @@ def test_record_of_exports_that_names_files_elsewhere_is_refused_and_nothing_rem
     assert not result.files
     assert f"{output}/exports.json: exports.transforms.json: expected a name within {output}" in result.problems[0]
     assert (tmp_path / "mine.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("build", "name", "value"),
+    [
+        *((PatchSettings, name, value) for name, value in (("patch", 100_000), ("batch", 10**8), ("workers", 100_000))),
+        *((kind, "size", 10**value) for kind in (Procedural, SimGeo, Preparation) for value in (6, 300)),
+        *((kind, "radius", 10**9) for kind in (GuidedFilter, JointBilateral, EdgeGuided)),
+        (GuidedFilter, "radius", 1e300), (Bilateral, "window", 10**9),
+    ],
+)  # fmt: skip
+def test_what_no_memory_can_hold_is_refused_in_one_line_that_names_it(build, name, value):
+    with pytest.raises(ValueError, match=rf"^{name}: expected [^\n]*\Z"):
+        build(**{name: value})

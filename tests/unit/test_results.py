@@ -109,6 +109,8 @@ def test_directory_named_twice_is_read_once(make_run, tmp_path):
         ("summary.json", "{"), ("summary.json", "[]"), ("summary.json", "{}"), ("versions.json", "x"),
         ("scores.csv", "a,b\n1,2\n"), ("scores.csv", ""),
         ("scores.csv", "dataset,scene,scale,downsampling,method,seed,metric,variant,value,valid_share\na,b,x,,,,,,,\n"),
+        ("scores.csv", "dataset,scene,scale,downsampling,method,seed,metric,variant,value,valid_share\n"
+         "a,s,4,box,b,0,RMSE_d,,1e308,1\n"),
     ],
 )  # fmt: skip
 def test_damaged_run_is_left_out_and_the_others_are_read(make_run, tmp_path, name, content):

@@ -10,6 +10,7 @@ from dsr.data import rendered
 from dsr.data.rendered import SimGeo
 from dsr.synthetic.rendering import cache_directory
 from dsr.synthetic.simgeo import SCENES, render_scene
+from dsr.utils.console import note_once
 
 SIZE = 64
 NAME = "cube_no_texture"
@@ -80,8 +81,11 @@ def test_sizes_do_not_share_a_rendering(cache, calls):
     assert calls == [(NAME, SIZE), (NAME, 32)]
 
 
-@pytest.mark.parametrize("damage", ["empty", "truncated", "foreign", "without a camera", "a wrong camera"])
-def test_damaged_cache_file_is_replaced(cache, calls, damage):
+@pytest.mark.parametrize(
+    "damage",
+    ["empty", "truncated", "foreign", "without a camera", "a wrong camera", "other sizes", "another type"],
+)
+def test_damaged_cache_file_is_replaced_and_it_is_said(cache, calls, damage, capfd):
     SimGeo(size=SIZE).load(NAME)
     [file] = cache.rglob("*.npz")
     with np.load(file) as kept:
@@ -94,10 +98,19 @@ def test_damaged_cache_file_is_replaced(cache, calls, damage):
         file.write_bytes(b"something else")
     elif damage == "without a camera":
         np.savez(file, rgb=content["rgb"], depth=content["depth"])
+    elif damage == "other sizes":
+        np.savez(file, **{**content, "depth": content["depth"][:-1]})
+    elif damage == "another type":
+        np.savez(file, **{**content, "rgb": content["rgb"].astype("U8")})
     else:
         np.savez(file, **{**content, "camera": json.dumps({"wide": 3})})
+    note_once.cache_clear()
+    assert capfd.readouterr() == ("", "")
     assert_rendered(SimGeo(size=SIZE).load(NAME))
     assert len(calls) == 2
+    told = capfd.readouterr().err
+    assert told.startswith(f"note: {file}: damaged")
+    assert told.count("\n") == 1
     SimGeo(size=SIZE).load(NAME)
     assert len(calls) == 2
     assert [path.name for path in file.parent.iterdir()] == [f"{NAME}.npz"]

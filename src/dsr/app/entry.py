@@ -33,6 +33,7 @@ from dsr.utils import interruption
 from dsr.utils.configuration import ConfigError, config_directories, list_choices
 from dsr.utils.console import USAGE_ERROR, one_line, print_error
 from dsr.utils.files import FullDiskError, silence_threads, space_for
+from dsr.utils.memory import OutOfMemoryError, refusing_excess
 
 _LIST = re.compile(r"(^|,)\s*\[")
 """Where a list begins in the value of an argument, or in one of several that -m runs."""
@@ -152,10 +153,10 @@ def _job(
                 take_gpu(Path(HydraConfig.get().sweep.dir))
         try:
             begun.append(True)
-            with _argv(_argv_of_job(argv)), interruption.requeued(), interruption.working():
+            with _argv(_argv_of_job(argv)), interruption.requeued(), interruption.working(), refusing_excess():
                 value = command(config)
             return JobResult(value if isinstance(value, int | float) else 0.0)
-        except (ConfigError, OSError, FullDiskError) as error:  # a multirun continues with its other jobs
+        except (ConfigError, OSError, FullDiskError, OutOfMemoryError) as error:  # a multirun goes on with the others
             problem = one_line(error)
             failed.append(problem)
             print_error(": ".join(filter(None, (job_name(), problem))))

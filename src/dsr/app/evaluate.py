@@ -206,6 +206,12 @@ def _example(prepared: _Prepared) -> DepthSample | None:
 
 def _run(prepared: _Prepared) -> pd.DataFrame:
     """Evaluate, and return the scores."""
+    with rundir.at_work(prepared.folder, prepared.plain, prepared.identity):
+        return _run_claimed(prepared)
+
+
+def _run_claimed(prepared: _Prepared) -> pd.DataFrame:
+    """Evaluate in a directory where no command with other settings is at work."""
     settings, folder, study = prepared.settings, prepared.folder, prepared.study
     workers, progress = prepared.workers, prepared.progress
     console = open_console()

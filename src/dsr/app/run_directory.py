@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,10 @@ from omegaconf import OmegaConf
 from dsr.app.run_names import NOT_IDENTITY, run_name
 from dsr.app.schema import Config, Identity
 from dsr.app.trust import imported
+from dsr.evaluation.sharing import Claims, InUseError
 from dsr.utils.configuration import ConfigError, expand_home
 from dsr.utils.console import shorten
-from dsr.utils.files import TargetError, expect_own, expect_target, write_text
+from dsr.utils.files import TargetError, expect_own, expect_target, owner, write_text
 from dsr.utils.guards import parse_json, read_limited
 from dsr.utils.versions import RESULTS, SCENES, hash_outside_code, versions
 
@@ -161,8 +163,41 @@ def expect_free(folder: Path, config: Config, identity: Identity, tolerated: Seq
 
 
 def _is_unused(folder: Path) -> bool:
-    """Return whether a directory is empty, but for a record that another run is writing right now."""
-    return all(path.name.startswith(f".{Path(_RECORD).stem}-") for path in folder.iterdir())
+    """Return whether a directory is empty, but for claims, and a record that another run is writing right now."""
+    return all(path.name.startswith((f".{Path(_RECORD).stem}-", ".claims")) for path in folder.iterdir())
+
+
+@contextlib.contextmanager
+def at_work(folder: Path, config: Config, identity: Identity, *, alone: bool = False) -> Iterator[None]:
+    """Within this context ``folder`` is that of commands with the settings of this one, and of no others.
+
+    Args:
+        folder: the directory of the run, which is made if it does not exist.
+        config: the run's configuration.
+        identity: see :func:`identity_of`.
+        alone: whether it is even that of this process alone.
+
+    Raises:
+        ConfigError: another command is at work there, or the directory cannot be written.
+
+    """
+    settings = owner() if alone else _hash_of({**identity, "metrics": config["metrics"]})
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(Claims(folder, settings))
+        except InUseError as error:
+            shared = "" if alone else " with other settings"
+            raise ConfigError(
+                f"output_dir: {error.owner} is at work in {folder}{shared}; wait for its end, or take another"
+            ) from error
+        except OSError as error:
+            raise _unwritable(folder, error) from error
+        yield
+
+
+def _unwritable(folder: Path, error: OSError) -> ConfigError:
+    """Return the error of a directory that cannot be written."""
+    return ConfigError(f"output_dir: expected a directory to write to, got {folder} ({error.strerror})")
 
 
 def claim(folder: Path, config: Config, identity: Identity, tolerated: Sequence[str] = ()) -> list[str]:
@@ -187,7 +222,7 @@ def claim(folder: Path, config: Config, identity: Identity, tolerated: Sequence[
         write_text(folder / _RECORD, json.dumps(record, indent=1) + "\n")
         write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(dict(config))))
     except OSError as error:
-        raise ConfigError(f"output_dir: expected a directory to write to, got {folder} ({error.strerror})") from error
+        raise _unwritable(folder, error) from error
     return different
 
 

@@ -11,6 +11,7 @@ from typing import Any, Self
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from dsr.utils.configuration import ConfigError, build, check_types
 from dsr.utils.guards import is_number
@@ -21,6 +22,8 @@ Config = Mapping[str, Any]
 Identity = Mapping[str, Any]
 """What the results of a run depend on: settings, weights, versions, the kind of device."""
 _LONGEST_NAME = 100
+_MOST = 1024
+"""Workers and threads, more of which no system starts."""
 STRATEGIES = ("auto", "ddp")
 KEPT = ("best", "last")
 VISUAL = ("mse_v", "dssim", "lpips")
@@ -225,8 +228,8 @@ class EvalConfig(RunConfig):
         super().check()
         for name in ("workers", "threads"):
             value = getattr(self, name)
-            if value != "auto" and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
-                raise ConfigError(f"{name}: expected auto or a whole number, 1 or more, got {value!r}")
+            if value != "auto" and (isinstance(value, bool) or not isinstance(value, int) or not 0 < value <= _MOST):
+                raise ConfigError(f"{name}: expected auto or a whole number from 1 to {_MOST}, got {value!r}")
         if not self.measured:
             _expect_factor(self.scale, "; downsampling=measured takes a sensor's map of any ratio")
         if not (is_number(self.scale) and self.scale >= 1) and self.scale != NATIVE:
@@ -361,8 +364,16 @@ def plain_config(config: DictConfig) -> dict[str, Any]:
     """Return a composed configuration as plain Python, interpolations resolved; missing values are "???".
 
     ``names`` gets the choices of the groups: those of the Hydra command, else the names of their classes.
+
+    Raises:
+        ConfigError: an interpolation cannot be resolved.
+
     """
-    plain: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
+    try:
+        plain: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
+    except OmegaConfBaseException as error:
+        reason = str(error).splitlines()[0]
+        raise ConfigError(f"{error.full_key}: expected a value that it can be resolved to, got: {reason}") from error
     nodes = {group: node for group, node in plain.items() if group in NAMED and isinstance(node, Mapping)}
     named = {group: str(node["_target_"]).rpartition(".")[2] for group, node in nodes.items() if "_target_" in node}
     if HydraConfig.initialized():

@@ -198,16 +198,26 @@ def _prepare(plain: Config, settings: TrainConfig, device: torch.device, devices
 
 
 def _train(plain: Config, settings: TrainConfig, device: torch.device, processes: Processes) -> float:
-    """Train in one of the processes, and return the best score."""
-    first = processes.first
-    progress = ConsoleProgress(Console(quiet=not first))
+    """Train in one of the processes, the first of which has the directory for itself, and return the best score."""
     prepared = _prepare(plain, settings, device, processes.count)
+    folder = prepared.folder
+    new = not folder.exists()
+    if not processes.first:
+        return _fit(plain, settings, prepared, processes, new=False)
+    rundir.expect_free(folder, plain, prepared.identity, prepared.tolerated)
+    with rundir.at_work(folder, plain, prepared.identity, alone=True):
+        return _fit(plain, settings, prepared, processes, new=new)
+
+
+def _fit(plain: Config, settings: TrainConfig, prepared: _Prepared, processes: Processes, *, new: bool) -> float:
+    """Train in a directory, which is ``new`` if this training has made it, and return the best score."""
+    first, device = processes.first, prepared.device
+    progress = ConsoleProgress(Console(quiet=not first))
     data, module, identity, folder = prepared.data, prepared.module, prepared.identity, prepared.folder
     resume, tolerated, weights = prepared.resume, prepared.tolerated, folder / WEIGHTS
-    new = False
     if first:
         _expect_trainable(folder, plain, identity, tolerated)
-        new = _claim(folder, plain, identity, tolerated, progress)
+        _claim(folder, plain, identity, tolerated, progress)
     idle = processes.count > 1 and has_idle_layers(module, data.example_batch())
     trainer = None
     try:
@@ -255,14 +265,12 @@ def _expect_unfinished(folder: Path, identity: Identity, *, overwrite: bool) -> 
     expect_no_divergence(folder, identity)
 
 
-def _claim(folder: Path, plain: Config, identity: Identity, tolerated: Sequence[str], progress: Progress) -> bool:
-    """Make the directory that of this training, without the files of one that it replaces; return whether it is new."""
-    new = not folder.exists()
+def _claim(folder: Path, plain: Config, identity: Identity, tolerated: Sequence[str], progress: Progress) -> None:
+    """Make the directory that of this training, without the files of one that it replaces."""
     for key in rundir.claim(folder, plain, identity, tolerated):
         progress.say(f"note: the run began with another {key}")
     if plain["overwrite"]:
         _clear(folder)
-    return new
 
 
 def _discard(trainer: lightning.Trainer | None, folder: Path) -> None:

@@ -10,11 +10,11 @@ import numpy as np
 from rich.console import Console
 
 from dsr.app.requests import ViewRequest
-from dsr.app.upsample.reporting import problem_line
 from dsr.app.upsample.stored import find_results, read_result
 from dsr.report.surface_page import Packed, is_view, pack_result, save_view
-from dsr.utils.console import ConsoleProgress, show
+from dsr.utils.console import ConsoleProgress, one_line, show
 from dsr.utils.files import expect_target
+from dsr.utils.memory import refusing_excess
 from dsr.utils.progress import megabytes
 
 _WHOLE_PAGE = 6
@@ -66,9 +66,10 @@ def _pack(request: ViewRequest, folders: Sequence[Path], console: Console) -> tu
     for folder in ConsoleProgress(console).track(folders, "read", label=lambda path: path.name, lines=False):
         name = "/".join(folder.relative_to(request.output).parts) or request.output.resolve().name
         try:
-            packed.append(pack_result(read_result(folder, name), each, photo_side))
-        except (ValueError, OSError, MemoryError) as error:
-            problems.append(problem_line(error))
+            with refusing_excess():
+                packed.append(pack_result(read_result(folder, name), each, photo_side))
+        except (ValueError, OSError) as error:
+            problems.append(one_line(error))
     return packed, problems
 
 

@@ -13,6 +13,7 @@ from dsr.data.download.collections import CATALOGUE, Collection
 from dsr.utils import interruption
 from dsr.utils.console import USAGE_ERROR, one_line, open_console, print_error, printable
 from dsr.utils.files import FullDiskError
+from dsr.utils.memory import refusing_excess
 
 _EXAMPLES = """\
 examples:
@@ -50,7 +51,7 @@ def main(arguments: Sequence[str] | None = None, catalogue: Mapping[str, Collect
     options = _parser().parse_args(arguments)
     console = open_console()
     try:
-        with interruption.working():
+        with interruption.working(), refusing_excess():
             problems = options.run(options, console, CATALOGUE if catalogue is None else catalogue)
     except KeyboardInterrupt as interrupted:
         return interruption.stop(str(interrupted))

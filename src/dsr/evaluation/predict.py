@@ -35,6 +35,7 @@ from dsr.utils.arrays import read_arrays
 from dsr.utils.console import one_line
 from dsr.utils.files import look_anew, replacing
 from dsr.utils.guards import parse_json
+from dsr.utils.memory import refusing_excess
 from dsr.utils.pool import LOST
 from dsr.utils.progress import SILENT, Progress
 
@@ -190,7 +191,8 @@ def _attempt(
 ) -> _Predicted | None:
     """Return what a function of a scene's settings returns, or what became of the scene instead."""
     try:
-        return function(study.stored_config(scene))
+        with refusing_excess():
+            return function(study.stored_config(scene))
     except StalePredictionError:
         raise
     except NoSolutionError as error:

@@ -6,6 +6,7 @@ Only files are read: ``scores.csv``, ``summary.json``, ``versions.json``, predic
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +27,8 @@ _SCORES, _SUMMARY, _VERSIONS = "scores.csv", "summary.json", "versions.json"
 _TEXT_COLUMNS = ("dataset", "scene", "downsampling", "method", "metric", "variant")
 _NUMBER_COLUMNS = ("scale", "seed", "value", "valid_share")
 _LARGEST_SCALE = 1e6
+_LARGEST_SCORE = 1e100
+"""Whose squares can be added; an infinite score is one of its own."""
 _DIGEST = 8
 """Number of displayed digits of a hash."""
 _Content = TypeVar("_Content", bound=BaseModel)
@@ -201,10 +204,14 @@ def _read_scores(path: Path) -> pd.DataFrame:
         scores["scale"] = pd.to_numeric(scores["scale"])
         if not scores["scale"].between(1, _LARGEST_SCALE).all() or not scores["seed"].between(0, 2**63 - 1).all():
             raise ValueError("a scale or seed is none")
+        unlike = scores["value"][scores["value"].abs().between(_LARGEST_SCORE, math.inf, inclusive="neither")]
     except TooLargeError:
         raise
     except (OSError, ValueError, KeyError, OverflowError, pd.errors.ParserError) as error:
         raise ValueError(f"{path}: expected a run's scores, got a damaged or foreign file") from error
+    if len(unlike):
+        where, came = unlike.index[0] + 2, unlike.iloc[0]
+        raise ValueError(f"{path}: line {where}: value: expected at most {_LARGEST_SCORE:g}, got {came:g}")
     return scores
 
 

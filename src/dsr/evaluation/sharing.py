@@ -1,10 +1,13 @@
 """The scenes of a run, worked through by several processes, each scene by one: of this command, and of others.
 
-``.claims/`` in that directory exists while one of them is at work. A claim is a file that only one process can create;
-it names the machine, the process and when that was started, and its time of modification is kept fresh. A claim is over
-when it is deleted, when its process is gone from the same machine, or when it has not been refreshed for :data:`LOST`
-seconds. It is then taken over by a claim of the next number, which again only one process can create, so that no
-deletion can meet a newer claim. What has been found out under a claim can be left for the others as a record.
+``.claims/`` in that directory exists while one of them is at work. Each command has a file of a member there, which
+says with which settings it works; those with others are refused until it has left or is gone.
+
+A claim is a file that only one process can create; it names the machine, the process and when that was started, and its
+time of modification is kept fresh. A claim is over when it is deleted, when its process is gone from the same machine,
+or when it has not been refreshed for :data:`LOST` seconds. It is then taken over by a claim of the next number, which
+again only one process can create, so that no deletion can meet a newer claim. What has been found out under a claim can
+be left for the others as a record.
 
 All files are made by ``O_EXCL`` or renaming, and times are compared with those that the same file system gives. The
 time of a claim and what a directory contains are asked for anew, as clients of NFS remember both for up to a minute. So
@@ -16,9 +19,10 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import itertools
 import json
+import math
 import os
-import shutil
 import socket
 import threading
 import time
@@ -27,8 +31,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
-from dsr.utils.files import birth, machine, space_for, write_text
+from dsr.utils.files import FullDiskError, birth, machine, space_for, write_text
 from dsr.utils.guards import parse_json, read_limited
+from dsr.utils.memory import free_memory
 from dsr.utils.pool import Pool, computing_threads
 from dsr.utils.progress import Progress
 
@@ -38,36 +43,91 @@ Claim = contextlib.ExitStack
 """A context at whose end something that is claimed is given back."""
 
 _R = TypeVar("_R")
-_BETWEEN_TRIES = 0.3
+_BETWEEN_TRIES, _BETWEEN_LOOKS = 0.3, 0.05
+_SECONDS_TO_LEAVE = 2.0
+_MEMBERS = "members"
+"""What is claimed to become a member, and to leave."""
+_NUMBERS = itertools.count()
 _MEMORY = 1 << 30
 """Bytes of free memory that the automatic number of workers leaves to each."""
+
+
+class InUseError(ValueError):
+    """A command with other settings is at work in a directory.
+
+    Args:
+        folder: the directory.
+        owner: the process and its machine.
+
+    """
+
+    def __init__(self, folder: Path, owner: str) -> None:
+        super().__init__(f"{folder}: {owner} is at work there with other settings; wait for its end, or take another")
+        self.owner = owner
 
 
 class Claims:
     """The claims in the directory of a run, to use in a ``with`` statement by each command that takes part.
 
-    The last command that leaves deletes the claims and the records.
+    The last command that leaves deletes the claims and the records, and the directory if it was made for them and is
+    empty. Within a command that takes part, further objects may claim without taking part themselves.
+
+    Args:
+        folder: the directory.
+        settings: text that all commands at work there must have in common; None for one that leaves this to others.
+
+    Raises:
+        InUseError: a command with other settings takes part, or one that is stopped has just come or is about to leave.
+
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, settings: str | None = None) -> None:
+        self._run, self._settings = folder, settings
         self._folder = folder / ".claims"
-        self._member = self._folder / f"member-{machine()}-{os.getpid()}"
+        self._member = self._folder / f"member-{machine()}-{os.getpid()}-{next(_NUMBERS)}"
         self._beating = contextlib.ExitStack()
+        self._made: list[Path] = []
 
     def __enter__(self) -> Self:
         """Take part."""
-        while not _create(self._member):
-            self._member.unlink(missing_ok=True)  # of a process that had this number
-        self._beating.enter_context(_fresh(self._member))
+        self._made = [each for each in (self._run, *self._run.parents) if not each.exists()]
+        with self._alone():
+            if self._settings is not None:
+                self._expect_agreement()
+            while not _create(self._member, self._settings):
+                self._member.unlink(missing_ok=True)  # of a process that had this number
+        self._beating.enter_context(_fresh(self._member, lambda: _create(self._member, self._settings)))
         return self
 
     def __exit__(self, *_: object) -> None:
         """Leave; the last one deletes everything."""
         self._beating.close()
-        if any(not self._is_over(each) for each in self._files("member-") if each != self._member):
-            self._member.unlink(missing_ok=True)
-        else:
-            shutil.rmtree(self._folder, ignore_errors=True)
+        with contextlib.ExitStack() as stack:
+            with contextlib.suppress(OSError, FullDiskError, TimeoutError):  # somebody is stopped right at this
+                stack.enter_context(self.wait(_MEMBERS, _SECONDS_TO_LEAVE))
+            if any(not self._is_over(each) for each in self._files("member-") if each != self._member):
+                self._member.unlink(missing_ok=True)
+                return
+            for path in self._files(""):
+                if not path.name.startswith(_digest(_MEMBERS)):
+                    path.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # there is something in it
+            for each in (self._folder, *self._made):
+                each.rmdir()
+
+    def wait(self, name: str, seconds: float = math.inf) -> Claim:
+        """Claim something once nobody else has it.
+
+        Raises:
+            TimeoutError: somebody has it after so many seconds.
+
+        """
+        deadline = time.monotonic() + seconds
+        while (claim := self.take(name)) is None:
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"{self._folder}: somebody has {name}")
+            time.sleep(_BETWEEN_LOOKS)
+        return claim
 
     def take(self, name: str) -> Claim | None:
         """Claim something; return None if somebody else has it."""
@@ -97,12 +157,39 @@ class Claims:
 
     def now(self) -> float:
         """Return the time of the file system, which is that of its server, in seconds."""
+        while True:
+            try:
+                os.utime(self._folder)
+                return self._folder.stat().st_mtime
+            except FileNotFoundError:  # the last command has just deleted it
+                self._folder.mkdir(parents=True, exist_ok=True)
+
+    def _alone(self) -> Claim:
+        """Claim that nobody else becomes a member meanwhile; raise InUseError if somebody is stopped right at that."""
         try:
-            os.utime(self._member)
-            return self._member.stat().st_mtime
-        except FileNotFoundError:  # deleted by a command that took this one for lost
-            _create(self._member)
-            return self._member.stat().st_mtime
+            return self.wait(_MEMBERS, LOST)
+        except TimeoutError as error:
+            owners = [_owner(path) for path in self._files(f"{_digest(_MEMBERS)}.")]
+            named = [f"process {owner['process']} of {owner['host']}" for owner in owners if owner]
+            raise InUseError(self._run, ", ".join(named) or "another process") from error
+
+    def _expect_agreement(self) -> None:
+        """Raise InUseError if a command with other settings is at work."""
+        for path in self._files("member-"):
+            owner = _owner(path)
+            if owner.get("settings") not in (None, self._settings) and self._lives(path, owner):
+                raise InUseError(self._run, f"process {owner['process']} of {owner['host']}")
+
+    def _lives(self, path: Path, owner: Mapping[str, Any]) -> bool:
+        """Return whether the process of a claim is there; a sign of life is waited for if it is another machine's."""
+        with contextlib.suppress(FileNotFoundError):
+            first = path.stat().st_mtime
+            while not self._is_over(path):
+                with path.open("rb") as file:
+                    if owner["machine"] == machine() or os.fstat(file.fileno()).st_mtime != first:
+                        return True
+                time.sleep(_BETWEEN_LOOKS)
+        return False
 
     def _record(self, name: str) -> Path:
         """Return the file of a record."""
@@ -134,13 +221,14 @@ class Claims:
         return age > LOST
 
 
-def _create(path: Path) -> bool:
+def _create(path: Path, settings: str | None = None) -> bool:
     """Create the file of a claim; return whether it was not there."""
     owner = {
         "host": socket.gethostname(),
         "machine": machine(),
         "process": os.getpid(),
         "birth": birth(os.getpid()),
+        "settings": settings,
     }
     with space_for(path):
         while True:
@@ -151,20 +239,36 @@ def _create(path: Path) -> bool:
                 return False
             except FileNotFoundError:  # the last command has just deleted the directory
                 continue
-            with file:
-                file.write(json.dumps(owner))
+            try:
+                with file:
+                    file.write(json.dumps(owner))
+            except BaseException:  # it would be nobody's
+                path.unlink(missing_ok=True)
+                raise
             return True
 
 
+def _owner(path: Path) -> dict[str, Any]:
+    """Return what the file of a claim says; nothing if it is gone, or not yet written."""
+    try:
+        owner = parse_json(read_limited(path), finite=False)
+        return {key: owner[key] for key in ("host", "machine", "process", "settings")}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+
+
 @contextlib.contextmanager
-def _fresh(path: Path) -> Iterator[None]:
-    """Refresh the time of a file within this context."""
+def _fresh(path: Path, lost: Callable[[], object] = lambda: None) -> Iterator[None]:
+    """Refresh the time of a file within this context; ``lost`` is called if somebody has deleted it."""
     ended = threading.Event()
 
     def refresh() -> None:
         while not ended.wait(BEAT):
-            with contextlib.suppress(OSError):
-                os.utime(path)
+            with contextlib.suppress(OSError, FullDiskError):
+                try:
+                    os.utime(path)
+                except FileNotFoundError:
+                    lost()
 
     thread = threading.Thread(target=refresh, daemon=True)
     thread.start()
@@ -218,7 +322,7 @@ def choose_workers(workers: int | None, threads: int | None, scenes: int, cores:
     if threads is None:
         threads = max(1, cores // max(1, scenes)) if together else cores
     if workers is None:
-        workers = min(max(1, cores // threads), max(1, _free_memory() // _MEMORY)) if together else 1
+        workers = min(max(1, cores // threads), max(1, free_memory() // _MEMORY)) if together else 1
     return Workers(max(1, min(workers, scenes)), threads)
 
 
@@ -310,12 +414,3 @@ def _attempt(scene: str, claims: Claims, name: str, ready: Callable[[str], _R | 
 def _scene_of(pair: tuple[str, object]) -> str:
     """Return the scene of a scene and something about it."""
     return pair[0]
-
-
-def _free_memory() -> int:
-    """Return the bytes of memory that are free; where the system does not tell it, those of a large machine."""
-    try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
-    except (OSError, ValueError, StopIteration):
-        return 1 << 40

@@ -106,6 +106,12 @@ def can_hold(suffix: str, dtype: np.dtype) -> bool:
     return str(dtype) in _STORABLE.get(_format(suffix), (str(dtype),))
 
 
+def storable(suffix: str, dtype: np.dtype) -> np.dtype:
+    """Return the type that the format of a suffix stores values of a type as: itself, or the widest of its kind."""
+    alike = [np.dtype(name) for name in _STORABLE.get(_format(suffix), ()) if np.dtype(name).kind == dtype.kind]
+    return dtype if can_hold(suffix, dtype) or not alike else max(alike, key=lambda each: each.itemsize)
+
+
 def _format(suffix: str) -> str:
     """Return the first of the suffixes that mean one format."""
     return ".tiff" if suffix == ".tif" else suffix

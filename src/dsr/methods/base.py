@@ -18,6 +18,9 @@ from dsr.utils.configuration import Node
 from dsr.utils.progress import Steps
 from dsr.utils.ratios import SCALES, round_ratio
 
+_HALF = float(np.finfo(np.float16).max)
+"""Largest number of half precision."""
+
 
 class NoSolutionError(ValueError):
     """A method has no solution for a valid image, which is reported as a result, as papers do."""
@@ -130,9 +133,16 @@ class Surface(NamedTuple):
         return self._replace(depth=function(self.depth), depth_error=depth_error, angle_error=angle_error)
 
     def error_arrays(self) -> dict[str, np.ndarray]:
-        """Return the expected errors by name, (H, W) in half precision, as they are stored; empty without them."""
+        """Return the expected errors by name, (H, W), as they are stored; empty without them.
+
+        They are in half precision, which holds up to 65 km, or in single precision if one is larger.
+        """
         named = {"depth_error": self.depth_error, "angle_error": self.angle_error}
-        return {name: each[0].cpu().numpy().astype(np.float16) for name, each in named.items() if each is not None}
+        found = {name: each[0].cpu().numpy() for name, each in named.items() if each is not None}
+        return {
+            name: values.astype(np.float16 if np.nanmax(values, initial=0) <= _HALF else np.float32)
+            for name, values in found.items()
+        }
 
 
 NoiseLaw = tuple[float, float]

@@ -17,8 +17,13 @@ from platformdirs import user_cache_path
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
 from dsr.utils.arrays import read_arrays
+from dsr.utils.console import note_once, printable
 from dsr.utils.files import replacing
 from dsr.utils.guards import parse_json
+from dsr.utils.memory import expect_memory
+
+_BYTES = 150
+"""Least memory that a pixel takes while a scene is made; random ones take four times as much."""
 
 
 @dataclass(frozen=True)
@@ -30,11 +35,21 @@ class Rendering:
         depth: (H, W) float64 orthogonal depth in metres.
         camera: camera of both.
 
+    Raises:
+        ValueError: the arrays are of other types or sizes.
+
     """
 
     rgb: NDArray[np.uint8]
     depth: NDArray[np.float64]
     camera: Camera
+
+    def __post_init__(self) -> None:
+        """Check the arrays."""
+        size = (self.camera.height, self.camera.width)
+        came = (self.rgb.dtype, self.rgb.shape, self.depth.dtype, self.depth.shape)
+        if came != (np.uint8, (*size, 3), np.float64, size):
+            raise ValueError(f"expected rgb and depth of {size} pixels, got {came}")
 
     def scene(self, dataset: str, name: str) -> Scene:
         """Return the rendering as a scene of a data set."""
@@ -45,17 +60,31 @@ class Rendering:
 def load_or_render(path: Path, make: Callable[[], Rendering]) -> Rendering:
     """Return the rendering at ``path`` in the cache directory; if there is none, make it and store it there.
 
-    A damaged file is replaced. If the cache cannot be written, the rendering is made each time.
+    A damaged file is replaced, with a note. If the cache cannot be written, the rendering is made each time.
     """
     path = cache_directory() / path
-    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # missing or damaged
+    try:
         kept = read_arrays(path)
         return Rendering(kept["rgb"], kept["depth"], Camera(**parse_json(str(kept["camera"]))))
+    except OSError:
+        pass  # there is none
+    except (ValueError, KeyError, TypeError):
+        note_once(f"{printable(str(path))}: damaged, so it is made anew")
     rendering = make()
     with contextlib.suppress(OSError), replacing(path) as temporary:
         camera = json.dumps(asdict(rendering.camera))
         np.savez_compressed(temporary, rgb=rendering.rgb, depth=rendering.depth, camera=camera)
     return rendering
+
+
+def expect_size(size: int) -> None:
+    """Refuse a height and width of scenes that this machine has too little memory to make.
+
+    Raises:
+        OutOfMemoryError: it has; the message begins with ``size``.
+
+    """
+    expect_memory("size", size, _BYTES * float(size) ** 2)
 
 
 def cache_directory() -> Path:

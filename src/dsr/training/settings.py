@@ -5,9 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from dsr.utils.memory import expect_memory
+
 _MAX_DEPTH_SCALE = 3.0
 """Depth changes by a factor of exp(3) = 20 at most."""
 _MIN_SIZE = 16
+_BYTES, _BYTES_OF_WORKER = 256, 1 << 26
+"""Least memory of a pixel, as of a photo, a map and one layer of a network, and of a process that crops patches."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +60,9 @@ class PatchSettings:
             raise ValueError(f"batch: expected a positive number, got {self.batch}")
         if self.scenes is not None and self.scenes < 1:
             raise ValueError(f"scenes: expected a positive number, or null for all, got {self.scenes}")
+        expect_memory("patch", self.patch, _BYTES * float(self.patch) ** 2)
+        expect_memory("batch", self.batch, _BYTES * float(self.batch) * self.patch**2)
+        expect_memory("workers", self.workers, _BYTES_OF_WORKER * float(self.workers))
         for name in ("workers", "validation_scenes"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name}: expected 0 or more, got {getattr(self, name)}")

@@ -17,13 +17,16 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import errno
 import importlib
+import io
 import os
 import select
 import signal
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Any, NoReturn
@@ -60,6 +63,32 @@ class Deferred:
         """Note the first signal; the default handler applies to the second one."""
         self.requested = True
         signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+
+
+class _Output(io.FileIO):
+    """A standard stream that nobody reads any longer, as of ``| head``, takes what is written and drops it.
+
+    Args:
+        descriptor: that of the stream.
+        dropped: numbers of the errors at which it does so.
+
+    """
+
+    def __init__(self, descriptor: int, dropped: tuple[int, ...]) -> None:
+        super().__init__(descriptor, "wb", closefd=False)
+        self._dropped = dropped
+
+    def write(self, data: Any, /) -> int:
+        """Write bytes, or from an error on drop them."""
+        try:
+            return super().write(data)
+        except OSError as error:
+            if error.errno not in self._dropped:
+                raise
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, self.fileno())
+            os.close(nowhere)
+            return len(data)
 
 
 class _State:
@@ -102,6 +131,8 @@ def start(module: str, function: str) -> NoReturn:
     """
     install()
     surroundings.close()
+    sys.stdout = _without(sys.stdout, errno.EPIPE)
+    sys.stderr = _without(sys.stderr, errno.EPIPE, errno.ENOSPC)  # what cannot be told must not change the exit code
     code: object = 0
     try:
         code = getattr(importlib.import_module(module), function)()
@@ -115,6 +146,24 @@ def start(module: str, function: str) -> NoReturn:
     _finish(code if isinstance(code, int) else int(code is not None))
 
 
+def _without(stream: Any, *dropped: int) -> Any:
+    """Return a standard stream that drops what is written from these errors on; None for none."""
+    if not isinstance(stream, io.TextIOWrapper):
+        return stream
+    try:
+        raw = _Output(stream.fileno(), dropped)
+    except OSError:  # it is closed
+        return stream
+    stream.flush()
+    return io.TextIOWrapper(
+        io.BufferedWriter(raw) if isinstance(stream.buffer, io.BufferedWriter) else raw,
+        encoding=stream.encoding,
+        errors=stream.errors,
+        line_buffering=stream.line_buffering,
+        write_through=stream.write_through,
+    )
+
+
 def install() -> None:
     """Make the handler that of this process; only from its main thread."""
     _State.installed = True
@@ -122,6 +171,8 @@ def install() -> None:
     _State.numbers = tuple(number for number in _SIGNALS if signal.getsignal(number) != signal.SIG_IGN)
     sys.unraisablehook = _unraisable
     sys.warnoptions.append("ignore:resource_tracker")  # it warns on stderr of what it cleans up after a sudden end
+    sys.warnoptions.append("ignore::RuntimeWarning")  # NumPy's, of numbers that are checked for what they became
+    warnings.simplefilter("ignore", RuntimeWarning)
     os.register_at_fork(after_in_child=_forget)
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
@@ -398,8 +449,9 @@ def _finish(code: int) -> NoReturn:
         atexit._run_exitfuncs()
         sys.stdout.flush()
     except OSError as error:
-        print(f"error: standard output: {error.strerror}", file=sys.stderr)  # noqa: T201
-        code = code or 2
+        if not code:  # it may be for the same reason that there was an error before
+            print(f"error: standard output: {error.strerror}", file=sys.stderr)  # noqa: T201
+            code = 2
     with contextlib.suppress(OSError):
         sys.stderr.flush()
     os._exit(code)

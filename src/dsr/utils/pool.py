@@ -15,6 +15,7 @@ import time
 import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, Generic, Literal, Self, TypeVar, cast
@@ -210,6 +211,8 @@ class Pool(Generic[_T, _R]):
         """Start a worker."""
         here, there = self._context.Pipe()
         arguments = (there, os.getpid(), self._plan if self._forks else None)
+        if not self._forks and os.name == "posix":
+            resource_tracker.ensure_running()  # else the first start begins it, and lets SIGINT through to the worker
         process = self._context.Process(target=_serve, args=arguments, daemon=True)  # type: ignore[attr-defined]
         with interruption.starting_workers(), warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)  # of forking with threads: those of this process sleep

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import platform
 import time
@@ -26,6 +27,7 @@ from dsr.app.upsample.reporting import Messages
 from dsr.app.upsample.request import UpsampleRequest, Upsampling, files_of, inputs_with_neighbours, settings_of
 from dsr.app.upsample.sequence import FrameSequence
 from dsr.degradation.sensors import Identified
+from dsr.evaluation.sharing import Claims
 from dsr.inference import AnyRatio, Plan, enlarged_by, find_sensor
 from dsr.io.inputs import FolderUnits, Picture, read_picture
 from dsr.io.pairs import Pair
@@ -54,14 +56,23 @@ class FrameWork:
 
     def __init__(self, request: UpsampleRequest, pairs: Sequence[Pair]) -> None:
         self._request, self._units = request, FolderUnits(pairs)
+        self._claims = Claims(request.results.output)
         self._sequence = FrameSequence(pairs, self._read, request.frames.neighbours, request.frames.poses)
 
     def __call__(self, pair: Pair, target: Path, reporter: Messages, progress: Progress) -> str:
-        """Upsample one picture, and return the outcome."""
-        request, sequence = self._request, self._sequence
+        """Upsample one picture, and return the outcome; commands that have it in common do so one after the other."""
+        depends_on = inputs_with_neighbours(self._request, pair, self._sequence.neighbours(pair))
+        job = _Job(self._request, pair, target, self._settings, depends_on, read_previous_run(target))
+        with contextlib.ExitStack() as stack:
+            if not (self._request.results.dry_run or job.is_done()):
+                stack.enter_context(self._claims.wait(f"frame {target.relative_to(self._request.results.output)}"))
+                job = replace(job, earlier=read_previous_run(target))
+            return self._work(job, reporter, progress)
+
+    def _work(self, job: _Job, reporter: Messages, progress: Progress) -> str:
+        """Upsample a picture that no other command is at, and return the outcome."""
+        request, sequence, pair, target = self._request, self._sequence, job.pair, job.target
         how, wanted = request.upsampling, request.results
-        depends_on = inputs_with_neighbours(request, pair, sequence.neighbours(pair))
-        job = _Job(request, pair, target, self._settings, depends_on, read_previous_run(target))
         job.expect_agreement()
         if job.is_done():
             job.expect_no_warning(job.earlier.warnings if job.earlier is not None else ())
@@ -86,13 +97,13 @@ class FrameWork:
         expect_free(target, inputs, ours=wanted.overwrite or job.earlier is not None)
         errors = any(part.errors for part in wanted.of_frame)
         surface = kept_surface(target, picture.camera, errors=errors) if job.reusable else None
-        begin(target, job.settings, job.inputs, () if job.earlier is None else job.earlier.files)
         started = time.perf_counter()
         if surface is None:
             surface = self._upsample(picture, identified, progress)
             reporter.facts(_describe(surface.noise, given="noise" in how.arguments))
             reporter.facts([*_describe_outliers(surface.outliers), *_describe_holes(surface, how)])
         seconds = time.perf_counter() - started
+        begin(target, job.settings, job.inputs, () if job.earlier is None else job.earlier.files)
         facts = _write(job, picture, surface, planned, seconds)
         reporter.facts(facts)
         reporter.say(f"{pair.name}: {planned.text}, {seconds:.1f} s -> {target}")

@@ -6,7 +6,7 @@ import contextlib
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import torch
 from dsr.app.upsample.parts import ERRORS, FILES, METRES, PARTS
 from dsr.evaluation.store import load_errors
 from dsr.geometry.camera import Camera
+from dsr.io.depth_files import storable
 from dsr.io.encoding import Encoding
 from dsr.io.inputs import Picture
 from dsr.methods.base import Surface
@@ -54,6 +55,8 @@ class PreviousRun:
 def output_encoding(encoding: Encoding, chosen: str | None) -> Encoding:
     """Return how the result is stored: as the input in the input's format, else in metres, or in whole millimetres.
 
+    Of whole numbers of 64 bits, which a TIFF may have and no writer writes, it has 32.
+
     Args:
         encoding: the input's.
         chosen: one of :data:`dsr.app.upsample.parts.FORMATS`; None for the input's.
@@ -61,7 +64,7 @@ def output_encoding(encoding: Encoding, chosen: str | None) -> Encoding:
     """
     own = "tiff" if encoding.suffix == ".tif" else encoding.suffix[1:]
     if chosen in (None, own):
-        return encoding
+        return replace(encoding, dtype=str(storable(encoding.suffix, np.dtype(encoding.dtype))))
     if chosen == "png":
         return Encoding(".png", "uint16", 1e-3, 0.0, "orthogonal")
     return Encoding(f".{chosen}", "float32", 1.0, math.nan, "orthogonal")

@@ -54,7 +54,7 @@ class Result:
     @functools.cached_property
     def certain(self) -> tuple[Tensor | None, tuple[Assumption, ...]]:
         """The depth, (1, H, W), without pixels that are likely to be wrong, None if none is left; and notes."""
-        from dsr.io.encoding import Assumption
+        from dsr.notes import Assumption
 
         depth, notes = self.surface.depth, list[Assumption]()
         if self.surface.depth_error is not None:
@@ -117,7 +117,8 @@ def _depth(folder: Path, result: Result) -> Output:
     import numpy as np
 
     from dsr.io.depth_files import write_depth_file
-    from dsr.io.encoding import Assumption, Encoding, encode
+    from dsr.io.encoding import Encoding, encode
+    from dsr.notes import Assumption
     from dsr.utils.files import replacing
 
     depth, encoding = result.surface.depth, result.encoding
@@ -161,8 +162,8 @@ def _cloud(folder: Path, result: Result) -> Output:
 
 
 def _mesh(folder: Path, result: Result) -> Output:
-    from dsr.io.encoding import Assumption
     from dsr.io.exports import write_mesh
+    from dsr.notes import Assumption
 
     depth, notes = result.certain
     if depth is None:
@@ -177,7 +178,7 @@ def _mesh(folder: Path, result: Result) -> Output:
 
 def _fewer(part: str, what: str, option: str, shape: Written) -> list[Assumption]:
     """Return a note on a shape that has less than the depth map gives."""
-    from dsr.io.encoding import Assumption
+    from dsr.notes import Assumption
 
     text = f"the {part} has fewer {what} than the depth map gives ({option})"
     return [Assumption(text, str(shape))] if shape.how else []

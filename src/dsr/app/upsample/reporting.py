@@ -6,11 +6,10 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Protocol
 
-import torch
 from rich.console import Console
 
 from dsr.notes import Assumption
-from dsr.utils.console import one_line, show
+from dsr.utils.console import show
 
 _SHOWN = 5
 """Number of names that a line lists; further ones are only counted."""
@@ -74,13 +73,6 @@ class Reporter:
         for text, count in self._counts.items():
             if count < pictures:
                 self.say(f"  {count} of {pictures} pictures: {text}")
-
-
-def problem_line(error: BaseException) -> str:
-    """Return an error as one line."""
-    if isinstance(error, (MemoryError, torch.OutOfMemoryError)):
-        return "not enough memory; a smaller --scale, --device cpu or a smaller photo needs less"
-    return one_line(error)
 
 
 def listed(names: Sequence[str]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
 from collections import Counter
@@ -11,9 +12,10 @@ from rich.console import Console
 
 from dsr.app.upsample.frames import Frames, find_frames
 from dsr.app.upsample.reporting import Reporter, listed
-from dsr.app.upsample.request import UpsampleRequest
+from dsr.app.upsample.request import UpsampleRequest, settings_of
 from dsr.app.upsample.scene import EXPORTS, write_scene
 from dsr.app.upsample.workers import work_through
+from dsr.evaluation.sharing import Claims
 from dsr.io.reading import Shard
 from dsr.utils.console import ConsoleProgress, show
 from dsr.utils.files import expect_targets, write_text
@@ -30,11 +32,23 @@ def run(request: UpsampleRequest, console: Console) -> list[str]:
         The problems, one line each; empty if there were none.
 
     Raises:
-        ValueError: the pairs cannot be determined, or a file would be written outside of the folder of results.
+        ValueError: the pairs cannot be determined, a file would be written outside of the folder of results, or a
+            command with other settings is at work in it.
         TargetError: a link, a device, a pipe or a socket is in the place of a file.
 
     """
-    frames, wanted, shard = find_frames(request), request.results, request.frames.shard
+    frames = find_frames(request)
+    with contextlib.ExitStack() as stack:
+        if not request.results.dry_run:
+            claims = Claims(request.results.output, json.dumps(settings_of(request), sort_keys=True))
+            with contextlib.suppress(PermissionError):  # all may be complete; what is written says so itself
+                stack.enter_context(claims)
+        return _run(request, frames, console)
+
+
+def _run(request: UpsampleRequest, frames: Frames, console: Console) -> list[str]:
+    """Upsample frames, and return the problems."""
+    wanted, shard = request.results, request.frames.shard
     started = time.perf_counter()
     found, single = frames.found, frames.single
     of_all = [] if shard is not None else [*(name for part in wanted.of_all for name in part.files), EXPORTS]

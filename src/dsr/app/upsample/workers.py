@@ -7,18 +7,16 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import torch
-
 from dsr.app.upsample.frame import FrameWork
 from dsr.app.upsample.frames import Frames
-from dsr.app.upsample.reporting import Messages, Record, Reporter, problem_line
+from dsr.app.upsample.reporting import Messages, Record, Reporter
 from dsr.app.upsample.request import UpsampleRequest
 from dsr.io.pairs import Pair
+from dsr.utils.console import one_line
+from dsr.utils.memory import refusing_excess
 from dsr.utils.pool import LOST, Pool
 from dsr.utils.progress import Progress
 
-_FAILURES = (ValueError, OSError, MemoryError, torch.OutOfMemoryError)
-"""What a picture may fail with, while the others go on."""
 _Job = tuple[Pair, Path]
 """A picture and the folder of its results."""
 _work: FrameWork | None = None
@@ -101,6 +99,7 @@ def _name_of(job: _Job) -> str:
 def attempt(work: FrameWork, pair: Pair, target: Path, reporter: Messages, progress: Progress) -> Done:
     """Upsample a picture, and return what became of it."""
     try:
-        return Done(pair, target, work(pair, target, reporter, progress), None)
-    except _FAILURES as error:
-        return Done(pair, target, "", problem_line(error))
+        with refusing_excess():
+            return Done(pair, target, work(pair, target, reporter, progress), None)
+    except (ValueError, OSError) as error:  # the others go on
+        return Done(pair, target, "", one_line(error))

@@ -36,7 +36,7 @@ from torch import Tensor
 
 from dsr.geometry.camera import RangeType
 from dsr.methods.base import Abilities, Cost
-from dsr.methods.classical.photo_guided import Guided, GuidedMethod, expect_positive
+from dsr.methods.classical.photo_guided import Guided, GuidedMethod, expect_positive, expect_window
 from dsr.methods.inpainting import inpaint
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
@@ -70,7 +70,8 @@ class Bilateral(GuidedMethod):
         self, window: int = 19, sigma_depth: float = 0.03, sigma_space: float = 3.0, *, fill_holes: bool = False
     ) -> None:
         super().__init__(fill_holes=fill_holes, slopes=True)
-        expect_positive("the bilateral filter", window=window, sigma_depth=sigma_depth, sigma_space=sigma_space)
+        expect_window("the bilateral filter", window=window)
+        expect_positive("the bilateral filter", sigma_depth=sigma_depth, sigma_space=sigma_space)
         self._window, self._sigma_depth, self._sigma_space = window, sigma_depth, sigma_space
 
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
@@ -126,7 +127,8 @@ class JointBilateral(GuidedMethod):
         slopes: bool = True,
     ) -> None:
         super().__init__(fill_holes=fill_holes, slopes=slopes)
-        expect_positive("joint bilateral upsampling", radius=radius, sigma_space=sigma_space, sigma_colour=sigma_colour)
+        expect_window("joint bilateral upsampling", radius=radius)
+        expect_positive("joint bilateral upsampling", sigma_space=sigma_space, sigma_colour=sigma_colour)
         self._radius, self._sigma_space, self._sigma_colour = radius, sigma_space, sigma_colour
 
     def filter_maps(self, guided: Guided) -> Tensor:

@@ -46,7 +46,7 @@ from dsr.geometry.camera import from_range
 from dsr.methods.base import Abilities, Cost, Method, whole_scale
 from dsr.methods.classical.edge_map import predict_edge_map
 from dsr.methods.classical.finite_differences import box_mean, repeat_blocks, upsample_linear_border
-from dsr.methods.classical.photo_guided import estimate_slopes, expect_positive
+from dsr.methods.classical.photo_guided import estimate_slopes, expect_positive, expect_window
 from dsr.methods.inpainting import inpaint
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps, part_of
@@ -259,6 +259,7 @@ class EdgeGuided(Method):
     ) -> None:
         expect_positive("edge-guided upsampling", step=step, sharp_weight=sharp_weight, smoothness=smoothness)
         expect_positive("edge-guided upsampling", sigma_space=sigma_space, mixed=mixed)
+        expect_window("edge-guided upsampling", radius=radius)
         for name, value in (("candidates", candidates), ("iterations", iterations), ("radius", radius)):
             if value < 1:
                 raise ValueError(f"{name}: expected at least 1 for edge-guided upsampling, got {value}")

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.methods.classical.photo_guided import Guided, GuidedMethod, expect_positive
+from dsr.methods.classical.photo_guided import Guided, GuidedMethod, expect_positive, expect_window
 
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """The entries of a symmetric 3 x 3 matrix, in the order of storage."""
@@ -48,7 +48,8 @@ class GuidedFilter(GuidedMethod):
         self, radius: float = 0.5, epsilon: float = 1e-3, *, fill_holes: bool = False, slopes: bool = True
     ) -> None:
         super().__init__(fill_holes=fill_holes, slopes=slopes)
-        expect_positive("the guided filter", radius=radius, epsilon=epsilon)
+        expect_window("the guided filter", radius=radius)
+        expect_positive("the guided filter", epsilon=epsilon)
         self._radius, self._epsilon = radius, epsilon
 
     def filter_maps(self, guided: Guided) -> Tensor:

@@ -25,6 +25,8 @@ from dsr.methods.networks.normalisation import lr_coordinates
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 
+_WIDEST = 1024
+"""Largest radius or width of a filter, in low-resolution pixels."""
 _BEYOND = 4.0
 """Factor by which a result may be farther than the farthest valid low-resolution pixel, or nearer than the nearest."""
 
@@ -136,6 +138,14 @@ def expect_positive(method: str, **values: float) -> None:
     for name, value in values.items():
         if not 0 < value < float("inf"):
             raise ValueError(f"{name}: expected a positive number for {method}, got {value}")
+
+
+def expect_window(method: str, **values: float) -> None:
+    """Raise a ValueError for the first of a method's windows that is not positive, or wider than any map needs."""
+    expect_positive(method, **values)
+    for name, value in values.items():
+        if value > _WIDEST:
+            raise ValueError(f"{name}: expected at most {_WIDEST} low-resolution pixels for {method}, got {value}")
 
 
 def _fit_planes(disparity_lr: Tensor) -> Tensor:

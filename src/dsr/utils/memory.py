@@ -1,0 +1,68 @@
+"""How much memory there is, and refusals, in one line, of what does not fit in it."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+
+from dsr.utils.progress import megabytes
+
+_NO_LIMIT = 1 << 40
+"""Bytes of memory where the system does not tell."""
+_ADVICE = "not enough memory; a smaller size, scale or batch, or fewer workers need less"
+_OF_ALLOCATORS = ("allocate memory", "not enough memory", "Insufficient memory", "out of memory")
+"""What torch's and OpenCV's errors say when there is no memory."""
+
+
+class OutOfMemoryError(ValueError):
+    """There is not enough memory for what was asked for."""
+
+
+def free_memory() -> int:
+    """Return the bytes of memory that are free; where the system does not tell it, those of a large machine."""
+    return _told("MemAvailable:")
+
+
+def expect_memory(name: str, value: object, needed: float) -> None:
+    """Refuse a value for which this machine, whatever else runs on it, has too little memory.
+
+    Args:
+        name: of the value.
+        value: what came.
+        needed: bytes that it needs at least.
+
+    Raises:
+        OutOfMemoryError: it has less; the message begins with ``name``.
+
+    """
+    there = _told("MemTotal:")
+    if needed > there:
+        size = f"at least {megabytes(needed)} of memory, of which there are {megabytes(there)}"
+        raise OutOfMemoryError(f"{name}: expected less, {value} needs {size}")
+
+
+@contextlib.contextmanager
+def refusing_excess() -> Iterator[None]:
+    """Raise OutOfMemoryError for whatever fails in this context for want of memory."""
+    try:
+        yield
+    except Exception as error:
+        if not isinstance(error, MemoryError) and not _is_of_allocator(error):
+            raise
+        raise OutOfMemoryError(_ADVICE) from error
+
+
+def _is_of_allocator(error: Exception) -> bool:
+    """Return whether an error is that of a library that could not allocate memory, as torch and OpenCV say it."""
+    foreign = isinstance(error, RuntimeError) or type(error).__module__.startswith("cv2")
+    return foreign and any(text in str(error) for text in _OF_ALLOCATORS)
+
+
+def _told(name: str) -> int:
+    """Return what the system tells of its memory, in bytes."""
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        return 1024 * next(int(line.split()[1]) for line in lines if line.startswith(name))
+    except (OSError, ValueError, StopIteration):
+        return _NO_LIMIT
