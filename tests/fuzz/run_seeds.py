@@ -23,7 +23,6 @@ from dsr.evaluation.sharing import _digest
 from dsr.utils.files import machine
 from fuzz.seeds import CAMERA, photo, unit, written
 
-
 INTERRUPTED = 130
 
 

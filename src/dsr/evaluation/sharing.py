@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any, Self, TypeVar
 
 from dsr.utils.files import birth, machine, space_for, write_text
-from dsr.utils.guards import parse_json, read_limited
+from dsr.utils.guards import opened, parse_json, read_limited
 from dsr.utils.pool import Pool, computing_threads
 from dsr.utils.progress import Progress
 
@@ -39,6 +39,8 @@ Claim = contextlib.ExitStack
 
 _R = TypeVar("_R")
 _BETWEEN_TRIES = 0.3
+_LARGEST = 1 << 12
+"""Bytes of a claim that are read."""
 _MEMORY = 1 << 30
 """Bytes of free memory that the automatic number of workers leaves to each."""
 
@@ -118,15 +120,16 @@ class Claims:
     def _is_over(self, path: Path) -> bool:
         """Return whether a claim has lost its process."""
         try:
-            with path.open(encoding="utf-8") as file:  # a client of NFS asks for a file's time when it is opened
+            with opened(path) as file:  # a client of NFS asks for a file's time when it is opened
                 age = self.now() - os.fstat(file.fileno()).st_mtime
-                text = file.read()
-        except PermissionError:
-            return self.now() - path.stat().st_mtime > LOST
+                text = file.read(_LARGEST)
         except OSError:
-            return False  # just deleted: whoever looks again sees that it is free
+            try:  # another user's, or no file
+                return self.now() - path.lstat().st_mtime > LOST
+            except OSError:
+                return False  # just deleted: whoever looks again sees that it is free
         try:
-            owner = json.loads(text)
+            owner = parse_json(text)
             if owner["machine"] == machine():
                 return birth(int(owner["process"])) != owner["birth"]
         except (ValueError, KeyError, TypeError):
