@@ -28,6 +28,7 @@ from urllib.parse import unquote, urlsplit
 import requests
 from filelock import FileLock, Timeout
 from requests.adapters import HTTPAdapter
+from requests.auth import HTTPBasicAuth
 from urllib3 import Retry
 from urllib3.exceptions import HTTPError
 
@@ -321,7 +322,7 @@ def _download(url: str, part: Path, moved: Task, room: float, credentials: _Cred
     """
     part.parent.mkdir(parents=True, exist_ok=True)
     with requests.Session() as session:
-        session.auth = credentials
+        session.auth = None if credentials is None else HTTPBasicAuth(*credentials)
         for scheme in ("http://", "https://"):
             session.mount(scheme, HTTPAdapter(max_retries=RETRIES))
         while True:
