@@ -180,6 +180,33 @@ def test_claim_of_no_process_is_taken_over(tmp_path, case):
         assert claims.take("a") is not None
 
 
+HOSTILE = {
+    "no text": b"\xff\xfe",
+    "nested": b"[" * 100_000,
+    "a process without end": json.dumps({"machine": machine(), "process": 10**30, "birth": "1"}).encode(),
+    "an infinite process": b'{"machine": "%s", "process": Infinity, "birth": "1"}' % machine().encode(),
+    "endless": b" " * (1 << 22),
+}
+
+
+@pytest.mark.parametrize("case", [*HOSTILE, "a pipe", "a folder"])
+def test_claim_that_a_stranger_left_keeps_nobody_from_the_work_for_long(tmp_path, case):
+    with Claims(tmp_path) as claims:
+        claims.take("a").pop_all()  # is not given back
+        [path] = (path for path in (tmp_path / ".claims").iterdir() if not path.name.startswith("member-"))
+        path.unlink()
+        if case == "a pipe":
+            os.mkfifo(path)
+        elif case == "a folder":
+            path.mkdir()
+        else:
+            path.write_bytes(HOSTILE[case])
+        if case not in ("a process without end",):  # which has ended
+            assert claims.take("a") is None
+        os.utime(path, (time.time() - LOST - 1,) * 2)
+        assert claims.take("a") is not None
+
+
 def test_time_of_a_claim_is_not_one_that_was_remembered(tmp_path, start, monkeypatch):
     silent = start("elsewhere")
     silent.take("a")

@@ -13,6 +13,8 @@ from tensorboard.plugins.custom_scalar import layout_pb2
 
 from dsr.training import loggers
 from dsr.training.loggers import log_layout, log_picture, log_settings
+from dsr.utils.configuration import ConfigError
+from dsr.utils.lightning import ValidationTable
 
 
 @pytest.fixture(autouse=True)
@@ -102,3 +104,29 @@ def test_logger_that_is_not_installed_is_named_with_its_extra(tmp_path, monkeypa
         ValueError, match=rf"^logger={name}: expected {name}, which is not installed; pip install dsr\[{name}\]$"
     ):
         getattr(loggers, name)(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "content", [b"step,train/loss\n\xff,1\n", b"loss\n1\n", b"step\n" + b"1" * 5000 + b"\n", b"step\n" + b"x" * 200_000]
+)
+def test_table_that_is_damaged_is_named_in_one_line(tmp_path, content):
+    (tmp_path / "csv").mkdir()
+    (tmp_path / "csv" / "metrics.csv").write_bytes(content)
+    with pytest.raises(ValueError, match=r"csv/metrics\.csv: expected the table of a training's log, got a damaged"):
+        loggers.CsvLog(tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"step\nx\n", b"step,set,metric,value\n1,a\n", b"\xff", b"s\n\n"])
+def test_validations_that_are_damaged_are_named_before_a_step(tmp_path, content):
+    path = tmp_path / "validation.csv"
+    path.write_bytes(content)
+    with pytest.raises(ConfigError, match=rf"^{path}: expected the scores of a training's validations"):
+        ValidationTable(path).on_train_start(None, None)
+
+
+def test_run_that_has_settings_of_wandb_sends_its_log_nowhere(tmp_path, monkeypatch):
+    monkeypatch.setattr(loggers, "expect_installed", lambda _: None)
+    (tmp_path / "wandb").mkdir()
+    (tmp_path / "wandb" / "settings").write_text("[default]\nbase_url = http://elsewhere\n")
+    with pytest.raises(ValueError, match=r"expected no settings of wandb in the run's directory, got .*wandb/settings"):
+        loggers.wandb(tmp_path)

@@ -32,7 +32,7 @@ from pathlib import Path
 from typing import Any, Self, TypeVar
 
 from dsr.utils.files import FullDiskError, birth, machine, space_for, write_text
-from dsr.utils.guards import parse_json, read_limited
+from dsr.utils.guards import opened, parse_json, read_limited
 from dsr.utils.memory import free_memory
 from dsr.utils.pool import Pool, computing_threads
 from dsr.utils.progress import Progress
@@ -48,6 +48,8 @@ _SECONDS_TO_LEAVE = 2.0
 _MEMBERS = "members"
 """What is claimed to become a member, and to leave."""
 _NUMBERS = itertools.count()
+_LARGEST = 1 << 12
+"""Bytes of a claim that are read."""
 _MEMORY = 1 << 30
 """Bytes of free memory that the automatic number of workers leaves to each."""
 
@@ -82,7 +84,7 @@ class Claims:
     """
 
     def __init__(self, folder: Path, settings: str | None = None) -> None:
-        self._run, self._settings = folder, settings
+        self._run, self._settings = folder, None if settings is None else _digest(settings)
         self._folder = folder / ".claims"
         self._member = self._folder / f"member-{machine()}-{os.getpid()}-{next(_NUMBERS)}"
         self._beating = contextlib.ExitStack()
@@ -205,15 +207,16 @@ class Claims:
     def _is_over(self, path: Path) -> bool:
         """Return whether a claim has lost its process."""
         try:
-            with path.open(encoding="utf-8") as file:  # a client of NFS asks for a file's time when it is opened
+            with opened(path) as file:  # a client of NFS asks for a file's time when it is opened
                 age = self.now() - os.fstat(file.fileno()).st_mtime
-                text = file.read()
-        except PermissionError:
-            return self.now() - path.stat().st_mtime > LOST
+                text = file.read(_LARGEST)
         except OSError:
-            return False  # just deleted: whoever looks again sees that it is free
+            try:  # another user's, or no file
+                return self.now() - path.lstat().st_mtime > LOST
+            except OSError:
+                return False  # just deleted: whoever looks again sees that it is free
         try:
-            owner = json.loads(text)
+            owner = parse_json(text)
             if owner["machine"] == machine():
                 return birth(int(owner["process"])) != owner["birth"]
         except (ValueError, KeyError, TypeError):

@@ -15,8 +15,9 @@ import cv2
 import numpy as np
 
 from dsr.geometry.camera import Camera
-from dsr.io.images import expect_depth_values, quiet_decoders, read_array, read_numbers
+from dsr.io.images import expect_depth_values, read_array, read_numbers
 from dsr.utils.arrays import array_headers, read_arrays
+from dsr.utils.decoding import quiet_decoders
 from dsr.utils.files import replacing
 from dsr.utils.guards import MOST_PIXELS, bytes_of_archive, expect_bytes, expect_pixels, refusing
 

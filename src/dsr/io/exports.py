@@ -40,10 +40,10 @@ from dsr.geometry.mesh import (
 )
 from dsr.geometry.shading import render
 from dsr.geometry.surface import depth_to_normals
-from dsr.io.images import decode_pixels
 from dsr.io.photos import write_png
 from dsr.sample import expect_distances
 from dsr.utils.arrays import array_headers, read_arrays
+from dsr.utils.decoding import decode_pixels
 from dsr.utils.files import replacing
 from dsr.utils.guards import MOST_FACES, MOST_POINTS
 

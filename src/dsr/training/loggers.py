@@ -17,9 +17,12 @@ from torch import Tensor
 from dsr.metrics.formats import main_first
 from dsr.utils.configuration import expect_library
 from dsr.utils.files import write_text
+from dsr.utils.guards import MOST_TABLE, read_limited
 from dsr.utils.runs_table import list_run
 
 _CURVES = ("loss", "gradient_norm")
+_LARGEST_NUMBER = 1 << 10
+"""Largest size in bytes of a file with a number."""
 _ROWS_AT_ONCE = 10
 """Rows of a table that are written together."""
 OPTIONAL = ("wandb", "mlflow")
@@ -225,16 +228,21 @@ def _read_table(path: Path) -> list[dict[str, Any]]:
     """Return the rows of a table without empty cells; a row that was cut off is left out."""
     if not path.is_file():
         return []
-    with path.open(newline="", encoding="utf-8") as file:
-        rows = [row for row in tables.DictReader(file) if None not in row and None not in row.values()]
-    whole = [row for row in rows if row["step"].isdecimal()]
-    return [{name: value for name, value in row.items() if value} | {"step": int(row["step"])} for row in whole]
+    try:
+        lines = read_limited(path, MOST_TABLE).decode().splitlines(keepends=True)
+        rows = [row for row in tables.DictReader(lines) if None not in row and None not in row.values()]
+        whole = [row for row in rows if row["step"].isdecimal()]
+        return [{name: value for name, value in row.items() if value} | {"step": int(row["step"])} for row in whole]
+    except (ValueError, KeyError, OSError, tables.Error) as error:
+        raise ValueError(f"{path}: expected the table of a training's log, got a damaged one") from error
 
 
 def _read_number(folder: Path, service: str) -> str | None:
     """Return the number that a service has given to the run, None for a new run."""
-    path = folder / RUN_IDS[service]
-    text = path.read_text(encoding="utf-8").strip() if path.is_file() else ""
+    try:
+        text = read_limited(folder / RUN_IDS[service], _LARGEST_NUMBER).decode().strip()
+    except (OSError, ValueError):
+        return None
     return text if re.fullmatch(r"\w{1,64}", text) else None
 
 

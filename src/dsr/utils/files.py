@@ -246,7 +246,7 @@ def _is_running(process: int) -> bool:
     """Return whether a process of this machine is there."""
     try:
         os.kill(process, 0)
-    except ProcessLookupError:
+    except (ProcessLookupError, OverflowError):
         return False
     except OSError:  # another user's
         return True

@@ -21,9 +21,12 @@ from dsr.utils import interruption
 from dsr.utils.checkpoints import AtomicCheckpoints, CheckpointError, DivergenceError, Interruption, Resumed
 from dsr.utils.configuration import ConfigError
 from dsr.utils.files import FullDiskError, replacing, space_for
+from dsr.utils.guards import MOST_TABLE, read_limited
 from dsr.utils.progress import Progress, Task
 from dsr.utils.runs_table import SCORES, list_scores
 
+_COLUMNS = 4
+"""Columns of a table of validations."""
 LOG_EVERY = 10
 """Steps between two values of a training in its log."""
 _SECONDS_BETWEEN_LOSSES = 0.2
@@ -80,15 +83,28 @@ class ValidationTable(Callback):
         if trainer.sanity_checking or not trainer.is_global_zero:
             return
         scored: Any = pl_module
-        step, before = trainer.global_step, []
-        if self._path.is_file():
-            with self._path.open(newline="", encoding="utf-8") as file:
-                before = list(csv.reader(file))[1:]
+        step, before = trainer.global_step, self._read()
         rows = [[str(step), kind, name, repr(value)]
                 for kind, each in scored.validation_scores.items() for name, value in each.items()]  # fmt: skip
         with replacing(self._path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
             kept = (row for row in before if int(row[0]) < step)
             csv.writer(file, lineterminator="\n").writerows([("step", "set", "metric", "value"), *kept, *rows])
+
+    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Check the rows from before an interruption."""
+        self._read()
+
+    def _read(self) -> list[list[str]]:
+        """Return the rows without their names; ConfigError where they are none."""
+        if not self._path.is_file():
+            return []
+        try:
+            rows = list(csv.reader(read_limited(self._path, MOST_TABLE).decode().splitlines()))[1:]
+            if all(len(row) == _COLUMNS and int(row[0]) >= 0 for row in rows):
+                return rows
+        except (ValueError, OSError, csv.Error):
+            pass
+        raise ConfigError(f"{self._path}: expected the scores of a training's validations, got a damaged file")
 
 
 class ListedScores(Callback):

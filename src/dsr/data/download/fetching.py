@@ -422,7 +422,7 @@ def _discard(*parts: Path) -> None:
 def _read_note(part: Path, url: str) -> dict[str, Any]:
     """Return what is known of the version that ``part`` is the beginning of; empty where it may be of another."""
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-        note = parse_json(_note(part).read_text(encoding="utf-8"))
+        note = parse_json(read_limited(_note(part)))
         mark, total = note["mark"], note["total"]
         if isinstance(mark, str | None) and type(total) in (int, type(None)) and (mark or note["url"] == url):
             return {"mark": mark, "total": total}

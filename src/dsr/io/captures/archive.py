@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from dsr.io.frames import Record
-from dsr.io.images import decode_pixels
+from dsr.utils.decoding import decode_pixels
 from dsr.utils.guards import read_limited, read_member, refusing
 
 PHOTO_LIMIT = 1 << 26

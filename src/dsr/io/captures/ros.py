@@ -30,10 +30,10 @@ import numpy as np
 
 from dsr.io.captures.archive import PHOTO_LIMIT, decode_photo
 from dsr.io.frames import CaptureFrame, Geometry, Record
-from dsr.io.images import decode_pixels
 from dsr.io.pairs import Pair, PairingResult, match_times
 from dsr.io.trajectories import intrinsics_camera
 from dsr.notes import Assumption
+from dsr.utils.decoding import decode_pixels
 from dsr.utils.guards import MOST_TEXT, expect_bytes, naming, natural_key, path_within, refusing
 
 _IMAGE, _COMPRESSED, _INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))

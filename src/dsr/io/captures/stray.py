@@ -31,10 +31,10 @@ import numpy as np
 
 from dsr.geometry.camera import Camera
 from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry, Record
-from dsr.io.images import quiet_decoders
 from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult
 from dsr.io.trajectories import describe_capture, intrinsics_camera, pose_from_quaternion, read_text
 from dsr.notes import Assumption
+from dsr.utils.decoding import quiet_decoders
 from dsr.utils.guards import expect_pixels, numbers_in
 from dsr.utils.versions import file_hash
 

@@ -33,7 +33,6 @@ the copy, may rise while the copy still differs. Holes have no data term, and st
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 
 import cv2
@@ -47,8 +46,8 @@ from dsr.methods.classical.finite_differences import upsample_linear_border
 from dsr.methods.classical.srfs_admm import ShadingProblem, ShadingSolver, Weights
 from dsr.methods.inpainting import inpaint
 from dsr.sample import DepthSample
-from dsr.utils.guards import MOST_FILE, expect_pixels, pixels_beside, read_limited
-from dsr.utils.picture_headers import picture_size
+from dsr.utils.decoding import decode_pixels
+from dsr.utils.guards import MOST_FILE, pixels_beside, read_limited
 from dsr.utils.progress import Steps
 
 _RENEW = 10
@@ -191,10 +190,7 @@ def read_foreground(path: Path, size: tuple[int, int]) -> np.ndarray:
     if not path.is_file():
         raise ValueError(f"{path}: expected a mask of the foreground, there is no such file")
     content = read_limited(path, MOST_FILE)
-    header = picture_size(io.BytesIO(content))
-    if header is not None:
-        expect_pixels(path, header.height, header.width, pixels_beside(*size))
-    levels = None if header is None else cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_GRAYSCALE)
+    levels = decode_pixels(path, content, cv2.IMREAD_GRAYSCALE, pixels_beside(*size))
     if levels is None:
         raise ValueError(f"{path}: expected a mask of the foreground, it is no picture or damaged")
     if levels.shape != size:
