@@ -27,6 +27,16 @@ LIMITS: dict[str, Limit] = {
         "pixels, of a photo with 800 on its longer side, by which its edges lie beside those of the depth map",
         "a person sees it in the relit surface from about 3 on",
     ),
+    "poses": Limit(
+        0.25,
+        "share of the pixels, by which frames agree in more under another reading of the poses",
+        "TODO",
+    ),
+    "poses-disagree": Limit(
+        1.5,
+        "times as many pixels of neighbouring frames disagree under the poses as without any motion",
+        "TODO",
+    ),
 }
 """By code: every warning that a command gives about its input; docs/checks.md shows them."""
 
