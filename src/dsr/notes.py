@@ -27,6 +27,11 @@ LIMITS: dict[str, Limit] = {
         "pixels, of a photo with 800 on its longer side, by which its edges lie beside those of the depth map",
         "a person sees it in the relit surface from about 3 on",
     ),
+    "neighbours-disagree": Limit(
+        0.2,
+        "of the neighbouring frames that see a pixel, the share that agrees with it; a warning below",
+        "TODO",
+    ),
     "poses": Limit(
         0.25,
         "share of the pixels, by which frames agree in more under another reading of the poses",
@@ -36,6 +41,11 @@ LIMITS: dict[str, Limit] = {
         1.5,
         "times as many pixels of neighbouring frames disagree under the poses as without any motion",
         "TODO",
+    ),
+    "poses-missing": Limit(
+        1,
+        "frames that have no pose in the file of `--poses`",
+        "results of such frames have no place in the world",
     ),
 }
 """By code: every warning that a command gives about its input; docs/checks.md shows them."""

@@ -60,6 +60,7 @@ class FuseRequest(Options):
         flags="-o --output",
         rule=Rule("a file that ends in .ply", lambda path: path.suffix.lower() == ".ply"),
     )
+    strict: bool = option(False, "refuse poses that can hardly be right; see docs/checks.md")
     voxel: float | None = option(
         None,
         "size of a voxel (default: the width of a pixel on the surfaces)",

@@ -117,6 +117,18 @@ def sample(count: int) -> list[tuple[int, ...]]:
     return sorted(group for group in groups if len(group) > 1)
 
 
+def check(count: int, load: Callable[[int], PosedMap | None]) -> Assumption | None:
+    """Compare some frames of a sequence with each other; see :func:`find_fault`.
+
+    Args:
+        count: number of frames.
+        load: returns the frame of a number; None for one that cannot be read, or has no pose.
+
+    """
+    groups = ([each for number in group if (each := load(number)) is not None] for group in sample(count))
+    return find_fault(compare(groups))
+
+
 def compare(groups: Iterable[Sequence[PosedMap]]) -> Agreement:
     """Return how far the frames of each group agree with each other."""
     found = [_compare(*pair) for group in groups for pair in itertools.combinations(map(_prepared, group), 2)]
