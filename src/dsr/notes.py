@@ -47,6 +47,11 @@ LIMITS: dict[str, Limit] = {
         "frames that have no pose in the file of `--poses`",
         "results of such frames have no place in the world",
     ),
+    "truths-differ": Limit(
+        2,
+        "truths of the scenes of one name in the runs of a report or a study",
+        "scores against different truths cannot be compared",
+    ),
 }
 """By code: every warning that a command gives about its input; docs/checks.md shows them."""
 

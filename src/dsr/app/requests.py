@@ -28,6 +28,7 @@ class ReportRequest(Options):
     light: str = option(
         FIGURE_LIGHT, f"of the figures: {LIGHT_CHOICES}; {FIGURE_LIGHT}", "NAME", rule=one_of(LIGHT_NAMES, str)
     )
+    strict: bool = option(False, "refuse runs with a warning; see docs/checks.md")
     title: str = option("Depth super-resolution", "of the page")
     page_mb: float = option(
         60.0, "maximum size of the page; 60", "MB", rule=Rule("a positive number", lambda size: size > 0)
@@ -149,6 +150,7 @@ class StudyRequest(Options):
     runs: tuple[Path, ...] = option(..., "runs, or directories with runs below", "RUNS", flags="runs")
     output: Path = option(..., "where to", "DIR", flags="-o --output")
     choice: Choice = group(Choice)
+    strict: bool = option(False, "refuse runs with a warning; see docs/checks.md")
     overwrite: bool = option(False, "replace another study, whose answers can then no longer be collected")
 
 
