@@ -97,6 +97,16 @@ _GAPS = (0, 1, 3, 10, 30)
 """Places of the frames of a group that are compared with each other, from its first one."""
 _GROUPS = 4
 """Groups of frames of a sequence."""
+_GOOD = 0.7
+"""Share of the pixels that have to agree under the right reading."""
+_LEAST_WEIGHT = 0.5
+"""Number of pairs that disagree wholly without motion, or as much of more pairs, that tell readings apart."""
+_TIE = 0.9
+"""Readings whose evidence is at least this much of the best one's cannot be told from it."""
+_MOST_NAMES = 3
+"""Readings that a message names."""
+_WORSE = 1.2
+"""Times as many pixels that have to disagree under poses that are wrong in another way as without motion."""
 
 
 class Agreement(NamedTuple):
@@ -189,31 +199,20 @@ def find_fault(agreement: Agreement) -> Assumption | None:
     if evidence[best] > 0 and gain[best] >= LIMITS["poses"].threshold:
         names = list(READINGS)
         tied = [names[place] for place in np.flatnonzero(evidence >= _TIE * evidence[best])]
-        fewest = min(name.count(",") for name in tied)
+        simplest = [name for name in tied if name.count(",") == min(other.count(",") for other in tied)]
         as_given = float((weight[:, best] * seen[:, 0] * agreed[:, 0]).sum() / total[best])
         return Assumption(
-            f"the poses are probably {' or '.join(name for name in tied if name.count(',') == fewest)}",
+            f"the poses are probably {' or '.join(simplest[:_MOST_NAMES])}",
             f"as given, neighbouring frames agree in {as_given:.0%} of the pixels, so read in {means[0][best]:.0%}",
             "poses",
             round(float(gain[best]), 3),
         )
-    wrong, still = ((seen[:, 0] * (1 - agreed[:, place])).sum() for place in (0, -1))
-    share, ratio = wrong / max(seen[:, 0].sum(), 1), wrong / max(still, 1e-9)
-    if share < _LEAST_WRONG or ratio < LIMITS["poses-disagree"].threshold:
+    wrong, still = (float((seen[:, 0] * (1 - agreed[:, k])).sum() / max(seen[:, 0].sum(), 1)) for k in (0, -1))
+    if wrong < LIMITS["poses-disagree"].threshold or wrong < _WORSE * still:
         return None
     return Assumption(
         "neighbouring frames do not agree under the poses",
-        f"they do in {1 - share:.0%} of the pixels, without any motion in {1 - share / ratio:.0%}",
+        f"they do in {1 - wrong:.0%} of the pixels, without any motion in {1 - still:.0%}",
         "poses-disagree",
-        round(float(ratio), 3),
+        round(wrong, 3),
     )
-
-
-_LEAST_WRONG = 0.1
-"""Share of the pixels that have to disagree for poses to be wrong."""
-_GOOD = 0.7
-"""Share of the pixels that have to agree under the right reading."""
-_LEAST_WEIGHT = 0.5
-"""Number of pairs that disagree wholly without motion, or as much of more pairs, that tell readings apart."""
-_TIE = 0.9
-"""Readings whose evidence is at least this much of the best one's cannot be told from it."""
