@@ -87,8 +87,11 @@ def _faults(frames: Sequence[Path], max_error: float) -> list[Assumption]:
     recordings: dict[Path, list[Path]] = {}
     for frame in frames:
         recordings.setdefault(frame.parent, []).append(frame)
-    found = [check(len(each), lambda number, each=each: _load(each[number], max_error)) for each in recordings.values()]
-    return list(dict.fromkeys(fault for fault in found if fault is not None))
+
+    def fault(recording: Sequence[Path]) -> Assumption | None:
+        return check(len(recording), lambda number: _load(recording[number], max_error))
+
+    return list(dict.fromkeys(each for each in map(fault, recordings.values()) if each is not None))
 
 
 def _count(frames: Sequence[Path]) -> str:

@@ -30,7 +30,7 @@ _LARGEST_SCALE = 1e6
 _DIGEST = 8
 """Number of displayed digits of a hash."""
 _SAME = 1e-3
-"""Difference of the depths of two truths, relative, and share of the pixels that may differ, up to which they are one."""
+"""Relative difference of depths, and share of the pixels that may differ more, up to which two truths are one."""
 _Content = TypeVar("_Content", bound=BaseModel)
 
 
@@ -242,7 +242,9 @@ def _by_truth(runs: Sequence[Run]) -> list[Run]:
             own = {scene: truth for scene in run.scenes if (truth := _Truth.of(run, scene)) is not None}
             if not own:
                 continue
-            fitting = (each for each in groups if all(each.get(scene, truth).equals(truth) for scene, truth in own.items()))
+            fitting = (
+                each for each in groups if all(each.get(scene, truth).equals(truth) for scene, truth in own.items())
+            )
             group = next(fitting, None)
             if group is None:
                 groups.append(group := {})
@@ -275,7 +277,7 @@ class _Truth(NamedTuple):
             return None
 
     def equals(self, other: _Truth) -> bool:
-        """Return whether two truths are the same but for rounding, as on another machine; one cannot be read if damaged."""
+        """Return whether two truths are the same but for rounding; one that cannot be read is told elsewhere."""
         if self.checksum == other.checksum:
             return True
         try:

@@ -1,8 +1,8 @@
 """Whether the poses of frames fit their depth maps, or would if they were read in another way.
 
-The points of one depth map are moved into the view of another: where they see the same surfaces, the depths agree. That is
-measured under the poses as given, under each of :data:`READINGS`, and without any motion, which says how much the frames
-tell: before a wall, or of a camera that stands still, all readings agree.
+The points of one depth map are moved into the view of another: where they see the same surfaces, the depths agree. That
+is measured under the poses as given, under each of :data:`READINGS`, and without any motion, which says how much the
+frames tell: before a wall, or of a camera that stands still, all readings agree.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ _WORSE = 1.2
 
 
 class Agreement(NamedTuple):
-    """How far pairs of frames agree under each of :data:`READINGS` and, last, without motion; (pairs, readings + 1) each.
+    """How far pairs of frames agree under each of :data:`READINGS` and, last, without motion, (pairs, readings + 1).
 
     ``overlap``: share of a frame's points that lie in the other's view. ``agreed``: share of these whose depths agree.
     """
@@ -147,7 +147,7 @@ def compare(groups: Iterable[Sequence[PosedMap]]) -> Agreement:
 
 
 class _Frame(NamedTuple):
-    """A reduced map, its camera, some of its points, (3, N), and its pose by each reading, last none, (readings + 1, 4, 4)."""
+    """A reduced map, its camera, some of its points, (3, N), and its poses by all readings, (readings + 1, 4, 4)."""
 
     depth: np.ndarray
     camera: Camera

@@ -86,7 +86,9 @@ class FrameSequence:
             raise ValueError(f"--neighbours: expected a pose for each frame, {where}")
         if picture.pose is None and self._file is not None:
             detail = f"{self._without} of {len(self._places)} frames have none"
-            notes.append(Assumption(f"{self._file.name} has no pose of this frame", detail, "poses-missing", self._without))
+            notes.append(
+                Assumption(f"{self._file.name} has no pose of this frame", detail, "poses-missing", self._without)
+            )
         if picture.pose is not None and (fault := self._fault(pair.depth.parent)) is not None:
             notes.append(fault)
         return replace(picture, assumptions=(*picture.assumptions, *notes)) if notes else picture
@@ -129,7 +131,9 @@ class FrameSequence:
         share = others / seeing if seeing else 0.0
         note = Assumption(text, detail)
         if share < LIMITS[code].threshold:
-            note = Assumption(f"{text}, and hardly any agree with it: are the poses right?", detail, code, round(share, 3))
+            note = Assumption(
+                f"{text}, and hardly any agree with it: are the poses right?", detail, code, round(share, 3)
+            )
         return replace(picture, depth_lr=fused.depth, assumptions=(*picture.assumptions, note))
 
     def _frame(self, pair: Pair) -> _Frame:
