@@ -27,6 +27,31 @@ LIMITS: dict[str, Limit] = {
         "pixels, of a photo with 800 on its longer side, by which its edges lie beside those of the depth map",
         "a person sees it in the relit surface from about 3 on",
     ),
+    "neighbours-disagree": Limit(
+        0.2,
+        "of the neighbouring frames that see a pixel, the share that agrees on it; below, there is a warning",
+        "right poses: 0.33 to 1.00, millimetres for metres: 0.00 to 0.02",
+    ),
+    "poses": Limit(
+        0.25,
+        "share of the pixels, by which frames agree in more under another reading of the poses",
+        "right poses of 280 rendered and 60 recorded sequences: TODO",
+    ),
+    "poses-disagree": Limit(
+        0.3,
+        "share of the pixels in which neighbouring frames disagree under the poses, and less without any motion",
+        "right poses of 48 rendered sequences: at most 0.26, or less than without motion",
+    ),
+    "poses-missing": Limit(
+        1,
+        "frames that have no pose in the file of `--poses`",
+        "results of such frames have no place in the world",
+    ),
+    "truths-differ": Limit(
+        2,
+        "truths of the scenes of one name in the runs of a report or a study",
+        "scores against different truths cannot be compared",
+    ),
 }
 """By code: every warning that a command gives about its input; docs/checks.md shows them."""
 

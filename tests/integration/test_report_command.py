@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import json
+import re
+import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 from commands import run_python
 
 from dsr.app import report
 from dsr.cli import main
+from dsr.sample import DepthSample
 
 SCENES = ("cube_high_freq", "statue")
 
@@ -154,3 +159,86 @@ def test_invalid_choice_is_one_line_and_nothing_is_written(
 
 def test_directory_without_runs_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "expected runs of eval.py" in refused(capsys, "report", tmp_path, "-o", tmp_path / "report")
+
+
+# truths of the same scenes that differ
+
+
+@pytest.fixture
+def apart(make_run: Callable[..., Path], tmp_path: Path) -> Path:
+    """Two methods on two scenes, with one truth each and with other ones of the same names."""
+    for label in ("Bicubic", "MSG-V"):
+        for place in ("one", "two"):
+            make_run(tmp_path / "runs" / place / label, label=label, method=label.lower(), scenes=SCENES)
+        with_truth(tmp_path / "runs" / "two" / label, lambda truth: truth + 0.5)
+    return tmp_path / "runs"
+
+
+def with_truth(run: Path, change: Callable[[torch.Tensor], torch.Tensor]) -> None:
+    """Change the truths that a run has stored."""
+    for path in (run / "scenes").iterdir():
+        sample = DepthSample.load(path)
+        assert sample.depth is not None
+        replace(sample, depth=change(sample.depth)).save(path)
+
+
+def test_different_truths_are_told_and_have_tables_of_their_own(
+    apart: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["report", str(apart), "-o", str(tmp_path / "report"), "--only", "tables,page"]) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert told.count("warning: simgeo x4: the runs have different truths") == 1
+    assert "left out" not in told
+    report = tmp_path / "report"
+    (warning,) = json.loads((report / "report.json").read_text())["warnings"]
+    assert (warning["code"], warning["value"]) == ("truths-differ", 2)
+    names = sorted(path.name for path in (report / "tables").glob("simgeo*.csv"))
+    assert len(names) == 2
+    for name in names:
+        table = pd.read_csv(report / "tables" / name)
+        assert set(table["method"]) == {"Bicubic", "MSG-V"}
+        assert len(set(table["dataset"])) == 1
+    averages = pd.read_csv(report / "tables" / "summary_x4_box.csv")
+    assert all(" " not in str(each).replace(" (truth ", "") for each in averages["dataset"])  # none over both
+    text = (report / "tables" / "all.md").read_text(encoding="utf-8")
+    assert text.count("the runs have different truths") == 3
+    assert "the runs have different truths" in (report / "index.html").read_text(encoding="utf-8")
+
+
+def test_truths_that_differ_by_rounding_are_one(
+    apart: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for label in ("Bicubic", "MSG-V"):
+        with_truth(apart / "two" / label, lambda truth: (truth - 0.5) * (1 + 1e-7))
+    assert main(["report", str(apart), "-o", str(tmp_path / "report"), "--only", "tables", "--strict"]) == 0
+    assert "warning" not in capsys.readouterr().out
+
+
+def test_run_without_its_scenes_is_compared_with_neither_truth(apart: Path, tmp_path: Path) -> None:
+    shutil.rmtree(apart / "one" / "MSG-V" / "scenes")
+    assert main(["report", str(apart), "-o", str(tmp_path / "report"), "--only", "tables"]) == 0
+    tables = [pd.read_csv(path) for path in (tmp_path / "report" / "tables").glob("simgeo*.csv")]
+    assert sorted(sorted(set(each["method"])) for each in tables) == [["Bicubic"], ["Bicubic", "MSG-V"], ["MSG-V"]]
+
+
+def test_strict_refuses_different_truths_unless_one_alone_is_chosen(
+    apart: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ("report", apart, "-o", tmp_path / "report", "--only", "tables", "--strict")
+    line = refused(capsys, *command)
+    assert "different truths" in line
+    assert not (tmp_path / "report").exists()
+    name = re.findall(r"simgeo \(truth [0-9a-f]{8}\)", line)[0]
+    assert main([*map(str, command), "--datasets", name]) == 0
+
+
+def test_study_asks_about_each_truth_and_strict_refuses(
+    apart: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["study", "build", str(apart), "-o", str(tmp_path / "study")]) == 0
+    assert "warning: simgeo x4: the runs have different truths" in " ".join(capsys.readouterr().out.split())
+    trials = json.loads((tmp_path / "study" / "key.json").read_text())["trials"].values()
+    assert len(trials) == 4
+    assert len({trial["dataset"] for trial in trials}) == 2
+    assert "different truths" in refused(capsys, "study", "build", apart, "-o", tmp_path / "other", "--strict")
+    assert not (tmp_path / "other").exists()

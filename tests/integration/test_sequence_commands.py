@@ -1,13 +1,17 @@
 """``dsr upsample`` on rigs and sequences, and ``dsr fuse``: what a user gets, and every refusal."""
 
 import json
+import re
 
+import captures
 import cv2
 import numpy as np
 import pytest
 import torch
 import trimesh
 from PIL import Image
+from scipy.spatial.transform import Rotation
+from small_frames import in_text, room, walk, write_recording
 
 from dsr.cli import main
 from dsr.geometry.camera import Camera
@@ -323,3 +327,151 @@ def test_warped_depth_agrees_with_the_library(rig):
     sensor = Camera(80, 64, 70.0, 70.0, 40.0, 31.0)
     seen = warp_depth(depth, sensor, torch.from_numpy(pose(-0.1))[None], CAMERA.rescale(75, 56))
     assert info(rig / "out")["input_holes"] == pytest.approx(float(seen.isnan().double().mean()), abs=1e-6)
+
+
+# poses that cannot be right
+
+
+MAP = Camera.centred(64, 48, 52.0)
+
+
+@pytest.fixture
+def walked(tmp_path):
+    """Six frames of a room, from a camera that walks and turns."""
+    return write_recording(tmp_path / "walked", MAP, walk(6))
+
+
+def poses_of(folder, change, count=6):
+    """Write the poses of a walk, changed, and return the option that names them."""
+    path = folder.parent / "poses.txt"
+    path.write_text(in_text([change(each) for each in walk(count)]))
+    return ("--poses", path)
+
+
+def in_millimetres(matrix):
+    changed = matrix.copy()
+    changed[:3, 3] *= 1000
+    return changed
+
+
+@pytest.mark.parametrize(
+    ("change", "name"), [(np.linalg.inv, "from world to camera"), (in_millimetres, "in millimetres")]
+)
+def test_poses_that_are_read_wrongly_are_told_once_and_in_every_info(walked, capsys, change, name):
+    out = walked.parent / "out"
+    assert upsample(walked, *poses_of(walked, change), *DEPTH_ONLY, "-o", out) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert told.count("warning: the poses are probably") == 1
+    assert re.search(rf"the poses are probably {name} \(as given, .* \d+% .* \d+%\)", told)
+    for number in range(6):
+        (warning,) = info(out / f"{number:03}")["warnings"]
+        assert warning["code"] == "poses"
+        assert warning["value"] > warning["threshold"]
+
+
+def test_right_poses_are_not_warned_of_and_strict_takes_them(walked, capsys):
+    command = (walked, *poses_of(walked, np.array), "--neighbours", "2", *DEPTH_ONLY, "--strict")
+    assert upsample(*command, "-o", walked.parent / "out") == 0
+    assert "warning" not in capsys.readouterr().out
+
+
+def test_strict_refuses_wrong_poses_and_writes_no_result(walked, capsys):
+    out = walked.parent / "out"
+    assert upsample(walked, *poses_of(walked, np.linalg.inv), *DEPTH_ONLY, "--strict", "-o", out) == 2
+    assert "the poses are probably from world to camera" in capsys.readouterr().err
+    assert not list(out.rglob("info.json"))
+
+
+def test_shards_and_workers_warn_alike(walked):
+    command = (walked, *poses_of(walked, np.linalg.inv), *DEPTH_ONLY)
+    out = walked.parent / "out"
+    assert upsample(*command, "-o", out / "whole") == 0
+    assert upsample(*command, "--shard", "3/3", "-o", out / "shard") == 0
+    assert upsample(*command, "--workers", "2", "-o", out / "workers") == 0
+    expected = info(out / "whole" / "005")["warnings"]
+    assert [each["code"] for each in expected] == ["poses"]
+    assert info(out / "shard" / "005")["warnings"] == info(out / "workers" / "005")["warnings"] == expected
+
+
+@pytest.mark.parametrize(("change", "codes"), [(np.array, []), (np.linalg.inv, ["poses"])])
+def test_poses_of_a_capture_are_compared_with_its_depth(tmp_path, monkeypatch, change, codes):
+    poses = walk(6, 0.12, 8.0)
+    size = Camera(captures.SIZE[1], captures.SIZE[0], *captures.INTRINSICS).rescale(*captures.SIZE_LR[::-1])
+    monkeypatch.setattr(captures, "FRAMES", len(poses))
+    monkeypatch.setattr(captures, "depth", lambda number=0: room(size, poses[number]))
+    monkeypatch.setattr(captures, "pose", lambda number=0: change(poses[number]))
+    captures.stray(tmp_path / "scan", video=False, own_intrinsics=False)
+    assert upsample(tmp_path / "scan", *DEPTH_ONLY, "-o", tmp_path / "out") == 0
+    about = [info(path.parent) for path in sorted((tmp_path / "out").rglob("info.json"))]
+    assert len(about) == len(poses)
+    assert all([each["code"] for each in one["warnings"] if each["code"].startswith("poses")] == codes for one in about)
+
+
+def test_neighbours_that_agree_are_counted_without_the_frame_itself(walked, capsys):
+    command = (walked, "--neighbours", "2", *DEPTH_ONLY)
+    assert upsample(*command, *poses_of(walked, np.array), "-o", walked.parent / "right") == 0
+    right = re.search(r"of (\d\.\d) that see a pixel (\d\.\d) agree", " ".join(capsys.readouterr().out.split()))
+    assert 1 < float(right[2]) <= float(right[1]) <= 2
+    assert upsample(*command, *poses_of(walked, in_millimetres), "-o", walked.parent / "wrong") == 0
+    assert "hardly any agree with it: are the poses right?" in " ".join(capsys.readouterr().out.split())
+    warning = info(walked.parent / "wrong" / "002")["warnings"][-1]
+    assert (warning["code"], warning["value"]) == ("neighbours-disagree", 0.0)
+
+
+def test_frames_without_a_pose_are_told_and_strict_refuses_them(walked, capsys):
+    def write(*numbers):
+        rows = [(*each[:3, 3], *Rotation.from_matrix(each[:3, :3]).as_quat()) for each in walk(6)]
+        lines = [f"{number} " + " ".join(map(str, rows[number % 6])) for number in numbers]
+        (walked.parent / "poses.txt").write_text("\n".join(lines) + "\n")
+
+    command = (walked, "--poses", walked.parent / "poses.txt", *DEPTH_ONLY)
+    write(0, 1, 2, 3)
+    assert upsample(*command, "-o", walked.parent / "fewer") == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "poses.txt: 4 poses for 6 frames" in told
+    assert told.count("warning: poses.txt has no pose of this frame (2 of 6 frames have none)") == 1
+    found = {number: [each["code"] for each in info(walked.parent / "fewer" / f"{number:03}")["warnings"]]
+             for number in range(6)}  # fmt: skip
+    assert found == {0: [], 1: [], 2: [], 3: [], 4: ["poses-missing"], 5: ["poses-missing"]}
+    assert upsample(*command, "--strict", "-o", walked.parent / "strict") == 2
+    assert "4 done, 2 failed" in " ".join(capsys.readouterr().out.split())
+    write(*range(8))
+    assert upsample(*command, "-o", walked.parent / "more") == 0
+    told = capsys.readouterr().out
+    assert "8 poses for 6 frames" in " ".join(told.split())
+    assert "warning" not in told
+    write(100, 101)
+    assert "expected a pose for each of the 6 frames" in error_of(capsys, upsample(*command, "-o", walked.parent / "x"))
+
+
+def test_poses_of_another_time_are_refused(walked, capsys):
+    for kind in ("rgb", "depth"):
+        for path in (walked / kind).iterdir():
+            path.rename(path.with_name(f"1305031102.{path.name}"))
+    (walked.parent / "poses.txt").write_text("".join(f"{time} 0 0 0 0 0 0 1\n" for time in range(6)))
+    command = (walked, "--poses", walked.parent / "poses.txt", *DEPTH_ONLY, "-o", walked.parent / "out")
+    assert "expected times as in the names of the frames" in error_of(capsys, upsample(*command))
+    assert not (walked.parent / "out").exists()
+
+
+def test_columns_in_place_of_rows_are_named(walked, capsys):
+    command = (walked, *poses_of(walked, np.transpose), *DEPTH_ONLY, "-o", walked.parent / "out")
+    assert "are rows and columns exchanged?" in error_of(capsys, upsample(*command))
+
+
+def test_fuse_tells_wrong_poses_and_strict_refuses_them(walked, capsys):
+    out, mesh = walked.parent / "out", walked.parent / "mesh.ply"
+    fuse = ["fuse", str(out), "-o", str(mesh), "--voxel", "0.05"]
+    assert upsample(walked, *poses_of(walked, np.array), *DEPTH_ONLY, "-o", out) == 0
+    capsys.readouterr()
+    assert main([*fuse, "--strict"]) == 0
+    assert "warning" not in capsys.readouterr().out
+    mesh.unlink()
+    for path in out.rglob("info.json"):
+        content = json.loads(path.read_text())
+        path.write_text(json.dumps({**content, "pose": np.linalg.inv(content["pose"]).tolist()}))
+    assert "the poses are probably from world to camera" in error_of(capsys, main([*fuse, "--strict"]))
+    assert not mesh.exists()
+    assert main(fuse) == 0
+    assert capsys.readouterr().out.count("warning: the poses are probably from world to camera") == 1
+    assert mesh.is_file()

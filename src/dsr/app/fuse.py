@@ -12,9 +12,11 @@ from dsr.app.requests import FuseRequest
 from dsr.app.upsample.outputs import INFO
 from dsr.app.upsample.parts import ERRORS
 from dsr.app.upsample.stored import read_camera, read_depth, read_errors, read_info
+from dsr.geometry.pose_check import check
 from dsr.geometry.rigid_motion import as_rigid
 from dsr.geometry.tsdf import PosedMap, fuse_maps, suggest_voxel
 from dsr.io.exports import write_ply
+from dsr.notes import Assumption, expect_no_warning
 from dsr.utils.console import one_line, show
 from dsr.utils.guards import natural_key
 
@@ -27,12 +29,13 @@ def fuse(request: FuseRequest, console: Console) -> list[str]:
     """Fuse the depth of results into a mesh, and return the problems, one line each.
 
     Raises:
-        ValueError: there is no result with a pose, or no surface.
+        ValueError: there is no result with a pose, or no surface; or a warning, with ``--strict``.
 
     """
     max_error = request.max_error / 100
     found = sorted({path.parent for folder in request.folders for path in folder.rglob(INFO)}, key=natural_key)
-    frames, problems = [], []
+    frames: list[Path] = []
+    problems: list[str] = []
     for folder in found:
         try:
             _load(folder, max_error)
@@ -42,6 +45,12 @@ def fuse(request: FuseRequest, console: Console) -> list[str]:
     if not frames:
         what = problems[0] if problems else f"{request.folders[0]}: found no {INFO}"
         raise ValueError(f"expected results of `dsr upsample` with poses; {what}")
+
+    warnings = _faults(frames, max_error)
+    if request.strict:
+        expect_no_warning(str(request.folders[0]), [each.message for each in warnings])
+    for each in warnings:
+        show(console, str(each))
 
     def maps() -> Iterator[PosedMap]:
         return (_load(folder, max_error) for folder in frames)
@@ -71,6 +80,18 @@ def _load(folder: Path, max_error: float) -> PosedMap:
         with np.errstate(invalid="ignore"):
             depth = np.where(deviation <= max_error * depth, depth, np.nan)
     return PosedMap(depth, camera, as_rigid(info["pose"], f"{path}: pose"), deviation)
+
+
+def _faults(frames: Sequence[Path], max_error: float) -> list[Assumption]:
+    """Return what is wrong with the poses of results, by some of each folder, each once."""
+    recordings: dict[Path, list[Path]] = {}
+    for frame in frames:
+        recordings.setdefault(frame.parent, []).append(frame)
+
+    def fault(recording: Sequence[Path]) -> Assumption | None:
+        return check(len(recording), lambda number: _load(recording[number], max_error))
+
+    return list(dict.fromkeys(each for each in map(fault, recordings.values()) if each is not None))
 
 
 def _count(frames: Sequence[Path]) -> str:

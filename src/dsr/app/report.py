@@ -10,6 +10,7 @@ from rich.console import Console
 
 from dsr.app.requests import ReportRequest
 from dsr.evaluation.run_files import load_results
+from dsr.notes import expect_no_warning
 from dsr.report.correlation_figure import draw_study
 from dsr.report.correlations import write_correlations
 from dsr.report.figures import Figures
@@ -46,12 +47,17 @@ def make_report(request: ReportRequest, console: Console) -> list[str]:
     _check(output)
     results = load_results(request.runs)
     results = results.only(request.methods, request.datasets, tuple(map(as_ratio, request.scales)))
+    if request.strict:
+        expect_no_warning(", ".join(map(str, request.runs)), [each.message for each in results.warnings])
     answers = None if request.study is None else read_study(request.study)
     workers = default_workers(results) if request.workers is None else request.workers
     progress = ConsoleProgress(console)
     with replacing_folder(output) as temporary, WorkerPool(results, workers, progress.say) as pool:
         notes = _write(temporary, pool, answers, request, progress)
-        write_text(temporary / _MARK, json.dumps({"runs": [str(run.folder) for run in results.runs]}, indent=1) + "\n")
+        about = {"runs": [str(run.folder) for run in results.runs], "warnings": [w.record() for w in results.warnings]}
+        write_text(temporary / _MARK, json.dumps(about, indent=1) + "\n")
+    for warning in results.warnings:
+        show(console, str(warning))
     for note in (*results.notes, *notes):
         show(console, f"note: {note}")
     for what, file in _MAIN.items():

@@ -28,6 +28,7 @@ class ReportRequest(Options):
     light: str = option(
         FIGURE_LIGHT, f"of the figures: {LIGHT_CHOICES}; {FIGURE_LIGHT}", "NAME", rule=one_of(LIGHT_NAMES, str)
     )
+    strict: bool = option(False, "refuse runs with a warning; see docs/checks.md")
     title: str = option("Depth super-resolution", "of the page")
     page_mb: float = option(
         60.0, "maximum size of the page; 60", "MB", rule=Rule("a positive number", lambda size: size > 0)
@@ -61,6 +62,7 @@ class FuseRequest(Options):
         rule=Rule("a file that ends in .ply", lambda path: path.suffix.lower() == ".ply"),
         writes="file",
     )
+    strict: bool = option(False, "refuse poses that can hardly be right; see docs/checks.md")
     voxel: float | None = option(
         None,
         "size of a voxel (default: the width of a pixel on the surfaces)",
@@ -147,6 +149,7 @@ class StudyRequest(Options):
     runs: tuple[Path, ...] = option(..., "runs, or directories with runs below", "RUNS", flags="runs")
     output: Path = option(..., "where to", "DIR", flags="-o --output", writes="folder")
     choice: Choice = group(Choice)
+    strict: bool = option(False, "refuse runs with a warning; see docs/checks.md")
     overwrite: bool = option(False, "replace another study, whose answers can then no longer be collected")
 
 

@@ -8,6 +8,7 @@ from rich.console import Console
 
 from dsr.app.requests import AnswersRequest, StudyRequest
 from dsr.cli.commands import Command, CommandGroup
+from dsr.notes import expect_no_warning
 from dsr.utils.console import ConsoleProgress, show
 
 if TYPE_CHECKING:
@@ -39,10 +40,12 @@ def _build(request: StudyRequest, console: Console, _: object) -> list[str]:
     from dsr.evaluation.run_files import load_results  # noqa: PLC0415 - torch and pandas take seconds to import
     from dsr.report.study.questionnaire import build_study  # noqa: PLC0415
 
-    progress = ConsoleProgress(console)
-    built = build_study(
-        load_results(request.runs), request.output, request.choice, progress, overwrite=request.overwrite
-    )
+    progress, results = ConsoleProgress(console), load_results(request.runs)
+    if request.strict:
+        expect_no_warning(", ".join(map(str, request.runs)), [each.message for each in results.warnings])
+    built = build_study(results, request.output, request.choice, progress, overwrite=request.overwrite)
+    for warning in results.warnings:
+        show(console, str(warning))
     for note in built.notes:
         show(console, note)
     key = built.key

@@ -14,6 +14,7 @@ from torch import Tensor
 from dsr.evaluation.store import load_errors, load_prediction, prediction_path, sample_path
 from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.metrics.formats import HEADLINES, MetricFormat, complete_formats, in_tables
+from dsr.notes import LIMITS, Assumption
 from dsr.sample import DepthSample
 from dsr.utils.arrays import array_headers
 
@@ -49,6 +50,8 @@ class Run:
         scenes: scenes with a prediction.
         unsolved: reason by scene why the method has no solution.
         formats: formats of its metrics that the run stores.
+        truth: where other runs have different truths of its scenes, what tells its truths from theirs, as ``dataset``
+            has it, too; empty otherwise.
 
     """
 
@@ -66,6 +69,7 @@ class Run:
     scenes: tuple[str, ...]
     unsolved: Mapping[str, str] = field(default_factory=dict)
     formats: Mapping[str, MetricFormat] = field(default_factory=dict)
+    truth: str = ""
 
     @property
     def problem(self) -> BenchmarkSetting:
@@ -134,6 +138,33 @@ class Results:
     notes: tuple[str, ...] = ()
 
     @property
+    def warnings(self) -> tuple[Assumption, ...]:
+        """What says that scenes of one name have different truths."""
+        apart: dict[tuple[str, float], dict[str, list[Run]]] = {}
+        for run in self.runs:
+            if run.truth:
+                name = run.dataset.removesuffix(f" ({run.truth})")
+                apart.setdefault((name, run.scale), {}).setdefault(run.dataset, []).append(run)
+        return tuple(
+            Assumption(
+                f"{name} x{scale}: the runs have different truths for scenes of the same names and are listed apart",
+                "; ".join(
+                    f"{dataset}: {runs[0].folder}{f' and {len(runs) - 1} more' if len(runs) > 1 else ''}"
+                    for dataset, runs in of_truth.items()
+                ),
+                "truths-differ",
+                len(of_truth),
+            )
+            for (name, scale), of_truth in apart.items()
+            if len(of_truth) >= LIMITS["truths-differ"].threshold
+        )
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """The warnings, and the notes."""
+        return (*map(str, self.warnings), *self.notes)
+
+    @property
     def scores(self) -> pd.DataFrame:
         """All scores in one table, with the columns ``label`` and ``run`` besides those of ``scores.csv``."""
         parts = [run.scores.assign(label=run.label, run=str(run.folder)) for run in self.runs]
@@ -155,6 +186,14 @@ class Results:
     def of(self, problem: BenchmarkSetting) -> list[Run]:
         """Return the runs of a setting, in order."""
         return [run for run in self.runs if run.problem == problem]
+
+    def by_scene(self, problem: BenchmarkSetting) -> dict[str, list[Run]]:
+        """Return the scenes of a setting with the runs that have a prediction of each, in the order of the runs."""
+        having: dict[str, list[Run]] = {}
+        for run in self.of(problem):
+            for scene in run.scenes:
+                having.setdefault(scene, []).append(run)
+        return having
 
     def only(self, methods: Sequence[str] = (), datasets: Sequence[str] = (), scales: Sequence[float] = ()) -> Results:
         """Return the runs of some methods (by label), data sets and scales; an empty sequence selects all.

@@ -42,7 +42,9 @@ def as_rigid(values: Sequence[Sequence[float]] | np.ndarray, name: str) -> Matri
     if not np.isfinite(matrix).all():
         raise ValueError(f"{name}: expected finite numbers, got {matrix[~np.isfinite(matrix)][0]}")
     if matrix.shape == (4, 4) and not np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6):
-        raise ValueError(f"{name}: expected 0 0 0 1 as the last row, got {_text(matrix[3])}")
+        columns = np.allclose(matrix[:, 3], (0, 0, 0, 1), atol=1e-6)
+        hint = "; are rows and columns exchanged?" if columns else ""
+        raise ValueError(f"{name}: expected 0 0 0 1 as the last row, got {_text(matrix[3])}{hint}")
     return _with_rotation(matrix, name)
 
 

@@ -67,11 +67,14 @@ class Fused(NamedTuple):
 
     ``depth`` (1, h, w): orthogonal depth in metres, NaN in holes. ``deviation`` (1, h, w): its expected standard
     deviation in metres, if the frames' noise is independent. ``votes`` (1, h, w): the number of frames that agree.
+    ``others`` and ``seeing`` (1, h, w): the number of neighbours that agree, and that see something there.
     """
 
     depth: Tensor
     deviation: Tensor
     votes: Tensor
+    others: Tensor
+    seeing: Tensor
 
 
 def fuse_views(reference: View, neighbours: Sequence[View]) -> Fused:
@@ -94,11 +97,12 @@ def fuse_views(reference: View, neighbours: Sequence[View]) -> Fused:
         mean = (weight * inverse.nan_to_num(0)).sum(0) / total
         centre = torch.where(total > 0, mean, centre)
     weight = _weights(inverse, deviation, centre)
-    votes = (weight > 0).sum(0)
+    agreeing = weight > 0
+    counts = agreeing.sum(0), agreeing[1:].sum(0), inverse[1:].isfinite().sum(0)
     spread = weight.sum(0).rsqrt() / centre.square()
     depth = centre.reciprocal()
     spread = spread.masked_fill(depth.isnan(), torch.nan)
-    return Fused(*(each[None].to(reference.depth) for each in (depth, spread, votes)))
+    return Fused(*(each[None].to(reference.depth) for each in (depth, spread, *counts)))
 
 
 def _own(view: View) -> tuple[Tensor, Tensor]:

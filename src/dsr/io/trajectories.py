@@ -50,7 +50,7 @@ class Trajectory:
         that the file has for a time get that; others are taken in order.
 
         Raises:
-            ValueError: the poses are to be taken in order, and there are not as many as frames.
+            ValueError: the poses are to be taken in order, and there are not as many as frames; or no frame has one.
 
         """
         taken = [time_of(pair.depth) or time_of(pair.rgb) for pair in pairs]
@@ -78,11 +78,17 @@ class Trajectory:
         candidates = order[np.stack((after - 1, np.minimum(after, len(order) - 1)))]  # (2, frames)
         gaps = np.abs(times[candidates] - wanted)
         best = candidates[gaps.argmin(0), np.arange(len(wanted))]
-        return {
+        found = {
             pair.name: self.poses[number]
             for pair, number, distance in zip(pairs, best, gaps.min(0), strict=True)
             if distance <= gap
         }
+        if not found:
+            raise ValueError(
+                f"{self.file}: expected times as in the names of the frames, {wanted.min():.3f} to {wanted.max():.3f}, "
+                f"got {times.min():.3f} to {times.max():.3f}"
+            )
+        return found
 
 
 def read_transform(path: Path) -> Matrix:

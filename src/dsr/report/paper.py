@@ -7,7 +7,7 @@ have missing measurements. Scenes of other data sets are grouped by whether thei
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from typing import NamedTuple
@@ -87,6 +87,7 @@ def _is_papers(run: Run, scene: str) -> bool:
     own = PAPER_FILES.get(run.dataset.partition(" (")[0], ())
     return (
         "validation_of" not in dataset
+        and not run.truth
         and scene in (_RELEASED if dataset.get("_target_") == _FOLDER else own)
         and run.downsampling == "box"
         and run.settings.get("downsampling", {}).get("range_type") is None
@@ -156,19 +157,22 @@ def sets_of_dataset(places: Sequence[Place]) -> list[SceneSet]:
     return [*map(_single, places), *averages]
 
 
-def sets_of_summary(places: Sequence[Place], complete: Callable[[Place], bool]) -> list[SceneSet]:
+def sets_of_summary(
+    places: Sequence[Place], complete: Callable[[Place], bool], apart: Collection[str] = ()
+) -> list[SceneSet]:
     """Return the averages over each data set, those of the paper's summary, and similar ones over other data sets.
 
     Args:
         places: all scenes.
         complete: predicate, whether the ground truth of a scene has no holes; only called for scenes not in the paper.
+        apart: data sets that are not averaged with others: different truths of the same scenes.
 
     """
     datasets = list(dict.fromkeys(place.dataset for place in places))
     found = [each for name in datasets for each in _averages_of_dataset(name, _within(places, name))]
     found += _averages_of_paper(places)
     if any(name not in PAPER_SCENES for name in datasets):
-        others = [place for place in places if place.dataset not in PAPER_SCENES]
+        others = [place for place in places if place.dataset not in (*PAPER_SCENES, *apart)]
         without_holes = [place for place in others if complete(place)]
         whole = frozenset(without_holes)
         with_holes = [place for place in others if place not in whole]

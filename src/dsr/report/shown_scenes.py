@@ -46,11 +46,6 @@ def first_runs(results: Results, problem: BenchmarkSetting) -> dict[str, list[Ru
     return {label: sorted(each, key=lambda run: run.seed) for label, each in runs.items()}
 
 
-def scene_names(runs: dict[str, list[Run]]) -> list[str]:
-    """Return the scenes with a result of at least one method, in the order of the runs."""
-    return list(dict.fromkeys(scene for each in runs.values() for run in each for scene in run.scenes))
-
-
 def drawable_scenes(
     results: Results, problem: BenchmarkSetting, notes: list[str], *, with_truth: bool = False
 ) -> list[str]:
@@ -63,11 +58,9 @@ def drawable_scenes(
         with_truth: whether scenes without ground truth are left out, too.
 
     """
-    runs = first_runs(results, problem)
-    ordered = [run for each in runs.values() for run in each]
     names = []
-    for name in scene_names(runs):
-        stored = next((run for run in ordered if run.has_sample(name)), None)
+    for name, runs in results.by_scene(problem).items():
+        stored = next((run for run in runs if run.has_sample(name)), None)
         if stored is None:
             _note(notes, f"no figures of {name}: {_NOT_STORED}")
         elif not with_truth or _has_truth(stored, name):
@@ -96,8 +89,9 @@ def shown_scenes(
 
     """
     runs = first_runs(results, problem)
-    for name in scene_names(runs) if names is None else names:
-        scene = _stored(name, [run for each in runs.values() for run in each], notes)
+    by_scene = results.by_scene(problem)
+    for name in by_scene if names is None else names:
+        scene = _stored(name, by_scene.get(name, ()), notes)
         if scene is None:
             continue
         depths: dict[str, Tensor | None] = {}

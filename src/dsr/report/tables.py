@@ -220,7 +220,8 @@ def build_tables(results: Results, study: pd.DataFrame | None = None) -> list[Pa
         places = list(dict.fromkeys(place for scenes in make.values.values() for place in scenes))
         if not places:
             continue
-        tables.append(make.table("summary", "Averages", sets_of_summary(places, complete)))
+        apart = {run.dataset for run in runs if run.truth}
+        tables.append(make.table("summary", "Averages", sets_of_summary(places, complete, apart)))
         for dataset in dict.fromkeys(place.dataset for place in places):
             sets = sets_of_dataset([place for place in places if place.dataset == dataset])
             tables.append(make.table(dataset, TITLES.get(dataset, dataset), sets))
@@ -267,7 +268,9 @@ class _Maker:
         columns = {key: each for key, each in self.columns.items() if key in used}
         slug = re.sub(r"[^A-Za-z0-9.-]+", "_", f"{name}_x{self.scale}_{self.downsampling}").strip("._-")
         title = f"{title}, x{self.scale}, {self.downsampling} downsampling"
-        return PaperTable(slug, title, tuple(_notes(groups, columns)), columns, groups)
+        apart = any(run.truth and run.dataset in {place.dataset for place in places} for run in self.runs)
+        notes = [f"{each.text}." for each in Results(tuple(self.runs)).warnings if apart]
+        return PaperTable(slug, title, (*notes, *_notes(groups, columns)), columns, groups)
 
     def _group(self, about: SceneSet, labels: Sequence[str]) -> Group:
         """Build the rows of some methods; a method without values has an empty row."""

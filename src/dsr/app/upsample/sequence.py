@@ -1,9 +1,9 @@
-"""Frames of a sequence for ``dsr upsample``: their poses, and the neighbours that vote on each frame's depth."""
+"""Frames of a sequence for ``dsr upsample``: their poses, whether these can be right, and neighbours that vote."""
 
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,11 +11,13 @@ import numpy as np
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
+from dsr.geometry.pose_check import check
+from dsr.geometry.tsdf import PosedMap
 from dsr.inference.sequences import View, fuse_views
 from dsr.io.inputs import Picture
 from dsr.io.pairs import Pair
 from dsr.io.trajectories import read_poses
-from dsr.notes import Assumption
+from dsr.notes import LIMITS, Assumption
 
 _Frame = tuple[Tensor, Camera, np.ndarray | None]
 """Depth map, camera of its pixels, and pose."""
@@ -25,7 +27,7 @@ class FrameSequence:
     """The frames of a folder in order, with their poses.
 
     Args:
-        pairs: the frames, which are iterated over if poses or neighbours are asked for.
+        pairs: the frames.
         read: reads one of them.
         neighbours: number of frames that vote on each frame's depth beside itself.
         poses: file of poses; None for those that the frames themselves have.
@@ -36,15 +38,23 @@ class FrameSequence:
     """
 
     def __init__(
-        self, pairs: Iterable[Pair], read: Callable[[Pair], Picture], neighbours: int, poses: Path | None
+        self, pairs: Sequence[Pair], read: Callable[[Pair], Picture], neighbours: int, poses: Path | None
     ) -> None:
         self._read, self._count, self._file = read, neighbours, poses
-        kept = tuple(pairs) if poses is not None or neighbours else ()
-        self._poses: Mapping[str, np.ndarray] | None = None if poses is None else read_poses(poses).assign(kept)
+        self._poses: Mapping[str, np.ndarray] | None = None
+        self._matched: list[Assumption] = []
+        if poses is not None:
+            trajectory = read_poses(poses)
+            self._poses = trajectory.assign(pairs)
+            self._without = len(pairs) - len(self._poses)
+            if len(trajectory.poses) != len(pairs):
+                counts = f"{len(trajectory.poses)} poses for {len(pairs)} frames"
+                self._matched.append(Assumption(f"{poses.name}: {counts}, by times or numbers in their names"))
         self._folders: dict[Path, list[Pair]] = {}
-        for pair in kept if neighbours else ():
+        for pair in pairs:
             self._folders.setdefault(pair.depth.parent, []).append(pair)
         self._places = {pair.name: place for folder in self._folders.values() for place, pair in enumerate(folder)}
+        self._faults: dict[Path, Assumption | None] = {}
         self._kept: OrderedDict[str, _Frame] = OrderedDict()
 
     def neighbours(self, pair: Pair) -> list[Pair]:
@@ -62,18 +72,41 @@ class FrameSequence:
         return found[: self._count]
 
     def with_pose(self, pair: Pair, picture: Picture) -> Picture:
-        """Return a frame with its pose from the file, if there is one.
+        """Return a frame with its pose from the file, if there is one, and with warnings of poses that cannot be right.
 
         Raises:
             ValueError: neighbours are to vote, and the frame has no pose.
 
         """
+        notes = list(self._matched)
         if self._poses is not None:
             picture = replace(picture, pose=self._poses.get(pair.name))
         if picture.pose is None and self._count:
             where = "this capture has none; give --poses" if self._file is None else f"{self._file} has none"
             raise ValueError(f"--neighbours: expected a pose for each frame, {where}")
-        return picture
+        if picture.pose is None and self._file is not None:
+            detail = f"{self._without} of {len(self._places)} frames have none"
+            notes.append(
+                Assumption(f"{self._file.name} has no pose of this frame", detail, "poses-missing", self._without)
+            )
+        if picture.pose is not None and (fault := self._fault(pair.depth.parent)) is not None:
+            notes.append(fault)
+        return replace(picture, assumptions=(*picture.assumptions, *notes)) if notes else picture
+
+    def _fault(self, folder: Path) -> Assumption | None:
+        """Return what is wrong with the poses of a folder's frames, by some of them; the same for all of its frames."""
+        if folder not in self._faults:
+            frames = [pair for pair in self._folders[folder] if self._poses is None or pair.name in self._poses]
+
+            def load(number: int) -> PosedMap | None:
+                try:
+                    depth, camera, pose = self._frame(frames[number])
+                except (ValueError, OSError):  # it is reported as a frame of its own
+                    return None
+                return None if pose is None else PosedMap(depth[0].double().numpy(), camera, pose)
+
+            self._faults[folder] = check(len(frames), load)
+        return self._faults[folder]
 
     def fuse(self, pair: Pair, picture: Picture) -> Picture:
         """Return a frame with its pose, its depth fused with that of its neighbours."""
@@ -90,9 +123,17 @@ class FrameSequence:
             if pose is not None:
                 views.append(View(depth, camera, pose))
         fused = fuse_views(View(picture.depth_lr, _camera_lr(picture), picture.pose), views)
-        votes = float(fused.votes[fused.depth.isfinite()].mean())
-        detail = f"{votes:.1f} frames agree on a pixel" + (f"; {failed} could not be read" if failed else "")
-        note = Assumption(f"{self._count} neighbouring frames vote on the depth", detail)
+        known = picture.depth_lr.isfinite()
+        others, seeing = (float(each[known].mean()) for each in (fused.others, fused.seeing))
+        detail = f"of {seeing:.1f} that see a pixel {others:.1f} agree with it"
+        detail += f"; {failed} could not be read" if failed else ""
+        text, code = f"{self._count} neighbouring frames vote on the depth", "neighbours-disagree"
+        share = others / seeing if seeing else 0.0
+        note = Assumption(text, detail)
+        if share < LIMITS[code].threshold:
+            note = Assumption(
+                f"{text}, and hardly any agree with it: are the poses right?", detail, code, round(share, 3)
+            )
         return replace(picture, depth_lr=fused.depth, assumptions=(*picture.assumptions, note))
 
     def _frame(self, pair: Pair) -> _Frame:

@@ -147,7 +147,7 @@ def save_page(
     problems = results.problems()
     data = {
         **_data(path, results, pictures.calibration(), tables, title),
-        "notes": [*results.notes, *notes],
+        "notes": [*results.remarks, *notes],
         "scenes": [
             {"problem": problems.index(view.problem), "name": view.scene, "data": f"s{number}"}
             for number, (view, _) in enumerate(shown)

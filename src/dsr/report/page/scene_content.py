@@ -70,11 +70,7 @@ def views_of(results: Results, setting: BenchmarkSetting | None = None) -> list[
     """Return the scenes with predictions of a setting, or of all; of several seeds of a method the lowest is used."""
     views: list[View] = []
     for problem in results.problems() if setting is None else [setting]:
-        having: dict[str, list[Run]] = {}
-        for run in results.of(problem):
-            for scene in run.scenes:
-                having.setdefault(scene, []).append(run)
-        views += [View(problem, scene, one_per_method(runs)) for scene, runs in having.items()]
+        views += [View(problem, scene, one_per_method(runs)) for scene, runs in results.by_scene(problem).items()]
     return views
 
 

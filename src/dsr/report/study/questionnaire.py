@@ -118,19 +118,17 @@ def build_study(
 
 def _questions(results: Results, choice: Choice) -> tuple[list[Question], list[str]]:
     """Return the questions, and notes on the scenes left out."""
-    runs = [run for run in results.runs if _is_selected(run, choice)]
     _expect_existing(results, choice)
     notes = list(results.notes)
+    selected = Results(tuple(run for run in results.runs if _is_selected(run, choice)))
     questions = []
-    for problem in dict.fromkeys(run.problem for run in runs):
-        of_problem = [run for run in runs if run.problem == problem]
-        scenes = dict.fromkeys(scene for run in of_problem for scene in run.scenes)
-        all_labels = {run.label for run in of_problem}
-        for scene in scenes:
+    for problem in selected.problems():
+        all_labels = {run.label for run in selected.of(problem)}
+        for scene, runs in selected.by_scene(problem).items():
             if choice.scenes and scene not in choice.scenes:
                 continue
             place = f"{problem.dataset}/{scene} x{problem.scale} {problem.downsampling}"
-            shown = one_per_method([run for run in of_problem if scene in run.scenes])
+            shown = one_per_method(runs)
             reason = _reason_to_skip(shown, scene)
             if reason:
                 notes.append(f"left out: {place}: {reason}")

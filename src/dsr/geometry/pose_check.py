@@ -1,0 +1,218 @@
+"""Whether the poses of frames fit their depth maps, or would if they were read in another way.
+
+The points of one depth map are moved into the view of another: where they see the same surfaces, the depths agree. That
+is measured under the poses as given, under each of :data:`READINGS`, and without any motion, which says how much the
+frames tell: before a wall, or of a camera that stands still, all readings agree.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from dsr.geometry.camera import Camera
+from dsr.geometry.rigid_motion import Matrix, invert
+from dsr.geometry.tsdf import PosedMap
+from dsr.notes import LIMITS, Assumption
+
+_Reading = Callable[[Matrix], Matrix]
+
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+_FORWARD_DOWN = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+"""Axes x right, y down, z forward in the frame x forward, y right, z down, as TartanAir and aircraft have it."""
+_FORWARD_UP = np.diag([1.0, -1.0, -1.0, 1.0]) @ _FORWARD_DOWN
+"""The same in the frame x forward, y left, z up, that of robots (ROS)."""
+
+
+def _as_given(pose: Matrix) -> Matrix:
+    return pose
+
+
+def _transposed(pose: Matrix) -> Matrix:
+    """Return a pose whose rotation was written by columns."""
+    changed = pose.copy()
+    changed[:3, :3] = pose[:3, :3].T
+    return changed
+
+
+def _scalar_first(pose: Matrix) -> Matrix:
+    """Return a pose whose quaternion w x y z was read as x y z w."""
+    w, x, y, z = Rotation.from_matrix(pose[:3, :3]).as_quat()
+    changed = pose.copy()
+    changed[:3, :3] = Rotation.from_quat((x, y, z, w)).as_matrix()
+    return changed
+
+
+_DIRECTIONS: dict[str, _Reading] = {"": _as_given, "from world to camera": invert}
+_AXES: dict[str, Matrix] = {
+    "": np.eye(4),
+    "of cameras with y up and z backward": _OPENGL,
+    "of cameras with x forward and z down": _FORWARD_DOWN,
+    "of cameras with x forward and z up": _FORWARD_UP,
+}
+_ROTATIONS: dict[str, _Reading] = {
+    "": _as_given,
+    "with rotations by columns": _transposed,
+    "with quaternions w x y z": _scalar_first,
+}
+_LENGTHS = {"": 1.0, "in millimetres": 1e-3, "in centimetres": 1e-2, "10 times too small": 10.0,
+            "100 times too small": 100.0, "1000 times too small": 1000.0}  # fmt: skip
+
+
+def _readings() -> dict[str, _Reading]:
+    """Return all readings: of direction, axes, rotation and length, those first that change less."""
+    found: dict[int, dict[str, _Reading]] = {}
+    for names in itertools.product(_ROTATIONS, _DIRECTIONS, _AXES, _LENGTHS):
+        turn, direction, axes, length = names
+        if turn and (axes or (direction and turn == "with rotations by columns")):
+            continue
+
+        def reading(pose: Matrix, names: tuple[str, ...] = names) -> Matrix:
+            turn, direction, axes, length = names
+            changed = _ROTATIONS[turn](pose)
+            changed = np.block([[changed[:3, :3], _LENGTHS[length] * changed[:3, 3:]], [changed[3:]]])
+            return _DIRECTIONS[direction](changed) @ _AXES[axes]
+
+        said = [name for name in (direction, turn, axes, length) if name]
+        found.setdefault(len(said), {})[", ".join(said)] = reading
+    return {name: reading for changes in sorted(found) for name, reading in found[changes].items()}
+
+
+READINGS = _readings()
+"""By what the poses then are: what makes poses as :mod:`dsr.geometry.rigid_motion` has them of those; "" as given."""
+
+_WIDEST = 320
+"""Maps are reduced to at most as many pixels across, by leaving out pixels."""
+_ACROSS = 24
+"""Points across a map that are moved."""
+_TOLERANCE = 0.04
+"""Difference of two depths, relative to the farther, up to which they agree."""
+_LEAST_OVERLAP = 0.3
+"""Share of the points that have to be seen again for a reading to say anything about two frames."""
+_GAPS = (0, 1, 3, 10, 30)
+"""Places of the frames of a group that are compared with each other, from its first one."""
+_GROUPS = 4
+"""Groups of frames of a sequence."""
+_GOOD = 0.7
+"""Share of the pixels that have to agree under the right reading."""
+_LEAST_WEIGHT = 0.5
+"""Number of pairs that disagree wholly without motion, or as much of more pairs, that tell readings apart."""
+_TIE = 0.9
+"""Readings whose evidence is at least this much of the best one's cannot be told from it."""
+_MOST_NAMES = 3
+"""Readings that a message names."""
+_WORSE = 1.2
+"""Times as many pixels that have to disagree under poses that are wrong in another way as without motion."""
+
+
+class Agreement(NamedTuple):
+    """How far pairs of frames agree under each of :data:`READINGS` and, last, without motion, (pairs, readings + 1).
+
+    ``overlap``: share of a frame's points that lie in the other's view. ``agreed``: share of these whose depths agree.
+    """
+
+    overlap: np.ndarray
+    agreed: np.ndarray
+
+
+def sample(count: int) -> list[tuple[int, ...]]:
+    """Return which frames of a sequence to compare with each other, as groups of their places."""
+    last = max(count - 1, 0)
+    starts = {round(number * max(last - _GAPS[-1], 0) / max(_GROUPS - 1, 1)) for number in range(_GROUPS)}
+    groups = {tuple(sorted({min(start + gap, last) for gap in _GAPS})) for start in starts}
+    return sorted(group for group in groups if len(group) > 1)
+
+
+def check(count: int, load: Callable[[int], PosedMap | None]) -> Assumption | None:
+    """Compare some frames of a sequence with each other; see :func:`find_fault`.
+
+    Args:
+        count: number of frames.
+        load: returns the frame of a number; None for one that cannot be read, or has no pose.
+
+    """
+    groups = ([each for number in group if (each := load(number)) is not None] for group in sample(count))
+    return find_fault(compare(groups))
+
+
+def compare(groups: Iterable[Sequence[PosedMap]]) -> Agreement:
+    """Return how far the frames of each group agree with each other."""
+    found = [_compare(*pair) for group in groups for pair in itertools.combinations(map(_prepared, group), 2)]
+    shares = np.reshape(found, (len(found), 2, len(READINGS) + 1))
+    return Agreement(shares[:, 0], shares[:, 1])
+
+
+class _Frame(NamedTuple):
+    """A reduced map, its camera, some of its points, (3, N), and its poses by all readings, (readings + 1, 4, 4)."""
+
+    depth: np.ndarray
+    camera: Camera
+    points: np.ndarray
+    poses: np.ndarray
+
+
+def _prepared(each: PosedMap) -> _Frame:
+    """Return a frame to compare."""
+    step = max(-(-each.camera.width // _WIDEST), 1)
+    camera = each.camera.decimate(step, step // 2)
+    depth = each.depth[step // 2 :: step, step // 2 :: step][: camera.height, : camera.width]
+    apart = max(camera.width // _ACROSS, 1)
+    part = (slice(None), *[slice(apart // 2, None, apart)] * 2)
+    points = (depth * camera.rays().numpy())[part].reshape(3, -1)
+    poses = np.stack([*(read(each.pose) for read in READINGS.values()), np.eye(4)])
+    return _Frame(depth, camera, points[:, np.isfinite(points[2])], poses)
+
+
+def _compare(frame: _Frame, other: _Frame) -> tuple[np.ndarray, np.ndarray]:
+    """Return overlap and agreement of another frame's points with a frame, (readings + 1,) each."""
+    moves = np.linalg.inv(frame.poses) @ other.poses
+    x, y, z = np.moveaxis(moves[:, :3, :3] @ other.points + moves[:, :3, 3:], 1, 0)  # (readings + 1, points) each
+    camera = frame.camera
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    inside = (z > 0) & (u > -0.5) & (v > -0.5) & (u < camera.width - 0.5) & (v < camera.height - 0.5)
+    rows, columns = (np.rint(np.where(inside, each, 0)).astype(np.intp) for each in (v, u))
+    seen = np.where(inside, frame.depth[rows, columns], np.nan)
+    count = np.isfinite(seen).sum(1)
+    agreeing = np.abs(seen - z) <= _TOLERANCE * np.maximum(seen, z)
+    return count / max(z.shape[1], 1), agreeing.sum(1) / np.maximum(count, 1)
+
+
+def find_fault(agreement: Agreement) -> Assumption | None:
+    """Return a warning where frames disagree under the poses as given; None where they agree, or tell too little.
+
+    A pair of frames counts as much as they disagree without motion.
+    """
+    seen, agreed = agreement.overlap >= _LEAST_OVERLAP, agreement.agreed
+    without = agreed[:, -1:]
+    given = np.where(seen[:, :1], agreed[:, :1], without)
+    weight = seen * (1 - without)  # (pairs, readings + 1)
+    total = weight.sum(0)
+    means = [(weight * each).sum(0) / np.maximum(total, 1e-9) for each in (agreed, given, without)]
+    gain = means[0] - np.maximum(means[1], means[2])
+    evidence = np.where((means[0] >= _GOOD) & (total >= _LEAST_WEIGHT), total * gain, 0)[:-1]
+    best = int(evidence.argmax())
+    if evidence[best] > 0 and gain[best] >= LIMITS["poses"].threshold:
+        names = list(READINGS)
+        tied = [names[place] for place in np.flatnonzero(evidence >= _TIE * evidence[best])]
+        simplest = [name for name in tied if name.count(",") == min(other.count(",") for other in tied)]
+        as_given = float((weight[:, best] * seen[:, 0] * agreed[:, 0]).sum() / total[best])
+        return Assumption(
+            f"the poses are probably {' or '.join(simplest[:_MOST_NAMES])}",
+            f"as given, neighbouring frames agree in {as_given:.0%} of the pixels, so read in {means[0][best]:.0%}",
+            "poses",
+            round(float(gain[best]), 3),
+        )
+    wrong, still = (float((seen[:, 0] * (1 - agreed[:, k])).sum() / max(seen[:, 0].sum(), 1)) for k in (0, -1))
+    if wrong < LIMITS["poses-disagree"].threshold or wrong < _WORSE * still:
+        return None
+    return Assumption(
+        "neighbouring frames do not agree under the poses",
+        f"they do in {1 - wrong:.0%} of the pixels, without any motion in {1 - still:.0%}",
+        "poses-disagree",
+        round(wrong, 3),
+    )

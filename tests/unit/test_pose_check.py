@@ -1,0 +1,124 @@
+"""Poses that are read wrongly are told by the depth maps, and nothing is said where these cannot tell."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from small_frames import room, walk
+
+from dsr.geometry.camera import Camera
+from dsr.geometry.pose_check import check, sample
+from dsr.geometry.rigid_motion import Matrix, invert
+from dsr.geometry.tsdf import PosedMap
+from dsr.notes import Assumption
+
+CAMERA = Camera.centred(64, 48, 52.0)
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+NED = np.array([[0.0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+"""The axes forward, right, down of a camera in its frame right, down, forward."""
+
+
+def scaled(pose: Matrix, factor: float) -> Matrix:
+    changed = pose.copy()
+    changed[:3, 3] *= factor
+    return changed
+
+
+def turned(pose: Matrix, change: Callable[[Matrix], Matrix]) -> Matrix:
+    changed = pose.copy()
+    changed[:3, :3] = change(pose[:3, :3])
+    return changed
+
+
+def scalar_first(turn: Matrix) -> Matrix:
+    """Return what x y z w is read as where w x y z is written."""
+    x, y, z, w = Rotation.from_matrix(turn).as_quat()
+    return Rotation.from_quat((w, x, y, z)).as_matrix()
+
+
+WRONG: list[tuple[str, Callable[[Matrix], Matrix]]] = [
+    ("from world to camera", invert),
+    ("in millimetres", lambda pose: scaled(pose, 1000)),
+    ("in centimetres", lambda pose: scaled(pose, 100)),
+    ("10 times too small", lambda pose: scaled(pose, 0.1)),
+    ("of cameras with y up and z backward", lambda pose: pose @ OPENGL),
+    ("of cameras with x forward and z down", lambda pose: pose @ NED),
+    ("with rotations by columns", lambda pose: turned(pose, np.transpose)),
+    ("with quaternions w x y z", lambda pose: turned(pose, scalar_first)),
+    ("from world to camera, in millimetres", lambda pose: scaled(invert(pose), 1000)),
+    ("from world to camera, of cameras with y up and z backward", lambda pose: invert(pose @ OPENGL)),
+]
+
+
+def checked(
+    poses: list[Matrix],
+    change: Callable[[Matrix], Matrix] = lambda pose: pose,
+    depth: Callable[[Camera, Matrix], np.ndarray] = room,
+) -> Assumption | None:
+    """Return what is said of poses that were changed, of maps with the noise of a sensor."""
+
+    def load(number: int) -> PosedMap:
+        draws = np.random.default_rng(number).standard_normal((CAMERA.height, CAMERA.width))
+        return PosedMap(depth(CAMERA, poses[number]) * (1 + 0.005 * draws), CAMERA, change(poses[number]))
+
+    return check(len(poses), load)
+
+
+def wall(camera: Camera, pose: Matrix) -> np.ndarray:
+    return 2 / np.einsum("j,jhw->hw", pose[2, :3], camera.rays().numpy())
+
+
+@pytest.mark.parametrize(("name", "change"), WRONG, ids=[name for name, _ in WRONG])
+def test_wrong_reading_is_told_by_its_name_with_figures(name: str, change: Callable[[Matrix], Matrix]) -> None:
+    found = checked(walk(8), change)
+    assert found is not None
+    assert found.code == "poses"
+    assert name in found.text.removeprefix("the poses are probably ").split(" or ")
+    assert found.value is not None
+    assert found.value > 0.25
+
+
+@pytest.mark.parametrize(
+    "poses",
+    [walk(8), walk(2), walk(60, 0.004, 0.3), walk(8, 0.0), walk(8, 0.08, 0.0), walk(20, 0.0, 0.0), walk(1), []],
+    ids=["photos", "two", "video", "rotation", "translation", "tripod", "one", "none"],
+)
+def test_right_poses_are_silent(poses: list[Matrix]) -> None:
+    assert checked(poses) is None
+
+
+@pytest.mark.parametrize(("name", "change"), WRONG, ids=[name for name, _ in WRONG])
+def test_wall_along_which_the_camera_moves_tells_nothing(name: str, change: Callable[[Matrix], Matrix]) -> None:
+    del name
+    poses = [np.eye(4) for _ in range(12)]
+    for number, pose in enumerate(poses):
+        pose[:2, 3] = 0.03 * number, 0.01 * number
+    found = checked(poses, change, wall)
+    assert found is None or found.code != "poses"
+
+
+def test_poses_that_no_reading_explains_disagree() -> None:
+    poses = walk(8, 0.02, 0.5)
+    rng = np.random.default_rng(3)
+    strange = {id(pose): Rotation.from_rotvec(rng.normal(0, 12, 3), degrees=True).as_matrix() for pose in poses}
+    found = checked(poses, lambda pose: turned(pose, lambda turn: turn @ strange[id(pose)]))
+    assert found is not None
+    assert found.code == "poses-disagree"
+
+
+def test_frames_that_cannot_be_read_are_left_out() -> None:
+    poses = walk(8)
+    assert check(8, lambda number: None) is None
+    some = check(8, lambda n: None if n == 1 else PosedMap(room(CAMERA, poses[n]), CAMERA, invert(poses[n])))
+    assert some is not None
+
+
+def test_frames_are_sampled_within_the_sequence_and_few_of_a_long_one() -> None:
+    for count in (0, 1, 2, 5, 31, 100_000):
+        groups = sample(count)
+        assert all(0 <= number < count for group in groups for number in group)
+        assert sum(map(len, groups)) <= 20
+        assert (len(groups) > 0) == (count > 1)
