@@ -394,7 +394,7 @@ READERS = (
     Reader("checkpoint", run_seeds.training, _checkpoint, 2),
     Reader("claims", run_seeds.claims, _claims),
     Reader("notes", run_seeds.notes, _notes),
-    Reader("foreground", lambda folder: seeds.photo(folder / "mask.png"), _foreground),
+    Reader("foreground", seeds.foreground, _foreground),
     Reader("view", run_seeds.results,
            lambda place: command("view", place.input / "out", "--no-open", "-o", place.out / "view.html")),
     Reader("fuse", run_seeds.results,

@@ -23,16 +23,12 @@ from dsr.evaluation.sharing import _digest
 from dsr.utils.files import machine
 from fuzz.seeds import CAMERA, photo, unit, written
 
-INTERRUPTED = 130
-
 
 def quietly(*arguments: object) -> None:
     """Run a command that has to succeed."""
     said = io.StringIO()
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
         code = main([str(each) for each in arguments])
-    if code == INTERRUPTED:
-        raise _InterruptedError
     assert code == 0, said.getvalue()
 
 
@@ -64,6 +60,10 @@ def evaluation_arguments(folder: Path, run: Path) -> list[str]:
     ]  # fmt: skip
 
 
+_STEPS = 2
+"""Steps of a training."""
+
+
 @functools.cache
 def _trained(steps: int) -> Path:
     """Return the directory of a training of two steps, which is made once; with fewer steps it was interrupted."""
@@ -81,24 +81,21 @@ def _trained(steps: int) -> Path:
     atexit.register(shutil.rmtree, place, ignore_errors=True)
     _scenes(place / "scenes", "room", "hall", "shed")
     folder = place / "run"
-    with mock.patch.object(trainer, "StepProgress", Interrupting), contextlib.suppress(_InterruptedError):
+    with mock.patch.object(trainer, "StepProgress", Interrupting), contextlib.suppress(SystemExit):
         quietly(
             "train", "model=msg_v", "scale=2", "trainer=smoke", "dataset=folder", f"dataset.root={place / 'scenes'}",
-            "trainer.max_steps=2", "trainer.val_check_interval=1", "patches.scenes=2", "metrics.lpips=false",
+            f"trainer.max_steps={_STEPS}", "trainer.val_check_interval=1", "patches.scenes=2", "metrics.lpips=false",
             "device=cpu", "precision=float32", "logger=[tensorboard,csv]", f"output_dir={folder}",
         )  # fmt: skip
+    assert (folder / "weights.safetensors").is_file() == (steps == _STEPS)
     for log in (folder / "tensorboard").rglob("events*"):
         log.unlink()
     return folder
 
 
-class _InterruptedError(Exception):
-    """A command was interrupted."""
-
-
 def training(folder: Path) -> None:
     """Write the directory of a finished training."""
-    shutil.copytree(_trained(2), folder / "run")
+    shutil.copytree(_trained(_STEPS), folder / "run")
 
 
 def training_without_weights(folder: Path) -> None:

@@ -49,6 +49,11 @@ def photo(path: Path, number: int = 0, **more: Any) -> Path:
     return path
 
 
+def foreground(folder: Path) -> None:
+    """Write a mask of 48 x 64 whose left half is white."""
+    captures.save(folder / "mask.png", np.uint8(255) * (np.indices((48, 64))[1] < 32))
+
+
 def pair(folder: Path, suffix: str) -> None:
     """Write a photo and a depth map of 12 x 16 in a format."""
     photo(folder / "photo.png")
