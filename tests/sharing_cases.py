@@ -19,6 +19,7 @@ from dsr.metrics.catalogue import catalogue
 from dsr.report.worker_pool import WorkerPool
 from dsr.sample import Scene
 from dsr.utils import interruption
+from dsr.utils.files import FullDiskError, replacing
 from dsr.utils.pool import Pool
 from dsr.utils.progress import SILENT, Progress
 
@@ -211,6 +212,22 @@ def test_worker_that_stops_at_a_signal_ends_without_a_word_and_another_begins_ag
         assert list(pool.results(["a"])) == [("a", "A")]
     assert told.lines == ["a: the worker was ended before it had a result; another one begins it again"]
     assert capfd.readouterr().err == ""
+
+
+def test_worker_that_is_ended_while_it_writes_leaves_no_temporary_file(tmp_path):
+    def work(item):
+        if item == "full":
+            while not list(tmp_path.glob(".file-*")):
+                time.sleep(0.01)
+            raise FullDiskError(tmp_path / "other")
+        with replacing(tmp_path / "file.png") as temporary:
+            temporary.write_bytes(b"half")
+            time.sleep(60)
+        return item
+
+    with Pool(2, work, lambda item: "lost") as pool, pytest.raises(FullDiskError):
+        list(pool.results(["file", "full"]))
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_workers_end_with_their_context():

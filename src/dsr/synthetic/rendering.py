@@ -84,7 +84,7 @@ def expect_size(size: int) -> None:
         OutOfMemoryError: it has; the message begins with ``size``.
 
     """
-    expect_memory("size", size, _BYTES * float(size) ** 2)
+    expect_memory("size", size, _BYTES * size**2)
 
 
 def cache_directory() -> Path:

@@ -60,9 +60,9 @@ class PatchSettings:
             raise ValueError(f"batch: expected a positive number, got {self.batch}")
         if self.scenes is not None and self.scenes < 1:
             raise ValueError(f"scenes: expected a positive number, or null for all, got {self.scenes}")
-        expect_memory("patch", self.patch, _BYTES * float(self.patch) ** 2)
-        expect_memory("batch", self.batch, _BYTES * float(self.batch) * self.patch**2)
-        expect_memory("workers", self.workers, _BYTES_OF_WORKER * float(self.workers))
+        expect_memory("patch", self.patch, _BYTES * self.patch**2)
+        expect_memory("batch", self.batch, _BYTES * self.batch * self.patch**2)
+        expect_memory("workers", self.workers, _BYTES_OF_WORKER * self.workers)
         for name in ("workers", "validation_scenes"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name}: expected 0 or more, got {getattr(self, name)}")

@@ -247,7 +247,7 @@ def requeued() -> Iterator[None]:
 
     def note(number: int, frame: FrameType | None) -> None:
         came.append(frame)
-        if _in_import(frame):
+        if in_import(frame):
             requeue(number, frame)
         elif _State.deferred is not None:
             _State.deferred.requested = True
@@ -374,7 +374,7 @@ def _handle(number: int, frame: FrameType | None) -> None:
     """Act upon a signal, in the main thread."""
     again, _State.handled = _State.handled, True
     _State.number = _State.number or number
-    if again or not _State.working or _in_import(frame):
+    if again or not _State.working or in_import(frame):
         end(_message())
     if _State.deferred is None:
         raise KeyboardInterrupt
@@ -415,7 +415,7 @@ def _unraisable(problem: Any) -> None:
     sys.__unraisablehook__(problem)
 
 
-def _in_import(frame: FrameType | None) -> bool:
+def in_import(frame: FrameType | None) -> bool:
     """Return whether a module is being imported, which takes no exception."""
     while frame is not None:
         if frame.f_code.co_filename.startswith("<frozen importlib"):

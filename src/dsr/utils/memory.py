@@ -10,6 +10,8 @@ from dsr.utils.progress import megabytes
 
 _NO_LIMIT = 1 << 40
 """Bytes of memory where the system does not tell."""
+_MOST = 1e300
+"""Bytes that a message can still name."""
 _ADVICE = "not enough memory; a smaller size, scale or batch, or fewer workers need less"
 _OF_ALLOCATORS = ("allocate memory", "not enough memory", "Insufficient memory", "out of memory")
 """What torch's and OpenCV's errors say when there is no memory."""
@@ -36,7 +38,7 @@ def expect_memory(name: str, value: object, needed: float) -> None:
         OutOfMemoryError: it has less; the message begins with ``name``.
 
     """
-    there = _told("MemTotal:")
+    there, needed = _told("MemTotal:"), min(needed, _MOST)
     if needed > there:
         size = f"at least {megabytes(needed)} of memory, of which there are {megabytes(there)}"
         raise OutOfMemoryError(f"{name}: expected less, {value} needs {size}")

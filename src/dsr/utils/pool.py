@@ -11,6 +11,7 @@ import contextlib
 import multiprocessing
 import os
 import signal
+import sys
 import time
 import warnings
 from collections import deque
@@ -18,6 +19,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
+from types import FrameType
 from typing import Any, Generic, Literal, Self, TypeVar, cast
 
 import cv2
@@ -102,10 +104,11 @@ class Pool(Generic[_T, _R]):
         """Terminate the workers, whatever they are doing."""
         for process in self._processes.values():
             process.terminate()
-        waits = interruption.is_ctrl_c()
+        waits, deadline = interruption.is_ctrl_c(), time.monotonic() + _SECONDS_TO_END
         with interruption.deferred(lambda: interruption.MESSAGE) if waits else contextlib.nullcontext():
             for connection, process in self._processes.items():
-                process.join(None if waits else _SECONDS_TO_END)  # for the step that it is at
+                # for the step that it is at, or for the end of what it is writing
+                process.join(None if waits else max(0.0, deadline - time.monotonic()))
                 process.kill()  # whatever kept it from ending
                 process.join()
                 connection.close()
@@ -226,10 +229,10 @@ class Pool(Generic[_T, _R]):
 
 def _serve(connection: Connection, parent: int, plan: tuple[Any, ...] | None) -> None:
     """Work on items in a worker, until it is terminated."""
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # a fork has its parent's handler
+    signal.signal(signal.SIGTERM, _leave)  # a fork has its parent's handler
     interruption.end_with(parent)
     surroundings.close_to_settings()
-    with contextlib.suppress(EOFError):  # the parent was interrupted
+    with contextlib.suppress(EOFError, KeyboardInterrupt):  # the parent was interrupted, or has ended this process
         work, prepare, arguments, threads = connection.recv() if plan is None else plan
         if plan is None:
             _set_threads(threads)
@@ -239,11 +242,17 @@ def _serve(connection: Connection, parent: int, plan: tuple[Any, ...] | None) ->
             item = connection.recv()
             try:
                 answer = (True, work(item))
-            except KeyboardInterrupt:  # SIGTERM came while the work noted signals, to save what it has
-                return
             except Exception as error:
                 answer = (False, error)
             connection.send(answer)
+
+
+def _leave(_: int, frame: FrameType | None) -> None:
+    """End this worker by an exception, so that its temporary files are removed."""
+    sys.unraisablehook = lambda _: None  # it may come where exceptions are dropped, with a word
+    if interruption.in_import(frame):
+        os._exit(128 + signal.SIGTERM)
+    raise KeyboardInterrupt
 
 
 @contextlib.contextmanager
