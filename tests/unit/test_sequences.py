@@ -48,6 +48,8 @@ def test_five_frames_have_less_than_half_the_noise_and_their_deviation_says_so()
     truth = room(first.pose)
     inner = (fused.votes == 5) & ((truth - 2.5).abs() < 0.01)
     assert float(inner.double().mean()) > 0.4
+    assert bool((fused.others == 4)[inner].all())
+    assert bool((fused.others <= fused.seeing).all())
     before, after = ((each - truth)[inner].std() for each in (first.depth, fused.depth))
     assert float(after) < 0.45 * float(before)
     assert float(fused.deviation[inner].mean()) == pytest.approx(float(after), rel=0.5)
@@ -98,6 +100,7 @@ def test_no_neighbours_leave_the_map_as_it_is():
     fused = fuse_views(first, [])
     assert torch.allclose(fused.depth, first.depth, rtol=1e-9)
     assert bool((fused.votes == 1).all())
+    assert not bool(fused.others.any() | fused.seeing.any())
 
 
 def test_frames_count_by_their_expected_errors():

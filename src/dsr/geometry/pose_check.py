@@ -157,22 +157,23 @@ class _Frame(NamedTuple):
 
 def _prepared(each: PosedMap) -> _Frame:
     """Return a frame to compare."""
-    step = max(-(-each.camera.width // _WIDEST), 1)
+    step = min(-(-each.camera.width // _WIDEST), each.camera.height)
     camera = each.camera.decimate(step, step // 2)
     depth = each.depth[step // 2 :: step, step // 2 :: step][: camera.height, : camera.width]
     apart = max(camera.width // _ACROSS, 1)
     part = (slice(None), *[slice(apart // 2, None, apart)] * 2)
     points = (depth * camera.rays().numpy())[part].reshape(3, -1)
-    poses = np.stack([*(read(each.pose) for read in READINGS.values()), np.eye(4)])
+    with np.errstate(over="ignore", invalid="ignore"):  # of numbers that no pose has
+        poses = np.stack([*(read(each.pose) for read in READINGS.values()), np.eye(4)])
     return _Frame(depth, camera, points[:, np.isfinite(points[2])], poses)
 
 
 def _compare(frame: _Frame, other: _Frame) -> tuple[np.ndarray, np.ndarray]:
     """Return overlap and agreement of another frame's points with a frame, (readings + 1,) each."""
-    moves = np.linalg.inv(frame.poses) @ other.poses
-    x, y, z = np.moveaxis(moves[:, :3, :3] @ other.points + moves[:, :3, 3:], 1, 0)  # (readings + 1, points) each
-    camera = frame.camera
+    camera, back = frame.camera, frame.poses[:, :3, :3].transpose(0, 2, 1)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        turn, shift = back @ other.poses[:, :3, :3], back @ (other.poses[:, :3, 3:] - frame.poses[:, :3, 3:])
+        x, y, z = np.moveaxis(turn @ other.points + shift, 1, 0)  # (readings + 1, points) each
         u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
     inside = (z > 0) & (u > -0.5) & (v > -0.5) & (u < camera.width - 0.5) & (v < camera.height - 0.5)
     rows, columns = (np.rint(np.where(inside, each, 0)).astype(np.intp) for each in (v, u))
