@@ -27,6 +27,50 @@ LIMITS: dict[str, Limit] = {
         "pixels, of a photo with 800 on its longer side, by which its edges lie beside those of the depth map",
         "a person sees it in the relit surface from about 3 on",
     ),
+    "along-the-ray": Limit(
+        0.7,
+        "share of the planar windows that are planar only if values are distances along the ray",
+        "PLACEHOLDER",
+    ),
+    "falls-with-distance": Limit(
+        2.0,
+        "windows in which the values are linear, over those in which their reciprocals are",
+        "PLACEHOLDER",
+    ),
+    "depth-near": Limit(0.05, "metres, of the 99th percentile, below which it is", "no depth camera measures nearer"),
+    "depth-far": Limit(
+        200.0,
+        "metres, of the 1st percentile",
+        "laser scanners of cars end at 120 m, photos of a landscape begin nearer",
+    ),
+    "view-narrow": Limit(5.0, "degrees of horizontal view, below which it is", "400 mm of focal length on 35 mm film"),
+    "view-wide": Limit(130.0, "degrees of horizontal view", "no lens without distortion sees more; 122 is sold"),
+    "focal-ratio": Limit(1.1, "larger over smaller focal length", "PLACEHOLDER"),
+    "off-centre": Limit(0.25, "of the size, from its middle to the principal point", "PLACEHOLDER"),
+    "other-picture": Limit(
+        0.1,
+        "of the size, from its middle to the principal point, if the numbers fit another size or order",
+        "PLACEHOLDER",
+    ),
+    "beside-axis": Limit(
+        80.0,
+        "degrees from the axis to the picture; refused, not warned of",
+        "a lens without distortion of 160 degrees would show it at its very edge",
+    ),
+    "far-millimetres": Limit(
+        6.0,
+        "metres, of the median of whole numbers as millimetres; the unit is asked for, not warned of",
+        "PLACEHOLDER",
+    ),
+    "far-metres": Limit(
+        10.0, "metres, of the median of floats, if planes do not show that they are depth; asked for", "PLACEHOLDER"
+    ),
+    "far-floats": Limit(30.0, "metres, of the median of floats; asked for up to 200", "PLACEHOLDER"),
+    "float-millimetres": Limit(
+        1000.0, "of the median of floats above 200 that are not whole; asked for below it", "PLACEHOLDER"
+    ),
+    "baseline-short": Limit(0.001, "metres, below which it is", "phones have cameras 10 mm apart"),
+    "baseline-long": Limit(5.0, "metres", "KITTI's car has 0.54 m, and rigs of 2 m are rare"),
 }
 """By code: every warning that a command gives about its input; docs/checks.md shows them."""
 

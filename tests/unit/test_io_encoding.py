@@ -7,15 +7,17 @@ import pytest
 import torch
 
 from dsr.geometry.camera import Camera
-from dsr.io.encoding import Encoding, decode, encode, find_holes, guess_unit
+from dsr.io.encoding import Encoding, decode, encode, find_holes
 from dsr.io.reading import parse_unit
+from dsr.io.units import tell
 
 CAMERA = Camera(4, 3, 5.0, 6.0, 1.0, 1.5, baseline=0.1)
 
 
 def guess(middle, dtype):
     values = np.full((3, 3), middle, dtype)
-    return guess_unit("d", values, np.zeros((3, 3), bool))
+    told = tell("d", values, np.zeros((3, 3), bool))
+    return told.unit, told.assumptions
 
 
 @pytest.mark.parametrize(
@@ -42,9 +44,9 @@ def test_depth_too_far_too_near_or_too_sparse_is_pointed_out():
     assert any("1/5000" in assumption.text for assumption in guess(12_000, "u2")[1])
     assert not any("1/5000" in assumption.text for assumption in guess(9_000, "u2")[1])
     sparse = np.arange(9).reshape(3, 3) > 2
-    assert any("1/256" in assumption.text for assumption in guess_unit("d", np.full((3, 3), 2000, "u2"), sparse)[1])
+    assert any("1/256" in assumption.text for assumption in tell("d", np.full((3, 3), 2000, "u2"), sparse).assumptions)
     assert not any(
-        "1/256" in assumption.text for assumption in guess_unit("d", np.full((3, 3), 2000, "u2"), ~sparse)[1]
+        "1/256" in assumption.text for assumption in tell("d", np.full((3, 3), 2000, "u2"), ~sparse).assumptions
     )
     assert any("nearer than 5 cm" in assumption.text for assumption in guess(0.01, "f4")[1])
 
