@@ -28,7 +28,7 @@ LIMITS: dict[str, Limit] = {
         "a person sees it in the relit surface from about 3 on",
     ),
     "along-the-ray": Limit(
-        0.7,
+        0.85,
         "share of the planar windows that are planar only if values are distances along the ray",
         "PLACEHOLDER",
     ),
@@ -57,6 +57,9 @@ LIMITS: dict[str, Limit] = {
         "degrees from the axis to the picture; refused, not warned of",
         "a lens without distortion of 160 degrees would show it at its very edge",
     ),
+    "near-millimetres": Limit(
+        0.5, "metres, of the 99th percentile of whole numbers as millimetres, below which it is", "PLACEHOLDER"
+    ),
     "far-millimetres": Limit(
         6.0,
         "metres, of the median of whole numbers as millimetres; the unit is asked for, not warned of",
@@ -67,7 +70,7 @@ LIMITS: dict[str, Limit] = {
     ),
     "far-floats": Limit(30.0, "metres, of the median of floats; asked for up to 200", "PLACEHOLDER"),
     "float-millimetres": Limit(
-        1000.0, "of the median of floats above 200 that are not whole; asked for below it", "PLACEHOLDER"
+        500.0, "of the median of floats above 200 that are not whole; asked for below it", "PLACEHOLDER"
     ),
     "baseline-short": Limit(0.001, "metres, below which it is", "phones have cameras 10 mm apart"),
     "baseline-long": Limit(5.0, "metres", "KITTI's car has 0.54 m, and rigs of 2 m are rare"),

@@ -12,8 +12,10 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera, RangeType
+from dsr.geometry.plausible import expect_possible
 from dsr.io.cameras import camera_only, find_camera, read_rig, scale_to_photo, to_photo
 from dsr.io.depth_files import ICL_CAMERA, ICL_SUFFIX, read_depth_file
+from dsr.io.doubts import doubt_camera, doubt_depth
 from dsr.io.encoding import Encoding, decode, find_holes, turn_back_bits
 from dsr.io.frames import SLACK, Geometry
 from dsr.io.images import CameraFile, pixels_in_header, read_mask
@@ -61,12 +63,9 @@ class FolderUnits:
         """
         kind = _kind(pair, stored)
         if (kind, may_fall) not in self._told:
-            path, first, missing = self._first(kind, hole_value) or (
-                pair.depth,
-                stored,
-                find_holes(stored, hole_value)[0],
-            )
-            self._told[kind, may_fall] = tell(str(path), first, missing, camera, may_fall=may_fall)
+            path, first = self._first(kind, hole_value) or (pair.depth, stored)
+            holes = find_holes(first, hole_value)[0]
+            self._told[kind, may_fall] = tell(str(path), first, holes, camera, may_fall=may_fall)
         return self._told[kind, may_fall]
 
     def _first(self, kind: Kind, hole_value: float | None) -> tuple[Path, np.ndarray] | None:
@@ -149,6 +148,7 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     pixels, assumptions = _photo(pair, size_lr)
     geometry = Geometry() if pair.capture is None else pair.capture.geometry((pixels.shape[0], pixels.shape[1]))
     described, camera_assumptions = _camera(pair, reading, geometry, (pixels.shape[0], pixels.shape[1]), size_lr)
+    expect_possible(described.camera, _told_by(pair, reading))
     pixels, crop_assumptions = _crop_to_multiple(pixels, pair.factor, size_lr)
     size: Size = (pixels.shape[0], pixels.shape[1])
     rig = None if reading.rig is None else read_rig(reading.rig, size_lr, reading.baseline)
@@ -175,6 +175,7 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     encoding = Encoding(_suffix(pair), str(stored.dtype), told.unit, mark, range_type)
     depth_lr = decode(stored, holes, encoding, of_depth)
     hole_assumptions += _expect_distances(pair.depth, depth_lr, holes, range_type)
+    doubts = [*doubt_camera(described.camera, "camera", size_lr), *doubt_depth(depth_lr, of_depth, range_type)]
     rgb = torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1))).float() / 255
     all_assumptions = (
         *assumptions,
@@ -184,8 +185,10 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
         *told.assumptions,
         *hole_assumptions,
         *confidence_assumptions,
+        *doubts,
     )
     if rig is not None:
+        all_assumptions = (*all_assumptions, *doubt_camera(rig.camera, "--depth-camera"))
         depth_lr, warped = to_photo(depth_lr, rig, camera)
         all_assumptions, confidence = (*all_assumptions, warped), None
     device_name = model_in_exif(pair.rgb) if pair.capture is None else pair.capture.app
@@ -285,6 +288,14 @@ def _camera(
     described, assumptions = find_camera(CameraChoice(file=pair.camera), pair.rgb, size, size_lr)
     found = Assumption(f"camera: {pair.camera.name} beside the pictures")
     return described, [*geometry.assumptions, found, *assumptions]
+
+
+def _told_by(pair: Pair, reading: Reading) -> str:
+    """Return what says where the photo's principal point is."""
+    if reading.camera.intrinsics is not None:
+        return "--intrinsics"
+    capture = None if pair.capture is None else pair.capture.told_by
+    return str(reading.camera.file or capture or pair.camera or pair.rgb)
 
 
 def _mask(path: Path, size: Size) -> np.ndarray:

@@ -36,6 +36,8 @@ _SAMPLE = 200_000
 _MOST = 0.99
 """Share of the values that are multiples of a step; 0.9 where farther ones have other bits."""
 _LEVELS = 256
+_ENDS = 4
+"""Largest number of pixels that have the smallest, and the largest, value of a normalised map."""
 
 _KNOWN_CAMERAS: tuple[tuple[int, float, float, float, str], ...] = (
     (640, 481.2, 480.0, 1 / 5000, "ICL-NUIM"),
@@ -113,6 +115,11 @@ class _Clues:
         return float(self.values[~self.holes].max())
 
     @functools.cached_property
+    def lowest(self) -> float:
+        """The smallest known value."""
+        return float(self.values[~self.holes].min())
+
+    @functools.cached_property
     def telling(self) -> bool:
         """Whether there are enough different values."""
         return np.unique(self.known).size >= _FEWEST_LEVELS
@@ -159,6 +166,11 @@ class _Clues:
 
 def _tell_whole(clues: _Clues) -> Told:
     """Return what whole numbers tell."""
+    if clues.lowest < clues.highest < _LEVELS and not (clues.telling and clues.may_fall and clues.votes.verdict):
+        raise ValueError(
+            f"{clues.name}: expected --depth-unit cm (median {clues.metres(1e-2)}), or --range-type disparity with "
+            f"--baseline METRES: whole numbers up to {clues.highest:g} are too small for millimetres"
+        )
     if not clues.telling:
         return _by_median(clues)
     if clues.values.dtype == np.uint16 and clues.multiples(1 << SUNRGBD_BITS, 0.9):
@@ -173,11 +185,6 @@ def _tell_whole(clues: _Clues) -> Told:
                 f"{clues.name}: expected depth, got multiples of {step}: a picture of 8 bits for viewing, widened to "
                 "16; --depth-unit METRES if its values are metric"
             )
-    if clues.highest < _LEVELS:
-        raise ValueError(
-            f"{clues.name}: expected --depth-unit cm (median {clues.metres(1e-2)}), or --range-type disparity with "
-            f"--baseline METRES: whole numbers up to {clues.highest:g} are too small for millimetres"
-        )
     return _by_data_set(clues) or _by_steps(clues) or _by_median(clues)
 
 
@@ -224,10 +231,17 @@ def _by_median(clues: _Clues) -> Told:
     """Return the unit of whole numbers that makes their median a distance."""
     middle = clues.middle
     if _MIN_MEDIAN <= middle * 1e-3 <= _MAX_MEDIAN:
+        others = "TUM RGB-D and ICL-NUIM store 1/5000 m"
         if clues.telling and middle * 1e-3 > LIMITS["far-millimetres"].threshold:
-            why = "as millimetres that is far for a depth camera; TUM RGB-D and ICL-NUIM store 1/5000 m"
+            why = f"as millimetres that is far for a depth camera; {others}"
             clues.ask(why, ("mm", 1e-3), ("1/5000", 1 / 5000))
         found = [Assumption("whole numbers are taken for millimetres", f"median {clues.metres(1e-3)}")]
+        if middle * 1e-3 > LIMITS["far-metres"].threshold:
+            found.append(Assumption(f"that is far for a sensor: {others} (--depth-unit), SUN RGB-D sunrgbd"))
+        near = float(np.percentile(clues.known, 99)) * 1e-3
+        if clues.telling and near < LIMITS["near-millimetres"].threshold:
+            text = "everything is near if whole numbers are millimetres: are they centimetres? --depth-unit mm or cm"
+            found.append(Assumption(text, f"99 % within {near:.2g} m", "near-millimetres", near))
         if clues.sparse:
             text = "that is sparse, as of a laser scanner: KITTI stores 1/256 m (--depth-unit 1/256)"
             found.append(Assumption(text))
@@ -266,15 +280,19 @@ def _expect_metric(clues: _Clues) -> None:
         ValueError: they are.
 
     """
-    if clues.highest > 1:
-        return
-    steps = clues.known.astype(np.float64)
-    of_levels = any(np.allclose(steps * most, np.round(steps * most), 0, 1e-3 * most / 255) for most in (255, 65535))
-    if clues.highest == 1 or of_levels or clues.middle < _MIN_MEDIAN:
-        why = "they are normalised, or fractions of a largest value" if clues.middle >= _MIN_MEDIAN else "too near"
+    known, highest = clues.known.astype(np.float64), clues.highest
+    if highest > 1:
+        ends = ((clues.values == end).sum() for end in (0, highest))
+        normalised = highest == round(highest) and all(0 < count <= _ENDS for count in ends)
+    else:
+        of_levels = any(
+            np.allclose(known * most, np.round(known * most), 0, 1e-3 * most / 255) for most in (255, 65535)
+        )
+        normalised = highest == 1 or of_levels or clues.middle < _MIN_MEDIAN
+    if normalised and not (known == np.round(known)).all():
         raise ValueError(
-            f"{clues.name}: expected metric depth, got floats up to {clues.highest:.4g} with a median of "
-            f"{clues.middle:.3g}: as metres {why}; --depth-unit METRES gives what 1 stands for"
+            f"{clues.name}: expected metric depth, got floats up to {highest:.4g} with a median of {clues.middle:.3g}, "
+            "as of normalised maps; --depth-unit METRES if they are metric, such as m"
         )
 
 
@@ -287,13 +305,13 @@ def _expect_one_reading(clues: _Clues) -> None:
     """
     middle = clues.middle
     whole = bool((clues.known == np.round(clues.known)).all())
-    likely_pixels = clues.may_fall and clues.votes.verdict != "rises" and not clues.sparse
+    likely_pixels = clues.may_fall and clues.votes.verdict != "rises" and not clues.scattered
     if LIMITS["far-metres"].threshold < middle <= LIMITS["far-floats"].threshold and likely_pixels:
         raise ValueError(
             f"{clues.name}: expected --depth-unit m (median {clues.metres(1.0)}), or --range-type disparity with "
             "--baseline METRES: floats of this size are as often pixels as metres, and there are too few planes to tell"
         )
-    if LIMITS["far-floats"].threshold < middle <= _FLOAT_MILLIMETRES and not clues.sparse:
+    if LIMITS["far-floats"].threshold < middle <= _FLOAT_MILLIMETRES and not clues.scattered:
         clues.ask("floats of this size are as often centimetres as metres", ("cm", 1e-2), ("m", 1.0))
     if _FLOAT_MILLIMETRES < middle <= LIMITS["float-millimetres"].threshold and not whole:
         clues.ask("floats of this size are as often centimetres as millimetres", ("cm", 1e-2), ("mm", 1e-3))
