@@ -68,17 +68,17 @@ LIMITS: dict[str, Limit] = {
     "near-millimetres": Limit(
         0.5,
         "metres, of the 99th percentile of whole numbers as millimetres, below which it is",
-        "of 73 maps of sensors the nearest ends at 0.93 m; 65 of 113 in centimetres end nearer",
+        "of 71 maps of sensors the nearest ends at 0.93 m; 65 of 113 in centimetres end nearer",
     ),
     "far-millimetres": Limit(
         6.0,
         "metres, of the median of whole numbers as millimetres; the unit is asked for, not warned of",
-        "of 73 maps of sensors none is beyond 5.2 m; in 1/5000 m 68 would be",
+        "of 71 maps of sensors none is beyond 5.2 m; in 1/5000 m 68 would be",
     ),
     "far-metres": Limit(
         10.0,
         "metres, of the median of floats, if planes do not show that they are depth; asked for",
-        "of 73 maps of sensors none is beyond 5.2 m; disparities of Middlebury have medians of 26 to 40 px",
+        "of 71 maps of sensors none is beyond 5.2 m; disparities of Middlebury have medians of 26 to 40 px",
     ),
     "far-floats": Limit(
         30.0,

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from dsr.geometry.camera import Camera
+from dsr.io.depth_files import read_depth_file
 from dsr.io.encoding import Encoding, decode, encode, find_holes
 from dsr.io.reading import parse_unit
 from dsr.io.units import tell
@@ -134,3 +135,28 @@ def test_values_beyond_16_bits_of_a_millimetre_become_counted_holes():
     values, lost = encode(depth, Encoding(".png", "uint16", 1e-3, 0.0, "orthogonal"), CAMERA)
     assert lost == 2
     np.testing.assert_array_equal(values[:2], [[65534, 0, 0, 0], [1000, 1001, 2000, 3000]])
+
+
+def test_maps_of_sensors_in_millimetres_and_metres_are_never_asked_about(shared):
+    """Each is read in both, as it is and as floats; nothing is warned of."""
+    paths = [
+        *(shared / "modern" / "RGBDD" / "Depth").glob("*.png"),
+        *(shared / "real" / "depth_camera").glob("*/raw_depth.png"),
+        *(shared / "real" / "ddrnet").glob("*depth*/*.png"),
+        *(shared / "real" / "stereo_board" / "depth").glob("*.png"),
+        shared / "real" / "iphone_lidar" / "arkit_depth.png",
+    ]
+    assert len(paths) > 30
+    for path in paths:
+        values = read_depth_file(path)
+        holes = find_holes(values, None)[0]
+        for each, unit in ((values, 1e-3), (values.astype(np.float32) / 1000, 1.0)):
+            told = tell(str(path), each, holes, Camera.from_fov(values.shape[1], values.shape[0]))
+            assert (told.unit, told.range_type, told.bits) == (unit, None, 0)
+            assert not [each for each in told.assumptions if each.code]
+
+
+def test_bits_of_sun_rgbd_are_told_from_its_own_files(shared):
+    for path in (shared / "real" / "sunrgbd").glob("*/depth*/*.png"):
+        values = read_depth_file(path)
+        assert tell(str(path), values, find_holes(values, None)[0]).bits == 3
