@@ -9,6 +9,9 @@ from torch import Tensor
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.sample import DepthSample, Scene
+from dsr.synthetic.ray_surfaces import rotation
+
+BALLS = [(-0.7, -0.4, 2.6, 0.4), (0.6, 0.3, 2.2, 0.35), (0.1, -0.7, 3.0, 0.3), (-0.5, 0.6, 2.4, 0.3)]
 
 
 def sample_of(disparity: Tensor, rgb: Tensor | None = None, scale: int = 4, doffs: float = 0.0) -> DepthSample:
@@ -58,3 +61,20 @@ def plane_map(height: int, width: int, along_u: float = 0.3, along_v: float = -0
     """Return disparities of a plane, (1, 1, H, W)."""
     v, u = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
     return (30 + along_u * u + along_v * v)[None, None]
+
+
+def room(camera: Camera, turn: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Return depth, and which surface is where: a room of 4 x 3 x 4 m with four balls, turned by some degrees."""
+    rays = camera.rays().numpy().reshape(3, -1)
+    turned = rotation(turn, turn / 2, turn / 3) @ rays
+    with np.errstate(divide="ignore"):
+        walls = np.stack([limit / turned[axis] for axis, limit in ((0, 2), (0, -2), (1, 1.5), (1, -1.5), (2, 4))])
+    hits = [np.where(walls > 0, walls, np.inf)]
+    for *place, radius in BALLS:
+        centre = np.array(place)
+        square, half = (rays**2).sum(axis=0), centre @ rays
+        root = half**2 - square * (centre @ centre - radius**2)
+        hits.append(np.where(root > 0, (half - np.sqrt(np.maximum(root, 0))) / square, np.inf)[None])
+    hits = np.concatenate(hits)
+    shape = (camera.height, camera.width)
+    return hits.min(axis=0).reshape(shape), hits.argmin(axis=0).reshape(shape)

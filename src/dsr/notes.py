@@ -52,8 +52,73 @@ LIMITS: dict[str, Limit] = {
         "truths of the scenes of one name in the runs of a report or a study",
         "scores against different truths cannot be compared",
     ),
+    "along-the-ray": Limit(
+        0.85,
+        "share of the planar windows that are planar only if values are distances along the ray",
+        "none of 133 right maps reaches it, the nearest has 0.83; of 133 along the ray 85 do",
+    ),
+    "falls-with-distance": Limit(
+        2.0,
+        "windows in which the values are linear, over those in which their reciprocals are",
+        "none of 133 right maps reaches it; of their reciprocals 75 do",
+    ),
+    "depth-near": Limit(0.05, "metres, of the 99th percentile, below which it is", "no depth camera measures nearer"),
+    "depth-far": Limit(
+        200.0,
+        "metres, of the 1st percentile",
+        "laser scanners of cars end at 120 m, photos of a landscape begin nearer",
+    ),
+    "view-narrow": Limit(5.0, "degrees of horizontal view, below which it is", "400 mm of focal length on 35 mm film"),
+    "view-wide": Limit(130.0, "degrees of horizontal view", "no lens without distortion sees more; 122 is sold"),
+    "focal-ratio": Limit(
+        1.1,
+        "larger over smaller focal length",
+        "37 cameras of data sets and devices stay below 1.01; a photo stretched from 16:9 to 4:3 has 1.33",
+    ),
+    "off-centre": Limit(
+        0.25,
+        "of the size, from its middle to the principal point",
+        "37 cameras of data sets and devices stay below 0.13; crops reach 0.25",
+    ),
+    "other-picture": Limit(
+        0.1,
+        "of the size, from its middle to the principal point, if the numbers fit another size or order",
+        "of 37 cameras of data sets and devices 3 are beyond, and fit no other size",
+    ),
+    "beside-axis": Limit(
+        80.0,
+        "degrees from the axis to the picture; refused, not warned of",
+        "a lens without distortion of 160 degrees would show it at its very edge",
+    ),
+    "near-millimetres": Limit(
+        0.5,
+        "metres, of the 99th percentile of whole numbers as millimetres, below which it is",
+        "of 71 maps of sensors the nearest ends at 0.93 m; 65 of 113 in centimetres end nearer",
+    ),
+    "far-millimetres": Limit(
+        6.0,
+        "metres, of the median of whole numbers as millimetres; the unit is asked for, not warned of",
+        "of 71 maps of sensors none is beyond 5.2 m; in 1/5000 m 68 would be",
+    ),
+    "far-metres": Limit(
+        10.0,
+        "metres, of the median of floats, if planes do not show that they are depth; asked for",
+        "of 71 maps of sensors none is beyond 5.2 m; disparities of Middlebury have medians of 26 to 40 px",
+    ),
+    "far-floats": Limit(
+        30.0,
+        "metres, of the median of floats; asked for up to 200",
+        "centimetres of a table begin here; no depth camera of rooms measures so far",
+    ),
+    "float-millimetres": Limit(
+        500.0,
+        "of the median of floats above 200 that are not whole; asked for below it",
+        "the Kinect v2, whose drivers store such floats, begins at 0.5 m; rooms in centimetres are mostly below 5 m",
+    ),
+    "baseline-short": Limit(0.001, "metres, below which it is", "phones have cameras 10 mm apart"),
+    "baseline-long": Limit(5.0, "metres", "KITTI's car has 0.54 m, and rigs of 2 m are rare"),
 }
-"""By code: every warning that a command gives about its input; docs/checks.md shows them."""
+"""By code: every warning that a command gives about its input, and what it refuses or asks for; see docs/checks.md."""
 
 
 class Assumption(NamedTuple):

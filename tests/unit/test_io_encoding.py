@@ -7,15 +7,18 @@ import pytest
 import torch
 
 from dsr.geometry.camera import Camera
-from dsr.io.encoding import Encoding, decode, encode, find_holes, guess_unit
+from dsr.io.depth_files import read_depth_file
+from dsr.io.encoding import Encoding, decode, encode, find_holes
 from dsr.io.reading import parse_unit
+from dsr.io.units import tell
 
 CAMERA = Camera(4, 3, 5.0, 6.0, 1.0, 1.5, baseline=0.1)
 
 
 def guess(middle, dtype):
     values = np.full((3, 3), middle, dtype)
-    return guess_unit("d", values, np.zeros((3, 3), bool))
+    told = tell("d", values, np.zeros((3, 3), bool))
+    return told.unit, told.assumptions
 
 
 @pytest.mark.parametrize(
@@ -42,9 +45,9 @@ def test_depth_too_far_too_near_or_too_sparse_is_pointed_out():
     assert any("1/5000" in assumption.text for assumption in guess(12_000, "u2")[1])
     assert not any("1/5000" in assumption.text for assumption in guess(9_000, "u2")[1])
     sparse = np.arange(9).reshape(3, 3) > 2
-    assert any("1/256" in assumption.text for assumption in guess_unit("d", np.full((3, 3), 2000, "u2"), sparse)[1])
+    assert any("1/256" in assumption.text for assumption in tell("d", np.full((3, 3), 2000, "u2"), sparse).assumptions)
     assert not any(
-        "1/256" in assumption.text for assumption in guess_unit("d", np.full((3, 3), 2000, "u2"), ~sparse)[1]
+        "1/256" in assumption.text for assumption in tell("d", np.full((3, 3), 2000, "u2"), ~sparse).assumptions
     )
     assert any("nearer than 5 cm" in assumption.text for assumption in guess(0.01, "f4")[1])
 
@@ -132,3 +135,28 @@ def test_values_beyond_16_bits_of_a_millimetre_become_counted_holes():
     values, lost = encode(depth, Encoding(".png", "uint16", 1e-3, 0.0, "orthogonal"), CAMERA)
     assert lost == 2
     np.testing.assert_array_equal(values[:2], [[65534, 0, 0, 0], [1000, 1001, 2000, 3000]])
+
+
+def test_maps_of_sensors_in_millimetres_and_metres_are_never_asked_about(shared):
+    """Each is read in both, as it is and as floats; nothing is warned of."""
+    paths = [
+        *(shared / "modern" / "RGBDD" / "Depth").glob("*.png"),
+        *(shared / "real" / "depth_camera").glob("*/raw_depth.png"),
+        *(shared / "real" / "ddrnet").glob("*depth*/*.png"),
+        *(shared / "real" / "stereo_board" / "depth").glob("*.png"),
+        shared / "real" / "iphone_lidar" / "arkit_depth.png",
+    ]
+    assert len(paths) > 30
+    for path in paths:
+        values = read_depth_file(path)
+        holes = find_holes(values, None)[0]
+        for each, unit in ((values, 1e-3), (values.astype(np.float32) / 1000, 1.0)):
+            told = tell(str(path), each, holes, Camera.from_fov(values.shape[1], values.shape[0]))
+            assert (told.unit, told.range_type, told.bits) == (unit, None, 0)
+            assert not [each for each in told.assumptions if each.code]
+
+
+def test_bits_of_sun_rgbd_are_told_from_its_own_files(shared):
+    for path in (shared / "real" / "sunrgbd").glob("*/depth*/*.png"):
+        values = read_depth_file(path)
+        assert tell(str(path), values, find_holes(values, None)[0]).bits == 3

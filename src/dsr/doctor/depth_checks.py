@@ -17,11 +17,11 @@ from scipy import ndimage
 
 from dsr.doctor.finding import Array, Finding, Level, length, metres
 from dsr.geometry.camera import baseline_times_focal
+from dsr.geometry.plausible import implausible_distance, plausible_baseline
+from dsr.notes import LIMITS
 from dsr.sample import Scene
 from dsr.utils.ratios import round_ratio
 
-_NEAREST, _FARTHEST = 0.05, 200.0
-"""Metres; depth entirely below or above is in another unit."""
 _NEAR, _FAR = 0.1, 30.0
 """Metres; a median below suggests macro photography, one above outdoors, or another unit."""
 _TYPICAL = (0.4, 8.0)
@@ -37,8 +37,6 @@ _FACTORS: tuple[tuple[float, str], ...] = (
     (1 / 256, "values of 1/256 m, as KITTI stores them, read as metres"),
 )
 """Most likely first."""
-_BASELINES = (1e-3, 5.0)
-"""Plausible range of baselines in metres."""
 _AGREEMENT = 1.25
 """Largest ratio of measured and high-resolution depth."""
 
@@ -82,9 +80,10 @@ def check_units(scene: Scene) -> list[Finding]:
     text = f"depth {length(low)} to {length(high)} (1st to 99th percentile), median {length(middle)}"
     level: Level
     level, remark = "ok", ""
-    if high < _NEAREST or low > _FARTHEST:
-        level, remark = "problem", f": {'nearer' if high < _NEAREST else 'farther'} than any room or table"
-    elif middle < _NEAR or middle > _FARTHEST:
+    beyond = implausible_distance(low, high)
+    if beyond is not None:
+        level, remark = "problem", f": {'nearer' if beyond == 'depth-near' else 'farther'} than any room or table"
+    elif middle < _NEAR or middle > LIMITS["depth-far"].threshold:
         level, remark = "warning", f": {'nearer' if middle < _NEAR else 'farther'} than most rooms and tables"
     elif middle > _FAR:
         level, remark = "note", ": too far for a room, plausible outdoors"
@@ -100,21 +99,17 @@ def _advise(scene: Scene, middle: float) -> str:
     texts = [f"x {factor:g} would make the median {length(middle * factor)} ({why})" for factor, why in fitting[:2]]
     where = 'set "depth_unit" in camera.json'
     baseline = scene.camera.baseline
-    if baseline is not None and not _plausible_baseline(baseline) and _plausible_baseline(baseline * fitting[0][0]):
+    if baseline is not None and not plausible_baseline(baseline) and plausible_baseline(baseline * fitting[0][0]):
         where = f'set "baseline_unit" in camera.json: the baseline of {length(baseline)} is off by the same factor'
     return f"{', or '.join(texts)}; {where}"
-
-
-def _plausible_baseline(baseline: float) -> bool:
-    return _BASELINES[0] <= baseline <= _BASELINES[1]
 
 
 def _baseline(scene: Scene) -> list[Finding]:
     """Check whether the baseline is plausible."""
     baseline = scene.camera.baseline
-    if baseline is None or _plausible_baseline(baseline):
+    if baseline is None or plausible_baseline(baseline):
         return []
-    low, high = (length(limit) for limit in _BASELINES)
+    low, high = (length(LIMITS[code].threshold) for code in ("baseline-short", "baseline-long"))
     message = f"baseline {length(baseline)}; {low} to {high} are usual"
     advice = 'check "baseline_unit" in camera.json; keep it if depth computed from it is plausible'
     return [Finding("units", "note", message, advice)]

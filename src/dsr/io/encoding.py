@@ -1,4 +1,4 @@
-"""Decoding and encoding of the values of depth files: unit, holes, range type, and assumptions about them."""
+"""Decoding and encoding of the values of depth files: unit, holes, range type; :mod:`dsr.io.units` tells which."""
 
 from __future__ import annotations
 
@@ -13,19 +13,9 @@ from dsr.geometry.camera import Camera, RangeType, from_range, to_range
 from dsr.notes import Assumption
 from dsr.sample import FARTHEST, NEAREST
 
-_MIN_MEDIAN, _MAX_MEDIAN = 0.05, 80.0
-"""Range of plausible medians in metres; a unit that gives another median is not assumed."""
-_OTHER_UNITS = ((1e-4, "0.1 mm"), (1e-6, "micrometres"), (1e-2, "centimetres"))
-"""Units of whole numbers that cannot be millimetres, the most likely first."""
-_SPARSE_FRACTION = 0.6
-"""Fraction of holes above which whole numbers may come from a laser scanner."""
-_FAR_FOR_A_SENSOR = 10.0
-"""Largest depth in metres of depth cameras that store millimetres."""
 _FULL, _NEARLY_FULL = 65000, 50000
 """Whole numbers of 16 bits from the first on are a sensor's end, not a distance, if there are none from the second on
 up to it."""
-_FLOAT_MILLIMETRES = 200.0
-"""Median above which floats are millimetres."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +38,8 @@ class Encoding:
     range_type: RangeType
 
 
-def turn_back_bits(name: str, values: np.ndarray, bits: int) -> tuple[np.ndarray, list[Assumption]]:
-    """Return values of 16 bits that were turned to the left, turned back, and the assumption.
+def turn_back_bits(name: str, values: np.ndarray, bits: int) -> np.ndarray:
+    """Return values of 16 bits that were turned to the left, turned back.
 
     Args:
         name: name of the file, for the error.
@@ -62,8 +52,7 @@ def turn_back_bits(name: str, values: np.ndarray, bits: int) -> tuple[np.ndarray
     """
     if values.dtype != np.uint16:
         raise ValueError(f"{name}: expected 16-bit values for --depth-unit sunrgbd, got {values.dtype}")
-    text = f"bits are turned back by {bits}, as SUN RGB-D turns them: millimetres, also in the result"
-    return (values >> bits) | (values << (16 - bits)), [Assumption(text)]
+    return (values >> bits) | (values << (16 - bits))
 
 
 def find_holes(values: np.ndarray, hole_value: float | None) -> tuple[np.ndarray, float, list[Assumption]]:
@@ -117,48 +106,6 @@ def _mark(values: np.ndarray, found: dict[str, float], hole_value: float | None)
         return 0.0
     found = {name: fraction for name, fraction in found.items() if name != "below 0"}
     return {"0": 0.0, "infinity": math.inf}.get(max(found, key=found.__getitem__, default=""), math.nan)
-
-
-def guess_unit(name: str, values: np.ndarray, holes: np.ndarray) -> tuple[float, list[Assumption]]:
-    """Return metres per value of a stored map, judged by its type and its median, and the assumptions.
-
-    Args:
-        name: name of the file, for the error.
-        values: (h, w) stored values of orthogonal or perspective depth.
-        holes: (h, w) bool, where depth is missing.
-
-    Raises:
-        ValueError: no usual unit makes the distances plausible.
-
-    """
-    middle = float(np.median(values[~holes]))
-    if values.dtype.kind == "f":
-        if middle > _FLOAT_MILLIMETRES:
-            return 1e-3, [Assumption("floats this large are taken for millimetres", f"median {middle:.4g}")]
-        assumptions = [Assumption("floats are taken for metres", f"median {middle:.3g} m")]
-        if middle < _MIN_MEDIAN:
-            assumptions.append(
-                Assumption("the depth is nearer than 5 cm: is it in metres? --depth-unit gives another unit")
-            )
-        return 1.0, assumptions
-    if _MIN_MEDIAN <= middle * 1e-3 <= _MAX_MEDIAN:
-        assumptions = [Assumption("whole numbers are taken for millimetres", f"median {middle * 1e-3:.3g} m")]
-        if middle * 1e-3 > _FAR_FOR_A_SENSOR:
-            assumptions.append(
-                Assumption(
-                    "that is far for a sensor: TUM and ICL-NUIM store 1/5000 m (--depth-unit), SUN RGB-D sunrgbd"
-                )
-            )
-        if holes.mean() > _SPARSE_FRACTION:
-            assumptions.append(
-                Assumption("that is sparse, as of a laser scanner: KITTI stores 1/256 m (--depth-unit 1/256)")
-            )
-        return 1e-3, assumptions
-    for unit, label in _OTHER_UNITS:
-        if _MIN_MEDIAN <= middle * unit <= _MAX_MEDIAN:
-            why = f"as millimetres the median would be {middle * 1e-3:.3g} m, now {middle * unit:.3g} m"
-            return unit, [Assumption(f"whole numbers are taken for {label}", why)]
-    raise ValueError(f"{name}: no usual unit makes its median of {middle:g} a distance; give one with --depth-unit")
 
 
 def decode(values: np.ndarray, holes: np.ndarray, encoding: Encoding, camera: Camera) -> Tensor:

@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, Field
 
 from dsr.geometry.camera import Camera, RangeType
+from dsr.io.viewing import describe_picture
 from dsr.utils.arrays import read_array_header
 from dsr.utils.decoding import decode_pixels
 from dsr.utils.guards import (
@@ -105,9 +106,13 @@ def expect_depth_values(path: Path, values: np.ndarray) -> np.ndarray:
 
     """
     if values.ndim != 2:
-        raise ValueError(f"{path}: expected one channel (height x width), got shape {values.shape}")
+        what = f": {describe_picture(values)}" if values.dtype in (np.uint8, np.uint16) else ""
+        raise ValueError(f"{path}: expected one channel (height x width), got shape {values.shape}{what}")
     if values.dtype.kind not in "fiu" or (values.dtype.kind in "iu" and values.dtype.itemsize == 1):
-        raise ValueError(f"{path}: expected 16-bit or floating point values, got {values.dtype} (too coarse for depth)")
+        what = f": {describe_picture(values)}" if values.dtype == np.uint8 else ""
+        raise ValueError(
+            f"{path}: expected 16-bit or floating point values, got {values.dtype} (too coarse for depth){what}"
+        )
     return values
 
 

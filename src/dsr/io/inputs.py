@@ -12,14 +12,17 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera, RangeType
+from dsr.geometry.plausible import expect_possible
 from dsr.io.cameras import camera_only, find_camera, read_rig, scale_to_photo, to_photo
 from dsr.io.depth_files import ICL_CAMERA, ICL_SUFFIX, read_depth_file
-from dsr.io.encoding import Encoding, decode, find_holes, guess_unit, turn_back_bits
+from dsr.io.doubts import doubt_camera, doubt_depth
+from dsr.io.encoding import Encoding, decode, find_holes, turn_back_bits
 from dsr.io.frames import SLACK, Geometry
 from dsr.io.images import CameraFile, pixels_in_header, read_mask
 from dsr.io.pairs import Pair, words_of
 from dsr.io.photos import Size, model_in_exif, read_photo, same_aspect
-from dsr.io.reading import CameraChoice, Reading
+from dsr.io.reading import SUNRGBD_BITS, CameraChoice, Reading
+from dsr.io.units import TURNED_BACK, Told, tell
 from dsr.notes import Assumption
 from dsr.sample import FARTHEST, NEAREST
 from dsr.utils.guards import natural_key, pixels_beside
@@ -31,7 +34,7 @@ _DISPARITY_WORDS = frozenset({"disparity", "disp"})
 
 
 class FolderUnits:
-    """Guesses the unit of each kind of map from the first by name that has a known pixel.
+    """Tells the unit and range type of each kind of map from the first by name that has a known pixel.
 
     The guess depends on the pairs alone, not on their order, nor on which of them were read or finished before.
 
@@ -42,31 +45,31 @@ class FolderUnits:
 
     def __init__(self, pairs: Sequence[Pair] = ()) -> None:
         self._pairs = pairs
-        self._units: dict[Kind, tuple[float, list[Assumption]]] = {}
+        self._told: dict[tuple[Kind, bool], Told] = {}
 
-    def guess(
-        self, pair: Pair, stored: np.ndarray, holes: np.ndarray, hole_value: float | None
-    ) -> tuple[float, list[Assumption]]:
-        """Return metres per value of a map, and the assumptions.
+    def tell(self, pair: Pair, stored: np.ndarray, hole_value: float | None, camera: Camera, *, may_fall: bool) -> Told:
+        """Return what the values of a map tell; see :func:`dsr.io.units.tell`.
 
         Args:
             pair: the map's pair.
             stored: (h, w) its values.
-            holes: (h, w) bool, where they are missing.
             hole_value: an additional value of holes, also in the other maps.
+            camera: of the map's pixels.
+            may_fall: whether the values may be disparities.
 
         Raises:
-            ValueError: no usual unit makes the distances plausible.
+            ValueError: no pixel is known, no usual unit makes the distances plausible, or two readings are as likely.
 
         """
         kind = _kind(pair, stored)
-        if kind not in self._units:
-            path, first, missing = self._first(kind, hole_value) or (pair.depth, stored, holes)
-            self._units[kind] = guess_unit(str(path), first, missing)
-        return self._units[kind]
+        if (kind, may_fall) not in self._told:
+            path, first = self._first(kind, hole_value) or (pair.depth, stored)
+            holes = find_holes(first, hole_value)[0]
+            self._told[kind, may_fall] = tell(str(path), first, holes, camera, may_fall=may_fall)
+        return self._told[kind, may_fall]
 
-    def _first(self, kind: Kind, hole_value: float | None) -> tuple[Path, np.ndarray, np.ndarray] | None:
-        """Return the first map of a kind that has a known pixel, and its holes."""
+    def _first(self, kind: Kind, hole_value: float | None) -> tuple[Path, np.ndarray] | None:
+        """Return the first map of a kind that has a known pixel."""
         for pair in self._in_order:
             if (pair.depth.parent, pair.depth.suffix.lower()) != kind[:2]:
                 continue
@@ -74,9 +77,8 @@ class FolderUnits:
                 stored = read_values_of(pair)
             except ValueError:  # a damaged map is reported when its own turn comes
                 continue
-            holes = find_holes(stored, hole_value)[0]
-            if _kind(pair, stored) == kind and not holes.all():
-                return pair.depth, stored, holes
+            if _kind(pair, stored) == kind and not find_holes(stored, hole_value)[0].all():
+                return pair.depth, stored
         return None
 
     @functools.cached_property
@@ -146,6 +148,7 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     pixels, assumptions = _photo(pair, size_lr)
     geometry = Geometry() if pair.capture is None else pair.capture.geometry((pixels.shape[0], pixels.shape[1]))
     described, camera_assumptions = _camera(pair, reading, geometry, (pixels.shape[0], pixels.shape[1]), size_lr)
+    expect_possible(described.camera, _told_by(pair, reading))
     pixels, crop_assumptions = _crop_to_multiple(pixels, pair.factor, size_lr)
     size: Size = (pixels.shape[0], pixels.shape[1])
     rig = None if reading.rig is None else read_rig(reading.rig, size_lr, reading.baseline)
@@ -155,34 +158,37 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     if reading.baseline is not None:
         camera = replace(camera, baseline=reading.baseline)
     hole_value = described.hole_value if reading.hole_value is None else reading.hole_value
-    bit_assumptions: list[Assumption] = []
-    if reading.turned_bits:
-        stored, bit_assumptions = turn_back_bits(str(pair.depth), stored, reading.turned_bits)
+    of_depth = camera.rescale(size_lr[1], size_lr[0]) if rig is None else rig.camera
+    range_type, range_assumptions = _range_type(pair, reading, described)
+    told = _unit(pair, reading, described, range_type, stored, FolderUnits() if units is None else units, of_depth)
+    range_type = told.range_type or range_type or "orthogonal"
+    if range_type == "disparity" and of_depth.baseline is None:
+        raise ValueError(f"{pair.depth}: disparities need the distance between the two cameras: --baseline METRES")
+    if told.bits:
+        stored = turn_back_bits(str(pair.depth), stored, told.bits)
     holes, mark, hole_assumptions = find_holes(stored, hole_value)
     if pair.mask is not None:
         holes |= ~_mask(pair.mask, size_lr)
     confidence, confidence_assumptions = _confidence(pair, reading, size_lr, holes)
     if holes.all():
         raise ValueError(f"{pair.depth}: expected at least one known pixel, all are holes")
-    range_type, range_assumptions = _range_type(pair, reading, described, camera)
-    guesses = FolderUnits() if units is None else units
-    unit, unit_assumptions = _unit(pair, reading, described, range_type, stored, holes, guesses)
-    encoding = Encoding(_suffix(pair), str(stored.dtype), unit, mark, range_type)
-    of_depth = camera.rescale(size_lr[1], size_lr[0]) if rig is None else rig.camera
+    encoding = Encoding(_suffix(pair), str(stored.dtype), told.unit, mark, range_type)
     depth_lr = decode(stored, holes, encoding, of_depth)
     hole_assumptions += _expect_distances(pair.depth, depth_lr, holes, range_type)
+    doubts = [*doubt_camera(described.camera, "camera", size_lr), *doubt_depth(depth_lr, of_depth, range_type)]
     rgb = torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1))).float() / 255
     all_assumptions = (
         *assumptions,
         *camera_assumptions,
         *crop_assumptions,
         *range_assumptions,
-        *unit_assumptions,
+        *told.assumptions,
         *hole_assumptions,
-        *bit_assumptions,
         *confidence_assumptions,
+        *doubts,
     )
     if rig is not None:
+        all_assumptions = (*all_assumptions, *doubt_camera(rig.camera, "--depth-camera"))
         depth_lr, warped = to_photo(depth_lr, rig, camera)
         all_assumptions, confidence = (*all_assumptions, warped), None
     device_name = model_in_exif(pair.rgb) if pair.capture is None else pair.capture.app
@@ -284,6 +290,14 @@ def _camera(
     return described, [*geometry.assumptions, found, *assumptions]
 
 
+def _told_by(pair: Pair, reading: Reading) -> str:
+    """Return what says where the photo's principal point is."""
+    if reading.camera.intrinsics is not None:
+        return "--intrinsics"
+    capture = None if pair.capture is None else pair.capture.told_by
+    return str(reading.camera.file or capture or pair.camera or pair.rgb)
+
+
 def _mask(path: Path, size: Size) -> np.ndarray:
     """Return the valid mask in a file, (h, w) bool."""
     mask = read_mask(path, pixels_beside(*size))
@@ -295,41 +309,36 @@ def _mask(path: Path, size: Size) -> np.ndarray:
     return mask
 
 
-def _range_type(
-    pair: Pair, reading: Reading, described: CameraFile, camera: Camera
-) -> tuple[RangeType, list[Assumption]]:
-    """Return the range type that the user gives, else that of the file's name, else that of the camera file."""
-    assumptions: list[Assumption] = []
+def _range_type(pair: Pair, reading: Reading, described: CameraFile) -> tuple[RangeType | None, list[Assumption]]:
+    """Return the range type that the user gives, else that of the file's name, else that of the camera file, if any."""
     if reading.range_type is not None:
-        range_type = reading.range_type
-    elif _DISPARITY_WORDS & set(words_of(pair.depth.stem)):
-        range_type = "disparity"
-        assumptions.append(Assumption("values are taken for disparities, by the file's name"))
-    elif _is_icl(pair):
-        range_type = "perspective"
-        assumptions.append(Assumption("values are distances along the rays in centimetres, as in ICL-NUIM's .depth"))
-    else:
-        range_type = described.range_type or "orthogonal"
-        if described.range_type not in (None, "orthogonal"):
-            assumptions.append(Assumption(f"values are of range type {range_type}, says the camera file"))
-    if range_type == "disparity" and camera.baseline is None:
-        raise ValueError(f"{pair.depth}: disparities need the distance between the two cameras: --baseline METRES")
-    return range_type, assumptions
+        return reading.range_type, []
+    if _DISPARITY_WORDS & set(words_of(pair.depth.stem)):
+        return "disparity", [Assumption("values are taken for disparities, by the file's name")]
+    if _is_icl(pair):
+        text = "values are distances along the rays in centimetres, as in ICL-NUIM's .depth"
+        return "perspective", [Assumption(text)]
+    if described.range_type in (None, "orthogonal"):
+        return described.range_type, []
+    return described.range_type, [Assumption(f"values are of range type {described.range_type}, says the camera file")]
 
 
 def _unit(
-    pair: Pair, reading: Reading, described: CameraFile, range_type: RangeType,
-    stored: np.ndarray, holes: np.ndarray, units: FolderUnits,
-) -> tuple[float, list[Assumption]]:  # fmt: skip
+    pair: Pair, reading: Reading, described: CameraFile, range_type: RangeType | None,
+    stored: np.ndarray, units: FolderUnits, camera: Camera,
+) -> Told:  # fmt: skip
     """Return metres per value, or pixels per value of disparities, and the assumptions."""
     if reading.metres is not None:
-        return reading.metres, []
+        turned = reading.unit == "sunrgbd"
+        return Told(reading.metres, (Assumption(TURNED_BACK),) if turned else (), bits=SUNRGBD_BITS if turned else 0)
     if range_type == "disparity":
-        return 1.0, [Assumption("disparities are taken for pixels of the depth map")]
+        return Told(1.0, (Assumption("disparities are taken for pixels of the depth map"),))
     if described.depth_unit is not None:
-        return described.depth_unit, [Assumption(f"unit: {described.depth_unit:g} m per value, says the camera file")]
+        unit = described.depth_unit
+        return Told(unit, (Assumption(f"unit: {unit:g} m per value, says the camera file"),))
     if pair.unit is not None:
-        return pair.unit, []
+        return Told(pair.unit, ())
     if _is_icl(pair):
-        return 1e-2, []
-    return units.guess(pair, stored, holes, described.hole_value if reading.hole_value is None else reading.hole_value)
+        return Told(1e-2, ())
+    hole_value = described.hole_value if reading.hole_value is None else reading.hole_value
+    return units.tell(pair, stored, hole_value, camera, may_fall=range_type is None)

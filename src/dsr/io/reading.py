@@ -12,7 +12,8 @@ from dsr.geometry.range_type import RangeType
 from dsr.utils.options import Options, Rule, group, option, positive
 
 _UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "sunrgbd": 1e-3}
-_SUNRGBD_BITS = 3
+SUNRGBD_BITS = 3
+"""How far SUN RGB-D turns the bits of its values to the left (``read3dPoints.m`` of its toolbox)."""
 _LARGEST_UNIT = 1e6
 
 
@@ -94,11 +95,6 @@ class Reading(Options):
     def metres(self) -> float | None:
         """Metres per value of the depth files; pixels per value of disparities."""
         return _UNITS["sunrgbd"] if self.unit == "sunrgbd" else self.unit
-
-    @property
-    def turned_bits(self) -> int:
-        """How far the bits of the values are turned left, as in SUN RGB-D (``read3dPoints.m`` of its toolbox)."""
-        return _SUNRGBD_BITS if self.unit == "sunrgbd" else 0
 
 
 def parse_unit(text: str) -> float:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from dsr.app.upsample.alignment import align
+from dsr.app.upsample.checks import check_planes
 from dsr.app.upsample.outputs import (
     PreviousRun,
     begin,
@@ -78,7 +79,7 @@ class FrameWork:
             job.expect_no_warning(job.earlier.warnings if job.earlier is not None else ())
             reporter.say(f"{pair.name}: complete already, in {target}")
             return "complete already"
-        picture = self._read(pair)
+        picture = check_planes(self._read(pair), pair, request.reading)
         try:
             identified = find_sensor(picture.depth_lr, how.sensor, picture.device_name)
         except ValueError as error:

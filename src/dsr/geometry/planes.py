@@ -1,0 +1,283 @@
+"""What planes tell of the values of a map: whether they are distances along the axis or the ray, or fall with distance.
+
+Planes become curved if distance along the ray is read as orthogonal depth: a plane is linear in 1 / z over the image.
+If the values s follow z = s / |r|**k, with k = 0 for orthogonal depth, 1 for distance along the ray, and -1 for
+orthogonal depth that was read as distance along the ray and divided by |r|, then 1 / s = (a u + b v + c) / |r|**k. This
+is linear in a, b, c and, as |r| changes little within a window, in k: 1 / s = a u + b v + c - k log|r| / s. A robust
+fit to windows of many sizes and positions estimates k. Windows with a good fit are planar and vote.
+
+Disparity and inverse depth, of any scale, are linear over a plane themselves, and their reciprocals are not. No camera
+is needed to tell that.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dsr.geometry.camera import Camera
+from dsr.notes import LIMITS
+
+Array = NDArray[np.float64]
+
+_SIZES = (1.0, 2 / 3, 1 / 2, 1 / 3, 1 / 4, 1 / 6)
+"""Sizes of windows, as fractions of the shorter image side."""
+_CELLS = 16
+"""Cells across a window; values are averaged within cells to reduce noise."""
+_ITERATIONS = 12
+_MIN_VALID, _INLIERS = 0.6, 0.55
+"""Minimum fractions of a window's cells that are valid, and that are on the plane."""
+_NOISE = 0.5
+"""Largest deviation of a planar window from its fit, as a fraction of the curvature that k = 1 causes."""
+_NEAR = 0.3
+"""Largest distance of k from the value that a window votes for."""
+_WHOLE = 0.95
+"""Minimum fraction of valid pixels in a cell."""
+_LARGEST = 1e3
+"""Upper limit of inverse depth, as a multiple of the median's."""
+_EXACT = 1e-12
+_LEAST, _LEAD = 4, 3
+"""Minimum number of votes for orthogonal depth, and their minimum ratio to all others."""
+_LEAST_BENT, _MAJORITY_BENT = 6, LIMITS["along-the-ray"].threshold
+"""Minimum number of votes for another type, and their minimum fraction of the planar windows."""
+_LEAST_INVERSE, _LEAD_INVERSE = 10, LIMITS["falls-with-distance"].threshold
+"""Minimum number of windows in which values, and not their reciprocals, are linear, and their minimum ratio to those in
+which the reciprocals are."""
+_LEAST_FEW, _LEAD_FEW, _BELOW = 4, 1.5, 1.15
+"""The same of a map whose values are larger below than above, and the minimum ratio of these."""
+_LINEAR = 2.0
+"""Ratio of the deviations of values and of their reciprocals from a plane above which a window votes."""
+_CURVED = 0.003
+"""Least deviation of the worse one of both, as a fraction of the values."""
+_REDUCED = 320
+"""Largest size of the longer side of a map that is judged whole; larger ones are thinned out."""
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Square windows of a map of inverse depth, averaged within cells.
+
+    Args:
+        inverse: (N, cells) 1 / s, as a multiple of the window's median; 0 where invalid.
+        valid: (N, cells) bool.
+        u, v: (N, cells) position within the window, about -1 to 1.
+        bend: (N, cells) logarithm of |r|, minus its mean over the window.
+
+    """
+
+    inverse: Array
+    valid: np.ndarray
+    u: Array
+    v: Array
+    bend: Array
+
+
+class RangeVotes(NamedTuple):
+    """How many planar windows support orthogonal depth, distance along the ray, and that divided by |r| once more."""
+
+    windows: int
+    flat: int
+    ray: int
+    reverse: int
+
+    @property
+    def verdict(self) -> Literal["orthogonal", "ray", "reverse"] | None:
+        """What the windows agree on; None if there are too few."""
+        for name, count in (("ray", self.ray), ("reverse", self.reverse)):
+            if count >= _LEAST_BENT and count > _MAJORITY_BENT * self.windows:
+                return "ray" if name == "ray" else "reverse"
+        enough = self.flat >= _LEAST and self.flat > _LEAD * (self.ray + self.reverse)
+        return "orthogonal" if enough else None
+
+
+class InverseVotes(NamedTuple):
+    """In how many windows a map's values are linear and their reciprocals are not, and the other way around.
+
+    ``below``: the median of the lowest third over that of the highest; the floor, which is near, is mostly below.
+    """
+
+    falling: int
+    rising: int
+    below: float = 1.0
+
+    @property
+    def ratio(self) -> float:
+        """Votes for values that fall with distance over those that rise."""
+        return self.falling / max(self.rising, 1)
+
+    @property
+    def verdict(self) -> Literal["falls", "rises"] | None:
+        """Whether values fall or rise with distance; None if there are too few planes."""
+        if self.falling >= _LEAST_INVERSE and self.ratio >= _LEAD_INVERSE:
+            return "falls"
+        if self.falling >= _LEAST_FEW and self.falling >= _LEAD_FEW * self.rising and self.below > _BELOW:
+            return "falls"
+        if self.rising >= _LEAST_INVERSE and self.rising >= _LEAD_INVERSE * self.falling:
+            return "rises"
+        return None
+
+
+def range_votes(values: Array, camera: Camera, step: float = 0.0) -> RangeVotes:
+    """Count what the planar windows of a map support; see :func:`plane_votes`."""
+    votes = plane_votes(values, camera, step)
+    flat, ray, reverse = (int((np.abs(votes - k) < _NEAR).sum()) for k in (0, 1, -1))
+    return RangeVotes(votes.size, flat, ray, reverse)
+
+
+def inverse_votes(values: Array) -> InverseVotes:
+    """Count in which windows of a map its values are linear, or else their reciprocals.
+
+    Args:
+        values: (H, W) positive, in any unit, NaN in holes; of a large map, every n-th pixel is read.
+
+    """
+    values, camera = thinned(values, Camera.from_fov(values.shape[1], values.shape[0]))
+    deviations, inliers = [], []
+    with np.errstate(over="ignore", divide="ignore"):
+        reciprocals = 1 / values
+    for each in (values, reciprocals):
+        windows = _windows(each, camera)
+        if not windows.inverse.size:
+            return InverseVotes(0, 0)
+        columns = np.stack((np.ones_like(windows.u), windows.u, windows.v), axis=-1)
+        fit, weight = _robust_fit(columns, windows)
+        deviations.append(_spread(windows.inverse - _product(columns, fit), weight))
+        inliers.append(weight.mean(axis=1) > _INLIERS)
+    of_reciprocals, of_values = deviations
+    curved = np.maximum(of_reciprocals, of_values) > _CURVED
+    falling = curved & inliers[1] & (_LINEAR * of_values < of_reciprocals)
+    rising = curved & inliers[0] & (_LINEAR * of_reciprocals < of_values)
+    third = -(-values.shape[0] // 3)
+    below, above = (float(np.median(part[np.isfinite(part)])) if np.isfinite(part).any() else math.nan
+                    for part in (values[-third:], values[:third]))  # fmt: skip
+    return InverseVotes(int(falling.sum()), int(rising.sum()), below / above)
+
+
+def thinned(values: Array, camera: Camera) -> tuple[Array, Camera]:
+    """Return every n-th pixel of a map that is large, and the camera of these pixels."""
+    every = math.ceil(max(values.shape) / _REDUCED)
+    if every == 1:
+        return values, camera
+    return values[::every, ::every], camera.decimate(every, 0)
+
+
+def plane_votes(values: Array, camera: Camera, step: float = 0.0) -> Array:
+    """Estimate the exponent k of each planar window: near 0 orthogonal, 1 along the ray, -1 the reverse.
+
+    Args:
+        values: (H, W) positive, in any unit, NaN in holes.
+        camera: camera of these pixels.
+        step: rounding step of the values, as a fraction of them.
+
+    """
+    windows = _windows(values, camera)
+    if not windows.inverse.size:
+        return np.empty(0)
+    columns = np.stack((np.ones_like(windows.u), windows.u, windows.v, -windows.bend * windows.inverse), axis=-1)
+    scale = np.sqrt(np.square(columns).mean(axis=1, keepdims=True))
+    columns = columns / scale
+    fit, weight = _robust_fit(columns, windows)
+    residual = windows.inverse - _product(columns, fit)
+    bent = columns[..., 3] * scale[..., 3]
+    bent = bent - _product(columns[..., :3], _solve(columns[..., :3], weight, bent))
+    signal, noise = (_spread(values, weight) for values in (bent, residual))
+    noise = np.hypot(noise, step / np.sqrt(12))
+    planar = (weight.mean(axis=1) > _INLIERS) & (noise < _NOISE * signal)
+    exponents: Array = (fit[:, 3] / scale[:, 0, 3])[planar]
+    return exponents
+
+
+def _windows(values: Array, camera: Camera) -> Windows:
+    """Return the windows of a map that have enough valid pixels."""
+    valid = np.isfinite(values)
+    inverse = np.where(valid, np.nanmedian(values) / values, 0).clip(max=_LARGEST)
+    tops, lefts, sizes = _places(*values.shape)
+    ends = np.round(np.arange(_CELLS + 1) * sizes[:, None] / _CELLS).astype(int)
+    rows, columns = tops[:, None] + ends, lefts[:, None] + ends
+    area = np.diff(rows)[:, :, None] * np.diff(columns)[:, None, :]
+    count = _totals(valid.astype(np.float64), rows, columns)
+    whole = count > _WHOLE * area
+    enough = whole.mean(axis=(1, 2)) > _MIN_VALID
+    rows, columns, whole, count = rows[enough], columns[enough], whole[enough], count[enough]
+    means = np.where(whole, _totals(inverse, rows, columns) / np.maximum(count, 1), 0)
+    v, u = (((part[:, 1:] + part[:, :-1]) - 1) / 2 for part in (rows, columns))
+    slopes = np.square((u - camera.cx) / camera.fx)[:, None, :] + np.square((v - camera.cy) / camera.fy)[:, :, None]
+    bend = np.log1p(slopes) / 2
+    bend -= bend.mean(axis=(1, 2), keepdims=True)
+    u, v = (2 * (part - part.mean(axis=1, keepdims=True)) / sizes[enough, None] for part in (u, v))
+    u, v = np.broadcast_to(u[:, None, :], bend.shape), np.broadcast_to(v[:, :, None], bend.shape)
+    shape = (len(means), _CELLS**2)
+    means, whole, u, v, bend = (field.reshape(shape) for field in (means, whole, u, v, bend))
+    scale = np.array([np.median(mean[own]) for mean, own in zip(means, whole, strict=True)])[:, None]
+    return Windows(means / scale, whole, u, v, bend)
+
+
+def _places(height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the first rows, first columns and sizes of windows that overlap by half."""
+    found = []
+    for fraction in _SIZES:
+        size = int(min(height, width) * fraction)
+        if size >= _CELLS:
+            tops, lefts = (
+                np.linspace(0, n - size, round(2 * (n - size) / size) + 1).astype(int) for n in (height, width)
+            )
+            found += [(top, left, size) for top in tops for left in lefts]
+    tops, lefts, sizes = np.array(found, dtype=int).reshape(-1, 3).T
+    return tops, lefts, sizes
+
+
+def _totals(values: Array, rows: np.ndarray, columns: np.ndarray) -> Array:
+    """Return the sums over the cells with borders at rows (N, n + 1) and columns (N, n + 1), (N, n, n)."""
+    sums = np.pad(values.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+    totals: Array = np.diff(np.diff(sums[rows[:, :, None], columns[:, None, :]], axis=1), axis=2)
+    return totals
+
+
+def _robust_fit(columns: Array, windows: Windows) -> tuple[Array, Array]:
+    """Return coefficients (N, 4), and weights (N, cells), 1 for inliers and 0 for outliers.
+
+    The first iterations minimise absolute deviations, which tolerates up to half of the cells as outliers; the others
+    use Tukey's biweight.
+    """
+    valid = windows.valid.astype(np.float64)
+    weight = valid
+    for iteration in range(_ITERATIONS):
+        size = np.abs(windows.inverse - _product(columns, _solve(columns, weight, windows.inverse)))
+        ratio = size / _deviation(size, windows.valid)
+        absolute = iteration < _ITERATIONS // 2
+        weight = valid * (
+            1 / np.maximum(ratio, 0.05) if absolute else np.square((1 - np.square(ratio / 4)).clip(min=0))
+        )
+    fit = _solve(columns, weight, windows.inverse)
+    size = np.abs(windows.inverse - _product(columns, fit))
+    return fit, valid * (size < 3 * _deviation(size, windows.valid))
+
+
+def _deviation(size: Array, valid: np.ndarray) -> Array:
+    """Estimate the standard deviation from the median absolute residual, (N, 1)."""
+    ordered, count = np.sort(np.where(valid, size, np.inf), axis=1), valid.sum(axis=1, keepdims=True)
+    middles = np.take_along_axis(ordered, np.concatenate(((count - 1) // 2, count // 2), axis=1), axis=1)
+    deviation: Array = 1.4826 * middles.mean(axis=1, keepdims=True) + _EXACT
+    return deviation
+
+
+def _solve(columns: Array, weight: Array, target: Array) -> Array:
+    """Return the weighted least-squares coefficients (N, k) of columns (N, cells, k)."""
+    weighted = columns.swapaxes(1, 2) * weight[:, None, :]
+    ridge = _EXACT * np.eye(columns.shape[-1]) * (1 + weight.sum(axis=1))[:, None, None]
+    solution: Array = np.linalg.solve(weighted @ columns + ridge, weighted @ target[..., None])[..., 0]
+    return solution
+
+
+def _product(columns: Array, fit: Array) -> Array:
+    product: Array = (columns @ fit[..., None])[..., 0]
+    return product
+
+
+def _spread(values: Array, weight: Array) -> Array:
+    """Return the weighted root mean square, (N,)."""
+    return np.sqrt((np.square(values) * weight).sum(axis=1) / np.maximum(weight.sum(axis=1), 1))

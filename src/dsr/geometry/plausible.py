@@ -1,0 +1,205 @@
+"""What of a camera, and of distances, can hardly be right, or not at all: decided here for every command."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Literal, NamedTuple
+
+from dsr.geometry.camera import Camera
+from dsr.notes import LIMITS
+
+_VIEW, _USUAL_VIEW = (LIMITS["view-narrow"].threshold, LIMITS["view-wide"].threshold), (20.0, 120.0)
+"""Horizontal fields of view in degrees that are plausible, and usual."""
+_OFFSET, _SMALL_OFFSET = LIMITS["off-centre"].threshold, LIMITS["other-picture"].threshold
+"""Distance of the principal point from the centre, as a fraction of the size."""
+_RATIO = LIMITS["focal-ratio"].threshold
+"""Largest plausible ratio of fx and fy."""
+_BASELINES = LIMITS["baseline-short"].threshold, LIMITS["baseline-long"].threshold
+"""Plausible range of baselines in metres."""
+_SCALES = (2.0, 3.0, 4.0, 8.0, 1.5, 2.5)
+_NUMBERS = ("fx", "fy", "cx", "cy")
+
+
+class Remark(NamedTuple):
+    """What was found about a camera.
+
+    Attributes:
+        level: ``note`` of what is correct at times; the others mean that it is probably, and certainly, wrong.
+        message: the numbers, with units.
+        advice: how to correct them.
+        code: of :data:`dsr.notes.LIMITS`; empty for a note.
+        value: what the limit was compared with.
+
+    """
+
+    level: Literal["note", "warning", "problem"]
+    message: str
+    advice: str
+    code: str = ""
+    value: float | None = None
+
+
+def judge_camera(camera: Camera, size_lr: tuple[int, int] | None = None) -> list[Remark]:
+    """Return what can hardly be right of a camera; nothing for a usual one.
+
+    Args:
+        camera: the camera.
+        size_lr: (height, width) of a depth map that another camera may have taken; None where there is none.
+
+    """
+    return [*_view(camera), *(_other_picture(camera, size_lr) or [*_centre(camera), *_shape(camera)])]
+
+
+def expect_possible(camera: Camera, name: str) -> None:
+    """Check that a camera could see its picture.
+
+    Raises:
+        ValueError: every ray of the picture is farther from the axis than any lens without distortion shows.
+
+    """
+    beyond = (max(-0.5 - middle, middle - size + 0.5, 0) / focal for middle, size, focal in _axes(camera))
+    angle = math.degrees(math.atan(math.hypot(*beyond)))
+    if angle > LIMITS["beside-axis"].threshold:
+        raise ValueError(
+            f"{name}: expected a principal point in or near the picture of {camera.width} x {camera.height} pixels "
+            f"(width x height), got cx {camera.cx:g} and cy {camera.cy:g} with fx {camera.fx:g} and fy {camera.fy:g}, "
+            f"from which the picture is {angle:.4g} degrees away"
+        )
+
+
+def _axes(camera: Camera) -> tuple[tuple[float, int, float], ...]:
+    """Return the principal point, size and focal length across and down."""
+    return (camera.cx, camera.width, camera.fx), (camera.cy, camera.height, camera.fy)
+
+
+def plausible_baseline(baseline: float) -> bool:
+    """Return whether two cameras may be so many metres apart."""
+    return _BASELINES[0] <= baseline <= _BASELINES[1]
+
+
+def implausible_distance(low: float, high: float) -> Literal["depth-near", "depth-far"] | None:
+    """Return which limit a depth map is beyond with all that it shows, if any.
+
+    Args:
+        low: near which its depth begins, in metres.
+        high: near which it ends.
+
+    """
+    if high < LIMITS["depth-near"].threshold:
+        return "depth-near"
+    return "depth-far" if low > LIMITS["depth-far"].threshold else None
+
+
+def view_of(camera: Camera) -> float:
+    """Return the horizontal field of view in degrees."""
+    left, right = camera.cx + 0.5, camera.width - 0.5 - camera.cx
+    return math.degrees(math.atan(left / camera.fx) + math.atan(right / camera.fx))
+
+
+def offset_of(camera: Camera) -> float:
+    """Return how far the principal point is off the centre, as a fraction of the width or height, the larger one."""
+    return max(map(abs, _offsets(camera)))
+
+
+def _offsets(camera: Camera) -> tuple[float, float]:
+    """Return the offset of the principal point from the centre, as fractions of the width and height."""
+    return (camera.cx + 0.5) / camera.width - 0.5, (camera.cy + 0.5) / camera.height - 0.5
+
+
+def _ratio(camera: Camera) -> float:
+    """Return the ratio of the focal lengths, at least 1."""
+    return max(camera.fx, camera.fy) / min(camera.fx, camera.fy)
+
+
+def _view(camera: Camera) -> list[Remark]:
+    """Judge the field of view."""
+    view = view_of(camera)
+    if _USUAL_VIEW[0] <= view <= _USUAL_VIEW[1]:
+        return []
+    low, high = _USUAL_VIEW
+    message = (
+        f"fx {camera.fx:.4g} px gives a horizontal field of view of {view:.3g} degrees; {low:g} to {high:g} are usual"
+    )
+    if _VIEW[0] <= view <= _VIEW[1]:
+        return [Remark("note", message, "correct for a telephoto or a very wide lens")]
+    degrees = f"60 degrees correspond to {0.866 * camera.width:.0f} px"
+    advice = f"give fx and fy in pixels of this image, not in mm; {degrees}"
+    return [Remark("warning", message, advice, "view-narrow" if view < _VIEW[0] else "view-wide", view)]
+
+
+def _other_picture(camera: Camera, size_lr: tuple[int, int] | None) -> list[Remark]:
+    """Judge whether the numbers fit better in another order, or to an image of another size."""
+    offset = offset_of(camera)
+    if offset <= _SMALL_OFFSET and _ratio(camera) <= _RATIO:
+        return []
+    text = f"fx {camera.fx:.4g}, fy {camera.fy:.4g}, cx {camera.cx:.4g}, cy {camera.cy:.4g} px"
+    order = _better_order(camera)
+    if order is not None:
+        correction = ", ".join(f"{name} is the number given as {other}" for name, other in order)
+        message = f"{text} fit the {camera.height} x {camera.width} image in another order"
+        return [Remark("problem", message, f"correct the order: {correction}", "other-picture", offset)]
+    across, down = (2 * camera.cx + 1) / camera.width, (2 * camera.cy + 1) / camera.height
+    if size_lr is not None and size_lr != (camera.height, camera.width):
+        height, width = size_lr
+        if _is_near(across, width / camera.width) and _is_near(down, height / camera.height):
+            message = (
+                f"{text} fit the depth map of {width} x {height}, not the photo of {camera.width} x {camera.height}"
+            )
+            advice = "give the intrinsics of the photo's camera, in pixels of the photo"
+            return [Remark("problem", message, advice, "other-picture", offset)]
+    for scale in (*_SCALES, *(1 / scale for scale in _SCALES)):
+        if _is_near(across, scale) and _is_near(down, scale):
+            size = f"{camera.height * scale:.0f} x {camera.width * scale:.0f}"
+            message = f"{text} fit an image {scale:.3g} times as large ({size})"
+            advice = f"divide them by {scale:.3g}, unless the image was cropped"
+            return [Remark("problem", message, advice, "other-picture", offset)]
+    return []
+
+
+def _is_near(found: float, wanted: float) -> bool:
+    """Return whether two ratios are equal within 5 %."""
+    return abs(found / wanted - 1) < 0.05
+
+
+def _better_order(camera: Camera) -> list[tuple[str, str]] | None:
+    """Return the numbers to exchange for a good fit, as (name, name under which its number is given), or None."""
+    values = [getattr(camera, name) for name in _NUMBERS]
+    best = None
+    for order in itertools.permutations(range(4)):
+        fx, fy, cx, cy = (values[index] for index in order)
+        if min(fx, fy) <= 0:
+            continue
+        other = Camera(camera.width, camera.height, fx, fy, cx, cy)
+        fits = offset_of(other) < 0.05 and _ratio(other) < 1.03 and _USUAL_VIEW[0] <= view_of(other) <= _USUAL_VIEW[1]
+        moved = [(_NUMBERS[place], _NUMBERS[index]) for place, index in enumerate(order) if place != index]
+        if fits and (best is None or len(moved) < len(best)):
+            best = moved
+    return best
+
+
+def _centre(camera: Camera) -> list[Remark]:
+    """Judge the principal point."""
+    right, below = _offsets(camera)
+    offset = offset_of(camera)
+    if offset <= _SMALL_OFFSET:
+        return []
+    message = (
+        f"principal point ({camera.cx:.4g}, {camera.cy:.4g}) px is {abs(right):.0%} of the width "
+        f"{'right' if right > 0 else 'left'} of the centre and {abs(below):.0%} of the height "
+        f"{'below' if below > 0 else 'above'} it"
+    )
+    if offset <= _OFFSET:
+        return [Remark("note", message, "correct for a cropped image")]
+    advice = "check cx and cy; if the image was cropped or resized, the camera must be adapted"
+    return [Remark("warning", message, advice, "off-centre", offset)]
+
+
+def _shape(camera: Camera) -> list[Remark]:
+    """Judge the ratio of the focal lengths."""
+    ratio = _ratio(camera)
+    if ratio <= _RATIO:
+        return []
+    message = f"fx {camera.fx:.4g} and fy {camera.fy:.4g} px differ by {ratio - 1:.0%}"
+    advice = "pixels are usually square: check both, and the aspect ratio of the image"
+    return [Remark("warning", message, advice, "focal-ratio", ratio)]

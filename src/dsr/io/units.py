@@ -1,0 +1,340 @@
+"""What the stored values of a depth map tell of their unit and range type; asked for where two readings are as likely.
+
+The clues are the median, the range, steps that all values are multiples of, the size and the camera of known data sets,
+single pixels as of a laser scanner, and the planes of the map (:func:`dsr.geometry.planes.inverse_votes`). A map of few
+different values tells nothing but its median.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import NamedTuple, NoReturn
+
+import numpy as np
+
+from dsr.geometry.camera import Camera, RangeType
+from dsr.geometry.planes import InverseVotes, inverse_votes
+from dsr.io.reading import SUNRGBD_BITS
+from dsr.notes import LIMITS, Assumption
+
+TURNED_BACK = f"bits are turned back by {SUNRGBD_BITS}, as SUN RGB-D turns them: millimetres, also in the result"
+_OVERRIDE = "--depth-unit overrides it"
+_MIN_MEDIAN, _MAX_MEDIAN = 0.05, 80.0
+"""Range of plausible medians in metres; a unit that gives another median is not assumed."""
+_OTHER_UNITS = ((1e-4, "0.1 mm"), (1e-6, "micrometres"), (1e-2, "centimetres"))
+"""Units of whole numbers that cannot be millimetres, the most likely first."""
+_SPARSE_FRACTION, _SCATTERED = 0.6, 0.6
+"""Fraction of holes above which whole numbers may come from a laser scanner; and do, if fewer of the known pixels than
+the second have a known one below."""
+_FLOAT_MILLIMETRES = 200.0
+"""Median above which floats of few levels are millimetres."""
+_FEWEST_LEVELS = 16
+"""Number of different values below which a map tells nothing but its median."""
+_SAMPLE = 200_000
+"""Largest number of values that are looked at."""
+_MOST = 0.99
+"""Share of the values that are multiples of a step; 0.9 where farther ones have other bits."""
+_LEVELS = 256
+_ENDS = 4
+"""Largest number of pixels that have the smallest, and the largest, value of a normalised map."""
+
+_KNOWN_CAMERAS: tuple[tuple[int, float, float, float, str], ...] = (
+    (640, 481.2, 480.0, 1 / 5000, "ICL-NUIM"),
+    (640, 517.3, 516.5, 1 / 5000, "TUM RGB-D, freiburg1"),
+    (640, 520.9, 521.0, 1 / 5000, "TUM RGB-D, freiburg2"),
+    (640, 535.4, 539.2, 1 / 5000, "TUM RGB-D, freiburg3"),
+)
+"""Width, focal lengths, metres per value, and the data set whose published calibration that is."""
+_REPLICA = 1200, 680
+"""Width and height of Replica's renderings, which store 1/6553.5 m (NICE-SLAM, configs/Replica)."""
+_KITTI_WIDTHS, _KITTI_HEIGHTS = range(1216, 1243), range(350, 377)
+"""Of KITTI's pictures, whose depth and disparity is stored in 1/256 (its devkit)."""
+
+
+class Told(NamedTuple):
+    """What values tell: metres (pixels) per value, the assumptions, and what else is not as usual.
+
+    ``range_type``: ``disparity`` where the values are; None where they tell of none. ``bits``: how far they were turned
+    to the left; the unit holds after turning them back.
+    """
+
+    unit: float
+    assumptions: tuple[Assumption, ...]
+    range_type: RangeType | None = None
+    bits: int = 0
+
+
+def tell(
+    name: str, values: np.ndarray, holes: np.ndarray, camera: Camera | None = None, *, may_fall: bool = True
+) -> Told:
+    """Return what the values of a map tell.
+
+    Args:
+        name: name of the file, for the error.
+        values: (h, w) as stored.
+        holes: (h, w) bool, where depth is missing.
+        camera: of these pixels; None for an unknown one.
+        may_fall: whether they may be disparities: nobody said that they are not.
+
+    Raises:
+        ValueError: no pixel is known, no usual unit makes the distances plausible, or two readings are as likely; the
+            message names both, with the option for each.
+
+    """
+    if holes.all():
+        raise ValueError(f"{name}: expected at least one known pixel, all are holes")
+    clues = _Clues(name, values, holes, camera, may_fall)
+    return _tell_floats(clues) if values.dtype.kind == "f" else _tell_whole(clues)
+
+
+@dataclass(frozen=True)
+class _Clues:
+    """A map, and what is to be seen of it."""
+
+    name: str
+    values: np.ndarray
+    holes: np.ndarray
+    camera: Camera | None
+    may_fall: bool
+
+    @functools.cached_property
+    def known(self) -> np.ndarray:
+        """The known values, or every n-th of them."""
+        known = self.values[~self.holes]
+        return known[:: -(-known.size // _SAMPLE)]
+
+    @functools.cached_property
+    def middle(self) -> float:
+        """The median."""
+        return float(np.median(self.values[~self.holes]))
+
+    @functools.cached_property
+    def highest(self) -> float:
+        """The largest known value."""
+        return float(self.values[~self.holes].max())
+
+    @functools.cached_property
+    def lowest(self) -> float:
+        """The smallest known value."""
+        return float(self.values[~self.holes].min())
+
+    @functools.cached_property
+    def telling(self) -> bool:
+        """Whether there are enough different values."""
+        return np.unique(self.known).size >= _FEWEST_LEVELS
+
+    @functools.cached_property
+    def votes(self) -> InverseVotes:
+        """What the planes say."""
+        known = np.where(self.holes, np.nan, self.values.astype(np.float64))
+        return inverse_votes(known) if self.telling else InverseVotes(0, 0)
+
+    @property
+    def scattered(self) -> bool:
+        """Whether the known pixels are single ones, as of a laser scanner."""
+        known = ~self.holes
+        return self.sparse and (known[1:] & known[:-1]).sum() < _SCATTERED * known.sum()
+
+    @property
+    def sparse(self) -> bool:
+        """Whether most pixels are missing."""
+        return bool(self.holes.mean() > _SPARSE_FRACTION)
+
+    @property
+    def of_kitti(self) -> bool:
+        """Whether the map has one of the sizes of KITTI."""
+        height, width = self.values.shape
+        return width in _KITTI_WIDTHS and height in _KITTI_HEIGHTS
+
+    def multiples(self, step: int, share: float = _MOST) -> bool:
+        """Return whether a share of the values are multiples of a step, and not of twice the step."""
+        values = self.known
+        if np.unique(values // step).size < _FEWEST_LEVELS:
+            return False
+        return bool((values % step == 0).mean() >= share and (values % (2 * step) == 0).mean() < _MOST * share)
+
+    def metres(self, unit: float) -> str:
+        """Return the median in a unit."""
+        return f"{self.middle * unit:.3g} m"
+
+    def ask(self, why: str, *units: tuple[str, float]) -> NoReturn:
+        """Raise the error that asks for one of several units, by their names for ``--depth-unit``."""
+        readings = " or ".join(f"--depth-unit {name} (median {self.metres(unit)})" for name, unit in units)
+        raise ValueError(f"{self.name}: expected {readings}: {why}")
+
+
+def _tell_whole(clues: _Clues) -> Told:
+    """Return what whole numbers tell."""
+    if clues.lowest < clues.highest < _LEVELS and not (clues.telling and clues.may_fall and clues.votes.verdict):
+        raise ValueError(
+            f"{clues.name}: expected --depth-unit cm (median {clues.metres(1e-2)}), or --range-type disparity with "
+            f"--baseline METRES: whole numbers up to {clues.highest:g} are too small for millimetres"
+        )
+    if not clues.telling:
+        return _by_median(clues)
+    if clues.values.dtype == np.uint16 and clues.multiples(1 << SUNRGBD_BITS, 0.9):
+        note = Assumption(f"values are multiples of 8: {TURNED_BACK}; {_OVERRIDE}")
+        return Told(1e-3, (note,), bits=SUNRGBD_BITS)
+    falling = _tell_falling(clues)
+    if falling is not None:
+        return falling
+    for step in (_LEVELS, _LEVELS + 1):
+        if clues.multiples(step):
+            raise ValueError(
+                f"{clues.name}: expected depth, got multiples of {step}: a picture of 8 bits for viewing, widened to "
+                "16; --depth-unit METRES if its values are metric"
+            )
+    return _by_data_set(clues) or _by_steps(clues) or _by_median(clues)
+
+
+def _by_data_set(clues: _Clues) -> Told | None:
+    """Return the unit of a data set with such a size or camera; None if there is none."""
+    height, width = clues.values.shape
+    camera = clues.camera
+    for known_width, fx, fy, unit, name in _KNOWN_CAMERAS:
+        if camera is not None and camera.width == known_width and np.allclose((camera.fx, camera.fy), (fx, fy), 1e-4):
+            return Told(unit, (_whole(clues, "1/5000 m", unit, f"the camera is that of {name}"),))
+    if (width, height) == _REPLICA and clues.middle / 6553.5 > 0.5:
+        return Told(1 / 6553.5, (_whole(clues, "1/6553.5 m", 1 / 6553.5, "1200 x 680 is the size of Replica's maps"),))
+    if clues.of_kitti and clues.sparse:
+        return Told(1 / 256, (_whole(clues, "1/256 m", 1 / 256, "size and holes are those of KITTI's maps"),))
+    if clues.of_kitti:
+        clues.ask("KITTI's maps have this size, and store 1/256 m", ("1/256", 1 / 256), ("mm", 1e-3), ("cm", 1e-2))
+    if clues.scattered:
+        clues.ask(
+            "single pixels, as of a laser scanner, which KITTI stores in 1/256 m", ("1/256", 1 / 256), ("mm", 1e-3)
+        )
+    return None
+
+
+def _by_steps(clues: _Clues) -> Told | None:
+    """Return the unit of millimetres that are stored more finely than they are; None if they are not."""
+    for step, name, unit, nearest in ((5, "1/5000", 1 / 5000, 0.5), (10, "0.0001", 1e-4, 0.3)):
+        if not clues.multiples(step):
+            continue
+        fine, coarse = nearest <= clues.middle * unit, clues.middle * 1e-3 <= LIMITS["far-millimetres"].threshold
+        why = f"values are multiples of {step}, as of millimetres stored in {name} m"
+        if fine and (step == 5 or not coarse):
+            return Told(unit, (_whole(clues, f"{name} m", unit, why),))
+        if fine or not coarse or step == 5:
+            clues.ask(why, ("mm", 1e-3), (name, unit))
+    return None
+
+
+def _whole(clues: _Clues, label: str, unit: float, why: str) -> Assumption:
+    """Return the note on a unit of whole numbers."""
+    return Assumption(f"whole numbers are taken for {label}: {why}; {_OVERRIDE}", f"median {clues.metres(unit)}")
+
+
+def _by_median(clues: _Clues) -> Told:
+    """Return the unit of whole numbers that makes their median a distance."""
+    middle = clues.middle
+    if _MIN_MEDIAN <= middle * 1e-3 <= _MAX_MEDIAN:
+        others = "TUM RGB-D and ICL-NUIM store 1/5000 m"
+        if clues.telling and middle * 1e-3 > LIMITS["far-millimetres"].threshold:
+            why = f"as millimetres that is far for a depth camera; {others}"
+            clues.ask(why, ("mm", 1e-3), ("1/5000", 1 / 5000))
+        found = [Assumption("whole numbers are taken for millimetres", f"median {clues.metres(1e-3)}")]
+        if middle * 1e-3 > LIMITS["far-metres"].threshold:
+            found.append(Assumption(f"that is far for a sensor: {others} (--depth-unit), SUN RGB-D sunrgbd"))
+        near = float(np.percentile(clues.known, 99)) * 1e-3
+        if clues.telling and near < LIMITS["near-millimetres"].threshold:
+            text = "everything is near if whole numbers are millimetres: are they centimetres? --depth-unit mm or cm"
+            found.append(Assumption(text, f"99 % within {near:.2g} m", "near-millimetres", near))
+        if clues.sparse:
+            text = "that is sparse, as of a laser scanner: KITTI stores 1/256 m (--depth-unit 1/256)"
+            found.append(Assumption(text))
+        return Told(1e-3, tuple(found))
+    for unit, label in _OTHER_UNITS:
+        if _MIN_MEDIAN <= middle * unit <= _MAX_MEDIAN:
+            why = f"as millimetres the median would be {clues.metres(1e-3)}, now {clues.metres(unit)}"
+            return Told(unit, (Assumption(f"whole numbers are taken for {label}", why),))
+    raise ValueError(
+        f"{clues.name}: no usual unit makes its median of {middle:g} a distance; give one with --depth-unit"
+    )
+
+
+def _tell_floats(clues: _Clues) -> Told:
+    """Return what floats tell."""
+    middle = clues.middle
+    if clues.telling:
+        _expect_metric(clues)
+        falling = _tell_falling(clues)
+        if falling is not None:
+            return falling
+        _expect_one_reading(clues)
+    whole = clues.telling and bool((clues.known == np.round(clues.known)).all())
+    if middle > (_FLOAT_MILLIMETRES if whole or not clues.telling else LIMITS["float-millimetres"].threshold):
+        return Told(1e-3, (Assumption("floats this large are taken for millimetres", f"median {middle:.4g}"),))
+    found = [Assumption("floats are taken for metres", f"median {clues.metres(1.0)}")]
+    if middle < _MIN_MEDIAN:
+        found.append(Assumption("the depth is nearer than 5 cm: is it in metres? --depth-unit gives another unit"))
+    return Told(1.0, tuple(found))
+
+
+def _expect_metric(clues: _Clues) -> None:
+    """Check that floats are not normalised.
+
+    Raises:
+        ValueError: they are.
+
+    """
+    known, highest = clues.known.astype(np.float64), clues.highest
+    if highest > 1:
+        ends = ((clues.values == end).sum() for end in (0, highest))
+        normalised = highest == round(highest) and all(0 < count <= _ENDS for count in ends)
+    else:
+        of_levels = any(
+            np.allclose(known * most, np.round(known * most), 0, 1e-3 * most / 255) for most in (255, 65535)
+        )
+        normalised = highest == 1 or of_levels or clues.middle < _MIN_MEDIAN
+    if normalised and not (known == np.round(known)).all():
+        raise ValueError(
+            f"{clues.name}: expected metric depth, got floats up to {highest:.4g} with a median of {clues.middle:.3g}, "
+            "as of normalised maps; --depth-unit METRES if they are metric, such as m"
+        )
+
+
+def _expect_one_reading(clues: _Clues) -> None:
+    """Check that the median of floats has one likely reading.
+
+    Raises:
+        ValueError: it has two.
+
+    """
+    middle = clues.middle
+    whole = bool((clues.known == np.round(clues.known)).all())
+    likely_pixels = clues.may_fall and clues.votes.verdict != "rises" and not clues.scattered
+    if LIMITS["far-metres"].threshold < middle <= LIMITS["far-floats"].threshold and likely_pixels:
+        raise ValueError(
+            f"{clues.name}: expected --depth-unit m (median {clues.metres(1.0)}), or --range-type disparity with "
+            "--baseline METRES: floats of this size are as often pixels as metres, and there are too few planes to tell"
+        )
+    if LIMITS["far-floats"].threshold < middle <= _FLOAT_MILLIMETRES and not clues.scattered:
+        clues.ask("floats of this size are as often centimetres as metres", ("cm", 1e-2), ("m", 1.0))
+    if _FLOAT_MILLIMETRES < middle <= LIMITS["float-millimetres"].threshold and not whole:
+        clues.ask("floats of this size are as often centimetres as millimetres", ("cm", 1e-2), ("mm", 1e-3))
+
+
+def _tell_falling(clues: _Clues) -> Told | None:
+    """Return what values that fall with distance are; None if they do not.
+
+    Raises:
+        ValueError: they do, and the distance of the two cameras is not known.
+
+    """
+    if not clues.may_fall or clues.votes.verdict != "falls":
+        return None
+    votes = clues.votes
+    why = f"values fall with distance (straight over {votes.falling} of {votes.falling + votes.rising} planes)"
+    width = clues.values.shape[1]
+    fitting = [unit for unit in (1.0, 1 / 256) if clues.highest * unit < width and (unit == 1 or clues.highest > width)]
+    if clues.camera is None or clues.camera.baseline is None or not fitting:
+        raise ValueError(
+            f"{clues.name}: expected --range-type disparity with --baseline METRES, or --range-type orthogonal for "
+            f"depth: {why}, as disparity and inverse depth do; inverse depth of a network has no metric unit"
+        )
+    label = "pixels" if fitting[0] == 1 else "1/256 pixel"
+    text = f"values are taken for disparities in {label} of the depth map: {why}; --range-type overrides it"
+    return Told(fitting[0], (Assumption(text),), "disparity")

@@ -1,0 +1,250 @@
+"""``dsr upsample`` of values and cameras that can't be what they are taken for: read, asked for, or warned of."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from small_scenes import room
+
+from dsr.cli import main
+from dsr.geometry.camera import Camera
+
+SMALL = Camera.from_fov(128, 96)
+"""Of the depth maps; the default of 60 degrees, so that no camera need be given."""
+DEPTH = room(SMALL, 17.0)[0]
+MILLIMETRES = np.round(DEPTH * 1000).astype(np.uint16)
+BASELINE = 0.1
+DISPARITY = BASELINE * SMALL.fx / DEPTH
+HD = (640, 480)
+
+
+def write(folder, values, size=(256, 192), name="depth"):
+    """Write a photo and a map, and return the options that name them."""
+    Image.fromarray(np.full((size[1], size[0], 3), 99, np.uint8)).save(folder / "photo.png")
+    values = np.asarray(values)
+    path = folder / f"{name}.npy"
+    if values.dtype in (np.uint8, np.uint16):
+        path = folder / f"{name}.png"
+        cv2.imwrite(str(path), values)
+    else:
+        np.save(path, values)
+    return ["--rgb", folder / "photo.png", "--depth", path]
+
+
+def upsample(*arguments):
+    return main(["upsample", *map(str, arguments), "--method", "bicubic", "--only", "depth"])
+
+
+def refused(capsys, code):
+    """Return the one line on stderr of a command that ended with 2."""
+    error = capsys.readouterr().err
+    assert (code, error.count("\n"), error[:7]) == (2, 1, "error: ")
+    return error[7:-1]
+
+
+def warned(tmp_path, capsys, files, *options):
+    """Return the codes in info.json, and what was printed, after checking that --strict refuses what is warned of."""
+    assert upsample(*files, *options, "-o", tmp_path / "out") == 0
+    printed = capsys.readouterr().out
+    warnings = json.loads((tmp_path / "out" / "info.json").read_text())["warnings"]
+    assert printed.count("warning: ") == len(warnings)
+    shutil.rmtree(tmp_path / "strict", ignore_errors=True)
+    code = upsample(*files, *options, "-o", tmp_path / "strict", "--strict")
+    assert not (tmp_path / "strict" / "info.json").exists() or not warnings
+    if warnings:
+        assert warnings[0]["message"] in refused(capsys, code)
+    else:
+        assert code == 0
+    return [each["code"] for each in warnings], printed
+
+
+def metres(folder):
+    return np.load(folder / "depth_metres.npy" if (folder / "depth_metres.npy").exists() else folder / "depth.npy")
+
+
+# encodings
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        (MILLIMETRES, "whole numbers are taken for millimetres"),
+        (MILLIMETRES * np.uint16(5), "whole numbers are taken for 1/5000 m: values are multiples of 5"),
+        ((MILLIMETRES << 3) | (MILLIMETRES >> 13), "values are multiples of 8: bits are turned back by 3"),
+        (DEPTH.astype(np.float32), "floats are taken for metres"),
+        (DEPTH.astype(np.float32) * 1000, "floats this large are taken for millimetres"),
+        (MILLIMETRES.astype(np.float32), "floats this large are taken for millimetres"),
+    ],
+)
+def test_what_values_tell_is_read_so_with_its_reason(tmp_path, capsys, values, said):
+    codes, printed = warned(tmp_path, capsys, write(tmp_path, values))
+    assert codes == []
+    assert said in printed
+    assert np.median(metres(tmp_path / "out")) == pytest.approx(np.median(DEPTH), rel=0.01)
+
+
+def test_told_units_are_overridden_by_the_option_that_the_line_names(tmp_path, capsys):
+    for number, values in enumerate((MILLIMETRES * np.uint16(5), (MILLIMETRES << 3) | (MILLIMETRES >> 13))):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        _, printed = warned(folder, capsys, write(folder, values))
+        assert "--depth-unit overrides it" in printed
+        assert upsample(*write(folder, values), "--depth-unit", "mm", "-o", folder / "mm") == 0
+        assert np.median(metres(folder / "mm")) == pytest.approx(np.median(values) / 1000, rel=0.01)
+        capsys.readouterr()
+
+
+def test_sizes_and_cameras_of_known_data_sets_tell_the_unit(tmp_path, capsys):
+    unrounded = np.round(cv2.resize(DEPTH, HD) * 5000).astype(np.uint16)
+    intrinsics = ("--intrinsics", 481.2, 480, 319.5, 239.5)
+    _, printed = warned(tmp_path, capsys, write(tmp_path, unrounded, HD), *intrinsics)
+    assert "1/5000 m: the camera is that of ICL-NUIM" in printed
+    replica = np.round(cv2.resize(DEPTH, (1200, 680)) * 6553.5).astype(np.uint16)
+    assert upsample(*write(tmp_path, replica, (1200, 680)), "-o", tmp_path / "r", "--dry-run") == 0
+    assert "1/6553.5 m: 1200 x 680 is the size of Replica's maps" in capsys.readouterr().out
+    lines = np.where(np.random.default_rng(1).random((375, 1242)) < 0.05, cv2.resize(DEPTH, (1242, 375)) * 5 * 256, 0)
+    assert upsample(*write(tmp_path, lines.astype(np.uint16), (1242, 375)), "-o", tmp_path / "k", "--dry-run") == 0
+    assert "1/256 m: size and holes are those of KITTI's maps" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        (np.round(DEPTH * 5000).astype(np.uint16), ("--depth-unit mm (", "--depth-unit 1/5000 (")),
+        (DEPTH * 100, ("--depth-unit cm (", "--depth-unit mm (")),
+        (DEPTH * 50, ("--depth-unit cm (", "--depth-unit m (")),
+        (DISPARITY, ("--range-type disparity with --baseline", "--range-type orthogonal")),
+        (np.round(DISPARITY * 256).astype(np.uint16), ("--range-type disparity with --baseline", "orthogonal")),
+        (np.round(DISPARITY).astype(np.uint16), ("--depth-unit cm (", "--range-type disparity")),
+        ((1 / DEPTH).astype(np.float32), ("--range-type disparity", "inverse depth of a network has no metric unit")),
+        (900 / DEPTH, ("--range-type disparity", "inverse depth of a network has no metric unit")),
+        ((DEPTH - DEPTH.min()) / np.ptp(DEPTH), ("normalised", "--depth-unit METRES")),
+        (20 * (DEPTH - DEPTH.min()) / np.ptp(DEPTH), ("normalised", "--depth-unit METRES")),
+        (np.round(255 * DEPTH / DEPTH.max()) / 255, ("normalised", "--depth-unit METRES")),
+        (np.uint16(257) * np.round(255 * DEPTH / DEPTH.max()).astype(np.uint16), ("for viewing", "--depth-unit")),
+        (np.round(255 * DEPTH / DEPTH.max()).astype(np.uint8), ("uint8", "for viewing")),
+        (np.where(np.random.default_rng(2).random(DEPTH.shape) < 0.1, MILLIMETRES, 0).astype(np.uint16),
+         ("--depth-unit 1/256 (", "--depth-unit mm (")),
+    ],
+)  # fmt: skip
+def test_what_has_two_likely_readings_or_no_unit_is_asked_for_in_one_line(tmp_path, capsys, values, expected):
+    line = refused(capsys, upsample(*write(tmp_path, values), "-o", tmp_path / "out"))
+    assert line.startswith(str(tmp_path / "depth"))
+    for text in expected:
+        assert text in line
+    assert not (tmp_path / "out").exists() or not list((tmp_path / "out").rglob("*.*"))
+
+
+@pytest.mark.parametrize(
+    ("picture", "expected"),
+    [
+        (cv2.applyColorMap(np.uint8(255 * DEPTH / DEPTH.max()), cv2.COLORMAP_JET), "by the map jet"),
+        (cv2.applyColorMap(np.uint8(255 * DEPTH / DEPTH.max()), cv2.COLORMAP_VIRIDIS)[..., ::-1], "by the map viridis"),
+        (np.dstack([np.uint8(255 * DEPTH / DEPTH.max())] * 3), "three equal channels"),
+        (np.random.default_rng(3).integers(0, 256, (96, 128, 3), np.uint8), "a picture in colour"),
+    ],
+)
+def test_pictures_for_viewing_are_named_by_their_kind(tmp_path, capsys, picture, expected):
+    assert expected in refused(capsys, upsample(*write(tmp_path, picture), "-o", tmp_path / "out"))
+
+
+def test_an_option_answers_what_was_asked(tmp_path, capsys):
+    for number, (values, options) in enumerate([
+        (np.round(DEPTH * 5000).astype(np.uint16), ("--depth-unit", "1/5000")), (DEPTH * 100, ("--depth-unit", "cm")),
+        (DISPARITY, ("--range-type", "disparity", "--baseline", BASELINE)),
+    ]):  # fmt: skip
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        assert warned(folder, capsys, write(folder, values), *options)[0] == []
+        assert np.median(metres(folder / "out")) == pytest.approx(np.median(DEPTH), rel=0.02)
+
+
+def test_values_that_fall_with_distance_are_disparities_where_the_baseline_is_known(tmp_path, capsys):
+    codes, printed = warned(tmp_path, capsys, write(tmp_path, DISPARITY), "--baseline", BASELINE)
+    assert codes == []
+    assert "values are taken for disparities in pixels of the depth map: values fall with distance" in printed
+    assert np.median(metres(tmp_path / "out")) == pytest.approx(np.median(DEPTH), rel=0.02)
+
+
+def test_whole_centimetres_of_a_room_are_not_taken_for_a_near_thing_in_silence(tmp_path, capsys):
+    files = write(tmp_path, np.round(DEPTH * 100).astype(np.uint16))
+    codes, printed = warned(tmp_path, capsys, files)
+    assert codes == ["near-millimetres"]
+    assert "are they centimetres?" in printed
+    assert warned(tmp_path, capsys, files, "--depth-unit", "cm", "--overwrite")[0] == []
+
+
+def test_planes_warn_of_distances_along_the_ray_and_of_disparities_given_as_depth(tmp_path, capsys):
+    files = write(tmp_path, DEPTH * SMALL.ray_lengths().numpy())
+    codes, printed = warned(tmp_path, capsys, files)
+    assert codes == ["along-the-ray"]
+    assert "--range-type perspective" in printed
+    for chosen in ("orthogonal", "perspective"):
+        assert warned(tmp_path, capsys, files, "--range-type", chosen, "--overwrite")[0] == []
+    files = write(tmp_path, DISPARITY)
+    assert warned(tmp_path, capsys, files, "--depth-unit", "m", "--overwrite")[0] == ["falls-with-distance"]
+    files = write(tmp_path, DEPTH, name="disparity")
+    codes, printed = warned(tmp_path, capsys, files, "--baseline", BASELINE, "--overwrite")
+    assert codes == ["falls-with-distance"]
+    assert "disparities rise with distance" in printed
+
+
+def test_distances_of_a_wrong_unit_are_warned_of(tmp_path, capsys):
+    files = write(tmp_path, MILLIMETRES)
+    assert warned(tmp_path, capsys, files, "--depth-unit", "m")[0] == ["depth-far"]
+    assert warned(tmp_path, capsys, files, "--depth-unit", "0.000001", "--overwrite")[0] == ["depth-near"]
+
+
+# cameras
+
+
+@pytest.mark.parametrize(
+    ("intrinsics", "codes", "said"),
+    [
+        ((220, 220, 127.5, 95.5), [], ""),
+        ((110, 110, 63.5, 47.5), ["other-picture"], "fit the depth map of 128 x 96, not the photo of 256 x 192"),
+        ((440, 440, 255.5, 191.5), ["other-picture"], "fit an image 2 times as large"),
+        ((220, 220, 700, 95.5), ["off-centre"], "principal point (700, 95.5) px"),
+        ((575, 5, 127.5, 95.5), ["focal-ratio"], "fx 575 and fy 5 px differ"),
+        ((4000, 4000, 127.5, 95.5), ["view-narrow"], "field of view of 3.67 degrees"),
+        ((4.2, 4.2, 127.5, 95.5), ["view-wide"], "field of view of 176 degrees"),
+        ((1000, 1000, 127.5, 95.5), [], ""),
+        ((220, 220, 100, 80), [], ""),
+    ],
+)
+def test_cameras_that_can_hardly_be_right_are_warned_of(tmp_path, capsys, intrinsics, codes, said):
+    found, printed = warned(tmp_path, capsys, write(tmp_path, MILLIMETRES), "--intrinsics", *intrinsics)
+    assert found == codes
+    assert said in printed
+
+
+def test_a_camera_that_cannot_see_its_picture_is_refused(tmp_path, capsys):
+    files = write(tmp_path, MILLIMETRES)
+    line = refused(capsys, upsample(*files, "--intrinsics", 220, 220, 1e9, 95.5, "-o", tmp_path / "out"))
+    assert line.startswith("--intrinsics: expected a principal point in or near the picture of 256 x 192 pixels")
+    content = {"width": 256, "height": 192, "fx": 220, "fy": 220, "cx": 127.5, "cy": -1e9}
+    (tmp_path / "camera.json").write_text(json.dumps(content))
+    line = refused(capsys, upsample(*files, "-o", tmp_path / "out"))
+    assert line.startswith(f"{tmp_path / 'camera.json'}: expected a principal point")
+
+
+@pytest.mark.parametrize(("baseline", "code"), [(100, "baseline-long"), (0.1 / 1000, "baseline-short")])
+def test_a_baseline_in_another_unit_is_warned_of(tmp_path, capsys, baseline, code):
+    files = write(tmp_path, DISPARITY, name="disparity")
+    codes, printed = warned(tmp_path, capsys, files, "--baseline", baseline)
+    assert codes[0] == code
+    assert "--baseline is in metres" in printed
+    codes, _ = warned(tmp_path, capsys, write(tmp_path, MILLIMETRES), "--baseline", baseline, "--overwrite")
+    assert codes == [code]
+
+
+def test_a_depth_cameras_own_intrinsics_are_checked(tmp_path, capsys):
+    (tmp_path / "depth.txt").write_text("110 0 110 0 110 47.5 0 0 1")
+    (tmp_path / "move.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1")
+    rig = ("--depth-camera", tmp_path / "depth.txt", "--extrinsics", tmp_path / "move.txt")
+    codes, printed = warned(tmp_path, capsys, write(tmp_path, MILLIMETRES), *rig)
+    assert codes == ["off-centre"]
+    assert "--depth-camera: principal point (110, 47.5) px" in printed
