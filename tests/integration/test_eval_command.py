@@ -278,7 +278,7 @@ USAGE_ERRORS = {
     "foreign authors' weights": (["method=svlrm", "weights=file"], "file: "),
     "a missing trunk": (["metrics.lpips_trunk=no"], "metrics.lpips_trunk: expected a file, got no"),
     "a foreign trunk": (["metrics.lpips_trunk=file"], "metrics.lpips_trunk: file: expected the weights"),
-    "a file as directory": (["output_dir=file"], "output_dir: expected a directory, file is a file"),
+    "a file as directory": (["output_dir=file"], "output_dir: file: expected a folder to write, got a file"),
     "a foreign directory": (["output_dir=foreign"], "output_dir: foreign holds files of something else"),
 }
 

@@ -394,7 +394,7 @@ USAGE_ERRORS = {
     "a measured map": (["downsampling=measured"], "downsampling: "),
     "a scale": (["scale=3"], "scale: "),
     "a foreign directory": (["output_dir=foreign"], "output_dir: foreign holds files of something else"),
-    "a file as directory": (["output_dir=file"], "output_dir: expected a directory, file is a file"),
+    "a file as directory": (["output_dir=file"], "output_dir: file: expected a folder to write, got a file"),
 }
 
 

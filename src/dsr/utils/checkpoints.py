@@ -185,7 +185,9 @@ def _fitting(value: Any, own: Any, place: str) -> Any:
         fits = number if isinstance(own, float | int) else own is None and (number or isinstance(value, str | None))
     if not fits:
         raise ValueError(f"{place}: expected what {type(own).__name__} stands for, got {type(value).__name__}")
-    return value.contiguous() if isinstance(value, Tensor) else value
+    if isinstance(own, Tensor):  # as it lies in memory, which such kernels take for granted, too
+        return torch.empty_like(own, dtype=value.dtype).copy_(value)
+    return value
 
 
 def _stepped(optimizer: torch.optim.Optimizer) -> dict[str, Any]:
