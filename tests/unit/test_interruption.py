@@ -166,6 +166,16 @@ def test_what_nobody_reads_changes_no_exit_code(tmp_path, streams, problem, code
     assert (done.returncode, done.stderr) == (code, errors)
 
 
+def test_signal_that_comes_while_a_worker_is_started_is_acted_upon_after_that(tmp_path: Path) -> None:
+    step = (
+        "with working():\n    with interruption.starting_workers():\n        READY\n        time.sleep(1)\n"
+        "        print('started', file=sys.stderr)\n    time.sleep(60)"
+    )
+    code, errors, seconds = run(tmp_path, script_of(step), signal.SIGINT)
+    assert (code, errors) == (130, f"started\n{MESSAGE}\n")
+    assert seconds < 10
+
+
 def test_spawned_workers_do_not_get_ctrl_c_from_the_first_on(tmp_path: Path) -> None:
     (tmp_path / "asked.py").write_text(
         "import signal\ndef blocked(_): return signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())\n"

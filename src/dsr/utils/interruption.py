@@ -103,6 +103,8 @@ class _State:
         deferred: what notes a signal; None if signals raise.
         requeues: whether a scheduler requeues the job of this process, see :func:`requeued`.
         silent: whether the process ends without a line, as another one of the same command says it.
+        starting: whether a process is being started, see :func:`starting_workers`.
+        late: whether a signal has come meanwhile.
         pools: how many groups of worker processes are at work, see :func:`with_workers`.
         ending: held by the thread that ends the process.
 
@@ -116,6 +118,8 @@ class _State:
     deferred: Deferred | None = None
     requeues = False
     silent = False
+    starting = False
+    late = False
     pools = 0
     ending = threading.Lock()
 
@@ -277,6 +281,8 @@ def await_requeue() -> None:
 def starting_workers(*further: signal.Signals) -> Iterator[None]:
     """Within this context started processes do not get SIGINT, which would meet them before :func:`end_with`.
 
+    A signal that comes to this process meanwhile is acted upon at the end: a process that is half started complains.
+
     Args:
         further: other signals that they do not get either.
 
@@ -285,10 +291,15 @@ def starting_workers(*further: signal.Signals) -> Iterator[None]:
         yield
         return
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, *further})
+    _State.starting = True
     try:
         yield
     finally:
+        _State.starting = False
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        if _State.late:
+            _State.late = _State.handled = False
+            _handle(_State.number, None)
 
 
 def end_with(parent: int) -> None:
@@ -374,6 +385,9 @@ def _handle(number: int, frame: FrameType | None) -> None:
     """Act upon a signal, in the main thread."""
     again, _State.handled = _State.handled, True
     _State.number = _State.number or number
+    if _State.starting and not again:  # it came to another thread, which does not block it
+        _State.late = True
+        return
     if again or not _State.working or in_import(frame):
         end(_message())
     if _State.deferred is None:
