@@ -98,7 +98,7 @@ LIMITS: dict[str, Limit] = {
     "far-millimetres": Limit(
         6.0,
         "metres, of the median of whole numbers as millimetres; the unit is asked for, not warned of",
-        "of 71 maps of sensors none is beyond 5.2 m; in 1/5000 m 68 would be",
+        "of 71 maps of sensors none is beyond 5.2 m; stored in 1/5000 m 63 would be",
     ),
     "far-metres": Limit(
         10.0,
