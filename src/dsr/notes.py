@@ -27,6 +27,21 @@ LIMITS: dict[str, Limit] = {
         "pixels, of a photo with 800 on its longer side, by which its edges lie beside those of the depth map",
         "a person sees it in the relit surface from about 3 on",
     ),
+    "photo-order": Limit(
+        2,
+        "pairs, of at most 12 over all, whose depth map fits another one's photo better, by as much as `photo-turned`",
+        "a single pair does in 1 of 100 right lists",
+    ),
+    "photo-other": Limit(
+        2.0,
+        "standard deviations of chance, and less, of the agreement of edges, where edges exist",
+        "2 of 405 right pairs, and 96 % of pairs with the photo of something else",
+    ),
+    "photo-turned": Limit(
+        4.5,
+        "standard deviations of chance by which edges agree better with a mirrored or turned photo",
+        "3.8 at most in 405 right pairs",
+    ),
 }
 """By code: every warning that a command gives about its input; docs/checks.md shows them."""
 
