@@ -11,15 +11,17 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from dsr.doctor.depth_checks import find_rounding
 from dsr.doctor.finding import Array, Finding, metres
 from dsr.geometry.camera import Camera
-from dsr.geometry.edges import APART, MAX_SHIFT, SHIFT, WORKING_SIZE, Match, best_match, find_edges
+from dsr.geometry.agreement import judge
+from dsr.geometry.edges import SHIFT, WORKING_SIZE
+from dsr.geometry.registration import Displacement, find_displacement
 from dsr.sample import Scene
 
 _VIEW, _USUAL_VIEW = (12.0, 130.0), (20.0, 120.0)
@@ -31,14 +33,6 @@ _RATIO = 1.10
 _SCALES = (2.0, 3.0, 4.0, 8.0, 1.5, 2.5)
 _NUMBERS = ("fx", "fy", "cx", "cy")
 _DIVISOR = 8
-
-_STRICTER = 1.5
-"""Factor of the thresholds for a flipped photo, because three flips are tried."""
-_TURNS: dict[str, Callable[[Array], Array]] = {
-    "mirrored left to right": lambda photo: photo[:, :, ::-1],
-    "mirrored top to bottom": lambda photo: photo[:, ::-1],
-    "turned by 180 degrees": lambda photo: photo[:, ::-1, ::-1],
-}
 
 _SIZES = (1.0, 2 / 3, 1 / 2, 1 / 3, 1 / 4, 1 / 6)
 """Sizes of windows, as fractions of the shorter image side."""
@@ -178,48 +172,34 @@ def _shape(camera: Camera) -> list[Finding]:
 
 
 def check_registration(scene: Scene) -> list[Finding]:
-    """Check whether the photo's edges coincide with the depth edges."""
-    every = math.ceil(max(scene.camera.height, scene.camera.width) / WORKING_SIZE)
-    depth, photo = _reduce(scene, every)
-    radius = max(round(max(depth.shape) * MAX_SHIFT), APART)
-    edges = find_edges(depth, radius)
-    if not edges.enough():
-        return [Finding("registration", "note", f"not enough depth edges for this check ({edges.count} pixels)")]
-    match = best_match(edges, photo, radius)
-    if match.found:
-        return [_report(match, every)]
-    for name, turn in _TURNS.items():
-        if best_match(edges, turn(photo), radius, _STRICTER).found:
-            advice = "flip or rotate the photo or the depth"
-            return [Finding("registration", "problem", f"the photo is {name} relative to the depth", advice)]
-    message = f"the photo's edges match the depth edges at no shift within {radius * every} px"
-    return [
-        Finding(
-            "registration", "note", message, "check that they belong together; noisy depth can have the same effect"
-        )
-    ]
+    """Check whether the photo shows what the depth map shows, and its edges coincide with the depth edges."""
+    verdict = judge(metres(scene), scene.rgb)
+    if verdict is None:
+        return [Finding("registration", "note", "not enough depth edges for this check, or no edges in the photo")]
+    if verdict.turned:
+        return [Finding("registration", "problem", str(verdict), "flip or rotate the photo or the depth")]
+    found = find_displacement(torch.from_numpy(metres(scene))[None], scene.rgb)
+    if found is not None and found.certain:
+        return [_report(found, math.ceil(max(scene.rgb.shape[1:]) / WORKING_SIZE))]
+    if verdict.fits:
+        return [Finding("registration", "ok", "the photo's edges match the depth edges")]
+    if verdict.apart or verdict.other:
+        return [Finding("registration", "warning", str(verdict), "check that photo and depth belong together")]
+    if found is None:
+        return [Finding("registration", "note", "not enough depth edges for this check")]
+    advice = "check that they belong together; noisy depth can have the same effect"
+    return [Finding("registration", "note", f"nothing tells whether they belong together: {verdict}", advice)]
 
 
-def _reduce(scene: Scene, every: int) -> tuple[Array, Array]:
-    """Return depth and photo reduced by a factor; depth is subsampled, which keeps its edges sharp."""
-    photo = scene.rgb.double().numpy()
-    height, width = (size // every for size in photo.shape[1:])
-    blocks = photo[:, : height * every, : width * every].reshape(3, height, every, width, every)
-    depth = metres(scene)[every // 2 :: every, every // 2 :: every][:height, :width]
-    return depth, blocks.mean(axis=(2, 4))
-
-
-def _report(match: Match, every: int) -> Finding:
-    """Return the finding for a shift between photo and depth."""
-    across = f"{abs(match.right) * every} px {'left' if match.right < 0 else 'right'}"
-    down = f"{abs(match.down) * every} px {'above' if match.down < 0 else 'below'}"
-    shifted = bool(match.right or match.down)
+def _report(found: Displacement, every: int) -> Finding:
+    """Return the finding for a displacement between photo and depth, compared in every so manieth pixel."""
+    right, down = round(found.right), round(found.down)
+    scale = f", at {found.scale:.3f} times the size" if found.scale != 1 else ""
     text = (
-        f"the photo's edges are {across}, {down} of the depth edges"
-        if shifted
-        else "the photo's edges match the depth edges"
+        f"the photo's edges are {abs(right)} px {'left' if right < 0 else 'right'}, "
+        f"{abs(down)} px {'above' if down < 0 else 'below'} of the depth edges{scale}"
     )
-    if max(abs(match.right), abs(match.down)) < SHIFT or not match.needed:
+    if not found.visible or (max(abs(right), abs(down)) < SHIFT * every and not scale):
         return Finding("registration", "ok", text)
     advice = "shift one of them; check for a crop, a resize or a lens correction applied to only one of them"
     return Finding("registration", "warning", text, advice)

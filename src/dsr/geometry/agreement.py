@@ -11,6 +11,7 @@ all other displacements, is the significance.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -26,7 +27,7 @@ from dsr.notes import LIMITS
 Size = tuple[int, int]
 _Floats = NDArray[np.float32]
 
-_SIDES = (128, 256)
+_SIDES = (96, 256)
 """Least and largest longer side of the grid in pixels; between them, that of the depth map."""
 _REACH = 4
 """Largest distance in pixels of the grid at which edges count as agreeing: what sensors fatten edges by."""
@@ -40,7 +41,7 @@ _HOLE = 0.5
 """Strength of the border of a wider hole."""
 _AROUND, _FAINT, _STRONGEST = 31, 0.004, 3.0
 """Width in pixels of what an edge of a photo is compared with, and least and largest of its values."""
-_LEAST_SIDE, _LEAST_LENGTH, _LEAST_COHERENCE, _MOST_SPREAD = 80, 300.0, 0.6, 0.03
+_LEAST_SIDE, _LEAST_LENGTH, _LEAST_COHERENCE, _MOST_SPREAD = 80, 300.0, 0.6, 0.045
 """Edges exist, so that a photo of the same would surely agree, where the depth map has so many pixels on its longer
 side, its contours are so long in pixels of the grid and its edges so coherent, and the score by chance spreads less."""
 _CONTOUR = 4.0
@@ -162,6 +163,27 @@ class Verdict:
         by_chance = self.as_given.significance < LIMITS["photo-other"].threshold
         return by_chance and self.telling and not self.turned and not self.apart
 
+    def __str__(self) -> str:
+        """Return what was found, for people."""
+        score = self.as_given.score
+        if self.turned:
+            return f"{self.statement} ({self.better.score:.2f} against {score:.2f})"
+        if self.apart:
+            x, y = self.as_given.right, self.as_given.down
+            sides = "right" if x > 0 else "left", "below" if y > 0 else "above"
+            where = f"{abs(x):.0%} of the width to the {sides[0]}, {abs(y):.0%} of the height {sides[1]}"
+            return f"{self.statement} ({where})"
+        return f"{self.statement} ({score:.2f}, by chance up to {2 * self.as_given.spread:.2f})"
+
+    @property
+    def statement(self) -> str:
+        """What was found, without figures."""
+        if self.turned:
+            return f"the depth map fits better with the photo {self.way}"
+        if self.apart:
+            return "the photo's edges lie beside the depth edges"
+        return "the photo seems to show something else than the depth map"
+
     @property
     def pixels(self) -> float:
         """The displacement where they agree, in pixels of a photo with ``WORKING_SIZE`` on its longer side."""
@@ -179,9 +201,7 @@ def judge(depth: Array, rgb: Tensor) -> Verdict | None:
         None if the depth map or the photo has no edge.
 
     """
-    height, width = rgb.shape[-2:]
-    factor = working_side(depth) / max(height, width)
-    size = (max(round(height * factor), _SMALLEST), max(round(width * factor), _SMALLEST))
+    size = working_size(depth, rgb)
     pixel = max(size) / max(depth.shape)
     outlines, photo = depth_outlines(depth, size), reduce_photo(rgb, size)
     seen = photo_outlines(photo, pixel)
@@ -199,9 +219,30 @@ def judge(depth: Array, rgb: Tensor) -> Verdict | None:
     return Verdict(compare(fields, transform(seen)), best, ways[best], enough)
 
 
-def working_side(depth: Array) -> int:
-    """Return the longer side of the grid for a depth map, in pixels."""
-    return min(max(*depth.shape, _SIDES[0]), _SIDES[1])
+def find_misplaced(depths: Sequence[Outlines], photos: Sequence[Outlines]) -> list[tuple[int, int]]:
+    """Return the depth maps that fit another's photo clearly better than their own, each with that photo.
+
+    Args:
+        depths: edges of depth maps.
+        photos: edges of as many photos, on the same grid.
+
+    """
+    seen = [transform(photo) for photo in photos]
+    found = []
+    for number, depth in enumerate(depths):
+        fields = transform(depth)
+        values = np.array([compare(fields, photo).significance for photo in seen])
+        best = int(values.argmax())
+        if best != number and values[best] - max(values[number], 0.0) >= LIMITS["photo-turned"].threshold:
+            found.append((number, best))
+    return found
+
+
+def working_size(depth: Array, rgb: Tensor) -> Size:
+    """Return the size of the grid for a depth map (h, w) and a photo (3, H, W)."""
+    height, width = rgb.shape[-2:]
+    factor = min(max(*depth.shape, _SIDES[0]), _SIDES[1]) / max(height, width)
+    return max(round(height * factor), _SMALLEST), max(round(width * factor), _SMALLEST)
 
 
 def reduce_photo(rgb: Tensor, size: Size) -> _Floats:

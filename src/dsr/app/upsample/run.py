@@ -5,16 +5,20 @@ from __future__ import annotations
 import json
 import time
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
 
+from dsr.app.upsample.alignment import check_order
 from dsr.app.upsample.frames import Frames, find_frames
 from dsr.app.upsample.reporting import Reporter, listed
 from dsr.app.upsample.request import UpsampleRequest
 from dsr.app.upsample.scene import write_scene
 from dsr.app.upsample.workers import work_through
+from dsr.io.inputs import FolderUnits, read_picture
 from dsr.io.reading import Shard
+from dsr.notes import Assumption, expect_no_warning
 from dsr.utils.console import ConsoleProgress, show
 from dsr.utils.files import write_text
 
@@ -35,8 +39,9 @@ def run(request: UpsampleRequest, console: Console) -> list[str]:
     """
     frames, wanted, shard = find_frames(request), request.results, request.frames.shard
     started = time.perf_counter()
-    found, single = frames.found, frames.single
     _show_found(console, request, frames)
+    frames = replace(frames, warnings=_check_order(request, frames))
+    found, single = frames.found, frames.single
     reporter, progress = Reporter(console), ConsoleProgress(console)
     problems: dict[str, list[str]] = {}
     outcomes: Counter[str] = Counter()
@@ -64,6 +69,15 @@ def run(request: UpsampleRequest, console: Console) -> list[str]:
         _write_summary(wanted.output, shard, outcomes, problems, time.perf_counter() - started)
     lines = [f"{listed(names)}: {message}" if len(found.pairs) > 1 else message for message, names in problems.items()]
     return lines + scene_problems
+
+
+def _check_order(request: UpsampleRequest, frames: Frames) -> tuple[Assumption, ...]:
+    """Return a warning if photos and depth maps are not in the same order, which is refused if that is asked for."""
+    units = FolderUnits(frames.whole)
+    warnings = check_order(frames.whole, lambda pair: read_picture(pair, request.reading, units))
+    if request.reading.strict:
+        expect_no_warning(str(frames.whole[0].depth.parent), [each.message for each in warnings])
+    return warnings
 
 
 def _write_summary(
