@@ -262,11 +262,16 @@ def test_mirrored_photo_is_recognised(sound, axes, text):
 
 
 def test_unrelated_photo_is_found(sound):
-    other = room_scene(turn=-50.0)
-    other = replace(other, rgb=other.rgb.roll((100, 70), (1, 2)))
-    [finding] = [finding for finding in examine(replace(sound, rgb=other.rgb)) if finding.level != "ok"]
+    other = room_scene(turn=-50.0).rgb.transpose(1, 2)
+    [finding] = [finding for finding in examine(replace(sound, rgb=other)) if finding.level != "ok"]
     assert (finding.check, finding.level) == ("registration", "warning")
     assert finding.message.startswith("the photo seems to show something else")
+
+
+def test_photo_far_beside_the_depth_is_found_with_its_place(sound):
+    level, message, _ = only(replace(sound, rgb=sound.rgb.roll((100, 70), (1, 2))), "registration")
+    assert level == "warning"
+    assert message.endswith("(27% of the width to the right, 39% of the height below)")
 
 
 def test_too_few_depth_edges_pass(sound):

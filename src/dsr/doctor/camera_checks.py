@@ -192,9 +192,9 @@ def check_registration(scene: Scene) -> list[Finding]:
 
 
 def _report(found: Displacement, every: int) -> Finding:
-    """Return the finding for a displacement between photo and depth, compared in every so manieth pixel."""
+    """Return the finding for a displacement between photo and depth, compared in steps of ``every`` pixels."""
     right, down = round(found.right), round(found.down)
-    scale = f", at {found.scale:.3f} times the size" if found.scale != 1 else ""
+    scale = f", at {found.scale:.3f} times the size" if round(found.scale, 3) != 1 else ""
     text = (
         f"the photo's edges are {abs(right)} px {'left' if right < 0 else 'right'}, "
         f"{abs(down)} px {'above' if down < 0 else 'below'} of the depth edges{scale}"

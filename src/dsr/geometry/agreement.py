@@ -219,23 +219,24 @@ def judge(depth: Array, rgb: Tensor) -> Verdict | None:
     return Verdict(compare(fields, transform(seen)), best, ways[best], enough)
 
 
-def find_misplaced(depths: Sequence[Outlines], photos: Sequence[Outlines]) -> list[tuple[int, int]]:
+def significances(depths: Sequence[Outlines], photos: Sequence[Outlines]) -> Array:
+    """Return the significance of the agreement of each depth map with each photo on the same grid, (N, M)."""
+    seen = [transform(photo) for photo in photos]
+    rows = [[compare(fields, photo).significance for photo in seen] for fields in map(transform, depths)]
+    return np.array(rows, np.float64).reshape(len(depths), len(photos))
+
+
+def find_misplaced(agreements: Array) -> list[tuple[int, int]]:
     """Return the depth maps that fit another's photo clearly better than their own, each with that photo.
 
     Args:
-        depths: edges of depth maps.
-        photos: edges of as many photos, on the same grid.
+        agreements: (N, N) significance of each depth map with each photo, of a pair on the diagonal.
 
     """
-    seen = [transform(photo) for photo in photos]
-    found = []
-    for number, depth in enumerate(depths):
-        fields = transform(depth)
-        values = np.array([compare(fields, photo).significance for photo in seen])
-        best = int(values.argmax())
-        if best != number and values[best] - max(values[number], 0.0) >= LIMITS["photo-turned"].threshold:
-            found.append((number, best))
-    return found
+    gains = agreements - np.maximum(np.diag(agreements), 0.0)[:, None]
+    best = gains.argmax(axis=1) if gains.size else np.empty(0, int)
+    least = LIMITS["photo-turned"].threshold
+    return [(row, int(column)) for row, column in enumerate(best) if column != row and gains[row, column] >= least]
 
 
 def working_size(depth: Array, rgb: Tensor) -> Size:

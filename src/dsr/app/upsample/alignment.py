@@ -16,6 +16,7 @@ from dsr.geometry.agreement import (
     judge,
     photo_outlines,
     reduce_photo,
+    significances,
     working_size,
 )
 from dsr.geometry.registration import Displacement, find_displacement, undo
@@ -37,18 +38,29 @@ def align(picture: Picture, *, register: bool) -> Picture:
     """
     if min(picture.depth_lr.shape[-2:]) < 2:
         return picture
-    verdict = judge(picture.depth_lr[0].cpu().numpy(), picture.rgb)
-    turned = verdict is not None and verdict.turned
-    found = None if turned else find_displacement(picture.depth_lr, picture.rgb)
-    certain = found is not None and found.certain
-    notes = [] if certain or verdict is None else _doubts(verdict)
+    found, notes = find_doubts(picture, judge(picture.depth_lr[0].cpu().numpy(), picture.rgb))
     if register:
+        certain = found is not None and found.certain
         depth_lr = undo(picture.depth_lr, found) if found is not None and certain else picture.depth_lr
-        return replace(picture, depth_lr=depth_lr, assumptions=(*picture.assumptions, _cure(found), *notes))
+        notes = [_cure(found), *notes]
+        return replace(picture, depth_lr=depth_lr, assumptions=(*picture.assumptions, *notes))
     if found is not None and found.visible:
         detail = f"{_where(found)}; --register moves the depth map"
         notes = [Assumption("the photo's edges lie beside the depth edges", detail, "edges-beside", found.moved)]
     return replace(picture, assumptions=(*picture.assumptions, *notes))
+
+
+def find_doubts(picture: Picture, verdict: Verdict | None) -> tuple[Displacement | None, list[Assumption]]:
+    """Return the displacement of a picture's depth map, and a warning if both can hardly belong together.
+
+    A mirrored or turned photo has no displacement, and one with a certain displacement belongs to the map.
+    """
+    if verdict is None:
+        return find_displacement(picture.depth_lr, picture.rgb), []
+    if verdict.turned:
+        return None, _doubts(verdict)
+    found = find_displacement(picture.depth_lr, picture.rgb)
+    return found, [] if found is not None and found.certain else _doubts(verdict)
 
 
 def check_order(pairs: Sequence[Pair], read: Callable[[Pair], Picture]) -> tuple[Assumption, ...]:
@@ -73,7 +85,7 @@ def check_order(pairs: Sequence[Pair], read: Callable[[Pair], Picture]) -> tuple
         depths.append(depth_outlines(depth, size))
         photos.append(photo_outlines(reduce_photo(picture.rgb, size), max(size) / max(depth.shape)))
         read_pairs.append(pair)
-    found = find_misplaced(depths, photos)
+    found = find_misplaced(significances(depths, photos))
     if len(found) < LIMITS["photo-order"].threshold:
         return ()
     text = f"of {len(depths)} pairs {len(found)} fit another photo better: are the lists in the same order?"
