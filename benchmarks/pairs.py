@@ -26,7 +26,7 @@ from real_sensors import _exr
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.app.upsample.alignment import find_doubts
+from dsr.app.upsample.alignment import align
 from dsr.data.detection import find_scenes
 from dsr.data.frame_files import read_picture
 from dsr.degradation.downsampling import scene_generator
@@ -176,13 +176,15 @@ def rendered(job: tuple[int, Path | None]) -> list[Right]:
     return list(degraded("rendered", scene, ((1, 4, 8)[index % 3],)))
 
 
-def examine(rgb: Tensor, depth: Tensor) -> Outcome:
-    """Return what ``dsr upsample`` finds."""
-    camera = Camera(rgb.shape[-1], rgb.shape[-2], 1.0, 1.0, 0.0, 0.0)
-    picture = Picture(rgb, depth, camera, Encoding(".npy", "float32", 1.0, np.nan, "orthogonal"), ())
+def examine(rgb: Tensor, depth: Tensor, *, right: bool = False) -> Outcome:
+    """Return what ``dsr upsample`` finds; in a wrong pair its displacement only where nothing else is told."""
     verdict = judge(depth[0].numpy(), rgb)
-    found, notes = find_doubts(picture, verdict)
-    code = "edges-beside" if found is not None and found.visible else "".join(note.code for note in notes)
+    if verdict is not None and not right and (verdict.turned or verdict.apart or verdict.other):
+        code = verdict.statement
+    else:
+        camera = Camera(rgb.shape[-1], rgb.shape[-2], 1.0, 1.0, 0.0, 0.0)
+        picture = Picture(rgb, depth, camera, Encoding(".npy", "float32", 1.0, np.nan, "orthogonal"), ())
+        code = "".join(note.code for note in align(picture, register=False).assumptions)
     if verdict is None:
         return Outcome(code, -99.0, 99.0, telling=False)
     return Outcome(code, verdict.margin, verdict.as_given.significance, telling=verdict.telling)
@@ -193,7 +195,7 @@ def outcomes(job: tuple[Right, Tensor]) -> dict[str, Outcome]:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     pair, other = job
-    found = {"": examine(pair.rgb, pair.depth)}
+    found = {"": examine(pair.rgb, pair.depth, right=True)}
     for kind, turn in TURNS.items():
         found[kind] = examine(turn(pair.rgb).contiguous(), pair.depth)
     found["other"] = examine(_resized(other, pair.rgb.shape[1:]), pair.depth)

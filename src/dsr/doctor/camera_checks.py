@@ -175,20 +175,18 @@ def check_registration(scene: Scene) -> list[Finding]:
     """Check whether the photo shows what the depth map shows, and its edges coincide with the depth edges."""
     verdict = judge(metres(scene), scene.rgb)
     if verdict is None:
-        return [Finding("registration", "note", "not enough depth edges for this check, or no edges in the photo")]
+        return [Finding("registration", "note", "no edges in the depth map or in the photo for this check")]
     if verdict.turned:
         return [Finding("registration", "problem", str(verdict), "flip or rotate the photo or the depth")]
     found = find_displacement(torch.from_numpy(metres(scene))[None], scene.rgb)
     if found is not None and found.certain:
         return [_report(found, math.ceil(max(scene.rgb.shape[1:]) / WORKING_SIZE))]
     if verdict.fits:
-        return [Finding("registration", "ok", "the photo's edges match the depth edges")]
+        return [Finding("registration", "ok", verdict.statement)]
     if verdict.apart or verdict.other:
         return [Finding("registration", "warning", str(verdict), "check that photo and depth belong together")]
-    if found is None:
-        return [Finding("registration", "note", "not enough depth edges for this check")]
-    advice = "check that they belong together; noisy depth can have the same effect"
-    return [Finding("registration", "note", f"nothing tells whether they belong together: {verdict}", advice)]
+    advice = "check that they belong together; few edges or noisy depth can have the same effect"
+    return [Finding("registration", "note", str(verdict), advice)]
 
 
 def _report(found: Displacement, every: int) -> Finding:

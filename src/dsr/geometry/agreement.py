@@ -46,7 +46,7 @@ _LEAST_SIDE, _LEAST_LENGTH, _LEAST_COHERENCE, _MOST_SPREAD = 80, 300.0, 0.6, 0.0
 side, its contours are so long in pixels of the grid and its edges so coherent, and the score by chance spreads less."""
 _CONTOUR = 4.0
 """Extent in pixels over which the edges of a contour run alike."""
-_FITS, _ELSEWHERE = 3.0, 8.0
+_FITS, _ELSEWHERE = 3.0, 7.0
 """Significance from which both surely agree, and from which they agree at a larger displacement."""
 _SMALLEST = 16
 """Least side of the grid in pixels."""
@@ -149,8 +149,7 @@ class Verdict:
     @property
     def apart(self) -> bool:
         """Whether both agree at a displacement that is larger than the edges of sensors are wide."""
-        found = self.as_given
-        return not self.turned and found.elsewhere >= _ELSEWHERE + max(found.significance, 0.0) / 2
+        return not self.turned and not self.fits and self.as_given.elsewhere >= _ELSEWHERE
 
     @property
     def telling(self) -> bool:
@@ -165,24 +164,30 @@ class Verdict:
 
     def __str__(self) -> str:
         """Return what was found, for people."""
-        score = self.as_given.score
-        if self.turned:
-            return f"{self.statement} ({self.better.score:.2f} against {score:.2f})"
-        if self.apart:
-            x, y = self.as_given.right, self.as_given.down
-            sides = "right" if x > 0 else "left", "below" if y > 0 else "above"
-            where = f"{abs(x):.0%} of the width to the {sides[0]}, {abs(y):.0%} of the height {sides[1]}"
-            return f"{self.statement} ({where})"
-        return f"{self.statement} ({score:.2f}, by chance up to {2 * self.as_given.spread:.2f})"
+        return f"{self.statement} ({self.figures})"
 
     @property
     def statement(self) -> str:
-        """What was found, without figures."""
+        """What was found."""
         if self.turned:
             return f"the depth map fits better with the photo {self.way}"
         if self.apart:
             return "the photo's edges lie beside the depth edges"
-        return "the photo seems to show something else than the depth map"
+        if self.other:
+            return "the photo seems to show something else than the depth map"
+        return "the photo's edges match the depth edges" + ("" if self.fits else " no better than by chance")
+
+    @property
+    def figures(self) -> str:
+        """The figures of it."""
+        score = self.as_given.score
+        if self.turned:
+            return f"{self.better.score:.2f} against {score:.2f}"
+        if self.apart:
+            right, down = self.as_given.right, self.as_given.down
+            across = f"{abs(right):.0%} of the width to the {'right' if right > 0 else 'left'}"
+            return f"{across}, {abs(down):.0%} of the height {'below' if down > 0 else 'above'}"
+        return f"{score:.2f}, by chance up to {2 * self.as_given.spread:.2f}"
 
     @property
     def pixels(self) -> float:

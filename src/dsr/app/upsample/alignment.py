@@ -38,29 +38,19 @@ def align(picture: Picture, *, register: bool) -> Picture:
     """
     if min(picture.depth_lr.shape[-2:]) < 2:
         return picture
-    found, notes = find_doubts(picture, judge(picture.depth_lr[0].cpu().numpy(), picture.rgb))
+    verdict = judge(picture.depth_lr[0].cpu().numpy(), picture.rgb)
+    if verdict is not None and verdict.turned:  # no displacement is the cure
+        return replace(picture, assumptions=(*picture.assumptions, *_doubts(verdict)))
+    found = find_displacement(picture.depth_lr, picture.rgb)
+    certain = found is not None and found.certain
+    notes = [] if certain or verdict is None else _doubts(verdict)
     if register:
-        certain = found is not None and found.certain
         depth_lr = undo(picture.depth_lr, found) if found is not None and certain else picture.depth_lr
-        notes = [_cure(found), *notes]
-        return replace(picture, depth_lr=depth_lr, assumptions=(*picture.assumptions, *notes))
+        return replace(picture, depth_lr=depth_lr, assumptions=(*picture.assumptions, _cure(found), *notes))
     if found is not None and found.visible:
         detail = f"{_where(found)}; --register moves the depth map"
         notes = [Assumption("the photo's edges lie beside the depth edges", detail, "edges-beside", found.moved)]
     return replace(picture, assumptions=(*picture.assumptions, *notes))
-
-
-def find_doubts(picture: Picture, verdict: Verdict | None) -> tuple[Displacement | None, list[Assumption]]:
-    """Return the displacement of a picture's depth map, and a warning if both can hardly belong together.
-
-    A mirrored or turned photo has no displacement, and one with a certain displacement belongs to the map.
-    """
-    if verdict is None:
-        return find_displacement(picture.depth_lr, picture.rgb), []
-    if verdict.turned:
-        return None, _doubts(verdict)
-    found = find_displacement(picture.depth_lr, picture.rgb)
-    return found, [] if found is not None and found.certain else _doubts(verdict)
 
 
 def check_order(pairs: Sequence[Pair], read: Callable[[Pair], Picture]) -> tuple[Assumption, ...]:
@@ -78,7 +68,7 @@ def check_order(pairs: Sequence[Pair], read: Callable[[Pair], Picture]) -> tuple
     for pair in _sample(pairs):
         try:
             picture = read(pair)
-        except (ValueError, OSError):
+        except (ValueError, OSError, MemoryError):
             continue
         depth = picture.depth_lr[0].cpu().numpy()
         size = working_size(depth, picture.rgb) if size is None else size
@@ -103,15 +93,14 @@ def _sample(pairs: Sequence[Pair]) -> list[Pair]:
 
 def _doubts(verdict: Verdict) -> list[Assumption]:
     """Return a warning if a pair can hardly belong together."""
-    figures = str(verdict).removeprefix(verdict.statement).strip(" ()")
     if verdict.turned:
-        detail = f"agreement of edges {figures}; turn one of the two files"
+        detail = f"agreement of edges {verdict.figures}; turn one of the two"
         return [Assumption(verdict.statement, detail, "photo-turned", verdict.margin)]
     if verdict.apart:
-        detail = f"{figures}; was one of the two cropped?"
+        detail = f"{verdict.figures}; was one of the two cropped?"
         return [Assumption(verdict.statement, detail, "edges-beside", verdict.pixels)]
     if verdict.other:
-        detail = f"agreement of edges {figures}; are they of the same moment?"
+        detail = f"agreement of edges {verdict.figures}; are the two of the same moment?"
         return [Assumption(verdict.statement, detail, "photo-other", verdict.as_given.significance)]
     return []
 
