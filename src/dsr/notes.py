@@ -117,6 +117,21 @@ LIMITS: dict[str, Limit] = {
     ),
     "baseline-short": Limit(0.001, "metres, below which it is", "phones have cameras 10 mm apart"),
     "baseline-long": Limit(5.0, "metres", "KITTI's car has 0.54 m, and rigs of 2 m are rare"),
+    "photo-order": Limit(
+        2,
+        "pairs, of at most 12 over all, whose depth map fits another one's photo better, by as much as `photo-turned`",
+        "a single pair does in 1 of 100 right lists",
+    ),
+    "photo-other": Limit(
+        2.0,
+        "standard deviations of chance, and less, of the agreement of edges, where edges exist",
+        "2 of 405 right pairs, and 96 % of pairs with the photo of something else",
+    ),
+    "photo-turned": Limit(
+        4.5,
+        "standard deviations of chance by which edges agree better with a mirrored or turned photo",
+        "3.8 at most in 405 right pairs",
+    ),
 }
 """By code: every warning that a command gives about its input, and what it refuses or asks for; see docs/checks.md."""
 

@@ -238,15 +238,25 @@ def test_shift_within_the_blur_of_edges_passes(sound):
 )
 def test_mirrored_photo_is_recognised(sound, axes, text):
     level, message, _ = only(replace(sound, rgb=sound.rgb.flip(axes)), "registration")
-    assert (level, message) == ("problem", f"the photo is {text} relative to the depth")
+    assert level == "problem"
+    figures = re.fullmatch(
+        rf"the depth map fits better with the photo {text} \((0\.\d\d) against (-?0\.\d\d)\)", message
+    )
+    assert figures is not None
+    assert float(figures[1]) > 2 * float(figures[2])
 
 
-def test_unrelated_photo_is_noted(sound):
-    other = room_scene(turn=-50.0)
-    other = replace(other, rgb=other.rgb.roll((100, 70), (1, 2)))
-    [finding] = [finding for finding in examine(replace(sound, rgb=other.rgb)) if finding.level != "ok"]
-    assert (finding.check, finding.level) == ("registration", "note")
-    assert finding.message.endswith("the depth edges at no shift within 8 px")
+def test_unrelated_photo_is_found(sound):
+    other = render_scene("cube_high_freq", SIZE).scene("simgeo", "cube").rgb
+    [finding] = [finding for finding in examine(replace(sound, rgb=other)) if finding.level != "ok"]
+    assert (finding.check, finding.level) == ("registration", "warning")
+    assert finding.message.startswith("the photo seems to show something else")
+
+
+def test_photo_far_beside_the_depth_is_found_with_its_place(sound):
+    level, message, _ = only(replace(sound, rgb=sound.rgb.roll((100, 70), (1, 2))), "registration")
+    assert level == "warning"
+    assert message.endswith("(27% of the width to the right, 39% of the height below)")
 
 
 def test_too_few_depth_edges_pass(sound):
@@ -256,12 +266,14 @@ def test_too_few_depth_edges_pass(sound):
     assert level_of(scene, "registration") == "note"
 
 
-def test_edges_beside_holes_are_not_counted(sound):
+def test_narrow_holes_are_no_edges(sound):
     depth = sound.depth.clone()
     depth[:, ::8] = torch.nan
     depth[:, :, ::8] = torch.nan
-    [finding] = check_registration(replace(sound, depth=depth))
-    assert finding.message.startswith("not enough depth edges")
+    assert level_of(replace(sound, depth=depth), "registration") == "ok"
+    assert level_of(replace(sound, depth=depth, rgb=sound.rgb.flip(2)), "registration") == "problem"
+    flat = torch.where(depth.isnan(), torch.nan, 2.0)
+    assert level_of(replace(sound, depth=flat), "registration") == "note"
 
 
 # holes

@@ -22,20 +22,12 @@ JUMP = 0.03
 """Relative difference of neighbouring depths that counts as an edge."""
 WORKING_SIZE = 800
 """Longer side in pixels at which edges are compared."""
-MAX_SHIFT = 16 / 512
-"""Largest shift as a fraction of the size."""
 SHIFT = LIMITS["edges-beside"].threshold
 """Shift between photo and depth that is reported, in working pixels."""
 APART = 4
 """Minimum distance in pixels of another shift from the best one."""
 _TILE = 32
 _LEAST_EDGES, _LEAST_TILES, _MOST_EDGES = 300, 12, 20_000
-_ABOVE_CHANCE, _ABOVE_OTHERS, _ABOVE_ZERO = 2.8, 2.0, 2.5
-"""Standard errors by which the best shift must exceed the median of all, the best other one, and no shift."""
-_EXPECTED = 0.7
-"""Factor of the second threshold for a shift below ``SHIFT``."""
-_CONTRAST = 1.3
-"""Minimum ratio of the gradients at the best shift and at the median one."""
 
 
 @dataclass(frozen=True)
@@ -72,23 +64,6 @@ class Edges:
         right = np.stack((factor * self.right[0] + middle, factor * (self.right[1] + 1) - 1))
         below = np.stack((factor * (self.below[0] + 1) - 1, factor * self.below[1] + middle))
         return Edges(right, below)
-
-
-@dataclass(frozen=True)
-class Match:
-    """The best shift between the edges of depth and photo.
-
-    Args:
-        right, down: pixels from the depth edges to the photo's edges.
-        found: whether this shift is significantly better than others.
-        needed: whether it is significantly better than no shift.
-
-    """
-
-    right: int
-    down: int
-    found: bool
-    needed: bool
 
 
 def find_edges(depth: Array, margin: int, gap: int | None = None) -> Edges:
@@ -138,39 +113,6 @@ def edge_gradients(photo: Array, smooth: float = 0.7) -> tuple[Array, Array]:
     right, below = (np.abs(np.diff(blurred, axis=axis)).max(axis=0) for axis in (2, 1))
     ratios = [np.minimum(gradient / (ndimage.uniform_filter(gradient, 31) + 0.01), 4) for gradient in (right, below)]
     return ratios[0], ratios[1]
-
-
-def best_match(edges: Edges, photo: Array, radius: int, strictness: float = 1.0) -> Match:
-    """Return the shift of the photo, up to ``radius`` pixels, with the largest gradients at the depth edges.
-
-    Args:
-        edges: depth edges at least ``radius`` pixels from the border.
-        photo: (3, H, W).
-        radius: largest shift in pixels.
-        strictness: factor of the thresholds.
-
-    """
-    gradients = edge_gradients(photo)
-    mean = mean_gradients(edges, gradients, radius)
-    row, column = np.unravel_index(mean.argmax(), mean.shape)
-    elsewhere = mean.copy()
-    elsewhere[max(row - APART, 0) : row + APART + 1, max(column - APART, 0) : column + APART + 1] = -1
-    other_row, other_column = np.unravel_index(elsewhere.argmax(), mean.shape)
-    down, right = int(row) - radius, int(column) - radius
-    tiles = edges.tiles()
-    best, other, none = (
-        sum_by_tile(edges, gradients, tiles, shift)
-        for shift in ((down, right), (int(other_row) - radius, int(other_column) - radius), (0, 0))
-    )
-    median = float(np.median(mean))
-    expected = _EXPECTED if max(abs(down), abs(right)) < SHIFT else 1.0
-    found = (
-        mean[row, column] > _CONTRAST * median
-        and standard_errors(best - median * np.bincount(tiles)) > strictness * _ABOVE_CHANCE
-        and standard_errors(best - other) > strictness * expected * _ABOVE_OTHERS
-        and max(abs(down), abs(right)) < radius
-    )
-    return Match(right, down, bool(found), bool(standard_errors(best - none) > _ABOVE_ZERO))
 
 
 def mean_gradients(edges: Edges, gradients: tuple[Array, Array], radius: int) -> Array:

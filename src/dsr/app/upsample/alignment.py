@@ -1,12 +1,31 @@
-"""Whether photo and depth edges lie apart, for ``dsr upsample``: a warning, or with ``--register`` the cure."""
+"""Whether photo and depth map belong together, for ``dsr upsample``: warnings, or with ``--register`` a cure."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+import numpy as np
+
+from dsr.geometry.agreement import (
+    Outlines,
+    Size,
+    Verdict,
+    depth_outlines,
+    find_misplaced,
+    judge,
+    photo_outlines,
+    reduce_photo,
+    significances,
+    working_size,
+)
 from dsr.geometry.registration import Displacement, find_displacement, undo
 from dsr.io.inputs import Picture
-from dsr.notes import Assumption
+from dsr.io.pairs import Pair
+from dsr.notes import LIMITS, Assumption
+
+_SAMPLE = 12
+"""Number of pairs that are compared with each other, in groups of two that follow each other."""
 
 
 def align(picture: Picture, *, register: bool) -> Picture:
@@ -19,16 +38,71 @@ def align(picture: Picture, *, register: bool) -> Picture:
     """
     if min(picture.depth_lr.shape[-2:]) < 2:
         return picture
+    verdict = judge(picture.depth_lr[0].cpu().numpy(), picture.rgb)
+    if verdict is not None and verdict.turned:  # no displacement is the cure
+        return replace(picture, assumptions=(*picture.assumptions, *_doubts(verdict)))
     found = find_displacement(picture.depth_lr, picture.rgb)
     certain = found is not None and found.certain
+    notes = [] if certain or verdict is None else _doubts(verdict)
     if register:
         depth_lr = undo(picture.depth_lr, found) if found is not None and certain else picture.depth_lr
-        return replace(picture, depth_lr=depth_lr, assumptions=(*picture.assumptions, _cure(found)))
-    if found is None or not found.visible:
-        return picture
-    detail = f"{_where(found)}; --register moves the depth map"
-    warning = Assumption("the photo's edges lie beside the depth edges", detail, "edges-beside", found.moved)
-    return replace(picture, assumptions=(*picture.assumptions, warning))
+        return replace(picture, depth_lr=depth_lr, assumptions=(*picture.assumptions, _cure(found), *notes))
+    if found is not None and found.visible:
+        detail = f"{_where(found)}; --register moves the depth map"
+        notes = [Assumption("the photo's edges lie beside the depth edges", detail, "edges-beside", found.moved)]
+    return replace(picture, assumptions=(*picture.assumptions, *notes))
+
+
+def check_order(pairs: Sequence[Pair], read: Callable[[Pair], Picture]) -> tuple[Assumption, ...]:
+    """Return a warning if depth maps fit other pairs' photos better than their own.
+
+    Args:
+        pairs: all pairs; a few spread evenly over them are read.
+        read: reads one; those that it cannot read are left out, as they are reported when their turn comes.
+
+    """
+    depths: list[Outlines] = []
+    photos: list[Outlines] = []
+    read_pairs: list[Pair] = []
+    size: Size | None = None
+    for pair in _sample(pairs):
+        try:
+            picture = read(pair)
+        except (ValueError, OSError, MemoryError):
+            continue
+        depth = picture.depth_lr[0].cpu().numpy()
+        size = working_size(depth, picture.rgb) if size is None else size
+        depths.append(depth_outlines(depth, size))
+        photos.append(photo_outlines(reduce_photo(picture.rgb, size), max(size) / max(depth.shape)))
+        read_pairs.append(pair)
+    found = find_misplaced(significances(depths, photos))
+    if len(found) < LIMITS["photo-order"].threshold:
+        return ()
+    text = f"of {len(depths)} pairs {len(found)} fit another photo better: are the lists in the same order?"
+    depth, photo = (read_pairs[number] for number in found[0])
+    return (Assumption(text, f"such as {depth.depth.name} with {photo.rgb.name}", "photo-order", float(len(found))),)
+
+
+def _sample(pairs: Sequence[Pair]) -> list[Pair]:
+    """Return pairs at equal distances, each with the next one, the same from either end."""
+    if len(pairs) <= _SAMPLE:
+        return list(pairs) if len(pairs) > 1 else []
+    first = np.linspace(0, len(pairs) - 2, _SAMPLE // 2).round().astype(int)
+    return [pairs[number] for number in np.unique((first, first + 1))]
+
+
+def _doubts(verdict: Verdict) -> list[Assumption]:
+    """Return a warning if a pair can hardly belong together."""
+    if verdict.turned:
+        detail = f"agreement of edges {verdict.figures}; turn one of the two"
+        return [Assumption(verdict.statement, detail, "photo-turned", verdict.margin)]
+    if verdict.apart:
+        detail = f"{verdict.figures}; was one of the two cropped?"
+        return [Assumption(verdict.statement, detail, "edges-beside", verdict.pixels)]
+    if verdict.other:
+        detail = f"agreement of edges {verdict.figures}; are the two of the same moment?"
+        return [Assumption(verdict.statement, detail, "photo-other", verdict.as_given.significance)]
+    return []
 
 
 def _cure(found: Displacement | None) -> Assumption:

@@ -49,14 +49,15 @@ class FrameWork:
     Args:
         request: the request.
         pairs: all of its pictures, also those of other shards, which determine units and neighbours.
+        warnings: of all pictures together.
 
     Raises:
         ValueError: the file of poses is damaged, or does not fit the pictures.
 
     """
 
-    def __init__(self, request: UpsampleRequest, pairs: Sequence[Pair]) -> None:
-        self._request, self._units = request, FolderUnits(pairs)
+    def __init__(self, request: UpsampleRequest, pairs: Sequence[Pair], warnings: Sequence[Assumption] = ()) -> None:
+        self._request, self._units, self._warnings = request, FolderUnits(pairs), tuple(warnings)
         self._claims = Claims(request.results.output)
         self._sequence = FrameSequence(pairs, self._read, request.frames.neighbours, request.frames.poses)
 
@@ -86,6 +87,7 @@ class FrameWork:
             raise ValueError(f"--{error}") from error
         picture = _with_sensor(sequence.fuse(pair, picture), identified)
         picture = align(picture, register=request.reading.register)
+        picture = replace(picture, assumptions=(*picture.assumptions, *self._warnings))
         size_lr = (picture.depth_lr.shape[-2], picture.depth_lr.shape[-1])
         size = (picture.camera.height, picture.camera.width)
         planned = self._upsampler.plan(size, size_lr)

@@ -8,6 +8,7 @@ from pathlib import Path
 from dsr.app.upsample.request import FrameChoice, UpsampleRequest
 from dsr.io.layouts import find_pairs_of_folder
 from dsr.io.pairs import Pair, PairingResult, add_confidence, find_pairs_of_lists, in_order
+from dsr.notes import Assumption
 from dsr.utils.guards import path_within
 
 
@@ -19,12 +20,14 @@ class Frames:
         found: the frames to work on, and what is said about them.
         whole: all frames that were found; poses, neighbours and units depend on them.
         single: whether there is a single picture, whose results are in the output folder itself.
+        warnings: what is wrong with all of them together.
 
     """
 
     found: PairingResult
     whole: tuple[Pair, ...]
     single: bool
+    warnings: tuple[Assumption, ...] = ()
 
     def target(self, output: Path, pair: Pair) -> Path:
         """Return the folder of a frame's results; OutsideError if a link leads it out of that of all."""

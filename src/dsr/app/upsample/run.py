@@ -6,17 +6,21 @@ import contextlib
 import json
 import time
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
 
+from dsr.app.upsample.alignment import check_order
 from dsr.app.upsample.frames import Frames, find_frames
 from dsr.app.upsample.reporting import Reporter, listed
 from dsr.app.upsample.request import UpsampleRequest, settings_of
 from dsr.app.upsample.scene import EXPORTS, write_scene
 from dsr.app.upsample.workers import work_through
 from dsr.evaluation.sharing import Claims
+from dsr.io.inputs import FolderUnits, read_picture
 from dsr.io.reading import Shard
+from dsr.notes import Assumption, expect_no_warning
 from dsr.utils.console import ConsoleProgress, show
 from dsr.utils.files import expect_targets, write_text
 
@@ -50,10 +54,11 @@ def _run(request: UpsampleRequest, frames: Frames, console: Console) -> list[str
     """Upsample frames, and return the problems."""
     wanted, shard = request.results, request.frames.shard
     started = time.perf_counter()
-    found, single = frames.found, frames.single
     of_all = [] if shard is not None else [*(name for part in wanted.of_all for name in part.files), EXPORTS]
     expect_targets(wanted.output, of_all if shard is None else [_summary_of(shard)])
     _show_found(console, request, frames)
+    frames = replace(frames, warnings=_check_order(request, frames))
+    found, single = frames.found, frames.single
     reporter, progress = Reporter(console), ConsoleProgress(console)
     problems: dict[str, list[str]] = {}
     outcomes: Counter[str] = Counter()
@@ -81,6 +86,15 @@ def _run(request: UpsampleRequest, frames: Frames, console: Console) -> list[str
         _write_summary(wanted.output, shard, outcomes, problems, time.perf_counter() - started)
     lines = [f"{listed(names)}: {message}" if len(found.pairs) > 1 else message for message, names in problems.items()]
     return lines + scene_problems
+
+
+def _check_order(request: UpsampleRequest, frames: Frames) -> tuple[Assumption, ...]:
+    """Return a warning if photos and depth maps are not in the same order, which is refused if that is asked for."""
+    units = FolderUnits(frames.whole)
+    warnings = check_order(frames.whole, lambda pair: read_picture(pair, request.reading, units))
+    if request.reading.strict:
+        expect_no_warning(str(frames.whole[0].depth.parent), [each.message for each in warnings])
+    return warnings
 
 
 def _write_summary(

@@ -1,0 +1,370 @@
+"""Whether a photo and a depth map show the same: how well their edges agree, against what chance would give.
+
+Both are reduced to a small grid. An edge is a strength and a direction: where the logarithm of depth jumps, or a hole
+begins, as sensors leave shadows along silhouettes; and where the photo changes more than around it. The agreement at a
+displacement is the sum of the products of both strengths, mostly weighted with the cosine of twice the angle between
+both directions, which a photo of something else has as often negative as positive. Fourier transforms give it for all
+cyclic displacements of the photo at once; slow changes over displacements are removed, as they come from where in the
+picture edges are frequent. The best of a few pixels around no displacement, in standard deviations of the same over
+all other displacements, is the significance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, ndimage
+from torch import Tensor
+
+from dsr.geometry.edges import JUMP, WORKING_SIZE, Array
+from dsr.notes import LIMITS
+
+Size = tuple[int, int]
+_Floats = NDArray[np.float32]
+
+_SIDES = (96, 256)
+"""Least and largest longer side of the grid in pixels; between them, that of the depth map."""
+_REACH = 4
+"""Largest distance in pixels of the grid at which edges count as agreeing: what sensors fatten edges by."""
+_SLOW = 16.0
+"""Standard deviation in pixels of what is removed from the agreement as a slow change."""
+_ANY_DIRECTION = 0.3
+"""Weight of the product of strengths whatever the directions."""
+_GAP = 0.03
+"""Width of the widest hole across which depth may jump, as a fraction of the longer side."""
+_HOLE = 0.5
+"""Strength of the border of a wider hole."""
+_AROUND, _FAINT, _STRONGEST = 31, 0.004, 3.0
+"""Width in pixels of what an edge of a photo is compared with, and least and largest of its values."""
+_LEAST_SIDE, _LEAST_LENGTH, _LEAST_COHERENCE, _MOST_SPREAD = 80, 300.0, 0.6, 0.045
+"""Edges exist, so that a photo of the same would surely agree, where the depth map has so many pixels on its longer
+side, its contours are so long in pixels of the grid and its edges so coherent, and the score by chance spreads less."""
+_CONTOUR = 4.0
+"""Extent in pixels over which the edges of a contour run alike."""
+_FITS, _ELSEWHERE = 3.0, 7.0
+"""Significance from which both surely agree, and from which they agree at a larger displacement."""
+_SMALLEST = 16
+"""Least side of the grid in pixels."""
+_WAYS: dict[str, tuple[bool, tuple[int, ...]]] = {
+    "mirrored left to right": (False, (1,)),
+    "mirrored top to bottom": (False, (0,)),
+    "turned by 180 degrees": (False, (0, 1)),
+    "turned by 90 degrees to the right": (True, (1,)),
+    "turned by 90 degrees to the left": (True, (0,)),
+}
+"""What is done to a photo to compare it: whether rows and columns are exchanged, and what is reversed then."""
+
+
+class Outlines(NamedTuple):
+    """Edges on a grid.
+
+    Args:
+        strength: (H, W), 0 for no edge.
+        direction: (H, W) complex, of the same size and with twice the angle of the gradient as its phase.
+
+    """
+
+    strength: _Floats
+    direction: NDArray[np.complex64]
+
+    def contours(self) -> tuple[float, float]:
+        """Return the length of coherent edges in pixels, and the mean coherence of all: 1 if neighbours run alike."""
+        alike = np.hypot(_blur(self.direction.real, _CONTOUR), _blur(self.direction.imag, _CONTOUR))
+        coherence = alike / (_blur(self.strength, _CONTOUR) + 1e-3)
+        length = float((self.strength * (2 * coherence - 1).clip(0, 1)).sum())
+        return length, float((self.strength * coherence).sum() / (self.strength.sum() + 1e-6))
+
+
+class Fields(NamedTuple):
+    """The Fourier transforms of outlines, to compare them with many.
+
+    Args:
+        strength, direction: of both parts, the first without its mean.
+        norm: of the strengths.
+
+    """
+
+    strength: NDArray[np.complex64]
+    direction: NDArray[np.complex64]
+    norm: float
+
+
+class Agreement(NamedTuple):
+    """How well the edges of depth and photo agree.
+
+    Args:
+        score: 0 by chance, up to 1 for equal edges.
+        significance: in standard deviations of what other displacements give.
+        spread: that standard deviation, as a score.
+        elsewhere: the largest significance at a displacement beyond the reach.
+        right, down: that displacement, from depth edges to the photo's, in fractions of the width and of the height.
+
+    """
+
+    score: float
+    significance: float
+    spread: float
+    elsewhere: float
+    right: float
+    down: float
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the edges of a photo and a depth map say about whether both belong together.
+
+    Args:
+        as_given: their agreement.
+        way: what would have to have been done to one of them for the best agreement of the other ways.
+        better: the agreement of that way.
+        contours: whether the depth map has enough of them.
+
+    """
+
+    as_given: Agreement
+    way: str
+    better: Agreement
+    contours: bool
+
+    @property
+    def margin(self) -> float:
+        """How much more significant the agreement of the best other way is."""
+        return self.better.significance - max(self.as_given.significance, 0.0)
+
+    @property
+    def turned(self) -> bool:
+        """Whether the other way fits clearly better."""
+        return self.margin >= LIMITS["photo-turned"].threshold
+
+    @property
+    def fits(self) -> bool:
+        """Whether both surely belong together."""
+        return self.as_given.significance >= _FITS and not self.turned
+
+    @property
+    def apart(self) -> bool:
+        """Whether both agree at a displacement that is larger than the edges of sensors are wide."""
+        return not self.turned and not self.fits and self.as_given.elsewhere >= _ELSEWHERE
+
+    @property
+    def telling(self) -> bool:
+        """Whether edges exist: whether a photo of the same would surely agree."""
+        return self.contours and self.as_given.spread < _MOST_SPREAD
+
+    @property
+    def other(self) -> bool:
+        """Whether the photo is probably of something else."""
+        by_chance = self.as_given.significance < LIMITS["photo-other"].threshold
+        return by_chance and self.telling and not self.turned and not self.apart
+
+    def __str__(self) -> str:
+        """Return what was found, for people."""
+        return f"{self.statement} ({self.figures})"
+
+    @property
+    def statement(self) -> str:
+        """What was found."""
+        if self.turned:
+            return f"the depth map fits better with the photo {self.way}"
+        if self.apart:
+            return "the photo's edges lie beside the depth edges"
+        if self.other:
+            return "the photo seems to show something else than the depth map"
+        return "the photo's edges match the depth edges" + ("" if self.fits else " no better than by chance")
+
+    @property
+    def figures(self) -> str:
+        """The figures of it."""
+        score = self.as_given.score
+        if self.turned:
+            return f"{self.better.score:.2f} against {score:.2f}"
+        if self.apart:
+            right, down = self.as_given.right, self.as_given.down
+            across = f"{abs(right):.0%} of the width to the {'right' if right > 0 else 'left'}"
+            return f"{across}, {abs(down):.0%} of the height {'below' if down > 0 else 'above'}"
+        return f"{score:.2f}, by chance up to {2 * self.as_given.spread:.2f}"
+
+    @property
+    def pixels(self) -> float:
+        """The displacement where they agree, in pixels of a photo with ``WORKING_SIZE`` on its longer side."""
+        return WORKING_SIZE * max(abs(self.as_given.right), abs(self.as_given.down))
+
+
+def judge(depth: Array, rgb: Tensor) -> Verdict | None:
+    """Compare the edges of a depth map with those of a photo, as they are, mirrored and turned.
+
+    Args:
+        depth: (h, w) in any unit of depth or of its reciprocal, NaN in holes.
+        rgb: (3, H, W) in [0, 1], of the same field of view.
+
+    Returns:
+        None if the depth map or the photo has no edge.
+
+    """
+    size = working_size(depth, rgb)
+    pixel = max(size) / max(depth.shape)
+    outlines, photo = depth_outlines(depth, size), reduce_photo(rgb, size)
+    seen = photo_outlines(photo, pixel)
+    if not outlines.strength.any() or not seen.strength.any():
+        return None
+    fields = transform(outlines)
+    across = photo_outlines(cv2.resize(photo.transpose(1, 0, 2), size[::-1]), pixel)
+    ways = {
+        name: compare(fields, transform(_reverse(across if exchanged else seen, axes)))
+        for name, (exchanged, axes) in _WAYS.items()
+    }
+    best = max(ways, key=lambda name: ways[name].significance)
+    length, coherence = outlines.contours()
+    enough = max(depth.shape) >= _LEAST_SIDE and length >= _LEAST_LENGTH and coherence >= _LEAST_COHERENCE
+    return Verdict(compare(fields, transform(seen)), best, ways[best], enough)
+
+
+def significances(depths: Sequence[Outlines], photos: Sequence[Outlines]) -> Array:
+    """Return the significance of the agreement of each depth map with each photo on the same grid, (N, M)."""
+    seen = [transform(photo) for photo in photos]
+    rows = [[compare(fields, photo).significance for photo in seen] for fields in map(transform, depths)]
+    return np.array(rows, np.float64).reshape(len(depths), len(photos))
+
+
+def find_misplaced(agreements: Array) -> list[tuple[int, int]]:
+    """Return the depth maps that fit another's photo clearly better than their own, each with that photo.
+
+    Args:
+        agreements: (N, N) significance of each depth map with each photo, of a pair on the diagonal.
+
+    """
+    gains = agreements - np.maximum(np.diag(agreements), 0.0)[:, None]
+    best = gains.argmax(axis=1) if gains.size else np.empty(0, int)
+    least = LIMITS["photo-turned"].threshold
+    return [(row, int(column)) for row, column in enumerate(best) if column != row and gains[row, column] >= least]
+
+
+def working_size(depth: Array, rgb: Tensor) -> Size:
+    """Return the size of the grid for a depth map (h, w) and a photo (3, H, W)."""
+    height, width = rgb.shape[-2:]
+    factor = min(max(*depth.shape, _SIDES[0]), _SIDES[1]) / max(height, width)
+    return max(round(height * factor), _SMALLEST), max(round(width * factor), _SMALLEST)
+
+
+def reduce_photo(rgb: Tensor, size: Size) -> _Floats:
+    """Return a photo (3, H, W) at another size, (h, w, 3)."""
+    channels = np.ascontiguousarray(rgb.permute(1, 2, 0).cpu().float().numpy())
+    larger = channels.shape[0] > size[0]
+    small = cv2.resize(channels, size[::-1], interpolation=cv2.INTER_AREA if larger else cv2.INTER_LINEAR)
+    return np.asarray(small, np.float32)
+
+
+def photo_outlines(photo: _Floats, pixel: float) -> Outlines:
+    """Return the edges of a photo, relative to the mean gradient around each.
+
+    Args:
+        photo: (H, W, 3) in [0, 1], at the size of the grid.
+        pixel: width of a pixel of the depth map on the grid.
+
+    """
+    right, down = _gradient(_blur(photo, max(pixel, 1.0) ** 0.5))
+    steepest = (right * right + down * down).argmax(axis=-1)[..., None]
+    right, down = (np.take_along_axis(each, steepest, axis=-1)[..., 0] for each in (right, down))
+    size = np.hypot(right, down)
+    around = cv2.blur(size, (_AROUND, _AROUND), borderType=cv2.BORDER_REFLECT)
+    return _outlines(np.minimum(size / (around + _FAINT), _STRONGEST), right, down)
+
+
+def depth_outlines(depth: Array, size: Size) -> Outlines:
+    """Return the edges of a depth map, from 0 to 1.
+
+    Args:
+        depth: (h, w) in any unit of depth or of its reciprocal, NaN in holes.
+        size: of the grid.
+
+    """
+    rows, columns = (((np.arange(n) + 0.5) * m / n).astype(np.intp) for n, m in zip(size, depth.shape, strict=True))
+    small = _bridge(depth[rows][:, columns].astype(np.float64), max(round(_GAP * max(size)), 1))
+    valid = np.isfinite(small)
+    if not valid.any():
+        return _outlines(np.zeros(size, np.float32), *np.zeros((2, *size), np.float32))
+    nearest = ndimage.distance_transform_edt(~valid, return_distances=False, return_indices=True)
+    logarithm = ndimage.median_filter(np.log(small[tuple(nearest)]).astype(np.float32), 3)
+    right, down = _gradient(_blur(logarithm, 0.7 * max(size[1] / depth.shape[1], 1)))
+    strength = ((2 * np.hypot(right, down) - JUMP / 2) / JUMP).clip(0, 1)
+    strength[ndimage.binary_dilation(~valid)] = 0
+    into, below = _gradient(_blur(valid.astype(np.float32), 1.0))
+    border = _HOLE * (2 * np.hypot(into, below) / 0.35).clip(0, 1)
+    beside = border > strength
+    right, down = np.where(beside, into, right), np.where(beside, below, down)
+    return _outlines(np.where(beside, border, strength), right, down)
+
+
+def transform(outlines: Outlines) -> Fields:
+    """Return the Fourier transforms of outlines."""
+    strength, direction = outlines
+    norm = float(np.linalg.norm(strength))
+    return Fields(fft.fft2(strength - strength.mean()), fft.fft2(direction), norm)
+
+
+def compare(depth: Fields, photo: Fields) -> Agreement:
+    """Return the agreement of the edges of a depth map with those of a photo on the same grid."""
+    height, width = depth.strength.shape
+    v, u = np.fft.fftfreq(height)[:, None], np.fft.fftfreq(width)[None]
+    spectrum = _ANY_DIRECTION * depth.strength.conj() * photo.strength + depth.direction.conj() * photo.direction
+    fast = 1 - np.exp(-2 * (np.pi * _SLOW) ** 2 * (v * v + u * u))
+    scores = fft.ifft2(spectrum * fast.astype(np.float32)).real / max(depth.norm * photo.norm, 1e-9)
+    best = ndimage.maximum_filter(scores, 2 * _REACH + 1, mode="wrap")
+    far = 2 * _REACH + 2
+    others = best[(np.abs(v * height) > far) | (np.abs(u * width) > far)]
+    mean, spread = float(others.mean()), max(float(others.std()), 1e-6)
+    row, column = np.unravel_index(scores.argmax(), scores.shape)
+    return Agreement(
+        float(best[0, 0]) / (1 + _ANY_DIRECTION),
+        (float(best[0, 0]) - mean) / spread,
+        spread / (1 + _ANY_DIRECTION),
+        (float(others.max()) - mean) / spread,
+        float(u[0, column]),
+        float(v[row, 0]),
+    )
+
+
+def _outlines(strength: _Floats, right: _Floats, down: _Floats) -> Outlines:
+    """Return outlines of strengths and gradients, without the border of the grid."""
+    inside = np.zeros(strength.shape, np.float32)
+    inside[2:-2, 2:-2] = strength[2:-2, 2:-2]
+    angle = 2 * np.arctan2(down, right)
+    return Outlines(inside, (inside * (np.cos(angle) + 1j * np.sin(angle))).astype(np.complex64))
+
+
+def _reverse(outlines: Outlines, axes: tuple[int, ...]) -> Outlines:
+    """Return the outlines of a photo that is reversed along axes."""
+    strength, direction = (np.flip(each, axes) for each in outlines)
+    return Outlines(strength, direction if len(axes) == 2 else direction.conj())
+
+
+def _bridge(depth: Array, gap: int) -> Array:
+    """Return a map whose narrow holes have the farther of the two ends: a sensor's shadow is behind the nearer one."""
+    for _ in range(2):  # along rows, then along columns
+        columns = np.arange(depth.shape[1])
+        valid = np.isfinite(depth)
+        before = np.maximum.accumulate(np.where(valid, columns, -1), axis=1)
+        after = np.minimum.accumulate(np.where(valid, columns, len(columns))[:, ::-1], axis=1)[:, ::-1]
+        narrow = ~valid & (before >= 0) & (after < len(columns)) & (after - before <= gap + 1)
+        ends = [np.take_along_axis(depth, each.clip(0, len(columns) - 1), axis=1) for each in (before, after)]
+        depth = np.where(narrow, np.fmax(*ends), depth).T
+    return depth
+
+
+def _blur(values: _Floats, deviation: float) -> _Floats:
+    """Return values blurred by a Gaussian."""
+    return np.asarray(cv2.GaussianBlur(np.ascontiguousarray(values), (0, 0), deviation))
+
+
+def _gradient(values: _Floats) -> tuple[_Floats, _Floats]:
+    """Return the change to the right and down per pixel, from three rows and columns."""
+    right, down = (
+        np.asarray(cv2.Sobel(values, cv2.CV_32F, *order, scale=1 / 8, borderType=cv2.BORDER_REPLICATE))
+        for order in ((1, 0), (0, 1))
+    )
+    return right, down

@@ -1,0 +1,209 @@
+"""Photos and depth maps that do not belong together are told by ``dsr upsample``, and right ones are not."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from dsr.cli import main
+from dsr.notes import LIMITS
+from dsr.synthetic.procedural.random_scene import render_random_scene
+
+SCENES = (1, 5, 6, 11)
+"""Numbers of rendered scenes with edges in depth and photo."""
+TURNS = {
+    "mirrored left to right": lambda photo: photo[:, ::-1],
+    "mirrored top to bottom": lambda photo: photo[::-1],
+    "turned by 180 degrees": lambda photo: photo[::-1, ::-1],
+    "turned by 90 degrees to the right": lambda photo: np.rot90(photo, 1),
+    "turned by 90 degrees to the left": lambda photo: np.rot90(photo, -1),
+}
+"""What is done to a photo, by what has to be done to it to undo that."""
+
+
+@pytest.fixture(scope="session")
+def rendered():
+    """Return photos (256, 256, 3) uint8 and depth maps (128, 128) in millimetres."""
+    found = []
+    for number in SCENES:
+        scene = render_random_scene(11, number, 256).scene("procedural", str(number))
+        rgb = (255 * scene.rgb).round().byte().permute(1, 2, 0).numpy()
+        depth = scene.depth[0].numpy()[1::2, 1::2]
+        found.append((rgb, (depth * 3000 / depth.max()).round().astype(np.uint16)))
+    return found
+
+
+def write(folder: Path, pairs):
+    """Write pairs of photo and depth map, and return the options that name them."""
+    folder.mkdir(exist_ok=True)
+    photos, depths = [], []
+    for number, (photo, depth) in enumerate(pairs):
+        photos.append(str(folder / f"{number:02}_photo.png"))
+        depths.append(str(folder / f"{number:02}_depth.png"))
+        cv2.imwrite(photos[-1], photo[..., ::-1])
+        cv2.imwrite(depths[-1], depth)
+    return ["--rgb", *photos, "--depth", *depths, "--depth-unit", "mm"]
+
+
+def upsample(options, out: Path, *more):
+    return main(["upsample", *options, "-o", str(out), "--method", "bicubic", "--only", "depth", *more])
+
+
+def told(out: Path):
+    """Return the warnings of a result by code."""
+    found = json.loads((out / "info.json").read_text())["warnings"]
+    assert all(each["threshold"] == LIMITS[each["code"]].threshold for each in found)
+    return {each["code"]: each for each in found}
+
+
+def expect_refused(options, out: Path, capsys):
+    """Expect that --strict refuses them with one line, and writes nothing."""
+    assert upsample(options, out, "--strict") == 2
+    assert not out.exists() or not list(out.rglob("info.json"))
+    error = capsys.readouterr().err
+    assert (error.count("\n"), error[:7]) == (1, "error: ")
+    return error
+
+
+@pytest.mark.parametrize("cure", TURNS)
+@pytest.mark.parametrize("number", [0, 3])
+def test_mirrored_and_turned_photos_are_told_with_their_cure(rendered, number, cure, tmp_path, capsys):
+    photo, depth = rendered[number]
+    options = write(tmp_path / "in", [(TURNS[cure](photo), depth)])
+    assert upsample(options, tmp_path / "out") == 0
+    said = capsys.readouterr().out
+    warning = told(tmp_path / "out")["photo-turned"]
+    assert f"warning: {warning['message']}" in said.replace("\n", " ").replace("  ", " ") or cure in said
+    assert cure in warning["message"]
+    assert warning["value"] >= warning["threshold"]
+    expect_refused(options, tmp_path / "strict", capsys)
+
+
+@pytest.mark.parametrize("number", range(len(SCENES)))
+def test_photo_of_another_scene_is_told(rendered, number, tmp_path, capsys):
+    photo, depth = rendered[number - 1][0], rendered[number][1]
+    options = write(tmp_path / "in", [(photo, depth)])
+    assert upsample(options, tmp_path / "out") == 0
+    [warning] = told(tmp_path / "out").values()
+    assert warning["code"] == "photo-other"
+    assert warning["value"] < warning["threshold"]
+    assert "something else" in capsys.readouterr().out
+    expect_refused(options, tmp_path / "strict", capsys)
+
+
+def test_photo_far_beside_its_depth_map_is_told(rendered, tmp_path, capsys):
+    photo, depth = rendered[3]
+    options = write(tmp_path / "in", [(photo[:, 32:], depth[:, :-16])])
+    assert upsample(options, tmp_path / "out") == 0
+    warning = told(tmp_path / "out")["edges-beside"]
+    assert warning["value"] == pytest.approx(800 * 32 / 224, rel=0.1)  # in pixels of a photo of 800
+    expect_refused(options, tmp_path / "strict", capsys)
+
+
+def test_lists_in_another_order_are_told_once_before_the_work(rendered, tmp_path, capsys):
+    photos, depths = zip(*rendered, strict=True)
+    options = write(tmp_path / "in", zip(photos[1:] + photos[:1], depths, strict=True))
+    assert upsample(options, tmp_path / "out") == 0
+    said = capsys.readouterr().out
+    assert said.count("are the lists in the same order?") == 1
+    for number in range(len(rendered)):
+        warning = told(tmp_path / "out" / f"{number:02}_photo")["photo-order"]
+        assert warning["value"] == 4
+        assert warning["message"].startswith("of 4 pairs 4 fit another photo better")
+    assert "same order" in expect_refused(options, tmp_path / "strict", capsys)
+    assert upsample(options, tmp_path / "block", "--shard", "2/2") == 0  # of which no frame fits another
+    assert told(tmp_path / "block" / "03_photo")["photo-order"]["value"] == 4
+
+
+def test_right_pairs_are_left_alone(rendered, tmp_path, capsys):
+    options = write(tmp_path / "in", rendered)
+    assert upsample(options, tmp_path / "out", "--strict") == 0
+    assert "warning" not in capsys.readouterr().out
+
+
+def test_near_duplicate_frames_are_left_alone_in_any_order(rendered, tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    photo, depth = rendered[0]
+    noisy = [
+        (
+            (photo + rng.normal(0, 3, photo.shape)).clip(0, 255).astype(np.uint8),
+            (depth * rng.normal(1, 0.002, depth.shape)).astype(np.uint16),
+        )
+        for _ in range(4)
+    ]
+    moved = [(each[:, shift : 240 + shift], d[:, shift // 2 : 120 + shift // 2])
+             for shift, (each, d) in zip((0, 2, 4, 6), noisy, strict=True)]  # fmt: skip
+    photos, depths = zip(*moved, strict=True)
+    for name, order in (("same", photos), ("next", photos[1:] + photos[:1])):
+        options = write(tmp_path / name, zip(order, depths, strict=True))
+        upsample(options, tmp_path / f"out_{name}")
+        assert "same order" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("case", ["flat wall", "noise on a wall", "photo without edges", "noise in the photo"])
+def test_nothing_is_said_where_nothing_can_be_known(rendered, case, tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    photo, depth = rendered[0]
+    if case == "flat wall":
+        depth = np.full_like(depth, 2000)
+    elif case == "noise on a wall":
+        depth = (2000 * rng.normal(1, 0.05, depth.shape)).astype(np.uint16)
+    elif case == "photo without edges":
+        photo = np.full_like(photo, 90)
+    else:
+        photo = rng.integers(0, 255, (64, 64, 3)).astype(np.uint8)
+        depth = depth[::4, ::4]
+    options = write(tmp_path / "in", [(photo, depth), (photo, depth)])
+    assert upsample(options, tmp_path / "out", "--strict") == 0
+    assert "warning" not in capsys.readouterr().out
+
+
+def test_damaged_frames_do_not_keep_the_others_from_being_compared(rendered, tmp_path, capsys):
+    photos, depths = zip(*rendered, strict=True)
+    options = write(tmp_path / "in", zip(photos[1:] + photos[:1], depths, strict=True))
+    (tmp_path / "in" / "00_depth.png").write_bytes(b"no picture")
+    assert upsample(options, tmp_path / "out") == 2
+    said = capsys.readouterr()
+    assert "of 3 pairs 2 fit another photo better" in said.out
+    assert "00_depth.png" in said.err
+
+
+REAL = {
+    "kinect-like": ("real/ddrnet/color_map/frame_000001.png", "real/ddrnet/depth_map/frame_000001.png"),
+    "stereo": ("real/depth_camera/1/rgb.png", "real/depth_camera/1/raw_depth.png"),
+    "time of flight": ("real/rgbdd_real/RGB/20200509112638_RGB.jpg",
+                       "real/rgbdd_real/DepthLR/20200509112638_LR_fill_depth.png"),
+    "phone": ("real/iphone_lidar/image.jpg", "real/iphone_lidar/arkit_depth.png"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_real_sensors_frames_are_judged(shared, name, tmp_path, capsys):
+    photo, depth = (cv2.imread(str(shared / file), cv2.IMREAD_UNCHANGED) for file in REAL[name])
+    photo = (
+        cv2.resize(photo, (4 * photo.shape[1] // 8, 4 * photo.shape[0] // 8))[..., ::-1]
+        if name == "phone"
+        else photo[..., ::-1]
+    )
+    assert upsample(write(tmp_path / "right", [(photo, depth)]), tmp_path / "out") == 0
+    assert not {"photo-turned", "photo-other", "photo-order"} & set(told(tmp_path / "out"))
+    for cure in ("mirrored left to right", "turned by 180 degrees"):
+        options = write(tmp_path / "wrong", [(TURNS[cure](photo), depth)])
+        assert upsample(options, tmp_path / cure) == 0
+        warnings = told(tmp_path / cure)
+        assert cure in warnings["photo-turned"]["message"]
+    expect_refused(options, tmp_path / "strict", capsys)
+
+
+def test_real_lists_in_another_order_are_told(shared, tmp_path, capsys):
+    names = sorted(path.name.split("_")[0] for path in (shared / "modern/RGBDD/RGB").iterdir())[:14]
+    photos = [str(shared / f"modern/RGBDD/RGB/{name}_RGB.jpg") for name in names]
+    depths = [str(shared / f"modern/RGBDD/Depth/{name}_HR_gt.png") for name in names]
+    for count, order in ((0, photos), (1, photos[::-1]), (1, photos[1:] + photos[:1])):
+        out = tmp_path / str(len(list(tmp_path.iterdir())))
+        assert upsample(["--rgb", *order, "--depth", *depths, "--depth-unit", "mm"], out, "--dry-run") == 0
+        assert capsys.readouterr().out.count("are the lists in the same order?") == count
