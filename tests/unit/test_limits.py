@@ -40,7 +40,15 @@ from dsr.methods.networks.weight_choice import packaged_weights
 from dsr.methods.networks.weight_files import load_network
 from dsr.sample import DepthSample
 from dsr.training.settings import PatchSettings
-from dsr.utils.guards import TooLargeError, bytes_of_archive, pixels_beside, pixels_of_file, read_limited, read_member
+from dsr.utils.guards import (
+    TooLargeError,
+    bytes_of_archive,
+    expect_stored,
+    pixels_beside,
+    pixels_of_file,
+    read_limited,
+    read_member,
+)
 from dsr.utils.picture_headers import picture_size
 from dsr.utils.torch_files import read_torch_file
 
@@ -290,3 +298,9 @@ def test_record_of_exports_that_names_files_elsewhere_is_refused_and_nothing_rem
 def test_what_no_memory_can_hold_is_refused_in_one_line_that_names_it(build, name, value):
     with pytest.raises(ValueError, match=rf"^{name}: expected [^\n]*\Z"):
         build(**{name: value})
+
+
+def test_device_without_an_end_is_no_torch_file(tmp_path):
+    (tmp_path / "last.ckpt").symlink_to("/dev/zero")
+    with pytest.raises(OSError, match=r"last\.ckpt"):
+        expect_stored(tmp_path / "last.ckpt")

@@ -131,9 +131,18 @@ def opened(path: Path) -> Iterator[BufferedReader]:
 
 
 def expect_stored(path: Path) -> None:
-    """Check that no member of a torch file is compressed or shared; torch writes none so."""
-    if not zipfile.is_zipfile(path):  # as of torch before version 1.6
+    """Check that no member of a torch file, if it is there, is compressed or shared; torch writes none so.
+
+    Raises:
+        OSError: it is no file, such as a device without an end.
+        ValueError: one is.
+
+    """
+    if not path.exists():
         return
+    with opened(path) as file:
+        if not zipfile.is_zipfile(file):  # as of torch before version 1.6
+            return
     with zipfile.ZipFile(path) as packed:
         members = packed.infolist()
     if any(member.compress_type != zipfile.ZIP_STORED for member in members):
