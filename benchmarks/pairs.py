@@ -40,7 +40,16 @@ from dsr.sample import AllHolesError, Scene
 from dsr.synthetic.procedural.random_scene import render_random_scene
 from dsr.synthetic.simgeo import SCENES, render_scene
 
-FOLDERS = "ddrnet", "icl_nuim", "middlebury2005", "middlebury2006", "middlebury2014", "rgbdd_real", "sunrgbd", "tartanair"
+FOLDERS = (
+    "ddrnet",
+    "icl_nuim",
+    "middlebury2005",
+    "middlebury2006",
+    "middlebury2014",
+    "rgbdd_real",
+    "sunrgbd",
+    "tartanair",
+)
 SENSORS = Everything(
     noises={"white": 1, "correlated": 1, "structured": 1, "flight": 1, "lidar": 1, "stereo": 1},
     holes={"none": 2, "blobs": 1, "shadows": 1, "steps": 1, "dark": 1, "pixels": 1},
@@ -121,7 +130,9 @@ def raw(shared: Path) -> Iterator[Right]:
     for folder in sorted((real / "sunrgbd").iterdir()):
         for path in folder.glob("depth/*.png"):
             yield right("sunrgbd raw", next((folder / "image").glob("*.jpg")), path, folder.name)
-    yield right("sunrgbd raw", *((real / "sunrgbd/open3d_sample" / f"SUN_{kind}") for kind in ("color.jpg", "depth.png")))
+    yield right(
+        "sunrgbd raw", *((real / "sunrgbd/open3d_sample" / f"SUN_{kind}") for kind in ("color.jpg", "depth.png"))
+    )
     yield right("books raw", shared / "scenes/books/rgb.png", shared / "scenes/books/disparity_lr4.npy", "books")
 
 
@@ -146,7 +157,8 @@ def real_pairs(shared: Path) -> Iterator[Right]:
         dataset = f"modern {folder.name}" if folder in modern else folder.name
         for _, load in find_scenes(folder):
             scene = load()
-            assert scene.depth is not None
+            if scene.depth is None:
+                continue
             yield Right(dataset, scene.name, scene.rgb.float(), scene.depth.float())
             for ratio, measured in scene.measured.items() if dataset.startswith("middlebury") else ():
                 yield Right(f"{dataset}, measured", f"{scene.name} x{ratio}", scene.rgb.float(), measured.float())
@@ -165,9 +177,8 @@ def rendered(job: tuple[int, Path | None]) -> list[Right]:
         made = render_random_scene(seed, index, SIDE)
         if index % 25 == 24:
             made = render_scene(SCENES[index // 25 % len(SCENES)], SIDE + 8 * (number % 2))
-        scene = made.scene("rendered", "")
-        assert scene.depth is not None
-        rgb, depth = scene.rgb, scene.depth
+        rgb = torch.from_numpy(made.rgb).permute(2, 0, 1).float() / 255
+        depth = torch.from_numpy(made.depth)[None]
         if path is not None:
             np.savez(path, rgb=(255 * rgb).round().byte().numpy(), depth=depth.float().numpy())
     side = rgb.shape[-1]
@@ -247,11 +258,9 @@ def lists(pairs: list[Right], *, developed: bool) -> str:
     """Return how many lists of pairs of different scenes get a warning, in the same and in another order."""
     rng = np.random.default_rng(1)
     size = (192, 256)
-    chosen = [
-        pair
-        for pair in pairs
-        if pair.developed == developed and max(pair.depth.shape) >= 80
-    ][:: 1 + len(pairs) // 400]
+    chosen = [pair for pair in pairs if pair.developed == developed and max(pair.depth.shape) >= 80][
+        :: 1 + len(pairs) // 400
+    ]
     tiny = np.stack([_tiny(pair.rgb) for pair in chosen])
     alike = tiny @ tiny.T >= _SAME
     depths = [depth_outlines(pair.depth[0].numpy(), size) for pair in chosen]
@@ -284,7 +293,8 @@ def table(pairs: list[Right], results: list[dict[str, Outcome]]) -> Iterator[str
         beside = alarms.count("edges-beside")
         telling = [result for _, result in group if result[""].telling]
         told = [
-            f"{sum(bool(result[kind].code) for result in telling)} of {len(telling)}" if telling else "" for kind in KINDS
+            f"{sum(bool(result[kind].code) for result in telling)} of {len(telling)}" if telling else ""
+            for kind in KINDS
         ]
         cry = f"{len(alarms) - beside}" + (f" (+ {beside} shifted)" if beside else "")
         yield f"| {name} | {len(group)} | {cry} | {len(telling)} | " + " | ".join(told) + " |"

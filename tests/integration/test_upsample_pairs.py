@@ -174,7 +174,7 @@ def test_damaged_frames_do_not_keep_the_others_from_being_compared(rendered, tmp
 
 REAL = {
     "kinect-like": ("real/ddrnet/color_map/frame_000001.png", "real/ddrnet/depth_map/frame_000001.png"),
-    "stereo": ("real/depth_camera/1/rgb.png", "real/depth_camera/1/raw_depth.png"),
+    "stereo": ("real/depth_camera/1/rgb.jpg", "real/depth_camera/1/raw_depth.png"),
     "time of flight": ("real/rgbdd_real/RGB/20200509112638_RGB.jpg",
                        "real/rgbdd_real/DepthLR/20200509112638_LR_fill_depth.png"),
     "phone": ("real/iphone_lidar/image.jpg", "real/iphone_lidar/arkit_depth.png"),
@@ -184,7 +184,11 @@ REAL = {
 @pytest.mark.parametrize("name", REAL)
 def test_real_sensors_frames_are_judged(shared, name, tmp_path, capsys):
     photo, depth = (cv2.imread(str(shared / file), cv2.IMREAD_UNCHANGED) for file in REAL[name])
-    photo = cv2.resize(photo, (4 * photo.shape[1] // 8, 4 * photo.shape[0] // 8))[..., ::-1] if name == "phone" else photo[..., ::-1]
+    photo = (
+        cv2.resize(photo, (4 * photo.shape[1] // 8, 4 * photo.shape[0] // 8))[..., ::-1]
+        if name == "phone"
+        else photo[..., ::-1]
+    )
     assert upsample(write(tmp_path / "right", [(photo, depth)]), tmp_path / "out") == 0
     assert not {"photo-turned", "photo-other", "photo-order"} & set(told(tmp_path / "out"))
     for cure in ("mirrored left to right", "turned by 180 degrees"):

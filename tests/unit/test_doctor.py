@@ -256,7 +256,9 @@ def test_shift_within_the_blur_of_edges_passes(sound):
 def test_mirrored_photo_is_recognised(sound, axes, text):
     level, message, _ = only(replace(sound, rgb=sound.rgb.flip(axes)), "registration")
     assert level == "problem"
-    figures = re.fullmatch(rf"the depth map fits better with the photo {text} \((0\.\d\d) against (-?0\.\d\d)\)", message)
+    figures = re.fullmatch(
+        rf"the depth map fits better with the photo {text} \((0\.\d\d) against (-?0\.\d\d)\)", message
+    )
     assert figures is not None
     assert float(figures[1]) > 2 * float(figures[2])
 

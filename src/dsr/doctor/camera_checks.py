@@ -18,8 +18,8 @@ import torch
 
 from dsr.doctor.depth_checks import find_rounding
 from dsr.doctor.finding import Array, Finding, metres
-from dsr.geometry.camera import Camera
 from dsr.geometry.agreement import judge
+from dsr.geometry.camera import Camera
 from dsr.geometry.edges import SHIFT, WORKING_SIZE
 from dsr.geometry.registration import Displacement, find_displacement
 from dsr.sample import Scene
