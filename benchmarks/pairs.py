@@ -157,7 +157,8 @@ def real_pairs(shared: Path) -> Iterator[Right]:
         dataset = f"modern {folder.name}" if folder in modern else folder.name
         for _, load in find_scenes(folder):
             scene = load()
-            assert scene.depth is not None
+            if scene.depth is None:
+                continue
             yield Right(dataset, scene.name, scene.rgb.float(), scene.depth.float())
             for ratio, measured in scene.measured.items() if dataset.startswith("middlebury") else ():
                 yield Right(f"{dataset}, measured", f"{scene.name} x{ratio}", scene.rgb.float(), measured.float())
@@ -176,9 +177,8 @@ def rendered(job: tuple[int, Path | None]) -> list[Right]:
         made = render_random_scene(seed, index, SIDE)
         if index % 25 == 24:
             made = render_scene(SCENES[index // 25 % len(SCENES)], SIDE + 8 * (number % 2))
-        scene = made.scene("rendered", "")
-        assert scene.depth is not None
-        rgb, depth = scene.rgb, scene.depth
+        rgb = torch.from_numpy(made.rgb).permute(2, 0, 1).float() / 255
+        depth = torch.from_numpy(made.depth)[None]
         if path is not None:
             np.savez(path, rgb=(255 * rgb).round().byte().numpy(), depth=depth.float().numpy())
     side = rgb.shape[-1]

@@ -174,7 +174,7 @@ def test_damaged_frames_do_not_keep_the_others_from_being_compared(rendered, tmp
 
 REAL = {
     "kinect-like": ("real/ddrnet/color_map/frame_000001.png", "real/ddrnet/depth_map/frame_000001.png"),
-    "stereo": ("real/depth_camera/1/rgb.png", "real/depth_camera/1/raw_depth.png"),
+    "stereo": ("real/depth_camera/1/rgb.jpg", "real/depth_camera/1/raw_depth.png"),
     "time of flight": ("real/rgbdd_real/RGB/20200509112638_RGB.jpg",
                        "real/rgbdd_real/DepthLR/20200509112638_LR_fill_depth.png"),
     "phone": ("real/iphone_lidar/image.jpg", "real/iphone_lidar/arkit_depth.png"),

@@ -213,7 +213,7 @@ def judge(depth: Array, rgb: Tensor) -> Verdict | None:
     if not outlines.strength.any() or not seen.strength.any():
         return None
     fields = transform(outlines)
-    across = photo_outlines(cv2.resize(photo.transpose(1, 0, 2), size[::-1]), pixel)
+    across = photo_outlines(np.asarray(cv2.resize(photo.transpose(1, 0, 2), size[::-1]), np.float32), pixel)
     ways = {
         name: compare(fields, transform(_reverse(across if exchanged else seen, axes)))
         for name, (exchanged, axes) in _WAYS.items()
@@ -339,7 +339,7 @@ def _outlines(strength: _Floats, right: _Floats, down: _Floats) -> Outlines:
 
 def _reverse(outlines: Outlines, axes: tuple[int, ...]) -> Outlines:
     """Return the outlines of a photo that is reversed along axes."""
-    strength, direction = (np.flip(each, axes) for each in outlines)
+    strength, direction = np.flip(outlines.strength, axes), np.flip(outlines.direction, axes)
     return Outlines(strength, direction if len(axes) == 2 else direction.conj())
 
 
@@ -363,8 +363,9 @@ def _blur(values: _Floats, deviation: float) -> _Floats:
 
 def _gradient(values: _Floats) -> tuple[_Floats, _Floats]:
     """Return the change to the right and down per pixel, from three rows and columns."""
-    right, down = (
-        np.asarray(cv2.Sobel(values, cv2.CV_32F, *order, scale=1 / 8, borderType=cv2.BORDER_REPLICATE))
-        for order in ((1, 0), (0, 1))
-    )
-    return right, down
+
+    def along(right: int, down: int) -> _Floats:
+        found = cv2.Sobel(values, cv2.CV_32F, right, down, scale=1 / 8, borderType=cv2.BORDER_REPLICATE)
+        return np.asarray(found, np.float32)
+
+    return along(1, 0), along(0, 1)

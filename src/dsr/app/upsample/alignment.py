@@ -79,8 +79,8 @@ def check_order(pairs: Sequence[Pair], read: Callable[[Pair], Picture]) -> tuple
     if len(found) < LIMITS["photo-order"].threshold:
         return ()
     text = f"of {len(depths)} pairs {len(found)} fit another photo better: are the lists in the same order?"
-    depth, photo = (read_pairs[number] for number in found[0])
-    return (Assumption(text, f"such as {depth.depth.name} with {photo.rgb.name}", "photo-order", float(len(found))),)
+    own, other = (read_pairs[number] for number in found[0])
+    return (Assumption(text, f"such as {own.depth.name} with {other.rgb.name}", "photo-order", float(len(found))),)
 
 
 def _sample(pairs: Sequence[Pair]) -> list[Pair]:
