@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 
@@ -167,8 +167,26 @@ class Assumption(NamedTuple):
 
     def record(self) -> dict[str, Any]:
         """Return a warning as values for JSON."""
-        threshold = LIMITS[self.code].threshold
-        return {"code": self.code, "message": self.message, "value": self.value, "threshold": threshold}
+        limit = LIMITS.get(self.code)
+        return {
+            "code": self.code,
+            "message": self.message,
+            "detail": self.detail,
+            "value": self.value,
+            "threshold": None if limit is None else limit.threshold,
+        }
+
+
+def read_warning(entry: Mapping[str, Any]) -> Assumption:
+    """Return the warning of a :meth:`Assumption.record`.
+
+    Raises:
+        KeyError, TypeError, ValueError: it is none.
+
+    """
+    message, detail, value = str(entry["message"]), str(entry["detail"]), entry["value"]
+    text = message.removesuffix(f" ({detail})")
+    return Assumption(text, detail, str(entry["code"]), None if value is None else float(value))
 
 
 def expect_no_warning(where: str, messages: Sequence[str]) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from dsr.notes import LIMITS, Assumption, expect_no_warning
+from dsr.notes import LIMITS, Assumption, expect_no_warning, read_warning
 
 CHECKS = Path(__file__).resolve().parents[2] / "docs" / "checks.md"
 
@@ -26,9 +26,15 @@ def test_warning_is_told_and_recorded_with_its_threshold() -> None:
     assert warning.record() == {
         "code": "edges-beside",
         "message": "edges apart (6 px)",
+        "detail": "6 px",
         "value": 6.0,
         "threshold": LIMITS["edges-beside"].threshold,
     }
+
+
+def test_recorded_warning_is_read_again() -> None:
+    for warning in (Assumption("a", "1 px", "edges-beside", 1.0), Assumption("a (b)", "", "poses", None)):
+        assert read_warning(warning.record()) == warning
 
 
 def test_strict_takes_a_warning_for_an_error() -> None:

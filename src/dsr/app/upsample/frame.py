@@ -77,7 +77,9 @@ class FrameWork:
         how, wanted = request.upsampling, request.results
         job.expect_agreement()
         if job.is_done():
-            job.expect_no_warning(job.earlier.warnings if job.earlier is not None else ())
+            earlier = job.earlier.warnings if job.earlier is not None else ()
+            job.expect_no_warning(earlier)
+            reporter.facts(earlier)
             reporter.say(f"{pair.name}: complete already, in {target}")
             return "complete already"
         picture = check_planes(self._read(pair), pair, request.reading)
@@ -91,7 +93,7 @@ class FrameWork:
         size_lr = (picture.depth_lr.shape[-2], picture.depth_lr.shape[-1])
         size = (picture.camera.height, picture.camera.width)
         planned = self._upsampler.plan(size, size_lr)
-        job.expect_no_warning([each.message for each in picture.assumptions if each.code])
+        job.expect_no_warning(picture.assumptions)
         reporter.facts(picture.assumptions)
         if wanted.dry_run:
             reporter.say(f"{pair.name}: {planned.text} -> {target}")
@@ -166,10 +168,10 @@ class _Job:
             what = "other settings: " + ", ".join(f"{name} {earlier.settings.get(name)}" for name in changed)
         raise ValueError(f"{self.target}: holds a result of {what}; take another -o, or --overwrite")
 
-    def expect_no_warning(self, messages: Sequence[str]) -> None:
-        """Raise ValueError if there is one, and that is not allowed."""
+    def expect_no_warning(self, notes: Sequence[Assumption]) -> None:
+        """Raise ValueError if one is a warning, and that is not allowed."""
         if self.request.reading.strict:
-            expect_no_warning(str(self.pair.depth), messages)
+            expect_no_warning(str(self.pair.depth), [each.message for each in notes if each.code])
 
     def is_done(self) -> bool:
         """Return whether all requested parts exist."""

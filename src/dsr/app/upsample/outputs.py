@@ -20,6 +20,7 @@ from dsr.io.depth_files import storable
 from dsr.io.encoding import Encoding
 from dsr.io.inputs import Picture
 from dsr.methods.base import Surface
+from dsr.notes import Assumption, read_warning
 from dsr.sample import FARTHEST, NEAREST
 from dsr.utils.arrays import open_array
 from dsr.utils.files import expect_targets, write_text
@@ -39,7 +40,7 @@ class PreviousRun:
         files: names of the files that it wrote.
         noise: that of its input, as JSON has it; None if it was not estimated.
         shapes: numbers of points and triangles of its cloud and mesh, and of its outliers.
-        warnings: that it gave, in words.
+        warnings: that it gave.
 
     """
 
@@ -49,7 +50,7 @@ class PreviousRun:
     files: tuple[str, ...]
     noise: Mapping[str, Any] | None = None
     shapes: Mapping[str, Any] = field(default_factory=dict)
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Assumption, ...] = ()
 
 
 def output_encoding(encoding: Encoding, chosen: str | None) -> Encoding:
@@ -94,7 +95,7 @@ def read_previous_run(folder: Path) -> PreviousRun | None:
             tuple(files),
             None if noise is None else dict(noise),
             {name: entries[name] for name in (*_SHAPES, "outliers") if name in entries},
-            tuple(str(each["message"]) for each in entries.get("warnings", ())),
+            tuple(read_warning(each) for each in entries.get("warnings", ())),
         )
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path}: expected a file of `dsr upsample`, got something else; take another -o") from error

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 from rich.console import Console
 
@@ -56,6 +56,7 @@ class Reporter:
     def __init__(self, console: Console) -> None:
         self._console = console
         self._counts: Counter[str] = Counter()
+        self._warned: dict[str, Assumption] = {}
 
     def say(self, line: str) -> None:
         """Show a line."""
@@ -67,6 +68,13 @@ class Reporter:
             if not self._counts[fact.statement]:
                 self.say(f"  {fact}")
             self._counts[fact.statement] += 1
+            if fact.code:
+                self._warned.setdefault(fact.statement, fact)
+
+    @property
+    def warnings(self) -> list[dict[str, Any]]:
+        """The warnings as values for JSON, each once, as of the first of so many ``pictures``."""
+        return [{**fact.record(), "pictures": self._counts[text]} for text, fact in self._warned.items()]
 
     def summary(self, pictures: int) -> None:
         """Show the notes that apply to some of the pictures only."""

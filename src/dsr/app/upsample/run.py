@@ -83,7 +83,14 @@ def _run(request: UpsampleRequest, frames: Frames, console: Console) -> list[str
         pictures = "1 picture" if len(found.pairs) == 1 else f"{len(found.pairs)} pictures"
         show(console, f"{pictures}: {', '.join(counts)} -> {wanted.output}")
     if shard is not None and not wanted.dry_run:
-        _write_summary(wanted.output, shard, outcomes, problems, time.perf_counter() - started)
+        summary = {
+            "shard": str(shard),
+            "outcomes": outcomes,
+            "failed": [{"problem": problem, "frames": names} for problem, names in problems.items()],
+            "warnings": reporter.warnings,
+            "seconds": round(time.perf_counter() - started, 3),
+        }
+        write_text(wanted.output / _summary_of(shard), json.dumps(summary, indent=2) + "\n")
     lines = [f"{listed(names)}: {message}" if len(found.pairs) > 1 else message for message, names in problems.items()]
     return lines + scene_problems
 
@@ -95,15 +102,6 @@ def _check_order(request: UpsampleRequest, frames: Frames) -> tuple[Assumption, 
     if request.reading.strict:
         expect_no_warning(str(frames.whole[0].depth.parent), [each.message for each in warnings])
     return warnings
-
-
-def _write_summary(
-    output: Path, shard: Shard, outcomes: Counter[str], problems: dict[str, list[str]], seconds: float
-) -> None:
-    """Write how many frames of a shard have which outcome, and those that failed, into the folder of the results."""
-    failed = [{"problem": problem, "frames": names} for problem, names in problems.items()]
-    summary = {"shard": str(shard), "outcomes": outcomes, "failed": failed, "seconds": round(seconds, 3)}
-    write_text(output / _summary_of(shard), json.dumps(summary, indent=2) + "\n")
 
 
 def _summary_of(shard: Shard) -> str:
