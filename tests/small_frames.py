@@ -18,7 +18,7 @@ def write_frames(folder, count=FRAMES, *, holes=2):
         (folder / kind).mkdir(parents=True)
     for number in range(count):
         Image.fromarray(rng.integers(0, 255, (24, 32, 3), dtype=np.uint8)).save(folder / "rgb" / f"{number:03}.png")
-        depth = 5 + 900 * (number > holes) + np.arange(8)[None] * 10 + np.zeros((6, 1))
+        depth = 500 + 900 * (number > holes) + np.arange(8)[None] * 10 + np.zeros((6, 1))
         Image.fromarray((depth * (number >= holes)).astype(np.uint16)).save(folder / "depth" / f"{number:03}.png")
     return folder
 

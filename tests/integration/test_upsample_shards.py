@@ -109,3 +109,15 @@ def test_bad_shards_are_refused_in_one_line(folder, tmp_path, capsys):
         (told,) = capsys.readouterr().err.strip().splitlines()
         assert told == f"error: --shard: expected K/N with K from 1 to N, such as 3/16, got {shard!r}"
     assert not (tmp_path / "out").exists()
+
+
+def test_warnings_of_a_shard_are_in_its_summary_and_told_again_once_it_is_complete(folder, tmp_path, capsys):
+    options = (*FAST[:-2], "--fov", "4", "-o", tmp_path / "out")
+    for _ in range(2):
+        assert upsample(folder, "--shard", "2/2", *options) == 0
+        assert capsys.readouterr().out.count("warning: ") == 1
+        [warning] = json.loads((tmp_path / "out" / "shard-2-of-2.json").read_text())["warnings"]
+        assert (warning["code"], warning["pictures"], warning["threshold"]) == ("view-narrow", 4, 5)
+        assert warning["value"] == pytest.approx(4, abs=0.1)
+    assert upsample(folder, "--shard", "2/2", "--strict", *options) == 2
+    assert "view" in capsys.readouterr().err
