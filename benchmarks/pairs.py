@@ -14,8 +14,10 @@ other rendered scene; the rest is reported separately. Lists of 12 pairs, in the
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
 
@@ -346,7 +348,7 @@ def main() -> None:
     parser.add_argument("--picture", type=Path)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    with ProcessPoolExecutor(arguments.workers) as pool:
+    with ProcessPoolExecutor(arguments.workers, get_context("spawn")) as pool:
         pairs = list(real_pairs(arguments.shared))
         if arguments.most is not None:
             pairs = pairs[:: max(len(pairs) // arguments.most, 1)]
@@ -354,7 +356,10 @@ def main() -> None:
         pairs += [pair for made in pool.map(rendered, jobs, chunksize=4) for pair in made]
         partners = others(pairs)
         jobs_of_pairs = ((pair, pairs[other].rgb) for pair, other in zip(pairs, partners, strict=True))
-        results = list(pool.map(outcomes, jobs_of_pairs, chunksize=1))
+        results = []
+        for number, result in enumerate(pool.map(outcomes, jobs_of_pairs), 1):
+            results.append(result)
+            print(f"\r{number} of {len(pairs)} pairs", end="", file=sys.stderr)
     print("\n".join(table(pairs, results)))
     for developed in (True, False):
         print(f"\n{LISTS} lists of {LENGTH} each, warnings,", "chosen on:" if developed else "others:",
