@@ -22,8 +22,9 @@ from mistakes.frames import Frame, rendered_frame, rendered_sequence, shared_fra
 from mistakes.kinds import KINDS, RIGHT, Case, Material
 
 ROOT = Path(__file__).resolve().parents[2]
-LISTED, RENDERED, SIZE, SEQUENCES, SEQUENCE_SIZE = 6, 24, 256, 8, 128
-"""Frames of a list, rendered frames to draw from and their size, sequences and theirs."""
+LISTED, RENDERED, SIZE, SEQUENCE_SIZE = 6, 24, 256, 128
+SEQUENCES = (0, 1, 2, 3, 4, 6, 7, 8, 9, 10, 11, 12)
+"""Frames of a list, rendered frames to draw from and their size; random scenes of sequences, none a landscape, and theirs."""
 ANSWERS = ("read rightly", "warned", "refused", "silent")
 
 
@@ -37,7 +38,7 @@ def draw(number: int, seed: int, sources: dict[str, Callable[[], Frame]], folder
     )]  # fmt: skip
     chosen = rng.choice(list(sources), min(LISTED, len(sources)), replace=False)
     factor = int(rng.choice((1, 4))) if kind != "the depth camera's" else 4
-    sequence = rendered_sequence(int(rng.integers(SEQUENCES)), SEQUENCE_SIZE) if "pose" in f"{group} {kind}" else ()
+    sequence = rendered_sequence(int(rng.choice(SEQUENCES)), SEQUENCE_SIZE) if "pose" in f"{group} {kind}" else ()
     count = len(chosen) if "lists" in kind else 2
     frames = [sources[name]().reduced(factor) for name in chosen[:count]] if not sequence else ()
     material = Material(frames, sequence, folder, rng)
