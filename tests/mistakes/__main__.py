@@ -24,7 +24,7 @@ from mistakes.kinds import KINDS, RIGHT, Case, Material
 ROOT = Path(__file__).resolve().parents[2]
 LISTED, RENDERED, SIZE, SEQUENCE_SIZE = 6, 24, 256, 128
 SEQUENCES = (0, 1, 2, 3, 4, 6, 7, 8, 9, 10, 11, 12)
-"""Frames of a list, rendered frames to draw from and their size; random scenes of sequences, none a landscape, and theirs."""
+"""Frames of a list, rendered frames to draw from and their size; scenes of sequences, no landscape, and theirs."""
 ANSWERS = ("read rightly", "warned", "refused", "silent")
 
 
