@@ -42,6 +42,11 @@ LIMITS: dict[str, Limit] = {
         "share of the pixels in which neighbouring frames disagree under the poses, and less without any motion",
         "right poses of 48 rendered sequences: at most 0.26, or less than half of that without motion",
     ),
+    "poses-far": Limit(
+        10.0,
+        "times the median depth, between all frames that are compared, though their depth maps are alike",
+        "frames that show something in common are less than 2 apart",
+    ),
     "poses-missing": Limit(
         1,
         "frames that have no pose in the file of `--poses`",

@@ -100,6 +100,15 @@ def test_wall_along_which_the_camera_moves_tells_nothing(name: str, change: Call
     assert found is None or found.code != "poses"
 
 
+def test_camera_that_hardly_moves_is_not_far_away_in_the_next_frame() -> None:
+    poses = walk(5, 0.03, 0.2)
+    assert checked(poses) is None
+    found = checked(poses, lambda pose: scaled(pose, 1000))
+    assert found is not None
+    assert (found.code, found.value) == ("poses-far", pytest.approx(30 / 2.5, rel=0.5))
+    assert checked(poses, lambda pose: scaled(pose, 1 / 1000)) is None
+
+
 def test_poses_that_no_reading_explains_disagree() -> None:
     poses = walk(8, 0.02, 0.5)
     rng = np.random.default_rng(3)

@@ -113,10 +113,12 @@ class Agreement(NamedTuple):
     """How far pairs of frames agree under each of :data:`READINGS` and, last, without motion, (pairs, readings + 1).
 
     ``overlap``: share of a frame's points that lie in the other's view. ``agreed``: share of these whose depths agree.
+    ``moved``: distance of the two places as given, over the median depth, (pairs,).
     """
 
     overlap: np.ndarray
     agreed: np.ndarray
+    moved: np.ndarray
 
 
 def sample(count: int) -> list[tuple[int, ...]]:
@@ -141,9 +143,11 @@ def check(count: int, load: Callable[[int], PosedMap | None]) -> Assumption | No
 
 def compare(groups: Iterable[Sequence[PosedMap]]) -> Agreement:
     """Return how far the frames of each group agree with each other."""
-    found = [_compare(*pair) for group in groups for pair in itertools.combinations(map(_prepared, group), 2)]
-    shares = np.reshape(found, (len(found), 2, len(READINGS) + 1))
-    return Agreement(shares[:, 0], shares[:, 1])
+    pairs = [pair for group in groups for pair in itertools.combinations(map(_prepared, group), 2)]
+    shares = np.reshape([_compare(*pair) for pair in pairs], (len(pairs), 2, len(READINGS) + 1))
+    with np.errstate(over="ignore", invalid="ignore"):
+        moved = [np.linalg.norm(one.poses[0, :3, 3] - other.poses[0, :3, 3]) / one.middle for one, other in pairs]
+    return Agreement(shares[:, 0], shares[:, 1], np.array(moved))
 
 
 class _Frame(NamedTuple):
@@ -153,6 +157,11 @@ class _Frame(NamedTuple):
     camera: Camera
     points: np.ndarray
     poses: np.ndarray
+
+    @property
+    def middle(self) -> float:
+        """The median depth of the points."""
+        return float(np.median(self.points[2])) if self.points.size else np.nan
 
 
 def _prepared(each: PosedMap) -> _Frame:
@@ -207,6 +216,15 @@ def find_fault(agreement: Agreement) -> Assumption | None:
             f"as given, neighbouring frames agree in {as_given:.0%} of the pixels, so read in {means[0][best]:.0%}",
             "poses",
             round(float(gain[best]), 3),
+        )
+    alike = agreement.moved.size > 0 and float(np.median(without)) >= _GOOD
+    if alike and agreement.moved.min() >= LIMITS["poses-far"].threshold:
+        nearest = float(agreement.moved.min())
+        return Assumption(
+            "under the poses the camera is far away in the next frame, which looks alike: are they in millimetres?",
+            f"{nearest:.3g} times as far as what it sees; {float(np.median(without)):.0%} of the pixels are unchanged",
+            "poses-far",
+            round(nearest, 1),
         )
     wrong, still = (float((seen[:, 0] * (1 - agreed[:, k])).sum() / max(seen[:, 0].sum(), 1)) for k in (0, -1))
     if wrong < LIMITS["poses-disagree"].threshold or wrong < _WORSE * still:
