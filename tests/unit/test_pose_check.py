@@ -101,12 +101,12 @@ def test_wall_along_which_the_camera_moves_tells_nothing(name: str, change: Call
 
 
 def test_camera_that_hardly_moves_is_not_far_away_in_the_next_frame() -> None:
-    poses = walk(5, 0.03, 0.2)
-    assert checked(poses) is None
-    found = checked(poses, lambda pose: scaled(pose, 1000))
+    poses = [np.eye(4) + 0.03 * number * np.eye(4, k=3) for number in range(12)]
+    assert checked(poses, depth=wall) is None
+    found = checked(poses, lambda pose: scaled(pose, 1000), wall)
     assert found is not None
-    assert (found.code, found.value) == ("poses-far", pytest.approx(30 / 2.5, rel=0.5))
-    assert checked(poses, lambda pose: scaled(pose, 1 / 1000)) is None
+    assert (found.code, found.value) == ("poses-far", pytest.approx(1000 * 0.03 / 2, rel=0.05))
+    assert checked(poses, lambda pose: scaled(pose, 1 / 1000), wall) is None
 
 
 def test_poses_that_no_reading_explains_disagree() -> None:
