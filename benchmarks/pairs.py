@@ -6,9 +6,10 @@ Right pairs are everything in ``DIR``: raw maps of sensors, maps with a truth at
 and 8 with noise and holes as sensors have them, and rendered scenes, at 1/1, 1/4 and 1/8, with the same. Wrong ones are
 made of them: the photo is mirrored, turned (by 90 degrees, and resized to what it was), taken from another scene, or
 photo and depth are cropped on opposite sides by 10 to 25 % of the size, so that they are shifted. Each goes through
-what ``dsr upsample`` does with a picture. Edges exist in a right pair if its :class:`dsr.geometry.agreement.Verdict`
-is ``telling``, which depends on its edges and not on how they agree. The thresholds were chosen on Middlebury and every
-other rendered scene; the rest is reported separately. Lists of 12 pairs, in the same and in another order, follow.
+what ``dsr upsample`` does with a picture. Edges exist in a right pair, and what remains of it after the crop, if its
+:class:`dsr.geometry.agreement.Verdict` is ``telling``, which depends on its edges and not on how they agree. The
+thresholds were chosen on Middlebury and every other rendered scene; the rest is reported separately. Lists of 12
+pairs, in the same and in another order, follow.
 """
 
 from __future__ import annotations
@@ -57,6 +58,7 @@ SENSORS = Everything(
     holes={"none": 2, "blobs": 1, "shadows": 1, "steps": 1, "dark": 1, "pixels": 1},
     folds=0,
     relief=0,
+    displaced=0,
 )
 TURNS: dict[str, Callable[[Tensor], Tensor]] = {
     "mirrored": lambda photo: photo.flip(2),
@@ -212,18 +214,22 @@ def outcomes(job: tuple[Right, Tensor]) -> dict[str, Outcome]:
     for kind, turn in TURNS.items():
         found[kind] = examine(turn(pair.rgb).contiguous(), pair.depth)
     found["other"] = examine(_resized(other, pair.rgb.shape[1:]), pair.depth)
-    found["shifted"] = examine(*_shifted(pair))
+    found["shifted"] = examine(*_cropped(pair, shifted=True))
+    as_right = judge(_cropped(pair, shifted=False)[1][0].numpy(), _cropped(pair, shifted=False)[0])
+    telling = as_right is not None and as_right.telling
+    found["shifted"] = found["shifted"]._replace(telling=found[""].telling and telling)
     return found
 
 
-def _shifted(pair: Right) -> tuple[Tensor, Tensor]:
-    """Return a pair cropped on opposite sides by 10 to 25 % of its width, or of its height."""
+def _cropped(pair: Right, *, shifted: bool) -> tuple[Tensor, Tensor]:
+    """Return a pair without 10 to 25 % of its width or height, cut off of photo and map on opposite sides or not."""
     rng = np.random.default_rng(len(pair.name) + pair.depth.shape[-1])
     axis, share = int(rng.integers(1, 3)), rng.uniform(0.1, 0.25)
     cut = round(share * pair.depth.shape[axis])
     left = round(cut / pair.depth.shape[axis] * pair.rgb.shape[axis])
     rgb = pair.rgb.narrow(axis, left, pair.rgb.shape[axis] - left)
-    return rgb.contiguous(), pair.depth.narrow(axis, 0, pair.depth.shape[axis] - cut).contiguous()
+    depth = pair.depth.narrow(axis, 0 if shifted else cut, pair.depth.shape[axis] - cut)
+    return rgb.contiguous(), depth.contiguous()
 
 
 def _resized(photo: Tensor, size: tuple[int, ...]) -> Tensor:

@@ -316,9 +316,10 @@ def compare(depth: Fields, photo: Fields) -> Agreement:
     scores = fft.ifft2(spectrum * fast.astype(np.float32)).real / max(depth.norm * photo.norm, 1e-9)
     best = ndimage.maximum_filter(scores, 2 * _REACH + 1, mode="wrap")
     far = 2 * _REACH + 2
-    others = best[(np.abs(v * height) > far) | (np.abs(u * width) > far)]
+    beyond = (np.abs(v * height) > far) | (np.abs(u * width) > far)
+    others = best[beyond]
     mean, spread = float(others.mean()), max(float(others.std()), 1e-6)
-    row, column = np.unravel_index(scores.argmax(), scores.shape)
+    row, column = np.unravel_index(np.where(beyond, scores, -np.inf).argmax(), scores.shape)
     return Agreement(
         float(best[0, 0]) / (1 + _ANY_DIRECTION),
         (float(best[0, 0]) - mean) / spread,
