@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from dsr.utils import interruption
 from dsr.utils.progress import megabytes
 
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
@@ -164,19 +165,20 @@ def replacing(path: Path) -> Iterator[Path]:
     The directory is created if it does not exist. After an error or an interruption the temporary file is deleted; one
     that a killed process has left is deleted the next time that a file is written in its directory.
     """
-    with space_for(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        remove_abandoned(path.parent)
-        handle, name = tempfile.mkstemp(prefix=f".{path.stem}-{owner()}-", suffix=path.suffix, dir=path.parent)
-    os.close(handle)
-    temporary = Path(name)
-    try:
+    with interruption.leaving():
         with space_for(path):
-            yield temporary
-            temporary.chmod(0o644)
-            temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            remove_abandoned(path.parent)
+            handle, name = tempfile.mkstemp(prefix=f".{path.stem}-{owner()}-", suffix=path.suffix, dir=path.parent)
+        os.close(handle)
+        temporary = Path(name)
+        try:
+            with space_for(path):
+                yield temporary
+                temporary.chmod(0o644)
+                temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager

@@ -103,6 +103,7 @@ class _State:
         silent: whether the process ends without a line, as another one of the same command says it.
         starting: whether a process is being started, see :func:`starting_workers`.
         late: whether a signal has come meanwhile.
+        terminated: whether this process is a worker that its parent ends by SIGTERM.
         pools: how many groups of worker processes are at work, see :func:`with_workers`.
         ending: held by the thread that ends the process.
 
@@ -118,6 +119,7 @@ class _State:
     silent = False
     starting = False
     late = False
+    terminated = False
     pools = 0
     ending = threading.Lock()
 
@@ -246,7 +248,7 @@ def requeued() -> Iterator[None]:
 
     def note(number: int, frame: FrameType | None) -> None:
         came.append(frame)
-        if in_import(frame):
+        if _in_import(frame):
             requeue(number, frame)
         elif _State.deferred is not None:
             _State.deferred.requested = True
@@ -297,8 +299,14 @@ def starting_workers(*further: signal.Signals) -> Iterator[None]:
             _handle(_State.number, None)
 
 
-def end_with(parent: int) -> None:
-    """End this process, a worker, once its parent is gone, and leave it to the parent to end it at Ctrl-C."""
+def end_with(parent: int, *, terminated: bool = False) -> None:
+    """End this process, a worker, once its parent is gone, and leave it to the parent to end it at Ctrl-C.
+
+    Args:
+        parent: number of the parent's process.
+        terminated: whether the parent ends it by SIGTERM: at once, but for :func:`leaving`.
+
+    """
 
     def watch() -> None:
         while os.getppid() == parent:
@@ -306,7 +314,24 @@ def end_with(parent: int) -> None:
         os._exit(exit_code())
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if terminated:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)  # a fork has its parent's handler
+        _State.terminated = True
     threading.Thread(target=watch, daemon=True).start()
+
+
+@contextlib.contextmanager
+def leaving() -> Iterator[None]:
+    """Within this context, in which a temporary file exists, SIGTERM ends a worker by an exception that removes it."""
+    main = threading.current_thread() is threading.main_thread()
+    if not (_State.terminated and main and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL):
+        yield
+        return
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def outlast_group() -> None:
@@ -383,7 +408,7 @@ def _handle(number: int, frame: FrameType | None) -> None:
     if _State.starting and not again:  # it came to another thread, which does not block it
         _State.late = True
         return
-    if again or not _State.working or in_import(frame):
+    if again or not _State.working or _in_import(frame):
         end(_message())
     if _State.deferred is None:
         raise KeyboardInterrupt
@@ -424,7 +449,7 @@ def _unraisable(problem: Any) -> None:
     sys.__unraisablehook__(problem)
 
 
-def in_import(frame: FrameType | None) -> bool:
+def _in_import(frame: FrameType | None) -> bool:
     """Return whether a module is being imported, which takes no exception."""
     while frame is not None:
         if frame.f_code.co_filename.startswith("<frozen importlib"):
