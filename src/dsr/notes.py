@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+CHECKS = 1
+"""Number of the present checks; another one where a warning is added, or a limit changes."""
+
 
 class Limit(NamedTuple):
     """From which value on a warning is given.

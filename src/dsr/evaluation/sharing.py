@@ -93,11 +93,15 @@ class Claims:
     def __enter__(self) -> Self:
         """Take part."""
         self._made = [each for each in (self._run, *self._run.parents) if not each.exists()]
-        with self._alone():
-            if self._settings is not None:
-                self._expect_agreement()
-            while not _create(self._member, self._settings):
-                self._member.unlink(missing_ok=True)  # of a process that had this number
+        try:
+            with self._alone():
+                if self._settings is not None:
+                    self._expect_agreement()
+                while not _create(self._member, self._settings):
+                    self._member.unlink(missing_ok=True)  # of a process that had this number
+        except BaseException:
+            self._remove_empty()
+            raise
         self._beating.enter_context(_fresh(self._member, lambda: _create(self._member, self._settings)))
         return self
 
@@ -113,6 +117,10 @@ class Claims:
             for path in self._files(""):
                 if not path.name.startswith(_digest(_MEMBERS)):
                     path.unlink(missing_ok=True)
+        self._remove_empty()
+
+    def _remove_empty(self) -> None:
+        """Delete the directories that were made, if they are empty."""
         with contextlib.suppress(OSError):  # there is something in it
             for each in (self._folder, *self._made):
                 each.rmdir()

@@ -26,6 +26,7 @@ class Remark(NamedTuple):
 
     Attributes:
         level: ``note`` of what is correct at times; the others mean that it is probably, and certainly, wrong.
+        kind: what it is, in words that are equal for all cameras.
         message: the numbers, with units.
         advice: how to correct them.
         code: of :data:`dsr.notes.LIMITS`; empty for a note.
@@ -34,6 +35,7 @@ class Remark(NamedTuple):
     """
 
     level: Literal["note", "warning", "problem"]
+    kind: str
     message: str
     advice: str
     code: str = ""
@@ -122,10 +124,26 @@ def _view(camera: Camera) -> list[Remark]:
         f"fx {camera.fx:.4g} px gives a horizontal field of view of {view:.3g} degrees; {low:g} to {high:g} are usual"
     )
     if _VIEW[0] <= view <= _VIEW[1]:
-        return [Remark("note", message, "correct for a telephoto or a very wide lens")]
+        return [
+            Remark(
+                "note",
+                "hardly any camera has this field of view",
+                message,
+                "correct for a telephoto or a very wide lens",
+            )
+        ]
     degrees = f"60 degrees correspond to {0.866 * camera.width:.0f} px"
     advice = f"give fx and fy in pixels of this image, not in mm; {degrees}"
-    return [Remark("warning", message, advice, "view-narrow" if view < _VIEW[0] else "view-wide", view)]
+    return [
+        Remark(
+            "warning",
+            "hardly any camera has this field of view",
+            message,
+            advice,
+            "view-narrow" if view < _VIEW[0] else "view-wide",
+            view,
+        )
+    ]
 
 
 def _other_picture(camera: Camera, size_lr: tuple[int, int] | None) -> list[Remark]:
@@ -138,7 +156,16 @@ def _other_picture(camera: Camera, size_lr: tuple[int, int] | None) -> list[Rema
     if order is not None:
         correction = ", ".join(f"{name} is the number given as {other}" for name, other in order)
         message = f"{text} fit the {camera.height} x {camera.width} image in another order"
-        return [Remark("problem", message, f"correct the order: {correction}", "other-picture", offset)]
+        return [
+            Remark(
+                "problem",
+                "the intrinsics are in another order",
+                message,
+                f"correct the order: {correction}",
+                "other-picture",
+                offset,
+            )
+        ]
     across, down = (2 * camera.cx + 1) / camera.width, (2 * camera.cy + 1) / camera.height
     if size_lr is not None and size_lr != (camera.height, camera.width):
         height, width = size_lr
@@ -147,13 +174,13 @@ def _other_picture(camera: Camera, size_lr: tuple[int, int] | None) -> list[Rema
                 f"{text} fit the depth map of {width} x {height}, not the photo of {camera.width} x {camera.height}"
             )
             advice = "give the intrinsics of the photo's camera, in pixels of the photo"
-            return [Remark("problem", message, advice, "other-picture", offset)]
+            return [Remark("problem", "the intrinsics fit another picture", message, advice, "other-picture", offset)]
     for scale in (*_SCALES, *(1 / scale for scale in _SCALES)):
         if _is_near(across, scale) and _is_near(down, scale):
             size = f"{camera.height * scale:.0f} x {camera.width * scale:.0f}"
             message = f"{text} fit an image {scale:.3g} times as large ({size})"
             advice = f"divide them by {scale:.3g}, unless the image was cropped"
-            return [Remark("problem", message, advice, "other-picture", offset)]
+            return [Remark("problem", "the intrinsics fit another picture", message, advice, "other-picture", offset)]
     return []
 
 
@@ -190,9 +217,9 @@ def _centre(camera: Camera) -> list[Remark]:
         f"{'below' if below > 0 else 'above'} it"
     )
     if offset <= _OFFSET:
-        return [Remark("note", message, "correct for a cropped image")]
+        return [Remark("note", "the principal point is far from the middle", message, "correct for a cropped image")]
     advice = "check cx and cy; if the image was cropped or resized, the camera must be adapted"
-    return [Remark("warning", message, advice, "off-centre", offset)]
+    return [Remark("warning", "the principal point is far from the middle", message, advice, "off-centre", offset)]
 
 
 def _shape(camera: Camera) -> list[Remark]:
@@ -202,4 +229,4 @@ def _shape(camera: Camera) -> list[Remark]:
         return []
     message = f"fx {camera.fx:.4g} and fy {camera.fy:.4g} px differ by {ratio - 1:.0%}"
     advice = "pixels are usually square: check both, and the aspect ratio of the image"
-    return [Remark("warning", message, advice, "focal-ratio", ratio)]
+    return [Remark("warning", "fx and fy differ", message, advice, "focal-ratio", ratio)]

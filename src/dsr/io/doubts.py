@@ -23,7 +23,9 @@ def doubt_camera(camera: Camera, whose: str, size_lr: tuple[int, int] | None = N
 
     """
     found = (each for each in judge_camera(camera, size_lr) if each.level != "note")
-    return [Assumption(f"{whose}: {each.message}", each.advice, each.code, each.value) for each in found]
+    return [
+        Assumption(f"{whose}: {each.kind}", f"{each.message}; {each.advice}", each.code, each.value) for each in found
+    ]
 
 
 def doubt_depth(depth_lr: Tensor, camera: Camera, range_type: RangeType) -> list[Assumption]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -31,6 +31,10 @@ Kind = tuple[Path, str, str]
 """Folder, suffix and type of value: maps alike in them have one unit."""
 
 _DISPARITY_WORDS = frozenset({"disparity", "disp"})
+
+
+_DOUBTED = 8
+"""About how many maps of a folder are asked whether what makes the first one doubtful holds for them, too."""
 
 
 class FolderUnits:
@@ -63,14 +67,21 @@ class FolderUnits:
         """
         kind = _kind(pair, stored)
         if (kind, may_fall) not in self._told:
-            path, first = self._first(kind, hole_value) or (pair.depth, stored)
-            holes = find_holes(first, hole_value)[0]
-            self._told[kind, may_fall] = tell(str(path), first, holes, camera, may_fall=may_fall)
+            path, first = next(self._maps(kind, hole_value), (pair.depth, stored))
+            told = tell(str(path), first, find_holes(first, hole_value)[0], camera, may_fall=may_fall)
+            if any(note.code for note in told.assumptions):
+                every = max(len(self._in_order) // _DOUBTED, 1)
+                for _, other in self._maps(kind, hole_value, every):
+                    notes = tell(str(path), other, find_holes(other, hole_value)[0], camera, may_fall=False).assumptions
+                    if not any(note.code for note in notes):  # the first one is an exception
+                        told = told._replace(assumptions=tuple(note for note in told.assumptions if not note.code))
+                        break
+            self._told[kind, may_fall] = told
         return self._told[kind, may_fall]
 
-    def _first(self, kind: Kind, hole_value: float | None) -> tuple[Path, np.ndarray] | None:
-        """Return the first map of a kind that has a known pixel."""
-        for pair in self._in_order:
+    def _maps(self, kind: Kind, hole_value: float | None, every: int = 1) -> Iterator[tuple[Path, np.ndarray]]:
+        """Yield those of every so many maps that are of a kind and have a known pixel."""
+        for pair in self._in_order[::every]:
             if (pair.depth.parent, pair.depth.suffix.lower()) != kind[:2]:
                 continue
             try:
@@ -78,8 +89,7 @@ class FolderUnits:
             except ValueError:  # a damaged map is reported when its own turn comes
                 continue
             if _kind(pair, stored) == kind and not find_holes(stored, hole_value)[0].all():
-                return pair.depth, stored
-        return None
+                yield pair.depth, stored
 
     @functools.cached_property
     def _in_order(self) -> list[Pair]:

@@ -41,7 +41,7 @@ _LONG = 2.0
 terminal."""
 
 
-_CREDENTIALS = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*://)\S*@")
+_CREDENTIALS = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*://)(?:[^\s/]*|\S*:\S*)@")
 """An address up to its host; a password may have a slash or an @ that should be written %2F and %40."""
 
 

@@ -105,6 +105,7 @@ class _State:
         silent: whether the process ends without a line, as another one of the same command says it.
         starting: whether a process is being started, see :func:`starting_workers`.
         late: whether a signal has come meanwhile.
+        terminated: whether this process is a worker that its parent ends by SIGTERM.
         pools: how many groups of worker processes are at work, see :func:`with_workers`.
         ending: held by the thread that ends the process.
 
@@ -120,6 +121,7 @@ class _State:
     silent = False
     starting = False
     late = False
+    terminated = False
     pools = 0
     ending = threading.Lock()
 
@@ -175,14 +177,18 @@ def install() -> None:
     _State.numbers = tuple(number for number in _SIGNALS if signal.getsignal(number) != signal.SIG_IGN)
     sys.unraisablehook = _unraisable
     sys.warnoptions.append("ignore:resource_tracker")  # it warns on stderr of what it cleans up after a sudden end
-    sys.warnoptions.append("ignore::RuntimeWarning")  # NumPy's, of numbers that are checked for what they became
-    warnings.simplefilter("ignore", RuntimeWarning)
+    ignore_warnings_of_numbers()
     os.register_at_fork(after_in_child=_forget)
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
     signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
     threading.Thread(target=_watch, args=(reading,), name="interruption", daemon=True).start()
     reinstall()
+
+
+def ignore_warnings_of_numbers() -> None:
+    """Leave out NumPy's warnings of numbers, which are checked for what they became, but for those in users' code."""
+    warnings.filterwarnings("ignore", category=RuntimeWarning, module=r"(dsr|numpy)\b")
 
 
 def silence() -> None:
@@ -251,7 +257,7 @@ def requeued() -> Iterator[None]:
 
     def note(number: int, frame: FrameType | None) -> None:
         came.append(frame)
-        if in_import(frame):
+        if _in_import(frame):
             requeue(number, frame)
         elif _State.deferred is not None:
             _State.deferred.requested = True
@@ -302,16 +308,40 @@ def starting_workers(*further: signal.Signals) -> Iterator[None]:
             _handle(_State.number, None)
 
 
-def end_with(parent: int) -> None:
-    """End this process, a worker, once its parent is gone, and leave it to the parent to end it at Ctrl-C."""
+def end_with(parent: int, *, terminated: bool = False) -> None:
+    """End this process, a worker, once its parent is gone, and leave it to the parent to end it at Ctrl-C.
+
+    Args:
+        parent: number of the parent's process.
+        terminated: whether the parent ends it by SIGTERM: at once, but for :func:`leaving`.
+
+    """
 
     def watch() -> None:
         while os.getppid() == parent:
             time.sleep(_BETWEEN_LOOKS)
         os._exit(exit_code())
 
+    ignore_warnings_of_numbers()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if terminated:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)  # a fork has its parent's handler
+        _State.terminated = True
     threading.Thread(target=watch, daemon=True).start()
+
+
+@contextlib.contextmanager
+def leaving() -> Iterator[None]:
+    """Within this context, in which a temporary file exists, SIGTERM ends a worker by an exception that removes it."""
+    main = threading.current_thread() is threading.main_thread()
+    if not (_State.terminated and main and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL):
+        yield
+        return
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def outlast_group() -> None:
@@ -388,7 +418,7 @@ def _handle(number: int, frame: FrameType | None) -> None:
     if _State.starting and not again:  # it came to another thread, which does not block it
         _State.late = True
         return
-    if again or not _State.working or in_import(frame):
+    if again or not _State.working or _in_import(frame):
         end(_message())
     if _State.deferred is None:
         raise KeyboardInterrupt
@@ -429,7 +459,7 @@ def _unraisable(problem: Any) -> None:
     sys.__unraisablehook__(problem)
 
 
-def in_import(frame: FrameType | None) -> bool:
+def _in_import(frame: FrameType | None) -> bool:
     """Return whether a module is being imported, which takes no exception."""
     while frame is not None:
         if frame.f_code.co_filename.startswith("<frozen importlib"):

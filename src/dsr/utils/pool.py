@@ -10,8 +10,6 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
-import signal
-import sys
 import time
 import warnings
 from collections import deque
@@ -19,7 +17,6 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from types import FrameType
 from typing import Any, Generic, Literal, Self, TypeVar, cast
 
 import cv2
@@ -229,8 +226,7 @@ class Pool(Generic[_T, _R]):
 
 def _serve(connection: Connection, parent: int, plan: tuple[Any, ...] | None) -> None:
     """Work on items in a worker, until it is terminated."""
-    signal.signal(signal.SIGTERM, _leave)  # a fork has its parent's handler
-    interruption.end_with(parent)
+    interruption.end_with(parent, terminated=True)
     surroundings.close_to_settings()
     with contextlib.suppress(EOFError, KeyboardInterrupt):  # the parent was interrupted, or has ended this process
         work, prepare, arguments, threads = connection.recv() if plan is None else plan
@@ -245,14 +241,6 @@ def _serve(connection: Connection, parent: int, plan: tuple[Any, ...] | None) ->
             except Exception as error:
                 answer = (False, error)
             connection.send(answer)
-
-
-def _leave(_: int, frame: FrameType | None) -> None:
-    """End this worker by an exception, so that its temporary files are removed."""
-    sys.unraisablehook = lambda _: None  # it may come where exceptions are dropped, with a word
-    if interruption.in_import(frame):
-        os._exit(128 + signal.SIGTERM)
-    raise KeyboardInterrupt
 
 
 @contextlib.contextmanager

@@ -33,7 +33,7 @@ from dsr.inference import AnyRatio, Plan, enlarged_by, find_sensor
 from dsr.io.inputs import FolderUnits, Picture, read_picture
 from dsr.io.pairs import Pair
 from dsr.methods.base import MapNoise, Outliers, Surface
-from dsr.notes import Assumption, expect_no_warning
+from dsr.notes import CHECKS, Assumption, expect_no_warning
 from dsr.utils.guards import readable
 from dsr.utils.progress import Progress
 from dsr.utils.versions import package_versions
@@ -169,13 +169,17 @@ class _Job:
         raise ValueError(f"{self.target}: holds a result of {what}; take another -o, or --overwrite")
 
     def expect_no_warning(self, notes: Sequence[Assumption]) -> None:
-        """Raise ValueError if one is a warning, and that is not allowed."""
+        """Raise ValueError if one is a warning, and that is not allowed; with one line for all frames of a folder."""
         if self.request.reading.strict:
-            expect_no_warning(str(self.pair.depth), [each.message for each in notes if each.code])
+            several = self.target != self.request.results.output
+            where = self.pair.depth.parent if several else self.pair.depth
+            expect_no_warning(str(where), [each.text if several else each.message for each in notes if each.code])
 
     def is_done(self) -> bool:
-        """Return whether all requested parts exist."""
+        """Return whether all requested parts exist, and were checked as now if no warning is allowed."""
         if not self.reusable or self.earlier is None:
+            return False
+        if self.request.reading.strict and self.earlier.checks != CHECKS:
             return False
         there = {name for name in self.earlier.files if (self.target / name).is_file()}
         return all(there & set(part.files) for part in self.request.results.of_frame)
@@ -259,6 +263,7 @@ def _write(job: _Job, picture: Picture, surface: Surface, planned: Plan, seconds
         **described(picture, encoding),
         **counts,
         "assumptions": [str(fact) for fact in (*picture.assumptions, *facts)],
+        "checks": CHECKS,
         "warnings": [fact.record() for fact in (*picture.assumptions, *facts) if fact.code],
         "seconds": {"upsampling": round(seconds, 3), "writing": round(time.perf_counter() - started, 3)},
         "versions": {"python": platform.python_version(), **package_versions(_PACKAGES)},

@@ -41,6 +41,7 @@ class PreviousRun:
         noise: that of its input, as JSON has it; None if it was not estimated.
         shapes: numbers of points and triangles of its cloud and mesh, and of its outliers.
         warnings: that it gave.
+        checks: number of the checks that gave them, see :data:`dsr.notes.CHECKS`.
 
     """
 
@@ -51,6 +52,7 @@ class PreviousRun:
     noise: Mapping[str, Any] | None = None
     shapes: Mapping[str, Any] = field(default_factory=dict)
     warnings: tuple[Assumption, ...] = ()
+    checks: object = None
 
 
 def output_encoding(encoding: Encoding, chosen: str | None) -> Encoding:
@@ -96,6 +98,7 @@ def read_previous_run(folder: Path) -> PreviousRun | None:
             None if noise is None else dict(noise),
             {name: entries[name] for name in (*_SHAPES, "outliers") if name in entries},
             tuple(read_warning(each) for each in entries.get("warnings", ())),
+            entries.get("checks"),
         )
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path}: expected a file of `dsr upsample`, got something else; take another -o") from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import time
 from collections import Counter
@@ -23,6 +24,8 @@ from dsr.io.reading import Shard
 from dsr.notes import Assumption, expect_no_warning
 from dsr.utils.console import ConsoleProgress, show
 from dsr.utils.files import expect_targets, write_text
+
+_READ_ONLY = (errno.EACCES, errno.EPERM, errno.EROFS)
 
 
 def run(request: UpsampleRequest, console: Console) -> list[str]:
@@ -45,8 +48,11 @@ def run(request: UpsampleRequest, console: Console) -> list[str]:
     with contextlib.ExitStack() as stack:
         if not request.results.dry_run:
             claims = Claims(request.results.output, json.dumps(settings_of(request), sort_keys=True))
-            with contextlib.suppress(PermissionError):  # all may be complete; what is written says so itself
+            try:
                 stack.enter_context(claims)
+            except OSError as error:
+                if error.errno not in _READ_ONLY:  # where all may be complete; what is written says so itself
+                    raise
         return _run(request, frames, console)
 
 
@@ -76,7 +82,7 @@ def _run(request: UpsampleRequest, frames: Frames, console: Console) -> list[str
             reporter.say(f"{part}: {len(targets)} frames -> {path}")
         scene_problems = scene.problems
     if not single:
-        reporter.summary(outcomes["done"] + outcomes["to do"])
+        reporter.summary(outcomes.total())
         counts = [f"{count} {outcome}" for outcome, count in outcomes.items()]
         counts += [f"{sum(map(len, problems.values()))} failed"] if problems else []
         counts = counts or ["nothing to do"]

@@ -216,9 +216,10 @@ class Server(NamedTuple):
         """
         scheme, _, rest = given.partition("://")
         before, at, place = rest.rpartition("@")
-        address = f"{scheme}://{place}".rstrip("/") if place else given
+        address = f"{scheme}://{place}".rstrip("/")
         if scheme.lower() not in ("http", "https") or not urlsplit(address).netloc:
-            raise ValueError(f"--mirror: expected an address that begins with http:// or https://, got {address!r}")
+            shown = address if place else given.rpartition("@")[2]
+            raise ValueError(f"--mirror: expected an address that begins with http:// or https://, got {shown!r}")
         if "/" in before:
             raise ValueError(f"--mirror: expected @ and / as %40 and %2F in an address with a password, got {place!r}")
         name, _, password = before.partition(":")
