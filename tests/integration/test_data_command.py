@@ -105,9 +105,9 @@ def test_dataset_is_fetched_listed_verified_and_not_fetched_twice(mirror, root):
     listed = run("data", "list")
     assert (listed.returncode, listed.stderr) == (0, "")
     rows = {line.split()[0]: line for line in listed.stdout.splitlines()}
-    assert rows["middlebury2003"].rstrip().endswith("complete")
-    assert rows["middlebury2006"].rstrip().endswith("absent")
-    assert rows["tofmark"].rstrip().endswith("manual")
+    assert rows["middlebury2003"].split()[-2:] == ["complete", "noted"]
+    assert rows["middlebury2006"].split()[-2:] == ["absent", "unknown"]
+    assert rows["tofmark"].split()[-2:] == ["manual", "unknown"]
 
     checked = run("data", "verify", "middlebury2003")
     assert (checked.returncode, checked.stdout, checked.stderr) == (0, "middlebury2003: complete, as recorded\n", "")
@@ -188,7 +188,12 @@ def test_file_found_nowhere_is_one_line_and_the_others_come(mirror, root, capsys
     assert (root / "set/1.png").exists()
     code, lines, _ = in_process(capsys, "data", "list", catalogue=mine(*items))
     assert code == 0
-    assert lines[-1].split() == ["mine", "Mine", "3.0", "MB", "partial", "1", "of", "2"]
+    assert lines[-1].split() == ["mine", "Mine", "3.0", "MB", "partial", "1", "of", "2"] + [
+        "1",
+        "unknown,",
+        "1",
+        "noted",
+    ]
 
 
 def test_damaged_file_is_found_and_fetched_again(mirror, root, capsys):

@@ -246,6 +246,6 @@ def test_a_depth_cameras_own_intrinsics_are_checked(tmp_path, capsys):
     (tmp_path / "move.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1")
     rig = ("--depth-camera", tmp_path / "depth.txt", "--extrinsics", tmp_path / "move.txt")
     codes, printed = warned(tmp_path, capsys, write(tmp_path, MILLIMETRES), *rig)
-    assert codes == ["off-centre"]
+    assert "off-centre" in codes
     assert "--depth-camera: " in printed
     assert "principal point (110, 47.5) px" in printed

@@ -163,13 +163,13 @@ def test_scale_is_split_into_prime_factors() -> None:
     assert [prime_factors(n) for n in (1, 2, 7, 8, 12)] == [[], [2], [7], [2, 2, 2], [2, 2, 3]]
 
 
-@pytest.mark.parametrize("name", ["step", "sharp_weight", "smoothness", "sigma_space", "mixed"])
+@pytest.mark.parametrize("name", ["radius", "step", "sharp_weight", "smoothness", "sigma_space", "mixed"])
 def test_parameter_that_is_not_positive_is_refused(name: str) -> None:
     with pytest.raises(ValueError, match=rf"^{name}: expected a positive number for edge-guided upsampling"):
         EdgeGuided(**{name: 0.0})
 
 
-@pytest.mark.parametrize("name", ["candidates", "iterations", "radius"])
+@pytest.mark.parametrize("name", ["candidates", "iterations"])
 def test_number_below_one_is_refused(name: str) -> None:
     with pytest.raises(ValueError, match=rf"^{name}: expected at least 1 for edge-guided upsampling, got 0"):
         EdgeGuided(**{name: 0})

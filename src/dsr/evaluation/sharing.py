@@ -116,7 +116,8 @@ class Claims:
                 return
             for path in self._files(""):
                 if not path.name.startswith(_digest(_MEMBERS)):
-                    path.unlink(missing_ok=True)
+                    with contextlib.suppress(OSError):  # a stranger's folder
+                        path.unlink()
         self._remove_empty()
 
     def _remove_empty(self) -> None:

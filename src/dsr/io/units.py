@@ -209,15 +209,15 @@ def _by_data_set(clues: _Clues) -> Told | None:
 
 
 def _by_steps(clues: _Clues) -> Told | None:
-    """Return the unit of millimetres that are stored more finely than they are; None if they are not."""
+    """Return the unit of millimetres that are stored more finely than they are; None where they are near then."""
     for step, name, unit, nearest in ((5, "1/5000", 1 / 5000, 0.5), (10, "0.0001", 1e-4, 0.3)):
         if not clues.multiples(step):
             continue
         fine, coarse = nearest <= clues.middle * unit, clues.middle * 1e-3 <= LIMITS["far-millimetres"].threshold
         why = f"values are multiples of {step}, as of millimetres stored in {name} m"
-        if fine and (step == 5 or not coarse):
+        if fine and not coarse:
             return Told(unit, (_whole(clues, f"{name} m", unit, why),))
-        if fine or not coarse or step == 5:
+        if not coarse or (fine and step == 5):  # sensors have steps of a centimetre, too
             clues.ask(why, ("mm", 1e-3), (name, unit))
     return None
 
