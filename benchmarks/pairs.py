@@ -292,7 +292,8 @@ def table(pairs: list[Right], results: list[dict[str, Outcome]]) -> Iterator[str
     yield "| data set | right pairs | false alarms | edges exist | " + " | ".join(KINDS) + " |"
     yield "| --- |" + " --- |" * (3 + len(KINDS))
     rows = list(zip(pairs, results, strict=True))
-    groups = {pair.dataset: [row for row in rows if row[0].dataset == pair.dataset] for pair in pairs}
+    names = dict.fromkeys(pair.dataset.partition(",")[0] for pair in pairs)
+    groups = {name: [row for row in rows if row[0].dataset.partition(",")[0] == name] for name in names}
     for title, developed in (("**all that thresholds were chosen on**", True), ("**all others**", False)):
         groups[title] = [row for row in rows if row[0].developed == developed]
     groups["**all**"] = rows

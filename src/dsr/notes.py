@@ -128,17 +128,17 @@ LIMITS: dict[str, Limit] = {
     "photo-order": Limit(
         2,
         "pairs, of at most 12 over all, whose depth map fits another one's photo better, by as much as `photo-turned`",
-        "a single pair does in 1 of 100 right lists",
+        "none of 400 right lists of 12, and all of 400 that are reversed or one off",
     ),
     "photo-other": Limit(
         2.0,
         "standard deviations of chance, and less, of the agreement of edges, where edges exist",
-        "2 of 405 right pairs, and 96 % of pairs with the photo of something else",
+        "1 % of right pairs, and 95 % of those with another photo, are below it",
     ),
     "photo-turned": Limit(
         4.5,
         "standard deviations of chance by which edges agree better with a mirrored or turned photo",
-        "3.8 at most in 405 right pairs",
+        "none of 823 right pairs, and 92 % of those with a mirrored or turned photo, reach it",
     ),
 }
 """By code: every warning that a command gives about its input, and what it refuses or asks for; see docs/checks.md."""

@@ -188,7 +188,7 @@ def test_file_found_nowhere_is_one_line_and_the_others_come(mirror, root, capsys
     assert (root / "set/1.png").exists()
     code, lines, _ = in_process(capsys, "data", "list", catalogue=mine(*items))
     assert code == 0
-    assert lines[-1].split() == "mine Mine 3.0 MB partial 1 of 2 1 unknown, 1 noted".split()
+    assert lines[-1].split() == ["mine", "Mine", "3.0", "MB", "partial", "1", "of", "2", "1", "unknown,", "1", "noted"]
 
 
 def test_damaged_file_is_found_and_fetched_again(mirror, root, capsys):
