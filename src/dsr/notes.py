@@ -68,7 +68,7 @@ LIMITS: dict[str, Limit] = {
     "falls-with-distance": Limit(
         2.0,
         "windows in which the values are linear, over those in which their reciprocals are",
-        "none of 133 right maps reaches it; of their reciprocals 75 do",
+        "none of 133 right maps reaches it; of their reciprocals 69 do",
     ),
     "depth-near": Limit(0.05, "metres, of the 99th percentile, below which it is", "no depth camera measures nearer"),
     "depth-far": Limit(

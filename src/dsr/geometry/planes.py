@@ -47,8 +47,6 @@ _LEAST_BENT, _MAJORITY_BENT = 6, LIMITS["along-the-ray"].threshold
 _LEAST_INVERSE, _LEAD_INVERSE = 10, LIMITS["falls-with-distance"].threshold
 """Minimum number of windows in which values, and not their reciprocals, are linear, and their minimum ratio to those in
 which the reciprocals are."""
-_LEAST_FEW, _LEAD_FEW, _BELOW = 4, 1.5, 1.15
-"""The same of a map whose values are larger below than above, and the minimum ratio of these."""
 _LINEAR = 2.0
 """Ratio of the deviations of values and of their reciprocals from a plane above which a window votes."""
 _CURVED = 0.003
@@ -95,14 +93,10 @@ class RangeVotes(NamedTuple):
 
 
 class InverseVotes(NamedTuple):
-    """In how many windows a map's values are linear and their reciprocals are not, and the other way around.
-
-    ``below``: the median of the lowest third over that of the highest; the floor, which is near, is mostly below.
-    """
+    """In how many windows a map's values are linear and their reciprocals are not, and the other way around."""
 
     falling: int
     rising: int
-    below: float = 1.0
 
     @property
     def ratio(self) -> float:
@@ -113,8 +107,6 @@ class InverseVotes(NamedTuple):
     def verdict(self) -> Literal["falls", "rises"] | None:
         """Whether values fall or rise with distance; None if there are too few planes."""
         if self.falling >= _LEAST_INVERSE and self.ratio >= _LEAD_INVERSE:
-            return "falls"
-        if self.falling >= _LEAST_FEW and self.falling >= _LEAD_FEW * self.rising and self.below > _BELOW:
             return "falls"
         if self.rising >= _LEAST_INVERSE and self.rising >= _LEAD_INVERSE * self.falling:
             return "rises"
@@ -151,10 +143,7 @@ def inverse_votes(values: Array) -> InverseVotes:
     curved = np.maximum(of_reciprocals, of_values) > _CURVED
     falling = curved & inliers[1] & (_LINEAR * of_values < of_reciprocals)
     rising = curved & inliers[0] & (_LINEAR * of_reciprocals < of_values)
-    third = -(-values.shape[0] // 3)
-    below, above = (float(np.median(part[np.isfinite(part)])) if np.isfinite(part).any() else math.nan
-                    for part in (values[-third:], values[:third]))  # fmt: skip
-    return InverseVotes(int(falling.sum()), int(rising.sum()), below / above)
+    return InverseVotes(int(falling.sum()), int(rising.sum()))
 
 
 def thinned(values: Array, camera: Camera) -> tuple[Array, Camera]:
