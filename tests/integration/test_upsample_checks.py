@@ -249,3 +249,49 @@ def test_a_depth_cameras_own_intrinsics_are_checked(tmp_path, capsys):
     assert "off-centre" in codes
     assert "--depth-camera: " in printed
     assert "principal point (110, 47.5) px" in printed
+
+
+def folder_of(place, maps, cameras=()):
+    """Write a folder of pairs, each with a camera of its own if there are some, and return it."""
+    for number, values in enumerate(maps):
+        frame = place / f"{number:03}" if cameras else place
+        for kind in ("rgb", "depth"):
+            (frame / kind).mkdir(parents=True, exist_ok=True)
+        Image.fromarray(np.full((192, 256, 3), 99, np.uint8)).save(frame / "rgb" / f"{number:03}.png")
+        cv2.imwrite(str(frame / "depth" / f"{number:03}.png"), values)
+        if cameras:
+            camera = {
+                "width": 256,
+                "height": 192,
+                "cx": 127.5,
+                "cy": 95.5,
+                "fx": cameras[number],
+                "fy": cameras[number],
+            }
+            (frame / "camera.json").write_text(json.dumps(camera))
+    return place
+
+
+def test_near_frame_of_a_folder_makes_no_other_doubtful(tmp_path):
+    near = (MILLIMETRES * 0.4 / DEPTH.max()).astype(np.uint16)
+    mixed = folder_of(tmp_path / "mixed", [near, MILLIMETRES, MILLIMETRES])
+    assert upsample(mixed, "--strict", "-o", tmp_path / "out") == 0
+    assert upsample(folder_of(tmp_path / "near", [near, near]), "--strict", "-o", tmp_path / "out_near") == 2
+
+
+def test_warning_of_cameras_of_frames_is_one_line(tmp_path, capsys):
+    folders = folder_of(tmp_path / "in", [MILLIMETRES] * 3, [4000.0, 4001.0, 4002.0])
+    assert upsample(*sorted(folders.iterdir()), "-o", tmp_path / "out") == 0
+    assert capsys.readouterr().out.count("warning: ") == 1
+    assert upsample(*sorted(folders.iterdir()), "-o", tmp_path / "strict", "--strict") == 2
+
+
+def test_result_of_other_checks_is_checked_again_where_no_warning_is_allowed(tmp_path, capsys):
+    files = (*write(tmp_path, MILLIMETRES), "--fov", "4", "-o", tmp_path / "out")
+    assert upsample(*files) == 0
+    path = tmp_path / "out" / "info.json"
+    info = json.loads(path.read_text())
+    path.write_text(json.dumps({**info, "warnings": [], "checks": None}))
+    assert upsample(*files) == 0
+    assert "complete already" in capsys.readouterr().out
+    assert "field of view" in refused(capsys, upsample(*files, "--strict"))

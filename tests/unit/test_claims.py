@@ -272,7 +272,8 @@ def test_member_that_was_taken_for_lost_comes_back(tmp_path, start):
     deadline = time.monotonic() + 30
     while not member.exists() and time.monotonic() < deadline:
         time.sleep(0.01)
-    time.sleep(0.1)  # until it is written
+    while not member.stat().st_size and time.monotonic() < deadline:  # until it is written
+        time.sleep(0.01)
     assert not start(settings="b").takes_part
 
 

@@ -22,7 +22,7 @@ import pytest
 from dsr.cli import main
 from dsr.data.download import fetching
 from dsr.data.download.collections import CATALOGUE, Collection, Item
-from dsr.data.download.fetching import Checksums, get, lock_directory, state, verify
+from dsr.data.download.fetching import Checksums, Server, get, lock_directory, state, verify
 from dsr.utils.console import print_error
 from dsr.utils.progress import Progress
 
@@ -865,3 +865,10 @@ def test_pinned_checksum_is_said_to_be_dsr_s_and_ends_with_2(server, tmp_path, m
         assert f"expected sha256 {sha256(OTHER)}, which dsr knows, got {sha256(PNG)}" in line
         assert "--accept-changed" not in line
     assert left_in(tmp_path) == []
+
+
+@pytest.mark.parametrize("given", ["me:s3cret@mirror.example/x", "https:/me:s3cret@mirror.example", "me:s3cret@"])
+def test_password_of_a_mistyped_mirror_is_not_shown(given):
+    with pytest.raises(ValueError, match="--mirror: expected an address") as error:
+        Server.of(given)
+    assert "s3cret" not in str(error.value)
