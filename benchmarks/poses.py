@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from dsr.degradation.noise import Kinect
 from dsr.geometry.camera import Camera
-from dsr.geometry.pose_check import READINGS, compare, find_fault, sample
+from dsr.geometry.pose_check import READINGS, compare, find_fault, prepare, sample
 from dsr.geometry.rigid_motion import Matrix, as_rigid, invert
 from dsr.geometry.tsdf import PosedMap
 from dsr.synthetic.procedural.random_scene import make_camera, random_scene
@@ -189,7 +189,7 @@ def outcome(recording: Recording, groups: Sequence[Sequence[int]], maps: dict[in
     change = WRONG[wrong]
     found = find_fault(
         compare(
-            [PosedMap(maps[number], recording.camera, change(recording.poses[number])) for number in group]
+            [prepare(PosedMap(maps[number], recording.camera, change(recording.poses[number]))) for number in group]
             for group in groups
         )
     )

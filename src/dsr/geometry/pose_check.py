@@ -137,20 +137,20 @@ def check(count: int, load: Callable[[int], PosedMap | None]) -> Assumption | No
         load: returns the frame of a number; None for one that cannot be read, or has no pose.
 
     """
-    groups = ([each for number in group if (each := load(number)) is not None] for group in sample(count))
+    groups = ([prepare(each) for number in group if (each := load(number)) is not None] for group in sample(count))
     return find_fault(compare(groups))
 
 
-def compare(groups: Iterable[Sequence[PosedMap]]) -> Agreement:
-    """Return how far the frames of each group agree with each other."""
-    pairs = [pair for group in groups for pair in itertools.combinations(map(_prepared, group), 2)]
+def compare(groups: Iterable[Sequence[Reduced]]) -> Agreement:
+    """Return how far the frames of each group agree with each other; see :func:`prepare`."""
+    pairs = [pair for group in groups for pair in itertools.combinations(group, 2)]
     shares = np.reshape([_compare(*pair) for pair in pairs], (len(pairs), 2, len(READINGS) + 1))
     with np.errstate(over="ignore", invalid="ignore"):
         moved = [np.linalg.norm(one.poses[0, :3, 3] - other.poses[0, :3, 3]) / one.middle for one, other in pairs]
     return Agreement(shares[:, 0], shares[:, 1], np.array(moved))
 
 
-class _Frame(NamedTuple):
+class Reduced(NamedTuple):
     """A reduced map, its camera, some of its points, (3, N), and its poses by all readings, (readings + 1, 4, 4)."""
 
     depth: np.ndarray
@@ -164,7 +164,7 @@ class _Frame(NamedTuple):
         return float(np.median(self.points[2])) if self.points.size else np.nan
 
 
-def _prepared(each: PosedMap) -> _Frame:
+def prepare(each: PosedMap) -> Reduced:
     """Return a frame to compare."""
     step = min(-(-each.camera.width // _WIDEST), each.camera.height)
     camera = each.camera.decimate(step, step // 2)
@@ -174,10 +174,10 @@ def _prepared(each: PosedMap) -> _Frame:
     points = (depth * camera.rays().numpy())[part].reshape(3, -1)
     with np.errstate(over="ignore", invalid="ignore"):  # of numbers that no pose has
         poses = np.stack([*(read(each.pose) for read in READINGS.values()), np.eye(4)])
-    return _Frame(depth, camera, points[:, np.isfinite(points[2])], poses)
+    return Reduced(depth, camera, points[:, np.isfinite(points[2])], poses)
 
 
-def _compare(frame: _Frame, other: _Frame) -> tuple[np.ndarray, np.ndarray]:
+def _compare(frame: Reduced, other: Reduced) -> tuple[np.ndarray, np.ndarray]:
     """Return overlap and agreement of another frame's points with a frame, (readings + 1,) each."""
     camera, back = frame.camera, frame.poses[:, :3, :3].transpose(0, 2, 1)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
