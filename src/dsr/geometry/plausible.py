@@ -104,9 +104,19 @@ def offset_of(camera: Camera) -> float:
     return max(map(abs, _offsets(camera)))
 
 
+def may_be_of(cx: float, cy: float, width: int, height: int) -> bool:
+    """Return whether a principal point may be that of a picture of this size."""
+    return max(map(abs, _from_middle(cx, cy, width, height))) <= _OFFSET
+
+
 def _offsets(camera: Camera) -> tuple[float, float]:
     """Return the offset of the principal point from the centre, as fractions of the width and height."""
-    return (camera.cx + 0.5) / camera.width - 0.5, (camera.cy + 0.5) / camera.height - 0.5
+    return _from_middle(camera.cx, camera.cy, camera.width, camera.height)
+
+
+def _from_middle(cx: float, cy: float, width: int, height: int) -> tuple[float, float]:
+    """Return the offset of a pixel from the middle, as fractions of the width and height."""
+    return (cx + 0.5) / width - 0.5, (cy + 0.5) / height - 0.5
 
 
 def _ratio(camera: Camera) -> float:

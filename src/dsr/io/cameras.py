@@ -13,6 +13,7 @@ from pydantic import BaseModel, Field
 from torch import Tensor
 
 from dsr.geometry.camera import ASSUMED_FOV, Camera
+from dsr.geometry.plausible import may_be_of
 from dsr.geometry.rigid_motion import Matrix
 from dsr.geometry.warping import registered_camera, warp_depth
 from dsr.io.images import CameraFile, Pixels, read_camera
@@ -25,8 +26,6 @@ from dsr.utils.validation import parse_model
 
 _FILM_DIAGONAL = math.hypot(36, 24)
 """Diagonal of 35 mm film in millimetres, to which equivalent focal lengths refer (CIPA DCG-001)."""
-_MAX_OFF_CENTRE = 0.25
-"""Largest distance of a plausible principal point from the middle as a fraction of the size."""
 
 
 def find_camera(choice: CameraChoice, photo: Path, size: Size, size_lr: Size) -> tuple[CameraFile, list[Assumption]]:
@@ -126,7 +125,7 @@ def _camera_of_matrix(path: Path, matrix: np.ndarray, size: Size, size_lr: Size)
     """Return the camera of a matrix: of the photo's pixels, or else of the depth map's, by its principal point."""
     for name, (height, width) in (("photo", size), ("depth map", size_lr)):
         cx, cy = matrix[0, 2], matrix[1, 2]
-        if max(abs((cx + 0.5) / width - 0.5), abs((cy + 0.5) / height - 0.5)) <= _MAX_OFF_CENTRE:
+        if may_be_of(cx, cy, width, height):
             camera = Camera(width, height, matrix[0, 0], matrix[1, 1], cx, cy)
             return camera_only(camera), [Assumption(f"camera: the matrix is taken for one of the {name}'s pixels")]
     raise ValueError(

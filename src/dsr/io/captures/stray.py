@@ -30,6 +30,7 @@ import cv2
 import numpy as np
 
 from dsr.geometry.camera import Camera
+from dsr.geometry.plausible import may_be_of
 from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry, Record
 from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult
 from dsr.io.trajectories import describe_capture, intrinsics_camera, pose_from_quaternion, read_text
@@ -43,7 +44,6 @@ _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _INTRINSICS = ("fx", "fy", "cx", "cy")
 _USUAL_SIZE = (1440, 1920)
 """Of the video, for extracted frames that were made smaller."""
-_MAX_OFF_CENTRE = 0.25
 _Row = Mapping[str, str]
 
 _OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
@@ -175,7 +175,7 @@ def _camera(folder: Path, place: str, numbers: list[float], size: tuple[int, int
     if (folder / "rgb.mp4").is_file() and (folder / "rgb").is_dir():
         sizes.append(video_size(folder / "rgb.mp4"))
     for height, width in (*sizes, _USUAL_SIZE):
-        if max(abs((cx + 0.5) / width - 0.5), abs((cy + 0.5) / height - 0.5)) <= _MAX_OFF_CENTRE:
+        if may_be_of(cx, cy, width, height):
             return intrinsics_camera(place, (height, width), numbers)
     intrinsics_camera(place, size, numbers)  # says what is wrong with numbers that are not finite
     raise ValueError(
