@@ -420,7 +420,7 @@ def test_long_message_keeps_the_name_at_its_beginning_and_its_end(capsys):
     message = f"/data/scene/camera.json: expected a number, got {'9' * 10_000} at the end"
     print_error(message)
     line = capsys.readouterr().err
-    assert len(line) <= len("error: \n") + 1000
+    assert len(line) <= len("\n") + 1000
     assert line.startswith("error: /data/scene/camera.json: expected a number, got 999")
     assert line.endswith("9 at the end\n")
     assert len(one_line(ValueError(message))) == 1000

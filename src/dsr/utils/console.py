@@ -63,8 +63,7 @@ def show(console: Console, line: str) -> None:
 
 def print_error(message: str) -> None:
     """Print one line on stderr; of a very long message the beginning, which names the file or key, and the end."""
-    text = shorten(printable(" ".join(message.split())))
-    print(f"error: {text}", file=sys.stderr, flush=True)  # noqa: T201
+    print(shorten(f"error: {printable(' '.join(message.split()))}"), file=sys.stderr, flush=True)  # noqa: T201
 
 
 @functools.cache
