@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 CHECKS = 1
@@ -197,13 +197,19 @@ def read_warning(entry: Mapping[str, Any]) -> Assumption:
     return Assumption(text, detail, str(entry["code"]), None if value is None else float(value))
 
 
-def expect_no_warning(where: str, messages: Sequence[str]) -> None:
+def expect_no_warning(where: str, notes: Iterable[Assumption], *, brief: bool = False) -> None:
     """Take warnings for an error, as ``--strict`` asks.
+
+    Args:
+        where: what they are about, at the beginning of the message.
+        notes: among which there may be warnings.
+        brief: whether the message is without figures, equal for all pictures.
 
     Raises:
         ValueError: there is one.
 
     """
+    messages = [each.text if brief else each.message for each in notes if each.code]
     if messages:
         more = f", and {len(messages) - 1} more" if len(messages) > 1 else ""
         raise ValueError(f"{where}: {messages[0]}{more}; --strict refuses what is otherwise a warning")

@@ -129,7 +129,8 @@ def test_exit_code_and_output_of_a_command_are_kept(tmp_path: Path) -> None:
 SPEAKING = """
 import sys
 def main():
-    import numpy
+    warning = "import numpy; numpy.float32(1) * numpy.float64(1e308).astype(numpy.float32)"
+    exec(warning, dict(__name__="dsr.case"))
     try:
         for _ in range(3000): print("a line of what the command has to say")
         sys.stdout.flush()

@@ -40,4 +40,6 @@ def test_recorded_warning_is_read_again() -> None:
 def test_strict_takes_a_warning_for_an_error() -> None:
     expect_no_warning("a.png", [])
     with pytest.raises(ValueError, match=r"a\.png: edges apart, and 1 more"):
-        expect_no_warning("a.png", ["edges apart", "another"])
+        expect_no_warning(
+            "a.png", [Assumption("edges apart", code="poses"), Assumption("told"), Assumption("b", code="poses")]
+        )

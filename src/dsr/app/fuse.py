@@ -48,7 +48,7 @@ def fuse(request: FuseRequest, console: Console) -> list[str]:
 
     warnings = _faults(frames, max_error)
     if request.strict:
-        expect_no_warning(str(request.folders[0]), [each.message for each in warnings])
+        expect_no_warning(str(request.folders[0]), warnings)
     for each in warnings:
         show(console, str(each))
 

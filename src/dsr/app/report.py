@@ -48,7 +48,7 @@ def make_report(request: ReportRequest, console: Console) -> list[str]:
     results = load_results(request.runs)
     results = results.only(request.methods, request.datasets, tuple(map(as_ratio, request.scales)))
     if request.strict:
-        expect_no_warning(", ".join(map(str, request.runs)), [each.message for each in results.warnings])
+        expect_no_warning(", ".join(map(str, request.runs)), results.warnings)
     answers = None if request.study is None else read_study(request.study)
     workers = default_workers(results) if request.workers is None else request.workers
     progress = ConsoleProgress(console)

@@ -42,7 +42,7 @@ def _build(request: StudyRequest, console: Console, _: object) -> list[str]:
 
     progress, results = ConsoleProgress(console), load_results(request.runs)
     if request.strict:
-        expect_no_warning(", ".join(map(str, request.runs)), [each.message for each in results.warnings])
+        expect_no_warning(", ".join(map(str, request.runs)), results.warnings)
     built = build_study(results, request.output, request.choice, progress, overwrite=request.overwrite)
     for warning in results.warnings:
         show(console, str(warning))

@@ -181,15 +181,14 @@ class Claims:
             return self.wait(_MEMBERS, LOST)
         except TimeoutError as error:
             owners = [_owner(path) for path in self._files(f"{_digest(_MEMBERS)}.")]
-            named = [f"process {owner['process']} of {owner['host']}" for owner in owners if owner]
-            raise InUseError(self._run, ", ".join(named) or "another process") from error
+            raise InUseError(self._run, ", ".join(map(_name_of, filter(None, owners))) or "another process") from error
 
     def _expect_agreement(self) -> None:
         """Raise InUseError if a command with other settings is at work."""
         for path in self._files("member-"):
             owner = _owner(path)
             if owner.get("settings") not in (None, self._settings) and self._lives(path, owner):
-                raise InUseError(self._run, f"process {owner['process']} of {owner['host']}")
+                raise InUseError(self._run, _name_of(owner))
 
     def _lives(self, path: Path, owner: Mapping[str, Any]) -> bool:
         """Return whether the process of a claim is there; a sign of life is waited for if it is another machine's."""
@@ -267,6 +266,11 @@ def _owner(path: Path) -> dict[str, Any]:
         return {key: owner[key] for key in ("host", "machine", "process", "settings")}
     except (OSError, ValueError, KeyError, TypeError):
         return {}
+
+
+def _name_of(owner: Mapping[str, Any]) -> str:
+    """Return how a message names the process of a claim."""
+    return f"process {owner['process']} of {owner['host']}"
 
 
 @contextlib.contextmanager

@@ -11,6 +11,7 @@ all other displacements, is the significance.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -309,14 +310,10 @@ def transform(outlines: Outlines) -> Fields:
 
 def compare(depth: Fields, photo: Fields) -> Agreement:
     """Return the agreement of the edges of a depth map with those of a photo on the same grid."""
-    height, width = depth.strength.shape
-    v, u = np.fft.fftfreq(height)[:, None], np.fft.fftfreq(width)[None]
+    v, u, fast, beyond = _displacements(*depth.strength.shape)
     spectrum = _ANY_DIRECTION * depth.strength.conj() * photo.strength + depth.direction.conj() * photo.direction
-    fast = 1 - np.exp(-2 * (np.pi * _SLOW) ** 2 * (v * v + u * u))
-    scores = fft.ifft2(spectrum * fast.astype(np.float32)).real / max(depth.norm * photo.norm, 1e-9)
+    scores = fft.ifft2(spectrum * fast).real / max(depth.norm * photo.norm, 1e-9)
     best = ndimage.maximum_filter(scores, 2 * _REACH + 1, mode="wrap")
-    far = 2 * _REACH + 2
-    beyond = (np.abs(v * height) > far) | (np.abs(u * width) > far)
     others = best[beyond]
     mean, spread = float(others.mean()), max(float(others.std()), 1e-6)
     row, column = np.unravel_index(np.where(beyond, scores, -np.inf).argmax(), scores.shape)
@@ -328,6 +325,19 @@ def compare(depth: Fields, photo: Fields) -> Agreement:
         float(u[0, column]),
         float(v[row, 0]),
     )
+
+
+@functools.lru_cache(maxsize=8)
+def _displacements(height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return what a grid's size determines: displacements, frequencies' weights, and what is beyond the reach.
+
+    The displacements, down (H, 1) and right (1, W), are in fractions of the size. The weights (H, W) leave out slow
+    changes. Displacements beyond the reach are True, (H, W).
+    """
+    v, u = np.fft.fftfreq(height)[:, None], np.fft.fftfreq(width)[None]
+    fast = 1 - np.exp(-2 * (np.pi * _SLOW) ** 2 * (v * v + u * u))
+    far = 2 * _REACH + 2
+    return v, u, fast.astype(np.float32), (np.abs(v * height) > far) | (np.abs(u * width) > far)
 
 
 def _outlines(strength: _Floats, right: _Floats, down: _Floats) -> Outlines:

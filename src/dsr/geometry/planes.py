@@ -201,8 +201,7 @@ def _windows(values: Array, camera: Camera) -> Windows:
     u, v = np.broadcast_to(u[:, None, :], bend.shape), np.broadcast_to(v[:, :, None], bend.shape)
     shape = (len(means), _CELLS**2)
     means, whole, u, v, bend = (field.reshape(shape) for field in (means, whole, u, v, bend))
-    scale = np.array([np.median(mean[own]) for mean, own in zip(means, whole, strict=True)])[:, None]
-    return Windows(means / scale, whole, u, v, bend)
+    return Windows(means / _medians(means, whole), whole, u, v, bend)
 
 
 def _places(height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -248,10 +247,15 @@ def _robust_fit(columns: Array, windows: Windows) -> tuple[Array, Array]:
 
 def _deviation(size: Array, valid: np.ndarray) -> Array:
     """Estimate the standard deviation from the median absolute residual, (N, 1)."""
-    ordered, count = np.sort(np.where(valid, size, np.inf), axis=1), valid.sum(axis=1, keepdims=True)
+    return 1.4826 * _medians(size, valid) + _EXACT
+
+
+def _medians(values: Array, valid: np.ndarray) -> Array:
+    """Return the medians of the valid values of each window, (N, 1)."""
+    ordered, count = np.sort(np.where(valid, values, np.inf), axis=1), valid.sum(axis=1, keepdims=True)
     middles = np.take_along_axis(ordered, np.concatenate(((count - 1) // 2, count // 2), axis=1), axis=1)
-    deviation: Array = 1.4826 * middles.mean(axis=1, keepdims=True) + _EXACT
-    return deviation
+    medians: Array = middles.mean(axis=1, keepdims=True)
+    return medians
 
 
 def _solve(columns: Array, weight: Array, target: Array) -> Array:

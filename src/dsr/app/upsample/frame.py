@@ -13,6 +13,7 @@ from typing import Any
 
 from dsr.app.upsample.alignment import align
 from dsr.app.upsample.checks import check_planes
+from dsr.app.upsample.frames import Frames
 from dsr.app.upsample.outputs import (
     PreviousRun,
     begin,
@@ -30,7 +31,7 @@ from dsr.app.upsample.sequence import FrameSequence
 from dsr.degradation.sensors import Identified
 from dsr.evaluation.sharing import Claims
 from dsr.inference import AnyRatio, Plan, enlarged_by, find_sensor
-from dsr.io.inputs import FolderUnits, Picture, read_picture
+from dsr.io.inputs import Picture, read_picture
 from dsr.io.pairs import Pair
 from dsr.methods.base import MapNoise, Outliers, Surface
 from dsr.notes import CHECKS, Assumption, expect_no_warning
@@ -48,18 +49,17 @@ class FrameWork:
 
     Args:
         request: the request.
-        pairs: all of its pictures, also those of other shards, which determine units and neighbours.
-        warnings: of all pictures together.
+        frames: all of its pictures, also those of other shards, which determine units and neighbours.
 
     Raises:
         ValueError: the file of poses is damaged, or does not fit the pictures.
 
     """
 
-    def __init__(self, request: UpsampleRequest, pairs: Sequence[Pair], warnings: Sequence[Assumption] = ()) -> None:
-        self._request, self._units, self._warnings = request, FolderUnits(pairs), tuple(warnings)
+    def __init__(self, request: UpsampleRequest, frames: Frames) -> None:
+        self._request, self._frames = request, frames
         self._claims = Claims(request.results.output)
-        self._sequence = FrameSequence(pairs, self._read, request.frames.neighbours, request.frames.poses)
+        self._sequence = FrameSequence(frames.whole, self._read, request.frames.neighbours, request.frames.poses)
 
     def __call__(self, pair: Pair, target: Path, reporter: Messages, progress: Progress) -> str:
         """Upsample one picture, and return the outcome; commands that have it in common do so one after the other."""
@@ -89,7 +89,7 @@ class FrameWork:
             raise ValueError(f"--{error}") from error
         picture = _with_sensor(sequence.fuse(pair, picture), identified)
         picture = align(picture, register=request.reading.register)
-        picture = replace(picture, assumptions=(*picture.assumptions, *self._warnings))
+        picture = replace(picture, assumptions=(*picture.assumptions, *self._frames.warnings))
         size_lr = (picture.depth_lr.shape[-2], picture.depth_lr.shape[-1])
         size = (picture.camera.height, picture.camera.width)
         planned = self._upsampler.plan(size, size_lr)
@@ -132,7 +132,7 @@ class FrameWork:
 
     def _read(self, pair: Pair) -> Picture:
         """Read a picture."""
-        return _without_repeats(read_picture(pair, self._request.reading, self._units))
+        return _without_repeats(read_picture(pair, self._request.reading, self._frames.units))
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,7 @@ class _Job:
         if self.request.reading.strict:
             several = self.target != self.request.results.output
             where = self.pair.depth.parent if several else self.pair.depth
-            expect_no_warning(str(where), [each.text if several else each.message for each in notes if each.code])
+            expect_no_warning(str(where), notes, brief=several)
 
     def is_done(self) -> bool:
         """Return whether all requested parts exist, and were checked as now if no warning is allowed."""

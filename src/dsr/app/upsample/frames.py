@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dsr.app.upsample.request import FrameChoice, UpsampleRequest
+from dsr.io.inputs import FolderUnits
 from dsr.io.layouts import find_pairs_of_folder
 from dsr.io.pairs import Pair, PairingResult, add_confidence, find_pairs_of_lists, in_order
 from dsr.notes import Assumption
@@ -20,6 +21,7 @@ class Frames:
         found: the frames to work on, and what is said about them.
         whole: all frames that were found; poses, neighbours and units depend on them.
         single: whether there is a single picture, whose results are in the output folder itself.
+        units: what the values of all of them tell.
         warnings: what is wrong with all of them together.
 
     """
@@ -27,6 +29,7 @@ class Frames:
     found: PairingResult
     whole: tuple[Pair, ...]
     single: bool
+    units: FolderUnits
     warnings: tuple[Assumption, ...] = ()
 
     def target(self, output: Path, pair: Pair) -> Path:
@@ -51,7 +54,7 @@ def find_frames(request: UpsampleRequest) -> Frames:
     single = len(whole) == 1 and not choice.folders and not choice.rgb[0].is_dir()
     if choice.shard is not None:
         found = replace(found, pairs=tuple(whole[number] for number in choice.shard.block(len(whole))))
-    return Frames(found, whole, single)
+    return Frames(found, whole, single, FolderUnits(whole))
 
 
 def _by_number(pairs: tuple[Pair, ...]) -> tuple[Pair, ...]:

@@ -19,7 +19,7 @@ from dsr.app.upsample.request import UpsampleRequest, settings_of
 from dsr.app.upsample.scene import EXPORTS, write_scene
 from dsr.app.upsample.workers import work_through
 from dsr.evaluation.sharing import Claims
-from dsr.io.inputs import FolderUnits, read_picture
+from dsr.io.inputs import read_picture
 from dsr.io.reading import Shard
 from dsr.notes import Assumption, expect_no_warning
 from dsr.utils.console import ConsoleProgress, show
@@ -103,10 +103,9 @@ def _run(request: UpsampleRequest, frames: Frames, console: Console) -> list[str
 
 def _check_order(request: UpsampleRequest, frames: Frames) -> tuple[Assumption, ...]:
     """Return a warning if photos and depth maps are not in the same order, which is refused if that is asked for."""
-    units = FolderUnits(frames.whole)
-    warnings = check_order(frames.whole, lambda pair: read_picture(pair, request.reading, units))
+    warnings = check_order(frames.whole, lambda pair: read_picture(pair, request.reading, frames.units))
     if request.reading.strict:
-        expect_no_warning(str(frames.whole[0].depth.parent), [each.message for each in warnings])
+        expect_no_warning(str(frames.whole[0].depth.parent), warnings)
     return warnings
 
 

@@ -84,7 +84,7 @@ class FrameSequence:
         if picture.pose is None and self._count:
             where = "this capture has none; give --poses" if self._file is None else f"{self._file} has none"
             raise ValueError(f"--neighbours: expected a pose for each frame, {where}")
-        if picture.pose is None and self._file is not None:
+        if picture.pose is None and self._file is not None and self._without >= LIMITS["poses-missing"].threshold:
             detail = f"{self._without} of {len(self._places)} frames have none"
             notes.append(
                 Assumption(f"{self._file.name} has no pose of this frame", detail, "poses-missing", self._without)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,7 +12,6 @@ from dsr.app.upsample.frames import Frames
 from dsr.app.upsample.reporting import Messages, Record, Reporter
 from dsr.app.upsample.request import UpsampleRequest
 from dsr.io.pairs import Pair
-from dsr.notes import Assumption
 from dsr.utils.console import one_line
 from dsr.utils.memory import refusing_excess
 from dsr.utils.pool import LOST, Pool
@@ -52,11 +51,11 @@ def work_through(request: UpsampleRequest, frames: Frames, reporter: Reporter, p
     jobs = [(pair, frames.target(request.results.output, pair)) for pair in frames.found.pairs]
     workers = min(request.frames.workers, len(jobs))
     if workers <= 1:
-        work = FrameWork(request, frames.whole, frames.warnings)
+        work = FrameWork(request, frames)
         for pair, target in progress.track(jobs, "upsample", label=lambda job: job[0].name, lines=False):
             yield attempt(work, pair, target, reporter, progress)
         return
-    FrameWork(request, frames.whole)  # raises for poses that do not fit
+    FrameWork(request, frames)  # raises for poses that do not fit
     with Pool(
         workers,
         _remote,
@@ -64,7 +63,7 @@ def work_through(request: UpsampleRequest, frames: Frames, reporter: Reporter, p
         progress.say,
         start="spawn",
         prepare=_begin,
-        arguments=(request, frames.whole, frames.warnings),
+        arguments=(request, frames),
         label=_name_of,
         threads=max(1, (os.cpu_count() or 1) // workers),
     ) as pool:
@@ -74,10 +73,10 @@ def work_through(request: UpsampleRequest, frames: Frames, reporter: Reporter, p
             yield done
 
 
-def _begin(request: UpsampleRequest, pairs: Sequence[Pair], warnings: Sequence[Assumption]) -> None:
+def _begin(request: UpsampleRequest, frames: Frames) -> None:
     """Prepare a worker."""
     global _work  # noqa: PLW0603 - the process's own
-    _work = FrameWork(request, pairs, warnings)
+    _work = FrameWork(request, frames)
 
 
 def _remote(job: _Job) -> tuple[Done, Record]:
