@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
-CHECKS = 1
+CHECKS = 2
 """Number of the present checks; another one where a warning is added, or a limit changes."""
 
 

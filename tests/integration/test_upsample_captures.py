@@ -130,7 +130,7 @@ def test_resumed_folder_of_millimetre_floats_keeps_its_unit(tmp_path, monkeypatc
         np.save(folder / "depth" / f"{number}.npy", np.full(SIZE_LR, far, np.float32))
 
     def read_first_only(pair, *arguments):
-        if pair.name != "0":
+        if pair.name != "0" and (out / "0" / "info.json").is_file():
             raise KeyboardInterrupt
         return read_picture(pair, *arguments)
 

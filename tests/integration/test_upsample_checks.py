@@ -295,3 +295,23 @@ def test_result_of_other_checks_is_checked_again_where_no_warning_is_allowed(tmp
     assert upsample(*files) == 0
     assert "complete already" in capsys.readouterr().out
     assert "field of view" in refused(capsys, upsample(*files, "--strict"))
+
+
+def test_what_most_of_the_maps_of_a_folder_tell_applies_to_all_of_them(tmp_path, capsys):
+    along_the_ray = DEPTH * SMALL.ray_lengths().numpy()
+    wall = np.full_like(DEPTH, 3.0)  # flat however it is read: it tells nothing, and is read like the others
+    for name, maps, expected in (
+        ("most", (along_the_ray, along_the_ray, wall), [["along-the-ray"]] * 3),
+        ("one", (along_the_ray, DEPTH, DEPTH), [[]] * 3),
+    ):
+        folder = tmp_path / name
+        folder.mkdir()
+        for number, values in enumerate(maps):
+            Image.fromarray(np.full((192, 256, 3), 99, np.uint8)).save(folder / f"{number}_photo.png")
+            np.save(folder / f"{number}_depth.npy", values)
+        assert upsample(folder, "-o", tmp_path / "out" / name) == 0
+        assert capsys.readouterr().out.count("warning: depth looks like distance along the ray") == (name == "most")
+        found = [
+            json.loads((tmp_path / "out" / name / f"{number}_photo" / "info.json").read_text()) for number in range(3)
+        ]
+        assert [[each["code"] for each in info["warnings"]] for info in found] == expected

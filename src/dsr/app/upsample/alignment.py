@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import replace
-
-import numpy as np
 
 from dsr.geometry.agreement import (
     Outlines,
@@ -23,9 +20,6 @@ from dsr.geometry.registration import Displacement, find_displacement, undo
 from dsr.io.inputs import Picture
 from dsr.io.pairs import Pair
 from dsr.notes import LIMITS, Assumption
-
-_SAMPLE = 12
-"""Number of pairs that are compared with each other, in groups of two that follow each other."""
 
 
 def align(picture: Picture, *, register: bool) -> Picture:
@@ -53,42 +47,32 @@ def align(picture: Picture, *, register: bool) -> Picture:
     return replace(picture, assumptions=(*picture.assumptions, *notes))
 
 
-def check_order(pairs: Sequence[Pair], read: Callable[[Pair], Picture]) -> tuple[Assumption, ...]:
-    """Return a warning if depth maps fit other pairs' photos better than their own.
+class Order:
+    """Whether depth maps fit their own photos better than those of other pairs."""
 
-    Args:
-        pairs: all pairs; a few spread evenly over them are read.
-        read: reads one; those that it cannot read are left out, as they are reported when their turn comes.
+    def __init__(self) -> None:
+        self._pairs: list[Pair] = []
+        self._depths: list[Outlines] = []
+        self._photos: list[Outlines] = []
+        self._size: Size | None = None
 
-    """
-    depths: list[Outlines] = []
-    photos: list[Outlines] = []
-    read_pairs: list[Pair] = []
-    size: Size | None = None
-    for pair in _sample(pairs):
-        try:
-            picture = read(pair)
-        except (ValueError, OSError, MemoryError):
-            continue
+    def add(self, pair: Pair, picture: Picture) -> None:
+        """Add a pair."""
         depth = picture.depth_lr[0].cpu().numpy()
-        size = working_size(depth, picture.rgb) if size is None else size
-        depths.append(depth_outlines(depth, size))
-        photos.append(photo_outlines(reduce_photo(picture.rgb, size), max(size) / max(depth.shape)))
-        read_pairs.append(pair)
-    found = find_misplaced(significances(depths, photos))
-    if len(found) < LIMITS["photo-order"].threshold:
-        return ()
-    text = f"of {len(depths)} pairs {len(found)} fit another photo better: are the lists in the same order?"
-    own, other = (read_pairs[number] for number in found[0])
-    return (Assumption(text, f"such as {own.depth.name} with {other.rgb.name}", "photo-order", float(len(found))),)
+        if self._size is None:
+            self._size = working_size(depth, picture.rgb)
+        self._pairs.append(pair)
+        self._depths.append(depth_outlines(depth, self._size))
+        self._photos.append(photo_outlines(reduce_photo(picture.rgb, self._size), max(self._size) / max(depth.shape)))
 
-
-def _sample(pairs: Sequence[Pair]) -> list[Pair]:
-    """Return pairs at equal distances, each with the next one, the same from either end."""
-    if len(pairs) <= _SAMPLE:
-        return list(pairs) if len(pairs) > 1 else []
-    first = np.linspace(0, len(pairs) - 2, _SAMPLE // 2).round().astype(int)
-    return [pairs[number] for number in np.unique((first, first + 1))]
+    def warnings(self) -> list[Assumption]:
+        """Return a warning if too many fit another photo better."""
+        found = find_misplaced(significances(self._depths, self._photos)) if len(self._pairs) > 1 else []
+        if len(found) < LIMITS["photo-order"].threshold:
+            return []
+        text = f"of {len(self._pairs)} pairs {len(found)} fit another photo better: are the lists in the same order?"
+        own, other = (self._pairs[number] for number in found[0])
+        return [Assumption(text, f"such as {own.depth.name} with {other.rgb.name}", "photo-order", float(len(found)))]
 
 
 def _doubts(verdict: Verdict) -> list[Assumption]:

@@ -1,11 +1,15 @@
-"""Whether the planes of a picture's depth map are flat as it was read, for ``dsr upsample``: else a warning."""
+"""What some frames tell of all of them, for ``dsr upsample``: warnings that are found once, and apply to all."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 
 import numpy as np
 
+from dsr.app.upsample.alignment import Order
+from dsr.app.upsample.sequence import FrameSequence
 from dsr.geometry.planes import Array, inverse_votes, range_votes, thinned
 from dsr.io.encoding import Encoding
 from dsr.io.inputs import Picture
@@ -13,12 +17,85 @@ from dsr.io.pairs import Pair
 from dsr.io.reading import Reading
 from dsr.notes import Assumption
 
+_SAMPLE = 12
+"""Number of frames that are looked at, in groups of two that follow each other."""
+_OF_PLANES = 4
+"""Largest number of them whose planes are looked at, which takes longer."""
 _HALF = 2**-10
 """Relative step of floats of 16 bits."""
 
 
-def check_planes(picture: Picture, pair: Pair, reading: Reading) -> Picture:
-    """Return a picture, with a warning where its planes are flat only if its values are read in another way.
+def check_together(
+    pairs: Sequence[Pair], reading: Reading, read: Callable[[Pair], Picture], sequence: FrameSequence
+) -> dict[str, tuple[Assumption, ...]]:
+    """Return the warnings that some frames give rise to, by the name of each frame that they apply to.
+
+    Frames of one folder are alike in what their values are, and their poses; a frame that is alone in its folder is
+    like those in other folders beside it.
+
+    Args:
+        pairs: all frames.
+        reading: what the user says about them.
+        read: reads one; those that it cannot read are left out, as they are reported when their turn comes.
+        sequence: the frames with their poses.
+
+    """
+    order, posed = Order(), set[Path]()
+    found: dict[str, list[Assumption]] = {pair.name: [] for pair in pairs}
+    sampled = {pair.name for pair in _sample(pairs)}
+    for group in _alike(pairs):
+        bent: list[list[Assumption]] = []
+        looked = [pair for pair in group if pair.name in sampled] or [group[len(group) // 2]]
+        every = -(-len(looked) // _OF_PLANES)
+        for number, pair in enumerate(looked):
+            try:
+                picture = read(pair)
+            except (ValueError, OSError, MemoryError):
+                continue
+            if number % every == 0:
+                bent.append(check_planes(picture, pair, reading))
+            if picture.pose is not None:
+                posed.add(pair.depth.parent)
+            if pair.name in sampled:
+                order.add(pair, picture)
+        common = _of_most(bent)
+        for pair in group:
+            found[pair.name] += common
+    in_order = order.warnings()
+    for folder, recording in sequence.recordings.items():
+        fault = sequence.fault(recording) if folder in posed or sequence.given else None
+        for pair in recording:
+            found[pair.name] += [*([] if fault is None else [fault]), *in_order]
+    return {name: tuple(warnings) for name, warnings in found.items() if warnings}
+
+
+def _alike(pairs: Sequence[Pair]) -> Iterable[list[Pair]]:
+    """Return the frames that are alike, in their order."""
+    folders = Counter(pair.depth.parent for pair in pairs)
+    groups: dict[Path, list[Pair]] = {}
+    for pair in pairs:
+        folder = pair.depth.parent
+        groups.setdefault(folder if folders[folder] > 1 else folder.parent, []).append(pair)
+    return groups.values()
+
+
+def _of_most(warnings: Sequence[Sequence[Assumption]]) -> list[Assumption]:
+    """Return the warnings that at least half of some frames have, each as the first one has it."""
+    votes = Counter(warning.code for each in warnings for warning in each)
+    firsts = {warning.code: warning for each in reversed(warnings) for warning in each}
+    return [firsts[code] for code, count in votes.items() if 2 * count >= len(warnings)]
+
+
+def _sample(pairs: Sequence[Pair]) -> list[Pair]:
+    """Return pairs at equal distances, each with the next one, the same from either end."""
+    if len(pairs) <= _SAMPLE:
+        return list(pairs)
+    first = np.linspace(0, len(pairs) - 2, _SAMPLE // 2).round().astype(int)
+    return [pairs[number] for number in np.unique((first, first + 1))]
+
+
+def check_planes(picture: Picture, pair: Pair, reading: Reading) -> list[Assumption]:
+    """Return a warning where the planes of a picture are flat only if its values are read in another way.
 
     What a capture's format or ``--range-type`` says is believed.
 
@@ -29,7 +106,7 @@ def check_planes(picture: Picture, pair: Pair, reading: Reading) -> Picture:
 
     """
     if pair.capture is not None or reading.range_type is not None or reading.rig is not None:
-        return picture
+        return []
     height, width = picture.depth_lr.shape[-2:]
     depth, camera = thinned(picture.depth_lr[0].double().numpy(), picture.camera.rescale(width, height))
     falls = inverse_votes(depth)
@@ -38,11 +115,10 @@ def check_planes(picture: Picture, pair: Pair, reading: Reading) -> Picture:
         given = "disparities rise with distance, as depth does" if encoding.range_type == "disparity" else (
             "values fall with distance, as disparities do")  # fmt: skip
         detail = f"straight over {falls.falling} of {falls.falling + falls.rising} planes; --range-type sets it"
-        warning = Assumption(given, detail, "falls-with-distance", falls.ratio)
-        return replace(picture, assumptions=(*picture.assumptions, warning))
+        return [Assumption(given, detail, "falls-with-distance", falls.ratio)]
     votes = range_votes(depth, camera, _step(depth, encoding))
     if votes.verdict not in ("ray", "reverse") or encoding.range_type == "disparity":
-        return picture
+        return []
     ray = votes.verdict == "ray"
     text, other = (
         ("depth looks like distance along the ray", "perspective")
@@ -51,8 +127,7 @@ def check_planes(picture: Picture, pair: Pair, reading: Reading) -> Picture:
     )
     support = votes.ray if ray else votes.reverse
     detail = f"{support} of {votes.windows} planes are flat then, {votes.flat} now; --range-type {other}"
-    warning = Assumption(text, detail, "along-the-ray", support / votes.windows)
-    return replace(picture, assumptions=(*picture.assumptions, warning))
+    return [Assumption(text, detail, "along-the-ray", support / votes.windows)]
 
 
 def _step(depth: Array, encoding: Encoding) -> float:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from dsr.app.upsample.alignment import align
-from dsr.app.upsample.checks import check_planes
+from dsr.app.upsample.checks import check_together
 from dsr.app.upsample.frames import Frames
 from dsr.app.upsample.outputs import (
     PreviousRun,
@@ -36,6 +36,7 @@ from dsr.io.pairs import Pair
 from dsr.methods.base import MapNoise, Outliers, Surface
 from dsr.notes import CHECKS, Assumption, expect_no_warning
 from dsr.utils.guards import readable
+from dsr.utils.memory import refusing_excess
 from dsr.utils.progress import Progress
 from dsr.utils.versions import package_versions
 
@@ -59,17 +60,48 @@ class FrameWork:
     def __init__(self, request: UpsampleRequest, frames: Frames) -> None:
         self._request, self._frames = request, frames
         self._claims = Claims(request.results.output)
+        self._read_last: tuple[str, Picture] | None = None
         self._sequence = FrameSequence(frames.whole, self._read, request.frames.neighbours, request.frames.poses)
+
+    def check_together(self, jobs: Sequence[tuple[Pair, Path]]) -> Frames:
+        """Return the frames with what is wrong with them together, if there is something to do.
+
+        Args:
+            jobs: the pictures to work on, each with the folder of its results.
+
+        """
+        if any(self._is_to_do(*job) for job in jobs):
+
+            def read(pair: Pair) -> Picture:
+                with refusing_excess():
+                    self._read_last = pair.name, self._read(pair)
+                return self._read_last[1]
+
+            frames = self._frames
+            warnings = check_together(frames.whole, self._request.reading, read, self._sequence)
+            self._frames = replace(frames, warnings=warnings)
+        return self._frames
 
     def __call__(self, pair: Pair, target: Path, reporter: Messages, progress: Progress) -> str:
         """Upsample one picture, and return the outcome; commands that have it in common do so one after the other."""
-        depends_on = inputs_with_neighbours(self._request, pair, self._sequence.neighbours(pair))
-        job = _Job(self._request, pair, target, self._settings, depends_on, read_previous_run(target))
+        job = self._job(pair, target)
         with contextlib.ExitStack() as stack:
             if not (self._request.results.dry_run or job.is_done()):
                 stack.enter_context(self._claims.wait(f"frame {target.relative_to(self._request.results.output)}"))
                 job = replace(job, earlier=read_previous_run(target))
             return self._work(job, reporter, progress)
+
+    def _is_to_do(self, pair: Pair, target: Path) -> bool:
+        """Return whether a picture is not complete; one that cannot be read is reported when its turn comes."""
+        try:
+            return not self._job(pair, target).is_done()
+        except (ValueError, OSError):
+            return False
+
+    def _job(self, pair: Pair, target: Path) -> _Job:
+        """Return what there is to do for a picture."""
+        depends_on = inputs_with_neighbours(self._request, pair, self._sequence.neighbours(pair))
+        return _Job(self._request, pair, target, self._settings, depends_on, read_previous_run(target))
 
     def _work(self, job: _Job, reporter: Messages, progress: Progress) -> str:
         """Upsample a picture that no other command is at, and return the outcome."""
@@ -82,14 +114,14 @@ class FrameWork:
             reporter.facts(earlier)
             reporter.say(f"{pair.name}: complete already, in {target}")
             return "complete already"
-        picture = check_planes(self._read(pair), pair, request.reading)
+        picture = self._read(pair)
+        picture = replace(picture, assumptions=(*picture.assumptions, *self._frames.warnings.get(pair.name, ())))
         try:
             identified = find_sensor(picture.depth_lr, how.sensor, picture.device_name)
         except ValueError as error:
             raise ValueError(f"--{error}") from error
         picture = _with_sensor(sequence.fuse(pair, picture), identified)
         picture = align(picture, register=request.reading.register)
-        picture = replace(picture, assumptions=(*picture.assumptions, *self._frames.warnings))
         size_lr = (picture.depth_lr.shape[-2], picture.depth_lr.shape[-1])
         size = (picture.camera.height, picture.camera.width)
         planned = self._upsampler.plan(size, size_lr)
@@ -131,7 +163,10 @@ class FrameWork:
         return surface.map(lambda values: values.cpu())
 
     def _read(self, pair: Pair) -> Picture:
-        """Read a picture."""
+        """Read a picture, unless it was the last one that the checks read."""
+        last, self._read_last = self._read_last, None
+        if last is not None and last[0] == pair.name:
+            return last[1]
         return _without_repeats(read_picture(pair, self._request.reading, self._frames.units))
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from dsr.app.upsample.request import FrameChoice, UpsampleRequest
@@ -22,7 +23,7 @@ class Frames:
         whole: all frames that were found; poses, neighbours and units depend on them.
         single: whether there is a single picture, whose results are in the output folder itself.
         units: what the values of all of them tell.
-        warnings: what is wrong with all of them together.
+        warnings: what is wrong with frames together, by the name of each; see :mod:`dsr.app.upsample.checks`.
 
     """
 
@@ -30,7 +31,7 @@ class Frames:
     whole: tuple[Pair, ...]
     single: bool
     units: FolderUnits
-    warnings: tuple[Assumption, ...] = ()
+    warnings: Mapping[str, tuple[Assumption, ...]] = field(default_factory=dict)
 
     def target(self, output: Path, pair: Pair) -> Path:
         """Return the folder of a frame's results; OutsideError if a link leads it out of that of all."""

@@ -7,21 +7,17 @@ import errno
 import json
 import time
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
 
-from dsr.app.upsample.alignment import check_order
 from dsr.app.upsample.frames import Frames, find_frames
 from dsr.app.upsample.reporting import Reporter, listed
 from dsr.app.upsample.request import UpsampleRequest, settings_of
 from dsr.app.upsample.scene import EXPORTS, write_scene
 from dsr.app.upsample.workers import work_through
 from dsr.evaluation.sharing import Claims
-from dsr.io.inputs import read_picture
 from dsr.io.reading import Shard
-from dsr.notes import Assumption, expect_no_warning
 from dsr.utils.console import ConsoleProgress, show
 from dsr.utils.files import expect_targets, write_text
 
@@ -63,7 +59,6 @@ def _run(request: UpsampleRequest, frames: Frames, console: Console) -> list[str
     of_all = [] if shard is not None else [*(name for part in wanted.of_all for name in part.files), EXPORTS]
     expect_targets(wanted.output, of_all if shard is None else [_summary_of(shard)])
     _show_found(console, request, frames)
-    frames = replace(frames, warnings=_check_order(request, frames))
     found, single = frames.found, frames.single
     reporter, progress = Reporter(console), ConsoleProgress(console)
     problems: dict[str, list[str]] = {}
@@ -99,14 +94,6 @@ def _run(request: UpsampleRequest, frames: Frames, console: Console) -> list[str
         write_text(wanted.output / _summary_of(shard), json.dumps(summary, indent=2) + "\n")
     lines = [f"{listed(names)}: {message}" if len(found.pairs) > 1 else message for message, names in problems.items()]
     return lines + scene_problems
-
-
-def _check_order(request: UpsampleRequest, frames: Frames) -> tuple[Assumption, ...]:
-    """Return a warning if photos and depth maps are not in the same order, which is refused if that is asked for."""
-    warnings = check_order(frames.whole, lambda pair: read_picture(pair, request.reading, frames.units))
-    if request.reading.strict:
-        expect_no_warning(str(frames.whole[0].depth.parent), warnings)
-    return warnings
 
 
 def _summary_of(shard: Shard) -> str:

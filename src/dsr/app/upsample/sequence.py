@@ -32,6 +32,9 @@ class FrameSequence:
         neighbours: number of frames that vote on each frame's depth beside itself.
         poses: file of poses; None for those that the frames themselves have.
 
+    Attributes:
+        recordings: the frames of each folder of depth maps.
+
     Raises:
         ValueError: the file is damaged, or does not fit the frames.
 
@@ -50,18 +53,17 @@ class FrameSequence:
             if len(trajectory.poses) != len(pairs):
                 counts = f"{len(trajectory.poses)} poses for {len(pairs)} frames"
                 self._matched.append(Assumption(f"{poses.name}: {counts}, by times or numbers in their names"))
-        self._folders: dict[Path, list[Pair]] = {}
+        self.recordings: dict[Path, list[Pair]] = {}
         for pair in pairs:
-            self._folders.setdefault(pair.depth.parent, []).append(pair)
-        self._places = {pair.name: place for folder in self._folders.values() for place, pair in enumerate(folder)}
-        self._faults: dict[Path, Assumption | None] = {}
+            self.recordings.setdefault(pair.depth.parent, []).append(pair)
+        self._places = {pair.name: place for folder in self.recordings.values() for place, pair in enumerate(folder)}
         self._kept: OrderedDict[str, _Frame] = OrderedDict()
 
     def neighbours(self, pair: Pair) -> list[Pair]:
         """Return the neighbours of a frame, the nearest first; those of its own folder that have a pose."""
         if not self._count:
             return []
-        folder, place = self._folders[pair.depth.parent], self._places[pair.name]
+        folder, place = self.recordings[pair.depth.parent], self._places[pair.name]
         found: list[Pair] = []
         for distance in range(1, len(folder)):
             for number in (place - distance, place + distance):
@@ -72,7 +74,7 @@ class FrameSequence:
         return found[: self._count]
 
     def with_pose(self, pair: Pair, picture: Picture) -> Picture:
-        """Return a frame with its pose from the file, if there is one, and with warnings of poses that cannot be right.
+        """Return a frame with its pose from the file, if there is one.
 
         Raises:
             ValueError: neighbours are to vote, and the frame has no pose.
@@ -89,24 +91,25 @@ class FrameSequence:
             notes.append(
                 Assumption(f"{self._file.name} has no pose of this frame", detail, "poses-missing", self._without)
             )
-        if picture.pose is not None and (fault := self._fault(pair.depth.parent)) is not None:
-            notes.append(fault)
         return replace(picture, assumptions=(*picture.assumptions, *notes)) if notes else picture
 
-    def _fault(self, folder: Path) -> Assumption | None:
-        """Return what is wrong with the poses of a folder's frames, by some of them; the same for all of its frames."""
-        if folder not in self._faults:
-            frames = [pair for pair in self._folders[folder] if self._poses is None or pair.name in self._poses]
+    @property
+    def given(self) -> bool:
+        """Whether the poses are those of a file."""
+        return self._poses is not None
 
-            def load(number: int) -> PosedMap | None:
-                try:
-                    depth, camera, pose = self._frame(frames[number])
-                except (ValueError, OSError):  # it is reported as a frame of its own
-                    return None
-                return None if pose is None else PosedMap(depth[0].double().numpy(), camera, pose)
+    def fault(self, recording: Sequence[Pair]) -> Assumption | None:
+        """Return what is wrong with the poses of a recording, by some of its frames."""
+        frames = [pair for pair in recording if self._poses is None or pair.name in self._poses]
 
-            self._faults[folder] = check(len(frames), load)
-        return self._faults[folder]
+        def load(number: int) -> PosedMap | None:
+            try:
+                depth, camera, pose = self._frame(frames[number])
+            except (ValueError, OSError, MemoryError):  # it is reported as a frame of its own
+                return None
+            return None if pose is None else PosedMap(depth[0].double().numpy(), camera, pose)
+
+        return check(len(frames), load)
 
     def fuse(self, pair: Pair, picture: Picture) -> Picture:
         """Return a frame with its pose, its depth fused with that of its neighbours."""

@@ -50,12 +50,12 @@ def work_through(request: UpsampleRequest, frames: Frames, reporter: Reporter, p
     """
     jobs = [(pair, frames.target(request.results.output, pair)) for pair in frames.found.pairs]
     workers = min(request.frames.workers, len(jobs))
+    work = FrameWork(request, frames)  # raises for poses that do not fit
+    frames = work.check_together(jobs)
     if workers <= 1:
-        work = FrameWork(request, frames)
         for pair, target in progress.track(jobs, "upsample", label=lambda job: job[0].name, lines=False):
             yield attempt(work, pair, target, reporter, progress)
         return
-    FrameWork(request, frames)  # raises for poses that do not fit
     with Pool(
         workers,
         _remote,
