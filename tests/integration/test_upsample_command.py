@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -512,3 +513,27 @@ def test_what_is_likely_to_be_wrong_is_left_out_of_the_mesh(pair, tmp_path, caps
     assert not (tmp_path / "sure" / "mesh.ply").exists()
     whole, kept = (np.load(tmp_path / name / "depth_metres.npy") for name in ("all", "sure"))
     np.testing.assert_array_equal(whole, kept)
+
+
+def test_dry_run_reads_one_frame_of_each_kind_and_sums_up_the_time(tmp_path, capsys):
+    folder = tmp_path / "in"
+    folder.mkdir()
+    for number in range(6):
+        size = (32, 24) if number < 5 else (64, 48)
+        cv2.imwrite(str(folder / f"{number}_rgb.png"), np.full((2 * size[1], 2 * size[0], 3), 128, np.uint8))
+        cv2.imwrite(str(folder / f"{number}_depth.png"), np.full(size[::-1], 2000, np.uint16))
+    assert upsample(folder, "-o", tmp_path / "out", "--dry-run") == 0
+    said = capsys.readouterr().out
+    assert said.count(" depth to ") == 2
+    assert "\n  4 more of these sizes" in said
+    assert re.search(r"\nin all about \d+ s on two CPU cores", said)
+    assert said.endswith(f"6 pictures: 6 to do -> {tmp_path / 'out'}\n")
+    assert not (tmp_path / "out").exists()
+    assert upsample(folder, "-o", tmp_path / "out", *DEPTH_ONLY) == 0
+    capsys.readouterr()
+    shutil.rmtree(tmp_path / "out" / "2_rgb")
+    assert upsample(folder, "-o", tmp_path / "out", *DEPTH_ONLY, "--dry-run") == 0
+    assert f"6 pictures: 5 complete already, 1 to do -> {tmp_path / 'out'}\n" in capsys.readouterr().out
+    (folder / "2_depth.png").write_bytes(b"no picture")
+    assert upsample(folder, "-o", tmp_path / "out", *DEPTH_ONLY, "--dry-run") == 2
+    assert "2_depth.png: expected a picture" in capsys.readouterr().err

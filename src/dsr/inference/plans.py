@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from dsr.inference.defaults import DEFAULT, USUAL_SCALE
 from dsr.methods.networks.weight_choice import SLACK, nearest_scale
 from dsr.methods.recipe import Recipe
+from dsr.utils.progress import duration
 
 LARGEST_OPTIMISED = 2**20
 """Pixels; optimising a network for a larger picture takes hours."""
@@ -33,7 +34,8 @@ class Plan:
         steps: the networks' factors, one after the other; empty for interpolation.
         coarsened: the factor by which depth of the photo's own size is downsampled first; 1 for low-resolution depth.
         way: the sizes and the method in one line.
-        text: the same and the memory that it takes.
+        text: the same, and the memory and time that it takes.
+        seconds: the time on two CPU cores; None where it is not known.
 
     """
 
@@ -43,6 +45,7 @@ class Plan:
     coarsened: int
     way: str
     text: str
+    seconds: float | None
 
 
 def steps_of(recipe: Recipe) -> Mapping[int, tuple[int, ...]]:
@@ -105,9 +108,10 @@ def plan_for(
         computed = round(math.prod(depth_size) * nearest_scale(recipe.computed_at, chosen) ** 2)
     way = f"{depth_size[0]} x {depth_size[1]} depth {before}to {photo_size[0]} x {photo_size[1]} by {what}"
     text = f"{way}, in about {abilities.cost.bytes_for(pixels, computed) / 2**30:.1f} GB of memory"
-    if abilities.cost.seconds is not None:
-        text += f" and {_duration(abilities.cost.seconds * computed / 1e6)} on two CPU cores"
-    return Plan(method, chosen, steps, coarsened, way, text)
+    seconds = None if abilities.cost.seconds is None else abilities.cost.seconds * computed / 1e6
+    if seconds is not None:
+        text += f" and about {duration(max(seconds, 1))} on two CPU cores"
+    return Plan(method, chosen, steps, coarsened, way, text, seconds)
 
 
 def _ratio(photo_size: tuple[int, int], depth_size: tuple[int, int]) -> float:
@@ -146,8 +150,3 @@ def _computed(photo_size: tuple[int, int], depth_size: tuple[int, int], steps: t
         return math.prod(photo_size)
     first = math.prod(depth_size) * steps[0] ** 2
     return max(first, math.prod(photo_size)) if len(steps) > 1 else first
-
-
-def _duration(seconds: float) -> str:
-    """Return a rough time for a reader."""
-    return f"about {max(seconds, 1):.0f} s" if seconds < 90 else f"about {seconds / 60:.0f} min"

@@ -43,7 +43,7 @@ def check_together(
     order, posed = Order(), set[Path]()
     found: dict[str, list[Assumption]] = {pair.name: [] for pair in pairs}
     sampled = {pair.name for pair in _sample(pairs)}
-    for group in _alike(pairs):
+    for group in alike(pairs):
         bent: list[list[Assumption]] = []
         looked = [pair for pair in group if pair.name in sampled] or [group[len(group) // 2]]
         every = -(-len(looked) // _OF_PLANES)
@@ -69,8 +69,8 @@ def check_together(
     return {name: tuple(warnings) for name, warnings in found.items() if warnings}
 
 
-def _alike(pairs: Sequence[Pair]) -> Iterable[list[Pair]]:
-    """Return the frames that are alike, in their order."""
+def alike(pairs: Sequence[Pair]) -> Iterable[list[Pair]]:
+    """Return the frames that are alike, as those of a folder are, in their order."""
     folders = Counter(pair.depth.parent for pair in pairs)
     groups: dict[Path, list[Pair]] = {}
     for pair in pairs:

@@ -312,7 +312,7 @@ class Results(Options):
         rule=at_least(100),
     )
     overwrite: bool = option(False, "redo existing results, replace other ones", recorded=False)
-    dry_run: bool = option(False, "read the files and say what would be done", recorded=False)
+    dry_run: bool = option(False, "say what would be done, and how long it takes", recorded=False)
 
     def __post_init__(self) -> None:
         """Check the values, and that there is something to write."""

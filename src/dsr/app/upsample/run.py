@@ -12,6 +12,7 @@ from pathlib import Path
 from rich.console import Console
 
 from dsr.app.upsample.frames import Frames, find_frames
+from dsr.app.upsample.preview import preview
 from dsr.app.upsample.reporting import Reporter, listed
 from dsr.app.upsample.request import UpsampleRequest, settings_of
 from dsr.app.upsample.scene import EXPORTS, write_scene
@@ -65,7 +66,8 @@ def _run(request: UpsampleRequest, frames: Frames, console: Console) -> list[str
     outcomes: Counter[str] = Counter()
     targets: dict[str, Path] = {}
     scene_problems: list[str] = []
-    for done in work_through(request, frames, reporter, progress):
+    through = preview if wanted.dry_run else work_through
+    for done in through(request, frames, reporter, progress):
         if done.problem is None:
             outcomes[done.outcome] += 1
             targets[done.pair.name] = done.target
@@ -77,7 +79,8 @@ def _run(request: UpsampleRequest, frames: Frames, console: Console) -> list[str
             reporter.say(f"{part}: {len(targets)} frames -> {path}")
         scene_problems = scene.problems
     if not single:
-        reporter.summary(outcomes.total())
+        if not wanted.dry_run:
+            reporter.summary(outcomes.total())
         counts = [f"{count} {outcome}" for outcome, count in outcomes.items()]
         counts += [f"{sum(map(len, problems.values()))} failed"] if problems else []
         counts = counts or ["nothing to do"]
