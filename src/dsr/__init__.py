@@ -3,9 +3,10 @@
 >>> import dsr
 >>> camera = dsr.Camera(width=640, height=480, fx=525.0, fy=525.0, cx=319.5, cy=239.5)
 
-and ``dsr.upsample(photo, depth, camera)``, see :func:`dsr.inference.api.upsample`;
-``dsr.upsample_with_errors`` also says how far off the result may be. ``dsr.compose("eval", ["method=facets"])``
-composes the configuration of a command, whose nodes :func:`hydra.utils.instantiate` makes.
+and ``dsr.upsample(photo, depth, camera)``, see :func:`dsr.inference.api.upsample`; ``dsr.upsample_with_errors`` also
+says how far off the result may be, and ``dsr.Upsampler`` keeps the weights for many frames.
+``dsr.compose("eval", ["method=facets"])`` composes the configuration of a command, whose nodes
+:func:`hydra.utils.instantiate` makes.
 """
 
 from __future__ import annotations
@@ -18,13 +19,14 @@ import dsr.utils.threads  # noqa: F401 - for forks
 if TYPE_CHECKING:
     from dsr.app.composition import compose
     from dsr.geometry.camera import Camera
-    from dsr.inference.api import upsample, upsample_with_errors
+    from dsr.inference.api import Upsampler, upsample, upsample_with_errors
 
 __version__ = "0.1.0"
-__all__ = ["Camera", "__version__", "compose", "upsample", "upsample_with_errors"]
+__all__ = ["Camera", "Upsampler", "__version__", "compose", "upsample", "upsample_with_errors"]
 
 _HOMES = {
     "Camera": "dsr.geometry.camera",
+    "Upsampler": "dsr.inference.api",
     "compose": "dsr.app.composition",
     "upsample": "dsr.inference.api",
     "upsample_with_errors": "dsr.inference.api",

@@ -106,6 +106,63 @@ class SurfaceArrays(NamedTuple, Generic[Array]):
     noise: MapNoise | None
 
 
+class Upsampler:
+    """A method that loads its weights once, for many pictures or the frames of a camera.
+
+    Args:
+        method, scale, device, fill, max_hole, **settings: those of :func:`upsample`.
+
+    Raises:
+        ValueError: a method, setting or scale is not as there.
+
+    Example:
+        >>> import numpy as np
+        >>> import dsr
+        >>> upsampler = dsr.Upsampler("bicubic")
+        >>> camera = dsr.Camera(width=32, height=24, fx=30.0, fy=30.0, cx=15.5, cy=11.5)
+        >>> frames = [(np.zeros((24, 32, 3), np.uint8), np.full((12, 16), metres)) for metres in (1.0, 2.0)]
+        >>> [float(upsampler(photo, depth, camera).depth[12, 16].round(1)) for photo, depth in frames]
+        [1.0, 2.0]
+
+    """
+
+    def __init__(
+        self,
+        method: str = DEFAULT,
+        scale: int | None = None,
+        *,
+        device: str = "auto",
+        fill: Fill = "small",
+        max_hole: float = WIDEST,
+        **settings: Any,
+    ) -> None:
+        self._run = upsampler(method, scale, settings=settings, device=device, fill=fill, max_hole=max_hole)
+
+    def __call__(
+        self, rgb: Array, depth: Array, camera: Camera, *, mask: Array | None = None, progress: Steps | None = None
+    ) -> SurfaceArrays[Array]:
+        """Upsample a depth map as :func:`upsample` does, and return its expected errors, too; see there."""
+        arrays = isinstance(rgb, np.ndarray)
+        if isinstance(depth, np.ndarray) != arrays:
+            kinds = f"{type(rgb).__name__} and {type(depth).__name__}"
+            raise ValueError(f"rgb, depth: expected two NumPy arrays or two tensors, got {kinds}")
+        photo, depth_lr = _photo(rgb), _tensor(depth)
+        if depth_lr.dim() == 2:
+            depth_lr = depth_lr[None]
+        if mask is not None:
+            valid = _tensor(mask).bool()
+            if valid.shape[-2:] != depth_lr.shape[-2:]:
+                raise ValueError(
+                    f"mask: expected the depth's shape {tuple(depth_lr.shape[-2:])}, got {tuple(valid.shape[-2:])}"
+                )
+            depth_lr = depth_lr.masked_fill(~valid, torch.nan) if depth_lr.is_floating_point() else depth_lr
+        surface = self._run.upsample(photo, depth_lr, camera, progress)
+        depth_hr, depth_error, angle_error = (
+            cast("Array", each[0].cpu().numpy() if arrays and each is not None else each) for each in surface[:3]
+        )
+        return SurfaceArrays(depth_hr, depth_error, angle_error, surface.noise)
+
+
 def upsample_with_errors(
     rgb: Array,
     depth: Array,
@@ -125,27 +182,8 @@ def upsample_with_errors(
     They are the mean absolute errors of depth and normal that are to be expected at each pixel. ``facets`` says them;
     for other methods they are estimated, see :mod:`dsr.inference.plausibility`.
     """
-    arrays = isinstance(rgb, np.ndarray)
-    if isinstance(depth, np.ndarray) != arrays:
-        raise ValueError(
-            f"rgb, depth: expected two NumPy arrays or two tensors, got {type(rgb).__name__} and {type(depth).__name__}"
-        )
-    photo, depth_lr = _photo(rgb), _tensor(depth)
-    if depth_lr.dim() == 2:
-        depth_lr = depth_lr[None]
-    if mask is not None:
-        valid = _tensor(mask).bool()
-        if valid.shape[-2:] != depth_lr.shape[-2:]:
-            raise ValueError(
-                f"mask: expected the depth's shape {tuple(depth_lr.shape[-2:])}, got {tuple(valid.shape[-2:])}"
-            )
-        depth_lr = depth_lr.masked_fill(~valid, torch.nan) if depth_lr.is_floating_point() else depth_lr
-    run = upsampler(method, scale, settings=settings, device=device, fill=fill, max_hole=max_hole)
-    surface = run.upsample(photo, depth_lr, camera, progress)
-    depth_hr, depth_error, angle_error = (
-        cast("Array", each[0].cpu().numpy() if arrays and each is not None else each) for each in surface[:3]
-    )
-    return SurfaceArrays(depth_hr, depth_error, angle_error, surface.noise)
+    run = Upsampler(method, scale, device=device, fill=fill, max_hole=max_hole, **settings)
+    return run(rgb, depth, camera, mask=mask, progress=progress)
 
 
 def _tensor(values: np.ndarray | Tensor) -> Tensor:
