@@ -120,9 +120,11 @@ class Upsampler:
         >>> import dsr
         >>> upsampler = dsr.Upsampler("bicubic")
         >>> camera = dsr.Camera(width=32, height=24, fx=30.0, fy=30.0, cx=15.5, cy=11.5)
-        >>> frames = [(np.zeros((24, 32, 3), np.uint8), np.full((12, 16), metres)) for metres in (1.0, 2.0)]
-        >>> [float(upsampler(photo, depth, camera).depth[12, 16].round(1)) for photo, depth in frames]
-        [1.0, 2.0]
+        >>> for metres in (1.0, 2.0):
+        ...     surface = upsampler(np.zeros((24, 32, 3), np.uint8), np.full((12, 16), metres), camera)
+        ...     print(f"{surface.depth.mean():.1f} m")
+        1.0 m
+        2.0 m
 
     """
 
