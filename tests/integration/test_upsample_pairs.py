@@ -92,12 +92,15 @@ def test_photo_of_another_scene_is_told(rendered, number, tmp_path, capsys):
     expect_refused(options, tmp_path / "strict", capsys)
 
 
-def test_photo_far_beside_its_depth_map_is_told(rendered, tmp_path, capsys):
+@pytest.mark.parametrize(("axis", "pixels"), [(1, 32), (0, 24), (1, 8)])
+def test_photo_beside_its_depth_map_is_told_with_the_pixels_of_the_photo(rendered, axis, pixels, tmp_path, capsys):
     photo, depth = rendered[3]
-    options = write(tmp_path / "in", [(photo[:, 32:], depth[:, :-16])])
+    moved = photo[:, pixels:] if axis else photo[pixels:]
+    options = write(tmp_path / "in", [(moved, depth[:, : -pixels // 2] if axis else depth[: -pixels // 2])])
     assert upsample(options, tmp_path / "out") == 0
     warning = told(tmp_path / "out")["edges-beside"]
-    assert warning["value"] == pytest.approx(32, rel=0.1)  # in pixels of the photo
+    assert warning["value"] == pytest.approx(pixels, rel=0.15)
+    assert warning["value"] >= warning["threshold"]
     expect_refused(options, tmp_path / "strict", capsys)
 
 
