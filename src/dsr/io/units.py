@@ -20,7 +20,7 @@ from dsr.notes import LIMITS, Assumption
 
 TURNED_BACK = f"bits are turned back by {SUNRGBD_BITS}, as SUN RGB-D turns them: millimetres, also in the result"
 _OVERRIDE = "--depth-unit overrides it"
-_MIN_MEDIAN, _MAX_MEDIAN = 0.05, 80.0
+_MIN_MEDIAN, _MAX_MEDIAN = (LIMITS[f"far-millimetres.{end}"].threshold for end in ("least", "most"))
 """Range of plausible medians in metres; a unit that gives another median is not assumed."""
 _OTHER_UNITS = ((1e-4, "0.1 mm"), (1e-6, "micrometres"), (1e-2, "centimetres"))
 """Units of whole numbers that cannot be millimetres, the most likely first."""
