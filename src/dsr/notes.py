@@ -215,7 +215,7 @@ LIMITS: dict[str, Limit] = {
     "far-millimetres.most": Limit(
         80.0,
         "metres, of the median, beyond which no unit is assumed",
-        "the farthest that KITTI's benchmark scores; of 110 maps of sensors and data sets the farthest median is 5.2 m",
+        "studies on KITTI score depth up to here; of 110 maps of sensors and data sets the farthest median is 5.2 m",
     ),
     "along-the-ray.planes": Limit(
         6,
