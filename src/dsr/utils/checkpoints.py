@@ -244,10 +244,13 @@ def _fitting_optimizer(value: Any, own: Any, place: str) -> dict[str, Any]:
     pairs = zip(groups, own["param_groups"], strict=True)
     fitting = [_settings(group, new, f"{place}.param_groups.{number}") for number, (group, new) in enumerate(pairs)]
     states, kept = _at(value, "state"), {}
+    if not isinstance(states, Mapping):
+        raise ValueError(f"{place}.state: expected dict, got {_kind(states)}")
     for key in (key for key in states if key in own["state"]):
         saved, new = states[key], own["state"][key]
         if "old_dirs" in new and isinstance(saved, Mapping):
-            history = len(saved.get("old_dirs") or ())
+            past = saved.get("old_dirs")
+            history = len(past) if isinstance(past, list) else 0
             flat = {name: [new["d"]] * history for name in ("old_dirs", "old_stps")}
             new = {**new, **flat, "ro": [0.0] * history, "al": [None] * own["param_groups"][0]["history_size"]}
         kept[key] = _fitting(saved, new, f"{place}.state.{key}")
@@ -271,7 +274,7 @@ def _settings(group: Any, own: Mapping[str, Any], place: str) -> dict[str, Any]:
             raise ValueError(f"{place}.{key}: expected a finite number, got {float(value):g}")
         return value
 
-    if _at({"": group}, "").get("params") != own["params"]:
+    if not isinstance(group, Mapping) or group.get("params") != own["params"]:
         raise ValueError(f"{place}.params: expected those of this training, in their order")
     return {key: taken(key, group[key], new) if key in group else new for key, new in own.items()}
 
@@ -303,14 +306,20 @@ def _tried(optimizer: torch.optim.Optimizer) -> Iterator[None]:
 
 
 def _try_step(optimizer: torch.optim.Optimizer, state: Any, schedules: Any, states: Any) -> None:
-    """Do a step from saved states; what they lack is raised now."""
-    optimizer.load_state_dict(copy.deepcopy(state))
-    for schedule, saved in zip(schedules, copy.deepcopy(states), strict=True):
-        schedule.load_state_dict(saved)
-    with _tried(optimizer):
-        for schedule in schedules:
-            if not isinstance(schedule, torch.optim.lr_scheduler.ReduceLROnPlateau):
-                schedule.step()
+    """Do a step from saved states; ValueError where that fails."""
+    try:
+        optimizer.load_state_dict(copy.deepcopy(state))
+        for schedule, saved in zip(schedules, copy.deepcopy(states), strict=True):
+            schedule.load_state_dict(saved)
+        with _tried(optimizer):
+            for schedule in schedules:
+                if not isinstance(schedule, torch.optim.lr_scheduler.ReduceLROnPlateau):
+                    schedule.step()
+    except MemoryError:
+        raise
+    except Exception as error:  # the same step without them was done
+        what = f"{type(error).__name__}: {one_line(error)}"
+        raise ValueError(f"optimizer_states, lr_schedulers: expected those of a next step, got {what}") from error
     rates = [float(group["lr"]) for group in optimizer.param_groups if "lr" in group]
     if not all(map(math.isfinite, rates)):
         raise ValueError(f"lr_schedulers: expected finite learning rates of the next step, got {rates[0]:g}")
