@@ -1,4 +1,4 @@
-"""Archives and folders with the same members, and LZFSE data; sizes are checked before anything is unpacked.
+"""Archives, folders with the same members, parts of files, and LZFSE data; sizes are checked before unpacking.
 
 LZFSE: https://github.com/lzfse/lzfse, of which lzfse_internal.h describes the blocks.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import struct
+import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -19,8 +20,19 @@ import numpy as np
 
 from dsr.io.frames import Record
 from dsr.utils.decoding import decode_pixels
-from dsr.utils.guards import read_limited, read_member, refusing
+from dsr.utils.files import expect_space
+from dsr.utils.guards import (
+    bytes_of_archive,
+    expect_bytes,
+    files_in,
+    naming,
+    opened,
+    read_limited,
+    read_member,
+    refusing,
+)
 
+_CHUNK = 1 << 20
 PHOTO_LIMIT = 1 << 26
 """Largest size in bytes of an encoded photo."""
 _DAMAGED = (zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError, struct.error)
@@ -118,6 +130,72 @@ class Member:
         return {"file": name, "sha256": hashlib.sha256(content).hexdigest()}
 
 
+@dataclass(frozen=True)
+class Section:
+    """A :class:`~dsr.io.frames.Source` of a part of a file.
+
+    Args:
+        file: the file.
+        name: of the part, for messages.
+        start, length: place in the file, in bytes.
+        decode: returns the pixels of the content, or raises a ValueError without the file's name.
+
+    """
+
+    file: Path
+    name: str
+    start: int
+    length: int
+    decode: Callable[[bytes], np.ndarray]
+
+    def read(self) -> np.ndarray:
+        """Return the pixels."""
+        with naming(self.file / self.name):
+            return self.decode(self._content())
+
+    def record(self) -> Record:
+        """Return the part's name and hash."""
+        return {"file": f"{self.file.name}/{self.name}", "sha256": hashlib.sha256(self._content()).hexdigest()}
+
+    def _content(self) -> bytes:
+        """Return the bytes of the part."""
+        with opened(self.file) as file:
+            file.seek(self.start)
+            return file.read(self.length)
+
+
+def unpack(path: Path) -> Path:
+    """Return a temporary folder with the files of a ZIP file, which is deleted when the program ends.
+
+    Raises:
+        ValueError: it is damaged or encrypted, a member is a link or leads outside the folder, or they are larger than
+            the size of the archive explains.
+        FullDiskError: the disk is too small for what it declares.
+
+    """
+    return _unpack(path, _state(path))[1]
+
+
+def inflate(content: bytes, size: int, bits: int = zlib.MAX_WBITS) -> bytes:
+    """Return what compressed data unpack to.
+
+    Args:
+        size: number of bytes that is expected.
+        bits: zlib's window size: negative for data without a header.
+
+    Raises:
+        ValueError: they are damaged, or unpack to another number of bytes.
+
+    """
+    with refusing(f"expected compressed data of {size} bytes, got damaged ones", zlib.error):
+        values = zlib.decompressobj(bits).decompress(content, size + 1)
+    if len(values) != size:
+        raise ValueError(
+            f"expected compressed data of {size} bytes, got {'more' if len(values) > size else len(values)}"
+        )
+    return values
+
+
 def decode_photo(content: bytes) -> np.ndarray:
     """Return the pixels of an encoded photo, (H, W, 3) uint8 RGB.
 
@@ -191,3 +269,30 @@ def _open(path: Path, _: tuple[int, int]) -> zipfile.ZipFile:
     """Return the open archive."""
     with refusing(f"{path}: expected a ZIP archive, got a damaged, truncated or foreign file", *_DAMAGED):
         return zipfile.ZipFile(path)
+
+
+@functools.cache
+def _unpack(path: Path, _: tuple[int, int]) -> tuple[tempfile.TemporaryDirectory[str], Path]:
+    """Return a temporary folder, and the one in it with the files of an archive."""
+    work = tempfile.TemporaryDirectory(prefix="dsr-")
+    target = Path(work.name) / path.name
+    target.mkdir()
+    with _open(path, _state(path)) as packed:
+        members = [each for each in files_in(packed, path) if not each.filename.startswith("__MACOSX/")]
+        total = sum(each.file_size for each in members)
+        expect_bytes(f"{path}: the members declare", total, bytes_of_archive(path.stat().st_size))
+        expect_space(target, total)
+        for each in members:
+            place = target / each.filename.replace("\\", "/")
+            with refusing(f"{path}: {each.filename}: expected a member of the archive, got a damaged one", *_DAMAGED):
+                place.parent.mkdir(parents=True, exist_ok=True)
+                with packed.open(each) as source, place.open("xb") as sink:
+                    left = each.file_size
+                    while part := source.read(_CHUNK):
+                        left -= len(part)
+                        if left < 0:
+                            raise zipfile.BadZipFile
+                        sink.write(part)
+                if left:
+                    raise zipfile.BadZipFile
+    return work, target
