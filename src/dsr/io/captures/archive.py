@@ -5,8 +5,12 @@ LZFSE: https://github.com/lzfse/lzfse, of which lzfse_internal.h describes the b
 
 from __future__ import annotations
 
+import atexit
+import contextlib
 import functools
 import hashlib
+import os
+import shutil
 import struct
 import tempfile
 import zipfile
@@ -173,7 +177,7 @@ def unpack(path: Path) -> Path:
         FullDiskError: the disk is too small for what it declares.
 
     """
-    return _unpack(path, _state(path))[1]
+    return _unpack(path, _state(path))
 
 
 def inflate(content: bytes, size: int, bits: int = zlib.MAX_WBITS) -> bytes:
@@ -272,27 +276,41 @@ def _open(path: Path, _: tuple[int, int]) -> zipfile.ZipFile:
 
 
 @functools.cache
-def _unpack(path: Path, _: tuple[int, int]) -> tuple[tempfile.TemporaryDirectory[str], Path]:
-    """Return a temporary folder, and the one in it with the files of an archive."""
-    work = tempfile.TemporaryDirectory(prefix="dsr-")
-    target = Path(work.name) / path.name
-    target.mkdir()
+def _unpack(path: Path, _: tuple[int, int]) -> Path:
+    """Return the folder with the files of an archive."""
     with _open(path, _state(path)) as packed:
         members = [each for each in files_in(packed, path) if not each.filename.startswith("__MACOSX/")]
         total = sum(each.file_size for each in members)
         expect_bytes(f"{path}: the members declare", total, bytes_of_archive(path.stat().st_size))
-        expect_space(target, total)
-        for each in members:
-            place = target / each.filename.replace("\\", "/")
-            with refusing(f"{path}: {each.filename}: expected a member of the archive, got a damaged one", *_DAMAGED):
-                place.parent.mkdir(parents=True, exist_ok=True)
-                with packed.open(each) as source, place.open("xb") as sink:
-                    left = each.file_size
-                    while part := source.read(_CHUNK):
-                        left -= len(part)
-                        if left < 0:
-                            raise zipfile.BadZipFile
-                        sink.write(part)
-                if left:
-                    raise zipfile.BadZipFile
-    return work, target
+        with contextlib.ExitStack() as stack:
+            work = tempfile.mkdtemp(prefix="dsr-")
+            stack.callback(shutil.rmtree, work, ignore_errors=True)
+            target = Path(work) / path.name
+            target.mkdir()
+            expect_space(target, total)
+            for each in members:
+                with refusing(f"{path}: {each.filename}: expected a member, got a damaged one", *_DAMAGED):
+                    _unpack_member(packed, each, target / each.filename.replace("\\", "/"))
+            stack.pop_all()
+    atexit.register(_remove, work, os.getpid())
+    return target
+
+
+def _unpack_member(packed: zipfile.ZipFile, member: zipfile.ZipInfo, path: Path) -> None:
+    """Write a member of an archive to a file that does not exist yet; it may have no more bytes than it declares."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    left = member.file_size
+    with packed.open(member) as source, path.open("xb") as sink:
+        while part := source.read(_CHUNK):
+            left -= len(part)
+            if left < 0:
+                break
+            sink.write(part)
+    if left:
+        raise zipfile.BadZipFile(f"{member.filename}: another size than {member.file_size} bytes")
+
+
+def _remove(folder: str, process: int) -> None:
+    """Delete a folder that a process made, in that process."""
+    if os.getpid() == process:
+        shutil.rmtree(folder, ignore_errors=True)
