@@ -304,13 +304,14 @@ def iphone_map(number):
 
 
 def scannetpp(folder, kind="lz4"):
-    """Write the iPhone of a scene of ScanNet++ with its maps as LZ4 or deflate in a file, or extracted."""
+    """Write the iPhone of a scene of ScanNet++, photos of 192 x 256, its maps as LZ4 or deflate, or extracted."""
     import lz4.block  # noqa: PLC0415 - an extra
 
     entries, parts, place = {}, [], folder / "iphone"
     for number in range(FRAMES):
-        matrix = intrinsic_matrix()
+        matrix = np.diag([4, 4, 1]) @ intrinsic_matrix()
         matrix[0, 0] += number
+        picture = cv2.resize(photo(number), (256, 192))
         aligned = {"aligned_pose": pose(number).tolist(), "pose": (pose(number) @ FLIP).tolist()}
         entries[f"frame_{number:06}"] = {"timestamp": 0.1, "intrinsic": matrix.tolist(), "imu": [], **aligned}
         values = np.round(1000 * iphone_map(number)).astype("<u2")
@@ -320,7 +321,7 @@ def scannetpp(folder, kind="lz4"):
             packed = packing.compress(iphone_map(number).astype("<f4").tobytes()) + packing.flush()
         parts += [struct.pack("<I", len(packed)), packed]
         if kind == "files":
-            save(place / "rgb" / f"frame_{number:06}.jpg", photo(number))
+            save(place / "rgb" / f"frame_{number:06}.jpg", picture)
             save(place / "depth" / f"frame_{number:06}.png", values)
     place.mkdir(parents=True, exist_ok=True)
     if kind != "files":
