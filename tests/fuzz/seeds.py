@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import importlib.util
 import json
+import shutil
 import tarfile
 import zipfile
 from pathlib import Path
@@ -341,6 +342,21 @@ def ros2(folder: Path) -> None:
 def r3d(folder: Path) -> None:
     """Write an archive of Record3D."""
     captures.record3d(folder / "scan.r3d")
+
+
+def sens(folder: Path) -> None:
+    """Write recordings of ScanNet, compressed in all ways."""
+    captures.sens(folder / "a.sens", lost=(1,))
+    captures.sens(folder / "b.sens", colour="raw", depth="raw", scale=5000.0)
+
+
+def zipped(folder: Path) -> None:
+    """Write a ZIP file of an export of 3D Scanner App."""
+    captures.scanner_app(folder / "scan")
+    with zipfile.ZipFile(folder / "scan.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        for path in sorted((folder / "scan").iterdir()):
+            archive.write(path, f"scan/{path.name}")
+    shutil.rmtree(folder / "scan")
 
 
 def record3d_folder(folder: Path) -> None:

@@ -347,7 +347,7 @@ def _unit(
         unit = described.depth_unit
         return Told(unit, (Assumption(f"unit: {unit:g} m per value, says the camera file"),))
     if pair.unit is not None:
-        return Told(pair.unit, ())
+        return Told(pair.unit, (), bits=pair.bits)
     if _is_icl(pair):
         return Told(1e-2, ())
     hole_value = described.hole_value if reading.hole_value is None else reading.hole_value
