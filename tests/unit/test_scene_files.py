@@ -1,6 +1,8 @@
 """Frames as other programs read them: axes, units, intrinsics and poses, read back by code of their own."""
 
 import json
+from dataclasses import replace
+from datetime import datetime
 
 import cv2
 import numpy as np
@@ -184,27 +186,63 @@ def test_splatting_without_poses_has_depth_alone_and_holes_alone_are_refused(mak
     assert not (tmp_path / "h").exists()
 
 
-def test_rerun_recording_is_read_back(make, tmp_path):
+def read_recording(path):
+    """Return the columns of a recording by entity and name, as rerun reads them."""
     chunk = pytest.importorskip("rerun.chunk", reason="pip install dsr[rerun]")
-    frames = [make(0), make(1, pose=None)]
-    path = tmp_path / "scene.rrd"
-    assert write_rerun(path, frames) == [path]
-    assert [each.name for each in tmp_path.iterdir() if each.is_file()] == ["scene.rrd"]
     columns = {}
     for part in chunk.RrdReader(str(path)).stream():
         batch = part.to_record_batch()
         for name in batch.schema.names:
-            columns[part.entity_path, name] = batch.column(name).to_pylist()
+            columns.setdefault((part.entity_path, name), []).extend(batch.column(name).to_pylist())
+    return columns
+
+
+def test_rerun_recording_is_read_back(make, tmp_path):
+    frames = [make(0), make(1, pose=None)]
+    path = tmp_path / "scene.rrd"
+    pytest.importorskip("rerun", reason="pip install dsr[rerun]")
+    assert write_rerun(path, frames) == [path]
+    assert [each.name for each in tmp_path.iterdir() if each.is_file()] == ["scene.rrd"]
+    columns = read_recording(path)
+    assert {"/", "/camera", "/camera/rgb", "/camera/depth"} <= {entity for entity, _ in columns}
     matrices = np.array(columns["/camera", "Pinhole:image_from_camera"]).reshape(2, 3, 3)
     np.testing.assert_allclose(matrices[0].T, [[10, 0, 5.75], [0, 11, 4], [0, 0, 1]])
     shifts = np.array(columns["/camera", "Transform3D:translation"]).reshape(2, 3)
     np.testing.assert_allclose(shifts, [POSE[:3, 3], [0, 0, 0]])
     turns = np.array(columns["/camera", "Transform3D:mat3x3"]).reshape(2, 3, 3)
     np.testing.assert_allclose(turns[0].T, POSE[:3, :3])
-    for number, values in enumerate(columns["/camera/depth", "DepthImage:buffer"]):
-        depth = np.frombuffer(bytes(values[0]), np.float32).reshape(8, 12)
-        np.testing.assert_array_equal(depth, np.nan_to_num(depth_map(number)))
-    assert len(columns["/camera/rgb", "EncodedImage:blob"]) == 2
+    meters = np.array(columns["/camera/depth", "EncodedDepthImage:meter"]).ravel()
+    for number, [blob] in enumerate(columns["/camera/depth", "EncodedDepthImage:blob"]):
+        values = cv2.imdecode(np.frombuffer(bytes(blob), np.uint8), cv2.IMREAD_UNCHANGED)
+        assert values.dtype == np.uint16
+        np.testing.assert_allclose(values / meters[number], np.nan_to_num(depth_map(number)), atol=5.1e-4)
+    for number, [blob] in enumerate(columns["/camera/rgb", "EncodedImage:blob"]):
+        assert bytes(blob[:3]) == b"\xff\xd8\xff"
+        photo = cv2.imdecode(np.frombuffer(bytes(blob), np.uint8), cv2.IMREAD_COLOR)
+        np.testing.assert_allclose(photo[4:, :, 2], 255 * number / 10, atol=4)
+    assert columns["/camera/depth", "frame"] == [0, 1]
+    assert ("/camera/depth", "time") not in columns
+
+
+@pytest.mark.parametrize(("ups", "axes"), [(("y", "y"), (3, 1, 6)), (("z", "z"), (3, 5, 1)), (("", ""), (3, 2, 5)),
+                                           (("y", ""), (3, 2, 5))])  # fmt: skip
+def test_rerun_world_has_the_captures_axes(make, tmp_path, ups, axes):
+    """The numbers are rerun's: 1 up, 2 down, 3 right, 4 left, 5 forward, 6 back."""
+    pytest.importorskip("rerun", reason="pip install dsr[rerun]")
+    write_rerun(tmp_path / "s.rrd", [replace(make(number), up=up) for number, up in enumerate(ups)])
+    columns = read_recording(tmp_path / "s.rrd")
+    [[coordinates]] = columns["/", "ViewCoordinates:xyz"]
+    assert tuple(coordinates) == axes
+    assert all(tuple(each) == (3, 2, 5) for [each] in columns["/camera", "Pinhole:camera_xyz"])
+
+
+@pytest.mark.parametrize("start", [12.5, 1305031102.25])
+def test_rerun_timeline_is_the_frames_times(make, tmp_path, start):
+    pytest.importorskip("rerun", reason="pip install dsr[rerun]")
+    write_rerun(tmp_path / "s.rrd", [replace(make(number), time=start + number / 2) for number in range(2)])
+    times = read_recording(tmp_path / "s.rrd")["/camera/depth", "time"]
+    seconds = [each.timestamp() if isinstance(each, datetime) else each.total_seconds() for each in times]
+    np.testing.assert_allclose(seconds, [start, start + 0.5], atol=1e-6)
 
 
 def test_rerun_without_the_library_names_the_extra(make, tmp_path, monkeypatch):

@@ -29,6 +29,10 @@ CONFIDENCE_SUFFIXES = (*DEPTH_SUFFIXES, ".bmp")
 """Of the files of confidence maps."""
 
 
+UPS = ("", "y", "z")
+"""Axes of a capture's world that point up; "" where it does not say."""
+
+
 class Source(Protocol):
     """A photo or a map inside of a file: a frame of a video, a member of an archive, a message of a recording.
 
@@ -61,12 +65,15 @@ class Geometry(NamedTuple):
 
     ``camera``: of a size of its own, which is scaled to the photo's; None if it does not say. ``pose``: camera to
     world, (4, 4) float64 in metres, rigid, of the camera's frame x right, y down, z forward; the world's frame is the
-    capture's own. None if it does not say. ``assumptions``: what was assumed for them.
+    capture's own. None if it does not say. ``assumptions``: what was assumed for them. ``up``: the axis of the world that
+    points up, one of :data:`UPS`. ``time``: of the frame, in seconds; None if it does not say.
     """
 
     camera: Camera | None = None
     pose: np.ndarray | None = None
     assumptions: tuple[Assumption, ...] = ()
+    up: str = ""
+    time: float | None = None
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,10 @@ to start from. Its principal point is counted from the corner of the image.
 
 A recording for the viewer of rerun: colour, depth and poses on a timeline of frames.
 
-Axes are the camera's, x right, y down, z forward (``RDF`` in rerun), units are metres. The library is the extra
-``rerun``, https://rerun.io/docs.
+A camera's axes are x right, y down, z forward (``RDF`` in rerun). The world's are said as far as the capture says which
+one points up: ``RUB`` with y up, ``RFU`` with z up, else ``RDF``. Photos are JPEG, depth is the 16-bit PNG in millimetres
+with ``meter``, which counts units per metre (rerun-io/rerun, re_sdk_types/definitions/rerun/components/depth_meter.fbs).
+The library is the extra ``rerun``, https://rerun.io/docs.
 """
 
 from __future__ import annotations
@@ -42,8 +44,9 @@ from torch import Tensor
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.rigid_motion import is_rotation
+from dsr.io.exports import to_jpeg
 from dsr.io.images import read_pixels
-from dsr.io.photos import write_png
+from dsr.io.photos import encode_png, write_png
 from dsr.utils.arrays import open_array
 from dsr.utils.files import replacing, write_text
 from dsr.utils.guards import pixels_beside, refusing
@@ -59,7 +62,12 @@ _LARGEST = 65535
 _POINTS = 100_000
 """Points of all frames together that the optimisation starts from."""
 
-_TIMELINE = "frame"
+_TIMELINE, _CLOCK = "frame", "time"
+_AXES = {"": "RDF", "y": "RUB", "z": "RFU"}
+"""Of the world in rerun, by what points up."""
+_EPOCH = 1e9
+"""Times from here on are seconds since 1970, smaller ones count from the start of a device or a recording."""
+_QUALITY = 95
 
 
 @dataclass(frozen=True)
@@ -73,6 +81,8 @@ class Frame:
             it is not known.
         colour: an 8-bit PNG.
         depth: an NPY of (H, W) orthogonal depth in metres, NaN in holes.
+        up: the axis of the world that points up, one of :data:`dsr.io.frames.UPS`.
+        time: of the frame in seconds; None if it is not known.
 
     """
 
@@ -81,6 +91,8 @@ class Frame:
     pose: Tensor | None
     colour: Path
     depth: Path
+    up: str = ""
+    time: float | None = None
 
     @property
     def stem(self) -> str:
@@ -138,6 +150,12 @@ def one_camera(frames: Sequence[Frame]) -> Camera | None:
     """Return the camera of all frames, or None if they differ."""
     cameras = {frame.camera for frame in frames}
     return cameras.pop() if len(cameras) == 1 else None
+
+
+def common_up(frames: Sequence[Frame]) -> str:
+    """Return the axis that points up in the world of all frames, or "" if they differ."""
+    ups = {frame.up for frame in frames}
+    return ups.pop() if len(ups) == 1 else ""
 
 
 def write_colour(path: Path, rgb: np.ndarray) -> None:
@@ -318,6 +336,8 @@ def _numbers(values: Sequence[float] | np.ndarray) -> str:
 def write_rerun(path: Path, frames: Sequence[Frame]) -> list[Path]:
     """Write a recording ``.rrd``: for each frame the entities ``camera``, ``camera/rgb`` and ``camera/depth``.
 
+    They are on the timeline ``frame``, by number, and on ``time`` if all frames have one.
+
     Args:
         frames: one at least; those without a pose stand at the origin.
 
@@ -333,18 +353,25 @@ def write_rerun(path: Path, frames: Sequence[Frame]) -> list[Path]:
     recording = rerun.RecordingStream("dsr")
     with replacing(path) as temporary:
         recording.save(str(temporary))
-        recording.log("/", rerun.ViewCoordinates.RDF, static=True)
+        recording.log("/", getattr(rerun.ViewCoordinates, _AXES[common_up(frames)]), static=True)
+        timed = all(frame.time is not None for frame in frames)
         for number, frame in enumerate(frames):
             camera = frame.camera
             recording.set_time(_TIMELINE, sequence=number)
+            if timed and frame.time is not None:
+                kind = "timestamp" if frame.time >= _EPOCH else "duration"
+                recording.set_time(_CLOCK, **{kind: frame.time})
             pose = np.eye(4) if frame.pose is None else frame.pose.numpy()
             recording.log("camera", rerun.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
             matrix = [[camera.fx, 0, camera.cx + 0.5], [0, camera.fy, camera.cy + 0.5], [0, 0, 1]]
             size = [camera.width, camera.height]
             view = rerun.Pinhole(image_from_camera=matrix, resolution=size, camera_xyz=rerun.ViewCoordinates.RDF)
             recording.log("camera", view)
-            recording.log("camera/rgb", rerun.Image(frame.read_colour()).compress(jpeg_quality=95))
-            recording.log("camera/depth", rerun.DepthImage(np.nan_to_num(frame.read_depth()), meter=1.0))
+            photo = to_jpeg(frame.read_colour(), max(size), _QUALITY)
+            recording.log("camera/rgb", rerun.EncodedImage(contents=photo, media_type="image/jpeg"))
+            depth = encode_png(to_millimetres(frame.read_depth())[0])
+            image = rerun.EncodedDepthImage(depth, media_type="image/png", meter=float(MILLIMETRES))
+            recording.log("camera/depth", image)
         recording.flush()
         recording.disconnect()
     return [path]

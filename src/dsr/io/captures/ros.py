@@ -131,10 +131,11 @@ def _read(path: Path, prefix: str = "") -> PairingResult:
     if not partner:
         raise ValueError(f"{path}: expected photos and depth maps within 20 ms of each other, found none")
     told = repr(info).encode()
-    geometry = functools.partial(_geometry, f"{path}{PurePosixPath(photo_topic).parent / 'camera_info'}", info)
+    place = f"{path}{PurePosixPath(photo_topic).parent / 'camera_info'}"
     pairs = []
     for first, second in sorted(partner.items()):
         photo, depth = photos[int(first.name)][0], depths[int(second.name)][0]
+        geometry = functools.partial(_geometry, place, info, named["rgb"][first])
         frame = CaptureFrame("ROS", geometry, path, told, photo, depth)
         name = f"{prefix}{int(first.name):06}"
         pairs.append(
@@ -209,15 +210,19 @@ def _camera_info(reader: Any, photo_topic: str) -> tuple[int, int, tuple[float, 
     return None
 
 
-def _geometry(place: str, info: tuple[int, int, tuple[float, ...], bool] | None, _: tuple[int, int]) -> Geometry:
-    """Return the camera of a recording."""
+def _geometry(
+    place: str, info: tuple[int, int, tuple[float, ...], bool] | None, time: float, _: tuple[int, int]
+) -> Geometry:
+    """Return the camera of a recording, and the frame's time."""
     if info is None:
-        return Geometry(None, None, (Assumption("the recording has no camera_info beside the photo's topic"),))
+        note = Assumption("the recording has no camera_info beside the photo's topic")
+        return Geometry(None, None, (note,), time=time)
     height, width, numbers, distorted = info
     if min(height, width) < 1:
         raise ValueError(f"{place}: expected a positive width and height, got {width} x {height}")
     text = "the photo's lens distortion is not undone: a rectified topic (image_rect) has none"
-    return Geometry(intrinsics_camera(place, (height, width), numbers), None, (Assumption(text),) if distorted else ())
+    notes = (Assumption(text),) if distorted else ()
+    return Geometry(intrinsics_camera(place, (height, width), numbers), None, notes, time=time)
 
 
 class _NamedErrors:
