@@ -58,7 +58,7 @@ def test_exports_are_written_beside_the_frames_and_again_after_a_resumption(capt
     assert "2 complete already" in capsys.readouterr().out
     assert "open3d/trajectory.log" in names_in(out)
     frames = json.loads((out / "transforms.json").read_text())["frames"]
-    assert [entry["file_path"] for entry in frames] == ["000/rgbd/color.png", "001/rgbd/color.png"]
+    assert [entry["file_path"] for entry in frames] == ["nerfstudio/images/000.png", "nerfstudio/images/001.png"]
     assert [entry["transform_matrix"][0][3] for entry in frames] == [0, 1]
     recorded = json.loads((out / "exports.json").read_text())["exports"]
     assert set(recorded) == {"open3d", "gaussian", "transforms.json"}

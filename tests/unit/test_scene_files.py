@@ -3,12 +3,15 @@
 import json
 from dataclasses import replace
 from datetime import datetime
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
+import trimesh
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from dsr.geometry.camera import Camera
 from dsr.io.open3d import write_open3d, write_rgbd
@@ -74,20 +77,59 @@ def test_depth_beyond_sixteen_bits_is_a_hole_and_said(tmp_path):
     assert str(fact) == "rgbd/depth.png: what is beyond 65.5 m is written as a hole (96 pixels)"
 
 
-def test_transforms_have_opengl_axes_and_find_their_files(make, tmp_path):
-    frames = [make(0), make(1)]
+def read_as_nerfstudio(path, moved, scale):
+    """Return frames and points as nerfstudio's parser has them after it has turned, moved and scaled the world.
+
+    A frame: name of the photo, its pixels, depth, intrinsics fx fy cx cy, and camera to world, of OpenGL's axes.
+    """
+    entries, folder = json.loads(path.read_text()), path.parent
+    assert entries["depth_unit_scale_factor"] == 0.001  # the parser's own default
+    frames = []
+    for entry in sorted(entries["frames"], key=lambda entry: entry["file_path"]):
+        camera = entries if "fl_x" in entries else entry
+        depth = cv2.imread(str(folder / entry["depth_file_path"]), cv2.IMREAD_ANYDEPTH).astype(np.float64) * 1e-3
+        pose = moved @ np.array(entry["transform_matrix"])
+        pose[:3, 3] *= scale
+        photo = cv2.imread(str(folder / entry["file_path"]))
+        assert photo.shape[:2] == depth.shape == (camera["h"], camera["w"])
+        numbers = [camera[name] for name in ("fl_x", "fl_y", "cx", "cy")]
+        frames.append((Path(entry["file_path"]).name, photo[..., ::-1], depth * scale, numbers, pose))
+    cloud = trimesh.load(folder / entries["ply_file_path"])
+    ways = [moved @ np.vstack((entries["applied_transform"], [0, 0, 0, 1])), moved]  # of versions up to and since 1.1
+    clouds = [scale * (np.asarray(cloud.vertices) @ way[:3, :3].T + way[:3, 3]) for way in ways]
+    np.testing.assert_allclose(*clouds, atol=1e-6)
+    return frames, clouds[0], np.asarray(cloud.colors)[:, :3]
+
+
+@pytest.mark.parametrize("second", [CAMERA, Camera(12, 8, 20.0, 21.0, 5.25, 3.5)])
+def test_transforms_are_read_as_nerfstudio_reads_them(make, tmp_path, second):
+    frames = [make(1, camera=second), make(0)]
     path = tmp_path / "out" / "transforms.json"
-    assert write_transforms(path, frames) == [path]
-    entries = json.loads(path.read_text())
-    assert [entries[key] for key in ("w", "h", "fl_x", "fl_y", "cx", "cy")] == [12, 8, 10, 11, 5.75, 4]
-    for frame, entry in zip(frames, entries["frames"], strict=True):
-        z = np.array(Image.open(path.parent / entry["depth_file_path"])) / 1000
-        assert cv2.imread(str(path.parent / entry["file_path"])).shape == (8, 12, 3)
-        v, u = np.mgrid[0:8, 0:12] + 0.5
-        points = np.stack(((u - entries["cx"]) / 10 * z, -(v - entries["cy"]) / 11 * z, -z, np.ones_like(z)))
-        world = np.einsum("ij,jhw->ihw", np.array(entry["transform_matrix"]), points)[:3]
-        known = z > 0
-        np.testing.assert_allclose(world[:, known], world_points(frame)[:, known], atol=1e-3)
+    files = write_transforms(path, frames)
+    assert {file.relative_to(path.parent).as_posix() for file in files} == {
+        "transforms.json", "nerfstudio/points.ply", *(
+            f"nerfstudio/{kind}/room_00{number}.png" for kind in ("images", "depths") for number in (0, 1))
+    }  # fmt: skip
+    moved = np.block([[Rotation.from_rotvec((0.3, -1.2, 0.4)).as_matrix(), np.array([[4.0], [-1], [2]])], [0, 0, 0, 1]])
+    read, points, colours = read_as_nerfstudio(path, moved, 0.25)
+    assert [name for name, *_ in read] == ["room_000.png", "room_001.png"]
+    known = sum(int(np.isfinite(depth_map(number)).sum()) for number in (0, 1))
+    assert len(points) == known
+    found = 0
+    for _, photo, depth, (fx, fy, cx, cy), pose in read:
+        seen = (points - pose[:3, 3]) @ pose[:3, :3]  # OpenGL: x right, y up, z backwards
+        z = -seen[:, 2]
+        column, row = cx + fx * seen[:, 0] / z - 0.5, cy - fy * seen[:, 1] / z - 0.5
+        inside = (np.abs(column - np.rint(column)) < 1e-3) & (np.abs(row - np.rint(row)) < 1e-3) & (z > 0)
+        inside &= (column > -0.5) & (column < 11.5) & (row > -0.5) & (row < 7.5)
+        u, v = np.rint(column[inside]).astype(int), np.rint(row[inside]).astype(int)
+        own = np.abs(depth[v, u] - z[inside]) < 0.25 * 1e-3
+        found += int(own.sum())
+        np.testing.assert_array_equal(photo[v, u][own], colours[inside][own])
+    assert found == known
+    first = json.loads(path.read_text())
+    np.testing.assert_allclose(np.array(first["frames"][0]["transform_matrix"]) @ np.diag([1, -1, -1, 1]), POSE)
+    assert ("fl_x" in first) == (second == CAMERA)
 
 
 def test_transforms_of_different_cameras_have_intrinsics_for_each_frame(make, tmp_path):

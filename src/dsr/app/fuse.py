@@ -60,7 +60,8 @@ def fuse(request: FuseRequest, console: Console) -> list[str]:
         mesh = fuse_maps(maps, voxel)
     except ValueError as error:
         raise ValueError(f"{frames[0]}{' and others' if len(frames) > 1 else ''}: {error}") from error
-    write_ply(request.output, mesh.vertices, mesh.normals, np.full(mesh.vertices.shape, _GREY, np.uint8), mesh.faces)
+    colours = np.full(mesh.vertices.shape, _GREY, np.uint8)
+    write_ply(request.output, mesh.vertices, colours, mesh.normals, mesh.faces)
     size = f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles, voxels of {1e3 * voxel:.3g} mm"
     show(console, f"{_count(frames)} -> {request.output}: {size}; in the world's frame of the poses")
     return problems

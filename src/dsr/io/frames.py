@@ -65,8 +65,8 @@ class Geometry(NamedTuple):
 
     ``camera``: of a size of its own, which is scaled to the photo's; None if it does not say. ``pose``: camera to
     world, (4, 4) float64 in metres, rigid, of the camera's frame x right, y down, z forward; the world's frame is the
-    capture's own. None if it does not say. ``assumptions``: what was assumed for them. ``up``: the axis of the world that
-    points up, one of :data:`UPS`. ``time``: of the frame, in seconds; None if it does not say.
+    capture's own. None if it does not say. ``assumptions``: what was assumed for them. ``up``: the axis of the world
+    that points up, one of :data:`UPS`. ``time``: of the frame, in seconds; None if it does not say.
     """
 
     camera: Camera | None = None

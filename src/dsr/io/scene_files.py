@@ -3,9 +3,12 @@
 ``transforms.json`` with depth, as nerfstudio and the programs around instant-ngp read it.
 
 Axes of a camera are those of OpenGL, x right, y up, z backwards, so that the second and third column of dsr's
-camera-to-world transform change their signs; the world stays as it is. The principal point is counted from the corner
-of the image, half a pixel more than dsr's. ``depth_file_path`` is a 16-bit PNG in millimetres, 0 in holes, which is
-nerfstudio's default unit (https://docs.nerf.studio/quickstart/data_conventions.html).
+camera-to-world transform change their signs. The world stays as it is, so ``applied_transform`` is the identity:
+nerfstudio turns it upright itself, and its versions differ in whether the points of ``ply_file_path`` are meant before or
+after that transform (nerfstudio-project/nerfstudio, nerfstudio/data/dataparsers/nerfstudio_dataparser.py). Names of files
+differ, as it finds reduced pictures by the name alone. The principal point is counted from the corner of the image, half
+a pixel more than dsr's. ``depth_file_path`` is a 16-bit PNG in millimetres, 0 in holes, which is its default unit; with
+another, ``depth_unit_scale_factor`` would have to be given to it, as it does not read that entry.
 
 Inverse depth for 3D Gaussian Splatting, and its scene where the capture has poses.
 
@@ -20,16 +23,15 @@ to start from. Its principal point is counted from the corner of the image.
 A recording for the viewer of rerun: colour, depth and poses on a timeline of frames.
 
 A camera's axes are x right, y down, z forward (``RDF`` in rerun). The world's are said as far as the capture says which
-one points up: ``RUB`` with y up, ``RFU`` with z up, else ``RDF``. Photos are JPEG, depth is the 16-bit PNG in millimetres
-with ``meter``, which counts units per metre (rerun-io/rerun, re_sdk_types/definitions/rerun/components/depth_meter.fbs).
-The library is the extra ``rerun``, https://rerun.io/docs.
+one points up: ``RUB`` with y up, ``RFU`` with z up, else ``RDF``. Photos are JPEG, depth is 16-bit PNG in millimetres
+with ``meter``, the units of a metre (rerun-io/rerun, re_sdk_types/definitions/rerun/components/depth_meter.fbs). The
+library is the extra ``rerun``, https://rerun.io/docs.
 """
 
 from __future__ import annotations
 
 import importlib
 import json
-import os
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -44,7 +46,7 @@ from torch import Tensor
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.rigid_motion import is_rotation
-from dsr.io.exports import to_jpeg
+from dsr.io.exports import to_jpeg, world_comment, write_ply
 from dsr.io.images import read_pixels
 from dsr.io.photos import encode_png, write_png
 from dsr.utils.arrays import open_array
@@ -52,6 +54,8 @@ from dsr.utils.files import replacing, write_text
 from dsr.utils.guards import pixels_beside, refusing
 
 RGBD = ("color.png", "depth.png", "intrinsic.json")
+SCENE = "nerfstudio"
+"""Folder of what ``transforms.json`` names."""
 MILLIMETRES = 1000
 MOST_MILLIMETRES = 65535
 _RIGID = 1e-3
@@ -179,14 +183,14 @@ def to_millimetres(depth: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def write_transforms(path: Path, frames: Sequence[Frame]) -> list[Path]:
-    """Write ``transforms.json`` for frames whose ``color.png`` and ``depth.png`` lie in one folder each.
+    """Write ``transforms.json``, and beside it ``nerfstudio/`` with ``images/``, ``depths/`` and ``points.ply``.
 
     Args:
-        path: the file; the frames' files are named relative to its folder.
+        path: the file.
         frames: one at least; a single one without a pose stands at the origin.
 
     Returns:
-        The file.
+        The files.
 
     Raises:
         ValueError: one of several frames has no pose.
@@ -196,21 +200,32 @@ def write_transforms(path: Path, frames: Sequence[Frame]) -> list[Path]:
     if missing and len(frames) > 1:
         raise ValueError(
             f"nerfstudio: expected a pose of each frame, got none for {len(missing)} of {len(frames)}, such as "
-            f"{missing[0]}; the capture has to record them"
+            f"{missing[0]}; --poses gives them"
         )
-    camera = one_camera(frames)
+    camera, folder = one_camera(frames), path.parent / SCENE
+    files = [folder / kind / f"{frame.stem}.png" for frame in frames for kind in ("images", "depths")]
+    for frame, photo, depth in zip(frames, files[::2], files[1::2], strict=True):
+        with replacing(photo) as temporary:
+            shutil.copyfile(frame.colour, temporary)
+        write_sixteen_bits(depth, to_millimetres(frame.read_depth())[0])
+    files.append(folder / "points.ply")
+    write_ply(files[-1], *_sparse(frames), frame=world_comment(common_up(frames)))
     entries: dict[str, Any] = {"camera_model": "OPENCV", **({} if camera is None else _intrinsics(camera))}
+    entries["depth_unit_scale_factor"] = 1 / MILLIMETRES
+    entries["applied_transform"] = np.eye(4)[:3].tolist()
+    names = [file.relative_to(path.parent).as_posix() for file in files]
+    entries["ply_file_path"] = names[-1]
     entries["frames"] = [
         {
-            "file_path": _relative(frame.colour, path),
-            "depth_file_path": _relative(frame.colour.with_name(RGBD[1]), path),
+            "file_path": photo_name,
+            "depth_file_path": depth_name,
             **({} if camera is not None else _intrinsics(frame.camera)),
             "transform_matrix": _to_opengl(frame),
         }
-        for frame in frames
+        for frame, photo_name, depth_name in zip(frames, names[:-1:2], names[1:-1:2], strict=True)
     ]
     write_text(path, json.dumps(entries, indent=2) + "\n")
-    return [path]
+    return [path, *files]
 
 
 def _to_opengl(frame: Frame) -> list[list[float]]:
@@ -231,11 +246,6 @@ def _intrinsics(camera: Camera) -> dict[str, float]:
         "cy": camera.cy + 0.5,
         **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
     }
-
-
-def _relative(file: Path, path: Path) -> str:
-    """Return a file's path relative to the folder of another, with slashes."""
-    return Path(os.path.relpath(file, path.parent)).as_posix()
 
 
 def write_splatting(folder: Path, frames: Sequence[Frame]) -> list[Path]:
@@ -306,21 +316,26 @@ def _images(frames: Sequence[Frame]) -> str:
 
 
 def _points(frames: Sequence[Frame]) -> str:
-    """Return ``points3D.txt``: points of all frames with their colours, on a grid of pixels."""
+    """Return ``points3D.txt``."""
     lines = ["# POINT3D_ID X Y Z R G B ERROR TRACK[]"]
+    for number, (point, (red, green, blue)) in enumerate(zip(*_sparse(frames), strict=True), 1):
+        lines.append(f"{number} {_numbers(point)} {red} {green} {blue} 0")
+    return "\n".join(lines) + "\n"
+
+
+def _sparse(frames: Sequence[Frame]) -> tuple[np.ndarray, np.ndarray]:
+    """Return points of all frames in the world, (N, 3), and their colours, (N, 3) uint8, on a grid of pixels."""
+    points, colours = [], []
     for frame in frames:
         camera, depth = frame.camera, frame.read_depth()
         step = max(1, int(np.ceil(np.sqrt(depth.size * len(frames) / _POINTS))))
         rows, columns = (each.ravel() for each in np.mgrid[0 : camera.height : step, 0 : camera.width : step])
         z = depth[rows, columns].astype(np.float64)
         rays = np.stack(((columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones(len(z))), axis=1)
-        pose = _matrix(frame)
-        points = (rays * z[:, None]) @ pose[:3, :3].T + pose[:3, 3]
-        colours = frame.read_colour()[rows, columns]
-        for point, colour in zip(points[np.isfinite(z)], colours[np.isfinite(z)], strict=True):
-            red, green, blue = colour
-            lines.append(f"{len(lines)} {_numbers(point)} {red} {green} {blue} 0")
-    return "\n".join(lines) + "\n"
+        pose, known = _matrix(frame), np.isfinite(z)
+        points.append((rays * z[:, None])[known] @ pose[:3, :3].T + pose[:3, 3])
+        colours.append(frame.read_colour()[rows, columns][known])
+    return np.concatenate(points), np.concatenate(colours)
 
 
 def _matrix(frame: Frame) -> np.ndarray:

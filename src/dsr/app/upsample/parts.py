@@ -259,7 +259,7 @@ PARTS: dict[str, Part] = {
         Part("input", ("input.npz",), _input),
         Part("rgbd", ("rgbd/color.png", "rgbd/depth.png", "rgbd/intrinsic.json"), _rgbd, usual=False),
         Part("open3d", ("open3d",), write_all=_open3d, needs=_OF_DEPTH, usual=False),
-        Part("nerfstudio", ("transforms.json",), write_all=_nerfstudio, needs=_OF_DEPTH, usual=False),
+        Part("nerfstudio", ("transforms.json", "nerfstudio"), write_all=_nerfstudio, needs=_OF_DEPTH, usual=False),
         Part("gaussian", ("gaussian",), write_all=_gaussian, needs=_OF_DEPTH, usual=False),
         Part("rerun", ("scene.rrd",), write_all=_rerun, needs=_OF_DEPTH, usual=False,
              library=("rerun", "rerun-sdk", "rerun")),

@@ -51,8 +51,9 @@ def write_scene(output: Path, folders: Mapping[str, Path], parts: Sequence[Part]
         assert part.write_all is not None  # noqa: S101 - they are of all frames
         name = part.files[0]
         path = output / name
-        if path.exists() and name not in recorded and not overwrite:
-            result.problems.append(f"{path}: is there already and not of an earlier run; --overwrite replaces it")
+        there = [output / each for each in part.files if (output / each).exists()]
+        if there and name not in recorded and not overwrite:
+            result.problems.append(f"{there[0]}: is there already and not of an earlier run; --overwrite replaces it")
             continue
         try:
             files = part.write_all(path, frames)
@@ -61,7 +62,7 @@ def write_scene(output: Path, folders: Mapping[str, Path], parts: Sequence[Part]
             continue
         stale = set(recorded.get(name, ())) - {file.relative_to(output).as_posix() for file in files}
         for old in stale:  # of frames that are no longer there
-            if old.split("/")[0] == name:
+            if old.split("/")[0] in part.files:
                 (output / old).unlink(missing_ok=True)
         recorded[name] = sorted(file.relative_to(output).as_posix() for file in files)
         write_text(output / EXPORTS, json.dumps({"exports": recorded}, indent=2) + "\n")
