@@ -146,12 +146,11 @@ def test_single_frame_without_a_pose_stands_at_the_origin(make, tmp_path):
     assert entry["transform_matrix"] == np.diag([1.0, -1, -1, 1]).tolist()
 
 
-def test_frames_without_poses_are_refused_in_one_line(make, tmp_path):
-    with pytest.raises(
-        ValueError, match=r"^nerfstudio: expected a pose of each frame, got none for 1 of 2, .*room/001"
-    ):
-        write_transforms(tmp_path / "t.json", [make(0), make(1, pose=None)])
-    assert not (tmp_path / "t.json").exists()
+@pytest.mark.parametrize(("part", "write"), [("nerfstudio", write_transforms), ("gaussian", write_splatting)])
+def test_frames_without_poses_are_refused_in_one_line(make, tmp_path, part, write):
+    with pytest.raises(ValueError, match=rf"^{part}: expected a pose of each frame, got none for 1 of 2, .*room/001"):
+        write(tmp_path / "made", [make(0), make(1, pose=None)])
+    assert not (tmp_path / "made").exists()
 
 
 def test_open3d_folder_has_colour_depth_intrinsics_and_trajectory(make, tmp_path):

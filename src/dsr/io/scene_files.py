@@ -4,11 +4,11 @@
 
 Axes of a camera are those of OpenGL, x right, y up, z backwards, so that the second and third column of dsr's
 camera-to-world transform change their signs. The world stays as it is, so ``applied_transform`` is the identity:
-nerfstudio turns it upright itself, and its versions differ in whether the points of ``ply_file_path`` are meant before or
-after that transform (nerfstudio-project/nerfstudio, nerfstudio/data/dataparsers/nerfstudio_dataparser.py). Names of files
-differ, as it finds reduced pictures by the name alone. The principal point is counted from the corner of the image, half
-a pixel more than dsr's. ``depth_file_path`` is a 16-bit PNG in millimetres, 0 in holes, which is its default unit; with
-another, ``depth_unit_scale_factor`` would have to be given to it, as it does not read that entry.
+nerfstudio turns it upright itself, and its versions differ in whether the points of ``ply_file_path`` are meant before
+or after that transform (nerfstudio-project/nerfstudio, nerfstudio/data/dataparsers/nerfstudio_dataparser.py). Names of
+files differ, as it finds reduced pictures by the name alone. The principal point is counted from the corner of the
+image, half a pixel more than dsr's. ``depth_file_path`` is a 16-bit PNG in millimetres, 0 in holes, its default unit;
+``depth_unit_scale_factor`` says so to other readers, as nerfstudio takes it from its own options.
 
 Inverse depth for 3D Gaussian Splatting, and its scene where the capture has poses.
 
@@ -33,7 +33,7 @@ from __future__ import annotations
 import importlib
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -196,12 +196,7 @@ def write_transforms(path: Path, frames: Sequence[Frame]) -> list[Path]:
         ValueError: one of several frames has no pose.
 
     """
-    missing = [frame.name for frame in frames if frame.pose is None]
-    if missing and len(frames) > 1:
-        raise ValueError(
-            f"nerfstudio: expected a pose of each frame, got none for {len(missing)} of {len(frames)}, such as "
-            f"{missing[0]}; --poses gives them"
-        )
+    expect_poses("nerfstudio", {frame.name: frame.pose is not None for frame in frames})
     camera, folder = one_camera(frames), path.parent / SCENE
     files = [folder / kind / f"{frame.stem}.png" for frame in frames for kind in ("images", "depths")]
     for frame, photo, depth in zip(frames, files[::2], files[1::2], strict=True):
@@ -228,6 +223,25 @@ def write_transforms(path: Path, frames: Sequence[Frame]) -> list[Path]:
     return [path, *files]
 
 
+def expect_poses(part: str, known: Mapping[str, bool]) -> None:
+    """Check that each frame has a pose; a single one needs none.
+
+    Args:
+        part: name of what needs them.
+        known: whether a frame has one, by its name.
+
+    Raises:
+        ValueError: one of several frames has none.
+
+    """
+    missing = [name for name, has in known.items() if not has]
+    if missing and len(known) > 1:
+        raise ValueError(
+            f"{part}: expected a pose of each frame, got none for {len(missing)} of {len(known)}, such as "
+            f"{missing[0]}; --poses gives them"
+        )
+
+
 def _to_opengl(frame: Frame) -> list[list[float]]:
     """Return the transform from OpenGL's camera frame to the world."""
     pose = torch.eye(4, dtype=torch.float64) if frame.pose is None else frame.pose
@@ -251,7 +265,7 @@ def _intrinsics(camera: Camera) -> dict[str, float]:
 def write_splatting(folder: Path, frames: Sequence[Frame]) -> list[Path]:
     """Write ``images/``, ``depths/`` and ``sparse/0/`` of a scene.
 
-    Without poses ``sparse/0/`` has ``depth_params.json`` alone, whose scale holds for a scene in metres.
+    Of a single frame without a pose ``sparse/0/`` has ``depth_params.json`` alone, whose scale is for a scene in metres.
 
     Args:
         folder: is created if it is missing.
@@ -261,9 +275,10 @@ def write_splatting(folder: Path, frames: Sequence[Frame]) -> list[Path]:
         The files.
 
     Raises:
-        ValueError: no frame has any depth.
+        ValueError: no frame has any depth, or one of several has no pose.
 
     """
+    expect_poses("gaussian", {frame.name: frame.pose is not None for frame in frames})
     nearest = min((_nearest(frame) for frame in frames), default=np.inf)
     if not np.isfinite(nearest):
         raise ValueError("gaussian: expected some depth, got holes alone")
