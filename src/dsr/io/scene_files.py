@@ -265,7 +265,7 @@ def _intrinsics(camera: Camera) -> dict[str, float]:
 def write_splatting(folder: Path, frames: Sequence[Frame]) -> list[Path]:
     """Write ``images/``, ``depths/`` and ``sparse/0/`` of a scene.
 
-    Of a single frame without a pose ``sparse/0/`` has ``depth_params.json`` alone, whose scale is for a scene in metres.
+    Of a single frame without a pose ``sparse/0/`` has ``depth_params.json`` alone, for a scene in metres.
 
     Args:
         folder: is created if it is missing.

@@ -44,8 +44,8 @@ def run(request: UpsampleRequest, console: Console) -> list[str]:
         The problems, one line each; empty if there were none.
 
     Raises:
-        ValueError: the pairs cannot be determined, frames lack poses that a part needs, a file would be written outside of the folder of results, or a
-            command with other settings is at work in it.
+        ValueError: the pairs cannot be determined, frames lack poses that a part needs, a file would be written outside
+            of the folder of results, or a command with other settings is at work in it.
         TargetError: a link, a device, a pipe or a socket is in the place of a file.
 
     """

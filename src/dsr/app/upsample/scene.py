@@ -9,8 +9,7 @@ from pathlib import Path
 
 from dsr.app.upsample.outputs import INFO
 from dsr.app.upsample.parts import METRES, Part
-from dsr.app.upsample.stored import DEPTHS, read_camera, read_info
-from dsr.io.frames import UPS
+from dsr.app.upsample.stored import DEPTHS, read_camera, read_info, read_up
 from dsr.io.scene_files import RGBD, Frame, parse_pose
 from dsr.utils.files import write_text
 from dsr.utils.guards import is_number, parse_json, path_within, read_limited
@@ -85,9 +84,9 @@ def read_frame(name: str, folder: Path) -> Frame:
     colour = folder / "rgbd" / RGBD[0]
     if depth is None or not colour.is_file():
         raise ValueError(f"{folder}: expected {METRES} and rgbd/{RGBD[0]} of this run, one is missing")
-    pose, up, time = parse_pose(f"{path}: pose", info.get("pose")), info.get("up"), info.get("time")
-    up, time = up if up in UPS else "", time if is_number(time) else None
-    return Frame(name, read_camera(path, info), pose, colour, depth, up, time)
+    pose, time = parse_pose(f"{path}: pose", info.get("pose")), info.get("time")
+    time = time if is_number(time) else None
+    return Frame(name, read_camera(path, info), pose, colour, depth, read_up(info), time)
 
 
 def expect_distinct(frames: Sequence[Frame]) -> None:
