@@ -132,7 +132,7 @@ def _geometry(place: str, intrinsics: Path | None, motion: _Motion | None, _: tu
         to_camera[:3, 3] = motion[3:]
         pose = check_pose(place, np.linalg.inv(to_camera))
     time = _time(place.rpartition(" ")[2])
-    return Geometry(camera, pose, tuple(notes), "z", time if math.isfinite(time) else None)
+    return Geometry(camera, pose, tuple(notes), up="z", time=time if math.isfinite(time) else None)
 
 
 class _PolycamCamera(BaseModel, strict=True):

@@ -144,15 +144,15 @@ def _geometry(folder: Path, number: int, row: _Row, matrix: str, size: tuple[int
     own = all(row.get(name) for name in _INTRINSICS)
     if own:
         camera = _camera(folder, place, _numbers(place, row, _INTRINSICS), size)
-        return Geometry(camera, pose, tuple(assumptions), "y", time)
+        return Geometry(camera, pose, tuple(assumptions), up="y", time=time)
     if not matrix:
-        return Geometry(None, pose, tuple(assumptions), "y", time)
+        return Geometry(None, pose, tuple(assumptions), up="y", time=time)
     assumptions.append(
         Assumption("camera: camera_matrix.csv of the whole capture; odometry.csv has none of each frame")
     )
     path = folder / "camera_matrix.csv"
     camera = _camera(folder, str(path), _read_matrix(path, matrix), size)
-    return Geometry(camera, pose, tuple(assumptions), "y", time)
+    return Geometry(camera, pose, tuple(assumptions), up="y", time=time)
 
 
 def _numbers(place: str, row: _Row, names: tuple[str, ...]) -> list[float]:
