@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from dsr.io.captures.arkit import find_arkitscenes, find_polycam
+from dsr.io.captures.colmap import add_model, find_colmap, model_file
 from dsr.io.captures.record3d import find_record3d
 from dsr.io.captures.ros import find_ros
 from dsr.io.captures.stray import find_stray
@@ -52,7 +53,8 @@ def find_pairs_of_folder(folder: Path, leave: Path | None = None) -> PairingResu
     The layouts are: a capture (:mod:`dsr.io.captures`), which may be a single file, too; a scene of dsr (``rgb.png``,
     ``camera.json`` and ``depth*`` or ``disparity*``); lists of TUM RGB-D (``rgb.txt`` and ``depth.txt``,
     https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats); two folders named for photos and depth maps; and
-    files side by side, told apart by their names or by what they hold.
+    files side by side, told apart by their names or by what they hold; to these a model of COLMAP or a trajectory of
+    Open3D may add poses. Of photos beside a model without depth maps, its points are the depth.
 
     Args:
         folder: folder to search, or a capture's file.
@@ -109,8 +111,11 @@ def _find_at(place: Path, root: Path | None = None) -> PairingResult:
             if camera is not None and any(pair.camera is None for pair in found.pairs):
                 pairs = tuple(replace(pair, camera=pair.camera or camera) for pair in found.pairs)
                 found = replace(found, pairs=pairs)
-            break
-    return found
+            model = model_file(place)
+            if model is not None and all(pair.capture is None for pair in found.pairs):
+                found = add_model(found, model)
+            return found
+    return find_colmap(place) or found
 
 
 def _scene(folder: Path) -> PairingResult:

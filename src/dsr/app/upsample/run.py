@@ -66,8 +66,8 @@ def run(request: UpsampleRequest, console: Console) -> list[str]:
 
 def _posed(request: UpsampleRequest, frames: Frames) -> dict[str, bool]:
     """Return whether each frame has a pose, of the file, of its capture or of its result; frames that fail count."""
-    if request.frames.poses is not None:
-        given = read_poses(request.frames.poses).assign(frames.whole)
+    if request.frames.trajectory is not None:
+        given = read_poses(request.frames.trajectory).assign(frames.whole)
         return {pair.name: pair.name in given for pair in frames.whole}
 
     def posed(pair: Pair) -> bool:
