@@ -153,6 +153,17 @@ def poses_of_lines(folder: Path) -> None:
     written(folder / "trajectory.log", "\n".join(blocks) + "\n")
 
 
+def colmap(folder: Path, *, binary: bool = True, depth: bool = True) -> None:
+    """Write photos with a sparse model of COLMAP, with depth maps or with points alone."""
+    models = unit("test_format_colmap")
+    for number in range(models.FRAMES):
+        photo(folder / "images" / f"{number:03}.png", number)
+        if depth:
+            captures.save(folder / "depth" / f"{number:03}.png", captures.millimetres(number))
+    write = models.write_binary if binary else models.write_text
+    write(folder / "sparse" / "0", "OPENCV", models.NAMES, points=not depth)
+
+
 def confidence_folder(folder: Path) -> None:
     """Write frames with confidence maps in many formats."""
     for number, suffix in enumerate((".png", ".npy", ".npz", ".pfm", ".bmp")):

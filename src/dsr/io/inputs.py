@@ -12,14 +12,15 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera, RangeType
+from dsr.geometry.lens import Lens, undistort
 from dsr.geometry.plausible import expect_possible
-from dsr.io.cameras import camera_only, find_camera, read_rig, scale_to_photo, to_photo
+from dsr.io.cameras import camera_only, find_camera, read_rig, scale_to_depth, scale_to_photo, to_photo
 from dsr.io.depth_files import ICL_CAMERA, ICL_SUFFIX, read_depth_file
 from dsr.io.doubts import doubt_camera, doubt_depth
 from dsr.io.encoding import Encoding, decode, find_holes, turn_back_bits
-from dsr.io.frames import SLACK, Geometry
+from dsr.io.frames import SLACK, Geometry, Rig
 from dsr.io.images import CameraFile, pixels_in_header, read_mask
-from dsr.io.pairs import Pair, words_of
+from dsr.io.pairs import Pair, time_of, words_of
 from dsr.io.photos import Size, model_in_exif, read_photo, same_aspect
 from dsr.io.reading import SUNRGBD_BITS, CameraChoice, Reading
 from dsr.io.units import TURNED_BACK, Told, tell
@@ -129,6 +130,8 @@ class Picture:
             the world of the capture; None where there is none.
         confidence: (1, h, w) float32 from 0 to 1, of the low-resolution map; None where there is none.
         device_name: of the app or the device, as the files state it; empty where they do not.
+        up: the axis of the world that points up, one of :data:`dsr.io.frames.UPS`.
+        time: of the frame in seconds, as the capture or the files' names have it; None where they have none.
 
     """
 
@@ -140,6 +143,8 @@ class Picture:
     pose: np.ndarray | None = None
     confidence: Tensor | None = None
     device_name: str = ""
+    up: str = ""
+    time: float | None = None
 
 
 def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None) -> Picture:
@@ -159,9 +164,11 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     geometry = Geometry() if pair.capture is None else pair.capture.geometry((pixels.shape[0], pixels.shape[1]))
     described, camera_assumptions = _camera(pair, reading, geometry, (pixels.shape[0], pixels.shape[1]), size_lr)
     expect_possible(described.camera, _told_by(pair, reading))
+    lens = geometry.lens if geometry.camera is not None and reading.camera == CameraChoice() else None
+    pixels, undone = _undistort_photo(pixels, described.camera, lens)
     pixels, crop_assumptions = _crop_to_multiple(pixels, pair.factor, size_lr)
     size: Size = (pixels.shape[0], pixels.shape[1])
-    rig = None if reading.rig is None else read_rig(reading.rig, size_lr, reading.baseline)
+    rig = _rig(pair, reading, geometry, size_lr)
     if rig is None:
         _expect_lower_resolution(pair, size, size_lr)
     camera = described.camera.crop(0, 0, *size)
@@ -182,6 +189,8 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     confidence, confidence_assumptions = _confidence(pair, reading, size_lr, holes)
     if holes.all():
         raise ValueError(f"{pair.depth}: expected at least one known pixel, all are holes")
+    lens_lr = lens if rig is None else rig.lens
+    stored, holes, confidence, undone_lr = _undistort_depth(stored, holes, confidence, of_depth, lens_lr)
     encoding = Encoding(_suffix(pair), str(stored.dtype), told.unit, mark, range_type)
     depth_lr = decode(stored, holes, encoding, of_depth)
     hole_assumptions += _expect_distances(pair.depth, depth_lr, holes, range_type)
@@ -190,19 +199,23 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     all_assumptions = (
         *assumptions,
         *camera_assumptions,
+        *undone,
         *crop_assumptions,
         *range_assumptions,
         *told.assumptions,
         *hole_assumptions,
         *confidence_assumptions,
+        *undone_lr,
         *doubts,
     )
     if rig is not None:
-        all_assumptions = (*all_assumptions, *doubt_camera(rig.camera, "--depth-camera"))
-        depth_lr, warped = to_photo(depth_lr, rig, camera)
-        all_assumptions, confidence = (*all_assumptions, warped), None
+        depth_lr, warped = _to_photo(pair, reading, depth_lr, rig, camera)
+        all_assumptions, confidence = (*all_assumptions, *warped), None
     device_name = model_in_exif(pair.rgb) if pair.capture is None else pair.capture.app
-    return Picture(rgb, depth_lr, camera, encoding, all_assumptions, geometry.pose, confidence, device_name)
+    time = next((each for each in (geometry.time, time_of(pair.depth), time_of(pair.rgb)) if each is not None), None)
+    return Picture(
+        rgb, depth_lr, camera, encoding, all_assumptions, geometry.pose, confidence, device_name, geometry.up, time
+    )
 
 
 def _expect_distances(path: Path, depth_lr: Tensor, holes: np.ndarray, range_type: RangeType) -> list[Assumption]:
@@ -298,6 +311,45 @@ def _camera(
     described, assumptions = find_camera(CameraChoice(file=pair.camera), pair.rgb, size, size_lr)
     found = Assumption(f"camera: {pair.camera.name} beside the pictures")
     return described, [*geometry.assumptions, found, *assumptions]
+
+
+def _rig(pair: Pair, reading: Reading, geometry: Geometry, size_lr: Size) -> Rig | None:
+    """Return the rig that the user gives, else the capture's; None if the depth map is in the photo's view."""
+    if reading.rig is not None:
+        return read_rig(reading.rig, size_lr, reading.baseline)
+    if pair.capture is None or geometry.rig is None:
+        return None
+    camera = scale_to_depth(str(pair.capture.told_by), geometry.rig.camera, size_lr)
+    return geometry.rig._replace(camera=replace(camera, baseline=reading.baseline or camera.baseline))
+
+
+def _to_photo(
+    pair: Pair, reading: Reading, depth_lr: Tensor, rig: Rig, photo: Camera
+) -> tuple[Tensor, list[Assumption]]:
+    """Return a depth camera's map in the photo's view, and notes."""
+    given = reading.rig is not None
+    doubts = doubt_camera(rig.camera, "--depth-camera" if given else "depth camera")
+    warped, note = to_photo(depth_lr, rig, photo, "--extrinsics" if given else _told_by(pair, reading))
+    return warped, [*doubts, note]
+
+
+def _undistort_photo(pixels: np.ndarray, camera: Camera, lens: Lens | None) -> tuple[np.ndarray, list[Assumption]]:
+    """Return a photo without its lens distortion, and a note if it had any."""
+    if lens is None or not lens.bends:
+        return pixels, []
+    return undistort(pixels, camera, lens), [Assumption("the lens distortion of the photo is undone", str(lens))]
+
+
+def _undistort_depth(
+    stored: np.ndarray, holes: np.ndarray, confidence: Tensor | None, camera: Camera, lens: Lens | None
+) -> tuple[np.ndarray, np.ndarray, Tensor | None, list[Assumption]]:
+    """Return a map's values, its holes and its confidence without lens distortion, and a note if it had any."""
+    if lens is None or not lens.bends:
+        return stored, holes, confidence, []
+    if confidence is not None:
+        confidence = torch.from_numpy(undistort(confidence[0].numpy(), camera, lens, 0))[None]
+    note = Assumption("the lens distortion of the depth map is undone", str(lens))
+    return undistort(stored, camera, lens, 0), undistort(holes, camera, lens, hole=True), confidence, [note]
 
 
 def _told_by(pair: Pair, reading: Reading) -> str:

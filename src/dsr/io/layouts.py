@@ -16,6 +16,7 @@ import numpy as np
 from dsr.geometry.rigid_motion import Matrix
 from dsr.io.captures.archive import unpack
 from dsr.io.captures.arkit import find_arkitscenes, find_polycam, find_scanner_app
+from dsr.io.captures.colmap import add_model, find_colmap, model_file
 from dsr.io.captures.data_sets import find_replica, find_scannet, find_seven_scenes, find_sunrgbd
 from dsr.io.captures.known import describe_content, lacking
 from dsr.io.captures.record3d import find_record3d
@@ -49,7 +50,7 @@ _TUM_UNIT = 1 / 5000
 _MAX_DEPTH = 3
 """Levels of subfolders that are searched."""
 
-CAPTURE_FILES = (".r3d", ".bag", ".sens", ".zip")
+CAPTURE_FILES = (".r3d", ".bag", ".mcap", ".db3", ".sens", ".zip")
 """Suffixes of captures that are a single file."""
 _LAYOUTS = (
     find_stray, find_record3d, find_polycam, find_arkitscenes, find_scanner_app, find_ros, find_scannetpp, find_scannet,
@@ -63,7 +64,8 @@ def find_pairs_of_folder(folder: Path, leave: Path | None = None) -> PairingResu
     The layouts are: a capture (:mod:`dsr.io.captures`), which may be a single file, too; a scene of dsr (``rgb.png``,
     ``camera.json`` and ``depth*`` or ``disparity*``); lists of TUM RGB-D (``rgb.txt`` and ``depth.txt``,
     https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats); two folders named for photos and depth maps; and
-    files side by side, told apart by their names or by what they hold.
+    files side by side, told apart by their names or by what they hold; to these a model of COLMAP or a trajectory of
+    Open3D may add poses. Of photos beside a model without depth maps, its points are the depth.
 
     Args:
         folder: folder to search, a capture's file, or a ZIP file of what a folder has, which is unpacked.
@@ -133,9 +135,11 @@ def _find_at(place: Path, root: Path | None = None) -> PairingResult:
             if camera is not None and any(pair.camera is None for pair in found.pairs):
                 pairs = tuple(replace(pair, camera=pair.camera or camera) for pair in found.pairs)
                 found = replace(found, pairs=pairs)
-            found = replace(found, assumptions=(*_alike(place), *found.assumptions))
-            break
-    return found
+            model = model_file(place)
+            if model is not None and all(pair.capture is None for pair in found.pairs):
+                found = add_model(found, model)
+            return replace(found, assumptions=(*_alike(place), *found.assumptions))
+    return find_colmap(place) or found
 
 
 def _scene(folder: Path) -> PairingResult:

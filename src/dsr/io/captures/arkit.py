@@ -9,7 +9,8 @@ ARKitScenes; https://github.com/apple/ARKitScenes, DATA.md and raw/README.md.
     41069021/lowres_wide.traj                                time, rotation (axis times angle), translation
 
 Rotation and translation of the trajectory lead from the world to the camera, whose axes are x right, y down, z forward
-(threedod/benchmark_scripts/utils/tenFpsDataLoader.py inverts them). The trajectory has ten poses a second; a frame
+(threedod/benchmark_scripts/utils/tenFpsDataLoader.py inverts them); the world is that of a laser scan, z up
+(https://github.com/apple/ARKitScenes/issues/81). The trajectory has ten poses a second; a frame
 takes that within 10 ms of it. Intrinsics may be a millisecond off.
 
 Polycam's raw export (developer mode); https://github.com/PolyCam/polyform describes it.
@@ -19,7 +20,7 @@ Polycam's raw export (developer mode); https://github.com/PolyCam/polyform descr
     keyframes/depth/TIME.png                  16-bit millimetres, 256 x 192
     keyframes/confidence/TIME.png             0 (low), 127 (medium) and 255 (high)
 
-t_ij are the rows of the pose from ARKit's camera (y up, looking along -z) to the world. The corrected photos and
+t_ij are the rows of the pose from ARKit's camera (y up, looking along -z) to the world, y up. The corrected photos and
 cameras are taken where a frame has both.
 
 3D Scanner App's export of all data; https://github.com/laanlabs/3dScannerApp_samples has some.
@@ -146,7 +147,8 @@ def _geometry(place: str, intrinsics: Path | None, motion: _Motion | None, _: tu
         to_camera[:3, :3] = Rotation.from_rotvec(motion[:3]).as_matrix()
         to_camera[:3, 3] = motion[3:]
         pose = check_pose(place, np.linalg.inv(to_camera))
-    return Geometry(camera, pose, tuple(notes))
+    time = _time(place.rpartition(" ")[2])
+    return Geometry(camera, pose, tuple(notes), up="z", time=time if math.isfinite(time) else None)
 
 
 class _PolycamCamera(BaseModel, strict=True):
@@ -209,7 +211,8 @@ def _polycam_geometry(path: Path, _: tuple[int, int]) -> Geometry:
     told = parse_model(_PolycamCamera, read_text(path, _LARGEST_JSON), path, f"expected {_POLYCAM}'s camera; ")
     camera = intrinsics_camera(str(path), (told.height, told.width), (told.fx, told.fy, told.cx, told.cy))
     rows = [[getattr(told, f"t_{row}{column}") for column in range(4)] for row in range(3)]
-    return Geometry(camera, check_pose(str(path), np.array([*rows, [0, 0, 0, 1]], dtype=np.float64), opengl=True))
+    pose = check_pose(str(path), np.array([*rows, [0, 0, 0, 1]], dtype=np.float64), opengl=True)
+    return Geometry(camera, pose, up="y")
 
 
 class _ScannerFrame(BaseModel, strict=True):
@@ -254,4 +257,5 @@ def _scanner_geometry(path: Path | None, size: tuple[int, int]) -> Geometry:
     told = parse_model(_ScannerFrame, read_text(path, _LARGEST_JSON), path, f"expected {_SCANNER}'s frame; ")
     fx, _, cx, _, fy, cy = told.intrinsics[:6]
     camera = fitting_camera(str(path), (size, USUAL_SIZE), (fx, fy, cx, cy))
-    return Geometry(camera, check_pose(str(path), np.reshape(told.pose, (4, 4)), opengl=True))
+    pose = check_pose(str(path), np.reshape(told.pose, (4, 4)), opengl=True)
+    return Geometry(camera, pose, up="y")

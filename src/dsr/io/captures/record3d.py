@@ -181,4 +181,4 @@ def _geometry(
     assumptions = () if own else (Assumption(text),)
     if pose is None:
         return Geometry(camera, None, assumptions)
-    return Geometry(camera, pose_from_quaternion(place, pose[:4], pose[4:], opengl=True), assumptions)
+    return Geometry(camera, pose_from_quaternion(place, pose[:4], pose[4:], opengl=True), assumptions, up="y")

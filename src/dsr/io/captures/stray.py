@@ -19,6 +19,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import functools
+import math
 import os
 import re
 import threading
@@ -128,16 +129,19 @@ def _geometry(folder: Path, number: int, row: _Row, matrix: str, size: tuple[int
         pose = pose_from_quaternion(place, values[3:], values[:3])
     else:
         assumptions.append(Assumption("no pose: odometry.csv has none of the frame"))
+    time = next((value for value in numbers_in([row.get("timestamp", "")]) if math.isfinite(value)), None)
     own = all(row.get(name) for name in _INTRINSICS)
     if own:
-        return Geometry(_camera(folder, place, _numbers(place, row, _INTRINSICS), size), pose, tuple(assumptions))
+        camera = _camera(folder, place, _numbers(place, row, _INTRINSICS), size)
+        return Geometry(camera, pose, tuple(assumptions), up="y", time=time)
     if not matrix:
-        return Geometry(None, pose, tuple(assumptions))
+        return Geometry(None, pose, tuple(assumptions), up="y", time=time)
     assumptions.append(
         Assumption("camera: camera_matrix.csv of the whole capture; odometry.csv has none of each frame")
     )
     path = folder / "camera_matrix.csv"
-    return Geometry(_camera(folder, str(path), _read_matrix(path, matrix), size), pose, tuple(assumptions))
+    camera = _camera(folder, str(path), _read_matrix(path, matrix), size)
+    return Geometry(camera, pose, tuple(assumptions), up="y", time=time)
 
 
 def _numbers(place: str, row: _Row, names: tuple[str, ...]) -> list[float]:
