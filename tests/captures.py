@@ -235,3 +235,108 @@ def ros(path, version, *, floats=False, compressed=False):
                 raw = store.serialize_ros1 if version == 1 else store.serialize_cdr
                 writer.write(connection, int(100e9 + 33e6 * number), bytes(raw(message(number), kind)))
     return path
+
+
+KINECT_DEPTH = (288, 320)
+KINECT_COLOUR, KINECT_LENS = (0.51, 0.49, 0.48, 0.64), (0.2, -0.3, 0.05, 0.25, -0.2, 0.01, 0, 0, 2e-4, -3e-4)
+KINECT_IR, KINECT_IR_LENS = (0.505, 0.502, 0.494, 0.4935), (1.1, 0.6, 0.03, 1.4, 0.9, 0.17, 0, 0, -6e-5, 4e-5)
+"""Of k4a: cx, cy, fx, fy of an image of 1 x 1; k1 to k6, codx, cody, p2, p1."""
+
+
+def kinect_motion():
+    """The motion from the depth camera's frame to the colour camera's, (4, 4)."""
+    motion = np.eye(4)
+    motion[:3, :3] = Rotation.from_euler("xyz", (6, 0.3, -0.2), degrees=True).as_matrix()
+    motion[:3, 3] = (-0.032, -0.002, 0.004)
+    return motion
+
+
+def kinect_calibration(*, wide=False):
+    """calibration.json of an Azure Kinect; its rig's frame is not the depth camera's. ``wide``: of an old device."""
+    rig = pose()
+    cx, cy, fx, fy = KINECT_COLOUR
+    colour = [cx, (3072 * cy - 384) / 2304, fx, fy * 3072 / 2304] if wide else [cx, cy, fx, fy]
+    cameras = [
+        {
+            "Intrinsics": {
+                "ModelParameterCount": 14, "ModelParameters": [*numbers, *lens],
+                "ModelType": "CALIBRATION_LensDistortionModelBrownConrady",
+            },
+            "Location": f"CALIBRATION_CameraLocation{place}", "MetricRadius": 1.7,
+            "Rt": {"Rotation": motion[:3, :3].ravel().tolist(), "Translation": motion[:3, 3].tolist()},
+            "SensorHeight": size[0], "SensorWidth": size[1],
+        }
+        for place, numbers, lens, size, motion in (
+            ("D0", KINECT_IR, KINECT_IR_LENS, (1024, 1024), rig),
+            ("PV0", colour, KINECT_LENS, (2304 if wide else 3072, 4096), kinect_motion() @ rig),
+        )
+    ]  # fmt: skip
+    return {"CalibrationInformation": {"Cameras": cameras, "InertialSensors": []}}
+
+
+def kinect(path, photos, depths, mode="MJPG", calibration=None, late=0.0):
+    """Write a recording of an Azure Kinect as k4arecorder does.
+
+    Args:
+        photos: of (H, W, 3) RGB; each is 1/30 s after the one before.
+        depths: (h, w) millimetres.
+        late: seconds from a photo to its depth map.
+
+    """
+
+    def element(name, *content):
+        body = b"".join(
+            each if isinstance(each, bytes) else each.encode() if isinstance(each, str) else struct.pack(">Q", each)
+            for each in content
+        )
+        return bytes.fromhex(name) + struct.pack(">Q", len(body) | 1 << 56) + body
+
+    def track(number, name, fourcc, bits, size):
+        header = struct.pack("<IiiHH4sIiiII", 40, size[1], size[0], 0, bits, fourcc, 0, 0, 0, 0, 0)
+        video = element("E0", element("B0", size[1]), element("BA", size[0]))
+        return element("AE", element("D7", number), element("73C5", number), element("83", 1), element("536E", name),
+                       element("86", "V_MS/VFW/FOURCC"), element("63A2", header), video)  # fmt: skip
+
+    def tag(name, value, track=0):
+        target = element("63C0", element("63C5", track), *([element("63CA", "TRACK")] if track else []))
+        return element("7373", target, element("67C8", element("45A3", name), element("4487", value)))
+
+    def encode(pixels):
+        yuv = cv2.cvtColor(pixels, cv2.COLOR_RGB2YUV_I420)
+        if mode == "MJPG":
+            return cv2.imencode(".jpg", pixels[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 98])[1].tobytes()
+        if mode == "BGRA":
+            return cv2.cvtColor(pixels, cv2.COLOR_RGB2BGRA).tobytes()
+        height, width = pixels.shape[:2]
+        y, u, v = np.split(yuv.ravel(), [height * width, height * width * 5 // 4])
+        if mode == "NV12":
+            return y.tobytes() + np.stack((u, v), -1).tobytes()
+        half = np.stack((u, v), -1).reshape(height // 2, width // 2, 2).repeat(2, 0)
+        return np.stack((y.reshape(height, width), half.reshape(height, width)), -1).tobytes()
+
+    def block(number, time, data):
+        return element("A3", bytes([0x80 | number]), struct.pack(">hB", time, 0x80), data)
+
+    size, size_lr = photos[0].shape[:2], depths[0].shape
+    content = json.dumps(kinect_calibration() if calibration is None else calibration)
+    bits = {"MJPG": 24, "NV12": 12, "YUY2": 16, "BGRA": 32}[mode]
+    clusters = []
+    for number, (photo, depth) in enumerate(zip(photos, depths, strict=True)):
+        later = round(1e6 * late)
+        clusters.append(element("1F43B675", element("E7", 1_000_000 + 33_333 * number), block(1, 0, encode(photo)),
+                                block(2, later, depth.astype(">u2").tobytes()),
+                                block(3, later, bytes(2 * depth.size))))  # fmt: skip
+    file = element("61A7", element("466E", "calibration.json"), element("4660", "application/octet-stream"),
+                   element("465C", content), element("46AE", 7))  # fmt: skip
+    tags = [tag("K4A_COLOR_TRACK", "1", 1), tag("K4A_COLOR_MODE", f"{mode}_{size[0]}P", 1),
+            tag("K4A_DEPTH_TRACK", "2", 2), tag("K4A_DEPTH_MODE", "NFOV_2X2BINNED", 2), tag("K4A_IR_TRACK", "3", 3),
+            tag("K4A_DEPTH_DELAY_NS", f"{round(1e9 * late)}")]  # fmt: skip
+    segment = element(
+        "18538067", element("1549A966", element("2AD7B1", 1000), element("7BA9", "Azure Kinect")),
+        element("1654AE6B", track(1, "COLOR", mode.encode(), bits, size), track(2, "DEPTH", b"b16g", 16, size_lr),
+                track(3, "IR", b"b16g", 16, size_lr)),
+        element("1941A469", file), element("1254C367", *tags), *clusters,
+    )  # fmt: skip
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(element("1A45DFA3", element("4282", "matroska"), element("4287", 2), element("4285", 2)) + segment)
+    return path

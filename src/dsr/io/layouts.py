@@ -13,6 +13,8 @@ import cv2
 import numpy as np
 
 from dsr.io.captures.arkit import find_arkitscenes, find_polycam
+from dsr.io.captures.heic import find_heic
+from dsr.io.captures.kinect import find_kinect
 from dsr.io.captures.record3d import find_record3d
 from dsr.io.captures.ros import find_ros
 from dsr.io.captures.stray import find_stray
@@ -33,6 +35,7 @@ from dsr.io.pairs import (
     role_of_words,
     words_of,
 )
+from dsr.io.photos import HEIC_SUFFIXES
 from dsr.notes import Assumption
 from dsr.utils.guards import MOST_TABLE, natural_key, numbers_in, path_within, read_limited
 
@@ -41,9 +44,9 @@ _TUM_UNIT = 1 / 5000
 _MAX_DEPTH = 3
 """Levels of subfolders that are searched."""
 
-CAPTURE_FILES = (".r3d", ".bag")
+CAPTURE_FILES = (".r3d", ".bag", ".mkv", *HEIC_SUFFIXES)
 """Suffixes of captures that are a single file."""
-_LAYOUTS = (find_stray, find_record3d, find_polycam, find_arkitscenes, find_ros)
+_LAYOUTS = (find_stray, find_record3d, find_polycam, find_arkitscenes, find_ros, find_kinect, find_heic)
 
 
 def find_pairs_of_folder(folder: Path, leave: Path | None = None) -> PairingResult:
@@ -201,5 +204,5 @@ def find_capture(place: Path) -> PairingResult | None:
         ValueError: it is a capture, and a file that all of its frames need is missing or damaged.
 
     """
-    layouts = (find_record3d, find_ros) if place.is_file() else _LAYOUTS
+    layouts = (find_record3d, find_ros, find_kinect, find_heic) if place.is_file() else _LAYOUTS
     return next((found for layout in layouts if (found := layout(place)) is not None), None)
