@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -14,8 +14,8 @@ from torch import Tensor
 
 from dsr.geometry.camera import ASSUMED_FOV, Camera
 from dsr.geometry.plausible import may_be_of
-from dsr.geometry.rigid_motion import Matrix
 from dsr.geometry.warping import registered_camera, warp_depth
+from dsr.io.frames import Rig
 from dsr.io.images import CameraFile, Pixels, read_camera
 from dsr.io.photos import Size, focal_in_exif, same_aspect
 from dsr.io.reading import CameraChoice, RigFiles
@@ -166,13 +166,6 @@ def _check_matrix(path: Path, matrix: np.ndarray) -> np.ndarray:
     return matrix
 
 
-class Rig(NamedTuple):
-    """A depth camera, of the depth map's pixels, and the transform from its frame to the photo camera's, metres."""
-
-    camera: Camera
-    transform: Matrix
-
-
 def read_rig(files: RigFiles, size_lr: Size, baseline: float | None) -> Rig:
     """Read the description of a rig.
 
@@ -189,25 +182,36 @@ def read_rig(files: RigFiles, size_lr: Size, baseline: float | None) -> Rig:
     if isinstance(content, np.ndarray):
         camera = Camera(width, height, content[0, 0], content[1, 1], content[0, 2], content[1, 2], baseline)
     else:
-        camera = content.camera
-        if not same_aspect((camera.height, camera.width), size_lr):
-            raise ValueError(
-                f"{files.camera}: the camera is of {camera.width} x {camera.height} pixels (width x height), the depth "
-                f"map has {width} x {height}, another aspect"
-            )
-        camera = camera.rescale(width, height)
+        camera = scale_to_depth(str(files.camera), content.camera, size_lr)
     own = camera.baseline if baseline is None else baseline
     camera = Camera(width, height, camera.fx, camera.fy, camera.cx, camera.cy, own, camera.doffs)
     return Rig(camera, read_transform(files.extrinsics))
 
 
-def to_photo(depth_lr: Tensor, rig: Rig, photo: Camera) -> tuple[Tensor, Assumption]:
+def scale_to_depth(place: str, camera: Camera, size_lr: Size) -> Camera:
+    """Return a depth camera scaled to the depth map's (height, width).
+
+    Raises:
+        ValueError: it is one of another aspect; the message begins with ``place``.
+
+    """
+    height, width = size_lr
+    if not same_aspect((camera.height, camera.width), size_lr):
+        raise ValueError(
+            f"{place}: the camera is of {camera.width} x {camera.height} pixels (width x height), the depth map has "
+            f"{width} x {height}, another aspect"
+        )
+    return camera.rescale(width, height)
+
+
+def to_photo(depth_lr: Tensor, rig: Rig, photo: Camera, place: str) -> tuple[Tensor, Assumption]:
     """Return a depth camera's map as the photo's camera sees it, and a note.
 
     Args:
         depth_lr: (1, h, w) orthogonal depth in metres, NaN in holes.
         rig: the depth camera.
         photo: the photo's camera.
+        place: what states the transform, with which the message begins.
 
     Returns:
         (1, h', w') as fine as the depth map is, in the photo's field of view.
@@ -220,8 +224,8 @@ def to_photo(depth_lr: Tensor, rig: Rig, photo: Camera) -> tuple[Tensor, Assumpt
     warped = warp_depth(depth_lr[None], rig.camera, torch.from_numpy(rig.transform)[None], target)[0]
     if not bool(warped.isfinite().any()):
         raise ValueError(
-            "--extrinsics: expected the transform from the depth camera's frame to the photo camera's, in metres; with "
-            "this one the photo shows nothing of the depth map"
+            f"{place}: expected the transform from the depth camera's frame to the photo camera's, in metres; with this "
+            "one the photo shows nothing of the depth map"
         )
     holes = f"{target.width} x {target.height}, {float(warped.isnan().float().mean()):.1%} holes"
     return warped, Assumption("the depth map is warped into the photo's view", holes)

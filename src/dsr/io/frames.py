@@ -12,6 +12,8 @@ import cv2
 import numpy as np
 
 from dsr.geometry.camera import Camera
+from dsr.geometry.lens import Lens
+from dsr.geometry.rigid_motion import Matrix
 from dsr.io.depth_files import DEPTH_SUFFIXES, read_array_file
 from dsr.io.images import read_pixels
 from dsr.notes import Assumption
@@ -56,17 +58,32 @@ class Source(Protocol):
         ...
 
 
+class Rig(NamedTuple):
+    """A depth camera, of the depth map's pixels, and the transform from its frame to the photo camera's, metres.
+
+    ``lens``: its lens; None without distortion.
+    """
+
+    camera: Camera
+    transform: Matrix
+    lens: Lens | None = None
+
+
 class Geometry(NamedTuple):
-    """What a capture says of a frame's camera.
+    """What a capture says of a frame's cameras.
 
     ``camera``: of a size of its own, which is scaled to the photo's; None if it does not say. ``pose``: camera to
     world, (4, 4) float64 in metres, rigid, of the camera's frame x right, y down, z forward; the world's frame is the
-    capture's own. None if it does not say. ``assumptions``: what was assumed for them.
+    capture's own. None if it does not say. ``assumptions``: what was assumed for them. ``lens``: of the photo, and of a
+    depth map without a rig, which lies in the photo's pixels; None without distortion. ``rig``: the depth map's own
+    camera, of a size of its own as well; None if the map is in the photo's view.
     """
 
     camera: Camera | None = None
     pose: np.ndarray | None = None
     assumptions: tuple[Assumption, ...] = ()
+    lens: Lens | None = None
+    rig: Rig | None = None
 
 
 @dataclass(frozen=True)

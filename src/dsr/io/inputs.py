@@ -12,12 +12,13 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera, RangeType
+from dsr.geometry.lens import undistort
 from dsr.geometry.plausible import expect_possible
-from dsr.io.cameras import camera_only, find_camera, read_rig, scale_to_photo, to_photo
+from dsr.io.cameras import camera_only, find_camera, read_rig, scale_to_depth, scale_to_photo, to_photo
 from dsr.io.depth_files import ICL_CAMERA, ICL_SUFFIX, read_depth_file
 from dsr.io.doubts import doubt_camera, doubt_depth
 from dsr.io.encoding import Encoding, decode, find_holes, turn_back_bits
-from dsr.io.frames import SLACK, Geometry
+from dsr.io.frames import SLACK, Geometry, Rig
 from dsr.io.images import CameraFile, pixels_in_header, read_mask
 from dsr.io.pairs import Pair, words_of
 from dsr.io.photos import Size, model_in_exif, read_photo, same_aspect
@@ -159,9 +160,14 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     geometry = Geometry() if pair.capture is None else pair.capture.geometry((pixels.shape[0], pixels.shape[1]))
     described, camera_assumptions = _camera(pair, reading, geometry, (pixels.shape[0], pixels.shape[1]), size_lr)
     expect_possible(described.camera, _told_by(pair, reading))
+    lens = geometry.lens if geometry.camera is not None and reading.camera == CameraChoice() else None
+    if lens is not None and lens.bends:
+        pixels = undistort(pixels, described.camera, lens)
+        undone = "the lens distortion of the photo is undone"
+        camera_assumptions = [*camera_assumptions, Assumption(undone, str(lens))]
     pixels, crop_assumptions = _crop_to_multiple(pixels, pair.factor, size_lr)
     size: Size = (pixels.shape[0], pixels.shape[1])
-    rig = None if reading.rig is None else read_rig(reading.rig, size_lr, reading.baseline)
+    rig = _rig(pair, reading, geometry, size_lr)
     if rig is None:
         _expect_lower_resolution(pair, size, size_lr)
     camera = described.camera.crop(0, 0, *size)
@@ -182,6 +188,12 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     confidence, confidence_assumptions = _confidence(pair, reading, size_lr, holes)
     if holes.all():
         raise ValueError(f"{pair.depth}: expected at least one known pixel, all are holes")
+    lens_lr = lens if rig is None else rig.lens
+    if lens_lr is not None and lens_lr.bends:
+        stored, holes = undistort(stored, of_depth, lens_lr, 0), undistort(holes, of_depth, lens_lr, hole=True)
+        if confidence is not None:
+            confidence = torch.from_numpy(undistort(confidence[0].numpy(), of_depth, lens_lr, 0))[None]
+        hole_assumptions.append(Assumption("the lens distortion of the depth map is undone", str(lens_lr)))
     encoding = Encoding(_suffix(pair), str(stored.dtype), told.unit, mark, range_type)
     depth_lr = decode(stored, holes, encoding, of_depth)
     hole_assumptions += _expect_distances(pair.depth, depth_lr, holes, range_type)
@@ -198,8 +210,9 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
         *doubts,
     )
     if rig is not None:
-        all_assumptions = (*all_assumptions, *doubt_camera(rig.camera, "--depth-camera"))
-        depth_lr, warped = to_photo(depth_lr, rig, camera)
+        given = reading.rig is not None
+        all_assumptions = (*all_assumptions, *doubt_camera(rig.camera, "--depth-camera" if given else "depth camera"))
+        depth_lr, warped = to_photo(depth_lr, rig, camera, "--extrinsics" if given else _told_by(pair, reading))
         all_assumptions, confidence = (*all_assumptions, warped), None
     device_name = model_in_exif(pair.rgb) if pair.capture is None else pair.capture.app
     return Picture(rgb, depth_lr, camera, encoding, all_assumptions, geometry.pose, confidence, device_name)
@@ -298,6 +311,16 @@ def _camera(
     described, assumptions = find_camera(CameraChoice(file=pair.camera), pair.rgb, size, size_lr)
     found = Assumption(f"camera: {pair.camera.name} beside the pictures")
     return described, [*geometry.assumptions, found, *assumptions]
+
+
+def _rig(pair: Pair, reading: Reading, geometry: Geometry, size_lr: Size) -> Rig | None:
+    """Return the rig that the user gives, else the capture's; None if the depth map is in the photo's view."""
+    if reading.rig is not None:
+        return read_rig(reading.rig, size_lr, reading.baseline)
+    if pair.capture is None or geometry.rig is None:
+        return None
+    camera = scale_to_depth(str(pair.capture.told_by), geometry.rig.camera, size_lr)
+    return geometry.rig._replace(camera=replace(camera, baseline=reading.baseline or camera.baseline))
 
 
 def _told_by(pair: Pair, reading: Reading) -> str:

@@ -23,11 +23,12 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
+from dsr.geometry.lens import Lens
 from dsr.io.captures.archive import PHOTO_LIMIT, decode_photo
 from dsr.io.frames import CaptureFrame, Geometry, Record
 from dsr.io.pairs import Pair, PairingResult, match_times
@@ -40,6 +41,12 @@ _IMAGE, _COMPRESSED, _INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "C
 _UNITS = {"u": 1e-3, "f": 1.0}
 _PREFERRED = {"depth": ("aligned", "registered"), "rgb": ("color", "colour", "rgb")}
 
+_LENSES = {
+    "plumb_bob": "brown_conrady",
+    "rational_polynomial": "brown_conrady",
+    "equidistant": "kannala_brandt",
+}
+"""Distortion models of CameraInfo, see sensor_msgs/distortion_models.h."""
 COLOURS = {
     "rgb8": (3, cv2.COLOR_RGB2BGR),
     "bgr8": (3, None),
@@ -194,8 +201,18 @@ def _times(reader: Any, path: Path, topic: str) -> list[tuple[Message, float]]:
     return found
 
 
-def _camera_info(reader: Any, photo_topic: str) -> tuple[int, int, tuple[float, ...], bool] | None:
-    """Return height, width, fx, fy, cx, cy, and whether there is distortion, of the topic beside the photo's."""
+class _Info(NamedTuple):
+    """What is read of a CameraInfo: fx, fy, cx, cy, and the model and coefficients of the distortion."""
+
+    height: int
+    width: int
+    numbers: tuple[float, ...]
+    model: str
+    distortion: tuple[float, ...]
+
+
+def _camera_info(reader: Any, photo_topic: str) -> _Info | None:
+    """Return the content of the topic beside the photo's; None if there is none."""
     for place in PurePosixPath(photo_topic).parents:
         connections = [each for each in reader.connections if each.topic == str(place / "camera_info")]
         for connection, _, raw in reader.messages(connections) if connections else ():
@@ -203,21 +220,26 @@ def _camera_info(reader: Any, photo_topic: str) -> tuple[int, int, tuple[float, 
             K = info.K if hasattr(info, "K") else info.k
             distortion = info.D if hasattr(info, "D") else info.d
             numbers = (float(K[0]), float(K[4]), float(K[2]), float(K[5]))
-            return info.height, info.width, numbers, bool(np.any(distortion))
+            return _Info(info.height, info.width, numbers, info.distortion_model, tuple(map(float, distortion)))
         if connections or len(place.parts) < 3:
             return None
     return None
 
 
-def _geometry(place: str, info: tuple[int, int, tuple[float, ...], bool] | None, _: tuple[int, int]) -> Geometry:
+def _geometry(place: str, info: _Info | None, _: tuple[int, int]) -> Geometry:
     """Return the camera of a recording."""
     if info is None:
         return Geometry(None, None, (Assumption("the recording has no camera_info beside the photo's topic"),))
-    height, width, numbers, distorted = info
-    if min(height, width) < 1:
-        raise ValueError(f"{place}: expected a positive width and height, got {width} x {height}")
-    text = "the photo's lens distortion is not undone: a rectified topic (image_rect) has none"
-    return Geometry(intrinsics_camera(place, (height, width), numbers), None, (Assumption(text),) if distorted else ())
+    if min(info.height, info.width) < 1:
+        raise ValueError(f"{place}: expected a positive width and height, got {info.width} x {info.height}")
+    camera = intrinsics_camera(place, (info.height, info.width), info.numbers)
+    if not any(info.distortion):
+        return Geometry(camera)
+    if info.model not in _LENSES:
+        text = f"the photo's lens distortion of the model {info.model!r:.40} is not undone: a rectified topic (image_rect) has none"
+        return Geometry(camera, None, (Assumption(text),))
+    with naming(place):
+        return Geometry(camera, lens=Lens(_LENSES[info.model], info.distortion))
 
 
 class _NamedErrors:

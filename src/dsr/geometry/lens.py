@@ -1,0 +1,129 @@
+"""Lens distortion, and pictures without it: as the pinhole camera of the same intrinsics sees them.
+
+    brown_conrady             OpenCV's and ROS's: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tx ty]]]], a rational function
+    modified_brown_conrady    RealSense's: k1 k2 p1 p2 k3, the tangential part of the point that the radial part moved
+    inverse_brown_conrady     RealSense's: k1 k2 p1 p2 k3, from the picture's point to that without distortion
+    kannala_brandt            of fisheyes: k1 k2 k3 k4 of the angle
+
+calib3d.hpp of https://github.com/opencv/opencv and include/librealsense2/rsutil.h of
+https://github.com/IntelRealSense/librealsense (``rs2_project_point_to_pixel``, ``rs2_deproject_pixel_to_point``).
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from dsr.geometry.camera import Camera
+
+_COUNTS = {
+    "brown_conrady": (4, 5, 8, 12, 14),
+    "modified_brown_conrady": (5,),
+    "inverse_brown_conrady": (5,),
+    "kannala_brandt": (4,),
+}
+_STEPS = 30
+"""Steps in which a distorted point is found whose inverse model is known; a lens of 80 degrees needs 12."""
+_MOST = (1 << 15) - 2
+"""Largest width and height that OpenCV's ``remap`` takes."""
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A lens: where in the picture the points of a pinhole camera lie.
+
+    Args:
+        model: one of those of the module's text.
+        coefficients: as many as the model has.
+
+    Raises:
+        ValueError: there is no such model, or the coefficients are too few, too many, or not finite.
+
+    """
+
+    model: str
+    coefficients: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        """Check model and coefficients."""
+        if self.model not in _COUNTS:
+            raise ValueError(f"lens: expected a model of {', '.join(_COUNTS)}, got {self.model!r:.60}")
+        count, counts = len(self.coefficients), _COUNTS[self.model]
+        if count not in counts or not np.isfinite(self.coefficients).all():
+            wanted = " or ".join(map(str, counts))
+            raise ValueError(f"lens: expected {wanted} finite numbers of {self.model}, got {self.coefficients!s:.120}")
+
+    def __str__(self) -> str:
+        return f"{self.model} {' '.join(f'{each:g}' for each in self.coefficients)}"
+
+    @property
+    def bends(self) -> bool:
+        """Whether it distorts at all: a fisheye does without coefficients, too."""
+        return any(self.coefficients) or self.model == "kannala_brandt"
+
+
+def undistort(picture: np.ndarray, camera: Camera, lens: Lens, hole: float | None = None) -> np.ndarray:
+    """Return a picture as the pinhole camera sees it.
+
+    Args:
+        picture: (h, w) or (h, w, 3) of the camera's size.
+        camera: the intrinsics, with the lens and without.
+        lens: the lens.
+        hole: what pixels of a map have that lie outside of the picture, the others have that of the nearest pixel; None
+            for a photo, which is interpolated and continued at its border.
+
+    Returns:
+        Picture of the same shape and dtype.
+
+    Raises:
+        ValueError: the picture is of another size than the camera, or larger than OpenCV takes.
+
+    """
+    if picture.shape[:2] != (camera.height, camera.width) or max(picture.shape[:2]) > _MOST:
+        got = f"{picture.shape[1]} x {picture.shape[0]}"
+        raise ValueError(f"lens: expected {camera.width} x {camera.height} pixels, each at most {_MOST}, got {got}")
+    x, y = _places(camera, lens)
+    if hole is None:
+        return cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    column, row = np.rint(x).astype(np.int32), np.rint(y).astype(np.int32)
+    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    found = np.full_like(picture, hole)
+    found[inside] = picture[row[inside], column[inside]]
+    return found
+
+
+@functools.lru_cache(maxsize=2)  # the photo's and the depth map's
+def _places(camera: Camera, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
+    """Return the columns and rows of a picture where the pixels of the pinhole camera lie, (h, w) float32 each."""
+    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    numbers, size, kind = np.array(lens.coefficients), (camera.width, camera.height), cv2.CV_32FC1
+    if lens.model == "brown_conrady":
+        places = cv2.initUndistortRectifyMap(matrix, numbers, None, matrix, size, kind)
+    elif lens.model == "kannala_brandt":
+        places = cv2.fisheye.initUndistortRectifyMap(matrix, numbers, np.eye(3), matrix, size, kind)
+    else:
+        rows, columns = np.mgrid[: camera.height, : camera.width].astype(np.float64)
+        x, y = own = (columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy
+        if lens.model == "inverse_brown_conrady":
+            for _ in range(_STEPS):
+                radial, dx, dy = _moved(x, y, lens.coefficients)
+                x, y = (own[0] - dx) / radial, (own[1] - dy) / radial
+        else:
+            radial = _moved(x, y, lens.coefficients)[0]
+            _, dx, dy = _moved(x * radial, y * radial, lens.coefficients)
+            x, y = x * radial + dx, y * radial + dy
+        places = (x * camera.fx + camera.cx, y * camera.fy + camera.cy)
+    outside = -2.0 * _MOST
+    x, y = (np.clip(np.nan_to_num(each, nan=outside), outside, 2 * _MOST).astype(np.float32) for each in places)
+    return x, y
+
+
+def _moved(x: np.ndarray, y: np.ndarray, numbers: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the factor of the radial distortion at points, and the tangential shift."""
+    k1, k2, p1, p2, k3 = numbers
+    square = x * x + y * y
+    radial = 1 + square * (k1 + square * (k2 + square * k3))
+    return radial, 2 * p1 * x * y + p2 * (square + 2 * x * x), 2 * p2 * x * y + p1 * (square + 2 * y * y)
