@@ -26,12 +26,14 @@ import numpy as np
 from dsr.geometry.camera import Camera
 from dsr.io.frames import CaptureFrame, Geometry, Record
 from dsr.io.pairs import Pair, PairingResult
-from dsr.io.photos import HEIC_SUFFIXES, model_in_exif, orientation_of, same_aspect
+from dsr.io.photos import HEIC_SUFFIXES, orientation_of, same_aspect
 from dsr.io.trajectories import intrinsics_camera
 from dsr.notes import Assumption
 from dsr.utils.guards import MOST_FILE, MOST_TEXT, expect_pixels, natural_key, numbers_in, read_limited, refusing
 from dsr.utils.versions import file_hash
 
+_APP = "HEIC"
+"""Not the device in the EXIF data: such depth is that of its two lenses or of a network, not of its depth sensor."""
 _HEAD = 1 << 20
 """Bytes at the beginning of a file in which its images are listed."""
 _MARK = re.compile(rb"urn:mpeg:hevc:2015:auxid:2|urn:mpeg:mpegB:cicp:systems:auxiliary:depth")
@@ -93,7 +95,7 @@ def find_heic(place: Path) -> PairingResult | None:
         return None
     pairs = [
         Pair(path.stem, path, path / "depth", unit=1.0, capture=CaptureFrame(
-            model_in_exif(path) or "HEIC", functools.partial(_geometry, path), path, _told(path),
+            _APP, functools.partial(_geometry, path), path, _told(path),
             HeicImage(path, "photo"), HeicImage(path, "depth")))
         for path in sorted(found, key=natural_key)
     ]  # fmt: skip
