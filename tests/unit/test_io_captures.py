@@ -18,7 +18,7 @@ from captures import FRAMES, INTRINSICS, SIZE, SIZE_LR
 
 from dsr.geometry.camera import Camera
 from dsr.io.captures.archive import decode_lzfse
-from dsr.io.captures.ros import decode_message
+from dsr.io.captures.ros_images import decode_message
 from dsr.io.inputs import FolderUnits, read_picture
 from dsr.io.layouts import find_pairs_of_folder
 from dsr.io.reading import Reading

@@ -23,7 +23,7 @@ from dsr.data.preparation import Preparation
 from dsr.data.rendered import Procedural, SimGeo
 from dsr.evaluation.run_files import read_run
 from dsr.evaluation.store import load_prediction
-from dsr.io.captures import ros, stray
+from dsr.io.captures import bags, stray
 from dsr.io.captures.record3d import find_record3d
 from dsr.io.depth_files import read_depth_file
 from dsr.io.exports import read_input
@@ -190,8 +190,8 @@ def test_chunk_of_a_recording_unpacks_to_no_more_than_is_allowed(monkeypatch, na
     tables = {**storage_mcap.DECOMPRESSORS, **reader.decompressors}
     monkeypatch.setattr(reader, "decompressors", dict(reader.decompressors))
     monkeypatch.setattr(storage_mcap, "DECOMPRESSORS", dict(storage_mcap.DECOMPRESSORS))
-    monkeypatch.setattr(ros, "_CHUNK", 1 << 20)
-    ros._limit_chunks()
+    monkeypatch.setattr(bags, "_CHUNK", 1 << 20)
+    bags._limit_chunks()
     compress = compress or {"lz4": importlib.import_module("lz4.frame"), "zstd": storage_mcap.zstd}[name].compress
     for table in (reader.decompressors, storage_mcap.DECOMPRESSORS):
         if name in table:

@@ -1,12 +1,12 @@
 """Lens distortion, and pictures without it: as the pinhole camera of the same intrinsics sees them.
 
     brown_conrady             OpenCV's and ROS's: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tx ty]]]], a rational function
-    modified_brown_conrady    RealSense's: k1 k2 p1 p2 k3, the tangential part of the point that the radial part moved
-    inverse_brown_conrady     RealSense's: k1 k2 p1 p2 k3, from the picture's point to that without distortion
+    modified_brown_conrady    RealSense's: k1 k2 p1 p2 k3, the tangential part of the point that the radial part moved;
+                              RealSense's "inverse Brown Conrady" as well, which its SDK computes in the same way
     kannala_brandt            of fisheyes: k1 k2 k3 k4 of the angle
 
-calib3d.hpp of https://github.com/opencv/opencv and include/librealsense2/rsutil.h of
-https://github.com/IntelRealSense/librealsense (``rs2_project_point_to_pixel``, ``rs2_deproject_pixel_to_point``).
+calib3d.hpp of https://github.com/opencv/opencv, and ``rs2_project_point_to_pixel`` in src/rs.cpp of
+https://github.com/IntelRealSense/librealsense.
 """
 
 from __future__ import annotations
@@ -22,11 +22,8 @@ from dsr.geometry.camera import Camera
 _COUNTS = {
     "brown_conrady": (4, 5, 8, 12, 14),
     "modified_brown_conrady": (5,),
-    "inverse_brown_conrady": (5,),
     "kannala_brandt": (4,),
 }
-_STEPS = 30
-"""Steps in which a distorted point is found whose inverse model is known; a lens of 80 degrees needs 12."""
 _MOST = (1 << 15) - 2
 """Largest width and height that OpenCV's ``remap`` takes."""
 
@@ -105,25 +102,14 @@ def _places(camera: Camera, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
     elif lens.model == "kannala_brandt":
         places = cv2.fisheye.initUndistortRectifyMap(matrix, numbers, np.eye(3), matrix, size, kind)
     else:
-        rows, columns = np.mgrid[: camera.height, : camera.width].astype(np.float64)
-        x, y = own = (columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy
-        if lens.model == "inverse_brown_conrady":
-            for _ in range(_STEPS):
-                radial, dx, dy = _moved(x, y, lens.coefficients)
-                x, y = (own[0] - dx) / radial, (own[1] - dy) / radial
-        else:
-            radial = _moved(x, y, lens.coefficients)[0]
-            _, dx, dy = _moved(x * radial, y * radial, lens.coefficients)
-            x, y = x * radial + dx, y * radial + dy
-        places = (x * camera.fx + camera.cx, y * camera.fy + camera.cy)
+        k1, k2, p1, p2, k3 = lens.coefficients
+        x = (np.arange(camera.width) - camera.cx) / camera.fx
+        y = (np.arange(camera.height)[:, None] - camera.cy) / camera.fy
+        square = x * x + y * y
+        radial = 1 + square * (k1 + square * (k2 + square * k3))
+        x, y = x * radial, y * radial
+        dx, dy = 2 * p1 * x * y + p2 * (square + 2 * x * x), 2 * p2 * x * y + p1 * (square + 2 * y * y)
+        places = ((x + dx) * camera.fx + camera.cx, (y + dy) * camera.fy + camera.cy)
     outside = -2.0 * _MOST
     x, y = (np.clip(np.nan_to_num(each, nan=outside), outside, 2 * _MOST).astype(np.float32) for each in places)
     return x, y
-
-
-def _moved(x: np.ndarray, y: np.ndarray, numbers: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the factor of the radial distortion at points, and the tangential shift."""
-    k1, k2, p1, p2, k3 = numbers
-    square = x * x + y * y
-    radial = 1 + square * (k1 + square * (k2 + square * k3))
-    return radial, 2 * p1 * x * y + p2 * (square + 2 * x * x), 2 * p2 * x * y + p1 * (square + 2 * y * y)

@@ -224,8 +224,8 @@ def to_photo(depth_lr: Tensor, rig: Rig, photo: Camera, place: str) -> tuple[Ten
     warped = warp_depth(depth_lr[None], rig.camera, torch.from_numpy(rig.transform)[None], target)[0]
     if not bool(warped.isfinite().any()):
         raise ValueError(
-            f"{place}: expected the transform from the depth camera's frame to the photo camera's, in metres; with this "
-            "one the photo shows nothing of the depth map"
+            f"{place}: expected the transform from the depth camera's frame to the photo camera's, in metres; with "
+            "this one the photo shows nothing of the depth map"
         )
     holes = f"{target.width} x {target.height}, {float(warped.isnan().float().mean()):.1%} holes"
     return warped, Assumption("the depth map is warped into the photo's view", holes)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera, RangeType
-from dsr.geometry.lens import undistort
+from dsr.geometry.lens import Lens, undistort
 from dsr.geometry.plausible import expect_possible
 from dsr.io.cameras import camera_only, find_camera, read_rig, scale_to_depth, scale_to_photo, to_photo
 from dsr.io.depth_files import ICL_CAMERA, ICL_SUFFIX, read_depth_file
@@ -161,10 +161,7 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     described, camera_assumptions = _camera(pair, reading, geometry, (pixels.shape[0], pixels.shape[1]), size_lr)
     expect_possible(described.camera, _told_by(pair, reading))
     lens = geometry.lens if geometry.camera is not None and reading.camera == CameraChoice() else None
-    if lens is not None and lens.bends:
-        pixels = undistort(pixels, described.camera, lens)
-        undone = "the lens distortion of the photo is undone"
-        camera_assumptions = [*camera_assumptions, Assumption(undone, str(lens))]
+    pixels, undone = _undistort_photo(pixels, described.camera, lens)
     pixels, crop_assumptions = _crop_to_multiple(pixels, pair.factor, size_lr)
     size: Size = (pixels.shape[0], pixels.shape[1])
     rig = _rig(pair, reading, geometry, size_lr)
@@ -189,11 +186,7 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     if holes.all():
         raise ValueError(f"{pair.depth}: expected at least one known pixel, all are holes")
     lens_lr = lens if rig is None else rig.lens
-    if lens_lr is not None and lens_lr.bends:
-        stored, holes = undistort(stored, of_depth, lens_lr, 0), undistort(holes, of_depth, lens_lr, hole=True)
-        if confidence is not None:
-            confidence = torch.from_numpy(undistort(confidence[0].numpy(), of_depth, lens_lr, 0))[None]
-        hole_assumptions.append(Assumption("the lens distortion of the depth map is undone", str(lens_lr)))
+    stored, holes, confidence, undone_lr = _undistort_depth(stored, holes, confidence, of_depth, lens_lr)
     encoding = Encoding(_suffix(pair), str(stored.dtype), told.unit, mark, range_type)
     depth_lr = decode(stored, holes, encoding, of_depth)
     hole_assumptions += _expect_distances(pair.depth, depth_lr, holes, range_type)
@@ -202,18 +195,18 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     all_assumptions = (
         *assumptions,
         *camera_assumptions,
+        *undone,
         *crop_assumptions,
         *range_assumptions,
         *told.assumptions,
         *hole_assumptions,
         *confidence_assumptions,
+        *undone_lr,
         *doubts,
     )
     if rig is not None:
-        given = reading.rig is not None
-        all_assumptions = (*all_assumptions, *doubt_camera(rig.camera, "--depth-camera" if given else "depth camera"))
-        depth_lr, warped = to_photo(depth_lr, rig, camera, "--extrinsics" if given else _told_by(pair, reading))
-        all_assumptions, confidence = (*all_assumptions, warped), None
+        depth_lr, warped = _to_photo(pair, reading, depth_lr, rig, camera)
+        all_assumptions, confidence = (*all_assumptions, *warped), None
     device_name = model_in_exif(pair.rgb) if pair.capture is None else pair.capture.app
     return Picture(rgb, depth_lr, camera, encoding, all_assumptions, geometry.pose, confidence, device_name)
 
@@ -321,6 +314,35 @@ def _rig(pair: Pair, reading: Reading, geometry: Geometry, size_lr: Size) -> Rig
         return None
     camera = scale_to_depth(str(pair.capture.told_by), geometry.rig.camera, size_lr)
     return geometry.rig._replace(camera=replace(camera, baseline=reading.baseline or camera.baseline))
+
+
+def _to_photo(
+    pair: Pair, reading: Reading, depth_lr: Tensor, rig: Rig, photo: Camera
+) -> tuple[Tensor, list[Assumption]]:
+    """Return a depth camera's map in the photo's view, and notes."""
+    given = reading.rig is not None
+    doubts = doubt_camera(rig.camera, "--depth-camera" if given else "depth camera")
+    warped, note = to_photo(depth_lr, rig, photo, "--extrinsics" if given else _told_by(pair, reading))
+    return warped, [*doubts, note]
+
+
+def _undistort_photo(pixels: np.ndarray, camera: Camera, lens: Lens | None) -> tuple[np.ndarray, list[Assumption]]:
+    """Return a photo without its lens distortion, and a note if it had any."""
+    if lens is None or not lens.bends:
+        return pixels, []
+    return undistort(pixels, camera, lens), [Assumption("the lens distortion of the photo is undone", str(lens))]
+
+
+def _undistort_depth(
+    stored: np.ndarray, holes: np.ndarray, confidence: Tensor | None, camera: Camera, lens: Lens | None
+) -> tuple[np.ndarray, np.ndarray, Tensor | None, list[Assumption]]:
+    """Return a map's values, its holes and its confidence without lens distortion, and a note if it had any."""
+    if lens is None or not lens.bends:
+        return stored, holes, confidence, []
+    if confidence is not None:
+        confidence = torch.from_numpy(undistort(confidence[0].numpy(), camera, lens, 0))[None]
+    note = Assumption("the lens distortion of the depth map is undone", str(lens))
+    return undistort(stored, camera, lens, 0), undistort(holes, camera, lens, hole=True), confidence, [note]
 
 
 def _told_by(pair: Pair, reading: Reading) -> str:

@@ -44,7 +44,7 @@ _TUM_UNIT = 1 / 5000
 _MAX_DEPTH = 3
 """Levels of subfolders that are searched."""
 
-CAPTURE_FILES = (".r3d", ".bag", ".mkv", *HEIC_SUFFIXES)
+CAPTURE_FILES = (".r3d", ".bag", ".mcap", ".db3", ".mkv", *HEIC_SUFFIXES)
 """Suffixes of captures that are a single file."""
 _LAYOUTS = (find_stray, find_record3d, find_polycam, find_arkitscenes, find_ros, find_kinect, find_heic)
 

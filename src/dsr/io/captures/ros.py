@@ -1,4 +1,4 @@
-"""Recordings of ROS 1 (``.bag``) and ROS 2 (a folder with ``metadata.yaml``), read by the package rosbags.
+"""Recordings of ROS 1 (``.bag``) and ROS 2 (``.mcap``, ``.db3``, or a folder of them with ``metadata.yaml``).
 
 Messages of sensor_msgs: Image, CompressedImage and CameraInfo,
 http://docs.ros.org/en/api/sensor_msgs/html/index-msg.html; depth is in millimetres as whole numbers and in metres as
@@ -6,38 +6,32 @@ floats, https://ros.org/reps/rep-0118.html.
 
 Of the topics of depth one named *aligned* or *registered* is taken before others, then one with more messages, then the
 first by name; of those of colour one named *color*, *colour* or *rgb*, then the same. The photo's camera is that of the
-topic ``camera_info`` beside it. Photo and depth map are paired by the times in their headers, within 20 ms. Poses are
+topic ``camera_info`` beside it, for its window and binning and with its distortion; of photos of a topic of
+``image_rect`` its P, without. Photo and depth map are paired by the times in their headers, within 20 ms. Poses are
 not read.
 
-``compressedDepth`` is that of https://github.com/ros-perception/image_transport_plugins.
+Recordings of RealSense's SDK are those of :mod:`dsr.io.captures.realsense`.
 """
 
 from __future__ import annotations
 
-import atexit
-import bz2
 import functools
-import hashlib
-import importlib
 import struct
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
-import cv2
-import numpy as np
-
 from dsr.geometry.lens import Lens
-from dsr.io.captures.archive import PHOTO_LIMIT, decode_photo
-from dsr.io.frames import CaptureFrame, Geometry, Record
+from dsr.io.captures import realsense
+from dsr.io.captures.bags import COMPRESSED, IMAGE, Message, NamedErrors, connections_of, first_message, open_recording
+from dsr.io.captures.ros_images import COLOURS, DEPTHS
+from dsr.io.frames import CaptureFrame, Geometry
 from dsr.io.pairs import Pair, PairingResult, match_times
 from dsr.io.trajectories import intrinsics_camera
 from dsr.notes import Assumption
-from dsr.utils.decoding import decode_pixels
-from dsr.utils.guards import MOST_TEXT, expect_bytes, naming, natural_key, path_within, refusing
+from dsr.utils.guards import naming, natural_key
 
-_IMAGE, _COMPRESSED, _INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
+FILES = (".bag", ".mcap", ".db3")
+"""Suffixes of recordings that are a single file."""
 _UNITS = {"u": 1e-3, "f": 1.0}
 _PREFERRED = {"depth": ("aligned", "registered"), "rgb": ("color", "colour", "rgb")}
 
@@ -47,60 +41,6 @@ _LENSES = {
     "equidistant": "kannala_brandt",
 }
 """Distortion models of CameraInfo, see sensor_msgs/distortion_models.h."""
-COLOURS = {
-    "rgb8": (3, cv2.COLOR_RGB2BGR),
-    "bgr8": (3, None),
-    "8UC3": (3, None),
-    "rgba8": (4, cv2.COLOR_RGBA2BGR),
-    "bgra8": (4, cv2.COLOR_BGRA2BGR),
-    "8UC4": (4, cv2.COLOR_BGRA2BGR),
-}
-"""Channels of encodings of colour, and OpenCV's conversion to BGR."""
-DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
-_CONFIG = struct.Struct("<iff")
-"""Header of compressedDepth: format, and two numbers of the quantisation of floats."""
-
-
-@dataclass(frozen=True)
-class Message:
-    """A :class:`~dsr.io.frames.Source` of an image in a recording.
-
-    Args:
-        file: the recording.
-        topic: its topic.
-        time: when it was recorded, in nanoseconds.
-        order: number among the topic's messages of this time.
-
-    """
-
-    file: Path
-    topic: str
-    time: int
-    order: int = 0
-
-    def read(self) -> np.ndarray:
-        """Return (H, W, 3) uint8 RGB of a photo, (h, w) of a depth map as it is stored."""
-        return decode_message(f"{self.file}{self.topic}", self._message())
-
-    def record(self) -> Record:
-        """Return the topic and a hash of the message."""
-        _, raw = self._raw()
-        return {"file": f"{self.file.name}{self.topic}", "sha256": hashlib.sha256(raw).hexdigest()}
-
-    def _message(self) -> Any:
-        """Return the message."""
-        kind, raw = self._raw()
-        with _NamedErrors(self.file):
-            return _reader(self.file, _state(self.file)).deserialize(raw, kind)
-
-    def _raw(self) -> tuple[str, bytes]:
-        """Return the message's type and bytes."""
-        with _NamedErrors(self.file):
-            reader = _reader(self.file, _state(self.file))
-            connections = [each for each in reader.connections if each.topic == self.topic]
-            found = list(reader.messages(connections, start=self.time, stop=self.time + 1))
-            connection, _, raw = found[self.order]
-            return connection.msgtype, bytes(raw)
 
 
 def find_ros(folder: Path) -> PairingResult | None:
@@ -111,10 +51,10 @@ def find_ros(folder: Path) -> PairingResult | None:
 
     """
     if folder.is_file():
-        return _read(folder) if folder.suffix.lower() == ".bag" else None
+        return _read(folder) if folder.suffix.lower() in FILES else None
     if (folder / "metadata.yaml").is_file() and any((*folder.glob("*.db3"), *folder.glob("*.mcap"))):
         return _read(folder)
-    bags = [path for path in folder.iterdir() if path.suffix.lower() == ".bag" and path.is_file()]
+    bags = [path for path in folder.iterdir() if path.suffix.lower() in FILES and path.is_file()]
     if not bags:
         return None
     parts = [_read(path, f"{path.stem}/") for path in sorted(bags, key=natural_key)]
@@ -125,8 +65,10 @@ def find_ros(folder: Path) -> PairingResult | None:
 
 def _read(path: Path, prefix: str = "") -> PairingResult:
     """Return the frames of a recording."""
-    with _NamedErrors(path):
-        reader = _reader(path, _state(path))
+    with NamedErrors(path):
+        reader = open_recording(path)
+        if realsense.is_recording(reader):
+            return realsense.read(reader, path, prefix)
         topics = _topics(reader)
         photo_topic, depth_topic = _choose(path, topics, "rgb"), _choose(path, topics, "depth")
         photos, depths = _times(reader, path, photo_topic), _times(reader, path, depth_topic)
@@ -160,12 +102,10 @@ def _read(path: Path, prefix: str = "") -> PairingResult:
 def _topics(reader: Any) -> dict[str, tuple[str, int]]:
     """Return, for each topic of images, its role (``rgb``, ``depth`` or empty) by its first message, and the count."""
     topics: dict[str, tuple[str, int]] = {}
-    for topic in sorted({each.topic for each in reader.connections if each.msgtype in (_IMAGE, _COMPRESSED)}):
-        connections = [each for each in reader.connections if each.topic == topic]
-        first = next(iter(reader.messages(connections)), None)
-        if first is not None:
-            message = reader.deserialize(first[2], first[0].msgtype)
-            topics[topic] = _role(message), sum(each.msgcount for each in connections)
+    for topic in sorted({each.topic for each in reader.connections if each.msgtype in (IMAGE, COMPRESSED)}):
+        message = first_message(reader, topic)
+        if message is not None:
+            topics[topic] = _role(message), sum(each.msgcount for each in connections_of(reader, topic))
     return topics
 
 
@@ -193,7 +133,7 @@ def _choose(path: Path, topics: dict[str, tuple[str, int]], role: str) -> str:
 def _times(reader: Any, path: Path, topic: str) -> list[tuple[Message, float]]:
     """Return the messages of a topic with the times in their headers, in seconds."""
     found: list[tuple[Message, float]] = []
-    for connection, time, raw in reader.messages([each for each in reader.connections if each.topic == topic]):
+    for connection, time, raw in reader.messages(connections_of(reader, topic)):
         same = found[-1][0].order + 1 if found and found[-1][0].time == time else 0
         seconds, nanoseconds = struct.unpack_from("<II", raw, 4)  # after a sequence number, or CDR's header
         stamp = seconds + 1e-9 * nanoseconds if seconds else 1e-9 * time
@@ -202,26 +142,44 @@ def _times(reader: Any, path: Path, topic: str) -> list[tuple[Message, float]]:
 
 
 class _Info(NamedTuple):
-    """What is read of a CameraInfo: fx, fy, cx, cy, and the model and coefficients of the distortion."""
+    """What is read of a CameraInfo.
+
+    ``numbers``: fx, fy, cx, cy of (height, width) pixels. ``window``: x, y, width and height of the part of them that
+    the photo shows, 0 for all. ``binning``: how many of them are one pixel of the photo, across and down. ``model``,
+    ``distortion``: of the lens; no numbers without one.
+    """
 
     height: int
     width: int
     numbers: tuple[float, ...]
+    window: tuple[int, int, int, int]
+    binning: tuple[int, int]
     model: str
     distortion: tuple[float, ...]
 
 
 def _camera_info(reader: Any, photo_topic: str) -> _Info | None:
-    """Return the content of the topic beside the photo's; None if there is none."""
+    """Return the content of the topic beside the photo's; None if there is none.
+
+    Photos of a rectified topic have the camera that P states, and no distortion.
+    """
     for place in PurePosixPath(photo_topic).parents:
-        connections = [each for each in reader.connections if each.topic == str(place / "camera_info")]
-        for connection, _, raw in reader.messages(connections) if connections else ():
-            info = reader.deserialize(raw, connection.msgtype)
-            K = info.K if hasattr(info, "K") else info.k
-            distortion = info.D if hasattr(info, "D") else info.d
-            numbers = (float(K[0]), float(K[4]), float(K[2]), float(K[5]))
-            return _Info(info.height, info.width, numbers, info.distortion_model, tuple(map(float, distortion)))
-        if connections or len(place.parts) < 3:
+        info = first_message(reader, str(place / "camera_info"))
+        if info is not None:
+            k, d, p = (info.K, info.D, info.P) if hasattr(info, "K") else (info.k, info.d, info.p)
+            rectified = "image_rect" in photo_topic
+            matrix = (p[0], p[5], p[2], p[6]) if rectified and p[0] else (k[0], k[4], k[2], k[5])
+            roi = info.roi
+            return _Info(
+                info.height,
+                info.width,
+                tuple(map(float, matrix)),
+                (roi.x_offset, roi.y_offset, roi.width, roi.height),
+                (max(info.binning_x, 1), max(info.binning_y, 1)),
+                info.distortion_model,
+                () if rectified else tuple(map(float, d)),
+            )
+        if len(place.parts) < 3:
             return None
     return None
 
@@ -233,146 +191,20 @@ def _geometry(place: str, info: _Info | None, _: tuple[int, int]) -> Geometry:
     if min(info.height, info.width) < 1:
         raise ValueError(f"{place}: expected a positive width and height, got {info.width} x {info.height}")
     camera = intrinsics_camera(place, (info.height, info.width), info.numbers)
+    x, y, width, height = info.window
+    with naming(place):
+        if width and height:
+            camera = camera.crop(y, x, height, width)
+        across, down = (max(n // by, 1) for n, by in zip((camera.width, camera.height), info.binning, strict=True))
+        camera = camera.crop(
+            0, 0, min(down * info.binning[1], camera.height), min(across * info.binning[0], camera.width)
+        )
+        camera = camera.rescale(across, down)
+        if not info.distortion:
+            return Geometry(camera)
+        if info.model in _LENSES:
+            return Geometry(camera, lens=Lens(_LENSES[info.model], info.distortion))
     if not any(info.distortion):
         return Geometry(camera)
-    if info.model not in _LENSES:
-        text = f"the photo's lens distortion of the model {info.model!r:.40} is not undone: a rectified topic (image_rect) has none"
-        return Geometry(camera, None, (Assumption(text),))
-    with naming(place):
-        return Geometry(camera, lens=Lens(_LENSES[info.model], info.distortion))
-
-
-class _NamedErrors:
-    """A context in which rosbags' errors become one that names the recording."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
-        if error is None or not isinstance(error, Exception):
-            return
-        if isinstance(error, ValueError) and str(error).startswith(str(self._path)):
-            return
-        raise ValueError(f"{self._path}: expected a recording of ROS, got a damaged one ({error!s:.120})") from error
-
-
-def _state(path: Path) -> tuple[int, ...]:
-    """Return sizes and times of the files of a recording, which tell whether it was replaced."""
-    files = sorted(path.iterdir()) if path.is_dir() else [path]
-    for file in files:
-        if file.exists() and not file.is_file() and not file.is_dir():  # a pipe would be waited for
-            raise ValueError(f"{file}: expected a file of the recording, got something else")
-    return tuple(number for file in files for number in (file.stat().st_size, file.stat().st_mtime_ns))
-
-
-def _reader(path: Path, state: tuple[int, ...]) -> Any:
-    """Return the open recording; the one before it is closed."""
-    key = (path, state)
-    if _OPEN.get("key") != key:
-        _close()
-        _OPEN.update(reader=_open(path), key=key)
-    return _OPEN["reader"]
-
-
-_OPEN: dict[str, Any] = {}
-"""The open recording with its path and state; empty if there is none."""
-
-
-@atexit.register
-def _close() -> None:
-    """Close the open recording."""
-    reader = _OPEN.get("reader")
-    _OPEN.clear()
-    if reader is not None:
-        reader.close()
-
-
-def _open(path: Path) -> Any:
-    """Open a recording."""
-    with refusing(f"{path}: recordings of ROS need the package rosbags: pip install 'dsr[captures]'", ImportError):
-        from rosbags.highlevel import AnyReader  # noqa: PLC0415 - an extra
-        from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
-    _limit_chunks()
-    description = path / "metadata.yaml"
-    if path.is_dir() and description.is_file():
-        expect_bytes(description, description.stat().st_size, MOST_TEXT)
-        for file in path.iterdir():  # of which rosbags takes those that the description names
-            path_within(path, file.name, f"{description}: relative_file_paths")
-    reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-    reader.open()
-    return reader
-
-
-_CHUNK = 1 << 28
-"""Largest number of bytes that a compressed chunk of a recording may unpack to; writers make chunks of a few MB."""
-
-
-def _limit_chunks() -> None:
-    """Make rosbags unpack no chunk to more than :data:`_CHUNK`: a bzip2 chunk of 700 bytes may stand for 1 GB."""
-    lz4: Any = importlib.import_module("lz4.frame")  # with the extra alone
-    from rosbags.rosbag1 import reader  # noqa: PLC0415
-    from rosbags.rosbag2 import storage_mcap  # noqa: PLC0415
-
-    def bounded(make: Callable[[], Any], data: bytes, *_: int) -> bytes:
-        unpacking = make()
-        content: bytes = unpacking.decompress(data, _CHUNK)
-        if not unpacking.eof:
-            raise ValueError(f"a chunk without end, or of more than {_CHUNK} bytes")
-        return content
-
-    kinds: dict[str, Callable[[], Any]] = {
-        "bz2": bz2.BZ2Decompressor,
-        "lz4": lz4.LZ4FrameDecompressor,
-        "zstd": storage_mcap.zstd.ZstdDecompressor,
-    }
-    for table in (reader.decompressors, storage_mcap.DECOMPRESSORS):
-        for name in kinds.keys() & table.keys():
-            table[name] = functools.partial(bounded, kinds[name])
-
-
-def decode_message(place: str, message: Any) -> np.ndarray:
-    """Return the pixels of an Image or a CompressedImage: (H, W, 3) uint8 RGB, or (h, w) of depth as it is stored.
-
-    Raises:
-        ValueError: its size does not fit its data, or they are damaged; the message begins with ``place``.
-
-    """
-    data = np.asarray(message.data, np.uint8)
-    if not hasattr(message, "encoding"):
-        if "compresseddepth" in message.format.lower():
-            return _decode_compressed_depth(place, message.format, data)
-        if data.size > PHOTO_LIMIT:
-            raise ValueError(f"{place}: expected a photo of at most {PHOTO_LIMIT} bytes, got {data.size}")
-        with naming(place):
-            return decode_photo(data.tobytes())
-    channels, code = COLOURS.get(message.encoding, (1, None))
-    dtype = np.dtype(DEPTHS.get(message.encoding, "u1")).newbyteorder(">" if message.is_bigendian else "<")
-    height, width, step = message.height, message.width, message.step
-    if min(height, width) < 1 or step < width * channels * dtype.itemsize or data.size != height * step:
-        raise ValueError(
-            f"{place}: expected an image of {width} x {height} pixels in rows of {step} bytes, got {data.size} bytes"
-        )
-    rows = data.reshape(height, step)[:, : width * channels * dtype.itemsize]
-    values = np.ascontiguousarray(rows).view(dtype).reshape(height, width, *([channels] if channels > 1 else []))
-    if message.encoding in DEPTHS:
-        return values.astype(dtype.newbyteorder("="))
-    return cv2.cvtColor(values if code is None else cv2.cvtColor(values, code), cv2.COLOR_BGR2RGB)
-
-
-def _decode_compressed_depth(place: str, encoding: str, data: np.ndarray) -> np.ndarray:
-    """Return the map of a message of compressedDepth: a PNG of whole numbers, or of quantised inverse metres."""
-    pixels = None
-    if _CONFIG.size < data.size <= PHOTO_LIMIT:
-        pixels = decode_pixels(place, data[_CONFIG.size :].tobytes(), cv2.IMREAD_UNCHANGED)
-    if pixels is None or pixels.ndim != 2 or pixels.dtype != np.uint16:
-        raise ValueError(
-            f"{place}: expected depth as a 16-bit PNG (compressedDepth), got {data.size} bytes of another kind"
-        )
-    if "32fc1" not in encoding.lower():
-        return pixels
-    _, a, b = _CONFIG.unpack(data[: _CONFIG.size].tobytes())
-    with np.errstate(divide="ignore"):
-        return np.where(pixels > 0, a / (pixels - np.float32(b)), np.nan).astype(np.float32)
+    text = f"the photo's lens distortion is not undone: its model {info.model!r:.40} is not known"
+    return Geometry(camera, None, (Assumption(text),))

@@ -1,0 +1,195 @@
+"""Recordings of ROS 1 and ROS 2, opened by the package rosbags, and their messages of images."""
+
+from __future__ import annotations
+
+import atexit
+import bz2
+import functools
+import hashlib
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dsr.io.captures.ros_images import decode_message
+from dsr.io.frames import Record
+from dsr.utils.guards import MOST_TEXT, expect_bytes, opened, path_within, refusing
+
+IMAGE, COMPRESSED = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage"))
+
+
+@dataclass(frozen=True)
+class Message:
+    """A :class:`~dsr.io.frames.Source` of an image in a recording.
+
+    Args:
+        file: the recording.
+        topic: its topic.
+        time: when it was recorded, in nanoseconds.
+        order: number among the topic's messages of this time.
+
+    """
+
+    file: Path
+    topic: str
+    time: int
+    order: int = 0
+
+    def read(self) -> np.ndarray:
+        """Return (H, W, 3) uint8 RGB of a photo, (h, w) of a depth map as it is stored."""
+        return decode_message(f"{self.file}{self.topic}", self._message())
+
+    def record(self) -> Record:
+        """Return the topic and a hash of the message."""
+        _, raw = self._raw()
+        return {"file": f"{self.file.name}{self.topic}", "sha256": hashlib.sha256(raw).hexdigest()}
+
+    def _message(self) -> Any:
+        """Return the message."""
+        kind, raw = self._raw()
+        with NamedErrors(self.file):
+            return deserialize(open_recording(self.file), raw, kind)
+
+    def _raw(self) -> tuple[str, bytes]:
+        """Return the message's type and bytes."""
+        with NamedErrors(self.file):
+            reader = open_recording(self.file)
+            found = list(reader.messages(connections_of(reader, self.topic), start=self.time, stop=self.time + 1))
+            connection, _, raw = found[self.order]
+            return connection.msgtype, bytes(raw)
+
+
+def connections_of(reader: Any, topic: str) -> list[Any]:
+    """Return the connections of a topic."""
+    return [each for each in reader.connections if each.topic == topic]
+
+
+def first_message(reader: Any, topic: str) -> Any:
+    """Return the first message of a topic; None if there is none."""
+    connections = connections_of(reader, topic)
+    for connection, _, raw in reader.messages(connections) if connections else ():
+        return deserialize(reader, raw, connection.msgtype)
+    return None
+
+
+def deserialize(reader: Any, raw: bytes, kind: str) -> Any:
+    """Return a message; behind an Image in a ``.bag`` RealSense's SDK puts four bytes that its definition lacks."""
+    if not reader.is2 and kind == IMAGE:
+        place = 12  # behind number and time
+        for behind in (8, 5):  # the header's text before height and width, the encoding before the rows' size
+            place += 4 + int.from_bytes(raw[place : place + 4], "little") + behind
+        raw = raw[: place + 4 + int.from_bytes(raw[place : place + 4], "little")]
+    return reader.deserialize(raw, kind)
+
+
+class NamedErrors:
+    """A context in which rosbags' errors become one that names the recording."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
+        if error is None or not isinstance(error, Exception):
+            return
+        if isinstance(error, ValueError) and str(error).startswith(str(self._path)):
+            return
+        raise ValueError(f"{self._path}: expected a recording of ROS, got a damaged one ({error!s:.120})") from error
+
+
+def state_of(path: Path) -> tuple[int, ...]:
+    """Return sizes and times of the files of a recording, which tell whether it was replaced."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    for file in files:
+        if file.exists() and not file.is_file() and not file.is_dir():  # a pipe would be waited for
+            raise ValueError(f"{file}: expected a file of the recording, got something else")
+    return tuple(number for file in files for number in (file.stat().st_size, file.stat().st_mtime_ns))
+
+
+def open_recording(path: Path) -> Any:
+    """Return the open recording; the one before it is closed.
+
+    Raises:
+        ValueError: it is missing, was interrupted, or the package rosbags is missing.
+
+    """
+    key = (path, state_of(path))
+    if _OPEN.get("key") != key:
+        _close()
+        _OPEN.update(reader=_open(path), key=key)
+    return _OPEN["reader"]
+
+
+_OPEN: dict[str, Any] = {}
+"""The open recording with its path and state; empty if there is none."""
+
+
+@atexit.register
+def _close() -> None:
+    """Close the open recording."""
+    reader = _OPEN.get("reader")
+    _OPEN.clear()
+    if reader is not None:
+        reader.close()
+
+
+def _open(path: Path) -> Any:
+    """Open a recording."""
+    with refusing(f"{path}: recordings of ROS need the package rosbags: pip install 'dsr[captures]'", ImportError):
+        from rosbags.highlevel import AnyReader  # noqa: PLC0415 - an extra
+        from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
+    _limit_chunks()
+    _expect_finished(path)
+    description = path / "metadata.yaml"
+    if path.is_dir() and description.is_file():
+        expect_bytes(description, description.stat().st_size, MOST_TEXT)
+        for file in path.iterdir():  # of which rosbags takes those that the description names
+            path_within(path, file.name, f"{description}: relative_file_paths")
+    reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+    reader.open()
+    return reader
+
+
+def _expect_finished(path: Path) -> None:
+    """Check that a ``.bag`` has its index, http://wiki.ros.org/Bags/Format/2.0: the first record tells its place."""
+    if path.suffix.lower() != ".bag":
+        return
+    with opened(path) as file:
+        head = file.read(1 << 12)
+    place = head.find(b"index_pos=")
+    if head.startswith(b"#ROSBAG V2.0") and place > 0 and head[place + 10 : place + 18] == bytes(8):
+        raise ValueError(
+            f"{path}: expected a finished recording, this one was interrupted and has no index; rosbag reindex adds it"
+        )
+
+
+_CHUNK = 1 << 28
+"""Largest number of bytes that a compressed chunk of a recording may unpack to; writers make chunks of a few MB."""
+
+
+def _limit_chunks() -> None:
+    """Make rosbags unpack no chunk to more than :data:`_CHUNK`: a bzip2 chunk of 700 bytes may stand for 1 GB."""
+    lz4: Any = importlib.import_module("lz4.frame")  # with the extra alone
+    from rosbags.rosbag1 import reader  # noqa: PLC0415
+    from rosbags.rosbag2 import storage_mcap  # noqa: PLC0415
+
+    def bounded(make: Callable[[], Any], data: bytes, *_: int) -> bytes:
+        unpacking = make()
+        content: bytes = unpacking.decompress(data, _CHUNK)
+        if not unpacking.eof:
+            raise ValueError(f"a chunk without end, or of more than {_CHUNK} bytes")
+        return content
+
+    kinds: dict[str, Callable[[], Any]] = {
+        "bz2": bz2.BZ2Decompressor,
+        "lz4": lz4.LZ4FrameDecompressor,
+        "zstd": storage_mcap.zstd.ZstdDecompressor,
+    }
+    for table in (reader.decompressors, storage_mcap.DECOMPRESSORS):
+        for name in kinds.keys() & table.keys():
+            table[name] = functools.partial(bounded, kinds[name])

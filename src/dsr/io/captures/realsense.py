@@ -1,0 +1,256 @@
+"""Recordings of RealSense's SDK: ``.bag`` (ROS 1, up to 2.57) and ``.db3`` (ROS 2, from 2.59), of one device.
+
+https://github.com/IntelRealSense/librealsense, src/media/ros/ros_file_format.h and ros_writer.cpp; ``.db3`` as the SDK
+2.59 writes it. Topics below ``/device_0/sensor_0``, for which the sensor of the stream has its own number:
+
+    .bag                                    .db3
+    /file_version                           the same                                    2 to 4
+    option/Depth_Units/value (Float32)      the same (String)                           metres; version 2: ``property``
+    Depth_0/image/data (Image)              ... or .../data/compressedDepth, /compressed
+    Depth_0/info/camera_info (CameraInfo)   Depth_0/camera_info (String: key=value;...)
+    Depth_0/tf/1 (Transform)                Depth_0/tf/ref_1 (String), column by column
+    Depth_0/image/metadata                  the same, with the frame's time stamp       ms; .bag: in the image's header
+
+``Color_0`` has the same. ``tf`` leads from the frame of reference of its number to the stream's, so depth to colour is
+that of colour after the inverse of that of depth. Frames are paired by their time stamps, within 20 ms.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dsr.geometry.camera import Camera
+from dsr.geometry.lens import Lens
+from dsr.geometry.rigid_motion import Matrix, as_rigid, from_quaternion, relative, invert
+from dsr.io.captures.bags import Message, connections_of, deserialize, first_message
+from dsr.io.frames import CaptureFrame, Geometry, Rig
+from dsr.io.pairs import Pair, PairingResult, match_times
+from dsr.io.trajectories import describe_capture, intrinsics_camera
+from dsr.notes import Assumption
+from dsr.utils.guards import naming, numbers_in
+
+_VERSION = "/file_version"
+_OLDEST = 2
+_IMAGES = re.compile(
+    r"(?P<stream>(?P<sensor>/device_\d+/sensor_\d+)/(?P<kind>\w+)_\d+)/image/data(/compressed(Depth)?)?"
+)
+_USUAL_UNIT = 1e-3
+_ALIKE = 1e-5
+"""Difference of numbers of two cameras, and of a transform to none, up to which they are the same."""
+_LENSES = {
+    "brown conrady": "brown_conrady",
+    "modified brown conrady": "modified_brown_conrady",
+    "inverse brown conrady": "modified_brown_conrady",
+    "kannala brandt4": "kannala_brandt",
+}
+"""The SDK's names of distortion models (``rs2_distortion_to_string``), in lower case."""
+
+
+class _Stream(NamedTuple):
+    """A stream's camera, its lens, its frame of reference with the transform from there, and notes."""
+
+    camera: Camera
+    lens: Lens | None
+    reference: str
+    transform: Matrix | None
+    notes: tuple[Assumption, ...]
+
+
+def is_recording(reader: Any) -> bool:
+    """Return whether an open recording is one of RealSense's SDK."""
+    return bool(connections_of(reader, _VERSION))
+
+
+def read(reader: Any, path: Path, prefix: str) -> PairingResult:
+    """Return the frames of a recording.
+
+    Args:
+        reader: the open recording.
+        path: its file.
+        prefix: of the frames' names.
+
+    Raises:
+        ValueError: it has no colour or no depth, or what describes them is missing or damaged.
+
+    """
+    version = int(first_message(reader, _VERSION).data)
+    if version < _OLDEST:
+        raise ValueError(f"{path}: expected file_version {_OLDEST} or later of RealSense's SDK, got {version}")
+    color_topic, depth_topic = (_choose(reader, path, kind) for kind in ("Color", "Depth"))
+    color, depth = (_stream(reader, path, topic) for topic in (color_topic, depth_topic))
+    unit, notes = _unit(reader, path, depth_topic)
+    geometry, registered = _geometry(color, depth)
+    photos, depths = (_frames(reader, path, topic) for topic in (color_topic, depth_topic))
+    partner = match_times(
+        {Path(f"{i:09}"): stamp for i, (_, stamp) in enumerate(photos)},
+        {Path(f"{i:09}"): stamp for i, (_, stamp) in enumerate(depths)},
+    )
+    if not partner:
+        raise ValueError(f"{path}: expected photos and depth maps within 20 ms of each other, found none")
+    device = _device(reader)
+    told = repr((color, depth)).encode()
+    places = Path(f"{path}{color_topic}"), Path(f"{path}{depth_topic}")
+    pairs = []
+    for first, second in sorted(partner.items()):
+        sources = photos[int(first.name)][0], depths[int(second.name)][0]
+        frame = CaptureFrame(device, functools.partial(_of_photo, geometry), path, told, *sources)
+        pairs.append(Pair(f"{prefix}{int(first.name):06}", *places, unit=unit, capture=frame))
+    about = describe_capture(f"a recording of {device}", f"units of {unit:g} m", pairs, poses=False)
+    others = sorted(
+        {each.topic for each in reader.connections if _IMAGES.fullmatch(each.topic)} - {color_topic, depth_topic}
+    )
+    if others:
+        notes.append(Assumption(f"topics that are not looked at: {', '.join(others)}"))
+    lone = [places[0]] * (len(photos) - len(pairs)) + [places[1]] * (len(depths) - len(pairs))
+    return PairingResult(tuple(pairs), (about, *registered, *notes), tuple(lone))
+
+
+def _choose(reader: Any, path: Path, kind: str) -> str:
+    """Return the topic of the images of the stream of a kind that has the most, the first by name of several."""
+    topics = {each.topic: each.msgcount for each in reader.connections
+              if (match := _IMAGES.fullmatch(each.topic)) and match["kind"] == kind and each.msgcount}  # fmt: skip
+    if not topics:
+        found = sorted({match["kind"] for each in reader.connections if (match := _IMAGES.fullmatch(each.topic))})
+        raise ValueError(f"{path}: expected a stream {kind} of RealSense's SDK, got {', '.join(found) or 'no images'}")
+    return min(topics, key=lambda topic: (-topics[topic], topic))
+
+
+def _part(topic: str, group: str) -> str:
+    """Return a part of the topic of a stream's images: ``stream`` or ``sensor``."""
+    match = _IMAGES.fullmatch(topic)
+    assert match is not None  # noqa: S101 - chosen by it
+    return match[group]
+
+
+def _stream(reader: Any, path: Path, topic: str) -> _Stream:
+    """Return the camera of a stream."""
+    stream = _part(topic, "stream")
+    place = f"{path}{stream}"
+    info = first_message(reader, f"{stream}/info/camera_info")
+    if info is not None:
+        size, model, distortion = (int(info.height), int(info.width)), info.distortion_model, info.D
+        numbers = [info.K[0], info.K[4], info.K[2], info.K[5]]
+    else:
+        entries = _entries(first_message(reader, f"{stream}/camera_info"), f"{place}: expected camera_info")
+        numbers = numbers_in(entries.get(key, "") for key in ("fx", "fy", "ppx", "ppy"))
+        sizes = numbers_in(entries.get(key, "") for key in ("height", "width"))
+        model, distortion = entries.get("model", "None"), numbers_in(entries.get("coeffs", "").split(","))
+        if not numbers or not sizes:
+            raise ValueError(
+                f"{place}: expected width, height, fx, fy, ppx and ppy in camera_info, got {entries!s:.120}"
+            )
+        size = int(sizes[0]), int(sizes[1])
+    if min(size) < 1:
+        raise ValueError(f"{place}: expected a positive width and height, got {size[1]} x {size[0]}")
+    camera = intrinsics_camera(place, size, [float(number) for number in numbers])
+    lens, notes = None, ()
+    if np.any(distortion):
+        name = _LENSES.get(model.strip().lower())
+        if name is None:
+            notes = (
+                Assumption(f"the lens distortion of {stream} is not undone: its model {model!r:.40} is not known"),
+            )
+        else:
+            with naming(place):
+                lens = Lens(name, tuple(map(float, distortion))[: 4 if name == "kannala_brandt" else None])
+    reference, transform = _transform(reader, place, stream)
+    return _Stream(camera, lens, reference, transform, notes)
+
+
+def _transform(reader: Any, place: str, stream: str) -> tuple[str, Matrix | None]:
+    """Return the number of a stream's frame of reference, and the transform from there; None if there is none."""
+    for topic in sorted(each.topic for each in reader.connections if each.topic.startswith(f"{stream}/tf/")):
+        message = first_message(reader, topic)
+        if message is None:
+            continue
+        if hasattr(message, "rotation"):
+            shift, turn = message.translation, message.rotation
+            return topic, from_quaternion((shift.x, shift.y, shift.z), (turn.x, turn.y, turn.z, turn.w), place)
+        entries = _entries(message, f"{place}: expected a transform")
+        rotation, translation = (numbers_in(entries.get(key, "").split(",")) for key in ("rotation", "translation"))
+        if (len(rotation), len(translation)) != (9, 3):
+            raise ValueError(f"{place}: expected 9 numbers of rotation and 3 of translation, got {entries!s:.120}")
+        return topic, as_rigid(np.column_stack((np.array(rotation).reshape(3, 3).T, translation)), place)
+    return "", None
+
+
+def _entries(message: Any, expected: str) -> dict[str, str]:
+    """Return the keys and values of a String of the form key=value;key=value."""
+    if message is None:
+        raise ValueError(f"{expected}, there is none")
+    pairs = (part.partition("=") for part in str(message.data).split(";"))
+    return {key.strip(): value.strip() for key, _, value in pairs}
+
+
+def _geometry(color: _Stream, depth: _Stream) -> tuple[Geometry, list[Assumption]]:
+    """Return the cameras of a recording, and how depth and photo belong together."""
+    notes = (*color.notes, *depth.notes)
+    geometry = Geometry(color.camera, None, notes, color.lens)
+    if color.transform is None or depth.transform is None or color.reference[-6:] != depth.reference[-6:]:
+        text = "the recording has no transform from depth to colour: depth is taken for registered to the photo"
+        return geometry, [Assumption(text)]
+    transform = color.transform @ invert(depth.transform)
+    numbers = [(c.width, c.height, c.fx, c.fy, c.cx, c.cy) for c in (color.camera, depth.camera)]
+    if np.allclose(*numbers, rtol=_ALIKE) and np.allclose(transform, np.eye(4), atol=_ALIKE):
+        return geometry, [Assumption("depth is registered to the photo: both streams have the same camera")]
+    return geometry._replace(rig=Rig(depth.camera, transform, depth.lens)), []
+
+
+def _of_photo(geometry: Geometry, _: tuple[int, int]) -> Geometry:
+    """Return the cameras, which are those of all photos."""
+    return geometry
+
+
+def _unit(reader: Any, path: Path, topic: str) -> tuple[float, list[Assumption]]:
+    """Return metres per value of the depth stream, and an assumption if it is not stated."""
+    sensor = _part(topic, "sensor")
+    message = first_message(reader, f"{sensor}/option/Depth_Units/value")
+    if message is not None:
+        unit = numbers_in([str(message.data)])
+        if not unit or not 0 < unit[0] < 1:
+            raise ValueError(f"{path}{sensor}: expected Depth_Units in metres, got {message.data!s:.40}")
+        return float(f"{unit[0]:.6g}"), []  # float32: 0.001 is 0.0010000000475
+    properties = connections_of(reader, f"{sensor}/property")
+    for connection, _, raw in reader.messages(properties) if properties else ():
+        found = deserialize(reader, raw, connection.msgtype)
+        unit = numbers_in([found.value])
+        if found.key.replace("_", " ") == "Depth Units" and unit and 0 < unit[0] < 1:
+            return unit[0], []
+    return _USUAL_UNIT, [Assumption("the recording does not state Depth Units: millimetres assumed (--depth-unit)")]
+
+
+def _frames(reader: Any, path: Path, topic: str) -> list[tuple[Message, float]]:
+    """Return the images of a stream with the time stamps of their frames in seconds, in the order of these."""
+    stamps = {}
+    described = connections_of(reader, f"{_part(topic, 'stream')}/image/metadata")
+    for connection, time, raw in reader.messages(described) if reader.is2 and described else ():
+        entries = _entries(deserialize(reader, raw, connection.msgtype), "")
+        stamps[time] = numbers_in([entries.get("timestamp", "")])
+    found: list[tuple[Message, float]] = []
+    for connection, time, raw in reader.messages(connections_of(reader, topic)):
+        same = found[-1][0].order + 1 if found and found[-1][0].time == time else 0
+        if reader.is2:
+            stamp = 1e-3 * (stamps.get(time) or [1e-6 * time])[0]
+        else:
+            header = deserialize(reader, raw, connection.msgtype).header.stamp
+            stamp = header.sec + 1e-9 * header.nanosec
+        found.append((Message(path, topic, time, same), stamp))
+    return sorted(found, key=lambda each: each[1])
+
+
+def _device(reader: Any) -> str:
+    """Return the name of the device, as it is recorded."""
+    connections = connections_of(reader, "/device_0/info")
+    for connection, _, raw in reader.messages(connections) if connections else ():
+        message = deserialize(reader, raw, connection.msgtype)
+        name = message.value if getattr(message, "key", "") == "Name" else ""
+        if hasattr(message, "data"):
+            name = _entries(message, "").get("Name", "")
+        if name:
+            return str(name)
+    return "RealSense"
