@@ -29,7 +29,16 @@ from dsr.io.pairs import Pair, PairingResult
 from dsr.io.photos import HEIC_SUFFIXES, orientation_of, same_aspect
 from dsr.io.trajectories import intrinsics_camera
 from dsr.notes import Assumption
-from dsr.utils.guards import MOST_FILE, MOST_TEXT, expect_pixels, natural_key, numbers_in, read_limited, refusing
+from dsr.utils.guards import (
+    MOST_FILE,
+    MOST_TEXT,
+    expect_pixels,
+    natural_key,
+    numbers_in,
+    opened,
+    read_limited,
+    refusing,
+)
 from dsr.utils.versions import file_hash
 
 _APP = "HEIC"
@@ -106,7 +115,7 @@ def _has_depth(path: Path) -> bool:
     """Return whether a file lists a depth map."""
     if not path.is_file():
         return False
-    with path.open("rb") as file:
+    with opened(path) as file:
         return _MARK.search(file.read(_HEAD)) is not None
 
 

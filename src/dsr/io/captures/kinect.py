@@ -34,7 +34,7 @@ from dsr.io.captures.archive import PHOTO_LIMIT, decode_photo
 from dsr.io.frames import CaptureFrame, Geometry, Record, Rig
 from dsr.io.pairs import Pair, PairingResult, match_times
 from dsr.io.trajectories import describe_capture, intrinsics_camera
-from dsr.utils.guards import expect_pixels, naming, natural_key, numbers_in, refusing
+from dsr.utils.guards import expect_pixels, naming, natural_key, numbers_in, opened, refusing
 from dsr.utils.validation import Number, Whole, parse_model
 
 _APP = "Azure Kinect"
@@ -183,7 +183,7 @@ def _is_ours(path: Path) -> bool:
     """Return whether a file is a recording of a Kinect, not another video."""
     if not path.is_file():
         return False
-    with path.open("rb") as file:
+    with opened(path) as file:
         return _MARK in file.read(_HEAD)
 
 
@@ -230,7 +230,7 @@ def _times(path: Path, container: Any) -> dict[str, list[Packet]]:
         if packet.pts is not None:
             role = roles[packet.stream.index]
             size = tracks[role].height, tracks[role].width
-            seconds = float(packet.pts * packet.time_base) + late[role]
+            seconds = packet.pts * float(packet.time_base) + late[role]
             found[role].append(Packet(path, packet.stream.index, packet.pts, size, kinds[role], seconds))
     return found
 
@@ -239,7 +239,8 @@ def _track(path: Path, container: Any, role: str) -> Any:
     """Return a track by its tag or its name."""
     name = role.upper()
     for track in container.streams.video:
-        if f"K4A_{name}_TRACK" in track.metadata or track.metadata.get("title") == name:
+        known = f"K4A_{name}_TRACK" in track.metadata or track.metadata.get("title") == name
+        if known and track.codec_context is not None:  # which a codec that FFmpeg does not know lacks
             expect_pixels(path, track.height, track.width)
             return track
     raise ValueError(f"{path}: expected a recording of {_APP} with tracks COLOR and DEPTH, there is no {name}")
@@ -319,4 +320,6 @@ def _open(path: Path, _: tuple[int, int]) -> Any:
     """Return the open recording; FFmpeg only takes it apart, and decodes nothing."""
     import av  # noqa: PLC0415 - an extra
 
+    with opened(path) as file:
+        file.read(1)  # or the error names the file, such as that of a link to a device
     return av.open(str(path), format="matroska", options={"codec_whitelist": "rawvideo", "analyzeduration": "0"})
