@@ -109,7 +109,7 @@ def record3d(path, compress=lzfse_block, **changes):
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("metadata", json.dumps(record3d_metadata(**changes)))
         for number in range(FRAMES):
-            encoded = cv2.imencode(".jpg", photos(number)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 98])[1]
+            encoded = cv2.imencode(".jpg", photo(number)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 98])[1]
             archive.writestr(f"rgbd/{number}.jpg", encoded.tobytes())
             archive.writestr(f"rgbd/{number}.depth", compress(depth(number).astype("<f4")))
             archive.writestr(f"rgbd/{number}.conf", compress(levels()))
