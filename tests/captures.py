@@ -177,8 +177,31 @@ def open3d(folder, camera="camera_intrinsic.json"):
     return folder
 
 
-def ros(path, version, *, floats=False, compressed=False):
-    """Write a recording of ROS 1 or 2 with colour, depth aligned to it, raw depth and infrared."""
+def ros(
+    path,
+    version,
+    *,
+    floats=False,
+    compressed=False,
+    photos=photo,
+    image_name="image_raw",
+    storage_plugin=None,
+    **of_info,
+):
+    """Write a recording of ROS 1 or 2 with colour, depth aligned to it, raw depth and infrared.
+
+    Args:
+        path: of the file, or of the folder of ROS 2.
+        version: of ROS.
+        floats: whether depth is in metres.
+        compressed: whether photos are JPEG.
+        photos: makes the photo of a number.
+        image_name: of the photos' topic.
+        storage_plugin: of rosbags' writer of ROS 2.
+        of_info: entries of CameraInfo that are not as for a plain picture; ``d``, ``k`` and ``p`` are lists, ``roi`` x,
+            y, width and height.
+
+    """
     from rosbags.rosbag1 import Writer as Writer1  # noqa: PLC0415 - an extra
     from rosbags.rosbag2 import Writer as Writer2  # noqa: PLC0415
     from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
@@ -198,7 +221,7 @@ def ros(path, version, *, floats=False, compressed=False):
         )  # fmt: skip
 
     def jpeg(number):
-        data = cv2.imencode(".jpg", photo(number)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 98])[1]
+        data = cv2.imencode(".jpg", photos(number)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 98])[1]
         kind = types["sensor_msgs/msg/CompressedImage"]
         return kind(header=header(number), format="rgb8; jpeg compressed bgr8", data=data.reshape(-1))
 
@@ -206,18 +229,19 @@ def ros(path, version, *, floats=False, compressed=False):
         fx, fy, cx, cy = INTRINSICS
         k = np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1.0])
         arrays = {"d": np.zeros(5), "k": k, "r": np.eye(3).reshape(-1), "p": np.zeros(12)}
+        arrays |= {name: np.array(of_info[name], float) for name in arrays.keys() & of_info.keys()}
         if version == 1:
             arrays = {name.upper(): value for name, value in arrays.items()}
-        roi = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
-        return types["sensor_msgs/msg/CameraInfo"](
-            header=header(number), height=SIZE[0], width=SIZE[1], distortion_model="plumb_bob", binning_x=0,
-            binning_y=0, roi=roi, **arrays,
-        )  # fmt: skip
+        x, y, width, height = of_info.get("roi", (0, 0, 0, 0))
+        roi = types["sensor_msgs/msg/RegionOfInterest"](x, y, height, width, False)
+        plain = {"height": SIZE[0], "width": SIZE[1], "distortion_model": "plumb_bob", "binning_x": 0, "binning_y": 0}
+        plain |= {name: of_info[name] for name in plain.keys() & of_info.keys()}
+        return types["sensor_msgs/msg/CameraInfo"](header=header(number), roi=roi, **plain, **arrays)
 
-    name = "/camera/color/image_raw"
+    name = f"/camera/color/{image_name}"
     topics = {
         name + "/compressed" if compressed else name:
-            jpeg if compressed else lambda number: image(number, photo(number)[..., ::-1], "bgr8"),
+            jpeg if compressed else lambda number: image(number, photos(number)[..., ::-1], "bgr8"),
         "/camera/color/camera_info": info,
         "/camera/depth/image_rect_raw": lambda number: image(number, 2 * millimetres(number), "16UC1"),
         "/camera/aligned_depth_to_color/image_raw": lambda number: image(
@@ -226,7 +250,11 @@ def ros(path, version, *, floats=False, compressed=False):
         ),
         "/camera/infra1/image_rect_raw": lambda number: image(number, levels(), "mono8"),
     }  # fmt: skip
-    make = Writer1(path) if version == 1 else Writer2(path, version=9)
+    make = (
+        Writer1(path)
+        if version == 1
+        else Writer2(path, version=9, **({"storage_plugin": storage_plugin} if storage_plugin else {}))
+    )
     with make as writer:
         for topic, message in topics.items():
             kind = message(0).__msgtype__
