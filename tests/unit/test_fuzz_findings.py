@@ -26,6 +26,7 @@ from dsr.io.captures.arkit import find_arkitscenes
 from dsr.io.captures.stray import find_stray
 from dsr.io.exports import read_input, write_input
 from dsr.io.photos import read_photo
+from dsr.io.trajectories import read_transform
 from dsr.methods.networks.weight_files import is_dsr_weights
 from dsr.methods.recipe import read_recipe
 from dsr.report.study.answers import files_of
@@ -190,3 +191,12 @@ def test_record_of_an_earlier_result_with_values_of_other_types_is_refused(tmp_p
     (tmp_path / "info.json").write_text(json.dumps(entries))
     with pytest.raises(ValueError, match=r"info\.json: expected a file of `dsr upsample`, got something else"):
         read_previous_run(tmp_path)
+
+
+@pytest.mark.filterwarnings("error")
+def test_translation_of_1e308_metres_is_refused_without_a_warning_of_overflow(tmp_path):
+    shift = np.eye(4)
+    shift[0, 3] = -1e308
+    np.savetxt(tmp_path / "extrinsics.txt", shift)
+    with pytest.raises(ValueError, match=r"extrinsics\.txt: expected a translation in metres, got one of 1e\+308"):
+        read_transform(tmp_path / "extrinsics.txt")

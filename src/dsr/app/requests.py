@@ -130,6 +130,13 @@ def check_method(method: str, directories: tuple[Path, ...]) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
+class FormatsRequest(Options):
+    """Which formats to show."""
+
+    names: tuple[str, ...] = option((), "those with one of these words; none for all", "WORD", flags="names")
+
+
+@dataclass(frozen=True, kw_only=True)
 class DoctorRequest(Options):
     """What to examine."""
 

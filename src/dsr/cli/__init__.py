@@ -7,7 +7,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from dsr.cli.commands import DOCTOR, EXPORT, FUSE, REPORT, UPSAMPLE, VIEW, add_data_command, add_hydra_commands
+from dsr.cli.commands import (
+    DOCTOR,
+    EXPORT,
+    FORMATS_COMMAND,
+    FUSE,
+    REPORT,
+    UPSAMPLE,
+    VIEW,
+    add_data_command,
+    add_hydra_commands,
+)
 from dsr.cli.study import STUDY
 from dsr.data.download.collections import CATALOGUE, Collection
 from dsr.utils import interruption
@@ -37,7 +47,7 @@ _COMMANDS = (
     add_hydra_commands,
     *(command.add for command in (REPORT, STUDY)),
     add_data_command,
-    *(command.add for command in (DOCTOR, EXPORT)),
+    *(command.add for command in (FORMATS_COMMAND, DOCTOR, EXPORT)),
 )
 
 

@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 
 from rich.console import Console
 
-from dsr.app.requests import DoctorRequest, ExportRequest, FuseRequest, ReportRequest, ViewRequest
+from dsr.app.requests import DoctorRequest, ExportRequest, FormatsRequest, FuseRequest, ReportRequest, ViewRequest
 from dsr.app.upsample.request import UpsampleRequest
+from dsr.io.formats import FORMATS, show
 from dsr.utils.options import Options, add_options, build
 
 
@@ -89,6 +90,16 @@ def _examine(request: DoctorRequest, *_: object) -> int:
     from dsr.doctor.examine import examine_directory  # noqa: PLC0415 - it takes seconds to import
 
     return examine_directory(request.directory, request.most)
+
+
+def _show_formats(request: FormatsRequest, console: Console, _: object) -> list[str]:
+    """Print the formats that are read."""
+    words = [word.lower() for word in request.names]
+    found = [each for each in FORMATS if not words or any(word in " ".join(each).lower() for word in words)]
+    if not found:
+        raise ValueError(f"{' '.join(words)}: expected a word of {', '.join(each.name for each in FORMATS)}")
+    console.print(show(found), markup=False, highlight=False, soft_wrap=True)
+    return []
 
 
 UPSAMPLE = Command(
@@ -198,6 +209,7 @@ degrees. docs/export.md has a program that runs such a file.
 """,
 )
 
+FORMATS_COMMAND = Command("formats", "what is read of which device or program", FormatsRequest, _show_formats)
 DOCTOR = Command("doctor", "check a directory of your own scenes", DoctorRequest, _examine)
 
 

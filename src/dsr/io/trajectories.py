@@ -111,7 +111,7 @@ def read_transform(path: Path) -> Matrix:
         if len({len(row) for row in rows}) > 1:
             raise ValueError(f"{path}: expected a matrix of 3 x 4 or 4 x 4 numbers, got rows of different lengths")
         matrix = as_rigid(rows, str(path))
-    distance = float(np.linalg.norm(matrix[:3, 3]))
+    distance = math.hypot(*matrix[:3, 3])  # of any finite numbers
     if distance > _MOST_BETWEEN:
         raise ValueError(f"{path}: expected a translation in metres, got one of {distance:g}; are these millimetres?")
     return matrix

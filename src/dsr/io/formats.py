@@ -1,0 +1,145 @@
+"""What is read of captures and layouts, a row a device, program or data set; docs/captures.md shows the same table.
+
+What a format is recognised by is decided by its reader, in :mod:`dsr.io.captures` and :mod:`dsr.io.layouts`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+_LIDAR = "interpolated from a few hundred dots: bent edges, nothing thinner than some centimetres"
+_KINECT1 = (
+    "stairs that grow with the square of the distance, edges smeared over 5 to 10 pixels, shadows beside near things"
+)
+_STEREO = "blobs as wide as the matching window, guesses on blank walls, glass believed"
+_FLIGHT = "flying pixels at edges, noise on dark surfaces, rounded inner corners"
+
+
+class Format(NamedTuple):
+    """What is read of a device, program or data set.
+
+    Args:
+        name: of the device, program or data set.
+        export: what to export, or what its files are called.
+        found_by: what it is recognised by.
+        read: depth, and which of intrinsics, poses, confidence, distortion and time.
+        tried: the files that it was tried with: real ones, or ones that an independent program wrote.
+        faults: of the sensor; empty where any sensor may have been used.
+        source: address of the writer's own description or code.
+
+    """
+
+    name: str
+    export: str
+    found_by: str
+    read: str
+    tried: str
+    faults: str
+    source: str
+
+
+FORMATS = (
+    Format(
+        "Stray Scanner",
+        "share the scan's folder",
+        "`camera_matrix.csv` or `odometry.csv`, with `depth/` and `rgb.mp4` or `rgb/000000.png`",
+        "depth in mm (16-bit PNG, NPY); intrinsics and pose of each frame; confidence 0 to 2",
+        "written by its format",
+        _LIDAR,
+        "https://github.com/strayrobots/scanner/blob/main/docs/format.md",
+    ),
+    Format(
+        "Record3D",
+        "the `.r3d` archive, or its export EXR + RGB",
+        "`*.r3d`; its unpacked folder (`metadata`, `rgbd/`); `metadata.json` with `rgb/` and `depth/*.exr`",
+        "depth in m (LZFSE, EXR); intrinsics of each frame, else of all; poses; confidence 0 to 2",
+        "a real export of 341 frames",
+        _LIDAR,
+        "https://github.com/marek-simonik/record3d/issues/27",
+    ),
+    Format(
+        "Polycam",
+        "raw data of a scan in developer mode",
+        "`keyframes/` with `cameras/*.json`",
+        "depth in mm (16-bit PNG); corrected photos, else all; intrinsics and pose of each frame; confidence",
+        "written by its format",
+        _LIDAR,
+        "https://github.com/PolyCam/polyform#polycams-data-format",
+    ),
+    Format(
+        "ARKitScenes",
+        "`raw` or `3dod` of the data set",
+        "`lowres_depth/` with `wide/`, `color/` or `lowres_wide/`",
+        "depth in mm (16-bit PNG); intrinsics (`*.pincam`); poses by time; confidence 0 to 2",
+        "written by its format",
+        _LIDAR,
+        "https://github.com/apple/ARKitScenes/blob/main/DATA.md",
+    ),
+    Format(
+        "ROS 1 and 2",
+        "`rosbag record`, `ros2 bag record` of a colour and a depth topic with their `camera_info`",
+        "`*.bag`; a folder with `metadata.yaml` and `*.db3` or `*.mcap`",
+        "depth in mm (16UC1), m (32FC1), compressedDepth; intrinsics (`camera_info`); time",
+        "written by rosbags",
+        "",
+        "https://docs.ros.org/en/api/sensor_msgs/html/index-msg.html",
+    ),
+    Format(
+        "Open3D",
+        "a folder of its reconstruction system",
+        "two folders of pictures, and `scene/trajectory.log` or `trajectory.log`",
+        "depth by its values, mostly mm; intrinsics (`camera_intrinsic.json`, `intrinsic.json`); poses",
+        "written by its format",
+        "",
+        "https://www.open3d.org/docs/release/tutorial/reconstruction_system/system_overview.html",
+    ),
+    Format(
+        "TUM RGB-D",
+        "a sequence of the data set, or of a program that writes its lists",
+        "`rgb.txt` and `depth.txt`",
+        "depth in 1/5000 m; pairs by time, within 20 ms",
+        "written by its format",
+        _KINECT1,
+        "https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats",
+    ),
+    Format(
+        "ICL-NUIM",
+        "the rendered frames",
+        "`*.depth` beside the photos",
+        "depth in cm along the ray (text); the data set's intrinsics",
+        "a real frame",
+        "",
+        "https://www.doc.ic.ac.uk/~ahanda/VaFRIC/iclnuim.html",
+    ),
+    Format(
+        "any two folders, or files side by side",
+        "photos, and depth as PNG, TIFF, EXR, PFM, NPY or NPZ",
+        "names that say rgb, color, depth ..., else by one channel of 16 bits or floats",
+        "depth by its values, intrinsics of a camera file beside them",
+        "real frames of seven sensors",
+        "",
+        "",
+    ),
+)
+
+
+def show(formats: Sequence[Format] = FORMATS) -> str:
+    """Return formats as text, a block each."""
+    blocks = []
+    for each in formats:
+        rows = {"export": each.export, "found by": each.found_by, "read": each.read, "tried": each.tried,
+                "sensor": each.faults, "source": each.source}  # fmt: skip
+        blocks.append(
+            "\n".join([each.name, *(f"  {name:9}{text.replace('`', '')}" for name, text in rows.items() if text)])
+        )
+    return "\n\n".join(blocks)
+
+
+def markdown(formats: Sequence[Format] = FORMATS) -> list[str]:
+    """Return the lines of a table of formats in Markdown."""
+    lines = ["| device or program | export | recognised by | read | tried | the sensor |", "| --- " * 6 + "|"]
+    for each in formats:
+        name = f"[{each.name}]({each.source})" if each.source else each.name
+        lines.append(f"| {name} | {each.export} | {each.found_by} | {each.read} | {each.tried} | {each.faults} |")
+    return lines
