@@ -470,3 +470,17 @@ def heic(path, levels, message=None, text="", orientation=1):
     whole = box(b"ftyp", top[b"ftyp"][0]) + box(b"meta", bytes(4), *boxes, box(b"iloc", located[:8], moved))
     path.write_bytes(whole + b"".join(box(b"mdat", each) for each in top[b"mdat"]) + box(b"mdat", text.encode()))
     return path
+
+
+def zed(folder, fx=700.0, **changes):
+    """Write pictures of a ZED at 1280 x 720 as its SDK exports them, without distortion and already side by side."""
+    for number in range(FRAMES):
+        save(folder / f"left{number:06}.png", np.kron(photo(number)[:45], np.ones((16, 20, 1), np.uint8)))
+        save(folder / f"depth{number:06}.png", np.full((720, 1280), 1000 + 100 * number, np.uint16))
+    camera = {"fx": fx, "fy": fx, "cx": 650.0, "cy": 355.0, **dict.fromkeys(("k1", "k2", "k3", "p1", "p2"), 0.0)}
+    stereo = {"Baseline": 119.9, **{f"{name}_HD": 0.0 for name in ("TY", "TZ", "RX", "CV", "RZ")}}
+    sections = {"LEFT_CAM_HD": camera, "RIGHT_CAM_HD": camera, "STEREO": stereo | changes}
+    lines = [f"[{name}]\n" + "".join(f"{key}={value}\n" for key, value in each.items())
+             for name, each in sections.items()]  # fmt: skip
+    (folder / "SN12345.conf").write_text("\n".join(lines))
+    return folder

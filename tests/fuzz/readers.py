@@ -350,6 +350,7 @@ READERS = (
     Reader("ros 2", seeds.ros2, _recording(), 2),
     Reader("kinect", seeds.kinect, _recording(), 2),
     Reader("heic", seeds.heic, _recording()),
+    Reader("zed", captures.zed, _recording(), 1),
     Reader("data folder", seeds.dsr_scenes, _dataset("folder", "Folder")),
     Reader("doctor", seeds.dsr_scenes, lambda place: command("doctor", place.input), 1),
     Reader("middlebury", seeds.middlebury, _dataset("middlebury", "Middlebury", scenes="found", size=None, fill=())),

@@ -18,6 +18,7 @@ from dsr.io.captures.kinect import find_kinect
 from dsr.io.captures.record3d import find_record3d
 from dsr.io.captures.ros import find_ros
 from dsr.io.captures.stray import find_stray
+from dsr.io.captures.zed import find_zed
 from dsr.io.depth_files import DEPTH_SUFFIXES
 from dsr.io.images import read_pixels
 from dsr.io.open3d import add_trajectory
@@ -46,7 +47,8 @@ _MAX_DEPTH = 3
 
 CAPTURE_FILES = (".r3d", ".bag", ".mcap", ".db3", ".mkv", *HEIC_SUFFIXES)
 """Suffixes of captures that are a single file."""
-_LAYOUTS = (find_stray, find_record3d, find_polycam, find_arkitscenes, find_ros, find_kinect, find_heic)
+_FILES = (find_record3d, find_ros, find_kinect, find_heic)
+_LAYOUTS = (find_stray, find_polycam, find_arkitscenes, find_zed, *_FILES)
 
 
 def find_pairs_of_folder(folder: Path, leave: Path | None = None) -> PairingResult:
@@ -204,5 +206,5 @@ def find_capture(place: Path) -> PairingResult | None:
         ValueError: it is a capture, and a file that all of its frames need is missing or damaged.
 
     """
-    layouts = (find_record3d, find_ros, find_kinect, find_heic) if place.is_file() else _LAYOUTS
+    layouts = _FILES if place.is_file() else _LAYOUTS
     return next((found for layout in layouts if (found := layout(place)) is not None), None)
