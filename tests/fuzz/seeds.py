@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import importlib.util
 import json
+import shutil
 import tarfile
 import zipfile
 from pathlib import Path
@@ -336,6 +337,15 @@ def checksums(folder: Path) -> None:
 def ros2(folder: Path) -> None:
     """Write a recording of ROS 2."""
     captures.ros(folder / "recording", 2)
+
+
+def ros2_alone(folder: Path) -> None:
+    """Write a file of ROS 2 without the folder that it is of."""
+    from rosbags.rosbag2 import StoragePlugin  # noqa: PLC0415 - an extra
+
+    whole = captures.ros(folder.parent / "whole", 2, storage_plugin=StoragePlugin.MCAP)
+    (whole / "whole.mcap").rename(folder / "scan.mcap")
+    shutil.rmtree(whole)
 
 
 def r3d(folder: Path) -> None:
