@@ -177,6 +177,33 @@ def open3d(folder, camera="camera_intrinsic.json"):
     return folder
 
 
+def rvl(values):
+    """Values as RVL, number by number, each in parts of four bits, into words of eight."""
+    parts = []
+
+    def add(number):
+        while True:
+            part, number = number & 7, number >> 3
+            parts.append(part | (8 if number else 0))
+            if not number:
+                return
+
+    flat, place, previous = values.reshape(-1).tolist(), 0, 0
+    while place < len(flat):
+        for zero in (True, False):
+            end = place
+            while end < len(flat) and (flat[end] == 0) == zero:
+                end += 1
+            add(end - place)
+            for value in [] if zero else flat[place:end]:
+                add(2 * (value - previous) if value >= previous else 2 * (previous - value) - 1)
+                previous = value
+            place = end
+    parts += [0] * (-len(parts) % 8)
+    words = [int("".join(f"{part:x}" for part in parts[i : i + 8]), 16) for i in range(0, len(parts), 8)]
+    return struct.pack("<II", values.shape[1], values.shape[0]) + struct.pack(f"<{len(words)}I", *words)
+
+
 def ros(
     path,
     version,
@@ -185,6 +212,7 @@ def ros(
     compressed=False,
     photos=photo,
     image_name="image_raw",
+    rvl_depth=False,
     storage_plugin=None,
     **of_info,
 ):
@@ -197,6 +225,7 @@ def ros(
         compressed: whether photos are JPEG.
         photos: makes the photo of a number.
         image_name: of the photos' topic.
+        rvl_depth: whether depth is compressedDepth of millimetres as RVL.
         storage_plugin: of rosbags' writer of ROS 2.
         of_info: entries of CameraInfo that are not as for a plain picture; ``d``, ``k`` and ``p`` are lists, ``roi`` x,
             y, width and height.
@@ -225,6 +254,11 @@ def ros(
         kind = types["sensor_msgs/msg/CompressedImage"]
         return kind(header=header(number), format="rgb8; jpeg compressed bgr8", data=data.reshape(-1))
 
+    def in_rvl(number):
+        data = np.frombuffer(struct.pack("<iff", 0, 0, 0) + rvl(millimetres(number)), np.uint8)
+        kind = types["sensor_msgs/msg/CompressedImage"]
+        return kind(header=header(number, 5e6), format="16UC1; compressedDepth rvl", data=data)
+
     def info(number):
         fx, fy, cx, cy = INTRINSICS
         k = np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1.0])
@@ -244,10 +278,11 @@ def ros(
             jpeg if compressed else lambda number: image(number, photos(number)[..., ::-1], "bgr8"),
         "/camera/color/camera_info": info,
         "/camera/depth/image_rect_raw": lambda number: image(number, 2 * millimetres(number), "16UC1"),
-        "/camera/aligned_depth_to_color/image_raw": lambda number: image(
-            number, depth(number).astype(np.float32) if floats else millimetres(number),
-            "32FC1" if floats else "16UC1", late=5e6,
-        ),
+        "/camera/aligned_depth_to_color/image_raw" + "/compressedDepth" * rvl_depth:
+            in_rvl if rvl_depth else lambda number: image(
+                number, depth(number).astype(np.float32) if floats else millimetres(number),
+                "32FC1" if floats else "16UC1", late=5e6,
+            ),
         "/camera/infra1/image_rect_raw": lambda number: image(number, levels(), "mono8"),
     }  # fmt: skip
     make = (

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import importlib.util
 import json
+import shutil
 import tarfile
 import zipfile
 from pathlib import Path
@@ -346,6 +347,15 @@ def kinect(folder: Path) -> None:
 def heic(folder: Path) -> None:
     """Write a HEIC photo with a depth map."""
     captures.heic(folder / "photo.heic", np.full(captures.HEIC_MAP, 99, np.uint8), text=captures.apple_text())
+
+
+def ros2_alone(folder: Path) -> None:
+    """Write a file of ROS 2 without the folder that it is of."""
+    from rosbags.rosbag2 import StoragePlugin  # noqa: PLC0415 - an extra
+
+    whole = captures.ros(folder.parent / "whole", 2, storage_plugin=StoragePlugin.MCAP)
+    (whole / "whole.mcap").rename(folder / "scan.mcap")
+    shutil.rmtree(whole)
 
 
 def r3d(folder: Path) -> None:

@@ -160,6 +160,22 @@ def changed(change):
     return calibration
 
 
+@pytest.mark.parametrize("centre", [0.0, 1e-3])
+def test_lens_of_orbbecs_wrapper_is_read_without_a_centre_of_its_own(tmp_path, centre):
+    def change(cameras):
+        for each in cameras:
+            each["Intrinsics"]["ModelType"] = "CALIBRATION_LensDistortionModelRational6KT"
+            each["Intrinsics"]["ModelParameters"][10] = centre
+
+    path = write(tmp_path / "scan.mkv", calibration=changed(change))
+    if centre:
+        with pytest.raises(ValueError, match=r"scan\.mkv: calibration\.json: "):
+            pictures(path)
+    else:
+        (plain,), (picture,) = (pictures(each) for each in (write(tmp_path / "plain.mkv"), path))
+        np.testing.assert_array_equal(picture.depth_lr, plain.depth_lr)
+
+
 @pytest.mark.parametrize(
     "calibration",
     [

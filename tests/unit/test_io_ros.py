@@ -118,36 +118,9 @@ def test_file_of_ros_2_is_read_without_its_folder(tmp_path, suffix):
         find_pairs_of_folder(alone)
 
 
-def rvl(values):
-    """Values as RVL, number by number, each in parts of four bits, into words of eight."""
-    parts = []
-
-    def add(number):
-        while True:
-            part, number = number & 7, number >> 3
-            parts.append(part | (8 if number else 0))
-            if not number:
-                return
-
-    flat, place, previous = values.reshape(-1).tolist(), 0, 0
-    while place < len(flat):
-        for zero in (True, False):
-            end = place
-            while end < len(flat) and (flat[end] == 0) == zero:
-                end += 1
-            add(end - place)
-            for value in [] if zero else flat[place:end]:
-                add(2 * (value - previous) if value >= previous else 2 * (previous - value) - 1)
-                previous = value
-            place = end
-    parts += [0] * (-len(parts) % 8)
-    words = [int("".join(f"{part:x}" for part in parts[i : i + 8]), 16) for i in range(0, len(parts), 8)]
-    return struct.pack("<II", values.shape[1], values.shape[0]) + struct.pack(f"<{len(words)}I", *words)
-
-
 def message(values, *, floats=False):
     a, b = (20_000.0, 3.0) if floats else (0.0, 0.0)
-    data = struct.pack("<iff", 0, a, b) + (values if isinstance(values, bytes) else rvl(values))
+    data = struct.pack("<iff", 0, a, b) + (values if isinstance(values, bytes) else captures.rvl(values))
     kind = "32FC1" if floats else "16UC1"
     return SimpleNamespace(format=f"{kind}; compressedDepth rvl", data=np.frombuffer(data, np.uint8))
 
@@ -164,6 +137,11 @@ def maps():
     return {**found, "holes": holes, "ends": ends, "none": np.zeros((5, 7), np.uint16)}
 
 
+def test_topic_of_compressed_depth_is_read(tmp_path):
+    found = find_pairs_of_folder(captures.ros(tmp_path / "a", 2, rvl_depth=True)).pairs
+    np.testing.assert_allclose(read_picture(found[2], Reading()).depth_lr[0], captures.depth(2), atol=6e-4)
+
+
 @pytest.mark.parametrize("name", maps())
 def test_rvl_is_decoded(name):
     values = maps()[name]
@@ -176,7 +154,7 @@ def test_rvl_is_decoded(name):
 
 
 def test_rvl_that_is_damaged_or_declares_more_than_it_can_hold_is_refused_before_memory_is_taken():
-    content = rvl(captures.millimetres())
+    content = captures.rvl(captures.millimetres())
     huge = struct.pack("<II", 60_000, 60_000) + content[8:]
     more = struct.pack("<II", 16, 13) + content[8:]
     fewer = struct.pack("<II", 16, 10) + content[8:]

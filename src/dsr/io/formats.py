@@ -89,8 +89,8 @@ FORMATS = (
         "Azure Kinect",
         "the `.mkv` of `k4arecorder`; of a Femto Bolt or Mega, that of Orbbec's K4A wrapper",
         "`*.mkv` with its tracks `COLOR` and `DEPTH`",
-        "depth in mm (b16g), warped into the photo's view; photos as MJPEG, NV12, YUY2, BGRA; intrinsics, extrinsics and "
-        "distortion of both cameras (`calibration.json`), undone; time",
+        "depth in mm (b16g), warped into the photo's view; photos as MJPEG, NV12, YUY2, BGRA; intrinsics, extrinsics "
+        "and distortion of both cameras (`calibration.json`), undone; time",
         "written by its format",
         _FLIGHT,
         "https://github.com/microsoft/Azure-Kinect-Sensor-SDK/tree/develop/src/record",

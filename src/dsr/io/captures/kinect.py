@@ -9,7 +9,8 @@ src/transformation/mode_specific_calibration.c.
                              1 x 1 whose corner is (0, 0), and the motion from the rig's frame to its own in metres
     K4A_DEPTH_DELAY_NS       how much later than a photo its depth map was taken, on purpose
 
-Each mode of a camera sees a part of that image, scaled. Photo and depth map are paired by their times, within 20 ms.
+The lens model is OpenCV's. That of Orbbec's wrapper of the SDK, Rational6KT, has half of OpenCV's mixed tangential terms, a
+difference of hundredths of a pixel, and is taken for it. Each mode of a camera sees a part of that image, scaled. Photo and depth map are paired by their times, within 20 ms.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ _DEPTH_MODES = {
     (1024, 1024): (1024, 0, 0),
 }
 """For each size of depth maps the size of the whole image, and what is cut off left and above."""
-_LENS = "CALIBRATION_LensDistortionModelBrownConrady"
+_LENS, _LENS_6KT = "CALIBRATION_LensDistortionModelBrownConrady", "CALIBRATION_LensDistortionModelRational6KT"
 _COLOUR_CAMERA, _DEPTH_CAMERA = "CALIBRATION_CameraLocationPV0", "CALIBRATION_CameraLocationD0"
 _DEPTH = "b16g"
 _LOCK = threading.Lock()
@@ -293,9 +294,11 @@ def _scale(
 
 def _lens(place: str, camera: _Camera) -> Lens:
     """Return the lens of a camera."""
-    if camera.Intrinsics.ModelType != _LENS:  # others were those of devices before the first that was sold
-        raise ValueError(f"{place}: ModelType: expected {_LENS}, got {camera.Intrinsics.ModelType:.60}")
-    k1, k2, k3, k4, k5, k6, _, _, p2, p1 = camera.Intrinsics.ModelParameters[4:14]
+    kind = camera.Intrinsics.ModelType
+    k1, k2, k3, k4, k5, k6, codx, cody, p2, p1 = camera.Intrinsics.ModelParameters[4:14]
+    if kind != _LENS and (kind != _LENS_6KT or codx or cody):  # with a centre of its own: of devices that were not sold
+        centre = f"({codx:g}, {cody:g})"
+        raise ValueError(f"{place}: expected a lens of {_LENS}, got {kind:.60} of the centre {centre}")
     return Lens("brown_conrady", (k1, k2, p1, p2, k3, k4, k5, k6))
 
 
