@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import captures
+import realsense
 
 from dsr.cli import main
 from fuzz import run_seeds, seeds
@@ -371,6 +372,13 @@ READERS = (
     Reader("ros 1 jpeg", lambda folder: captures.ros(folder / "scan.bag", 1, floats=True, compressed=True),
            _recording(), 2),
     Reader("ros 2", seeds.ros2, _recording(), 2),
+    Reader("kinect", seeds.kinect, _recording(), 2),
+    Reader("heic", seeds.heic, _recording()),
+    Reader("zed", captures.zed, _recording(), 1),
+    Reader("ros 2 mcap", seeds.ros2_alone, _recording(), 2),
+    Reader("ros rvl", lambda folder: captures.ros(folder / "scan.bag", 1, rvl_depth=True), _recording(), 2),
+    Reader("realsense bag", lambda folder: realsense.bag(folder / "scan.bag", realsense.Recording()), _recording(), 2),
+    Reader("realsense db3", lambda folder: realsense.db3(folder / "scan.db3", realsense.Recording()), _recording(), 2),
     Reader("data folder", seeds.dsr_scenes, _dataset("folder", "Folder")),
     Reader("doctor", seeds.dsr_scenes, lambda place: command("doctor", place.input), 1),
     Reader("middlebury", seeds.middlebury, _dataset("middlebury", "Middlebury", scenes="found", size=None, fill=())),

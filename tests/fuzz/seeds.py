@@ -350,6 +350,25 @@ def ros2(folder: Path) -> None:
     captures.ros(folder / "recording", 2)
 
 
+def kinect(folder: Path) -> None:
+    """Write a recording of an Azure Kinect."""
+    captures.kinect(folder / "scan.mkv", [captures.photo()] * 2, [np.full(captures.KINECT_DEPTH, 1000, np.uint16)] * 2)
+
+
+def heic(folder: Path) -> None:
+    """Write a HEIC photo with a depth map."""
+    captures.heic(folder / "photo.heic", np.full(captures.HEIC_MAP, 99, np.uint8), text=captures.apple_text())
+
+
+def ros2_alone(folder: Path) -> None:
+    """Write a file of ROS 2 without the folder that it is of."""
+    from rosbags.rosbag2 import StoragePlugin  # noqa: PLC0415 - an extra
+
+    whole = captures.ros(folder.parent / "whole", 2, storage_plugin=StoragePlugin.MCAP)
+    (whole / "whole.mcap").rename(folder / "scan.mcap")
+    shutil.rmtree(whole)
+
+
 def r3d(folder: Path) -> None:
     """Write an archive of Record3D."""
     captures.record3d(folder / "scan.r3d")

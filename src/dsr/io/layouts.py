@@ -18,11 +18,14 @@ from dsr.io.captures.archive import unpack
 from dsr.io.captures.arkit import find_arkitscenes, find_polycam, find_scanner_app
 from dsr.io.captures.colmap import add_model, find_colmap, model_file
 from dsr.io.captures.data_sets import find_replica, find_scannet, find_seven_scenes, find_sunrgbd
+from dsr.io.captures.heic import find_heic
+from dsr.io.captures.kinect import find_kinect
 from dsr.io.captures.known import describe_content, lacking
 from dsr.io.captures.record3d import find_record3d
 from dsr.io.captures.ros import find_ros
 from dsr.io.captures.scannet import find_scannetpp, find_sens
 from dsr.io.captures.stray import find_stray
+from dsr.io.captures.zed import find_zed
 from dsr.io.depth_files import DEPTH_SUFFIXES
 from dsr.io.frames import CaptureFrame, Geometry
 from dsr.io.images import read_pixels
@@ -41,6 +44,7 @@ from dsr.io.pairs import (
     role_of_words,
     words_of,
 )
+from dsr.io.photos import HEIC_SUFFIXES
 from dsr.io.trajectories import read_poses
 from dsr.notes import Assumption
 from dsr.utils.guards import MOST_TABLE, natural_key, numbers_in, path_within, read_limited
@@ -50,12 +54,14 @@ _TUM_UNIT = 1 / 5000
 _MAX_DEPTH = 3
 """Levels of subfolders that are searched."""
 
-CAPTURE_FILES = (".r3d", ".bag", ".mcap", ".db3", ".sens", ".zip")
+CAPTURE_FILES = (".r3d", ".bag", ".mcap", ".db3", ".mkv", ".sens", ".zip", *HEIC_SUFFIXES)
 """Suffixes of captures that are a single file."""
+_FILES = (find_record3d, find_ros, find_kinect, find_heic, find_sens)
 _LAYOUTS = (
-    find_stray, find_record3d, find_polycam, find_arkitscenes, find_scanner_app, find_ros, find_scannetpp, find_scannet,
-    find_sens, find_seven_scenes, find_sunrgbd, find_replica,
+    find_stray, find_polycam, find_arkitscenes, find_scanner_app, find_scannetpp, find_scannet, find_seven_scenes,
+    find_sunrgbd, find_replica, find_zed, *_FILES,
 )  # fmt: skip
+"""A video of ScanNet++ is asked before those of a Kinect."""
 
 
 def find_pairs_of_folder(folder: Path, leave: Path | None = None) -> PairingResult:
@@ -252,5 +258,5 @@ def find_capture(place: Path) -> PairingResult | None:
         ValueError: it is a capture, and a file that all of its frames need is missing or damaged.
 
     """
-    layouts = (find_record3d, find_ros, find_sens) if place.is_file() else _LAYOUTS
+    layouts = _FILES if place.is_file() else _LAYOUTS
     return next((found for layout in layouts if (found := layout(place)) is not None), None)

@@ -16,6 +16,7 @@ from dsr.utils.files import replacing
 
 _MODEL, _ORIENTATION, _EXIF_IFD, _EXIF_FOCAL_35 = 0x0110, 0x0112, 0x8769, 0xA405
 _ASPECT_TOLERANCE = 0.02
+HEIC_SUFFIXES = (".heic", ".heif")
 _TURNS: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     2: lambda pixels: pixels[:, ::-1],
     3: lambda pixels: pixels[::-1, ::-1],
@@ -33,7 +34,7 @@ Size = tuple[int, int]
 
 def read_photo(path: Path, size_lr: Size) -> tuple[np.ndarray, list[Assumption]]:
     """Return the photo, (H, W, 3) uint8 RGB, turned upright only if the depth map fits so, and the assumptions."""
-    if path.suffix.lower() in (".heic", ".heif"):
+    if path.suffix.lower() in HEIC_SUFFIXES:
         raise ValueError(f"{path}: expected a JPEG or PNG photo, got HEIC; export it as JPEG")
     pixels = cv2.cvtColor(read_pixels(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION), cv2.COLOR_BGR2RGB)
     orientation = orientation_of(path)
@@ -73,9 +74,15 @@ def _exif(photo: Path) -> dict[int, Any]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of data that are damaged
-            with Image.open(photo) as image:
-                exif = image.getexif()
-                return {**dict(exif), **exif.get_ifd(_EXIF_IFD)}
+            if photo.suffix.lower() in HEIC_SUFFIXES:
+                import pillow_heif  # noqa: PLC0415 - an extra
+
+                exif = Image.Exif()
+                exif.load(pillow_heif.open_heif(photo).info["exif"])
+            else:
+                with Image.open(photo) as image:
+                    exif = image.getexif()
+            return {**dict(exif), **exif.get_ifd(_EXIF_IFD)}
     except Exception:  # damaged data are ignored
         return {}
 

@@ -148,7 +148,8 @@ def _stream(reader: Any, path: Path, topic: str) -> _Stream:
     if min(size) < 1:
         raise ValueError(f"{place}: expected a positive width and height, got {size[1]} x {size[0]}")
     camera = intrinsics_camera(place, size, [float(number) for number in numbers])
-    lens, notes = None, ()
+    lens: Lens | None = None
+    notes: tuple[Assumption, ...] = ()
     if np.any(distortion):
         name = _LENSES.get(model.strip().lower())
         if name is None:
@@ -168,14 +169,15 @@ def _transform(reader: Any, place: str, stream: str) -> tuple[str, Matrix | None
         message = first_message(reader, topic)
         if message is None:
             continue
+        reference = topic.rpartition("/")[2]
         if hasattr(message, "rotation"):
             shift, turn = message.translation, message.rotation
-            return topic, from_quaternion((shift.x, shift.y, shift.z), (turn.x, turn.y, turn.z, turn.w), place)
+            return reference, from_quaternion((shift.x, shift.y, shift.z), (turn.x, turn.y, turn.z, turn.w), place)
         entries = _entries(message, f"{place}: expected a transform")
         rotation, translation = (numbers_in(entries.get(key, "").split(",")) for key in ("rotation", "translation"))
         if (len(rotation), len(translation)) != (9, 3):
             raise ValueError(f"{place}: expected 9 numbers of rotation and 3 of translation, got {entries!s:.120}")
-        return topic, as_rigid(np.column_stack((np.array(rotation).reshape(3, 3).T, translation)), place)
+        return reference, as_rigid(np.column_stack((np.array(rotation).reshape(3, 3).T, translation)), place)
     return "", None
 
 
@@ -191,12 +193,12 @@ def _geometry(color: _Stream, depth: _Stream) -> tuple[Geometry, list[Assumption
     """Return the cameras of a recording, and how depth and photo belong together."""
     notes = (*color.notes, *depth.notes)
     geometry = Geometry(color.camera, None, notes, color.lens)
-    if color.transform is None or depth.transform is None or color.reference[-6:] != depth.reference[-6:]:
+    if color.transform is None or depth.transform is None or color.reference != depth.reference:
         text = "the recording has no transform from depth to colour: depth is taken for registered to the photo"
         return geometry, [Assumption(text)]
     transform = color.transform @ invert(depth.transform)
-    numbers = [(c.width, c.height, c.fx, c.fy, c.cx, c.cy) for c in (color.camera, depth.camera)]
-    if np.allclose(*numbers, rtol=_ALIKE) and np.allclose(transform, np.eye(4), atol=_ALIKE):
+    own, other = ((c.width, c.height, c.fx, c.fy, c.cx, c.cy) for c in (color.camera, depth.camera))
+    if np.allclose(own, other, rtol=_ALIKE) and np.allclose(transform, np.eye(4), atol=_ALIKE):
         return geometry, [Assumption("depth is registered to the photo: both streams have the same camera")]
     return geometry._replace(rig=Rig(depth.camera, transform, depth.lens)), []
 

@@ -201,11 +201,9 @@ def _camera(place: str, info: _Info | None) -> Geometry:
     with naming(place):
         if width and height:
             camera = camera.crop(y, x, height, width)
-        across, down = (max(n // by, 1) for n, by in zip((camera.width, camera.height), info.binning, strict=True))
-        camera = camera.crop(
-            0, 0, min(down * info.binning[1], camera.height), min(across * info.binning[0], camera.width)
-        )
-        camera = camera.rescale(across, down)
+        across, down = (min(by, n) for by, n in zip(info.binning, (camera.width, camera.height), strict=True))
+        height, width = camera.height // down, camera.width // across
+        camera = camera.crop(0, 0, height * down, width * across).rescale(width, height)
         if not info.distortion:
             return Geometry(camera)
         if info.model in _LENSES:

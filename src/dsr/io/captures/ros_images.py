@@ -101,6 +101,8 @@ def decode_rvl(content: bytes) -> np.ndarray:
         raise ValueError(damaged)
     width, height = struct.unpack_from("<II", content)
     expect_pixels("depth as RVL", height, width, pixels_of_file(len(content)))
+    if min(width, height) < 1:
+        raise ValueError(damaged)
     words = np.frombuffer(content, "<u4", offset=8)
     parts = (words[:, None] >> np.arange(28, -4, -4, dtype=np.uint32) & 15).reshape(-1).astype(np.int64)
     ends = np.flatnonzero(parts < 8)

@@ -1,0 +1,206 @@
+"""Photos with a depth map in one HEIC file, as iPhones write in portrait mode, read by the package pillow-heif.
+
+The depth map is an auxiliary image of 8 bits. What they stand for is a message of HEVC (H.265, depth representation
+information), which libheif reads: https://github.com/strukturag/libheif, libheif/api/libheif/heif.h. Apple's depth is
+mostly disparity in 1/m; its calibration is XMP text of the map, of which pillow-heif has none and which is searched for
+in the file (tags of https://exiftool.org/TagNames/XMP.html#apple_pdi and AVDepthData's documentation):
+
+    depthData:Accuracy                    absolute; or relative, disparity up to an unknown scale and shift
+    depthData:IntrinsicMatrix             column by column, pixels of the reference size
+    IntrinsicMatrixReferenceWidth, -Height
+
+The photo comes upright; the matrix is of the picture before it was turned as the EXIF orientation says.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from dsr.geometry.camera import Camera
+from dsr.io.frames import CaptureFrame, Geometry, Record
+from dsr.io.pairs import Pair, PairingResult
+from dsr.io.photos import HEIC_SUFFIXES, orientation_of, same_aspect
+from dsr.io.trajectories import intrinsics_camera
+from dsr.notes import Assumption
+from dsr.utils.guards import (
+    MOST_FILE,
+    MOST_TEXT,
+    expect_pixels,
+    natural_key,
+    numbers_in,
+    opened,
+    read_limited,
+    refusing,
+)
+from dsr.utils.versions import file_hash
+
+_APP = "HEIC"
+"""Not the device in the EXIF data: such depth is that of its two lenses or of a network, not of its depth sensor."""
+_HEAD = 1 << 20
+"""Bytes at the beginning of a file in which its images are listed."""
+_MARK = re.compile(rb"urn:mpeg:hevc:2015:auxid:2|urn:mpeg:mpegB:cicp:systems:auxiliary:depth")
+_INVERSE_DEPTH, _DISPARITY, _DEPTH = 0, 1, 2
+"""Of HEVC's ``depth_representation_type``."""
+_TURNS: dict[int, Callable[[float, float, float, float, int, int], tuple[float, float, float, float]]] = {
+    1: lambda fx, fy, cx, cy, _, __: (fx, fy, cx, cy),
+    3: lambda fx, fy, cx, cy, width, height: (fx, fy, width - 1 - cx, height - 1 - cy),
+    6: lambda fx, fy, cx, cy, _, height: (fy, fx, height - 1 - cy, cx),
+    8: lambda fx, fy, cx, cy, width, _: (fy, fx, cy, width - 1 - cx),
+}
+"""Intrinsics of a turned picture, by EXIF orientation; mirrored ones are no photos of a camera."""
+
+
+@dataclass(frozen=True)
+class HeicImage:
+    """A :class:`~dsr.io.frames.Source` of the photo or the depth map of a HEIC file.
+
+    Args:
+        file: the file.
+        role: which of both.
+
+    """
+
+    file: Path
+    role: Literal["photo", "depth"]
+
+    def read(self) -> np.ndarray:
+        """Return (H, W, 3) uint8 RGB, or (h, w) float32 depth in metres, NaN where there is none."""
+        image = _open(self.file)
+        if self.role == "depth":
+            return _read_depth(self.file, _first_map(self.file, image))
+        pixels = _pixels(self.file, image)
+        if pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
+            raise ValueError(f"{self.file}: expected a colour photo, got {image.mode}")
+        return pixels[..., :3]
+
+    def record(self) -> Record:
+        """Return the file's name and hash."""
+        return {"file": f"{self.file.name}/{self.role}", "sha256": file_hash(self.file)}
+
+
+def find_heic(place: Path) -> PairingResult | None:
+    """Return the pairs of a HEIC file, or of those in a folder; None if none has a depth map.
+
+    Raises:
+        ValueError: a file that is given has none, or pillow-heif is missing.
+
+    """
+    if place.is_file():
+        if place.suffix.lower() not in HEIC_SUFFIXES:
+            return None
+        if not _has_depth(place):
+            raise ValueError(f"{place}: expected a HEIC photo with a depth map, as of portrait mode; there is none")
+        found = [place]
+    else:
+        found = [path for path in place.iterdir() if path.suffix.lower() in HEIC_SUFFIXES and _has_depth(path)]
+    if not found:
+        return None
+    pairs = [
+        Pair(path.stem, path, path / "depth", unit=1.0, capture=CaptureFrame(
+            _APP, functools.partial(_geometry, path), path, _told(path),
+            HeicImage(path, "photo"), HeicImage(path, "depth")))
+        for path in sorted(found, key=natural_key)
+    ]  # fmt: skip
+    return PairingResult(tuple(pairs), (Assumption("HEIC photos with depth maps of their own"),))
+
+
+def _has_depth(path: Path) -> bool:
+    """Return whether a file lists a depth map."""
+    if not path.is_file():
+        return False
+    with opened(path) as file:
+        return _MARK.search(file.read(_HEAD)) is not None
+
+
+def _open(path: Path) -> Any:
+    """Return the photo, whose pixels are not decoded yet."""
+    with refusing(f"{path}: HEIC photos need the package pillow-heif: pip install 'dsr[captures]'", ImportError):
+        import pillow_heif  # noqa: PLC0415 - an extra
+    content = read_limited(path, MOST_FILE)
+    with refusing(f"{path}: expected a HEIC photo, got a damaged one", *_DAMAGED):
+        file = pillow_heif.open_heif(content)
+        return file[file.primary_index]
+
+
+_DAMAGED = (ValueError, RuntimeError, SyntaxError, EOFError, OSError, IndexError, MemoryError)
+"""What pillow-heif raises."""
+
+
+def _pixels(path: Path, image: Any) -> np.ndarray:
+    """Return the decoded pixels of an image."""
+    width, height = image.size
+    expect_pixels(path, height, width)
+    with refusing(f"{path}: expected a HEIC photo, got a damaged one", *_DAMAGED):
+        return np.array(image)
+
+
+def _first_map(path: Path, image: Any) -> Any:
+    """Return the depth map that belongs to a photo."""
+    maps = [each for each in image.info.get("depth_images", ()) if each is not None]
+    if not maps:
+        raise ValueError(f"{path}: expected a depth map of the photo, there is none that can be read")
+    return maps[0]
+
+
+def _read_depth(path: Path, stored: Any) -> np.ndarray:
+    """Return depth in metres, (h, w) float32, NaN where it is none."""
+    values, told = _pixels(path, stored), stored.info["metadata"] or {}
+    kind = told.get("representation_type")
+    names = ("d_min", "d_max") if kind == _DISPARITY else ("z_near", "z_far")
+    if kind not in (_INVERSE_DEPTH, _DISPARITY, _DEPTH) or not all(name in told for name in names):
+        raise ValueError(f"{path}: expected a depth map with the range of its values, got {told!s:.120}")
+    low, high = (float(told[name]) for name in names)
+    share = values.astype(np.float64) / np.iinfo(values.dtype).max
+    with np.errstate(all="ignore"):
+        if kind == _INVERSE_DEPTH:
+            low, high = (float(np.divide(1, each)) for each in (high, low))
+        mapped = low + share * (high - low)
+        depth = mapped if kind == _DEPTH else 1 / mapped
+    return np.where(np.isfinite(depth) & (depth > 0), depth, np.nan).astype(np.float32)
+
+
+def _told(path: Path) -> bytes:
+    """Return the XMP text about the depth map; empty if there is none."""
+    content = read_limited(path, MOST_FILE)
+    place = content.find(b"http://ns.apple.com/depthData/")
+    first, end = content.rfind(b"<x:xmpmeta", 0, max(place, 0)), content.find(b"</x:xmpmeta>", max(place, 0))
+    return content[first:end] if place >= 0 and first >= 0 and end - first <= MOST_TEXT and end >= 0 else b""
+
+
+def _geometry(path: Path, size: tuple[int, int]) -> Geometry:
+    """Return the camera of a photo of (height, width)."""
+    text = _told(path).decode(errors="replace")
+    accuracy = re.search(r"depthData:Accuracy\W{1,3}(\w+)", text)
+    notes = []
+    if accuracy is None or accuracy[1] != "absolute":
+        known = "is relative, says the file" if accuracy else "may be relative, the file does not say"
+        notes.append(Assumption(f"the depth {known}: sizes and distances mean little"))
+    camera = _camera(path, text, orientation_of(path), size)
+    return Geometry(camera, None, tuple(notes))
+
+
+def _camera(path: Path, text: str, orientation: int, size: tuple[int, int]) -> Camera | None:
+    """Return the camera that the text about the depth map tells; None if there is none."""
+    matrix = re.search(r"depthData:IntrinsicMatrix>(.*?)</depthData:IntrinsicMatrix>", text, re.DOTALL)
+    sides = dict(re.findall(r"depthData:IntrinsicMatrixReference(Width|Height)\W{1,3}(\d{1,6})\b", text))
+    if matrix is None or len(sides) < 2:
+        return None
+    values = numbers_in(re.findall(r"<rdf:li>\s*([^<\s]*)\s*</rdf:li>", matrix[1]))
+    width, height = int(sides["Width"]), int(sides["Height"])
+    if len(values) != 9 or min(width, height) < 1:
+        raise ValueError(f"{path}: depthData:IntrinsicMatrix: expected 9 numbers, got {matrix[1].strip()!r:.60}")
+    numbers = _TURNS.get(orientation, _TURNS[1])(values[0], values[4], values[6], values[7], width, height)
+    turned = (width, height) if orientation in (6, 8) else (height, width)
+    if not same_aspect(turned, size):
+        raise ValueError(
+            f"{path}: depthData:IntrinsicMatrix: expected the photo's aspect, got a camera of {turned[1]} x "
+            f"{turned[0]} for {size[1]} x {size[0]} pixels (width x height)"
+        )
+    return intrinsics_camera(f"{path}: depthData:IntrinsicMatrix", turned, numbers)

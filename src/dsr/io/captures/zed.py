@@ -1,0 +1,91 @@
+"""Pictures that the ZED SDK's sample *SVO Export* writes, beside the camera's factory calibration.
+
+https://github.com/stereolabs/zed-sdk, recording/export/svo (mode LEFT + DEPTH_16Bit), and
+https://github.com/stereolabs/zed-open-capture, examples/include/calibration.hpp.
+
+    left000000.png     the left photo, rectified
+    depth000000.png    16-bit millimetres in the left photo's pixels, 0 in holes
+    SN12345.conf       both cameras before they are rectified, for each resolution: fx, fy, cx, cy, k1, k2, p1, p2, k3;
+                       Baseline in mm, TY and TZ; RX, CV and RZ, a rotation vector
+
+The camera of the rectified photo is what OpenCV's ``stereoRectify`` makes of them, as in the second source. The SDK
+may calibrate anew when it opens a camera, and then has another one within about a percent.
+"""
+
+from __future__ import annotations
+
+import configparser
+import functools
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from dsr.io.frames import CaptureFrame, Geometry
+from dsr.io.pairs import Pair, PairingResult
+from dsr.io.trajectories import describe_capture, intrinsics_camera, read_text
+from dsr.notes import Assumption
+from dsr.utils.guards import numbers_in, refusing
+
+_APP = "ZED"
+_RESOLUTIONS = {(1242, 2208): "2K", (1080, 1920): "FHD", (720, 1280): "HD", (376, 672): "VGA"}
+_CAMERA = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+
+
+def find_zed(folder: Path) -> PairingResult | None:
+    """Return the frames of a folder of exported pictures with a calibration; None if it is none.
+
+    Raises:
+        ValueError: it has several calibrations.
+
+    """
+    calibrations = sorted(path for path in folder.glob("SN*.conf") if path.is_file())
+    if not calibrations:
+        return None
+    found: dict[str, dict[str, Path]] = {"left": {}, "depth": {}}
+    for path in sorted(folder.iterdir()):
+        if match := re.fullmatch(r"(left|depth)(\d{1,9})\.png", path.name):
+            found[match[1]][match[2]] = path
+    both = sorted(found["left"].keys() & found["depth"].keys())
+    if not both:
+        return None
+    if len(calibrations) > 1:
+        raise ValueError(f"{folder}: expected one calibration of {_APP}, got {', '.join(p.name for p in calibrations)}")
+    text = read_text(calibrations[0])
+    frame = CaptureFrame(_APP, functools.partial(_geometry, calibrations[0], text), calibrations[0], text.encode())
+    pairs = tuple(Pair(name, found["left"][name], found["depth"][name], unit=1e-3, capture=frame) for name in both)
+    lone = tuple(path for each in found.values() for name, path in each.items() if name not in both)
+    return PairingResult(pairs, (describe_capture(f"pictures of {_APP}", "millimetres", pairs, poses=False),), lone)
+
+
+def _geometry(path: Path, text: str, size: tuple[int, int]) -> Geometry:
+    """Return the camera of the rectified photo of (height, width)."""
+    if size not in _RESOLUTIONS:
+        sizes = ", ".join(f"{width} x {height}" for height, width in _RESOLUTIONS)
+        return Geometry(None, None, (Assumption(f"{path.name} is not used: it is of photos of {sizes}"),))
+    resolution = _RESOLUTIONS[size]
+    parser = configparser.ConfigParser(strict=False, interpolation=None)
+    with refusing(f"{path}: expected the calibration of {_APP}, got a damaged or foreign file", configparser.Error):
+        parser.read_string(text)
+    cameras = [_values(path, parser, f"{side}_CAM_{resolution}", _CAMERA) for side in ("LEFT", "RIGHT")]
+    names = ("Baseline", *(f"{name}_{resolution}" for name in ("TY", "TZ", "RX", "CV", "RZ")))
+    between = _values(path, parser, "STEREO", names)
+    matrices = [np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]) for fx, fy, cx, cy, *_ in cameras]
+    lenses = [np.array(each[4:]) for each in cameras]
+    with refusing(f"{path}: expected the calibration of two cameras side by side, got another", cv2.error):
+        rectified = cv2.stereoRectify(
+            matrices[0], lenses[0], matrices[1], lenses[1], size[::-1], cv2.Rodrigues(np.array(between[3:]))[0],
+            np.array(between[:3]).reshape(3, 1), flags=cv2.CALIB_ZERO_DISPARITY, alpha=0,
+        )[2]  # fmt: skip
+    camera = intrinsics_camera(str(path), size, [float(rectified[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2))])
+    return Geometry(camera, None, (Assumption("camera: that of the factory calibration, which the SDK refines"),))
+
+
+def _values(path: Path, parser: configparser.ConfigParser, section: str, names: tuple[str, ...]) -> list[float]:
+    """Return numbers of a section."""
+    came = [parser.get(section, name, fallback="nothing") for name in names]
+    values = numbers_in(came)
+    if not values or not np.isfinite(values).all():
+        raise ValueError(f"{path}: {section}: expected numbers for {', '.join(names)}, got {', '.join(came):.120}")
+    return values

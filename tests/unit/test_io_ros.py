@@ -1,0 +1,167 @@
+"""Recordings of ROS: cameras for window, binning, rectification and distortion, lone files, and RVL."""
+
+import struct
+from types import SimpleNamespace
+
+import captures
+import cv2
+import numpy as np
+import pytest
+from captures import FRAMES, INTRINSICS, SIZE
+
+from dsr.geometry.camera import Camera
+from dsr.io.captures.ros_images import decode_message
+from dsr.io.inputs import read_picture
+from dsr.io.layouts import find_pairs_of_folder
+from dsr.io.reading import Reading
+
+pytest.importorskip("rosbags")
+CAMERA = Camera(SIZE[1], SIZE[0], *INTRINSICS)
+
+
+def read_first(path):
+    return read_picture(find_pairs_of_folder(path).pairs[0], Reading())
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_window_and_binning_of_the_sensor_are_taken_off_the_camera(tmp_path, version):
+    """The calibration is of 200 x 120 pixels, of which the photo shows 128 x 96 from (30, 10) on, 2 x 2 as one."""
+    k = [100.0, 0, 93.5, 0, 102.0, 58.5, 0, 0, 1]
+    path = captures.ros(tmp_path / "a.bag" if version == 1 else tmp_path / "a", version, k=k, width=200, height=120,
+                        roi=(30, 10, 128, 96), binning_x=2, binning_y=2)  # fmt: skip
+    # centres of the first and of the 64th pair of columns are at 30.5 and 156.5
+    camera = read_first(path).camera
+    assert camera == Camera(64, 48, 50.0, 51.0, (93.5 - 30.5) / 2, (58.5 - 10.5) / 2)
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_photos_of_a_rectified_topic_have_the_projection_and_no_distortion(tmp_path, version):
+    p = [40.0, 0, 30, -4, 0, 41, 22, 0, 0, 0, 1, 0]
+    path = captures.ros(tmp_path / "a.bag" if version == 1 else tmp_path / "a", version, p=p, d=[0.3, 0.1, 0, 0, 0],
+                        image_name="image_rect_color")  # fmt: skip
+    picture = read_first(path)
+    assert picture.camera == Camera(64, 48, 40.0, 41.0, 30.0, 22.0)
+    np.testing.assert_array_equal(np.rint(255 * picture.rgb.permute(1, 2, 0).numpy()), captures.photo())
+
+
+@pytest.mark.parametrize(
+    ("model", "numbers"),
+    [
+        ("plumb_bob", (-0.25, 0.1, 0.002, -0.003, 0.01)),
+        ("rational_polynomial", (0.3, -0.1, 0.001, 0.002, 0.02, 0.6, -0.05, 0.01)),
+        ("equidistant", (-0.05, 0.02, -0.01, 0.002)),
+    ],
+)
+def test_photos_with_distortion_become_those_of_the_pinhole_camera(tmp_path, model, numbers):
+    fx, fy, cx, cy = INTRINSICS
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    v, u = np.mgrid[: SIZE[0], : SIZE[1]].astype(float)
+    points = np.stack((u, v), -1).reshape(-1, 1, 2)
+    project = cv2.fisheye.projectPoints if model == "equidistant" else cv2.projectPoints
+    ideal, zero = points.copy(), np.zeros((3, 1))
+    for _ in range(60):
+        ray = np.concatenate(((ideal - (cx, cy)) / (fx, fy), np.ones((len(points), 1, 1))), -1)
+        ideal += 0.7 * (points - project(ray, zero, zero, matrix, np.array(numbers))[0])
+    place = ideal.reshape(*SIZE, 2)
+
+    def pattern(x, y):
+        return np.stack((60 + x, 40 + 2 * y, 20 + x + y), -1)
+
+    distorted = np.clip(np.rint(pattern(place[..., 0], place[..., 1])), 0, 255).astype(np.uint8)
+    path = captures.ros(tmp_path / "a", 2, photos=lambda _: distorted, distortion_model=model, d=numbers)
+    picture = read_first(path)
+    assert picture.camera == CAMERA
+    found = 255 * picture.rgb.permute(1, 2, 0).numpy()
+    assert np.abs(distorted - pattern(u, v))[6:-6, 6:-6].max() > 3
+    assert np.abs(found - pattern(u, v))[6:-6, 6:-6].max() < 1.5
+    assert any(f"{numbers[0]:g}" in str(fact) for fact in picture.assumptions)
+
+
+def test_unknown_distortion_is_said_and_left(tmp_path):
+    picture = read_first(captures.ros(tmp_path / "a", 2, distortion_model="thin_prism", d=[0.1, 0.2]))
+    np.testing.assert_array_equal(np.rint(255 * picture.rgb.permute(1, 2, 0).numpy()), captures.photo())
+    assert any("thin_prism" in str(fact) for fact in picture.assumptions)
+
+
+@pytest.mark.parametrize(
+    ("of_info", "said"),
+    [
+        ({"roi": (30, 10, 128, 96)}, "crop: expected a window"),
+        ({"d": [np.nan, 0, 0, 0, 0]}, "lens: expected"),
+        ({"d": [0.1, 0.2, 0.3]}, "lens: expected"),
+        ({"width": 0}, "expected a positive width and height"),
+    ],
+)
+def test_camera_info_that_is_none_is_one_line(tmp_path, of_info, said):
+    path = captures.ros(tmp_path / "a.bag", 1, **of_info)
+    with pytest.raises(ValueError, match=f"^{path}/camera/color/camera_info: {said}"):
+        read_first(path)
+
+
+@pytest.mark.parametrize("suffix", [".db3", ".mcap"])
+def test_file_of_ros_2_is_read_without_its_folder(tmp_path, suffix):
+    from rosbags.rosbag2 import StoragePlugin  # noqa: PLC0415 - an extra
+
+    plugin = StoragePlugin.MCAP if suffix == ".mcap" else StoragePlugin.SQLITE3
+    folder = captures.ros(tmp_path / "whole", 2, storage_plugin=plugin)
+    alone = tmp_path / "alone" / f"scan{suffix}"
+    alone.parent.mkdir()
+    (folder / f"whole{suffix}").rename(alone)
+    for place in (alone, alone.parent):
+        found = find_pairs_of_folder(place)
+        assert len(found.pairs) == FRAMES
+        picture = read_picture(found.pairs[1], Reading())
+        assert picture.camera == CAMERA
+        np.testing.assert_allclose(picture.depth_lr[0], captures.depth(1), atol=6e-4)
+    alone.write_bytes(alone.read_bytes()[:3000])
+    with pytest.raises(ValueError, match=f"^{alone}: expected a recording of ROS"):
+        find_pairs_of_folder(alone)
+
+
+def message(values, *, floats=False):
+    a, b = (20_000.0, 3.0) if floats else (0.0, 0.0)
+    data = struct.pack("<iff", 0, a, b) + (values if isinstance(values, bytes) else captures.rvl(values))
+    kind = "32FC1" if floats else "16UC1"
+    return SimpleNamespace(format=f"{kind}; compressedDepth rvl", data=np.frombuffer(data, np.uint8))
+
+
+def maps():
+    generator = np.random.default_rng(0)
+    sparse = generator.integers(0, 65536, (23, 31)) * (generator.random((23, 31)) < 0.4)
+    holes = captures.millimetres()
+    holes[3:6, 4:] = 0
+    ends = captures.millimetres()
+    ends[-1] = 0
+    extremes = np.array([[1, 65535, 0, 65535, 1, 0]], np.uint16)
+    found = {"sparse": sparse.astype(np.uint16), "slope": captures.millimetres(), "extremes": extremes}
+    return {**found, "holes": holes, "ends": ends, "none": np.zeros((5, 7), np.uint16)}
+
+
+def test_topic_of_compressed_depth_is_read(tmp_path):
+    found = find_pairs_of_folder(captures.ros(tmp_path / "a", 2, rvl_depth=True)).pairs
+    np.testing.assert_allclose(read_picture(found[2], Reading()).depth_lr[0], captures.depth(2), atol=6e-4)
+
+
+@pytest.mark.parametrize("name", maps())
+def test_rvl_is_decoded(name):
+    values = maps()[name]
+    found = decode_message("topic", message(values))
+    assert found.dtype == np.uint16
+    np.testing.assert_array_equal(found, values)
+    metres = decode_message("topic", message(values, floats=True))
+    expected = np.where(values > 0, 20_000 / np.where(values == 3, np.nan, values - 3.0), np.nan)
+    np.testing.assert_allclose(metres, expected, rtol=1e-6)
+
+
+def test_rvl_that_is_damaged_or_declares_more_than_it_can_hold_is_refused_before_memory_is_taken():
+    content = captures.rvl(captures.millimetres())
+    huge = struct.pack("<II", 60_000, 60_000) + content[8:]
+    more = struct.pack("<II", 16, 13) + content[8:]
+    fewer = struct.pack("<II", 16, 10) + content[8:]
+    endless = content[:8] + b"\xff" * 64
+    empty = struct.pack("<II", 0, 12) + content[8:]
+    still = struct.pack("<II", 16, 12) + bytes(400)
+    for wrong in (huge, more, fewer, endless, empty, still, content[:40], content[:6], content[:-1]):
+        with pytest.raises(ValueError, match=r"^topic: ") as caught:
+            decode_message("topic", message(wrong))
+        assert "\n" not in str(caught.value)
