@@ -163,7 +163,10 @@ _MAGIC = b"#ROSBAG V2.0\n"
 
 
 def _expect_finished(path: Path) -> None:
-    """Check that a ``.bag`` is one and has its index, http://wiki.ros.org/Bags/Format/2.0: the first record tells its place."""
+    """Check that a ``.bag`` is one, and has its index: the first record tells its place.
+
+    http://wiki.ros.org/Bags/Format/2.0
+    """
     if path.suffix.lower() != ".bag":
         return
     with opened(path) as file:
