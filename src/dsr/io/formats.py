@@ -88,11 +88,20 @@ FORMATS = (
     Format(
         "ROS 1 and 2",
         "`rosbag record`, `ros2 bag record` of a colour and a depth topic with their `camera_info`",
-        "`*.bag`; a folder with `metadata.yaml` and `*.db3` or `*.mcap`",
-        "depth in mm (16UC1), m (32FC1), compressedDepth; intrinsics (`camera_info`); time",
+        "`*.bag`, `*.mcap`, `*.db3`; a folder of them with `metadata.yaml`",
+        "depth in mm (16UC1), m (32FC1), compressedDepth as PNG or RVL; intrinsics and distortion (`camera_info`); time",
         "written by rosbags",
         "",
         "https://docs.ros.org/en/api/sensor_msgs/html/index-msg.html",
+    ),
+    Format(
+        "RealSense SDK",
+        "record in RealSense Viewer, or `enable_record_to_file`, with depth and colour",
+        "`*.bag` (SDK up to 2.57), `*.db3` (since)",
+        "depth in the unit of `Depth_Units`, warped to the photo; both intrinsics, extrinsics and distortions; time",
+        "two recordings that SDK 2.55 and 2.59 wrote",
+        _STEREO,
+        "https://github.com/IntelRealSense/librealsense/blob/master/src/media/ros/ros_file_format.h",
     ),
     Format(
         "Azure Kinect",

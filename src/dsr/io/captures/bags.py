@@ -152,24 +152,36 @@ def _open(path: Path) -> Any:
             path_within(path, file.name, f"{description}: relative_file_paths")
     reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
     reader.open()
+    sizes = [chunk.datasize for each in reader.readers for chunk in getattr(each, "chunks", {}).values()]
+    if max(sizes, default=0) > _CHUNK:  # a damaged number, which rosbags would read all the same
+        reader.close()
+        raise ValueError(f"{path}: expected chunks of at most {_CHUNK} bytes, got one of {max(sizes)}")
     return reader
 
 
+_MAGIC = b"#ROSBAG V2.0\n"
+
+
 def _expect_finished(path: Path) -> None:
-    """Check that a ``.bag`` has its index, http://wiki.ros.org/Bags/Format/2.0: the first record tells its place."""
+    """Check that a ``.bag`` is one, and has its index: the first record tells its place.
+
+    http://wiki.ros.org/Bags/Format/2.0
+    """
     if path.suffix.lower() != ".bag":
         return
     with opened(path) as file:
         head = file.read(1 << 12)
+    if not head.startswith(_MAGIC):  # which rosbags looks for up to the first line's end, wherever that is
+        raise ValueError(f"{path}: expected a recording of ROS, got another file")
     place = head.find(b"index_pos=")
-    if head.startswith(b"#ROSBAG V2.0") and place > 0 and head[place + 10 : place + 18] == bytes(8):
+    if place > 0 and head[place + 10 : place + 18] == bytes(8):
         raise ValueError(
             f"{path}: expected a finished recording, this one was interrupted and has no index; rosbag reindex adds it"
         )
 
 
 _CHUNK = 1 << 28
-"""Largest number of bytes that a compressed chunk of a recording may unpack to; writers make chunks of a few MB."""
+"""Largest number of bytes of a chunk of a recording, packed or not; writers make chunks of a few MB."""
 
 
 def _limit_chunks() -> None:

@@ -60,7 +60,6 @@ _LAYOUTS = (
     _Known("TUM RGB-D", ("rgb.txt", "depth.txt"), {"rgb.txt": ("rgb.txt",), "depth.txt": ("depth.txt",)}),
     _Known("Open3D", ("scene/trajectory.log", "trajectory.log"), {
         "color/": ("color/*", "image/*", "rgb/*"), "depth/": ("depth/*",)}),
-    _Known("ROS 2", ("*.db3", "*.mcap"), {"metadata.yaml": ("metadata.yaml",)}),
 )  # fmt: skip
 
 
