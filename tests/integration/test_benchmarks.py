@@ -95,3 +95,20 @@ def test_benchmark_of_poses_counts_what_is_told() -> None:
     lines = run_benchmark("poses.py", "--scenes", "1", "--size", "48", "--right").splitlines()
     (row,) = [line for line in lines if line.startswith("| right |")]
     assert re.fullmatch(r"\| right( \| \d / \d / \d / \d){7} \|", row)
+
+
+def test_pairs_have_their_published_rows(shared: Path, tmp_path: Path) -> None:
+    for name in ("rgbdd_real", "cleargrasp", "icl_nuim", "middlebury2005", "middlebury2006", "middlebury2014",
+                 "tartanair", "depth_camera", "ddrnet", "../modern", "../scenes"):  # fmt: skip
+        (tmp_path / "real" / name).mkdir(parents=True)
+    for name in ("real/ddrnet/color_map", "real/ddrnet/depth_map", "real/iphone_lidar", "real/sunrgbd", "scenes/books"):
+        (tmp_path / name).symlink_to(shared / name)
+    printed = run_benchmark("pairs.py", "--shared", str(tmp_path), "--rendered", "6", "--workers", "1")
+    published = (BENCHMARKS.parent / "docs" / "checks.md").read_text()
+    measured, expected = (
+        {row[0]: [*row[1:9], row[10]] for line in text.splitlines() if len(row := line.strip("| ").split(" | ")) == 11}
+        for text in (printed, published)
+    )  # but for those with another photo, which is drawn from all
+    rows = ("ddrnet raw", "iphone_lidar", "sunrgbd raw", "sunrgbd", "books raw")
+    assert {name: measured[name] for name in rows} == {name: expected[name] for name in rows}
+    assert measured["rendered"][0] == "6"
