@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -107,3 +109,23 @@ def test_benchmark_of_encodings_counts_what_is_said() -> None:
         assert counts[right] == [2, 0, 0, 0], right
     for without_unit in ("0 to 1", "8 bits for viewing", "false colours", "disparity, 8 bits"):
         assert counts[without_unit] == [0, 0, 2, 0], without_unit
+
+
+def test_pairs_have_their_published_rows(shared: Path, tmp_path: Path) -> None:
+    for name in ("rgbdd_real", "cleargrasp", "icl_nuim", "middlebury2005", "middlebury2006", "middlebury2014",
+                 "tartanair", "depth_camera", "ddrnet", "sunrgbd", "../modern", "../scenes"):  # fmt: skip
+        (tmp_path / "real" / name).mkdir(parents=True)
+    ddrnet, camera = ("real/ddrnet/color_map", "real/ddrnet/depth_map"), "real/sunrgbd/open3d_sample"
+    for name in (*ddrnet, "real/iphone_lidar", camera, "scenes/books"):
+        (tmp_path / name).symlink_to(shared / name)
+    command = (sys.executable, str(BENCHMARKS / "pairs.py"), "--shared", str(tmp_path), "--rendered", "4")
+    done = subprocess.run([*command, "--workers", "1"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    published = (BENCHMARKS.parent / "docs" / "checks.md").read_text()
+    measured, expected = (
+        {row[0]: [*row[1:9], row[10]] for line in text.splitlines() if len(row := line.strip("| ").split(" | ")) == 11}
+        for text in (done.stdout, published)
+    )  # but for those with another photo, which is drawn from all
+    rows = ("ddrnet raw", "iphone_lidar", "books raw")
+    assert {name: measured[name] for name in rows} == {name: expected[name] for name in rows}
+    assert measured["rendered"][0] == "4"

@@ -215,7 +215,7 @@ def test_arrays_and_tensors_give_the_same_result() -> None:
     np.testing.assert_allclose(floats, of_arrays, rtol=1e-4)
 
 
-def test_arrays_with_negative_strides_or_read_only_are_taken_as_they_read() -> None:
+def test_arrays_of_any_strides_and_byte_order_or_read_only_are_taken_as_they_read() -> None:
     camera = _camera(24, 32)
     photo = (_photo(24, 32).permute(1, 2, 0).numpy() * 255).astype(np.uint8)
     depth = _plane(12, 16, camera)[0].float().numpy()
@@ -224,8 +224,10 @@ def test_arrays_with_negative_strides_or_read_only_are_taken_as_they_read() -> N
     flipped = [np.flip(np.flip(each).copy()) for each in (photo, depth, mask)]
     photo.flags.writeable = depth.flags.writeable = False
     assert all(min(each.strides) < 0 for each in flipped)
-    plain, other = (dsr.upsample(rgb, z, camera, mask=m) for rgb, z, m in ((photo, depth, mask), flipped))
-    np.testing.assert_array_equal(other, plain)
+    swapped = (photo, depth.astype(">f4"), mask)
+    plain, *others = (dsr.upsample(rgb, z, camera, mask=m) for rgb, z, m in ((photo, depth, mask), flipped, swapped))
+    for other in others:
+        np.testing.assert_array_equal(other, plain)
 
 
 def test_result_without_any_depth_is_refused_rather_than_filled(monkeypatch: pytest.MonkeyPatch) -> None:

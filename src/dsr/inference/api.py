@@ -189,8 +189,10 @@ def upsample_with_errors(
 
 
 def _tensor(values: np.ndarray | Tensor) -> Tensor:
-    """Return an array as a tensor, also one that torch cannot share: flipped, with negative strides, or read-only."""
-    return torch.as_tensor(np.require(values, requirements=("C", "W")) if isinstance(values, np.ndarray) else values)
+    """Return an array as a tensor, also one that torch cannot share: flipped, read-only, or of another byte order."""
+    if isinstance(values, np.ndarray):
+        values = np.require(values, values.dtype.newbyteorder("="), ("C", "W"))
+    return torch.as_tensor(values)
 
 
 def _photo(rgb: np.ndarray | Tensor) -> Tensor:
