@@ -4,6 +4,7 @@ import json
 import os
 import struct
 import zipfile
+import zlib
 
 import cv2
 import numpy as np
@@ -298,6 +299,144 @@ def ros(
                 raw = store.serialize_ros1 if version == 1 else store.serialize_cdr
                 writer.write(connection, int(100e9 + 33e6 * number), bytes(raw(message(number), kind)))
     return path
+
+
+def write_matrix(path, matrix):
+    """Write a matrix as rows of numbers."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("\n".join(" ".join(f"{value:.9f}" for value in row) for row in matrix) + "\n")
+
+
+def intrinsic_matrix(side=3):
+    fx, fy, cx, cy = INTRINSICS
+    matrix = np.eye(side)
+    matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2] = fx, fy, cx, cy
+    return matrix
+
+
+def seven_scenes(folder, name="{:06}".format):
+    """Write a sequence of 7-Scenes, whose holes are 65535."""
+    for number in range(FRAMES):
+        stem = "frame-" + name(number)
+        values = millimetres(number)
+        values[0, 0] = 65535
+        save(folder / f"{stem}.color.png", photo(number))
+        save(folder / f"{stem}.depth.png", values)
+        write_matrix(folder / f"{stem}.pose.txt", pose(number))
+    return folder
+
+
+def scannet(folder, lost=()):
+    """Write an export of ScanNet; the poses of lost frames are -inf."""
+    for number in range(FRAMES):
+        save(folder / "color" / f"{number}.jpg", photo(number))
+        save(folder / "depth" / f"{number}.png", millimetres(number))
+        write_matrix(folder / "pose" / f"{number}.txt", np.full((4, 4), -np.inf) if number in lost else pose(number))
+    for kind, side in (("color", SIZE[1]), ("depth", SIZE_LR[1])):
+        matrix = intrinsic_matrix(4)
+        matrix[:2] *= side / SIZE[1]
+        write_matrix(folder / "intrinsic" / f"intrinsic_{kind}.txt", matrix)
+        write_matrix(folder / "intrinsic" / f"extrinsic_{kind}.txt", np.eye(4))
+    return folder
+
+
+def sens(path, *, colour="jpeg", depth="zlib", scale=1000.0, lost=()):
+    """Write a recording of ScanNet."""
+    kinds = {"raw": 0, "png": 1, "jpeg": 2}
+    parts = [struct.pack("<IQ", 4, 9), b"Structure"]
+    parts += [np.asarray(matrix, "<f4").tobytes() for matrix in (intrinsic_matrix(4), np.eye(4)) * 2]
+    sizes = (SIZE[1], SIZE[0], SIZE_LR[1], SIZE_LR[0])
+    parts.append(struct.pack("<iiIIIIfQ", kinds[colour], depth == "zlib", *sizes, scale, FRAMES))
+    for number in range(FRAMES):
+        matrix = np.full((4, 4), -np.inf) if number in lost else pose(number)
+        rgb = photo(number).tobytes()
+        if colour != "raw":
+            rgb = cv2.imencode(f".{colour}", photo(number)[..., ::-1])[1].tobytes()
+        stored = np.round(scale * globals()["depth"](number)).astype("<u2").tobytes()
+        stored = zlib.compress(stored) if depth == "zlib" else stored
+        parts += [matrix.astype("<f4").tobytes(), struct.pack("<4Q", 7, 8, len(rgb), len(stored)), rgb, stored]
+    parts.append(struct.pack("<Q", 0))  # of the inertial sensor
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(b"".join(parts))
+    return path
+
+
+def iphone_map(number):
+    """A map of an iPhone in metres, (192, 256), with the smallest depth of :func:`depth`."""
+    return 1.5 + 0.5 * number + np.mgrid[0:192, 0:256][1] / 1000
+
+
+def scannetpp(folder, kind="lz4"):
+    """Write the iPhone of a scene of ScanNet++, photos of 192 x 256, its maps as LZ4 or deflate, or extracted."""
+    import lz4.block  # noqa: PLC0415 - an extra
+
+    entries, parts, place = {}, [], folder / "iphone"
+    for number in range(FRAMES):
+        matrix = np.diag([4, 4, 1]) @ intrinsic_matrix()
+        matrix[0, 0] += number
+        picture = cv2.resize(photo(number), (256, 192))
+        aligned = {"aligned_pose": pose(number).tolist(), "pose": (pose(number) @ FLIP).tolist()}
+        entries[f"frame_{number:06}"] = {"timestamp": 0.1, "intrinsic": matrix.tolist(), "imu": [], **aligned}
+        values = np.round(1000 * iphone_map(number)).astype("<u2")
+        packed = lz4.block.compress(values.tobytes(), store_size=False)
+        if kind == "deflate":
+            packing = zlib.compressobj(wbits=-15)
+            packed = packing.compress(iphone_map(number).astype("<f4").tobytes()) + packing.flush()
+        parts += [struct.pack("<I", len(packed)), packed]
+        if kind == "files":
+            save(place / "rgb" / f"frame_{number:06}.jpg", picture)
+            save(place / "depth" / f"frame_{number:06}.png", values)
+    place.mkdir(parents=True, exist_ok=True)
+    if kind != "files":
+        write_video(place / "rgb.mp4", [cv2.resize(photo(number), (256, 192)) for number in range(FRAMES)])
+        (place / "depth.bin").write_bytes(b"".join(parts))
+    (place / "pose_intrinsic_imu.json").write_text(json.dumps(entries))
+    return folder
+
+
+def replica(folder, *, params=True, step=1):
+    """Write a scene of Replica as NICE-SLAM renders it: all poses, and one of every few frames."""
+    rows = []
+    for number in range(FRAMES * step):
+        rows.append(" ".join(f"{value:.9f}" for value in pose(number // step).ravel()))
+        if number % step == 0:
+            save(folder / "results" / f"frame{number:06}.jpg", photo(number // step))
+            values = np.round(6553.5 * depth(number // step)).astype(np.uint16)
+            save(folder / "results" / f"depth{number:06}.png", values)
+    (folder / "traj.txt").write_text("\n".join(rows) + "\n")
+    if params:
+        names = zip(("fx", "fy", "cx", "cy"), INTRINSICS, strict=True)
+        entries = {"camera": {"w": SIZE[1], "h": SIZE[0], **dict(names), "scale": 6553.5}}
+        (folder / "cam_params.json").write_text(json.dumps(entries))
+    return folder
+
+
+def scanner_app(folder, name="{:05}".format):
+    """Write all data of 3D Scanner App, whose last photo is left out."""
+    fx, fy, cx, cy = INTRINSICS
+    folder.mkdir(parents=True, exist_ok=True)
+    for number in range(FRAMES + 1):
+        stem = name(number)
+        told = {"intrinsics": [fx + number, 0, cx, 0, fy, cy, 0, 0, 1], "time": 1.5, "frame_index": number}
+        told["cameraPoseARFrame"] = (pose(number) @ FLIP).ravel().tolist()
+        (folder / f"frame_{stem}.json").write_text(json.dumps(told))
+        save(folder / f"depth_{stem}.png", millimetres(number))
+        save(folder / f"conf_{stem}.png", levels())
+        if number < FRAMES:
+            save(folder / f"frame_{stem}.jpg", photo(number))
+    return folder
+
+
+def sunrgbd(folder):
+    """Write a scene of SUN RGB-D with a distance beyond 8 m, whose turned bits are no multiple of 8."""
+    values = millimetres() * np.uint16(6)
+    assert values.max() > 8192
+    turned = (values << 3) | (values >> 13)
+    save(folder / "image" / "0000144.jpg", photo())
+    save(folder / "depth" / "0000144.png", turned)
+    save(folder / "depth_bfx" / "0000144.png", np.full_like(turned, 8000))
+    (folder / "intrinsics.txt").write_text(" ".join(f"{value:g}" for value in intrinsic_matrix().ravel()) + "\n")
+    write_matrix(folder / "extrinsics" / "20141221170930.txt", np.eye(4)[:3])
 
 
 KINECT_DEPTH = (288, 320)

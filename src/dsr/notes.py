@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
-CHECKS = 2
+CHECKS = 3
 """Number of the present checks; another one where a warning is added, or a limit changes."""
 
 
@@ -27,7 +27,7 @@ class Limit(NamedTuple):
 LIMITS: dict[str, Limit] = {
     "edges-beside": Limit(
         3.0,
-        "pixels, of a photo with 800 on its longer side, by which its edges lie beside those of the depth map",
+        "pixels of the photo, at most 800 on its longer side, by which its edges lie beside those of the depth map",
         "7 of 823 right pairs are beyond it, 2 of them one frame that does lie beside its photo",
     ),
     "neighbours-disagree": Limit(
@@ -115,12 +115,12 @@ LIMITS: dict[str, Limit] = {
     ),
     "far-floats": Limit(
         30.0,
-        "metres, of the median of floats; asked for up to 200",
+        "metres, of the median of floats; asked for up to `float-millimetres.whole`",
         "centimetres of a table begin here; no depth camera of rooms measures so far",
     ),
     "float-millimetres": Limit(
         500.0,
-        "of the median of floats above 200 that are not whole; asked for below it",
+        "of the median of floats above `float-millimetres.whole` that are not whole; asked for below it",
         "the Kinect v2, whose drivers store such floats, begins at 0.5 m; rooms in centimetres are mostly below 5 m",
     ),
     "baseline-short": Limit(0.001, "metres, below which it is", "phones have cameras 10 mm apart"),
@@ -140,8 +140,143 @@ LIMITS: dict[str, Limit] = {
         "standard deviations of chance by which edges agree better with a mirrored or turned photo",
         "none of 823 right pairs, and 92 % of those with a mirrored or turned photo, reach it",
     ),
+    "edges-beside.elsewhere": Limit(
+        5.0,
+        "standard deviations of chance, of the agreement of edges at a displacement beyond 4 % of the size",
+        "none of 383 right pairs is told for it, from 4.5 on 2; of 182 shifted ones 171 are told, from 7 on 163",
+    ),
+    "edges-beside.lead": Limit(
+        2.0,
+        "standard deviations by which that agreement is larger than without a displacement",
+        "without it 2 of 383 right pairs more are told",
+    ),
+    "edges-beside.chance": Limit(
+        2.8,
+        "standard errors by which the photo's gradients at the displaced depth edges exceed those at a typical shift",
+        "5 of 383 right pairs are told with all these conditions, 2 of them one frame that does lie so",
+    ),
+    "edges-beside.others": Limit(
+        2.0, "standard errors by which they exceed those at the best other shift", "as for `edges-beside.chance`"
+    ),
+    "edges-beside.none": Limit(
+        3.0, "standard errors by which they exceed those without a displacement", "as for `edges-beside.chance`"
+    ),
+    "edges-beside.contrast": Limit(1.2, "times the gradients at a typical shift", "as for `edges-beside.chance`"),
+    "edges-beside.edges": Limit(
+        300,
+        "pixels of depth edges, below which no displacement up to 8 % is searched",
+        "25 in each of the fewest parts",
+    ),
+    "edges-beside.tiles": Limit(
+        12,
+        "parts of 32 x 32 pixels that have edges, below which no displacement up to 8 % is searched",
+        "the standard error of 12 parts is itself off by a fifth",
+    ),
+    "photo-other.side": Limit(
+        80,
+        "pixels of the depth map's longer side, below which edges do not exist",
+        "3 of 383 right pairs are below `photo-other` with it, 5 without it",
+    ),
+    "photo-other.length": Limit(
+        300,
+        "pixels of contours on the grid, below which edges do not exist",
+        "3 of 383 right pairs are below `photo-other`, 31 without the four conditions",
+    ),
+    "photo-other.coherence": Limit(
+        0.6,
+        "mean coherence of neighbouring edges, below which they do not exist",
+        "3 of 383 right pairs are below `photo-other` with it, 6 without it",
+    ),
+    "photo-other.spread": Limit(
+        0.045,
+        "standard deviation of the agreement by chance, from which on edges do not exist",
+        "3 of 383 right pairs are below `photo-other`, 31 without the four conditions",
+    ),
+    "other-picture.size": Limit(
+        0.05,
+        "relative difference of twice the principal point from another size, up to which it fits that",
+        "half of `other-picture`: the numbers have to fit the other size clearly better",
+    ),
+    "other-picture.offset": Limit(
+        0.05,
+        "of the size, from its middle to the principal point, up to which numbers fit in another order",
+        "half of `other-picture`: the numbers have to fit in the other order clearly better",
+    ),
+    "other-picture.ratio": Limit(
+        1.03,
+        "larger over smaller focal length, up to which numbers fit in another order",
+        "37 cameras of data sets and devices stay below 1.01",
+    ),
+    "far-millimetres.least": Limit(
+        0.05,
+        "metres, of the median, below which no unit is assumed",
+        "no depth camera measures nearer; of 110 maps of sensors and data sets the nearest median is 0.6 m",
+    ),
+    "far-millimetres.most": Limit(
+        80.0,
+        "metres, of the median, beyond which no unit is assumed",
+        "studies on KITTI score depth up to here; of 110 maps of sensors and data sets the farthest median is 5.2 m",
+    ),
+    "along-the-ray.planes": Limit(
+        6,
+        "planar windows that are planar only if values are distances along the ray",
+        "none of 28 right maps of sensors and data sets has any",
+    ),
+    "falls-with-distance.planes": Limit(
+        10,
+        "windows in which the values are linear, and not their reciprocals",
+        "28 right maps of sensors and data sets have at most 4",
+    ),
+    "poses.tolerance": Limit(
+        0.04,
+        "difference of two depths over the farther one, up to which frames agree in a pixel",
+        "right poses of 15 rendered sequences, off by 1 cm and half a degree, agree in 83 to 97 % of the pixels so",
+    ),
+    "poses.overlap": Limit(
+        0.3,
+        "share of a frame's points in another one's view, below which the two are not compared",
+        "of 10 pairs of photos, 4 degrees and more apart, 3 to 6 are below it; of a video none is",
+    ),
+    "poses.explained": Limit(
+        0.7,
+        "share of the pixels in which frames agree under the other reading",
+        "right poses of 15 rendered sequences: 0.83 to 0.97",
+    ),
+    "poses.weight": Limit(
+        0.5,
+        "pairs of frames that disagree wholly without motion, or as much of more pairs; fewer tell nothing apart",
+        "15 rendered sequences whose camera moves have 3.1 to 22",
+    ),
+    "poses-disagree.still": Limit(
+        1.2,
+        "times as many pixels disagree under the poses as without any motion",
+        "15 rendered sequences: right poses 0.1 to 0.27 times as many; with y up 1.15 to 1.6 in videos",
+    ),
+    "poses-far.alike": Limit(
+        0.7,
+        "share of the pixels in which frames agree without any motion",
+        "videos have 0.72 to 0.90, photos 0.06 to 0.17, as medians over their pairs",
+    ),
+    "float-millimetres.whole": Limit(
+        200.0,
+        "of the median of floats, from which on they are no metres; whole ones, or few different ones, are millimetres",
+        "laser scanners of cars end at 120 m; the nearest median of 110 maps of sensors and data sets is 0.6 m",
+    ),
+    "far-millimetres.5": Limit(
+        0.5,
+        "metres, of the median of multiples of 5 in 1/5000 m, below which they are not taken for it",
+        "the nearest median of 110 maps of sensors and data sets is 0.6 m",
+    ),
+    "far-millimetres.10": Limit(
+        0.3,
+        "metres, of the median of multiples of 10 in 0.1 mm, below which they are not taken for it",
+        "half of the nearest median of 110 maps of sensors and data sets, 0.6 m",
+    ),
 }
-"""By code: every warning that a command gives about its input, and what it refuses or asks for; see docs/checks.md."""
+"""By code: every warning that a command gives about its input, and what it refuses or asks for; see docs/checks.md.
+
+A name with a dot is another condition of the warning, or the question, before the dot.
+"""
 
 
 class Assumption(NamedTuple):

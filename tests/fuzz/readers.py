@@ -6,6 +6,7 @@ import contextlib
 import io
 import os
 import re
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -100,6 +101,15 @@ def _recording(*options: str) -> Callable[[Place], None]:
         command("upsample", place.input, "-o", place.out, "--dry-run", *options)
 
     return read
+
+
+def _zip(place: Place) -> None:
+    """Read a ZIP file, which is unpacked into the folder of temporary files."""
+    before, tempfile.tempdir = tempfile.tempdir, str(place.out)
+    try:
+        command("upsample", place.input / "scan.zip", "-o", place.out / "results", "--dry-run")
+    finally:
+        tempfile.tempdir = before
 
 
 def _confidences(place: Place) -> None:
@@ -336,6 +346,10 @@ READERS = (
     Reader("tum poses", seeds.tum, _sequence("groundtruth.txt")),
     Reader("kitti poses", seeds.poses_of_lines, _sequence("kitti.txt", "frames")),
     Reader("log poses", seeds.poses_of_lines, _sequence("trajectory.log", "frames")),
+    Reader("colmap", seeds.colmap, _sequence("sparse/0/images.bin")),
+    Reader("colmap text", lambda folder: seeds.colmap(folder, binary=False), _recording()),
+    Reader("colmap points", lambda folder: seeds.colmap(folder, depth=False), _recording()),
+    Reader("colmap text points", lambda folder: seeds.colmap(folder, binary=False, depth=False), _recording()),
     Reader("dsr scenes", seeds.dsr_scenes, _recording()),
     Reader("stray", lambda folder: captures.stray(folder, video=False), _recording()),
     Reader("stray video", captures.stray, _recording()),
@@ -345,6 +359,15 @@ READERS = (
     Reader("polycam", captures.polycam, _recording("--min-confidence", "0.5")),
     Reader("arkitscenes app", captures.arkitscenes, _recording()),
     Reader("open3d", captures.open3d, _recording()),
+    Reader("sens", seeds.sens, _recording()),
+    Reader("scannetpp", captures.scannetpp, _recording(), 2),
+    Reader("scannetpp deflate", lambda folder: captures.scannetpp(folder, "deflate"), _recording(), 1),
+    Reader("scannet", captures.scannet, _recording(), 2),
+    Reader("7-scenes", captures.seven_scenes, _recording(), 2),
+    Reader("sunrgbd app", captures.sunrgbd, _recording(), 2),
+    Reader("replica", captures.replica, _recording(), 2),
+    Reader("scanner app", captures.scanner_app, _recording("--min-confidence", "0.5"), 2),
+    Reader("zip", seeds.zipped, _zip),
     Reader("ros 1", lambda folder: captures.ros(folder / "scan.bag", 1), _recording(), 2),
     Reader("ros 1 jpeg", lambda folder: captures.ros(folder / "scan.bag", 1, floats=True, compressed=True),
            _recording(), 2),

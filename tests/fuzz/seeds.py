@@ -153,6 +153,17 @@ def poses_of_lines(folder: Path) -> None:
     written(folder / "trajectory.log", "\n".join(blocks) + "\n")
 
 
+def colmap(folder: Path, *, binary: bool = True, depth: bool = True) -> None:
+    """Write photos with a sparse model of COLMAP, with depth maps or with points alone."""
+    models = unit("test_format_colmap")
+    for number in range(models.FRAMES):
+        photo(folder / "images" / f"{number:03}.png", number)
+        if depth:
+            captures.save(folder / "depth" / f"{number:03}.png", captures.millimetres(number))
+    write = models.write_binary if binary else models.write_text
+    write(folder / "sparse" / "0", "OPENCV", models.NAMES, points=not depth)
+
+
 def confidence_folder(folder: Path) -> None:
     """Write frames with confidence maps in many formats."""
     for number, suffix in enumerate((".png", ".npy", ".npz", ".pfm", ".bmp")):
@@ -361,6 +372,21 @@ def ros2_alone(folder: Path) -> None:
 def r3d(folder: Path) -> None:
     """Write an archive of Record3D."""
     captures.record3d(folder / "scan.r3d")
+
+
+def sens(folder: Path) -> None:
+    """Write recordings of ScanNet, compressed in all ways."""
+    captures.sens(folder / "a.sens", lost=(1,))
+    captures.sens(folder / "b.sens", colour="raw", depth="raw", scale=5000.0)
+
+
+def zipped(folder: Path) -> None:
+    """Write a ZIP file of an export of 3D Scanner App."""
+    captures.scanner_app(folder / "scan")
+    with zipfile.ZipFile(folder / "scan.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        for path in sorted((folder / "scan").iterdir()):
+            archive.write(path, f"scan/{path.name}")
+    shutil.rmtree(folder / "scan")
 
 
 def record3d_folder(folder: Path) -> None:

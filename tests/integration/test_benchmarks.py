@@ -95,3 +95,15 @@ def test_benchmark_of_poses_counts_what_is_told() -> None:
     lines = run_benchmark("poses.py", "--scenes", "1", "--size", "48", "--right").splitlines()
     (row,) = [line for line in lines if line.startswith("| right |")]
     assert re.fullmatch(r"\| right( \| \d / \d / \d / \d){7} \|", row)
+
+
+def test_benchmark_of_encodings_counts_what_is_said() -> None:
+    printed = run_benchmark("depth_encodings.py", "--frames", "2", "--reduce", "2").splitlines()
+    (_, frames, *answers), _, *rows = [[cell.strip() for cell in line.split("|")[:-1]] for line in printed]
+    assert (frames, answers) == ("2 frames", ["read rightly", "warned", "refused", "silent"])
+    counts = {name: [int(cell) for cell in cells] for _, name, *cells in rows}
+    assert all(sum(each) == 2 for each in counts.values())
+    for right in ("millimetres, 16 bits", "float metres", "float millimetres", "SUN RGB-D's bits"):
+        assert counts[right] == [2, 0, 0, 0], right
+    for without_unit in ("0 to 1", "8 bits for viewing", "false colours", "disparity, 8 bits"):
+        assert counts[without_unit] == [0, 0, 2, 0], without_unit

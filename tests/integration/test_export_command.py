@@ -46,32 +46,46 @@ def set_poses(out):
 
 def test_exports_are_written_beside_the_frames_and_again_after_a_resumption(capture, tmp_path, capsys):
     out = tmp_path / "out"
-    asked = ("--only", "open3d,gaussian", "-o", out)
-    assert upsample(capture, *asked) == 0
+    assert upsample(capture, "--only", "open3d", "-o", out) == 0
     said = capsys.readouterr().out
     assert f"open3d: 2 frames -> {out / 'open3d'}" in said
     frame = {"info.json", "depth.png", "depth_metres.npy", "rgbd/color.png", "rgbd/depth.png", "rgbd/intrinsic.json"}
     assert names_in(out / "000") == frame
     assert "open3d/trajectory.log" not in names_in(out)
     set_poses(out)
-    assert upsample(capture, "--only", "open3d,nerfstudio", "-o", out) == 0
+    assert upsample(capture, "--only", "open3d,nerfstudio,gaussian", "-o", out) == 0
     assert "2 complete already" in capsys.readouterr().out
     assert "open3d/trajectory.log" in names_in(out)
     frames = json.loads((out / "transforms.json").read_text())["frames"]
-    assert [entry["file_path"] for entry in frames] == ["000/rgbd/color.png", "001/rgbd/color.png"]
+    assert [entry["file_path"] for entry in frames] == ["nerfstudio/images/000.png", "nerfstudio/images/001.png"]
     assert [entry["transform_matrix"][0][3] for entry in frames] == [0, 1]
     recorded = json.loads((out / "exports.json").read_text())["exports"]
     assert set(recorded) == {"open3d", "gaussian", "transforms.json"}
     assert all((out / name).is_file() for names in recorded.values() for name in names)
 
 
-def test_frames_without_poses_are_one_line_and_the_other_exports_are_written(capture, tmp_path, capsys):
-    assert upsample(capture, "--only", "depth,nerfstudio,open3d", "-o", tmp_path / "out") == 2
-    error = capsys.readouterr().err
-    assert error.startswith("error: nerfstudio: expected a pose of each frame, got none for 2 of 2")
-    assert error.count("\n") == 1
-    assert not (tmp_path / "out" / "transforms.json").exists()
-    assert (tmp_path / "out" / "open3d" / "intrinsic.json").is_file()
+@pytest.mark.parametrize("part", ["nerfstudio", "gaussian"])
+@pytest.mark.parametrize("more", [(), ("--dry-run",), ("--poses", "one.txt")])
+def test_frames_without_poses_are_refused_before_anything_is_computed(
+    capture, tmp_path, capsys, part, more, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "one.txt").write_text("0 0 0 0 0 0 0 1\n7 0 0 0 0 0 0 1\n")
+    assert upsample(capture, "--only", f"depth,open3d,{part}", *more, "-o", tmp_path / "out") == 2
+    [error] = capsys.readouterr().err.splitlines()
+    missing = "1 of 2, such as 001" if "--poses" in more else "2 of 2, such as 000"
+    assert error.startswith(f"error: {part}: expected a pose of each frame, got none for {missing}")
+    assert "--poses" in error
+    assert not (tmp_path / "out").exists()
+
+
+def test_poses_of_a_file_are_those_of_the_exports(capture, tmp_path):
+    (tmp_path / "poses.txt").write_text("".join(f"{number} {number} 2 3 0 0 0 1\n" for number in range(2)))
+    out = tmp_path / "out"
+    assert upsample(capture, "--only", "nerfstudio,gaussian", "--poses", tmp_path / "poses.txt", "-o", out) == 0
+    frames = json.loads((out / "transforms.json").read_text())["frames"]
+    assert [[row[3] for row in entry["transform_matrix"][:3]] for entry in frames] == [[0, 2, 3], [1, 2, 3]]
+    assert {"cameras.txt", "images.txt", "points3D.txt"} <= names_in(out / "gaussian/sparse/0")
 
 
 def test_foreign_file_in_place_of_an_export_is_left_alone(capture, tmp_path, capsys):

@@ -52,6 +52,14 @@ def is_at_work(folder):
     return any((folder / ".claims").glob("member-*")) if (folder / ".claims").is_dir() else False
 
 
+def wait_for_members(count, folder, program):
+    """Wait until so many processes take part in the work on a folder, or a program has ended."""
+    deadline = time.monotonic() + 120
+    while not program.ended and len(list((folder / ".claims").glob("member-*"))) < count:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
 def stop_at_work(program, folder):
     """Stop a program as soon as it is at work in a folder, but not while it becomes a member."""
     deadline = time.monotonic() + 120
@@ -124,7 +132,7 @@ def test_commands_of_the_same_settings_work_together(first, second, tmp_path, en
     with Program(*first, cwd=tmp_path, env=environment) as program:
         stop_at_work(program, tmp_path / "out")
         with Program(*second, cwd=tmp_path, env=environment) as other:
-            time.sleep(0.5)
+            wait_for_members(2, tmp_path / "out", other)
             program.send_signal(signal.SIGCONT)
             for each in (program, other):
                 assert each.communicate()[1] == ""

@@ -300,6 +300,28 @@ def test_results_with_poses_become_one_mesh(capture, capsys):
     assert abs(np.ptp(box[:, 0]) - 0.6) < 0.12  # the frames' boxes coincide
 
 
+@pytest.mark.parametrize(("part", "up"), [("input", "y"), ("rgbd", ""), ("depth", "")])
+def test_fused_mesh_says_its_frame_and_has_the_photos_colours(capture, part, up):
+    out, path = capture.parent / "out", capture.parent / "mesh.ply"
+    options = ("--method", "bicubic", "--only", f"depth,{part}")
+    assert upsample(capture, "--poses", capture.parent / "poses.txt", *options, "-o", out) == 0
+    for each in out.rglob("info.json"):
+        each.write_text(json.dumps({**json.loads(each.read_text()), "up": up}))
+    assert main(["fuse", str(out), "-o", str(path), "--voxel", "0.03"]) == 0
+    header = path.read_bytes().partition(b"end_header")[0].decode().splitlines()
+    assert f"comment world frame of the poses{': y up' if up else ''}; metres" in header
+    names = [line.split()[2] for line in header if line.startswith(("property float", "property uchar"))]
+    assert names[:9] == ["x", "y", "z", "nx", "ny", "nz", "red", "green", "blue"]
+    mesh = trimesh.load(path, process=False)
+    vertices, colours = np.asarray(mesh.vertices), np.asarray(mesh.visual.vertex_colors)[:, :3].astype(int)
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertex_normals, axis=1), 1, atol=1e-3)
+    wall = (vertices[:, 2] > 1.9) & (np.abs(vertices[:, 0]) > 0.7)
+    box = (vertices[:, 2] < 1.25) & (np.abs(vertices[:, 0]) < 0.2) & (np.abs(vertices[:, 1]) < 0.15)
+    for places, colour in ((wall, COLOURS[0]), (box, COLOURS[1])):
+        expected = colour if part != "depth" else 190
+        assert np.abs(np.median(colours[places], axis=0) - expected).max() <= 6
+
+
 def test_results_without_poses_and_damaged_ones_are_refused(capture, capsys):
     out, mesh = capture.parent / "out", capture.parent / "mesh.ply"
     assert upsample(capture, *DEPTH_ONLY, "-o", out) == 0

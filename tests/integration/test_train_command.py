@@ -663,8 +663,32 @@ def damage(*keys, value):
     return change
 
 
+class Unpickled:
+    """Makes a directory where it is unpickled."""
+
+    def __reduce__(self):
+        return os.mkdir, ("executed",)
+
+
 BATCHES = ("loops", "fit_loop", "epoch_loop.batch_progress")
+GROUP, FIRST = ("optimizer_states", 0, "param_groups", 0), ("optimizer_states", 0, "state", 0)
 REFUSED = {
+    "arguments that are objects": damage("hyper_parameters", value={"net": Unpickled()}),
+    "a state of a callback that is an object": damage("callbacks", "Curves", value=Unpickled()),
+    "steps below zero": damage(*FIRST, "step", value=torch.tensor(-5.0)),
+    "steps without number": damage(*FIRST, "step", value=torch.tensor(float("nan"))),
+    "steps of a vector": damage(*FIRST, "step", value=torch.zeros(1)),
+    "no average": lambda checkpoint: checkpoint["optimizer_states"][0]["state"][0].pop("exp_avg_sq"),
+    "averages of whole numbers": lambda checkpoint: checkpoint["optimizer_states"][0]["state"][0].update(
+        exp_avg=checkpoint["optimizer_states"][0]["state"][0]["exp_avg"].long()
+    ),
+    "parameters in another order": lambda checkpoint: checkpoint["optimizer_states"][0]["param_groups"][0][
+        "params"
+    ].reverse(),
+    "a group that is none": damage(*GROUP, value=(1,)),
+    "one beta": damage(*GROUP, "betas", value=(0.9,)),
+    "a rate without number": damage(*GROUP, "lr", value=float("nan")),
+    "batches below zero": damage(*BATCHES, "current", "ready", value=-3),
     "no callbacks": lambda checkpoint: checkpoint.pop("callbacks"),
     "callbacks without names": damage("callbacks", value=[1]),
     "sums as text": damage("callbacks", "Curves", "sums", value={"train/loss": "x"}),
@@ -698,7 +722,29 @@ REFUSED = {
          "checkpoint_callback_best": 0.1, "early_stop_callback_wait": 1, "early_stop_callback_patience": 1}
     ),
 }  # fmt: skip
+NAMED = {
+    "sums as text": "sums",
+    "a score as text": "best_model_score",
+    "a schedule as text": "lr_schedulers.0.last_epoch",
+    "no schedule": "lr_schedulers",
+    "a rate as text": "optimizer_states.0.param_groups.0.lr",
+    "averages of another size": "optimizer_states.0.state.0.exp_avg",
+    "averages as text": "optimizer_states.0.state.0",
+    "no loops": "loops.fit_loop",
+    "no weights": "net.guidance.0.conv.weight",
+    "steps below zero": "optimizer_states.0.state.0.step",
+    "steps of a vector": "optimizer_states.0.state.0.step",
+    "no average": "exp_avg_sq",
+    "parameters in another order": "optimizer_states.0.param_groups.0.params",
+    "one beta": "optimizer_states.0.param_groups.0.betas",
+    "batches below zero": "loops.fit_loop.epoch_loop.batch_progress.current.ready",
+}
+"""What lines of refused states name."""
 TAKEN = {
+    "a step that is no tensor": damage(*FIRST, "step", value=3),
+    "no averages": lambda checkpoint: checkpoint["optimizer_states"][0]["state"].pop(0),
+    "averages of no parameter": damage("optimizer_states", 0, "state", 999, value={"exp_avg": torch.zeros(3)}),
+    "another kind of averages": damage(*GROUP, "amsgrad", value=True),
     "callbacks of other classes": lambda checkpoint: checkpoint["callbacks"].update(
         {"OnExceptionCheckpoint": {"dirpath": "mine"}, "BasePredictionWriter": {"output_dir": "mine"},
          "\x1b]0;evil\x07ModelCheckpoint": {"best_model_path": "mine/thesis.txt"}}
@@ -756,6 +802,7 @@ def test_state_that_is_none_of_the_training_is_refused_in_one_line(crafted, tmp_
     line = "error: out/checkpoints/last.ckpt: expected a checkpoint of this training, got a damaged or foreign one"
     assert (code, len(errors)) == (2, 1), errors
     assert errors[0].startswith(line)
+    assert NAMED.get(case, "") in errors[0].removeprefix(line)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine", "out"]
     assert tree(tmp_path / "mine") == ["thesis.txt"]
 
@@ -769,6 +816,32 @@ def test_state_that_is_not_the_training_s_has_no_say(crafted, tmp_path, within, 
     assert last_step(tmp_path / "out") == 4
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine", "out"]
     assert (tmp_path / "mine" / "thesis.txt").read_text() == "precious"
+
+
+def test_error_of_the_training_itself_is_not_one_of_the_checkpoint(tmp_path, within, interrupt, monkeypatch):
+    (tmp_path / "modules").mkdir()
+    (tmp_path / "modules" / "own_errors.py").write_text(
+        "import torch\nfrom pathlib import Path\nfrom lightning.pytorch.callbacks import Callback\n"
+        "def act(trainer):\n"
+        "    exec(Path('act').read_text() if Path('act').is_file() else '')\n"
+        "class Own(Callback):\n"
+        "    def on_train_start(self, trainer, *_):\n        act(trainer)\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path / "modules"))
+    interrupt(3)
+    assert within(*FOUR, "+callbacks.own._target_=own_errors.Own")[0] == 130
+    interrupt(None)
+    (tmp_path / "act").write_text("{}['of mine']")
+    with pytest.raises(KeyError, match="of mine"):
+        within("resume=out", "trust=own_errors.Own")
+    for line, told in (
+        ("torch.empty(1 << 60)", "error: not enough memory; "),
+        ("[each.data.fill_(torch.nan) for each in trainer.model.parameters()]", "error: out: the training diverged at"),
+    ):
+        (tmp_path / "act").write_text(line)
+        code, _, errors = within("resume=out", "trust=own_errors.Own")
+        assert code == 2
+        assert errors[-1].startswith(told)
 
 
 LINKS = {

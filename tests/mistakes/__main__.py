@@ -18,14 +18,13 @@ from pathlib import Path
 import numpy as np
 from commands import run_python
 
-from mistakes.frames import Frame, rendered_frame, rendered_sequence, shared_frames
-from mistakes.kinds import KINDS, RIGHT, Case, Material
+from mistakes.frames import Frame, all_frames, rendered_sequence
+from mistakes.kinds import ANSWERS, KINDS, RIGHT, Case, Material, judged
 
 ROOT = Path(__file__).resolve().parents[2]
-LISTED, RENDERED, SIZE, SEQUENCE_SIZE = 6, 24, 256, 128
+LISTED, SEQUENCE_SIZE = 6, 128
 SEQUENCES = (0, 1, 2, 3, 4, 6, 7, 8, 9, 10, 11, 12)
-"""Frames of a list, rendered frames to draw from and their size; scenes of sequences, no landscape, and theirs."""
-ANSWERS = ("read rightly", "warned", "refused", "silent")
+"""Frames of a list, and size of sequences; their scenes, no landscape."""
 
 
 def draw(number: int, seed: int, sources: dict[str, Callable[[], Frame]], folder: Path) -> tuple[str, str, Case]:
@@ -56,12 +55,8 @@ def answer(case: Case, folder: Path) -> tuple[str, str]:
         raise RuntimeError(f"exit {done.returncode}: {done.stderr[-500:]}")
     infos = [json.loads(path.read_text()) for path in sorted(out.rglob("info.json"))]
     warnings = [each["message"] for info in infos for each in info["warnings"]]
-    if warnings:
-        return "warned", warnings[0]
     read = infos[0]["input_depth"]
-    unit, range_type = case.reading or (np.nan, "")
-    rightly = abs(read["unit"] / unit - 1) < 1e-3 and read["range_type"] == range_type
-    return "read rightly" if rightly else "silent", ""
+    return judged(case, warnings, read["unit"], read["range_type"]), "".join(warnings[:1])
 
 
 def main() -> None:
@@ -72,12 +67,7 @@ def main() -> None:
     parser.add_argument("--shared", type=Path, default=os.environ.get("DSR_SHARED", ROOT.parent / "shared"))
     parser.add_argument("--only", default="", help="kinds whose name contains this")
     options = parser.parse_args()
-    sources: dict[str, Callable[[], Frame]] = {}
-    if options.shared.is_dir():
-        sources = shared_frames(options.shared)
-    else:
-        for number in range(RENDERED):
-            sources[f"rendered/{number}"] = lambda number=number: rendered_frame(number, SIZE)  # type: ignore[misc]
+    sources = all_frames(options.shared)
     counts: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
     started = time.monotonic()
     for number in range(options.cases):

@@ -27,6 +27,8 @@ DATA_SETS = (
 """Folders that dsr finds scenes in by itself."""
 LIDAR_FOCAL = 1440.0
 """Pixels of a phone's photo of 1920 x 1440, which comes without a camera."""
+RENDERED, SIZE = 24, 256
+"""Rendered frames to draw from, and their size in pixels."""
 LENGTH, STEP = 5, 0.03
 """Frames of a sequence, and distance of their places as a fraction of that to what they look at."""
 
@@ -50,6 +52,13 @@ class Frame:
         return replace(
             self, photo=self.photo[:height, :width], depth=depth, camera=self.camera.crop(0, 0, height, width)
         )
+
+
+def all_frames(shared: Path) -> dict[str, Callable[[], Frame]]:
+    """Return what reads each frame of the shared material by name, or renders some where there is none."""
+    if shared.is_dir():
+        return shared_frames(shared)
+    return {f"rendered/{number}": partial(rendered_frame, number, SIZE) for number in range(RENDERED)}
 
 
 def shared_frames(shared: Path) -> dict[str, Callable[[], Frame]]:

@@ -13,6 +13,8 @@ from scipy.spatial.transform import Rotation
 from mistakes.frames import Frame
 
 RIGHT = "right"
+ANSWERS = ("read rightly", "warned", "refused", "silent")
+"""What may be said of a case."""
 CENTIMETRES, SHIFT, MILLIMETRES = 1e2, 0.05, 1e3
 """Values of a metre; and the shift of a photo as a fraction of its width."""
 
@@ -22,6 +24,13 @@ class Case(NamedTuple):
 
     arguments: list[str]
     reading: tuple[float, str] | None = None
+
+
+def judged(case: Case, warnings: Sequence[str], unit: float, range_type: str) -> str:
+    """Return which of :data:`ANSWERS` a case that is not refused was given, by how its values were read."""
+    wanted, of_type = case.reading or (np.nan, "")
+    rightly = abs(unit / wanted - 1) < 1e-3 and range_type == of_type
+    return "warned" if warnings else "read rightly" if rightly else "silent"
 
 
 class Material(NamedTuple):

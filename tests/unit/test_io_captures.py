@@ -84,6 +84,16 @@ def test_camera_depth_and_pose_of_each_frame_come_from_the_capture(folder, layou
             np.testing.assert_allclose(picture.pose, captures.pose(number), atol=1e-6)
 
 
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_world_and_time_are_those_that_the_capture_says(folder, layout):
+    """ARKit's world has y up, that of ARKitScenes' laser scans z; Stray Scanner and ARKitScenes have times."""
+    pictures = read_all(LAYOUTS[layout](folder))
+    assert {picture.up for picture in pictures} == {"z" if layout == "arkitscenes" else "y"}
+    step = {"stray video": 1 / 60, "stray files": 1 / 60, "arkitscenes": 0.1}.get(layout)
+    for number, picture in enumerate(pictures):
+        assert picture.time == (None if step is None else pytest.approx(10 + step * number))
+
+
 @pytest.mark.parametrize("layout", [name for name in LAYOUTS if name != "record3d export"])
 @pytest.mark.parametrize(("least", "columns"), [(None, 0), (0, 0), (0.5, 2), (0.6, 4), (1, 4)])
 def test_pixels_of_too_little_confidence_become_holes(folder, layout, least, columns):
@@ -120,6 +130,7 @@ def test_open3d_folder_has_its_camera_and_its_trajectory(folder, camera):
     for number, picture in enumerate(pictures):
         assert picture.camera == Camera(SIZE[1], SIZE[0], *INTRINSICS)
         np.testing.assert_allclose(picture.pose, captures.pose(number), atol=1e-9)
+        assert (picture.up, picture.time) == ("", None)
     (folder / "depth" / "000001.png").unlink()
     found = find_pairs_of_folder(folder)
     assert any("no poses: trajectory.log has 3, for 2 pairs" in fact.text for fact in found.assumptions)
@@ -140,7 +151,8 @@ def test_recordings_of_ros_are_paired_by_time_with_the_aligned_depth(folder, ver
         assert picture.camera == Camera(SIZE[1], SIZE[0], *INTRINSICS)
         np.testing.assert_allclose(picture.depth_lr[0], captures.depth(number), atol=6e-4)
         assert abs(255 * picture.rgb.permute(1, 2, 0).numpy() - captures.photo(number)).mean() < 4
-        assert (picture.pose, picture.encoding.suffix) == (None, ".npy")
+        assert (picture.pose, picture.up, picture.encoding.suffix) == (None, "", ".npy")
+        assert picture.time == pytest.approx(100 + 0.033 * number, abs=1e-6)
 
 
 def test_recording_whose_description_is_too_large_is_refused_before_it_is_read(folder):

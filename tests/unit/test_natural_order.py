@@ -3,6 +3,8 @@
 import json
 import random
 import re
+import zipfile
+from functools import partial
 
 import captures
 import numpy as np
@@ -24,13 +26,14 @@ NAMES = {
     "gaps": "{gap}",
     "two numbers": "v2_{0}_{late}",
     "some zeros": "{0:02}",
+    "times": "{time:.3f}",
 }
 """Names of frames 0 to 11; as texts they sort otherwise, but for those with enough zeros."""
 
 
 def named(style, number):
     """Return the name of a frame."""
-    return NAMES[style].format(number, gap=number**2, late=95 + number)
+    return NAMES[style].format(number, gap=number**2, late=95 + number, time=95.5 + number)
 
 
 @pytest.fixture
@@ -63,7 +66,7 @@ def pairs(folder, style, photo, depth):
 def frame_numbers(pairs):
     """Return the numbers of the frames that maps show, which lie half a metre farther with each number."""
     pictures = [read_picture(pair, Reading(unit=pair.unit or 1e-3)) for pair in pairs]
-    return [round(2 * float(picture.depth_lr.min() - captures.depth().min())) for picture in pictures], pictures
+    return [round(2 * float(np.nanmin(picture.depth_lr) - captures.depth().min())) for picture in pictures], pictures
 
 
 def pose_numbers(poses):
@@ -71,12 +74,53 @@ def pose_numbers(poses):
     return [None if pose is None else round(10 * pose[0, 3]) for pose in poses]
 
 
+def replica(folder, style):
+    """Write renderings whose poses are those of all numbers, or of the frames that are there."""
+    captures.replica(folder, step=4 if style == "gaps" else 1)
+    for path in (folder / "results").iterdir():
+        if style != "gaps":
+            path.rename(path.with_name(f"{path.stem[:5]}{named(style, int(path.stem[5:]))}{path.suffix}"))
+    return folder
+
+
+def tum(folder, style):
+    """Write lists of TUM that name files of any names, by time."""
+    lines = {"rgb": [], "depth": [], "groundtruth": []}
+    for number in range(FRAMES):
+        name, time = named(style, number), f"{95.5 + number / 8:.4f}"
+        captures.save(folder / "rgb" / f"{name}.png", captures.photo(number))
+        captures.save(folder / "depth" / f"{name}.png", 5 * captures.millimetres(number))
+        for kind in ("rgb", "depth"):
+            lines[kind].append(f"{time} {kind}/{name}.png")
+        lines["groundtruth"].append(f"{time} {0.1 * number} 0 0 0 0 0 1")
+    for kind, each in lines.items():
+        (folder / f"{kind}.txt").write_text("\n".join(each) + "\n")
+    return folder
+
+
+def zipped(folder, style):
+    """Write a ZIP file of a capture of Polycam."""
+    renamed(captures.polycam(folder), style, first=1000)
+    with zipfile.ZipFile(folder / "scan.zip", "w") as archive:
+        for path in (folder / "keyframes").rglob("*.*"):
+            archive.write(path, path.relative_to(folder))
+    return folder / "scan.zip"
+
+
+NUMBERS = ["plain", "gaps", "some zeros"]
 CAPTURES = {
     "stray": (lambda folder, style: renamed(captures.stray(folder, video=False), style), ["plain"]),
     "polycam": (lambda folder, style: renamed(captures.polycam(folder), style, first=1000), list(NAMES)),
     "open3d": (lambda folder, style: renamed(captures.open3d(folder), style), list(NAMES)),
     "record3d": (lambda folder, _: captures.record3d(folder / "scan.r3d").parent, ["plain"]),
-    "arkitscenes": (lambda folder, _: captures.arkitscenes(folder, start=99.5), ["plain"]),
+    "arkitscenes": (lambda folder, _: captures.arkitscenes(folder, start=99.5), ["times"]),
+    "7-scenes": (lambda folder, style: captures.seven_scenes(folder, partial(named, style)), list(NAMES)),
+    "scannet": (lambda folder, style: renamed(captures.scannet(folder), style), NUMBERS),
+    "sens": (lambda folder, _: captures.sens(folder / "scene.sens"), ["plain"]),
+    "scanner app": (lambda folder, style: captures.scanner_app(folder, partial(named, style)), NUMBERS),
+    "replica": (replica, NUMBERS),
+    "tum": (tum, list(NAMES)),
+    "zip": (zipped, list(NAMES)),
 }
 
 

@@ -1,12 +1,17 @@
 """Frames as other programs read them: axes, units, intrinsics and poses, read back by code of their own."""
 
 import json
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
+import trimesh
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from dsr.geometry.camera import Camera
 from dsr.io.open3d import write_open3d, write_rgbd
@@ -72,20 +77,59 @@ def test_depth_beyond_sixteen_bits_is_a_hole_and_said(tmp_path):
     assert str(fact) == "rgbd/depth.png: what is beyond 65.5 m is written as a hole (96 pixels)"
 
 
-def test_transforms_have_opengl_axes_and_find_their_files(make, tmp_path):
-    frames = [make(0), make(1)]
+def read_as_nerfstudio(path, moved, scale):
+    """Return frames and points as nerfstudio's parser has them after it has turned, moved and scaled the world.
+
+    A frame: name of the photo, its pixels, depth, intrinsics fx fy cx cy, and camera to world, of OpenGL's axes.
+    """
+    entries, folder = json.loads(path.read_text()), path.parent
+    assert entries["depth_unit_scale_factor"] == 0.001  # the parser's own default
+    frames = []
+    for entry in sorted(entries["frames"], key=lambda entry: entry["file_path"]):
+        camera = entries if "fl_x" in entries else entry
+        depth = cv2.imread(str(folder / entry["depth_file_path"]), cv2.IMREAD_ANYDEPTH).astype(np.float64) * 1e-3
+        pose = moved @ np.array(entry["transform_matrix"])
+        pose[:3, 3] *= scale
+        photo = cv2.imread(str(folder / entry["file_path"]))
+        assert photo.shape[:2] == depth.shape == (camera["h"], camera["w"])
+        numbers = [camera[name] for name in ("fl_x", "fl_y", "cx", "cy")]
+        frames.append((Path(entry["file_path"]).name, photo[..., ::-1], depth * scale, numbers, pose))
+    cloud = trimesh.load(folder / entries["ply_file_path"])
+    ways = [moved @ np.vstack((entries["applied_transform"], [0, 0, 0, 1])), moved]  # of versions up to and since 1.1
+    clouds = [scale * (np.asarray(cloud.vertices) @ way[:3, :3].T + way[:3, 3]) for way in ways]
+    np.testing.assert_allclose(*clouds, atol=1e-6)
+    return frames, clouds[0], np.asarray(cloud.colors)[:, :3]
+
+
+@pytest.mark.parametrize("second", [CAMERA, Camera(12, 8, 20.0, 21.0, 5.25, 3.5)])
+def test_transforms_are_read_as_nerfstudio_reads_them(make, tmp_path, second):
+    frames = [make(1, camera=second), make(0)]
     path = tmp_path / "out" / "transforms.json"
-    assert write_transforms(path, frames) == [path]
-    entries = json.loads(path.read_text())
-    assert [entries[key] for key in ("w", "h", "fl_x", "fl_y", "cx", "cy")] == [12, 8, 10, 11, 5.75, 4]
-    for frame, entry in zip(frames, entries["frames"], strict=True):
-        z = np.array(Image.open(path.parent / entry["depth_file_path"])) / 1000
-        assert cv2.imread(str(path.parent / entry["file_path"])).shape == (8, 12, 3)
-        v, u = np.mgrid[0:8, 0:12] + 0.5
-        points = np.stack(((u - entries["cx"]) / 10 * z, -(v - entries["cy"]) / 11 * z, -z, np.ones_like(z)))
-        world = np.einsum("ij,jhw->ihw", np.array(entry["transform_matrix"]), points)[:3]
-        known = z > 0
-        np.testing.assert_allclose(world[:, known], world_points(frame)[:, known], atol=1e-3)
+    files = write_transforms(path, frames)
+    assert {file.relative_to(path.parent).as_posix() for file in files} == {
+        "transforms.json", "nerfstudio/points.ply", *(
+            f"nerfstudio/{kind}/room_00{number}.png" for kind in ("images", "depths") for number in (0, 1))
+    }  # fmt: skip
+    moved = np.block([[Rotation.from_rotvec((0.3, -1.2, 0.4)).as_matrix(), np.array([[4.0], [-1], [2]])], [0, 0, 0, 1]])
+    read, points, colours = read_as_nerfstudio(path, moved, 0.25)
+    assert [name for name, *_ in read] == ["room_000.png", "room_001.png"]
+    known = sum(int(np.isfinite(depth_map(number)).sum()) for number in (0, 1))
+    assert len(points) == known
+    found = 0
+    for _, photo, depth, (fx, fy, cx, cy), pose in read:
+        seen = (points - pose[:3, 3]) @ pose[:3, :3]  # OpenGL: x right, y up, z backwards
+        z = -seen[:, 2]
+        column, row = cx + fx * seen[:, 0] / z - 0.5, cy - fy * seen[:, 1] / z - 0.5
+        inside = (np.abs(column - np.rint(column)) < 1e-3) & (np.abs(row - np.rint(row)) < 1e-3) & (z > 0)
+        inside &= (column > -0.5) & (column < 11.5) & (row > -0.5) & (row < 7.5)
+        u, v = np.rint(column[inside]).astype(int), np.rint(row[inside]).astype(int)
+        own = np.abs(depth[v, u] - z[inside]) < 0.25 * 1e-3
+        found += int(own.sum())
+        np.testing.assert_array_equal(photo[v, u][own], colours[inside][own])
+    assert found == known
+    first = json.loads(path.read_text())
+    np.testing.assert_allclose(np.array(first["frames"][0]["transform_matrix"]) @ np.diag([1, -1, -1, 1]), POSE)
+    assert ("fl_x" in first) == (second == CAMERA)
 
 
 def test_transforms_of_different_cameras_have_intrinsics_for_each_frame(make, tmp_path):
@@ -102,12 +146,11 @@ def test_single_frame_without_a_pose_stands_at_the_origin(make, tmp_path):
     assert entry["transform_matrix"] == np.diag([1.0, -1, -1, 1]).tolist()
 
 
-def test_frames_without_poses_are_refused_in_one_line(make, tmp_path):
-    with pytest.raises(
-        ValueError, match=r"^nerfstudio: expected a pose of each frame, got none for 1 of 2, .*room/001"
-    ):
-        write_transforms(tmp_path / "t.json", [make(0), make(1, pose=None)])
-    assert not (tmp_path / "t.json").exists()
+@pytest.mark.parametrize(("part", "write"), [("nerfstudio", write_transforms), ("gaussian", write_splatting)])
+def test_frames_without_poses_are_refused_in_one_line(make, tmp_path, part, write):
+    with pytest.raises(ValueError, match=rf"^{part}: expected a pose of each frame, got none for 1 of 2, .*room/001"):
+        write(tmp_path / "made", [make(0), make(1, pose=None)])
+    assert not (tmp_path / "made").exists()
 
 
 def test_open3d_folder_has_colour_depth_intrinsics_and_trajectory(make, tmp_path):
@@ -184,27 +227,63 @@ def test_splatting_without_poses_has_depth_alone_and_holes_alone_are_refused(mak
     assert not (tmp_path / "h").exists()
 
 
-def test_rerun_recording_is_read_back(make, tmp_path):
+def read_recording(path):
+    """Return the columns of a recording by entity and name, as rerun reads them."""
     chunk = pytest.importorskip("rerun.chunk", reason="pip install dsr[rerun]")
-    frames = [make(0), make(1, pose=None)]
-    path = tmp_path / "scene.rrd"
-    assert write_rerun(path, frames) == [path]
-    assert [each.name for each in tmp_path.iterdir() if each.is_file()] == ["scene.rrd"]
     columns = {}
     for part in chunk.RrdReader(str(path)).stream():
         batch = part.to_record_batch()
         for name in batch.schema.names:
-            columns[part.entity_path, name] = batch.column(name).to_pylist()
+            columns.setdefault((part.entity_path, name), []).extend(batch.column(name).to_pylist())
+    return columns
+
+
+def test_rerun_recording_is_read_back(make, tmp_path):
+    frames = [make(0), make(1, pose=None)]
+    path = tmp_path / "scene.rrd"
+    pytest.importorskip("rerun", reason="pip install dsr[rerun]")
+    assert write_rerun(path, frames) == [path]
+    assert [each.name for each in tmp_path.iterdir() if each.is_file()] == ["scene.rrd"]
+    columns = read_recording(path)
+    assert {"/", "/camera", "/camera/rgb", "/camera/depth"} <= {entity for entity, _ in columns}
     matrices = np.array(columns["/camera", "Pinhole:image_from_camera"]).reshape(2, 3, 3)
     np.testing.assert_allclose(matrices[0].T, [[10, 0, 5.75], [0, 11, 4], [0, 0, 1]])
     shifts = np.array(columns["/camera", "Transform3D:translation"]).reshape(2, 3)
     np.testing.assert_allclose(shifts, [POSE[:3, 3], [0, 0, 0]])
     turns = np.array(columns["/camera", "Transform3D:mat3x3"]).reshape(2, 3, 3)
     np.testing.assert_allclose(turns[0].T, POSE[:3, :3])
-    for number, values in enumerate(columns["/camera/depth", "DepthImage:buffer"]):
-        depth = np.frombuffer(bytes(values[0]), np.float32).reshape(8, 12)
-        np.testing.assert_array_equal(depth, np.nan_to_num(depth_map(number)))
-    assert len(columns["/camera/rgb", "EncodedImage:blob"]) == 2
+    meters = np.array(columns["/camera/depth", "EncodedDepthImage:meter"]).ravel()
+    for number, [blob] in enumerate(columns["/camera/depth", "EncodedDepthImage:blob"]):
+        values = cv2.imdecode(np.frombuffer(bytes(blob), np.uint8), cv2.IMREAD_UNCHANGED)
+        assert values.dtype == np.uint16
+        np.testing.assert_allclose(values / meters[number], np.nan_to_num(depth_map(number)), atol=5.1e-4)
+    for number, [blob] in enumerate(columns["/camera/rgb", "EncodedImage:blob"]):
+        assert bytes(blob[:3]) == b"\xff\xd8\xff"
+        photo = cv2.imdecode(np.frombuffer(bytes(blob), np.uint8), cv2.IMREAD_COLOR)
+        np.testing.assert_allclose(photo[4:, :, 2], 255 * number / 10, atol=4)
+    assert columns["/camera/depth", "frame"] == [0, 1]
+    assert ("/camera/depth", "time") not in columns
+
+
+@pytest.mark.parametrize(("ups", "axes"), [(("y", "y"), (3, 1, 6)), (("z", "z"), (3, 5, 1)), (("", ""), (3, 2, 5)),
+                                           (("y", ""), (3, 2, 5))])  # fmt: skip
+def test_rerun_world_has_the_captures_axes(make, tmp_path, ups, axes):
+    """The numbers are rerun's: 1 up, 2 down, 3 right, 4 left, 5 forward, 6 back."""
+    pytest.importorskip("rerun", reason="pip install dsr[rerun]")
+    write_rerun(tmp_path / "s.rrd", [replace(make(number), up=up) for number, up in enumerate(ups)])
+    columns = read_recording(tmp_path / "s.rrd")
+    [[coordinates]] = columns["/", "ViewCoordinates:xyz"]
+    assert tuple(coordinates) == axes
+    assert all(tuple(each) == (3, 2, 5) for [each] in columns["/camera", "Pinhole:camera_xyz"])
+
+
+@pytest.mark.parametrize("start", [12.5, 1305031102.25])
+def test_rerun_timeline_is_the_frames_times(make, tmp_path, start):
+    pytest.importorskip("rerun", reason="pip install dsr[rerun]")
+    write_rerun(tmp_path / "s.rrd", [replace(make(number), time=start + number / 2) for number in range(2)])
+    times = read_recording(tmp_path / "s.rrd")["/camera/depth", "time"]
+    seconds = [each.timestamp() if isinstance(each, datetime) else each.total_seconds() for each in times]
+    np.testing.assert_allclose(seconds, [start, start + 0.5], atol=1e-6)
 
 
 def test_rerun_without_the_library_names_the_extra(make, tmp_path, monkeypatch):

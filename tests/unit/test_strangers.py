@@ -111,6 +111,49 @@ def test_checkpoint_of_something_else_is_refused(tmp_path, content):
     assert "\n" not in str(refused.value)
 
 
+class History(OneWeight):
+    """A training of two numbers by an optimiser whose state has lists, of its last steps."""
+
+    def __init__(self):
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.tensor([0.5, -1.0]))
+
+    def training_step(self, batch, _):
+        return (self.weight.cosh() * torch.tensor([1.0, 3.0]) - batch * self.weight).sum()
+
+    def configure_optimizers(self):
+        return torch.optim.LBFGS(self.parameters(), 0.1, max_iter=2, history_size=3)
+
+
+def train_history(folder, steps, resume=None):
+    module, quiet = History(), {"logger": False, "enable_checkpointing": False, "default_root_dir": folder}
+    trainer = make_trainer(torch.device("cpu"), steps, 8, callbacks=[], **quiet)
+    fit(trainer, module, torch.utils.data.DataLoader(torch.ones(8)), resume)
+    return trainer, module.weight.detach()
+
+
+@pytest.mark.parametrize("steps", [1, 2, 4])
+def test_history_of_an_optimiser_goes_on_as_saved(tmp_path, steps):
+    train_history(tmp_path, steps)[0].save_checkpoint(tmp_path / "last.ckpt", weights_only=False)
+    assert torch.equal(train_history(tmp_path, 6, tmp_path / "last.ckpt")[1], train_history(tmp_path, 6)[1])
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("old_dirs", [torch.zeros(9)] * 3), ("old_stps", []), ("ro", ["x"] * 3), ("old_dirs", 7), ("d", torch.zeros(9)),
+        ("n_iter", "x"), ("prev_flat_grad", None), ("al", [None]),
+    ],
+)  # fmt: skip
+def test_history_of_another_optimiser_is_refused(tmp_path, key, value):
+    train_history(tmp_path, 4)[0].save_checkpoint(tmp_path / "last.ckpt", weights_only=False)
+    checkpoint = torch.load(tmp_path / "last.ckpt", weights_only=True)
+    checkpoint["optimizer_states"][0]["state"][0][key] = value
+    torch.save(checkpoint, tmp_path / "last.ckpt")
+    with pytest.raises(ValueError, match=r"last\.ckpt: expected a checkpoint of this training.*optimizer_states"):
+        train_history(tmp_path, 6, tmp_path / "last.ckpt")
+
+
 class _Interrupted:
     """A loader that is interrupted as it starts, after Lightning has tried whether it can."""
 

@@ -5,22 +5,27 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 from rich.console import Console
 
 from dsr.app.requests import FuseRequest
 from dsr.app.upsample.outputs import INFO
 from dsr.app.upsample.parts import ERRORS
-from dsr.app.upsample.stored import read_camera, read_depth, read_errors, read_info
+from dsr.app.upsample.stored import read_camera, read_depth, read_errors, read_info, read_up
 from dsr.geometry.pose_check import check
 from dsr.geometry.rigid_motion import as_rigid
 from dsr.geometry.tsdf import PosedMap, fuse_maps, suggest_voxel
-from dsr.io.exports import write_ply
+from dsr.io.exports import INPUT, read_input, world_comment, write_ply
+from dsr.io.images import read_pixels
+from dsr.io.scene_files import RGBD
 from dsr.notes import Assumption, expect_no_warning
 from dsr.utils.console import one_line, show
 from dsr.utils.guards import natural_key
 
 _GREY = 190
+_SEEN = 2.0
+"""Distance between a point and a frame's depth, in voxels, up to which the frame sees it."""
 _LEAST_ERROR = 1e-4
 """Smallest expected error in metres that a weight distinguishes."""
 
@@ -60,7 +65,10 @@ def fuse(request: FuseRequest, console: Console) -> list[str]:
         mesh = fuse_maps(maps, voxel)
     except ValueError as error:
         raise ValueError(f"{frames[0]}{' and others' if len(frames) > 1 else ''}: {error}") from error
-    write_ply(request.output, mesh.vertices, mesh.normals, np.full(mesh.vertices.shape, _GREY, np.uint8), mesh.faces)
+    colours = _colours(mesh.vertices, frames, max_error, _SEEN * voxel, problems)
+    ups = {read_up(read_info(folder / INFO)) for folder in frames}
+    comment = world_comment(ups.pop() if len(ups) == 1 else "")
+    write_ply(request.output, mesh.vertices, colours, mesh.normals, mesh.faces, frame=comment)
     size = f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles, voxels of {1e3 * voxel:.3g} mm"
     show(console, f"{_count(frames)} -> {request.output}: {size}; in the world's frame of the poses")
     return problems
@@ -80,6 +88,53 @@ def _load(folder: Path, max_error: float) -> PosedMap:
         with np.errstate(invalid="ignore"):
             depth = np.where(deviation <= max_error * depth, depth, np.nan)
     return PosedMap(depth, camera, as_rigid(info["pose"], f"{path}: pose"), deviation)
+
+
+def _colours(
+    vertices: np.ndarray, frames: Sequence[Path], max_error: float, near: float, problems: list[str]
+) -> np.ndarray:
+    """Return the mean colour that the photos of results have at points, (N, 3) uint8, grey where none sees them.
+
+    Args:
+        vertices: (N, 3) in the world's frame.
+        frames: the results.
+        max_error: expected error of the depth, relative to it, from which a pixel does not count.
+        near: metres between a point and the depth of a frame that sees it.
+        problems: gets a line for a photo that cannot be read.
+
+    """
+    total, weight = np.zeros(vertices.shape), np.zeros(len(vertices))
+    for folder in frames:
+        try:
+            photo = _photo(folder)
+        except (ValueError, OSError) as error:
+            problems.append(one_line(error))
+            continue
+        if photo is None:
+            continue
+        depth, camera, pose, _ = _load(folder, max_error)
+        x, y, z = ((vertices - pose[:3, 3]) @ pose[:3, :3]).T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        inside = (z > 0) & (u > -0.5) & (v > -0.5) & (u < camera.width - 0.5) & (v < camera.height - 0.5)
+        places = np.flatnonzero(inside)
+        rows, columns = (np.rint(each[places]).astype(np.intp) for each in (v, u))
+        seen = np.abs(depth[rows, columns] - z[places]) <= near
+        places, rows, columns = places[seen], rows[seen], columns[seen]
+        own = photo[rows * photo.shape[0] // camera.height, columns * photo.shape[1] // camera.width]
+        total[places] += own / z[places, None] ** 2
+        weight[places] += 1 / z[places] ** 2
+    known = weight > 0
+    total[known] /= weight[known, None]
+    return np.where(known[:, None], np.rint(total), _GREY).astype(np.uint8)
+
+
+def _photo(folder: Path) -> np.ndarray | None:
+    """Return the photo of a result, (H, W, 3) uint8, perhaps smaller than its depth; None if there is none."""
+    if (folder / INPUT).is_file():
+        return read_input(folder / INPUT)[0]
+    path = folder / "rgbd" / RGBD[0]
+    return read_pixels(path, cv2.IMREAD_COLOR)[..., ::-1] if path.is_file() else None
 
 
 def _faults(frames: Sequence[Path], max_error: float) -> list[Assumption]:

@@ -42,13 +42,10 @@ _HOLE = 0.5
 """Strength of the border of a wider hole."""
 _AROUND, _FAINT, _STRONGEST = 31, 0.004, 3.0
 """Width in pixels of what an edge of a photo is compared with, and least and largest of its values."""
-_LEAST_SIDE, _LEAST_LENGTH, _LEAST_COHERENCE, _MOST_SPREAD = 80, 300.0, 0.6, 0.045
-"""Edges exist, so that a photo of the same would surely agree, where the depth map has so many pixels on its longer
-side, its contours are so long in pixels of the grid and its edges so coherent, and the score by chance spreads less."""
 _CONTOUR = 4.0
 """Extent in pixels over which the edges of a contour run alike."""
-_FITS, _ELSEWHERE = 3.0, 7.0
-"""Significance from which both surely agree, and from which they agree at a larger displacement."""
+_FITS = 3.0
+"""Significance from which both surely agree."""
 _SMALLEST = 16
 """Least side of the grid in pixels."""
 _WAYS: dict[str, tuple[bool, tuple[int, ...]]] = {
@@ -124,6 +121,7 @@ class Verdict:
         way: what would have to have been done to one of them for the best agreement of the other ways.
         better: the agreement of that way.
         contours: whether the depth map has enough of them.
+        size: height and width of the photo in pixels.
 
     """
 
@@ -131,6 +129,7 @@ class Verdict:
     way: str
     better: Agreement
     contours: bool
+    size: Size
 
     @property
     def margin(self) -> float:
@@ -145,17 +144,23 @@ class Verdict:
     @property
     def fits(self) -> bool:
         """Whether both surely belong together."""
-        return self.as_given.significance >= _FITS and not self.turned
+        return self.as_given.significance >= _FITS and not self.turned and not self.apart
 
     @property
     def apart(self) -> bool:
         """Whether both agree at a displacement that is larger than the edges of sensors are wide."""
-        return not self.turned and not self.fits and self.as_given.elsewhere >= _ELSEWHERE
+        found = self.as_given
+        return (
+            not self.turned
+            and found.elsewhere >= LIMITS["edges-beside.elsewhere"].threshold
+            and found.elsewhere - max(found.significance, 0.0) >= LIMITS["edges-beside.lead"].threshold
+            and self.pixels >= LIMITS["edges-beside"].threshold
+        )
 
     @property
     def telling(self) -> bool:
         """Whether edges exist: whether a photo of the same would surely agree."""
-        return self.contours and self.as_given.spread < _MOST_SPREAD
+        return self.contours and self.as_given.spread < LIMITS["photo-other.spread"].threshold
 
     @property
     def other(self) -> bool:
@@ -192,8 +197,10 @@ class Verdict:
 
     @property
     def pixels(self) -> float:
-        """The displacement where they agree, in pixels of a photo with ``WORKING_SIZE`` on its longer side."""
-        return WORKING_SIZE * max(abs(self.as_given.right), abs(self.as_given.down))
+        """The displacement where they agree, in pixels of the photo, at most ``WORKING_SIZE`` on its longer side."""
+        height, width = self.size
+        pixels = max(abs(self.as_given.right) * width, abs(self.as_given.down) * height)
+        return pixels * min(WORKING_SIZE / max(self.size), 1.0)
 
 
 def judge(depth: Array, rgb: Tensor) -> Verdict | None:
@@ -220,9 +227,9 @@ def judge(depth: Array, rgb: Tensor) -> Verdict | None:
         for name, (exchanged, axes) in _WAYS.items()
     }
     best = max(ways, key=lambda name: ways[name].significance)
-    length, coherence = outlines.contours()
-    enough = max(depth.shape) >= _LEAST_SIDE and length >= _LEAST_LENGTH and coherence >= _LEAST_COHERENCE
-    return Verdict(compare(fields, transform(seen)), best, ways[best], enough)
+    found = dict(zip(("side", "length", "coherence"), (max(depth.shape), *outlines.contours()), strict=True))
+    enough = all(value >= LIMITS[f"photo-other.{name}"].threshold for name, value in found.items())
+    return Verdict(compare(fields, transform(seen)), best, ways[best], enough, (rgb.shape[-2], rgb.shape[-1]))
 
 
 def significances(depths: Sequence[Outlines], photos: Sequence[Outlines]) -> Array:

@@ -23,11 +23,10 @@ JUMP = 0.03
 WORKING_SIZE = 800
 """Longer side in pixels at which edges are compared."""
 SHIFT = LIMITS["edges-beside"].threshold
-"""Shift between photo and depth that is reported, in working pixels."""
+"""Shift between photo and depth that is reported, in pixels of the photo, at most so many on its longer side."""
 APART = 4
 """Minimum distance in pixels of another shift from the best one."""
-_TILE = 32
-_LEAST_EDGES, _LEAST_TILES, _MOST_EDGES = 300, 12, 20_000
+_TILE, _MOST_EDGES = 32, 20_000
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,8 @@ class Edges:
 
     def enough(self) -> bool:
         """Return whether there are enough edges, in enough places, to compare them with a photo's."""
-        return self.count >= _LEAST_EDGES and int(self.tiles().max()) + 1 >= _LEAST_TILES
+        few = self.count < LIMITS["edges-beside.edges"].threshold
+        return not few and int(self.tiles().max()) + 1 >= LIMITS["edges-beside.tiles"].threshold
 
     def scale_up(self, factor: int) -> Edges:
         """Return the edges in pixels of a photo that is a whole factor larger than the depth map."""

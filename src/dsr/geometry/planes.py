@@ -42,9 +42,9 @@ _LARGEST = 1e3
 _EXACT = 1e-12
 _LEAST, _LEAD = 4, 3
 """Minimum number of votes for orthogonal depth, and their minimum ratio to all others."""
-_LEAST_BENT, _MAJORITY_BENT = 6, LIMITS["along-the-ray"].threshold
+_LEAST_BENT, _MAJORITY_BENT = (LIMITS[f"along-the-ray{each}"].threshold for each in (".planes", ""))
 """Minimum number of votes for another type, and their minimum fraction of the planar windows."""
-_LEAST_INVERSE, _LEAD_INVERSE = 10, LIMITS["falls-with-distance"].threshold
+_LEAST_INVERSE, _LEAD_INVERSE = (LIMITS[f"falls-with-distance{each}"].threshold for each in (".planes", ""))
 """Minimum number of windows in which values, and not their reciprocals, are linear, and their minimum ratio to those in
 which the reciprocals are."""
 _LINEAR = 2.0

@@ -195,8 +195,8 @@ def _other_picture(camera: Camera, size_lr: tuple[int, int] | None) -> list[Rema
 
 
 def _is_near(found: float, wanted: float) -> bool:
-    """Return whether two ratios are equal within 5 %."""
-    return abs(found / wanted - 1) < 0.05
+    """Return whether two ratios are about equal."""
+    return abs(found / wanted - 1) < LIMITS["other-picture.size"].threshold
 
 
 def _better_order(camera: Camera) -> list[tuple[str, str]] | None:
@@ -208,7 +208,9 @@ def _better_order(camera: Camera) -> list[tuple[str, str]] | None:
         if min(fx, fy) <= 0:
             continue
         other = Camera(camera.width, camera.height, fx, fy, cx, cy)
-        fits = offset_of(other) < 0.05 and _ratio(other) < 1.03 and _USUAL_VIEW[0] <= view_of(other) <= _USUAL_VIEW[1]
+        centred = offset_of(other) < LIMITS["other-picture.offset"].threshold
+        square = _ratio(other) < LIMITS["other-picture.ratio"].threshold
+        fits = centred and square and _USUAL_VIEW[0] <= view_of(other) <= _USUAL_VIEW[1]
         moved = [(_NUMBERS[place], _NUMBERS[index]) for place, index in enumerate(order) if place != index]
         if fits and (best is None or len(moved) < len(best)):
             best = moved

@@ -89,24 +89,14 @@ _WIDEST = 320
 """Maps are reduced to at most as many pixels across, by leaving out pixels."""
 _ACROSS = 24
 """Points across a map that are moved."""
-_TOLERANCE = 0.04
-"""Difference of two depths, relative to the farther, up to which they agree."""
-_LEAST_OVERLAP = 0.3
-"""Share of the points that have to be seen again for a reading to say anything about two frames."""
 _GAPS = (0, 1, 3, 10, 30)
 """Places of the frames of a group that are compared with each other, from its first one."""
 _GROUPS = 4
 """Groups of frames of a sequence."""
-_GOOD = 0.7
-"""Share of the pixels that have to agree under the right reading."""
-_LEAST_WEIGHT = 0.5
-"""Number of pairs that disagree wholly without motion, or as much of more pairs, that tell readings apart."""
 _TIE = 0.9
 """Readings whose evidence is at least this much of the best one's cannot be told from it."""
 _MOST_NAMES = 3
 """Readings that a message names."""
-_WORSE = 1.2
-"""Times as many pixels that have to disagree under poses that are wrong in another way as without motion."""
 
 
 class Agreement(NamedTuple):
@@ -188,7 +178,7 @@ def _compare(frame: Reduced, other: Reduced) -> tuple[np.ndarray, np.ndarray]:
     rows, columns = (np.rint(np.where(inside, each, 0)).astype(np.intp) for each in (v, u))
     seen = np.where(inside, frame.depth[rows, columns], np.nan)
     count = np.isfinite(seen).sum(1)
-    agreeing = np.abs(seen - z) <= _TOLERANCE * np.maximum(seen, z)
+    agreeing = np.abs(seen - z) <= LIMITS["poses.tolerance"].threshold * np.maximum(seen, z)
     return count / max(z.shape[1], 1), agreeing.sum(1) / np.maximum(count, 1)
 
 
@@ -197,14 +187,15 @@ def find_fault(agreement: Agreement) -> Assumption | None:
 
     A pair of frames counts as much as they disagree without motion.
     """
-    seen, agreed = agreement.overlap >= _LEAST_OVERLAP, agreement.agreed
+    seen, agreed = agreement.overlap >= LIMITS["poses.overlap"].threshold, agreement.agreed
     without = agreed[:, -1:]
     given = np.where(seen[:, :1], agreed[:, :1], without)
     weight = seen * (1 - without)  # (pairs, readings + 1)
     total = weight.sum(0)
     means = [(weight * each).sum(0) / np.maximum(total, 1e-9) for each in (agreed, given, without)]
     gain = means[0] - np.maximum(means[1], means[2])
-    evidence = np.where((means[0] >= _GOOD) & (total >= _LEAST_WEIGHT), total * gain, 0)[:-1]
+    explained, least = LIMITS["poses.explained"].threshold, LIMITS["poses.weight"].threshold
+    evidence = np.where((means[0] >= explained) & (total >= least), total * gain, 0)[:-1]
     best = int(evidence.argmax())
     if evidence[best] > 0 and gain[best] >= LIMITS["poses"].threshold:
         names = list(READINGS)
@@ -217,7 +208,7 @@ def find_fault(agreement: Agreement) -> Assumption | None:
             "poses",
             round(float(gain[best]), 3),
         )
-    alike = agreement.moved.size > 0 and float(np.median(without)) >= _GOOD
+    alike = agreement.moved.size > 0 and float(np.median(without)) >= LIMITS["poses-far.alike"].threshold
     if alike and agreement.moved.min() >= LIMITS["poses-far"].threshold:
         nearest = float(agreement.moved.min())
         return Assumption(
@@ -227,7 +218,7 @@ def find_fault(agreement: Agreement) -> Assumption | None:
             round(nearest, 1),
         )
     wrong, still = (float((seen[:, 0] * (1 - agreed[:, k])).sum() / max(seen[:, 0].sum(), 1)) for k in (0, -1))
-    if wrong < LIMITS["poses-disagree"].threshold or wrong < _WORSE * still:
+    if wrong < LIMITS["poses-disagree"].threshold or wrong < LIMITS["poses-disagree.still"].threshold * still:
         return None
     return Assumption(
         "neighbouring frames do not agree under the poses",

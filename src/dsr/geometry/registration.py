@@ -28,6 +28,7 @@ from dsr.geometry.edges import (
     standard_errors,
     sum_by_tile,
 )
+from dsr.notes import LIMITS
 
 _MAX_SHIFT = 0.08
 """Largest shift as a fraction of the longer side: of a Kinect whose colour and depth were never registered."""
@@ -35,12 +36,10 @@ _LEAST_RADIUS = 4
 """Smallest radius of the search in pixels of the depth map."""
 _SCALES = tuple(1 + step / 200 for step in range(-10, 11))
 """Scales that are searched, in steps of 0.5 %."""
-_ABOVE_CHANCE, _ABOVE_OTHERS, _CONTRAST = 2.8, 2.0, 1.2
-"""Standard errors by which the gradients must exceed those at a typical and at the best other shift; and a factor."""
 _WEAK = 2.0
 """Standard errors below which a shift along one axis is left out: its edges may all run along that axis."""
-_ABOVE_NONE, _ABOVE_SHIFT = 3.0, 2.5
-"""Standard errors by which a displacement must exceed none, and one with a scale the best shift."""
+_ABOVE_SHIFT = 2.5
+"""Standard errors by which a displacement with a scale must exceed the best shift."""
 _MUCH = 1.1
 """Factor of the gradients that is a lot for a change of scale to gain."""
 _COARSE = 2
@@ -62,7 +61,7 @@ class Displacement:
         scale: about the middle c of the map.
         certain: whether photo and depth agree significantly better there than elsewhere, and than with no displacement.
         visible: whether it is at least a pixel of the depth map and one that the eye sees in the photo.
-        moved: how far it moves a corner of the map, in pixels of a photo at the size at which edges are compared.
+        moved: how far it moves a corner, in pixels of the photo, at most ``WORKING_SIZE`` on its longer side.
 
     """
 
@@ -89,6 +88,7 @@ class _Comparison:
         gradients: of the photo to the right and down.
         tiles: of each edge.
         size: height and width of the working photo.
+        whole: longer side of the photo, at most ``WORKING_SIZE``.
         pixel: width of a pixel of the depth map in working pixels.
 
     """
@@ -97,6 +97,7 @@ class _Comparison:
     gradients: tuple[Array, Array]
     tiles: np.ndarray
     size: tuple[int, int]
+    whole: int
     pixel: float
 
     def scaled(self, scale: float) -> Edges:
@@ -198,7 +199,8 @@ def _compare(depth: Array, rgb: Tensor, every: int) -> _Comparison | None:
     if not edges.enough():
         return None
     photo = functional.interpolate(rgb[None].float().cpu(), size, mode="bilinear", antialias=True)[0]
-    return _Comparison(edges, edge_gradients(photo.double().numpy()), edges.tiles(), size, float(factor))
+    whole = min(max(rgb.shape[-2:]), WORKING_SIZE)
+    return _Comparison(edges, edge_gradients(photo.double().numpy()), edges.tiles(), size, whole, float(factor))
 
 
 def _gap(size: tuple[int, ...]) -> int:
@@ -277,13 +279,14 @@ def _judge(comparison: _Comparison, found: tuple[float, float, float], radius: i
     middle = (np.array(comparison.size) - 1) / 2
     corner = max(abs(down) + abs(scale - 1) * middle[0], abs(right) + abs(scale - 1) * middle[1])
     certain = (
-        sums.sum() > _CONTRAST * median * counts.sum()
-        and standard_errors(sums - median * counts) > _ABOVE_CHANCE
-        and standard_errors(sums - elsewhere) > _ABOVE_OTHERS
-        and standard_errors(sums - comparison.sums(0, 0, 1)) > _ABOVE_NONE
+        sums.sum() > LIMITS["edges-beside.contrast"].threshold * median * counts.sum()
+        and standard_errors(sums - median * counts) > LIMITS["edges-beside.chance"].threshold
+        and standard_errors(sums - elsewhere) > LIMITS["edges-beside.others"].threshold
+        and standard_errors(sums - comparison.sums(0, 0, 1)) > LIMITS["edges-beside.none"].threshold
         and max(abs(down), abs(right)) < radius
         and corner >= _SMALLEST * comparison.pixel
     )
     back = every / comparison.pixel
-    visible = corner >= max(SHIFT, comparison.pixel)
-    return Displacement(right * back, down * back, scale, bool(certain), bool(certain and visible), float(corner))
+    moved = float(corner) * comparison.whole / max(comparison.size)
+    visible = corner >= max(SHIFT, comparison.pixel)  # at the working size, which has no more pixels than the photo
+    return Displacement(right * back, down * back, scale, bool(certain), bool(certain and visible), moved)

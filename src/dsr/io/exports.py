@@ -52,7 +52,7 @@ _LARGEST_TEXTURE = 4096
 """Largest side of a texture in pixels, which every viewer supports."""
 _LOSSLESS = 2**21
 """Largest number of pixels of a texture that is stored without loss."""
-_FRAME = b"comment camera frame: x right, y down, z forward; metres\n"
+CAMERA_FRAME = "camera frame: x right, y down, z forward; metres"
 
 _STRIP = 1 << 20
 """Pixels whose normals are held in memory at a time."""
@@ -66,23 +66,36 @@ _MOST_BYTES = 64 << 20
 _MOST_PIXELS = 1 << 28
 
 
+def world_comment(up: str) -> str:
+    """Return what a PLY file says of its frame, the world with the axis ``up``, see :data:`dsr.io.frames.UPS`."""
+    return f"world frame of the poses{f': {up} up' if up else ''}; metres"
+
+
 def write_ply(
-    path: Path, points: np.ndarray, normals: np.ndarray, colours: np.ndarray, faces: np.ndarray | None = None
+    path: Path,
+    points: np.ndarray,
+    colours: np.ndarray,
+    normals: np.ndarray | None = None,
+    faces: np.ndarray | None = None,
+    *,
+    frame: str = CAMERA_FRAME,
 ) -> None:
     """Write a binary PLY file atomically.
 
     Args:
-        points: (N, 3) in metres, in the camera frame.
-        normals: (N, 3) unit vectors.
+        points: (N, 3) in metres.
         colours: (N, 3) uint8, sRGB.
+        normals: (N, 3) unit vectors; None to leave them out.
         faces: (M, 3) indices, counterclockwise from outside; None for a cloud.
+        frame: what the file says of the frame of the points, and of the unit.
 
     """
     corners = np.empty((0, 3), int) if faces is None else faces
     model = trimesh.Trimesh(points, corners, vertex_normals=normals, vertex_colors=colours, process=False)
-    header, mark, content = export_ply(model, vertex_normal=True).partition(b"element vertex")
+    content = export_ply(model, vertex_normal=normals is not None)
+    header, mark, content = content.partition(b"element vertex")
     with replacing(path) as temporary, temporary.open("wb") as file:
-        file.writelines((header, _FRAME, mark, content))
+        file.writelines((header, f"comment {frame}\n".encode(), mark, content))
 
 
 def write_glb(
@@ -219,7 +232,7 @@ def write_cloud(path: Path, rgb: Tensor, depth: Tensor, camera: Camera, *, most:
     """
     mesh = triangulate(depth, camera, isolated=True)
     chosen, normals = select_points(mesh, most, camera), vertex_normals(mesh)
-    write_ply(path, mesh.vertices[chosen], normals[chosen], _colours(rgb, mesh.pixels[chosen]))
+    write_ply(path, mesh.vertices[chosen], _colours(rgb, mesh.pixels[chosen]), normals[chosen])
     fewer = len(chosen) < len(mesh.vertices)
     return Written(len(mesh.vertices), len(chosen), "leaving out rows and columns" if fewer else "")
 
@@ -266,7 +279,7 @@ def write_mesh(
     normals = vertex_normals(mesh)
     for path in paths:
         if path.suffix.lower() == ".ply":
-            write_ply(path, mesh.vertices, normals, _colours(rgb, mesh.pixels), mesh.faces)
+            write_ply(path, mesh.vertices, _colours(rgb, mesh.pixels), normals, mesh.faces)
         else:
             places = project(mesh.vertices, camera)
             write_glb(path, mesh.vertices, normals, mesh.faces, places, _bytes(rgb).transpose(1, 2, 0).copy())

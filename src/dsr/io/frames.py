@@ -31,6 +31,10 @@ CONFIDENCE_SUFFIXES = (*DEPTH_SUFFIXES, ".bmp")
 """Of the files of confidence maps."""
 
 
+UPS = ("", "y", "z")
+"""Axes of a capture's world that point up; "" where it does not say."""
+
+
 class Source(Protocol):
     """A photo or a map inside of a file: a frame of a video, a member of an archive, a message of a recording.
 
@@ -76,7 +80,8 @@ class Geometry(NamedTuple):
     world, (4, 4) float64 in metres, rigid, of the camera's frame x right, y down, z forward; the world's frame is the
     capture's own. None if it does not say. ``assumptions``: what was assumed for them. ``lens``: of the photo, and of a
     depth map without a rig, which lies in the photo's pixels; None without distortion. ``rig``: the depth map's own
-    camera, of a size of its own as well; None if the map is in the photo's view.
+    camera, of a size of its own as well; None if the map is in the photo's view. ``up``: the axis of the world that
+    points up, one of :data:`UPS`. ``time``: of the frame, in seconds; None if it does not say.
     """
 
     camera: Camera | None = None
@@ -84,6 +89,8 @@ class Geometry(NamedTuple):
     assumptions: tuple[Assumption, ...] = ()
     lens: Lens | None = None
     rig: Rig | None = None
+    up: str = ""
+    time: float | None = None
 
 
 @dataclass(frozen=True)

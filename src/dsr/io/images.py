@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, Field
+from pydantic import AliasChoices, BaseModel, BeforeValidator, Field
 
 from dsr.geometry.camera import Camera, RangeType
 from dsr.io.viewing import describe_picture
@@ -24,6 +24,7 @@ from dsr.utils.guards import (
     naming,
     numbers_in,
     opened,
+    parse_json,
     pixels_of_file,
     read_limited,
     refusing,
@@ -181,7 +182,7 @@ class CameraFile:
 
 
 def read_camera(path: Path) -> CameraFile:
-    """Return the content of a ``camera.json``.
+    """Return the content of a ``camera.json`` of dsr, or a ``cam_params.json`` as NICE-SLAM's data sets have it.
 
     Raises:
         ValueError: it is missing or damaged, or a key is missing, unknown or out of range.
@@ -189,12 +190,35 @@ def read_camera(path: Path) -> CameraFile:
     """
     if not path.is_file():
         raise ValueError(f"{path}: expected a camera file, there is none")
-    entries = parse_model(_CameraJson, read_limited(path), path).model_dump(exclude_unset=True, exclude_none=True)
+    content = read_limited(path)
+    if (params := _params_in(content)) is not None:
+        return _read_params(path, content, params)
+    entries = parse_model(_CameraJson, content, path).model_dump(exclude_unset=True, exclude_none=True)
     if "baseline" in entries:
         entries["baseline"] *= _METRES[entries.get("baseline_unit", "m")]
     with naming(path):
         camera = Camera(**{each.name: entries[each.name] for each in fields(Camera) if each.name in entries})
     return CameraFile(camera, *map(entries.get, ("range_type", "depth_unit", "hole_value")))
+
+
+def _params_in(content: bytes) -> type[_Params | _NestedParams] | None:
+    """Return how JSON has the keys of NICE-SLAM's ``cam_params.json``, nested or not; None if it has none of them."""
+    try:
+        entries = parse_json(content)
+    except ValueError:
+        return None
+    if not isinstance(entries, dict):
+        return None
+    return _NestedParams if isinstance(entries.get("camera"), dict) else _Params if _SCALES & entries.keys() else None
+
+
+def _read_params(path: Path, content: bytes, kind: type[_Params | _NestedParams]) -> CameraFile:
+    """Return the camera of a ``cam_params.json``, and the unit that its scale says."""
+    read = parse_model(kind, content, path)
+    params = read.camera if isinstance(read, _NestedParams) else read
+    with naming(path):
+        camera = Camera(params.w, params.h, params.fx, params.fy, params.cx, params.cy)
+    return CameraFile(camera, None, None if params.scale is None else 1 / params.scale, None)
 
 
 def _metres(unit: Any) -> Any:
@@ -227,6 +251,27 @@ class _CameraJson(BaseModel, strict=True, extra="forbid"):
     doffs: _Number = 0.0
     depth_unit: Annotated[_Number, Field(gt=0), BeforeValidator(_metres)] = 1.0
     hole_value: _Number = 0.0
+
+
+_SCALES = {"scale", "png_depth_scale"}
+
+
+class _Params(BaseModel, strict=True):
+    """NICE-SLAM's ``cam_params.json``; the scale is the number of values in a metre."""
+
+    w: Pixels = Field(validation_alias=AliasChoices("w", "W", "width"))
+    h: Pixels = Field(validation_alias=AliasChoices("h", "H", "height"))
+    fx: _Number
+    fy: _Number
+    cx: _Number
+    cy: _Number
+    scale: Annotated[_Number, Field(ge=1)] | None = Field(None, validation_alias=AliasChoices(*sorted(_SCALES)))
+
+
+class _NestedParams(BaseModel, strict=True):
+    """The same under the key ``camera``."""
+
+    camera: _Params
 
 
 def _content(path: Path) -> bytes:

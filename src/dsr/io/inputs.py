@@ -20,7 +20,7 @@ from dsr.io.doubts import doubt_camera, doubt_depth
 from dsr.io.encoding import Encoding, decode, find_holes, turn_back_bits
 from dsr.io.frames import SLACK, Geometry, Rig
 from dsr.io.images import CameraFile, pixels_in_header, read_mask
-from dsr.io.pairs import Pair, words_of
+from dsr.io.pairs import Pair, time_of, words_of
 from dsr.io.photos import Size, model_in_exif, read_photo, same_aspect
 from dsr.io.reading import SUNRGBD_BITS, CameraChoice, Reading
 from dsr.io.units import TURNED_BACK, Told, tell
@@ -130,6 +130,8 @@ class Picture:
             the world of the capture; None where there is none.
         confidence: (1, h, w) float32 from 0 to 1, of the low-resolution map; None where there is none.
         device_name: of the app or the device, as the files state it; empty where they do not.
+        up: the axis of the world that points up, one of :data:`dsr.io.frames.UPS`.
+        time: of the frame in seconds, as the capture or the files' names have it; None where they have none.
 
     """
 
@@ -141,6 +143,8 @@ class Picture:
     pose: np.ndarray | None = None
     confidence: Tensor | None = None
     device_name: str = ""
+    up: str = ""
+    time: float | None = None
 
 
 def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None) -> Picture:
@@ -208,7 +212,10 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
         depth_lr, warped = _to_photo(pair, reading, depth_lr, rig, camera)
         all_assumptions, confidence = (*all_assumptions, *warped), None
     device_name = model_in_exif(pair.rgb) if pair.capture is None else pair.capture.app
-    return Picture(rgb, depth_lr, camera, encoding, all_assumptions, geometry.pose, confidence, device_name)
+    time = next((each for each in (geometry.time, time_of(pair.depth), time_of(pair.rgb)) if each is not None), None)
+    return Picture(
+        rgb, depth_lr, camera, encoding, all_assumptions, geometry.pose, confidence, device_name, geometry.up, time
+    )
 
 
 def _expect_distances(path: Path, depth_lr: Tensor, holes: np.ndarray, range_type: RangeType) -> list[Assumption]:
@@ -392,7 +399,7 @@ def _unit(
         unit = described.depth_unit
         return Told(unit, (Assumption(f"unit: {unit:g} m per value, says the camera file"),))
     if pair.unit is not None:
-        return Told(pair.unit, ())
+        return Told(pair.unit, (), bits=pair.bits)
     if _is_icl(pair):
         return Told(1e-2, ())
     hole_value = described.hole_value if reading.hole_value is None else reading.hole_value

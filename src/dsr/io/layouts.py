@@ -7,19 +7,27 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from dsr.io.captures.arkit import find_arkitscenes, find_polycam
+from dsr.geometry.rigid_motion import Matrix
+from dsr.io.captures.archive import unpack
+from dsr.io.captures.arkit import find_arkitscenes, find_polycam, find_scanner_app
+from dsr.io.captures.colmap import add_model, find_colmap, model_file
+from dsr.io.captures.data_sets import find_replica, find_scannet, find_seven_scenes, find_sunrgbd
 from dsr.io.captures.heic import find_heic
 from dsr.io.captures.kinect import find_kinect
+from dsr.io.captures.known import describe_content, lacking
 from dsr.io.captures.record3d import find_record3d
 from dsr.io.captures.ros import find_ros
+from dsr.io.captures.scannet import find_scannetpp, find_sens
 from dsr.io.captures.stray import find_stray
 from dsr.io.captures.zed import find_zed
 from dsr.io.depth_files import DEPTH_SUFFIXES
+from dsr.io.frames import CaptureFrame, Geometry
 from dsr.io.images import read_pixels
 from dsr.io.open3d import add_trajectory
 from dsr.io.pairs import (
@@ -37,6 +45,7 @@ from dsr.io.pairs import (
     words_of,
 )
 from dsr.io.photos import HEIC_SUFFIXES
+from dsr.io.trajectories import read_poses
 from dsr.notes import Assumption
 from dsr.utils.guards import MOST_TABLE, natural_key, numbers_in, path_within, read_limited
 
@@ -45,10 +54,14 @@ _TUM_UNIT = 1 / 5000
 _MAX_DEPTH = 3
 """Levels of subfolders that are searched."""
 
-CAPTURE_FILES = (".r3d", ".bag", ".mcap", ".db3", ".mkv", *HEIC_SUFFIXES)
+CAPTURE_FILES = (".r3d", ".bag", ".mcap", ".db3", ".mkv", ".sens", ".zip", *HEIC_SUFFIXES)
 """Suffixes of captures that are a single file."""
-_FILES = (find_record3d, find_ros, find_kinect, find_heic)
-_LAYOUTS = (find_stray, find_polycam, find_arkitscenes, find_zed, *_FILES)
+_FILES = (find_record3d, find_ros, find_kinect, find_heic, find_sens)
+_LAYOUTS = (
+    find_stray, find_polycam, find_arkitscenes, find_scanner_app, find_scannetpp, find_scannet, find_seven_scenes,
+    find_sunrgbd, find_replica, find_zed, *_FILES,
+)  # fmt: skip
+"""A video of ScanNet++ is asked before those of a Kinect."""
 
 
 def find_pairs_of_folder(folder: Path, leave: Path | None = None) -> PairingResult:
@@ -57,16 +70,21 @@ def find_pairs_of_folder(folder: Path, leave: Path | None = None) -> PairingResu
     The layouts are: a capture (:mod:`dsr.io.captures`), which may be a single file, too; a scene of dsr (``rgb.png``,
     ``camera.json`` and ``depth*`` or ``disparity*``); lists of TUM RGB-D (``rgb.txt`` and ``depth.txt``,
     https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats); two folders named for photos and depth maps; and
-    files side by side, told apart by their names or by what they hold.
+    files side by side, told apart by their names or by what they hold; to these a model of COLMAP or a trajectory of
+    Open3D may add poses. Of photos beside a model without depth maps, its points are the depth.
 
     Args:
-        folder: folder to search, or a capture's file.
+        folder: folder to search, a capture's file, or a ZIP file of what a folder has, which is unpacked.
         leave: folder that is skipped, such as that of the results.
 
     Raises:
         ValueError: there is no such folder, or no pair in it.
 
     """
+    if folder.suffix.lower() == ".zip" and folder.is_file():
+        folder = unpack(folder)
+        while len(inside := list(folder.iterdir())) == 1 and inside[0].is_dir():
+            folder = inside[0]
     if folder.is_file():
         single = _find_at(folder)
         return replace(single, pairs=make_names_unique(single.pairs))
@@ -75,7 +93,10 @@ def find_pairs_of_folder(folder: Path, leave: Path | None = None) -> PairingResu
     found = _search(folder, folder, None if leave is None else leave.resolve(), 0)
     if not found.pairs:
         unpaired = f"; {len(found.unpaired)} pictures have no partner" if found.unpaired else ""
-        raise ValueError(f"{folder}: expected photos and depth maps that belong together, found no pair{unpaired}")
+        raise ValueError(
+            f"{folder}: expected photos and depth maps that belong together, found no pair{unpaired}; "
+            f"{describe_content(folder, _MAX_DEPTH)}"
+        )
     return PairingResult(make_names_unique(found.pairs), found.assumptions, found.unpaired)
 
 
@@ -94,9 +115,15 @@ def _search(folder: Path, root: Path, leave: Path | None, depth: int) -> Pairing
         for path, below in deeper
         for pair in below.pairs
     ]
-    assumptions = tuple(dict.fromkeys(assumption for _, below in deeper for assumption in below.assumptions))
+    alike = _alike(folder) if pairs else ()
+    assumptions = tuple(dict.fromkeys((*alike, *(fact for _, below in deeper for fact in below.assumptions))))
     unpaired = (*found.unpaired, *(path for _, below in deeper for path in below.unpaired))
     return PairingResult(tuple(pairs), assumptions, unpaired)
+
+
+def _alike(folder: Path) -> tuple[Assumption, ...]:
+    """Return notes on the captures that a folder looks like, and that its pairs were not read as."""
+    return tuple(Assumption(f"{text}: read without what it says of camera, unit and poses") for text in lacking(folder))
 
 
 def _find_at(place: Path, root: Path | None = None) -> PairingResult:
@@ -114,8 +141,11 @@ def _find_at(place: Path, root: Path | None = None) -> PairingResult:
             if camera is not None and any(pair.camera is None for pair in found.pairs):
                 pairs = tuple(replace(pair, camera=pair.camera or camera) for pair in found.pairs)
                 found = replace(found, pairs=pairs)
-            break
-    return found
+            model = model_file(place)
+            if model is not None and all(pair.capture is None for pair in found.pairs):
+                found = add_model(found, model)
+            return replace(found, assumptions=(*_alike(place), *found.assumptions))
+    return find_colmap(place) or found
 
 
 def _scene(folder: Path) -> PairingResult:
@@ -142,10 +172,32 @@ def _tum(folder: Path) -> PairingResult:
         return PairingResult(())
     photos, depths = (_timed(path) for path in lists)
     partner = match_times(photos, depths)
-    pairs = tuple(Pair(path.stem, path, partner[path], unit=_TUM_UNIT) for path in photos if path in partner)
+    pairs = [Pair(path.stem, path, partner[path], unit=_TUM_UNIT) for path in photos if path in partner]
     used = {*partner, *partner.values()}
     unpaired = [path for path in (*photos, *depths) if path not in used]
-    return PairingResult(pairs, (Assumption("rgb.txt and depth.txt of TUM RGB-D: depth in 1/5000 m"),), tuple(unpaired))
+    text, truth = "rgb.txt and depth.txt of TUM RGB-D: depth in 1/5000 m", folder / "groundtruth.txt"
+    if truth.is_file() and pairs:
+        poses = _tum_poses(truth, [depths[pair.depth] for pair in pairs])
+        text += f"; poses: {truth.name}, of {sum(pose is not None for pose in poses)} of {len(pairs)} frames"
+        told = [b"" if pose is None else pose.tobytes() for pose in poses]
+        frames = [CaptureFrame("TUM RGB-D", partial(_tum_geometry, pose), truth, each)
+                  for pose, each in zip(poses, told, strict=True)]  # fmt: skip
+        pairs = [replace(pair, capture=frame) for pair, frame in zip(pairs, frames, strict=True)]
+    return PairingResult(tuple(pairs), (Assumption(text),), tuple(unpaired))
+
+
+def _tum_poses(path: Path, times: list[float]) -> list[Matrix | None]:
+    """Return the poses nearest in time to depth maps, None where there is none within 20 ms."""
+    trajectory = read_poses(path)
+    if trajectory.times is None:
+        raise ValueError(f"{path}: expected lines of a time, a translation and a quaternion, got matrices")
+    return trajectory.at(np.array(times))
+
+
+def _tum_geometry(pose: Matrix | None, _: tuple[int, int]) -> Geometry:
+    """Return the pose of a frame; TUM's lists have no camera."""
+    notes = () if pose is not None else (Assumption("no pose: groundtruth.txt has none within 20 ms of the frame"),)
+    return Geometry(None, pose, notes)
 
 
 def _timed(path: Path) -> dict[Path, float]:

@@ -31,8 +31,8 @@ _MAX_GAP = 0.02
 """Largest time in seconds between the two pictures of a pair."""
 
 CAMERA_NAMES = (
-    "camera.json", "intrinsics.json", "intrinsic.json", "camera_intrinsic.json", "camera_primesense.json",
-    "intrinsic_color.txt", "intrinsics.txt", "intrinsic.txt",
+    "camera.json", "cam_params.json", "intrinsics.json", "intrinsic.json", "camera_intrinsic.json",
+    "camera_primesense.json", "intrinsic_color.txt", "intrinsics.txt", "intrinsic.txt", "camera-intrinsics.txt",
 )  # fmt: skip
 _SUFFIXES = frozenset((*PHOTO_SUFFIXES, *READ_SUFFIXES))
 
@@ -147,6 +147,7 @@ class Pair:
         factor: upsampling factor if the file's name has it, as in ``depth_lr4.npy``.
         capture: what the capture that the pair is of says about it; None if it is of none.
         confidence: where its confidence map is; None for none.
+        bits: how far the layout turns values of 16 bits to the left; the unit holds after turning them back.
 
     """
 
@@ -159,6 +160,7 @@ class Pair:
     factor: int | None = None
     capture: CaptureFrame | None = field(default=None, compare=False)
     confidence: ConfidenceMap | None = field(default=None, compare=False)
+    bits: int = 0
 
 
 @dataclass(frozen=True)
@@ -300,6 +302,21 @@ def list_pictures(folder: Path) -> list[Path]:
     with os.scandir(folder) as entries:  # knows files from folders without asking for each
         names = [entry.name for entry in entries if _is_picture(entry)]
     return [folder / name for name in sorted(names, key=natural_key)]
+
+
+def numbered_files(folder: Path, suffixes: tuple[str, ...], before: str = "") -> dict[int, Path]:
+    """Return the files of a folder that have a number for a name, behind a word, by number, in order; {} without it."""
+    if not folder.is_dir():
+        return {}
+    form = re.compile(re.escape(before) + r"(\d{1,9})", re.ASCII)
+    found = ((form.fullmatch(path.stem), path) for path in folder.iterdir() if path.suffix.lower() in suffixes)
+    return dict(sorted((int(match[1]), path) for match, path in found if match))
+
+
+def has_name(folder: Path, first: str, last: str) -> bool:
+    """Return whether a file or folder in a folder has a name that begins and ends so."""
+    with os.scandir(folder) as entries:  # a folder may have a million
+        return any(entry.name.startswith(first) and entry.name.endswith(last) for entry in entries)
 
 
 def has_pictures(folder: Path) -> bool:

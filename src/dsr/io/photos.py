@@ -107,8 +107,13 @@ def write_png(path: Path, picture: np.ndarray, known: np.ndarray | None = None) 
     if known is not None and not known.all():
         colours = picture if picture.ndim == 3 else np.repeat(picture[..., None], 3, axis=2)
         picture = np.concatenate((colours, np.where(known, 255, 0).astype(np.uint8)[..., None]), axis=2)
+    with replacing(path) as temporary:
+        temporary.write_bytes(encode_png(picture))
+
+
+def encode_png(picture: np.ndarray) -> bytes:
+    """Return a picture, (H, W) or (H, W, 3 or 4) blue first, uint8 or uint16, as a PNG; OSError if it cannot be."""
     done, content = cv2.imencode(".png", picture)
     if not done:
-        raise OSError(f"{path}: the picture of {picture.shape} could not be encoded")
-    with replacing(path) as temporary:
-        temporary.write_bytes(content.tobytes())
+        raise OSError(f"the picture of {picture.shape} could not be encoded")
+    return content.tobytes()

@@ -3,9 +3,12 @@
 ``transforms.json`` with depth, as nerfstudio and the programs around instant-ngp read it.
 
 Axes of a camera are those of OpenGL, x right, y up, z backwards, so that the second and third column of dsr's
-camera-to-world transform change their signs; the world stays as it is. The principal point is counted from the corner
-of the image, half a pixel more than dsr's. ``depth_file_path`` is a 16-bit PNG in millimetres, 0 in holes, which is
-nerfstudio's default unit (https://docs.nerf.studio/quickstart/data_conventions.html).
+camera-to-world transform change their signs. The world stays as it is, so ``applied_transform`` is the identity:
+nerfstudio turns it upright itself, and its versions differ in whether the points of ``ply_file_path`` are meant before
+or after that transform (nerfstudio-project/nerfstudio, nerfstudio/data/dataparsers/nerfstudio_dataparser.py). Names of
+files differ, as it finds reduced pictures by the name alone. The principal point is counted from the corner of the
+image, half a pixel more than dsr's. ``depth_file_path`` is a 16-bit PNG in millimetres, 0 in holes, its default unit;
+``depth_unit_scale_factor`` says so to other readers, as nerfstudio takes it from its own options.
 
 Inverse depth for 3D Gaussian Splatting, and its scene where the capture has poses.
 
@@ -19,17 +22,18 @@ to start from. Its principal point is counted from the corner of the image.
 
 A recording for the viewer of rerun: colour, depth and poses on a timeline of frames.
 
-Axes are the camera's, x right, y down, z forward (``RDF`` in rerun), units are metres. The library is the extra
-``rerun``, https://rerun.io/docs.
+A camera's axes are x right, y down, z forward (``RDF`` in rerun). The world's are said as far as the capture says which
+one points up: ``RUB`` with y up, ``RFU`` with z up, else ``RDF``. Photos are JPEG, depth is 16-bit PNG in millimetres
+with ``meter``, the units of a metre (rerun-io/rerun, re_sdk_types/definitions/rerun/components/depth_meter.fbs). The
+library is the extra ``rerun``, https://rerun.io/docs.
 """
 
 from __future__ import annotations
 
 import importlib
 import json
-import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,13 +46,16 @@ from torch import Tensor
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.rigid_motion import is_rotation
+from dsr.io.exports import to_jpeg, world_comment, write_ply
 from dsr.io.images import read_pixels
-from dsr.io.photos import write_png
+from dsr.io.photos import encode_png, write_png
 from dsr.utils.arrays import open_array
 from dsr.utils.files import replacing, write_text
 from dsr.utils.guards import pixels_beside, refusing
 
 RGBD = ("color.png", "depth.png", "intrinsic.json")
+SCENE = "nerfstudio"
+"""Folder of what ``transforms.json`` names."""
 MILLIMETRES = 1000
 MOST_MILLIMETRES = 65535
 _RIGID = 1e-3
@@ -59,7 +66,12 @@ _LARGEST = 65535
 _POINTS = 100_000
 """Points of all frames together that the optimisation starts from."""
 
-_TIMELINE = "frame"
+_TIMELINE, _CLOCK = "frame", "time"
+_AXES = {"": "RDF", "y": "RUB", "z": "RFU"}
+"""Of the world in rerun, by what points up."""
+_EPOCH = 1e9
+"""Times from here on are seconds since 1970, smaller ones count from the start of a device or a recording."""
+_QUALITY = 95
 
 
 @dataclass(frozen=True)
@@ -73,6 +85,8 @@ class Frame:
             it is not known.
         colour: an 8-bit PNG.
         depth: an NPY of (H, W) orthogonal depth in metres, NaN in holes.
+        up: the axis of the world that points up, one of :data:`dsr.io.frames.UPS`.
+        time: of the frame in seconds; None if it is not known.
 
     """
 
@@ -81,6 +95,8 @@ class Frame:
     pose: Tensor | None
     colour: Path
     depth: Path
+    up: str = ""
+    time: float | None = None
 
     @property
     def stem(self) -> str:
@@ -140,6 +156,12 @@ def one_camera(frames: Sequence[Frame]) -> Camera | None:
     return cameras.pop() if len(cameras) == 1 else None
 
 
+def common_up(frames: Sequence[Frame]) -> str:
+    """Return the axis that points up in the world of all frames, or "" if they differ."""
+    ups = {frame.up for frame in frames}
+    return ups.pop() if len(ups) == 1 else ""
+
+
 def write_colour(path: Path, rgb: np.ndarray) -> None:
     """Write (H, W, 3) uint8, red first, as a PNG, atomically."""
     write_png(path, np.ascontiguousarray(rgb[..., ::-1]))
@@ -161,38 +183,63 @@ def to_millimetres(depth: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def write_transforms(path: Path, frames: Sequence[Frame]) -> list[Path]:
-    """Write ``transforms.json`` for frames whose ``color.png`` and ``depth.png`` lie in one folder each.
+    """Write ``transforms.json``, and beside it ``nerfstudio/`` with ``images/``, ``depths/`` and ``points.ply``.
 
     Args:
-        path: the file; the frames' files are named relative to its folder.
+        path: the file.
         frames: one at least; a single one without a pose stands at the origin.
 
     Returns:
-        The file.
+        The files.
 
     Raises:
         ValueError: one of several frames has no pose.
 
     """
-    missing = [frame.name for frame in frames if frame.pose is None]
-    if missing and len(frames) > 1:
-        raise ValueError(
-            f"nerfstudio: expected a pose of each frame, got none for {len(missing)} of {len(frames)}, such as "
-            f"{missing[0]}; the capture has to record them"
-        )
-    camera = one_camera(frames)
+    expect_poses("nerfstudio", {frame.name: frame.pose is not None for frame in frames})
+    camera, folder = one_camera(frames), path.parent / SCENE
+    files = [folder / kind / f"{frame.stem}.png" for frame in frames for kind in ("images", "depths")]
+    for frame, photo, depth in zip(frames, files[::2], files[1::2], strict=True):
+        with replacing(photo) as temporary:
+            shutil.copyfile(frame.colour, temporary)
+        write_sixteen_bits(depth, to_millimetres(frame.read_depth())[0])
+    files.append(folder / "points.ply")
+    write_ply(files[-1], *_sparse(frames), frame=world_comment(common_up(frames)))
     entries: dict[str, Any] = {"camera_model": "OPENCV", **({} if camera is None else _intrinsics(camera))}
+    entries["depth_unit_scale_factor"] = 1 / MILLIMETRES
+    entries["applied_transform"] = np.eye(4)[:3].tolist()
+    names = [file.relative_to(path.parent).as_posix() for file in files]
+    entries["ply_file_path"] = names[-1]
     entries["frames"] = [
         {
-            "file_path": _relative(frame.colour, path),
-            "depth_file_path": _relative(frame.colour.with_name(RGBD[1]), path),
+            "file_path": photo_name,
+            "depth_file_path": depth_name,
             **({} if camera is not None else _intrinsics(frame.camera)),
             "transform_matrix": _to_opengl(frame),
         }
-        for frame in frames
+        for frame, photo_name, depth_name in zip(frames, names[:-1:2], names[1:-1:2], strict=True)
     ]
     write_text(path, json.dumps(entries, indent=2) + "\n")
-    return [path]
+    return [path, *files]
+
+
+def expect_poses(part: str, known: Mapping[str, bool]) -> None:
+    """Check that each frame has a pose; a single one needs none.
+
+    Args:
+        part: name of what needs them.
+        known: whether a frame has one, by its name.
+
+    Raises:
+        ValueError: one of several frames has none.
+
+    """
+    missing = [name for name, has in known.items() if not has]
+    if missing and len(known) > 1:
+        raise ValueError(
+            f"{part}: expected a pose of each frame, got none for {len(missing)} of {len(known)}, such as "
+            f"{missing[0]}; --poses gives them"
+        )
 
 
 def _to_opengl(frame: Frame) -> list[list[float]]:
@@ -215,15 +262,10 @@ def _intrinsics(camera: Camera) -> dict[str, float]:
     }
 
 
-def _relative(file: Path, path: Path) -> str:
-    """Return a file's path relative to the folder of another, with slashes."""
-    return Path(os.path.relpath(file, path.parent)).as_posix()
-
-
 def write_splatting(folder: Path, frames: Sequence[Frame]) -> list[Path]:
     """Write ``images/``, ``depths/`` and ``sparse/0/`` of a scene.
 
-    Without poses ``sparse/0/`` has ``depth_params.json`` alone, whose scale holds for a scene in metres.
+    Of a single frame without a pose ``sparse/0/`` has ``depth_params.json`` alone, for a scene in metres.
 
     Args:
         folder: is created if it is missing.
@@ -233,9 +275,10 @@ def write_splatting(folder: Path, frames: Sequence[Frame]) -> list[Path]:
         The files.
 
     Raises:
-        ValueError: no frame has any depth.
+        ValueError: no frame has any depth, or one of several has no pose.
 
     """
+    expect_poses("gaussian", {frame.name: frame.pose is not None for frame in frames})
     nearest = min((_nearest(frame) for frame in frames), default=np.inf)
     if not np.isfinite(nearest):
         raise ValueError("gaussian: expected some depth, got holes alone")
@@ -288,21 +331,26 @@ def _images(frames: Sequence[Frame]) -> str:
 
 
 def _points(frames: Sequence[Frame]) -> str:
-    """Return ``points3D.txt``: points of all frames with their colours, on a grid of pixels."""
+    """Return ``points3D.txt``."""
     lines = ["# POINT3D_ID X Y Z R G B ERROR TRACK[]"]
+    for number, (point, (red, green, blue)) in enumerate(zip(*_sparse(frames), strict=True), 1):
+        lines.append(f"{number} {_numbers(point)} {red} {green} {blue} 0")
+    return "\n".join(lines) + "\n"
+
+
+def _sparse(frames: Sequence[Frame]) -> tuple[np.ndarray, np.ndarray]:
+    """Return points of all frames in the world, (N, 3), and their colours, (N, 3) uint8, on a grid of pixels."""
+    points, colours = [], []
     for frame in frames:
         camera, depth = frame.camera, frame.read_depth()
         step = max(1, int(np.ceil(np.sqrt(depth.size * len(frames) / _POINTS))))
         rows, columns = (each.ravel() for each in np.mgrid[0 : camera.height : step, 0 : camera.width : step])
         z = depth[rows, columns].astype(np.float64)
         rays = np.stack(((columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones(len(z))), axis=1)
-        pose = _matrix(frame)
-        points = (rays * z[:, None]) @ pose[:3, :3].T + pose[:3, 3]
-        colours = frame.read_colour()[rows, columns]
-        for point, colour in zip(points[np.isfinite(z)], colours[np.isfinite(z)], strict=True):
-            red, green, blue = colour
-            lines.append(f"{len(lines)} {_numbers(point)} {red} {green} {blue} 0")
-    return "\n".join(lines) + "\n"
+        pose, known = _matrix(frame), np.isfinite(z)
+        points.append((rays * z[:, None])[known] @ pose[:3, :3].T + pose[:3, 3])
+        colours.append(frame.read_colour()[rows, columns][known])
+    return np.concatenate(points), np.concatenate(colours)
 
 
 def _matrix(frame: Frame) -> np.ndarray:
@@ -317,6 +365,8 @@ def _numbers(values: Sequence[float] | np.ndarray) -> str:
 
 def write_rerun(path: Path, frames: Sequence[Frame]) -> list[Path]:
     """Write a recording ``.rrd``: for each frame the entities ``camera``, ``camera/rgb`` and ``camera/depth``.
+
+    They are on the timeline ``frame``, by number, and on ``time`` if all frames have one.
 
     Args:
         frames: one at least; those without a pose stand at the origin.
@@ -333,18 +383,25 @@ def write_rerun(path: Path, frames: Sequence[Frame]) -> list[Path]:
     recording = rerun.RecordingStream("dsr")
     with replacing(path) as temporary:
         recording.save(str(temporary))
-        recording.log("/", rerun.ViewCoordinates.RDF, static=True)
+        recording.log("/", getattr(rerun.ViewCoordinates, _AXES[common_up(frames)]), static=True)
+        timed = all(frame.time is not None for frame in frames)
         for number, frame in enumerate(frames):
             camera = frame.camera
             recording.set_time(_TIMELINE, sequence=number)
+            if timed and frame.time is not None:
+                kind = "timestamp" if frame.time >= _EPOCH else "duration"
+                recording.set_time(_CLOCK, **{kind: frame.time})
             pose = np.eye(4) if frame.pose is None else frame.pose.numpy()
             recording.log("camera", rerun.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
             matrix = [[camera.fx, 0, camera.cx + 0.5], [0, camera.fy, camera.cy + 0.5], [0, 0, 1]]
             size = [camera.width, camera.height]
             view = rerun.Pinhole(image_from_camera=matrix, resolution=size, camera_xyz=rerun.ViewCoordinates.RDF)
             recording.log("camera", view)
-            recording.log("camera/rgb", rerun.Image(frame.read_colour()).compress(jpeg_quality=95))
-            recording.log("camera/depth", rerun.DepthImage(np.nan_to_num(frame.read_depth()), meter=1.0))
+            photo = to_jpeg(frame.read_colour(), max(size), _QUALITY)
+            recording.log("camera/rgb", rerun.EncodedImage(contents=photo, media_type="image/jpeg"))
+            depth = encode_png(to_millimetres(frame.read_depth())[0])
+            image = rerun.EncodedDepthImage(depth, media_type="image/png", meter=float(MILLIMETRES))
+            recording.log("camera/depth", image)
         recording.flush()
         recording.disconnect()
     return [path]

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from dsr.geometry.camera import Camera
+from dsr.geometry.plausible import may_be_of
 from dsr.geometry.rigid_motion import Matrix, as_rigid, from_quaternion, is_rotation
 from dsr.io.pairs import Pair, time_of
 from dsr.notes import Assumption
@@ -21,6 +22,9 @@ _MAX_GAP = 0.02
 """Largest time in seconds between a frame and its pose."""
 _MOST_BETWEEN = 10.0
 """Largest plausible distance in metres between the two cameras of a rig; more is taken for millimetres."""
+
+USUAL_SIZE = (1440, 1920)
+"""Height and width of the photos of iPhones' captures, for photos that were made smaller."""
 
 _TOLERANCE = 1e-3
 """Largest deviation of a rotation's entries, and of a quaternion's length, from those of a rigid motion."""
@@ -55,13 +59,12 @@ class Trajectory:
         """
         taken = [time_of(pair.depth) or time_of(pair.rgb) for pair in pairs]
         if self.times is not None:
-            times = np.array(self.times)
             if all(time is not None for time in taken):
-                return self._nearest(pairs, np.array(taken, dtype=np.float64), times, _MAX_GAP)
+                return self._nearest(pairs, np.array(taken, dtype=np.float64), _MAX_GAP)
             numbers = [_number(pair) for pair in pairs]
             known = set(self.times)
             if all(number is not None for number in numbers) and known.intersection(numbers):
-                return self._nearest(pairs, np.array(numbers, dtype=np.float64), times, 0)
+                return self._nearest(pairs, np.array(numbers, dtype=np.float64), 0)
         if len(self.poses) != len(pairs):
             raise ValueError(
                 f"{self.file}: expected a pose for each of the {len(pairs)} frames, or times as in their names, got "
@@ -69,26 +72,27 @@ class Trajectory:
             )
         return {pair.name: pose for pair, pose in zip(pairs, self.poses, strict=True)}
 
-    def _nearest(
-        self, pairs: Sequence[Pair], wanted: np.ndarray, times: np.ndarray, gap: float
-    ) -> Mapping[str, Matrix]:
-        """Return the poses nearest in time."""
+    def _nearest(self, pairs: Sequence[Pair], wanted: np.ndarray, gap: float) -> Mapping[str, Matrix]:
+        """Return the poses nearest in time by the names of the frames."""
+        poses = self.at(wanted, gap)
+        found = {pair.name: pose for pair, pose in zip(pairs, poses, strict=True) if pose is not None}
+        if not found:
+            times = self.times or (math.nan,)
+            raise ValueError(
+                f"{self.file}: expected times as in the names of the frames, {wanted.min():.3f} to {wanted.max():.3f}, "
+                f"got {min(times):.3f} to {max(times):.3f}"
+            )
+        return found
+
+    def at(self, wanted: np.ndarray, gap: float = _MAX_GAP) -> list[Matrix | None]:
+        """Return the pose nearest to each time, None for those without one within a gap in seconds."""
+        times = np.array(self.times)
         order = np.argsort(times)
         after = np.searchsorted(times[order], wanted).clip(1, max(len(order) - 1, 1))
         candidates = order[np.stack((after - 1, np.minimum(after, len(order) - 1)))]  # (2, frames)
         gaps = np.abs(times[candidates] - wanted)
         best = candidates[gaps.argmin(0), np.arange(len(wanted))]
-        found = {
-            pair.name: self.poses[number]
-            for pair, number, distance in zip(pairs, best, gaps.min(0), strict=True)
-            if distance <= gap
-        }
-        if not found:
-            raise ValueError(
-                f"{self.file}: expected times as in the names of the frames, {wanted.min():.3f} to {wanted.max():.3f}, "
-                f"got {times.min():.3f} to {times.max():.3f}"
-            )
-        return found
+        return [self.poses[place] if near <= gap else None for place, near in zip(best, gaps.min(0), strict=True)]
 
 
 def read_transform(path: Path) -> Matrix:
@@ -260,6 +264,24 @@ def intrinsics_camera(source: str, size: tuple[int, int], numbers: Sequence[floa
         if fy <= 0:
             raise ValueError(f"camera fy: expected a positive number of pixels, got {fy!r}")
         return Camera(size[1], size[0], fx, fy, cx, cy)
+
+
+def fitting_camera(source: str, sizes: Sequence[tuple[int, int]], numbers: Sequence[float]) -> Camera:
+    """Return the camera of fx, fy, cx, cy, of the first (height, width) that has its principal point near the middle.
+
+    Raises:
+        ValueError: none has, or they are those of no camera; the message begins with ``source``.
+
+    """
+    cx, cy = numbers[2:]
+    for height, width in sizes:
+        if may_be_of(cx, cy, width, height):
+            return intrinsics_camera(source, (height, width), numbers)
+    intrinsics_camera(source, sizes[0], numbers)  # says what is wrong with numbers that are not finite
+    raise ValueError(
+        f"{source}: expected a principal point near the middle of the {sizes[0][1]} x {sizes[0][0]} photo (width x "
+        f"height), got {cx:g}, {cy:g}"
+    )
 
 
 def describe_capture(app: str, unit: str, pairs: Sequence[Pair], *, poses: bool) -> Assumption:

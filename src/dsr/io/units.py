@@ -20,15 +20,13 @@ from dsr.notes import LIMITS, Assumption
 
 TURNED_BACK = f"bits are turned back by {SUNRGBD_BITS}, as SUN RGB-D turns them: millimetres, also in the result"
 _OVERRIDE = "--depth-unit overrides it"
-_MIN_MEDIAN, _MAX_MEDIAN = 0.05, 80.0
+_MIN_MEDIAN, _MAX_MEDIAN = (LIMITS[f"far-millimetres.{end}"].threshold for end in ("least", "most"))
 """Range of plausible medians in metres; a unit that gives another median is not assumed."""
 _OTHER_UNITS = ((1e-4, "0.1 mm"), (1e-6, "micrometres"), (1e-2, "centimetres"))
 """Units of whole numbers that cannot be millimetres, the most likely first."""
 _SPARSE_FRACTION, _SCATTERED = 0.6, 0.6
 """Fraction of holes above which whole numbers may come from a laser scanner; and do, if fewer of the known pixels than
 the second have a known one below."""
-_FLOAT_MILLIMETRES = 200.0
-"""Median above which floats of few levels are millimetres."""
 _FEWEST_LEVELS = 16
 """Number of different values below which a map tells nothing but its median."""
 _SAMPLE = 200_000
@@ -210,9 +208,10 @@ def _by_data_set(clues: _Clues) -> Told | None:
 
 def _by_steps(clues: _Clues) -> Told | None:
     """Return the unit of millimetres that are stored more finely than they are; None where they are near then."""
-    for step, name, unit, nearest in ((5, "1/5000", 1 / 5000, 0.5), (10, "0.0001", 1e-4, 0.3)):
+    for step, name, unit in ((5, "1/5000", 1 / 5000), (10, "0.0001", 1e-4)):
         if not clues.multiples(step):
             continue
+        nearest = LIMITS[f"far-millimetres.{step}"].threshold
         fine, coarse = nearest <= clues.middle * unit, clues.middle * 1e-3 <= LIMITS["far-millimetres"].threshold
         why = f"values are multiples of {step}, as of millimetres stored in {name} m"
         if fine and not coarse:
@@ -265,7 +264,8 @@ def _tell_floats(clues: _Clues) -> Told:
             return falling
         _expect_one_reading(clues)
     whole = clues.telling and bool((clues.known == np.round(clues.known)).all())
-    if middle > (_FLOAT_MILLIMETRES if whole or not clues.telling else LIMITS["float-millimetres"].threshold):
+    sure = "float-millimetres.whole" if whole or not clues.telling else "float-millimetres"
+    if middle > LIMITS[sure].threshold:
         return Told(1e-3, (Assumption("floats this large are taken for millimetres", f"median {middle:.4g}"),))
     found = [Assumption("floats are taken for metres", f"median {clues.metres(1.0)}")]
     if middle < _MIN_MEDIAN:
@@ -311,9 +311,10 @@ def _expect_one_reading(clues: _Clues) -> None:
             f"{clues.name}: expected --depth-unit m (median {clues.metres(1.0)}), or --range-type disparity with "
             "--baseline METRES: floats of this size are as often pixels as metres, and there are too few planes to tell"
         )
-    if LIMITS["far-floats"].threshold < middle <= _FLOAT_MILLIMETRES and not clues.scattered:
+    least = LIMITS["float-millimetres.whole"].threshold
+    if LIMITS["far-floats"].threshold < middle <= least and not clues.scattered:
         clues.ask("floats of this size are as often centimetres as metres", ("cm", 1e-2), ("m", 1.0))
-    if _FLOAT_MILLIMETRES < middle <= LIMITS["float-millimetres"].threshold and not whole:
+    if least < middle <= LIMITS["float-millimetres"].threshold and not whole:
         clues.ask("floats of this size are as often centimetres as millimetres", ("cm", 1e-2), ("mm", 1e-3))
 
 

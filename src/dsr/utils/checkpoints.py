@@ -8,9 +8,10 @@ row are tolerated. Weights that are not finite, or predictions without a finite 
 from __future__ import annotations
 
 import contextlib
+import copy
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -114,12 +115,14 @@ class CheckpointError(ConfigError):
 
     Args:
         path: the file.
-        error: what reading it raised.
+        error: what reading or restoring it raised.
 
     """
 
     def __init__(self, path: Path, error: Exception) -> None:
-        text = f"expected a checkpoint of this training, got a damaged or foreign one ({type(error).__name__})"
+        what = one_line(error).removeprefix(f"{path}: ")
+        what = what if type(error) is ValueError else f"{type(error).__name__}: {what}"
+        text = f"expected a checkpoint of this training, got a damaged or foreign one ({what:.200})"
         super().__init__(f"{path}: {text}; overwrite=true begins anew")
         self._made_of = (path, error)
 
@@ -129,15 +132,30 @@ class CheckpointError(ConfigError):
 
 
 class Resumed(Callback):
-    """Lets a training go on from a state of its own kind alone, and tells whether it has done a step since.
+    """Lets a training go on from a state of its own kind alone; it is the last of the callbacks.
 
     Lightning and torch take over what a checkpoint has as attributes of their objects. Of what a new training has, a
     checkpoint may have other numbers, and nothing else: what is unknown is left out. Kernels that update some tensors
-    at once do not check sizes: they would write beyond averages that are smaller than their weights.
+    at once do not check sizes: they would write beyond averages that are smaller than their weights. An optimiser and
+    a schedule of their own then try a step with the state, so that a training does not fail at it later.
+
+    Attributes:
+        restoring: whether what is raised now is about the checkpoint, and not about the training.
+
     """
 
     def __init__(self) -> None:
-        self.begun = False
+        self.restoring = False
+
+    def setup(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, stage: str) -> None:
+        """Find what the states of this training's optimiser and schedule are like."""
+        made: Any = pl_module.configure_optimizers()
+        self._optimizer, node = (made["optimizer"], made["lr_scheduler"]) if isinstance(made, Mapping) else (made, None)
+        self._schedules = [] if node is None else [node["scheduler"]]
+        self._new = [each.state_dict() for each in self._schedules]
+        with _tried(self._optimizer):
+            self._own = copy.deepcopy(self._optimizer.state_dict())
+        self.restoring = True
 
     def on_load_checkpoint(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, checkpoint: dict[str, Any]
@@ -148,24 +166,39 @@ class Resumed(Callback):
             ValueError: one is not of the training's kind.
 
         """
-        made: Any = pl_module.configure_optimizers()
-        optimizer, schedule = (made["optimizer"], made["lr_scheduler"]) if isinstance(made, Mapping) else (made, None)
-        schedules = [] if schedule is None else [schedule["scheduler"].state_dict()]
-        [averages] = checkpoint["optimizer_states"]
-        checkpoint["optimizer_states"] = [_fitting(averages, _stepped(optimizer), "optimizer_states")]
-        checkpoint["lr_schedulers"] = _fitting(checkpoint["lr_schedulers"], schedules, "lr_schedulers")
+        states = _at(checkpoint, "optimizer_states")
+        if not isinstance(states, list) or len(states) != 1:
+            raise ValueError(f"optimizer_states: expected a list of 1, got {_kind(states)}")
+        checkpoint["optimizer_states"] = [_fitting_optimizer(states[0], self._own, "optimizer_states.0")]
+        schedules = _fitting(_at(checkpoint, "lr_schedulers"), self._new, "lr_schedulers")
+        checkpoint["lr_schedulers"] = schedules
+        _try_step(self._optimizer, checkpoint["optimizer_states"][0], self._schedules, schedules)
         loop = trainer.fit_loop.state_dict()
-        checkpoint["loops"] = {"fit_loop": _fitting(checkpoint["loops"]["fit_loop"], loop, "fit_loop")}
+        progress = _fitting(_at(checkpoint, "loops", "fit_loop"), loop, "loops.fit_loop")
+        _expect_counts(progress, loop, "loops.fit_loop")
+        checkpoint["loops"] = {"fit_loop": progress}
         states = checkpoint["callbacks"]
         own = {each.state_key: each for each in trainer.callbacks if each.state_key in states}  # type: ignore[attr-defined]
         checkpoint["callbacks"] = {
-            key: _fitting(states[key], each.state_dict(), key) if isinstance(each, _LIGHTNINGS) else states[key]
+            key: _fitting(states[key], each.state_dict(), f"callbacks.{key}")
+            if isinstance(each, _LIGHTNINGS)
+            else states[key]
             for key, each in own.items()
         }
+        checkpoint["callbacks"][self.state_key] = {"restoring": False}  # is loaded after the others
 
-    def on_train_batch_end(self, *_: Any) -> None:
-        """Note that there was a step."""
-        self.begun = True
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Note that all is restored but what has been tried."""
+        self.restoring = False
+
+
+def _at(state: Any, *keys: str) -> Any:
+    """Return an entry; ValueError where there is none."""
+    for done, key in enumerate(keys, 1):
+        if not isinstance(state, Mapping) or key not in state:
+            raise ValueError(f"{'.'.join(keys[:done])}: missing")
+        state = state[key]
+    return state
 
 
 def _fitting(value: Any, own: Any, place: str) -> Any:
@@ -174,39 +207,127 @@ def _fitting(value: Any, own: Any, place: str) -> Any:
         known = own or dict.fromkeys(value)  # of what is empty at first, there may be any numbers
         return {key: _fitting(each, known[key], f"{place}.{key}") for key, each in value.items() if key in known}
     if isinstance(own, list | tuple) and isinstance(value, list | tuple) and len(value) == len(own):
-        return type(own)(_fitting(*each, place) for each in zip(value, own, strict=True))
-    if isinstance(own, Tensor):
+        pairs = enumerate(zip(value, own, strict=True))
+        return type(own)(_fitting(*each, f"{place}.{index}") for index, each in pairs)
+    number = isinstance(value, float) or _is_whole(value) or (isinstance(value, Tensor) and not value.dim())
+    if isinstance(own, Tensor) and own.dim():
         fits = isinstance(value, Tensor) and value.shape == own.shape
         fits = fits and value.is_floating_point() == own.is_floating_point()
     elif isinstance(own, bool | str):
         fits = isinstance(value, type(own)) or value is None
     else:
-        number = isinstance(value, float) or _is_whole(value) or (isinstance(value, Tensor) and not value.dim())
-        fits = number if isinstance(own, float | int) else own is None and (number or isinstance(value, str | None))
+        fits = number if isinstance(own, Tensor | float | int) else own is None and (number or value is None)
+        fits = fits or (own is None and isinstance(value, str))
     if not fits:
-        raise ValueError(f"{place}: expected what {type(own).__name__} stands for, got {type(value).__name__}")
-    if isinstance(own, Tensor):  # as it lies in memory, which such kernels take for granted, too
+        raise ValueError(f"{place}: expected {_kind(own)}, got {_kind(value)}")
+    if isinstance(own, Tensor) and isinstance(value, Tensor):  # as in memory, which such kernels take for granted, too
         return torch.empty_like(own, dtype=value.dtype).copy_(value)
     return value
 
 
-def _stepped(optimizer: torch.optim.Optimizer) -> dict[str, Any]:
-    """Return an optimiser's state after a step with gradients of zero; its weights stay as they are."""
+def _kind(value: Any) -> str:
+    """Return what a value is, for a message."""
+    if isinstance(value, Tensor):
+        return f"a tensor of {tuple(value.shape)}, {value.dtype}"
+    size = f" of {len(value)}" if isinstance(value, list | tuple) else ""
+    return f"{'a number' if value is None else type(value).__name__}{size}"
+
+
+def _fitting_optimizer(value: Any, own: Any, place: str) -> dict[str, Any]:
+    """Return an optimiser's state in an own one's form: its groups' settings but for the numbers, and their parameters.
+
+    A parameter without a state has not had a gradient. Those of the history of LBFGS are as many as there are.
+    """
+    groups = _at(value, "param_groups")
+    if not isinstance(groups, list) or len(groups) != len(own["param_groups"]):
+        raise ValueError(f"{place}.param_groups: expected {_kind(own['param_groups'])}, got {_kind(groups)}")
+    pairs = zip(groups, own["param_groups"], strict=True)
+    fitting = [_settings(group, new, f"{place}.param_groups.{number}") for number, (group, new) in enumerate(pairs)]
+    states, kept = _at(value, "state"), {}
+    if not isinstance(states, Mapping):
+        raise ValueError(f"{place}.state: expected dict, got {_kind(states)}")
+    for key in (key for key in states if key in own["state"]):
+        saved, new = states[key], own["state"][key]
+        if "old_dirs" in new and isinstance(saved, Mapping):
+            past = saved.get("old_dirs")
+            history = len(past) if isinstance(past, list) else 0
+            flat = {name: [new["d"]] * history for name in ("old_dirs", "old_stps")}
+            new = {**new, **flat, "ro": [0.0] * history, "al": [None] * own["param_groups"][0]["history_size"]}
+        kept[key] = _fitting(saved, new, f"{place}.state.{key}")
+        step = float(kept[key].get("step", 0)) if isinstance(kept[key], Mapping) else 0
+        if not 0 <= step < math.inf:
+            raise ValueError(f"{place}.state.{key}.step: expected a number of steps, got {step:g}")
+    return {"state": kept, "param_groups": fitting}
+
+
+def _settings(group: Any, own: Mapping[str, Any], place: str) -> dict[str, Any]:
+    """Return the settings of a group of parameters, with the numbers, which schedules change, of a saved one."""
+
+    def taken(key: str, value: Any, new: Any) -> Any:
+        if isinstance(new, list | tuple) and new:
+            saved = _fitting(value, new, f"{place}.{key}")
+            return type(new)(taken(key, *pair) for pair in zip(saved, new, strict=True))
+        if not isinstance(new, Tensor | float) and not (_is_whole(new) and isinstance(value, float)):
+            return new
+        value = _fitting(value, new, f"{place}.{key}")
+        if not math.isfinite(float(value)):
+            raise ValueError(f"{place}.{key}: expected a finite number, got {float(value):g}")
+        return value
+
+    if not isinstance(group, Mapping) or group.get("params") != own["params"]:
+        raise ValueError(f"{place}.params: expected those of this training, in their order")
+    return {key: taken(key, group[key], new) if key in group else new for key, new in own.items()}
+
+
+def _expect_counts(progress: Any, own: Any, place: str) -> None:
+    """Check that what a loop counts is a whole number, 0 or more."""
+    for key, value in progress.items():
+        if isinstance(own.get(key), Mapping):
+            _expect_counts(value, own[key], f"{place}.{key}")
+        elif not isinstance(own.get(key, ""), bool | str) and not (_is_whole(value) and value >= 0):
+            raise ValueError(f"{place}.{key}: expected a count, got {value!r:.40}")
+
+
+@contextlib.contextmanager
+def _tried(optimizer: torch.optim.Optimizer) -> Iterator[None]:
+    """Do a step of an optimiser, with gradients of one; its weights are then as before."""
     weights = [each for group in optimizer.param_groups for each in group["params"]]
     before = [each.detach().clone() for each in weights]
     for each in weights:
-        each.grad = torch.zeros_like(each)
-    optimizer.step(lambda: 0.0)
-    with torch.no_grad():
-        for each, values in zip(weights, before, strict=True):
-            each.copy_(values)
-            each.grad = None
-    return optimizer.state_dict()
+        each.grad = torch.ones_like(each)
+    try:
+        optimizer.step(lambda: 0.0)
+        yield
+    finally:
+        with torch.no_grad():
+            for each, values in zip(weights, before, strict=True):
+                each.copy_(values)
+                each.grad = None
+
+
+def _try_step(optimizer: torch.optim.Optimizer, state: Any, schedules: Any, states: Any) -> None:
+    """Do a step from saved states; ValueError where that fails."""
+    try:
+        optimizer.load_state_dict(copy.deepcopy(state))
+        for schedule, saved in zip(schedules, copy.deepcopy(states), strict=True):
+            schedule.load_state_dict(saved)
+        with _tried(optimizer):
+            for schedule in schedules:
+                if not isinstance(schedule, torch.optim.lr_scheduler.ReduceLROnPlateau):
+                    schedule.step()
+    except MemoryError:
+        raise
+    except Exception as error:  # the same step without them was done
+        what = f"{type(error).__name__}: {one_line(error)}"
+        raise ValueError(f"optimizer_states, lr_schedulers: expected those of a next step, got {what}") from error
+    rates = [float(group["lr"]) for group in optimizer.param_groups if "lr" in group]
+    if not all(map(math.isfinite, rates)):
+        raise ValueError(f"lr_schedulers: expected finite learning rates of the next step, got {rates[0]:g}")
 
 
 def _is_whole(value: Any) -> bool:
     """Return whether a value is a whole number that 64 bits hold."""
-    return isinstance(value, int) and -(2**63) <= value < 2**63
+    return isinstance(value, int) and not isinstance(value, bool) and -(2**63) <= value < 2**63
 
 
 class OwnFiles(Callback):

@@ -12,6 +12,7 @@ import json
 import math
 import os
 import re
+import stat
 import zipfile
 from collections.abc import Iterable, Iterator
 from io import BufferedReader
@@ -148,6 +149,22 @@ def expect_stored(path: Path) -> None:
     if any(member.compress_type != zipfile.ZIP_STORED for member in members):
         raise ValueError(f"{path}: expected members that are not compressed")
     expect_bytes(path, sum(member.file_size for member in members), path.stat().st_size)
+
+
+def files_in(packed: zipfile.ZipFile, archive: object) -> list[zipfile.ZipInfo]:
+    """Return the files of an archive that may be unpacked.
+
+    Raises:
+        ValueError: one is a link or a device, or leads outside the folder; the message begins with ``archive``.
+
+    """
+    entries = [each for each in packed.infolist() if not each.is_dir()]
+    for each in entries:
+        if stat.S_IFMT(each.external_attr >> 16) not in (0, stat.S_IFREG):
+            raise ValueError(f"{archive}: refused: {each.filename!r} in it is neither a file nor a directory")
+        if leads_outside(each.filename):
+            raise ValueError(f"{archive}: refused: {each.filename!r} in it leads outside the directory it belongs into")
+    return entries
 
 
 def read_member(packed: zipfile.ZipFile, name: str) -> bytes:

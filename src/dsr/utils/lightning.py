@@ -34,7 +34,7 @@ _SECONDS_BETWEEN_LOSSES = 0.2
 
 
 _NOT_OF_A_CHECKPOINT = (OSError, FullDiskError, ConfigError, DivergenceError, MemoryError, torch.OutOfMemoryError)
-"""Errors of a training's first step that the checkpoint that it went on from has no part in."""
+"""Errors while a checkpoint is restored that it has no part in."""
 _LOST = ("Connection closed", "Connection reset", "Broken pipe")
 """What gloo says when another process is gone."""
 
@@ -283,7 +283,8 @@ def fit(
 
     """
     resumed = Resumed()
-    trainer.callbacks.append(resumed)  # type: ignore[attr-defined]
+    if resume is not None:
+        trainer.callbacks.append(resumed)  # type: ignore[attr-defined]
     try:
         with without_chatter(), space_for(Path(trainer.log_dir or trainer.default_root_dir)):
             trainer.fit(module, data, ckpt_path=resume, weights_only=True, **named)
@@ -297,7 +298,7 @@ def fit(
             if any(each.requested for each in trainer.callbacks if isinstance(each, Interruption)):  # type: ignore[attr-defined]
                 raise KeyboardInterrupt from error  # the first process has saved the step
             raise LostProcessError(error) from error
-        if resume is None or resumed.begun or isinstance(error, _NOT_OF_A_CHECKPOINT):
+        if resume is None or not resumed.restoring or isinstance(error, _NOT_OF_A_CHECKPOINT):
             raise
         raise CheckpointError(resume, error) from error
     finally:

@@ -67,7 +67,7 @@ class FrameWork:
         self._claims = Claims(request.results.output)
         self.seconds: float | None = None
         self._read_last: tuple[str, Picture] | None = None
-        self._sequence = FrameSequence(frames.whole, self._read, request.frames.neighbours, request.frames.poses)
+        self._sequence = FrameSequence(frames.whole, self._read, request.frames.neighbours, request.frames.trajectory)
 
     def check_together(self, jobs: Sequence[tuple[Pair, Path]]) -> Frames:
         """Return the frames with what is wrong with them together, if there is something to do.

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from dsr.app.upsample.request import FrameChoice, UpsampleRequest
+from dsr.io.captures.colmap import add_model
 from dsr.io.inputs import FolderUnits
 from dsr.io.layouts import find_pairs_of_folder
 from dsr.io.pairs import Pair, PairingResult, add_confidence, find_pairs_of_lists, in_order
@@ -51,6 +52,10 @@ def find_frames(request: UpsampleRequest) -> Frames:
         found = replace(found, pairs=add_confidence(found.pairs, choice.confidence))
     if choice.rgb:
         found = replace(found, pairs=_by_number(found.pairs))
+    if choice.model is not None:
+        found = add_model(found, choice.model)
+        if not any(pair.capture is not None and pair.capture.told_by == choice.model for pair in found.pairs):
+            raise ValueError(f"{choice.model}: expected images named as the photos, such as {found.pairs[0].rgb.name}")
     whole = found.pairs
     single = len(whole) == 1 and not choice.folders and not choice.rgb[0].is_dir()
     if choice.shard is not None:

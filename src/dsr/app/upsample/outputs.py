@@ -173,6 +173,8 @@ def described(picture: Picture, encoding: Encoding) -> dict[str, Any]:
         "input_holes": round(1 - float(picture.depth_lr.isfinite().float().mean()), 6),
         "camera": asdict(picture.camera),
         "pose": None if picture.pose is None else picture.pose.tolist(),
+        "up": picture.up,
+        "time": picture.time,
         "input_depth": _plain(picture.encoding),
         "depth_file": _plain(encoding),
     }

@@ -90,6 +90,7 @@ class Part(NamedTuple):
         usual: whether it is written unless something else is asked for.
         shape: whether it takes as long as all the rest, and is written beside it.
         errors: whether it depends on the expected errors.
+        poses: whether it needs a pose of each frame, where there are several.
         library: a module that it needs, its package, and the extra of dsr that installs it.
 
     """
@@ -102,6 +103,7 @@ class Part(NamedTuple):
     usual: bool = True
     shape: bool = False
     errors: bool = False
+    poses: bool = False
     library: tuple[str, str, str] | None = None
 
     def check_library(self) -> None:
@@ -259,8 +261,9 @@ PARTS: dict[str, Part] = {
         Part("input", ("input.npz",), _input),
         Part("rgbd", ("rgbd/color.png", "rgbd/depth.png", "rgbd/intrinsic.json"), _rgbd, usual=False),
         Part("open3d", ("open3d",), write_all=_open3d, needs=_OF_DEPTH, usual=False),
-        Part("nerfstudio", ("transforms.json",), write_all=_nerfstudio, needs=_OF_DEPTH, usual=False),
-        Part("gaussian", ("gaussian",), write_all=_gaussian, needs=_OF_DEPTH, usual=False),
+        Part("nerfstudio", ("transforms.json", "nerfstudio"), write_all=_nerfstudio, needs=_OF_DEPTH, usual=False,
+             poses=True),
+        Part("gaussian", ("gaussian",), write_all=_gaussian, needs=_OF_DEPTH, usual=False, poses=True),
         Part("rerun", ("scene.rrd",), write_all=_rerun, needs=_OF_DEPTH, usual=False,
              library=("rerun", "rerun-sdk", "rerun")),
     )

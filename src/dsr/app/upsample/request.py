@@ -30,6 +30,13 @@ def _parse_settings(texts: list[str]) -> tuple[tuple[str, Any], ...]:
     return tuple(parse_settings(texts).items())
 
 
+def _parse_poses(text: str) -> Path:
+    """Return the file of poses; of a folder with a model of COLMAP that of its images."""
+    from dsr.io.captures.colmap import model_file  # noqa: PLC0415 - few commands have poses
+
+    return model_file(Path(text)) or Path(text)
+
+
 @dataclass(frozen=True, kw_only=True)
 class FrameChoice(Options):
     """Which frames to work on, and how many at a time."""
@@ -54,7 +61,13 @@ class FrameChoice(Options):
         "N",
         rule=Rule("0 or a positive number of frames", lambda count: count >= 0),
     )
-    poses: Path | None = option(None, "camera poses: TUM's format, or 4 x 4 matrices", "FILE", recorded=False)
+    poses: Path | None = option(
+        None,
+        "camera poses: TUM's format, 4 x 4 matrices, or a model of COLMAP with its cameras",
+        "FILE",
+        parse=_parse_poses,
+        recorded=False,
+    )
     workers: int = option(
         1,
         "pictures at a time, each in its own process (default: 1)",
@@ -72,6 +85,18 @@ class FrameChoice(Options):
             raise OptionError("mask", "expected --rgb and --depth with it, got folders")
         if self.poses is not None and len(self.folders) > 1:
             raise OptionError("poses", f"expected the frames of one folder, got {len(self.folders)} folders")
+
+    @property
+    def model(self) -> Path | None:
+        """The file of the images of a model of COLMAP, whose poses, cameras and lenses the frames have; or None."""
+        from dsr.io.captures.colmap import model_file  # noqa: PLC0415 - few commands have poses
+
+        return None if self.poses is None else model_file(self.poses)
+
+    @property
+    def trajectory(self) -> Path | None:
+        """The file of poses alone, or None."""
+        return self.poses if self.model is None else None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,16 +12,24 @@ from pathlib import Path
 from rich.console import Console
 
 from dsr.app.upsample.frames import Frames, find_frames
+from dsr.app.upsample.outputs import INFO
 from dsr.app.upsample.preview import preview
 from dsr.app.upsample.reporting import Reporter, listed
 from dsr.app.upsample.request import UpsampleRequest, settings_of
 from dsr.app.upsample.scene import EXPORTS, write_scene
+from dsr.app.upsample.stored import read_info
 from dsr.app.upsample.workers import work_through
 from dsr.evaluation.sharing import Claims
+from dsr.io.images import pixels_in_header
+from dsr.io.pairs import Pair
 from dsr.io.reading import Shard
+from dsr.io.scene_files import expect_poses
+from dsr.io.trajectories import read_poses
 from dsr.utils.console import ConsoleProgress, show
 from dsr.utils.files import expect_targets, write_text
 
+_USUAL_SIZE = (1440, 1920)
+"""Of photos in videos and archives, whose poses do not depend on it."""
 _READ_ONLY = (errno.EACCES, errno.EPERM, errno.EROFS)
 
 
@@ -36,12 +44,15 @@ def run(request: UpsampleRequest, console: Console) -> list[str]:
         The problems, one line each; empty if there were none.
 
     Raises:
-        ValueError: the pairs cannot be determined, a file would be written outside of the folder of results, or a
-            command with other settings is at work in it.
+        ValueError: the pairs cannot be determined, frames lack poses that a part needs, a file would be written outside
+            of the folder of results, or a command with other settings is at work in it.
         TargetError: a link, a device, a pipe or a socket is in the place of a file.
 
     """
     frames = find_frames(request)
+    for part in request.results.of_all:
+        if part.poses:
+            expect_poses(part.name, _posed(request, frames))
     with contextlib.ExitStack() as stack:
         if not request.results.dry_run:
             claims = Claims(request.results.output, json.dumps(settings_of(request), sort_keys=True))
@@ -51,6 +62,27 @@ def run(request: UpsampleRequest, console: Console) -> list[str]:
                 if error.errno not in _READ_ONLY:  # where all may be complete; what is written says so itself
                     raise
         return _run(request, frames, console)
+
+
+def _posed(request: UpsampleRequest, frames: Frames) -> dict[str, bool]:
+    """Return whether each frame has a pose, of the file, of its capture or of its result; frames that fail count."""
+    if request.frames.trajectory is not None:
+        given = read_poses(request.frames.trajectory).assign(frames.whole)
+        return {pair.name: pair.name in given for pair in frames.whole}
+
+    def posed(pair: Pair) -> bool:
+        try:
+            told = None if pair.capture is None else pair.capture.geometry(pixels_in_header(pair.rgb) or _USUAL_SIZE)
+        except (ValueError, OSError):
+            return True
+        if told is not None and told.pose is not None:
+            return True
+        try:
+            return read_info(frames.target(request.results.output, pair) / INFO).get("pose") is not None
+        except (ValueError, OSError):
+            return False
+
+    return {pair.name: posed(pair) for pair in frames.whole}
 
 
 def _run(request: UpsampleRequest, frames: Frames, console: Console) -> list[str]:

@@ -9,10 +9,10 @@ from pathlib import Path
 
 from dsr.app.upsample.outputs import INFO
 from dsr.app.upsample.parts import METRES, Part
-from dsr.app.upsample.stored import DEPTHS, read_camera, read_info
+from dsr.app.upsample.stored import DEPTHS, read_camera, read_info, read_up
 from dsr.io.scene_files import RGBD, Frame, parse_pose
 from dsr.utils.files import write_text
-from dsr.utils.guards import parse_json, path_within, read_limited
+from dsr.utils.guards import is_number, parse_json, path_within, read_limited
 
 EXPORTS = "exports.json"
 """The record of exports, in the folder of the results."""
@@ -50,8 +50,9 @@ def write_scene(output: Path, folders: Mapping[str, Path], parts: Sequence[Part]
         assert part.write_all is not None  # noqa: S101 - they are of all frames
         name = part.files[0]
         path = output / name
-        if path.exists() and name not in recorded and not overwrite:
-            result.problems.append(f"{path}: is there already and not of an earlier run; --overwrite replaces it")
+        there = [output / each for each in part.files if (output / each).exists()]
+        if there and name not in recorded and not overwrite:
+            result.problems.append(f"{there[0]}: is there already and not of an earlier run; --overwrite replaces it")
             continue
         try:
             files = part.write_all(path, frames)
@@ -60,7 +61,7 @@ def write_scene(output: Path, folders: Mapping[str, Path], parts: Sequence[Part]
             continue
         stale = set(recorded.get(name, ())) - {file.relative_to(output).as_posix() for file in files}
         for old in stale:  # of frames that are no longer there
-            if old.split("/")[0] == name:
+            if old.split("/")[0] in part.files:
                 (output / old).unlink(missing_ok=True)
         recorded[name] = sorted(file.relative_to(output).as_posix() for file in files)
         write_text(output / EXPORTS, json.dumps({"exports": recorded}, indent=2) + "\n")
@@ -83,7 +84,9 @@ def read_frame(name: str, folder: Path) -> Frame:
     colour = folder / "rgbd" / RGBD[0]
     if depth is None or not colour.is_file():
         raise ValueError(f"{folder}: expected {METRES} and rgbd/{RGBD[0]} of this run, one is missing")
-    return Frame(name, read_camera(path, info), parse_pose(f"{path}: pose", info.get("pose")), colour, depth)
+    pose, time = parse_pose(f"{path}: pose", info.get("pose")), info.get("time")
+    time = time if is_number(time) else None
+    return Frame(name, read_camera(path, info), pose, colour, depth, read_up(info), time)
 
 
 def expect_distinct(frames: Sequence[Frame]) -> None:

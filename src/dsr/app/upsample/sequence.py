@@ -82,7 +82,7 @@ class FrameSequence:
         """
         notes = list(self._matched)
         if self._poses is not None:
-            picture = replace(picture, pose=self._poses.get(pair.name))
+            picture = replace(picture, pose=self._poses.get(pair.name), up="")
         if picture.pose is None and self._count:
             where = "this capture has none; give --poses" if self._file is None else f"{self._file} has none"
             raise ValueError(f"--neighbours: expected a pose for each frame, {where}")

@@ -16,6 +16,7 @@ from dsr.app.upsample.parts import ERRORS, METRES, Results
 from dsr.evaluation.store import load_errors
 from dsr.geometry.camera import Camera
 from dsr.io.exports import INPUT, read_input
+from dsr.io.frames import UPS
 from dsr.report.surface_page import ViewedResult
 from dsr.sample import expect_distances
 from dsr.utils.arrays import array_headers, open_array
@@ -101,6 +102,12 @@ def read_info(path: Path) -> Mapping[str, Any]:
     if complete is not True:
         raise ValueError(f"{path}: expected a complete result, got that of an interrupted run; run it again")
     return info
+
+
+def read_up(info: Mapping[str, Any]) -> str:
+    """Return the axis of the world that points up, one of :data:`dsr.io.frames.UPS`."""
+    up = info.get("up")
+    return up if isinstance(up, str) and up in UPS else ""
 
 
 def read_camera(path: Path, info: Mapping[str, Any]) -> Camera:

@@ -13,7 +13,6 @@ import json
 import os
 import re
 import shutil
-import stat
 import tarfile
 import zipfile
 import zlib
@@ -35,7 +34,7 @@ from urllib3.exceptions import HTTPError
 from dsr.data.download.collections import Collection, Item
 from dsr.utils.console import one_line
 from dsr.utils.files import FullDiskError, expect_space, expect_target, space_for, temporary_folder, write_text
-from dsr.utils.guards import leads_outside, natural_key, opened, parse_json, read_limited, refusing
+from dsr.utils.guards import files_in, leads_outside, natural_key, opened, parse_json, read_limited, refusing
 from dsr.utils.progress import Progress, Task, megabytes
 from dsr.utils.versions import file_hash
 
@@ -484,10 +483,7 @@ def _members(archive: Path) -> Iterator[list[_Member]]:
     with opened(archive) as file, contextlib.ExitStack() as stack:
         if file.read(2) == b"PK":
             packed = stack.enter_context(zipfile.ZipFile(archive))
-            entries = [each for each in packed.infolist() if not each.is_dir()]
-            for each in entries:
-                if stat.S_IFMT(each.external_attr >> 16) not in (0, stat.S_IFREG):
-                    raise ValueError(f"{archive}: refused: {each.filename!r} in it is neither a file nor a directory")
+            entries = files_in(packed, archive)
             members = [_Member(each.filename, each.file_size, partial(packed.open, each)) for each in entries]
         else:
             tar = stack.enter_context(tarfile.open(archive))

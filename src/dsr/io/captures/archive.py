@@ -1,13 +1,18 @@
-"""Archives and folders with the same members, and LZFSE data; sizes are checked before anything is unpacked.
+"""Archives, folders with the same members, parts of files, and LZFSE data; sizes are checked before unpacking.
 
 LZFSE: https://github.com/lzfse/lzfse, of which lzfse_internal.h describes the blocks.
 """
 
 from __future__ import annotations
 
+import atexit
+import contextlib
 import functools
 import hashlib
+import os
+import shutil
 import struct
+import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -19,8 +24,19 @@ import numpy as np
 
 from dsr.io.frames import Record
 from dsr.utils.decoding import decode_pixels
-from dsr.utils.guards import read_limited, read_member, refusing
+from dsr.utils.files import expect_space
+from dsr.utils.guards import (
+    bytes_of_archive,
+    expect_bytes,
+    files_in,
+    naming,
+    opened,
+    read_limited,
+    read_member,
+    refusing,
+)
 
+_CHUNK = 1 << 20
 PHOTO_LIMIT = 1 << 26
 """Largest size in bytes of an encoded photo."""
 _DAMAGED = (zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError, struct.error)
@@ -118,6 +134,72 @@ class Member:
         return {"file": name, "sha256": hashlib.sha256(content).hexdigest()}
 
 
+@dataclass(frozen=True)
+class Section:
+    """A :class:`~dsr.io.frames.Source` of a part of a file.
+
+    Args:
+        file: the file.
+        name: of the part, for messages.
+        start, length: place in the file, in bytes.
+        decode: returns the pixels of the content, or raises a ValueError without the file's name.
+
+    """
+
+    file: Path
+    name: str
+    start: int
+    length: int
+    decode: Callable[[bytes], np.ndarray]
+
+    def read(self) -> np.ndarray:
+        """Return the pixels."""
+        with naming(self.file / self.name):
+            return self.decode(self._content())
+
+    def record(self) -> Record:
+        """Return the part's name and hash."""
+        return {"file": f"{self.file.name}/{self.name}", "sha256": hashlib.sha256(self._content()).hexdigest()}
+
+    def _content(self) -> bytes:
+        """Return the bytes of the part."""
+        with opened(self.file) as file:
+            file.seek(self.start)
+            return file.read(self.length)
+
+
+def unpack(path: Path) -> Path:
+    """Return a temporary folder with the files of a ZIP file, which is deleted when the program ends.
+
+    Raises:
+        ValueError: it is damaged or encrypted, a member is a link or leads outside the folder, or they are larger than
+            the size of the archive explains.
+        FullDiskError: the disk is too small for what it declares.
+
+    """
+    return _unpack(path, _state(path))
+
+
+def inflate(content: bytes, size: int, bits: int = zlib.MAX_WBITS) -> bytes:
+    """Return what compressed data unpack to.
+
+    Args:
+        size: number of bytes that is expected.
+        bits: zlib's window size: negative for data without a header.
+
+    Raises:
+        ValueError: they are damaged, or unpack to another number of bytes.
+
+    """
+    with refusing(f"expected compressed data of {size} bytes, got damaged ones", zlib.error):
+        values = zlib.decompressobj(bits).decompress(content, size + 1)
+    if len(values) != size:
+        raise ValueError(
+            f"expected compressed data of {size} bytes, got {'more' if len(values) > size else len(values)}"
+        )
+    return values
+
+
 def decode_photo(content: bytes) -> np.ndarray:
     """Return the pixels of an encoded photo, (H, W, 3) uint8 RGB.
 
@@ -191,3 +273,44 @@ def _open(path: Path, _: tuple[int, int]) -> zipfile.ZipFile:
     """Return the open archive."""
     with refusing(f"{path}: expected a ZIP archive, got a damaged, truncated or foreign file", *_DAMAGED):
         return zipfile.ZipFile(path)
+
+
+@functools.cache
+def _unpack(path: Path, _: tuple[int, int]) -> Path:
+    """Return the folder with the files of an archive."""
+    with _open(path, _state(path)) as packed:
+        members = [each for each in files_in(packed, path) if not each.filename.startswith("__MACOSX/")]
+        total = sum(each.file_size for each in members)
+        expect_bytes(f"{path}: the members declare", total, bytes_of_archive(path.stat().st_size))
+        with contextlib.ExitStack() as stack:
+            work = tempfile.mkdtemp(prefix="dsr-")
+            stack.callback(shutil.rmtree, work, ignore_errors=True)
+            target = Path(work) / path.name
+            target.mkdir()
+            expect_space(target, total)
+            for each in members:
+                with refusing(f"{path}: {each.filename}: expected a member, got a damaged one", *_DAMAGED):
+                    _unpack_member(packed, each, target / each.filename.replace("\\", "/"))
+            stack.pop_all()
+    atexit.register(_remove, work, os.getpid())
+    return target
+
+
+def _unpack_member(packed: zipfile.ZipFile, member: zipfile.ZipInfo, path: Path) -> None:
+    """Write a member of an archive to a file that does not exist yet; it may have no more bytes than it declares."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    left = member.file_size
+    with packed.open(member) as source, path.open("xb") as sink:
+        while part := source.read(_CHUNK):
+            left -= len(part)
+            if left < 0:
+                break
+            sink.write(part)
+    if left:
+        raise zipfile.BadZipFile(f"{member.filename}: another size than {member.file_size} bytes")
+
+
+def _remove(folder: str, process: int) -> None:
+    """Delete a folder that a process made, in that process."""
+    if os.getpid() == process:
+        shutil.rmtree(folder, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""Captures of ARKit's lidar: videos of ARKitScenes and raw exports of Polycam.
+"""Captures of ARKit's lidar: videos of ARKitScenes, and exports of Polycam and 3D Scanner App.
 
 ARKitScenes; https://github.com/apple/ARKitScenes, DATA.md and raw/README.md.
 
@@ -9,7 +9,8 @@ ARKitScenes; https://github.com/apple/ARKitScenes, DATA.md and raw/README.md.
     41069021/lowres_wide.traj                                time, rotation (axis times angle), translation
 
 Rotation and translation of the trajectory lead from the world to the camera, whose axes are x right, y down, z forward
-(threedod/benchmark_scripts/utils/tenFpsDataLoader.py inverts them). The trajectory has ten poses a second; a frame
+(threedod/benchmark_scripts/utils/tenFpsDataLoader.py inverts them); the world is that of a laser scan, z up
+(https://github.com/apple/ARKitScenes/issues/81). The trajectory has ten poses a second; a frame
 takes that within 10 ms of it. Intrinsics may be a millisecond off.
 
 Polycam's raw export (developer mode); https://github.com/PolyCam/polyform describes it.
@@ -19,8 +20,15 @@ Polycam's raw export (developer mode); https://github.com/PolyCam/polyform descr
     keyframes/depth/TIME.png                  16-bit millimetres, 256 x 192
     keyframes/confidence/TIME.png             0 (low), 127 (medium) and 255 (high)
 
-t_ij are the rows of the pose from ARKit's camera (y up, looking along -z) to the world. The corrected photos and
+t_ij are the rows of the pose from ARKit's camera (y up, looking along -z) to the world, y up. The corrected photos and
 cameras are taken where a frame has both.
+
+3D Scanner App's export of all data; https://github.com/laanlabs/3dScannerApp_samples has some.
+
+    frame_00000.jpg          photos, 1920 x 1440, of every few frames
+    frame_00000.json         intrinsics, 9 numbers row by row, and cameraPoseARFrame, 16, ARKit's camera to world
+    depth_00000.png          16-bit millimetres, 256 x 192; frame_00000.exr in some versions
+    conf_00000.png           0 (low) to 2 (high)
 """
 
 from __future__ import annotations
@@ -28,15 +36,23 @@ from __future__ import annotations
 import functools
 import math
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 from scipy.spatial.transform import Rotation
 
 from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry
 from dsr.io.images import Pixels, read_numbers
-from dsr.io.pairs import Pair, PairingResult
-from dsr.io.trajectories import check_pose, describe_capture, intrinsics_camera, read_text
+from dsr.io.pairs import Pair, PairingResult, has_name, numbered_files
+from dsr.io.trajectories import (
+    USUAL_SIZE,
+    check_pose,
+    describe_capture,
+    fitting_camera,
+    intrinsics_camera,
+    read_text,
+)
 from dsr.notes import Assumption
 from dsr.utils.guards import natural_key, numbers_in, read_limited
 from dsr.utils.validation import parse_model
@@ -53,6 +69,7 @@ _Motion = tuple[float, ...]
 _POLYCAM = "Polycam"
 _LARGEST_JSON = 1 << 20
 """Largest file of a camera in bytes."""
+_SCANNER = "3D Scanner App"
 _KINDS = ("corrected_images", "images")
 _CAMERAS = {"corrected_images": "corrected_cameras", "images": "cameras"}
 
@@ -130,7 +147,8 @@ def _geometry(place: str, intrinsics: Path | None, motion: _Motion | None, _: tu
         to_camera[:3, :3] = Rotation.from_rotvec(motion[:3]).as_matrix()
         to_camera[:3, 3] = motion[3:]
         pose = check_pose(place, np.linalg.inv(to_camera))
-    return Geometry(camera, pose, tuple(notes))
+    time = _time(place.rpartition(" ")[2])
+    return Geometry(camera, pose, tuple(notes), up="z", time=time if math.isfinite(time) else None)
 
 
 class _PolycamCamera(BaseModel, strict=True):
@@ -193,4 +211,51 @@ def _polycam_geometry(path: Path, _: tuple[int, int]) -> Geometry:
     told = parse_model(_PolycamCamera, read_text(path, _LARGEST_JSON), path, f"expected {_POLYCAM}'s camera; ")
     camera = intrinsics_camera(str(path), (told.height, told.width), (told.fx, told.fy, told.cx, told.cy))
     rows = [[getattr(told, f"t_{row}{column}") for column in range(4)] for row in range(3)]
-    return Geometry(camera, check_pose(str(path), np.array([*rows, [0, 0, 0, 1]], dtype=np.float64), opengl=True))
+    pose = check_pose(str(path), np.array([*rows, [0, 0, 0, 1]], dtype=np.float64), opengl=True)
+    return Geometry(camera, pose, up="y")
+
+
+class _ScannerFrame(BaseModel, strict=True):
+    """A file of a frame of 3D Scanner App; numbers may be NaN here."""
+
+    intrinsics: Annotated[list[float], Field(min_length=9, max_length=9)]
+    pose: Annotated[list[float], Field(min_length=16, max_length=16)] = Field(alias="cameraPoseARFrame")
+
+
+def find_scanner_app(folder: Path) -> PairingResult | None:
+    """Return the frames of an export of all data of 3D Scanner App; None if the folder is none."""
+    if not has_name(folder, "frame_", ".json"):
+        return None
+    told, photos = (numbered_files(folder, (suffix,), "frame_") for suffix in (".json", ".jpg"))
+    depths = numbered_files(folder, (".exr",), "frame_") | numbered_files(folder, (".png",), "depth_")
+    if not photos or not depths or not told:
+        return None
+    if b"cameraPoseARFrame" not in read_limited(next(iter(told.values())), _LARGEST_JSON):
+        return None
+    confidences = numbered_files(folder, (".png",), "conf_")
+    pairs = []
+    for number in sorted(photos.keys() & depths.keys()):
+        path = told.get(number)
+        content = b"" if path is None else read_limited(path, _LARGEST_JSON)
+        geometry = functools.partial(_scanner_geometry, path)
+        frame = CaptureFrame(_SCANNER, geometry, path or folder / f"frame_{number:05}.json", content)
+        known = ConfidenceMap(confidences[number], HIGHEST_LEVEL) if number in confidences else None
+        unit = 1e-3 if depths[number].suffix.lower() == ".png" else None
+        pairs.append(
+            Pair(photos[number].stem, photos[number], depths[number], unit=unit, capture=frame, confidence=known)
+        )
+    unit_text = "millimetres" if all(pair.unit for pair in pairs) else "floats"
+    note = describe_capture(f"a capture of {_SCANNER}", unit_text, pairs, poses=True)
+    lone = [each[number] for each in (photos, depths) for number in each if not (number in photos and number in depths)]
+    return PairingResult(tuple(pairs), (note,), tuple(lone))
+
+
+def _scanner_geometry(path: Path | None, size: tuple[int, int]) -> Geometry:
+    """Return camera and pose of a frame."""
+    if path is None:
+        return Geometry(assumptions=(Assumption("no camera and no pose: there is no JSON of the frame"),))
+    told = parse_model(_ScannerFrame, read_text(path, _LARGEST_JSON), path, f"expected {_SCANNER}'s frame; ")
+    fx, _, cx, _, fy, cy = told.intrinsics[:6]
+    camera = fitting_camera(str(path), (size, USUAL_SIZE), (fx, fy, cx, cy))
+    pose = check_pose(str(path), np.reshape(told.pose, (4, 4)), opengl=True)
+    return Geometry(camera, pose, up="y")

@@ -26,7 +26,7 @@ from pydantic import BaseModel, Field, ValidationError
 
 from dsr.io.captures.archive import PHOTO_LIMIT, Archive, Member, decode_lzfse, decode_photo
 from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry
-from dsr.io.pairs import Pair, PairingResult
+from dsr.io.pairs import Pair, PairingResult, numbered_files
 from dsr.io.trajectories import describe_capture, intrinsics_camera, pose_from_quaternion
 from dsr.notes import Assumption
 from dsr.utils.guards import natural_key
@@ -114,7 +114,7 @@ def _read_export(folder: Path) -> PairingResult | None:
         return None
     metadata = _parse(path, content)
     photos, depths, confidences = (
-        _numbered(folder / kind, suffixes)
+        numbered_files(folder / kind, suffixes)
         for kind, suffixes in (("rgb", _EXPORT_PHOTOS), ("depth", (".exr",)), ("conf", (".exr", ".png")))
     )
     both = sorted(photos.keys() & depths.keys())
@@ -133,14 +133,6 @@ def _found(metadata: _Metadata, pairs: Sequence[Pair]) -> tuple[Assumption, ...]
     if metadata.poses and not metadata.moves:
         found.append(Assumption("no poses: those of the capture are all the same"))
     return tuple(found)
-
-
-def _numbered(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
-    """Return the files of a folder by number."""
-    if not folder.is_dir():
-        return {}
-    paths = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in suffixes]
-    return {int(path.stem): path for path in paths if re.fullmatch(r"\d{1,9}", path.stem)}
 
 
 def _is_ours(content: bytes) -> bool:
@@ -189,4 +181,4 @@ def _geometry(
     assumptions = () if own else (Assumption(text),)
     if pose is None:
         return Geometry(camera, None, assumptions)
-    return Geometry(camera, pose_from_quaternion(place, pose[:4], pose[4:], opengl=True), assumptions)
+    return Geometry(camera, pose_from_quaternion(place, pose[:4], pose[4:], opengl=True), assumptions, up="y")

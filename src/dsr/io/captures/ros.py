@@ -80,10 +80,11 @@ def _read(path: Path, prefix: str = "") -> PairingResult:
     if not partner:
         raise ValueError(f"{path}: expected photos and depth maps within 20 ms of each other, found none")
     told = repr(info).encode()
-    geometry = functools.partial(_geometry, f"{path}{PurePosixPath(photo_topic).parent / 'camera_info'}", info)
+    place = f"{path}{PurePosixPath(photo_topic).parent / 'camera_info'}"
     pairs = []
     for first, second in sorted(partner.items()):
         photo, depth = photos[int(first.name)][0], depths[int(second.name)][0]
+        geometry = functools.partial(_geometry, place, info, named["rgb"][first])
         frame = CaptureFrame("ROS", geometry, path, told, photo, depth)
         name = f"{prefix}{int(first.name):06}"
         pairs.append(
@@ -184,7 +185,12 @@ def _camera_info(reader: Any, photo_topic: str) -> _Info | None:
     return None
 
 
-def _geometry(place: str, info: _Info | None, _: tuple[int, int]) -> Geometry:
+def _geometry(place: str, info: _Info | None, time: float, _: tuple[int, int]) -> Geometry:
+    """Return the camera of a recording, and the frame's time."""
+    return _camera(place, info)._replace(time=time)
+
+
+def _camera(place: str, info: _Info | None) -> Geometry:
     """Return the camera of a recording."""
     if info is None:
         return Geometry(None, None, (Assumption("the recording has no camera_info beside the photo's topic"),))

@@ -19,6 +19,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import functools
+import math
 import os
 import re
 import threading
@@ -30,10 +31,9 @@ import cv2
 import numpy as np
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.plausible import may_be_of
 from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry, Record
-from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult
-from dsr.io.trajectories import describe_capture, intrinsics_camera, pose_from_quaternion, read_text
+from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult, numbered_files
+from dsr.io.trajectories import USUAL_SIZE, describe_capture, fitting_camera, pose_from_quaternion, read_text
 from dsr.notes import Assumption
 from dsr.utils.decoding import quiet_decoders
 from dsr.utils.guards import expect_pixels, numbers_in
@@ -42,8 +42,6 @@ from dsr.utils.versions import file_hash
 _APP = "Stray Scanner"
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _INTRINSICS = ("fx", "fy", "cx", "cy")
-_USUAL_SIZE = (1440, 1920)
-"""Of the video, for extracted frames that were made smaller."""
 _Row = Mapping[str, str]
 
 _OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
@@ -65,10 +63,10 @@ def find_stray(folder: Path) -> PairingResult | None:
     video, matrix, odometry = folder / "rgb.mp4", folder / "camera_matrix.csv", folder / "odometry.csv"
     if not (matrix.is_file() or odometry.is_file()):
         return None
-    photos, depths = _numbered(folder / "rgb", PHOTO_SUFFIXES), _numbered(folder / "depth", (".png", ".npy"))
+    photos, depths = numbered_files(folder / "rgb", PHOTO_SUFFIXES), numbered_files(folder / "depth", (".png", ".npy"))
     if not depths or not (photos or video.is_file()):
         return None
-    confidence, rows = _numbered(folder / "confidence", (".png",)), _read_odometry(odometry)
+    confidence, rows = numbered_files(folder / "confidence", (".png",)), _read_odometry(odometry)
     text = read_text(matrix) if matrix.is_file() else ""
     pairs, unpaired = [], []
     for number, depth in depths.items():
@@ -85,11 +83,11 @@ def find_stray(folder: Path) -> PairingResult | None:
         pairs.append(Pair(f"{number:06}", rgb, depth, unit=1e-3, capture=frame, confidence=known))
     unpaired += [path for number, path in photos.items() if number not in depths]
     found = describe_capture(f"a capture of {_APP}", "millimetres", pairs, poses=bool(rows))
-    notes = (found,) if photos else (found, *_check_count(video, max(depths) + 1))
+    notes = (found,) if photos else (found, *check_count(video, max(depths) + 1))
     return PairingResult(tuple(pairs), notes, tuple(unpaired))
 
 
-def _check_count(video: Path, expected: int) -> list[Assumption]:
+def check_count(video: Path, expected: int) -> list[Assumption]:
     """Return a warning if a video has another number of frames than there are maps: they may belong to others."""
     try:
         count = count_frames(video)
@@ -99,14 +97,6 @@ def _check_count(video: Path, expected: int) -> list[Assumption]:
         return []
     text = f"{video.name} has {count} frames, the depth maps count to {expected}: photos may be some frames off"
     return [Assumption(text)]
-
-
-def _numbered(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
-    """Return the files of a folder by their numbers, in order."""
-    if not folder.is_dir():
-        return {}
-    paths = [path for path in folder.iterdir() if path.suffix.lower() in suffixes]
-    return dict(sorted((int(path.stem), path) for path in paths if re.fullmatch(r"\d{1,9}", path.stem)))
 
 
 def _read_odometry(path: Path) -> dict[int, _Row]:
@@ -139,16 +129,19 @@ def _geometry(folder: Path, number: int, row: _Row, matrix: str, size: tuple[int
         pose = pose_from_quaternion(place, values[3:], values[:3])
     else:
         assumptions.append(Assumption("no pose: odometry.csv has none of the frame"))
+    time = next((value for value in numbers_in([row.get("timestamp", "")]) if math.isfinite(value)), None)
     own = all(row.get(name) for name in _INTRINSICS)
     if own:
-        return Geometry(_camera(folder, place, _numbers(place, row, _INTRINSICS), size), pose, tuple(assumptions))
+        camera = _camera(folder, place, _numbers(place, row, _INTRINSICS), size)
+        return Geometry(camera, pose, tuple(assumptions), up="y", time=time)
     if not matrix:
-        return Geometry(None, pose, tuple(assumptions))
+        return Geometry(None, pose, tuple(assumptions), up="y", time=time)
     assumptions.append(
         Assumption("camera: camera_matrix.csv of the whole capture; odometry.csv has none of each frame")
     )
     path = folder / "camera_matrix.csv"
-    return Geometry(_camera(folder, str(path), _read_matrix(path, matrix), size), pose, tuple(assumptions))
+    camera = _camera(folder, str(path), _read_matrix(path, matrix), size)
+    return Geometry(camera, pose, tuple(assumptions), up="y", time=time)
 
 
 def _numbers(place: str, row: _Row, names: tuple[str, ...]) -> list[float]:
@@ -170,18 +163,10 @@ def _read_matrix(path: Path, text: str) -> list[float]:
 
 def _camera(folder: Path, place: str, numbers: list[float], size: tuple[int, int]) -> Camera:
     """Return the camera, of the photo's pixels, or of the video's if extracted photos were made smaller."""
-    cx, cy = numbers[2:]
     sizes = [size]
     if (folder / "rgb.mp4").is_file() and (folder / "rgb").is_dir():
         sizes.append(video_size(folder / "rgb.mp4"))
-    for height, width in (*sizes, _USUAL_SIZE):
-        if may_be_of(cx, cy, width, height):
-            return intrinsics_camera(place, (height, width), numbers)
-    intrinsics_camera(place, size, numbers)  # says what is wrong with numbers that are not finite
-    raise ValueError(
-        f"{place}: expected a principal point near the middle of the {size[1]} x {size[0]} photo (width x height), "
-        f"got {cx:g}, {cy:g}"
-    )
+    return fitting_camera(place, (*sizes, USUAL_SIZE), numbers)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,404 @@
+"""Sparse models of COLMAP: cameras, poses and lenses of photos, and their points as coarse depth.
+
+https://colmap.github.io/format.html; src/colmap/scene/reconstruction_io_binary.cc and src/colmap/sensor/models.h of
+https://github.com/colmap/colmap. Numbers are little-endian:
+
+    cameras.bin    count u8; camera i4, model i4, width u8, height u8, its numbers f8
+    images.bin     count u8; image u4, quaternion w x y z and translation f8, camera u4, name and 0, count u8 of
+                   observations: x, y f8, point u8 (2^64 - 1 for none)
+    points3D.bin   count u8; point u8, x, y, z f8, colour 3 u1, error f8, count u8 of observations: u4, u4
+    *.txt          the same in lines: cameras with the model's name; images in two lines, of which the second has the
+                   observations and may be empty
+
+Poses lead from the world to the camera, whose axes are x right, y down, z forward; the centre of the first pixel is at
+0.5. The unit of a model is whatever it was made with; it is taken for the metre. A photo is that of an image whose name
+ends its path, else of the only one of its stem.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import struct
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from dsr.geometry.lens import Lens
+from dsr.geometry.rigid_motion import from_quaternion, invert
+from dsr.io.frames import CaptureFrame, Geometry, Record
+from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult
+from dsr.io.trajectories import intrinsics_camera
+from dsr.notes import Assumption
+from dsr.utils.guards import naming, natural_key, numbers_in, read_limited
+from dsr.utils.versions import file_hash
+
+_APP = "COLMAP"
+_PLACES = (".", "sparse/0", "sparse", "colmap/sparse/0")
+"""Where the model of a folder of photos may be."""
+_LARGEST = 1 << 30
+_LARGEST_SIDE = 1 << 15
+_NONE = 2**64 - 1
+"""The point of an observation that has none."""
+_FEWEST = 16
+"""Observed points of a photo from which they make a map."""
+_BROWN, _FISHEYE = ("brown_conrady", (4, 8)), ("kannala_brandt", (4,))
+
+
+class _Model(NamedTuple):
+    """A camera model: numbers of focal length, of coefficients, and the lens with its possible numbers of these."""
+
+    name: str
+    focal: int
+    bends: int
+    lens: tuple[str, tuple[int, ...]] | None = None
+
+
+_MODELS = {
+    0: _Model("SIMPLE_PINHOLE", 1, 0), 1: _Model("PINHOLE", 2, 0), 2: _Model("SIMPLE_RADIAL", 1, 1, _BROWN),
+    3: _Model("RADIAL", 1, 2, _BROWN), 4: _Model("OPENCV", 2, 4, _BROWN), 5: _Model("OPENCV_FISHEYE", 2, 4, _FISHEYE),
+    6: _Model("FULL_OPENCV", 2, 8, _BROWN), 8: _Model("SIMPLE_RADIAL_FISHEYE", 1, 1, _FISHEYE),
+    9: _Model("RADIAL_FISHEYE", 1, 2, _FISHEYE),
+}  # fmt: skip
+_BY_NAME = {model.name: model for model in _MODELS.values()}
+
+
+class _Camera(NamedTuple):
+    """A camera as it is stored."""
+
+    model: _Model
+    width: int
+    height: int
+    numbers: tuple[float, ...]
+
+
+class _Image(NamedTuple):
+    """An image as it is stored: ``quaternion`` w x y z, ``observed``: column, row and point of each, (n, 3) float64."""
+
+    name: str
+    quaternion: tuple[float, ...]
+    translation: tuple[float, ...]
+    camera: int
+    observed: np.ndarray
+
+
+@dataclass(frozen=True)
+class Model:
+    """A sparse model.
+
+    Args:
+        file: its file of images.
+        cameras, images: as they are stored; images in the order of their names.
+
+    """
+
+    file: Path
+    cameras: Mapping[int, _Camera]
+    images: Sequence[_Image]
+
+    def frame(self, image: _Image) -> CaptureFrame:
+        """Return what the model says of an image."""
+        camera = self.cameras.get(image.camera)
+        if camera is None:
+            raise ValueError(
+                f"{self.file}: image {image.name!r:.80}: expected a camera of the model, got {image.camera}"
+            )
+        told = (image.quaternion, image.translation, camera)
+        geometry = functools.partial(_geometry, f"{self.file}: image {image.name!r:.80}", *told)
+        return CaptureFrame(_APP, geometry, self.file, repr(told).encode())
+
+
+def model_file(place: Path) -> Path | None:
+    """Return the file of images of a model, given by itself or as a folder; None if there is none."""
+    if place.is_dir():
+        files = (place / part / f"images{suffix}" for part in _PLACES for suffix in (".bin", ".txt"))
+        return next((each for each in files if each.is_file() and _beside(each, "cameras").is_file()), None)
+    found = place.name in ("images.bin", "images.txt") and place.is_file() and _beside(place, "cameras").is_file()
+    return place if found else None
+
+
+def _beside(file: Path, name: str) -> Path:
+    """Return the file of a name beside that of the images."""
+    return file.with_name(name + file.suffix)
+
+
+def read_model(file: Path) -> Model:
+    """Read a model.
+
+    Args:
+        file: ``images.bin`` or ``images.txt``, with the file of cameras beside it.
+
+    Raises:
+        ValueError: a file is damaged or foreign, or a camera has a model that is not known; the message names it.
+
+    """
+    path, binary = _beside(file, "cameras"), file.suffix == ".bin"
+    cameras = (_cameras_of_bytes if binary else _cameras_of_text)(path, read_limited(path, _LARGEST))
+    images = (_images_of_bytes if binary else _images_of_text)(file, read_limited(file, _LARGEST))
+    return Model(file, cameras, sorted(images, key=lambda image: natural_key(image.name)))
+
+
+def add_model(found: PairingResult, file: Path) -> PairingResult:
+    """Return pairs with the cameras and poses of a model; the same with a note if it has none of their photos.
+
+    Raises:
+        ValueError: see :func:`read_model`.
+
+    """
+    model = read_model(file)
+    names = {image.name: image for image in model.images}
+    stems = Counter(Path(image.name).stem for image in model.images)
+    lone = {Path(name).stem: image for name, image in names.items() if stems[Path(name).stem] == 1}
+    pairs, count = [], 0
+    for pair in found.pairs:
+        parts = pair.rgb.parts
+        ends = ("/".join(parts[place:]) for place in range(len(parts)))
+        image = next((names[end] for end in ends if end in names), None) or lone.get(pair.rgb.stem)
+        if image is None:
+            pairs.append(pair)
+            continue
+        count += 1
+        frame = model.frame(image)
+        if pair.capture is not None:
+            frame = replace(frame, app=pair.capture.app, photo=pair.capture.photo, depth=pair.capture.depth)
+        pairs.append(replace(pair, capture=frame))
+    if not count:
+        text = f"no poses: {file.name} of {_APP} has {len(names)} images, none of these names"
+        return replace(found, assumptions=(*found.assumptions, Assumption(text)))
+    return replace(found, pairs=tuple(pairs), assumptions=(*found.assumptions, _note(count, len(pairs), file)))
+
+
+def _note(count: int, total: int, file: Path) -> Assumption:
+    """Return what was taken from a model."""
+    text = f"cameras and poses of {_APP}: {file.parent.name}/{file.name}; its unit is taken for the metre"
+    return Assumption(text, f"{count} of {total} photos")
+
+
+def find_colmap(folder: Path) -> PairingResult | None:
+    """Return the photos of a model in a folder without depth maps, with its points as depth; None if there is none.
+
+    Raises:
+        ValueError: see :func:`read_model`.
+
+    """
+    file = model_file(folder)
+    if file is None or not (points := _beside(file, "points3D")).is_file():
+        return None
+    model, pairs, lone = read_model(file), [], []
+    for image in model.images:
+        places = (folder / part / image.name for part in ("images", ".", "rgb", "color"))
+        photo = next((each for each in places if ".." not in each.parts and each.is_file()), None)
+        if photo is None or photo.suffix.lower() not in PHOTO_SUFFIXES:
+            continue
+        if int((image.observed[:, 2] >= 0).sum()) < _FEWEST:
+            lone.append(photo)
+            continue
+        frame = model.frame(image)
+        source = SparseDepth(points, image, model.cameras[image.camera])
+        name = Path(image.name).with_suffix("").as_posix()
+        pairs.append(Pair(name, photo, points, unit=1.0, capture=replace(frame, depth=source)))
+    if not pairs:
+        return None
+    note = Assumption(f"depth is that of the points of {points.name}, a coarse and sparse map")
+    return PairingResult(tuple(pairs), (_note(len(pairs), len(model.images), file), note), tuple(lone))
+
+
+@dataclass(frozen=True, eq=False)
+class SparseDepth:
+    """A :class:`~dsr.io.frames.Source` of the depth of the points that an image shows.
+
+    The map has about a pixel for each of them; of several points in a pixel it has the nearest.
+
+    Args:
+        file: that of the points.
+        image: as it is stored.
+        camera: as it is stored.
+
+    """
+
+    file: Path
+    image: _Image
+    camera: _Camera
+
+    def read(self) -> np.ndarray:
+        """Return the depth, (h, w) float32 in the unit of the model, NaN in holes."""
+        stat = self.file.stat()
+        places = _points(self.file, (stat.st_size, stat.st_mtime_ns))
+        seen = [(x, y, places[int(point)]) for x, y, point in self.image.observed if int(point) in places]
+        width, height = self.camera.width, self.camera.height
+        step = math.sqrt(width * height / max(len(seen), 4))
+        size = max(2, round(height / step)), max(2, round(width / step))
+        depth = np.full(size, np.nan, np.float32)
+        if not seen:
+            return depth
+        pose = _pose(str(self.file), self.image.quaternion, self.image.translation)
+        columns, rows, points = (np.array(each) for each in zip(*seen, strict=True))
+        z = points @ pose[2, :3] + pose[2, 3]
+        inside = (z > 0) & (columns >= 0) & (rows >= 0) & (columns < width) & (rows < height)
+        order = np.flatnonzero(inside)[np.argsort(-z[inside])]
+        row, column = (rows[order] * size[0] / height).astype(int), (columns[order] * size[1] / width).astype(int)
+        depth[row, column] = z[order]
+        return depth
+
+    def record(self) -> Record:
+        """Return a hash of the file of points, and the image's name."""
+        return {"file": f"{self.file.name}/{self.image.name}", "sha256": file_hash(self.file)}
+
+
+def _geometry(
+    place: str, quaternion: Sequence[float], translation: Sequence[float], camera: _Camera, _: tuple[int, int]
+) -> Geometry:
+    """Return camera, pose and lens of an image."""
+    model, numbers = camera.model, camera.numbers
+    fx, fy, (cx, cy) = numbers[0], numbers[model.focal - 1], numbers[model.focal : model.focal + 2]
+    found = intrinsics_camera(place, (camera.height, camera.width), (fx, fy, cx - 0.5, cy - 0.5))
+    bends = numbers[model.focal + 2 :]
+    lens = None
+    if model.lens is not None:
+        name, counts = model.lens
+        count = next(each for each in counts if each >= len(bends))
+        with naming(place):
+            lens = Lens(name, (*bends, *[0.0] * (count - len(bends))))
+    return Geometry(found, invert(_pose(place, quaternion, translation)), lens=lens if lens and lens.bends else None)
+
+
+def _pose(place: str, quaternion: Sequence[float], translation: Sequence[float]) -> np.ndarray:
+    """Return the transform from world to camera, (4, 4)."""
+    w, x, y, z = quaternion
+    return from_quaternion(translation, (x, y, z, w), place)
+
+
+class _Bytes:
+    """A binary file, read from its beginning."""
+
+    def __init__(self, path: Path, content: bytes) -> None:
+        self.path, self.content, self.place = path, content, 0
+
+    def read(self, layout: str) -> tuple[float, ...]:
+        """Return the next numbers of a layout of :mod:`struct`."""
+        layout = f"<{layout}"
+        self.expect(struct.calcsize(layout))
+        found = struct.unpack_from(layout, self.content, self.place)
+        self.place += struct.calcsize(layout)
+        return found
+
+    def count(self, least: int) -> int:
+        """Return the next number of records, of ``least`` bytes each."""
+        (count,) = self.read("Q")
+        self.expect(int(count) * least)
+        return int(count)
+
+    def expect(self, length: int) -> None:
+        """Raise ValueError unless as many bytes follow."""
+        if length > len(self.content) - self.place:
+            left = len(self.content) - self.place
+            raise ValueError(f"{self.path}: expected {length} bytes more of a model of {_APP}, got {left}")
+
+    def text(self) -> str:
+        """Return the next text, which ends with a 0."""
+        end = self.content.find(b"\0", self.place)
+        if end < 0:
+            raise ValueError(f"{self.path}: expected the name of an image, got no end of it")
+        found = self.content[self.place : end].decode("utf-8", "replace")
+        self.place = end + 1
+        return found
+
+
+def _checked(
+    path: Path, model: _Model | None, came: object, width: float, height: float, numbers: Sequence[float]
+) -> _Camera:
+    """Return a camera after checking that it is one."""
+    if model is None:
+        raise ValueError(f"{path}: expected a camera model of {', '.join(_BY_NAME)}, got {came!s:.40}")
+    if len(numbers) != model.focal + 2 + model.bends:
+        raise ValueError(
+            f"{path}: expected {model.focal + 2 + model.bends} numbers of {model.name}, got {len(numbers)}"
+        )
+    if not all(1 <= side <= _LARGEST_SIDE and float(side).is_integer() for side in (width, height)):
+        raise ValueError(f"{path}: expected a width and a height in pixels, got {width:g} x {height:g}")
+    return _Camera(model, int(width), int(height), tuple(numbers))
+
+
+def _cameras_of_bytes(path: Path, content: bytes) -> dict[int, _Camera]:
+    """Return the cameras of ``cameras.bin`` by their numbers."""
+    file, cameras = _Bytes(path, content), {}
+    for _ in range(file.count(24)):
+        number, kind, width, height = file.read("iiQQ")
+        model = _MODELS.get(int(kind))
+        numbers = () if model is None else file.read(f"{model.focal + 2 + model.bends}d")
+        cameras[int(number)] = _checked(path, model, kind, width, height, numbers)
+    return cameras
+
+
+def _images_of_bytes(path: Path, content: bytes) -> list[_Image]:
+    """Return the images of ``images.bin``."""
+    file, images = _Bytes(path, content), []
+    for _ in range(file.count(73)):
+        _, *numbers, camera = file.read("I7dI")
+        name, count = file.text(), file.count(24)
+        kinds = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<u8")])
+        stored = np.frombuffer(content, kinds, count, file.place)
+        file.place += 24 * count
+        points = np.where(stored["point"] == _NONE, -1.0, stored["point"].astype(np.float64))
+        observed = np.stack((stored["x"], stored["y"], points), axis=1)
+        images.append(_Image(name, tuple(numbers[:4]), tuple(numbers[4:]), int(camera), observed))
+    return images
+
+
+def _lines(path: Path, content: bytes) -> list[str]:
+    """Return the lines of a text without comments; empty ones count."""
+    return [line for line in content.decode("utf-8", "replace").splitlines() if not line.startswith("#")]
+
+
+def _cameras_of_text(path: Path, content: bytes) -> dict[int, _Camera]:
+    """Return the cameras of ``cameras.txt`` by their numbers."""
+    cameras = {}
+    for line in filter(str.strip, _lines(path, content)):
+        words = line.split()
+        numbers = numbers_in([*words[:1], *words[2:]])
+        if len(numbers) < 3 or not numbers[0].is_integer():
+            raise ValueError(f"{path}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS, got {line!r:.80}")
+        number, width, height, *numbers = numbers
+        cameras[int(number)] = _checked(path, _BY_NAME.get(words[1]), words[1], width, height, numbers)
+    return cameras
+
+
+def _images_of_text(path: Path, content: bytes) -> list[_Image]:
+    """Return the images of ``images.txt``."""
+    images, lines = [], iter(_lines(path, content))
+    for line in lines:
+        if not line.strip():
+            continue
+        *words, name = line.strip().split(maxsplit=9)
+        numbers, stored = numbers_in(words), next(lines, "")
+        seen = numbers_in(stored.split())
+        if len(numbers) != 9 or not numbers[8].is_integer() or len(seen) % 3 or bool(seen) != bool(stored.strip()):
+            what = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, and a line of X Y POINT3D_ID of each point"
+            raise ValueError(f"{path}: expected {what}, got {line!r:.80}")
+        observed = np.array(seen, np.float64).reshape(-1, 3)
+        images.append(_Image(name, tuple(numbers[1:5]), tuple(numbers[5:8]), int(numbers[8]), observed))
+    return images
+
+
+@functools.lru_cache(maxsize=1)
+def _points(path: Path, _: tuple[int, int]) -> dict[int, tuple[float, ...]]:
+    """Return the places of the points of a file of a size and a time, by their numbers."""
+    content, points = read_limited(path, _LARGEST), {}
+    if path.suffix == ".bin":
+        file = _Bytes(path, content)
+        for _number in range(file.count(51)):
+            number, *place = file.read("Q3d3Bd")
+            points[int(number)] = tuple(place[:3])
+            length = 8 * file.count(8)
+            file.place += length
+        return points
+    for line in filter(str.strip, _lines(path, content)):
+        numbers = numbers_in(line.split()[:4])
+        if len(numbers) != 4 or not numbers[0].is_integer():
+            raise ValueError(f"{path}: expected POINT3D_ID X Y Z, got {line!r:.80}")
+        points[int(numbers[0])] = tuple(numbers[1:])
+    return points

@@ -1,0 +1,202 @@
+"""Data sets of depth cameras in their own folders: 7-Scenes, ScanNet's exports, SUN RGB-D, and Replica as renderings.
+
+7-Scenes, as its page describes it (microsoft.com, RGB-D Dataset 7-Scenes); 3DMatch has the same names, and a camera.
+
+    frame-000000.color.png, frame-000000.depth.png    640 x 480; 16-bit millimetres, 65535 in holes
+    frame-000000.pose.txt                             4 x 4, from camera to world
+    camera-intrinsics.txt                             3DMatch: 3 x 3, here or one folder up
+
+The cameras of 7-Scenes, Kinects v1, are not calibrated; its page names 585 pixels and the centre 320, 240.
+
+ScanNet's exports; https://github.com/ScanNet/ScanNet, SensReader/python/SensorData.py.
+
+    color/0.jpg, depth/0.png                          1296 x 968, often made smaller; 16-bit millimetres, registered
+    pose/0.txt                                        4 x 4, from camera to world; -inf where the frame has none
+    intrinsic/intrinsic_color.txt, intrinsic_depth.txt    4 x 4
+
+SUN RGB-D; ``read3dPoints.m`` of its toolbox.
+
+    image/0000144.jpg, depth/0000144.png              16-bit millimetres, turned to the left by three bits
+    depth_bfx/0000144.png                             the same, filled; taken where depth/ has none
+    intrinsics.txt, extrinsics/*.txt                  3 x 3; the tilt, which is no pose and not read
+
+Replica as NICE-SLAM renders it; https://github.com/cvg/nice-slam, src/utils/datasets.py and configs/Replica.
+
+    results/frame000000.jpg, results/depth000000.png  1200 x 680; 1/6553.5 m
+    traj.txt                                          a pose of 4 x 4, from camera to world, in each line
+    cam_params.json                                   here or one folder up: camera with w, h, fx, fy, cx, cy, scale
+
+Line n is the pose of the n-th photo if there are as many lines as photos, else of the photo with the number n from 0.
+Cameras have the axes x right, y down, z forward in all of them.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from dsr.geometry.camera import Camera
+from dsr.geometry.rigid_motion import Matrix, as_rigid
+from dsr.io.frames import CaptureFrame, Geometry
+from dsr.io.images import read_numbers
+from dsr.io.pairs import (
+    PHOTO_SUFFIXES,
+    Pair,
+    PairingResult,
+    find_camera_file,
+    has_name,
+    has_pictures,
+    list_pictures,
+    match_pairs,
+    numbered_files,
+)
+from dsr.io.photos import same_aspect
+from dsr.io.reading import SUNRGBD_BITS
+from dsr.io.trajectories import describe_capture, fitting_camera, read_poses
+from dsr.io.units import TURNED_BACK
+from dsr.notes import Assumption
+from dsr.utils.guards import natural_key, read_limited
+
+_LARGEST_TEXT = 1 << 16
+"""Largest file of a matrix in bytes."""
+_KINECT = 585.0, 585.0, 320.0, 240.0
+_KINECT_SIZE, _SCANNET_SIZE, _REPLICA_SIZE = (480, 640), (968, 1296), (680, 1200)
+_REPLICA_CAMERA, _REPLICA_UNIT = (600.0, 600.0, 599.5, 339.5), 1 / 6553.5
+_CameraOf = Callable[[tuple[int, int]], tuple[Camera | None, str]]
+"""Returns the camera of a photo of (height, width), and what was assumed for it."""
+_PARAMS = ("cam_params.json", "camera.json")
+
+
+def find_seven_scenes(folder: Path) -> PairingResult | None:
+    """Return the frames of a sequence of 7-Scenes or 3DMatch; None if the folder is none."""
+    if not has_name(folder, "", ".pose.txt"):
+        return None
+    poses, photos, depths = (
+        {path.name.removesuffix(end): path for path in folder.glob(f"*{end}")}
+        for end in (".pose.txt", ".color.png", ".depth.png")
+    )
+    both = sorted(photos.keys() & depths.keys(), key=natural_key)
+    if not both:
+        return None
+    camera = find_camera_file(folder, folder.parent)
+    pairs = []
+    for name in both:
+        frame = _frame("7-Scenes", poses.get(name), folder / f"{name}.pose.txt", None if camera else _kinect)
+        pairs.append(Pair(name, photos[name], depths[name], camera, unit=1e-3, capture=frame))
+    lone = [each[name] for each in (photos, depths) for name in sorted(each, key=natural_key) if name not in both]
+    text = "a sequence of 7-Scenes: depth in millimetres; from the folder: poses"
+    return PairingResult(tuple(pairs), (Assumption(text),), tuple(lone))
+
+
+def find_scannet(folder: Path) -> PairingResult | None:
+    """Return the frames of a folder of ScanNet's exports; None if it is none."""
+    matrices = [folder / "intrinsic" / f"intrinsic_{kind}.txt" for kind in ("color", "depth")]
+    if not any(path.is_file() for path in matrices):
+        return None
+    photos, depths = (
+        numbered_files(folder / kind, suffixes) for kind, suffixes in (("color", PHOTO_SUFFIXES), ("depth", (".png",)))
+    )
+    both = sorted(photos.keys() & depths.keys())
+    if not both:
+        return None
+    camera = functools.partial(_scannet_camera, [path for path in matrices if path.is_file()])
+    told = b"".join(read_limited(path, _LARGEST_TEXT) for path in matrices if path.is_file())
+    pairs = []
+    for number in both:
+        path = folder / "pose" / f"{photos[number].stem}.txt"
+        frame = _frame("ScanNet", path if path.is_file() else None, path, camera, told)
+        pairs.append(Pair(photos[number].stem, photos[number], depths[number], unit=1e-3, capture=frame))
+    lone = [each[number] for each in (photos, depths) for number in each if number not in both]
+    note = describe_capture("an export of ScanNet", "millimetres", pairs, poses=(folder / "pose").is_dir())
+    return PairingResult(tuple(pairs), (note,), tuple(lone))
+
+
+def find_sunrgbd(folder: Path) -> PairingResult | None:
+    """Return the pair of a scene of SUN RGB-D; None if the folder is none."""
+    matrix, kinds = folder / "intrinsics.txt", [folder / kind for kind in ("depth", "depth_bfx")]
+    kinds = [path for path in kinds if path.is_dir() and has_pictures(path)]
+    ours = matrix.is_file() and any((folder / name).is_dir() for name in ("depth_bfx", "extrinsics"))
+    if not ours or not kinds or not (folder / "image").is_dir():
+        return None
+    found = match_pairs(list_pictures(folder / "image"), list_pictures(kinds[0]), matrix)
+    pairs = tuple(replace(pair, unit=1e-3, bits=SUNRGBD_BITS) for pair in found.pairs)
+    text = f"a scene of SUN RGB-D, depth of {kinds[0].name}/: {TURNED_BACK}; --depth-unit overrides it"
+    return PairingResult(pairs, (Assumption(text),), found.unpaired) if pairs else None
+
+
+def find_replica(folder: Path) -> PairingResult | None:
+    """Return the frames of a scene of Replica as NICE-SLAM renders it; None if the folder is none."""
+    photos = numbered_files(folder / "results", PHOTO_SUFFIXES, "frame")
+    depths = numbered_files(folder / "results", (".png",), "depth")
+    trajectory, both = folder / "traj.txt", sorted(photos.keys() & depths.keys())
+    places = [place / name for place in (folder, folder.parent) for name in _PARAMS]
+    params = next((path for path in places if path.is_file()), None)
+    if not both or not (params or trajectory.is_file()):
+        return None
+    poses = read_poses(trajectory).poses if trajectory.is_file() else ()
+    in_order = len(poses) == len(photos)
+    ranks = {number: rank if in_order else number for rank, number in enumerate(photos)}
+    pairs = []
+    for number in both:
+        pose = poses[ranks[number]] if ranks[number] < len(poses) else None
+        geometry = functools.partial(_replica, pose, known=params is not None)
+        frame = CaptureFrame("Replica", geometry, trajectory, repr(None if pose is None else pose.tolist()).encode())
+        files = photos[number], depths[number], params
+        pairs.append(Pair(photos[number].stem, *files, unit=_REPLICA_UNIT, capture=frame))
+    lone = [each[number] for each in (photos, depths) for number in each if number not in both]
+    text = "a scene of Replica as NICE-SLAM renders it" + ("" if params else ": depth in 1/6553.5 m (--depth-unit)")
+    note = Assumption(text + ("; from the folder: poses" if poses else ""))
+    return PairingResult(tuple(pairs), (note,), tuple(lone))
+
+
+def _frame(app: str, path: Path | None, expected: Path, camera: _CameraOf | None, told: bytes = b"") -> CaptureFrame:
+    """Return a frame with the pose in a file, if there is one, and what tells its camera, if anything does."""
+    content = b"" if path is None else read_limited(path, _LARGEST_TEXT)
+    return CaptureFrame(app, functools.partial(_geometry, path, camera), expected, told + content)
+
+
+def _geometry(path: Path | None, camera: _CameraOf | None, size: tuple[int, int]) -> Geometry:
+    """Return camera and pose of a frame."""
+    found, text = (None, "") if camera is None else camera(size)
+    notes = [Assumption(text)] if text else []
+    matrix = np.full((4, 4), np.nan) if path is None else read_numbers(path, 16).reshape(4, 4)
+    if not np.isfinite(matrix).all():
+        notes.append(Assumption("no pose: the capture has none of the frame"))
+        return Geometry(found, None, tuple(notes))
+    return Geometry(found, as_rigid(matrix, str(path)), tuple(notes))
+
+
+def _kinect(size: tuple[int, int]) -> tuple[Camera | None, str]:
+    """Return the camera that 7-Scenes names, for photos of its aspect."""
+    if not same_aspect(size, _KINECT_SIZE):
+        return None, ""
+    text = "camera: 585 pixels and the centre 320, 240 assumed, which 7-Scenes names; its Kinects are not calibrated"
+    return Camera(_KINECT_SIZE[1], _KINECT_SIZE[0], *_KINECT), f"{text} (--intrinsics)"
+
+
+def _scannet_camera(paths: list[Path], size: tuple[int, int]) -> tuple[Camera | None, str]:
+    """Return the camera of the first matrix that fits the photo, else of ScanNet's photos as they are recorded."""
+    numbers = {}
+    for path in paths:
+        matrix = read_numbers(path, 16).reshape(4, 4)
+        numbers[path] = [float(matrix[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2))]
+    for path, each in numbers.items():
+        try:
+            return fitting_camera(str(path), (size,), each), ""
+        except ValueError:  # it is of other pixels
+            continue
+    return fitting_camera(str(paths[0]), (size, _SCANNET_SIZE), numbers[paths[0]]), ""
+
+
+def _replica(pose: Matrix | None, size: tuple[int, int], *, known: bool) -> Geometry:
+    """Return camera and pose of a rendering; the camera is None where a file is known to say it."""
+    notes = [] if pose is not None else [Assumption("no pose: the capture has none of the frame")]
+    if known or not same_aspect(size, _REPLICA_SIZE):
+        return Geometry(None, pose, tuple(notes))
+    text = "camera: 600 pixels assumed, that of NICE-SLAM's renderings; there is no cam_params.json"
+    camera = Camera(_REPLICA_SIZE[1], _REPLICA_SIZE[0], *_REPLICA_CAMERA)
+    return Geometry(camera, pose, (Assumption(text), *notes))

@@ -1,0 +1,258 @@
+"""Recordings of ScanNet (.sens) and of the iPhone in ScanNet++.
+
+ScanNet; https://github.com/ScanNet/ScanNet, SensReader/python/SensorData.py. Little-endian:
+
+    uint32 4, uint64 length, the sensor's name
+    4 x 16 float32           intrinsics and extrinsics of colour, then of depth, row by row
+    2 int32                  compression of colour: 0 raw, 1 PNG, 2 JPEG; of depth: 0 raw, 1 zlib, of uint16
+    4 uint32                 width and height of colour, then of depth
+    float32, uint64          values per metre (1000), and the number of frames; of each:
+        16 float32           pose from camera (x right, y down, z forward) to world, -inf where there is none
+        4 uint64             two times, bytes of colour, bytes of depth; then those bytes
+
+Depth is registered to colour.
+
+ScanNet++; https://github.com/scannetpp/scannetpp, iphone/prepare_iphone_data.py and common/scene_release.py.
+
+    iphone/rgb.mkv (.mp4)    photos, 1920 x 1440; extracted ones in rgb/frame_000000.jpg
+    iphone/depth.bin         for each frame a uint32 of its bytes, and 256 x 192 values: LZ4 of uint16 in millimetres,
+                             or raw deflate of float32 in metres
+    iphone/depth/            extracted maps, frame_000000.png of 16-bit millimetres, instead
+    iphone/pose_intrinsic_imu.json    of each ``frame_000000``: intrinsic, 3 x 3, and aligned_pose, 4 x 4, from camera
+                             (x right, y down, z forward) to the world of the scene's laser scan
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import struct
+import zlib
+from collections.abc import Mapping
+from io import BufferedReader
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from pydantic import BaseModel, Field, TypeAdapter, ValidationError
+
+from dsr.geometry.rigid_motion import as_rigid
+from dsr.io.captures.archive import PHOTO_LIMIT, Section, decode_photo, inflate
+from dsr.io.captures.stray import VideoFrame, check_count
+from dsr.io.frames import CaptureFrame, Geometry
+from dsr.io.pairs import Pair, PairingResult, has_name, numbered_files
+from dsr.io.trajectories import USUAL_SIZE, describe_capture, fitting_camera, intrinsics_camera
+from dsr.notes import Assumption
+from dsr.utils.guards import natural_key, opened, read_limited, refusing
+from dsr.utils.validation import describe
+
+_BEGINNING, _HEADER, _FRAME = struct.Struct("<IQ"), struct.Struct("<64f2i4IfQ"), struct.Struct("<16f4Q")
+_VERSION = 4
+_LONGEST_NAME, _LARGEST_SIDE = 1 << 12, 1 << 14
+_NO_POSE = Assumption("no pose: the capture has none of the frame")
+
+_JSON, _LARGEST_JSON = "pose_intrinsic_imu.json", 1 << 28
+_VIDEOS = ("rgb.mkv", "rgb.mp4")
+_MAP = (192, 256)
+_LARGEST_MAP = 4 * _MAP[0] * _MAP[1] + (1 << 12)
+"""Largest size in bytes of a compressed map."""
+
+
+def find_sens(place: Path) -> PairingResult | None:
+    """Return the frames of a ``.sens`` file, or of those in a folder; None if there are none.
+
+    Raises:
+        ValueError: a file is damaged, truncated, or compressed in another way.
+
+    """
+    if place.is_file():
+        return _read_sens(place, "") if place.suffix.lower() == ".sens" else None
+    if not has_name(place, "", ".sens"):
+        return None
+    files = sorted(place.glob("*.sens"), key=natural_key)
+    parts = [_read_sens(path, f"{path.stem}/" if len(files) > 1 else "") for path in files]
+    return PairingResult(tuple(pair for part in parts for pair in part.pairs), parts[0].assumptions)
+
+
+class _Sens(NamedTuple):
+    """The description in a ``.sens`` file; sizes are (height, width)."""
+
+    intrinsics: list[float]
+    compression: tuple[int, int]
+    photo: tuple[int, int]
+    depth: tuple[int, int]
+    scale: float
+    frames: int
+
+
+def _read_sens(path: Path, before: str) -> PairingResult:
+    """Return the frames of a file; ``before`` begins their names."""
+    size = path.stat().st_size
+    with opened(path) as file:
+        told = _read_header(path, file)
+        place, pairs = file.tell(), []
+        if told.frames > size // _FRAME.size:
+            raise ValueError(f"{path}: expected {told.frames} frames, the file has only {size} bytes")
+        for number in range(told.frames):
+            file.seek(place)
+            content = file.read(_FRAME.size)
+            values = _FRAME.unpack(content.ljust(_FRAME.size, b"\0"))
+            lengths, start = values[18:], place + _FRAME.size
+            place = start + sum(lengths)
+            if len(content) < _FRAME.size or place > size or max(lengths) > PHOTO_LIMIT:
+                raise ValueError(f"{path}: expected {told.frames} frames, it is damaged or ends in frame {number}")
+            photo = Section(path, f"color/{number}", start, lengths[0], functools.partial(_photo, told))
+            depth = Section(path, f"depth/{number}", start + lengths[0], lengths[1], functools.partial(_depth, told))
+            geometry = functools.partial(_geometry, f"{path}: frame {number}", told, values[:16])
+            frame = CaptureFrame("ScanNet", geometry, path, content[:64] + repr(told).encode(), photo, depth)
+            places = path / photo.name, path / depth.name
+            pairs.append(Pair(f"{before}{number:06}", *places, unit=1 / told.scale, capture=frame))
+    if not pairs:
+        raise ValueError(f"{path}: expected frames, there is none")
+    unit = "millimetres" if told.scale == 1000 else f"1/{told.scale:g} m"
+    return PairingResult(tuple(pairs), (describe_capture("a recording of ScanNet", unit, pairs, poses=True),))
+
+
+def _read_header(path: Path, file: BufferedReader) -> _Sens:
+    """Return the description at the beginning of a file, after checking it."""
+    with refusing(f"{path}: expected a recording of ScanNet (.sens), got a damaged or foreign file", struct.error):
+        version, length = _BEGINNING.unpack(file.read(_BEGINNING.size))
+        if version != _VERSION or length > _LONGEST_NAME:
+            raise ValueError(f"{path}: expected a recording of ScanNet (.sens) of version 4, got another file")
+        file.seek(length, 1)
+        values = _HEADER.unpack(file.read(_HEADER.size))
+    matrix, (colour, depth) = values[:16], values[64:66]
+    wide, high, narrow, low, scale, count = values[66:]
+    if colour not in (0, 1, 2) or depth not in (0, 1):
+        raise ValueError(
+            f"{path}: expected colour that is raw, PNG or JPEG (0, 1, 2) and depth that is raw or of zlib (0, 1), got "
+            f"compression {colour} and {depth}"
+        )
+    if not all(1 <= side <= _LARGEST_SIDE for side in (wide, high, narrow, low)) or not 1 <= scale <= 1e6:
+        raise ValueError(
+            f"{path}: expected sizes and values per metre, got {wide} x {high}, {narrow} x {low} and {scale:g}"
+        )
+    numbers = [matrix[0], matrix[5], matrix[2], matrix[6]]
+    return _Sens(numbers, (colour, depth), (high, wide), (low, narrow), scale, count)
+
+
+def _photo(told: _Sens, content: bytes) -> np.ndarray:
+    """Return the photo in the bytes of a frame."""
+    if told.compression[0]:
+        return decode_photo(content)
+    if len(content) != 3 * told.photo[0] * told.photo[1]:
+        raise ValueError(f"expected {told.photo[1]} x {told.photo[0]} colours, got {len(content)} bytes")
+    return np.frombuffer(content, np.uint8).reshape(*told.photo, 3)
+
+
+def _depth(told: _Sens, content: bytes) -> np.ndarray:
+    """Return the depth map in the bytes of a frame, (h, w) uint16."""
+    size = 2 * told.depth[0] * told.depth[1]
+    values = inflate(content, size) if told.compression[1] else content
+    if len(values) != size:
+        raise ValueError(f"expected {told.depth[1]} x {told.depth[0]} values of 16 bits, got {len(values)} bytes")
+    return np.frombuffer(values, "<u2").reshape(told.depth)
+
+
+def _geometry(place: str, told: _Sens, values: tuple[float, ...], _: tuple[int, int]) -> Geometry:
+    """Return camera and pose of a frame."""
+    camera, matrix = intrinsics_camera(place, told.photo, told.intrinsics), np.reshape(values, (4, 4))
+    if not np.isfinite(matrix).all():
+        return Geometry(camera, None, (_NO_POSE,))
+    return Geometry(camera, as_rigid(matrix, place))
+
+
+_Row3 = Annotated[list[float], Field(min_length=3, max_length=3)]
+_Row4 = Annotated[list[float], Field(min_length=4, max_length=4)]
+
+
+class _Entry(BaseModel, strict=True):
+    """What the JSON says of a frame; numbers may be NaN here, each frame's are checked when it is read."""
+
+    intrinsic: Annotated[list[_Row3], Field(min_length=3, max_length=3)] | None = None
+    aligned_pose: Annotated[list[_Row4], Field(min_length=4, max_length=4)] | None = None
+
+
+_ENTRIES = TypeAdapter(dict[str, _Entry])
+
+
+def find_scannetpp(folder: Path) -> PairingResult | None:
+    """Return the frames of the iPhone in a scene of ScanNet++, or of its folder ``iphone``; None if there are none.
+
+    Raises:
+        ValueError: the description or the maps are damaged, or the maps are compressed all at once.
+
+    """
+    folder = folder / "iphone" if (folder / "iphone" / _JSON).is_file() else folder
+    path, packed = folder / _JSON, folder / "depth.bin"
+    depths: Mapping[int, Path | Section] = numbered_files(folder / "depth", (".png",), "frame_")
+    photos = numbered_files(folder / "rgb", (".jpg", ".png"), "frame_")
+    video = next((folder / name for name in _VIDEOS if (folder / name).is_file()), None)
+    if not path.is_file() or not (depths or packed.is_file()) or not (photos or video):
+        return None
+    with refusing(f"{path}: expected intrinsics and poses of frames as JSON, got something else", RecursionError):
+        try:
+            entries = _ENTRIES.validate_json(read_limited(path, _LARGEST_JSON))
+        except ValidationError as error:
+            raise ValueError(f"{path}: expected ScanNet++'s intrinsics and poses; {describe(error)}") from error
+    depths = depths or _sections(packed)
+    pairs, unpaired = [], [path for number, path in photos.items() if number not in depths]
+    for number, depth in depths.items():
+        place = depth if isinstance(depth, Path) else packed / depth.name
+        if photos and number not in photos:
+            unpaired.append(place)
+            continue
+        entry = entries.get(f"frame_{number:06}", _Entry())
+        frame = CaptureFrame(
+            "ScanNet++ iPhone",
+            functools.partial(_iphone_geometry, f"{path}: frame_{number:06}", entry),
+            path,
+            entry.model_dump_json().encode(),
+            None if photos or video is None else VideoFrame(video, number),
+            None if isinstance(depth, Path) else depth,
+        )
+        photo = photos.get(number) or (video or folder) / f"{number:06}"
+        pairs.append(Pair(f"{number:06}", photo, place, unit=1e-3, capture=frame))
+    notes = [describe_capture("the iPhone of a scene of ScanNet++", "millimetres", pairs, poses=True)]
+    if not photos and video is not None and depths:
+        notes += check_count(video, max(depths) + 1)
+    return PairingResult(tuple(pairs), tuple(notes), tuple(unpaired))
+
+
+def _sections(path: Path) -> dict[int, Section]:
+    """Return the maps of a file that has one after another."""
+    size, place, found = path.stat().st_size, 0, dict[int, Section]()
+    with opened(path) as file:
+        while place < size:
+            file.seek(place)
+            content = file.read(4)
+            length = int.from_bytes(content, "little")
+            start, place = place + 4, place + 4 + length
+            if not 0 < length <= _LARGEST_MAP or place > size:
+                raise ValueError(
+                    f"{path}: expected maps one by one, map {len(found)} is damaged, or all are compressed together: "
+                    "ScanNet++'s prepare_iphone_data.py unpacks those to depth/"
+                )
+            found[len(found)] = Section(path, f"{len(found):06}", start, length, _map)
+    return found
+
+
+def _map(content: bytes) -> np.ndarray:
+    """Return a map in millimetres, (192, 256): uint16 as LZ4, or float32 in metres as raw deflate."""
+    with refusing("LZ4 data need the package lz4: pip install 'dsr[captures]'", ImportError):
+        import lz4.block  # noqa: PLC0415 - an extra
+    count = _MAP[0] * _MAP[1]
+    with contextlib.suppress(lz4.block.LZ4BlockError, MemoryError):
+        values = lz4.block.decompress(content, uncompressed_size=2 * count)
+        if len(values) == 2 * count:
+            return np.frombuffer(values, "<u2").reshape(_MAP)
+    return 1000 * np.frombuffer(inflate(content, 4 * count, -zlib.MAX_WBITS), "<f4").reshape(_MAP)
+
+
+def _iphone_geometry(place: str, entry: _Entry, size: tuple[int, int]) -> Geometry:
+    """Return camera and pose of a frame."""
+    camera, notes = None, [] if entry.aligned_pose else [_NO_POSE]
+    if entry.intrinsic is not None:
+        (fx, _, cx), (_, fy, cy), _ = entry.intrinsic
+        camera = fitting_camera(place, (size, USUAL_SIZE), (fx, fy, cx, cy))
+    return Geometry(camera, as_rigid(entry.aligned_pose, place) if entry.aligned_pose else None, tuple(notes))

@@ -1,0 +1,282 @@
+"""Sparse models of COLMAP: cameras, poses, lenses and points, of binary and text, against writers of their own."""
+
+import json
+import pickle
+import struct
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from dsr.cli import main
+from dsr.geometry.camera import Camera
+from dsr.geometry.lens import Lens
+from dsr.io.inputs import read_picture
+from dsr.io.layouts import find_pairs_of_folder
+from dsr.io.reading import Reading
+
+WIDTH, HEIGHT, FRAMES = 64, 48, 3
+F, CX, CY = 60.0, 33.0, 23.5
+MODELS = {
+    "SIMPLE_PINHOLE": (0, (F, CX, CY), None),
+    "PINHOLE": (1, (F, F + 1, CX, CY), None),
+    "SIMPLE_RADIAL": (2, (F, CX, CY, 0.05), Lens("brown_conrady", (0.05, 0, 0, 0))),
+    "RADIAL": (3, (F, CX, CY, 0.05, -0.01), Lens("brown_conrady", (0.05, -0.01, 0, 0))),
+    "OPENCV": (4, (F, F + 1, CX, CY, 0.05, -0.01, 1e-3, 2e-3), Lens("brown_conrady", (0.05, -0.01, 1e-3, 2e-3))),
+    "OPENCV_FISHEYE": (5, (F, F + 1, CX, CY, 0.02, 3e-3, 2e-3, 1e-3), Lens("kannala_brandt", (0.02, 3e-3, 2e-3, 1e-3))),
+    "FULL_OPENCV": (6, (F, F + 1, CX, CY, *(1e-3 * k for k in range(1, 9))),
+                    Lens("brown_conrady", tuple(1e-3 * k for k in range(1, 9)))),
+    "SIMPLE_RADIAL_FISHEYE": (8, (F, CX, CY, 0.02), Lens("kannala_brandt", (0.02, 0, 0, 0))),
+    "RADIAL_FISHEYE": (9, (F, CX, CY, 0.02, 3e-3), Lens("kannala_brandt", (0.02, 3e-3, 0, 0))),
+}  # fmt: skip
+
+
+def distorted(kind, x, y):
+    """Return where COLMAP's models (models.h) have a point of the plane at distance 1."""
+    numbers = MODELS[kind][1]
+    more = numbers[3 if numbers[1] != F + 1 else 4 :]
+    square = x * x + y * y
+    if "FISHEYE" in kind:
+        angle = np.arctan(np.sqrt(square))
+        factor = angle * sum(k * angle ** (2 * n) for n, k in enumerate((1, *more))) / np.sqrt(square)
+        return x * factor, y * factor
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*more, *[0] * (8 - len(more)))
+    factor = (1 + k1 * square + k2 * square**2 + k3 * square**3) / (1 + k4 * square + k5 * square**2 + k6 * square**3)
+    dx, dy = 2 * p1 * x * y + p2 * (square + 2 * x * x), 2 * p2 * x * y + p1 * (square + 2 * y * y)
+    return x * factor + dx, y * factor + dy
+
+
+def pose(number):
+    """Return the camera's place: camera to world, x right, y down, z forward."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_rotvec((0.02, 0.05 * number, -0.03)).as_matrix()
+    matrix[:3, 3] = (0.1 * number, -0.02, 0.03)
+    return matrix
+
+
+def cloud():
+    """Return points, (400, 3), in front of all cameras."""
+    rng = np.random.default_rng(0)
+    return np.column_stack((rng.uniform(-1.5, 1.5, 400), rng.uniform(-1, 1, 400), rng.uniform(2, 4, 400)))
+
+
+def observations(number):
+    """Return columns, rows and depths of the points that a pinhole camera shows, and their numbers."""
+    own = np.linalg.inv(pose(number))
+    x, y, z = (cloud() @ own[:3, :3].T + own[:3, 3]).T
+    u, v = F * x / z + CX, F * y / z + CY
+    seen = (u > 0) & (v > 0) & (u < WIDTH) & (v < HEIGHT)
+    return u[seen], v[seen], z[seen], np.flatnonzero(seen)
+
+
+def entries(number):
+    own = np.linalg.inv(pose(number))
+    x, y, z, w = Rotation.from_matrix(own[:3, :3]).as_quat()
+    return (w, x, y, z), tuple(own[:3, 3])
+
+
+def write_binary(folder, kind, names, points=True):
+    """Write a model by the format's description, its images from last to first."""
+    folder.mkdir(parents=True, exist_ok=True)
+    number, numbers, _ = MODELS[kind]
+    camera = struct.pack("<QiiQQ", 1, 7, number, WIDTH, HEIGHT) + struct.pack(f"<{len(numbers)}d", *numbers)
+    (folder / "cameras.bin").write_bytes(camera)
+    content = struct.pack("<Q", len(names))
+    for place, name in reversed(list(enumerate(names))):
+        quaternion, shift = entries(place)
+        content += struct.pack("<I7dI", place + 1, *quaternion, *shift, 7) + name.encode() + b"\0"
+        columns, rows, _, seen = observations(place)
+        content += struct.pack("<Q", len(seen) + 1) + struct.pack("<ddQ", 1.0, 2.0, 2**64 - 1)
+        content += b"".join(struct.pack("<ddQ", u, v, 10 + k) for u, v, k in zip(columns, rows, seen, strict=True))
+    (folder / "images.bin").write_bytes(content)
+    if points:
+        content = struct.pack("<Q", 400)
+        for k, point in enumerate(cloud()):
+            track = struct.pack("<QII", 1, 1, k) if k % 2 else struct.pack("<Q", 0)
+            content += struct.pack("<Q3d3Bd", 10 + k, *point, 1, 2, 3, 0.5) + track
+        (folder / "points3D.bin").write_bytes(content)
+
+
+def write_text(folder, kind, names, points=True):
+    folder.mkdir(parents=True, exist_ok=True)
+    _, numbers, _ = MODELS[kind]
+    text = " ".join(map(repr, map(float, numbers)))
+    (folder / "cameras.txt").write_text(f"# cameras\n7 {kind} {WIDTH} {HEIGHT} {text}\n")
+    lines = ["# images"]
+    for place, name in enumerate(names):
+        quaternion, shift = entries(place)
+        head = " ".join(f"{float(value):.17g}" for value in (*quaternion, *shift))
+        columns, rows, _, seen = observations(place)
+        told = [f"{u:.17g} {v:.17g} {10 + k}" for u, v, k in zip(columns, rows, seen, strict=True)]
+        lines += [f"{place + 1} {head} 7 {name}", " ".join([*told, "1 2 -1"]) if points else ""]
+    (folder / "images.txt").write_text("\n".join(lines) + "\n")
+    if points:
+        text = "".join(f"{10 + k} {x:.17g} {y:.17g} {z:.17g} 1 2 3 0.5 1 2\n" for k, (x, y, z) in enumerate(cloud()))
+        (folder / "points3D.txt").write_text("# points\n" + text)
+
+
+def write_by_pycolmap(folder, kind, names, points=True):
+    pycolmap = pytest.importorskip("pycolmap", reason="pip install pycolmap")
+    folder.mkdir(parents=True, exist_ok=True)
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(model=kind, width=WIDTH, height=HEIGHT, params=MODELS[kind][1], camera_id=7)
+    model.add_camera_with_trivial_rig(camera)
+    numbers = [model.add_point3D(point, pycolmap.Track(), np.zeros(3, np.uint8)) for point in cloud()] if points else []
+    for place, name in enumerate(names):
+        columns, rows, _, seen = observations(place)
+        image = pycolmap.Image(name, np.column_stack((columns, rows)), 7, place + 1)
+        own = np.linalg.inv(pose(place))[:3]
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(own))
+        for index, k in enumerate(seen if points else ()):
+            model.add_observation(numbers[k], pycolmap.TrackElement(place + 1, index))
+    model.write_binary(str(folder))
+
+
+WRITERS = {"binary": write_binary, "text": write_text, "pycolmap": write_by_pycolmap}
+
+
+def photo(number):
+    rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH]
+    return np.stack((4 * columns, 5 * rows, np.full_like(rows, 60 * number)), axis=2).astype(np.uint8)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Photos and depth maps in millimetres of a quarter of the size."""
+    for number in range(FRAMES):
+        for kind in ("images", "depth"):
+            (tmp_path / "scan" / kind).mkdir(parents=True, exist_ok=True)
+        Image.fromarray(photo(number)).save(tmp_path / "scan/images" / f"{number:03}.png")
+        depth = np.full((HEIGHT // 4, WIDTH // 4), 2000 + number, np.uint16)
+        Image.fromarray(depth).save(tmp_path / "scan/depth" / f"{number:03}.png")
+    return tmp_path / "scan"
+
+
+NAMES = [f"{number:03}.png" for number in range(FRAMES)]
+
+
+@pytest.mark.parametrize("writer", WRITERS)
+@pytest.mark.parametrize("kind", MODELS)
+def test_cameras_poses_and_lenses_are_those_of_the_model(folder, writer, kind):
+    WRITERS[writer](folder / "sparse" / "0", kind, NAMES)
+    found = find_pairs_of_folder(folder)
+    assert any(str(fact).startswith("cameras and poses of COLMAP: 0/images.") for fact in found.assumptions)
+    assert len(found.pairs) == FRAMES
+    _, numbers, lens = MODELS[kind]
+    fy = F + 1 if numbers[1] == F + 1 else F
+    for number, pair in enumerate(pickle.loads(pickle.dumps(found.pairs))):
+        geometry = pair.capture.geometry((HEIGHT, WIDTH))
+        assert geometry.camera == Camera(WIDTH, HEIGHT, F, fy, CX - 0.5, CY - 0.5)
+        np.testing.assert_allclose(geometry.pose, pose(number), atol=1e-12)
+        assert geometry.lens == lens
+    picture = read_picture(found.pairs[1], Reading())
+    rows, columns = np.mgrid[8 : HEIGHT - 8, 8 : WIDTH - 8]
+    x, y = distorted(kind, (columns + 0.5 - CX) / F, (rows + 0.5 - CY) / fy)
+    expected = np.stack((4 * (F * x + CX - 0.5), 5 * (fy * y + CY - 0.5)))
+    np.testing.assert_allclose(255 * picture.rgb[:2, 8:-8, 8:-8].numpy(), expected, atol=0.8)
+    np.testing.assert_allclose(picture.depth_lr[picture.depth_lr.isfinite()], 2.001)
+
+
+@pytest.mark.parametrize("writer", WRITERS)
+@pytest.mark.parametrize("place", [".", "sparse", "colmap/sparse/0"])
+def test_points_are_the_depth_of_photos_without_maps(folder, writer, place):
+    for path in (folder / "depth").iterdir():
+        path.unlink()
+    WRITERS[writer](folder / place, "SIMPLE_PINHOLE", NAMES)
+    found = find_pairs_of_folder(folder)
+    assert [pair.name for pair in found.pairs] == ["000", "001", "002"]
+    for number, pair in enumerate(found.pairs):
+        picture = read_picture(pair, Reading())
+        columns, rows, z, seen = observations(number)
+        height, width = picture.depth_lr.shape[-2:]
+        assert len(seen) / 2 < height * width < 2 * len(seen)
+        expected = np.full((height, width), np.inf)
+        cells = (rows * height / HEIGHT).astype(int), (columns * width / WIDTH).astype(int)
+        np.minimum.at(expected, cells, z)
+        known = np.isfinite(expected)
+        np.testing.assert_array_equal(picture.depth_lr[0].isfinite().numpy(), known)
+        np.testing.assert_allclose(picture.depth_lr[0].numpy()[known], expected[known], rtol=1e-5)
+        np.testing.assert_allclose(picture.pose, pose(number), atol=1e-9)
+
+
+@pytest.mark.parametrize("given", ["model", "model/sparse/0", "model/sparse/0/images.bin"])
+def test_model_elsewhere_is_given_by_poses(folder, tmp_path, given, capsys):
+    write_binary(tmp_path / "model/sparse/0", "OPENCV", ["shots/000.jpg", "shots/001.jpg", "shots/002.jpg"])
+    command = ("upsample", folder, "--poses", tmp_path / given, "--method", "bicubic", "--only", "nerfstudio")
+    assert main([*map(str, command), "-o", str(tmp_path / "out")]) == 0
+    assert "cameras and poses of COLMAP" in capsys.readouterr().out
+    told = json.loads((tmp_path / "out/001/info.json").read_text())
+    np.testing.assert_allclose(told["pose"], pose(1), atol=1e-9)
+    assert [told["camera"][name] for name in ("fx", "fy", "cx", "cy")] == [F, F + 1, CX - 0.5, CY - 0.5]
+    assert told["inputs"]["poses"]["file"] == "images.bin"
+    assert len(json.loads((tmp_path / "out/transforms.json").read_text())["frames"]) == FRAMES
+
+
+def test_photo_without_an_image_has_no_pose_and_a_model_of_other_photos_is_none(folder, tmp_path, capsys):
+    write_text(folder / "sparse/0", "PINHOLE", NAMES[:1], points=False)
+    pairs = find_pairs_of_folder(folder).pairs
+    assert [pair.capture is None for pair in pairs] == [False, True, True]
+    write_text(folder / "sparse/0", "PINHOLE", ["else.png"])
+    found = find_pairs_of_folder(folder)
+    assert any("none of these names" in str(fact) for fact in found.assumptions)
+    command = ("upsample", folder, "--poses", folder / "sparse/0", "-o", tmp_path / "out")
+    assert main([*map(str, command)]) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert "images.txt: expected images named as the photos, such as 000.png" in line
+    assert not (tmp_path / "out").exists()
+
+
+def cut(path):
+    path.write_bytes(path.read_bytes()[:-5])
+
+
+def patch(path, place, layout, value):
+    content = bytearray(path.read_bytes())
+    struct.pack_into(layout, content, place, value)
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize(
+    ("name", "damage"),
+    [
+        ("cameras.bin", cut),
+        ("images.bin", cut),
+        ("cameras.bin", lambda path: patch(path, 0, "<Q", 2**60)),
+        ("images.bin", lambda path: patch(path, 0, "<Q", 2**60)),
+        ("cameras.bin", lambda path: patch(path, 12, "<i", 99)),
+        ("cameras.bin", lambda path: patch(path, 16, "<Q", 0)),
+        ("images.bin", lambda path: path.write_bytes(path.read_bytes()[:80])),
+        ("images.bin", lambda path: patch(path, 68, "<I", 3)),
+        ("cameras.txt", lambda path: path.write_text("1 PINHOLE 64 48 60 60 32\n")),
+        ("cameras.txt", lambda path: path.write_text("1 FOV 64 48 60 60 32 24 1\n")),
+        ("cameras.txt", lambda path: path.write_text("PINHOLE\n")),
+        ("images.txt", lambda path: path.write_text("1 1 0 0 0 0 0 0 7\n")),
+        ("images.txt", lambda path: path.write_text("1 1 0 0 0 0 0 0 7 000.png\n1 2\n")),
+        ("images.txt", lambda path: path.write_text("1 1 0 0 0 0 0 0 7 000.png\nno numbers here\n")),
+    ],
+)
+def test_damaged_model_is_one_line_that_names_the_file(folder, tmp_path, capsys, name, damage):
+    (write_text if name.endswith("txt") else write_binary)(folder / "sparse/0", "PINHOLE", NAMES)
+    damage(folder / "sparse/0" / name)
+    assert main(["upsample", str(folder), "--method", "bicubic", "-o", str(tmp_path / "out")]) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert name in line
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("place", "value"), [(12, 5.0), (12, np.nan), (44, np.inf)])
+def test_pose_that_is_none_and_points_that_are_damaged_concern_a_frame(folder, tmp_path, capsys, place, value):
+    write_binary(folder / "sparse/0", "PINHOLE", NAMES)
+    patch(folder / "sparse/0/images.bin", place, "<d", value)  # of the first one that is stored, the last photo
+    command = ["upsample", str(folder), "--method", "bicubic", "--only", "depth", "-o", str(tmp_path / "out")]
+    assert main(command) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert "images.bin: image '002.png'" in line
+    assert (tmp_path / "out/000/info.json").is_file()
+    write_binary(folder / "sparse/0", "PINHOLE", NAMES)
+    for path in (folder / "depth").iterdir():
+        path.unlink()
+    cut(folder / "sparse/0/points3D.bin")
+    assert main([*command[:-1], str(tmp_path / "more")]) == 2
+    assert all("points3D.bin" in line for line in capsys.readouterr().err.splitlines())
