@@ -9,9 +9,9 @@ src/transformation/mode_specific_calibration.c.
                              1 x 1 whose corner is (0, 0), and the motion from the rig's frame to its own in metres
     K4A_DEPTH_DELAY_NS       how much later than a photo its depth map was taken, on purpose
 
-The lens model is OpenCV's. That of Orbbec's wrapper of the SDK, Rational6KT, has half of OpenCV's mixed tangential
-terms, a difference of hundredths of a pixel, and is taken for it. Each mode of a camera sees a part of that image,
-scaled. Photo and depth map are paired by their times, within 20 ms.
+Each mode of a camera sees a part of that image, scaled. The lens model is OpenCV's. That of Orbbec's wrapper of the
+SDK, Rational6KT, has half of OpenCV's mixed tangential terms and is taken for it: tenths of a pixel in the corners of a
+4K photo. Photo and depth map are paired by their times, within 20 ms.
 """
 
 from __future__ import annotations
