@@ -241,7 +241,7 @@ SENSORS = (
         "ARKit lidar",
         "lidar",
         256,
-        r"arkit|record3d|stray scanner|polycam|iphone ?1[2-9] ?pro|ipad.*\bpro|"
+        r"arkit|record3d|stray scanner|polycam|3d scanner app|scannet\+\+|iphone ?1[2-9] ?pro|ipad.*\bpro|"
         r"iphone(13,[34]|14,[23]|15,[23]|16,[12]|17,[12])\b",
         extent=6.0,
         edges="of a step 14 % fall between neighbours and 52 % over three pixels; never a hole",

@@ -88,7 +88,7 @@ def find_seven_scenes(folder: Path) -> PairingResult | None:
         frame = _frame("7-Scenes", poses.get(name), folder / f"{name}.pose.txt", None if camera else _kinect)
         pairs.append(Pair(name, photos[name], depths[name], camera, unit=1e-3, capture=frame))
     lone = [each[name] for each in (photos, depths) for name in sorted(each, key=natural_key) if name not in both]
-    text = "a sequence of 7-Scenes: depth in millimetres; from the folder: poses"
+    text = "a sequence of 7-Scenes or 3DMatch: depth in millimetres; from the folder: poses"
     return PairingResult(tuple(pairs), (Assumption(text),), tuple(lone))
 
 
