@@ -146,7 +146,7 @@ def test_images_of_a_db3_may_be_raw_and_those_of_a_bag_in_yuv(tmp_path):
         yuv = []
         for each in grey:
             both = np.full((48, 64, 2), 128, np.uint8)
-            both[..., place] = np.rint(16 + each[..., 0] * 219 / 255)
+            both[..., place] = np.rint(16 + each[..., 0] * (219 / 255))
             yuv.append(both)
         pictures = read_all(realsense.bag(tmp_path / f"{encoding}.bag", Recording(photos=yuv, encoding=encoding)))
         assert [pixels(picture).mean() for picture in pictures] == pytest.approx([60, 100, 140], abs=2)
