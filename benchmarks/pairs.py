@@ -280,7 +280,7 @@ def lists(pairs: list[Right], *, developed: bool) -> str:
         for number in rng.permutation(len(chosen)):
             if not alike[number, drawn].any() and len(drawn) < LENGTH:
                 drawn.append(int(number))
-        exchanged = [drawn[1], drawn[0], *drawn[2:]]
+        exchanged = [*drawn[1::-1], *drawn[2:]]
         for kind, order in zip(counts, (drawn, drawn[::-1], drawn[1:] + drawn[:1], exchanged), strict=True):
             found = find_misplaced(agreements[np.ix_(drawn, order)])
             counts[kind] += len(found) >= LIMITS["photo-order"].threshold
