@@ -118,7 +118,7 @@ def test_pairs_have_their_published_rows(shared: Path, tmp_path: Path) -> None:
     ddrnet, camera = ("real/ddrnet/color_map", "real/ddrnet/depth_map"), "real/sunrgbd/open3d_sample"
     for name in (*ddrnet, "real/iphone_lidar", camera, "scenes/books"):
         (tmp_path / name).symlink_to(shared / name)
-    command = (sys.executable, str(BENCHMARKS / "pairs.py"), "--shared", str(tmp_path), "--rendered", "4")
+    command = (sys.executable, str(BENCHMARKS / "pairs.py"), "--shared", str(tmp_path), "--rendered", "8")
     done = subprocess.run([*command, "--workers", "1"], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     published = (BENCHMARKS.parent / "docs" / "checks.md").read_text()
@@ -128,4 +128,4 @@ def test_pairs_have_their_published_rows(shared: Path, tmp_path: Path) -> None:
     )  # but for those with another photo, which is drawn from all
     rows = ("ddrnet raw", "iphone_lidar", "books raw")
     assert {name: measured[name] for name in rows} == {name: expected[name] for name in rows}
-    assert measured["rendered"][0] == "4"
+    assert measured["rendered"][0] == "8"
