@@ -200,3 +200,23 @@ def test_translation_of_1e308_metres_is_refused_without_a_warning_of_overflow(tm
     np.savetxt(tmp_path / "extrinsics.txt", shift)
     with pytest.raises(ValueError, match=r"extrinsics\.txt: expected a translation in metres, got one of 1e\+308"):
         read_transform(tmp_path / "extrinsics.txt")
+
+
+def test_archive_with_a_file_without_a_name_is_refused(tmp_path):
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as packed:
+        packed.writestr("abc", b"depth")
+    (tmp_path / "set.zip").write_bytes(nameless(content.getvalue()))
+    with pytest.raises(ValueError, match=r"set\.zip: refused"):
+        unpack(tmp_path / "set.zip", tmp_path / "out", lambda *_, **__: None)
+
+
+def nameless(content):
+    """Take the name `abc` off the central directory's only entry of an archive."""
+    entry = content.index(b"PK\x01\x02")
+    end = content.index(b"PK\x05\x06")
+    directory = bytearray(content[entry : entry + 46] + content[entry + 49 : end])
+    struct.pack_into("<H", directory, 28, 0)
+    tail = bytearray(content[end:])
+    struct.pack_into("<I", tail, 12, len(directory))
+    return content[:entry] + bytes(directory) + bytes(tail)

@@ -155,11 +155,13 @@ def files_in(packed: zipfile.ZipFile, archive: object) -> list[zipfile.ZipInfo]:
     """Return the files of an archive that may be unpacked.
 
     Raises:
-        ValueError: one is a link or a device, or leads outside the folder; the message begins with ``archive``.
+        ValueError: one is a link or a device, has no name or leads outside the folder; it begins with ``archive``.
 
     """
-    entries = [each for each in packed.infolist() if not each.is_dir()]
+    entries = [each for each in packed.infolist() if not each.filename.endswith("/")]
     for each in entries:
+        if not each.filename:
+            raise ValueError(f"{archive}: refused: a file in it has no name")
         if stat.S_IFMT(each.external_attr >> 16) not in (0, stat.S_IFREG):
             raise ValueError(f"{archive}: refused: {each.filename!r} in it is neither a file nor a directory")
         if leads_outside(each.filename):
