@@ -113,7 +113,7 @@ class Upsampler:
         method, scale, device, fill, max_hole, **settings: those of :func:`upsample`.
 
     Raises:
-        ValueError: a method, setting or scale is not as there.
+        ValueError: a method is not as there; settings and scale are checked with the first picture.
 
     Example:
         >>> import numpy as np
