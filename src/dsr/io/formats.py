@@ -8,12 +8,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-_LIDAR = "interpolated from a few hundred dots: bent edges, nothing thinner than some centimetres"
-_KINECT1 = (
-    "stairs that grow with the square of the distance, edges smeared over 5 to 10 pixels, shadows beside near things"
-)
-_STEREO = "blobs as wide as the matching window, guesses on blank walls, glass believed"
-_FLIGHT = "flying pixels at edges, noise on dark surfaces, rounded inner corners"
+_LIDAR = "bent edges, nothing thin"
+_KINECT1 = "stairs far away, smeared edges, shadows beside near things"
+_STEREO = "blobs, guesses on blank walls, glass believed"
+_FLIGHT = "flying pixels, noise on dark surfaces, rounded corners"
 
 
 class Format(NamedTuple):
