@@ -64,10 +64,11 @@ def estimate_light(normals: Tensor, intensity: Tensor, albedo: Tensor, valid: Te
         valid: (B, 1, H, W) bool, the pixels to explain.
 
     """
-    basis = torch.where(valid, albedo * harmonics(normals), 0).flatten(2)
+    # In 64 bits: of nearly flat surfaces the equations are so badly conditioned that 32 leave nothing but rounding.
+    basis = torch.where(valid, albedo * harmonics(normals), 0).flatten(2).double()
     squares = basis @ basis.transpose(1, 2)
     squares = squares + _RIDGE * torch.eye(9, dtype=basis.dtype, device=basis.device)
-    return torch.linalg.solve(squares, basis @ intensity.flatten(2).transpose(1, 2))[..., 0]
+    return torch.linalg.solve(squares, basis @ intensity.flatten(2).transpose(1, 2).double())[..., 0].to(normals)
 
 
 def estimate_albedo(rgb: Tensor) -> Tensor:
