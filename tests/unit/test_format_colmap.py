@@ -200,6 +200,15 @@ def test_points_are_the_depth_of_photos_without_maps(folder, writer, place):
         np.testing.assert_allclose(picture.pose, pose(number), atol=1e-9)
 
 
+@pytest.mark.parametrize("outside", ["{}/000.png", "../{}/000.png"])
+def test_photos_that_a_model_names_outside_of_its_folder_are_not_read(folder, tmp_path, outside):
+    other = (folder / "images").rename(tmp_path / "other")
+    name = outside.format(other if outside.startswith("{") else "other")
+    write_binary(folder / "sparse/0", "PINHOLE", [name, name, name])
+    with pytest.raises(ValueError, match="found no pair"):
+        find_pairs_of_folder(folder)
+
+
 @pytest.mark.parametrize("given", ["model", "model/sparse/0", "model/sparse/0/images.bin"])
 def test_model_elsewhere_is_given_by_poses(folder, tmp_path, given, capsys):
     write_binary(tmp_path / "model/sparse/0", "OPENCV", ["shots/000.jpg", "shots/001.jpg", "shots/002.jpg"])

@@ -34,7 +34,7 @@ from dsr.io.frames import CaptureFrame, Geometry, Record
 from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult
 from dsr.io.trajectories import intrinsics_camera
 from dsr.notes import Assumption
-from dsr.utils.guards import naming, natural_key, numbers_in, read_limited
+from dsr.utils.guards import leads_outside, naming, natural_key, numbers_in, read_limited
 from dsr.utils.versions import file_hash
 
 _APP = "COLMAP"
@@ -190,8 +190,8 @@ def find_colmap(folder: Path) -> PairingResult | None:
         return None
     model, pairs, lone = read_model(file), [], []
     for image in model.images:
-        places = (folder / part / image.name for part in ("images", ".", "rgb", "color"))
-        photo = next((each for each in places if ".." not in each.parts and each.is_file()), None)
+        places = (folder / part for part in ("images", ".", "rgb", "color") if not leads_outside(image.name))
+        photo = next((place / image.name for place in places if (place / image.name).is_file()), None)
         if photo is None or photo.suffix.lower() not in PHOTO_SUFFIXES:
             continue
         if int((image.observed[:, 2] >= 0).sum()) < _FEWEST:
