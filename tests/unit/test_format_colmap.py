@@ -263,6 +263,7 @@ def patch(path, place, layout, value):
         ("images.txt", lambda path: path.write_text("1 1 0 0 0 0 0 0 7\n")),
         ("images.txt", lambda path: path.write_text("1 1 0 0 0 0 0 0 7 000.png\n1 2\n")),
         ("images.txt", lambda path: path.write_text("1 1 0 0 0 0 0 0 7 000.png\nno numbers here\n")),
+        ("images.txt", lambda path: path.write_text("1 1 0 0 0 0 0 0 7 000.png\n1 2 inf\n")),
     ],
 )
 def test_damaged_model_is_one_line_that_names_the_file(folder, tmp_path, capsys, name, damage):

@@ -376,7 +376,8 @@ def _images_of_text(path: Path, content: bytes) -> list[_Image]:
         *words, name = line.strip().split(maxsplit=9)
         numbers, stored = numbers_in(words), next(lines, "")
         seen = numbers_in(stored.split())
-        if len(numbers) != 9 or not numbers[8].is_integer() or len(seen) % 3 or bool(seen) != bool(stored.strip()):
+        damaged = len(seen) % 3 or bool(seen) != bool(stored.strip()) or not all(map(math.isfinite, seen))
+        if len(numbers) != 9 or not numbers[8].is_integer() or damaged:
             what = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, and a line of X Y POINT3D_ID of each point"
             raise ValueError(f"{path}: expected {what}, got {line!r:.80}")
         observed = np.array(seen, np.float64).reshape(-1, 3)
