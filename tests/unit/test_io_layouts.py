@@ -358,6 +358,19 @@ def test_zip_file_that_unpacks_to_more_than_it_declares_or_is_damaged_is_refused
         find_pairs_of_folder(path)
 
 
+@pytest.mark.parametrize("kind", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_member_that_is_damaged_is_refused_however_it_is_packed(tmp_path, kind):
+    path = tmp_path / "scan.zip"
+    with zipfile.ZipFile(path, "w", kind) as archive:
+        archive.writestr("rgb.png", bytes(range(256)) * 20)
+    content = bytearray(path.read_bytes())
+    for place in range(50, 80):
+        content[place] ^= 0x5A
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"scan.zip: rgb.png: expected a member, got a damaged one"):
+        find_pairs_of_folder(path)
+
+
 def remove(*names):
     def change(folder):
         for name in names:
