@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections import Counter
@@ -114,10 +115,14 @@ def match_names(photos: Iterable[Path], depths: Iterable[Path]) -> list[tuple[Pa
 
 
 def match_times(photos: dict[Path, float], depths: dict[Path, float]) -> dict[Path, Path]:
-    """Return which depth map was taken with which photo: the nearest first, each used once, within 20 ms."""
-    order = sorted(depths, key=depths.__getitem__)
-    candidates, first = [], 0
-    for path in sorted(photos, key=photos.__getitem__):
+    """Return which depth map was taken with which photo: the nearest first, each used once, within 20 ms.
+
+    Those without a finite time belong to none.
+    """
+    ordered = [sorted((path for path in each if math.isfinite(each[path])), key=each.__getitem__)
+               for each in (photos, depths)]  # fmt: skip
+    order, candidates, first = ordered[1], [], 0
+    for path in ordered[0]:
         while first < len(order) and depths[order[first]] < photos[path] - _MAX_GAP:
             first += 1
         for other in order[first:]:
