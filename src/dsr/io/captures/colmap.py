@@ -21,7 +21,7 @@ import functools
 import math
 import struct
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -163,13 +163,25 @@ def add_model(found: PairingResult, file: Path) -> PairingResult:
             continue
         count += 1
         frame = model.frame(image)
-        if pair.capture is not None:
-            frame = replace(frame, app=pair.capture.app, photo=pair.capture.photo, depth=pair.capture.depth)
-        pairs.append(replace(pair, capture=frame))
+        pairs.append(replace(pair, capture=frame if pair.capture is None else _within(frame, pair.capture)))
     if not count:
         text = f"no poses: {file.name} of {_APP} has {len(names)} images, none of these names"
         return replace(found, assumptions=(*found.assumptions, Assumption(text)))
     return replace(found, pairs=tuple(pairs), assumptions=(*found.assumptions, _note(count, len(pairs), file)))
+
+
+def _within(frame: CaptureFrame, capture: CaptureFrame) -> CaptureFrame:
+    """Return what a model says of a frame of a capture, which has its pictures, its depth camera and its time."""
+    geometry = functools.partial(_joined, frame.geometry, capture.geometry)
+    return replace(capture, geometry=geometry, told_by=frame.told_by, told=frame.told + capture.told)
+
+
+def _joined(
+    model: Callable[[tuple[int, int]], Geometry], capture: Callable[[tuple[int, int]], Geometry], size: tuple[int, int]
+) -> Geometry:
+    """Return camera, pose and lens of a model, depth camera and time of a capture."""
+    own = capture(size)
+    return model(size)._replace(rig=own.rig, time=own.time)
 
 
 def _note(count: int, total: int, file: Path) -> Assumption:
