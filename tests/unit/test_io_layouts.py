@@ -22,7 +22,7 @@ from dsr.cli import main
 from dsr.geometry.camera import Camera
 from dsr.io.inputs import FolderUnits, read_picture
 from dsr.io.layouts import find_pairs_of_folder
-from dsr.io.reading import Reading
+from dsr.io.reading import CameraChoice, Reading
 
 CAMERA = Camera(SIZE[1], SIZE[0], *INTRINSICS)
 
@@ -143,6 +143,13 @@ def test_real_scenes_of_sun_rgbd_are_read_in_metres(shared):
         known = picture.depth_lr[~picture.depth_lr.isnan()]
         assert 1 < float(known.median()) < 4
         assert float(known.max()) < 12
+
+
+def test_replica_has_its_unit_from_the_file_also_where_the_camera_is_given(folder):
+    path = captures.replica(folder) / "cam_params.json"
+    path.write_text(path.read_text().replace("6553.5", "1000.0"))
+    [known, *_], [given, *_] = read_all(folder), read_all(folder, camera=CameraChoice(fov=60.0))
+    torch.testing.assert_close(given.depth_lr, known.depth_lr, equal_nan=True)
 
 
 def test_replica_has_its_unit_from_the_file_one_folder_up_or_from_the_data_set(folder):
