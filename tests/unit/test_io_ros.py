@@ -165,3 +165,28 @@ def test_rvl_that_is_damaged_or_declares_more_than_it_can_hold_is_refused_before
         with pytest.raises(ValueError, match=r"^topic: ") as caught:
             decode_message("topic", message(wrong))
         assert "\n" not in str(caught.value)
+
+
+def packed(path, mode):
+    """Write a message of 300 MB of zeros, in about 30 KB, on its own or with its file."""
+    from rosbags import rosbag2  # noqa: PLC0415 - an extra
+    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
+
+    writer = rosbag2.Writer(path, version=8)
+    writer.set_compression(rosbag2.CompressionMode[mode], rosbag2.CompressionFormat.ZSTD)
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with writer:
+        connection = writer.add_connection("/color/image_raw", "sensor_msgs/msg/Image", typestore=store)
+        writer.write(connection, 1, bytes(300 << 20))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("mode", "said"),
+    [("MESSAGE", "a chunk without end, or of more than 268435456 bytes"), ("FILE", "its files are packed whole")],
+)
+def test_packed_messages_and_files_are_not_unpacked_to_any_size(tmp_path, mode, said):
+    path = packed(tmp_path / "scan", mode)
+    (path / "scan.db3").touch()  # a recording has such a file
+    with pytest.raises(ValueError, match=f"^{path}: expected a recording of ROS, got a damaged one .{said}"):
+        find_pairs_of_folder(path)
