@@ -13,7 +13,7 @@ from dsr.geometry.camera import Camera
 from dsr.io.captures.ros_images import decode_message
 from dsr.io.inputs import read_picture
 from dsr.io.layouts import find_pairs_of_folder
-from dsr.io.reading import Reading
+from dsr.io.reading import CameraChoice, Reading
 
 pytest.importorskip("rosbags")
 CAMERA = Camera(SIZE[1], SIZE[0], *INTRINSICS)
@@ -81,6 +81,16 @@ def test_unknown_distortion_is_said_and_left(tmp_path):
     picture = read_first(captures.ros(tmp_path / "a", 2, distortion_model="thin_prism", d=[0.1, 0.2]))
     np.testing.assert_array_equal(np.rint(255 * picture.rgb.permute(1, 2, 0).numpy()), captures.photo())
     assert any("thin_prism" in str(fact) for fact in picture.assumptions)
+
+
+def test_camera_that_is_not_calibrated_is_assumed_or_given(tmp_path):
+    """CameraInfo has zeros for it."""
+    [pair, *_] = find_pairs_of_folder(captures.ros(tmp_path / "a.bag", 1, k=[0.0] * 9)).pairs
+    picture = read_picture(pair, Reading())
+    assert any("not calibrated" in fact.text for fact in picture.assumptions)
+    assert any("none given" in fact.text for fact in picture.assumptions)
+    assert picture.time == pytest.approx(100)
+    assert read_picture(pair, Reading(camera=CameraChoice(intrinsics=INTRINSICS))).camera == CAMERA
 
 
 @pytest.mark.parametrize(
