@@ -77,6 +77,14 @@ def test_what_has_no_finite_time_is_no_partner_of_anything():
     assert match_times(photos, depths) == {names[1]: names[0]}
 
 
+def test_many_pictures_of_one_time_take_no_memory_of_all_pairs():
+    alike = dict.fromkeys((Path(f"{number}.png") for number in range(20_000)), 1.0)
+    with pytest.raises(ValueError, match="expected frames of different times, got too many"):
+        match_times(alike, alike)
+    few = dict(list(alike.items())[:100])
+    assert len(match_times(few, few)) == 100
+
+
 def test_nearest_time_is_matched_and_no_depth_map_twice(tmp_path):
     touch(
         tmp_path,

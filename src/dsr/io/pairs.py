@@ -30,6 +30,8 @@ _SECONDS_BY_DIGITS = {10: 1.0, 13: 1e-3, 16: 1e-6, 19: 1e-9}
 """Times since 1970 as whole seconds, milli-, micro- and nanoseconds."""
 _MAX_GAP = 0.02
 """Largest time in seconds between the two pictures of a pair."""
+_MOST_CANDIDATES, _RATE = 1 << 20, 40
+"""Pairs within that time that there may be at all, and for each photo, where there are more: at 1000 a second."""
 
 CAMERA_NAMES = (
     "camera.json", "cam_params.json", "intrinsics.json", "intrinsic.json", "camera_intrinsic.json",
@@ -118,6 +120,10 @@ def match_times(photos: dict[Path, float], depths: dict[Path, float]) -> dict[Pa
     """Return which depth map was taken with which photo: the nearest first, each used once, within 20 ms.
 
     Those without a finite time belong to none.
+
+    Raises:
+        ValueError: far more are within that time of each other than any cameras take.
+
     """
     ordered = [sorted((path for path in each if math.isfinite(each[path])), key=each.__getitem__)
                for each in (photos, depths)]  # fmt: skip
@@ -130,6 +136,8 @@ def match_times(photos: dict[Path, float], depths: dict[Path, float]) -> dict[Pa
             if gap > _MAX_GAP:
                 break
             candidates.append((abs(gap), path, other))
+        if len(candidates) > max(_MOST_CANDIDATES, _RATE * len(photos)):
+            raise ValueError(f"{path}: expected frames of different times, got too many within {_MAX_GAP:g} s")
     partner: dict[Path, Path] = {}
     taken: set[Path] = set()
     for _, path, other in sorted(candidates):
