@@ -4,6 +4,7 @@ import json
 import pickle
 import struct
 
+import captures
 import numpy as np
 import pytest
 from PIL import Image
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from dsr.cli import main
 from dsr.geometry.camera import Camera
 from dsr.geometry.lens import Lens
+from dsr.io.captures.colmap import add_model, model_file
 from dsr.io.inputs import read_picture
 from dsr.io.layouts import find_pairs_of_folder
 from dsr.io.reading import Reading
@@ -200,6 +202,32 @@ def test_points_are_the_depth_of_photos_without_maps(folder, writer, place):
         np.testing.assert_allclose(picture.pose, pose(number), atol=1e-9)
 
 
+def test_model_of_a_recording_leaves_it_its_depth_camera_and_its_times(tmp_path):
+    photos = [captures.photo(number).repeat(10, 0).repeat(10, 1) for number in range(FRAMES)]
+    depths = [np.full((288, 320), 1000, np.uint16)] * FRAMES
+    found = find_pairs_of_folder(captures.kinect(tmp_path / "scan.mkv", photos, depths))
+    write_binary(tmp_path / "model", "OPENCV", [f"{pair.rgb.name}.jpg" for pair in found.pairs])
+    joined = add_model(found, model_file(tmp_path / "model"))
+    size = photos[0].shape[:2]
+    for number, (before, after) in enumerate(zip(found.pairs, pickle.loads(pickle.dumps(joined.pairs)), strict=True)):
+        own, geometry = before.capture.geometry(size), after.capture.geometry(size)
+        assert geometry.rig is not None
+        np.testing.assert_array_equal(geometry.rig.transform, own.rig.transform)
+        assert (geometry.rig.camera, geometry.rig.lens, geometry.time) == (own.rig.camera, own.rig.lens, own.time)
+        np.testing.assert_allclose(geometry.pose, pose(number), atol=1e-12)
+        assert geometry.lens == MODELS["OPENCV"][2]
+        assert after.capture.record() != before.capture.record()
+
+
+@pytest.mark.parametrize("outside", ["{}/000.png", "../{}/000.png"])
+def test_photos_that_a_model_names_outside_of_its_folder_are_not_read(folder, tmp_path, outside):
+    other = (folder / "images").rename(tmp_path / "other")
+    name = outside.format(other if outside.startswith("{") else "other")
+    write_binary(folder / "sparse/0", "PINHOLE", [name, name, name])
+    with pytest.raises(ValueError, match="found no pair"):
+        find_pairs_of_folder(folder)
+
+
 @pytest.mark.parametrize("given", ["model", "model/sparse/0", "model/sparse/0/images.bin"])
 def test_model_elsewhere_is_given_by_poses(folder, tmp_path, given, capsys):
     write_binary(tmp_path / "model/sparse/0", "OPENCV", ["shots/000.jpg", "shots/001.jpg", "shots/002.jpg"])
@@ -254,6 +282,7 @@ def patch(path, place, layout, value):
         ("images.txt", lambda path: path.write_text("1 1 0 0 0 0 0 0 7\n")),
         ("images.txt", lambda path: path.write_text("1 1 0 0 0 0 0 0 7 000.png\n1 2\n")),
         ("images.txt", lambda path: path.write_text("1 1 0 0 0 0 0 0 7 000.png\nno numbers here\n")),
+        ("images.txt", lambda path: path.write_text("1 1 0 0 0 0 0 0 7 000.png\n1 2 inf\n")),
     ],
 )
 def test_damaged_model_is_one_line_that_names_the_file(folder, tmp_path, capsys, name, damage):

@@ -114,6 +114,7 @@ def test_pairs_are_of_one_time_less_the_delay_that_was_asked_for(tmp_path):
     assert len(pairs) == 3
     for number, pair in enumerate(pairs):
         np.testing.assert_array_equal(pair.capture.depth.read(), plane() + 100 * number)
+        assert read_picture(pair, Reading()).time == pytest.approx(1 + number / 30, abs=1e-4)  # the photo's
 
 
 def test_recordings_in_a_folder_are_found_among_other_videos(tmp_path):

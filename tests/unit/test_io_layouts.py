@@ -22,7 +22,7 @@ from dsr.cli import main
 from dsr.geometry.camera import Camera
 from dsr.io.inputs import FolderUnits, read_picture
 from dsr.io.layouts import find_pairs_of_folder
-from dsr.io.reading import Reading
+from dsr.io.reading import CameraChoice, Reading
 
 CAMERA = Camera(SIZE[1], SIZE[0], *INTRINSICS)
 
@@ -143,6 +143,13 @@ def test_real_scenes_of_sun_rgbd_are_read_in_metres(shared):
         known = picture.depth_lr[~picture.depth_lr.isnan()]
         assert 1 < float(known.median()) < 4
         assert float(known.max()) < 12
+
+
+def test_replica_has_its_unit_from_the_file_also_where_the_camera_is_given(folder):
+    path = captures.replica(folder) / "cam_params.json"
+    path.write_text(path.read_text().replace("6553.5", "1000.0"))
+    [known, *_], [given, *_] = read_all(folder), read_all(folder, camera=CameraChoice(fov=60.0))
+    torch.testing.assert_close(given.depth_lr, known.depth_lr, equal_nan=True)
 
 
 def test_replica_has_its_unit_from_the_file_one_folder_up_or_from_the_data_set(folder):
@@ -355,6 +362,19 @@ def test_zip_file_that_unpacks_to_more_than_it_declares_or_is_damaged_is_refused
     path = packed(tmp_path / "half.zip", captures.polycam(folder))
     path.write_bytes(path.read_bytes()[:2000])
     with pytest.raises(ValueError, match=r"half.zip: expected a ZIP archive, got a damaged, truncated or foreign file"):
+        find_pairs_of_folder(path)
+
+
+@pytest.mark.parametrize("kind", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_member_that_is_damaged_is_refused_however_it_is_packed(tmp_path, kind):
+    path = tmp_path / "scan.zip"
+    with zipfile.ZipFile(path, "w", kind) as archive:
+        archive.writestr("rgb.png", bytes(range(256)) * 20)
+    content = bytearray(path.read_bytes())
+    for place in range(50, 80):
+        content[place] ^= 0x5A
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"scan.zip: rgb.png: expected a member, got a damaged one"):
         find_pairs_of_folder(path)
 
 

@@ -1,11 +1,14 @@
 """Pairs of photo and depth map in the layouts that people have, and what has no partner."""
 
+import math
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 
 from dsr.io.layouts import find_pairs_of_folder
-from dsr.io.pairs import find_pairs_of_lists, key_of, role_of, time_of, words_of
+from dsr.io.pairs import find_pairs_of_lists, key_of, match_times, role_of, time_of, words_of
 
 
 def touch(folder, *names):
@@ -65,6 +68,21 @@ def test_damaged_tum_list_is_refused_by_file_and_line(tmp_path):
     (tmp_path / "depth.txt").write_text("")
     with pytest.raises(ValueError, match=r"rgb.txt: line 1: expected a time and a file name, got '10.00'$"):
         find_pairs_of_folder(tmp_path)
+
+
+def test_what_has_no_finite_time_is_no_partner_of_anything():
+    names = [Path(f"{number}.png") for number in range(4)]
+    photos = dict(zip(names, (math.nan, 1.0, math.inf, 5.0), strict=True))
+    depths = dict(zip(names, (1.01, 9.0, math.inf, math.nan), strict=True))
+    assert match_times(photos, depths) == {names[1]: names[0]}
+
+
+def test_many_pictures_of_one_time_take_no_memory_of_all_pairs():
+    alike = dict.fromkeys((Path(f"{number}.png") for number in range(20_000)), 1.0)
+    with pytest.raises(ValueError, match="expected frames of different times, got too many"):
+        match_times(alike, alike)
+    few = dict(list(alike.items())[:100])
+    assert len(match_times(few, few)) == 100
 
 
 def test_nearest_time_is_matched_and_no_depth_map_twice(tmp_path):

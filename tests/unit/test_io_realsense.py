@@ -85,6 +85,7 @@ def test_frames_are_in_the_order_of_their_time_stamps(tmp_path, suffix):
     recording = Recording(stamps=(1066.6, 1000.0, 1033.3))
     pictures = read_all(WRITERS[suffix](tmp_path / f"a{suffix}", recording))
     assert [int(255 * picture.rgb[0, 0, 0]) for picture in pictures] == [40, 80, 0]
+    assert [picture.time for picture in pictures] == pytest.approx([1.0, 1.0333, 1.0666], abs=1e-6)
 
 
 @pytest.mark.parametrize("suffix", WRITERS)

@@ -13,7 +13,7 @@ from dsr.geometry.camera import Camera
 from dsr.io.captures.ros_images import decode_message
 from dsr.io.inputs import read_picture
 from dsr.io.layouts import find_pairs_of_folder
-from dsr.io.reading import Reading
+from dsr.io.reading import CameraChoice, Reading
 
 pytest.importorskip("rosbags")
 CAMERA = Camera(SIZE[1], SIZE[0], *INTRINSICS)
@@ -81,6 +81,16 @@ def test_unknown_distortion_is_said_and_left(tmp_path):
     picture = read_first(captures.ros(tmp_path / "a", 2, distortion_model="thin_prism", d=[0.1, 0.2]))
     np.testing.assert_array_equal(np.rint(255 * picture.rgb.permute(1, 2, 0).numpy()), captures.photo())
     assert any("thin_prism" in str(fact) for fact in picture.assumptions)
+
+
+def test_camera_that_is_not_calibrated_is_assumed_or_given(tmp_path):
+    """CameraInfo has zeros for it."""
+    [pair, *_] = find_pairs_of_folder(captures.ros(tmp_path / "a.bag", 1, k=[0.0] * 9)).pairs
+    picture = read_picture(pair, Reading())
+    assert any("not calibrated" in fact.text for fact in picture.assumptions)
+    assert any("none given" in fact.text for fact in picture.assumptions)
+    assert picture.time == pytest.approx(100)
+    assert read_picture(pair, Reading(camera=CameraChoice(intrinsics=INTRINSICS))).camera == CAMERA
 
 
 @pytest.mark.parametrize(
@@ -165,3 +175,28 @@ def test_rvl_that_is_damaged_or_declares_more_than_it_can_hold_is_refused_before
         with pytest.raises(ValueError, match=r"^topic: ") as caught:
             decode_message("topic", message(wrong))
         assert "\n" not in str(caught.value)
+
+
+def packed(path, mode):
+    """Write a message of 300 MB of zeros, in about 30 KB, on its own or with its file."""
+    from rosbags import rosbag2  # noqa: PLC0415 - an extra
+    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
+
+    writer = rosbag2.Writer(path, version=8)
+    writer.set_compression(rosbag2.CompressionMode[mode], rosbag2.CompressionFormat.ZSTD)
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with writer:
+        connection = writer.add_connection("/color/image_raw", "sensor_msgs/msg/Image", typestore=store)
+        writer.write(connection, 1, bytes(300 << 20))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("mode", "said"),
+    [("MESSAGE", "a chunk without end, or of more than 268435456 bytes"), ("FILE", "its files are packed whole")],
+)
+def test_packed_messages_and_files_are_not_unpacked_to_any_size(tmp_path, mode, said):
+    path = packed(tmp_path / "scan", mode)
+    (path / "scan.db3").touch()  # a recording has such a file
+    with pytest.raises(ValueError, match=f"^{path}: expected a recording of ROS, got a damaged one .{said}"):
+        find_pairs_of_folder(path)

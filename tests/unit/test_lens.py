@@ -154,3 +154,11 @@ def test_depth_map_in_the_photos_pixels_has_the_photos_lens(capture):
     frame = CaptureFrame("Test", lambda _: geometry, capture.depth, b"")
     found = read_picture(Pair("x", capture.rgb, capture.depth, unit=1e-3, capture=frame), Reading()).depth_lr[0].numpy()
     assert np.nanmax(np.abs(found - (2 + ideal_rays()[::2, ::2, 0]))) < 2 / 130
+
+
+@pytest.mark.parametrize("model", ["brown_conrady", "kannala_brandt"])
+def test_intrinsics_of_whole_numbers_are_those_of_floats(model):
+    picture = np.arange(64 * 48, dtype=np.float32).reshape(48, 64)
+    whole, real = (Camera(64, 48, *map(kind, (60, 60, 31, 24))) for kind in (int, float))
+    lens = Lens(model, (1, 0, 0, 0))
+    np.testing.assert_array_equal(undistort(picture, whole, lens), undistort(picture, real, lens))

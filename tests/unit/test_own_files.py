@@ -1,5 +1,6 @@
 """A training that goes on from a stranger's checkpoint touches no file outside its own directory of checkpoints."""
 
+import gc
 import shutil
 from pathlib import Path
 
@@ -111,3 +112,16 @@ def test_run_that_was_moved_keeps_its_best_and_removes_it_for_a_better_one(run, 
     assert (said, best.best_model_path) == ([], str(folder / "best-step=3.ckpt"))
     assert [path.name for path in folder.glob("best*")] == ["best-step=3.ckpt"]
     assert not (tmp_path / "run").exists()
+
+
+def test_what_a_checkpoint_was_tried_with_takes_no_memory_in_the_training(run, monkeypatch):
+    found = []
+
+    def count(module):
+        gc.collect()
+        made = [each for each in gc.get_objects() if type(each) is torch.optim.SGD]
+        found.append(sum(each.param_groups[0]["params"][0] is module.weight for each in made))
+
+    monkeypatch.setattr(Improving, "on_train_start", count, raising=False)
+    train(run, 2, [0.5, 0.4], run / "last.ckpt")
+    assert found == [1]

@@ -95,8 +95,8 @@ def undistort(picture: np.ndarray, camera: Camera, lens: Lens, hole: float | Non
 @functools.lru_cache(maxsize=2)  # the photo's and the depth map's
 def _places(camera: Camera, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
     """Return the columns and rows of a picture where the pixels of the pinhole camera lie, (h, w) float32 each."""
-    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-    numbers, size, kind = np.array(lens.coefficients), (camera.width, camera.height), cv2.CV_32FC1
+    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], np.float64)
+    numbers, size, kind = np.array(lens.coefficients, np.float64), (camera.width, camera.height), cv2.CV_32FC1
     if lens.model == "brown_conrady":
         places = cv2.initUndistortRectifyMap(matrix, numbers, None, matrix, size, kind)
     elif lens.model == "kannala_brandt":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections import Counter
@@ -29,6 +30,8 @@ _SECONDS_BY_DIGITS = {10: 1.0, 13: 1e-3, 16: 1e-6, 19: 1e-9}
 """Times since 1970 as whole seconds, milli-, micro- and nanoseconds."""
 _MAX_GAP = 0.02
 """Largest time in seconds between the two pictures of a pair."""
+_MOST_CANDIDATES, _RATE = 1 << 20, 40
+"""Pairs within that time that there may be at all, and for each photo, where there are more: at 1000 a second."""
 
 CAMERA_NAMES = (
     "camera.json", "cam_params.json", "intrinsics.json", "intrinsic.json", "camera_intrinsic.json",
@@ -114,10 +117,18 @@ def match_names(photos: Iterable[Path], depths: Iterable[Path]) -> list[tuple[Pa
 
 
 def match_times(photos: dict[Path, float], depths: dict[Path, float]) -> dict[Path, Path]:
-    """Return which depth map was taken with which photo: the nearest first, each used once, within 20 ms."""
-    order = sorted(depths, key=depths.__getitem__)
-    candidates, first = [], 0
-    for path in sorted(photos, key=photos.__getitem__):
+    """Return which depth map was taken with which photo: the nearest first, each used once, within 20 ms.
+
+    Those without a finite time belong to none.
+
+    Raises:
+        ValueError: far more are within that time of each other than any cameras take.
+
+    """
+    ordered = [sorted((path for path in each if math.isfinite(each[path])), key=each.__getitem__)
+               for each in (photos, depths)]  # fmt: skip
+    order, candidates, first = ordered[1], [], 0
+    for path in ordered[0]:
         while first < len(order) and depths[order[first]] < photos[path] - _MAX_GAP:
             first += 1
         for other in order[first:]:
@@ -125,6 +136,8 @@ def match_times(photos: dict[Path, float], depths: dict[Path, float]) -> dict[Pa
             if gap > _MAX_GAP:
                 break
             candidates.append((abs(gap), path, other))
+        if len(candidates) > max(_MOST_CANDIDATES, _RATE * len(photos)):
+            raise ValueError(f"{path}: expected frames of different times, got too many within {_MAX_GAP:g} s")
     partner: dict[Path, Path] = {}
     taken: set[Path] = set()
     for _, path, other in sorted(candidates):

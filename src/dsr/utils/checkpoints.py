@@ -186,6 +186,7 @@ class Resumed(Callback):
             for key, each in own.items()
         }
         checkpoint["callbacks"][self.state_key] = {"restoring": False}  # is loaded after the others
+        del self._optimizer, self._schedules, self._new, self._own  # which take several times the weights' memory
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Note that all is restored but what has been tried."""

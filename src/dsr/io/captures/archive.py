@@ -9,6 +9,7 @@ import atexit
 import contextlib
 import functools
 import hashlib
+import lzma
 import os
 import shutil
 import struct
@@ -39,7 +40,7 @@ from dsr.utils.guards import (
 _CHUNK = 1 << 20
 PHOTO_LIMIT = 1 << 26
 """Largest size in bytes of an encoded photo."""
-_DAMAGED = (zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError, struct.error)
+_DAMAGED = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, OSError, EOFError, RuntimeError, struct.error)
 """What reading a damaged or encrypted archive raises."""
 
 

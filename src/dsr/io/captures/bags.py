@@ -10,7 +10,8 @@ import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -181,11 +182,14 @@ def _expect_finished(path: Path) -> None:
 
 
 _CHUNK = 1 << 28
-"""Largest number of bytes of a chunk of a recording, packed or not; writers make chunks of a few MB."""
+"""Largest number of bytes of a chunk or a packed message of a recording; writers make chunks of a few MB."""
 
 
 def _limit_chunks() -> None:
-    """Make rosbags unpack no chunk to more than :data:`_CHUNK`: a bzip2 chunk of 700 bytes may stand for 1 GB."""
+    """Make rosbags unpack nothing to more than :data:`_CHUNK`: a bzip2 chunk of 700 bytes may stand for 1 GB.
+
+    Messages may be packed one by one. Recordings whose files are packed whole, of any size, are refused.
+    """
     lz4: Any = importlib.import_module("lz4.frame")  # with the extra alone
     from rosbags.rosbag1 import reader  # noqa: PLC0415
     from rosbags.rosbag2 import storage_mcap  # noqa: PLC0415
@@ -205,3 +209,9 @@ def _limit_chunks() -> None:
     for table in (reader.decompressors, storage_mcap.DECOMPRESSORS):
         for name in kinds.keys() & table.keys():
             table[name] = functools.partial(bounded, kinds[name])
+
+    def refuse(*_: object) -> NoReturn:
+        raise ValueError("its files are packed whole, which zstd -d undoes")
+
+    of_messages: Any = importlib.import_module("rosbags.rosbag2.reader")
+    of_messages.zstd = SimpleNamespace(decompress=functools.partial(bounded, kinds["zstd"]), open=refuse)

@@ -21,7 +21,7 @@ import functools
 import math
 import struct
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -34,7 +34,7 @@ from dsr.io.frames import CaptureFrame, Geometry, Record
 from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult
 from dsr.io.trajectories import intrinsics_camera
 from dsr.notes import Assumption
-from dsr.utils.guards import naming, natural_key, numbers_in, read_limited
+from dsr.utils.guards import leads_outside, naming, natural_key, numbers_in, read_limited
 from dsr.utils.versions import file_hash
 
 _APP = "COLMAP"
@@ -163,13 +163,25 @@ def add_model(found: PairingResult, file: Path) -> PairingResult:
             continue
         count += 1
         frame = model.frame(image)
-        if pair.capture is not None:
-            frame = replace(frame, app=pair.capture.app, photo=pair.capture.photo, depth=pair.capture.depth)
-        pairs.append(replace(pair, capture=frame))
+        pairs.append(replace(pair, capture=frame if pair.capture is None else _within(frame, pair.capture)))
     if not count:
         text = f"no poses: {file.name} of {_APP} has {len(names)} images, none of these names"
         return replace(found, assumptions=(*found.assumptions, Assumption(text)))
     return replace(found, pairs=tuple(pairs), assumptions=(*found.assumptions, _note(count, len(pairs), file)))
+
+
+def _within(frame: CaptureFrame, capture: CaptureFrame) -> CaptureFrame:
+    """Return what a model says of a frame of a capture, which has its pictures, its depth camera and its time."""
+    geometry = functools.partial(_joined, frame.geometry, capture.geometry)
+    return replace(capture, geometry=geometry, told_by=frame.told_by, told=frame.told + capture.told)
+
+
+def _joined(
+    model: Callable[[tuple[int, int]], Geometry], capture: Callable[[tuple[int, int]], Geometry], size: tuple[int, int]
+) -> Geometry:
+    """Return camera, pose and lens of a model, depth camera and time of a capture."""
+    own = capture(size)
+    return model(size)._replace(rig=own.rig, time=own.time)
 
 
 def _note(count: int, total: int, file: Path) -> Assumption:
@@ -190,8 +202,8 @@ def find_colmap(folder: Path) -> PairingResult | None:
         return None
     model, pairs, lone = read_model(file), [], []
     for image in model.images:
-        places = (folder / part / image.name for part in ("images", ".", "rgb", "color"))
-        photo = next((each for each in places if ".." not in each.parts and each.is_file()), None)
+        places = (folder / part for part in ("images", ".", "rgb", "color") if not leads_outside(image.name))
+        photo = next((place / image.name for place in places if (place / image.name).is_file()), None)
         if photo is None or photo.suffix.lower() not in PHOTO_SUFFIXES:
             continue
         if int((image.observed[:, 2] >= 0).sum()) < _FEWEST:
@@ -376,7 +388,8 @@ def _images_of_text(path: Path, content: bytes) -> list[_Image]:
         *words, name = line.strip().split(maxsplit=9)
         numbers, stored = numbers_in(words), next(lines, "")
         seen = numbers_in(stored.split())
-        if len(numbers) != 9 or not numbers[8].is_integer() or len(seen) % 3 or bool(seen) != bool(stored.strip()):
+        damaged = len(seen) % 3 or bool(seen) != bool(stored.strip()) or not all(map(math.isfinite, seen))
+        if len(numbers) != 9 or not numbers[8].is_integer() or damaged:
             what = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, and a line of X Y POINT3D_ID of each point"
             raise ValueError(f"{path}: expected {what}, got {line!r:.80}")
         observed = np.array(seen, np.float64).reshape(-1, 3)

@@ -42,7 +42,7 @@ import numpy as np
 from dsr.geometry.camera import Camera
 from dsr.geometry.rigid_motion import Matrix, as_rigid
 from dsr.io.frames import CaptureFrame, Geometry
-from dsr.io.images import read_numbers
+from dsr.io.images import read_camera, read_numbers
 from dsr.io.pairs import (
     PHOTO_SUFFIXES,
     Pair,
@@ -137,6 +137,7 @@ def find_replica(folder: Path) -> PairingResult | None:
     params = next((path for path in places if path.is_file()), None)
     if not both or not (params or trajectory.is_file()):
         return None
+    unit = (None if params is None else _unit(params)) or _REPLICA_UNIT  # also where the camera is given by other means
     poses = read_poses(trajectory).poses if trajectory.is_file() else ()
     in_order = len(poses) == len(photos)
     ranks = {number: rank if in_order else number for rank, number in enumerate(photos)}
@@ -146,7 +147,7 @@ def find_replica(folder: Path) -> PairingResult | None:
         geometry = functools.partial(_replica, pose, known=params is not None)
         frame = CaptureFrame("Replica", geometry, trajectory, repr(None if pose is None else pose.tolist()).encode())
         files = photos[number], depths[number], params
-        pairs.append(Pair(photos[number].stem, *files, unit=_REPLICA_UNIT, capture=frame))
+        pairs.append(Pair(photos[number].stem, *files, unit=unit, capture=frame))
     lone = [each[number] for each in (photos, depths) for number in each if number not in both]
     text = "a scene of Replica as NICE-SLAM renders it" + ("" if params else ": depth in 1/6553.5 m (--depth-unit)")
     note = Assumption(text + ("; from the folder: poses" if poses else ""))
@@ -190,6 +191,14 @@ def _scannet_camera(paths: list[Path], size: tuple[int, int]) -> tuple[Camera | 
         except ValueError:  # it is of other pixels
             continue
     return fitting_camera(str(paths[0]), (size, _SCANNET_SIZE), numbers[paths[0]]), ""
+
+
+def _unit(params: Path) -> float | None:
+    """Return metres per value by a camera file; None if it does not say."""
+    try:
+        return read_camera(params).depth_unit
+    except ValueError:  # is said where its camera is needed
+        return None
 
 
 def _replica(pose: Matrix | None, size: tuple[int, int], *, known: bool) -> Geometry:

@@ -19,7 +19,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -112,7 +112,7 @@ class Packet:
         time: when it was taken, in the track's unit.
         size: (height, width).
         kind: ``b16g`` of depth, or the first letters of ``K4A_COLOR_MODE``.
-        seconds: when it was taken, to be compared with the other track's.
+        seconds: when it was taken, or should have been, of a depth map that is late on purpose.
 
     """
 
@@ -206,7 +206,8 @@ def _read(path: Path, prefix: str = "") -> PairingResult:
     geometry = functools.partial(_geometry, f"{path}: calibration.json", bytes(attached[0]), size, size_lr)
     pairs = tuple(
         Pair(f"{prefix}{photo.name}", photo, depth, unit=1e-3, capture=CaptureFrame(
-            _APP, geometry, path, bytes(attached[0]), photos[photo], depths[depth]))
+            _APP, functools.partial(_of_frame, geometry, photos[photo].seconds), path, bytes(attached[0]),
+            photos[photo], depths[depth]))
         for photo, depth in sorted(partner.items())
     )  # fmt: skip
     note = describe_capture(f"a recording of {_APP}", "millimetres", pairs, poses=False)
@@ -215,7 +216,7 @@ def _read(path: Path, prefix: str = "") -> PairingResult:
 
 
 def _times(path: Path, container: Any) -> dict[str, list[Packet]]:
-    """Return the frames of both tracks in order; the photos' times are those that their depth maps should have."""
+    """Return the frames of both tracks in order; the depth maps' times are those that their photos should have."""
     tracks = {role: _track(path, container, role) for role in ("color", "depth")}
     kinds = {"color": tracks["color"].metadata.get("K4A_COLOR_MODE", "MJPG").partition("_")[0], "depth": _DEPTH}
     if kinds["color"] not in ("MJPG", *_COLOURS):
@@ -224,7 +225,7 @@ def _times(path: Path, container: Any) -> dict[str, list[Packet]]:
     delay = numbers_in([told])
     if not delay:
         raise ValueError(f"{path}: K4A_DEPTH_DELAY_NS: expected a whole number, got {told:.40}")
-    late = {"color": 1e-9 * delay[0], "depth": 0.0}
+    late = {"color": 0.0, "depth": 1e-9 * delay[0]}
     roles = {track.index: role for role, track in tracks.items()}
     found: dict[str, list[Packet]] = {role: [] for role in tracks}
     container.seek(0)
@@ -232,7 +233,7 @@ def _times(path: Path, container: Any) -> dict[str, list[Packet]]:
         if packet.pts is not None:
             role = roles[packet.stream.index]
             size = tracks[role].height, tracks[role].width
-            seconds = packet.pts * float(packet.time_base) + late[role]
+            seconds = packet.pts * float(packet.time_base) - late[role]
             found[role].append(Packet(path, packet.stream.index, packet.pts, size, kinds[role], seconds))
     return found
 
@@ -246,6 +247,11 @@ def _track(path: Path, container: Any, role: str) -> Any:
             expect_pixels(path, track.height, track.width)
             return track
     raise ValueError(f"{path}: expected a recording of {_APP} with tracks COLOR and DEPTH, there is no {name}")
+
+
+def _of_frame(cameras: Callable[[tuple[int, int]], Geometry], time: float, size: tuple[int, int]) -> Geometry:
+    """Return the cameras of a recording, and the frame's time."""
+    return cameras(size)._replace(time=time)
 
 
 def _geometry(

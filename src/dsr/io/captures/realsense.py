@@ -98,7 +98,8 @@ def read(reader: Any, path: Path, prefix: str) -> PairingResult:
     pairs = []
     for first, second in sorted(partner.items()):
         sources = photos[int(first.name)][0], depths[int(second.name)][0]
-        frame = CaptureFrame(device, functools.partial(_of_photo, geometry), path, told, *sources)
+        own = functools.partial(_of_photo, geometry._replace(time=photos[int(first.name)][1]))
+        frame = CaptureFrame(device, own, path, told, *sources)
         pairs.append(Pair(f"{prefix}{int(first.name):06}", *places, unit=unit, capture=frame))
     about = describe_capture(f"a recording of {device}", f"units of {unit:g} m", pairs, poses=False)
     others = sorted(
@@ -204,7 +205,7 @@ def _geometry(color: _Stream, depth: _Stream) -> tuple[Geometry, list[Assumption
 
 
 def _of_photo(geometry: Geometry, _: tuple[int, int]) -> Geometry:
-    """Return the cameras, which are those of all photos."""
+    """Return the cameras, which are those of photos of all sizes."""
     return geometry
 
 

@@ -194,6 +194,8 @@ def _camera(place: str, info: _Info | None) -> Geometry:
     """Return the camera of a recording."""
     if info is None:
         return Geometry(None, None, (Assumption("the recording has no camera_info beside the photo's topic"),))
+    if not info.numbers[0]:  # as sensor_msgs says
+        return Geometry(None, None, (Assumption("the camera is not calibrated, says the recording's camera_info"),))
     if min(info.height, info.width) < 1:
         raise ValueError(f"{place}: expected a positive width and height, got {info.width} x {info.height}")
     camera = intrinsics_camera(place, (info.height, info.width), info.numbers)
