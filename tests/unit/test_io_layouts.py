@@ -427,3 +427,15 @@ def test_folder_without_pairs_says_what_it_has(folder):
     (folder / "empty").mkdir()
     with pytest.raises(ValueError, match=r"the folder is empty$"):
         find_pairs_of_folder(folder / "empty")
+
+
+def test_zip_file_of_thousands_of_folders_is_refused_and_one_without_pairs_by_its_own_name(tmp_path):
+    with zipfile.ZipFile(tmp_path / "many.zip", "w") as archive:
+        for number in range(1001):
+            archive.writestr(f"{number}/notes.txt", "")
+    with pytest.raises(ValueError, match=r"many\.zip: expected at most \d+ files in 1000 folders, got 1001 in 1002"):
+        find_pairs_of_folder(tmp_path / "many.zip")
+    with zipfile.ZipFile(tmp_path / "none.zip", "w") as archive:
+        archive.writestr("notes.txt", "")
+    with pytest.raises(ValueError, match=rf"^{tmp_path}/none\.zip: expected photos"):
+        find_pairs_of_folder(tmp_path / "none.zip")

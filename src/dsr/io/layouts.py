@@ -81,6 +81,7 @@ def find_pairs_of_folder(folder: Path, leave: Path | None = None) -> PairingResu
         ValueError: there is no such folder, or no pair in it.
 
     """
+    given = folder
     if folder.suffix.lower() == ".zip" and folder.is_file():
         folder = unpack(folder)
         while len(inside := list(folder.iterdir())) == 1 and inside[0].is_dir():
@@ -94,7 +95,7 @@ def find_pairs_of_folder(folder: Path, leave: Path | None = None) -> PairingResu
     if not found.pairs:
         unpaired = f"; {len(found.unpaired)} pictures have no partner" if found.unpaired else ""
         raise ValueError(
-            f"{folder}: expected photos and depth maps that belong together, found no pair{unpaired}; "
+            f"{given}: expected photos and depth maps that belong together, found no pair{unpaired}; "
             f"{describe_content(folder, _MAX_DEPTH)}"
         )
     return PairingResult(make_names_unique(found.pairs), found.assumptions, found.unpaired)

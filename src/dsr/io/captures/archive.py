@@ -18,7 +18,7 @@ import zipfile
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import cv2
 import numpy as np
@@ -38,6 +38,8 @@ from dsr.utils.guards import (
 )
 
 _CHUNK = 1 << 20
+_MOST_FILES, _MOST_FOLDERS = 200_000, 1000
+"""Of a ZIP file that is unpacked."""
 PHOTO_LIMIT = 1 << 26
 """Largest size in bytes of an encoded photo."""
 _DAMAGED = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, OSError, EOFError, RuntimeError, struct.error)
@@ -282,6 +284,12 @@ def _unpack(path: Path, _: tuple[int, int]) -> Path:
     with _open(path, _state(path)) as packed:
         members = [each for each in files_in(packed, path) if not each.filename.startswith("__MACOSX/")]
         total = sum(each.file_size for each in members)
+        folders = {folder for each in members for folder in PurePosixPath(each.filename.replace("\\", "/")).parents}
+        if len(members) > _MOST_FILES or len(folders) > _MOST_FOLDERS:
+            raise ValueError(
+                f"{path}: expected at most {_MOST_FILES} files in {_MOST_FOLDERS} folders, got {len(members)} in "
+                f"{len(folders)}"
+            )
         expect_bytes(f"{path}: the members declare", total, bytes_of_archive(path.stat().st_size))
         with contextlib.ExitStack() as stack:
             work = tempfile.mkdtemp(prefix="dsr-")

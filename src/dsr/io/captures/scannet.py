@@ -48,7 +48,7 @@ from dsr.utils.validation import describe
 
 _BEGINNING, _HEADER, _FRAME = struct.Struct("<IQ"), struct.Struct("<64f2i4IfQ"), struct.Struct("<16f4Q")
 _VERSION = 4
-_LONGEST_NAME, _LARGEST_SIDE = 1 << 12, 1 << 14
+_LONGEST_NAME, _LARGEST_SIDE, _MOST_FRAMES = 1 << 12, 1 << 14, 1 << 16
 _NO_POSE = Assumption("no pose: the capture has none of the frame")
 
 _JSON, _LARGEST_JSON = "pose_intrinsic_imu.json", 1 << 28
@@ -92,15 +92,15 @@ def _read_sens(path: Path, before: str) -> PairingResult:
     with opened(path) as file:
         told = _read_header(path, file)
         place, pairs = file.tell(), []
-        if told.frames > size // _FRAME.size:
-            raise ValueError(f"{path}: expected {told.frames} frames, the file has only {size} bytes")
+        if told.frames > min(size // _FRAME.size, _MOST_FRAMES):
+            raise ValueError(f"{path}: expected at most {_MOST_FRAMES} frames, got {told.frames} in {size} bytes")
         for number in range(told.frames):
             file.seek(place)
             content = file.read(_FRAME.size)
             values = _FRAME.unpack(content.ljust(_FRAME.size, b"\0"))
             lengths, start = values[18:], place + _FRAME.size
             place = start + sum(lengths)
-            if len(content) < _FRAME.size or place > size or max(lengths) > PHOTO_LIMIT:
+            if len(content) < _FRAME.size or place > size or max(lengths) > PHOTO_LIMIT or not min(lengths):
                 raise ValueError(f"{path}: expected {told.frames} frames, it is damaged or ends in frame {number}")
             photo = Section(path, f"color/{number}", start, lengths[0], functools.partial(_photo, told))
             depth = Section(path, f"depth/{number}", start + lengths[0], lengths[1], functools.partial(_depth, told))
