@@ -217,7 +217,7 @@ BROKEN_SENS = {
     "no such compression": (lambda path: header(path, 21 + 256 + 4, "<i", 2), "got compression 2 and 2"),
     "no size": (lambda path: header(path, 21 + 256 + 8, "<I", 0), "expected sizes and values per metre"),
     "no unit": (lambda path: header(path, 21 + 256 + 24, "<f", float("nan")), "expected sizes and values per metre"),
-    "too many frames": (lambda path: header(path, 21 + 256 + 28, "<Q", 1 << 60), "expected 1152921504606846976 frames"),
+    "too many frames": (lambda path: header(path, 21 + 256 + 28, "<Q", 1 << 60), "frames, got 1152921504606846976"),
     "a frame without end": (lambda path: header(path, 21 + 292 + 80, "<Q", (1 << 64) - 1), "ends in frame 0"),
     "truncated": (lambda path: path.write_bytes(path.read_bytes()[:-60]), "ends in frame 2"),
     "no frames": (lambda path: header(path, 21 + 256 + 28, "<Q", 0), "expected frames, there is none"),
