@@ -40,7 +40,7 @@ def _scores(depth: Tensor, sample: DepthSample) -> dict[str, float]:
 def test_dip_v_is_better_than_bicubic_in_depth_and_in_looks(sample: DepthSample) -> None:
     bicubic = _scores(Interpolation("bicubic")(sample), sample)
     precision = fast_precision(torch.device("cpu"))
-    prior = DeepImagePrior(scale=4, downsampling=BOX, steps=140, average=0.97, validate_every=0, precision=precision)
+    prior = DeepImagePrior(scale=4, downsampling=BOX, steps=180, average=0.97, validate_every=0, precision=precision)
     ours = _scores(prior(sample), sample)
     assert ours["RMSE_v"] < 0.85 * bicubic["RMSE_v"]
     assert ours["RMSE_d"] < 0.9 * bicubic["RMSE_d"]

@@ -724,7 +724,7 @@ REFUSED = {
 }  # fmt: skip
 NAMED = {
     "sums as text": "sums",
-    "a score as text": "best_model_score",
+    "a score as text": "kth_value",
     "a schedule as text": "lr_schedulers.0.last_epoch",
     "no schedule": "lr_schedulers",
     "a rate as text": "optimizer_states.0.param_groups.0.lr",

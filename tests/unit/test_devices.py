@@ -211,7 +211,8 @@ def test_any_photo_and_map_are_upsampled_on_a_gpu(method: str, of: str, gpu: tor
     assert found.depth.device == depth.device
     for mine, other in zip(found[:3], expected[:3], strict=True):
         if other is not None:
-            torch.testing.assert_close(mine.cpu(), other, rtol=2e-2, atol=1e-3, equal_nan=True)
+            # a GPU computes in bfloat16, and a processor without it in float32
+            torch.testing.assert_close(mine.cpu(), other, rtol=5e-2, atol=1e-3, equal_nan=True)
 
 
 KINDS: dict[str, Callable[[Tensor, Tensor], Any]] = {
