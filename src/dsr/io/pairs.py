@@ -192,6 +192,14 @@ class PairingResult:
     unpaired: tuple[Path, ...] = ()
 
 
+def join(parts: Iterable[PairingResult]) -> PairingResult:
+    """Return what several recordings of a folder have, with each assumption once."""
+    parts = tuple(parts)
+    notes = dict.fromkeys(note for part in parts for note in part.assumptions)
+    pairs = tuple(pair for part in parts for pair in part.pairs)
+    return PairingResult(pairs, tuple(notes), tuple(path for part in parts for path in part.unpaired))
+
+
 def find_pairs_of_lists(photos: Sequence[Path], depths: Sequence[Path], masks: Sequence[Path] = ()) -> PairingResult:
     """Return the pairs of files in the order given, or of two folders by the names in them.
 

@@ -23,7 +23,7 @@ from pathlib import Path, PurePosixPath
 import cv2
 import numpy as np
 
-from dsr.io.frames import Record
+from dsr.io.frames import Record, file_state
 from dsr.utils.decoding import decode_pixels
 from dsr.utils.files import expect_space
 from dsr.utils.guards import (
@@ -67,7 +67,7 @@ class Archive:
         if self.path.is_dir():
             paths = sorted(path for path in self.path.rglob("*") if path.is_file())
             return [path.relative_to(self.path).as_posix() for path in paths]
-        return _open(self.path, _state(self.path)).namelist()
+        return _open(self.path, file_state(self.path, "an archive")).namelist()
 
     def read(self, name: str, limit: int) -> bytes:
         """Return a member's content.
@@ -88,14 +88,14 @@ class Archive:
         with refusing(f"{place}: expected a member of the archive, got a damaged one", *_DAMAGED):
             if self.path.is_dir():
                 return read_limited(place, limit)
-            return read_member(_open(self.path, _state(self.path)), name)
+            return read_member(_open(self.path, file_state(self.path, "an archive")), name)
 
     def _declared(self, name: str) -> int | None:
         """Return the size of a member, which an archive declares; None if there is no such member."""
         if self.path.is_dir():
             return (self.path / name).stat().st_size if (self.path / name).is_file() else None
         try:
-            return _open(self.path, _state(self.path)).getinfo(name).file_size
+            return _open(self.path, file_state(self.path, "an archive")).getinfo(name).file_size
         except KeyError:
             return None
 
@@ -180,7 +180,7 @@ def unpack(path: Path) -> Path:
         FullDiskError: the disk is too small for what it declares.
 
     """
-    return _unpack(path, _state(path))
+    return _unpack(path, file_state(path, "an archive"))
 
 
 def inflate(content: bytes, size: int, bits: int = zlib.MAX_WBITS) -> bytes:
@@ -264,13 +264,6 @@ def _declared_size(content: bytes) -> int:
     return total
 
 
-def _state(path: Path) -> tuple[int, int]:
-    """Return size and time of a file, which tell whether it was replaced."""
-    if not path.is_file():
-        raise ValueError(f"{path}: expected an archive, there is none")
-    return path.stat().st_size, path.stat().st_mtime_ns
-
-
 @functools.lru_cache(maxsize=1)
 def _open(path: Path, _: tuple[int, int]) -> zipfile.ZipFile:
     """Return the open archive."""
@@ -281,7 +274,7 @@ def _open(path: Path, _: tuple[int, int]) -> zipfile.ZipFile:
 @functools.cache
 def _unpack(path: Path, _: tuple[int, int]) -> Path:
     """Return the folder with the files of an archive."""
-    with _open(path, _state(path)) as packed:
+    with _open(path, file_state(path, "an archive")) as packed:
         members = [each for each in files_in(packed, path) if not each.filename.startswith("__MACOSX/")]
         total = sum(each.file_size for each in members)
         folders = {folder for each in members for folder in PurePosixPath(each.filename.replace("\\", "/")).parents}

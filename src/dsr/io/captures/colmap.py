@@ -30,12 +30,11 @@ import numpy as np
 
 from dsr.geometry.lens import Lens
 from dsr.geometry.rigid_motion import from_quaternion, invert
-from dsr.io.frames import CaptureFrame, Geometry, Record
+from dsr.io.frames import CaptureFrame, Geometry, Record, file_state, hash_once
 from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult
 from dsr.io.trajectories import intrinsics_camera
 from dsr.notes import Assumption
 from dsr.utils.guards import leads_outside, naming, natural_key, numbers_in, read_limited
-from dsr.utils.versions import file_hash
 
 _APP = "COLMAP"
 _PLACES = (".", "sparse/0", "sparse", "colmap/sparse/0")
@@ -238,8 +237,7 @@ class SparseDepth:
 
     def read(self) -> np.ndarray:
         """Return the depth, (h, w) float32 in the unit of the model, NaN in holes."""
-        stat = self.file.stat()
-        places = _points(self.file, (stat.st_size, stat.st_mtime_ns))
+        places = _points(self.file, file_state(self.file, "points"))
         seen = [(x, y, places[int(point)]) for x, y, point in self.image.observed if int(point) in places]
         width, height = self.camera.width, self.camera.height
         step = math.sqrt(width * height / max(len(seen), 4))
@@ -258,7 +256,10 @@ class SparseDepth:
 
     def record(self) -> Record:
         """Return a hash of the file of points, and the image's name."""
-        return {"file": f"{self.file.name}/{self.image.name}", "sha256": file_hash(self.file)}
+        return {
+            "file": f"{self.file.name}/{self.image.name}",
+            "sha256": hash_once(self.file, "points"),
+        }
 
 
 def _geometry(

@@ -33,8 +33,8 @@ from dsr.geometry.camera import Camera
 from dsr.geometry.lens import Lens
 from dsr.geometry.rigid_motion import Matrix, as_rigid, invert
 from dsr.io.captures.archive import PHOTO_LIMIT, decode_photo
-from dsr.io.frames import CaptureFrame, Geometry, Record, Rig
-from dsr.io.pairs import Pair, PairingResult, match_times
+from dsr.io.frames import CaptureFrame, Geometry, Record, Rig, file_state
+from dsr.io.pairs import Pair, PairingResult, join, match_times
 from dsr.io.trajectories import describe_capture, intrinsics_camera
 from dsr.utils.guards import expect_pixels, naming, natural_key, numbers_in, opened, refusing
 from dsr.utils.validation import Number, Whole, parse_model
@@ -154,7 +154,7 @@ class Packet:
     def _content(self) -> bytes:
         """Return the frame as it is stored."""
         with _LOCK, _demuxing(self.file):
-            container = _open(self.file, _state(self.file))
+            container = _open(self.file, file_state(self.file, "a recording"))
             track = container.streams[self.track]
             container.seek(self.time, stream=track, any_frame=True)
             for packet in container.demux(track):
@@ -175,10 +175,7 @@ def find_kinect(place: Path) -> PairingResult | None:
     found = [path for path in place.iterdir() if path.suffix.lower() == ".mkv" and _is_ours(path)]
     if not found:
         return None
-    parts = [_read(path, f"{path.stem}/") for path in sorted(found, key=natural_key)]
-    notes = tuple(dict.fromkeys(note for part in parts for note in part.assumptions))
-    pairs = tuple(pair for part in parts for pair in part.pairs)
-    return PairingResult(pairs, notes, tuple(path for part in parts for path in part.unpaired))
+    return join([_read(path, f"{path.stem}/") for path in sorted(found, key=natural_key)])
 
 
 def _is_ours(path: Path) -> bool:
@@ -192,7 +189,7 @@ def _is_ours(path: Path) -> bool:
 def _read(path: Path, prefix: str = "") -> PairingResult:
     """Return the frames of a recording."""
     with _LOCK, _demuxing(path):
-        container = _open(path, _state(path))
+        container = _open(path, file_state(path, "a recording"))
         times = _times(path, container)
         attached = [each.data for each in container.streams.attachments if each.name == "calibration.json"]
     if not attached:
@@ -316,13 +313,6 @@ def _demuxing(path: Path) -> Iterator[None]:
         import av  # noqa: PLC0415 - an extra
     with refusing(f"{path}: expected a recording of {_APP}, got a damaged or foreign file", av.FFmpegError):
         yield
-
-
-def _state(path: Path) -> tuple[int, int]:
-    """Return size and time of a file, which tell whether it was replaced."""
-    if not path.is_file():
-        raise ValueError(f"{path}: expected a recording, there is none")
-    return path.stat().st_size, path.stat().st_mtime_ns
 
 
 @functools.lru_cache(maxsize=1)

@@ -25,7 +25,7 @@ from dsr.io.captures import realsense
 from dsr.io.captures.bags import COMPRESSED, IMAGE, Message, NamedErrors, connections_of, first_message, open_recording
 from dsr.io.captures.ros_images import COLOURS, DEPTHS
 from dsr.io.frames import CaptureFrame, Geometry
-from dsr.io.pairs import Pair, PairingResult, match_times
+from dsr.io.pairs import Pair, PairingResult, join, match_times
 from dsr.io.trajectories import intrinsics_camera
 from dsr.notes import Assumption
 from dsr.utils.guards import naming, natural_key
@@ -57,10 +57,7 @@ def find_ros(folder: Path) -> PairingResult | None:
     bags = [path for path in folder.iterdir() if path.suffix.lower() in FILES and path.is_file()]
     if not bags:
         return None
-    parts = [_read(path, f"{path.stem}/") for path in sorted(bags, key=natural_key)]
-    notes = tuple(dict.fromkeys(note for part in parts for note in part.assumptions))
-    pairs = tuple(pair for part in parts for pair in part.pairs)
-    return PairingResult(pairs, notes, tuple(path for part in parts for path in part.unpaired))
+    return join([_read(path, f"{path.stem}/") for path in sorted(bags, key=natural_key)])
 
 
 def _read(path: Path, prefix: str = "") -> PairingResult:

@@ -31,13 +31,12 @@ import cv2
 import numpy as np
 
 from dsr.geometry.camera import Camera
-from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry, Record
+from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry, Record, file_state, hash_once
 from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult, numbered_files
 from dsr.io.trajectories import USUAL_SIZE, describe_capture, fitting_camera, pose_from_quaternion, read_text
 from dsr.notes import Assumption
 from dsr.utils.decoding import quiet_decoders
 from dsr.utils.guards import expect_pixels, numbers_in
-from dsr.utils.versions import file_hash
 
 _APP = "Stray Scanner"
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -190,11 +189,15 @@ class VideoFrame:
 
         """
         with _LOCK:
-            return _player(self.file, _state(self.file)).read(self.index)
+            return _player(self.file, file_state(self.file, "a video")).read(self.index)
 
     def record(self) -> Record:
         """Return the video's name and hash, and the frame's number."""
-        return {"file": self.file.name, "frame": self.index, "sha256": _hash(self.file, _state(self.file))}
+        return {
+            "file": self.file.name,
+            "frame": self.index,
+            "sha256": hash_once(self.file, "a video"),
+        }
 
 
 class _Player:
@@ -248,7 +251,7 @@ def count_frames(path: Path) -> int:
 
     """
     with _LOCK:
-        return _player(path, _state(path)).count
+        return _player(path, file_state(path, "a video")).count
 
 
 def video_size(path: Path) -> tuple[int, int]:
@@ -262,23 +265,10 @@ def video_size(path: Path) -> tuple[int, int]:
     return shape[0], shape[1]
 
 
-def _state(path: Path) -> tuple[int, int]:
-    """Return size and time of a file, which tell whether it was replaced."""
-    if not path.is_file():
-        raise ValueError(f"{path}: expected a video, there is none")
-    return path.stat().st_size, path.stat().st_mtime_ns
-
-
 @functools.lru_cache(maxsize=1)
 def _player(path: Path, _: tuple[int, int]) -> _Player:
     """Return the open video."""
     return _Player(path)
-
-
-@functools.lru_cache(maxsize=4)
-def _hash(path: Path, _: tuple[int, int]) -> str:
-    """Return the hash of a video, which is computed once."""
-    return file_hash(path)
 
 
 @contextlib.contextmanager
