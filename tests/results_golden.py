@@ -25,6 +25,7 @@ import cv2
 import numpy as np
 import small_golden
 import torch
+from methods_at_hand import AT_HAND
 from reference_metrics import Array
 from torch import Tensor
 
@@ -55,7 +56,7 @@ from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.msg_net import MSGNet
 from dsr.methods.networks.weight_choice import packaged_names, packaged_weights
 from dsr.methods.noise_level import estimate_noise, estimate_sensor_noise
-from dsr.methods.recipe import Known, Run, list_methods, read_recipe
+from dsr.methods.recipe import Known, Run, read_recipe
 from dsr.sample import Scene
 from dsr.training.degradation import Degradation, to_tensors
 from dsr.training.module import SuperResolution
@@ -82,8 +83,7 @@ Job = Callable[[], Any]
 
 def upsampling() -> Iterator[tuple[str, Job]]:
     """Yield upsampled maps and their expected errors: each method at each ratio, and what the options change."""
-    peers = [name for name in list_methods() if "weights_files" in read_recipe(name).node]
-    for method in (name for name in list_methods() if name not in peers):
+    for method in AT_HAND:
         settings = {"steps": 2} if method.startswith("dip") else {}
         settings |= {"iterations": 30} if method == "tgv" else {"iterations": 4} if method == "srfs" else {}
         errors = method in ("facets", "bicubic", "msg_v")

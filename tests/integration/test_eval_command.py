@@ -212,6 +212,35 @@ def test_bad_scene_keeps_the_others_results_and_sets_the_exit_code(tmp_path, wit
     assert "last" in output
 
 
+def test_folders_of_predictions_are_judged_as_methods_are(tmp_path, within):
+    for number, name in enumerate(("first", "second")):
+        write_scene(tmp_path / "data" / name, seed=number)
+    data = ("dataset=folder", "dataset.root=data")
+    assert within(*data, "output_dir=made")[0] == 0
+    for name in ("mine", "yours"):
+        (tmp_path / name).mkdir()
+        for scene in ("first", "second"):
+            np.save(tmp_path / name / f"{scene}.npy", np.load(tmp_path / f"made/predictions/{scene}.npz")["depth"])
+    (tmp_path / "yours" / "second.npy").rename(tmp_path / "yours" / "third.npy")
+    code, output, errors = within("-m", *data, "method=external", "method.path=mine,yours")
+    assert code == 2
+    assert errors[0] == "note: yours: 1 files are of no scene: third.npy"
+    assert errors[1].startswith("error: yours/second: expected a map as .png, ")
+    folders = {
+        name: next((tmp_path / "outputs" / "eval").glob(f"external_*path-{name}_*")) for name in ("mine", "yours")
+    }
+    strip = [{key: value for key, value in row.items() if key != "method"} for row in rows(tmp_path / "made")]
+    for name, folder in folders.items():
+        own = rows(folder)
+        assert {row["method"] for row in own} == {name}
+        assert [{k: v for k, v in row.items() if k != "method"} for row in own] == [
+            row for row in strip if name == "mine" or row["scene"] == "first"
+        ]
+    np.save(tmp_path / "mine" / "first.npy", 1.01 * np.load(tmp_path / "mine" / "first.npy"))
+    code, _, errors = within(*data, "method=external", "method.path=mine")
+    assert (code, "made with another method_content" in errors[-1]) == (2, True)
+
+
 def test_repaired_scene_is_added_by_the_same_command(tmp_path, within):
     write_scene(tmp_path / "data" / "a")
     camera = write_scene(tmp_path / "data" / "b") / "camera.json"

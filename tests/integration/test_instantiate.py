@@ -12,26 +12,25 @@ import torch
 from hydra.utils import instantiate
 from lightning.pytorch.callbacks import Callback, EarlyStopping
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
+from methods_at_hand import AT_HAND, PEERS
 
 import dsr
 from dsr.app.schema import TrainConfig, plain_config
 from dsr.degradation.downsampling import Downsampling, Measured
 from dsr.methods.base import Method
 from dsr.methods.networks.network import DisparityNetwork
-from dsr.methods.recipe import list_methods, read_recipe
+from dsr.methods.recipe import read_recipe
 from dsr.training.module import SuperResolution
 from dsr.training.objective import Objective
 from dsr.training.settings import PatchSettings
 from dsr.utils.configuration import build, config_directories, list_choices
-
-PEERS = [name for name in list_methods() if "weights_files" in read_recipe(name).node]
 
 
 def choices(group: str) -> list[str]:
     return list_choices(group, config_directories())
 
 
-@pytest.mark.parametrize("name", [name for name in list_methods() if name not in PEERS])
+@pytest.mark.parametrize("name", AT_HAND)
 def test_method_is_instantiated_with_its_weights(name: str) -> None:
     scale = 8 if 8 in read_recipe(name).factors else 4
     made = instantiate(dsr.compose("eval", [f"method={name}", f"scale={scale}"]).method)

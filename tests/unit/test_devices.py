@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from methods_at_hand import AT_HAND
 from pretend_cuda import pretend_cuda
 from small_lpips import random_lpips
 from small_scenes import sample_of
@@ -29,7 +30,7 @@ from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.msg_net import MSGNet
 from dsr.methods.networks.pdn import PrimalDualNetwork
 from dsr.methods.networks.peers.peer import PEERS
-from dsr.methods.recipe import Run, list_methods, read_recipe
+from dsr.methods.recipe import Run, read_recipe
 from dsr.metrics import losses
 from dsr.metrics.catalogue import PROTOCOLS, catalogue, score_image
 from dsr.metrics.classes import compute_means, visual_metrics
@@ -49,7 +50,7 @@ SHORT: dict[str, dict[str, Any]] = {
     "srfs": {"iterations": 1}, "anisotropic_diffusion": {"steps": 20},
 }  # fmt: skip
 SLOW = {"eg", "srfs", "dip", "dip_v", "dip_v_warm"}
-METHODS = [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in list_methods()]
+METHODS = [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in AT_HAND]
 CPU = torch.device("cpu")
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from methods_at_hand import AT_HAND
 from torch import Tensor
 
 import dsr
@@ -278,7 +279,7 @@ def test_progress_covers_all_steps() -> None:
     assert parts == [(i + 1, 8) for i in range(8)]  # x8, then x4, each an ensemble of four
 
 
-@pytest.mark.parametrize("method", [name for name in list_methods() if "weights_files" not in read_recipe(name).at(4)])
+@pytest.mark.parametrize("method", AT_HAND)
 def test_every_method_upsamples_any_size_and_its_holes(method: str) -> None:
     camera = _camera(31, 42)
     depth = _plane(15, 21, camera)

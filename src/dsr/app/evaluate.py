@@ -151,6 +151,8 @@ def _prepare(plain: Config, node: Any, source: SceneSource | None, *, here: bool
         lpips_trunk=settings.metrics.lpips_trunk,
     )
     method = selected.build(run)
+    if method.name is not None:
+        name, label = method.name, method.name if label == name else label
     study = Evaluation(
         source,
         downsampling,
@@ -220,6 +222,8 @@ def _run_claimed(prepared: _Prepared) -> pd.DataFrame:
         shutil.rmtree(folder / WORKSPACE, ignore_errors=True)
     _seed(settings.seed)
     prepare_scenes(study.source, study.source.scenes(), progress)
+    for remark in study.method.remarks(study.source.name, study.source.scenes(), study.scale):
+        note_once(remark)
     try:
         outcome = predict(
             study, folder, progress, overwrite=settings.overwrite, workers=workers, meanwhile=_import_report

@@ -88,7 +88,9 @@ class Evaluation:
 
     def stored_config(self, scene: str) -> dict[str, Any]:
         """Return the settings that a prediction of this scene depends on."""
-        return {**self.config, "scene": scene, "scene_content": self.source.fingerprint(scene)}
+        content = self.method.content(self.source.name, scene, self.scale)
+        own = {} if content is None else {"method_content": content}
+        return {**self.config, "scene": scene, "scene_content": self.source.fingerprint(scene), **own}
 
 
 @dataclass

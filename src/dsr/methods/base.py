@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal, NamedTuple
 
@@ -204,12 +204,14 @@ class Method(abc.ABC):
             type, too, as in the paper, which evaluates every method on the type that it was designed for.
         history: of the last call of a method that iterates, one entry per recorded iteration: ``iteration`` first, then
             the method's own quantities, such as ``objective`` and ``moved``, in an order of its own. None for others.
+        name: in scores and tables, of a method that takes it from its input; None for that of its file of ``conf``.
 
     """
 
     abilities: ClassVar[Abilities] = Abilities()
     range_type: RangeType = "disparity"
     history: list[dict[str, float]] | None = None
+    name: str | None = None
 
     @classmethod
     def abilities_of(cls, node: Node) -> Abilities:
@@ -247,6 +249,14 @@ class Method(abc.ABC):
     def describe(self, sample: DepthSample) -> str:
         """Return what is to be said of how a sample is upsampled, beside its scores; nothing by default."""
         return ""
+
+    def content(self, dataset: str, scene: str, scale: float) -> str | None:
+        """Return a hash of what a scene's result depends on beside the sample and the settings; None for nothing."""
+        return None
+
+    def remarks(self, dataset: str, scenes: Sequence[str], scale: float) -> list[str]:
+        """Return what is to be said before the scenes of a data set are upsampled, a line each; nothing by default."""
+        return []
 
     def count_steps(self, height: int, width: int) -> int:
         """Return the total that ``progress`` receives for a photo of height x width pixels, if it is known before."""

@@ -1,0 +1,293 @@
+"""Maps that another program predicted, one file a scene: they are judged and drawn as every other method's result.
+
+A monocular network's map has no scale, and often no shift. Such a map is fitted to the low-resolution one, robustly and
+without the truth, see :func:`fit_line`: in its own quantity, so that relative inverse depth, as of MiDaS and Depth
+Anything, is fitted in inverse depth.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dsr.geometry.camera import RANGE_TYPES, Camera, from_range, to_range
+from dsr.io.depth_files import DEPTH_SUFFIXES, read_depth_file
+from dsr.io.encoding import find_holes
+from dsr.io.reading import parse_unit
+from dsr.methods.base import Abilities, Cost, Method
+from dsr.sample import FARTHEST, NEAREST, DepthSample
+from dsr.utils.guards import natural_key, pixels_beside
+from dsr.utils.progress import Steps
+from dsr.utils.ratios import round_ratio
+from dsr.utils.versions import file_hash
+
+INVERSE = "inverse"
+QUANTITIES = (*RANGE_TYPES, INVERSE)
+"""What the values measure: a range type, or inverse depth in 1/m, or in any unit where it is fitted."""
+Resize = Literal["nearest", "bilinear"]
+Fit = Literal["scale", "affine"]
+_FIELD = re.compile(r"\{(\w*)\}")
+_FIELDS = ("scene", "dataset", "scale")
+_NAMED = 5
+"""Largest number of files that a message names."""
+_STEPS = 50
+"""Largest number of iterations of a robust fit."""
+_CONTRAST = 0.05
+"""Relative deviation of a scene's inverse depth from which on agreement with it is looked at."""
+_LEAST_AGREEMENT = 0.2
+"""Correlation with the low-resolution map below which a map is of something else."""
+_MOST_OFF = 3.0
+"""Factor between the medians from which on the unit is another one."""
+
+
+class External(Method):
+    """A method that reads its results from files.
+
+    Args:
+        path: directory of the predictions; its name is the method's in scores and tables.
+        file: name of a scene's file, with or without a suffix; ``{scene}``, ``{dataset}`` and ``{scale}`` stand for the
+            sample's. Without a suffix, it is any of the formats of :data:`dsr.io.depth_files.DEPTH_SUFFIXES`.
+        range_type: what the values measure: ``orthogonal``, ``perspective``, ``disparity`` in pixels of the photo's
+            camera, or ``inverse``.
+        unit: m, cm, mm or metres per value (of disparities and inverse depths: pixels or 1/m per value). None for 1 of
+            floats; whole numbers need one.
+        hole_value: a value that marks a hole, beside those of :func:`dsr.io.encoding.find_holes`.
+        fit: to the low-resolution map, in the values' quantity: ``scale``, ``affine`` (scale and shift), None for maps
+            that are metric.
+        resize: how a map of another size is brought to the photo's; None to refuse it.
+        check: whether maps are refused that cannot be of the scene, or in the unit: of another median, or unlike the
+            low-resolution map.
+
+    Raises:
+        ValueError: a value is not one of these, or there is no such directory.
+
+    """
+
+    abilities = Abilities(ratios="any", own_size=True, cost=Cost(60))
+    range_type = "orthogonal"
+
+    def __init__(
+        self,
+        path: str,
+        file: str = "{scene}",
+        range_type: str = "orthogonal",
+        unit: str | float | None = None,
+        hole_value: float | None = None,
+        fit: str | None = None,
+        resize: str | None = None,
+        *,
+        check: bool = True,
+    ) -> None:
+        for key, value, known in (
+            ("range_type", range_type, QUANTITIES),
+            ("fit", fit, (None, *get_args(Fit))),
+            ("resize", resize, (None, *get_args(Resize))),
+        ):
+            if value not in known:
+                names = ", ".join("null" if each is None else each for each in known)
+                raise ValueError(f"{key}: expected one of {names}, got {value!r}")
+        unknown = set(_FIELD.findall(file)) - set(_FIELDS)
+        if unknown or not file:
+            raise ValueError(f"file: expected a name with {', '.join(f'{{{each}}}' for each in _FIELDS)}, got {file!r}")
+        self.folder = Path(path).expanduser()
+        if not self.folder.is_dir():
+            raise ValueError(f"path: expected a directory of predictions, got {path} (no such directory)")
+        whole = self.folder.resolve()
+        self.name = (whole.parent if whole.name == "predictions" else whole).name  # those of a run of dsr
+        self._file, self._quantity, self._hole_value = file, range_type, hole_value
+        try:
+            self._unit = None if unit is None else parse_unit(str(unit))
+        except ValueError as error:
+            raise ValueError(f"unit: {error}") from None
+        self._fit, self._resize, self._check = fit, resize, check
+
+    def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
+        """Return the map of the sample's scene, (1, H, W) orthogonal depth in metres, NaN in holes.
+
+        Raises:
+            ValueError: the file is missing or damaged, of another size, has no known pixel, or is not of the scene.
+
+        """
+        path = self._find(sample)
+        values = self._read(path, sample.camera)
+        if self._fit is not None:
+            values = self._fitted(path, values, sample)
+        depth = _to_depth(values, sample.camera, self._quantity)
+        depth = depth.masked_fill((depth < NEAREST) | (depth > FARTHEST), torch.nan)
+        if not bool(depth.isfinite().any()):
+            raise ValueError(f"{path}: expected a depth, no value is one between {NEAREST:g} and {FARTHEST:g} m")
+        if self._check:
+            _expect_likeness(path, depth, sample)
+        return depth.to(sample.depth_lr.device)
+
+    def describe(self, sample: DepthSample) -> str:
+        """Return what the scene's map came as, where that costs precision or the map was changed."""
+        path = self._found(self._stem(sample))
+        fitted = f"{self._fit} fitted to the low-resolution map" if self._fit else ""
+        whole = path is not None and path.suffix.lower() == ".png"
+        stored = f"predictions come as whole numbers of {self._unit:g}" if whole and self._unit else ""
+        return "; ".join(filter(None, (stored, fitted)))
+
+    def remarks(self, dataset: str, scenes: Sequence[str], scale: float) -> list[str]:
+        """Return lines on files that are of no scene."""
+        used = {self._found(self._name(dataset, scene, scale)) for scene in scenes}
+        files = {path for path in self.folder.rglob("*") if path.suffix.lower() in DEPTH_SUFFIXES and path.is_file()}
+        others = sorted((os.fspath(path.relative_to(self.folder)) for path in files - used), key=natural_key)
+        if not others:
+            return []
+        more = f" and {len(others) - _NAMED} more" if len(others) > _NAMED else ""
+        return [f"{self.folder}: {len(others)} files are of no scene: {', '.join(others[:_NAMED])}{more}"]
+
+    def content(self, dataset: str, scene: str, scale: float) -> str | None:
+        """Return the SHA-256 of a scene's file; None without one."""
+        path = self._found(self._name(dataset, scene, scale))
+        return None if path is None else file_hash(path)
+
+    def _stem(self, sample: DepthSample) -> str:
+        return self._name(sample.dataset, sample.scene, sample.scale)
+
+    def _name(self, dataset: str, scene: str, scale: float) -> str:
+        """Return the file's name of a scene."""
+        values = {"dataset": dataset, "scene": scene, "scale": str(round_ratio(scale))}
+        return _FIELD.sub(lambda match: values[match[1]], self._file)
+
+    def _found(self, name: str) -> Path | None:
+        """Return the file of a name; None if there is none."""
+        suffixes = ("",) if name.lower().endswith(DEPTH_SUFFIXES) else DEPTH_SUFFIXES
+        found = [path for suffix in suffixes if (path := self.folder / f"{name}{suffix}").is_file()]
+        if len(found) > 1:
+            raise ValueError(f"{self.folder}: expected one map of {name}, got {', '.join(path.name for path in found)}")
+        return found[0] if found else None
+
+    def _find(self, sample: DepthSample) -> Path:
+        """Return the file of a sample's scene."""
+        name = self._stem(sample)
+        path = self._found(name)
+        if path is None:
+            raise ValueError(f"{self.folder / name}: expected a map as {', '.join(DEPTH_SUFFIXES)}, there is none")
+        return path
+
+    def _read(self, path: Path, camera: Camera) -> Tensor:
+        """Return the values of a file, (1, H, W) float64 in their quantity's unit, NaN in holes."""
+        stored = read_depth_file(path, pixels_beside(camera.height, camera.width))
+        whole = stored.dtype.kind in "iu"
+        if whole and self._unit is None:
+            raise ValueError(f"{path}: expected method.unit=mm, or another one, for {stored.dtype} values, got none")
+        holes = ~np.isfinite(stored) if self._fit else find_holes(stored, self._hole_value)[0]
+        if self._fit and self._hole_value is not None:
+            holes |= stored == self._hole_value
+        if holes.all():
+            negative = not whole and bool((stored < 0).any())
+            came = "all are negative or none: depth along the other direction of the axis?" if negative else "all holes"
+            raise ValueError(f"{path}: expected at least one known pixel, got {came}")
+        values = torch.from_numpy(np.where(holes, np.nan, stored.astype(np.float64)))[None] * (self._unit or 1.0)
+        size = (camera.height, camera.width)
+        if tuple(values.shape[-2:]) == size:
+            return values
+        if self._resize is None:
+            came = " x ".join(map(str, stored.shape))
+            raise ValueError(
+                f"{path}: expected {size[0]} x {size[1]} pixels (height x width), got {came}; "
+                "method.resize=nearest or bilinear resizes it"
+            )
+        factor = size[1] / values.shape[-1] if self._quantity == "disparity" else 1.0  # in pixels of the photo
+        corners = {} if self._resize == "nearest" else {"align_corners": False}
+        mode = "nearest-exact" if self._resize == "nearest" else self._resize
+        return torch.nn.functional.interpolate(values[None], size, mode=mode, **corners)[0] * factor
+
+    def _fitted(self, path: Path, values: Tensor, sample: DepthSample) -> Tensor:
+        """Return values fitted to the low-resolution map."""
+        target = _from_depth(sample.depth_lr.to("cpu", torch.float64), sample, self._quantity)
+        reduced = _reduce(values, target)
+        known = reduced.isfinite() & target.isfinite()
+        if int(known.sum()) < 2:
+            raise ValueError(f"{path}: expected pixels that the low-resolution map knows, too; there are none")
+        gain, shift = fit_line(reduced[known], target[known], shift=self._fit == "affine")
+        if not gain > 0:
+            raise ValueError(
+                f"{path}: expected values that rise with the low-resolution map's, they fall: "
+                f"is method.range_type={self._quantity} right?"
+            )
+        return gain * values + shift
+
+
+def fit_line(values: Tensor, target: Tensor, *, shift: bool = True) -> tuple[float, float]:
+    """Return the gain and shift of the line with the least sum of absolute errors.
+
+    Reweighted least squares, which begin at the line of least squares; outliers, as at depth steps, hardly count.
+
+    Args:
+        values: (N,) numbers.
+        target: (N,) those that ``gain * values + shift`` is to be near to.
+        shift: whether there is one; else it is 0.
+
+    """
+    weight, line = torch.ones_like(values), torch.zeros(2, dtype=values.dtype)
+    floor = 1e-6 * float(target.abs().median()) + torch.finfo(values.dtype).tiny
+    for _ in range(_STEPS):
+        sums = ((weight * each).sum() / weight.sum() if shift else each.new_zeros(()) for each in (values, target))
+        mean, middle = sums
+        centred = values - mean
+        gain = (weight * centred * (target - middle)).sum() / (weight * centred.square()).sum()
+        before, line = line, torch.stack((gain, middle - gain * mean))
+        if torch.allclose(before, line, rtol=1e-9, atol=0):
+            break
+        weight = 1 / (target - line[0] * values - line[1]).abs().clamp(min=floor)
+    return float(line[0]), float(line[1])
+
+
+def _to_depth(values: Tensor, camera: Camera, quantity: str) -> Tensor:
+    """Return values of a quantity as orthogonal depth; NaN where there is none."""
+    if quantity == INVERSE:
+        return torch.where(values > 0, 1 / values, torch.nan)
+    depth = from_range(values, camera, quantity)  # type: ignore[arg-type]  # it is a range type
+    return torch.where(depth > 0, depth, torch.nan)
+
+
+def _from_depth(depth_lr: Tensor, sample: DepthSample, quantity: str) -> Tensor:
+    """Return the low-resolution map in a quantity, of disparity in pixels of the photo's camera."""
+    if quantity == INVERSE:
+        return 1 / depth_lr
+    if quantity == "disparity":
+        return sample.disparity_lr(torch.float64).cpu()
+    return to_range(depth_lr, sample.camera_lr, quantity)  # type: ignore[arg-type]  # it is a range type
+
+
+def _reduce(values: Tensor, smaller: Tensor) -> Tensor:
+    """Return the means of the known values within the pixels of a smaller map, NaN where less than half are known."""
+    known, size = values.isfinite(), smaller.shape[-2:]
+    pool = torch.nn.functional.adaptive_avg_pool2d
+    share = pool(known.to(values.dtype), size)
+    return torch.where(share >= 0.5, pool(torch.where(known, values, 0), size) / share, torch.nan)
+
+
+def _expect_likeness(path: Path, depth: Tensor, sample: DepthSample) -> None:
+    """Raise a ValueError if a map cannot be of the sample's scene."""
+    coarse = 1 / sample.depth_lr.to("cpu", torch.float64)
+    reduced = _reduce(1 / depth, coarse)
+    known = reduced.isfinite() & coarse.isfinite()
+    own, theirs = reduced[known], coarse[known]
+    if own.numel() < 2:
+        return
+    off = float(theirs.median() / own.median())
+    if not 1 / _MOST_OFF < off < _MOST_OFF:
+        raise ValueError(
+            f"{path}: expected depths like the low-resolution map's, the median is {off:.3g} times theirs: another "
+            "unit, or method.fit=affine for a map without a scale? method.check=false takes it"
+        )
+    if float(theirs.std() / theirs.mean()) < _CONTRAST:
+        return
+    agreement = float(torch.corrcoef(torch.stack((own, theirs)))[0, 1].nan_to_num())
+    if agreement < _LEAST_AGREEMENT:
+        what = "disparity taken for depth" if agreement < -_LEAST_AGREEMENT else "another scene"
+        raise ValueError(
+            f"{path}: expected a map like the low-resolution one, their correlation is {agreement:.2f}: {what}? "
+            "method.check=false takes it"
+        )

@@ -1,0 +1,181 @@
+"""Maps of another program as a method: read in every format and quantity, fitted without the truth, and refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from small_scenes import plane, sample_of
+from torch import Tensor
+
+from dsr.methods.external import External, fit_line
+from dsr.sample import DepthSample
+
+
+@pytest.fixture
+def sample() -> DepthSample:
+    return sample_of(plane() + 3 * (plane() > 6.5), scale=4)
+
+
+def full(sample: DepthSample) -> Tensor:
+    """Return the true depth."""
+    assert sample.depth is not None
+    return sample.depth
+
+
+def truth(sample: DepthSample) -> np.ndarray:
+    return full(sample)[0].numpy()
+
+
+def write(folder: Path, name: str, values: np.ndarray) -> None:
+    """Write a map with NumPy or OpenCV alone."""
+    path = folder / name
+    if path.suffix == ".npy":
+        np.save(path, values)
+    elif path.suffix == ".npz":
+        np.savez(path, depth=values)
+    elif path.suffix == ".pfm":
+        path.write_bytes(b"Pf\n%d %d\n-1.0\n" % values.shape[::-1] + values[::-1].astype("<f4").tobytes())
+    else:
+        assert cv2.imwrite(str(path), values)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "unit", "tolerance"),
+    [
+        ("hall.npy", np.float64, None, 1e-12),
+        ("hall.npz", np.float32, None, 1e-6),
+        ("hall.pfm", np.float32, None, 1e-6),
+        ("hall.tiff", np.float32, None, 1e-6),
+        ("hall.png", np.uint16, "mm", 6e-4),
+        ("hall.png", np.uint16, 1 / 5000, 2e-4),
+        ("hall.npy", np.float32, "cm", 1e-6),
+    ],
+)
+def test_map_is_read_in_metres(
+    sample: DepthSample, tmp_path: Path, name: str, kind: type, unit: str | float | None, tolerance: float
+) -> None:
+    metres = {"mm": 1e-3, "cm": 1e-2, None: 1.0}.get(unit, unit)  # type: ignore[arg-type]
+    values = truth(sample) / metres
+    write(tmp_path, name, (values.round() if np.issubdtype(kind, np.integer) else values).astype(kind))
+    depth = External(str(tmp_path), unit=unit)(sample)
+    assert depth.shape == (1, 32, 48)
+    assert float((depth - full(sample)).abs().max()) <= tolerance
+
+
+def quantity(sample: DepthSample, name: str) -> Tensor:
+    """Return the true map in a quantity, by its definition."""
+    camera, depth = sample.camera, full(sample).double()
+    v, u = torch.meshgrid(torch.arange(32).double(), torch.arange(48).double(), indexing="ij")
+    ray = (((u - camera.cx) / camera.fx) ** 2 + ((v - camera.cy) / camera.fy) ** 2 + 1).sqrt()
+    return {"perspective": depth * ray, "disparity": 0.2 * camera.fx / depth, "inverse": 1 / depth}[name]
+
+
+@pytest.mark.parametrize("name", ["perspective", "disparity", "inverse"])
+def test_quantity_is_converted(sample: DepthSample, tmp_path: Path, name: str) -> None:
+    write(tmp_path, "hall.npy", quantity(sample, name)[0].numpy())
+    torch.testing.assert_close(External(str(tmp_path), range_type=name)(sample), sample.depth)
+
+
+@pytest.mark.parametrize(("name", "gain", "shift"), [("inverse", 7.0, -0.5), ("disparity", 0.01, 2.0)])
+def test_relative_map_is_fitted_to_the_coarse_one_without_the_truth(
+    sample: DepthSample, tmp_path: Path, name: str, gain: float, shift: float
+) -> None:
+    write(tmp_path, "hall.npy", (gain * quantity(sample, name)[0] + shift).numpy())
+    blind = sample_of(plane() + 3 * (plane() > 6.5), scale=4)
+    object.__setattr__(blind, "depth", None)
+    depth = External(str(tmp_path), range_type=name, fit="affine")(blind)
+    torch.testing.assert_close(depth, sample.depth, rtol=1e-3, atol=0)
+
+
+def test_holes_stay_holes_and_a_scale_is_fitted_around_them(sample: DepthSample, tmp_path: Path) -> None:
+    values = 40 * truth(sample)
+    values[4:9, 3:20] = np.nan
+    write(tmp_path, "hall.npy", values)
+    depth = External(str(tmp_path), fit="scale")(sample)
+    assert torch.equal(depth.isnan()[0], torch.from_numpy(np.isnan(values)))
+    assert float((depth / full(sample) - 1).nan_to_num().abs().max()) < 0.02
+
+
+def test_line_passes_through_most_points() -> None:
+    x = torch.linspace(0, 1, 101, dtype=torch.float64)
+    y = 3 * x + 2
+    y[::4] += 50 * x[::4]
+    assert fit_line(x, y) == pytest.approx((3, 2), abs=1e-3)
+    assert fit_line(x, 5 * x, shift=False) == pytest.approx((5, 0))
+
+
+def test_map_of_another_size_is_resized_only_when_told(sample: DepthSample, tmp_path: Path) -> None:
+    write(tmp_path, "hall.npy", truth(sample)[::2, ::2])
+    with pytest.raises(ValueError, match=r"hall.npy: expected 32 x 48 pixels .* got 16 x 24; .*resize=nearest"):
+        External(str(tmp_path))(sample)
+    near = External(str(tmp_path), resize="nearest")(sample)
+    assert torch.equal(near[:, ::2, ::2], torch.from_numpy(truth(sample)[None, ::2, ::2]))
+    assert torch.equal(near[:, 1::2, 1::2], near[:, ::2, ::2])
+    assert External(str(tmp_path), resize="bilinear")(sample).shape == (1, 32, 48)
+
+
+def test_names_follow_a_template_and_other_files_are_told(sample: DepthSample, tmp_path: Path) -> None:
+    (tmp_path / "set" / "x4").mkdir(parents=True)
+    write(tmp_path, "set/x4/hall_pred.npy", truth(sample))
+    write(tmp_path, "set/x4/cellar_pred.npy", truth(sample))
+    method = External(str(tmp_path), file="{dataset}/x{scale}/{scene}_pred")
+    torch.testing.assert_close(method(sample), sample.depth)
+    (remark,) = method.remarks("set", ["hall"], 4)
+    assert "cellar_pred.npy" in remark
+    assert method.remarks("set", ["hall", "cellar"], 4) == []
+    assert method.content("set", "hall", 4) != method.content("set", "attic", 4)
+
+
+@pytest.mark.parametrize(
+    ("change", "settings", "message"),
+    [
+        (lambda z: z * 1000, {}, r"hall.npy: .* the median is .* another unit"),
+        (lambda z: 4 - z, {}, r"correlation is -.*disparity taken for depth"),
+        (lambda z: -z, {}, r"hall.npy: expected at least one known pixel, .*negative"),
+        (lambda z: z * np.nan, {}, r"hall.npy: expected at least one known pixel, got all holes"),
+        (lambda z: z * np.inf, {}, r"hall.npy: expected at least one known pixel, got all holes"),
+        (lambda z: np.random.default_rng(0).permuted(z).reshape(z.shape), {}, r"another scene"),
+        (lambda z: z, {"range_type": "inverse", "fit": "affine"}, r"hall.npy: expected values that rise"),
+        (lambda z: (1000 * z).astype(np.uint16), {}, r"hall.npy: expected method.unit=mm"),
+    ],
+)
+def test_map_that_cannot_be_right_is_refused_by_name(
+    sample: DepthSample, tmp_path: Path, change: object, settings: dict[str, str], message: str
+) -> None:
+    write(tmp_path, "hall.npy", change(truth(sample)))  # type: ignore[operator]
+    with pytest.raises(ValueError, match=message):
+        External(str(tmp_path), **settings)(sample)  # type: ignore[arg-type]
+
+
+def test_unlikely_map_is_taken_when_told(sample: DepthSample, tmp_path: Path) -> None:
+    write(tmp_path, "hall.npy", 10 * truth(sample))
+    torch.testing.assert_close(External(str(tmp_path), check=False)(sample), 10 * full(sample))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"path": "nowhere"}, "path: expected a directory"),
+        ({"file": "{seen}"}, "file: expected a name with {scene}"),
+        ({"range_type": "depth"}, "range_type: expected one of orthogonal"),
+        ({"fit": "cubic"}, "fit: expected one of null, scale, affine"),
+        ({"resize": "cubic"}, "resize: expected one of null, nearest"),
+        ({"unit": "feet"}, "unit: expected m, cm, mm"),
+    ],
+)
+def test_settings_are_checked(tmp_path: Path, settings: dict[str, str], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        External(**{"path": str(tmp_path), **settings})  # type: ignore[arg-type]
+
+
+def test_two_files_of_a_scene_and_a_missing_one_are_refused(sample: DepthSample, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"hall: expected a map as .*there is none"):
+        External(str(tmp_path))(sample)
+    for name in ("hall.npy", "hall.npz"):
+        write(tmp_path, name, truth(sample))
+    with pytest.raises(ValueError, match=r"expected one map of hall, got hall.npy, hall.npz"):
+        External(str(tmp_path))(sample)
