@@ -222,7 +222,7 @@ def test_folders_of_predictions_are_judged_as_methods_are(tmp_path, within):
         for scene in ("first", "second"):
             np.save(tmp_path / name / f"{scene}.npy", np.load(tmp_path / f"made/predictions/{scene}.npz")["depth"])
     (tmp_path / "yours" / "second.npy").rename(tmp_path / "yours" / "third.npy")
-    code, output, errors = within("-m", *data, "method=external", "method.path=mine,yours")
+    code, _, errors = within("-m", *data, "method=external", "method.path=mine,yours")
     assert code == 2
     assert errors[0] == "note: yours: 1 files are of no scene: third.npy"
     assert errors[1].startswith("error: yours/second: expected a map as .png, ")

@@ -119,7 +119,7 @@ class External(Method):
         values = self._read(path, sample.camera)
         if self._fit is not None:
             values = self._fitted(path, values, sample)
-        depth = _to_depth(values, sample.camera, self._quantity)
+        depth = to_depth(values, sample.camera, self._quantity)
         depth = depth.masked_fill((depth < NEAREST) | (depth > FARTHEST), torch.nan)
         if not bool(depth.isfinite().any()):
             raise ValueError(f"{path}: expected a depth, no value is one between {NEAREST:g} and {FARTHEST:g} m")
@@ -204,7 +204,7 @@ class External(Method):
 
     def _fitted(self, path: Path, values: Tensor, sample: DepthSample) -> Tensor:
         """Return values fitted to the low-resolution map."""
-        target = _from_depth(sample.depth_lr.to("cpu", torch.float64), sample, self._quantity)
+        target = from_depth(sample.depth_lr.to("cpu", torch.float64), sample, self._quantity)
         reduced = _reduce(values, target)
         known = reduced.isfinite() & target.isfinite()
         if int(known.sum()) < 2:
@@ -243,7 +243,7 @@ def fit_line(values: Tensor, target: Tensor, *, shift: bool = True) -> tuple[flo
     return float(line[0]), float(line[1])
 
 
-def _to_depth(values: Tensor, camera: Camera, quantity: str) -> Tensor:
+def to_depth(values: Tensor, camera: Camera, quantity: str) -> Tensor:
     """Return values of a quantity as orthogonal depth; NaN where there is none."""
     if quantity == INVERSE:
         return torch.where(values > 0, 1 / values, torch.nan)
@@ -251,7 +251,7 @@ def _to_depth(values: Tensor, camera: Camera, quantity: str) -> Tensor:
     return torch.where(depth > 0, depth, torch.nan)
 
 
-def _from_depth(depth_lr: Tensor, sample: DepthSample, quantity: str) -> Tensor:
+def from_depth(depth_lr: Tensor, sample: DepthSample, quantity: str) -> Tensor:
     """Return the low-resolution map in a quantity, of disparity in pixels of the photo's camera."""
     if quantity == INVERSE:
         return 1 / depth_lr
@@ -262,7 +262,7 @@ def _from_depth(depth_lr: Tensor, sample: DepthSample, quantity: str) -> Tensor:
 
 def _reduce(values: Tensor, smaller: Tensor) -> Tensor:
     """Return the means of the known values within the pixels of a smaller map, NaN where less than half are known."""
-    known, size = values.isfinite(), smaller.shape[-2:]
+    known, size = values.isfinite(), (smaller.shape[-2], smaller.shape[-1])
     pool = torch.nn.functional.adaptive_avg_pool2d
     share = pool(known.to(values.dtype), size)
     return torch.where(share >= 0.5, pool(torch.where(known, values, 0), size) / share, torch.nan)

@@ -99,7 +99,7 @@ def write_onnx(path: Path, graph: OnnxGraph, facts: Mapping[str, Any]) -> float:
         ValueError: `onnx` or `onnxruntime` is not installed, or the results differ.
 
     """
-    onnx, runtime = _import("onnx"), _import("onnxruntime")
+    onnx, runtime = import_library("onnx", "--onnx"), import_library("onnxruntime", "--onnx")
     with replacing(path) as temporary:
         _trace(temporary, graph)
         model = onnx.load(str(temporary))
@@ -200,7 +200,7 @@ def _compare(session: Any, graph: OnnxGraph) -> float:
     return max(differences)
 
 
-def _import(name: str) -> Any:
-    """Return a library of the extra ``onnx``."""
-    with refusing(f"--onnx: expected the library {name}, which `pip install dsr[onnx]` installs", ImportError):
+def import_library(name: str, wanted_by: str) -> Any:
+    """Return a library of the extra ``onnx``; ``wanted_by`` is what the user gave that needs it."""
+    with refusing(f"{wanted_by}: expected the library {name}, which `pip install dsr[onnx]` installs", ImportError):
         return importlib.import_module(name)

@@ -1,0 +1,214 @@
+"""A network as an ONNX or TorchScript file, whose inputs and result are declared, as a method.
+
+What a network's authors did to its inputs is no part of its file: which quantity its depth is, what became 0..1, and
+how the map was enlarged. The configuration declares it.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from dsr.geometry.camera import RANGE_TYPES
+from dsr.methods.base import Abilities, Cost, Method
+from dsr.methods.classical.finite_differences import LUMA
+from dsr.methods.external import QUANTITIES, from_depth, to_depth
+from dsr.methods.inpainting import inpaint
+from dsr.methods.networks.normalisation import normalise, normalise_imagenet, resize_bicubic
+from dsr.methods.networks.onnx_export import import_library
+from dsr.sample import DepthSample
+from dsr.utils.guards import refusing
+from dsr.utils.progress import Steps
+from dsr.utils.ratios import round_ratio
+from dsr.utils.versions import file_hash
+
+_IMAGES: Mapping[str, Callable[[Tensor], Tensor]] = {
+    "image": lambda rgb: rgb,
+    "image255": lambda rgb: 255 * rgb,
+    "imagenet": normalise_imagenet,
+    "grey": lambda rgb: (rgb * rgb.new_tensor(LUMA).view(3, 1, 1)).sum(dim=1, keepdim=True),
+}
+_MAPS = ("lr", "up", "valid")
+CONTENTS = (*_IMAGES, *_MAPS)
+"""What an input may get: the photo in 0..1, in 0..255, normalised as for ImageNet, or its luma; the low-resolution map,
+that map enlarged by Keys' cubic kernel to the photo's size, and where the low-resolution map is known (bool)."""
+SAME, RESIDUAL, MEASURED = "same", "residual", "measured"
+OUTPUTS = (SAME, RESIDUAL, *QUANTITIES)
+TORCHSCRIPT = (".pt", ".pth", ".ts", ".torchscript")
+_Run = Callable[[dict[str, Tensor]], Tensor]
+
+
+class NetworkFile(Method):
+    """A method that is a network's file.
+
+    Args:
+        path: ``.onnx``, which needs ``pip install dsr[onnx]``, or TorchScript, one of ``TORCHSCRIPT``. TorchScript is a
+            program: only load one that you trust.
+        inputs: one of ``CONTENTS`` for each input, by name; of TorchScript in the order of its arguments. Pictures are
+            (1, C, H, W) float32.
+        range_type: what the depth inputs measure, and the type that the low-resolution map is averaged in:
+            ``orthogonal``, ``perspective``, ``disparity`` in pixels of the photo's camera, or ``inverse`` in 1/m, which
+            is averaged as disparity.
+        range: what becomes 0..1 in the depth inputs: ``measured`` for the low-resolution map's minimum and maximum, two
+            numbers in the quantity's unit, or None for values as they are.
+        output: what the network returns, (1, 1, H, W): ``same`` as its depth inputs, in the same range; ``residual``,
+            to be added to the enlarged map; or a quantity as it is, of :data:`dsr.methods.external.QUANTITIES`.
+        result: name of the output of an ONNX file; None for its first.
+        multiple: the number that has to divide the photo's height and width; it is continued at the right and bottom.
+        device: where to compute.
+
+    Raises:
+        ValueError: the file is missing, damaged or of another kind, or a declaration does not fit it.
+
+    """
+
+    abilities = Abilities(ratios="any", own_size=True, cost=Cost(1000))
+
+    def __init__(
+        self,
+        path: str,
+        inputs: Mapping[str, str],
+        range_type: str = "disparity",
+        range: str | Sequence[float] | None = MEASURED,  # noqa: A002 - the key's name
+        output: str = SAME,
+        result: str | None = None,
+        multiple: int = 1,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self._path = Path(path).expanduser()
+        if self._path.suffix.lower() not in (".onnx", *TORCHSCRIPT):
+            raise ValueError(f"path: expected a file {', '.join(('.onnx', *TORCHSCRIPT))}, got {path}")
+        if not self._path.is_file():
+            raise ValueError(f"path: expected a network's file, got {path} (no such file)")
+        for key, value, known in (("range_type", range_type, QUANTITIES), ("output", output, OUTPUTS)):
+            if value not in known:
+                raise ValueError(f"{key}: expected one of {', '.join(known)}, got {value!r}")
+        self._inputs = dict(inputs)
+        for name, content in self._inputs.items():
+            if content not in CONTENTS:
+                raise ValueError(f"inputs.{name}: expected one of {', '.join(CONTENTS)}, got {content!r}")
+        if not self._inputs:
+            raise ValueError(f"inputs: expected one of {', '.join(CONTENTS)} for each input, got none")
+        self._limits = None if range in (None, MEASURED) else _limits(range)
+        if multiple < 1:
+            raise ValueError(f"multiple: expected 1 or more, got {multiple}")
+        self.name = self._path.stem
+        self.range_type = range_type if range_type in RANGE_TYPES else "disparity"
+        self._quantity, self._scaled, self._output = range_type, range is not None, output
+        self._result, self._multiple, self.device = result, multiple, torch.device(device)
+        self._runs: dict[int, _Run] = {}
+        self._load(threads=1)  # its errors, before anything is computed
+
+    @torch.inference_mode()
+    def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
+        """Return the high-resolution orthogonal depth, (1, H, W) in metres on the sample's device.
+
+        Raises:
+            ValueError: the network cannot be run on pictures of this size, or returns something else than a map.
+
+        """
+        size = sample.camera.height, sample.camera.width
+        known = sample.mask_lr[None].to(self.device)
+        values_lr = inpaint(from_depth(sample.depth_lr, sample, self._quantity)[None]).to(self.device)
+        scaled = normalise(values_lr, self._limits)
+        lowest, span = (scaled.minimum, scaled.value_range) if self._scaled else (0.0, 1.0)
+        low = (scaled.values if self._scaled else values_lr).float()
+        enlarged = resize_bicubic(low, size)
+        pictures = {"lr": low, "up": enlarged, "valid": known}
+        rgb = sample.rgb.to(self.device, torch.float32)[None]
+        given = {
+            name: self._padded(_IMAGES[content](rgb) if content in _IMAGES else pictures[content], size)
+            for name, content in self._inputs.items()
+        }
+        if os.getpid() not in self._runs:  # a worker has a program of its own
+            self._runs[os.getpid()] = self._load(torch.get_num_threads())
+        with refusing(f"{self._path}: expected a network for {size[0]} x {size[1]} pixels, it failed", Exception):
+            found = self._runs[os.getpid()](given)
+        found = found.reshape(1, 1, *found.shape[-2:]) if found.numel() == found.shape[-2:].numel() else found
+        if found.dim() != 4 or found.shape[:2] != (1, 1) or any(map(int.__lt__, found.shape[-2:], size)):
+            raise ValueError(f"{self._path}: expected a map of {size[0]} x {size[1]}, got {tuple(found.shape)}")
+        values = found[..., : size[0], : size[1]].to(values_lr)
+        if self._output in (SAME, RESIDUAL):
+            values = (values + enlarged if self._output == RESIDUAL else values) * span + lowest
+        quantity = self._quantity if self._output in (SAME, RESIDUAL) else self._output
+        if progress is not None:
+            progress(1, 1)
+        return to_depth(values[0], sample.camera, quantity).to(sample.depth_lr)
+
+    def content(self, dataset: str, scene: str, scale: float) -> str:
+        """Return the SHA-256 of the network's file."""
+        return _hash(self._path, self._path.stat())
+
+    def _padded(self, picture: Tensor, size: tuple[int, int]) -> Tensor:
+        """Return a picture continued to as many pixels as make the photo's size a multiple."""
+        more = [-each % self._multiple for each in size]
+        if not any(more):
+            return picture
+        ratio = size[0] / picture.shape[-2]
+        steps = [each / ratio for each in more]
+        if any(step != int(step) for step in steps):
+            raise ValueError(f"multiple: expected one that x{round_ratio(ratio)} divides, got {self._multiple}")
+        padding = (0, int(steps[1]), 0, int(steps[0]))
+        return functional.pad(picture.float(), padding, mode="replicate").to(picture.dtype)
+
+    def _load(self, threads: int) -> _Run:
+        """Return a function that runs the network."""
+        return self._load_onnx(threads) if self._path.suffix.lower() == ".onnx" else self._load_torchscript()
+
+    def _load_onnx(self, threads: int) -> _Run:
+        """Return a function that runs an ONNX file, in a session that begins with it."""
+        runtime = import_library("onnxruntime", f"method.path={self._path}")
+        options = runtime.SessionOptions()
+        options.intra_op_num_threads, options.log_severity_level = threads, 3
+        providers = ["CUDAExecutionProvider"] if self.device.type == "cuda" else []
+        with refusing(f"{self._path}: expected an ONNX file, got a damaged or foreign one", Exception):
+            session = runtime.InferenceSession(str(self._path), options, providers=[*providers, "CPUExecutionProvider"])
+        names = [each.name for each in session.get_inputs()]
+        if set(names) != set(self._inputs):
+            raise ValueError(f"inputs: expected {', '.join(names)}, as {self._path} has, got {', '.join(self._inputs)}")
+        results = [each.name for each in session.get_outputs()]
+        if self._result is not None and self._result not in results:
+            raise ValueError(f"result: expected one of {', '.join(results)}, got {self._result!r}")
+        result = self._result or results[0]
+
+        def run(given: dict[str, Tensor]) -> Tensor:
+            (found,) = session.run([result], {name: each.cpu().numpy() for name, each in given.items()})
+            return torch.from_numpy(found)
+
+        return run
+
+    def _load_torchscript(self) -> _Run:
+        """Return a function that runs a TorchScript file."""
+        if self._result is not None:
+            raise ValueError(
+                f"result: expected null for TorchScript, whose first result is taken, got {self._result!r}"
+            )
+        with refusing(f"{self._path}: expected a TorchScript file, got a damaged or foreign one", Exception):
+            module = torch.jit.load(str(self._path), map_location=self.device).eval()
+
+        def run(given: dict[str, Tensor]) -> Tensor:
+            found: Any = module(*given.values())
+            while not isinstance(found, Tensor):
+                found = next(iter(found.values() if isinstance(found, Mapping) else found))
+            return found
+
+        return run
+
+
+def _limits(given: Any) -> Tensor:
+    """Return the values that become 0 and 1, (1, 2, 1, 1)."""
+    if isinstance(given, str) or len(given) != 2 or not given[0] < given[1]:
+        raise ValueError(f"range: expected {MEASURED}, null or two numbers that rise, got {given!r}")
+    return torch.tensor([float(each) for each in given], dtype=torch.float64).view(1, 2, 1, 1)
+
+
+@functools.cache
+def _hash(path: Path, _: os.stat_result) -> str:
+    return file_hash(path)
