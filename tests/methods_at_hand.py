@@ -1,11 +1,9 @@
 """The methods by what they need: all that dsr has, or files that a user brings."""
 
-from omegaconf import OmegaConf
-
 from dsr.methods.recipe import list_methods, read_recipe
 
 PEERS = [name for name in list_methods() if "weights_files" in read_recipe(name).node]
 """Those whose weights their authors have."""
-OPEN = [name for name in list_methods() if OmegaConf.missing_keys(read_recipe(name).node)]
+OPEN = [name for name in list_methods() if "???" in read_recipe(name).at(4).values()]
 """Those that a user names files for."""
 AT_HAND = [name for name in list_methods() if name not in (*PEERS, *OPEN)]
