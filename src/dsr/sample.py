@@ -84,6 +84,8 @@ class Scene:
             differ by 2 %.
         notes: what somebody who reads the scores should know, such as "depth is not metric".
         unit: the unit in which the data set's benchmark prints errors.
+        regions: parts of the scene that tables show on their own, by name: (1, H, W) uint8, 0 outside; a region of
+            several objects, such as planes, numbers them from 1.
 
     Raises:
         ValueError: a shape, range or unit is not as above.
@@ -98,10 +100,12 @@ class Scene:
     measured: Mapping[float, Tensor] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     unit: Unit = CENTIMETRES
+    regions: Mapping[str, Tensor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check shapes and value ranges."""
         _expect_rgb(self.name, self.rgb, self.camera)
+        _expect_regions(self.name, self.regions, self.camera)
         if self.depth is None and not self.measured:
             raise ValueError(f"{self.name}: expected a depth map, high-resolution or measured, got none")
         if self.depth is not None:
@@ -129,7 +133,8 @@ class Scene:
                 measured[ratio] = depth_lr[:, first_row:end_row, first_column:end_column]
         depth = None if self.depth is None else self.depth[window]
         camera = self.camera.crop(top, left, height, width)
-        return replace(self, rgb=self.rgb[window], depth=depth, camera=camera, measured=measured)
+        regions = {name: region[window] for name, region in self.regions.items()}
+        return replace(self, rgb=self.rgb[window], depth=depth, camera=camera, measured=measured, regions=regions)
 
     def _steps(self, ratio: float) -> tuple[Fraction, Fraction]:
         """Return the height and the width of a pixel of a measured map in the photo's pixels."""
@@ -154,6 +159,7 @@ class DepthSample:
         depth: (1, H, W) true high-resolution depth, or None where it is not known.
         notes: what somebody who reads the scores should know, such as "cropped from 513 x 512".
         unit: the unit in which the data set's benchmark prints errors.
+        regions: as of a :class:`Scene`.
 
     Raises:
         ValueError: a shape, range or unit is not as above.
@@ -170,10 +176,12 @@ class DepthSample:
     depth: Tensor | None = None
     notes: tuple[str, ...] = field(default=())
     unit: Unit = CENTIMETRES
+    regions: Mapping[str, Tensor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check shapes, value ranges and cameras against each other."""
         _expect_rgb(self.scene, self.rgb, self.camera)
+        _expect_regions(self.scene, self.regions, self.camera)
         object.__setattr__(self, "scale", as_ratio(self.scale))
         if not 1 <= self.scale < math.inf:
             raise ValueError(f"{self.scene}: scale: expected a number of 1 or more, got {self.scale}")
@@ -207,6 +215,7 @@ class DepthSample:
         }
         if self.depth is not None:
             arrays["depth"] = self.depth[0].cpu().numpy()
+        arrays |= {f"{_REGION}{name}": region[0].cpu().numpy() for name, region in self.regions.items()}
         with replacing(path) as temporary:
             np.savez_compressed(temporary, allow_pickle=False, about=json.dumps(about), **arrays)
 
@@ -232,6 +241,11 @@ class DepthSample:
                 torch.from_numpy(arrays["depth"])[None] if "depth" in arrays else None,
                 tuple(about["notes"]),
                 _read_unit(about["unit"]),
+                {
+                    name.removeprefix(_REGION): torch.from_numpy(values)[None]
+                    for name, values in arrays.items()
+                    if name.startswith(_REGION)
+                },
             )
         except FileNotFoundError:
             raise ValueError(f"{path}: expected the sample of a scene, there is none") from None
@@ -274,6 +288,8 @@ def _read_unit(entries: Mapping[str, Any]) -> Unit:
     return Unit(**{**entries, "limits": None if limits is None else tuple(limits)})
 
 
+_REGION = "region_"
+"""Beginning of the names of arrays that are regions."""
 _BITS = {"uint8": 255, "uint16": 65535}
 """The largest values of the integers that photos are stored as."""
 
@@ -310,6 +326,13 @@ def _expect_rgb(scene: str, rgb: Tensor, camera: Camera) -> None:
     _expect_shape(scene, "rgb", rgb, (3, camera.height, camera.width))
     if not rgb.is_floating_point() or not bool(((rgb >= 0) & (rgb <= 1)).all()):
         raise ValueError(f"{scene}: rgb: expected floating point values in [0, 1]")
+
+
+def _expect_regions(scene: str, regions: Mapping[str, Tensor], camera: Camera) -> None:
+    for name, region in regions.items():
+        _expect_shape(scene, f"region {name}", region, (1, camera.height, camera.width))
+        if region.dtype != torch.uint8 or not name.isidentifier():
+            raise ValueError(f"{scene}: region {name}: expected uint8, and a name of letters; got {region.dtype}")
 
 
 def expect_distances(place: str, depth: Tensor) -> None:

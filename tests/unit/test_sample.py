@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera, baseline_times_focal
 from dsr.sample import CENTIMETRES, DepthSample, Scene, Unit
 
@@ -207,6 +208,18 @@ def test_sample_is_read_with_the_same_bits(tmp_path: Path, dtype: torch.dtype, l
 def test_sample_without_truth_is_read_without_truth(tmp_path: Path) -> None:
     _sample(depth=None).save(tmp_path / "hall.npz")
     assert DepthSample.load(tmp_path / "hall.npz").depth is None
+
+
+def test_regions_are_cropped_handed_on_and_read(tmp_path: Path) -> None:
+    planes = torch.arange(32, dtype=torch.uint8).view(1, 4, 8)
+    window = _scene(regions={"planes": planes}).crop(2, 4, 2, 4)
+    assert torch.equal(window.regions["planes"], planes[:, 2:, 4:])
+    sample = make_sample(window, 2, Downsampling("box"), "orthogonal")
+    sample.save(tmp_path / "hall.npz")
+    assert torch.equal(DepthSample.load(tmp_path / "hall.npz").regions["planes"], planes[:, 2:, 4:])
+    for region, message in ((planes[:, 1:], "expected shape"), (planes.bool(), "expected uint8")):
+        with pytest.raises(ValueError, match=f"hall: region planes: {message}"):
+            _scene(regions={"planes": region})
 
 
 def test_unit_of_a_sample_is_read(tmp_path: Path) -> None:

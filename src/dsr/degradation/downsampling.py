@@ -224,8 +224,9 @@ def make_sample(
     if holes is not None:
         depth_lr = depth_lr.masked_fill(holes(depth_lr, camera_lr, of_holes), torch.nan)
     return DepthSample(
-        scene.dataset, scene.name, scene.rgb, depth_lr, scene.camera, camera_lr, ratio, scene.depth, notes, scene.unit
-    )
+        scene.dataset, scene.name, scene.rgb, depth_lr, scene.camera, camera_lr, ratio, scene.depth, notes, scene.unit,
+        scene.regions,
+    )  # fmt: skip
 
 
 def _true_depth(scene: Scene) -> Tensor:
