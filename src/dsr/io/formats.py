@@ -1,11 +1,13 @@
 """What is read of captures and layouts, a row a device, program or data set; docs/captures.md shows the same table.
 
-What a format is recognised by is decided by its reader, in :mod:`dsr.io.captures` and :mod:`dsr.io.layouts`.
+A row also says which files a layout's reader, in :mod:`dsr.io.captures` or :mod:`dsr.io.layouts`, needs to recognise
+it; of a folder that has some of them, :mod:`dsr.io.captures.known` tells which ones it lacks.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 _LIDAR = "bent edges, nothing thin"
@@ -25,6 +27,9 @@ class Format(NamedTuple):
         tried: the files that it was tried with: real ones, or ones that an independent program wrote.
         faults: of the sensor; empty where any sensor may have been used.
         source: address of the writer's own description or code.
+        marks: patterns of files from its folder on, of which one tells it from other layouts; ``*`` in the last part
+            stands for anything. Empty for what is a single file, or has no names of its own.
+        needs: names of its parts, each with patterns of which one has to be there.
 
     """
 
@@ -35,6 +40,8 @@ class Format(NamedTuple):
     tried: str
     faults: str
     source: str
+    marks: tuple[str, ...] = ()
+    needs: Mapping[str, tuple[str, ...]] = MappingProxyType({})
 
 
 FORMATS = (
@@ -46,6 +53,8 @@ FORMATS = (
         "written by its format",
         _LIDAR,
         "https://github.com/strayrobots/scanner/blob/main/docs/format.md",
+        marks=("odometry.csv", "camera_matrix.csv"),
+        needs={"depth/": ("depth/*",), "rgb.mp4 or rgb/": ("rgb.mp4", "rgb/*")},
     ),
     Format(
         "Record3D",
@@ -55,6 +64,8 @@ FORMATS = (
         "a real export of 341 frames",
         _LIDAR,
         "https://github.com/marek-simonik/record3d/issues/27",
+        marks=("rgbd/*.depth",),
+        needs={"metadata": ("metadata",)},
     ),
     Format(
         "Polycam",
@@ -64,6 +75,12 @@ FORMATS = (
         "written by its format",
         _LIDAR,
         "https://github.com/PolyCam/polyform#polycams-data-format",
+        marks=("keyframes/*",),
+        needs={
+            "keyframes/images/": ("keyframes/images/*.jpg", "keyframes/corrected_images/*.jpg"),
+            "keyframes/cameras/*.json": ("keyframes/cameras/*.json", "keyframes/corrected_cameras/*.json"),
+            "keyframes/depth/": ("keyframes/depth/*.png",),
+        },
     ),
     Format(
         "ARKitScenes",
@@ -73,6 +90,11 @@ FORMATS = (
         "written by its format",
         _LIDAR,
         "https://github.com/apple/ARKitScenes/blob/main/DATA.md",
+        marks=("lowres_depth/*", "lowres_wide.traj"),
+        needs={
+            "lowres_depth/": ("lowres_depth/*.png",),
+            "wide/, color/ or lowres_wide/": ("wide/*.png", "color/*.png", "lowres_wide/*.png"),
+        },
     ),
     Format(
         "3D Scanner App",
@@ -82,6 +104,12 @@ FORMATS = (
         "written by its format",
         _LIDAR,
         "https://github.com/laanlabs/3dScannerApp_samples",
+        marks=("conf_00000.png", "frame_*.json"),
+        needs={
+            "frame_*.jpg": ("frame_*.jpg",),
+            "frame_*.json": ("frame_*.json",),
+            "depth_*.png": ("depth_*.png", "frame_*.exr"),
+        },
     ),
     Format(
         "ROS 1 and 2",
@@ -128,6 +156,8 @@ FORMATS = (
         "written by its format",
         _STEREO,
         "https://github.com/stereolabs/zed-open-capture",
+        marks=("SN*.conf", "left000000.png"),
+        needs={"left*.png": ("left*.png",), "depth*.png": ("depth*.png",), "SN*.conf": ("SN*.conf",)},
     ),
     Format(
         "COLMAP",
@@ -146,6 +176,8 @@ FORMATS = (
         "written by its format",
         "",
         "https://www.open3d.org/docs/release/tutorial/reconstruction_system/system_overview.html",
+        marks=("scene/trajectory.log", "trajectory.log"),
+        needs={"color/": ("color/*", "image/*", "rgb/*"), "depth/": ("depth/*",)},
     ),
     Format(
         "TUM RGB-D",
@@ -155,6 +187,8 @@ FORMATS = (
         "written by its format",
         _KINECT1,
         "https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats",
+        marks=("rgb.txt", "depth.txt"),
+        needs={"rgb.txt": ("rgb.txt",), "depth.txt": ("depth.txt",)},
     ),
     Format(
         "ScanNet",
@@ -164,6 +198,12 @@ FORMATS = (
         "written by its format",
         _KINECT1,
         "https://github.com/ScanNet/ScanNet/blob/master/SensReader/python/SensorData.py",
+        marks=("intrinsic/intrinsic_*.txt", "pose/*.txt"),
+        needs={
+            "color/": ("color/*",),
+            "depth/": ("depth/*.png",),
+            "intrinsic/intrinsic_color.txt": ("intrinsic/intrinsic_*.txt",),
+        },
     ),
     Format(
         "ScanNet++ iPhone",
@@ -173,15 +213,23 @@ FORMATS = (
         "written by its format",
         _LIDAR,
         "https://github.com/scannetpp/scannetpp/blob/main/iphone/prepare_iphone_data.py",
+        marks=("pose_intrinsic_imu.json", "depth.bin"),
+        needs={
+            "pose_intrinsic_imu.json": ("pose_intrinsic_imu.json",),
+            "depth.bin": ("depth.bin", "depth/*.png"),
+            "rgb.mkv": ("rgb.mkv", "rgb.mp4", "rgb/*.jpg"),
+        },
     ),
     Format(
-        "7-Scenes, 3DMatch",
+        "7-Scenes or 3DMatch",
         "a sequence",
         "`*.color.png`, `*.depth.png`, `*.pose.txt`",
         "depth in mm (16-bit PNG), 65535 in holes; `camera-intrinsics.txt`, else those of its page; poses",
         "written by its format",
         _KINECT1,
         "https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes/",
+        marks=("*.pose.txt",),
+        needs={"*.color.png": ("*.color.png",), "*.depth.png": ("*.depth.png",)},
     ),
     Format(
         "SUN RGB-D",
@@ -191,6 +239,8 @@ FORMATS = (
         "real frames of two sensors",
         "Kinects, Xtion and RealSense",
         "https://rgbd.cs.princeton.edu/",
+        marks=("depth_bfx/*",),
+        needs={"image/": ("image/*",), "intrinsics.txt": ("intrinsics.txt",)},
     ),
     Format(
         "Replica of NICE-SLAM",
@@ -200,6 +250,11 @@ FORMATS = (
         "written by its format",
         "",
         "https://github.com/cvg/nice-slam/blob/master/src/utils/datasets.py",
+        marks=("results/depth*.png",),
+        needs={
+            "results/frame*.jpg": ("results/frame*",),
+            "traj.txt or cam_params.json": ("traj.txt", "cam_params.json"),
+        },
     ),
     Format(
         "ICL-NUIM",
