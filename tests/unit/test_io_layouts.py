@@ -81,6 +81,16 @@ def test_camera_unit_and_pose_of_each_frame_come_from_the_layout(folder, layout)
     np.testing.assert_array_equal(again.depth_lr, pictures[1].depth_lr)
 
 
+def test_seven_scenes_may_have_photos_as_jpeg(folder):
+    captures.seven_scenes(folder)
+    for number, path in enumerate(sorted(folder.glob("*.color.png"))):
+        captures.save(path.with_suffix(".jpg"), captures.photo(number))
+        path.unlink()
+    pairs = find_pairs_of_folder(folder).pairs
+    assert [pair.name for pair in pairs] == [f"frame-{number:06}" for number in range(FRAMES)]
+    np.testing.assert_allclose(read_picture(pairs[1], Reading()).pose, captures.pose(1), atol=1e-6)
+
+
 def test_seven_scenes_without_a_camera_has_the_usual_one_of_its_kinect(folder):
     captures.seven_scenes(folder)
     picture = read_all(folder)[0]
