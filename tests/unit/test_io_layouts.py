@@ -81,8 +81,9 @@ def test_camera_unit_and_pose_of_each_frame_come_from_the_layout(folder, layout)
     np.testing.assert_array_equal(again.depth_lr, pictures[1].depth_lr)
 
 
-def test_seven_scenes_may_have_photos_as_jpeg(folder):
+def test_seven_scenes_may_have_photos_as_jpeg_and_poses_with_commas(folder):
     captures.seven_scenes(folder)
+    np.savetxt(folder / "frame-000001.pose.txt", captures.pose(1), delimiter=",")
     for number, path in enumerate(sorted(folder.glob("*.color.png"))):
         captures.save(path.with_suffix(".jpg"), captures.photo(number))
         path.unlink()

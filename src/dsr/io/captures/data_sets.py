@@ -4,7 +4,8 @@
 
     frame-000000.color.png, frame-000000.depth.png    640 x 480; 16-bit millimetres, 65535 in holes; photos as JPEG in
                                                       copies, as of https://github.com/andyzeng/tsdf-fusion-python
-    frame-000000.pose.txt                             4 x 4, from camera to world
+    frame-000000.pose.txt                             4 x 4, from camera to world; with commas in vReLoc
+                                                      (https://github.com/loveoxford/vReLoc)
     camera-intrinsics.txt                             3DMatch: 3 x 3, here or one folder up
 
 The cameras of 7-Scenes, Kinects v1, are not calibrated; its page names 585 pixels and the centre 320, 240.
