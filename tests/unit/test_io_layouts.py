@@ -81,6 +81,16 @@ def test_camera_unit_and_pose_of_each_frame_come_from_the_layout(folder, layout)
     np.testing.assert_array_equal(again.depth_lr, pictures[1].depth_lr)
 
 
+def test_recordings_of_scannet_in_a_folder_are_told_apart_and_each_says_its_unit(folder):
+    captures.sens(folder / "a.sens")
+    captures.sens(folder / "b.sens", scale=5000.0)
+    found = find_pairs_of_folder(folder)
+    assert [pair.name for pair in found.pairs] == [f"{each}/{number:06}" for each in "ab" for number in range(FRAMES)]
+    millimetres, fifths = (note.text for note in found.assumptions)
+    assert "depth in millimetres;" in millimetres
+    assert "depth in 1/5000 m;" in fifths
+
+
 def test_seven_scenes_may_have_photos_as_jpeg_and_poses_with_commas(folder):
     captures.seven_scenes(folder)
     np.savetxt(folder / "frame-000001.pose.txt", captures.pose(1), delimiter=",")
