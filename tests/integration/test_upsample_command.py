@@ -402,6 +402,29 @@ def test_invalid_arguments_are_refused_in_one_line(pair, tmp_path, capsys, argum
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(
+    ("first", "second", "given"),
+    [
+        ("color", "depth", "--rgb color --depth depth"),
+        ("depth", "color", "--rgb color --depth depth"),
+        ("color/0.png", "depth/0.png", "--rgb color/0.png --depth depth/0.png"),
+        ("files/photo.png", "files/my_depth.png", "--rgb files/photo.png --depth files/my_depth.png"),
+        ("color", "nothing/depth", None),
+        ("color", "other", None),
+    ],
+)
+def test_photos_and_depth_maps_in_two_arguments_are_refused_with_the_options_for_them(
+    pair, tmp_path, capsys, monkeypatch, first, second, given
+):
+    names = ("color/0.png", "depth/0.png", "files/photo.png", "files/my_depth.png", "other/0.png")
+    for number, name in enumerate(names):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        shutil.copy(pair[number % 2], tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    message = refused(capsys, main(["upsample", first, second, "-o", "out", "--dry-run"]))
+    assert message.endswith(given) if given else "--rgb" not in message
+
+
 def test_pictures_that_do_not_fit_each_other_are_refused_in_one_line(pair, tmp_path, capsys):
     photo, depth, _ = pair
     for name, array, message in (

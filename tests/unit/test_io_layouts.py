@@ -4,6 +4,7 @@ import json
 import os
 import pickle
 import re
+import shutil
 import stat
 import struct
 import subprocess
@@ -20,10 +21,12 @@ from captures import FRAMES, INTRINSICS, SIZE
 
 from dsr.cli import main
 from dsr.geometry.camera import Camera
+from dsr.io.formats import FORMATS
 from dsr.io.inputs import FolderUnits, read_picture
 from dsr.io.layouts import find_pairs_of_folder
 from dsr.io.reading import CameraChoice, Reading
 
+FORMAT = {each.name: each for each in FORMATS}
 CAMERA = Camera(SIZE[1], SIZE[0], *INTRINSICS)
 
 
@@ -76,6 +79,27 @@ def test_camera_unit_and_pose_of_each_frame_come_from_the_layout(folder, layout)
         assert "taken for millimetres" not in said(picture)
     again = read_picture(pickle.loads(pickle.dumps(find_pairs_of_folder(place).pairs[1])), Reading())
     np.testing.assert_array_equal(again.depth_lr, pictures[1].depth_lr)
+
+
+def test_recordings_of_scannet_in_a_folder_are_told_apart_and_each_says_its_unit(folder):
+    captures.sens(folder / "a.sens")
+    captures.sens(folder / "b.sens", scale=5000.0)
+    found = find_pairs_of_folder(folder)
+    assert [pair.name for pair in found.pairs] == [f"{each}/{number:06}" for each in "ab" for number in range(FRAMES)]
+    millimetres, fifths = (note.text for note in found.assumptions)
+    assert "depth in millimetres;" in millimetres
+    assert "depth in 1/5000 m;" in fifths
+
+
+def test_seven_scenes_may_have_photos_as_jpeg_and_poses_with_commas(folder):
+    captures.seven_scenes(folder)
+    np.savetxt(folder / "frame-000001.pose.txt", captures.pose(1), delimiter=",")
+    for number, path in enumerate(sorted(folder.glob("*.color.png"))):
+        captures.save(path.with_suffix(".jpg"), captures.photo(number))
+        path.unlink()
+    pairs = find_pairs_of_folder(folder).pairs
+    assert [pair.name for pair in pairs] == [f"frame-{number:06}" for number in range(FRAMES)]
+    np.testing.assert_allclose(read_picture(pairs[1], Reading()).pose, captures.pose(1), atol=1e-6)
 
 
 def test_seven_scenes_without_a_camera_has_the_usual_one_of_its_kinect(folder):
@@ -392,7 +416,8 @@ LACKING = {
     "polycam without photos": (captures.polycam, remove("keyframes/*images/*"),
                                "like Polycam, without keyframes/images/"),
     "scannet without photos": (captures.scannet, remove("color/*"), "like ScanNet, without color/"),
-    "7-scenes without maps": (captures.seven_scenes, remove("*.depth.png"), "like 7-Scenes, without *.depth.png"),
+    "7-scenes without maps": (captures.seven_scenes, remove("*.depth.png"),
+                              "like 7-Scenes or 3DMatch, without *.depth.png"),
     "scanner app without maps": (captures.scanner_app, remove("depth_*.png"),
                                  "like 3D Scanner App, without depth_*.png"),
 }  # fmt: skip
@@ -408,6 +433,31 @@ def test_capture_that_lacks_a_file_is_refused_with_its_name_and_that_of_the_file
     with pytest.raises(ValueError, match=re.escape(f"it looks {message}{' in scan' * below}")) as caught:
         find_pairs_of_folder(folder)
     assert "\n" not in str(caught.value)
+
+
+def unpacked(folder):
+    shutil.unpack_archive(captures.record3d(folder.parent / "scan.r3d"), folder, "zip")
+
+
+WRITTEN = {
+    "Record3D": unpacked,
+    "Stray Scanner": captures.stray, "Polycam": captures.polycam, "ARKitScenes": captures.arkitscenes,
+    "3D Scanner App": captures.scanner_app, "ZED": captures.zed, "Open3D": captures.open3d, "ScanNet": captures.scannet,
+    "ScanNet++ iPhone": captures.scannetpp, "7-Scenes or 3DMatch": captures.seven_scenes,
+    "SUN RGB-D": captures.sunrgbd, "Replica of NICE-SLAM": captures.replica,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "need"), [(name, need) for name in WRITTEN for need in FORMAT[name].needs])
+def test_each_part_that_the_table_says_a_layout_needs_is_needed_and_named_where_it_lacks(folder, name, need):
+    WRITTEN[name](folder)
+    assert not any(f"like {name}, without" in fact.text for fact in find_pairs_of_folder(folder).assumptions)
+    remove(*FORMAT[name].needs[need])(folder / "iphone" if name == "ScanNet++ iPhone" else folder)
+    try:
+        said = "; ".join(fact.text for fact in find_pairs_of_folder(folder).assumptions)
+    except ValueError as error:
+        said = str(error)
+    assert f"like {name}, without {need}" in said
 
 
 def test_capture_without_its_cameras_is_read_as_pictures_and_says_so(folder):

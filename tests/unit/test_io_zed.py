@@ -27,6 +27,26 @@ def test_cameras_that_are_not_parallel_are_rectified(tmp_path):
     assert 5 < abs(camera_of(captures.zed(tmp_path, CV_HD=0.02)).cx - 650) < 15
 
 
+def test_translation_is_of_each_resolution_or_of_all_or_0_as_the_files_of_each_age_have_it(tmp_path):
+    path = captures.zed(tmp_path, TY_HD=9.0, TZ_HD=-30.0, CV_HD=0.02) / "SN12345.conf"
+    text, each = path.read_text(), camera_of(tmp_path)
+    path.write_text(text.replace("TY_HD", "TY").replace("TZ_HD", "TZ"))
+    assert camera_of(tmp_path) == each
+    path.write_text("".join(line for line in text.splitlines(keepends=True) if not line.startswith(("TY", "TZ"))))
+    without = camera_of(tmp_path)
+    assert without == camera_of(captures.zed(tmp_path, CV_HD=0.02))
+    assert without != each
+
+
+@pytest.mark.parametrize(("name", "size"), [("FHD1200", (1200, 1920)), ("SVGA", (600, 960))])
+def test_resolutions_of_a_zed_x_have_sections_of_their_own(tmp_path, name, size):
+    path = captures.zed(tmp_path, fx=400.0) / "SN12345.conf"
+    path.write_text(path.read_text().replace("_HD", f"_{name}"))
+    captures.save(tmp_path / "left000000.png", np.zeros((*size, 3), np.uint8))
+    captures.save(tmp_path / "depth000000.png", np.full(size, 900, np.uint16))
+    np.testing.assert_allclose(camera_of(tmp_path).fx, 400, atol=0.01)
+
+
 def test_photos_of_another_size_have_no_camera(tmp_path):
     captures.zed(tmp_path)
     for kind, values in (("left", captures.photo()), ("depth", np.full(captures.SIZE, 900, np.uint16))):

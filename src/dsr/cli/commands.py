@@ -95,7 +95,7 @@ def _examine(request: DoctorRequest, *_: object) -> int:
 def _show_formats(request: FormatsRequest, console: Console, _: object) -> list[str]:
     """Print the formats that are read."""
     words = [word.lower() for word in request.names]
-    found = [each for each in FORMATS if not words or any(word in " ".join(each).lower() for word in words)]
+    found = [each for each in FORMATS if not words or any(word in show([each]).lower() for word in words)]
     if not found:
         raise ValueError(f"{' '.join(words)}: expected a word of {', '.join(each.name for each in FORMATS)}")
     console.print(show(found), markup=False, highlight=False, soft_wrap=True)

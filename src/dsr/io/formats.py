@@ -1,11 +1,13 @@
 """What is read of captures and layouts, a row a device, program or data set; docs/captures.md shows the same table.
 
-What a format is recognised by is decided by its reader, in :mod:`dsr.io.captures` and :mod:`dsr.io.layouts`.
+A row also says which files a layout's reader, in :mod:`dsr.io.captures` or :mod:`dsr.io.layouts`, needs to recognise
+it; of a folder that has some of them, :mod:`dsr.io.captures.known` tells which ones it lacks.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 _LIDAR = "bent edges, nothing thin"
@@ -25,6 +27,9 @@ class Format(NamedTuple):
         tried: the files that it was tried with: real ones, or ones that an independent program wrote.
         faults: of the sensor; empty where any sensor may have been used.
         source: address of the writer's own description or code.
+        marks: patterns of files from its folder on, of which one tells it from other layouts; ``*`` in the last part
+            stands for anything. Empty for what is a single file, or has no names of its own.
+        needs: names of its parts, each with patterns of which one has to be there.
 
     """
 
@@ -35,6 +40,8 @@ class Format(NamedTuple):
     tried: str
     faults: str
     source: str
+    marks: tuple[str, ...] = ()
+    needs: Mapping[str, tuple[str, ...]] = MappingProxyType({})
 
 
 FORMATS = (
@@ -43,9 +50,11 @@ FORMATS = (
         "share the scan's folder",
         "`camera_matrix.csv` or `odometry.csv`, with `depth/` and `rgb.mp4` or `rgb/000000.png`",
         "depth in mm (16-bit PNG, NPY); intrinsics and pose of each frame; confidence 0 to 2",
-        "written by its format",
+        "tables of a real scan; pictures written by its format",
         _LIDAR,
         "https://github.com/strayrobots/scanner/blob/main/docs/format.md",
+        marks=("odometry.csv", "camera_matrix.csv"),
+        needs={"depth/": ("depth/*",), "rgb.mp4 or rgb/": ("rgb.mp4", "rgb/*")},
     ),
     Format(
         "Record3D",
@@ -55,6 +64,8 @@ FORMATS = (
         "a real export of 341 frames",
         _LIDAR,
         "https://github.com/marek-simonik/record3d/issues/27",
+        marks=("rgbd/*.depth",),
+        needs={"metadata": ("metadata",)},
     ),
     Format(
         "Polycam",
@@ -64,6 +75,12 @@ FORMATS = (
         "written by its format",
         _LIDAR,
         "https://github.com/PolyCam/polyform#polycams-data-format",
+        marks=("keyframes/*",),
+        needs={
+            "keyframes/images/": ("keyframes/images/*.jpg", "keyframes/corrected_images/*.jpg"),
+            "keyframes/cameras/*.json": ("keyframes/cameras/*.json", "keyframes/corrected_cameras/*.json"),
+            "keyframes/depth/": ("keyframes/depth/*.png",),
+        },
     ),
     Format(
         "ARKitScenes",
@@ -73,15 +90,26 @@ FORMATS = (
         "written by its format",
         _LIDAR,
         "https://github.com/apple/ARKitScenes/blob/main/DATA.md",
+        marks=("lowres_depth/*", "lowres_wide.traj"),
+        needs={
+            "lowres_depth/": ("lowres_depth/*.png",),
+            "wide/, color/ or lowres_wide/": ("wide/*.png", "color/*.png", "lowres_wide/*.png"),
+        },
     ),
     Format(
         "3D Scanner App",
         "share the scan as All data, a folder or ZIP file",
         "`frame_*.json` with `cameraPoseARFrame`, `frame_*.jpg`, `depth_*.png`",
         "depth in mm (16-bit PNG; EXR); intrinsics and pose of each frame; confidence 0 to 2",
-        "written by its format",
+        "two real scans, of 24 and 146 photos",
         _LIDAR,
         "https://github.com/laanlabs/3dScannerApp_samples",
+        marks=("conf_00000.png", "frame_*.json"),
+        needs={
+            "frame_*.jpg": ("frame_*.jpg",),
+            "frame_*.json": ("frame_*.json",),
+            "depth_*.png": ("depth_*.png", "frame_*.exr"),
+        },
     ),
     Format(
         "ROS 1 and 2",
@@ -107,7 +135,7 @@ FORMATS = (
         "`*.mkv` with its tracks `COLOR` and `DEPTH`",
         "depth in mm (b16g), warped into the photo's view; photos as MJPEG, NV12, YUY2, BGRA; intrinsics, extrinsics "
         "and distortion of both cameras (`calibration.json`), undone; time",
-        "written by its format",
+        "written by its format; a real device's calibration gives its SDK's own numbers",
         _FLIGHT,
         "https://github.com/microsoft/Azure-Kinect-Sensor-SDK/tree/develop/src/record",
     ),
@@ -124,17 +152,19 @@ FORMATS = (
         "ZED",
         "LEFT + DEPTH_16Bit of the SDK's sample SVO Export, and `SN*.conf` of the settings folder put beside it",
         "`left000000.png`, `depth000000.png` and `SN*.conf`",
-        "depth in mm (16-bit PNG); intrinsics of the rectified photo (2208, 1920, 1280 or 672 pixels wide)",
-        "written by its format",
+        "depth in mm (16-bit PNG); intrinsics of the rectified photo (2208, 1920, 1280, 960 or 672 pixels wide)",
+        "written by its format; calibrations as other programs' tests have them",
         _STEREO,
         "https://github.com/stereolabs/zed-open-capture",
+        marks=("SN*.conf", "left000000.png"),
+        needs={"left*.png": ("left*.png",), "depth*.png": ("depth*.png",), "SN*.conf": ("SN*.conf",)},
     ),
     Format(
         "COLMAP",
         "a sparse model, in the folder of photos and depth maps, or of photos alone; or `--poses MODEL`",
         "`sparse/0/`, `sparse/`, `colmap/sparse/0/` with `images.bin` or `images.txt`, or these beside the photos",
         "intrinsics; distortion; poses; depth of the maps by its values, without maps of the model's points",
-        "written by pycolmap",
+        "written by pycolmap; models of two real scenes",
         "",
         "https://colmap.github.io/format.html",
     ),
@@ -146,15 +176,19 @@ FORMATS = (
         "written by its format",
         "",
         "https://www.open3d.org/docs/release/tutorial/reconstruction_system/system_overview.html",
+        marks=("scene/trajectory.log", "trajectory.log"),
+        needs={"color/": ("color/*", "image/*", "rgb/*"), "depth/": ("depth/*",)},
     ),
     Format(
         "TUM RGB-D",
         "a sequence of the data set, or of a program that writes its lists",
         "`rgb.txt` and `depth.txt`",
         "depth in 1/5000 m; pairs by time, within 20 ms; poses by time (`groundtruth.txt`)",
-        "written by its format",
+        "193 real frames of another program; lists and poses of a real sequence",
         _KINECT1,
         "https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats",
+        marks=("rgb.txt", "depth.txt"),
+        needs={"rgb.txt": ("rgb.txt",), "depth.txt": ("depth.txt",)},
     ),
     Format(
         "ScanNet",
@@ -164,6 +198,12 @@ FORMATS = (
         "written by its format",
         _KINECT1,
         "https://github.com/ScanNet/ScanNet/blob/master/SensReader/python/SensorData.py",
+        marks=("intrinsic/intrinsic_*.txt", "pose/*.txt"),
+        needs={
+            "color/": ("color/*",),
+            "depth/": ("depth/*.png",),
+            "intrinsic/intrinsic_color.txt": ("intrinsic/intrinsic_*.txt",),
+        },
     ),
     Format(
         "ScanNet++ iPhone",
@@ -173,15 +213,23 @@ FORMATS = (
         "written by its format",
         _LIDAR,
         "https://github.com/scannetpp/scannetpp/blob/main/iphone/prepare_iphone_data.py",
+        marks=("pose_intrinsic_imu.json", "depth.bin"),
+        needs={
+            "pose_intrinsic_imu.json": ("pose_intrinsic_imu.json",),
+            "depth.bin": ("depth.bin", "depth/*.png"),
+            "rgb.mkv": ("rgb.mkv", "rgb.mp4", "rgb/*.jpg"),
+        },
     ),
     Format(
-        "7-Scenes, 3DMatch",
+        "7-Scenes or 3DMatch",
         "a sequence",
-        "`*.color.png`, `*.depth.png`, `*.pose.txt`",
+        "`*.color.png` or `.jpg`, `*.depth.png`, `*.pose.txt`",
         "depth in mm (16-bit PNG), 65535 in holes; `camera-intrinsics.txt`, else those of its page; poses",
-        "written by its format",
+        "a real sequence of 1000 frames",
         _KINECT1,
         "https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes/",
+        marks=("*.pose.txt",),
+        needs={"*.color.png": ("*.color.png", "*.color.jpg"), "*.depth.png": ("*.depth.png",)},
     ),
     Format(
         "SUN RGB-D",
@@ -191,6 +239,8 @@ FORMATS = (
         "real frames of two sensors",
         "Kinects, Xtion and RealSense",
         "https://rgbd.cs.princeton.edu/",
+        marks=("depth_bfx/*",),
+        needs={"image/": ("image/*",), "intrinsics.txt": ("intrinsics.txt",)},
     ),
     Format(
         "Replica of NICE-SLAM",
@@ -200,6 +250,11 @@ FORMATS = (
         "written by its format",
         "",
         "https://github.com/cvg/nice-slam/blob/master/src/utils/datasets.py",
+        marks=("results/depth*.png",),
+        needs={
+            "results/frame*.jpg": ("results/frame*",),
+            "traj.txt or cam_params.json": ("traj.txt", "cam_params.json"),
+        },
     ),
     Format(
         "ICL-NUIM",

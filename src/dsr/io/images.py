@@ -36,7 +36,7 @@ MAP_SUFFIXES = (".npy", ".png", ".tiff", ".tif", ".pfm")
 _METRES = {"m": 1.0, "mm": 1e-3}
 _LONGEST = 40
 """Largest number of bytes of a number and the blank behind it."""
-_TEXT = re.compile(rb"[-+.\deEnaifNAIF\s]*")
+_TEXT = re.compile(rb"[-+.\deEnaifNAIF\s,]*")
 
 
 def pixels_in_header(path: Path) -> tuple[int, int] | None:
@@ -144,7 +144,7 @@ def read_mask(path: Path, most: int | None = None) -> np.ndarray:
 
 
 def read_numbers(path: Path, count: int) -> np.ndarray:
-    """Return the numbers of a text file, separated by blanks or line ends, as float64 (count,).
+    """Return the numbers of a text file, separated by blanks, commas or line ends, as float64 (count,).
 
     Raises:
         ValueError: it is missing, holds something else, or another number of them.
@@ -157,7 +157,7 @@ def read_numbers(path: Path, count: int) -> np.ndarray:
         raise ValueError(f"{path}: expected {count} numbers, got {size} bytes, too many for that")
     content = read_limited(path, size)
     with refusing(f"{path}: expected {count} numbers, got text or bytes that are none", ValueError):
-        values = np.array(content.split() if _TEXT.fullmatch(content) else "", dtype=np.float64)
+        values = np.array(content.replace(b",", b" ").split() if _TEXT.fullmatch(content) else "", dtype=np.float64)
     if values.size != count:
         raise ValueError(f"{path}: expected {count} numbers, got {values.size}")
     return values

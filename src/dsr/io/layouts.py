@@ -176,7 +176,7 @@ def _tum(folder: Path) -> PairingResult:
     pairs = [Pair(path.stem, path, partner[path], unit=_TUM_UNIT) for path in photos if path in partner]
     used = {*partner, *partner.values()}
     unpaired = [path for path in (*photos, *depths) if path not in used]
-    text, truth = "rgb.txt and depth.txt of TUM RGB-D: depth in 1/5000 m", folder / "groundtruth.txt"
+    text, truth = "rgb.txt and depth.txt of TUM RGB-D: depth in 1/5000 m (--depth-unit)", folder / "groundtruth.txt"
     if truth.is_file() and pairs:
         poses = _tum_poses(truth, [depths[pair.depth] for pair in pairs])
         text += f"; poses: {truth.name}, of {sum(pose is not None for pose in poses)} of {len(pairs)} frames"

@@ -10,7 +10,17 @@ from dsr.app.upsample.request import FrameChoice, UpsampleRequest
 from dsr.io.captures.colmap import add_model
 from dsr.io.inputs import FolderUnits
 from dsr.io.layouts import find_pairs_of_folder
-from dsr.io.pairs import Pair, PairingResult, add_confidence, find_pairs_of_lists, in_order
+from dsr.io.pairs import (
+    Pair,
+    PairingResult,
+    Role,
+    add_confidence,
+    find_pairs_of_lists,
+    in_order,
+    role_of,
+    role_of_words,
+    words_of,
+)
 from dsr.notes import Assumption
 from dsr.utils.guards import path_within
 
@@ -76,7 +86,11 @@ def _search(choice: FrameChoice, output: Path) -> PairingResult:
     """Return the pairs in the user's files and folders."""
     if not choice.folders:
         return find_pairs_of_lists(choice.rgb, choice.depth, choice.mask)
-    parts = [find_pairs_of_folder(folder, output) for folder in choice.folders]
+    try:
+        parts = [find_pairs_of_folder(folder, output) for folder in choice.folders]
+    except ValueError as error:
+        _expect_both(choice.folders, error)
+        raise
     if len(parts) == 1:
         return parts[0]
     pairs = [
@@ -88,3 +102,21 @@ def _search(choice: FrameChoice, output: Path) -> PairingResult:
         raise ValueError("expected folders of different names; give those of one name in commands of their own")
     facts = tuple(dict.fromkeys(fact for part in parts for fact in part.assumptions))
     return PairingResult(tuple(pairs), facts, tuple(path for part in parts for path in part.unpaired))
+
+
+def _expect_both(places: tuple[Path, ...], error: ValueError) -> None:
+    """Say how photos and depth maps are named that came as two folders or files, where their names say so."""
+    roles = {path: _role(path) for path in places if path.exists()}
+    rgb, depth = ([path for path, role in roles.items() if role == wanted] for wanted in ("rgb", "depth"))
+    if len(places) == 2 and len(rgb) == len(depth) == 1:
+        raise ValueError(
+            f"{places[0]} and {places[1]}: expected folders that hold both; photos and depth maps apart are given as "
+            f"--rgb {rgb[0]} --depth {depth[0]}"
+        ) from error
+
+
+def _role(path: Path) -> Role:
+    """Return the role of a folder by its name, or of a file by its own and, where that says nothing, its folder's."""
+    path = path.resolve()
+    role = role_of(path) if path.is_file() else role_of_words(words_of(path.name)) or "rgb"
+    return _role(path.parent) if path.is_file() and role == "rgb" else role

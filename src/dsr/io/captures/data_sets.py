@@ -2,8 +2,10 @@
 
 7-Scenes, as its page describes it (microsoft.com, RGB-D Dataset 7-Scenes); 3DMatch has the same names, and a camera.
 
-    frame-000000.color.png, frame-000000.depth.png    640 x 480; 16-bit millimetres, 65535 in holes
-    frame-000000.pose.txt                             4 x 4, from camera to world
+    frame-000000.color.png, frame-000000.depth.png    640 x 480; 16-bit millimetres, 65535 in holes; photos as JPEG in
+                                                      copies, as of https://github.com/andyzeng/tsdf-fusion-python
+    frame-000000.pose.txt                             4 x 4, from camera to world; with commas in vReLoc
+                                                      (https://github.com/loveoxford/vReLoc)
     camera-intrinsics.txt                             3DMatch: 3 x 3, here or one folder up
 
 The cameras of 7-Scenes, Kinects v1, are not calibrated; its page names 585 pixels and the centre 320, 240.
@@ -76,8 +78,8 @@ def find_seven_scenes(folder: Path) -> PairingResult | None:
     if not has_name(folder, "", ".pose.txt"):
         return None
     poses, photos, depths = (
-        {path.name.removesuffix(end): path for path in folder.glob(f"*{end}")}
-        for end in (".pose.txt", ".color.png", ".depth.png")
+        {path.name.removesuffix(end): path for end in ends for path in folder.glob(f"*{end}")}
+        for ends in ((".pose.txt",), (".color.jpg", ".color.png"), (".depth.png",))
     )
     both = sorted(photos.keys() & depths.keys(), key=natural_key)
     if not both:

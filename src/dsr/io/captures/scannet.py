@@ -40,7 +40,7 @@ from dsr.geometry.rigid_motion import as_rigid
 from dsr.io.captures.archive import PHOTO_LIMIT, Section, decode_photo, inflate
 from dsr.io.captures.stray import VideoFrame, check_count
 from dsr.io.frames import CaptureFrame, Geometry
-from dsr.io.pairs import Pair, PairingResult, numbered_files
+from dsr.io.pairs import Pair, PairingResult, join, numbered_files
 from dsr.io.trajectories import USUAL_SIZE, describe_capture, fitting_camera, intrinsics_camera
 from dsr.notes import Assumption
 from dsr.utils.guards import natural_key, opened, read_limited, refusing
@@ -71,8 +71,7 @@ def find_sens(place: Path) -> PairingResult | None:
     files = [path for path in files if path.is_file()]
     if not files:
         return None
-    parts = [_read_sens(path, f"{path.stem}/" if len(files) > 1 else "") for path in files]
-    return PairingResult(tuple(pair for part in parts for pair in part.pairs), parts[0].assumptions)
+    return join(_read_sens(path, f"{path.stem}/" if len(files) > 1 else "") for path in files)
 
 
 class _Sens(NamedTuple):

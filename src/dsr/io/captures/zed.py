@@ -6,7 +6,8 @@ https://github.com/stereolabs/zed-open-capture, examples/include/calibration.hpp
     left000000.png     the left photo, rectified
     depth000000.png    16-bit millimetres in the left photo's pixels, 0 in holes
     SN12345.conf       both cameras before they are rectified, for each resolution: fx, fy, cx, cy, k1, k2, p1, p2, k3;
-                       Baseline in mm, TY and TZ; RX, CV and RZ, a rotation vector
+                       Baseline, TY and TZ in mm, the latter for each resolution, for all, or not at all, which
+                       is 0; RX, CV and RZ, a rotation vector
 
 The camera of the rectified photo is what OpenCV's ``stereoRectify`` makes of them, as in the second source. The SDK
 may calibrate anew when it opens a camera, and then has another one within about a percent.
@@ -29,7 +30,10 @@ from dsr.notes import Assumption
 from dsr.utils.guards import numbers_in, refusing
 
 _APP = "ZED"
-_RESOLUTIONS = {(1242, 2208): "2K", (1080, 1920): "FHD", (720, 1280): "HD", (376, 672): "VGA"}
+_RESOLUTIONS = {
+    (1242, 2208): "2K", (1200, 1920): "FHD1200", (1080, 1920): "FHD", (720, 1280): "HD", (600, 960): "SVGA",
+    (376, 672): "VGA",
+}  # fmt: skip
 _CAMERA = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 
 
@@ -68,6 +72,9 @@ def _geometry(path: Path, text: str, size: tuple[int, int]) -> Geometry:
     parser = configparser.ConfigParser(strict=False, interpolation=None)
     with refusing(f"{path}: expected the calibration of {_APP}, got a damaged or foreign file", configparser.Error):
         parser.read_string(text)
+    if parser.has_section("STEREO"):
+        for name in ("TY", "TZ"):
+            parser["STEREO"].setdefault(f"{name}_{resolution}", parser.get("STEREO", name, fallback="0"))
     cameras = [_values(path, parser, f"{side}_CAM_{resolution}", _CAMERA) for side in ("LEFT", "RIGHT")]
     names = ("Baseline", *(f"{name}_{resolution}" for name in ("TY", "TZ", "RX", "CV", "RZ")))
     between = _values(path, parser, "STEREO", names)
