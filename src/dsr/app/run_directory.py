@@ -50,8 +50,8 @@ def identity_of(
     outside = hash_outside_code([*(target for _, target in imported(kept)), *targets])
     code = {"results_version": RESULTS, "scenes_version": SCENES}
     more = {} if outside is None else {"outside_code": outside}
-    if config["metrics"]["alignment"] != "none":
-        more["alignment"] = config["metrics"]["alignment"]
+    if (alignment := config.get("metrics", {}).get("alignment", "none")) != "none":
+        more["alignment"] = alignment
     return {**kept, "device": device.type, "weights_sha256": weights_hash, **code, **more}
 
 
