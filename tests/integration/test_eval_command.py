@@ -16,6 +16,8 @@ from commands import Program, run_python
 
 from dsr.app.entry import run_command
 from dsr.app.evaluate import evaluate
+from dsr.evaluation.run_files import load_results
+from dsr.report.tables import build_tables
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 SIMGEO = [
@@ -284,6 +286,32 @@ def test_changed_scene_is_refused_unless_overwritten(tmp_path, within):
     assert (tmp_path / "out" / "predictions" / "a.npz").read_bytes() != before
 
 
+def test_aligned_scores_are_a_result_of_their_own_and_say_so(tmp_path, within):
+    write_scene(tmp_path / "data" / "a")
+    arguments = ("dataset=folder", "dataset.root=data", "metrics=depth", "scale=8")
+    assert within(*arguments)[0] == 0
+    code, output, errors = within(*arguments, "metrics.alignment=affine")
+    assert (code, errors) == (0, [])
+    assert "(affine)" in output
+    as_it_is, aligned = sorted((tmp_path / "outputs" / "eval").iterdir(), key=lambda path: "alignment" in path.name)
+    assert aligned.name == as_it_is.name.replace("_seed", "_alignment-affine_seed")
+    depths = [np.load(aligned / kind / "a.npz")["depth"].astype(float).ravel() for kind in ("predictions", "scenes")]
+    scale, shift = np.polyfit(*depths, 1)
+    expected = np.sqrt(((scale * depths[0] + shift - depths[1]) ** 2).mean())
+    found = {folder: {row["metric"]: float(row["value"]) for row in rows(folder)} for folder in (as_it_is, aligned)}
+    assert found[aligned]["Depth_RMSE"] == pytest.approx(expected, rel=1e-5)
+    assert found[aligned]["Depth_RMSE"] < 0.999 * found[as_it_is]["Depth_RMSE"]
+    code, _, errors = within(*arguments, "metrics.alignment=robust", f"output_dir={aligned}")
+    assert code == 2
+    assert f"output_dir: {aligned} holds a run with another alignment; " in errors[0]
+    results = load_results([tmp_path / "outputs"])
+    assert [run.label for run in results.runs] == ["Bicubic", "Bicubic (alignment=affine)"]
+    [summary, table] = build_tables(results)
+    for notes in (summary.notes, table.notes, results.remarks):
+        assert any("Bicubic (alignment=affine) aligned to the truth" in note for note in notes)
+    np.testing.assert_allclose(results.runs[1].prediction("a").numpy().ravel(), scale * depths[0] + shift, rtol=1e-5)
+
+
 USAGE_ERRORS = {
     "an added key": (["+scal=8"], "scal: unknown key; expected names, dataset, "),
     "an added key of a group": (["+method.sharp=1"], "method.sharp: unknown key; method=bicubic takes order, "),
@@ -307,6 +335,7 @@ USAGE_ERRORS = {
     "foreign authors' weights": (["method=svlrm", "weights=file"], "file: "),
     "a missing trunk": (["metrics.lpips_trunk=no"], "metrics.lpips_trunk: expected a file, got no"),
     "a foreign trunk": (["metrics.lpips_trunk=file"], "metrics.lpips_trunk: file: expected the weights"),
+    "an unknown alignment": (["metrics.alignment=median"], "metrics.alignment: expected one of none, scale, affine, "),
     "a file as directory": (["output_dir=file"], "output_dir: file: expected a folder to write, got a file"),
     "a foreign directory": (["output_dir=foreign"], "output_dir: foreign holds files of something else"),
 }

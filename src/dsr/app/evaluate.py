@@ -233,7 +233,8 @@ def _run_claimed(prepared: _Prepared) -> pd.DataFrame:
     metrics = chosen_metrics(settings.metrics)
     formats = {metric.name: metric.format for metric in metrics}
     illustrate = functools.partial(_illustrate, folder, study.label, formats)
-    scores = score(study, folder, metrics, outcome, progress, illustrate, workers=workers)
+    alignment = settings.metrics.alignment
+    scores = score(study, folder, metrics, outcome, progress, illustrate, alignment=alignment, workers=workers)
     _save_dashboard(folder)
     _report(console, folder, scores, outcome, formats)
     if outcome.failures:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dsr.app.schema import MetricsConfig
+from dsr.metrics.alignment import ALIGNMENTS
 from dsr.metrics.catalogue import PROTOCOLS, Metric, catalogue
 from dsr.metrics.lpips import GET_TRUNK, LPIPS, load_lpips
 from dsr.utils.configuration import ConfigError, load_object
@@ -36,17 +37,19 @@ def metric_collection(settings: MetricsConfig) -> torchmetrics.MetricCollection:
 
     settings = replace(settings, protocols=list(dict.fromkeys((*settings.protocols, "paper"))))
     extra = extra_metrics(settings)
-    return visual_metrics(_network(settings, extra), extra, settings.protocols)
+    return visual_metrics(_network(settings, extra), extra, settings.protocols, settings.alignment)
 
 
 def check_metrics(settings: MetricsConfig) -> None:
     """Check a configuration's metrics, before anything is written.
 
     Raises:
-        ConfigError: a metric or the network's file is not valid.
+        ConfigError: a metric, the alignment or the network's file is not valid.
 
     """
     extra_metrics(settings)
+    if settings.alignment not in ALIGNMENTS:
+        raise ConfigError(f"metrics.alignment: expected one of {', '.join(ALIGNMENTS)}, got {settings.alignment!r}")
     if settings.lpips and settings.lpips_trunk is not None:
         perceptual_network(settings.lpips_trunk)
 

@@ -30,7 +30,9 @@ _NO_BITS = ("log_every_n_steps", "profiler", "detect_anomaly", "enable_progress_
 def identity_of(
     config: Config, weights_hash: str | None, device: torch.device, targets: Iterable[str] = ()
 ) -> dict[str, Any]:
-    """Return everything that a run's predictions depend on, as plain values: settings, weights, kind of device.
+    """Return everything that a run's results depend on, as plain values: settings, weights, kind of device.
+
+    Of the metrics it has how predictions are aligned before they are scored, where they are; the rest may change.
 
     The code counts by its numbers in :mod:`dsr.utils.versions`, that of the user's own classes by its hash.
 
@@ -48,6 +50,8 @@ def identity_of(
     outside = hash_outside_code([*(target for _, target in imported(kept)), *targets])
     code = {"results_version": RESULTS, "scenes_version": SCENES}
     more = {} if outside is None else {"outside_code": outside}
+    if (alignment := config.get("metrics", {}).get("alignment", "none")) != "none":
+        more["alignment"] = alignment
     return {**kept, "device": device.type, "weights_sha256": weights_hash, **code, **more}
 
 

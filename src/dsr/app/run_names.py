@@ -62,6 +62,8 @@ def run_name(kind: str, config: Config, identity: Identity) -> tuple[str, bool]:
         key.startswith("method.weights") for key in given_keys()
     ):
         settings.append((f"weights-{str(identity['weights_sha256'])[:8]}", True))
+    if "alignment" in identity:
+        settings.append(_setting("alignment", identity["alignment"]))
     if "precision" in given_keys():
         settings.append((str(config["precision"]), True))
     begin = (config["names"][head], f"x{round_ratio(config['scale'])}")

@@ -88,6 +88,7 @@ class MetricsConfig:
     protocols: list[str] = field(default_factory=lambda: ["paper"])
     lpips: bool = True
     lpips_trunk: str | None = None
+    alignment: str = "none"
     extra: list[str] = field(default_factory=list)
 
 

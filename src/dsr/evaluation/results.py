@@ -12,6 +12,7 @@ import pandas as pd
 from torch import Tensor
 
 from dsr.evaluation.store import load_errors, load_prediction, prediction_path, sample_path
+from dsr.metrics.alignment import ALIGNMENTS, align_map
 from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.metrics.formats import HEADLINES, MetricFormat, complete_formats, in_tables
 from dsr.notes import LIMITS, Assumption
@@ -76,6 +77,11 @@ class Run:
         """The setting of the run."""
         return BenchmarkSetting(self.dataset, self.scale, self.downsampling)
 
+    @property
+    def alignment(self) -> str:
+        """How predictions were aligned to the truth before they were scored, one of ``ALIGNMENTS``."""
+        return str(self.settings.get("alignment", "none"))
+
     @functools.cached_property
     def headlines(self) -> dict[str, dict[str, float]]:
         """The scores by scene and metric in raw units, worst of four lights for metrics of renderings."""
@@ -93,13 +99,14 @@ class Run:
             return None
 
     def prediction(self, scene: str) -> Tensor:
-        """Return the predicted depth, (1, H, W) in metres, NaN in holes.
+        """Return the predicted depth, (1, H, W) in metres, NaN in holes; aligned where it was for its scores.
 
         Raises:
-            ValueError: the file is missing or damaged.
+            ValueError: a file is missing or damaged.
 
         """
-        return load_prediction(prediction_path(self.folder, scene))
+        depth = load_prediction(prediction_path(self.folder, scene))
+        return depth if self.alignment == "none" else align_map(depth, self.sample(scene).depth, self.alignment)
 
     def expected_errors(self, scene: str) -> tuple[Tensor, Tensor] | None:
         """Return the expected errors, (1, H, W): depth in metres, normal in degrees; None for a method without them.
@@ -161,8 +168,9 @@ class Results:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """The warnings, and the notes."""
-        return (*map(str, self.warnings), *self.notes)
+        """The warnings, the notes, and how predictions were aligned."""
+        aligned = alignment_note(self.runs)
+        return (*map(str, self.warnings), *self.notes, *([aligned] if aligned else []))
 
     @property
     def scores(self) -> pd.DataFrame:
@@ -222,6 +230,21 @@ def formats_of(runs: Sequence[Run]) -> dict[str, MetricFormat]:
     """
     names = dict.fromkeys(str(name) for run in runs for name in run.scores["metric"].unique())
     return in_tables(complete_formats(names, KNOWN_FORMATS, *(run.formats for run in runs)))
+
+
+def alignment_note(runs: Sequence[Run]) -> str:
+    """Return how predictions of some runs were aligned to the truth before they were scored; empty if none were."""
+    labels: dict[str, list[str]] = {}
+    for run in runs:
+        labels.setdefault(run.alignment, [])
+        if run.label not in labels[run.alignment]:
+            labels[run.alignment].append(run.label)
+    found = [
+        f"{', '.join(of)} aligned to the truth before scoring, {ALIGNMENTS.get(how, 'unknown')} ({how})"
+        for how, of in labels.items()
+        if how != "none"
+    ]
+    return f"{'; '.join(found)}." if found else ""
 
 
 def one_per_method(runs: Sequence[Run]) -> tuple[Run, ...]:

@@ -295,8 +295,8 @@ class _Truth(NamedTuple):
 
 
 def _identity_of_method(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings that distinguish methods of one label: parameters, weights, precision."""
-    found = method_settings(settings)
+    """Return the settings that distinguish methods of one label: parameters, weights, precision, alignment."""
+    found = method_settings(settings) | {"alignment": settings.get("alignment")}
     for key, name in (("weights_sha256", "weights"), ("precision", "precision")):
         if settings.get(key) is not None:
             found[name] = str(settings[key])[:_DIGEST]

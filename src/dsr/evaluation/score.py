@@ -15,6 +15,7 @@ from torch import Tensor
 from dsr.evaluation.predict import Evaluation, Outcome, failure_line
 from dsr.evaluation.sharing import ALONE, Claims, Workers, share
 from dsr.evaluation.store import load_prediction, prediction_path, sample_path
+from dsr.metrics.alignment import align_map
 from dsr.metrics.catalogue import Metric, score_image
 from dsr.metrics.formats import HEADLINES
 from dsr.sample import DepthSample
@@ -45,6 +46,7 @@ def score(
     progress: Progress,
     illustrate: Callable[[DepthSample, Tensor, Mapping[str, float]], None],
     *,
+    alignment: str = "none",
     workers: Workers = ALONE,
 ) -> pd.DataFrame:
     """Score the predictions in ``folder`` against the samples there; write ``scores.csv`` and ``summary.json``.
@@ -56,13 +58,14 @@ def score(
         metrics: from :func:`dsr.metrics.catalogue.catalogue`.
         outcome: outcome of :func:`predict`; failures and scenes without true depth are added to it.
         illustrate: function that draws a picture of a sample, the predicted depth and its worst-of-four scores.
+        alignment: one of :data:`dsr.metrics.alignment.ALIGNMENTS`, of each prediction before it is scored and drawn.
         workers: how many scenes are scored at a time, each in a process of its own.
 
     Returns:
         The content of ``scores.csv``.
 
     """
-    names = [metric.name for metric in metrics]
+    names = [alignment, *(metric.name for metric in metrics)]
     rows: list[dict[str, Any]] = []
     with Claims(folder) as claims:
 
@@ -70,7 +73,7 @@ def score(
             return _recorded(claims, scene, _record_key(folder, scene, names))
 
         def work(scene: str, _: Progress) -> _Scored:
-            result = _score_and_illustrate(study, scene, folder, metrics, illustrate)
+            result = _score_and_illustrate(study, scene, folder, metrics, illustrate, alignment)
             claims.write_record(f"score {scene}", {"key": _record_key(folder, scene, names), **asdict(result)})
             return result
 
@@ -106,6 +109,7 @@ def _score_and_illustrate(
     folder: Path,
     metrics: tuple[Metric, ...],
     illustrate: Callable[[DepthSample, Tensor, Mapping[str, float]], None],
+    alignment: str,
 ) -> _Scored:
     """Score and draw one scene."""
     result = _Scored()
@@ -114,6 +118,10 @@ def _score_and_illustrate(
         if sample.scene != scene:  # its name becomes that of pictures
             raise ValueError(f"{sample_path(folder, scene)}: expected the scene {scene}, got {sample.scene!r:.100}")
         depth = load_prediction(prediction_path(folder, scene))
+        if sample.depth is not None and depth.shape != sample.depth.shape:
+            came, expected = tuple(depth.shape), tuple(sample.depth.shape)
+            raise ValueError(f"{scene}: expected a prediction of shape {expected}, got {came}")
+        depth = align_map(depth, sample.depth, alignment)
         result.rows = list(_score_scene(study, sample, depth, metrics))
         result.unscored = sample.depth is None
         result.notes = list(sample.notes)
@@ -132,7 +140,7 @@ def _recorded(claims: Claims, scene: str, key: Sequence[Any]) -> _Scored | None:
 
 
 def _record_key(folder: Path, scene: str, names: Sequence[str]) -> list[Any]:
-    """Return what recorded scores are of: the files of a scene and the metrics."""
+    """Return what recorded scores are of: the files of a scene, the alignment and the metrics."""
     files = (prediction_path(folder, scene), sample_path(folder, scene))
     try:
         return [[[each.stat().st_mtime_ns, each.stat().st_size] for each in files], list(names)]
@@ -175,9 +183,6 @@ def _score_scene(
     """Yield the rows of one scene; none without true depth."""
     if sample.depth is None:
         return
-    if depth.shape != sample.depth.shape:
-        came, expected = tuple(depth.shape), tuple(sample.depth.shape)
-        raise ValueError(f"{sample.scene}: expected a prediction of shape {expected}, got {came}")
     rays = sample.camera.rays(device=study.device)
     truth = sample.depth.to(study.device, torch.float64)
     for result in score_image(depth.to(study.device, torch.float64), truth, rays, metrics, sample.unit):

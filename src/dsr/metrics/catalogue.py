@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dsr.metrics import field, functional, sensor
+from dsr.metrics import depth, field, functional, normals, points, sensor
 from dsr.metrics.formats import MetricFormat
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS, MIN_SIZE, lpips_v
@@ -99,8 +99,16 @@ METRICS: tuple[Metric, ...] = (
     ),
 )
 """The metrics of the paper, in the order of ``scores.csv``; those with a position are the columns of its tables."""
-PROTOCOLS: Mapping[str, tuple[Metric, ...]] = {"paper": METRICS, "field": field.METRICS, "sensor": sensor.METRICS}
-"""Sets of metrics by name: the paper's, those that the field prints, and those for real sensors."""
+PROTOCOLS: Mapping[str, tuple[Metric, ...]] = {
+    "paper": METRICS,
+    "field": field.METRICS,
+    "sensor": sensor.METRICS,
+    "depth": depth.METRICS,
+    "normals": normals.METRICS,
+    "points": points.METRICS,
+}
+"""Sets of metrics by name: the paper's, those that the field prints, those for real sensors, and those of depth
+estimation."""
 KNOWN_FORMATS = {metric.name: metric.format for metric in METRICS}
 
 

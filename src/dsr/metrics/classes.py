@@ -18,7 +18,8 @@ import torchmetrics
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.metrics.catalogue import METRICS, catalogue
+from dsr.metrics.alignment import align_pair
+from dsr.metrics.catalogue import PROTOCOLS, catalogue
 from dsr.metrics.formats import MetricFormat
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS
@@ -116,16 +117,19 @@ class PerImageMean(torchmetrics.Metric):
         return self
 
 
+_KNOWN = {metric.name: metric for metrics in PROTOCOLS.values() for metric in metrics}
+
+
 def _named(name: str) -> Metric:
-    return next(metric for metric in METRICS if metric.name == name)
+    return _KNOWN[name]
 
 
-def _with_threshold(name: str, threshold: int, unit: str = "") -> Metric:
+def _with_threshold(name: str, threshold: float, unit: str = "") -> Metric:
     """Return the catalogue's metric of this name and threshold."""
     try:
-        return _named(f"{name}_{threshold}{unit}")
-    except StopIteration:
-        choices = ", ".join(metric.name for metric in METRICS if metric.name.startswith(name))
+        return _named(f"{name}_{threshold:g}{unit}".replace(".", "_"))
+    except KeyError:
+        choices = ", ".join(known for known in _KNOWN if known.startswith(name))
         raise ValueError(f"threshold: expected one that gives {choices}; got {threshold!r}") from None
 
 
@@ -193,20 +197,91 @@ class BumpinessD(PerImageMean):
         super().__init__(_named("Bumpiness_d"), **settings)
 
 
+class AbsRel(PerImageMean):
+    """AbsRel, a fraction."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(_named("Depth_AbsRel"), **settings)
+
+
+class DeltaAccuracy(PerImageMean):
+    """delta, the fraction of pixels whose depths have a ratio of less than 105, 110 or 125 percent."""
+
+    def __init__(self, threshold: int = 125, **settings: Any) -> None:
+        super().__init__(_with_threshold("Depth_delta", threshold), **settings)
+
+
+class SIlog(PerImageMean):
+    """SIlog; KITTI prints 100 times as much."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(_named("Depth_SIlog"), **settings)
+
+
+class NormalAngle(PerImageMean):
+    """The mean angle between normals in degrees; the median of each image where ``median``."""
+
+    def __init__(self, *, median: bool = False, **settings: Any) -> None:
+        super().__init__(_named("Normal_median" if median else "Normal_mean"), **settings)
+
+
+class NormalsWithin(PerImageMean):
+    """The fraction of normals less than 5, 7.5, 11.25, 22.5 or 30 degrees off."""
+
+    def __init__(self, threshold: float = 11.25, **settings: Any) -> None:
+        super().__init__(_with_threshold("Normal_within", threshold), **settings)
+
+
+class FlyingPixels(PerImageMean):
+    """The fraction of the points that fly between two surfaces."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(_named("Points_flying"), **settings)
+
+
+class ChamferDistance(PerImageMean):
+    """The Chamfer distance in metres."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(_named("Points_chamfer"), **settings)
+
+
+class FScore(PerImageMean):
+    """The F-score of the points: threshold 1 or 5 cm."""
+
+    def __init__(self, threshold: int = 5, **settings: Any) -> None:
+        super().__init__(_with_threshold("Points_F", threshold, "cm"), **settings)
+
+
 class SurfaceMetrics(torchmetrics.MetricCollection):
-    """A collection that makes one :class:`~dsr.metrics.functional.SurfacePair` of a batch for all of its metrics."""
+    """A collection that makes one :class:`~dsr.metrics.functional.SurfacePair` of a batch for all of its metrics.
+
+    Args:
+        *metrics: as for every torchmetrics collection.
+        alignment: one of :data:`dsr.metrics.alignment.ALIGNMENTS`, of each prediction to its truth.
+        **settings: as for every torchmetrics collection.
+
+    """
+
+    def __init__(self, *metrics: Any, alignment: str = "none", **settings: Any) -> None:
+        super().__init__(*metrics, **settings)
+        self._alignment = alignment
 
     def update(self, *batch: Any, **named: Any) -> None:
         """Add a batch; arguments as for :meth:`dsr.metrics.functional.SurfacePair.of`."""
-        super().update(SurfacePair.of(*batch, **named))
+        super().update(align_pair(SurfacePair.of(*batch, **named), self._alignment))
 
     def forward(self, *batch: Any, **named: Any) -> dict[str, Any]:
         """Add a batch as :meth:`update` does, and return its own values by name."""
-        return super().forward(SurfacePair.of(*batch, **named))
+        return super().forward(align_pair(SurfacePair.of(*batch, **named), self._alignment))
 
 
 def visual_metrics(
-    network: LPIPS | None = None, extra: Sequence[Metric] = (), protocols: Sequence[str] = ("paper",), **settings: Any
+    network: LPIPS | None = None,
+    extra: Sequence[Metric] = (),
+    protocols: Sequence[str] = ("paper",),
+    alignment: str = "none",
+    **settings: Any,
 ) -> SurfaceMetrics:
     """Return all metrics of some protocols, each of the worst of four lights, as one collection.
 
@@ -214,12 +289,13 @@ def visual_metrics(
         network: for perceptual metrics; None leaves them out.
         extra: metrics beside those of the protocols.
         protocols: names of :data:`dsr.metrics.catalogue.PROTOCOLS`.
+        alignment: see :class:`SurfaceMetrics`.
         **settings: as for every torchmetrics class.
 
     """
     chosen = catalogue(network, extra, protocols)
     metrics: dict[str, Any] = {metric.name: PerImageMean(metric, **settings) for metric in chosen}
-    return SurfaceMetrics(metrics, compute_groups=False)  # no two have the same states
+    return SurfaceMetrics(metrics, alignment=alignment, compute_groups=False)  # no two have the same states
 
 
 def compute_means(metrics: torchmetrics.MetricCollection) -> dict[str, Tensor]:

@@ -35,12 +35,22 @@ def unit_error(pair: SurfacePair) -> Tensor:
 
 def rmse(pair: SurfacePair) -> Tensor:
     """Return the RMS error in the benchmark's unit, (B,)."""
-    return masked_mean(pair.derive(unit_error).square(), pair.depth_mask).sqrt().squeeze(1)
+    return root_mean_square(pair.derive(unit_error), pair)
 
 
 def mae(pair: SurfacePair) -> Tensor:
     """Return the mean absolute error in the benchmark's unit, (B,)."""
-    return masked_mean(pair.derive(unit_error), pair.depth_mask).squeeze(1)
+    return mean_absolute(pair.derive(unit_error), pair)
+
+
+def root_mean_square(error: Tensor, pair: SurfacePair) -> Tensor:
+    """Return the RMS of an error, (B, 1, H, W), over the pixels with both depths, (B,)."""
+    return masked_mean(error.square(), pair.depth_mask).sqrt().squeeze(1)
+
+
+def mean_absolute(error: Tensor, pair: SurfacePair) -> Tensor:
+    """Return the mean of the absolute value of an error, (B, 1, H, W), over the pixels with both depths, (B,)."""
+    return masked_mean(error.abs(), pair.depth_mask).squeeze(1)
 
 
 def beyond(pair: SurfacePair, distance: float) -> Tensor:
@@ -50,8 +60,17 @@ def beyond(pair: SurfacePair, distance: float) -> Tensor:
 
 def beyond_ratio(pair: SurfacePair, ratio: float) -> Tensor:
     """Return the fraction of pixels where the larger depth is more than ``ratio`` times the smaller one, (B,)."""
+    return masked_mean(larger_ratio(pair) > ratio, pair.depth_mask).squeeze(1)
+
+
+def larger_ratio(pair: SurfacePair) -> Tensor:
+    """Return the larger of the two depths over the smaller one, (B, 1, H, W); meaningful where both are."""
+    return pair.derive(_larger_ratio)
+
+
+def _larger_ratio(pair: SurfacePair) -> Tensor:
     quotient = pair.prediction / pair.target
-    return masked_mean(torch.maximum(quotient, 1 / quotient) > ratio, pair.depth_mask).squeeze(1)
+    return torch.maximum(quotient, 1 / quotient)
 
 
 def _in_unit(unit: str) -> tuple[Metric, Metric]:

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.shading import lights, shade
-from dsr.geometry.surface import depth_to_normals, length, normal_mask
+from dsr.geometry.surface import angle_between, depth_to_normals, length, normal_mask
 from dsr.sample import CENTIMETRES, Unit
 from dsr.utils.compute_device import known_true
 
@@ -264,12 +264,36 @@ def bumpiness_d(pair: SurfacePair) -> Tensor:
     return 100 * masked_mean(squares.sqrt().clamp(max=BUMPINESS_CLIP), pair.bumpiness_mask).squeeze(1)
 
 
+def angle(pair: SurfacePair) -> Tensor:
+    """Return the angle between the two normals in degrees, (B, 1, H, W); meaningful where ``normal_mask`` is set."""
+    return pair.derive(_angle)
+
+
+def _angle(pair: SurfacePair) -> Tensor:
+    return angle_between(*pair.normals)
+
+
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
     """Return the mean over the last two axes of ``values`` (B, C, H, W) where ``mask`` (B, 1, H, W) is set, (B, C)."""
     if known_true(mask):
         return values.mean(dim=(-2, -1)) if values.is_floating_point() else values.double().mean(dim=(-2, -1))
     total = torch.where(mask, values, 0).sum(dim=(-2, -1), dtype=None if values.is_floating_point() else torch.float64)
     return total / mask.sum(dim=(-2, -1))
+
+
+def masked_median(values: Tensor, mask: Tensor) -> Tensor:
+    """Return the median over the pixels that are set, (B, 1, 1, 1); of an even number the mean of the middle two.
+
+    Args:
+        values: (B, 1, H, W).
+        mask: (B, 1, H, W) bool; NaN for an image without a set pixel.
+
+    """
+    ordered = values.masked_fill(~mask, torch.inf).flatten(1).sort(dim=1).values
+    count = mask.flatten(1).sum(dim=1, keepdim=True)
+    middle = torch.cat(((count - 1).clamp(min=0) // 2, count // 2), dim=1)
+    median = ordered.gather(1, middle.clamp(max=ordered.shape[1] - 1)).mean(dim=1)
+    return torch.where(count[:, 0] > 0, median, torch.nan)[:, None, None, None]
 
 
 def ssim_map(x: Tensor, y: Tensor) -> Tensor:

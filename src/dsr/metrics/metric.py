@@ -91,6 +91,11 @@ def depth_mask(pair: SurfacePair) -> Tensor:
     return pair.depth_mask
 
 
+def target_mask(pair: SurfacePair) -> Tensor:
+    """Return the pixels with a true depth, which a prediction should cover."""
+    return pair.target_mask
+
+
 def normal_mask(pair: SurfacePair) -> Tensor:
     """Return the pixels with a normal in both maps."""
     return pair.normal_mask

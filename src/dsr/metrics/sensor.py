@@ -10,14 +10,11 @@ leaving out what is difficult, so the fraction of scored pixels, ``Sensor_covere
 
 from __future__ import annotations
 
-from functools import cached_property
-
 import torch
 from torch import Tensor
 
-from dsr.geometry.surface import angle_between
 from dsr.metrics.formats import BEFORE_THE_PAPER, MetricFormat
-from dsr.metrics.functional import SSIM_WINDOW, SurfacePair, masked_mean, ssim_map
+from dsr.metrics.functional import SSIM_WINDOW, SurfacePair, angle, masked_mean, masked_median, ssim_map
 from dsr.metrics.metric import Metric
 
 TRUTH_EROSION = 3
@@ -55,11 +52,6 @@ class SensorComparison:
             image_dtype=pair.image_dtype,
         )
 
-    @cached_property
-    def angle(self) -> Tensor:
-        """(B, 1, H, W) angle between the normals in degrees."""
-        return angle_between(*self.surfaces.normals)
-
 
 def erode(mask: Tensor, steps: int) -> Tensor:
     """Return a mask without the pixels within ``steps`` of an unset one, counted along rows and columns.
@@ -74,21 +66,6 @@ def erode(mask: Tensor, steps: int) -> Tensor:
         along_u = padded[..., 1:-1, 2:] & padded[..., 1:-1, :-2]
         mask = mask & along_u & padded[..., 2:, 1:-1] & padded[..., :-2, 1:-1]
     return mask
-
-
-def masked_median(values: Tensor, mask: Tensor) -> Tensor:
-    """Return the median over the pixels that are set, (B, 1, 1, 1); of an even number the mean of the middle two.
-
-    Args:
-        values: (B, 1, H, W).
-        mask: (B, 1, H, W) bool; NaN for an image without a set pixel.
-
-    """
-    ordered = values.masked_fill(~mask, torch.inf).flatten(1).sort(dim=1).values
-    count = mask.flatten(1).sum(dim=1, keepdim=True)
-    middle = torch.cat(((count - 1).clamp(min=0) // 2, count // 2), dim=1)
-    median = ordered.gather(1, middle.clamp(max=ordered.shape[1] - 1)).mean(dim=1)
-    return torch.where(count[:, 0] > 0, median, torch.nan)[:, None, None, None]
 
 
 def covered(pair: SurfacePair) -> Tensor:
@@ -129,13 +106,13 @@ def dssim_v(pair: SurfacePair) -> Tensor:
 def angle_mean(pair: SurfacePair) -> Tensor:
     """Return the mean angle between the normals over the scored pixels, (B,) in degrees."""
     comparison = pair.derive(SensorComparison)
-    return masked_mean(comparison.angle, comparison.scored).squeeze(1)
+    return masked_mean(angle(comparison.surfaces), comparison.scored).squeeze(1)
 
 
 def angle_median(pair: SurfacePair) -> Tensor:
     """Return the median angle between the normals over the scored pixels, (B,) in degrees."""
     comparison = pair.derive(SensorComparison)
-    return masked_median(comparison.angle, comparison.scored).flatten()
+    return masked_median(angle(comparison.surfaces), comparison.scored).flatten()
 
 
 def _inner(pair: SurfacePair) -> Tensor:

@@ -88,6 +88,7 @@ def _is_papers(run: Run, scene: str) -> bool:
     return (
         "validation_of" not in dataset
         and not run.truth
+        and run.alignment == "none"
         and scene in (_RELEASED if dataset.get("_target_") == _FOLDER else own)
         and run.downsampling == "box"
         and run.settings.get("downsampling", {}).get("range_type") is None

@@ -13,7 +13,7 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
-from dsr.evaluation.results import Results, Run
+from dsr.evaluation.results import Results, Run, alignment_note
 from dsr.metrics.formats import Formats, MetricFormat, describe_directions
 from dsr.report.paper import average_of, implementation_note, paper_name, paper_row
 from dsr.report.tables import FACTS, Cell, Fact, Group, PaperTable, Row, build_tables, in_shown_units, shown
@@ -248,8 +248,11 @@ def score_table(run: Run, formats: Formats) -> Table:
         paper = paper_row(average_of(run.dataset, scenes), [run], scenes)
         if paper is not None and _has_any(paper, columns):
             table.add_row("", "paper", *_cells(paper, columns), style="dim")
+    notes = [alignment_note([run])]
     if any(paper is not None for paper in papers):
-        table.caption = implementation_note([paper_name(run)]) or None
+        notes.append(implementation_note([paper_name(run)]))
+    if any(notes):
+        table.caption = escape("\n".join(filter(None, notes)))
         table.caption_justify = "left"
     return table
 

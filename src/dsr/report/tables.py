@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import pandas as pd
 
-from dsr.evaluation.results import Results, Run
+from dsr.evaluation.results import Results, Run, alignment_note
 from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.metrics.formats import (
     AFTER_THE_PAPER,
@@ -270,6 +270,8 @@ class _Maker:
         title = f"{title}, x{self.scale}, {self.downsampling} downsampling"
         apart = any(run.truth and run.dataset in {place.dataset for place in places} for run in self.runs)
         notes = [f"{each.text}." for each in Results(tuple(self.runs)).warnings if apart]
+        if note := alignment_note([run for run in self.runs if run.dataset in {place.dataset for place in places}]):
+            notes.append(note)
         return PaperTable(slug, title, (*notes, *_notes(groups, columns)), columns, groups)
 
     def _group(self, about: SceneSet, labels: Sequence[str]) -> Group:

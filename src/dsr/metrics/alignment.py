@@ -1,0 +1,110 @@
+"""Alignment of a prediction to the truth, for predictions without a scale, such as those of a single photo.
+
+The field's ways, of which an evaluation takes one (``metrics.alignment``):
+
+- ``scale``: the prediction times the ratio of the medians of the two maps. It is the median scaling of Zhou et al.,
+  *Unsupervised Learning of Depth and Ego-Motion from Video*, CVPR 2017; ``evaluate_depth.py`` of nianticlabs/monodepth2
+  (b676244), which clamps to 80 m afterwards.
+- ``affine``: least squares of a z + b, clamped at 1e-4 m. ``src/util/alignment.py`` of prs-eth/Marigold (b1dffaa);
+  ``depth_affine_lst_sq_clip_by_0`` in ``evalmde/utils/depth.py`` of princeton-vl/EvalMDE (ea9e21c).
+- ``affine_disparity``: least squares of a / z + b, the inverse depth, clamped at 1e-4 / m. Ranftl et al., *Towards
+  Robust Monocular Depth Estimation* (MiDaS), TPAMI 2022; EvalMDE's ``disparity_affine_clip_by_0``.
+- ``robust``: the a z + b of the least sum of |a z + b - t| / t, clamped as ``affine`` is. Wang et al., *MoGe*, CVPR
+  2025; ``align_depth_affine`` in ``moge/utils/alignment.py`` of microsoft/MoGe (0744441), which solves it for 64 x 64
+  of the pixels. Here all count, by iteratively reweighted least squares.
+
+A prediction fitted to the truth has fewer errors than one that knows its scale: tables say which one they are of.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dsr.metrics.functional import SurfacePair, masked_median
+
+ALIGNMENTS = {
+    "none": "",
+    "scale": "by the ratio of medians",
+    "affine": "by scale and shift of depth, least squares",
+    "affine_disparity": "by scale and shift of inverse depth, least squares",
+    "robust": "by scale and shift of depth, least absolute relative errors",
+}
+"""What each alignment does, for notes."""
+LEAST = 1e-4
+"""Metres or 1 / metres: smallest value that a shift may leave."""
+_ITERATIONS, _SMALLEST_ERROR = 50, 1e-6
+"""Of the reweighted least squares: steps, and the relative error from which on weights stay finite."""
+
+
+def align(prediction: Tensor, target: Tensor, mask: Tensor | None, how: str) -> Tensor:
+    """Return each image's prediction aligned to its truth; no gradients are meant to pass.
+
+    Args:
+        prediction, target: (B, 1, H, W) orthogonal depth in metres, the prediction's up to the alignment; NaN is a
+            hole, and so is a depth that is not positive.
+        mask: (B, 1, H, W) bool, the pixels to fit; None for all. Only those with both depths count.
+        how: one of :data:`ALIGNMENTS`.
+
+    Returns:
+        (B, 1, H, W) in the prediction's dtype; its holes are as they were. NaN for an image without a pixel to fit.
+
+    Raises:
+        ValueError: there is no such alignment, or the shapes differ.
+
+    """
+    if how not in ALIGNMENTS:
+        raise ValueError(f"alignment: expected one of {', '.join(ALIGNMENTS)}, got {how!r}")
+    if prediction.shape != target.shape or prediction.dim() != 4:
+        came = f"{tuple(prediction.shape)} and {tuple(target.shape)}"
+        raise ValueError(f"prediction, target: expected two depth maps of shape (B, 1, H, W), got {came}")
+    if how == "none":
+        return prediction
+    known = prediction.isfinite() & (prediction > 0)
+    valid = known & target.isfinite() & (target > 0)
+    valid = valid if mask is None else valid & mask
+    z = torch.where(known, prediction, 1).double()
+    truth = torch.where(valid, target, 1).double()
+    if how == "scale":
+        aligned = z * (masked_median(truth, valid) / masked_median(z, valid))
+    elif how == "affine":
+        aligned = _least_squares(z, truth, valid.double()).clamp(min=LEAST)
+    elif how == "affine_disparity":
+        aligned = 1 / _least_squares(1 / z, 1 / truth, valid.double()).clamp(min=LEAST)
+    else:
+        aligned = _least_deviations(z, truth, valid / truth).clamp(min=LEAST)
+    return torch.where(known, aligned.to(prediction.dtype), prediction)
+
+
+def align_map(depth: Tensor, truth: Tensor | None, how: str) -> Tensor:
+    """Return a prediction, (1, H, W), aligned to its truth, see :func:`align`; as it is where there is none."""
+    return depth if truth is None else align(depth[None], truth[None], None, how)[0]
+
+
+def align_pair(pair: SurfacePair, how: str) -> SurfacePair:
+    """Return a pair with the prediction aligned to the truth, see :func:`align`."""
+    if how == "none":
+        return pair
+    prediction, target = pair.given
+    aligned = align(prediction, target, pair.target_mask, how)
+    return SurfacePair(aligned, target, pair.rays, pair.target_mask, unit=pair.unit, image_dtype=pair.image_dtype)
+
+
+def _least_squares(x: Tensor, y: Tensor, weights: Tensor) -> Tensor:
+    """Return a x + b with the least weighted sum of squared differences from y; the mean of y if x is constant."""
+
+    def mean(values: Tensor) -> Tensor:
+        return (weights * values).sum(dim=(-3, -2, -1), keepdim=True) / total
+
+    total = weights.sum(dim=(-3, -2, -1), keepdim=True)
+    x, middle = x - mean(x), mean(y)
+    variance = mean(x.square())
+    return torch.where(variance > 0, mean(x * (y - middle)) / variance, 0) * x + middle
+
+
+def _least_deviations(x: Tensor, y: Tensor, weights: Tensor) -> Tensor:
+    """Return a x + b with the least weighted sum of absolute differences from y."""
+    fitted = _least_squares(x, y, weights)
+    for _ in range(_ITERATIONS):
+        fitted = _least_squares(x, y, weights / torch.maximum((fitted - y).abs(), _SMALLEST_ERROR * y))
+    return fitted
