@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dsr.metrics import field, functional, sensor
+from dsr.metrics import boundaries, evalmde, field, functional, sensor
 from dsr.metrics.formats import MetricFormat
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS, MIN_SIZE, lpips_v
@@ -99,7 +99,13 @@ METRICS: tuple[Metric, ...] = (
     ),
 )
 """The metrics of the paper, in the order of ``scores.csv``; those with a position are the columns of its tables."""
-PROTOCOLS: Mapping[str, tuple[Metric, ...]] = {"paper": METRICS, "field": field.METRICS, "sensor": sensor.METRICS}
+PROTOCOLS: Mapping[str, tuple[Metric, ...]] = {
+    "paper": METRICS,
+    "field": field.METRICS,
+    "sensor": sensor.METRICS,
+    "evalmde": evalmde.METRICS,
+    "boundaries": boundaries.METRICS,
+}
 """Sets of metrics by name: the paper's, those that the field prints, and those for real sensors."""
 KNOWN_FORMATS = {metric.name: metric.format for metric in METRICS}
 
