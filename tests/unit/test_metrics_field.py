@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dsr.geometry.camera import Camera
 from dsr.metrics import field
-from dsr.metrics.catalogue import Score, catalogue, score_image
+from dsr.metrics.catalogue import PROTOCOLS, Score, catalogue, score_image
 from dsr.metrics.classes import compute_means, visual_metrics
 from dsr.metrics.functional import SurfacePair
 from dsr.sample import CENTIMETRES, Unit
@@ -122,5 +122,5 @@ def test_collection_has_the_metrics_of_the_benchmarks_that_it_saw() -> None:
 @pytest.mark.parametrize("protocols", [(), ("papers",), ("field", "none")])
 def test_unknown_protocol_is_refused(protocols: tuple[str, ...]) -> None:
     came = ", ".join(protocols) or "none"
-    with pytest.raises(ValueError, match=rf"^protocols: expected some of paper, field, sensor, got {came}$"):
+    with pytest.raises(ValueError, match=rf"^protocols: expected some of {', '.join(PROTOCOLS)}, got {came}$"):
         catalogue(protocols=protocols)

@@ -18,7 +18,7 @@ import torchmetrics
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.metrics.catalogue import METRICS, catalogue
+from dsr.metrics.catalogue import METRICS, PROTOCOLS, catalogue
 from dsr.metrics.formats import MetricFormat
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS
@@ -117,7 +117,7 @@ class PerImageMean(torchmetrics.Metric):
 
 
 def _named(name: str) -> Metric:
-    return next(metric for metric in METRICS if metric.name == name)
+    return next(metric for metrics in PROTOCOLS.values() for metric in metrics if metric.name == name)
 
 
 def _with_threshold(name: str, threshold: int, unit: str = "") -> Metric:
@@ -191,6 +191,34 @@ class BumpinessD(PerImageMean):
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(_named("Bumpiness_d"), **settings)
+
+
+class RelNormal(PerImageMean):
+    """RelNormal of EvalMDE in radians."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(_named("EvalMDE_RelNormal"), **settings)
+
+
+class SAWAH(PerImageMean):
+    """SAWA-H of EvalMDE."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(_named("EvalMDE_SAWA_H"), **settings)
+
+
+class BoundaryF1(PerImageMean):
+    """Boundary F1 of Depth Pro."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(_named("DepthPro_F1"), **settings)
+
+
+class MoGeF1(PerImageMean):
+    """Boundary F1 of MoGe: radius 1, 2 or 3."""
+
+    def __init__(self, radius: int = 1, **settings: Any) -> None:
+        super().__init__(_named(f"MoGe_F1_{radius}"), **settings)
 
 
 class SurfaceMetrics(torchmetrics.MetricCollection):

@@ -16,14 +16,15 @@ take the depth there to be 1 m.) ``EvalMDE_covered`` is the fraction of the true
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable
 from functools import lru_cache, partial
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from dsr.geometry.surface import length
 from dsr.metrics.boundaries import boundary_f1, covered, true_mask
 from dsr.metrics.formats import BEFORE_THE_PAPER, MetricFormat
 from dsr.metrics.functional import SurfacePair
@@ -33,9 +34,8 @@ SCALES = (1, 2, 4, 8)
 RADIUS, SMALLEST_RADIUS = 32, 3
 """Pixels: the largest distance of two normals along each axis at scale 1, and the smallest such limit at any scale."""
 PAIRS = 10**6
-DRAWN = 1_100_000
-"""Sobol points of one draw; more are drawn until enough pairs lie inside the map."""
 CHUNK = 1 << 15
+"""How many points or pairs are worked on at a time."""
 STEEPEST = 1e-5
 """Sine of the angle between the two edges of a triangle below which it has no normal."""
 RATIO = 1.25**0.125
@@ -99,19 +99,18 @@ def sobol_pairs(height: int, width: int, device: torch.device) -> list[Tensor]:
     for scale in SCALES:
         h, w = (-(-size // scale) - 2 for size in (height, width))
         reach = min(max(RADIUS // scale, SMALLEST_RADIUS), max(h, w))
-        pairs: list[Tensor] = []
-        for index in itertools.count():
-            if index == len(draws):
-                draws.append(engine.draw(DRAWN, dtype=torch.float64).T.contiguous())
-            v, u, down, right = draws[index]
-            ends = [v * h, u * w, v * h + (down * 2 * reach - reach), u * w + (right * 2 * reach - reach)]
-            v, u, below, beside = (each.floor_().int() for each in ends)
+        keys: list[Tensor] = []
+        while sum(map(len, keys)) < PAIRS:
+            if len(keys) == len(draws):
+                draws.append(engine.draw(CHUNK, dtype=torch.float64).T.contiguous())
+            v, u, down, right = draws[len(keys)]
+            v, u = v * h, u * w
+            below, beside = (v + (2 * reach * down - reach)).floor(), (u + (2 * reach * right - reach)).floor()
             inside = (below >= 0) & (below < h) & (beside >= 0) & (beside < w)
-            pairs.append(torch.stack((v * w + u, below * w + beside))[:, inside])
-            if sum(each.shape[1] for each in pairs) >= PAIRS:
-                break
-        chosen = torch.cat(pairs, dim=1)[:, :PAIRS]
-        found.append(chosen[:, chosen[0].argsort()].to(device))
+            first, second = (v.floor() * w + u.floor()).long(), (below * w + beside).long()
+            keys.append(((first << 32) + second)[inside])
+        ordered = torch.from_numpy(np.sort(torch.cat(keys)[:PAIRS].numpy()))
+        found.append(torch.stack((ordered >> 32, ordered & 0xFFFFFFFF)).int().to(device))
     return found
 
 
@@ -172,12 +171,13 @@ def _taken(values: Tensor, source: Tensor) -> Tensor:
 
 def _normals(points: Tensor, mask: Tensor) -> Tensor:
     """Return the normals of points (B, 3, h, w) and whether there are any, in 32 bits, (B, 4, h - 2, w - 2)."""
-    corners = [points[..., :-2, :-2], points[..., 2:, :-2], points[..., :-2, 2:]]
-    down, right = (torch.nn.functional.normalize(each - corners[0], dim=1) for each in corners[1:])
-    normals = torch.linalg.cross(down, right, dim=1)
-    lengths = normals.norm(dim=1, keepdim=True)
-    valid = (lengths > STEEPEST) & mask[..., :-2, :-2] & mask[..., 2:, :-2] & mask[..., :-2, 2:]
-    return torch.cat((torch.where(valid, normals / lengths, 0), valid), dim=1).float()
+    corner, below, beside = points[..., :-2, :-2], points[..., 2:, :-2], points[..., :-2, 2:]
+    (a, b, c), (d, e, f) = ((each - corner).unbind(1) for each in (below, beside))
+    normal = torch.stack((b * f - c * e, c * d - a * f, a * e - b * d), dim=1)
+    lengths = length(normal)
+    least = STEEPEST * (length(below - corner) * length(beside - corner))
+    valid = (lengths > least) & mask[..., :-2, :-2] & mask[..., 2:, :-2] & mask[..., :-2, 2:]
+    return torch.cat((torch.where(valid, normal / lengths, 0), valid), dim=1).float()
 
 
 def _pair_error(rows: Tensor, first: Tensor, second: Tensor) -> Tensor:
