@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dsr.metrics import depth, field, functional, normals, points, sensor
+from dsr.metrics import boundaries, depth, evalmde, field, functional, normals, points, sensor
 from dsr.metrics.formats import MetricFormat
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS, MIN_SIZE, lpips_v
@@ -106,9 +106,11 @@ PROTOCOLS: Mapping[str, tuple[Metric, ...]] = {
     "depth": depth.METRICS,
     "normals": normals.METRICS,
     "points": points.METRICS,
+    "evalmde": evalmde.METRICS,
+    "boundaries": boundaries.METRICS,
 }
-"""Sets of metrics by name: the paper's, those that the field prints, those for real sensors, and those of depth
-estimation."""
+"""Sets of metrics by name: the paper's, those that the field prints, those for real sensors, of depth estimation, of
+EvalMDE and of boundaries."""
 KNOWN_FORMATS = {metric.name: metric.format for metric in METRICS}
 
 

@@ -253,6 +253,34 @@ class FScore(PerImageMean):
         super().__init__(_with_threshold("Points_F", threshold, "cm"), **settings)
 
 
+class RelNormal(PerImageMean):
+    """RelNormal of EvalMDE in radians."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(_named("EvalMDE_RelNormal"), **settings)
+
+
+class SAWAH(PerImageMean):
+    """SAWA-H of EvalMDE."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(_named("EvalMDE_SAWA_H"), **settings)
+
+
+class BoundaryF1(PerImageMean):
+    """Boundary F1 of Depth Pro."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(_named("DepthPro_F1"), **settings)
+
+
+class MoGeF1(PerImageMean):
+    """Boundary F1 of MoGe: radius 1, 2 or 3."""
+
+    def __init__(self, radius: int = 1, **settings: Any) -> None:
+        super().__init__(_named(f"MoGe_F1_{radius}"), **settings)
+
+
 class SurfaceMetrics(torchmetrics.MetricCollection):
     """A collection that makes one :class:`~dsr.metrics.functional.SurfacePair` of a batch for all of its metrics.
 

@@ -1,0 +1,331 @@
+"""Metrics of depth boundaries and planes: Depth Pro's and MoGe's boundary F1, and the geometric errors of iBims-1.
+
+An edge is a pair of pixels whose depths have a ratio above a threshold; a prediction has found it where its own ratio
+of the same two pixels is above the same threshold. This is scale-invariant and has no tolerance in place.
+
+- Depth Pro (Bochkovskii et al., *Depth Pro: Sharp Monocular Metric Depth in Less Than a Second*, ICLR 2025; apple/
+  ml-depth-pro 9efe5c1, ``src/depth_pro/eval/boundary_metrics.py``): neighbours in a row or column, thresholds 1.05 to
+  1.25; precision and recall are means over four directions, and a direction without edges counts 0. So a truth may have
+  less than 1 against itself, which is the ceiling beside it. Its recall for mattes thins the predicted edges.
+- MoGe (Wang et al., *MoGe-2*, NeurIPS 2025; microsoft/MoGe 0744441, ``moge/test/metrics.py``): pixels up to a radius
+  apart in any direction, counted together, a border of the radius left out. Its code has the names of precision and
+  recall the wrong way round, which F1 does not see, and weights thresholds by 0.05 to 0.25 where Depth Pro has 1.05 to
+  1.25.
+- iBims-1 (Koch et al., *Evaluation of CNN-based Single-Image Depth Estimation Methods*, ECCV Workshops 2018; its Python
+  v0.9, in bulatko/DepthART b2bc093, ``mde/capsules/meter/ibims_official/evaluate_ibims_error_metrics.py``): depth
+  boundary error, directed depth error, planarity error.
+
+Unknown truth is left out of both maps. A prediction has no edges at its holes: true edges there are missed, but false
+ones cannot be there, and the directed errors leave holes out as their authors do. Therefore the fraction of the true
+pixels that have a prediction, ``Boundary_covered``, belongs to every score.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dsr.metrics.formats import BEFORE_THE_PAPER, MetricFormat
+from dsr.metrics.functional import SurfacePair, masked_mean
+from dsr.metrics.metric import Metric, depth_mask
+from dsr.metrics.sensor import masked_median
+
+RATIOS = tuple(np.linspace(1.05, 1.25, 10).tolist())
+"""Depth Pro's thresholds, which are their own weights; MoGe's weights are 1 less."""
+MOGE_RADII = (1, 2, 3)
+DBE_RANGE = 10.0
+"""Pixels; predicted boundaries further from a true one are no boundaries of it."""
+DDE_PLANE = 3.0
+"""Metres from the camera to the plane that the directed depth error is about."""
+PLANE_SHARE = 0.05
+"""Smaller planes, as a fraction of the image, have no planarity error."""
+
+
+def known_maps(pair: SurfacePair) -> tuple[Tensor, Tensor]:
+    """Return the prediction and the truth with NaN where the truth is unknown, and in holes, (B, 1, H, W) each."""
+    prediction, target = pair.given
+    return torch.where(pair.depth_mask, prediction, torch.nan), torch.where(pair.target_mask, target, torch.nan)
+
+
+def count_edges(first: Tensor, second: Tensor) -> Tensor:
+    """Return how many ratios are above each of :data:`RATIOS`.
+
+    Args:
+        first, second: (B, ...) ratios of the same pairs of pixels in two maps; NaN is below.
+
+    Returns:
+        (B, 3, T) int64: in the first map, in the second, in both.
+
+    """
+    images, steps = len(first), len(RATIOS) + 1
+    first, second = first.flatten(1), second.flatten(1)
+    image, place = ((first > RATIOS[0]) | (second > RATIOS[0])).nonzero(as_tuple=True)  # the others are above none
+    thresholds = torch.tensor(RATIOS, dtype=first.dtype, device=first.device)
+    levels = [torch.bucketize(ratios[image, place].nan_to_num(0), thresholds) for ratios in (first, second)]
+    levels.append(torch.minimum(*levels))
+    counts = [(image * steps + level).bincount(minlength=images * steps).view(images, steps) for level in levels]
+    return torch.stack(counts, dim=1).flip(2).cumsum(2).flip(2)[..., 1:]
+
+
+def boundary_counts(pair: SurfacePair) -> Tensor:
+    """Return the counts of Depth Pro's edges, (B, 4, 3, T): for each direction as :func:`count_edges` has them."""
+    maps = pair.derive(known_maps)
+    along_u = [(each[..., 1:], each[..., :-1]) for each in maps]
+    along_v = [(each[..., 1:, :], each[..., :-1, :]) for each in maps]
+    ways = [way for axis in (along_u, along_v) for way in (axis, [(near, far) for far, near in axis])]
+    return torch.stack([count_edges(*(far / near for far, near in way)) for way in ways], dim=1)
+
+
+def boundary_f1(pair: SurfacePair) -> Tensor:
+    """Return Depth Pro's scale-invariant boundary F1, (B,), a fraction, higher is better."""
+    predicted, true, both = pair.derive(boundary_counts).double().unbind(2)
+    recall, precision = ((both / each.clamp(min=1)).mean(dim=1) for each in (true, predicted))
+    f1 = 2 * recall * precision / (recall + precision).clamp(min=torch.finfo(torch.float64).tiny)
+    return _over_thresholds(f1, 0, pair)
+
+
+def boundary_ceiling(pair: SurfacePair) -> Tensor:
+    """Return :func:`boundary_f1` of the truth against itself, (B,): the fraction of directions that have edges."""
+    true = pair.derive(boundary_counts)[:, :, 1]
+    return _over_thresholds((true > 0).double().mean(dim=1), 0, pair)
+
+
+def moge_f1(pair: SurfacePair, radius: int = 1) -> Tensor:
+    """Return MoGe's boundary F1, (B,), a fraction, higher is better; without any true edge it is 0, as theirs is.
+
+    Args:
+        pair: the two maps, larger than 2 ``radius`` in height and width. MoGe fits the prediction to the truth first
+            by a factor, which changes nothing, or by a factor and an offset, which is up to the caller.
+        radius: largest distance of the two pixels, 1, 2 or 3 in their tables.
+
+    """
+    height, width = (size - 2 * radius for size in pair.target.shape[-2:])
+    span = range(2 * radius + 1)
+    near = [(v, u) for v in span for u in span if 0 < math.hypot(v - radius, u - radius) <= radius]
+    maps = pair.derive(known_maps)
+    inner = [each[..., radius : radius + height, radius : radius + width] for each in maps]
+    counts = []
+    for v, u in near:
+        ratios = (each[..., v : v + height, u : u + width] / own for each, own in zip(maps, inner, strict=True))
+        counts.append(count_edges(*ratios))
+    predicted, true, both = torch.stack(counts).sum(dim=0).double().unbind(1)
+    return _over_thresholds(2 * both / (predicted + true).clamp(min=1), 1, pair)
+
+
+def matte_recall(depth: Tensor, matte: Tensor, opaque: float = 0.1) -> Tensor:
+    """Return Depth Pro's boundary recall for a matte, (B,), a fraction, higher is better.
+
+    The outline of the foreground is found where the prediction is nearer inside than outside. Of the neighbouring
+    predicted edges in a row (a column) only the one with the largest ratio counts.
+
+    Args:
+        depth: (B, 1, H, W) predicted depth of any unit; NaN and what is not positive has no edges.
+        matte: (B, 1, H, W) fraction of each pixel that the foreground covers.
+        opaque: a pixel with more is foreground.
+
+    Raises:
+        ValueError: the shapes differ.
+
+    """
+    if depth.shape != matte.shape or depth.dim() != 4:
+        raise ValueError(f"depth, matte: expected two (B, 1, H, W), got {tuple(depth.shape)}, {tuple(matte.shape)}")
+    depth, inside = torch.where(depth > 0, depth, torch.nan), matte > opaque
+    recalls = []
+    for z, mask in ((depth[:, 0], inside[:, 0]), (depth[:, 0].mT, inside[:, 0].mT)):
+        for near, far in ((slice(1, None), slice(-1)), (slice(-1), slice(1, None))):
+            true, ratio = mask[..., near] & ~mask[..., far], z[..., far] / z[..., near]
+            found = torch.stack([(_thinned(ratio, t) & true).sum(dim=(1, 2)) for t in RATIOS], dim=1)
+            recalls.append(found / true.sum(dim=(1, 2)).clamp(min=1)[:, None])
+    weights = torch.tensor(RATIOS, dtype=torch.float64, device=depth.device)
+    return torch.stack(recalls).mean(dim=0).double() @ (weights / weights.sum())
+
+
+def depth_boundaries(depth: Tensor) -> Tensor:
+    """Return the boundaries of a depth map as iBims-1 finds them in a prediction, (B, 1, H, W) bool.
+
+    A Canny filter (sigma sqrt 2, thresholds 0.1 and 0.2, scikit-image's) of the map between its own smallest and
+    largest depth. Holes, NaN, have none, nor has what the filter's Gaussian reaches from them.
+    """
+    from skimage.feature import canny  # noqa: PLC0415 - it takes a third of a second to import
+
+    found = torch.zeros(depth.shape, dtype=torch.bool)
+    for image, each in zip(found[:, 0], depth.detach()[:, 0].cpu().float().numpy(), strict=True):
+        if np.isfinite(each).any():
+            shifted = each - np.nanmin(each)
+            with np.errstate(invalid="ignore"):
+                scaled = shifted / np.nanmax(shifted)  # as they have it, in 32 bits
+            image[:] = torch.from_numpy(canny(scaled, math.sqrt(2), 0.1, 0.2))
+    return found.to(depth.device)
+
+
+def depth_boundary_error(found: Tensor, true: Tensor) -> tuple[Tensor, Tensor]:
+    """Return iBims-1's accuracy and completeness of depth boundaries, (B,) float64 each, in pixels, lower is better.
+
+    The accuracy is the mean distance of found boundaries to true ones, of those less than :data:`DBE_RANGE` away; the
+    completeness that of true boundaries to found ones, without limit. Both are that range where no boundary is found
+    within it, and NaN without true ones. Others' copies limit the completeness, too, or use thresholds of .15 and .3.
+
+    Args:
+        found, true: (B, 1, H, W) bool. iBims-1 has annotated true ones, and ``depth_boundaries(prediction)``.
+
+    """
+    from scipy.ndimage import distance_transform_edt  # noqa: PLC0415 - as above
+
+    errors = torch.full((2, len(true)), torch.nan, dtype=torch.float64)
+    for i, (mine, theirs) in enumerate(zip(found[:, 0].cpu().numpy(), true[:, 0].cpu().numpy(), strict=True)):
+        if theirs.any():
+            distance = distance_transform_edt(~theirs)
+            near = mine & (distance < DBE_RANGE)
+            both = (distance[near].mean(), distance_transform_edt(~mine)[theirs].mean()) if near.any() else DBE_RANGE
+            errors[:, i] = torch.tensor(both, dtype=torch.float64)
+    accuracy, completeness = errors.to(true.device)
+    return accuracy, completeness
+
+
+def directed_depth_error(pair: SurfacePair, plane: float = DDE_PLANE) -> Tensor:
+    """Return iBims-1's directed depth error, (B, 3): the fractions of pixels that are on the right side of a plane,
+    in front of it though the truth is not, and beyond it though the truth is not.
+
+    Their code overwrites depths by 0 and 1 before it has compared all of them, so that planes nearer than 1 m came out
+    wrong; here they are right.
+
+    Args:
+        pair: the two maps.
+        plane: its orthogonal depth in metres.
+
+    """  # noqa: D205
+    before, truly = pair.prediction <= plane, pair.target <= plane
+    parts = (before == truly, before & ~truly, ~before & truly)
+    return torch.cat([masked_mean(part, pair.depth_mask) for part in parts], dim=1)
+
+
+def planarity(
+    pair: SurfacePair, planes: Tensor, normals: Tensor | None = None, smallest: float = PLANE_SHARE
+) -> tuple[Tensor, Tensor]:
+    """Return iBims-1's planarity errors of each plane, (B, P) each, lower is better.
+
+    The prediction is scaled by the ratio of the two median depths in the plane, and a plane is fitted to its points.
+    An image's error is the mean over its planes (``nanmean``).
+
+    Args:
+        pair: the two maps.
+        planes: (B, P, H, W) bool, the pixels of each plane.
+        normals: (B, P, 3) true normals, x right, y down, z forward, of either sign; None for those of the truth's
+            points, fitted alike. iBims-1's are x right, y forward, z up: theirs of (x, y, z) is (x, -z, y) here.
+        smallest: planes with a lower fraction of the image's pixels get NaN.
+
+    Returns:
+        The flatness, the standard deviation of the points about their plane in metres, and the orientation, the angle
+        between its normal and the true one in degrees.
+
+    Raises:
+        ValueError: shapes or types do not fit together.
+
+    """
+    images, _, height, width = pair.target.shape
+    if planes.dim() != 4 or planes.dtype != torch.bool or planes[:, :1].shape != pair.target.shape:
+        came = f"{planes.dtype} {tuple(planes.shape)}"
+        raise ValueError(f"planes: expected bool of shape ({images}, P, {height}, {width}), got {came}")
+    if normals is not None and normals.shape != (*planes.shape[:2], 3):
+        raise ValueError(f"normals: expected shape {(*planes.shape[:2], 3)}, got {tuple(normals.shape)}")
+    flatness, orientation = [], []
+    for index in range(planes.shape[1]):
+        mask = planes[:, index : index + 1] & pair.depth_mask
+        factor = masked_median(pair.target, mask) / masked_median(pair.prediction, mask)
+        spread, normal = _fit_plane(pair.prediction * factor * pair.rays, mask)
+        true = _fit_plane(pair.target * pair.rays, mask)[1] if normals is None else normals[:, index].to(normal)
+        angle = torch.atan2(torch.linalg.cross(normal, true).norm(dim=1), (normal * true).sum(dim=1).abs())
+        large = mask.double().mean(dim=(1, 2, 3)) >= smallest
+        flatness.append(torch.where(large, spread, torch.nan))
+        orientation.append(torch.where(large, angle.rad2deg(), torch.nan))
+    return torch.stack(flatness, dim=1), torch.stack(orientation, dim=1)
+
+
+def covered(pair: SurfacePair) -> Tensor:
+    """Return the fraction of the true pixels that have a prediction, (B,)."""
+    return masked_mean(pair.depth_mask, pair.target_mask).squeeze(1)
+
+
+def true_mask(pair: SurfacePair) -> Tensor:
+    """Return the pixels with a truth."""
+    return pair.target_mask
+
+
+def _over_thresholds(scores: Tensor, less: float, pair: SurfacePair) -> Tensor:
+    """Return the mean of (B, T) weighted by the thresholds less something, (B,); NaN for an image without a truth."""
+    weights = torch.tensor(RATIOS, dtype=scores.dtype, device=scores.device) - less
+    return torch.where(pair.target_mask.flatten(1).any(dim=1), scores @ (weights / weights.sum()), torch.nan)
+
+
+def _thinned(ratio: Tensor, threshold: float) -> Tensor:
+    """Return where a ratio, (B, H, W), is the first largest of a run above the threshold along its row."""
+    above = ratio > threshold
+    starts = above.clone()
+    starts[..., 1:] &= ~above[..., :-1]
+    place = above.flatten().nonzero()[:, 0]
+    run, values = starts.flatten()[place].cumsum(0) - 1, ratio.flatten()[place]
+    largest = values == values.new_zeros(len(place)).scatter_reduce(0, run, values, "amax")[run]
+    run, place = run[largest], place[largest]
+    thinned = torch.zeros_like(above).flatten()
+    thinned[place[run.diff(prepend=run.new_tensor([-1])) != 0]] = True
+    return thinned.view_as(above)
+
+
+def _fit_plane(points: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the standard deviation of points (B, 3, H, W) about their plane, (B,), and its normal, (B, 3)."""
+    weights = mask.to(points).flatten(2)
+    weights = weights / weights.sum(dim=2, keepdim=True).clamp(min=1)
+    centred = torch.where(mask, points, 0).flatten(2)
+    centred = centred - (centred * weights).sum(dim=2, keepdim=True)
+    values, vectors = torch.linalg.eigh((centred * weights) @ centred.mT)
+    return values[:, 0].clamp(min=0).sqrt(), vectors[..., 0]
+
+
+def _boundary_errors(pair: SurfacePair) -> tuple[Tensor, Tensor]:
+    prediction, target = pair.derive(known_maps)
+    return depth_boundary_error(depth_boundaries(prediction), depth_boundaries(target))
+
+
+def _boundary_error(pair: SurfacePair, part: int) -> Tensor:
+    return pair.derive(_boundary_errors)[part]
+
+
+def _directed_error(pair: SurfacePair, part: int) -> Tensor:
+    return pair.derive(directed_depth_error)[:, part]
+
+
+def _shown(heading: str, unit: str, factor: float = 1e2, *, higher: bool = True, column: bool = True) -> MetricFormat:
+    return MetricFormat(heading, unit, factor, 1, higher, BEFORE_THE_PAPER if column else None)
+
+
+def _moge(radius: int) -> Metric:
+    shown = _shown("F1", f"MoGe, {radius} px, %", column=radius == 1)
+    return Metric(f"MoGe_F1_{radius}", partial(moge_f1, radius=radius), true_mask, shown, min_size=7, whole=True)
+
+
+def _boundary(part: int, name: str) -> Metric:
+    shown = _shown("DBE", f"{name}, px", 1, higher=False)
+    return Metric(f"DBE_{name}", partial(_boundary_error, part=part), true_mask, shown, min_size=3, whole=True)
+
+
+def _directed(part: int, name: str) -> Metric:
+    shown = _shown("DDE", f"3 m, {name}, %", higher=part == 0, column=False)
+    return Metric(f"DDE_{name}", partial(_directed_error, part=part), depth_mask, shown, min_size=1, whole=True)
+
+
+METRICS: tuple[Metric, ...] = (
+    Metric("DepthPro_F1", boundary_f1, true_mask, _shown("F1", "Depth Pro, %"), whole=True),
+    Metric("DepthPro_ceiling", boundary_ceiling, true_mask, _shown("F1", "of the truth, %"), whole=True),
+    *map(_moge, MOGE_RADII),
+    _boundary(0, "accuracy"),
+    _boundary(1, "completeness"),
+    _directed(0, "right"),
+    _directed(1, "before"),
+    _directed(2, "beyond"),
+    Metric("Boundary_covered", covered, true_mask, _shown("Covered", "%"), min_size=1, whole=True),
+)
+"""The metrics of ``metrics=boundaries``."""

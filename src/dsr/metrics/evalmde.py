@@ -1,0 +1,246 @@
+"""RelNormal and SAWA-H of EvalMDE, and the parts of SAWA-H singly.
+
+Chen et al., *Toward a Better Evaluation of Monocular Depth* (arXiv 2510.19814); princeton-vl/EvalMDE ea9e21c,
+``evalmde/metrics/rel_normal.py``, ``sawa_h.py``, ``standard.py``, ``boundary.py``, ``evalmde/utils/depth.py`` and
+``downsample.py``. SAWA-H is a sum of errors whose weights were fitted to what people see; lower is better throughout:
+
+    SAWA-H = 3.65 wkdr + 0.18 beyond_disparity + 0.01 beyond_depth + 0.20 (1 - boundary F1) + 1.94 RelNormal
+
+What differs from their code: WKDR is of all pairs of pixels, of which theirs draws 10^7 without a seed, so that SAWA-H
+scatters by 3e-4 there; Sobol points are in 64 bits, theirs in 32 bits move RelNormal by 3e-6.
+
+Pixels without a truth are left out. Holes of a prediction count as errors, so that none pays: pi in RelNormal, as
+theirs do; a pair of pixels in the wrong order; beyond the ratio; no edges where the truth has some. (Their other parts
+take the depth there to be 1 m.) ``EvalMDE_covered`` is the fraction of the true pixels that have a prediction.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import lru_cache, partial
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dsr.geometry.surface import length
+from dsr.metrics.boundaries import boundary_f1, covered, true_mask
+from dsr.metrics.formats import BEFORE_THE_PAPER, MetricFormat
+from dsr.metrics.functional import SurfacePair
+from dsr.metrics.metric import Metric
+
+SCALES = (1, 2, 4, 8)
+RADIUS, SMALLEST_RADIUS = 32, 3
+"""Pixels: the largest distance of two normals along each axis at scale 1, and the smallest such limit at any scale."""
+PAIRS = 10**6
+CHUNK = 1 << 15
+"""How many points or pairs are worked on at a time."""
+STEEPEST = 1e-5
+"""Sine of the angle between the two edges of a triangle below which it has no normal."""
+RATIO = 1.25**0.125
+NEAREST = 1e-4
+"""Lower limit of aligned depth in metres and of aligned disparity in 1/m."""
+MIN_SIZE = 2 * SCALES[-1] + 1
+"""Of a map with a normal at the coarsest scale."""
+
+
+def rel_normal(pair: SurfacePair) -> Tensor:
+    """Return RelNormal, (B,) in radians: lower is better: the mean error of the angle between two normals.
+
+    At each of four scales, 10^6 pairs of pixels up to 32 pixels of scale 1 apart, and the mean of the scales' means. At
+    a coarser scale each block has the depth of the pixel with a truth that is nearest to its centre. Normals are of the
+    triangle of a pixel and those two to the right and two below. A pair counts if the truth has both normals, as an
+    error of pi if the prediction has not.
+    """
+    shape, found = pair.target.shape, []
+    target = torch.where(pair.target_mask, pair.given[1], 1)
+    for scale, (first, second) in zip(SCALES, sobol_pairs(*shape[-2:], pair.target.device), strict=True):
+        source = nearest_to_centres(pair.target_mask, scale)
+        rays = _taken(pair.rays.expand(len(source), -1, -1, -1), source)
+        maps = ((target, pair.target_mask), (pair.prediction, pair.depth_mask))
+        surfaces = [_normals(_taken(depth, source) * rays, _taken(mask, source)) for depth, mask in maps]
+        rows = torch.cat(surfaces, dim=1).flatten(2).mT.contiguous()  # (B, h w, 8): what a pair reads lies together
+        found.append(torch.stack([_pair_error(each, first, second) for each in rows]))
+    return torch.stack(found, dim=1).nanmean(dim=1)
+
+
+def nearest_to_centres(mask: Tensor, scale: int) -> Tensor:
+    """Return which pixel stands for each block: the set one nearest to its centre, the first of equally near ones.
+
+    Args:
+        mask: (B, 1, H, W) bool.
+        scale: size of a block in pixels; blocks at the lower and right border may be smaller.
+
+    Returns:
+        (B, ceil(H / scale), ceil(W / scale)) int64, indices into the flattened map; of any pixel where none is set.
+
+    """
+    (height, width), device = mask.shape[-2:], mask.device
+    padded = torch.nn.functional.pad(mask, (0, -width % scale, 0, -height % scale))
+    blocks = torch.nn.functional.pixel_unshuffle(padded.float(), scale)  # (B, scale^2, h, w), row by row
+    offset = torch.arange(scale, device=device)
+    squares = (2 * offset - scale + 1) ** 2
+    order = (squares[:, None] + squares).flatten().argsort(stable=True)
+    inside = order[blocks[:, order].argmax(dim=1)]
+    v = torch.arange(blocks.shape[-2], device=device)[:, None] * scale + inside // scale
+    u = torch.arange(blocks.shape[-1], device=device) * scale + inside % scale
+    return v.clamp(max=height - 1) * width + u.clamp(max=width - 1)
+
+
+@lru_cache(maxsize=2)
+def sobol_pairs(height: int, width: int, device: torch.device) -> list[Tensor]:
+    """Return the pairs of normals that RelNormal compares, for each scale (2, 10^6) int32 indices into its normal map.
+
+    They are the first of an unscrambled Sobol sequence in four dimensions inside the map (position, offset), sorted
+    by the first index, so that what is read lies together.
+    """
+    engine, draws, found = torch.quasirandom.SobolEngine(4), [], []
+    for scale in SCALES:
+        h, w = (-(-size // scale) - 2 for size in (height, width))
+        reach = min(max(RADIUS // scale, SMALLEST_RADIUS), max(h, w))
+        keys: list[Tensor] = []
+        while sum(map(len, keys)) < PAIRS:
+            if len(keys) == len(draws):
+                draws.append(engine.draw(CHUNK, dtype=torch.float64).T.contiguous())
+            v, u, down, right = draws[len(keys)]
+            v, u = v * h, u * w
+            below, beside = (v + (2 * reach * down - reach)).floor(), (u + (2 * reach * right - reach)).floor()
+            inside = (below >= 0) & (below < h) & (beside >= 0) & (beside < w)
+            first, second = (v.floor() * w + u.floor()).long(), (below * w + beside).long()
+            keys.append(((first << 32) + second)[inside])
+        ordered = torch.from_numpy(np.sort(torch.cat(keys)[:PAIRS].numpy()))
+        found.append(torch.stack((ordered >> 32, ordered & 0xFFFFFFFF)).int().to(device))
+    return found
+
+
+def wkdr(pair: SurfacePair) -> Tensor:
+    """Return the fraction of pairs of pixels that the prediction has in another order, (B,), lower is better.
+
+    Of all ordered pairs (i, j) of pixels with a truth, those for which only one map has depth i < depth j, and those
+    with a hole of the prediction. It is 1 less the accuracy of the authors' code, which has no weights.
+    """
+    from scipy.stats import kendalltau  # noqa: PLC0415 - it takes half a second to import
+
+    errors = []
+    for prediction, target, known, true in zip(*pair.given, pair.depth_mask, pair.target_mask, strict=True):
+        x, y = (each[known].detach().float().cpu() for each in (prediction, target))  # in 32 bits, as theirs
+        keys = [each.view(torch.int32) for each in (x, y)]
+        ties = [_tied(each) for each in (*keys, (keys[0].long() << 32) | keys[1])]
+        count = len(x) * (len(x) - 1) // 2
+        tau = kendalltau(x.numpy(), y.numpy()).statistic if count > max(ties) else 0
+        balance = round(tau * math.sqrt((count - ties[0]) * (count - ties[1])))  # concordant pairs less discordant ones
+        right = len(x) ** 2 - (count - ties[2] - balance)
+        total = int(true.sum())
+        errors.append(1 - right / total**2 if total else math.nan)
+    return torch.tensor(errors, dtype=torch.float64, device=pair.target.device)
+
+
+def beyond_disparity(pair: SurfacePair) -> Tensor:
+    """Return the fraction of pixels with a ratio to the true depth of 1.25^.125 or more, (B,), lower is better.
+
+    The prediction's inverse depth is first fitted to the true one by a factor and an offset, by least squares.
+    """
+    aligned = _aligned(pair, 1 / pair.prediction, 1 / pair.target)
+    return _beyond(pair, 1 / aligned)
+
+
+def beyond_depth(pair: SurfacePair) -> Tensor:
+    """Return the same as :func:`beyond_disparity` with depth itself fitted to the true depth, (B,), lower is better."""
+    return _beyond(pair, _aligned(pair, pair.prediction, pair.target))
+
+
+def boundary_error(pair: SurfacePair) -> Tensor:
+    """Return 1 less the boundary F1 of Depth Pro, (B,), see :func:`dsr.metrics.boundaries.boundary_f1`."""
+    return 1 - pair.derive(boundary_f1)
+
+
+WEIGHTS = {wkdr: 3.65, beyond_disparity: 0.18, beyond_depth: 0.01, boundary_error: 0.20, rel_normal: 1.94}
+
+
+def sawa_h(pair: SurfacePair) -> Tensor:
+    """Return SAWA-H, (B,), without unit, lower is better: the sum of the parts by :data:`WEIGHTS`."""
+    return torch.stack([weight * pair.derive(part).double() for part, weight in WEIGHTS.items()]).sum(dim=0)
+
+
+def _taken(values: Tensor, source: Tensor) -> Tensor:
+    """Return the pixels (B, h, w) of a map (B, C, H, W), (B, C, h, w)."""
+    index = source.flatten(1)[:, None].expand(-1, values.shape[1], -1)
+    return values.flatten(2).gather(2, index).unflatten(2, source.shape[1:])
+
+
+def _normals(points: Tensor, mask: Tensor) -> Tensor:
+    """Return the normals of points (B, 3, h, w) and whether there are any, in 32 bits, (B, 4, h - 2, w - 2)."""
+    corner, below, beside = points[..., :-2, :-2], points[..., 2:, :-2], points[..., :-2, 2:]
+    (a, b, c), (d, e, f) = ((each - corner).unbind(1) for each in (below, beside))
+    normal = torch.stack((b * f - c * e, c * d - a * f, a * e - b * d), dim=1)
+    lengths = length(normal)
+    least = STEEPEST * (length(below - corner) * length(beside - corner))
+    valid = (lengths > least) & mask[..., :-2, :-2] & mask[..., 2:, :-2] & mask[..., :-2, 2:]
+    return torch.cat((torch.where(valid, normal / lengths, 0), valid), dim=1).float()
+
+
+def _pair_error(rows: Tensor, first: Tensor, second: Tensor) -> Tensor:
+    """Return the mean error of the pairs of one scale, (): NaN if the truth has both normals of none.
+
+    Args:
+        rows: (N, 8) true normals and whether there are any, then the predicted ones.
+        first, second: (P,) indices of rows.
+
+    """
+    sums = rows.new_zeros(8, 2)  # of squares: a matrix product, as sums over three columns are slow
+    sums[:3, 0] = sums[4:7, 1] = 1
+    total, count = rows.new_zeros((), dtype=torch.float64), rows.new_zeros((), dtype=torch.float64)
+    for one, two in zip(first.split(CHUNK), second.split(CHUNK), strict=True):
+        a, b = rows.index_select(0, one), rows.index_select(0, two)
+        valid = a[:, 3::4] * b[:, 3::4]
+        # from the chord, which is precise for small angles in 32 bits
+        angles = 2 * (((a - b).square() @ sums).sqrt() / 2).clamp(max=1).asin()
+        error = torch.where(valid[:, 1] > 0, (angles[:, 0] - angles[:, 1]).abs(), torch.pi)
+        total, count = total + (error * valid[:, 0]).sum(), count + valid[:, 0].sum()
+    return total / count
+
+
+def _tied(keys: Tensor) -> int:
+    """Return how many pairs of numbers are equal."""
+    counts = torch.unique_consecutive(keys.sort().values, return_counts=True)[1]
+    return int((counts * (counts - 1) // 2).sum())
+
+
+def _aligned(pair: SurfacePair, values: Tensor, target: Tensor) -> Tensor:
+    """Return values with the factor and offset that fit them best to a target, clamped, (B, 1, H, W) in 64 bits."""
+    weights = pair.depth_mask.double()
+    count = weights.sum(dim=(2, 3), keepdim=True)
+    values, target = values.double(), target.double()
+    means = [(each * weights).sum(dim=(2, 3), keepdim=True) / count for each in (values, target)]
+    centred = (values - means[0]) * weights
+    square = (centred * centred).sum(dim=(2, 3), keepdim=True)
+    factor = (centred * (target - means[1])).sum(dim=(2, 3), keepdim=True) / square.clamp(min=1e-300)
+    return ((values - means[0]) * factor + means[1]).clamp(min=NEAREST)
+
+
+def _beyond(pair: SurfacePair, aligned: Tensor) -> Tensor:
+    ratio = torch.maximum(aligned / pair.target, pair.target / aligned)
+    within = ((ratio < RATIO) & pair.depth_mask).sum(dim=(1, 2, 3))
+    return 1 - within.double() / pair.target_mask.sum(dim=(1, 2, 3))
+
+
+def _metric(name: str, part: Callable[[SurfacePair], Tensor], shown: MetricFormat) -> Metric:
+    function = partial(SurfacePair.derive, make=part)  # SAWA-H has the parts of the same pair
+    return Metric(f"EvalMDE_{name}", function, true_mask, shown, min_size=MIN_SIZE, whole=True)
+
+
+METRICS: tuple[Metric, ...] = (
+    _metric("SAWA_H", sawa_h, MetricFormat("SAWA-H", position=BEFORE_THE_PAPER)),
+    _metric("RelNormal", rel_normal, MetricFormat("RelNormal", "rad", position=BEFORE_THE_PAPER)),
+    _metric("WKDR", wkdr, MetricFormat("WKDR", "%", 1e2, 2, position=None)),
+    _metric(
+        "beyond_disparity",
+        beyond_disparity,
+        MetricFormat("Beyond", "1.028 x, disparity fitted, %", 1e2, 1, position=None),
+    ),
+    _metric("beyond_depth", beyond_depth, MetricFormat("Beyond", "1.028 x, depth fitted, %", 1e2, 1, position=None)),
+    _metric("boundary", boundary_error, MetricFormat("1 - F1", "Depth Pro, %", 1e2, 1, position=None)),
+    _metric("covered", covered, MetricFormat("Covered", "%", 1e2, 1, higher_is_better=True, position=BEFORE_THE_PAPER)),
+)
+"""The metrics of ``metrics=evalmde``."""

@@ -1,0 +1,252 @@
+"""Boundary F1, boundary errors and planes: the values of their authors' code, closed forms, holes."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+from depth_steps import CAMERA, UNKNOWN, Array, holed, pair_of, steps
+from torch import Tensor
+
+from dsr.geometry.camera import Camera
+from dsr.metrics import boundaries
+from dsr.metrics.catalogue import catalogue, score_image
+from dsr.metrics.classes import BoundaryF1, MoGeF1
+from dsr.metrics.functional import SurfacePair
+
+METRICS = catalogue(protocols=("boundaries",))
+THRESHOLDS = np.linspace(1.05, 1.25, 10)
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def _scores(pair: SurfacePair) -> dict[str, float]:
+    return {metric.name: metric.function(pair).item() for metric in METRICS}
+
+
+def _flat(height: int, width: int, near: float = 2.0) -> Array:
+    return np.full((height, width), near)
+
+
+def _mask(array: Array) -> Tensor:
+    return torch.from_numpy(array.astype(bool))[None, None]
+
+
+def test_f1_is_that_of_the_authors_code() -> None:
+    """Executed: apple/ml-depth-pro 9efe5c1, with NaN for unknown truth in both, and microsoft/MoGe 0744441, masked."""
+    assert boundaries.boundary_f1(pair_of(*steps())).item() == pytest.approx(0.9412966260255751, abs=1e-9)
+    assert boundaries.boundary_f1(pair_of(*holed())).item() == pytest.approx(0.9410074986768165, abs=1e-9)
+    found = [boundaries.moge_f1(pair_of(*holed()), radius).item() for radius in (1, 2, 3)]
+    assert found == pytest.approx([0.9343173556422164, 0.9498005727791907, 0.9622220048683943], abs=1e-6)
+
+
+def test_ceiling_is_the_truth_against_itself() -> None:
+    _, truth = holed()
+    few = _flat(8, 9)
+    few[:, 4:], few[2:, 7:] = 2.3, 2.6
+    for each, expected in ((truth, 1), (few, 0.21316425120772947)):
+        pair = pair_of(each, each, CAMERA.crop(0, 0, *each.shape))
+        assert boundaries.boundary_f1(pair).item() == pytest.approx(expected)
+        assert boundaries.boundary_ceiling(pair).item() == pytest.approx(expected)
+        assert boundaries.boundary_ceiling(pair_of(*steps())).item() == 1
+
+
+def test_f1_of_a_step_is_a_count() -> None:
+    """A step of 1.1 is above three thresholds of Depth Pro, in one of four directions; half of it is displaced."""
+    truth = _flat(10, 12)
+    truth[:, 6:] *= 1.1
+    prediction = truth.copy()
+    prediction[:5, 5:] = 2.2
+    pair = pair_of(5 * prediction, truth, CAMERA.crop(0, 0, 10, 12))
+    passed = THRESHOLDS[:3].sum()
+    # 5 of 10 edges to the right are found; one to the bottom is predicted where the displaced part ends
+    precision, recall = (5 / 10) / 4, (5 / 10) / 4
+    assert precision == recall
+    assert boundaries.boundary_f1(pair).item() == pytest.approx(recall * passed / THRESHOLDS.sum())
+    # MoGe leaves out a border: rows 1 to 8, of which 4 are found, and the one edge downwards
+    share = (THRESHOLDS[:3] - 1).sum() / (THRESHOLDS - 1).sum()
+    assert boundaries.moge_f1(pair).item() == pytest.approx(2 * 4 / (8 + 9) * share)
+
+
+def test_f1_knows_no_scale() -> None:
+    prediction, truth = holed()
+    found, scaled = (_scores(pair_of(factor * prediction, truth)) for factor in (1, 4))
+    for name in ("DepthPro_F1", *(f"MoGe_F1_{radius}" for radius in (1, 2, 3)), "DBE_accuracy", "DBE_completeness"):
+        assert scaled[name] == found[name]
+
+
+def test_recall_of_mattes_is_that_of_the_authors_code() -> None:
+    """Executed: apple/ml-depth-pro 9efe5c1; the blurred map has runs of edges, which are thinned."""
+    prediction, truth = steps()
+    matte = ((truth - 0.004 * np.mgrid[:120, :160][1]) < 2.4).astype(float)
+    shifted = [np.roll(prediction, *each) for each in ((1, 1), (2, 1), (1, 0))]
+    blurred = (prediction + shifted[0] + shifted[1] + shifted[2]) / 4
+    depths = torch.from_numpy(np.stack((prediction, blurred)))[:, None]
+    found = boundaries.matte_recall(depths, torch.from_numpy(matte).expand(2, 1, 120, 160))
+    assert found.tolist() == pytest.approx([0.9223585950080515, 0.5124908581588835], abs=1e-6)
+
+
+def test_recall_of_mattes_needs_the_foreground_in_front() -> None:
+    matte = np.zeros((12, 14))
+    matte[4:8, 5:9] = 1
+    for near, expected in ((1.0, 1), (3.0, 0)):
+        depth = torch.from_numpy(np.where(matte > 0, near, 2))[None, None]
+        assert boundaries.matte_recall(depth, torch.from_numpy(matte)[None, None]).item() == expected
+
+
+def test_boundary_error_is_that_of_the_authors_code() -> None:
+    """Executed: Koch's v0.9 in bulatko/DepthART b2bc093, ``compute_depth_boundary_error``, 0 for holes."""
+    prediction, truth = steps()
+    edges = np.zeros_like(truth)
+    edges[:, 24::24] = edges[18::18] = 1
+
+    def errors(depth: Array, true: Tensor) -> list[float]:
+        found = boundaries.depth_boundaries(torch.from_numpy(depth)[None, None])
+        return [each.item() for each in boundaries.depth_boundary_error(found, true)]
+
+    assert errors(prediction, _mask(edges)) == pytest.approx([0.4078452444922085, 0.3103054352942402])
+    prediction[30:40, 100:140] = np.nan
+    assert errors(prediction, _mask(edges)) == pytest.approx([0.4120397428404442, 0.9073455151906227])
+    assert errors(_flat(120, 160) + 1e-3 * np.arange(160), _mask(edges)) == [10, 10]
+    assert errors(np.full_like(truth, np.nan), _mask(edges)) == [10, 10]
+    assert all(map(math.isnan, errors(prediction, _mask(np.zeros_like(edges)))))
+    prediction, truth = holed()
+    prediction[UNKNOWN] = np.nan  # unknown truth is left out of both maps
+    own = boundaries.depth_boundaries(torch.from_numpy(truth)[None, None])
+    assert errors(prediction, own) == pytest.approx([0.2465675057208238, 0.3090241343126967])
+    found = _scores(pair_of(*holed()))
+    assert [found["DBE_accuracy"], found["DBE_completeness"]] == errors(prediction, own)
+
+
+def test_boundary_error_is_a_distance() -> None:
+    found, true = np.zeros((40, 60)), np.zeros((40, 60))
+    true[:, 30], found[:, 33], found[:, 45] = 1, 1, 1  # the second is of no true boundary
+    assert [each.item() for each in boundaries.depth_boundary_error(_mask(found), _mask(true))] == [3, 3]
+    found[:, 33] = 0
+    assert [each.item() for each in boundaries.depth_boundary_error(_mask(found), _mask(true))] == [10, 10]
+    found[0, 39] = 1  # completeness has no limit
+    accuracy, completeness = boundaries.depth_boundary_error(_mask(found), _mask(true))
+    assert accuracy.item() == 9
+    assert completeness.item() == pytest.approx(np.minimum(15, np.hypot(9, np.arange(40))).mean())
+
+
+def test_directed_error_is_that_of_the_authors_code_from_a_metre_on() -> None:
+    """Executed: the same file's ``compute_directed_depth_error`` of the pixels with a truth."""
+    pair = pair_of(*holed())
+    for plane, expected in ((2.5, [0.96210191, 0, 0.03789809]), (3.0, [0.95440552, 0.00244161, 0.04315287])):
+        assert boundaries.directed_depth_error(pair, plane)[0].tolist() == pytest.approx(expected, abs=1e-8)
+    near = pair_of(*(each / 10 for each in holed()))  # where theirs counts its own marks
+    assert boundaries.directed_depth_error(near, 0.25).tolist() == boundaries.directed_depth_error(pair, 2.5).tolist()
+
+
+def test_planarity_is_that_of_the_authors_code() -> None:
+    """Executed: the same file's ``compute_planarity_error``, of a large plane and of one that is too small."""
+    planes = torch.zeros(1, 2, 120, 160, dtype=torch.bool)
+    planes[:, 0, 10:], planes[:, 1, :10] = True, True
+    x, forward, up = 0.1, -0.2, 0.97
+    normals = torch.tensor([x, -up, forward]).expand(1, 2, 3) / math.hypot(x, forward, up)
+    share = 0.05 * 640 * 480 / (120 * 160)
+    flatness, orientation = boundaries.planarity(pair_of(*holed()), planes, normals, share)
+    np.testing.assert_allclose(flatness.numpy(), [[0.3394655151, np.nan]], rtol=1e-5)
+    np.testing.assert_allclose(orientation.numpy(), [[77.97643416, np.nan]], rtol=1e-5)
+
+
+def test_planarity_of_planes_is_exact() -> None:
+    camera = Camera(80, 60, 70.0, 71.0, 40.0, 30.0)
+    rays = camera.rays().numpy().astype(float)
+    true, tilted = np.array((0.1, 0.2, 1.0)), np.array((0.1, 0.5, 1.0))
+    planes = torch.zeros(1, 2, 60, 80, dtype=torch.bool)
+    planes[0, 0, :30], planes[0, 1, 30:] = True, True
+    maps = [2 / np.einsum("c,chw->hw", each, rays) for each in (true, tilted)]
+    maps[1][:30] = 3 * maps[0][:30]  # a factor is no error
+    maps[1][2, 3:9] = np.nan
+    angle = math.degrees(math.acos(true @ tilted / np.linalg.norm(true) / np.linalg.norm(tilted)))
+    for normals in (None, -torch.from_numpy(true / np.linalg.norm(true)).expand(1, 2, 3)):
+        flatness, orientation = boundaries.planarity(pair_of(maps[1], maps[0], camera), planes, normals)
+        np.testing.assert_allclose(flatness.numpy(), [[0, 0]], atol=1e-6)
+        np.testing.assert_allclose(orientation.numpy(), [[0, angle]], atol=1e-4)
+    # a wave of amplitude 1 cm about a plane that faces the camera
+    wave = 2 + 0.01 * np.where(np.indices((60, 80)).sum(axis=0) % 2, 1, -1)
+    flatness, _ = boundaries.planarity(pair_of(wave, np.full_like(wave, 2), camera), planes[:, :1] | planes[:, 1:])
+    assert flatness.item() == pytest.approx(0.01, rel=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("planes", "normals", "message"),
+    [
+        (torch.zeros(1, 2, 120, 160), None, r"^planes: expected bool of shape \(1, P, 120, 160\), got torch.float32"),
+        (torch.zeros(1, 2, 120, 159, dtype=torch.bool), None, r"^planes: expected bool"),
+        (torch.zeros(1, 2, 120, 160, dtype=torch.bool), torch.zeros(1, 3), r"^normals: expected shape \(1, 2, 3\)"),
+    ],
+)
+def test_planes_that_do_not_fit_are_refused(planes: Tensor, normals: Tensor | None, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        boundaries.planarity(pair_of(*steps()), planes, normals)
+
+
+def test_matte_of_another_size_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"^depth, matte: expected two \(B, 1, H, W\), got"):
+        boundaries.matte_recall(torch.ones(1, 1, 4, 5), torch.ones(1, 1, 4, 4))
+
+
+def test_scores_of_a_batch_are_those_of_its_images() -> None:
+    maps = [holed(), steps(1)]
+    maps[1][0][5:9, 10:50] = np.nan
+    batch = pair_of(*(np.stack(each) for each in zip(*maps, strict=True)))
+    for metric in METRICS:
+        singles = torch.cat([metric.function(pair_of(*each)) for each in maps])
+        torch.testing.assert_close(metric.function(batch), singles, msg=metric.name)
+    planes = torch.ones(2, 1, 120, 160, dtype=torch.bool)
+    images = (boundaries.planarity(pair_of(*each), planes[:1]) for each in maps)
+    pairs = zip(boundaries.planarity(batch, planes), *images, strict=True)
+    for found, *singles in pairs:
+        torch.testing.assert_close(found, torch.cat(singles))
+
+
+def test_unknown_truth_reaches_no_score() -> None:
+    prediction, truth = holed()
+    changed = prediction.copy()
+    changed[UNKNOWN] = 40
+    assert _scores(pair_of(changed, truth)) == _scores(pair_of(prediction, truth))
+
+
+def test_holes_of_a_prediction_miss_the_edges_there_and_are_told() -> None:
+    _, truth = steps()
+    prediction = truth.copy()
+    full = _scores(pair_of(prediction, truth))
+    prediction[30:60, 30:90] = np.nan
+    part = _scores(pair_of(prediction, truth))
+    assert all(
+        part[name] < 0.95 and full[name] == pytest.approx(1)
+        for name in ("DepthPro_F1", "MoGe_F1_1", "MoGe_F1_2", "MoGe_F1_3")
+    )
+    assert part["DBE_completeness"] > full["DBE_completeness"] == 0
+    assert part["DepthPro_ceiling"] == full["DepthPro_ceiling"]
+    assert part["Boundary_covered"] == pytest.approx(1 - 30 * 60 / truth.size)
+
+
+def test_images_without_truth_have_no_score() -> None:
+    prediction, truth = (torch.from_numpy(each)[None] for each in steps())
+    rows = list(score_image(prediction, torch.full_like(truth, torch.nan), CAMERA.rays(), METRICS))
+    assert len(rows) == len(METRICS)
+    assert all(math.isnan(row.value) and row.valid_share == 0 for row in rows)
+
+
+@pytest.mark.parametrize("size", list(itertools.product((1, 2, 3, 6, 7), (1, 8))))
+def test_small_maps_have_the_scores_that_they_are_large_enough_for(size: tuple[int, int]) -> None:
+    maps = (torch.full((1, *size), depth) for depth in (2.0, 2.1))
+    rows = {row.metric: row.value for row in score_image(*maps, CAMERA.rays()[:, : size[0], : size[1]], METRICS)}
+    for metric in METRICS:
+        if min(size) < metric.min_size:
+            assert math.isnan(rows[metric.name])
+    assert rows["DDE_right"] == rows["Boundary_covered"] == 1
+
+
+def test_classes_have_the_functions_values() -> None:
+    pair = pair_of(*steps())
+    for made, expected in ((BoundaryF1(), boundaries.boundary_f1(pair)), (MoGeF1(2), boundaries.moge_f1(pair, 2))):
+        made.update(pair)
+        assert made.compute().item() == expected.item()

@@ -1,0 +1,208 @@
+"""RelNormal and SAWA-H: the values that EvalMDE's own code gives, closed forms, and that no hole pays."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from depth_steps import CAMERA, UNKNOWN, Array, holed, pair_of, steps
+
+from dsr.geometry.camera import Camera
+from dsr.metrics import evalmde
+from dsr.metrics.catalogue import catalogue, score_image
+from dsr.metrics.classes import SAWAH, RelNormal
+from dsr.metrics.functional import SurfacePair
+
+METRICS = catalogue(protocols=("evalmde",))
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def _scores(pair: SurfacePair) -> dict[str, float]:
+    return {metric.name.removeprefix("EvalMDE_"): metric.function(pair).item() for metric in METRICS}
+
+
+def test_scores_of_their_example_are_those_of_their_code(shared: Path) -> None:
+    folder = shared / "expected" / "evalmde"
+    stored, prediction = (np.load(folder / name) for name in ("gt_depth.npz", "depthpro_gt_focal.npz"))
+    truth = np.where(stored["valid"], stored["depth"], np.nan)
+    camera = Camera(truth.shape[1], truth.shape[0], *map(float, stored["intr"]))
+    found = _scores(pair_of(prediction["depth"], truth, camera))
+    assert found["RelNormal"] == pytest.approx(0.3900358, abs=2e-6)
+    assert 1 - found["WKDR"] == pytest.approx(0.935941, abs=1e-6)
+    assert 1 - found["beyond_disparity"] == pytest.approx(0.0821814, abs=1e-6)
+    assert 1 - found["beyond_depth"] == pytest.approx(0.0192955, abs=1e-6)
+    assert 1 - found["boundary"] == pytest.approx(0.4865937, abs=1e-6)
+    assert found["SAWA_H"] == pytest.approx(1.26818, abs=5e-6)
+    assert found["SAWA_H"] == pytest.approx(1.2682612, abs=1e-3)  # of one draw of their random pairs
+
+
+def test_scores_of_a_map_with_unknown_truth_are_those_of_their_code() -> None:
+    """Executed: princeton-vl/EvalMDE ea9e21c, with the truth's mask; WKDR by its formula for all pairs."""
+    found = _scores(pair_of(*holed()))
+    expected = {
+        "RelNormal": 0.2733864,
+        "WKDR": 0.0234771497,
+        "beyond_disparity": 0.0446922,
+        "beyond_depth": 0.0447452,
+        "boundary": 0.0589925013,
+        "covered": 1,
+    }
+    weights = dict(
+        zip(
+            ("WKDR", "beyond_disparity", "beyond_depth", "boundary", "RelNormal"),
+            (3.65, 0.18, 0.01, 0.2, 1.94),
+            strict=True,
+        )
+    )
+    expected["SAWA_H"] = sum(weight * expected[name] for name, weight in weights.items())
+    assert found == pytest.approx(expected, abs=5e-6)
+
+
+def test_missing_normals_are_errors_of_pi_as_in_their_code() -> None:
+    prediction, truth = holed()
+    prediction[20:30, 90:120] = np.nan
+    assert evalmde.rel_normal(pair_of(prediction, truth)).item() == pytest.approx(0.4731059, abs=5e-6)
+
+
+def test_no_part_gains_by_leaving_pixels_out() -> None:
+    prediction, truth = steps()
+    full = _scores(pair_of(prediction, truth))
+    prediction[30:60, 30:90] = np.nan
+    part = _scores(pair_of(prediction, truth))
+    assert all(part[name] > value for name, value in full.items() if name != "covered")
+    assert part["covered"] == pytest.approx(1 - 30 * 60 / truth.size)
+
+
+def test_truth_is_without_error_whatever_its_scale() -> None:
+    _, truth = holed()
+    found = _scores(pair_of(3 * np.nan_to_num(truth, nan=1.0), truth))
+    assert found.pop("covered") == 1
+    assert found == pytest.approx(dict.fromkeys(found, 0), abs=1e-5)
+
+
+def test_affine_maps_of_depth_and_of_disparity_are_fitted() -> None:
+    _, truth = steps()
+    truth = 3 * truth.astype(float) - 5
+    of_depth, of_disparity = pair_of(0.3 * truth + 0.7, truth), pair_of(1 / (0.4 / truth + 0.1), truth)
+    assert evalmde.beyond_depth(of_depth).item() == evalmde.beyond_disparity(of_disparity).item() == 0
+    assert evalmde.beyond_depth(of_disparity).item() > 0
+    assert evalmde.beyond_disparity(of_depth).item() > 0
+
+
+def test_two_tilted_halves_have_the_angle_between_them() -> None:
+    """A prediction is flat, the truth a roof: a pair errs by the roof's angle if it is astride of the ridge."""
+    size = 200
+    camera = Camera(size, size, 100.0, 100.0, 99.5, 99.5)
+    x = camera.rays()[0].numpy()
+    slope = math.tan(math.radians(20))
+    roof = 2 / (1 + slope * np.abs(x))  # planes z = 2 -+ slope x
+    astride = evalmde.rel_normal(pair_of(np.full_like(roof, 2), roof, camera)).item()
+    # offsets d are even within 32 pixels; of the columns, |d| in 200 are astride, but near the border some are outside
+    offsets, columns = np.arange(-32, 32), np.arange(198)
+    inside = (columns[:, None] + offsets >= 0) & (columns[:, None] + offsets < 198)
+    share = (inside & ((columns[:, None] < 99) != (columns[:, None] + offsets < 99))).sum() / inside.sum()
+    assert astride == pytest.approx(math.radians(40) * share, rel=0.06)
+
+
+@pytest.mark.parametrize("ties", [False, True])
+def test_order_of_pairs_is_counted_one_by_one(ties: bool) -> None:
+    random = np.random.default_rng(0)
+    prediction, truth = 1 + random.random((2, 18, 20))
+    if ties:
+        prediction, truth = prediction.round(1), truth.round(1)
+    prediction[2, :5], truth[5:7, 3] = np.nan, np.nan
+    known = np.isfinite(truth)
+    p, t = prediction[known].astype("f"), truth[known].astype("f")
+    wrong = ((p[:, None] < p) != (t[:, None] < t)) | np.isnan(p[:, None]) | np.isnan(p)
+    found = evalmde.wkdr(pair_of(prediction, truth, CAMERA.crop(0, 0, 18, 20)))
+    assert found.item() == pytest.approx(wrong.mean(), rel=1e-12)
+
+
+@pytest.mark.parametrize("constant", [1, 0])
+def test_order_of_a_map_of_one_depth_is_defined(constant: int) -> None:
+    maps = [1 + np.arange(360.0).reshape(18, 20), np.full((18, 20), 2.0)]
+    found = evalmde.wkdr(pair_of(*maps[:: constant or -1], CAMERA.crop(0, 0, 18, 20)))
+    assert found.item() == pytest.approx((1 - 1 / 360) / 2)
+
+
+def _block_pixels(mask: Array, scale: int) -> Array:
+    """Return what stands for each block, pixel by pixel; -1 where nothing does."""
+    height, width = (-(-size // scale) for size in mask.shape)
+    found = np.full((height, width), -1)
+    for i, j in itertools.product(range(height), range(width)):
+        centre = np.array((i, j)) * scale + (scale - 1) / 2
+        near = [
+            (((np.array((v, u)) - centre) ** 2).sum(), v * mask.shape[1] + u)
+            for v in range(i * scale, min((i + 1) * scale, mask.shape[0]))
+            for u in range(j * scale, min((j + 1) * scale, mask.shape[1]))
+            if mask[v, u]
+        ]
+        found[i, j] = min(near, default=(0, -1))[1]
+    return found
+
+
+@pytest.mark.parametrize("scale", evalmde.SCALES)
+def test_coarse_levels_have_the_known_pixel_nearest_to_the_centre(scale: int) -> None:
+    mask = np.random.default_rng(scale).random((21, 27)) < 0.2
+    found = evalmde.nearest_to_centres(torch.from_numpy(mask)[None, None], scale)[0].numpy()
+    expected = _block_pixels(mask, scale)
+    np.testing.assert_array_equal(np.where(expected < 0, -1, found), expected)
+
+
+def test_pairs_are_the_first_of_the_sequence_inside_the_map() -> None:
+    points = torch.quasirandom.SobolEngine(4).draw(2_000_000, dtype=torch.float64).numpy()
+    for scale, pairs in zip(evalmde.SCALES, evalmde.sobol_pairs(90, 123, torch.device("cpu")), strict=True):
+        h, w = -(-90 // scale) - 2, -(-123 // scale) - 2
+        start, reach = points[:, :2] * (h, w), max(32 // scale, 3)
+        ends = np.floor(np.stack((start, start + (points[:, 2:] * 2 * reach - reach))))
+        inside = ((ends >= 0) & (ends < (h, w))).all(axis=(0, 2))
+        expected = (ends[:, inside][:, :1_000_000] @ (w, 1)).astype(int)
+        assert expected.shape[1] == 1_000_000
+        np.testing.assert_array_equal(pairs.numpy(), expected[:, np.lexsort(expected[::-1])])
+
+
+def test_scores_of_a_batch_are_those_of_its_images() -> None:
+    maps = [holed(), steps(1)]
+    maps[1][0][5:9, 10:50] = np.nan
+    batch = pair_of(*(np.stack(each) for each in zip(*maps, strict=True)))
+    for metric in METRICS:
+        singles = torch.cat([metric.function(pair_of(*each)) for each in maps])
+        torch.testing.assert_close(metric.function(batch), singles, msg=metric.name)
+
+
+def test_unknown_truth_reaches_no_score() -> None:
+    prediction, truth = holed()
+    changed = prediction.copy()
+    changed[UNKNOWN] = np.nan
+    assert _scores(pair_of(changed, truth)) == _scores(pair_of(prediction, truth))
+
+
+def test_images_without_truth_or_too_small_have_no_score() -> None:
+    prediction, truth = (torch.from_numpy(each)[None] for each in steps())
+    for maps in ((prediction, torch.full_like(truth, torch.nan)), (prediction[:, :16], truth[:, :16])):
+        rows = list(score_image(*maps, CAMERA.rays()[:, : maps[0].shape[1]], METRICS))
+        assert len(rows) == len(METRICS)
+        assert all(math.isnan(row.value) for row in rows)
+
+
+def test_prediction_of_holes_alone_has_the_largest_errors() -> None:
+    prediction, truth = steps()
+    found = _scores(pair_of(np.full_like(prediction, np.nan), truth))
+    assert found.pop("SAWA_H") == pytest.approx(3.65 + 0.18 + 0.01 + 0.2 + 1.94 * math.pi)
+    assert found == {
+        **dict.fromkeys(("WKDR", "beyond_disparity", "beyond_depth", "boundary"), 1),
+        "RelNormal": pytest.approx(math.pi),
+        "covered": 0,
+    }
+
+
+def test_classes_have_the_functions_values() -> None:
+    pair = pair_of(*steps())
+    for made, function in ((RelNormal(), evalmde.rel_normal), (SAWAH(), evalmde.sawa_h)):
+        made.update(pair)
+        assert made.compute().item() == pytest.approx(function(pair).item())
