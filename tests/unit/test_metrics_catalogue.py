@@ -169,3 +169,36 @@ def test_prediction_of_one_pixel_has_no_visual_score(network: LPIPS) -> None:
 def test_scoring_keeps_no_graph() -> None:
     prediction, target = _maps()
     assert all(isinstance(score.value, float) for score in _scores(prediction.requires_grad_(), target).values())
+
+
+def test_metrics_of_a_region_are_those_of_its_pixels_alone() -> None:
+    target = torch.full((1, 40, 48), 2.0, dtype=torch.float64)
+    prediction = target.clone()
+    prediction[:, 10:20, 5:30] += 0.1
+    glass = torch.zeros((1, 40, 48), dtype=torch.uint8)
+    glass[:, 10:20, 5:30] = 1
+    regions = {"glass": glass, "outside": 1 - glass}
+    metrics = catalogue(protocols=["sensor", "depth", "paper"], regions=["glass", "outside", "edges"])
+    rows = {row.metric: row for row in score_image(prediction, target, CAMERA.rays(), metrics, regions=regions)}
+    assert rows["Depth_AbsRel@glass"].value == pytest.approx(0.05)
+    assert rows["Depth_AbsRel@glass"].valid_share == pytest.approx(250 / 1920)
+    assert rows["Depth_AbsRel@outside"].value == 0
+    assert rows["Depth_AbsRel"].value == pytest.approx(0.05 * 250 / 1920)
+    assert "RMSE_v@glass" in rows
+    assert not any(name.endswith("@edges") or name.startswith(("DSSIM_v@", "Sensor_RMSE_v@")) for name in rows)
+    assert metrics[-1].format.unit.startswith("edges")
+
+
+def test_planes_of_a_region_have_a_planarity_error() -> None:
+    metrics = catalogue(protocols=["boundaries"])
+    v, u = torch.meshgrid(torch.arange(40).double(), torch.arange(48).double(), indexing="ij")
+    target = 1 / (0.5 + 0.002 * (u - CAMERA.cx))[None]
+    planes = (1 + (v > 20))[None].to(torch.uint8)
+    wavy = target * (1 + 0.01 * (u.remainder(2) - 0.5))
+    for prediction, flat in ((2 * target, True), (wavy, False)):
+        rows = score_image(prediction, target, CAMERA.rays(), metrics, regions={"planes": planes})
+        error = {row.metric: row.value for row in rows}
+        assert (error["PE_flatness"] < 1e-6) == flat
+        assert (error["PE_orientation"] < 1e-3) or not flat
+    rows = score_image(target, target, CAMERA.rays(), metrics)
+    assert not any(row.metric.startswith("PE_") for row in rows)

@@ -24,7 +24,7 @@ from dsr.app.metrics import check_metrics, chosen_metrics, metric_collection
 from dsr.app.multirun import Plan, runs_here
 from dsr.app.schema import Config, EvalConfig, Identity, given_keys, plain_config, raw_group, user_directories
 from dsr.data.folder import Folder
-from dsr.data.scene_source import SceneSource, prepare_scenes
+from dsr.data.scene_source import SceneSource, prepare_scenes, regions_of
 from dsr.degradation.downsampling import Downsampling, Measured, make_sample
 from dsr.evaluation.predict import Evaluation, Outcome, StalePredictionError, failure_line, predict
 from dsr.evaluation.run_files import read_run
@@ -230,7 +230,7 @@ def _run_claimed(prepared: _Prepared) -> pd.DataFrame:
         )
     except StalePredictionError as error:
         raise ConfigError(str(error)) from error
-    metrics = chosen_metrics(settings.metrics)
+    metrics = chosen_metrics(settings.metrics, regions_of(study.source))
     formats = {metric.name: metric.format for metric in metrics}
     illustrate = functools.partial(_illustrate, folder, study.label, formats)
     alignment = settings.metrics.alignment

@@ -20,15 +20,15 @@ if TYPE_CHECKING:
     import torchmetrics
 
 
-def chosen_metrics(settings: MetricsConfig) -> tuple[Metric, ...]:
-    """Return the metrics to compute.
+def chosen_metrics(settings: MetricsConfig, regions: Sequence[str] = ()) -> tuple[Metric, ...]:
+    """Return the metrics to compute, those of some regions of the scenes, too.
 
     Raises:
         ConfigError: a metric or the network's file is not valid.
 
     """
     extra = extra_metrics(settings)
-    return catalogue(_network(settings, extra), extra, settings.protocols)
+    return catalogue(_network(settings, extra), extra, settings.protocols, regions)
 
 
 def metric_collection(settings: MetricsConfig) -> torchmetrics.MetricCollection:

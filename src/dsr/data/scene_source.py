@@ -84,6 +84,11 @@ def unprepared(source: SceneSource, names: Sequence[str]) -> list[str]:
     return getattr(source, "unprepared", lambda _: [])(names)
 
 
+def regions_of(source: SceneSource) -> tuple[str, ...]:
+    """Return the names of the regions that a data set's scenes may have, in the order of tables: its ``regions``."""
+    return tuple(getattr(source, "regions", ()))
+
+
 class SceneSubset:
     """A subset of the scenes of a data set.
 
@@ -95,6 +100,7 @@ class SceneSubset:
 
     def __init__(self, source: SceneSource, names: Sequence[str]) -> None:
         self.name, self.evaluation = source.name, source.evaluation
+        self.regions = regions_of(source)
         self.soft_edges = bool(getattr(source, "soft_edges", False))
         self._source, self._names = source, list(names)
 

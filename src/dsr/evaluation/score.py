@@ -185,7 +185,8 @@ def _score_scene(
         return
     rays = sample.camera.rays(device=study.device)
     truth = sample.depth.to(study.device, torch.float64)
-    for result in score_image(depth.to(study.device, torch.float64), truth, rays, metrics, sample.unit):
+    regions = {name: region.to(study.device) for name, region in sample.regions.items()}
+    for result in score_image(depth.to(study.device, torch.float64), truth, rays, metrics, sample.unit, regions):
         yield {
             "dataset": sample.dataset,
             "scene": sample.scene,

@@ -41,6 +41,8 @@ DBE_RANGE = 10.0
 """Pixels; predicted boundaries further from a true one are no boundaries of it."""
 DDE_PLANE = 3.0
 """Metres from the camera to the plane that the directed depth error is about."""
+PLANES = "planes"
+"""The region with numbered planes, see :class:`dsr.sample.Scene`."""
 PLANE_SHARE = 0.05
 """Smaller planes, as a fraction of the image, have no planarity error."""
 
@@ -298,6 +300,19 @@ def _directed_error(pair: SurfacePair, part: int) -> Tensor:
     return pair.derive(directed_depth_error)[:, part]
 
 
+def _planarity(pair: SurfacePair) -> tuple[Tensor, Tensor]:
+    """Return the planarity errors, means over the planes of the region ``planes``, (B,) each."""
+    numbers = pair.regions[PLANES]
+    count = max(int(numbers.max()), 1)
+    planes = numbers == torch.arange(1, count + 1, dtype=numbers.dtype, device=numbers.device).view(1, -1, 1, 1)
+    flatness, orientation = (each.nanmean(dim=1) for each in planarity(pair, planes))
+    return flatness, orientation
+
+
+def _planarity_error(pair: SurfacePair, part: int) -> Tensor:
+    return pair.derive(_planarity)[part]
+
+
 def _shown(heading: str, unit: str, factor: float = 1e2, *, higher: bool = True, column: bool = True) -> MetricFormat:
     return MetricFormat(heading, unit, factor, 1, higher, BEFORE_THE_PAPER if column else None)
 
@@ -317,6 +332,13 @@ def _directed(part: int, name: str) -> Metric:
     return Metric(f"DDE_{name}", partial(_directed_error, part=part), depth_mask, shown, min_size=1, whole=True)
 
 
+def _plane(part: int, name: str, unit: str, factor: float) -> Metric:
+    shown = _shown("PE", f"{name}, {unit}", factor, higher=False)
+    return Metric(
+        f"PE_{name}", partial(_planarity_error, part=part), depth_mask, shown, min_size=3, region=PLANES, whole=True
+    )
+
+
 METRICS: tuple[Metric, ...] = (
     Metric("DepthPro_F1", boundary_f1, true_mask, _shown("F1", "Depth Pro, %"), whole=True),
     Metric("DepthPro_ceiling", boundary_ceiling, true_mask, _shown("F1", "of the truth, %"), whole=True),
@@ -326,6 +348,8 @@ METRICS: tuple[Metric, ...] = (
     _directed(0, "right"),
     _directed(1, "before"),
     _directed(2, "beyond"),
+    _plane(0, "flatness", "mm", 1e3),
+    _plane(1, "orientation", "deg", 1),
     Metric("Boundary_covered", covered, true_mask, _shown("Covered", "%"), min_size=1, whole=True),
 )
 """The metrics of ``metrics=boundaries``."""

@@ -115,7 +115,10 @@ KNOWN_FORMATS = {metric.name: metric.format for metric in METRICS}
 
 
 def catalogue(
-    network: LPIPS | None = None, extra: Sequence[Metric] = (), protocols: Sequence[str] = ("paper",)
+    network: LPIPS | None = None,
+    extra: Sequence[Metric] = (),
+    protocols: Sequence[str] = ("paper",),
+    regions: Sequence[str] = (),
 ) -> tuple[Metric, ...]:
     """Return the metrics that can be computed: those of some protocols, then others.
 
@@ -123,6 +126,7 @@ def catalogue(
         network: for perceptual metrics; None leaves them out.
         extra: metrics beside those of the protocols.
         protocols: names of protocols, in the order of the metrics.
+        regions: parts of the scenes, for which the columns of tables that are means over pixels follow once more.
 
     Raises:
         ValueError: there is no such protocol, or two metrics have one name.
@@ -131,6 +135,11 @@ def catalogue(
     if not protocols or not set(protocols) <= set(PROTOCOLS):
         raise ValueError(f"protocols: expected some of {', '.join(PROTOCOLS)}, got {', '.join(protocols) or 'none'}")
     metrics = (*(metric for name in dict.fromkeys(protocols) for metric in PROTOCOLS[name]), *extra)
+    pixelwise = [
+        each for each in metrics if each.mask in (depth_mask, normal_mask) and each.format.position is not None
+    ]
+    pixelwise = [each for each in pixelwise if not (each.per_light or each.perceptual or each.region)]
+    metrics = (*metrics, *(each.within(region) for region in regions for each in pixelwise))
     names = [metric.name for metric in metrics]
     for name in names:
         if names.count(name) > 1:
@@ -152,7 +161,12 @@ class Score:
 
 @torch.no_grad()
 def score_image(
-    prediction: Tensor, target: Tensor, rays: Tensor, metrics: tuple[Metric, ...], unit: Unit = CENTIMETRES
+    prediction: Tensor,
+    target: Tensor,
+    rays: Tensor,
+    metrics: tuple[Metric, ...],
+    unit: Unit = CENTIMETRES,
+    regions: Mapping[str, Tensor] | None = None,
 ) -> Iterator[Score]:
     """Score one predicted depth map.
 
@@ -163,8 +177,9 @@ def score_image(
         prediction: (1, H, W) orthogonal depth in metres, NaN where missing.
         target: (1, H, W) orthogonal depth in metres, NaN where missing.
         rays: (3, H, W), see :meth:`dsr.geometry.camera.Camera.rays`.
-        metrics: from :func:`catalogue`; those for other units are left out.
+        metrics: from :func:`catalogue`; those for other units, and of regions that there are not, are left out.
         unit: of the benchmark.
+        regions: parts of the image by name, (1, H, W) uint8.
 
     Yields:
         The scores, NaN where no pixel can be scored.
@@ -173,7 +188,8 @@ def score_image(
 
     def pair_of(window: tuple[Any, ...]) -> SurfacePair:
         maps = (values[window][None] for values in (prediction, target, rays))
-        return SurfacePair(*maps, unit=unit, image_dtype=torch.float32)
+        parts = {name: region[window][None] for name, region in (regions or {}).items()}
+        return SurfacePair(*maps, unit=unit, regions=parts, image_dtype=torch.float32)
 
     window = (..., *_covered(prediction))
     whole = covered = pair_of((...,))

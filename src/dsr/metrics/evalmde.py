@@ -95,7 +95,8 @@ def sobol_pairs(height: int, width: int, device: torch.device) -> list[Tensor]:
     They are the first of an unscrambled Sobol sequence in four dimensions inside the map (position, offset), sorted
     by the first index, so that what is read lies together.
     """
-    engine, draws, found = torch.quasirandom.SobolEngine(4), [], []
+    engine, found = torch.quasirandom.SobolEngine(4), []
+    draws: list[Tensor] = []
     for scale in SCALES:
         h, w = (-(-size // scale) - 2 for size in (height, width))
         reach = min(max(RADIUS // scale, SMALLEST_RADIUS), max(h, w))

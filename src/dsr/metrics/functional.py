@@ -15,7 +15,8 @@ gets NaN.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -45,6 +46,7 @@ class SurfacePair:
         rays: (B or 1, 3, H, W) rays with z = 1, see :meth:`dsr.geometry.camera.Camera.rays`.
         mask: (B, 1, H, W) bool, the pixels to compare; None for all.
         unit: unit of the metrics that are in the benchmark's own.
+        regions: parts of the images by name, (B, 1, H, W) uint8, 0 outside, see :class:`dsr.sample.Scene`.
         image_dtype: of normals and renderings, None for the depth's. float32 halves their computing time and changes
             scores by about 1e-7; depths and their differences keep their own dtype.
 
@@ -61,6 +63,7 @@ class SurfacePair:
         mask: Tensor | None = None,
         *,
         unit: Unit = CENTIMETRES,
+        regions: Mapping[str, Tensor] | None = None,
         image_dtype: torch.dtype | None = None,
     ) -> None:
         if prediction.dim() != 4 or prediction.shape[1] != 1 or prediction.shape != target.shape:
@@ -82,6 +85,7 @@ class SurfacePair:
         self.complete = known_true(self.depth_mask)
         self.rays = rays.to(target.dtype)
         self.unit = unit
+        self.mask, self.regions = mask, dict(regions or {})
         self.image_dtype = image_dtype or target.dtype
         self.given = prediction, target
         self._derived: dict[Callable[[SurfacePair], Any], Any] = {}
@@ -127,6 +131,10 @@ class SurfacePair:
             self._derived[make] = make(self)
         derived: _Derived = self._derived[make]
         return derived
+
+    def within(self, region: str) -> SurfacePair:
+        """Return the pair in a region alone."""
+        return self.derive(_in_region(region))
 
     @cached_property
     def normals(self) -> tuple[Tensor, Tensor]:
@@ -187,6 +195,19 @@ class SurfacePair:
     def _blank(self, values: Tensor) -> Tensor:
         """Return ``values`` with 0 where a normal is invalid."""
         return values if self.complete else values * self.normal_mask
+
+
+@functools.cache
+def _in_region(name: str) -> Callable[[SurfacePair], SurfacePair]:
+    """Return a function that restricts a pair to a region, the same for each name."""
+
+    def restrict(pair: SurfacePair) -> SurfacePair:
+        mask = pair.regions[name] > 0
+        mask = mask if pair.mask is None else mask & pair.mask
+        regions, kind = {name: pair.regions[name]}, pair.image_dtype
+        return SurfacePair(*pair.given, pair.rays, mask, unit=pair.unit, regions=regions, image_dtype=kind)
+
+    return restrict
 
 
 def rmse_d(pair: SurfacePair) -> Tensor:

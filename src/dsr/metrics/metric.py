@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -31,6 +31,8 @@ class Metric:
         perceptual: whether the function takes an LPIPS network, ``network``.
         network: that of a perceptual metric; :func:`dsr.metrics.catalogue.catalogue` sets it.
         unit: name of the unit of the benchmarks that it is for, see :class:`dsr.sample.Unit`; None for all of them.
+        region: the part of the image that it is of, see :class:`dsr.sample.Scene`; None for all of it. It is left out
+            where a scene has no such region.
         whole: whether it is computed of the whole image even where a method left out rows or columns at the border.
 
     """
@@ -44,11 +46,17 @@ class Metric:
     perceptual: bool = False
     network: LPIPS | None = field(default=None, repr=False, compare=False)
     unit: str | None = None
+    region: str | None = None
     whole: bool = False
 
     def applies(self, pair: SurfacePair) -> bool:
-        """Return whether the metric is for the pair's benchmark."""
-        return self.unit in (None, pair.unit.name)
+        """Return whether the metric is for the pair's benchmark, and there is its region."""
+        return self.unit in (None, pair.unit.name) and (self.region is None or self.region in pair.regions)
+
+    def within(self, region: str) -> Metric:
+        """Return the metric of a region, ``NAME@REGION``."""
+        unit = f"{region}, {self.format.unit}" if self.format.unit else region
+        return replace(self, name=f"{self.name}@{region}", region=region, format=replace(self.format, unit=unit))
 
     @property
     def worst(self) -> str:
@@ -60,6 +68,7 @@ class Metric:
 
         NaN for images below the metric's smallest size.
         """
+        pair = pair if self.region is None else pair.within(self.region)
         count, size = len(pair.target), min(pair.target.shape[-2:])
         if size < self.min_size:
             values = pair.target.new_full((count, len(LIGHT_NAMES)) if self.per_light else (count,), torch.nan)
@@ -83,6 +92,7 @@ class Metric:
         """Return the valid fraction of the pixels that the metric would use in a complete map, (B,)."""
         if min(pair.target.shape[-2:]) < self.min_size:
             return torch.zeros(len(pair.target), dtype=torch.float64)
+        pair = pair if self.region is None else pair.within(self.region)
         return self.mask(pair).double().mean(dim=(-3, -2, -1))
 
 
