@@ -13,7 +13,7 @@ from dsr.evaluation.results import Run
 from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.metrics.formats import in_tables
 from dsr.report.paper import published, published_row
-from dsr.report.table_layouts import score_table
+from dsr.report.table_layouts import score_tables
 from dsr.report.tables import in_shown_units
 
 RAW = {
@@ -54,7 +54,7 @@ def text(table, label="Bicubic", *, folder=Path("none"), range_type=None, **data
     about = (str(first["dataset"]), int(first["scale"]), str(first["downsampling"]), 0, label.lower(), label)
     run = Run(folder, *about, table, {}, settings, {}, tuple(table["scene"].unique()))
     console = Console(width=120, file=io.StringIO())
-    console.print(score_table(run, KNOWN_FORMATS))
+    console.print(*score_tables(run, KNOWN_FORMATS))
     return console.file.getvalue()
 
 

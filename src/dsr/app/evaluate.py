@@ -36,7 +36,7 @@ from dsr.methods.base import WORKSPACE, Method
 from dsr.methods.networks.weight_files import files_of_weights
 from dsr.methods.recipe import OF_RUN, Known, Recipe, Run
 from dsr.metrics.formats import HEADLINES, Formats
-from dsr.report.table_layouts import score_table
+from dsr.report.table_layouts import score_tables
 from dsr.sample import DepthSample, slope
 from dsr.utils.compute_device import fast_precision, pick_device
 from dsr.utils.configuration import ConfigError
@@ -360,7 +360,8 @@ def _illustrate(
 def _report(console: Console, folder: Path, scores: pd.DataFrame, outcome: Outcome, formats: Formats) -> None:
     """Print the table of scores, notes and failures."""
     if not scores.empty:
-        console.print(score_table(read_run(folder), formats))
+        for table in score_tables(read_run(folder), formats):
+            console.print(table)
     scenes_by_note: dict[str, list[str]] = {}
     for scene, notes in outcome.notes.items():
         scenes_by_note.setdefault("; ".join(notes), []).append(scene)

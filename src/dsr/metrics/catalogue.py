@@ -103,11 +103,16 @@ PROTOCOLS: Mapping[str, tuple[Metric, ...]] = {
     "paper": METRICS,
     "field": field.METRICS,
     "sensor": sensor.METRICS,
-    "depth": depth.METRICS,
-    "normals": normals.METRICS,
-    "points": points.METRICS,
-    "evalmde": evalmde.METRICS,
-    "boundaries": boundaries.METRICS,
+    **{
+        name: tuple(replace(metric, format=replace(metric.format, family=name)) for metric in metrics)
+        for name, metrics in {
+            "depth": depth.METRICS,
+            "normals": normals.METRICS,
+            "points": points.METRICS,
+            "evalmde": evalmde.METRICS,
+            "boundaries": boundaries.METRICS,
+        }.items()
+    },
 }
 """Sets of metrics by name: the paper's, those that the field prints, those for real sensors, of depth estimation, of
 EvalMDE and of boundaries."""

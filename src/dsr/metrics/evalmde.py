@@ -235,14 +235,18 @@ def _metric(name: str, part: Callable[[SurfacePair], Tensor], shown: MetricForma
 METRICS: tuple[Metric, ...] = (
     _metric("SAWA_H", sawa_h, MetricFormat("SAWA-H", position=BEFORE_THE_PAPER)),
     _metric("RelNormal", rel_normal, MetricFormat("RelNormal", "rad", position=BEFORE_THE_PAPER)),
-    _metric("WKDR", wkdr, MetricFormat("WKDR", "%", 1e2, 2, position=None)),
+    _metric("WKDR", wkdr, MetricFormat("WKDR", "%", 1e2, 2, position=BEFORE_THE_PAPER)),
     _metric(
         "beyond_disparity",
         beyond_disparity,
-        MetricFormat("Beyond", "1.028 x, disparity fitted, %", 1e2, 1, position=None),
+        MetricFormat("Beyond", "1.028 x, disparity fitted, %", 1e2, 1, position=BEFORE_THE_PAPER),
     ),
-    _metric("beyond_depth", beyond_depth, MetricFormat("Beyond", "1.028 x, depth fitted, %", 1e2, 1, position=None)),
-    _metric("boundary", boundary_error, MetricFormat("1 - F1", "Depth Pro, %", 1e2, 1, position=None)),
+    _metric(
+        "beyond_depth",
+        beyond_depth,
+        MetricFormat("Beyond", "1.028 x, depth fitted, %", 1e2, 1, position=BEFORE_THE_PAPER),
+    ),
+    _metric("boundary", boundary_error, MetricFormat("1 - F1", "Depth Pro, %", 1e2, 1, position=BEFORE_THE_PAPER)),
     _metric("covered", covered, MetricFormat("Covered", "%", 1e2, 1, higher_is_better=True, position=BEFORE_THE_PAPER)),
 )
 """The metrics of ``metrics=evalmde``."""

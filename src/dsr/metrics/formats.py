@@ -10,6 +10,8 @@ BEFORE_THE_PAPER = 0
 """The position of metrics that stand before those of the paper's tables."""
 AFTER_THE_PAPER = 100
 """The position of metrics that the paper's tables do not have."""
+PAPER = "paper"
+"""The family of the paper's metrics, and of those that stand beside them."""
 _MOST_DIGITS = 20
 LOOKS = ("RMSE_v", "RMSE_v1", "DSSIM_v", "LPIPS_v")
 """The metrics of how a surface looks, by which results are compared first: RMSE_v, without lights, and three for the
@@ -30,6 +32,7 @@ class MetricFormat:
         factor: from raw values, as in ``scores.csv``, to shown ones.
         digits: number of digits after the decimal point.
         higher_is_better: direction of the ranking.
+        family: metrics of one family share a table; those of other families and of regions have one of their own.
         position: place among the columns of a table, from the left; None for a metric that is only in ``scores.csv``.
 
     Raises:
@@ -43,6 +46,7 @@ class MetricFormat:
     digits: int = 3
     higher_is_better: bool = False
     position: int | None = AFTER_THE_PAPER
+    family: str = PAPER
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -73,6 +77,13 @@ def in_tables(formats: Formats) -> dict[str, MetricFormat]:
     """Return the formats of the metrics that tables show, in the order of the columns."""
     shown = {name: each for name, each in formats.items() if each.position is not None}
     return dict(sorted(shown.items(), key=lambda item: item[1].position or 0))
+
+
+def by_family(formats: Formats) -> dict[str, dict[str, MetricFormat]]:
+    """Return the formats of each family, the paper's first."""
+    families = dict.fromkeys((PAPER, *(each.family for each in formats.values())))
+    found = {name: {key: each for key, each in formats.items() if each.family == name} for name in families}
+    return {name: members for name, members in found.items() if members}
 
 
 def describe_directions(formats: Formats) -> str:

@@ -56,7 +56,9 @@ class Metric:
     def within(self, region: str) -> Metric:
         """Return the metric of a region, ``NAME@REGION``."""
         unit = f"{region}, {self.format.unit}" if self.format.unit else region
-        return replace(self, name=f"{self.name}@{region}", region=region, format=replace(self.format, unit=unit))
+        return replace(
+            self, name=f"{self.name}@{region}", region=region, format=replace(self.format, unit=unit, family=region)
+        )
 
     @property
     def worst(self) -> str:

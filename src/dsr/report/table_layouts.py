@@ -14,7 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from dsr.evaluation.results import Results, Run, alignment_note
-from dsr.metrics.formats import Formats, MetricFormat, describe_directions
+from dsr.metrics.formats import PAPER, Formats, MetricFormat, by_family, describe_directions, in_tables
 from dsr.report.paper import average_of, implementation_note, paper_name, paper_row
 from dsr.report.tables import FACTS, Cell, Fact, Group, PaperTable, Row, build_tables, in_shown_units, shown
 from dsr.utils.files import write_text
@@ -225,12 +225,41 @@ def latex_text(text: str) -> str:
     return "".join(map(_letter, composed))
 
 
-def score_table(run: Run, formats: Formats) -> Table:
-    """Build the terminal table of one run: per scene our values and the paper's, then the mean."""
+def score_tables(run: Run, formats: Formats) -> list[Table]:
+    """Build the terminal tables of one run: the paper's metrics by scene, and the means of other families."""
+    families = by_family(in_tables(formats))
+    paper = [_score_table(run, families.pop(PAPER))] if PAPER in families else []
+    return [*paper, *([_family_table(run, families)] if families else [])]
+
+
+def _family_table(run: Run, families: Mapping[str, Formats]) -> Table:
+    """Build a terminal table with a row a metric: its mean, least and largest value of the scenes."""
+    table = Table(title=escape(_about(run)), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for name in ("family", "metric", "better"):
+        table.add_column(name)
+    for name in ("mean", "least", "most"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for family, members in families.items():
+        ours = in_shown_units(run.scores, members)
+        for number, (name, values) in enumerate(ours.items()):
+            column = members[str(name)]
+            texts = [column.text(value) for value in (values.mean(), values.min(), values.max())]
+            better = "higher" if column.higher_is_better else "lower"
+            table.add_row("" if number else escape(family), escape(column.title), better, *texts)
+    table.caption, table.caption_justify = escape(alignment_note([run])) or None, "left"
+    return table
+
+
+def _about(run: Run) -> str:
+    """Return a line on a run."""
+    return f"{run.label} on {run.dataset}, x{run.scale}, {run.downsampling} downsampling"
+
+
+def _score_table(run: Run, formats: Formats) -> Table:
+    """Build a terminal table: per scene our values and the paper's, then the mean."""
     ours = in_shown_units(run.scores, formats)
     columns = {str(name): formats[str(name)] for name in ours}
-    about = f"{run.label} on {run.dataset}, x{run.scale}, {run.downsampling} downsampling"
-    title = f"{about} - {describe_directions(columns)}"
+    title = f"{_about(run)} - {describe_directions(columns)}"
     table = Table(title=escape(title), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("scene", overflow="fold")
     table.add_column("from")

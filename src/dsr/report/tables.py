@@ -24,8 +24,10 @@ from dsr.metrics.formats import (
     AFTER_THE_PAPER,
     HEADLINES,
     LIGHTS_NOTE,
+    PAPER,
     Formats,
     MetricFormat,
+    by_family,
     describe_directions,
     in_tables,
 )  # fmt: skip
@@ -221,10 +223,10 @@ def build_tables(results: Results, study: pd.DataFrame | None = None) -> list[Pa
         if not places:
             continue
         apart = {run.dataset for run in runs if run.truth}
-        tables.append(make.table("summary", "Averages", sets_of_summary(places, complete, apart)))
+        tables += make.tables("summary", "Averages", sets_of_summary(places, complete, apart))
         for dataset in dict.fromkeys(place.dataset for place in places):
             sets = sets_of_dataset([place for place in places if place.dataset == dataset])
-            tables.append(make.table(dataset, TITLES.get(dataset, dataset), sets))
+            tables += make.tables(dataset, TITLES.get(dataset, dataset), sets)
     return _with_unique_names(tables)
 
 
@@ -258,6 +260,15 @@ class _Maker:
     def columns(self) -> Formats:
         """All columns: the metrics, then those of the user study."""
         return {**self.formats, **_SHARES}
+
+    def tables(self, name: str, title: str, sets: Sequence[SceneSet]) -> Iterator[PaperTable]:
+        """Yield a table of some sets of scenes for each family of metrics that has a value there."""
+        for family, formats in by_family(self.formats).items():
+            make = replace(self, formats=formats, study=self.study if family == PAPER else None)
+            about = (name, title) if family == PAPER else (f"{name}_{family}", f"{title}, {family}")
+            table = make.table(*about, sets)
+            if family == PAPER or table.columns:
+                yield table
 
     def table(self, name: str, title: str, sets: Sequence[SceneSet]) -> PaperTable:
         """Build a table of some sets of scenes."""
@@ -382,7 +393,8 @@ def _notes(groups: Sequence[Group], columns: Formats) -> Iterator[str]:
     if user:
         direction += " and User columns higher" if " of " in direction else ", of User columns higher"
     yield f"{direction[0].upper()}{direction[1:]}."
-    yield f"{LIGHTS_NOTE}."
+    if any(each.family == PAPER for each in metrics.values()):
+        yield f"{LIGHTS_NOTE}."
     yield "In each group our best displayed value is bold, the second best underlined; equal values share the mark."
     of_paper = [name for name, each in in_tables(KNOWN_FORMATS).items() if each.position != AFTER_THE_PAPER]
     missing = [name for name in of_paper if name not in metrics]

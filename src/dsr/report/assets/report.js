@@ -17,7 +17,7 @@ function showSummary(data) {
     [data.seeds.length === 1 ? "Seed" : "Seeds", data.seeds.join(", ")],
   ];
   find(".facts").append(...facts.map(([name, value]) => make("div", {}, make("dt", { textContent: name }), make("dd", { textContent: value }))));
-  find(".overview").append(...data.problems.map((problem) => overview(problem, data.metrics)));
+  find(".overview").append(...data.problems.map((problem) => overview(problem, data.metrics.filter((metric) => metric.family === data.metrics[0].family))));
   if (data.notes.length) {
     find(".notes").append(make("h3", { textContent: "Notes" }), make("ul", {}, ...data.notes.map((note) => make("li", { textContent: note }))));
   }

@@ -124,21 +124,23 @@ function showTables(data, entries, open) {
   const matches = (text, part) => text.toLowerCase().includes(part.toLowerCase());
   const all = [];
   const home = find("#tables .tables");
-  data.problems.forEach((problem, index) => {
-    const seeds = Math.max(...problem.means.map((row) => row.seeds));
-    const meanPlaces = new Map(data.metrics.map((metric) => [metric.id, ranked(problem.means, metric)]));
+  const families = [...new Set(data.metrics.map((metric) => metric.family))];
+  const both = (problem, index, family) => {
+    const metrics = data.metrics.filter((metric) => metric.family === family);
+    const name = problemName(problem) + (family === families[0] ? "" : `, ${family}`);
+    const meanPlaces = new Map(metrics.map((metric) => [metric.id, ranked(problem.means, metric)]));
     const means = sortable(
       [
         ...factColumns(problem.facts.filter(({ name }) => name !== "scene")),
-        ...metricColumns(data.metrics, (_, metric) => meanPlaces.get(metric.id), problem.scenes.length, options),
+        ...metricColumns(metrics, (_, metric) => meanPlaces.get(metric.id), problem.scenes.length, options),
       ],
       problem.means,
-      { caption: `${problemName(problem)}: means`, visible: (row) => matches(row.method, options.method) },
+      { caption: `${name}: means`, visible: (row) => matches(row.method, options.method) },
     );
     const places = new Map();
     for (const scene of problem.scenes) {
       const own = problem.rows.filter((row) => row.scene === scene);
-      places.set(scene, new Map(data.metrics.map((metric) => [metric.id, ranked(own, metric)])));
+      places.set(scene, new Map(metrics.map((metric) => [metric.id, ranked(own, metric)])));
     }
     const has = new Set(entries.filter((entry) => entry.problem === index).map((entry) => entry.name));
     const scenes = sortable(
@@ -146,18 +148,24 @@ function showTables(data, entries, open) {
         ...factColumns(problem.facts, { scene: (row) => has.has(row.scene)
           ? make("button", { type: "button", className: "go", textContent: row.scene, title: "show its pictures", onclick: () => open(index, row.scene, row.method) })
           : row.scene }),
-        ...metricColumns(data.metrics, (row, metric) => places.get(row.scene).get(metric.id), 0, options),
+        ...metricColumns(metrics, (row, metric) => places.get(row.scene).get(metric.id), 0, options),
       ],
       problem.rows,
-      { caption: `${problemName(problem)}: scenes`, visible: (row) => matches(row.method, options.method) && matches(row.scene, options.scene) },
+      { caption: `${name}: scenes`, visible: (row) => matches(row.method, options.method) && matches(row.scene, options.scene) },
     );
     all.push(means, scenes);
     const details = make("details", { open: data.problems.length === 1 },
       make("summary", {}, "Scene by scene ", make("small", { textContent: `${plural(problem.scenes.length, "scene")}, ${plural(problem.methods.length, "method")}` })),
       scenes.element);
+    return [means.element, details];
+  };
+  data.problems.forEach((problem, index) => {
+    const seeds = Math.max(...problem.means.map((row) => row.seeds));
+    const used = families.filter((family) => data.metrics.some((metric) => metric.family === family && problem.means.some((row) => row.values[metric.id])));
+    const others = used.slice(1).map((family) => make("details", {}, make("summary", {}, family[0].toUpperCase() + family.slice(1)), ...both(problem, index, family)));
     home.append(make("div", { className: "block" },
       make("h3", {}, problemName(problem), make("small", { textContent: ` \u00b7 mean over ${plural(problem.scenes.length, "scene")}${seeds > 1 ? `, mean \u00b1 standard deviation over up to ${seeds} seeds` : ""}` })),
-      means.element, details));
+      ...(used.length ? both(problem, index, used[0]) : []), ...others));
   });
   const foot = make("p", { className: "foot", hidden: true, textContent: "Below ours, the published values." });
   home.append(foot);

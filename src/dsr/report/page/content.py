@@ -11,7 +11,7 @@ from urllib.parse import quote
 import pandas as pd
 
 from dsr.evaluation.results import BenchmarkSetting, Results, Run
-from dsr.metrics.formats import Formats
+from dsr.metrics.formats import Formats, by_family
 from dsr.report.paper import Place, SceneSet, average_of, paper_row
 from dsr.report.tables import FACTS, Row, in_shown_units
 from dsr.utils.guards import natural_key
@@ -21,11 +21,12 @@ _FOLDERS = {"tables": (".csv", ".md", ".tex"), "metrics": (".csv",), "figures": 
 
 
 def metrics_data(results: Results) -> list[dict[str, Any]]:
-    """Return the metrics of all runs: heading, unit, digits, and whether higher is better."""
+    """Return the metrics of all runs: heading, unit, digits, whether higher is better, and their family."""
     return [
-        {"id": name, "name": each.heading, "unit": each.unit, "digits": each.digits, "higher": each.higher_is_better}
-        for name, each in results.formats.items()
-    ]
+        {"id": name, "name": each.heading, "unit": each.unit, "digits": each.digits, "higher": each.higher_is_better,
+         "family": family}
+        for family, members in by_family(results.formats).items() for name, each in members.items()
+    ]  # fmt: skip
 
 
 def problem_data(results: Results, problem: BenchmarkSetting) -> dict[str, Any]:
