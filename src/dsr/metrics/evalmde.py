@@ -1,8 +1,8 @@
 """RelNormal and SAWA-H of EvalMDE, and the parts of SAWA-H singly.
 
-Chen et al., *Toward a Better Evaluation of Monocular Depth* (arXiv 2510.19814); princeton-vl/EvalMDE ea9e21c,
-``evalmde/metrics/rel_normal.py``, ``sawa_h.py``, ``standard.py``, ``boundary.py``, ``evalmde/utils/depth.py`` and
-``downsample.py``. SAWA-H is a sum of errors whose weights were fitted to what people see; lower is better throughout:
+Wu et al., *Toward a Better Understanding of Monocular Depth Evaluation* (arXiv 2510.19814); princeton-vl/EvalMDE
+ea9e21c, ``evalmde/metrics/rel_normal.py``, ``sawa_h.py``, ``standard.py``, ``boundary.py``, ``evalmde/utils/depth.py`` and
+``downsample.py``. SAWA-H is a sum of errors, weighted to agree with human judgment; lower is better throughout:
 
     SAWA-H = 3.65 wkdr + 0.18 beyond_disparity + 0.01 beyond_depth + 0.20 (1 - boundary F1) + 1.94 RelNormal
 
@@ -46,7 +46,7 @@ MIN_SIZE = 2 * SCALES[-1] + 1
 
 
 def rel_normal(pair: SurfacePair) -> Tensor:
-    """Return RelNormal, (B,) in radians: lower is better: the mean error of the angle between two normals.
+    """Return RelNormal, (B,) in radians, the mean error of the angle between two normals; lower is better.
 
     At each of four scales, 10^6 pairs of pixels up to 32 pixels of scale 1 apart, and the mean of the scales' means. At
     a coarser scale each block has the depth of the pixel with a truth that is nearest to its centre. Normals are of the
