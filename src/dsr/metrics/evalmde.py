@@ -1,17 +1,18 @@
 """RelNormal and SAWA-H of EvalMDE, and the parts of SAWA-H singly.
 
 Wu et al., *Toward a Better Understanding of Monocular Depth Evaluation* (arXiv 2510.19814); princeton-vl/EvalMDE
-ea9e21c, ``evalmde/metrics/rel_normal.py``, ``sawa_h.py``, ``standard.py``, ``boundary.py``, ``evalmde/utils/depth.py`` and
-``downsample.py``. SAWA-H is a sum of errors, weighted to agree with human judgment; lower is better throughout:
+ea9e21c, ``evalmde/metrics/`` (``rel_normal.py``, ``sawa_h.py``, ``standard.py``, ``boundary.py``) and ``evalmde/utils/``
+(``depth.py``, ``downsample.py``). SAWA-H is a sum of errors, weighted to agree with human judgment; lower is better:
 
     SAWA-H = 3.65 wkdr + 0.18 beyond_disparity + 0.01 beyond_depth + 0.20 (1 - boundary F1) + 1.94 RelNormal
 
 What differs from their code: WKDR is of all pairs of pixels, of which theirs draws 10^7 without a seed, so that SAWA-H
-scatters by 3e-4 there; Sobol points are in 64 bits, theirs in 32 bits move RelNormal by 3e-6.
+scatters by 3e-4 there; Sobol points are in 64 bits, theirs in 32 bits move RelNormal by 6e-7 on their example.
 
-Pixels without a truth are left out. Holes of a prediction count as errors, so that none pays: pi in RelNormal, as
-theirs do; a pair of pixels in the wrong order; beyond the ratio; no edges where the truth has some. (Their other parts
-take the depth there to be 1 m.) ``EvalMDE_covered`` is the fraction of the true pixels that have a prediction.
+Pixels without a truth are left out. Holes of a prediction count as errors: pi in RelNormal, as theirs do; a pair of
+pixels in the wrong order; beyond the ratio; no edges where the truth has some. (Their other parts take the depth there
+to be 1 m.) Only false edges are spared by holes, so ``EvalMDE_covered``, the fraction of the true pixels that have a
+prediction, belongs to every score.
 """
 
 from __future__ import annotations
