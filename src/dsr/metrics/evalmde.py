@@ -1,7 +1,7 @@
 """RelNormal and SAWA-H of EvalMDE, and the parts of SAWA-H singly.
 
 Wu et al., *Toward a Better Understanding of Monocular Depth Evaluation* (arXiv 2510.19814); princeton-vl/EvalMDE
-ea9e21c, ``evalmde/metrics/`` (``rel_normal.py``, ``sawa_h.py``, ``standard.py``, ``boundary.py``) and ``evalmde/utils/``
+ea9e21c, ``evalmde/metrics`` (``rel_normal.py``, ``sawa_h.py``, ``standard.py``, ``boundary.py``), ``evalmde/utils``
 (``depth.py``, ``downsample.py``). SAWA-H is a sum of errors, weighted to agree with human judgment; lower is better:
 
     SAWA-H = 3.65 wkdr + 0.18 beyond_disparity + 0.01 beyond_depth + 0.20 (1 - boundary F1) + 1.94 RelNormal
