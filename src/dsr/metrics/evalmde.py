@@ -1,17 +1,18 @@
 """RelNormal and SAWA-H of EvalMDE, and the parts of SAWA-H singly.
 
-Chen et al., *Toward a Better Evaluation of Monocular Depth* (arXiv 2510.19814); princeton-vl/EvalMDE ea9e21c,
-``evalmde/metrics/rel_normal.py``, ``sawa_h.py``, ``standard.py``, ``boundary.py``, ``evalmde/utils/depth.py`` and
-``downsample.py``. SAWA-H is a sum of errors whose weights were fitted to what people see; lower is better throughout:
+Wu et al., *Toward a Better Understanding of Monocular Depth Evaluation* (arXiv 2510.19814); princeton-vl/EvalMDE
+ea9e21c, ``evalmde/metrics`` (``rel_normal.py``, ``sawa_h.py``, ``standard.py``, ``boundary.py``), ``evalmde/utils``
+(``depth.py``, ``downsample.py``). SAWA-H is a sum of errors, weighted to agree with human judgment; lower is better:
 
     SAWA-H = 3.65 wkdr + 0.18 beyond_disparity + 0.01 beyond_depth + 0.20 (1 - boundary F1) + 1.94 RelNormal
 
 What differs from their code: WKDR is of all pairs of pixels, of which theirs draws 10^7 without a seed, so that SAWA-H
-scatters by 3e-4 there; Sobol points are in 64 bits, theirs in 32 bits move RelNormal by 3e-6.
+scatters by 3e-4 there; Sobol points are in 64 bits, theirs in 32 bits move RelNormal by 6e-7 on their example.
 
-Pixels without a truth are left out. Holes of a prediction count as errors, so that none pays: pi in RelNormal, as
-theirs do; a pair of pixels in the wrong order; beyond the ratio; no edges where the truth has some. (Their other parts
-take the depth there to be 1 m.) ``EvalMDE_covered`` is the fraction of the true pixels that have a prediction.
+Pixels without a truth are left out. Holes of a prediction count as errors: pi in RelNormal, as theirs do; a pair of
+pixels in the wrong order; beyond the ratio; no edges where the truth has some. (Their other parts take the depth there
+to be 1 m.) Only false edges are spared by holes, so ``EvalMDE_covered``, the fraction of the true pixels that have a
+prediction, belongs to every score.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ MIN_SIZE = 2 * SCALES[-1] + 1
 
 
 def rel_normal(pair: SurfacePair) -> Tensor:
-    """Return RelNormal, (B,) in radians: lower is better: the mean error of the angle between two normals.
+    """Return RelNormal, (B,) in radians, the mean error of the angle between two normals; lower is better.
 
     At each of four scales, 10^6 pairs of pixels up to 32 pixels of scale 1 apart, and the mean of the scales' means. At
     a coarser scale each block has the depth of the pixel with a truth that is nearest to its centre. Normals are of the
