@@ -147,7 +147,7 @@ def _shown(heading: str, unit: str, factor: float, digits: int, *, higher: bool 
 
 def _f_score(centimetres: int) -> Metric:
     function = partial(f_score, threshold=centimetres / 100)
-    form = _shown("F-score", f"{centimetres} cm, %", 1e2, 2, higher=True)
+    form = _shown(f"F at {centimetres} cm", "%", 1e2, 2, higher=True)
     return Metric(f"Points_F_{centimetres}cm", function, target_mask, form, min_size=1, unit="cm", whole=True)
 
 
