@@ -2,6 +2,7 @@
 
 import math
 import statistics
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
@@ -69,6 +70,15 @@ def test_tables_are_a_summary_and_one_per_dataset_for_each_scale_and_degradation
         "summary_x4_box", "simgeo_x4_box", "icl_x4_box", "summary_x8_box", "simgeo_x8_box",
         "summary_x4_box_noise_0.01_blobs", "simgeo_x4_box_noise_0.01_blobs",
     ]  # fmt: skip
+
+
+def test_aligned_scores_are_noted_and_not_beside_the_papers():
+    plain = run("Bicubic", {"lucy": 1.0})
+    aligned = replace(plain, settings={**plain.settings, "alignment": "affine_disparity"})
+    for each, beside in ((plain, True), (aligned, False)):
+        found = tables(each)["simgeo_x4_box"]
+        assert found.has_published is beside
+        assert any("affine_disparity" in note for note in found.notes) is not beside
 
 
 def test_file_names_are_distinct_on_any_file_system_and_plain_ascii():

@@ -104,7 +104,7 @@ def _metric(
 
 
 def _within(name: str, ratio: float, shown: str) -> Metric:
-    form = MetricFormat("delta", f"{shown}, %", 1e2, 2, higher_is_better=True, position=BEFORE_THE_PAPER)
+    form = MetricFormat(f"delta {shown}", "%", 1e2, 2, higher_is_better=True, position=BEFORE_THE_PAPER)
     return Metric(f"Depth_delta_{name}", partial(within_ratio, ratio=ratio), depth_mask, form, min_size=1, unit="cm")
 
 

@@ -51,7 +51,7 @@ def _true_normals(pair: SurfacePair) -> Tensor:
 
 def _within(degrees: float) -> Metric:
     name, function = f"Normal_within_{degrees:g}".replace(".", "_"), partial(within, degrees=degrees)
-    return Metric(name, function, normal_mask, _shown("Within", f"{degrees:g} deg, forward, %", 1e2, higher=True))
+    return Metric(name, function, normal_mask, _shown(f"< {degrees:g} deg", "forward, %", 1e2, higher=True))
 
 
 def _shown(heading: str, unit: str, factor: float, digits: int = 1, *, higher: bool = False) -> MetricFormat:
@@ -59,8 +59,8 @@ def _shown(heading: str, unit: str, factor: float, digits: int = 1, *, higher: b
 
 
 METRICS: tuple[Metric, ...] = (
-    Metric("Normal_mean", mean, normal_mask, _shown("Angle", "mean, forward, deg", 1, 2)),
-    Metric("Normal_median", median, normal_mask, _shown("Angle", "median, forward, deg", 1, 2)),
+    Metric("Normal_mean", mean, normal_mask, _shown("Mean angle", "forward, deg", 1, 2)),
+    Metric("Normal_median", median, normal_mask, _shown("Median angle", "forward, deg", 1, 2)),
     *map(_within, ANGLES),
     Metric("Normal_covered", covered, _true_normals, _shown("Covered", "normals, %", 1e2, higher=True), whole=True),
 )
