@@ -9,8 +9,10 @@ import pandas as pd
 import pytest
 
 from dsr.evaluation.results import Results, Run
+from dsr.metrics.formats import MetricFormat
 from dsr.report.paper import PAPER_SCENES, Place, published, sets_of_dataset, sets_of_summary
 from dsr.report.study.study_table import read_study
+from dsr.report.table_layouts import to_markdown
 from dsr.report.tables import build_tables
 
 SIMGEO = (*PAPER_SCENES["simgeo"][:5], "statue")
@@ -336,3 +338,30 @@ def test_non_numeric_study_fractions_are_refused(tmp_path):
     study_of(("m", "a", "A", 80.0, 70, 90)).assign(user_first="most").to_csv(tmp_path / "study.csv", index=False)
     with pytest.raises(ValueError, match=r"study.csv: expected numbers in user_first, got text"):
         read_study(tmp_path / "study.csv")
+
+
+def test_averages_have_intervals_and_a_better_best_is_marked_when_asked():
+    names = [f"scene{number}" for number in range(8)]
+    near, far = ({name: base + number for number, name in enumerate(names)} for base in (10.0, 14.0))
+    alike = {name: near[name] + (0.1 if number % 2 else -0.099) for number, name in enumerate(names)}
+    for other, marked in ((far, True), (alike, False)):
+        runs = Results((run("Near", near, dataset="mine"), run("Other", other, dataset="mine")))
+        [_, table] = build_tables(runs, intervals=True)
+        [group] = [each for each in table.groups if each.about.average]
+        cell = next(row for row in group.rows if row.label == "Near").cells["RMSE_d"]
+        assert cell.interval[0] < cell.mean < cell.interval[1]
+        assert cell.significant == marked
+        assert ("**\\*" in to_markdown(table)) == marked
+        assert all(row.cells["RMSE_d"].interval is None for each in table.groups[:1] for row in each.rows)
+    assert all(row.cells["RMSE_d"].interval is None for row in build_tables(runs)[1].rows)
+
+
+def test_families_of_metrics_have_tables_of_their_own():
+    one = run("Near", all_of(["hall", "yard"]), dataset="mine")
+    more = one.scores[one.scores["metric"] == "RMSE_d"].assign(metric="SAWA")
+    family = MetricFormat("SAWA", "", digits=2, family="evalmde")
+    both = replace(one, scores=pd.concat([one.scores, more]), formats={"SAWA": family})
+    found = tables(both)
+    assert [name for name in found if "evalmde" in name] == ["summary_evalmde_x4_box", "mine_evalmde_x4_box"]
+    assert list(found["mine_evalmde_x4_box"].columns) == ["SAWA"]
+    assert list(found["mine_x4_box"].columns) == ["RMSE_d", "DSSIM_v"]

@@ -87,7 +87,7 @@ def _write(
     pictures = Pictures(pool) if "page" in request.parts else None
 
     def tables() -> None:
-        write_tables(folder / "tables", results, study)
+        write_tables(folder / "tables", results, study, intervals=request.intervals)
 
     def metrics() -> None:
         write_correlations(folder / "metrics", results)

@@ -28,6 +28,7 @@ class ReportRequest(Options):
     light: str = option(
         FIGURE_LIGHT, f"of the figures: {LIGHT_CHOICES}; {FIGURE_LIGHT}", "NAME", rule=one_of(LIGHT_NAMES, str)
     )
+    intervals: bool = option(False, "averages with 95 % intervals, and a test of the best against the second best")
     strict: bool = option(False, "refuse runs with a warning; see docs/checks.md")
     title: str = option("Depth super-resolution", "of the page")
     page_mb: float = option(

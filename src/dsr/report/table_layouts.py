@@ -46,14 +46,16 @@ _HEAD = r"""\documentclass{article}
 """
 
 
-def write_tables(folder: Path, results: Results, study: pd.DataFrame | None = None) -> list[Path]:
+def write_tables(
+    folder: Path, results: Results, study: pd.DataFrame | None = None, *, intervals: bool = False
+) -> list[Path]:
     """Write all tables of some runs.
 
     Args:
         folder: output directory for ``NAME.md``, ``NAME.tex``, ``NAME_published.tex`` (if the paper has values) and
             ``NAME.csv`` of each table, and for ``all.md`` and ``all.tex`` with all tables.
         results: runs.
-        study: see :func:`dsr.report.tables.build_tables`.
+        study, intervals: see :func:`dsr.report.tables.build_tables`.
 
     Returns:
         Paths of the files.
@@ -62,7 +64,7 @@ def write_tables(folder: Path, results: Results, study: pd.DataFrame | None = No
         ValueError: the table of the study is invalid.
 
     """
-    tables = build_tables(results, study)
+    tables = build_tables(results, study, intervals=intervals)
     texts = {"all.md": "\n".join(map(to_markdown, tables)), "all.tex": to_document(tables)}
     for table in tables:
         texts |= {f"{table.name}.md": to_markdown(table), f"{table.name}.tex": to_latex(table)}
@@ -84,6 +86,7 @@ class Style:
         marks: text before and after a value, by rank.
         plus_minus: separator between a value and its spread.
         seeds: format of the number of seeds, with ``{}``.
+        star: mark of a value that is better than the second best by a test.
         number: formats a number.
 
     """
@@ -93,6 +96,7 @@ class Style:
     marks: Mapping[int, tuple[str, str]]
     plus_minus: str
     seeds: str
+    star: str
     number: Callable[[str], str] = str
 
     def text(self, column: MetricFormat, cell: Cell | None, seeds: int) -> str:
@@ -100,7 +104,7 @@ class Style:
         if cell is None:
             return self.missing
         before, after = self.marks[cell.rank]
-        text = f"{before}{self.number(shown(column, cell.mean))}{after}"
+        text = f"{before}{self.number(shown(column, cell.mean))}{after}" + self.star * cell.significant
         if cell.spread is not None:
             text += f" {self.plus_minus} {self.number(shown(column, cell.spread))}"
         if cell.interval is not None:
@@ -298,6 +302,7 @@ def _values(key: str, column: MetricFormat, row: Row) -> Iterator[tuple[str, flo
     yield f"{key} scenes", None if cell is None else cell.scenes
     yield f"{key} low{unit}", low
     yield f"{key} high{unit}", high
+    yield f"{key} significant", 1 if cell is not None and cell.significant else None
     yield f"{key} paper{unit}", paper
     yield f"{key} difference{unit}", difference
     yield f"{key} ratio", ratio
@@ -462,8 +467,14 @@ def _cells(values: pd.Series, columns: Formats) -> list[str]:
 
 
 _MARKDOWN = Style(
-    escaped, MISSING, {0: ("", ""), 1: ("**", "**"), 2: ("<ins>", "</ins>")}, "\N{PLUS-MINUS SIGN}", "n = {}"
+    escaped, MISSING, {0: ("", ""), 1: ("**", "**"), 2: ("<ins>", "</ins>")}, "\N{PLUS-MINUS SIGN}", "n = {}", "\\*"
 )
 _LATEX = Style(
-    latex_text, "--", {0: ("", ""), 1: ("\\textbf{", "}"), 2: ("\\underline{", "}")}, "$\\pm$", "$n = {}$", _number
+    latex_text,
+    "--",
+    {0: ("", ""), 1: ("\\textbf{", "}"), 2: ("\\underline{", "}")},
+    "$\\pm$",
+    "$n = {}$",
+    "$^*$",
+    _number,
 )

@@ -44,6 +44,7 @@ from dsr.report.paper import (
     sets_of_dataset,
     sets_of_summary,
 )  # fmt: skip
+from dsr.report.significance import LEAST, LEVEL, interval_of_mean, p_of_difference
 from dsr.report.study.study_table import PERCENTAGES, check_study, study_cells
 
 
@@ -56,7 +57,9 @@ class Cell:
         spread: sample standard deviation over seeds; None for one seed.
         seeds: number of seeds of the spread; 0 for values without seeds.
         scenes, of: number of scenes with a value, and of all scenes of the row.
-        interval: 95 % confidence interval of a percentage of answers.
+        interval: 95 % confidence interval of a percentage of answers, or of a mean over scenes.
+        by_scene: value of each scene; NaN for missing ones.
+        significant: whether it is the best, and better than the second best, by a paired test over the scenes.
         rank: 1 for the best displayed value, 2 for the second best; 0 for others and for incomplete averages.
 
     """
@@ -67,6 +70,8 @@ class Cell:
     scenes: int = 1
     of: int = 1
     interval: tuple[float, float] | None = None
+    by_scene: tuple[float, ...] = field(default=(), repr=False)
+    significant: bool = False
     rank: int = 0
 
     def against(self, paper: float | None) -> tuple[float, float | None] | None:
@@ -198,13 +203,15 @@ def shown(column: MetricFormat, value: float) -> str:
     return text.removeprefix("-") if float(text) == 0 else text
 
 
-def build_tables(results: Results, study: pd.DataFrame | None = None) -> list[PaperTable]:
+def build_tables(results: Results, study: pd.DataFrame | None = None, *, intervals: bool = False) -> list[PaperTable]:
     """Build the tables of all runs: per scale and degradation a summary, then one table per data set.
 
     Args:
         results: runs.
         study: table written by ``dsr study collect``: columns ``dataset, scene, scale, downsampling, label``, and
             ``user_first, user_second, user_top2`` in percent with ``_low`` and ``_high`` of each.
+        intervals: whether averages have confidence intervals, and the best one is tested against the second best, see
+            :mod:`dsr.report.significance`.
 
     Raises:
         ValueError: the study lacks a column.
@@ -218,7 +225,7 @@ def build_tables(results: Results, study: pd.DataFrame | None = None) -> list[Pa
         runs = [run for run in results.runs if (run.scale, run.downsampling) == (scale, downsampling)]
         formats = results.formats
         values = _values(runs, formats)
-        make = _Maker(scale, downsampling, results.methods(), values, runs, study, formats)
+        make = _Maker(scale, downsampling, results.methods(), values, runs, study, formats, intervals)
         places = list(dict.fromkeys(place for scenes in make.values.values() for place in scenes))
         if not places:
             continue
@@ -245,6 +252,7 @@ class _Maker:
         runs: runs.
         study: table of the user study.
         formats: formats of the metrics, in column order.
+        intervals: whether averages are tested.
 
     """
 
@@ -255,6 +263,7 @@ class _Maker:
     runs: Sequence[Run]
     study: pd.DataFrame | None
     formats: Formats
+    intervals: bool = False
 
     @property
     def columns(self) -> Formats:
@@ -275,6 +284,8 @@ class _Maker:
         places = {place for each in sets for place in each.places}
         labels = [label for label in self.methods if not places.isdisjoint(self.values.get(label, ()))]
         groups = tuple(_ranked(self._group(each, labels), self.columns) for each in sets)
+        if self.intervals:
+            groups = tuple(_tested(each) if each.about.average else each for each in groups)
         used = {key for group in groups for row in group.rows for key in row.cells}
         columns = {key: each for key, each in self.columns.items() if key in used}
         slug = re.sub(r"[^A-Za-z0-9.-]+", "_", f"{name}_x{self.scale}_{self.downsampling}").strip("._-")
@@ -361,7 +372,8 @@ def _cell(scenes: Sequence[Mapping[int, float]]) -> Cell | None:
     seeds = set.intersection(*map(set, valid))  # seeds that have all of these scenes
     averages = [statistics.fmean(by_seed[seed] for by_seed in valid) for seed in sorted(seeds)]
     spread = statistics.stdev(averages) if len(averages) > 1 else None
-    return Cell(mean, spread, max(len(averages), 1), len(valid), len(scenes))
+    by_scene = tuple(statistics.fmean(each.values()) if each else math.nan for each in scenes)
+    return Cell(mean, spread, max(len(averages), 1), len(valid), len(scenes), by_scene=by_scene)
 
 
 def _ranked(group: Group, columns: Formats) -> Group:
@@ -380,6 +392,23 @@ def _ranked(group: Group, columns: Formats) -> Group:
         replace(row, cells={key: replace(cell, rank=ranks.get((row.label, key), 0)) for key, cell in row.cells.items()})
         for row in group.rows
     ]
+    return replace(group, rows=tuple(rows))
+
+
+def _tested(group: Group) -> Group:
+    """Return the group of an average with intervals, and the best values that are better than all others marked."""
+    rows = []
+    for row in group.rows:
+        cells = dict(row.cells)
+        for key, cell in row.cells.items():
+            if not (cell.complete and cell.by_scene):
+                continue
+            others = [other.cells[key] for other in group.rows if other is not row and key in other.cells]
+            second = [other.by_scene for other in others if other.rank == 2 and other.by_scene]
+            alone = cell.rank == 1 and not any(other.rank == 1 for other in others)
+            beats = alone and bool(second) and all(p_of_difference(cell.by_scene, each) < LEVEL for each in second)
+            cells[key] = replace(cell, interval=interval_of_mean(cell.by_scene), significant=beats)
+        rows.append(replace(row, cells=cells))
     return replace(group, rows=tuple(rows))
 
 
@@ -402,6 +431,9 @@ def _notes(groups: Sequence[Group], columns: Formats) -> Iterator[str]:
         yield f"Not computed: {', '.join(missing)}."
     if any(cell.spread is not None for cell in cells):
         yield "Mean ± sample standard deviation over seeds; seeds are averaged within each scene, then scenes."
+    if any(cell.by_scene and cell.interval for cell in cells):
+        yield f"[low, high]: 95 % interval of the average, by a bootstrap over the scenes (of {LEAST} or more)."
+        yield "*: better than the second best, p < .05 by a paired bootstrap; not corrected for many tests."
     if any(not cell.complete for cell in cells):
         yield "(k of n): an average over k of the n scenes; it is not compared with the others."
     note = implementation_note(row.label for row in rows if row.published)

@@ -1,0 +1,37 @@
+"""Intervals of means over scenes, and the paired test between two methods."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import bootstrap
+
+from dsr.report.significance import interval_of_mean, p_of_difference
+
+
+@pytest.mark.parametrize("count", [5, 30])
+def test_interval_is_that_of_another_bootstrap(count: int) -> None:
+    values = np.random.default_rng(1).gamma(2, size=count)
+    theirs = bootstrap((values,), np.mean, n_resamples=10_000, method="percentile", rng=0).confidence_interval
+    assert interval_of_mean(values.tolist()) == pytest.approx(theirs, rel=0.03)
+
+
+def test_few_scenes_have_no_interval_and_no_test() -> None:
+    assert interval_of_mean([1, 2, 3, 4]) is None
+    assert p_of_difference([1, 2, 3, 4], [5, 6, 7, 8]) == 1
+
+
+def test_scenes_are_paired() -> None:
+    random = np.random.default_rng(2)
+    scenes = random.normal(0, 10, 12)
+    better, worse = scenes, scenes + 1 + random.normal(0, 0.1, 12)
+    assert p_of_difference(better, worse) < 0.001
+    assert p_of_difference(better, random.permutation(worse)) > 0.05
+    assert p_of_difference(better, worse) == p_of_difference(worse, better)
+    assert p_of_difference(better, better) == 1
+
+
+def test_equal_methods_are_rarely_told_apart() -> None:
+    random = np.random.default_rng(3)
+    found = [p_of_difference(*random.normal(0, 1, (2, 20))) < 0.05 for _ in range(200)]
+    assert sum(found) < 30
