@@ -354,7 +354,8 @@ def sens(path, *, colour="jpeg", depth="zlib", scale=1000.0, lost=()):
             rgb = cv2.imencode(f".{colour}", photo(number)[..., ::-1])[1].tobytes()
         stored = np.round(scale * globals()["depth"](number)).astype("<u2").tobytes()
         stored = zlib.compress(stored) if depth == "zlib" else stored
-        parts += [matrix.astype("<f4").tobytes(), struct.pack("<4Q", 7, 8, len(rgb), len(stored)), rgb, stored]
+        told = struct.pack("<4Q", 1_000_000 + 33_333 * number, 8, len(rgb), len(stored))
+        parts += [matrix.astype("<f4").tobytes(), told, rgb, stored]
     parts.append(struct.pack("<Q", 0))  # of the inertial sensor
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(b"".join(parts))

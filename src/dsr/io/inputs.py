@@ -20,7 +20,7 @@ from dsr.io.doubts import doubt_camera, doubt_depth
 from dsr.io.encoding import Encoding, decode, find_holes, turn_back_bits
 from dsr.io.frames import SLACK, Geometry, Rig
 from dsr.io.images import CameraFile, pixels_in_header, read_mask
-from dsr.io.pairs import Pair, time_of, words_of
+from dsr.io.pairs import Pair, words_of
 from dsr.io.photos import Size, model_in_exif, read_photo, same_aspect
 from dsr.io.reading import SUNRGBD_BITS, CameraChoice, Reading
 from dsr.io.units import TURNED_BACK, Told, tell
@@ -212,7 +212,8 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
         depth_lr, warped = _to_photo(pair, reading, depth_lr, rig, camera)
         all_assumptions, confidence = (*all_assumptions, *warped), None
     device_name = model_in_exif(pair.rgb) if pair.capture is None else pair.capture.app
-    time = next((each for each in (geometry.time, time_of(pair.depth), time_of(pair.rgb)) if each is not None), None)
+    own = None if pair.capture is None else pair.capture.time
+    time = pair.named_time if own is None else own
     return Picture(
         rgb, depth_lr, camera, encoding, all_assumptions, geometry.pose, confidence, device_name, geometry.up, time
     )

@@ -178,9 +178,8 @@ def _within(frame: CaptureFrame, capture: CaptureFrame) -> CaptureFrame:
 def _joined(
     model: Callable[[tuple[int, int]], Geometry], capture: Callable[[tuple[int, int]], Geometry], size: tuple[int, int]
 ) -> Geometry:
-    """Return camera, pose and lens of a model, depth camera and time of a capture."""
-    own = capture(size)
-    return model(size)._replace(rig=own.rig, time=own.time)
+    """Return camera, pose and lens of a model, depth camera of a capture."""
+    return model(size)._replace(rig=capture(size).rig)
 
 
 def _note(count: int, total: int, file: Path) -> Assumption:

@@ -81,8 +81,8 @@ def _read(path: Path, prefix: str = "") -> PairingResult:
     pairs = []
     for first, second in sorted(partner.items()):
         photo, depth = photos[int(first.name)][0], depths[int(second.name)][0]
-        geometry = functools.partial(_geometry, place, info, named["rgb"][first])
-        frame = CaptureFrame("ROS", geometry, path, told, photo, depth)
+        geometry = functools.partial(_geometry, place, info)
+        frame = CaptureFrame("ROS", geometry, path, told, photo, depth, named["rgb"][first])
         name = f"{prefix}{int(first.name):06}"
         pairs.append(
             Pair(name, Path(f"{path}{photo_topic}"), Path(f"{path}{depth_topic}"), unit=_UNITS[kind], capture=frame)
@@ -182,12 +182,7 @@ def _camera_info(reader: Any, photo_topic: str) -> _Info | None:
     return None
 
 
-def _geometry(place: str, info: _Info | None, time: float, _: tuple[int, int]) -> Geometry:
-    """Return the camera of a recording, and the frame's time."""
-    return _camera(place, info)._replace(time=time)
-
-
-def _camera(place: str, info: _Info | None) -> Geometry:
+def _geometry(place: str, info: _Info | None, _: tuple[int, int]) -> Geometry:
     """Return the camera of a recording."""
     if info is None:
         return Geometry(None, None, (Assumption("the recording has no camera_info beside the photo's topic"),))
