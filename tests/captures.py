@@ -215,6 +215,7 @@ def ros(
     image_name="image_raw",
     rvl_depth=False,
     storage_plugin=None,
+    packed=False,
     **of_info,
 ):
     """Write a recording of ROS 1 or 2 with colour, depth aligned to it, raw depth and infrared.
@@ -228,11 +229,13 @@ def ros(
         image_name: of the photos' topic.
         rvl_depth: whether depth is compressedDepth of millimetres as RVL.
         storage_plugin: of rosbags' writer of ROS 2.
+        packed: whether the file of ROS 2 is packed whole.
         of_info: entries of CameraInfo that are not as for a plain picture; ``d``, ``k`` and ``p`` are lists, ``roi`` x,
             y, width and height.
 
     """
     from rosbags.rosbag1 import Writer as Writer1  # noqa: PLC0415 - an extra
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode  # noqa: PLC0415
     from rosbags.rosbag2 import Writer as Writer2  # noqa: PLC0415
     from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
 
@@ -291,6 +294,8 @@ def ros(
         if version == 1
         else Writer2(path, version=9, **({"storage_plugin": storage_plugin} if storage_plugin else {}))
     )
+    if packed:
+        make.set_compression(CompressionMode.FILE, CompressionFormat.ZSTD)
     with make as writer:
         for topic, message in topics.items():
             kind = message(0).__msgtype__

@@ -372,6 +372,7 @@ READERS = (
     Reader("ros 1 jpeg", lambda folder: captures.ros(folder / "scan.bag", 1, floats=True, compressed=True),
            _recording(), 2),
     Reader("ros 2", seeds.ros2, _recording(), 2),
+    Reader("ros 2 packed", seeds.ros2_packed, _recording(), 1),
     Reader("kinect", seeds.kinect, _recording(), 2),
     Reader("heic", seeds.heic, _recording()),
     Reader("zed", captures.zed, _recording(), 1),
