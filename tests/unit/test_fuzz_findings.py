@@ -4,6 +4,7 @@ import io
 import json
 import os
 import struct
+import tarfile
 import tracemalloc
 import zipfile
 import zlib
@@ -83,6 +84,22 @@ def test_odometry_with_a_field_longer_than_a_table_may_have_is_refused(tmp_path)
     path.write_text(path.read_text() + "x" * 200_000 + "\n")
     with pytest.raises(ValueError, match=r"odometry\.csv: expected a table of .*field larger than field limit"):
         find_stray(tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["zip", "tar"])
+def test_damaged_lzma_is_a_damaged_archive(tmp_path, kind):
+    path = tmp_path / f"data.{kind}"
+    if kind == "zip":
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA) as file:
+            file.writestr("depth.png", bytes(range(256)) * 20)
+    else:
+        with tarfile.open(path, "w:xz") as file:
+            file.addfile(tarfile.TarInfo("depth.png"), io.BytesIO())
+    content = bytearray(path.read_bytes())
+    content[50:80] = bytes(each ^ 0x5A for each in content[50:80])
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match="expected an archive, got a damaged one"):
+        unpack(path, tmp_path / "out", Mock())
 
 
 def test_zip_whose_member_lies_before_its_start_is_a_damaged_archive(tmp_path):
