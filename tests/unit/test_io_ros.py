@@ -110,6 +110,29 @@ def test_camera_info_that_is_none_is_one_line(tmp_path, of_info, said):
         read_first(path)
 
 
+def test_damaged_camera_info_does_not_matter_where_a_camera_is_given(tmp_path):
+    [pair, *_] = find_pairs_of_folder(captures.ros(tmp_path / "a.bag", 1, d=[np.nan, 0, 0, 0, 0])).pairs
+    for choice in (CameraChoice(intrinsics=INTRINSICS), CameraChoice(fov=60)):
+        picture = read_picture(pair, Reading(camera=choice))
+        if choice.fov is None:
+            assert picture.camera == CAMERA
+        assert [fact.code for fact in picture.assumptions if fact.code] == ["cameras-damaged"]
+        assert "camera_info: lens: expected" in " ".join(map(str, picture.assumptions))
+        assert picture.time == pytest.approx(100)
+        np.testing.assert_allclose(picture.depth_lr[0], captures.depth(0), atol=6e-4)
+
+
+def test_distortion_stays_and_is_said_where_a_camera_is_given(tmp_path):
+    lens = [-0.25, 0.1, 0.002, -0.003, 0.01]
+    [pair, *_] = find_pairs_of_folder(captures.ros(tmp_path / "bent.bag", 1, d=lens)).pairs
+    picture = read_picture(pair, Reading(camera=CameraChoice(intrinsics=INTRINSICS)))
+    np.testing.assert_array_equal(np.rint(255 * picture.rgb.permute(1, 2, 0).numpy()), captures.photo())
+    assert any("-0.25 0.1 0.002" in fact.detail for fact in picture.assumptions)
+    [pair, *_] = find_pairs_of_folder(captures.ros(tmp_path / "straight.bag", 1)).pairs
+    picture = read_picture(pair, Reading(camera=CameraChoice(intrinsics=INTRINSICS)))
+    assert not any("distortion" in fact.text for fact in picture.assumptions)
+
+
 @pytest.mark.parametrize("suffix", [".db3", ".mcap"])
 def test_file_of_ros_2_is_read_without_its_folder(tmp_path, suffix):
     from rosbags.rosbag2 import StoragePlugin  # noqa: PLC0415 - an extra

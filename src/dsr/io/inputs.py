@@ -161,10 +161,14 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     stored = read_values_of(pair)
     size_lr: Size = (stored.shape[0], stored.shape[1])
     pixels, assumptions = _photo(pair, size_lr)
-    geometry = Geometry() if pair.capture is None else pair.capture.geometry((pixels.shape[0], pixels.shape[1]))
+    geometry, doubted = read_geometry(pair, (pixels.shape[0], pixels.shape[1]), reading)
     described, camera_assumptions = _camera(pair, reading, geometry, (pixels.shape[0], pixels.shape[1]), size_lr)
     expect_possible(described.camera, _told_by(pair, reading))
-    lens = geometry.lens if geometry.camera is not None and reading.camera == CameraChoice() else None
+    given = reading.camera != CameraChoice()
+    lens = geometry.lens if geometry.camera is not None and not given else None
+    if given and geometry.lens is not None and geometry.lens.bends:
+        text = "the lens distortion that the capture states is left: the camera is given"
+        camera_assumptions = [*camera_assumptions, Assumption(text, str(geometry.lens))]
     pixels, undone = _undistort_photo(pixels, described.camera, lens)
     pixels, crop_assumptions = _crop_to_multiple(pixels, pair.factor, size_lr)
     size: Size = (pixels.shape[0], pixels.shape[1])
@@ -206,6 +210,7 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
         *hole_assumptions,
         *confidence_assumptions,
         *undone_lr,
+        *doubted,
         *doubts,
     )
     if rig is not None:
@@ -217,6 +222,27 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     return Picture(
         rgb, depth_lr, camera, encoding, all_assumptions, geometry.pose, confidence, device_name, geometry.up, time
     )
+
+
+def read_geometry(pair: Pair, size: Size, reading: Reading) -> tuple[Geometry, list[Assumption]]:
+    """Return what a pair's capture says of its cameras; nothing, with a warning, if it is damaged and one is given.
+
+    Args:
+        size: of the photo.
+
+    Raises:
+        ValueError: it is damaged.
+
+    """
+    if pair.capture is None:
+        return Geometry(), []
+    try:
+        return pair.capture.geometry(size), []
+    except ValueError as error:
+        if reading.camera == CameraChoice():
+            raise
+        text = "the capture's cameras are damaged: the given one is taken, and no pose or depth camera of the capture"
+        return Geometry(), [Assumption(text, str(error), "cameras-damaged", 1)]
 
 
 def _expect_distances(path: Path, depth_lr: Tensor, holes: np.ndarray, range_type: RangeType) -> list[Assumption]:
