@@ -70,6 +70,7 @@ def _posed(request: UpsampleRequest, frames: Frames) -> dict[str, bool]:
         return {pair.name: pair.name in given for pair in frames.whole}
 
     def posed(pair: Pair) -> bool:
+        info = frames.target(request.results.output, pair) / INFO
         try:
             told, _ = read_geometry(pair, pixels_in_header(pair.rgb) or USUAL_SIZE, request.reading)
         except (ValueError, OSError):
@@ -77,7 +78,7 @@ def _posed(request: UpsampleRequest, frames: Frames) -> dict[str, bool]:
         if told.pose is not None:
             return True
         try:
-            return read_info(frames.target(request.results.output, pair) / INFO).get("pose") is not None
+            return read_info(info).get("pose") is not None
         except (ValueError, OSError):
             return False
 
