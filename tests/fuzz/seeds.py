@@ -360,6 +360,12 @@ def kinect(folder: Path) -> None:
     captures.kinect(folder / "scan.mkv", [captures.photo()] * 2, [np.full(captures.KINECT_DEPTH, 1000, np.uint16)] * 2)
 
 
+def heic_beside_depth(folder: Path) -> None:
+    """Write a HEIC photo and a depth map of its own file."""
+    heic(folder)
+    np.save(folder / "depth.npy", captures.depth())
+
+
 def heic(folder: Path) -> None:
     """Write a HEIC photo with a depth map."""
     captures.heic(folder / "photo.heic", np.full(captures.HEIC_MAP, 99, np.uint8), text=captures.apple_text())

@@ -22,6 +22,7 @@ from dsr.app.trust import read_plain_yaml
 from dsr.app.upsample.outputs import read_previous_run
 from dsr.data.download.fetching import unpack
 from dsr.data.tofmark import read_matrices
+from dsr.geometry.planes import inverse_votes
 from dsr.inference import upsampler
 from dsr.io.captures.arkit import find_arkitscenes
 from dsr.io.captures.stray import find_stray
@@ -217,6 +218,26 @@ def test_translation_of_1e308_metres_is_refused_without_a_warning_of_overflow(tm
     np.savetxt(tmp_path / "extrinsics.txt", shift)
     with pytest.raises(ValueError, match=r"extrinsics\.txt: expected a translation in metres, got one of 1e\+308"):
         read_transform(tmp_path / "extrinsics.txt")
+
+
+@pytest.mark.filterwarnings("error")
+def test_distance_of_1e_minus_310_is_looked_at_without_a_warning_of_overflow():
+    values = np.add.outer(np.linspace(1, 2, 48), np.linspace(0, 1, 64))
+    usual = inverse_votes(values)
+    values[5, 5] = 1e-310
+    assert inverse_votes(values).verdict == usual.verdict
+
+
+def test_heic_file_of_gigabytes_is_not_read_for_its_exif_data(tmp_path):
+    path = tmp_path / "photo.heic"
+    with path.open("wb") as file:
+        file.truncate(3 << 30)
+    tracemalloc.start()
+    with pytest.raises(ValueError, match=r"photo\.heic"):
+        read_photo(path, (12, 16))
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 1 << 20
 
 
 def test_archive_with_a_file_without_a_name_is_refused(tmp_path):
