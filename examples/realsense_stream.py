@@ -17,15 +17,21 @@ if len(sys.argv) > 1:
 profile = pipeline.start(config)
 metres = profile.get_device().first_depth_sensor().get_depth_scale()
 align = rs.align(rs.stream.color)
+orders = {rs.format.rgb8: 1, rs.format.bgr8: -1}
 while True:
     there, frames = pipeline.try_wait_for_frames()
     if not there:
         break
+    if not frames.get_color_frame() or not frames.get_depth_frame():
+        continue  # one of them was dropped
     frames = align.process(frames)
     color, depth = frames.get_color_frame(), frames.get_depth_frame()
+    kind = color.profile.format()
+    if kind not in orders:
+        sys.exit(f"expected photos as RGB8 or BGR8, got {kind}")
     lens = color.profile.as_video_stream_profile().intrinsics
     camera = dsr.Camera(lens.width, lens.height, lens.fx, lens.fy, lens.ppx, lens.ppy)
-    stored = np.asanyarray(depth.get_data())  # 0 in holes
-    surface = upsampler(np.asanyarray(color.get_data()), stored * metres, camera, mask=stored > 0)
+    photo, stored = np.asanyarray(color.get_data())[..., :: orders[kind]], np.asanyarray(depth.get_data())  # 0 in holes
+    surface = upsampler(photo, stored * metres, camera, mask=stored > 0)
     print(f"frame {color.frame_number}: {np.nanmedian(surface.depth):.3f} +- {np.nanmedian(surface.depth_error):.4f} m")
 pipeline.stop()

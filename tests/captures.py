@@ -215,6 +215,7 @@ def ros(
     image_name="image_raw",
     rvl_depth=False,
     storage_plugin=None,
+    packed=False,
     **of_info,
 ):
     """Write a recording of ROS 1 or 2 with colour, depth aligned to it, raw depth and infrared.
@@ -228,11 +229,13 @@ def ros(
         image_name: of the photos' topic.
         rvl_depth: whether depth is compressedDepth of millimetres as RVL.
         storage_plugin: of rosbags' writer of ROS 2.
+        packed: whether the file of ROS 2 is packed whole.
         of_info: entries of CameraInfo that are not as for a plain picture; ``d``, ``k`` and ``p`` are lists, ``roi`` x,
             y, width and height.
 
     """
     from rosbags.rosbag1 import Writer as Writer1  # noqa: PLC0415 - an extra
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode  # noqa: PLC0415
     from rosbags.rosbag2 import Writer as Writer2  # noqa: PLC0415
     from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
 
@@ -291,6 +294,8 @@ def ros(
         if version == 1
         else Writer2(path, version=9, **({"storage_plugin": storage_plugin} if storage_plugin else {}))
     )
+    if packed:
+        make.set_compression(CompressionMode.FILE, CompressionFormat.ZSTD)
     with make as writer:
         for topic, message in topics.items():
             kind = message(0).__msgtype__
@@ -354,7 +359,8 @@ def sens(path, *, colour="jpeg", depth="zlib", scale=1000.0, lost=()):
             rgb = cv2.imencode(f".{colour}", photo(number)[..., ::-1])[1].tobytes()
         stored = np.round(scale * globals()["depth"](number)).astype("<u2").tobytes()
         stored = zlib.compress(stored) if depth == "zlib" else stored
-        parts += [matrix.astype("<f4").tobytes(), struct.pack("<4Q", 7, 8, len(rgb), len(stored)), rgb, stored]
+        told = struct.pack("<4Q", 1_000_000 + 33_333 * number, 8, len(rgb), len(stored))
+        parts += [matrix.astype("<f4").tobytes(), told, rgb, stored]
     parts.append(struct.pack("<Q", 0))  # of the inertial sensor
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(b"".join(parts))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
-CHECKS = 3
+CHECKS = 4
 """Number of the present checks; another one where a warning is added, or a limit changes."""
 
 
@@ -25,6 +25,11 @@ class Limit(NamedTuple):
 
 
 LIMITS: dict[str, Limit] = {
+    "cameras-damaged": Limit(
+        1,
+        "frames whose capture describes its cameras in a damaged way, where another camera is given",
+        "a pose and a depth camera beside the photo's, which it may describe, too, are missing then",
+    ),
     "edges-beside": Limit(
         3.0,
         "pixels of the photo, at most 800 on its longer side, by which its edges lie beside those of the depth map",

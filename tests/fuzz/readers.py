@@ -20,7 +20,7 @@ from fuzz import run_seeds, seeds
 from fuzz.judging import EscapedError, RefusedError
 from fuzz.place import Place
 
-_SUFFIXES = (".png", ".jpg", ".tiff", ".npy", ".npz", ".pfm", ".exr", ".depth", ".json", ".txt")
+_SUFFIXES = (".png", ".jpg", ".heic", ".tiff", ".npy", ".npz", ".pfm", ".exr", ".depth", ".json", ".txt")
 _LIBRARY = (ValueError, OSError)
 """What the commands turn into a line."""
 
@@ -372,8 +372,10 @@ READERS = (
     Reader("ros 1 jpeg", lambda folder: captures.ros(folder / "scan.bag", 1, floats=True, compressed=True),
            _recording(), 2),
     Reader("ros 2", seeds.ros2, _recording(), 2),
+    Reader("ros 2 packed", seeds.ros2_packed, _recording(), 1),
     Reader("kinect", seeds.kinect, _recording(), 2),
     Reader("heic", seeds.heic, _recording()),
+    Reader("heic beside depth", seeds.heic_beside_depth, _pair("depth.npy", rgb="photo.heic"), 2),
     Reader("zed", captures.zed, _recording(), 1),
     Reader("ros 2 mcap", seeds.ros2_alone, _recording(), 2),
     Reader("ros rvl", lambda folder: captures.ros(folder / "scan.bag", 1, rvl_depth=True), _recording(), 2),

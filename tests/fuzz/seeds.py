@@ -350,9 +350,20 @@ def ros2(folder: Path) -> None:
     captures.ros(folder / "recording", 2)
 
 
+def ros2_packed(folder: Path) -> None:
+    """Write a recording of ROS 2 whose file is packed whole."""
+    captures.ros(folder / "recording", 2, packed=True)
+
+
 def kinect(folder: Path) -> None:
     """Write a recording of an Azure Kinect."""
     captures.kinect(folder / "scan.mkv", [captures.photo()] * 2, [np.full(captures.KINECT_DEPTH, 1000, np.uint16)] * 2)
+
+
+def heic_beside_depth(folder: Path) -> None:
+    """Write a HEIC photo and a depth map of its own file."""
+    heic(folder)
+    np.save(folder / "depth.npy", captures.depth())
 
 
 def heic(folder: Path) -> None:

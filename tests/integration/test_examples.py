@@ -55,8 +55,10 @@ STORED = [(1500 + 300 * k + 4 * u).astype(np.uint16) * (v > 1) for k in (1, 2)]
 
 STAND_INS = {
     "pyrealsense2": """
+import os
 class Frame:
-    def __init__(self, number, values): self.frame_number, self.values = number, values
+    def __init__(self, number, values, kind="z16"): self.frame_number, self.values, self.kind = number, values, kind
+    def format(self): return self.kind
     def get_data(self): return self.values
     @property
     def profile(self): return self
@@ -64,20 +66,25 @@ class Frame:
     class intrinsics: width, height, fx, fy, ppx, ppy = 32, 24, 27.7, 27.7, 15.5, 11.5
 class Frames:
     def __init__(self, number): self.number = number
-    def get_color_frame(self): return Frame(self.number, PHOTOS[self.number])
+    def get_color_frame(self):  # BGR in the second frame
+        return Frame(self.number, PHOTOS[self.number][..., :: 1 - 2 * self.number], KINDS[self.number])
     def get_depth_frame(self): return Frame(self.number, STORED[self.number])
+class WithoutDepth(Frames):
+    def get_depth_frame(self): return None
+KINDS = [*os.environ.get("KINDS", "rgb8 bgr8").split()]
 class pipeline:
-    def __init__(self): self.left = [0, 1]
+    def __init__(self): self.left = [Frames(0), WithoutDepth(1), Frames(1)]
     def start(self, config): return self
     def get_device(self): return self
     def first_depth_sensor(self): return self
     def get_depth_scale(self): return 0.001
-    def try_wait_for_frames(self): return (True, Frames(self.left.pop(0))) if self.left else (False, None)
+    def try_wait_for_frames(self): return (True, self.left.pop(0)) if self.left else (False, None)
     def stop(self): pass
 class align:
     def __init__(self, stream): pass
     def process(self, frames): return frames
 class stream: color = 2
+class format: rgb8, bgr8 = "rgb8", "bgr8"
 config = Any
 """,
     "depthai": """
@@ -136,15 +143,20 @@ class CvBridge:
 }
 
 
-@pytest.mark.parametrize(("program", "times"), [("realsense_stream.py", 1), ("oak_stream.py", 1), ("ros2_node.py", 2)])
-def test_frames_of_a_camera_are_those_of_dsr_upsample(tmp_path, program, times):
+def with_stand_ins(tmp_path):
+    """Write the stand-ins, and return the environment in which they are found."""
     for name, content in STAND_INS.items():
         path = tmp_path / "modules" / f"{name.replace('.', '/')}.py"
         if any(other.startswith(f"{name}.") for other in STAND_INS):
             path = path.with_suffix("") / "__init__.py"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(FRAMES + content)
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (REPOSITORY / "src", tmp_path / "modules")))}
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (REPOSITORY / "src", tmp_path / "modules")))}
+
+
+@pytest.mark.parametrize(("program", "times"), [("realsense_stream.py", 1), ("oak_stream.py", 1), ("ros2_node.py", 2)])
+def test_frames_of_a_camera_are_those_of_dsr_upsample(tmp_path, program, times):
+    environment = with_stand_ins(tmp_path)
     command = [sys.executable, REPOSITORY / "examples" / program]
     ended = subprocess.run(command, env=environment, check=True, timeout=280, capture_output=True, text=True)
     frames = {}
@@ -155,6 +167,13 @@ def test_frames_of_a_camera_are_those_of_dsr_upsample(tmp_path, program, times):
     ]
     assert expected[0] != expected[1]
     assert re.findall(r"\d\.\d{3}(?!\d)", ended.stdout) == [each for each in expected for _ in range(times)]
+
+
+def test_photos_of_another_format_end_the_stream_of_a_realsense_in_a_line(tmp_path):
+    command = [sys.executable, REPOSITORY / "examples" / "realsense_stream.py"]
+    environment = with_stand_ins(tmp_path) | {"KINDS": "yuyv yuyv"}
+    ended = subprocess.run(command, env=environment, check=False, timeout=280, capture_output=True, text=True)
+    assert (ended.returncode, ended.stderr.splitlines()) == (1, ["expected photos as RGB8 or BGR8, got yuyv"])
 
 
 def test_the_page_on_python_shows_the_program_for_a_camera():

@@ -79,6 +79,19 @@ def test_frames_without_poses_are_refused_before_anything_is_computed(
     assert not (tmp_path / "out").exists()
 
 
+def test_result_that_a_link_leads_elsewhere_is_told_and_not_taken_for_one_without_a_pose(capture, tmp_path, capsys):
+    out, other = tmp_path / "out", tmp_path / "other"
+    assert upsample(capture, "--only", "depth,rgbd", "-o", out) == 0
+    set_poses(out)
+    (out / "001").rename(other)
+    (out / "001").symlink_to(other)
+    capsys.readouterr()
+    assert upsample(capture, "--only", "nerfstudio", "-o", out) == 2
+    [error] = capsys.readouterr().err.splitlines()
+    assert f"a link to {other}" in error
+    assert names_in(other) == names_in(out / "000")
+
+
 def test_poses_of_a_file_are_those_of_the_exports(capture, tmp_path):
     (tmp_path / "poses.txt").write_text("".join(f"{number} {number} 2 3 0 0 0 1\n" for number in range(2)))
     out = tmp_path / "out"

@@ -670,6 +670,9 @@ class Unpickled:
         return os.mkdir, ("executed",)
 
 
+STEPS = (
+    "loops", "fit_loop", "epoch_loop.automatic_optimization.optim_progress", "optimizer", "step", "total", "completed",
+)  # fmt: skip
 BATCHES = ("loops", "fit_loop", "epoch_loop.batch_progress")
 GROUP, FIRST = ("optimizer_states", 0, "param_groups", 0), ("optimizer_states", 0, "state", 0)
 REFUSED = {
@@ -689,6 +692,11 @@ REFUSED = {
     "one beta": damage(*GROUP, "betas", value=(0.9,)),
     "a rate without number": damage(*GROUP, "lr", value=float("nan")),
     "batches below zero": damage(*BATCHES, "current", "ready", value=-3),
+    "more steps than the training has": damage(*STEPS, value=10**12),
+    "bicubic scores as text": damage("bicubic", value={"bicubic": {"RMSE": "x"}}),
+    "bicubic scores without end": damage("bicubic", value={"bicubic": {"RMSE": 10**400}}),
+    "bicubic scores of many": damage("bicubic", value={"bicubic": {"RMSE": torch.zeros(3)}}),
+    "bicubic scores without names": damage("bicubic", value=[1]),
     "no callbacks": lambda checkpoint: checkpoint.pop("callbacks"),
     "callbacks without names": damage("callbacks", value=[1]),
     "sums as text": damage("callbacks", "Curves", "sums", value={"train/loss": "x"}),
@@ -723,6 +731,8 @@ REFUSED = {
     ),
 }  # fmt: skip
 NAMED = {
+    "more steps than the training has": f"{'.'.join(STEPS)}: expected at most 4 steps, got 1000000000000",
+    **dict.fromkeys((name for name in REFUSED if name.startswith("bicubic")), "(bicubic: "),
     "sums as text": "sums",
     "a score as text": "kth_value",
     "a schedule as text": "lr_schedulers.0.last_epoch",

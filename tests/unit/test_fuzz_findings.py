@@ -4,6 +4,7 @@ import io
 import json
 import os
 import struct
+import tarfile
 import tracemalloc
 import zipfile
 import zlib
@@ -21,6 +22,7 @@ from dsr.app.trust import read_plain_yaml
 from dsr.app.upsample.outputs import read_previous_run
 from dsr.data.download.fetching import unpack
 from dsr.data.tofmark import read_matrices
+from dsr.geometry.planes import inverse_votes
 from dsr.inference import upsampler
 from dsr.io.captures.arkit import find_arkitscenes
 from dsr.io.captures.stray import find_stray
@@ -83,6 +85,22 @@ def test_odometry_with_a_field_longer_than_a_table_may_have_is_refused(tmp_path)
     path.write_text(path.read_text() + "x" * 200_000 + "\n")
     with pytest.raises(ValueError, match=r"odometry\.csv: expected a table of .*field larger than field limit"):
         find_stray(tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["zip", "tar"])
+def test_damaged_lzma_is_a_damaged_archive(tmp_path, kind):
+    path = tmp_path / f"data.{kind}"
+    if kind == "zip":
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA) as file:
+            file.writestr("depth.png", bytes(range(256)) * 20)
+    else:
+        with tarfile.open(path, "w:xz") as file:
+            file.addfile(tarfile.TarInfo("depth.png"), io.BytesIO())
+    content = bytearray(path.read_bytes())
+    content[50:80] = bytes(each ^ 0x5A for each in content[50:80])
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match="expected an archive, got a damaged one"):
+        unpack(path, tmp_path / "out", Mock())
 
 
 def test_zip_whose_member_lies_before_its_start_is_a_damaged_archive(tmp_path):
@@ -200,6 +218,26 @@ def test_translation_of_1e308_metres_is_refused_without_a_warning_of_overflow(tm
     np.savetxt(tmp_path / "extrinsics.txt", shift)
     with pytest.raises(ValueError, match=r"extrinsics\.txt: expected a translation in metres, got one of 1e\+308"):
         read_transform(tmp_path / "extrinsics.txt")
+
+
+@pytest.mark.filterwarnings("error")
+def test_distance_of_1e_minus_310_is_looked_at_without_a_warning_of_overflow():
+    values = np.add.outer(np.linspace(1, 2, 48), np.linspace(0, 1, 64))
+    usual = inverse_votes(values)
+    values[5, 5] = 1e-310
+    assert inverse_votes(values).verdict == usual.verdict
+
+
+def test_heic_file_of_gigabytes_is_not_read_for_its_exif_data(tmp_path):
+    path = tmp_path / "photo.heic"
+    with path.open("wb") as file:
+        file.truncate(3 << 30)
+    tracemalloc.start()
+    with pytest.raises(ValueError, match=r"photo\.heic"):
+        read_photo(path, (12, 16))
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 1 << 20
 
 
 def test_archive_with_a_file_without_a_name_is_refused(tmp_path):

@@ -7,11 +7,13 @@ import sys
 import captures
 import numpy as np
 import pytest
+from PIL import Image
 
 from dsr.cli import main
 from dsr.io.inputs import read_picture
 from dsr.io.layouts import find_pairs_of_folder
-from dsr.io.reading import Reading
+from dsr.io.pairs import Pair
+from dsr.io.reading import CameraChoice, Reading
 
 pytest.importorskip("pillow_heif")
 
@@ -99,6 +101,39 @@ def test_photos_of_a_folder_are_found_among_those_without_depth(tmp_path):
     assert [pair.name for pair in pairs] == ["a", "b"]
     with pytest.raises(ValueError, match=r"plain\.heic: "):
         find_pairs_of_folder(tmp_path / "plain.heic")
+
+
+@pytest.mark.parametrize("upright", [True, False])
+@pytest.mark.parametrize(("orientation", "quarters"), [(1, 0), (3, 2), (6, 3), (8, 1)])
+def test_photo_of_a_pair_may_be_heic_and_is_turned_as_its_jpeg_would_be(tmp_path, orientation, quarters, upright):
+    """The depth map, another file, lies as the photo is stored or, if only that fits, as it is shown."""
+    path = write(tmp_path / "photo.heic", orientation=orientation)
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    stored = captures.photo().repeat(4, 0).repeat(4, 1)
+    Image.fromarray(stored).save(tmp_path / "photo.jpg", exif=exif, quality=98, subsampling=0)
+    depth = np.rot90(captures.depth(), quarters if upright else 0)
+    np.save(tmp_path / "depth.npy", depth)
+    heic, jpeg = (
+        read_picture(Pair(path.stem, path, tmp_path / "depth.npy"), Reading(camera=CameraChoice(fov=60)))
+        for path in (path, tmp_path / "photo.jpg")
+    )
+    assert heic.rgb.shape == jpeg.rgb.shape
+    assert float((heic.rgb - jpeg.rgb).abs().mean()) < 0.02
+    assert heic.assumptions == jpeg.assumptions
+    np.testing.assert_array_equal(heic.depth_lr[0], depth.astype(np.float32))
+
+
+def test_heic_photo_has_the_camera_of_its_exif_data_and_is_upsampled(tmp_path, capsys):
+    path, out = write(tmp_path / "photo.heic"), tmp_path / "out"
+    np.save(tmp_path / "depth.npy", captures.depth())
+    files = "--rgb", str(path), "--depth", str(tmp_path / "depth.npy")
+    assert main(["upsample", *files, "-o", str(out), "--method", "bicubic", "--only", "depth"]) == 0
+    assert "52 mm" in capsys.readouterr().out
+    assert np.load(out / "depth.npy").shape == captures.HEIC
+    path.write_bytes(path.read_bytes()[:2000])
+    assert main(["upsample", *files, "-o", str(tmp_path / "other"), "--method", "bicubic"]) == 2
+    assert "photo.heic: expected a HEIC photo, got a damaged one" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Layouts of data sets and of apps' exports: camera, unit, holes and pose of each frame; archives; what is lacking."""
 
+import errno
 import json
 import os
 import pickle
@@ -11,6 +12,7 @@ import subprocess
 import sys
 import zipfile
 import zlib
+from pathlib import Path
 
 import bombs
 import captures
@@ -25,6 +27,7 @@ from dsr.io.formats import FORMATS
 from dsr.io.inputs import FolderUnits, read_picture
 from dsr.io.layouts import find_pairs_of_folder
 from dsr.io.reading import CameraChoice, Reading
+from dsr.utils.files import FullDiskError
 
 FORMAT = {each.name: each for each in FORMATS}
 CAMERA = Camera(SIZE[1], SIZE[0], *INTRINSICS)
@@ -347,7 +350,37 @@ def test_folder_of_an_unpacked_zip_file_is_deleted_at_the_end(folder, tmp_path):
     )
     assert (done.returncode, done.stderr) == (0, "")
     assert f"{FRAMES} pairs of photo and depth map" in done.stdout
-    assert list(place.glob("dsr-*")) == []
+    assert list(place.iterdir()) == []
+
+
+def test_folder_of_a_killed_program_is_deleted_by_the_next_one(folder, tmp_path):
+    path = packed(tmp_path / "scan.zip", captures.polycam(folder))
+    place = tmp_path / "temporary"
+    place.mkdir()
+    code = "import os, sys; from pathlib import Path; from dsr.io.captures.archive import unpack\n" \
+           "unpack(Path(sys.argv[1])); {}"  # fmt: skip
+    environment = {**os.environ, "TMPDIR": str(place), "PYTHONPATH": os.pathsep.join(sys.path)}
+    for end, left in (("os.kill(os.getpid(), 9)", 1), ("os.kill(os.getpid(), 9)", 1), ("", 0)):
+        subprocess.run((sys.executable, "-c", code.format(end), str(path)), env=environment, check=False)
+        assert len(list(place.iterdir())) == left
+
+
+def test_zip_file_for_which_the_disk_is_too_small_is_not_called_damaged(folder, tmp_path, monkeypatch):
+    path = packed(tmp_path / "scan.zip", captures.polycam(folder))
+    place = tmp_path / "temporary"
+    place.mkdir()
+    original = Path.open
+
+    def opened(path, mode="r", *rest, **options):
+        if mode == "xb":
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return original(path, mode, *rest, **options)
+
+    monkeypatch.setattr("tempfile.tempdir", str(place))
+    monkeypatch.setattr(Path, "open", opened)
+    with pytest.raises(FullDiskError, match=f"{place}.*: expected space to write the file"):
+        find_pairs_of_folder(path)
+    assert list(place.iterdir()) == []
 
 
 def hostile(path, name="a.jpg", *, link=False, bomb=False):

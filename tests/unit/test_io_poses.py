@@ -3,10 +3,13 @@
 import json
 from pathlib import Path
 
+import captures
 import numpy as np
 import pytest
+import realsense
 from scipy.spatial.transform import Rotation
 
+from dsr.io.layouts import find_pairs_of_folder
 from dsr.io.pairs import Pair
 from dsr.io.trajectories import read_poses, read_transform
 
@@ -122,6 +125,42 @@ def test_times_in_names_get_the_nearest_pose_within_20_ms(tmp_path):
 def test_numbers_in_names_get_the_pose_of_that_number(tmp_path):
     found = write_tum(tmp_path, 7, 8, 9).assign(pairs("frame_0009", "frame_0007", "frame_0011"))
     assert {name: pose[0, 3] for name, pose in found.items()} == {"frame_0009": 2, "frame_0007": 0}
+
+
+@pytest.mark.parametrize("kind", ["ros 1", "ros 2", "realsense", "sens", "stray"])
+def test_frames_of_recordings_get_the_pose_nearest_to_their_own_time(tmp_path, kind):
+    """Of poses at 200 Hz in any order, of which those near the second frame are missing."""
+    pytest.importorskip("rosbags")
+    make, start, step = {
+        "ros 1": (lambda: captures.ros(tmp_path / "a.bag", 1), 100, 0.033),
+        "ros 2": (lambda: captures.ros(tmp_path / "a", 2), 100, 0.033),
+        "realsense": (lambda: realsense.bag(tmp_path / "a.bag", realsense.Recording()), 1, 0.0333),
+        "sens": (lambda: captures.sens(tmp_path / "a.sens"), 1, 0.033333),
+        "stray": (lambda: captures.stray(tmp_path, video=False), 10, 1 / 60),
+    }[kind]
+    frames = find_pairs_of_folder(make() or tmp_path).pairs
+    assert len(frames) == captures.FRAMES
+    times = start - 0.1 + 0.005 * np.arange(100)
+    times = times[abs(times - start - step) > 0.02] if kind != "stray" else times
+    found = write_tum(tmp_path, *np.random.default_rng(0).permutation(times)).assign(frames)
+    trajectory = read_poses(tmp_path / "poses.txt")
+    for number, frame in enumerate(frames):
+        gaps = abs(np.array(trajectory.times) - start - step * number)
+        if gaps.min() > 0.02:
+            assert frame.name not in found
+        else:
+            np.testing.assert_array_equal(found[frame.name], trajectory.poses[gaps.argmin()])
+    # times of another clock count from the first frame: as many poses as frames are taken in order
+    found = write_tum(tmp_path, *(step * number + 5000.5 for number in range(len(frames)))).assign(frames)
+    assert [found[frame.name][0, 3] for frame in frames] == [0, 1, 2]
+    with pytest.raises(ValueError, match="a pose for each of the 3 frames"):
+        write_tum(tmp_path, 5000.5, 5000.6).assign(frames)
+
+
+def test_numbers_in_names_suit_more_frames_than_a_time_that_is_one_by_chance(tmp_path):
+    frames = find_pairs_of_folder(captures.stray(tmp_path, video=False) or tmp_path).pairs  # 10.000 s, 10.017 s ...
+    found = write_tum(tmp_path, 10, 0, 1, 2).assign(frames)
+    assert [found[frame.name][0, 3] for frame in frames] == [1, 2, 3]
 
 
 def test_poses_without_times_have_to_be_as_many_as_frames(tmp_path):

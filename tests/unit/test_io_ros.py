@@ -1,5 +1,6 @@
 """Recordings of ROS: cameras for window, binning, rectification and distortion, lone files, and RVL."""
 
+import errno
 import struct
 from types import SimpleNamespace
 
@@ -14,6 +15,7 @@ from dsr.io.captures.ros_images import decode_message
 from dsr.io.inputs import read_picture
 from dsr.io.layouts import find_pairs_of_folder
 from dsr.io.reading import CameraChoice, Reading
+from dsr.utils.files import FullDiskError
 
 pytest.importorskip("rosbags")
 CAMERA = Camera(SIZE[1], SIZE[0], *INTRINSICS)
@@ -108,6 +110,29 @@ def test_camera_info_that_is_none_is_one_line(tmp_path, of_info, said):
         read_first(path)
 
 
+def test_damaged_camera_info_does_not_matter_where_a_camera_is_given(tmp_path):
+    [pair, *_] = find_pairs_of_folder(captures.ros(tmp_path / "a.bag", 1, d=[np.nan, 0, 0, 0, 0])).pairs
+    for choice in (CameraChoice(intrinsics=INTRINSICS), CameraChoice(fov=60)):
+        picture = read_picture(pair, Reading(camera=choice))
+        if choice.fov is None:
+            assert picture.camera == CAMERA
+        assert [fact.code for fact in picture.assumptions if fact.code] == ["cameras-damaged"]
+        assert "camera_info: lens: expected" in " ".join(map(str, picture.assumptions))
+        assert picture.time == pytest.approx(100)
+        np.testing.assert_allclose(picture.depth_lr[0], captures.depth(0), atol=6e-4)
+
+
+def test_distortion_stays_and_is_said_where_a_camera_is_given(tmp_path):
+    lens = [-0.25, 0.1, 0.002, -0.003, 0.01]
+    [pair, *_] = find_pairs_of_folder(captures.ros(tmp_path / "bent.bag", 1, d=lens)).pairs
+    picture = read_picture(pair, Reading(camera=CameraChoice(intrinsics=INTRINSICS)))
+    np.testing.assert_array_equal(np.rint(255 * picture.rgb.permute(1, 2, 0).numpy()), captures.photo())
+    assert any("-0.25 0.1 0.002" in fact.detail for fact in picture.assumptions)
+    [pair, *_] = find_pairs_of_folder(captures.ros(tmp_path / "straight.bag", 1)).pairs
+    picture = read_picture(pair, Reading(camera=CameraChoice(intrinsics=INTRINSICS)))
+    assert not any("distortion" in fact.text for fact in picture.assumptions)
+
+
 @pytest.mark.parametrize("suffix", [".db3", ".mcap"])
 def test_file_of_ros_2_is_read_without_its_folder(tmp_path, suffix):
     from rosbags.rosbag2 import StoragePlugin  # noqa: PLC0415 - an extra
@@ -177,6 +202,35 @@ def test_rvl_that_is_damaged_or_declares_more_than_it_can_hold_is_refused_before
         assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("plugin", ["SQLITE3", "MCAP"])
+def test_recording_whose_files_are_packed_whole_is_read_and_leaves_nothing(tmp_path, monkeypatch, plugin):
+    from rosbags.rosbag2 import StoragePlugin  # noqa: PLC0415 - an extra
+
+    path = captures.ros(tmp_path / "scan", 2, storage_plugin=StoragePlugin[plugin], packed=True)
+    assert [file.suffix for file in path.iterdir() if file.stem != "metadata"] == [".zstd"]
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    found = find_pairs_of_folder(path)
+    assert len(found.pairs) == FRAMES
+    for number, pair in enumerate(found.pairs):
+        picture = read_picture(pair, Reading())
+        assert picture.camera == CAMERA
+        np.testing.assert_allclose(picture.depth_lr[0], captures.depth(number), atol=6e-4)
+    read_first(captures.ros(tmp_path / "other.bag", 1))
+    assert not any((tmp_path / "temporary").iterdir())
+    [content] = path.glob("*.zstd")
+    content.write_bytes(content.read_bytes()[:-40])
+    with pytest.raises(ValueError, match=f"^{path}: expected a recording of ROS"):
+        find_pairs_of_folder(path)
+    monkeypatch.setattr("shutil.copyfileobj", _fill_disk)
+    with pytest.raises(FullDiskError, match="temporary"):
+        find_pairs_of_folder(path)
+
+
+def _fill_disk(*_):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
 def packed(path, mode):
     """Write a message of 300 MB of zeros, in about 30 KB, on its own or with its file."""
     from rosbags import rosbag2  # noqa: PLC0415 - an extra
@@ -193,10 +247,12 @@ def packed(path, mode):
 
 @pytest.mark.parametrize(
     ("mode", "said"),
-    [("MESSAGE", "a chunk without end, or of more than 268435456 bytes"), ("FILE", "its files are packed whole")],
+    [
+        ("MESSAGE", "a chunk without end, or of more than 268435456 bytes"),
+        ("FILE", "a packed file of more than 268435456 bytes"),
+    ],
 )
 def test_packed_messages_and_files_are_not_unpacked_to_any_size(tmp_path, mode, said):
     path = packed(tmp_path / "scan", mode)
-    (path / "scan.db3").touch()  # a recording has such a file
     with pytest.raises(ValueError, match=f"^{path}: expected a recording of ROS, got a damaged one .{said}"):
         find_pairs_of_folder(path)

@@ -183,7 +183,8 @@ def plane_votes(values: Array, camera: Camera, step: float = 0.0) -> Array:
 def _windows(values: Array, camera: Camera) -> Windows:
     """Return the windows of a map that have enough valid pixels."""
     valid = np.isfinite(values)
-    inverse = np.where(valid, np.nanmedian(values) / values, 0).clip(max=_LARGEST)
+    with np.errstate(over="ignore"):
+        inverse = np.where(valid, np.nanmedian(values) / values, 0).clip(max=_LARGEST)
     tops, lefts, sizes = _places(*values.shape)
     ends = np.round(np.arange(_CELLS + 1) * sizes[:, None] / _CELLS).astype(int)
     rows, columns = tops[:, None] + ends, lefts[:, None] + ends

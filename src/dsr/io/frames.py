@@ -83,7 +83,7 @@ class Geometry(NamedTuple):
     capture's own. None if it does not say. ``assumptions``: what was assumed for them. ``lens``: of the photo, and of a
     depth map without a rig, which lies in the photo's pixels; None without distortion. ``rig``: the depth map's own
     camera, of a size of its own as well; None if the map is in the photo's view. ``up``: the axis of the world that
-    points up, one of :data:`UPS`. ``time``: of the frame, in seconds; None if it does not say.
+    points up, one of :data:`UPS`.
     """
 
     camera: Camera | None = None
@@ -92,7 +92,6 @@ class Geometry(NamedTuple):
     lens: Lens | None = None
     rig: Rig | None = None
     up: str = ""
-    time: float | None = None
 
 
 @dataclass(frozen=True)
@@ -107,6 +106,7 @@ class CaptureFrame:
         told: the part of it that this frame depends on, which identifies it in ``info.json``.
         photo: where the photo is, if it is no file of its own.
         depth: where the depth map is, if it is no file of its own.
+        time: of the frame, in seconds; None if the capture does not say.
 
     """
 
@@ -116,6 +116,7 @@ class CaptureFrame:
     told: bytes
     photo: Source | None = None
     depth: Source | None = None
+    time: float | None = None
 
     def record(self) -> Record:
         """Return what identifies the description of the camera."""

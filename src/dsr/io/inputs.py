@@ -20,7 +20,7 @@ from dsr.io.doubts import doubt_camera, doubt_depth
 from dsr.io.encoding import Encoding, decode, find_holes, turn_back_bits
 from dsr.io.frames import SLACK, Geometry, Rig
 from dsr.io.images import CameraFile, pixels_in_header, read_mask
-from dsr.io.pairs import Pair, time_of, words_of
+from dsr.io.pairs import Pair, words_of
 from dsr.io.photos import Size, model_in_exif, read_photo, same_aspect
 from dsr.io.reading import SUNRGBD_BITS, CameraChoice, Reading
 from dsr.io.units import TURNED_BACK, Told, tell
@@ -161,10 +161,14 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     stored = read_values_of(pair)
     size_lr: Size = (stored.shape[0], stored.shape[1])
     pixels, assumptions = _photo(pair, size_lr)
-    geometry = Geometry() if pair.capture is None else pair.capture.geometry((pixels.shape[0], pixels.shape[1]))
+    geometry, doubted = read_geometry(pair, (pixels.shape[0], pixels.shape[1]), reading)
     described, camera_assumptions = _camera(pair, reading, geometry, (pixels.shape[0], pixels.shape[1]), size_lr)
     expect_possible(described.camera, _told_by(pair, reading))
-    lens = geometry.lens if geometry.camera is not None and reading.camera == CameraChoice() else None
+    given = reading.camera != CameraChoice()
+    lens = geometry.lens if geometry.camera is not None and not given else None
+    if given and geometry.lens is not None and geometry.lens.bends:
+        text = "the lens distortion that the capture states is left: the camera is given"
+        camera_assumptions = [*camera_assumptions, Assumption(text, str(geometry.lens))]
     pixels, undone = _undistort_photo(pixels, described.camera, lens)
     pixels, crop_assumptions = _crop_to_multiple(pixels, pair.factor, size_lr)
     size: Size = (pixels.shape[0], pixels.shape[1])
@@ -206,16 +210,39 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
         *hole_assumptions,
         *confidence_assumptions,
         *undone_lr,
+        *doubted,
         *doubts,
     )
     if rig is not None:
         depth_lr, warped = _to_photo(pair, reading, depth_lr, rig, camera)
         all_assumptions, confidence = (*all_assumptions, *warped), None
     device_name = model_in_exif(pair.rgb) if pair.capture is None else pair.capture.app
-    time = next((each for each in (geometry.time, time_of(pair.depth), time_of(pair.rgb)) if each is not None), None)
+    own = None if pair.capture is None else pair.capture.time
+    time = pair.named_time if own is None else own
     return Picture(
         rgb, depth_lr, camera, encoding, all_assumptions, geometry.pose, confidence, device_name, geometry.up, time
     )
+
+
+def read_geometry(pair: Pair, size: Size, reading: Reading) -> tuple[Geometry, list[Assumption]]:
+    """Return what a pair's capture says of its cameras; nothing, with a warning, if it is damaged and one is given.
+
+    Args:
+        size: of the photo.
+
+    Raises:
+        ValueError: it is damaged.
+
+    """
+    if pair.capture is None:
+        return Geometry(), []
+    try:
+        return pair.capture.geometry(size), []
+    except ValueError as error:
+        if reading.camera == CameraChoice():
+            raise
+        text = "the capture's cameras are damaged: the given one is taken, and no pose or depth camera of the capture"
+        return Geometry(), [Assumption(text, str(error), "cameras-damaged", 1)]
 
 
 def _expect_distances(path: Path, depth_lr: Tensor, holes: np.ndarray, range_type: RangeType) -> list[Assumption]:

@@ -175,6 +175,12 @@ class Pair:
     confidence: ConfidenceMap | None = field(default=None, compare=False)
     bits: int = 0
 
+    @property
+    def named_time(self) -> float | None:
+        """The time in seconds in the names of the files; None if there is none."""
+        time = time_of(self.depth)
+        return time_of(self.rgb) if time is None else time
+
 
 @dataclass(frozen=True)
 class PairingResult:

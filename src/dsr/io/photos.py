@@ -13,6 +13,7 @@ import numpy as np
 from dsr.io.images import read_pixels
 from dsr.notes import Assumption
 from dsr.utils.files import replacing
+from dsr.utils.guards import MOST_FILE, expect_pixels, read_limited, refusing
 
 _MODEL, _ORIENTATION, _EXIF_IFD, _EXIF_FOCAL_35 = 0x0110, 0x0112, 0x8769, 0xA405
 _ASPECT_TOLERANCE = 0.02
@@ -27,6 +28,8 @@ _TURNS: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     8: lambda pixels: pixels.transpose(1, 0, 2)[::-1],
 }
 """Operations that turn a photo upright, by EXIF orientation."""
+_BACK = {6: 8, 8: 6}
+"""Orientations whose operation undoes that of another one; the others undo themselves."""
 
 Size = tuple[int, int]
 """Height and width in pixels."""
@@ -34,10 +37,11 @@ Size = tuple[int, int]
 
 def read_photo(path: Path, size_lr: Size) -> tuple[np.ndarray, list[Assumption]]:
     """Return the photo, (H, W, 3) uint8 RGB, turned upright only if the depth map fits so, and the assumptions."""
-    if path.suffix.lower() in HEIC_SUFFIXES:
-        raise ValueError(f"{path}: expected a JPEG or PNG photo, got HEIC; export it as JPEG")
-    pixels = cv2.cvtColor(read_pixels(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION), cv2.COLOR_BGR2RGB)
     orientation = orientation_of(path)
+    if path.suffix.lower() in HEIC_SUFFIXES:
+        pixels = _TURNS.get(_BACK.get(orientation, orientation), np.asarray)(read_heic(path))
+    else:
+        pixels = cv2.cvtColor(read_pixels(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION), cv2.COLOR_BGR2RGB)
     if orientation == 1:
         return pixels, []
     size: Size = (pixels.shape[0], pixels.shape[1])
@@ -48,6 +52,42 @@ def read_photo(path: Path, size_lr: Size) -> tuple[np.ndarray, list[Assumption]]
     return pixels, [
         Assumption("the photo's EXIF orientation is left out: the depth map is taken to lie as the file does")
     ]
+
+
+def read_heic(path: Path) -> np.ndarray:
+    """Return the photo of a HEIC file, (H, W, 3) uint8 RGB, upright.
+
+    Raises:
+        ValueError: it is missing, damaged or grey, or pillow-heif is missing.
+
+    """
+    image = open_heic(path)
+    pixels = decode_heic(path, image)
+    if pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
+        raise ValueError(f"{path}: expected a colour photo, got {image.mode}")
+    return pixels[..., :3]
+
+
+def open_heic(path: Path) -> Any:
+    """Return the photo of a HEIC file, pillow-heif's image, whose pixels are not decoded yet; ValueError if damaged."""
+    with refusing(f"{path}: HEIC photos need the package pillow-heif: pip install 'dsr[captures]'", ImportError):
+        import pillow_heif  # noqa: PLC0415 - an extra
+    content = read_limited(path, MOST_FILE)
+    with refusing(f"{path}: expected a HEIC photo, got a damaged one", *_DAMAGED):
+        file = pillow_heif.open_heif(content)
+        return file[file.primary_index]
+
+
+_DAMAGED = (ValueError, RuntimeError, SyntaxError, EOFError, OSError, IndexError, MemoryError)
+"""What pillow-heif raises."""
+
+
+def decode_heic(path: Path, image: Any) -> np.ndarray:
+    """Return the decoded pixels of an image of a HEIC file; ValueError if it is damaged or too large."""
+    width, height = image.size
+    expect_pixels(path, height, width)
+    with refusing(f"{path}: expected a HEIC photo, got a damaged one", *_DAMAGED):
+        return np.array(image)
 
 
 def same_aspect(first: Size, second: Size) -> bool:
@@ -75,10 +115,8 @@ def _exif(photo: Path) -> dict[int, Any]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of data that are damaged
             if photo.suffix.lower() in HEIC_SUFFIXES:
-                import pillow_heif  # noqa: PLC0415 - an extra
-
                 exif = Image.Exif()
-                exif.load(pillow_heif.open_heif(photo).info["exif"])
+                exif.load(open_heic(photo).info["exif"])
             else:
                 with Image.open(photo) as image:
                     exif = image.getexif()

@@ -13,7 +13,7 @@ import numpy as np
 from dsr.geometry.camera import Camera
 from dsr.geometry.plausible import may_be_of
 from dsr.geometry.rigid_motion import Matrix, as_rigid, from_quaternion, is_rotation
-from dsr.io.pairs import Pair, time_of
+from dsr.io.pairs import Pair
 from dsr.notes import Assumption
 from dsr.utils.guards import naming, numbers_in, parse_json, read_limited, refusing
 
@@ -50,42 +50,42 @@ class Trajectory:
     def assign(self, pairs: Sequence[Pair]) -> Mapping[str, Matrix]:
         """Return the poses of frames by their names, without those of frames that have none.
 
-        Frames whose names are times get the pose nearest in time, within 20 ms; those whose names end in the number
-        that the file has for a time get that; others are taken in order.
+        Of a file with times, frames get the pose nearest to the time that their capture states for them, or to that in
+        their names, within 20 ms, or that of the number in which their names end: whichever suits more frames, the
+        first of these if several do. Others are taken in order.
 
         Raises:
-            ValueError: the poses are to be taken in order, and there are not as many as frames; or no frame has one.
+            ValueError: the poses are to be taken in order, and there are not as many as frames; or the names are times,
+                and no frame has a pose.
 
         """
-        taken = [time_of(pair.depth) or time_of(pair.rgb) for pair in pairs]
         if self.times is not None:
-            if all(time is not None for time in taken):
-                return self._nearest(pairs, np.array(taken, dtype=np.float64), _MAX_GAP)
-            numbers = [_number(pair) for pair in pairs]
-            known = set(self.times)
-            if all(number is not None for number in numbers) and known.intersection(numbers):
-                return self._nearest(pairs, np.array(numbers, dtype=np.float64), 0)
+            named = _known([pair.named_time for pair in pairs])
+            own = _known([None if pair.capture is None else pair.capture.time for pair in pairs])
+            numbers = _known([_number(pair) for pair in pairs])
+            ways = [(own, _MAX_GAP), *(way for way in ((named, _MAX_GAP), (numbers, 0.0)) if np.isfinite(way[0]).all())]
+            found = max((self._nearest(pairs, *way) for way in ways), key=len)
+            if found:
+                return found
+            if np.isfinite(named).all():
+                raise ValueError(
+                    f"{self.file}: expected times as in the names of the frames, {named.min():.3f} to "
+                    f"{named.max():.3f}, got {min(self.times):.3f} to {max(self.times):.3f}"
+                )
         if len(self.poses) != len(pairs):
             raise ValueError(
-                f"{self.file}: expected a pose for each of the {len(pairs)} frames, or times as in their names, got "
+                f"{self.file}: expected a pose for each of the {len(pairs)} frames, or their times, got "
                 f"{len(self.poses)} poses"
             )
         return {pair.name: pose for pair, pose in zip(pairs, self.poses, strict=True)}
 
     def _nearest(self, pairs: Sequence[Pair], wanted: np.ndarray, gap: float) -> Mapping[str, Matrix]:
-        """Return the poses nearest in time by the names of the frames."""
+        """Return the poses nearest in time by the names of the frames; of those that have one."""
         poses = self.at(wanted, gap)
-        found = {pair.name: pose for pair, pose in zip(pairs, poses, strict=True) if pose is not None}
-        if not found:
-            times = self.times or (math.nan,)
-            raise ValueError(
-                f"{self.file}: expected times as in the names of the frames, {wanted.min():.3f} to {wanted.max():.3f}, "
-                f"got {min(times):.3f} to {max(times):.3f}"
-            )
-        return found
+        return {pair.name: pose for pair, pose in zip(pairs, poses, strict=True) if pose is not None}
 
     def at(self, wanted: np.ndarray, gap: float = _MAX_GAP) -> list[Matrix | None]:
-        """Return the pose nearest to each time, None for those without one within a gap in seconds."""
+        """Return the pose nearest to each time, None for those without one within a gap in seconds, as for NaN."""
         times = np.array(self.times)
         order = np.argsort(times)
         after = np.searchsorted(times[order], wanted).clip(1, max(len(order) - 1, 1))
@@ -198,6 +198,11 @@ def _matrix_of_json(path: Path, text: str) -> list[list[float]]:
     if not isinstance(content, list):
         raise ValueError(f"{path}: expected a matrix of 3 x 4 or 4 x 4 numbers, got something else")
     return content
+
+
+def _known(times: Sequence[float | None]) -> np.ndarray:
+    """Return times, (frames,) float64, NaN where there is none."""
+    return np.array([math.nan if time is None else time for time in times], dtype=np.float64)
 
 
 def _number(pair: Pair) -> float | None:

@@ -30,6 +30,7 @@ from dsr.training.degradation import Batch
 from dsr.training.loggers import log_picture
 from dsr.training.objective import Objective, to_depth
 from dsr.training.parts import node_of, partial_node_of, read_node
+from dsr.utils.guards import refusing
 from dsr.utils.torch_files import read_torch_file
 
 _RENDERED_SCENES = 4
@@ -329,7 +330,9 @@ class SuperResolution(lightning.LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Restore the scores of bicubic interpolation, which earlier checkpoints lack."""
         stored = checkpoint.get("bicubic", {})
-        self.bicubic = {str(kind): {str(k): float(v) for k, v in each.items()} for kind, each in stored.items()}
+        message = f"bicubic: expected scores by the names of sets and metrics, got {stored!s:.80}"
+        with refusing(message, AttributeError, TypeError, ValueError, OverflowError, RuntimeError):
+            self.bicubic = {str(kind): {str(k): float(v) for k, v in each.items()} for kind, each in stored.items()}
 
     def _gather(self) -> None:
         """Gather the pictures of all devices."""

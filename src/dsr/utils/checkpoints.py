@@ -131,6 +131,12 @@ class CheckpointError(ConfigError):
         return type(self), self._made_of
 
 
+_STEPS = (
+    "loops", "fit_loop", "epoch_loop.automatic_optimization.optim_progress", "optimizer", "step", "total", "completed",
+)  # fmt: skip
+"""Where Lightning counts the steps that are done."""
+
+
 class Resumed(Callback):
     """Lets a training go on from a state of its own kind alone; it is the last of the callbacks.
 
@@ -177,6 +183,9 @@ class Resumed(Callback):
         progress = _fitting(_at(checkpoint, "loops", "fit_loop"), loop, "loops.fit_loop")
         _expect_counts(progress, loop, "loops.fit_loop")
         checkpoint["loops"] = {"fit_loop": progress}
+        done = _at(checkpoint, *_STEPS)
+        if 0 <= trainer.max_steps < done:  # which would end at once, as if complete
+            raise ValueError(f"{'.'.join(_STEPS)}: expected at most {trainer.max_steps} steps, got {done}")
         states = checkpoint["callbacks"]
         own = {each.state_key: each for each in trainer.callbacks if each.state_key in states}  # type: ignore[attr-defined]
         checkpoint["callbacks"] = {

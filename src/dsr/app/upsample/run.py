@@ -21,15 +21,14 @@ from dsr.app.upsample.stored import read_info
 from dsr.app.upsample.workers import work_through
 from dsr.evaluation.sharing import Claims
 from dsr.io.images import pixels_in_header
+from dsr.io.inputs import read_geometry
 from dsr.io.pairs import Pair
 from dsr.io.reading import Shard
 from dsr.io.scene_files import expect_poses
-from dsr.io.trajectories import read_poses
+from dsr.io.trajectories import USUAL_SIZE, read_poses
 from dsr.utils.console import ConsoleProgress, show
 from dsr.utils.files import expect_targets, write_text
 
-_USUAL_SIZE = (1440, 1920)
-"""Of photos in videos and archives, whose poses do not depend on it."""
 _READ_ONLY = (errno.EACCES, errno.EPERM, errno.EROFS)
 
 
@@ -71,14 +70,15 @@ def _posed(request: UpsampleRequest, frames: Frames) -> dict[str, bool]:
         return {pair.name: pair.name in given for pair in frames.whole}
 
     def posed(pair: Pair) -> bool:
+        info = frames.target(request.results.output, pair) / INFO
         try:
-            told = None if pair.capture is None else pair.capture.geometry(pixels_in_header(pair.rgb) or _USUAL_SIZE)
+            told, _ = read_geometry(pair, pixels_in_header(pair.rgb) or USUAL_SIZE, request.reading)
         except (ValueError, OSError):
             return True
-        if told is not None and told.pose is not None:
+        if told.pose is not None:
             return True
         try:
-            return read_info(frames.target(request.results.output, pair) / INFO).get("pose") is not None
+            return read_info(info).get("pose") is not None
         except (ValueError, OSError):
             return False
 

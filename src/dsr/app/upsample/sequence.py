@@ -52,7 +52,7 @@ class FrameSequence:
             self._without = len(pairs) - len(self._poses)
             if len(trajectory.poses) != len(pairs):
                 counts = f"{len(trajectory.poses)} poses for {len(pairs)} frames"
-                self._matched.append(Assumption(f"{poses.name}: {counts}, by times or numbers in their names"))
+                self._matched.append(Assumption(f"{poses.name}: {counts}, by their times or numbers"))
         self.recordings: dict[Path, list[Pair]] = {}
         for pair in pairs:
             self.recordings.setdefault(pair.depth.parent, []).append(pair)

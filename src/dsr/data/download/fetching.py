@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import json
+import lzma
 import os
 import re
 import shutil
@@ -58,7 +59,8 @@ _BEGINNINGS: Mapping[str, tuple[bytes, ...]] = {
     ".zip": (b"PK",),
 }  # fmt: skip
 _DAMAGE = (
-    zipfile.BadZipFile, tarfile.TarError, EOFError, zlib.error, KeyError, RuntimeError, UnicodeError, OSError,
+    zipfile.BadZipFile, tarfile.TarError, EOFError, zlib.error, lzma.LZMAError, KeyError, RuntimeError, UnicodeError,
+    OSError,
 )  # fmt: skip
 """What a damaged or encrypted archive raises; an OSError without a number is gzip's, and an invalid argument is a place
 before the file's beginning."""

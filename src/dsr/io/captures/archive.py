@@ -25,7 +25,7 @@ import numpy as np
 
 from dsr.io.frames import Record, file_state
 from dsr.utils.decoding import decode_pixels
-from dsr.utils.files import expect_space
+from dsr.utils.files import expect_space, owner, remove_abandoned, space_for
 from dsr.utils.guards import (
     bytes_of_archive,
     expect_bytes,
@@ -174,10 +174,12 @@ class Section:
 def unpack(path: Path) -> Path:
     """Return a temporary folder with the files of a ZIP file, which is deleted when the program ends.
 
+    Those that killed programs left are deleted first.
+
     Raises:
         ValueError: it is damaged or encrypted, a member is a link or leads outside the folder, or they are larger than
             the size of the archive explains.
-        FullDiskError: the disk is too small for what it declares.
+        FullDiskError: the disk is too small.
 
     """
     return _unpack(path, file_state(path, "an archive"))
@@ -285,13 +287,15 @@ def _unpack(path: Path, _: tuple[int, int]) -> Path:
             )
         expect_bytes(f"{path}: the members declare", total, bytes_of_archive(path.stat().st_size))
         with contextlib.ExitStack() as stack:
-            work = tempfile.mkdtemp(prefix="dsr-")
+            remove_abandoned(Path(tempfile.gettempdir()))
+            work = tempfile.mkdtemp(prefix=f".dsr-{owner()}-")
             stack.callback(shutil.rmtree, work, ignore_errors=True)
             target = Path(work) / path.name
             target.mkdir()
             expect_space(target, total)
             for each in members:
-                with refusing(f"{path}: {each.filename}: expected a member, got a damaged one", *_DAMAGED):
+                text = f"{path}: {each.filename}: expected a member, got a damaged one"
+                with refusing(text, *_DAMAGED), space_for(target):
                     _unpack_member(packed, each, target / each.filename.replace("\\", "/"))
             stack.pop_all()
     atexit.register(_remove, work, os.getpid())

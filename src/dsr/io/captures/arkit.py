@@ -88,7 +88,8 @@ def find_arkitscenes(folder: Path) -> PairingResult | None:
         place = f"{folder / 'lowres_wide.traj'}: frame {stem}"
         geometry = functools.partial(_geometry, place, intrinsics, motion)
         told = (b"" if intrinsics is None else read_limited(intrinsics, _LARGEST_PINCAM)) + repr(motion).encode()
-        frame = CaptureFrame(_ARKITSCENES, geometry, intrinsics or folder / "lowres_wide.traj", told)
+        time = _time(stem) if math.isfinite(_time(stem)) else None
+        frame = CaptureFrame(_ARKITSCENES, geometry, intrinsics or folder / "lowres_wide.traj", told, time=time)
         path = folder / "confidence" / f"{stem}.png"
         known = ConfidenceMap(path, HIGHEST_LEVEL) if path.is_file() else None
         pairs.append(Pair(stem, photos[stem], depths[stem], unit=1e-3, capture=frame, confidence=known))
@@ -147,8 +148,7 @@ def _geometry(place: str, intrinsics: Path | None, motion: _Motion | None, _: tu
         to_camera[:3, :3] = Rotation.from_rotvec(motion[:3]).as_matrix()
         to_camera[:3, 3] = motion[3:]
         pose = check_pose(place, np.linalg.inv(to_camera))
-    time = _time(place.rpartition(" ")[2])
-    return Geometry(camera, pose, tuple(notes), up="z", time=time if math.isfinite(time) else None)
+    return Geometry(camera, pose, tuple(notes), up="z")
 
 
 class _PolycamCamera(BaseModel, strict=True):

@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import atexit
 import bz2
+import contextlib
 import functools
 import hashlib
 import importlib
-from collections.abc import Callable
+import os
+import tempfile
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NoReturn
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from dsr.io.captures.ros_images import decode_message
 from dsr.io.frames import Record
-from dsr.utils.guards import MOST_TEXT, expect_bytes, opened, path_within, refusing
+from dsr.utils.files import FullDiskError, space_for
+from dsr.utils.guards import MOST_TEXT, bytes_of_archive, expect_bytes, opened, path_within, refusing
 
 IMAGE, COMPRESSED = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage"))
 
@@ -98,7 +102,8 @@ class NamedErrors:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
         if error is None or not isinstance(error, Exception):
             return
-        if isinstance(error, ValueError) and str(error).startswith(str(self._path)):
+        named = isinstance(error, ValueError) and str(error).startswith(str(self._path))
+        if named or isinstance(error, FullDiskError):
             return
         raise ValueError(f"{self._path}: expected a recording of ROS, got a damaged one ({error!s:.120})") from error
 
@@ -152,7 +157,8 @@ def _open(path: Path) -> Any:
         for file in path.iterdir():  # of which rosbags takes those that the description names
             path_within(path, file.name, f"{description}: relative_file_paths")
     reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-    reader.open()
+    with space_for(Path(tempfile.gettempdir()) / path.name):  # where files that are packed whole are unpacked
+        reader.open()
     sizes = [chunk.datasize for each in reader.readers for chunk in getattr(each, "chunks", {}).values()]
     if max(sizes, default=0) > _CHUNK:  # a damaged number, which rosbags would read all the same
         reader.close()
@@ -188,7 +194,8 @@ _CHUNK = 1 << 28
 def _limit_chunks() -> None:
     """Make rosbags unpack nothing to more than :data:`_CHUNK`: a bzip2 chunk of 700 bytes may stand for 1 GB.
 
-    Messages may be packed one by one. Recordings whose files are packed whole, of any size, are refused.
+    Messages may be packed one by one. Files that are packed whole, which rosbags unpacks into a temporary folder, are
+    unpacked to what :func:`~dsr.utils.guards.bytes_of_archive` explains.
     """
     lz4: Any = importlib.import_module("lz4.frame")  # with the extra alone
     from rosbags.rosbag1 import reader  # noqa: PLC0415
@@ -210,8 +217,28 @@ def _limit_chunks() -> None:
         for name in kinds.keys() & table.keys():
             table[name] = functools.partial(bounded, kinds[name])
 
-    def refuse(*_: object) -> NoReturn:
-        raise ValueError("its files are packed whole, which zstd -d undoes")
+    @contextlib.contextmanager
+    def unpacked(file: BinaryIO, mode: str) -> Iterator[_Bounded]:
+        with zstd.open(file, mode) as content:
+            yield _Bounded(content, bytes_of_archive(os.fstat(file.fileno()).st_size))
 
+    zstd: Any = storage_mcap.zstd
     of_messages: Any = importlib.import_module("rosbags.rosbag2.reader")
-    of_messages.zstd = SimpleNamespace(decompress=functools.partial(bounded, kinds["zstd"]), open=refuse)
+    of_messages.zstd = SimpleNamespace(decompress=functools.partial(bounded, kinds["zstd"]), open=unpacked)
+
+
+@dataclass
+class _Bounded:
+    """A file that ends in a ValueError behind a number of bytes."""
+
+    file: BinaryIO
+    most: int
+    count: int = 0
+
+    def read(self, size: int) -> bytes:
+        """Return the next bytes, at most ``size``."""
+        content = self.file.read(size)
+        self.count += len(content)
+        if self.count > self.most:
+            raise ValueError(f"a packed file of more than {self.most} bytes")
+        return content

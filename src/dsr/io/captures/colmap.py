@@ -18,10 +18,11 @@ ends its path, else of the only one of its stem.
 from __future__ import annotations
 
 import functools
+import io
 import math
 import struct
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -178,9 +179,8 @@ def _within(frame: CaptureFrame, capture: CaptureFrame) -> CaptureFrame:
 def _joined(
     model: Callable[[tuple[int, int]], Geometry], capture: Callable[[tuple[int, int]], Geometry], size: tuple[int, int]
 ) -> Geometry:
-    """Return camera, pose and lens of a model, depth camera and time of a capture."""
-    own = capture(size)
-    return model(size)._replace(rig=own.rig, time=own.time)
+    """Return camera, pose and lens of a model, depth camera of a capture."""
+    return model(size)._replace(rig=capture(size).rig)
 
 
 def _note(count: int, total: int, file: Path) -> Assumption:
@@ -237,17 +237,17 @@ class SparseDepth:
 
     def read(self) -> np.ndarray:
         """Return the depth, (h, w) float32 in the unit of the model, NaN in holes."""
-        places = _points(self.file, file_state(self.file, "points"))
-        seen = [(x, y, places[int(point)]) for x, y, point in self.image.observed if int(point) in places]
+        numbers, places = _points(self.file, file_state(self.file, "points"))
+        seen = self.image.observed[np.isin(self.image.observed[:, 2], numbers)]
         width, height = self.camera.width, self.camera.height
         step = math.sqrt(width * height / max(len(seen), 4))
         size = max(2, round(height / step)), max(2, round(width / step))
         depth = np.full(size, np.nan, np.float32)
-        if not seen:
+        if not len(seen):
             return depth
         pose = _pose(str(self.file), self.image.quaternion, self.image.translation)
-        columns, rows, points = (np.array(each) for each in zip(*seen, strict=True))
-        z = points @ pose[2, :3] + pose[2, 3]
+        columns, rows, points = seen.T
+        z = places[np.searchsorted(numbers, points, side="right") - 1] @ pose[2, :3] + pose[2, 3]
         inside = (z > 0) & (columns >= 0) & (rows >= 0) & (columns < width) & (rows < height)
         order = np.flatnonzero(inside)[np.argsort(-z[inside])]
         row, column = (rows[order] * size[0] / height).astype(int), (columns[order] * size[1] / width).astype(int)
@@ -362,15 +362,17 @@ def _images_of_bytes(path: Path, content: bytes) -> list[_Image]:
     return images
 
 
-def _lines(path: Path, content: bytes) -> list[str]:
-    """Return the lines of a text without comments; empty ones count."""
-    return [line for line in content.decode("utf-8", "replace").splitlines() if not line.startswith("#")]
+def _lines(content: bytes) -> Iterator[str]:
+    """Yield the lines of a text without comments; empty ones count."""
+    for line in io.TextIOWrapper(io.BytesIO(content), "utf-8", "replace"):
+        if not line.startswith("#"):
+            yield line.rstrip("\n")
 
 
 def _cameras_of_text(path: Path, content: bytes) -> dict[int, _Camera]:
     """Return the cameras of ``cameras.txt`` by their numbers."""
     cameras = {}
-    for line in filter(str.strip, _lines(path, content)):
+    for line in filter(str.strip, _lines(content)):
         words = line.split()
         numbers = numbers_in([*words[:1], *words[2:]])
         if len(numbers) < 3 or not numbers[0].is_integer():
@@ -382,7 +384,7 @@ def _cameras_of_text(path: Path, content: bytes) -> dict[int, _Camera]:
 
 def _images_of_text(path: Path, content: bytes) -> list[_Image]:
     """Return the images of ``images.txt``."""
-    images, lines = [], iter(_lines(path, content))
+    images, lines = [], iter(_lines(content))
     for line in lines:
         if not line.strip():
             continue
@@ -399,20 +401,24 @@ def _images_of_text(path: Path, content: bytes) -> list[_Image]:
 
 
 @functools.lru_cache(maxsize=1)
-def _points(path: Path, _: tuple[int, int]) -> dict[int, tuple[float, ...]]:
-    """Return the places of the points of a file of a size and a time, by their numbers."""
-    content, points = read_limited(path, _LARGEST), {}
+def _points(path: Path, _: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the numbers of the points of a file of a size and a time, (n,) float64 in order, and their places."""
+    content, number = read_limited(path, _LARGEST), "<f8"
+    stored = bytearray()  # number and place of each
     if path.suffix == ".bin":
-        file = _Bytes(path, content)
+        number, file = "<u8", _Bytes(path, content)
         for _number in range(file.count(51)):
-            number, *place = file.read("Q3d3Bd")
-            points[int(number)] = tuple(place[:3])
+            file.expect(51)
+            stored += content[file.place : file.place + 32]
+            file.place += 43
             length = 8 * file.count(8)
             file.place += length
-        return points
-    for line in filter(str.strip, _lines(path, content)):
-        numbers = numbers_in(line.split()[:4])
-        if len(numbers) != 4 or not numbers[0].is_integer():
-            raise ValueError(f"{path}: expected POINT3D_ID X Y Z, got {line!r:.80}")
-        points[int(numbers[0])] = tuple(numbers[1:])
-    return points
+    else:
+        for line in filter(str.strip, _lines(content)):
+            numbers = numbers_in(line.split()[:4])
+            if len(numbers) != 4 or not numbers[0].is_integer():
+                raise ValueError(f"{path}: expected POINT3D_ID X Y Z, got {line!r:.80}")
+            stored += struct.pack("<4d", *numbers)
+    points = np.frombuffer(stored, [("number", number), ("place", "<f8", 3)])
+    order = np.argsort(points["number"], kind="stable")
+    return points["number"][order].astype(np.float64), points["place"][order]

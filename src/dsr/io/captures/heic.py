@@ -26,19 +26,10 @@ import numpy as np
 from dsr.geometry.camera import Camera
 from dsr.io.frames import CaptureFrame, Geometry, Record
 from dsr.io.pairs import Pair, PairingResult
-from dsr.io.photos import HEIC_SUFFIXES, orientation_of, same_aspect
+from dsr.io.photos import HEIC_SUFFIXES, decode_heic, open_heic, orientation_of, read_heic, same_aspect
 from dsr.io.trajectories import intrinsics_camera
 from dsr.notes import Assumption
-from dsr.utils.guards import (
-    MOST_FILE,
-    MOST_TEXT,
-    expect_pixels,
-    natural_key,
-    numbers_in,
-    opened,
-    read_limited,
-    refusing,
-)
+from dsr.utils.guards import MOST_FILE, MOST_TEXT, natural_key, numbers_in, opened, read_limited
 from dsr.utils.versions import file_hash
 
 _APP = "HEIC"
@@ -72,13 +63,9 @@ class HeicImage:
 
     def read(self) -> np.ndarray:
         """Return (H, W, 3) uint8 RGB, or (h, w) float32 depth in metres, NaN where there is none."""
-        image = _open(self.file)
         if self.role == "depth":
-            return _read_depth(self.file, _first_map(self.file, image))
-        pixels = _pixels(self.file, image)
-        if pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
-            raise ValueError(f"{self.file}: expected a colour photo, got {image.mode}")
-        return pixels[..., :3]
+            return _read_depth(self.file, _first_map(self.file, open_heic(self.file)))
+        return read_heic(self.file)
 
     def record(self) -> Record:
         """Return the file's name and hash."""
@@ -119,28 +106,6 @@ def _has_depth(path: Path) -> bool:
         return _MARK.search(file.read(_HEAD)) is not None
 
 
-def _open(path: Path) -> Any:
-    """Return the photo, whose pixels are not decoded yet."""
-    with refusing(f"{path}: HEIC photos need the package pillow-heif: pip install 'dsr[captures]'", ImportError):
-        import pillow_heif  # noqa: PLC0415 - an extra
-    content = read_limited(path, MOST_FILE)
-    with refusing(f"{path}: expected a HEIC photo, got a damaged one", *_DAMAGED):
-        file = pillow_heif.open_heif(content)
-        return file[file.primary_index]
-
-
-_DAMAGED = (ValueError, RuntimeError, SyntaxError, EOFError, OSError, IndexError, MemoryError)
-"""What pillow-heif raises."""
-
-
-def _pixels(path: Path, image: Any) -> np.ndarray:
-    """Return the decoded pixels of an image."""
-    width, height = image.size
-    expect_pixels(path, height, width)
-    with refusing(f"{path}: expected a HEIC photo, got a damaged one", *_DAMAGED):
-        return np.array(image)
-
-
 def _first_map(path: Path, image: Any) -> Any:
     """Return the depth map that belongs to a photo."""
     maps = [each for each in image.info.get("depth_images", ()) if each is not None]
@@ -151,7 +116,7 @@ def _first_map(path: Path, image: Any) -> Any:
 
 def _read_depth(path: Path, stored: Any) -> np.ndarray:
     """Return depth in metres, (h, w) float32, NaN where it is none."""
-    values, told = _pixels(path, stored), stored.info["metadata"] or {}
+    values, told = decode_heic(path, stored), stored.info["metadata"] or {}
     kind = told.get("representation_type")
     names = ("d_min", "d_max") if kind == _DISPARITY else ("z_near", "z_far")
     if kind not in (_INVERSE_DEPTH, _DISPARITY, _DEPTH) or not all(name in told for name in names):

@@ -19,7 +19,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -203,8 +203,7 @@ def _read(path: Path, prefix: str = "") -> PairingResult:
     geometry = functools.partial(_geometry, f"{path}: calibration.json", bytes(attached[0]), size, size_lr)
     pairs = tuple(
         Pair(f"{prefix}{photo.name}", photo, depth, unit=1e-3, capture=CaptureFrame(
-            _APP, functools.partial(_of_frame, geometry, photos[photo].seconds), path, bytes(attached[0]),
-            photos[photo], depths[depth]))
+            _APP, geometry, path, bytes(attached[0]), photos[photo], depths[depth], photos[photo].seconds))
         for photo, depth in sorted(partner.items())
     )  # fmt: skip
     note = describe_capture(f"a recording of {_APP}", "millimetres", pairs, poses=False)
@@ -244,11 +243,6 @@ def _track(path: Path, container: Any, role: str) -> Any:
             expect_pixels(path, track.height, track.width)
             return track
     raise ValueError(f"{path}: expected a recording of {_APP} with tracks COLOR and DEPTH, there is no {name}")
-
-
-def _of_frame(cameras: Callable[[tuple[int, int]], Geometry], time: float, size: tuple[int, int]) -> Geometry:
-    """Return the cameras of a recording, and the frame's time."""
-    return cameras(size)._replace(time=time)
 
 
 def _geometry(

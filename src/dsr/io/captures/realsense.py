@@ -98,8 +98,8 @@ def read(reader: Any, path: Path, prefix: str) -> PairingResult:
     pairs = []
     for first, second in sorted(partner.items()):
         sources = photos[int(first.name)][0], depths[int(second.name)][0]
-        own = functools.partial(_of_photo, geometry._replace(time=photos[int(first.name)][1]))
-        frame = CaptureFrame(device, own, path, told, *sources)
+        own = functools.partial(_of_photo, geometry)
+        frame = CaptureFrame(device, own, path, told, *sources, time=photos[int(first.name)][1])
         pairs.append(Pair(f"{prefix}{int(first.name):06}", *places, unit=unit, capture=frame))
     about = describe_capture(f"a recording of {device}", f"units of {unit:g} m", pairs, poses=False)
     others = sorted(

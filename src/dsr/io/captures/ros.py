@@ -1,6 +1,6 @@
 """Recordings of ROS 1 (``.bag``) and ROS 2 (``.mcap``, ``.db3``, or a folder of them with ``metadata.yaml``).
 
-Messages of sensor_msgs: Image, CompressedImage and CameraInfo,
+The files in such a folder may be packed (``.zstd``). Messages of sensor_msgs: Image, CompressedImage and CameraInfo,
 http://docs.ros.org/en/api/sensor_msgs/html/index-msg.html; depth is in millimetres as whole numbers and in metres as
 floats, https://ros.org/reps/rep-0118.html.
 
@@ -32,6 +32,8 @@ from dsr.utils.guards import naming, natural_key
 
 FILES = (".bag", ".mcap", ".db3")
 """Suffixes of recordings that are a single file."""
+_FILES_2 = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
+"""Those beside ``metadata.yaml``."""
 _UNITS = {"u": 1e-3, "f": 1.0}
 _PREFERRED = {"depth": ("aligned", "registered"), "rgb": ("color", "colour", "rgb")}
 
@@ -52,7 +54,7 @@ def find_ros(folder: Path) -> PairingResult | None:
     """
     if folder.is_file():
         return _read(folder) if folder.suffix.lower() in FILES else None
-    if (folder / "metadata.yaml").is_file() and any((*folder.glob("*.db3"), *folder.glob("*.mcap"))):
+    if (folder / "metadata.yaml").is_file() and any(any(folder.glob(f"*{suffix}")) for suffix in _FILES_2):
         return _read(folder)
     bags = [path for path in folder.iterdir() if path.suffix.lower() in FILES and path.is_file()]
     if not bags:
@@ -81,8 +83,8 @@ def _read(path: Path, prefix: str = "") -> PairingResult:
     pairs = []
     for first, second in sorted(partner.items()):
         photo, depth = photos[int(first.name)][0], depths[int(second.name)][0]
-        geometry = functools.partial(_geometry, place, info, named["rgb"][first])
-        frame = CaptureFrame("ROS", geometry, path, told, photo, depth)
+        geometry = functools.partial(_geometry, place, info)
+        frame = CaptureFrame("ROS", geometry, path, told, photo, depth, named["rgb"][first])
         name = f"{prefix}{int(first.name):06}"
         pairs.append(
             Pair(name, Path(f"{path}{photo_topic}"), Path(f"{path}{depth_topic}"), unit=_UNITS[kind], capture=frame)
@@ -182,12 +184,7 @@ def _camera_info(reader: Any, photo_topic: str) -> _Info | None:
     return None
 
 
-def _geometry(place: str, info: _Info | None, time: float, _: tuple[int, int]) -> Geometry:
-    """Return the camera of a recording, and the frame's time."""
-    return _camera(place, info)._replace(time=time)
-
-
-def _camera(place: str, info: _Info | None) -> Geometry:
+def _geometry(place: str, info: _Info | None, _: tuple[int, int]) -> Geometry:
     """Return the camera of a recording."""
     if info is None:
         return Geometry(None, None, (Assumption("the recording has no camera_info beside the photo's topic"),))

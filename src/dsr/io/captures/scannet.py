@@ -8,7 +8,7 @@ ScanNet; https://github.com/ScanNet/ScanNet, SensReader/python/SensorData.py. Li
     4 uint32                 width and height of colour, then of depth
     float32, uint64          values per metre (1000), and the number of frames; of each:
         16 float32           pose from camera (x right, y down, z forward) to world, -inf where there is none
-        4 uint64             two times, bytes of colour, bytes of depth; then those bytes
+        4 uint64             times of colour and depth in microseconds, 0 for none; bytes of both; then those bytes
 
 Depth is registered to colour.
 
@@ -104,7 +104,8 @@ def _read_sens(path: Path, before: str) -> PairingResult:
             photo = Section(path, f"color/{number}", start, lengths[0], functools.partial(_photo, told))
             depth = Section(path, f"depth/{number}", start + lengths[0], lengths[1], functools.partial(_depth, told))
             geometry = functools.partial(_geometry, f"{path}: frame {number}", told, values[:16])
-            frame = CaptureFrame("ScanNet", geometry, path, content[:64] + repr(told).encode(), photo, depth)
+            time = 1e-6 * values[16] if values[16] else None
+            frame = CaptureFrame("ScanNet", geometry, path, content[:64] + repr(told).encode(), photo, depth, time)
             places = path / photo.name, path / depth.name
             pairs.append(Pair(f"{before}{number:06}", *places, unit=1 / told.scale, capture=frame))
     if not pairs:

@@ -76,7 +76,9 @@ def find_stray(folder: Path) -> PairingResult | None:
         row = rows.get(number, {})
         told = (odometry if row else matrix, repr((text, sorted(row.items()))).encode())
         geometry = functools.partial(_geometry, folder, number, row, text)
-        frame = CaptureFrame(_APP, geometry, *told, photo=None if photo else VideoFrame(video, number))
+        source = None if photo else VideoFrame(video, number)
+        time = next((value for value in numbers_in([row.get("timestamp", "")]) if math.isfinite(value)), None)
+        frame = CaptureFrame(_APP, geometry, *told, photo=source, time=time)
         known = ConfidenceMap(confidence[number], HIGHEST_LEVEL) if number in confidence else None
         rgb = photo or video / f"{number:06}"
         pairs.append(Pair(f"{number:06}", rgb, depth, unit=1e-3, capture=frame, confidence=known))
@@ -128,19 +130,18 @@ def _geometry(folder: Path, number: int, row: _Row, matrix: str, size: tuple[int
         pose = pose_from_quaternion(place, values[3:], values[:3])
     else:
         assumptions.append(Assumption("no pose: odometry.csv has none of the frame"))
-    time = next((value for value in numbers_in([row.get("timestamp", "")]) if math.isfinite(value)), None)
     own = all(row.get(name) for name in _INTRINSICS)
     if own:
         camera = _camera(folder, place, _numbers(place, row, _INTRINSICS), size)
-        return Geometry(camera, pose, tuple(assumptions), up="y", time=time)
+        return Geometry(camera, pose, tuple(assumptions), up="y")
     if not matrix:
-        return Geometry(None, pose, tuple(assumptions), up="y", time=time)
+        return Geometry(None, pose, tuple(assumptions), up="y")
     assumptions.append(
         Assumption("camera: camera_matrix.csv of the whole capture; odometry.csv has none of each frame")
     )
     path = folder / "camera_matrix.csv"
     camera = _camera(folder, str(path), _read_matrix(path, matrix), size)
-    return Geometry(camera, pose, tuple(assumptions), up="y", time=time)
+    return Geometry(camera, pose, tuple(assumptions), up="y")
 
 
 def _numbers(place: str, row: _Row, names: tuple[str, ...]) -> list[float]:
