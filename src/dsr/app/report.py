@@ -8,7 +8,7 @@ from pathlib import Path
 import pandas as pd
 from rich.console import Console
 
-from dsr.app.requests import ReportRequest
+from dsr.app.requests import LeaderboardRequest, ReportRequest
 from dsr.evaluation.run_files import load_results
 from dsr.notes import expect_no_warning
 from dsr.report.correlation_figure import draw_study
@@ -66,6 +66,29 @@ def make_report(request: ReportRequest, console: Console) -> list[str]:
     return []
 
 
+def make_leaderboard(request: LeaderboardRequest, console: Console) -> list[str]:
+    """Write a page of runs that begins with one row a method, with the tables beside it.
+
+    Raises:
+        ValueError: as :func:`make_report`.
+
+    """
+    return make_report(
+        ReportRequest(
+            runs=request.runs,
+            output=request.output,
+            methods=request.methods,
+            datasets=request.datasets,
+            scales=request.scales,
+            title=request.title,
+            leaderboard=True,
+            intervals=True,
+            parts=("tables", "page"),
+        ),
+        console,
+    )
+
+
 def _check(output: Path) -> None:
     """Check the directory, before anything is read."""
     if output.exists() and not (output.is_dir() and ((output / _MARK).is_file() or not any(output.iterdir()))):
@@ -109,6 +132,7 @@ def _write(
                     budget_mb=request.page_mb,
                     progress=task,
                     pictures=pictures,
+                    leaderboard=request.leaderboard,
                 )
             )
 

@@ -29,6 +29,7 @@ class ReportRequest(Options):
         FIGURE_LIGHT, f"of the figures: {LIGHT_CHOICES}; {FIGURE_LIGHT}", "NAME", rule=one_of(LIGHT_NAMES, str)
     )
     intervals: bool = option(False, "averages with 95 % intervals, and a test of the best against the second best")
+    leaderboard: bool = option(False, "the page begins with one row a method, by mean rank")
     strict: bool = option(False, "refuse runs with a warning; see docs/checks.md")
     title: str = option("Depth super-resolution", "of the page")
     page_mb: float = option(
@@ -48,6 +49,18 @@ class ReportRequest(Options):
         "N",
         rule=Rule(f"1..{_MOST_WORKERS}", lambda count: 1 <= count <= _MOST_WORKERS),
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeaderboardRequest(Options):
+    """What a leaderboard is of, and where it goes."""
+
+    runs: tuple[Path, ...] = option(..., "directories of runs, or with runs below them", "DIR", flags="runs")
+    output: Path = option(..., "where the page goes", "DIR", flags="-o --output", writes="folder")
+    methods: tuple[str, ...] = option((), "these alone, as the tables name them", "NAME")
+    datasets: tuple[str, ...] = option((), "these alone", "NAME")
+    scales: tuple[float, ...] = option((), "these alone", "N", flags="--scale")
+    title: str = option("Depth super-resolution: leaderboard", "of the page")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,6 +12,7 @@ from dsr.cli.commands import (
     EXPORT,
     FORMATS_COMMAND,
     FUSE,
+    LEADERBOARD,
     REPORT,
     UPSAMPLE,
     VIEW,
@@ -45,7 +46,7 @@ In a checkout of the project, `python eval.py` and `python train.py` are the sam
 _COMMANDS = (
     *(command.add for command in (UPSAMPLE, VIEW, FUSE)),
     add_hydra_commands,
-    *(command.add for command in (REPORT, STUDY)),
+    *(command.add for command in (REPORT, LEADERBOARD, STUDY)),
     add_data_command,
     *(command.add for command in (FORMATS_COMMAND, DOCTOR, EXPORT)),
 )

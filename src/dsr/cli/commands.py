@@ -11,7 +11,15 @@ from typing import Any, NamedTuple
 
 from rich.console import Console
 
-from dsr.app.requests import DoctorRequest, ExportRequest, FormatsRequest, FuseRequest, ReportRequest, ViewRequest
+from dsr.app.requests import (
+    DoctorRequest,
+    ExportRequest,
+    FormatsRequest,
+    FuseRequest,
+    LeaderboardRequest,
+    ReportRequest,
+    ViewRequest,
+)
 from dsr.app.upsample.request import UpsampleRequest
 from dsr.io.formats import FORMATS, show
 from dsr.utils.options import Options, add_options, build
@@ -185,6 +193,25 @@ examples:
   dsr report outputs/eval -o report --only tables
 
 Open report/index.html in a browser. It needs no network and can be sent as it is.
+""",
+)
+
+LEADERBOARD = Command(
+    "leaderboard",
+    "a page with one row a method, from runs of eval.py",
+    LeaderboardRequest,
+    _later("dsr.app.report", "make_leaderboard"),
+    description="""\
+Make a static page that ranks the methods of all runs in and below the directories over all data sets, scales and
+metrics, with their surfaces under any light. A click on a method shows it beside another.
+""",
+    epilog="""\
+examples:
+  python eval.py -m +experiment=reference
+  python eval.py -m method=external method.path=mine,yours metrics=suite
+  dsr leaderboard outputs/eval -o site
+
+Open site/index.html in a browser, or publish the folder as it is.
 """,
 )
 

@@ -31,6 +31,7 @@ function showSummary(data) {
 function directions(metrics) {
   const higher = metrics.filter((metric) => metric.higher).map((metric) => metric.name);
   if (!higher.length) return "lower is better throughout";
+  if (higher.length > 4 && higher.length < metrics.length) return "lower is better, but where a table says higher";
   return higher.length === metrics.length ? "higher is better throughout" : `lower is better, of ${higher.join(", ")} higher`;
 }
 

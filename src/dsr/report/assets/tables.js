@@ -111,11 +111,34 @@ const factColumns = (facts, cells = {}) => facts.map(({ name, word }) => (
 /** Return the columns of the metrics. */
 function metricColumns(metrics, places, total, options) {
   return metrics.map((metric) => ({
-    title: metric.name,
+    title: metric.higher ? `${metric.name} \u2191` : metric.name,
     unit: metric.unit || "\u00a0",
     value: (row) => row.values[metric.id]?.[0],
     cell: (row) => scoreCell(row, metric, places(row, metric), total, options.published),
   }));
+}
+
+/** Return the standings of the methods over all settings; a click on one shows it, where it has pictures. */
+function standingsTable(data, entries, open) {
+  const total = data.problems.length;
+  const shown = (method) => entries.find((entry) => data.problems[entry.problem].methods.includes(method));
+  const rows = data.standings.map((row, index) => ({ ...row, place: index + 1, paper: {} }));
+  const places = new Map(data.metrics.map((metric) => [metric.id, ranked(rows, metric)]));
+  const button = (method) => {
+    const entry = shown(method);
+    return entry ? make("button", { type: "button", className: "go", textContent: method, title: "show its surfaces", onclick: () => open(entry.problem, entry.name, method) }) : method;
+  };
+  const columns = [
+    { title: "Place", unit: "\u00a0", value: (row) => row.place },
+    { title: "Method", unit: "\u00a0", word: true, value: (row) => row.method, cell: (row) => button(row.method) },
+    { title: "Mean rank", unit: "\u00a0", value: (row) => row.rank, cell: (row) => number(row.rank, 2) },
+    { title: "Settings", unit: `of ${total}`, value: (row) => row.settings },
+    ...metricColumns(data.metrics.filter((metric) => rows.some((row) => row.values[metric.id])), (_, metric) => places.get(metric.id), 0, { published: false }),
+  ];
+  return make("div", { className: "block" },
+    make("h3", {}, "Leaderboard", make("small", { textContent: ` \u00b7 ${plural(total, "setting")}` })),
+    sortable(columns, rows, { caption: "Leaderboard" }).element,
+    make("p", { className: "foot", textContent: "Mean rank: of each metric in each setting, averaged within families of metrics, then over families, then over settings, over the metrics and scenes that all methods have. Values are means over all settings." }));
 }
 
 /** Fill the section of tables; `open(problem, scene)` shows a scene, where it has pictures. */
@@ -124,6 +147,7 @@ function showTables(data, entries, open) {
   const matches = (text, part) => text.toLowerCase().includes(part.toLowerCase());
   const all = [];
   const home = find("#tables .tables");
+  if (data.standings.length > 1) home.append(standingsTable(data, entries, open));
   const families = [...new Set(data.metrics.map((metric) => metric.family))];
   const both = (problem, index, family) => {
     const metrics = data.metrics.filter((metric) => metric.family === family);

@@ -16,6 +16,7 @@ from dsr.evaluation.results import BenchmarkSetting, Results
 from dsr.geometry.lights import BASIS, LIGHTS, VIEWING_LIGHT
 from dsr.pictures.canvas import HOLE_COLOUR
 from dsr.report.html_page import asset, block, fill, json_text, palette
+from dsr.report.leaderboard import standings
 from dsr.report.page.content import links, metrics_data, problem_data, run_data
 from dsr.report.page.scene_content import View, calibration_data, scene_data, views_of
 from dsr.report.page.value_pictures import LEVELS, Level, PictureStore, megabytes
@@ -112,6 +113,7 @@ def save_page(
     budget_mb: float = 60,
     progress: Steps | None = None,
     pictures: Pictures | None = None,
+    leaderboard: bool = False,
 ) -> list[str]:
     """Write a page with the scores, renderings, errors, times and settings of runs, atomically.
 
@@ -127,6 +129,7 @@ def save_page(
             increasing compression, then at lower resolution; the page reports the choice.
         progress: called with the number of finished scenes and of all; restarts if more compression is needed.
         pictures: the runs' pictures, if they are under way; None to encode them here.
+        leaderboard: whether the tables begin with the methods by mean rank.
 
     Returns:
         Notes on what could not be shown and how the pictures were stored.
@@ -148,6 +151,7 @@ def save_page(
     data = {
         **_data(path, results, pictures.calibration(), tables, title),
         "notes": [*results.remarks, *notes],
+        "standings": standings(results) if leaderboard else [],
         "scenes": [
             {"problem": problems.index(view.problem), "name": view.scene, "data": f"s{number}"}
             for number, (view, _) in enumerate(shown)
