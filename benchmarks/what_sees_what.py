@@ -44,6 +44,8 @@ ERRORS = (0.0005, 0.001, 0.002, 0.005, 0.01)
 SHARES = (0.01, 0.02, 0.05, 0.1, 0.2)
 """Share of holes at each strength."""
 MIDDLE = 2
+MUCH = 30
+"""Percent from which on a share is bold; even ones would be 17."""
 SUITE = ("paper", "depth", "normals", "points", "boundaries", "evalmde")
 SIMGEO = ("statue", "cube_no_texture")
 """Scenes of different shapes."""
@@ -157,13 +159,13 @@ def write(folder: Path, table: pd.DataFrame, summary: pd.DataFrame, metrics: tup
     folder.mkdir(parents=True, exist_ok=True)
     table.to_csv(folder / "what_sees_what.csv", index=False)
     shown = in_tables({metric.name: metric.format for metric in metrics})
-    names = [name for name in summary.index if name in shown]
+    names = [name for name in summary.index if name in shown and summary.loc[name, list(DISTORTIONS)].notna().any()]
     heads = [f"{shown[name].family}: {shown[name].title}" for name in names]
     kinds = list(DISTORTIONS)
     lines = [f"| metric | {' | '.join(kinds)} | ranks | ranks holes |", "| --- " + "| ---: " * (len(kinds) + 2) + "|"]
     for name, head in zip(names, heads, strict=True):
         row = summary.loc[name]
-        cells = [f"**{row[kind]:.0f}**" if row[kind] == row[kinds].max() else f"{row[kind]:.0f}" for kind in kinds]
+        cells = [f"**{row[kind]:.0f}**" if row[kind] >= MUCH else f"{row[kind]:.0f}" for kind in kinds]
         lines.append(f"| {head} | {' | '.join(cells)} | {row['ranks']:.2f} | {row['ranks holes']:.2f} |")
     (folder / "table.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
     figure = Figure(figsize=(7, 0.24 * len(names) + 1.2), dpi=130, layout="constrained")
