@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dsr.metrics import depth, field, functional, normals, points, sensor
+from dsr.metrics import calibration, depth, field, functional, normals, points, sensor
 from dsr.metrics.formats import MetricFormat
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS, MIN_SIZE, lpips_v
@@ -106,9 +106,10 @@ PROTOCOLS: Mapping[str, tuple[Metric, ...]] = {
     "depth": depth.METRICS,
     "normals": normals.METRICS,
     "points": points.METRICS,
+    "calibration": calibration.METRICS,
 }
-"""Sets of metrics by name: the paper's, those that the field prints, those for real sensors, and those of depth
-estimation."""
+"""Sets of metrics by name: the paper's, those that the field prints, those for real sensors, those of depth
+estimation, and those of stated errors."""
 KNOWN_FORMATS = {metric.name: metric.format for metric in METRICS}
 
 
@@ -150,7 +151,13 @@ class Score:
 
 @torch.no_grad()
 def score_image(
-    prediction: Tensor, target: Tensor, rays: Tensor, metrics: tuple[Metric, ...], unit: Unit = CENTIMETRES
+    prediction: Tensor,
+    target: Tensor,
+    rays: Tensor,
+    metrics: tuple[Metric, ...],
+    unit: Unit = CENTIMETRES,
+    *,
+    errors: tuple[Tensor, Tensor] | None = None,
 ) -> Iterator[Score]:
     """Score one predicted depth map.
 
@@ -161,8 +168,9 @@ def score_image(
         prediction: (1, H, W) orthogonal depth in metres, NaN where missing.
         target: (1, H, W) orthogonal depth in metres, NaN where missing.
         rays: (3, H, W), see :meth:`dsr.geometry.camera.Camera.rays`.
-        metrics: from :func:`catalogue`; those for other units are left out.
+        metrics: from :func:`catalogue`; those for other units are left out, and without ``errors`` those of them.
         unit: of the benchmark.
+        errors: the method's expected errors, (1, H, W): of depth in metres, of normals in degrees.
 
     Yields:
         The scores, NaN where no pixel can be scored.
@@ -171,7 +179,9 @@ def score_image(
 
     def pair_of(window: tuple[Any, ...]) -> SurfacePair:
         maps = (values[window][None] for values in (prediction, target, rays))
-        return SurfacePair(*maps, unit=unit, image_dtype=torch.float32)
+        named = zip(("depth_error", "angle_error"), errors or (), strict=False)
+        stated = {name: each[window][None] for name, each in named}
+        return SurfacePair(*maps, unit=unit, image_dtype=torch.float32, **stated)
 
     window = (..., *_covered(prediction))
     whole = covered = pair_of((...,))

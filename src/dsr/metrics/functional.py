@@ -45,6 +45,8 @@ class SurfacePair:
         rays: (B or 1, 3, H, W) rays with z = 1, see :meth:`dsr.geometry.camera.Camera.rays`.
         mask: (B, 1, H, W) bool, the pixels to compare; None for all.
         unit: unit of the metrics that are in the benchmark's own.
+        depth_error, angle_error: (B, 1, H, W) expected absolute errors of the predicted depth in metres and of its
+            normals in degrees, NaN where there is none; None from a method that states none.
         image_dtype: of normals and renderings, None for the depth's. float32 halves their computing time and changes
             scores by about 1e-7; depths and their differences keep their own dtype.
 
@@ -61,6 +63,8 @@ class SurfacePair:
         mask: Tensor | None = None,
         *,
         unit: Unit = CENTIMETRES,
+        depth_error: Tensor | None = None,
+        angle_error: Tensor | None = None,
         image_dtype: torch.dtype | None = None,
     ) -> None:
         if prediction.dim() != 4 or prediction.shape[1] != 1 or prediction.shape != target.shape:
@@ -75,6 +79,10 @@ class SurfacePair:
         if mask is not None and (mask.dtype != torch.bool or mask.shape != target.shape):
             came = f"{mask.dtype} {tuple(mask.shape)}"
             raise ValueError(f"mask: expected bool of shape {tuple(target.shape)}, got {came}")
+        for name, error in (("depth_error", depth_error), ("angle_error", angle_error)):
+            if error is not None and error.shape != target.shape:
+                raise ValueError(f"{name}: expected shape {tuple(target.shape)}, got {tuple(error.shape)}")
+        self.depth_error, self.angle_error = depth_error, angle_error
         self.target_mask = target.isfinite() & (target > 0)
         if mask is not None:
             self.target_mask = self.target_mask & mask

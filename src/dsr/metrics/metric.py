@@ -32,6 +32,8 @@ class Metric:
         network: that of a perceptual metric; :func:`dsr.metrics.catalogue.catalogue` sets it.
         unit: name of the unit of the benchmarks that it is for, see :class:`dsr.sample.Unit`; None for all of them.
         whole: whether it is computed of the whole image even where a method left out rows or columns at the border.
+        stated: the expected errors of the method that it compares, ``depth_error`` or ``angle_error``; it is left out
+            for methods that state none. None if it needs none.
 
     """
 
@@ -45,10 +47,12 @@ class Metric:
     network: LPIPS | None = field(default=None, repr=False, compare=False)
     unit: str | None = None
     whole: bool = False
+    stated: str | None = None
 
     def applies(self, pair: SurfacePair) -> bool:
-        """Return whether the metric is for the pair's benchmark."""
-        return self.unit in (None, pair.unit.name)
+        """Return whether the metric is for the pair's benchmark, and the pair has the errors that it compares."""
+        known = self.stated is None or getattr(pair, self.stated) is not None
+        return known and self.unit in (None, pair.unit.name)
 
     @property
     def worst(self) -> str:
