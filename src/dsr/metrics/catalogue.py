@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dsr.metrics import calibration, depth, field, functional, normals, points, sensor
+from dsr.metrics import calibration, depth, field, functional, normals, plane, points, sensor
 from dsr.metrics.formats import MetricFormat
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS, MIN_SIZE, lpips_v
@@ -107,9 +107,10 @@ PROTOCOLS: Mapping[str, tuple[Metric, ...]] = {
     "normals": normals.METRICS,
     "points": points.METRICS,
     "calibration": calibration.METRICS,
+    "plane": plane.METRICS,
 }
 """Sets of metrics by name: the paper's, those that the field prints, those for real sensors, those of depth
-estimation, and those of stated errors."""
+estimation, those of stated errors, and those of planes."""
 KNOWN_FORMATS = {metric.name: metric.format for metric in METRICS}
 
 

@@ -283,6 +283,20 @@ class StatedRatio(PerImageMean):
         super().__init__(_named("Calibration_stated"), **settings)
 
 
+class PlaneDeviation(PerImageMean):
+    """The standard deviation of depth about a plane in metres."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(_named("Plane_std"), **settings)
+
+
+class PlaneAngle(PerImageMean):
+    """The mean angle between normals and a plane's in degrees."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(_named("Plane_angle"), **settings)
+
+
 class SurfaceMetrics(torchmetrics.MetricCollection):
     """A collection that makes one :class:`~dsr.metrics.functional.SurfacePair` of a batch for all of its metrics.
 
