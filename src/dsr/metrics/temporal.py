@@ -4,10 +4,10 @@
   which nothing moves. Temporal noise is that of Intel's Depth Quality Tool, ``calculate_temporal_noise`` in
   ``tools/depth-quality/rs-depth-quality.cpp`` of IntelRealSense/librealsense (cacc8e7), there of 39 frames.
 - :func:`opw` needs poses: the optical-flow-based warping metric of Wang et al., *Less Is More: Consistent Video Depth
-  Estimation with Masked Frames Modeling*, ACM MM 2022, and *Neural Video Depth Stabilizer*, ICCV 2023, with the rigid flow
-  of depth and pose.
+  Estimation with Masked Frames Modeling*, ACM MM 2022, and *Neural Video Depth Stabilizer*, ICCV 2023, with the rigid
+  flow of depth and pose; ``smooth_loss.py`` (d7b66e4) and ``infer_NVDS_dpt_bi.py`` (720a979) of RaymondWang987/NVDS.
 - :func:`tgm` needs a truth: temporal gradient matching of Chen et al., *Video Depth Anything*, CVPR 2025,
-  ``TemporalGradientMatchingLoss`` in ``loss/loss.py`` of DepthAnything/Video-Depth-Anything (4f5ae23) with its stride of 1.
+  ``TemporalGradientMatchingLoss`` in ``loss/loss.py`` of DepthAnything/Video-Depth-Anything (4f5ae23), with one stride.
 
 All are of one sequence, (), and lower is better. None knows whether the depth is right: a constant has the best of each
 but the last. Holes are left out, and :func:`covered` stands beside them.
@@ -99,9 +99,9 @@ def opw(
     """Return the mean difference between the depth of a frame and that of the frame before, warped into its view.
 
     The frame before is warped with a z-buffer, so that what a surface hides does not count, and what appears is a hole.
-    Their code normalises each map of disparity by its median and mean deviation, sums weights of three colours in 0 to
-    255, with which hardly any pixel counts, and takes 10 times the mean over all pixels; here it is a weighted mean in
-    metres.
+    The authors' code normalises each map of disparity by its median and mean deviation, sums weights of three colours
+    from 0 to 255, with which hardly any pixel counts, and takes 10 times the mean over all pixels. Here it is a
+    weighted mean in metres.
 
     Args:
         depths: (T, 1, H, W) orthogonal depth in metres, T at least 2; NaN is a hole.
@@ -141,8 +141,8 @@ def opw(
 def tgm(prediction: Tensor, target: Tensor, static: Tensor | None = None) -> Tensor:
     """Return the mean difference between the changes of predicted and true depth from frame to frame.
 
-    Pixels count whose true depth changes by less than 5 % of the range of the later frame's: it is of one surface. Their
-    training takes disparity, fitted to the truth by a scale and a shift, and ten times the value.
+    Pixels count whose true depth changes by less than 5 % of the range of the later frame's: it is of one surface. The
+    authors' training takes disparity, fitted to the truth by a scale and a shift, and ten times the value.
 
     Args:
         prediction: (T, 1, H, W) orthogonal depth in metres, T at least 2; NaN is a hole.
