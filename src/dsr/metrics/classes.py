@@ -270,7 +270,10 @@ class AUSE(PerImageMean):
 
 
 class OffAUC(PerImageMean):
-    """How well expected errors tell the pixels that are off by more than a threshold, 0.02 m."""
+    """How well expected errors tell the pixels that are off by more than a threshold in metres, 0.02.
+
+    NaN if in one of the images none is, or all are.
+    """
 
     def __init__(self, threshold: float = OFF, **settings: Any) -> None:
         super().__init__(auc_metric(threshold), **settings)
