@@ -35,7 +35,6 @@ import torch
 import yaml
 from captures import CAPTURES, Capture, ddrnet, ddrnet_frames, rgbdd_real, without_truth
 from flatness import FLOORS, flatness, given
-from scipy.stats import mannwhitneyu
 from torch import Tensor
 
 from dsr.data.frame_files import read_millimetres, read_picture
@@ -43,13 +42,17 @@ from dsr.geometry.camera import Camera
 from dsr.inference import upsample_surface
 from dsr.methods.base import Surface
 from dsr.methods.classical.bilateral import filter_bilateral
+from dsr.metrics.calibration import OFF, off_auc, stated_ratio
+from dsr.metrics.functional import SurfacePair
+from dsr.metrics.plane import PlaneComparison, angle, deviation
+from dsr.metrics.sensor import LARGEST_ERROR
 from dsr.sample import DepthSample
 
 FILTERS = ((19, 0.03, 3.0), (41, 0.05, 9.0), (81, 0.06, 18.0))
-INSIDE, EDGE, NEAR = 12, 36, 0.06
-"""Pixels inside the board's outline that are left out, those that count as its edge, and metres from the plane."""
-OFF, SURE = 0.02, 0.005
-"""Metres: pixels that are further off are wrong, and those stated to be off by less are believed."""
+INSIDE, EDGE = 12, 36
+"""Pixels inside the board's outline that are left out, and those that count as its edge."""
+SURE = 0.005
+"""Metres: pixels stated to be off by less are believed."""
 CONF = Path(__file__).resolve().parent.parent / "conf"
 PARTS = ("board", "ddrnet", "rgbdd", "floors", "phone", "glass", "clean")
 CLEAN = ("lucy_box", "plant_box")
@@ -57,12 +60,11 @@ Method = Callable[[DepthSample], Surface]
 
 
 class Plane(NamedTuple):
-    """A frame before the board: the sample, the plane's true depth and normal, and the distance inside its outline."""
+    """A frame before the board: the sample, the plane's true depth, (1, H, W), and the distance inside its outline."""
 
     sample: DepthSample
-    depth: np.ndarray
-    normal: np.ndarray
-    inside: np.ndarray
+    depth: Tensor
+    inside: Tensor
 
 
 def boards(shared: Path, count: int | None) -> list[Plane]:
@@ -77,34 +79,22 @@ def boards(shared: Path, count: int | None) -> list[Plane]:
         inside = np.zeros(plane.shape, np.uint8)
         cv2.fillPoly(inside, [np.round(frame["polygon"]).astype(np.int32)], 1)
         distance = cv2.distanceTransform(inside, cv2.DIST_L2, 5)
-        found.append(Plane(sample, np.where(plane > 0, plane, np.nan), np.array(frame["normal"]), distance))
+        known = np.where(plane > 0, plane, np.nan)
+        found.append(Plane(sample, torch.from_numpy(known)[None], torch.from_numpy(distance)[None]))
     return found
 
 
 def score_board(frame: Plane, surface: Surface) -> dict[str, float]:
     """Score a result before the board."""
-    depth = surface.depth[0].double().numpy()
-    off = depth - frame.depth
-    off -= np.nanmedian(off[frame.inside > INSIDE])
-    inner = (frame.inside > INSIDE) & (np.abs(off) < NEAR)
-    edge = inner & (frame.inside <= EDGE)
-    points = depth * frame.sample.camera.rays().numpy()
-    along_u, along_v = np.full_like(points, np.nan), np.full_like(points, np.nan)
-    along_u[..., 1:-1] = points[..., 2:] - points[..., :-2]
-    along_v[:, 1:-1] = points[:, 2:] - points[:, :-2]
-    normal = np.cross(along_u, along_v, axis=0)[:, inner]
-    cosine = np.abs(frame.normal @ (normal / np.linalg.norm(normal, axis=0)))
-    angle = np.degrees(np.arccos(cosine.clip(max=1)))
-    found = {"std": 1e3 * off[inner].std(), "edge": 1e3 * off[edge].std(), "angle": float(np.nanmean(angle))}
+    maps = surface.depth[None].double(), frame.depth[None], frame.sample.camera.rays()[None]
+    inside = frame.inside[None]
+    board, border = (SurfacePair(*maps, mask) for mask in (inside > INSIDE, (inside > INSIDE) & (inside <= EDGE)))
+    found = {"std": 1e3 * float(deviation(board)), "edge": 1e3 * float(deviation(border)), "angle": float(angle(board))}
     if surface.depth_error is not None:
-        found["stated"] = stated(surface.depth_error[0].numpy()[inner], off[inner])
+        comparison = board.derive(PlaneComparison)
+        off = comparison.off.abs().masked_fill(~comparison.scored, torch.nan)[0]
+        found["stated"] = float(stated_ratio(surface.depth_error, off))
     return found
-
-
-def stated(expected: np.ndarray, error: np.ndarray) -> float:
-    """Return the median stated error over the median error; pixels without either are left out."""
-    both = np.isfinite(expected) & np.isfinite(error)
-    return float(np.median(expected[both]) / np.median(np.abs(error[both])))
 
 
 def score_capture(capture: Capture, surface: Surface) -> dict[str, float]:
@@ -114,9 +104,9 @@ def score_capture(capture: Capture, surface: Surface) -> dict[str, float]:
     found = {"RMSE_v": 1e3 * scores["RMSE_v"], "angle": scores["angle"], "covered": 100 * scores["covered"]}
     assert capture.truth is not None  # noqa: S101 - for the type checker
     if surface.depth_error is not None:
-        off = (surface.depth - capture.truth.depth)[0].double().numpy()
-        off -= np.nanmedian(off)
-        found["stated"] = stated(np.where(np.abs(off) < 0.1, surface.depth_error[0].numpy(), np.nan), off)
+        off = (surface.depth - capture.truth.depth).double()
+        off = (off - np.nanmedian(off)).abs()
+        found["stated"] = float(stated_ratio(surface.depth_error, off.masked_fill(off >= LARGEST_ERROR, torch.nan)))
     return found
 
 
@@ -174,13 +164,13 @@ def _camera(path: Path, width: int, height: int) -> Camera:
 def score_glass(scene: Glass, surface: Surface) -> dict[str, float]:
     """Score a result in the clear objects."""
     inside = scene.mask & scene.twin.isfinite() & surface.depth.isfinite()
-    wrong = ((surface.depth - scene.twin).abs() > OFF)[inside]
+    off = (surface.depth - scene.twin).abs()[inside]
+    wrong = off > OFF
     found = {"wrong": 100 * float(wrong.double().mean())}
     if surface.depth_error is not None:
         error = surface.depth_error[inside]
         found["believed"] = 100 * float((error[wrong] < SURE).double().mean())
-        rank = mannwhitneyu(error[wrong].numpy(), error[~wrong].numpy()).statistic
-        found["AUC"] = float(rank) / max(int(wrong.sum()) * int((~wrong).sum()), 1)
+        found["AUC"] = float(off_auc(error, off, OFF))
     return found
 
 

@@ -312,6 +312,29 @@ def test_aligned_scores_are_a_result_of_their_own_and_say_so(tmp_path, within):
     np.testing.assert_allclose(results.runs[1].prediction("a").numpy().ravel(), scale * depths[0] + shift, rtol=1e-5)
 
 
+def test_errors_that_a_method_states_are_scored_and_scaled_with_the_prediction(tmp_path, within):
+    write_scene(tmp_path / "data" / "a", height=64, width=64)
+    arguments = ("dataset=folder", "dataset.root=data", "scale=4", "metrics=calibration")
+    folder = tmp_path / "out"
+    assert within(*arguments, "method=facets", f"output_dir={folder}")[0] == 0
+    found = {row["metric"]: row["value"] for row in rows(folder) if row["metric"].startswith("Calibration")}
+    stored, truth = (np.load(folder / kind / "a.npz") for kind in ("predictions", "scenes"))
+    off = np.abs(stored["depth"].astype(float) - truth["depth"])
+    assert float(found["Calibration_stated"]) == pytest.approx(
+        np.median(stored["depth_error"]) / np.median(off), rel=1e-3
+    )
+    assert float(found["Calibration_covered"]) == 1
+    assert found["Calibration_AUC_20mm"] == ""  # nothing is off by so much
+    assert len(found) == 7
+    assert within(*arguments, "method=facets", "metrics.alignment=scale", "output_dir=scaled")[0] == 0
+    gain = np.median(truth["depth"]) / np.median(stored["depth"])
+    expected = gain * np.median(stored["depth_error"]) / np.median(np.abs(gain * stored["depth"] - truth["depth"]))
+    [scaled] = [float(row["value"]) for row in rows(tmp_path / "scaled") if row["metric"] == "Calibration_stated"]
+    assert scaled == pytest.approx(expected, rel=1e-2)
+    code, _, errors = within(*arguments, "metrics.protocols=[calibration]", "output_dir=bicubic")
+    assert (code, errors, rows(tmp_path / "bicubic")) == (0, [], [])
+
+
 USAGE_ERRORS = {
     "an added key": (["+scal=8"], "scal: unknown key; expected names, dataset, "),
     "an added key of a group": (["+method.sharp=1"], "method.sharp: unknown key; method=bicubic takes order, "),

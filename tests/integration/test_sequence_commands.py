@@ -16,6 +16,7 @@ from small_frames import in_text, room, walk, write_recording
 from dsr.cli import main
 from dsr.geometry.camera import Camera
 from dsr.geometry.warping import warp_depth
+from dsr.metrics.temporal import opw
 
 CAMERA = Camera.centred(96, 72, 90.0)
 DEPTH_ONLY = ("--method", "bicubic", "--only", "depth")
@@ -289,8 +290,15 @@ def test_neighbours_without_poses_are_refused(capture, capsys):
 def test_results_with_poses_become_one_mesh(capture, capsys):
     out = capture.parent / "out"
     assert upsample(capture, "--poses", capture.parent / "poses.txt", *DEPTH_ONLY, "-o", out) == 0
-    assert main(["fuse", str(out), "-o", str(capture.parent / "mesh.ply"), "--voxel", "0.03"]) == 0
-    assert "5 results -> " in " ".join(capsys.readouterr().out.split())
+    assert main(["fuse", str(out), "-o", str(capture.parent / "mesh.ply"), "--voxel", "0.03", "--score"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "5 results -> " in said
+    folders = sorted(path.parent for path in out.rglob("info.json"))
+    depths = torch.from_numpy(np.stack([np.load(each / "depth_metres.npy") for each in folders]))[:, None]
+    info = [json.loads((each / "info.json").read_text()) for each in folders]
+    expected = opw(depths.double(), Camera(**info[0]["camera"]), [np.array(each["pose"]) for each in info])
+    found = re.search(r"successive results differ by ([\d.e-]+) mm, 4 pairs of a view in common \(OPW\)", said)
+    assert float(found[1]) == pytest.approx(1e3 * float(expected), rel=0.01)
     mesh = trimesh.load(capture.parent / "mesh.ply", process=False)
     wall = mesh.vertices[mesh.vertices[:, 2] > 1.8]
     box = mesh.vertices[mesh.vertices[:, 2] < 1.25]

@@ -7,9 +7,24 @@ import math
 import numpy as np
 import pytest
 import torch
+from scipy.stats import mannwhitneyu
 
 from dsr.geometry.camera import Camera
-from dsr.metrics.calibration import error_ratios, measured_errors, squared_error_share
+from dsr.metrics.alignment import align_pair
+from dsr.metrics.calibration import (
+    ause,
+    ence,
+    error_ratios,
+    measured_errors,
+    off_auc,
+    sparsification,
+    squared_error_share,
+    stated_ratio,
+)
+from dsr.metrics.catalogue import catalogue, score_image
+from dsr.metrics.classes import AUSE, ENCE, OffAUC, StatedRatio, compute_means, visual_metrics
+from dsr.metrics.functional import SurfacePair
+from dsr.sample import Unit
 
 CAMERA = Camera(width=24, height=20, fx=30.0, fy=29.0, cx=11.0, cy=10.5)
 
@@ -113,3 +128,160 @@ def test_measured_errors_are_unknown_in_holes_of_either_map_and_those_of_normals
     beside = {(v + dv, u + du) for v, u in holes for dv, du in ((0, 0), (-1, 0), (0, -1))}
     assert {tuple(place) for place in np.argwhere(depth[0, 0].isnan().numpy())} == holes
     assert {tuple(place) for place in np.argwhere(angle[0, 0].isnan().numpy())} == beside
+
+
+V, U = np.mgrid[:40, :60].astype(float)
+ERRORS = np.abs(0.02 * (1.2 + np.sin(0.9 * U + 0.31 * V)) * (1 + np.cos(1.7 * V - 0.23 * U)))
+STATED = 0.8 * ERRORS + 0.01 * (1.5 + np.sin(0.37 * U * U - 0.53 * V))
+GIVEN = torch.from_numpy(STATED), torch.from_numpy(ERRORS)
+
+
+@pytest.mark.parametrize(
+    ("steps", "expected"), [(20, 0.0012544785979542988), (50, 0.0012496075809134838), (100, 0.0012538239836805947)]
+)
+def test_sparsification_error_is_that_of_mono_uncertainty(steps: int, expected: float) -> None:
+    # abs_rel of compute_aucs in evaluate.py of mattpoggi/mono-uncertainty (543772b), a truth of 1, `intervals` as here
+    assert float(ause(*GIVEN, steps)) * ERRORS.mean() == pytest.approx(expected, rel=1e-12)
+
+
+def test_sparsification_error_is_that_of_numpy_step_by_step() -> None:
+    order = np.argsort(STATED, axis=None)
+    means = [ERRORS.ravel()[order[: 2400 - math.ceil(2399 * step / 10)]].mean() for step in range(10)]
+    np.testing.assert_allclose(sparsification(*GIVEN, 10).numpy(), [*means, 0])
+
+
+def test_area_depends_on_the_steps_and_not_on_units_or_the_order_of_pixels() -> None:
+    measured = torch.from_numpy(np.random.default_rng(4).standard_exponential(20_001) ** 2)
+    unrelated = measured.flip(0)
+    areas = [float(ause(unrelated, measured, steps)) for steps in (20, 100)]
+    assert areas[1] / areas[0] > 1.01
+    assert float(ause(7 * unrelated, 1e3 * measured)) == pytest.approx(areas[1])
+    constant, mixed = torch.ones_like(measured), torch.from_numpy(np.random.default_rng(5).permutation(measured))
+    assert float(ause(constant, measured)) == pytest.approx(float(ause(constant, mixed)), rel=1e-12)
+    assert float(ause(constant, measured)) == pytest.approx(areas[1], rel=0.05)
+
+
+def test_area_of_a_constant_before_uniform_errors_is_a_fourth_and_of_the_truth_itself_nothing() -> None:
+    # the mean of the least (1 - x) of them is half of 1 - x: the curves are 1 and 1 - x, relative to the mean 1 / 2
+    measured = torch.linspace(0, 1, 100_001, dtype=torch.float64)
+    assert float(ause(torch.ones_like(measured), measured)) == pytest.approx(0.5 - 1 / 200, rel=1e-4)
+    assert float(ause(3 * measured, measured)) == 0
+
+
+def test_normalised_calibration_error_of_gaussian_and_laplace_errors_is_known() -> None:
+    random = np.random.default_rng(6)
+    scales = random.uniform(0.5, 2, 400_000)
+    expected, gaussian, laplace = (
+        torch.from_numpy(each)
+        for each in (scales, np.sqrt(np.pi / 2) * random.normal(0, scales), random.laplace(0, scales))
+    )
+    assert float(ence(expected, gaussian)) < 0.01
+    assert float(ence(expected, 1.5 * gaussian)) == pytest.approx(0.5, abs=0.01)
+    assert float(ence(expected, laplace)) == pytest.approx(2 / np.sqrt(np.pi) - 1, abs=0.015)
+
+
+def test_normalised_calibration_error_is_that_of_numpy_over_parts_of_equal_numbers() -> None:
+    order = np.argsort(STATED, axis=None)
+    parts = [(STATED.ravel()[part], ERRORS.ravel()[part]) for part in np.array_split(order, 7)]
+    rmv = [np.sqrt(np.pi / 2 * np.mean(stated**2)) for stated, _ in parts]
+    rmse = [np.sqrt(np.mean(errors**2)) for _, errors in parts]
+    expected = np.mean([abs(e - v) / v for e, v in zip(rmse, rmv, strict=True)])
+    assert float(ence(*GIVEN, parts=7)) == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("decimals", [8, 2])
+def test_area_under_the_roc_curve_is_that_of_the_rank_test(decimals: int) -> None:
+    stated = np.round(STATED, decimals)  # with two decimals most are equal to others
+    off = ERRORS > 0.02
+    pairs = off.sum() * (~off).sum()
+    expected = mannwhitneyu(stated[off], stated[~off]).statistic / pairs
+    assert float(off_auc(torch.from_numpy(stated), GIVEN[1])) == pytest.approx(expected, rel=1e-12)
+    assert float(off_auc(torch.ones_like(GIVEN[1]), GIVEN[1])) == 0.5
+    assert float(off_auc(GIVEN[1], GIVEN[1], threshold=0.03)) == 1
+    assert math.isnan(off_auc(*GIVEN, threshold=1.0))
+
+
+def test_stated_over_true_error_is_the_ratio_of_medians() -> None:
+    assert float(stated_ratio(*GIVEN)) == pytest.approx(np.median(STATED) / np.median(ERRORS), rel=1e-12)
+
+
+@pytest.mark.parametrize("function", [ence, ause, off_auc, stated_ratio])
+def test_pixels_without_either_error_are_left_out(function) -> None:
+    stated, errors = STATED.copy(), ERRORS.copy()
+    stated[3:9, :20], errors[6:12, 10:30] = np.nan, np.nan
+    both = np.isfinite(stated) & np.isfinite(errors)
+    found = function(torch.from_numpy(stated), torch.from_numpy(errors))
+    assert float(found) == pytest.approx(
+        float(function(torch.from_numpy(stated[both]), torch.from_numpy(errors[both])))
+    )
+    assert math.isnan(function(torch.full_like(GIVEN[0], torch.nan), GIVEN[1]))
+
+
+LENS = Camera(width=60, height=40, fx=70.0, fy=70.0, cx=29.5, cy=19.5)
+TRUTH = torch.from_numpy(2 + 0.05 * np.sin(0.2 * U + 0.1 * V))[None]
+PREDICTION = TRUTH + torch.from_numpy(ERRORS * np.sign(np.sin(1 + 2.3 * U * V)))
+ANGLES = torch.from_numpy(20 + 10 * np.sin(0.4 * U * V))
+METRICS = catalogue(protocols=("calibration",))
+
+
+def _scores(prediction: torch.Tensor = PREDICTION, **more) -> dict[str, float]:
+    more = {"errors": (GIVEN[0][None], ANGLES[None]), **more}
+    return {row.metric: row.value for row in score_image(prediction, TRUTH, LENS.rays(), METRICS, **more)}
+
+
+def test_scores_compare_what_is_stated_with_depth_and_normals() -> None:
+    depth, angle = measured_errors(PREDICTION[None], TRUTH[None], LENS.rays()[None])
+    ratio = float(stated_ratio(*GIVEN))
+    assert _scores() == pytest.approx(
+        {
+            "Calibration_ENCE": float(ence(GIVEN[0], depth[0, 0])),
+            "Calibration_AUSE_d": float(ause(GIVEN[0], depth[0, 0])),
+            "Calibration_AUSE_v": float(ause(ANGLES, angle[0, 0])),
+            "Calibration_AUC_20mm": float(off_auc(GIVEN[0], depth[0, 0])),
+            "Calibration_stated": ratio,
+            "Calibration_factor": max(ratio, 1 / ratio),
+            "Calibration_covered": 1,
+        },
+        rel=1e-4,
+    )
+
+
+def test_scores_count_what_has_no_stated_error_and_need_metres_for_millimetres() -> None:
+    prediction, stated = PREDICTION.clone(), GIVEN[0].clone()[None]
+    prediction[0, 10:20, 10:20], stated[0, 15:25, 15:25] = torch.nan, torch.nan
+    found = _scores(prediction, errors=(stated, ANGLES[None]))
+    assert found["Calibration_covered"] == pytest.approx(1 - (2 * 100 - 25) / 2400)
+    known = (prediction - TRUTH).abs()
+    assert found["Calibration_AUSE_d"] == pytest.approx(float(ause(stated, known)))
+    assert "Calibration_AUC_20mm" not in _scores(unit=Unit("levels", inverse=True, factor=30.0, offset=0.0))
+
+
+def test_method_that_states_no_errors_has_no_such_scores() -> None:
+    assert _scores(errors=None) == {}
+    metrics = visual_metrics(protocols=("field", "calibration"))
+    maps = PREDICTION[None], TRUTH[None], LENS.rays()[None]
+    metrics.update(SurfacePair(*maps))
+    assert not any(name.startswith("Calibration") for name in compute_means(metrics))
+    metrics.update(SurfacePair(*maps, depth_error=GIVEN[0][None, None], angle_error=ANGLES[None, None]))
+    assert float(compute_means(metrics)["Calibration_AUSE_d"]) == pytest.approx(float(ause(*GIVEN)))
+
+
+def test_classes_are_the_metrics_of_the_protocol() -> None:
+    errors = {"depth_error": GIVEN[0][None, None], "angle_error": ANGLES[None, None]}
+    pair, found = SurfacePair(PREDICTION[None], TRUTH[None], LENS.rays()[None], **errors), _scores()
+    for made, name in ((ENCE(), "ENCE"), (AUSE(), "AUSE_d"), (AUSE(normals=True), "AUSE_v"), (OffAUC(), "AUC_20mm"),
+                       (StatedRatio(), "stated")):  # fmt: skip
+        assert float(made(pair)) == pytest.approx(found[f"Calibration_{name}"], rel=1e-4)
+    assert float(OffAUC(0.05)(pair)) == pytest.approx(float(off_auc(*GIVEN, threshold=0.05)))
+    with pytest.raises(ValueError, match=r"^depth_error: expected shape \(1, 1, 40, 60\), got \(40, 60\)$"):
+        SurfacePair(*pair.given, pair.rays, depth_error=GIVEN[0])
+
+
+def test_alignment_by_a_scale_scales_what_is_stated_and_by_a_shift_drops_it() -> None:
+    errors = {"depth_error": GIVEN[0][None, None] / 3, "angle_error": ANGLES[None, None]}
+    pair = SurfacePair(PREDICTION[None] / 3, TRUTH[None], LENS.rays()[None], **errors)
+    aligned = align_pair(pair, "scale")
+    factor = TRUTH.median() / PREDICTION.median()
+    torch.testing.assert_close(aligned.depth_error, factor * GIVEN[0][None, None], rtol=1e-3, atol=0)
+    assert torch.equal(aligned.angle_error, pair.angle_error)
+    assert align_pair(pair, "affine").depth_error is align_pair(pair, "robust").angle_error is None

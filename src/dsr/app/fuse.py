@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 from rich.console import Console
 
 from dsr.app.requests import FuseRequest
@@ -71,7 +74,23 @@ def fuse(request: FuseRequest, console: Console) -> list[str]:
     write_ply(request.output, mesh.vertices, colours, mesh.normals, mesh.faces, frame=comment)
     size = f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles, voxels of {1e3 * voxel:.3g} mm"
     show(console, f"{_count(frames)} -> {request.output}: {size}; in the world's frame of the poses")
+    if request.score:
+        show(console, f"successive results differ by {_difference(frames, max_error)} (OPW)")
     return problems
+
+
+def _difference(frames: Sequence[Path], max_error: float) -> str:
+    """Return the mean difference of successive results of each recording, with its unit and how many pairs it is of."""
+    from dsr.metrics.temporal import opw  # noqa: PLC0415 - torchmetrics, which takes a second
+
+    found = []
+    for pair in itertools.pairwise(frames):
+        first, second = (_load(folder, max_error) for folder in pair)
+        if pair[0].parent == pair[1].parent and first.camera == second.camera:
+            depths = torch.from_numpy(np.stack((first.depth, second.depth)))[:, None]
+            found.append(float(opw(depths, first.camera, (first.pose, second.pose))))
+    known = [each for each in found if not math.isnan(each)]
+    return f"{1e3 * float(np.mean(known)) if known else math.nan:.3g} mm, {len(known)} pairs of a view in common"
 
 
 def _load(folder: Path, max_error: float) -> PosedMap:

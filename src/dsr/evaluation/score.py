@@ -14,8 +14,8 @@ from torch import Tensor
 
 from dsr.evaluation.predict import Evaluation, Outcome, failure_line
 from dsr.evaluation.sharing import ALONE, Claims, Workers, share
-from dsr.evaluation.store import load_prediction, prediction_path, sample_path
-from dsr.metrics.alignment import align_map
+from dsr.evaluation.store import load_errors, load_prediction, prediction_path, sample_path
+from dsr.metrics.alignment import align_errors, align_map
 from dsr.metrics.catalogue import Metric, score_image
 from dsr.metrics.formats import HEADLINES
 from dsr.sample import DepthSample
@@ -121,8 +121,9 @@ def _score_and_illustrate(
         if sample.depth is not None and depth.shape != sample.depth.shape:
             came, expected = tuple(depth.shape), tuple(sample.depth.shape)
             raise ValueError(f"{scene}: expected a prediction of shape {expected}, got {came}")
-        depth = align_map(depth, sample.depth, alignment)
-        result.rows = list(_score_scene(study, sample, depth, metrics))
+        given, depth = depth, align_map(depth, sample.depth, alignment)
+        errors = align_errors(load_errors(prediction_path(folder, scene)), given, depth, alignment)
+        result.rows = list(_score_scene(study, sample, depth, errors, metrics))
         result.unscored = sample.depth is None
         result.notes = list(sample.notes)
         illustrate(sample, depth, {row["metric"]: row["value"] for row in result.rows if row["variant"] in HEADLINES})
@@ -178,7 +179,11 @@ def summary(study: Evaluation, scores: pd.DataFrame, outcome: Outcome, metrics: 
 
 
 def _score_scene(
-    study: Evaluation, sample: DepthSample, depth: Tensor, metrics: tuple[Metric, ...]
+    study: Evaluation,
+    sample: DepthSample,
+    depth: Tensor,
+    errors: tuple[Tensor, Tensor] | None,
+    metrics: tuple[Metric, ...],
 ) -> Iterator[dict[str, Any]]:
     """Yield the rows of one scene; none without true depth."""
     if sample.depth is None:
@@ -186,7 +191,9 @@ def _score_scene(
     rays = sample.camera.rays(device=study.device)
     truth = sample.depth.to(study.device, torch.float64)
     regions = {name: region.to(study.device) for name, region in sample.regions.items()}
-    for result in score_image(depth.to(study.device, torch.float64), truth, rays, metrics, sample.unit, regions):
+    stated = None if errors is None else (errors[0].to(study.device), errors[1].to(study.device))
+    depth = depth.to(study.device, torch.float64)
+    for result in score_image(depth, truth, rays, metrics, sample.unit, regions=regions, errors=stated):
         yield {
             "dataset": sample.dataset,
             "scene": sample.scene,

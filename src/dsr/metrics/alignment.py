@@ -81,13 +81,36 @@ def align_map(depth: Tensor, truth: Tensor | None, how: str) -> Tensor:
     return depth if truth is None else align(depth[None], truth[None], None, how)[0]
 
 
+def align_errors(
+    errors: tuple[Tensor, Tensor] | None, depth: Tensor, aligned: Tensor, how: str
+) -> tuple[Tensor, Tensor] | None:
+    """Return the expected errors of depth and normals of an aligned prediction.
+
+    A scale multiplies those of depth and leaves those of normals; what a shift makes of them is not known.
+
+    Args:
+        errors: those of ``depth``, of its shape; None without any.
+        depth, aligned: the prediction before and after its alignment.
+        how: the alignment, one of :data:`ALIGNMENTS`.
+
+    """
+    if errors is None or how == "none":
+        return errors
+    return (errors[0] * (aligned / depth), errors[1]) if how == "scale" else None
+
+
 def align_pair(pair: SurfacePair, how: str) -> SurfacePair:
     """Return a pair with the prediction aligned to the truth, see :func:`align`."""
     if how == "none":
         return pair
     prediction, target = pair.given
     aligned = align(prediction, target, pair.target_mask, how)
-    return SurfacePair(aligned, target, pair.rays, pair.target_mask, unit=pair.unit, image_dtype=pair.image_dtype)
+    errors = None
+    if pair.depth_error is not None and pair.angle_error is not None:
+        errors = align_errors((pair.depth_error, pair.angle_error), prediction, aligned, how)
+    depth_error, angle_error = errors or (None, None)
+    return SurfacePair(aligned, target, pair.rays, pair.target_mask, unit=pair.unit, depth_error=depth_error,
+                       angle_error=angle_error, image_dtype=pair.image_dtype)  # fmt: skip
 
 
 def _least_squares(x: Tensor, y: Tensor, weights: Tensor) -> Tensor:

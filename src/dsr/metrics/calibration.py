@@ -1,17 +1,38 @@
 """Comparison of the errors that a method expects of its result with the measured ones.
 
 Expected errors are calibrated if they are right on average both where they are small and where they are large, see
-:func:`error_ratios`. They are informative if they are largest where the result is worst, see
-:func:`squared_error_share`. Both functions take the pixels of one image or of many.
+:func:`error_ratios` and :func:`ence`. They are informative if they are largest where the result is worst, see
+:func:`squared_error_share`, :func:`ause` and :func:`off_auc`. These functions take the pixels of one image or of many;
+pixels without either error are left out, and ``Calibration_covered`` says how many have both.
+
+ENCE is that of Levi et al., *Evaluating and Calibrating Uncertainty Prediction in Regression Tasks*, Sensors 2022
+(arXiv 1905.11659), with parts of equal numbers of pixels, while ``ENCE.py`` of EFS-OpenSource/calibration-framework
+(cc19d1b) has bins of equal width. AUSE is that of Ilg et al., *Uncertainty Estimates and Multi-Hypotheses Networks for
+Optical Flow*, ECCV 2018, with the subsets of ``compute_aucs`` in ``evaluate.py`` of mattpoggi/mono-uncertainty
+(543772b), which has 50 steps, does not divide by the mean error, and keeps all pixels of equal expected error or none.
 """
 
 from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from dsr.geometry.surface import angle_between, depth_to_normals
+from dsr.metrics.formats import BEFORE_THE_PAPER, MetricFormat
+from dsr.metrics.functional import SurfacePair, angle, masked_mean
+from dsr.metrics.metric import Metric, depth_mask, normal_mask, target_mask
+
+DEVIATION = math.sqrt(math.pi / 2)
+"""Standard deviation of a Gaussian over its mean absolute value."""
+STEPS = 100
+"""Steps of a sparsification curve."""
+OFF = 0.02
+"""Metres from which on a pixel is off."""
 
 
 def measured_errors(prediction: Tensor, target: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
@@ -80,6 +101,131 @@ def squared_error_share(expected: Tensor, measured: Tensor, kept: float = 0.8) -
     return squares[: round(kept * len(squares))].sum() / squares.sum()
 
 
+def ence(expected: Tensor, measured: Tensor, parts: int = 10) -> Tensor:
+    """Return the expected normalised calibration error: the mean of |RMSE - RMV| / RMV over equal parts of the pixels.
+
+    The parts are those of :func:`error_ratios`. RMSE is the root of a part's mean squared error, RMV that of its mean
+    variance, for which an expected absolute error counts as that of a Gaussian: its standard deviation is sqrt(pi / 2)
+    of it. Errors with heavier tails than a Gaussian's have a larger RMSE, even where they are expected rightly.
+
+    Args:
+        expected: expected absolute errors, of any shape and unit; NaN where there is none.
+        measured: measured errors of the same pixels in the same unit; NaN where there is none.
+        parts: number of parts; those without pixels are left out.
+
+    Returns:
+        () float64, 0 or more; lower is better. NaN without pixels, infinite if a part's expected errors are all 0.
+
+    Raises:
+        ValueError: the shapes differ.
+
+    """
+    expected, measured = _ordered(expected, measured)
+    variances, squares = (DEVIATION * expected).square().tensor_split(parts), measured.square().tensor_split(parts)
+    rmv, rmse = (torch.stack([part.mean() for part in each if len(part)] or [each[0].mean()]).sqrt()
+                 for each in (variances, squares))  # fmt: skip
+    return ((rmse - rmv).abs() / rmv).mean()
+
+
+def sparsification(expected: Tensor, measured: Tensor, steps: int = STEPS) -> Tensor:
+    """Return the mean error of the pixels that are left when those with the largest expected errors are removed.
+
+    Step t removes t / steps of the pixels. Of pixels of equal expected error, each part that is left has their mean
+    error.
+
+    Args:
+        expected: expected absolute errors, of any shape and unit; NaN where there is none.
+        measured: measured absolute errors of the same pixels in any unit; NaN where there is none.
+        steps: number of steps.
+
+    Returns:
+        (steps + 1,) float64, from the mean of all pixels to 0 for none. NaN without pixels.
+
+    Raises:
+        ValueError: the shapes differ.
+
+    """
+    expected, measured = _ordered(expected, measured)
+    count = len(measured)
+    if not count:
+        return measured.new_full((steps + 1,), torch.nan)
+    of, sizes = expected.unique_consecutive(return_inverse=True, return_counts=True)[1:]
+    means = measured.new_zeros(len(sizes)).index_add(0, of, measured) / sizes
+    kept = torch.tensor([count - -(-(count - 1) * step // steps) for step in range(steps)], device=measured.device)
+    return torch.cat((means[of].cumsum(0)[kept - 1] / kept, measured.new_zeros(1)))
+
+
+def ause(expected: Tensor, measured: Tensor, steps: int = STEPS) -> Tensor:
+    """Return the area under the sparsification error, relative to the mean error.
+
+    The sparsification error is the curve of :func:`sparsification` less that of an oracle, which expects the measured
+    errors; the area is by trapezoids. It depends on the number of steps: by a sixth from 20 to 100.
+
+    Args:
+        expected, measured, steps: as for :func:`sparsification`.
+
+    Returns:
+        () float64, 0 or more, lower is better. Expected errors that have nothing to do with the measured ones give that
+        of a constant. NaN without pixels, or if all are without error.
+
+    Raises:
+        ValueError: the shapes differ.
+
+    """
+    measured = measured.masked_fill(~expected.isfinite(), torch.nan)
+    curve, oracle = (sparsification(each, measured, steps) for each in (expected, measured))
+    return torch.trapezoid((curve - oracle) / curve[0], dx=1 / steps)
+
+
+def off_auc(expected: Tensor, measured: Tensor, threshold: float = OFF) -> Tensor:
+    """Return how well expected errors tell pixels that are off from the others: the area under the ROC curve.
+
+    It is the probability that of a pixel that is off by more than a threshold and one that is not the former has the
+    larger expected error; equal ones count half.
+
+    Args:
+        expected: expected absolute errors, of any shape and unit; NaN where there is none.
+        measured: measured absolute errors of the same pixels; NaN where there is none.
+        threshold: in the unit of ``measured``.
+
+    Returns:
+        () float64, higher is better, 0.5 is chance. NaN if no pixel is off, or all are.
+
+    Raises:
+        ValueError: the shapes differ.
+
+    """
+    expected, measured = _ordered(expected, measured)
+    of, sizes = expected.unique_consecutive(return_inverse=True, return_counts=True)[1:]
+    off = expected.new_zeros(len(sizes)).index_add(0, of, (measured > threshold).to(expected))
+    right = sizes - off
+    return (off * (right.cumsum(0) - right / 2)).sum() / (off.sum() * right.sum())
+
+
+def stated_ratio(expected: Tensor, measured: Tensor) -> Tensor:
+    """Return the median expected error over the median measured one.
+
+    Args:
+        expected: expected absolute errors, of any shape and unit; NaN where there is none.
+        measured: measured absolute errors of the same pixels in the same unit; NaN where there is none.
+
+    Returns:
+        () float64. 1 is as expected, less means larger errors than expected. NaN without pixels.
+
+    Raises:
+        ValueError: the shapes differ.
+
+    """
+    first, second = map(_median, _ordered(expected, measured))
+    return first / second
+
+
+def _median(values: Tensor) -> Tensor:
+    """Return the median of (N,) values; of an even number the mean of the middle two."""
+    count = len(values)
+    return values.sort().values[[(count - 1) // 2, count // 2]].mean() if count else values.mean()
+
+
 def _ordered(expected: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
     """Return the errors of pixels that have both, in the order of the expected ones, (N,) float64 each."""
     if expected.shape != measured.shape:
@@ -102,3 +248,78 @@ def _stable_order(values: Tensor) -> Tensor:
         bits = halves.abs().view(torch.int16)  # ordered as the numbers are
         return torch.from_numpy(np.argsort(bits.numpy(), kind="stable"))
     return values.argsort(stable=True)
+
+
+_Comparison = Callable[[Tensor, Tensor], Tensor]
+
+
+def of_depth(pair: SurfacePair, compare: _Comparison) -> Tensor:
+    """Return a comparison of the expected and the measured errors of each image's orthogonal depth in metres, (B,)."""
+    assert pair.depth_error is not None  # noqa: S101 - the metric applies
+    return _per_image(compare, pair.depth_error, (pair.prediction - pair.target).abs(), pair.depth_mask)
+
+
+def of_normals(pair: SurfacePair, compare: _Comparison) -> Tensor:
+    """Return a comparison of the expected and the measured errors of each image's normals in degrees, (B,)."""
+    assert pair.angle_error is not None  # noqa: S101 - the metric applies
+    return _per_image(compare, pair.angle_error, angle(pair), pair.normal_mask)
+
+
+def factor_off(expected: Tensor, measured: Tensor) -> Tensor:
+    """Return the factor between the medians of expected and measured errors, 1 or more, lower is better."""
+    ratio = stated_ratio(expected, measured)
+    return torch.maximum(ratio, 1 / ratio)
+
+
+def covered(pair: SurfacePair) -> Tensor:
+    """Return the fraction of the pixels with a true depth that have a predicted one and its expected error, (B,)."""
+    assert pair.depth_error is not None  # noqa: S101 - the metric applies
+    return masked_mean(pair.depth_mask & pair.depth_error.isfinite(), pair.target_mask).squeeze(1)
+
+
+def _per_image(compare: _Comparison, expected: Tensor, measured: Tensor, mask: Tensor) -> Tensor:
+    expected = expected.masked_fill(~mask, torch.nan)
+    return torch.stack([compare(*each) for each in zip(expected, measured, strict=True)])
+
+
+def _of_depth(name: str, compare: _Comparison, shown: MetricFormat, unit: str | None = None) -> Metric:
+    function = partial(of_depth, compare=compare)
+    return Metric(f"Calibration_{name}", function, depth_mask, shown, min_size=1, unit=unit, stated="depth_error")
+
+
+def auc_metric(threshold: float = OFF) -> Metric:
+    """Return the metric of :func:`off_auc` of depth for a threshold in metres."""
+    millimetres = f"{1e3 * threshold:g}"
+    shown = MetricFormat("AUC", f"off by {millimetres} mm", 1, 3, higher_is_better=True, position=BEFORE_THE_PAPER)
+    compare = partial(off_auc, threshold=threshold)
+    return _of_depth(f"AUC_{millimetres}mm".replace(".", "_"), compare, shown, unit="cm")
+
+
+def _shown(heading: str, unit: str, factor: float = 1, digits: int = 3) -> MetricFormat:
+    return MetricFormat(heading, unit, factor, digits, position=BEFORE_THE_PAPER)
+
+
+METRICS: tuple[Metric, ...] = (
+    _of_depth("ENCE", ence, _shown("ENCE", "depth, %", 1e2, 1)),
+    _of_depth("AUSE_d", ause, _shown("AUSE", f"depth, {STEPS} steps")),
+    Metric(
+        "Calibration_AUSE_v",
+        partial(of_normals, compare=ause),
+        normal_mask,
+        _shown("AUSE", f"normals, {STEPS} steps"),
+        stated="angle_error",
+    ),
+    auc_metric(),
+    _of_depth("stated", stated_ratio, MetricFormat("Stated", "of true error", position=None)),
+    _of_depth("factor", factor_off, _shown("Stated off", "factor", digits=2)),
+    Metric(
+        "Calibration_covered",
+        covered,
+        target_mask,
+        MetricFormat("Covered", "stated, %", 1e2, 1, higher_is_better=True, position=BEFORE_THE_PAPER),
+        min_size=1,
+        stated="depth_error",
+        whole=True,
+    ),
+)
+"""The metrics of ``metrics=calibration``, of methods that state their errors."""

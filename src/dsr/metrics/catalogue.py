@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dsr.metrics import boundaries, depth, evalmde, field, functional, normals, points, sensor
+from dsr.metrics import boundaries, calibration, depth, evalmde, field, functional, normals, plane, points, sensor
 from dsr.metrics.formats import MetricFormat
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS, MIN_SIZE, lpips_v
@@ -111,11 +111,13 @@ PROTOCOLS: Mapping[str, tuple[Metric, ...]] = {
             "points": points.METRICS,
             "evalmde": evalmde.METRICS,
             "boundaries": boundaries.METRICS,
+            "calibration": calibration.METRICS,
+            "plane": plane.METRICS,
         }.items()
     },
 }
 """Sets of metrics by name: the paper's, those that the field prints, those for real sensors, of depth estimation, of
-EvalMDE and of boundaries."""
+EvalMDE, of boundaries, of stated errors and of planes."""
 KNOWN_FORMATS = {metric.name: metric.format for metric in METRICS}
 
 
@@ -171,7 +173,9 @@ def score_image(
     rays: Tensor,
     metrics: tuple[Metric, ...],
     unit: Unit = CENTIMETRES,
+    *,
     regions: Mapping[str, Tensor] | None = None,
+    errors: tuple[Tensor, Tensor] | None = None,
 ) -> Iterator[Score]:
     """Score one predicted depth map.
 
@@ -182,9 +186,11 @@ def score_image(
         prediction: (1, H, W) orthogonal depth in metres, NaN where missing.
         target: (1, H, W) orthogonal depth in metres, NaN where missing.
         rays: (3, H, W), see :meth:`dsr.geometry.camera.Camera.rays`.
-        metrics: from :func:`catalogue`; those for other units, and of regions that there are not, are left out.
+        metrics: from :func:`catalogue`; those for other units are left out, and those of regions or stated errors that
+            there are not.
         unit: of the benchmark.
         regions: parts of the image by name, (1, H, W) uint8.
+        errors: the method's expected errors, (1, H, W): of depth in metres, of normals in degrees.
 
     Yields:
         The scores, NaN where no pixel can be scored.
@@ -194,7 +200,9 @@ def score_image(
     def pair_of(window: tuple[Any, ...]) -> SurfacePair:
         maps = (values[window][None] for values in (prediction, target, rays))
         parts = {name: region[window][None] for name, region in (regions or {}).items()}
-        return SurfacePair(*maps, unit=unit, regions=parts, image_dtype=torch.float32)
+        named = zip(("depth_error", "angle_error"), errors or (), strict=False)
+        stated = {name: each[window][None] for name, each in named}
+        return SurfacePair(*maps, unit=unit, regions=parts, image_dtype=torch.float32, **stated)
 
     window = (..., *_covered(prediction))
     whole = covered = pair_of((...,))

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from dsr.geometry.camera import Camera
 from dsr.metrics.alignment import align_pair
+from dsr.metrics.calibration import OFF, auc_metric
 from dsr.metrics.catalogue import PROTOCOLS, catalogue
 from dsr.metrics.formats import MetricFormat
 from dsr.metrics.functional import SurfacePair
@@ -33,7 +34,7 @@ class PerImageMean(torchmetrics.Metric):
     NaN, so that a method that fails never looks better than one that does not.
 
     Attributes:
-        applied: () bool, whether the metric is for all benchmarks, or for that of a pair so far.
+        applied: () bool, whether the metric is for all pairs, or was for one so far.
 
     Args:
         metric: from :func:`dsr.metrics.catalogue.catalogue`.
@@ -61,7 +62,7 @@ class PerImageMean(torchmetrics.Metric):
         self._total = f"total_{metric.name}_{self._variant}"  # else compute groups merge metrics of equal first values
         self.add_state(self._total, torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
         self.add_state("count", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
-        self.add_state("applied", torch.tensor(metric.unit is None), dist_reduce_fx="max")
+        self.add_state("applied", torch.tensor(metric.unit is metric.stated is None), dist_reduce_fx="max")
 
     @property
     def format(self) -> MetricFormat:
@@ -89,7 +90,8 @@ class PerImageMean(torchmetrics.Metric):
         """Add a batch, as for :meth:`dsr.metrics.functional.SurfacePair.of`.
 
         Args:
-            preds: a pair, which is left out if it is of another benchmark than the metric's; or predicted depth.
+            preds: a pair, which is left out if it is of another benchmark than the metric's, or has no expected errors
+                for a metric of these; or predicted depth.
             target: true depth.
             camera: the camera of these pixels, or their rays.
             mask: the pixels to compare.
@@ -279,6 +281,51 @@ class MoGeF1(PerImageMean):
 
     def __init__(self, radius: int = 1, **settings: Any) -> None:
         super().__init__(_named(f"MoGe_F1_{radius}"), **settings)
+
+
+class ENCE(PerImageMean):
+    """The expected normalised calibration error of depth; of pairs with expected errors alone, as the next three."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(_named("Calibration_ENCE"), **settings)
+
+
+class AUSE(PerImageMean):
+    """The area under the sparsification error of depth, or of ``normals``."""
+
+    def __init__(self, *, normals: bool = False, **settings: Any) -> None:
+        super().__init__(_named("Calibration_AUSE_v" if normals else "Calibration_AUSE_d"), **settings)
+
+
+class OffAUC(PerImageMean):
+    """How well expected errors tell the pixels that are off by more than a threshold in metres, 0.02.
+
+    NaN if in one of the images none is, or all are.
+    """
+
+    def __init__(self, threshold: float = OFF, **settings: Any) -> None:
+        super().__init__(auc_metric(threshold), **settings)
+
+
+class StatedRatio(PerImageMean):
+    """The median expected error of depth over the median measured one."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(_named("Calibration_stated"), **settings)
+
+
+class PlaneDeviation(PerImageMean):
+    """The standard deviation of depth about a plane in metres."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(_named("Plane_std"), **settings)
+
+
+class PlaneAngle(PerImageMean):
+    """The mean angle between normals and a plane's in degrees."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(_named("Plane_angle"), **settings)
 
 
 class SurfaceMetrics(torchmetrics.MetricCollection):

@@ -47,6 +47,8 @@ class SurfacePair:
         mask: (B, 1, H, W) bool, the pixels to compare; None for all.
         unit: unit of the metrics that are in the benchmark's own.
         regions: parts of the images by name, (B, 1, H, W) uint8, 0 outside, see :class:`dsr.sample.Scene`.
+        depth_error, angle_error: (B, 1, H, W) expected absolute errors of the predicted depth in metres and of its
+            normals in degrees, NaN where there is none; None from a method that states none.
         image_dtype: of normals and renderings, None for the depth's. float32 halves their computing time and changes
             scores by about 1e-7; depths and their differences keep their own dtype.
 
@@ -64,6 +66,8 @@ class SurfacePair:
         *,
         unit: Unit = CENTIMETRES,
         regions: Mapping[str, Tensor] | None = None,
+        depth_error: Tensor | None = None,
+        angle_error: Tensor | None = None,
         image_dtype: torch.dtype | None = None,
     ) -> None:
         if prediction.dim() != 4 or prediction.shape[1] != 1 or prediction.shape != target.shape:
@@ -78,6 +82,10 @@ class SurfacePair:
         if mask is not None and (mask.dtype != torch.bool or mask.shape != target.shape):
             came = f"{mask.dtype} {tuple(mask.shape)}"
             raise ValueError(f"mask: expected bool of shape {tuple(target.shape)}, got {came}")
+        for name, error in (("depth_error", depth_error), ("angle_error", angle_error)):
+            if error is not None and error.shape != target.shape:
+                raise ValueError(f"{name}: expected shape {tuple(target.shape)}, got {tuple(error.shape)}")
+        self.depth_error, self.angle_error = depth_error, angle_error
         self.target_mask = target.isfinite() & (target > 0)
         if mask is not None:
             self.target_mask = self.target_mask & mask
@@ -205,7 +213,16 @@ def _in_region(name: str) -> Callable[[SurfacePair], SurfacePair]:
         mask = pair.regions[name] > 0
         mask = mask if pair.mask is None else mask & pair.mask
         regions, kind = {name: pair.regions[name]}, pair.image_dtype
-        return SurfacePair(*pair.given, pair.rays, mask, unit=pair.unit, regions=regions, image_dtype=kind)
+        return SurfacePair(
+            *pair.given,
+            pair.rays,
+            mask,
+            unit=pair.unit,
+            regions=regions,
+            depth_error=pair.depth_error,
+            angle_error=pair.angle_error,
+            image_dtype=kind,
+        )
 
     return restrict
 

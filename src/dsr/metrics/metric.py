@@ -34,6 +34,8 @@ class Metric:
         region: the part of the image that it is of, see :class:`dsr.sample.Scene`; None for all of it. It is left out
             where a scene has no such region.
         whole: whether it is computed of the whole image even where a method left out rows or columns at the border.
+        stated: the expected errors of the method that it compares, ``depth_error`` or ``angle_error``; it is left out
+            for methods that state none. None if it needs none.
 
     """
 
@@ -48,10 +50,12 @@ class Metric:
     unit: str | None = None
     region: str | None = None
     whole: bool = False
+    stated: str | None = None
 
     def applies(self, pair: SurfacePair) -> bool:
-        """Return whether the metric is for the pair's benchmark, and there is its region."""
-        return self.unit in (None, pair.unit.name) and (self.region is None or self.region in pair.regions)
+        """Return whether the metric is for the pair's benchmark, and there are the region and errors that it needs."""
+        known = self.stated is None or getattr(pair, self.stated) is not None
+        return known and self.unit in (None, pair.unit.name) and (self.region is None or self.region in pair.regions)
 
     def within(self, region: str) -> Metric:
         """Return the metric of a region, ``NAME@REGION``."""

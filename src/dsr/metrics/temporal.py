@@ -1,0 +1,270 @@
+"""Metrics of depth over time: flicker of what stands still, and whether frames of a moving camera agree.
+
+- :func:`flicker`, :func:`temporal_noise` and :func:`normal_flicker` need a camera that stands still, or the pixels at
+  which nothing moves. Temporal noise is that of Intel's Depth Quality Tool, ``calculate_temporal_noise`` in
+  ``tools/depth-quality/rs-depth-quality.cpp`` of IntelRealSense/librealsense (cacc8e7), there of 39 frames.
+- :func:`opw` needs poses: the optical-flow-based warping metric of Wang et al., *Less Is More: Consistent Video Depth
+  Estimation with Masked Frames Modeling*, ACM MM 2022, and *Neural Video Depth Stabilizer*, ICCV 2023, with the rigid
+  flow of depth and pose; ``smooth_loss.py`` (d7b66e4) and ``infer_NVDS_dpt_bi.py`` (720a979) of RaymondWang987/NVDS.
+- :func:`tgm` needs a truth: temporal gradient matching of Chen et al., *Video Depth Anything*, CVPR 2025,
+  ``TemporalGradientMatchingLoss`` in ``loss/loss.py`` of DepthAnything/Video-Depth-Anything (4f5ae23), with one stride.
+
+All are of one sequence, (), and lower is better. None knows whether the depth is right: a constant has the best of each
+but the last. Holes are left out, and :func:`covered` stands beside them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+import torchmetrics
+from torch import Tensor
+
+from dsr.geometry.camera import Camera
+from dsr.geometry.rigid_motion import as_rigid, relative
+from dsr.geometry.surface import angle_between, depth_to_normals, length
+from dsr.geometry.warping import source_pixels, warp_depth
+from dsr.metrics.functional import masked_mean, masked_median
+
+Poses = Tensor | np.ndarray | Sequence[np.ndarray]
+_VISIBLE = 50.0
+"""How fast the weight of a pixel falls with the squared difference of its colours."""
+_MOVING = 0.05
+"""Change of the true depth from frame to frame, as a fraction of the frame's range, from which on it is motion."""
+
+
+def flicker(depths: Tensor, static: Tensor | None = None) -> Tensor:
+    """Return the mean over the pixels of the standard deviation over time of depth, relative to its median over time.
+
+    Args:
+        depths: (T, 1, H, W) orthogonal depth in metres, T at least 2; NaN is a hole, and so is a depth that is not
+            positive. A pixel counts if it has a depth in two frames or more.
+        static: (1, 1, H, W) bool, the pixels where nothing moves; None for all.
+
+    Returns:
+        () a fraction; NaN if no pixel counts.
+
+    Raises:
+        ValueError: a shape is not as above.
+
+    """
+    spread, mask = _spread(depths, static)
+    return masked_mean(spread, mask).squeeze()
+
+
+def temporal_noise(depths: Tensor, static: Tensor | None = None) -> Tensor:
+    """Return the median over the pixels of what :func:`flicker` has the mean of.
+
+    Intel's tool counts pixels that never have a depth as 0, so that a map with holes in half of them has no noise. Here
+    they are left out.
+    """
+    return masked_median(*_spread(depths, static)).squeeze()
+
+
+def normal_flicker(depths: Tensor, camera: Camera, static: Tensor | None = None) -> Tensor:
+    """Return the mean over the pixels of the RMS angle over time between a normal and its mean direction, in degrees.
+
+    Args:
+        depths, static: as for :func:`flicker`; a pixel counts if it has a normal in two frames or more.
+        camera: that stands still.
+
+    """
+    known = _known(depths)
+    normals = depth_to_normals(depths.masked_fill(~known, torch.nan), camera.rays(device=depths.device)[None])
+    known = normals.isfinite().all(dim=1, keepdim=True)
+    mean = torch.where(known, normals, 0).sum(dim=0, keepdim=True)
+    angles = angle_between(normals, mean / length(mean))
+    count = known.sum(dim=0, keepdim=True)
+    squares = torch.where(known, angles.square(), 0).sum(dim=0, keepdim=True)
+    return masked_mean((squares / count.clamp(min=1)).sqrt(), _counted(count, static)).squeeze()
+
+
+def covered(depths: Tensor, static: Tensor | None = None) -> Tensor:
+    """Return the fraction of the pixels of all frames that have a depth, (); higher is better.
+
+    Args:
+        depths, static: as for :func:`flicker`.
+
+    """
+    share = _known(depths).to(depths).mean(dim=0, keepdim=True)
+    return masked_mean(share, torch.ones_like(share, dtype=torch.bool) if static is None else static).squeeze()
+
+
+def opw(
+    depths: Tensor, camera: Camera, poses: Poses, photos: Tensor | None = None, static: Tensor | None = None
+) -> Tensor:
+    """Return the mean difference between the depth of a frame and that of the frame before, warped into its view.
+
+    The frame before is warped with a z-buffer, so that what a surface hides does not count, and what appears is a hole.
+    The authors' code normalises each map of disparity by its median and mean deviation, sums weights of three colours
+    from 0 to 255, with which hardly any pixel counts, and takes 10 times the mean over all pixels. Here it is a
+    weighted mean in metres.
+
+    Args:
+        depths: (T, 1, H, W) orthogonal depth in metres, T at least 2; NaN is a hole.
+        camera: of all frames.
+        poses: (T, 4, 4) transforms from the camera's frame (x right, y down, z forward) to the world's, metres.
+        photos: (T, 3, H, W) in 0 to 1: pixels weigh exp(-50 d^2), where d^2 is the sum of the squared differences of a
+            pixel's colours, so that what moves counts less. None for equal weights.
+        static: (T, 1, H, W) bool, the pixels of each frame to compare; None for all.
+
+    Returns:
+        () in metres, the mean over the pairs of frames; NaN if one has nothing to compare.
+
+    Raises:
+        ValueError: a shape is not as above, or a pose is not rigid.
+
+    """
+    known = _known(depths) if static is None else _known(depths) & static
+    frames = [as_rigid(np.asarray(each), f"poses: {number}") for number, each in enumerate(poses)]
+    if len(frames) != len(depths) or (photos is not None and len(photos) != len(depths)):
+        raise ValueError(f"poses, photos: expected as many as the {len(depths)} depth maps, got {len(frames)} poses")
+    found = []
+    for now in range(1, len(depths)):
+        before = now - 1
+        move = torch.from_numpy(relative(frames[before], frames[now]))[None].to(depths.device)
+        warped = warp_depth(depths[before:now], camera, move, camera)
+        mask = known[now][None] & warped.isfinite()
+        weight = mask.to(depths)
+        if photos is not None:
+            seen = _sample(photos[before:now], source_pixels(warped, camera, move, camera))
+            apart = (seen - photos[now]).square().sum(dim=1, keepdim=True)
+            weight = torch.where(mask, torch.exp(-_VISIBLE * apart), 0)
+        error = torch.where(mask, (depths[now] - warped).abs(), 0)
+        found.append((weight * error).sum() / weight.sum())
+    return torch.stack(found).mean()
+
+
+def tgm(prediction: Tensor, target: Tensor, static: Tensor | None = None) -> Tensor:
+    """Return the mean difference between the changes of predicted and true depth from frame to frame.
+
+    Pixels count whose true depth changes by less than 5 % of the range of the later frame's: it is of one surface. The
+    authors' training takes disparity, fitted to the truth by a scale and a shift, and ten times the value.
+
+    Args:
+        prediction: (T, 1, H, W) orthogonal depth in metres, T at least 2; NaN is a hole.
+        target: true depth, likewise.
+        static: (T, 1, H, W) bool, the pixels to compare; None for all.
+
+    Returns:
+        () in metres; NaN if no pixel counts.
+
+    Raises:
+        ValueError: a shape is not as above.
+
+    """
+    if prediction.shape != target.shape:
+        raise ValueError(f"target: expected shape {tuple(prediction.shape)}, got {tuple(target.shape)}")
+    true = _known(target) if static is None else _known(target) & static
+    known = true & _known(prediction)
+    highest, lowest = (torch.where(true, target, end).flatten(1) for end in (-torch.inf, torch.inf))
+    limit = _MOVING * (highest.amax(dim=1) - lowest.amin(dim=1))[1:, None, None, None]
+    change = target.diff(dim=0)
+    counted = known[1:] & known[:-1] & (change.abs() < limit)
+    return torch.where(counted, (prediction.diff(dim=0) - change).abs(), 0).sum() / counted.sum()
+
+
+def _known(depths: Tensor) -> Tensor:
+    """Return the pixels with a depth, after checking the shape."""
+    if depths.dim() != 4 or depths.shape[1] != 1 or len(depths) < 2:
+        raise ValueError(f"depths: expected shape (T, 1, H, W) of two frames or more, got {tuple(depths.shape)}")
+    return depths.isfinite() & (depths > 0)
+
+
+def _counted(count: Tensor, static: Tensor | None) -> Tensor:
+    """Return the pixels that count, from the number of frames that see each, (1, 1, H, W)."""
+    if static is not None and static.shape != count.shape:
+        raise ValueError(f"static: expected shape {tuple(count.shape)}, got {tuple(static.shape)}")
+    return count > 1 if static is None else (count > 1) & static
+
+
+def _spread(depths: Tensor, static: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Return the standard deviation over time over the median, and the pixels where it counts, (1, 1, H, W) each."""
+    known = _known(depths)
+    count = known.sum(dim=0, keepdim=True)
+    values = torch.where(known, depths, 0)
+    mean = values.sum(dim=0, keepdim=True) / count.clamp(min=1)
+    variance = torch.where(known, (depths - mean).square(), 0).sum(dim=0, keepdim=True) / count.clamp(min=1)
+    of_pixels = (each.flatten(1).T[:, None, None] for each in (values, known))  # (H W, 1, 1, T)
+    median = masked_median(*of_pixels).view_as(mean)
+    counted = _counted(count, static)
+    return torch.where(counted, variance.sqrt() / median, 0), counted
+
+
+def _sample(photo: Tensor, places: tuple[Tensor, Tensor]) -> Tensor:
+    """Return a photo, (1, 3, H, W), at columns and rows, (1, H, W) each, by linear interpolation."""
+    grid = torch.stack([2 * place / (size - 1) - 1 for place, size in zip(places, photo.shape[:1:-1], strict=True)], -1)
+    grid = grid.nan_to_num(0).to(photo)
+    return torch.nn.functional.grid_sample(photo, grid, padding_mode="border", align_corners=True)
+
+
+class SequenceMean(torchmetrics.Metric):
+    """The mean over sequences of a function of this module; ``update`` has its arguments.
+
+    It is NaN if one of the sequences has nothing to compare.
+
+    Args:
+        function: from a sequence to ().
+        **settings: as for every torchmetrics class.
+
+    """
+
+    is_differentiable = False
+    higher_is_better = False
+    full_state_update = False
+    total: Tensor
+    count: Tensor
+
+    def __init__(self, function: Callable[..., Tensor], **settings: Any) -> None:
+        super().__init__(**settings)
+        self._function = function
+        for name in ("total", "count"):
+            self.add_state(name, torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
+
+    @torch.no_grad()
+    def update(self, *sequence: Any, **named: Any) -> None:
+        """Add a sequence."""
+        self.total = self.total + self._function(*sequence, **named).to(self.total)
+        self.count = self.count + 1
+
+    def compute(self) -> Tensor:
+        """Return the mean over the sequences."""
+        return self.total / self.count
+
+
+class Flicker(SequenceMean):
+    """The flicker of depth, a fraction."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(flicker, **settings)
+
+
+class TemporalNoise(SequenceMean):
+    """The temporal noise of Intel's tool, a fraction."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(temporal_noise, **settings)
+
+
+class NormalFlicker(SequenceMean):
+    """The flicker of normals in degrees."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(normal_flicker, **settings)
+
+
+class OPW(SequenceMean):
+    """The warping metric in metres."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(opw, **settings)
+
+
+class TGM(SequenceMean):
+    """Temporal gradient matching in metres."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(tgm, **settings)
