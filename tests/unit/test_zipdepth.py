@@ -12,6 +12,7 @@ import torch
 from small_scenes import plane, random_scene, sample_of
 from torch import Tensor
 
+from dsr.methods.base import NoSolutionError
 from dsr.methods.networks.zipdepth import Sizes, ZipDepth, ZipDepthMonocular
 from dsr.methods.recipe import read_recipe
 from dsr.utils.configuration import ConfigError
@@ -84,7 +85,7 @@ def test_result_is_fitted_without_the_truth(file: Path) -> None:
     problem.depth_lr[:, 2:5, 3:9] = torch.nan
     torch.testing.assert_close(method(problem), truth, rtol=1e-3, atol=0)
     assert "affine" in method.describe(problem)
-    with pytest.raises(ValueError, match=r"zipdepth_base.pth: expected values that rise"):
+    with pytest.raises(NoSolutionError, match=r"zipdepth_base.pth: expected values that rise"):
         method(sample_of(30 - 2 * relative, rgb, scale=4))
 
 

@@ -227,10 +227,7 @@ def fit_to_map(values: Tensor, sample: DepthSample, quantity: str, fit: Fit, pla
         raise ValueError(f"{place}: expected pixels that the low-resolution map knows, too; there are none")
     gain, shift = fit_line(reduced[known], target[known], shift=fit == "affine")
     if not gain > 0:
-        raise ValueError(
-            f"{place}: expected values that rise with the low-resolution map's in {quantity}, they do not; "
-            "another quantity?"
-        )
+        raise ValueError(f"{place}: expected values that rise with the low-resolution map's {quantity}, they do not")
     return gain * values + shift
 
 

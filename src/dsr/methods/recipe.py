@@ -154,6 +154,11 @@ class Recipe:
             )
         return factors
 
+    @functools.cached_property
+    def of_run(self) -> tuple[str, ...]:
+        """Keys of the node that a run gives in another way, of weights only to a method that needs a file."""
+        return OF_RUN if self.abilities.needs else tuple(key for key in OF_RUN if key != "weights")
+
     @property
     def computed_at(self) -> tuple[float, ...]:
         """Factors at which a method computes that takes a map of any size, if there are only some."""
@@ -209,7 +214,7 @@ class Recipe:
         given = {**given, **told, **decided, "scale": factor}
         if self.abilities.needs is not None:
             given |= {"weights": self.weights(factor), "networks": self._networks}
-        own = {key: value for key, value in node.items() if key not in (*OF_RUN, _NETWORK, *told)}
+        own = {key: value for key, value in node.items() if key not in (*self.of_run, _NETWORK, *told)}
         method: Method = build("method", own, given, self.name)
         return method
 

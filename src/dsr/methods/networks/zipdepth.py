@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dsr.methods.base import Abilities, Cost, Method
+from dsr.methods.base import Abilities, Cost, Method, NoSolutionError
 from dsr.methods.external import INVERSE, Fit, describe_fit, fit_to_map, to_depth, within_limits
 from dsr.methods.networks.weight_files import load_parameters
 from dsr.sample import DepthSample
@@ -377,11 +377,14 @@ class ZipDepthMonocular(Method):
         """Return the high-resolution orthogonal depth, (1, H, W) in metres on the sample's device.
 
         Raises:
-            ValueError: the result falls where the low-resolution map rises.
+            NoSolutionError: the result falls where the low-resolution map rises.
 
         """
         values = self.relative(sample.rgb.to(self.device, torch.float32)[None])[0]
-        fitted = fit_to_map(values.cpu(), sample, INVERSE, _FIT, self._path)
+        try:
+            fitted = fit_to_map(values.cpu(), sample, INVERSE, _FIT, self._path)
+        except ValueError as error:
+            raise NoSolutionError(str(error)) from error
         if progress is not None:
             progress(1, 1)
         return within_limits(to_depth(fitted, sample.camera, INVERSE)).to(sample.depth_lr)
