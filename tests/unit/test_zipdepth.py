@@ -93,6 +93,7 @@ def test_directory_of_the_authors_files_is_enough(file: Path) -> None:
     problem = sample_of(plane(64, 96), random_scene(64, 96)[1])
     recipe = read_recipe("zipdepth", {"size": 64}).with_weights(file.parent)
     assert recipe.weights(4) == file
+    assert read_recipe("zipdepth", {"weights": str(file.parent)}).weights(4) == file
     assert isinstance(recipe.build(4), ZipDepthMonocular)
     assert recipe.build(4).abilities.takes(problem.scale)
     with pytest.raises(ConfigError, match=r"weights: method=zipdepth: .* needs weights=FILE, .*zipdepth_base.pth"):

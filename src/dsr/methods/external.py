@@ -227,7 +227,8 @@ def fit_to_map(values: Tensor, sample: DepthSample, quantity: str, fit: Fit, pla
         raise ValueError(f"{place}: expected pixels that the low-resolution map knows, too; there are none")
     gain, shift = fit_line(reduced[known], target[known], shift=fit == "affine")
     if not gain > 0:
-        raise ValueError(f"{place}: expected values that rise with the low-resolution map's {quantity}, they do not")
+        what = quantity if quantity == "disparity" else f"{quantity} depth"
+        raise ValueError(f"{place}: expected values that rise with the low-resolution map's {what}, they do not")
     return gain * values + shift
 
 

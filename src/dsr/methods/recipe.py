@@ -290,7 +290,10 @@ def read_recipe(name: str, settings: Mapping[str, Any] | None = None, directorie
         raise ConfigError(f"method: expected one of {', '.join(names)}, got {name!r}")
     try:
         content = _read_file("method", name, places, ())
-        node = OmegaConf.merge(content.get("method", {}), dict(settings or {}))
+        node, given = content.get("method", {}), dict(settings or {})
+        if isinstance(given.get("weights"), str) and isinstance(node.get("weights"), DictConfig):
+            given["weights"] = {"path": given["weights"]}
+        node = OmegaConf.merge(node, given)
     except OmegaConfBaseException as error:
         raise ConfigError(f"method={name}: {str(error).splitlines()[0]}") from error
     assert isinstance(node, DictConfig)  # noqa: S101 - for the type checker

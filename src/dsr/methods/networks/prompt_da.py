@@ -73,7 +73,7 @@ class PromptDA(Method):
 
     """
 
-    abilities = Abilities(ratios="any", own_size=True, cost=Cost(60, program=8e9))
+    abilities = Abilities(ratios="any", own_size=True, cost=Cost(60, program=5e9))
     range_type = "orthogonal"
 
     def __init__(self, weights: str, size: int = SIZE, device: torch.device | str = "cpu") -> None:
