@@ -127,6 +127,8 @@ def test_graph_that_dsr_exports_gives_what_the_network_does(tmp_path: Path) -> N
         ({"range": "truth"}, "range: expected measured"),
         ({"output": "log"}, "output: expected one of same"),
         ({"fit": "cubic"}, "fit: expected one of null, scale, affine"),
+        ({"size": [20, 20]}, "size: expected null"),
+        ({"size": [20], "inputs": {"rgb": "image"}}, "size: expected null, or"),
         ({"multiple": 0}, "multiple: expected 1 or more"),
         ({"result": "depth"}, "result: expected null"),
     ],
@@ -158,6 +160,24 @@ def test_relative_result_is_fitted_to_the_coarse_map_without_the_truth(
     assert "affine" in method.describe(problem)
     with pytest.raises(ValueError, match=r"mine.pt: expected values that rise"):
         NetworkFile(str(tmp_path / "mine.pt"), {"rgb": "image"}, output="orthogonal", fit="affine")(problem)
+
+
+def of_one_size(rgb: Tensor) -> Tensor:
+    assert rgb.shape[2] == 24
+    assert rgb.shape[3] == 40
+    return 4 + rgb[:, :1]
+
+
+def test_photo_is_resized_for_a_network_that_sees_it_alone(tmp_path: Path) -> None:
+    ramp = torch.linspace(0.2, 0.8, 48).expand(3, 32, 48)
+    path, inputs = script(tmp_path, of_one_size), {"rgb": "image"}
+    for output, factor in (("orthogonal", 1), ("disparity", 48 / 40)):
+        method = NetworkFile(path, inputs, output=output, size=[24, 40], multiple=8)
+        problem = sample_of(plane(), ramp, scale=4)
+        found = method(problem)
+        found = found if output == "orthogonal" else to_range(found, problem.camera, "disparity")
+        inner = (slice(None), slice(None), slice(4, -4))  # the kernel ends at the border
+        torch.testing.assert_close(found[inner], factor * (4 + ramp[:1].double())[inner], rtol=0, atol=1e-3)
 
 
 @pytest.mark.parametrize("name", ["bad.onnx", "bad.pt"])

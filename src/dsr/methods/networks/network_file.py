@@ -71,7 +71,9 @@ class NetworkFile(Method):
         fit: of the result to the low-resolution map, in the quantity that it measures: ``scale``, ``affine``, or None
             for a network that is metric. See :func:`dsr.methods.external.fit_to_map`.
         result: name of the output of an ONNX file; None for its first.
-        multiple: the number that has to divide the photo's height and width; it is continued at the right and bottom.
+        size: height and width that photos are resized to by Keys' cubic kernel, and the result bilinearly back, for a
+            network that sees the photo alone; None for the photo's.
+        multiple: the number that has to divide the height and width; the photo is continued at the right and bottom.
         device: where to compute.
 
     Raises:
@@ -90,6 +92,7 @@ class NetworkFile(Method):
         output: str = SAME,
         fit: str | None = None,
         result: str | None = None,
+        size: Sequence[int] | None = None,
         multiple: int = 1,
         device: torch.device | str = "cpu",
     ) -> None:
@@ -113,6 +116,10 @@ class NetworkFile(Method):
         self._limits = None if range in (None, MEASURED) else _limits(range)
         if multiple < 1:
             raise ValueError(f"multiple: expected 1 or more, got {multiple}")
+        sees_map = set(self._inputs.values()) & set(_MAPS) or output == RESIDUAL
+        if size is not None and (len(size) != 2 or min(size) < 1 or sees_map):
+            raise ValueError(f"size: expected null, or [height, width] for inputs {', '.join(_IMAGES)}, got {size}")
+        self._size = None if size is None else (int(size[0]), int(size[1]))
         self.name = self._path.stem
         self.range_type = range_type if range_type in RANGE_TYPES else "disparity"
         self._quantity, self._scaled, self._output = range_type, range is not None, output
@@ -129,15 +136,18 @@ class NetworkFile(Method):
             ValueError: the network cannot be run on pictures of this size, or returns something else than a map.
 
         """
-        size = sample.camera.height, sample.camera.width
+        photo_size = sample.camera.height, sample.camera.width
+        size = self._size or photo_size
         known = sample.mask_lr[None].to(self.device)
         values_lr = inpaint(from_depth(sample.depth_lr, sample, self._quantity)[None]).to(self.device)
         scaled = normalise(values_lr, self._limits)
         lowest, span = (scaled.minimum, scaled.value_range) if self._scaled else (0.0, 1.0)
         low = (scaled.values if self._scaled else values_lr).float()
-        enlarged = resize_bicubic(low, size)
+        enlarged = resize_bicubic(low, photo_size)
         pictures = {"lr": low, "up": enlarged, "valid": known}
         rgb = sample.rgb.to(self.device, torch.float32)[None]
+        if size != photo_size:
+            rgb = resize_bicubic(rgb, size).clamp(0, 1)
         given = {
             name: self._padded(_IMAGES[content](rgb) if content in _IMAGES else pictures[content], size)
             for name, content in self._inputs.items()
@@ -153,6 +163,9 @@ class NetworkFile(Method):
         if self._output in (SAME, RESIDUAL):
             values = (values + enlarged if self._output == RESIDUAL else values) * span + lowest
         quantity = self._quantity if self._output in (SAME, RESIDUAL) else self._output
+        if size != photo_size:
+            factor = photo_size[1] / size[1] if quantity == "disparity" else 1.0  # in pixels of the photo
+            values = functional.interpolate(values, photo_size, mode="bilinear", align_corners=False) * factor
         if progress is not None:
             progress(1, 1)
         if self._fit is None:
