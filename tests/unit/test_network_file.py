@@ -126,6 +126,9 @@ def test_graph_that_dsr_exports_gives_what_the_network_does(tmp_path: Path) -> N
         ({"range": [2, 1]}, "range: expected measured"),
         ({"range": "truth"}, "range: expected measured"),
         ({"output": "log"}, "output: expected one of same"),
+        ({"fit": "cubic"}, "fit: expected one of null, scale, affine"),
+        ({"size": [20, 20]}, "size: expected null"),
+        ({"size": [20], "inputs": {"rgb": "image"}}, "size: expected null, or"),
         ({"multiple": 0}, "multiple: expected 1 or more"),
         ({"result": "depth"}, "result: expected null"),
     ],
@@ -134,6 +137,47 @@ def test_declaration_is_checked(tmp_path: Path, settings: dict[str, Any], messag
     given = {"path": script(tmp_path, second), "inputs": {"rgb": "image", "depth": "up"}}
     with pytest.raises(ValueError, match=message):
         NetworkFile(**{**given, **settings})
+
+
+class Relative(nn.Module):
+    """Seven times the inverse depth that the photo's red channel holds, minus a shift."""
+
+    def forward(self, rgb: Tensor) -> Tensor:
+        return 7 * rgb[:, 0] - 0.5
+
+
+@pytest.mark.parametrize("output", ["inverse", "disparity"])
+def test_relative_result_is_fitted_to_the_coarse_map_without_the_truth(
+    sample: DepthSample, tmp_path: Path, output: str
+) -> None:
+    torch.jit.script(Relative()).save(str(tmp_path / "mine.pt"))
+    assert sample.depth is not None
+    disparity = to_range(sample.depth, sample.camera, "disparity")[0]
+    problem = sample_of(disparity, (disparity / 20).float().expand(3, 32, 48), scale=4)
+    object.__setattr__(problem, "depth", None)
+    method = NetworkFile(str(tmp_path / "mine.pt"), {"rgb": "image"}, output=output, fit="affine")
+    torch.testing.assert_close(method(problem), sample.depth, rtol=1e-3, atol=0)
+    assert "affine" in method.describe(problem)
+    with pytest.raises(ValueError, match=r"mine.pt: expected values that rise"):
+        NetworkFile(str(tmp_path / "mine.pt"), {"rgb": "image"}, output="orthogonal", fit="affine")(problem)
+
+
+def of_one_size(rgb: Tensor) -> Tensor:
+    assert rgb.shape[2] == 24
+    assert rgb.shape[3] == 40
+    return 4 + rgb[:, :1]
+
+
+def test_photo_is_resized_for_a_network_that_sees_it_alone(tmp_path: Path) -> None:
+    ramp = torch.linspace(0.2, 0.8, 48).expand(3, 32, 48)
+    path, inputs = script(tmp_path, of_one_size), {"rgb": "image"}
+    for output, factor in (("orthogonal", 1), ("disparity", 48 / 40)):
+        method = NetworkFile(path, inputs, output=output, size=[24, 40], multiple=8)
+        problem = sample_of(plane(), ramp, scale=4)
+        found = method(problem)
+        found = found if output == "orthogonal" else to_range(found, problem.camera, "disparity")
+        inner = (slice(None), slice(None), slice(4, -4))  # the kernel ends at the border
+        torch.testing.assert_close(found[inner], factor * (4 + ramp[:1].double())[inner], rtol=0, atol=1e-3)
 
 
 @pytest.mark.parametrize("name", ["bad.onnx", "bad.pt"])

@@ -34,7 +34,7 @@ from dsr.evaluation.store import load_errors, prediction_path
 from dsr.inference.selection import select
 from dsr.methods.base import WORKSPACE, Method
 from dsr.methods.networks.weight_files import files_of_weights
-from dsr.methods.recipe import OF_RUN, Known, Recipe, Run
+from dsr.methods.recipe import Known, Recipe, Run
 from dsr.metrics.formats import HEADLINES, Formats
 from dsr.report.table_layouts import score_tables
 from dsr.sample import DepthSample, slope
@@ -125,7 +125,7 @@ def _prepare(plain: Config, node: Any, source: SceneSource | None, *, here: bool
     source = source or _source(settings)
     name, scale = settings.names["method"], _scale(settings, source)
     recipe = Recipe(name, OmegaConf.create(node), user_directories(), plain)
-    own = {key: value for key, value in plain["method"].items() if key not in OF_RUN}
+    own = {key: value for key, value in plain["method"].items() if key not in recipe.of_run}
     plain = {**plain, "method": own, "precision": _precision(settings, recipe, device), "scale": scale}
     settings = EvalConfig.of(plain)
     selected = select(recipe, scale, _weights(settings, recipe), measured=settings.measured)

@@ -58,8 +58,9 @@ def run_name(kind: str, config: Config, identity: Identity) -> tuple[str, bool]:
     settings = [_setting(key, value) for key, value in _differing(config, defaults, head).items()]
     if config.get("run") is not None:
         settings.append((_setting("run", Path(config["run"]).absolute().name)[0], False))
-    elif config.get("weights") != defaults.get("weights") or any(
-        key.startswith("method.weights") for key in given_keys()
+    elif identity["weights_sha256"] is not None and (
+        config.get("weights") != defaults.get("weights")
+        or any(key.startswith("method.weights") for key in given_keys())
     ):
         settings.append((f"weights-{str(identity['weights_sha256'])[:8]}", True))
     if "alignment" in identity:

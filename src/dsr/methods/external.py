@@ -23,7 +23,7 @@ from dsr.io.encoding import find_holes
 from dsr.io.reading import parse_unit
 from dsr.methods.base import Abilities, Cost, Method
 from dsr.sample import FARTHEST, NEAREST, DepthSample
-from dsr.utils.guards import natural_key, pixels_beside
+from dsr.utils.guards import expect_one_of, natural_key, pixels_beside
 from dsr.utils.progress import Steps
 from dsr.utils.ratios import round_ratio
 from dsr.utils.versions import file_hash
@@ -90,9 +90,7 @@ class External(Method):
             ("fit", fit, (None, *get_args(Fit))),
             ("resize", resize, (None, *get_args(Resize))),
         ):
-            if value not in known:
-                names = ", ".join("null" if each is None else each for each in known)
-                raise ValueError(f"{key}: expected one of {names}, got {value!r}")
+            expect_one_of(key, value, known)
         unknown = set(_FIELD.findall(file)) - set(_FIELDS)
         if unknown or not file:
             raise ValueError(f"file: expected a name with {', '.join(f'{{{each}}}' for each in _FIELDS)}, got {file!r}")
@@ -106,7 +104,8 @@ class External(Method):
             self._unit = None if unit is None else parse_unit(str(unit))
         except ValueError as error:
             raise ValueError(f"unit: {error}") from None
-        self._fit, self._resize, self._check = fit, resize, check
+        self._fit: Fit | None = fit  # type: ignore[assignment]  # it has been checked
+        self._resize, self._check = resize, check
 
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
         """Return the map of the sample's scene, (1, H, W) orthogonal depth in metres, NaN in holes.
@@ -118,9 +117,8 @@ class External(Method):
         path = self._find(sample)
         values = self._read(path, sample.camera)
         if self._fit is not None:
-            values = self._fitted(path, values, sample)
-        depth = to_depth(values, sample.camera, self._quantity)
-        depth = depth.masked_fill((depth < NEAREST) | (depth > FARTHEST), torch.nan)
+            values = fit_to_map(values, sample, self._quantity, self._fit, path)
+        depth = within_limits(to_depth(values, sample.camera, self._quantity))
         if not bool(depth.isfinite().any()):
             raise ValueError(f"{path}: expected a depth, no value is one between {NEAREST:g} and {FARTHEST:g} m")
         if self._check:
@@ -130,10 +128,9 @@ class External(Method):
     def describe(self, sample: DepthSample) -> str:
         """Return what the scene's map came as, where that costs precision or the map was changed."""
         path = self._found(self._stem(sample))
-        fitted = f"{self._fit} fitted to the low-resolution map" if self._fit else ""
         whole = path is not None and path.suffix.lower() == ".png"
         stored = f"predictions come as whole numbers of {self._unit:g}" if whole and self._unit else ""
-        return "; ".join(filter(None, (stored, fitted)))
+        return "; ".join(filter(None, (stored, describe_fit(self._fit))))
 
     def remarks(self, dataset: str, scenes: Sequence[str], scale: float) -> list[str]:
         """Return lines on files that are of no scene."""
@@ -202,20 +199,37 @@ class External(Method):
         mode = "nearest-exact" if self._resize == "nearest" else self._resize
         return torch.nn.functional.interpolate(values[None], size, mode=mode, **corners)[0] * factor
 
-    def _fitted(self, path: Path, values: Tensor, sample: DepthSample) -> Tensor:
-        """Return values fitted to the low-resolution map."""
-        target = from_depth(sample.depth_lr.to("cpu", torch.float64), sample, self._quantity)
-        reduced = _reduce(values, target)
-        known = reduced.isfinite() & target.isfinite()
-        if int(known.sum()) < 2:
-            raise ValueError(f"{path}: expected pixels that the low-resolution map knows, too; there are none")
-        gain, shift = fit_line(reduced[known], target[known], shift=self._fit == "affine")
-        if not gain > 0:
-            raise ValueError(
-                f"{path}: expected values that rise with the low-resolution map's, they fall: "
-                f"is method.range_type={self._quantity} right?"
-            )
-        return gain * values + shift
+
+def describe_fit(fit: str | None) -> str:
+    """Return what is said beside the scores of a map that was fitted; nothing without a fit."""
+    return f"{fit} fitted to the low-resolution map" if fit else ""
+
+
+def fit_to_map(values: Tensor, sample: DepthSample, quantity: str, fit: Fit, place: Path) -> Tensor:
+    """Return values of a quantity, fitted to the low-resolution map.
+
+    Args:
+        values: (1, H, W) on the CPU, in any unit, NaN in holes.
+        sample: the problem, whose truth is not looked at.
+        quantity: what they measure, of :data:`QUANTITIES`.
+        fit: ``scale``, or ``affine``.
+        place: the file that they are of, for messages.
+
+    Raises:
+        ValueError: the map knows none of their pixels, or falls where they rise.
+
+    """
+    target = from_depth(sample.depth_lr.to("cpu", torch.float64), sample, quantity)
+    values = values.to(torch.float64)
+    reduced = _reduce(values, target)
+    known = reduced.isfinite() & target.isfinite()
+    if int(known.sum()) < 2:
+        raise ValueError(f"{place}: expected pixels that the low-resolution map knows, too; there are none")
+    gain, shift = fit_line(reduced[known], target[known], shift=fit == "affine")
+    if not gain > 0:
+        what = quantity if quantity == "disparity" else f"{quantity} depth"
+        raise ValueError(f"{place}: expected values that rise with the low-resolution map's {what}, they do not")
+    return gain * values + shift
 
 
 def fit_line(values: Tensor, target: Tensor, *, shift: bool = True) -> tuple[float, float]:
@@ -249,6 +263,11 @@ def to_depth(values: Tensor, camera: Camera, quantity: str) -> Tensor:
         return torch.where(values > 0, 1 / values, torch.nan)
     depth = from_range(values, camera, quantity)  # type: ignore[arg-type]  # it is a range type
     return torch.where(depth > 0, depth, torch.nan)
+
+
+def within_limits(depth: Tensor) -> Tensor:
+    """Return depth in metres with NaN where it is nearer or farther than depth maps of dsr hold."""
+    return depth.masked_fill((depth < NEAREST) | (depth > FARTHEST), torch.nan)
 
 
 def from_depth(depth_lr: Tensor, sample: DepthSample, quantity: str) -> Tensor:

@@ -154,6 +154,11 @@ class Recipe:
             )
         return factors
 
+    @functools.cached_property
+    def of_run(self) -> tuple[str, ...]:
+        """Keys of the node that a run gives in another way, of weights only to a method that needs a file."""
+        return OF_RUN if self.abilities.needs else tuple(key for key in OF_RUN if key != "weights")
+
     @property
     def computed_at(self) -> tuple[float, ...]:
         """Factors at which a method computes that takes a map of any size, if there are only some."""
@@ -209,7 +214,7 @@ class Recipe:
         given = {**given, **told, **decided, "scale": factor}
         if self.abilities.needs is not None:
             given |= {"weights": self.weights(factor), "networks": self._networks}
-        own = {key: value for key, value in node.items() if key not in (*OF_RUN, _NETWORK, *told)}
+        own = {key: value for key, value in node.items() if key not in (*self.of_run, _NETWORK, *told)}
         method: Method = build("method", own, given, self.name)
         return method
 
@@ -285,7 +290,10 @@ def read_recipe(name: str, settings: Mapping[str, Any] | None = None, directorie
         raise ConfigError(f"method: expected one of {', '.join(names)}, got {name!r}")
     try:
         content = _read_file("method", name, places, ())
-        node = OmegaConf.merge(content.get("method", {}), dict(settings or {}))
+        node, given = content.get("method", {}), dict(settings or {})
+        if isinstance(given.get("weights"), str) and isinstance(node.get("weights"), DictConfig):
+            given["weights"] = {"path": given["weights"]}
+        node = OmegaConf.merge(node, given)
     except OmegaConfBaseException as error:
         raise ConfigError(f"method={name}: {str(error).splitlines()[0]}") from error
     assert isinstance(node, DictConfig)  # noqa: S101 - for the type checker

@@ -109,8 +109,8 @@ def align_pair(pair: SurfacePair, how: str) -> SurfacePair:
     if pair.depth_error is not None and pair.angle_error is not None:
         errors = align_errors((pair.depth_error, pair.angle_error), prediction, aligned, how)
     depth_error, angle_error = errors or (None, None)
-    return SurfacePair(aligned, target, pair.rays, pair.target_mask, unit=pair.unit, depth_error=depth_error,
-                       angle_error=angle_error, image_dtype=pair.image_dtype)  # fmt: skip
+    return SurfacePair(aligned, target, pair.rays, pair.target_mask, unit=pair.unit, regions=pair.regions,
+                       depth_error=depth_error, angle_error=angle_error, image_dtype=pair.image_dtype)  # fmt: skip
 
 
 def _least_squares(x: Tensor, y: Tensor, weights: Tensor) -> Tensor:

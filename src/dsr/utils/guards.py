@@ -14,7 +14,7 @@ import os
 import re
 import stat
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from io import BufferedReader
 from numbers import Real
 from pathlib import Path, PurePath, PurePosixPath
@@ -215,6 +215,13 @@ def naming(place: object) -> Iterator[None]:
         yield
     except ValueError as error:
         raise ValueError(f"{place}: {error}") from error
+
+
+def expect_one_of(key: str, value: object, known: Sequence[str | None]) -> None:
+    """Raise a ValueError if a key's value is not one of those that are known."""
+    if value not in known:
+        names = ", ".join("null" if each is None else each for each in known)
+        raise ValueError(f"{key}: expected one of {names}, got {value!r}")
 
 
 @contextlib.contextmanager

@@ -10,7 +10,7 @@ import functools
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import torch
 from torch import Tensor
@@ -19,12 +19,20 @@ from torch.nn import functional
 from dsr.geometry.camera import RANGE_TYPES
 from dsr.methods.base import Abilities, Cost, Method
 from dsr.methods.classical.finite_differences import LUMA
-from dsr.methods.external import QUANTITIES, from_depth, to_depth
+from dsr.methods.external import (
+    QUANTITIES,
+    Fit,
+    describe_fit,
+    fit_to_map,
+    from_depth,
+    to_depth,
+    within_limits,
+)
 from dsr.methods.inpainting import inpaint
 from dsr.methods.networks.normalisation import normalise, normalise_imagenet, resize_bicubic
 from dsr.methods.networks.onnx_export import import_library
 from dsr.sample import DepthSample
-from dsr.utils.guards import refusing
+from dsr.utils.guards import expect_one_of, refusing
 from dsr.utils.progress import Steps
 from dsr.utils.ratios import round_ratio
 from dsr.utils.versions import file_hash
@@ -60,8 +68,12 @@ class NetworkFile(Method):
             numbers in the quantity's unit, or None for values as they are.
         output: what the network returns, (1, 1, H, W): ``same`` as its depth inputs, in the same range; ``residual``,
             to be added to the enlarged map; or a quantity as it is, of :data:`dsr.methods.external.QUANTITIES`.
+        fit: of the result to the low-resolution map, in the quantity that it measures: ``scale``, ``affine``, or None
+            for a network that is metric. See :func:`dsr.methods.external.fit_to_map`.
         result: name of the output of an ONNX file; None for its first.
-        multiple: the number that has to divide the photo's height and width; it is continued at the right and bottom.
+        size: height and width that photos are resized to by Keys' cubic kernel, and the result bilinearly back, for a
+            network that sees the photo alone; None for the photo's.
+        multiple: the number that has to divide the height and width; the photo is continued at the right and bottom.
         device: where to compute.
 
     Raises:
@@ -78,7 +90,9 @@ class NetworkFile(Method):
         range_type: str = "disparity",
         range: str | Sequence[float] | None = MEASURED,  # noqa: A002 - the key's name
         output: str = SAME,
+        fit: str | None = None,
         result: str | None = None,
+        size: Sequence[int] | None = None,
         multiple: int = 1,
         device: torch.device | str = "cpu",
     ) -> None:
@@ -87,9 +101,12 @@ class NetworkFile(Method):
             raise ValueError(f"path: expected a file {', '.join(('.onnx', *TORCHSCRIPT))}, got {path}")
         if not self._path.is_file():
             raise ValueError(f"path: expected a network's file, got {path} (no such file)")
-        for key, value, known in (("range_type", range_type, QUANTITIES), ("output", output, OUTPUTS)):
-            if value not in known:
-                raise ValueError(f"{key}: expected one of {', '.join(known)}, got {value!r}")
+        for key, value, known in (
+            ("range_type", range_type, QUANTITIES),
+            ("output", output, OUTPUTS),
+            ("fit", fit, (None, *get_args(Fit))),
+        ):
+            expect_one_of(key, value, known)
         self._inputs = dict(inputs)
         for name, content in self._inputs.items():
             if content not in CONTENTS:
@@ -99,9 +116,14 @@ class NetworkFile(Method):
         self._limits = None if range in (None, MEASURED) else _limits(range)
         if multiple < 1:
             raise ValueError(f"multiple: expected 1 or more, got {multiple}")
+        sees_map = set(self._inputs.values()) & set(_MAPS) or output == RESIDUAL
+        if size is not None and (len(size) != 2 or min(size) < 1 or sees_map):
+            raise ValueError(f"size: expected null, or [height, width] for inputs {', '.join(_IMAGES)}, got {size}")
+        self._size = None if size is None else (int(size[0]), int(size[1]))
         self.name = self._path.stem
         self.range_type = range_type if range_type in RANGE_TYPES else "disparity"
         self._quantity, self._scaled, self._output = range_type, range is not None, output
+        self._fit: Fit | None = fit  # type: ignore[assignment]  # it has been checked
         self._result, self._multiple, self.device = result, multiple, torch.device(device)
         self._runs: dict[int, _Run] = {}
         self._load(threads=1)  # its errors, before anything is computed
@@ -114,15 +136,18 @@ class NetworkFile(Method):
             ValueError: the network cannot be run on pictures of this size, or returns something else than a map.
 
         """
-        size = sample.camera.height, sample.camera.width
+        photo_size = sample.camera.height, sample.camera.width
+        size = self._size or photo_size
         known = sample.mask_lr[None].to(self.device)
         values_lr = inpaint(from_depth(sample.depth_lr, sample, self._quantity)[None]).to(self.device)
         scaled = normalise(values_lr, self._limits)
         lowest, span = (scaled.minimum, scaled.value_range) if self._scaled else (0.0, 1.0)
         low = (scaled.values if self._scaled else values_lr).float()
-        enlarged = resize_bicubic(low, size)
+        enlarged = resize_bicubic(low, photo_size)
         pictures = {"lr": low, "up": enlarged, "valid": known}
         rgb = sample.rgb.to(self.device, torch.float32)[None]
+        if size != photo_size:
+            rgb = resize_bicubic(rgb, size).clamp(0, 1)
         given = {
             name: self._padded(_IMAGES[content](rgb) if content in _IMAGES else pictures[content], size)
             for name, content in self._inputs.items()
@@ -138,9 +163,19 @@ class NetworkFile(Method):
         if self._output in (SAME, RESIDUAL):
             values = (values + enlarged if self._output == RESIDUAL else values) * span + lowest
         quantity = self._quantity if self._output in (SAME, RESIDUAL) else self._output
+        if size != photo_size:
+            factor = photo_size[1] / size[1] if quantity == "disparity" else 1.0  # in pixels of the photo
+            values = functional.interpolate(values, photo_size, mode="bilinear", align_corners=False) * factor
         if progress is not None:
             progress(1, 1)
-        return to_depth(values[0], sample.camera, quantity).to(sample.depth_lr)
+        if self._fit is None:
+            return to_depth(values[0], sample.camera, quantity).to(sample.depth_lr)
+        fitted = fit_to_map(values[0].cpu(), sample, quantity, self._fit, self._path)
+        return within_limits(to_depth(fitted, sample.camera, quantity)).to(sample.depth_lr)
+
+    def describe(self, sample: DepthSample) -> str:
+        """Return how the result was fitted."""
+        return describe_fit(self._fit)
 
     def content(self, dataset: str, scene: str, scale: float) -> str:
         """Return the SHA-256 of the network's file."""

@@ -85,7 +85,7 @@ class WeightChoice:
         """Say which weights are needed, and where they are."""
         published = f", or a directory with {files[0]} (from {self.source})" if files else ""
         needs = f"scale {round_ratio(self.scale)} needs weights=FILE{published}"
-        if self.files:
+        if files and self.packaged is None:
             return f"{needs}; its authors publish them, dsr does not come with them"
         return f"dsr comes with {', '.join(packaged_names())}; {needs}"
 

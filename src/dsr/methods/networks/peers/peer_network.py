@@ -12,7 +12,7 @@ import abc
 import copy
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import ClassVar, Literal, get_args
 
@@ -29,6 +29,7 @@ from dsr.methods.networks.normalisation import compute_min_max, normalise
 from dsr.methods.networks.weight_files import load_parameters
 from dsr.methods.tiling import TILE, UNTILED, AxisTile, blend_tiles, split_axis
 from dsr.sample import DepthSample
+from dsr.utils.guards import expect_one_of
 from dsr.utils.progress import Steps
 from dsr.utils.torch_files import read_torch_file
 
@@ -221,9 +222,9 @@ class PeerUpsampler(Method):
         device: torch.device | str = "cpu",
         tile: int | None = None,
     ) -> None:
-        _expect("range_type", range_type, RANGE_TYPES)
-        _expect("range", value_range, get_args(Range))
-        _expect("precision", precision, DTYPES)
+        expect_one_of("range_type", range_type, RANGE_TYPES)
+        expect_one_of("range", value_range, get_args(Range))
+        expect_one_of("precision", precision, DTYPES)
         if tile is not None and tile < net.multiple:
             raise ValueError(f"tile: expected at least {net.multiple} pixels, got {tile}")
         if net.depth_range is not None and value_range == "truth":
@@ -327,9 +328,3 @@ class PeerUpsampler(Method):
         if sample.depth is None:
             raise ValueError(f"{sample.scene}: range=truth expects a scene with a true depth map, there is none")
         return compute_min_max(to_range(sample.depth, sample.camera, self.range_type)[None])
-
-
-def _expect(name: str, value: str, accepted: Iterable[str]) -> None:
-    """Raise a ValueError unless a value is an accepted one."""
-    if value not in accepted:
-        raise ValueError(f"{name}: expected one of {', '.join(accepted)}, got {value!r}")

@@ -1,0 +1,220 @@
+"""Prompt Depth Anything: a foundation network of photos that a low-resolution depth map tells the metric depth.
+
+Lin, Peng, Chen, Peng, Sun, Liu, Bao, Feng, Zhou, Kang, *Prompting Depth Anything for 4K Resolution Accurate Metric
+Depth Estimation*, CVPR 2025. The network is that of Hugging Face's ``transformers``
+(PromptDepthAnythingForDepthEstimation, ``pip install dsr[transformers]``), the weights are its authors'. What its image
+processor does is done here in torch, as in transformers' models/prompt_depth_anything: the photo is resized by Pillow's
+bicubic kernel to multiples of the patches and normalised as for ImageNet, the result by a bicubic kernel with
+a = -0.75 to the photo's size. The processor resizes photos of 8 bits and rounds, this does not.
+
+The network itself brings the prompt's minimum and maximum to 0 and 1, its result back, and the prompt, of any size, to
+those of its features. It was trained on the 256 x 192 pixels of ARKit's lidar.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from dsr.methods.base import Abilities, Cost, Method
+from dsr.methods.external import within_limits
+from dsr.methods.inpainting import inpaint
+from dsr.methods.networks.normalisation import normalise_imagenet, resize_bicubic
+from dsr.sample import DepthSample
+from dsr.utils.configuration import expect_library
+from dsr.utils.guards import expect_bytes, parse_json, read_limited, refusing
+from dsr.utils.progress import Steps
+from dsr.utils.versions import file_hash
+
+SIZE = 756
+"""Side in pixels to which the authors' processor brings photos, that which has to be changed less."""
+CONFIG, WEIGHTS = "config.json", "model.safetensors"
+_HUB_NAME = re.compile(r"[\w.-]+/[\w.-]+")
+_NETWORK = (
+    "patch_size", "reassemble_hidden_size", "reassemble_factors", "neck_hidden_sizes", "fusion_hidden_size",
+    "head_in_index", "head_hidden_size", "depth_estimation_type", "max_depth",
+)  # fmt: skip
+_BACKBONE = (
+    "hidden_size", "num_hidden_layers", "num_attention_heads", "mlp_ratio", "hidden_act", "layer_norm_eps",
+    "image_size", "patch_size", "num_channels", "qkv_bias", "layerscale_value", "use_swiglu_ffn", "out_indices",
+    "out_features", "apply_layernorm", "reshape_hidden_states", "use_mask_token",
+)  # fmt: skip
+"""What is read of a configuration; the rest can name code and files that are to be fetched."""
+_LARGEST = 4096
+"""Largest whole number in a configuration."""
+
+
+class PromptDA(Method):
+    """A method that is Prompt Depth Anything.
+
+    Holes of the low-resolution map are filled before, so that the range that the network normalises by is that of
+    depths. Large photos are resized, which limits the memory and what is seen of them.
+
+    Args:
+        weights: a folder with ``config.json`` and ``model.safetensors``, as ``save_pretrained`` writes it, or a name of
+            the Hugging Face hub, such as ``depth-anything/prompt-depth-anything-vits-hf``, whose files are taken from
+            its cache, or else fetched. Nothing but these two files is read, and no code in them is executed.
+        size: to which that side of the photo is brought, at its aspect, that has to be changed less; both sides are
+            rounded to multiples of the backbone's patches.
+        device: where to compute.
+
+    Raises:
+        ValueError: ``transformers`` is missing, there are no such files, they are damaged or of another network, or
+            ``size`` is less than a patch.
+
+    """
+
+    abilities = Abilities(ratios="any", own_size=True, cost=Cost(60, program=5e9))
+    range_type = "orthogonal"
+
+    def __init__(self, weights: str, size: int = SIZE, device: torch.device | str = "cpu") -> None:
+        expect_library("weights", "transformers", "transformers")
+        self._folder = _find(str(weights))
+        self._size, self.device = size, torch.device(device)
+        self.net, self._patch = _load(self._folder)
+        self.net = self.net.to(self.device)
+        if size < self._patch:
+            raise ValueError(f"size: expected {self._patch} or more, got {size}")
+
+    @torch.inference_mode()
+    def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
+        """Return the high-resolution orthogonal depth, (1, H, W) in metres on the sample's device."""
+        prompt = inpaint(sample.depth_lr.to(torch.float64)[None])
+        depth = self.predict(sample.rgb[None], prompt)[0]
+        if progress is not None:
+            progress(1, 1)
+        return within_limits(depth).to(sample.depth_lr)
+
+    def predict(self, rgb: Tensor, prompt: Tensor) -> Tensor:
+        """Return depth in metres, (B, 1, H, W) on the network's device.
+
+        Args:
+            rgb: (B, 3, H, W) photos in 0..1.
+            prompt: (B, 1, h, w) low-resolution depth in metres, without holes.
+
+        """
+        size = (rgb.shape[-2], rgb.shape[-1])
+        photo = resize_bicubic(rgb.to(torch.float64), self._size_within(size)).clamp(0, 1)  # as exact as Pillow's
+        flat = prompt.amax(dim=(-2, -1), keepdim=True) == prompt.amin(dim=(-2, -1), keepdim=True)
+        corner = torch.zeros_like(prompt)
+        corner[..., 0, 0] = 1e-6  # gives a constant map a range, which the network divides by
+        prompt = torch.where(flat, prompt * (1 + corner), prompt)
+        given = (each.to(self.device, torch.float32) for each in (normalise_imagenet(photo), prompt))
+        depth = self.net(*given).predicted_depth[:, None]
+        return functional.interpolate(depth, size, mode="bicubic", align_corners=False)
+
+    def content(self, dataset: str, scene: str, scale: float) -> str:
+        """Return the SHA-256 of the network's files."""
+        return _hash(*((path := self._folder / name, path.stat().st_mtime_ns) for name in (CONFIG, WEIGHTS)))
+
+    def _size_within(self, size: tuple[int, int]) -> tuple[int, int]:
+        """Return the height and width that the network gets of a photo."""
+        factor = min((self._size / n for n in size), key=lambda each: abs(1 - each))
+        height, width = (max(1, round(factor * n / self._patch)) * self._patch for n in size)
+        return height, width
+
+
+def _find(weights: str) -> Path:
+    """Return the folder with the files of a network."""
+    folder = Path(weights).expanduser()
+    if not folder.is_dir() and _HUB_NAME.fullmatch(weights):
+        folder = _fetched(weights)
+    missing = [name for name in (CONFIG, WEIGHTS) if not (folder / name).is_file()]
+    if missing:
+        raise ValueError(f"weights: expected a folder with {CONFIG} and {WEIGHTS}, got {weights} (no {missing[0]})")
+    return folder
+
+
+def _fetched(name: str) -> Path:
+    """Return the folder with the files of a name of the hub: in its cache, or fetched if they are not there."""
+    import huggingface_hub  # noqa: PLC0415 - it comes with an extra
+
+    arguments: dict[str, Any] = {"allow_patterns": [CONFIG, WEIGHTS]}
+    with contextlib.suppress(Exception):
+        cached = Path(huggingface_hub.snapshot_download(name, local_files_only=True, **arguments))
+        if all((cached / file).is_file() for file in (CONFIG, WEIGHTS)):
+            return cached
+    message = f"weights: expected a folder, or a name of the Hugging Face hub that can be reached, got {name}"
+    with refusing(message, Exception):
+        return Path(huggingface_hub.snapshot_download(name, **arguments))
+
+
+def _load(folder: Path) -> tuple[nn.Module, int]:
+    """Return the network of a folder, in float32 on the CPU, and the side of its patches."""
+    from transformers import (  # noqa: PLC0415 - it comes with an extra, and takes seconds
+        Dinov2Config,
+        PromptDepthAnythingConfig,
+        PromptDepthAnythingForDepthEstimation,
+    )
+
+    path, weights = folder / CONFIG, folder / WEIGHTS
+    network, backbone = _read_config(path)
+    with refusing(f"{path}: expected the configuration of a network, got one that makes none", Exception):
+        config = PromptDepthAnythingConfig(**network, backbone_config=Dinov2Config(**backbone))
+        with torch.device("meta"):  # takes no memory
+            net = PromptDepthAnythingForDepthEstimation(config)
+    expect_bytes(weights, sum(each.numel() for each in net.parameters()), weights.stat().st_size)
+    message = f"{weights}: expected the tensors that {CONFIG} describes, got others or a damaged file"
+    with refusing(message, Exception), _silent():
+        net, found = PromptDepthAnythingForDepthEstimation.from_pretrained(
+            folder, config=config, use_safetensors=True, local_files_only=True, trust_remote_code=False,
+            dtype=torch.float32, output_loading_info=True,
+        )  # fmt: skip
+    lacking = sorted(map(str, (*found["missing_keys"], *found["mismatched_keys"])))
+    if lacking:
+        raise ValueError(f"{weights}: expected the tensors that {CONFIG} describes, but {lacking[0]} does not fit")
+    if not all(bool(each.isfinite().all()) for each in net.parameters()):
+        raise ValueError(f"{weights}: expected finite numbers, got others")
+    return net.eval().requires_grad_(requires_grad=False), int(config.patch_size)
+
+
+def _read_config(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return what a configuration says of the network and of its backbone."""
+    with refusing(f"{path}: expected a configuration of JSON, got something else", ValueError, RecursionError):
+        content = parse_json(read_limited(path))
+    kind = content.get("model_type") if isinstance(content, Mapping) else None
+    if kind != "prompt_depth_anything":
+        raise ValueError(f"{path}: expected model_type prompt_depth_anything, got {kind!r}")
+    backbone = content.get("backbone_config")
+    kind = backbone.get("model_type") if isinstance(backbone, Mapping) else None
+    if kind != "dinov2":
+        raise ValueError(f"{path}: expected a backbone_config of model_type dinov2, got {kind!r}")
+    found = [
+        {key: part[key] for key in keys if key in part} for part, keys in ((content, _NETWORK), (backbone, _BACKBONE))
+    ]
+    numbers = [n for part in found for value in part.values() for n in (value if isinstance(value, list) else [value])]
+    if any(isinstance(n, int) and abs(n) > _LARGEST for n in numbers) or not isinstance(
+        content.get("patch_size", 14), int
+    ):
+        raise ValueError(f"{path}: expected sizes of a network of at most {_LARGEST}")
+    return found[0], found[1]
+
+
+@contextlib.contextmanager
+def _silent() -> Iterator[None]:
+    """Silence the progress and the notes of transformers, which are told as errors here."""
+    from transformers.utils import logging  # noqa: PLC0415 - it comes with an extra
+
+    level, shown = logging.get_verbosity(), logging.is_progress_bar_enabled()
+    logging.set_verbosity(logging.CRITICAL)
+    logging.disable_progress_bar()
+    try:
+        yield
+    finally:
+        logging.set_verbosity(level)
+        if shown:
+            logging.enable_progress_bar()
+
+
+@functools.cache
+def _hash(*files: tuple[Path, int]) -> str:
+    return hashlib.sha256("".join(file_hash(path) for path, _ in files).encode()).hexdigest()
