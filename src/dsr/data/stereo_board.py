@@ -2,8 +2,9 @@
 
 ``downsampling=measured scale=1`` takes the camera's maps as the input.
 
-Five pairs of a RealSense that the authors of self-supervised depth denoising publish with their code, MIT licence;
-github.com/alr-internship/self-supervised-depth-denoising, ``resources/images/uncalibrated/realsense``:
+Five pairs of a RealSense that came with the code of Kienle and Petri, "Multi-Object Self-Supervised Depth Denoising",
+arXiv 2305.05778, MIT licence; ``resources/images/uncalibrated/realsense`` in the commit c73b356 of
+github.com/alr-internship/self-supervised-depth-denoising:
 
     color/8.png    the photo, 1920 x 1080, with the lens's distortion
     depth/8.png    the camera's depth, registered to the photo, 16 bits, mm, 0 = hole
