@@ -217,6 +217,18 @@ FIELD = (
         _cleargrasp_synthetic(),
     ),
     Collection(
+        "ibims",
+        "iBims-1, 100 rooms before a laser scanner, with their planes and edges marked",
+        "https://doi.org/10.14459/2018mp1455541",
+        "Its terms are on its homepage.",
+        "T. Koch, L. Liebel, F. Fraundorfer, M. Körner: Evaluation of CNN-based single-image depth estimation methods. "
+        "ECCV Workshops 2018.",
+        ("ibims",),
+        None,
+        manual="fetch ibims1_core_mat.zip or ibims1_core_raw.zip from its homepage and unpack it anywhere below {folder}",
+        patterns=("**/*_*[0-9].*",),
+    ),
+    Collection(
         "rgbdd",
         "RGB-D-D, photos with a time-of-flight sensor's depth",
         _RGBDD,
