@@ -225,8 +225,22 @@ FIELD = (
         "ECCV Workshops 2018.",
         ("ibims",),
         None,
-        manual="fetch ibims1_core_mat.zip or ibims1_core_raw.zip from its homepage and unpack it anywhere below {folder}",
-        patterns=("**/*_*[0-9].*",),
+        manual="fetch ibims1_core_mat.zip or ibims1_core_raw.zip from its homepage and unpack it below {folder}",
+        patterns=("**/*_[0-9]*.*",),
+    ),
+    Collection(
+        "hammer",
+        "HAMMER, glass and metal before three depth cameras, with a scanner's truth",
+        "https://github.com/Junggy/HAMMER-dataset",
+        RESEARCH,
+        "H. Jung, P. Ruhkamp, G. Zhai, N. Brasch, Y. Li, Y. Verdie, J. Song, Y. Zhou, A. Armagan, S. Ilic, A. "
+        "Leonardis, N. Navab, B. Busam: On the importance of accurate geometry data for dense 3D vision tasks. CVPR "
+        "2023.",
+        ("hammer",),
+        None,
+        manual="fetch _dataset_processed.zip by the link in its README and unpack it, or its scenes 12 to 14 to "
+        "evaluate on, below {folder}",
+        patterns=("**/polarization/_gt/*.png", "**/polarization/depth_d435/*.png"),
     ),
     Collection(
         "rgbdd",
