@@ -467,6 +467,24 @@ _COLLECTIONS = (
         ),
     ),
     Collection(
+        "diode",
+        "DIODE, rooms and streets before a laser scanner, 771 images to evaluate on",
+        "https://diode-dataset.org/",
+        "MIT licence, as the code beside it.",
+        "I. Vasiljevic, N. Kolkin, S. Zhang, R. Luo, H. Wang, F. Z. Dai, A. F. Daniele, M. Mostajabi, S. Basart, M. R. "
+        "Walter, G. Shakhnarovich: DIODE: a dense indoor and outdoor depth dataset. arXiv 1908.00463, 2019.",
+        ("diode",),
+        2.6e9,
+        (
+            Item(
+                "diode/val.tar.gz",
+                ("http://diode-dataset.s3.amazonaws.com/val.tar.gz",),
+                unpack_to="diode",
+                contains=("val",),
+            ),
+        ),
+    ),
+    Collection(
         "tofmark",
         "ToFMark, time-of-flight depth with measured ground truth",
         "https://rvlab.icg.tugraz.at/tofmark/",
