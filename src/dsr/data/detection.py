@@ -15,6 +15,7 @@ from dsr.data import (
     diml,
     diode,
     eight_bit,
+    eth3d,
     hammer,
     ibims,
     icl,
@@ -49,6 +50,7 @@ _FRAMES: tuple[tuple[Callable[[Path], Mapping[str, tuple[Any, ...]]], Callable[.
     (ibims.find_pictures, ibims.load_pictures, "ibims"),
     (hammer.find_frames, hammer.load_frame, "hammer"),
     (diode.find_frames, diode.load_frame, "diode"),
+    (eth3d.find_frames, eth3d.load_frame, "eth3d"),
     *(
         (functools.partial(eight_bit.find_frames, dataset=benchmark), eight_bit.load_frame, benchmark)
         for benchmark in eight_bit.BENCHMARKS

@@ -485,6 +485,19 @@ _COLLECTIONS = (
         ),
     ),
     Collection(
+        "eth3d",
+        "ETH3D, buildings and rooms before a laser scanner, 454 photos of 13 scenes",
+        "https://www.eth3d.net/datasets",
+        "Creative Commons BY-NC-SA 4.0.",
+        "T. Schöps, J. L. Schönberger, S. Galliani, T. Sattler, K. Schindler, M. Pollefeys, A. Geiger: A multi-view "
+        "stereo benchmark with high-resolution images and multi-camera videos. CVPR 2017.",
+        ("eth3d",),
+        None,
+        manual="fetch the archives SCENE_dslr_jpg.7z and SCENE_dslr_depth.7z of its high-resolution multi-view "
+        "training scenes and unpack both of each scene into {folder}",
+        patterns=("*/images/dslr_images/*.JPG", "*/ground_truth_depth/dslr_images/*.JPG"),
+    ),
+    Collection(
         "tofmark",
         "ToFMark, time-of-flight depth with measured ground truth",
         "https://rvlab.icg.tugraz.at/tofmark/",
