@@ -10,7 +10,15 @@ from refusals import refused
 from small_files import encoded_png as png
 from small_files import written
 
-from dsr.data.cleargrasp import EDGE, ClearGrasp, find_captures, find_renderings, load_capture, load_rendering
+from dsr.data.cleargrasp import (
+    EDGE,
+    ClearGrasp,
+    find_captures,
+    find_renderings,
+    load_capture,
+    load_rendering,
+    read_depth,
+)
 
 ROWS, COLUMNS = np.mgrid[0:36, 0:64]
 TWIN = 0.5 + ROWS / 128 + COLUMNS / 256
@@ -97,12 +105,23 @@ def test_regions_are_the_mask_the_rest_and_five_pixels_on_either_side_of_its_out
 def test_depth_of_renderings_is_that_of_a_plane_again(tmp_path):
     files, depth = rendering(tmp_path)
     scene = load_rendering(*files, "cleargrasp_synthetic", "a")
-    assert abs(scene.depth[0].numpy() / depth - 1).max() < 2**-11
+    assert abs(scene.depth[0].numpy() / depth - 1).max() < 2**-10  # half a step of rounding, and half of smoothing
     assert scene.measured == {}
     points = scene.depth * scene.camera.rays()
     off = 0.2 * points[0] + 0.1 * points[1] + points[2] - 0.8
-    assert off.abs().max() < 0.8 * 2**-11
+    assert off.abs().max() < 0.8 * 2**-10
     np.testing.assert_array_equal(scene.regions["glass"][0], MASK > 0)
+
+
+def test_steps_of_16_bits_are_smoothed_in_renderings_alone(tmp_path):
+    slope = 0.5 + 2**-11 * (COLUMNS + 0.3) / 8
+    path = exr(tmp_path / "a.exr", np.where(ROWS == 0, np.nan, slope))
+    stored, smooth = read_depth(path)[0].numpy()[1:], read_depth(path, smooth=True)[0].numpy()[1:]
+    assert len(np.unique(stored)) == 9
+    assert abs(smooth - stored).max() <= 2**-12 * (1 + 1e-9)
+    errors = [abs(each - slope[1:])[:, 8:-8].mean() for each in (smooth, stored)]
+    assert errors[0] < 0.3 * errors[1]
+    assert read_depth(path, smooth=True)[0, 0].isnan().all()
 
 
 def test_scenes_are_found_by_split_and_need_all_their_files(tmp_path):
