@@ -120,7 +120,7 @@ def test_steps_of_16_bits_are_smoothed_in_renderings_alone(tmp_path):
     assert len(np.unique(stored)) == 9
     assert abs(smooth - stored).max() <= 2**-12 * (1 + 1e-9)
     errors = [abs(each - slope[1:])[:, 8:-8].mean() for each in (smooth, stored)]
-    assert errors[0] < 0.3 * errors[1]
+    assert errors[0] < 0.5 * errors[1]
     assert read_depth(path, smooth=True)[0, 0].isnan().all()
 
 
