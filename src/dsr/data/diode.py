@@ -1,7 +1,7 @@
 """``dataset=diode``: rooms and streets before a laser scanner (Vasiljevic et al., 2019).
 
 Vasiljevic et al., "DIODE: A Dense Indoor and Outdoor DEpth Dataset", arXiv 1908.00463; README.md, diode.py,
-intrinsics.txt and diode_meta.json of github.com/diode-dataset/diode-devkit. 1024 x 768:
+intrinsics.txt and diode_meta.json of github.com/diode-dataset/diode-devkit (MIT licence). 1024 x 768:
 
     val/indoors/scene_00019/scan_00183/00019_00183_indoors_000_010.png              the photo
     val/indoors/scene_00019/scan_00183/00019_00183_indoors_000_010_depth.npy        metres, 768 x 1024 x 1, float32

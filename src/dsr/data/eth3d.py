@@ -1,8 +1,8 @@
 """``dataset=eth3d``: buildings, meadows and rooms before a laser scanner (Schöps et al., CVPR 2017).
 
 Schöps et al., "A Multi-View Stereo Benchmark with High-Resolution Images and Multi-Camera Videos", CVPR 2017;
-www.eth3d.net/documentation. 454 photos of the 13 scenes of the high-resolution multi-view training set, of the archives
-``*_dslr_jpg.7z`` and ``*_dslr_depth.7z``, both unpacked into one directory:
+www.eth3d.net/documentation (CC BY-NC-SA 4.0). 454 photos of the 13 scenes of the high-resolution multi-view training
+set, of the archives ``*_dslr_jpg.7z`` and ``*_dslr_depth.7z``, both unpacked into one directory:
 
     courtyard/images/dslr_images/DSC_0286.JPG                the photo as the lens shows it, about 6048 x 4032
     courtyard/ground_truth_depth/dslr_images/DSC_0286.JPG    its orthogonal depth in metres: float32, little-endian, row

@@ -4,9 +4,8 @@
 ``tof``, indirect time of flight, or ``l515``, direct time of flight.
 
 Jung et al., "On the Importance of Accurate Geometry Data for Dense 3D Vision Tasks", CVPR 2023, the HAMMER data set;
-README.md of github.com/Junggy/HAMMER-dataset. Scenes 2 to 11 are to train on, 12 to 14 to test. As the archive
-``_dataset_processed.zip`` has them, by the loaders of several who use it (such as
-``datasets/hammer_single_depth.py``, made for CompletionFormer):
+README.md of github.com/Junggy/HAMMER-dataset, which states no licence. Scenes 2 to 11 are to train on, 12 to 14 to
+test. As the archive ``_dataset_processed.zip`` has them, by the loaders of others who use it:
 
     scene12_traj1_1/polarization/rgb/000000.png            the polarisation camera's photo, 1088 x 832
     scene12_traj1_1/polarization/_gt/000000.png            depth rendered from the scans, 16 bits, mm, 0 = unknown

@@ -2,8 +2,8 @@
 
 Koch, Liebel, Fraundorfer, Körner, "Evaluation of CNN-based Single-Image Depth Estimation Methods", ECCV Workshops 2018;
 ``evaluate_ibims.py`` and ``evaluate_ibims_error_metrics.py``, version 0.9, of its authors (a copy is in
-``mde/capsules/meter/ibims_official`` of github.com/bulatko/DepthART). 100 scenes of 640 x 480 pixels, each a MATLAB
-file with a structure ``data``:
+``mde/capsules/meter/ibims_official`` of github.com/bulatko/DepthART); its terms are on doi.org/10.14459/2018mp1455541.
+100 scenes of 640 x 480 pixels, each a MATLAB file with a structure ``data``:
 
     ibims1_core_mat/corridor_01.mat    rgb, depth in metres, 0 = hole, calib, edges, mask_invalid and mask_transp,
                                        0 where a pixel is not to be counted, mask_wall, mask_table and mask_floor, in
