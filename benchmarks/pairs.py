@@ -25,11 +25,11 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
-from real_sensors import _exr
 from torch import Tensor
 from torch.nn import functional
 
 from dsr.app.upsample.alignment import align
+from dsr.data.cleargrasp import read_depth
 from dsr.data.detection import find_scenes
 from dsr.data.frame_files import read_picture
 from dsr.degradation.downsampling import scene_generator
@@ -143,7 +143,7 @@ def raw(shared: Path) -> Iterator[Right]:
 def _stored(path: Path, dataset: str) -> Tensor:
     """Return a depth map in metres, or in some unit, as the units are no matter here."""
     if path.suffix == ".exr":
-        return _exr(path)
+        return read_depth(path)
     stored = np.load(path) if path.suffix == ".npy" else cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     stored = stored if stored.ndim == 2 else stored[..., 0]
     if dataset == "sunrgbd raw" and "open3d" not in str(path):

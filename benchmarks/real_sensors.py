@@ -23,9 +23,8 @@ window, standard deviation in metres, in pixels. A filter states no error.
 from __future__ import annotations
 
 import argparse
-import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -37,8 +36,8 @@ from captures import CAPTURES, Capture, ddrnet, ddrnet_frames, rgbdd_real, witho
 from flatness import FLOORS, flatness, given
 from torch import Tensor
 
-from dsr.data.frame_files import read_millimetres, read_picture
-from dsr.geometry.camera import Camera
+from dsr.data.cleargrasp import ClearGrasp
+from dsr.data.stereo_board import StereoBoard
 from dsr.inference import upsample_surface
 from dsr.methods.base import Surface
 from dsr.methods.classical.bilateral import filter_bilateral
@@ -49,8 +48,6 @@ from dsr.metrics.sensor import LARGEST_ERROR
 from dsr.sample import DepthSample
 
 FILTERS = ((19, 0.03, 3.0), (41, 0.05, 9.0), (81, 0.06, 18.0))
-INSIDE, EDGE = 12, 36
-"""Pixels inside the board's outline that are left out, and those that count as its edge."""
 SURE = 0.005
 """Metres: pixels stated to be off by less are believed."""
 CONF = Path(__file__).resolve().parent.parent / "conf"
@@ -60,35 +57,28 @@ Method = Callable[[DepthSample], Surface]
 
 
 class Plane(NamedTuple):
-    """A frame before the board: the sample, the plane's true depth, (1, H, W), and the distance inside its outline."""
+    """A frame before the board: the sample, the plane's true depth, (1, H, W), and the board and its border."""
 
     sample: DepthSample
     depth: Tensor
-    inside: Tensor
+    regions: Mapping[str, Tensor]
 
 
 def boards(shared: Path, count: int | None) -> list[Plane]:
     """Return the frames before the board."""
-    folder = shared / "real" / "stereo_board"
-    facts = json.loads((folder / "board.json").read_text())
-    camera, found = Camera(**facts["camera"]), []
-    for name, frame in list(facts["frames"].items())[:count]:
-        rgb = read_picture(next(folder.glob(f"color/{name}.*")))
-        sample = without_truth(name, rgb, read_millimetres(folder / "depth" / f"{name}.png"), camera)
-        plane = cv2.imread(str(folder / "plane" / f"{name}.png"), cv2.IMREAD_UNCHANGED) / 1e4
-        inside = np.zeros(plane.shape, np.uint8)
-        cv2.fillPoly(inside, [np.round(frame["polygon"]).astype(np.int32)], 1)
-        distance = cv2.distanceTransform(inside, cv2.DIST_L2, 5)
-        known = np.where(plane > 0, plane, np.nan)
-        found.append(Plane(sample, torch.from_numpy(known)[None], torch.from_numpy(distance)[None]))
+    data, found = StereoBoard(str(shared / "real" / "stereo_board")), []
+    for name in data.scenes()[:count]:
+        scene = data.load(name)
+        assert scene.depth is not None  # noqa: S101 - for the type checker
+        sample = without_truth(name, scene.rgb, scene.measured[1], scene.camera)
+        found.append(Plane(sample, scene.depth, scene.regions))
     return found
 
 
 def score_board(frame: Plane, surface: Surface) -> dict[str, float]:
     """Score a result before the board."""
-    maps = surface.depth[None].double(), frame.depth[None], frame.sample.camera.rays()[None]
-    inside = frame.inside[None]
-    board, border = (SurfacePair(*maps, mask) for mask in (inside > INSIDE, (inside > INSIDE) & (inside <= EDGE)))
+    maps = surface.depth[None].double(), frame.depth[None].double(), frame.sample.camera.rays()[None]
+    board, border = (SurfacePair(*maps, frame.regions[each][None] > 0) for each in ("board", "border"))
     found = {"std": 1e3 * float(deviation(board)), "edge": 1e3 * float(deviation(border)), "angle": float(angle(board))}
     if surface.depth_error is not None:
         comparison = board.derive(PlaneComparison)
@@ -133,32 +123,13 @@ class Glass(NamedTuple):
 
 def glasses(shared: Path) -> list[Glass]:
     """Return the captures of clear objects."""
-    folder = shared / "real" / "cleargrasp"
-    found = []
-    for path in sorted(folder.glob("*-mask.png")):
-        name = path.name.removesuffix("-mask.png")
-        rgb = read_picture(folder / f"{name}-transparent-rgb-img.jpg")
-        camera = _camera(folder / "camera_intrinsics.yaml", rgb.shape[2], rgb.shape[1])
-        depth, twin = (_exr(folder / f"{name}-{kind}-depth-img.exr") for kind in ("transparent", "opaque"))
-        mask = torch.from_numpy(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))[None] > 0
-        found.append(Glass(without_truth(name, rgb, depth, camera), twin, mask))
+    data, found = ClearGrasp(str(shared / "real" / "cleargrasp"), synthetic=False), []
+    for name in data.scenes():
+        scene = data.load(name)
+        assert scene.depth is not None  # noqa: S101 - for the type checker
+        sample = without_truth(name, scene.rgb, scene.measured[1], scene.camera)
+        found.append(Glass(sample, scene.depth, scene.regions["glass"] > 0))
     return found
-
-
-def _exr(path: Path) -> Tensor:
-    """Return the depth of an EXR file, (1, H, W) in metres, NaN in holes."""
-    import OpenEXR  # noqa: PLC0415 - this part alone needs it
-
-    channels = OpenEXR.File(str(path)).channels()
-    values = next(iter(channels.values())).pixels
-    depth = torch.from_numpy(np.ascontiguousarray(values[..., 0] if values.ndim == 3 else values)).float()[None]
-    return depth.masked_fill(~(depth > 0), torch.nan)
-
-
-def _camera(path: Path, width: int, height: int) -> Camera:
-    """Return the camera of ClearGrasp's file."""
-    values = yaml.safe_load(path.read_text())
-    return Camera(width, height, *(float(values[key]) for key in ("fx", "fy", "cx", "cy")))
 
 
 def score_glass(scene: Glass, surface: Surface) -> dict[str, float]:

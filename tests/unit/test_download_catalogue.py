@@ -1,6 +1,7 @@
 """The catalogue of data sets: every entry can be fetched or says how to get it, and lies where its reader looks."""
 
 import hashlib
+from collections import Counter
 from pathlib import Path, PurePosixPath
 from urllib.parse import urlsplit
 
@@ -50,11 +51,15 @@ def test_items_have_addresses_of_their_names_and_paths_below_the_root():
 
 def test_files_of_a_commit_are_pinned_and_the_shared_ones_are_these(shared):
     pinned = {item.path: item.sha256 for item in ITEMS if item.sha256 is not None}
-    assert len(pinned) == 2 * 6 + 2 * 30 + 3 * 22
-    assert {path.split("/")[0] for path in pinned} == {"lu", "middlebury8", "ddrnet"}
+    counts = Counter(path.split("/")[0] for path in pinned)
+    assert counts == {
+        "lu": 2 * 6, "middlebury8": 2 * 30, "ddrnet": 3 * 22, "stereo_board": 2 * 5, "cleargrasp": 4 * 4 + 1,
+        "cleargrasp_synthetic": 3 * 3,
+    }  # fmt: skip
     for item in ITEMS:
         assert (item.sha256 is not None) == ("raw.githubusercontent.com" in item.urls[0])
-    for ours, theirs in (("lu", "modern/Lu"), ("middlebury8", "modern/Middlebury")):
+    folders = (("lu", "modern/Lu"), ("middlebury8", "modern/Middlebury"), ("stereo_board", "real/stereo_board"))
+    for ours, theirs in folders:
         for path, digest in pinned.items():
             folder, _, name = path.partition("/")
             if folder == ours:

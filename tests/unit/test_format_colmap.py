@@ -21,6 +21,7 @@ from dsr.io.reading import Reading
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 3
 F, CX, CY = 60.0, 33.0, 23.5
+PRISM = (0.02, 3e-3, 1e-3, 2e-3, -1e-3, 2e-3, 3e-3, -2e-3)
 MODELS = {
     "SIMPLE_PINHOLE": (0, (F, CX, CY), None),
     "PINHOLE": (1, (F, F + 1, CX, CY), None),
@@ -32,6 +33,7 @@ MODELS = {
                     Lens("brown_conrady", tuple(1e-3 * k for k in range(1, 9)))),
     "SIMPLE_RADIAL_FISHEYE": (8, (F, CX, CY, 0.02), Lens("kannala_brandt", (0.02, 0, 0, 0))),
     "RADIAL_FISHEYE": (9, (F, CX, CY, 0.02, 3e-3), Lens("kannala_brandt", (0.02, 3e-3, 0, 0))),
+    "THIN_PRISM_FISHEYE": (10, (F, F + 1, CX, CY, *PRISM), Lens("thin_prism_fisheye", PRISM)),
 }  # fmt: skip
 
 
@@ -40,6 +42,13 @@ def distorted(kind, x, y):
     numbers = MODELS[kind][1]
     more = numbers[3 if numbers[1] != F + 1 else 4 :]
     square = x * x + y * y
+    if kind == "THIN_PRISM_FISHEYE":
+        k1, k2, p1, p2, k3, k4, sx1, sy1 = more
+        shrinks = np.arctan(np.sqrt(square)) / np.sqrt(square)
+        x, y, square = x * shrinks, y * shrinks, np.arctan(np.sqrt(square)) ** 2
+        factor = 1 + k1 * square + k2 * square**2 + k3 * square**3 + k4 * square**4
+        dx = 2 * p1 * x * y + p2 * (square + 2 * x * x) + sx1 * square
+        return x * factor + dx, y * factor + 2 * p2 * x * y + p1 * (square + 2 * y * y) + sy1 * square
     if "FISHEYE" in kind:
         angle = np.arctan(np.sqrt(square))
         factor = angle * sum(k * angle ** (2 * n) for n, k in enumerate((1, *more))) / np.sqrt(square)

@@ -16,12 +16,14 @@ from dsr.io.reading import CameraChoice, Reading
 
 CAMERA = Camera(160, 120, 130.0, 128.0, 81.0, 58.5)
 MATRIX = np.array([[130, 0, 81], [0, 128, 58.5], [0, 0, 1]])
+PRISM = (-0.06, 0.02, 0.002, -0.001, -0.01, 0.002, 0.003, -0.002)
 BROWN, FISHEYE = (-0.3, 0.12, 0.004, -0.003, -0.02), (-0.06, 0.02, -0.01, 0.002)
 LENSES = {
     "brown_conrady": BROWN,
     "rational": (0.4, -0.1, 0.001, 0.002, 0.03, 0.7, -0.05, 0.02),
     "modified_brown_conrady": BROWN,
     "kannala_brandt": FISHEYE,
+    "thin_prism_fisheye": PRISM,
 }
 
 
@@ -43,6 +45,14 @@ def forward(name, numbers, rays):
         f = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
         x, y = x * f, y * f  # r2 stays that of the point before
         return np.stack((x + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)), -1)
+    if name == "thin_prism_fisheye":
+        k1, k2, p1, p2, k3, k4, sx1, sy1 = numbers
+        theta, phi = np.arctan(np.sqrt(x**2 + y**2)), np.arctan2(y, x)
+        u, v = theta * np.cos(phi), theta * np.sin(phi)
+        radial = 1 + k1 * theta**2 + k2 * theta**4 + k3 * theta**6 + k4 * theta**8
+        du = 2 * p1 * u * v + p2 * (theta**2 + 2 * u**2) + sx1 * theta**2
+        dv = 2 * p2 * u * v + p1 * (theta**2 + 2 * v**2) + sy1 * theta**2
+        return np.stack((u * radial + du, v * radial + dv), -1)
     points = np.stack((x, y, np.ones_like(x)), -1).reshape(-1, 1, 3)
     project = cv2.fisheye.projectPoints if name == "kannala_brandt" else cv2.projectPoints
     zero = np.zeros((3, 1))
@@ -93,6 +103,7 @@ def test_depth_takes_the_nearest_pixel_and_what_no_pixel_saw_is_a_hole(name):
 def test_a_lens_without_coefficients_does_nothing_unless_it_is_a_fisheye():
     assert not Lens("brown_conrady", (0.0,) * 5).bends
     assert Lens("kannala_brandt", (0.0,) * 4).bends
+    assert Lens("thin_prism_fisheye", (0.0,) * 8).bends
 
 
 @pytest.mark.parametrize(

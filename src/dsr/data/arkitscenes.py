@@ -11,8 +11,9 @@ NeurIPS Datasets and Benchmarks 2021; DATA.md and the READMEs of github.com/appl
     Validation/41069021/confidence/41069021_305.244.png         of the lidar, 256 x 192, 8 bits, 0 (low) to 2 (high)
     Validation/41069021/wide_intrinsics/41069021_305.244.pincam   width height fx fy cx cy
 
-and the same in ``Training``. Depth 0 is a hole. Intrinsics may be a millisecond off, and belong to the raw data; where
-there are none, 60 degrees of horizontal view are assumed. Photos stay as the camera was held.
+and the same in ``Training``: 287 and 1970 videos, the splits of upsampling_train_val_splits.csv. They are among the raw
+data, too, where they alone have ``highres_depth``. Depth 0 is a hole. Intrinsics may be a millisecond off, and belong
+to the raw data; where there are none, 60 degrees of horizontal view are assumed. Photos stay as the camera was held.
 """
 
 from __future__ import annotations

@@ -4,9 +4,10 @@
     modified_brown_conrady    RealSense's: k1 k2 p1 p2 k3, the tangential part of the point that the radial part moved;
                               RealSense's "inverse Brown Conrady" as well, which its SDK computes in the same way
     kannala_brandt            of fisheyes: k1 k2 k3 k4 of the angle
+    thin_prism_fisheye        COLMAP's and ETH3D's: k1 k2 p1 p2 k3 k4 sx1 sy1, Brown's of the angle and a prism's
 
-calib3d.hpp of https://github.com/opencv/opencv, and ``rs2_project_point_to_pixel`` in src/rs.cpp of
-https://github.com/IntelRealSense/librealsense.
+calib3d.hpp of https://github.com/opencv/opencv, ``rs2_project_point_to_pixel`` in src/rs.cpp of
+https://github.com/IntelRealSense/librealsense, and src/colmap/sensor/models.h of https://github.com/colmap/colmap.
 """
 
 from __future__ import annotations
@@ -23,7 +24,9 @@ _COUNTS = {
     "brown_conrady": (4, 5, 8, 12, 14),
     "modified_brown_conrady": (5,),
     "kannala_brandt": (4,),
+    "thin_prism_fisheye": (8,),
 }
+_FISHEYES = ("kannala_brandt", "thin_prism_fisheye")
 _MOST = (1 << 15) - 2
 """Largest width and height that OpenCV's ``remap`` takes."""
 
@@ -59,7 +62,7 @@ class Lens:
     @property
     def bends(self) -> bool:
         """Whether it distorts at all: a fisheye does without coefficients, too."""
-        return any(self.coefficients) or self.model == "kannala_brandt"
+        return any(self.coefficients) or self.model in _FISHEYES
 
 
 def undistort(picture: np.ndarray, camera: Camera, lens: Lens, hole: float | None = None) -> np.ndarray:
@@ -102,14 +105,36 @@ def _places(camera: Camera, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
     elif lens.model == "kannala_brandt":
         places = cv2.fisheye.initUndistortRectifyMap(matrix, numbers, np.eye(3), matrix, size, kind)
     else:
-        k1, k2, p1, p2, k3 = lens.coefficients
         x = (np.arange(camera.width) - camera.cx) / camera.fx
         y = (np.arange(camera.height)[:, None] - camera.cy) / camera.fy
-        square = x * x + y * y
-        radial = 1 + square * (k1 + square * (k2 + square * k3))
-        x, y = x * radial, y * radial
-        dx, dy = 2 * p1 * x * y + p2 * (square + 2 * x * x), 2 * p2 * x * y + p1 * (square + 2 * y * y)
-        places = ((x + dx) * camera.fx + camera.cx, (y + dy) * camera.fy + camera.cy)
+        x, y = (_thin_prism_fisheye if lens.model == "thin_prism_fisheye" else _modified_brown_conrady)(
+            x, y, lens.coefficients
+        )
+        places = (x * camera.fx + camera.cx, y * camera.fy + camera.cy)
     outside = -2.0 * _MOST
     x, y = (np.clip(np.nan_to_num(each, nan=outside), outside, 2 * _MOST).astype(np.float32) for each in places)
     return x, y
+
+
+def _modified_brown_conrady(
+    x: np.ndarray, y: np.ndarray, coefficients: tuple[float, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return where the points (x, y, 1) of rays lie at a focal length of 1."""
+    k1, k2, p1, p2, k3 = coefficients
+    square = x * x + y * y
+    radial = 1 + square * (k1 + square * (k2 + square * k3))
+    x, y = x * radial, y * radial
+    return x + 2 * p1 * x * y + p2 * (square + 2 * x * x), y + 2 * p2 * x * y + p1 * (square + 2 * y * y)
+
+
+def _thin_prism_fisheye(x: np.ndarray, y: np.ndarray, coefficients: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the same of the other model."""
+    k1, k2, p1, p2, k3, k4, sx1, sy1 = coefficients
+    angle = np.hypot(x, y)
+    shrinks = np.divide(np.arctan(angle), angle, out=np.ones_like(angle), where=angle > 0)
+    x, y = x * shrinks, y * shrinks
+    square = x * x + y * y
+    radial = 1 + square * (k1 + square * (k2 + square * (k3 + square * k4)))
+    dx = 2 * p1 * x * y + p2 * (square + 2 * x * x) + sx1 * square
+    dy = 2 * p2 * x * y + p1 * (square + 2 * y * y) + sy1 * square
+    return x * radial + dx, y * radial + dy

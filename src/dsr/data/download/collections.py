@@ -23,6 +23,20 @@ _DCTNET_FILES = (
     "https://raw.githubusercontent.com/Zhaozixiang1228/GDSR-DCTNet/5243875223398fd7996bca2e54dc2792bb96862a/RawDatasets"
 )
 """Test images of the field, at the commit of which the files are known."""
+_BOARD = "https://github.com/alr-internship/self-supervised-depth-denoising"
+_BOARD_FILES = (
+    "https://raw.githubusercontent.com/alr-internship/self-supervised-depth-denoising/"
+    "c73b3566db0188a0961f382509db0df424510f98"
+)
+"""At a commit of 2021; later ones keep these files elsewhere."""
+_CLEARGRASP = "https://github.com/Shreeyak/cleargrasp"
+_CLEARGRASP_FILES = (
+    "https://raw.githubusercontent.com/Shreeyak/cleargrasp/0688647e49380139e440bacbe8562132bb2afbd7/data/sample_dataset"
+)
+_CITE_CLEARGRASP = (
+    "S. S. Sajjan, M. Moore, M. Pan, G. Nagaraja, J. Lee, A. Zeng, S. Song: ClearGrasp: 3D shape estimation of "
+    "transparent objects for manipulation. ICRA 2020."
+)
 _RGBDD = "https://github.com/lingzhi96/RGB-D-D-Dataset"
 _RGBDD_TERMS = "For non-commercial research; its owners ask for a signed agreement."
 _CITE_RGBDD = (
@@ -113,6 +127,24 @@ def _ddrnet() -> tuple[Item, ...]:
     return _of_commit("ddrnet", _DDRNET_FILES, paths)
 
 
+def _cleargrasp() -> tuple[Item, ...]:
+    """Return the captures that ClearGrasp's authors publish with their code."""
+    kinds = ("transparent-rgb-img.jpg", "transparent-depth-img.exr", "opaque-depth-img.exr", "mask.png")
+    files = [f"{number:09d}-{kind}" for number in (80, 123, 130, 153) for kind in kinds]
+    paths = [f"real-val/d435/{file}" for file in (*files, "camera_intrinsics.yaml")]
+    return _of_commit("cleargrasp", _CLEARGRASP_FILES, paths)
+
+
+def _cleargrasp_synthetic() -> tuple[Item, ...]:
+    """Return the renderings that they publish with it."""
+    kinds = (
+        "rgb-imgs/{:09d}-rgb.jpg", "depth-imgs-rectified/{:09d}-depth-rectified.exr",
+        "segmentation-masks/{:09d}-segmentation-mask.png",
+    )  # fmt: skip
+    paths = [f"synthetic-val/square-plastic-bottle-val/{kind.format(n)}" for n in (0, 2, 4) for kind in kinds]
+    return _of_commit("cleargrasp_synthetic", _CLEARGRASP_FILES, paths)
+
+
 def _of_commit(folder: str, base: str, paths: Sequence[str]) -> tuple[Item, ...]:
     """Return files of a commit, whose checksums are pinned."""
     return tuple(Item(f"{folder}/{path}", (f"{base}/{path}",), sha256=_PINNED[f"{folder}/{path}"]) for path in paths)
@@ -149,6 +181,66 @@ FIELD = (
         ("ddrnet",),
         12.3e6,
         _ddrnet(),
+    ),
+    Collection(
+        "stereo_board",
+        "Five pairs of a stereo camera before a board, an exact plane",
+        _BOARD,
+        "MIT licence.",
+        "C. Kienle, D. Petri: Multi-object self-supervised depth denoising. arXiv 2305.05778, 2023.",
+        ("stereo_board",),
+        17e6,
+        _of_commit(
+            "stereo_board",
+            f"{_BOARD_FILES}/resources/images/uncalibrated/realsense",
+            [f"{folder}/{number}.png" for number in (8, 14, 19, 25, 31) for folder in ("color", "depth")],
+        ),
+    ),
+    Collection(
+        "cleargrasp",
+        "ClearGrasp, glass before a stereo camera and painted twins: the 4 captures that come with its code",
+        _CLEARGRASP,
+        "Apache License 2.0, as the code that they come with.",
+        _CITE_CLEARGRASP,
+        ("cleargrasp",),
+        3.0e6,
+        _cleargrasp(),
+    ),
+    Collection(
+        "cleargrasp_synthetic",
+        "ClearGrasp, rendered glass: the 3 scenes that come with its code",
+        _CLEARGRASP,
+        "Apache License 2.0, as the code that they come with.",
+        _CITE_CLEARGRASP,
+        ("cleargrasp_synthetic",),
+        3.2e6,
+        _cleargrasp_synthetic(),
+    ),
+    Collection(
+        "ibims",
+        "iBims-1, 100 rooms before a laser scanner, with their planes and edges marked",
+        "https://doi.org/10.14459/2018mp1455541",
+        "Its terms are on its homepage.",
+        "T. Koch, L. Liebel, F. Fraundorfer, M. Körner: Evaluation of CNN-based single-image depth estimation methods. "
+        "ECCV Workshops 2018.",
+        ("ibims",),
+        None,
+        manual="fetch ibims1_core_mat.zip or ibims1_core_raw.zip from its homepage and unpack it below {folder}",
+        patterns=("**/*_[0-9]*.*",),
+    ),
+    Collection(
+        "hammer",
+        "HAMMER, glass and metal before three depth cameras, with a scanner's truth",
+        "https://github.com/Junggy/HAMMER-dataset",
+        RESEARCH,
+        "H. Jung, P. Ruhkamp, G. Zhai, N. Brasch, Y. Li, Y. Verdie, J. Song, Y. Zhou, A. Armagan, S. Ilic, A. "
+        "Leonardis, N. Navab, B. Busam: On the importance of accurate geometry data for dense 3D vision tasks. CVPR "
+        "2023.",
+        ("hammer",),
+        None,
+        manual="fetch _dataset_processed.zip by the link in its README and unpack it, or its scenes 12 to 14 to "
+        "evaluate on, below {folder}",
+        patterns=("**/polarization/_gt/*.png", "**/polarization/depth_d435/*.png"),
     ),
     Collection(
         "rgbdd",
@@ -373,6 +465,37 @@ _COLLECTIONS = (
                 contains=("SUNRGBD",),
             ),
         ),
+    ),
+    Collection(
+        "diode",
+        "DIODE, rooms and streets before a laser scanner, 771 images to evaluate on",
+        "https://diode-dataset.org/",
+        "MIT licence, as the code beside it.",
+        "I. Vasiljevic, N. Kolkin, S. Zhang, R. Luo, H. Wang, F. Z. Dai, A. F. Daniele, M. Mostajabi, S. Basart, M. R. "
+        "Walter, G. Shakhnarovich: DIODE: a dense indoor and outdoor depth dataset. arXiv 1908.00463, 2019.",
+        ("diode",),
+        2.6e9,
+        (
+            Item(
+                "diode/val.tar.gz",
+                ("http://diode-dataset.s3.amazonaws.com/val.tar.gz",),
+                unpack_to="diode",
+                contains=("val",),
+            ),
+        ),
+    ),
+    Collection(
+        "eth3d",
+        "ETH3D, buildings and rooms before a laser scanner, 454 photos of 13 scenes",
+        "https://www.eth3d.net/datasets",
+        "Creative Commons BY-NC-SA 4.0.",
+        "T. Schöps, J. L. Schönberger, S. Galliani, T. Sattler, K. Schindler, M. Pollefeys, A. Geiger: A multi-view "
+        "stereo benchmark with high-resolution images and multi-camera videos. CVPR 2017.",
+        ("eth3d",),
+        None,
+        manual="fetch the archives SCENE_dslr_jpg.7z and SCENE_dslr_depth.7z of its high-resolution multi-view "
+        "training scenes and unpack both of each scene into {folder}",
+        patterns=("*/images/dslr_images/*.JPG", "*/ground_truth_depth/dslr_images/*.JPG"),
     ),
     Collection(
         "tofmark",

@@ -63,6 +63,7 @@ _MODELS = {
     3: _Model("RADIAL", 1, 2, _BROWN), 4: _Model("OPENCV", 2, 4, _BROWN), 5: _Model("OPENCV_FISHEYE", 2, 4, _FISHEYE),
     6: _Model("FULL_OPENCV", 2, 8, _BROWN), 8: _Model("SIMPLE_RADIAL_FISHEYE", 1, 1, _FISHEYE),
     9: _Model("RADIAL_FISHEYE", 1, 2, _FISHEYE),
+    10: _Model("THIN_PRISM_FISHEYE", 2, 8, ("thin_prism_fisheye", (8,))),
 }  # fmt: skip
 _BY_NAME = {model.name: model for model in _MODELS.values()}
 

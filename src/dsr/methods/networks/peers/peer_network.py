@@ -224,7 +224,7 @@ class PeerUpsampler(Method):
     ) -> None:
         expect_one_of("range_type", range_type, RANGE_TYPES)
         expect_one_of("range", value_range, get_args(Range))
-        expect_one_of("precision", precision, DTYPES)
+        expect_one_of("precision", precision, tuple(DTYPES))
         if tile is not None and tile < net.multiple:
             raise ValueError(f"tile: expected at least {net.multiple} pixels, got {tile}")
         if net.depth_range is not None and value_range == "truth":

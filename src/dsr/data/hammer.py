@@ -1,0 +1,120 @@
+"""``dataset=hammer``: tables with glass, metal and other things before three depth cameras, with a scanner's truth.
+
+``downsampling=measured scale=1`` takes the maps of the camera ``dataset.sensor`` as the input: ``d435``, active stereo,
+``tof``, indirect time of flight, or ``l515``, direct time of flight.
+
+Jung et al., "On the Importance of Accurate Geometry Data for Dense 3D Vision Tasks", CVPR 2023, the HAMMER data set;
+README.md of github.com/Junggy/HAMMER-dataset, which states no licence. Scenes 2 to 11 are to train on, 12 to 14 to
+test. As the archive ``_dataset_processed.zip`` has them, by the loaders of others who use it:
+
+    scene12_traj1_1/polarization/rgb/000000.png            the polarisation camera's photo, 1088 x 832
+    scene12_traj1_1/polarization/_gt/000000.png            depth rendered from the scans, 16 bits, mm, 0 = unknown
+    scene12_traj1_1/polarization/depth_d435/000000.png     the camera's depth, warped into the photo, mm, 0 = hole
+    scene12_traj1_1/polarization/intrinsics.txt            3 x 3, taken as it is: pixel centres at integers
+
+likewise ``depth_tof`` and ``depth_l515``. The sequences ``scene12_traj1_naked_1`` have the same views without the
+objects.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Literal, get_args
+
+from dsr.data.frame_files import (
+    expect_size,
+    find_beside,
+    in_natural_order,
+    read_millimetres,
+    read_picture,
+    to_camera,
+)
+from dsr.data.preparation import Preparation, PreparedDataset, list_frames, make_records
+from dsr.data.scene_source import SceneSelection
+from dsr.io.images import read_numbers
+from dsr.sample import Scene
+
+Sensor = Literal["d435", "tof", "l515"]
+Split = Literal["test", "train"]
+TEST = (12, 13, 14)
+"""Numbers of the scenes to test on."""
+_SEQUENCE = re.compile(r"scene(\d+)_traj\d+(_naked)?_\d+")
+_PHOTO = re.compile(r"(\d+)\.png")
+
+
+def find_frames(
+    root: Path, sensor: Sensor = "d435", split: Split | None = None, naked: bool = False
+) -> dict[str, tuple[Path, Path, Path, Path]]:
+    """Return photo, measured and true depth, and intrinsics by name "scene12_traj1_1/000000", in order.
+
+    Args:
+        root: directory of the sequences, or one above it.
+        sensor: the camera that measured.
+        split: of the scenes; None for both.
+        naked: whether to take sequences without objects, instead of those with them.
+
+    Raises:
+        ValueError: there is no such directory.
+
+    """
+    found = {}
+    others = (f"depth_{sensor}/{{}}.png", "_gt/{}.png", "intrinsics.txt")
+    for place, frame, (photo, measured, truth, intrinsics) in find_beside(root, "rgb", _PHOTO, others):
+        sequence = place.resolve().parent.name
+        match = _SEQUENCE.fullmatch(sequence)
+        if (
+            match is not None
+            and bool(match[2]) == naked
+            and split in (None, "test" if int(match[1]) in TEST else "train")
+        ):
+            found[f"{sequence}/{frame}"] = (photo, measured, truth, intrinsics)
+    return in_natural_order(found)
+
+
+def load_frame(
+    rgb_path: Path, measured_path: Path, truth_path: Path, intrinsics_path: Path, dataset: str, name: str
+) -> Scene:
+    """Return one frame with a camera's map, measured at the photo's size.
+
+    Raises:
+        ValueError: a file is missing, damaged, or does not fit the others; the message names it.
+
+    """
+    rgb, measured, truth = read_picture(rgb_path), read_millimetres(measured_path), read_millimetres(truth_path)
+    size = (rgb.shape[1], rgb.shape[2])
+    for path, image in ((measured_path, measured), (truth_path, truth)):
+        expect_size(path, tuple(image.shape[1:]), size)
+    camera = to_camera(intrinsics_path, read_numbers(intrinsics_path, 9).reshape(3, 3), size)
+    return Scene(dataset, name, rgb, camera, truth, {1: measured})
+
+
+class Hammer(PreparedDataset):
+    """Frames of HAMMER at their own size, a camera's map as measured at x1.
+
+    Args:
+        root: directory of the sequences, or one above it.
+        sensor: the camera that measured: ``d435``, ``tof`` or ``l515``.
+        split: ``test``, to evaluate on, or ``train``, to train on.
+        naked: whether to use the sequences without objects, instead of those with them.
+        scenes: names of the scenes to use, such as ``scene12_traj1_1_000000``; None and ``found`` for all of the split.
+
+    Raises:
+        ValueError: a scene is not on disk, or a value is out of range.
+
+    """
+
+    def __init__(
+        self,
+        root: str,
+        sensor: Sensor = "d435",
+        split: Split = "test",
+        naked: bool = False,
+        scenes: SceneSelection = None,
+    ) -> None:
+        for name, value, choices in (("sensor", sensor, Sensor), ("split", split, Split)):
+            if value not in get_args(choices):
+                raise ValueError(f"{name}: expected one of {', '.join(get_args(choices))}, got {value}")
+        found = make_records(list_frames(find_frames, root, sensor, split, naked), load_frame, "hammer")
+        super().__init__("hammer", root, found, None, scenes, Preparation(None))
+        self.evaluation = split == "test"

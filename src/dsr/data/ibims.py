@@ -1,0 +1,199 @@
+"""``dataset=ibims``: rooms before a laser scanner, with their planes and depth edges marked (Koch et al., 2018).
+
+Koch, Liebel, Fraundorfer, Körner, "Evaluation of CNN-based Single-Image Depth Estimation Methods", ECCV Workshops 2018;
+``evaluate_ibims.py`` and ``evaluate_ibims_error_metrics.py``, version 0.9, of its authors (a copy is in
+``mde/capsules/meter/ibims_official`` of github.com/bulatko/DepthART); its terms are on doi.org/10.14459/2018mp1455541.
+100 scenes of 640 x 480 pixels, each a MATLAB file with a structure ``data``:
+
+    ibims1_core_mat/corridor_01.mat    rgb, depth in metres, 0 = hole, calib, edges, mask_invalid and mask_transp,
+                                       0 where a pixel is not to be counted, mask_wall, mask_table and mask_floor, in
+                                       which planes are numbered from 1
+
+or, with the same in it, as pictures:
+
+    ibims1_core_raw/rgb/corridor_01.png        ibims1_core_raw/depth/corridor_01.png     16 bits, v 50 / 65535 metres
+    ibims1_core_raw/calib/corridor_01.txt      fx,fy,cx,cy
+    ibims1_core_raw/edges/corridor_01.png      and so on, a folder for each; where a scene has no table, there is no
+                                               file in ``mask_table``
+
+``calib`` is the transpose of a matrix of intrinsics, and its pixels are counted from 1: the principal point is less by
+1 here. As in the authors' evaluation, pixels whose depth is 0, invalid, or behind something transparent have no truth.
+
+Regions are ``planes``, numbered from 1 (walls, then tables, then floors; the authors score those alone that have 5 % of
+the picture), and ``edges``, lines of a pixel, where a scene has such.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dsr.data.frame_files import (
+    expect_size,
+    find_beside,
+    in_natural_order,
+    read_16bit,
+    read_bytes,
+    read_picture,
+    to_camera,
+    to_depth,
+    walk,
+)
+from dsr.data.matlab import read_variables
+from dsr.data.preparation import Preparation, PreparedDataset, list_frames, make_records
+from dsr.data.scene_source import SceneSelection
+from dsr.geometry.camera import Camera
+from dsr.io.images import read_levels
+from dsr.sample import Scene
+
+COUNT = 100
+"""Number of scenes."""
+SIZE = (480, 640)
+FARTHEST = 50.0
+"""Depth of the largest value in pictures, metres."""
+_VALID = ("mask_invalid", "mask_transp")
+_PLANES = ("mask_wall", "mask_table", "mask_floor")
+_MASKS = (*_VALID, "edges", *_PLANES)
+_PHOTO = re.compile(r"(.+)\.png")
+Pictures = tuple[Path, Path, Path, *tuple[Path | None, ...]]
+
+
+def find_matrices(root: Path) -> dict[str, tuple[Path]]:
+    """Return the MATLAB files of scenes, the first argument of :func:`load_matrices`, by name, in order.
+
+    Args:
+        root: directory of the files, or one above it; results of methods, ``*_results.mat``, are left out.
+
+    Raises:
+        ValueError: there is no such directory.
+
+    """
+    found: dict[str, tuple[Path]] = {}
+    for folder, _, files in walk(root):
+        names = (file.removesuffix(".mat") for file in files if file.endswith(".mat"))
+        found |= {name: (folder / f"{name}.mat",) for name in names if not name.endswith("_results")}
+    return in_natural_order(found)
+
+
+def find_pictures(root: Path) -> dict[str, Pictures]:
+    """Return the files of scenes in folders, the first arguments of :func:`load_pictures`, by name, in order.
+
+    Args:
+        root: directory of ``rgb``, ``depth`` and ``calib``, or one above it.
+
+    Raises:
+        ValueError: there is no such directory.
+
+    """
+    found: dict[str, Pictures] = {}
+    needed = ("depth/{}.png", "calib/{}.txt", *(f"{mask}/{{}}.png" for mask in _VALID))
+    for place, name, (photo, depth, calibration, *_) in find_beside(root, "rgb", _PHOTO, needed):
+        masks = (place / mask / photo.name for mask in _MASKS)
+        found[name] = (photo, depth, calibration, *(path if path.is_file() else None for path in masks))
+    return in_natural_order(found)
+
+
+def load_matrices(path: Path, dataset: str, name: str) -> Scene:
+    """Return the scene of a MATLAB file.
+
+    Raises:
+        ValueError: it is missing or damaged, or a matrix is missing or of another size; the message names it.
+
+    """
+    stored = {key.removeprefix("data."): values for key, values in read_variables(path).items()}
+    needed = ("rgb", "depth", "calib", *_VALID)
+    missing = [key for key in needed if key not in stored]
+    if missing:
+        raise ValueError(
+            f"{path}: expected a structure data with {', '.join(needed)}, got none of {', '.join(missing)}"
+        )
+    shapes = {"rgb": (*SIZE, 3), "calib": (3, 3), **dict.fromkeys(("depth", *_MASKS), SIZE)}
+    for key, shape in shapes.items():
+        if key in stored and stored[key].size and stored[key].shape != shape:
+            raise ValueError(f"{path}: {key}: expected shape {shape}, got {stored[key].shape}")
+    if stored["rgb"].dtype != np.uint8:
+        raise ValueError(f"{path}: rgb: expected 8 bits a channel, got {stored['rgb'].dtype}")
+    rgb = torch.from_numpy(np.ascontiguousarray(stored["rgb"].transpose(2, 0, 1))).float() / 255
+    camera = _camera(path, stored["calib"].T)
+    masks = {key: stored[key] for key in _MASKS if key in stored and stored[key].size}
+    return _scene(path, rgb, camera, stored["depth"], masks, dataset, name)
+
+
+def load_pictures(rgb_path: Path, depth_path: Path, calibration_path: Path, *paths: Path | str | None) -> Scene:
+    """Return the scene of pictures.
+
+    Args:
+        rgb_path: photo.
+        depth_path: depth, 16 bits.
+        calibration_path: intrinsics.
+        paths: the masks of pixels that are invalid, of those that are transparent, of edges, walls, tables and floors,
+            the last four None where there is none; then the names of data set and scene.
+
+    Raises:
+        ValueError: a file is missing, damaged or of another size; the message names it.
+
+    """
+    *mask_paths, dataset, name = paths
+    rgb, depth = read_picture(rgb_path), read_16bit(depth_path)
+    given = {key: path for key, path in zip(_MASKS, mask_paths, strict=True) if isinstance(path, Path)}
+    masks = {key: read_levels(path) for key, path in given.items()}
+    sizes = {rgb_path: tuple(rgb.shape[1:]), depth_path: depth.shape, **{given[key]: masks[key].shape for key in masks}}
+    for path, size in sizes.items():
+        expect_size(path, size, SIZE)
+    text = read_bytes(calibration_path, "a text file of fx,fy,cx,cy").decode("utf-8", "replace")
+    try:
+        fx, fy, cx, cy = map(float, text.replace(",", " ").split())
+    except ValueError as error:
+        raise ValueError(f"{calibration_path}: expected fx,fy,cx,cy, got {text[:60]!r}") from error
+    camera = _camera(calibration_path, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
+    return _scene(depth_path, rgb, camera, depth * (FARTHEST / 65535), masks, str(dataset), str(name))
+
+
+def _camera(path: Path, matrix: np.ndarray) -> Camera:
+    """Return the camera of intrinsics whose pixels are counted from 1."""
+    return to_camera(path, matrix - np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0]]), SIZE)
+
+
+def _scene(
+    path: Path,
+    rgb: Tensor,
+    camera: Camera,
+    depth: np.ndarray,
+    masks: Mapping[str, np.ndarray],
+    dataset: str,
+    name: str,
+) -> Scene:
+    """Return the scene of depth in metres, 0 in holes, and masks."""
+    valid = np.all([masks[key] > 0 for key in _VALID], axis=0)
+    truth = to_depth(path, np.where(valid, depth, 0))
+    planes = np.zeros(SIZE, np.int64)
+    for mask in (masks[key].astype(np.int64) for key in _PLANES if key in masks):
+        planes = np.where(mask > 0, mask + planes.max(), planes)
+    if planes.max() > 255:
+        raise ValueError(f"{path}: expected up to 255 planes, got {planes.max()}")
+    regions = {"planes": planes.astype(np.uint8), "edges": (masks.get("edges", np.zeros(SIZE)) > 0).astype(np.uint8)}
+    found = {key: torch.from_numpy(region)[None] for key, region in regions.items() if region.any()}
+    return Scene(dataset, name, rgb, camera, truth, regions=found)
+
+
+class IBims(PreparedDataset):
+    """Scenes of iBims-1 at their own size.
+
+    Args:
+        root: directory of the MATLAB files, or of the folders of pictures, or one above them.
+        scenes: names of the scenes to use, such as ``corridor_01``; None for all 100, ``found`` for those in ``root``.
+
+    Raises:
+        ValueError: a scene is not on disk.
+
+    """
+
+    def __init__(self, root: str, scenes: SceneSelection = None) -> None:
+        pictures = make_records(list_frames(find_pictures, root), load_pictures, "ibims")
+        found = pictures | make_records(list_frames(find_matrices, root), load_matrices, "ibims")
+        super().__init__("ibims", root, found, None, scenes, Preparation(None), count=COUNT)

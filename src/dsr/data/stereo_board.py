@@ -1,0 +1,157 @@
+"""``dataset=stereo_board``: a stereo camera before a board, which is an exact plane.
+
+``downsampling=measured scale=1`` takes the camera's maps as the input.
+
+Five pairs of a RealSense that came with the code of Kienle and Petri, "Multi-Object Self-Supervised Depth Denoising",
+arXiv 2305.05778, MIT licence; ``resources/images/uncalibrated/realsense`` in the commit c73b356 of
+github.com/alr-internship/self-supervised-depth-denoising:
+
+    color/8.png    the photo, 1920 x 1080, with the lens's distortion
+    depth/8.png    the camera's depth, registered to the photo, 16 bits, mm, 0 = hole
+
+likewise 14, 19, 25 and 31. A ChArUco board is in view. Its corners gave what this module has in :data:`CAMERA`,
+:data:`LENS` and :data:`BOARDS` (root mean square of 0.30 pixels when projected), and so the depth of every pixel on the
+board: that of the plane where the pixel's ray, bent by the lens, meets it. Elsewhere nothing is known. The scene's
+camera has no lens, so that planes are bent in it by up to 4.5 mm, the truth's and the map's alike.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+
+import cv2
+import numpy as np
+import torch
+
+from dsr.data.frame_files import expect_size, find_beside, in_natural_order, read_millimetres, read_picture
+from dsr.data.preparation import Preparation, PreparedDataset, list_frames, make_records
+from dsr.data.scene_source import SceneSelection
+from dsr.geometry.camera import Camera
+from dsr.geometry.lens import Lens
+from dsr.sample import Scene
+
+
+@dataclass(frozen=True)
+class Board:
+    """The board in a frame.
+
+    Args:
+        normal: of its plane, of length 1, in the camera's axes (right, down, forward).
+        distance: of its plane from the camera along the normal, metres.
+        outline: (column, row) of its corners, in pixels of the photo.
+
+    """
+
+    normal: tuple[float, float, float]
+    distance: float
+    outline: tuple[tuple[float, float], ...]
+
+
+CAMERA = Camera(1920, 1080, 1368.937, 1370.763, 936.091, 541.831)
+LENS = Lens("brown_conrady", (0.13314, -0.3092, 0.0, 0.0))
+BOARDS = MappingProxyType(
+    {
+        "8": Board(
+            (0.442803, 0.010729, 0.896555), 1.36465, ((1331, 662.4), (891.1, 595.5), (922.7, 297.4), (1373.9, 313.9))
+        ),
+        "14": Board(
+            (-0.494666, -0.003126, 0.869077), 0.92904, ((1439.5, 693), (1021.5, 764.2), (998.6, 347.5), (1424.4, 347))
+        ),
+        "19": Board(
+            (-0.043949, -0.422185, 0.905444),
+            1.22079,
+            ((1513.8, 597.5), (1054.4, 736.5), (954.8, 457.7), (1459.7, 289.6)),
+        ),
+        "25": Board(
+            (0.234985, -0.645635, 0.726593), 1.06151, ((1645, 616.2), (1149.1, 671.8), (1045.7, 430.4), (1601.7, 318.5))
+        ),
+        "31": Board(
+            (-0.196585, -0.516696, 0.833294), 1.12616, ((1285.1, 732), (926.5, 591.8), (1108.8, 309.1), (1475.6, 498.6))
+        ),
+    }
+)
+"""By the name of the frame."""
+INSIDE, BORDER = 12, 36
+"""Pixels inside the outline up to which its own error of a pixel or two counts, and up to which the border reaches."""
+_PHOTO = re.compile(r"(\d+)\.(?:png|jpg)")
+
+
+def find_frames(root: Path) -> dict[str, tuple[Path, Path, str]]:
+    """Return photo, depth and name, the first arguments of :func:`load_frame`, by name "8", in order.
+
+    Args:
+        root: directory of ``color`` and ``depth``, or one above it.
+
+    Raises:
+        ValueError: there is no such directory.
+
+    """
+    found = {}
+    for _, name, (photo, depth) in find_beside(root, "color", _PHOTO, ("depth/{}.png",)):
+        if name in BOARDS:
+            found[name] = (photo, depth, name)
+    return in_natural_order(found)
+
+
+def load_frame(rgb_path: Path, depth_path: Path, board: str, dataset: str, name: str) -> Scene:
+    """Return one frame, the camera's map measured at the photo's size and the board's plane as the truth.
+
+    Its regions are ``board``, deeper inside the outline than :data:`INSIDE` pixels, and of that ``border``, not deeper
+    than :data:`BORDER`: what is blurred across the outline shows there.
+
+    Args:
+        rgb_path: photo.
+        depth_path: camera's depth.
+        board: which of :data:`BOARDS`.
+        dataset, name: of the scene.
+
+    Raises:
+        ValueError: a file is missing, damaged, or not of 1920 x 1080 pixels; the message names it.
+
+    """
+    rgb, measured = read_picture(rgb_path), read_millimetres(depth_path)
+    for path, image in ((rgb_path, rgb), (depth_path, measured)):
+        expect_size(path, tuple(image.shape[1:]), (CAMERA.height, CAMERA.width))
+    inside = depth_inside(BOARDS[board])
+    regions = {"board": inside > INSIDE, "border": (inside > INSIDE) & (inside <= BORDER)}
+    truth = torch.from_numpy(plane_depth(BOARDS[board]))[None]
+    found = {each: torch.from_numpy(region.astype(np.uint8))[None] for each, region in regions.items()}
+    return Scene(dataset, name, rgb, CAMERA, truth, {1: measured}, regions=found)
+
+
+def depth_inside(board: Board) -> np.ndarray:
+    """Return how many pixels inside the board's outline each pixel lies, (1080, 1920) float32, 0 outside."""
+    inside = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
+    cv2.fillPoly(inside, [np.round(board.outline).astype(np.int32)], 1)
+    return cv2.distanceTransform(inside, cv2.DIST_L2, 5)
+
+
+def plane_depth(board: Board) -> np.ndarray:
+    """Return the board's depth, (1080, 1920) float64 in metres, NaN outside of its outline."""
+    depth = np.full((CAMERA.height, CAMERA.width), np.nan)
+    rows, columns = np.nonzero(depth_inside(board))
+    matrix = np.array([[CAMERA.fx, 0, CAMERA.cx], [0, CAMERA.fy, CAMERA.cy], [0, 0, 1]])
+    pixels = np.stack([columns, rows], axis=1).astype(np.float64)[:, None]
+    across, down = cv2.undistortPoints(pixels, matrix, np.array(LENS.coefficients))[:, 0].T
+    depth[rows, columns] = board.distance / (np.stack([across, down, np.ones_like(down)], axis=1) @ board.normal)
+    return depth
+
+
+class StereoBoard(PreparedDataset):
+    """Five frames of a stereo camera before an exact plane, at their own size, its map as measured at x1.
+
+    Args:
+        root: directory of ``color`` and ``depth``, or one above it.
+        scenes: names of the scenes to use, such as ``14``; None for all five, ``found`` for those in ``root``.
+
+    Raises:
+        ValueError: a scene is not on disk.
+
+    """
+
+    def __init__(self, root: str, scenes: SceneSelection = None) -> None:
+        found = make_records(list_frames(find_frames, root), load_frame, "stereo_board")
+        super().__init__("stereo_board", root, found, tuple(BOARDS), scenes, Preparation(None))

@@ -1,0 +1,99 @@
+"""The stereo camera before a board: its plane as the lens shows it, its regions, every damage named."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from refusals import refused
+from small_files import encoded_png as png
+from small_files import written
+
+from dsr.data.stereo_board import BOARDS, CAMERA, LENS, StereoBoard, find_frames, load_frame
+
+ROWS, COLUMNS = np.mgrid[0:1080, 0:1920]
+MEASURED = (1000 + ROWS // 2 + COLUMNS // 4).astype(np.uint16)
+PHOTO = png(np.full((1080, 1920, 3), 51, np.uint8))
+
+
+def frame(root, name="14", suffix="png"):
+    """Write a frame with a hole in a corner."""
+    measured = MEASURED.copy()
+    measured[0, 0] = 0
+    return written(root / f"color/{name}.{suffix}", PHOTO), written(root / f"depth/{name}.png", png(measured))
+
+
+def test_measured_map_is_metres_and_nothing_is_known_beside_the_board(tmp_path):
+    scene = load_frame(*frame(tmp_path), "14", "stereo_board", "14")
+    assert (scene.camera, list(scene.measured)) == (CAMERA, [1])
+    assert scene.measured[1].isnan().nonzero().tolist() == [[0, 0, 0]]
+    assert scene.measured[1][0, 10, 20].item() == pytest.approx(1.010)
+    outline = np.array(BOARDS["14"].outline)
+    known = scene.depth[0].isfinite().nonzero().numpy()
+    low, high = known.min(axis=0), known.max(axis=0)
+    np.testing.assert_allclose([low[::-1], high[::-1]], [outline.min(axis=0), outline.max(axis=0)], atol=1)
+
+
+@pytest.mark.parametrize("name", BOARDS)
+def test_points_of_the_truth_lie_on_the_plane_and_are_seen_where_the_lens_shows_them(tmp_path, name):
+    scene, board = load_frame(*frame(tmp_path, name), name, "stereo_board", name), BOARDS[name]
+    assert np.linalg.norm(board.normal) == pytest.approx(1, abs=1e-5)
+    depth = scene.depth[0].numpy()
+    rows, columns = (each[::997] for each in np.nonzero(np.isfinite(depth)))
+    u, v = (columns - CAMERA.cx) / CAMERA.fx, (rows - CAMERA.cy) / CAMERA.fy
+    x, y = u.copy(), v.copy()
+    k1, k2, *_ = LENS.coefficients
+    for _ in range(100):  # the lens, turned around by a fixed point
+        square = x**2 + y**2
+        radial = 1 + k1 * square + k2 * square**2
+        x, y = u / radial, v / radial
+    z = depth[rows, columns]
+    assert abs(np.stack([x * z, y * z, z], axis=1) @ board.normal - board.distance).max() < 1e-5
+
+
+def test_regions_are_the_board_from_12_pixels_inside_its_outline_and_of_that_up_to_36(tmp_path):
+    scene = load_frame(*frame(tmp_path), "14", "stereo_board", "14")
+    board, border = (scene.regions[name][0].numpy() for name in ("board", "border"))
+    assert board.dtype == border.dtype == np.uint8
+    assert set(np.unique(board)) == set(np.unique(border)) == {0, 1}
+    assert not (border & ~board & 1).any()
+    assert np.isfinite(scene.depth[0].numpy())[board > 0].all()
+    outline = np.round(BOARDS["14"].outline).astype(np.float32)[:, None]
+    for row, column in np.argwhere(board)[::4999]:
+        inside = cv2.pointPolygonTest(outline, (float(column), float(row)), measureDist=True)
+        assert inside > 12 - 2
+        assert abs(inside - 36) < 2 or (inside < 36) == bool(border[row, column])
+
+
+def test_frames_are_those_of_the_boards(tmp_path):
+    for name in ("8", "31", "9"):
+        frame(tmp_path / "realsense", name, "jpg" if name == "31" else "png")
+    assert list(find_frames(tmp_path)) == ["8", "31"]
+    assert StereoBoard(str(tmp_path), "found").scenes() == ["8", "31"]
+    with pytest.raises(ValueError, match=r"dataset=stereo_board: expected 14, 19, 25 in .* got 2 of 5 scenes"):
+        StereoBoard(str(tmp_path))
+
+
+@pytest.mark.parametrize("which", range(2))
+@pytest.mark.parametrize("content", [b"", b"text", png(MEASURED)[:999], png(MEASURED[1:]), None])
+def test_damaged_or_missing_file_is_refused_in_one_line_that_names_it(tmp_path, capfd, which, content):
+    files = frame(tmp_path)
+    files[which].unlink() if content is None else files[which].write_bytes(content)
+    assert refused(lambda: load_frame(*files, "14", "stereo_board", "14"), files[which], capfd).startswith("expected ")
+
+
+def test_real_frames_have_the_planes_that_were_measured(shared):
+    folder = shared / "real/stereo_board"
+    facts = json.loads((folder / "board.json").read_text())
+    data = StereoBoard(str(folder))
+    assert data.scenes() == ["8", "14", "19", "25", "31"]
+    for name in data.scenes():
+        told, scene = facts["frames"][name], data.load(name)
+        assert (list(BOARDS[name].normal), BOARDS[name].distance) == (told["normal"], told["distance"])
+        plane = torch.from_numpy(cv2.imread(str(folder / f"plane/{name}.png"), cv2.IMREAD_UNCHANGED) / 1e4)
+        both = (plane > 0) & scene.depth[0].isfinite()
+        assert int(both.sum()) >= int((plane > 0).sum()) - 1
+        assert (plane - scene.depth[0])[both].abs().max() < 6e-5
+        off = (scene.measured[1] - scene.depth)[0][scene.regions["board"][0] > 0]
+        assert 0.001 < (off - off.nanmedian()).abs().nanmedian() < 0.02
