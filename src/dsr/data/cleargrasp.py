@@ -41,7 +41,7 @@ import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import cv2
 import numpy as np
@@ -242,6 +242,8 @@ class ClearGrasp(PreparedDataset):
         ValueError: a scene is not on disk, or a value is out of range.
 
     """
+
+    regions: ClassVar[tuple[str, ...]] = ("glass", "outside", "edges")
 
     def __init__(self, root: str, synthetic: bool, split: Split | None = None, scenes: SceneSelection = None) -> None:
         if split not in (None, *SPLITS):

@@ -28,6 +28,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -192,6 +193,8 @@ class IBims(PreparedDataset):
         ValueError: a scene is not on disk.
 
     """
+
+    regions: ClassVar[tuple[str, ...]] = ("planes", "edges")
 
     def __init__(self, root: str, scenes: SceneSelection = None) -> None:
         pictures = make_records(list_frames(find_pictures, root), load_pictures, "ibims")

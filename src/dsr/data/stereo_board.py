@@ -21,6 +21,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -151,6 +152,8 @@ class StereoBoard(PreparedDataset):
         ValueError: a scene is not on disk.
 
     """
+
+    regions: ClassVar[tuple[str, ...]] = ("board", "border")
 
     def __init__(self, root: str, scenes: SceneSelection = None) -> None:
         found = make_records(list_frames(find_frames, root), load_frame, "stereo_board")
