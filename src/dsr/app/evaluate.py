@@ -152,7 +152,7 @@ def _prepare(plain: Config, node: Any, source: SceneSource | None, *, here: bool
     )
     method = selected.build(run)
     if method.name is not None:
-        name, label = method.name, method.name if label == name else label
+        label = method.name if label == name else label
     study = Evaluation(
         source,
         downsampling,

@@ -127,14 +127,18 @@ class External(Method):
 
     def describe(self, sample: DepthSample) -> str:
         """Return what the scene's map came as, where that costs precision or the map was changed."""
-        path = self._found(self._stem(sample))
-        whole = path is not None and path.suffix.lower() == ".png"
-        stored = f"predictions come as whole numbers of {self._unit:g}" if whole and self._unit else ""
-        return "; ".join(filter(None, (stored, describe_fit(self._fit))))
+        found = self._found(self._stem(sample))
+        stored = ""
+        if len(found) == 1:
+            kind = read_depth_file(found[0], pixels_beside(sample.camera.height, sample.camera.width)).dtype
+            stored = f"predictions come as whole numbers of {self._unit or 1:g} m" if kind.kind in "iu" else ""
+            stored = stored if self._quantity in ("orthogonal", "perspective") else stored.removesuffix(" m")
+        fitted = f"{self._fit} fitted to the low-resolution map" if self._fit else ""
+        return "; ".join(filter(None, (stored, fitted)))
 
     def remarks(self, dataset: str, scenes: Sequence[str], scale: float) -> list[str]:
         """Return lines on files that are of no scene."""
-        used = {self._found(self._name(dataset, scene, scale)) for scene in scenes}
+        used = {path for scene in scenes for path in self._found(self._name(dataset, scene, scale))}
         files = {path for path in self.folder.rglob("*") if path.suffix.lower() in DEPTH_SUFFIXES and path.is_file()}
         others = sorted((os.fspath(path.relative_to(self.folder)) for path in files - used), key=natural_key)
         if not others:
@@ -144,8 +148,7 @@ class External(Method):
 
     def content(self, dataset: str, scene: str, scale: float) -> str | None:
         """Return the SHA-256 of a scene's file; None without one."""
-        path = self._found(self._name(dataset, scene, scale))
-        return None if path is None else file_hash(path)
+        return ", ".join(map(file_hash, self._found(self._name(dataset, scene, scale)))) or None
 
     def _stem(self, sample: DepthSample) -> str:
         return self._name(sample.dataset, sample.scene, sample.scale)
@@ -155,30 +158,30 @@ class External(Method):
         values = {"dataset": dataset, "scene": scene, "scale": str(round_ratio(scale))}
         return _FIELD.sub(lambda match: values[match[1]], self._file)
 
-    def _found(self, name: str) -> Path | None:
-        """Return the file of a name; None if there is none."""
+    def _found(self, name: str) -> list[Path]:
+        """Return the files of a name."""
         suffixes = ("",) if name.lower().endswith(DEPTH_SUFFIXES) else DEPTH_SUFFIXES
-        found = [path for suffix in suffixes if (path := self.folder / f"{name}{suffix}").is_file()]
-        if len(found) > 1:
-            raise ValueError(f"{self.folder}: expected one map of {name}, got {', '.join(path.name for path in found)}")
-        return found[0] if found else None
+        return [path for suffix in suffixes if (path := self.folder / f"{name}{suffix}").is_file()]
 
     def _find(self, sample: DepthSample) -> Path:
         """Return the file of a sample's scene."""
         name = self._stem(sample)
-        path = self._found(name)
-        if path is None:
+        found = self._found(name)
+        if not found:
             raise ValueError(f"{self.folder / name}: expected a map as {', '.join(DEPTH_SUFFIXES)}, there is none")
-        return path
+        if len(found) > 1:
+            raise ValueError(f"{self.folder}: expected one map of {name}, got {', '.join(path.name for path in found)}")
+        return found[0]
 
     def _read(self, path: Path, camera: Camera) -> Tensor:
         """Return the values of a file, (1, H, W) float64 in their quantity's unit, NaN in holes."""
         stored = read_depth_file(path, pixels_beside(camera.height, camera.width))
         whole = stored.dtype.kind in "iu"
-        if whole and self._unit is None:
+        free = self._fit is not None and self._quantity in (INVERSE, "disparity")  # 0 may be the farthest point
+        if whole and self._unit is None and self._fit is None:
             raise ValueError(f"{path}: expected method.unit=mm, or another one, for {stored.dtype} values, got none")
-        holes = ~np.isfinite(stored) if self._fit else find_holes(stored, self._hole_value)[0]
-        if self._fit and self._hole_value is not None:
+        holes = ~np.isfinite(stored) if free else find_holes(stored, self._hole_value)[0]
+        if free and self._hole_value is not None:
             holes |= stored == self._hole_value
         if holes.all():
             negative = not whole and bool((stored < 0).any())

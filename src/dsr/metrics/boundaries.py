@@ -218,7 +218,8 @@ def planarity(
         planes: (B, P, H, W) bool, the pixels of each plane.
         normals: (B, P, 3) true normals, x right, y down, z forward, of either sign; None for those of the truth's
             points, fitted alike. iBims-1's are x right, y forward, z up: theirs of (x, y, z) is (x, -z, y) here.
-        smallest: planes with a lower fraction of the image's pixels get NaN.
+        smallest: planes with a lower fraction of the image's pixels, whatever of them is predicted, get NaN; so does a
+            larger one without a prediction.
 
     Returns:
         The flatness, the standard deviation of the points about their plane in metres, and the orientation, the angle
@@ -241,7 +242,7 @@ def planarity(
         spread, normal = _fit_plane(pair.prediction * factor * pair.rays, mask)
         true = _fit_plane(pair.target * pair.rays, mask)[1] if normals is None else normals[:, index].to(normal)
         angle = torch.atan2(torch.linalg.cross(normal, true).norm(dim=1), (normal * true).sum(dim=1).abs())
-        large = mask.double().mean(dim=(1, 2, 3)) >= smallest
+        large = planes[:, index].double().mean(dim=(1, 2)) >= smallest
         flatness.append(torch.where(large, spread, torch.nan))
         orientation.append(torch.where(large, angle.rad2deg(), torch.nan))
     return torch.stack(flatness, dim=1), torch.stack(orientation, dim=1)
@@ -301,12 +302,22 @@ def _directed_error(pair: SurfacePair, part: int) -> Tensor:
 
 
 def _planarity(pair: SurfacePair) -> tuple[Tensor, Tensor]:
-    """Return the planarity errors, means over the planes of the region ``planes``, (B,) each."""
+    """Return the planarity errors, means over the large planes of the region ``planes``, (B,) each.
+
+    NaN if one of them has no prediction.
+    """
     numbers = pair.regions[PLANES]
     count = max(int(numbers.max()), 1)
     planes = numbers == torch.arange(1, count + 1, dtype=numbers.dtype, device=numbers.device).view(1, -1, 1, 1)
-    flatness, orientation = (each.nanmean(dim=1) for each in planarity(pair, planes))
+    large = planes.double().mean(dim=(2, 3)) >= PLANE_SHARE
+    flatness, orientation = (
+        torch.where(large, each, 0).sum(dim=1) / large.sum(dim=1) for each in planarity(pair, planes)
+    )
     return flatness, orientation
+
+
+def _planes_covered(pair: SurfacePair) -> Tensor:
+    return covered(pair.within(PLANES))
 
 
 def _planarity_error(pair: SurfacePair, part: int) -> Tensor:
@@ -350,6 +361,7 @@ METRICS: tuple[Metric, ...] = (
     _directed(2, "beyond"),
     _plane(0, "flatness", "mm", 1e3),
     _plane(1, "orientation", "deg", 1),
+    Metric("PE_covered", _planes_covered, true_mask, _shown("PE", "covered, %"), min_size=1, region=PLANES, whole=True),
     Metric("Boundary_covered", covered, true_mask, _shown("Covered", "%"), min_size=1, whole=True),
 )
 """The metrics of ``metrics=boundaries``."""

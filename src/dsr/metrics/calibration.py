@@ -319,6 +319,7 @@ METRICS: tuple[Metric, ...] = (
         MetricFormat("Covered", "stated, %", 1e2, 1, higher_is_better=True, position=BEFORE_THE_PAPER),
         min_size=1,
         stated="depth_error",
+        regional=True,
         whole=True,
     ),
 )

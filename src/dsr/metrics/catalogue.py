@@ -142,11 +142,8 @@ def catalogue(
     if not protocols or not set(protocols) <= set(PROTOCOLS):
         raise ValueError(f"protocols: expected some of {', '.join(PROTOCOLS)}, got {', '.join(protocols) or 'none'}")
     metrics = (*(metric for name in dict.fromkeys(protocols) for metric in PROTOCOLS[name]), *extra)
-    pixelwise = [
-        each for each in metrics if each.mask in (depth_mask, normal_mask) and each.format.position is not None
-    ]
-    pixelwise = [each for each in pixelwise if not (each.per_light or each.perceptual or each.region)]
-    metrics = (*metrics, *(each.within(region) for region in regions for each in pixelwise))
+    of_regions = [each for each in metrics if each.in_regions]
+    metrics = (*metrics, *(each.within(region) for region in regions for each in of_regions))
     names = [metric.name for metric in metrics]
     for name in names:
         if names.count(name) > 1:

@@ -130,6 +130,7 @@ METRICS: tuple[Metric, ...] = (
         MetricFormat("Covered", "%", 1e2, 1, higher_is_better=True, position=BEFORE_THE_PAPER),
         min_size=1,
         unit="cm",
+        regional=True,
         whole=True,
     ),
 )

@@ -33,6 +33,8 @@ class Metric:
         unit: name of the unit of the benchmarks that it is for, see :class:`dsr.sample.Unit`; None for all of them.
         region: the part of the image that it is of, see :class:`dsr.sample.Scene`; None for all of it. It is left out
             where a scene has no such region.
+        regional: whether tables of regions have it; None for metrics that are means over the pixels with a depth, or
+            a normal, in both maps.
         whole: whether it is computed of the whole image even where a method left out rows or columns at the border.
         stated: the expected errors of the method that it compares, ``depth_error`` or ``angle_error``; it is left out
             for methods that state none. None if it needs none.
@@ -49,6 +51,7 @@ class Metric:
     network: LPIPS | None = field(default=None, repr=False, compare=False)
     unit: str | None = None
     region: str | None = None
+    regional: bool | None = None
     whole: bool = False
     stated: str | None = None
 
@@ -56,6 +59,13 @@ class Metric:
         """Return whether the metric is for the pair's benchmark, and there are the region and errors that it needs."""
         known = self.stated is None or getattr(pair, self.stated) is not None
         return known and self.unit in (None, pair.unit.name) and (self.region is None or self.region in pair.regions)
+
+    @property
+    def in_regions(self) -> bool:
+        """Whether tables of regions have it."""
+        if self.per_light or self.perceptual or self.region is not None or self.format.position is None:
+            return False
+        return self.mask in (depth_mask, normal_mask) if self.regional is None else self.regional
 
     def within(self, region: str) -> Metric:
         """Return the metric of a region, ``NAME@REGION``."""

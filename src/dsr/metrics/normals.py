@@ -62,6 +62,13 @@ METRICS: tuple[Metric, ...] = (
     Metric("Normal_mean", mean, normal_mask, _shown("Mean angle", "forward, deg", 1, 2)),
     Metric("Normal_median", median, normal_mask, _shown("Median angle", "forward, deg", 1, 2)),
     *map(_within, ANGLES),
-    Metric("Normal_covered", covered, _true_normals, _shown("Covered", "normals, %", 1e2, higher=True), whole=True),
+    Metric(
+        "Normal_covered",
+        covered,
+        _true_normals,
+        _shown("Covered", "normals, %", 1e2, higher=True),
+        regional=True,
+        whole=True,
+    ),
 )
 """The metrics of ``metrics=normals``."""

@@ -189,7 +189,13 @@ METRICS: tuple[Metric, ...] = (
     Metric("Plane_std", deviation, depth_mask, _shown("Std", "plane, mm", 1e3, 2), unit="cm"),
     Metric("Plane_angle", angle, depth_mask, _shown("Angle", "plane, central, deg", 1, 1), min_size=3),
     Metric(
-        "Plane_covered", covered, target_mask, _shown("Covered", "plane, %", 1e2, 1, higher=True), unit="cm", whole=True
+        "Plane_covered",
+        covered,
+        target_mask,
+        _shown("Covered", "plane, %", 1e2, 1, higher=True),
+        unit="cm",
+        regional=True,
+        whole=True,
     ),
 )
 """The metrics of ``metrics=plane``."""

@@ -159,6 +159,7 @@ METRICS: tuple[Metric, ...] = (
         _shown("Flying", "1 % of depth, %", 1e2, 2),
         min_size=1,
         unit="cm",
+        regional=False,  # the outlines of a region's objects are edges of what lies outside
         whole=True,
     ),
     Metric("Points_chamfer", chamfer, target_mask, _shown("Chamfer", "mm", 1e3, 2), min_size=1, unit="cm", whole=True),

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from dsr.evaluation.results import Results
-from dsr.metrics.formats import LIGHTS_NOTE, Formats
+from dsr.metrics.formats import LIGHTS_NOTE, PAPER, Formats, by_family
 from dsr.pictures.canvas import write_figure
 from dsr.report.correlations import DEPTH_LIMIT, REFERENCE, correlate, metric_matrix, pairs, with_reference
 
@@ -68,7 +68,7 @@ def save_scatter_matrix(folder: Path, results: Results) -> list[Path]:
     labels = [label for label in results.methods() if label in matrix.index.get_level_values("label")]
     ranking = with_reference(matrix)
     with mpl.rc_context(_STYLE):
-        figures = {"scatter_matrix": scatter_matrix(matrix, labels, results.formats)}
+        figures = {"scatter_matrix": scatter_matrix(matrix, labels, by_family(results.formats).get(PAPER, {}))}
         if len(ranking):
             figures["with_lpips"] = _ranking(ranking, len(matrix))
         paths = []

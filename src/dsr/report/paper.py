@@ -18,6 +18,8 @@ from dsr.evaluation.results import Run
 
 PAPER_METHODS = {"bicubic": "Bicubic", "dip": "DIP", "dip_v": "DIP-V", "msg": "MSG", "msg_v": "MSG-V"}
 """Method names of the paper by name in ``scores.csv``, where the label may differ from them."""
+OF_FILES = ("external", "monocular", "onnx", "torchscript")
+"""Methods whose maps or networks are files of a user's."""
 REIMPLEMENTED = ("SRfS", "EG", "PDN", "DG")
 """Methods that the paper ran with other programs or weights than dsr's."""
 PAPER_FILES = {
@@ -98,8 +100,11 @@ def _is_papers(run: Run, scene: str) -> bool:
 
 
 def paper_name(run: Run) -> str:
-    """Return the name that a run's method has in the paper, if it is there."""
-    return PAPER_METHODS.get(run.method, run.label)
+    """Return the name that a run's method has in the paper, if it is there.
+
+    Maps and networks of files have labels of their own, which say nothing of how they were made.
+    """
+    return PAPER_METHODS.get(run.method, f"{run.label} ({run.method})" if run.method in OF_FILES else run.label)
 
 
 def paper_row(name: str, runs: Sequence[Run], scenes: Iterable[str]) -> pd.Series | None:
