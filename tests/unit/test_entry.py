@@ -283,7 +283,7 @@ def test_config_dir_adds_choices(command, tmp_path):
     assert (code, error, config.method.strength) == (0, "", 2)
     code, error, _ = command("method=mein", "--config-dir=own")
     assert code == 2
-    assert "mine, msg" in error
+    assert "mine, monocular" in error
     code, error, _ = command("-cd", "own", "method=mine", "method.strenth=2")
     assert (code, error) == (2, "error: method.strenth: unknown key; expected method.strength=2\n")
 

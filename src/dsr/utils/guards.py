@@ -14,7 +14,7 @@ import os
 import re
 import stat
 import zipfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator
 from io import BufferedReader
 from numbers import Real
 from pathlib import Path, PurePath, PurePosixPath
@@ -217,7 +217,7 @@ def naming(place: object) -> Iterator[None]:
         raise ValueError(f"{place}: {error}") from error
 
 
-def expect_one_of(key: str, value: object, known: Sequence[str | None]) -> None:
+def expect_one_of(key: str, value: object, known: Collection[str | None]) -> None:
     """Raise a ValueError if a key's value is not one of those that are known."""
     if value not in known:
         names = ", ".join("null" if each is None else each for each in known)
