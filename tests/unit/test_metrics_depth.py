@@ -144,7 +144,8 @@ def test_classes_are_the_metrics_of_their_protocols() -> None:
     means = compute_means(metrics)
     for made, name in (
         (AbsRel(), "Depth_AbsRel"),
-        (DeltaAccuracy(105), "Depth_delta_105"),
+        (DeltaAccuracy(1.05), "Depth_delta_105"),
+        (DeltaAccuracy(1.25**3), "Depth_delta_125_3"),
         (SIlog(), "Depth_SIlog"),
         (NormalAngle(median=True), "Normal_median"),
         (NormalsWithin(7.5), "Normal_within_7_5"),

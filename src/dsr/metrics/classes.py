@@ -62,7 +62,9 @@ class PerImageMean(torchmetrics.Metric):
         self._total = f"total_{metric.name}_{self._variant}"  # else compute groups merge metrics of equal first values
         self.add_state(self._total, torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
         self.add_state("count", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
-        self.add_state("applied", torch.tensor(metric.unit is metric.stated is None), dist_reduce_fx="max")
+        self.add_state(
+            "applied", torch.tensor(metric.unit is metric.region is metric.stated is None), dist_reduce_fx="max"
+        )
 
     @property
     def format(self) -> MetricFormat:
@@ -126,10 +128,11 @@ def _named(name: str) -> Metric:
     return _KNOWN[name]
 
 
-def _with_threshold(name: str, threshold: float, unit: str = "") -> Metric:
+def _with_threshold(name: str, threshold: float | str, unit: str = "") -> Metric:
     """Return the catalogue's metric of this name and threshold."""
+    text = threshold if isinstance(threshold, str) else f"{threshold:g}"
     try:
-        return _named(f"{name}_{threshold:g}{unit}".replace(".", "_"))
+        return _named(f"{name}_{text}{unit}".replace(".", "_"))
     except KeyError:
         choices = ", ".join(known for known in _KNOWN if known.startswith(name))
         raise ValueError(f"threshold: expected one that gives {choices}; got {threshold!r}") from None
@@ -207,10 +210,12 @@ class AbsRel(PerImageMean):
 
 
 class DeltaAccuracy(PerImageMean):
-    """delta, the fraction of pixels whose depths have a ratio of less than 105, 110 or 125 percent."""
+    """delta, the fraction of pixels whose depths have a ratio of less than 1.05, 1.1, 1.25, 1.25**2 or 1.25**3."""
 
-    def __init__(self, threshold: int = 125, **settings: Any) -> None:
-        super().__init__(_with_threshold("Depth_delta", threshold), **settings)
+    def __init__(self, threshold: float = 1.25, **settings: Any) -> None:
+        powers = {round(1.25**power, 6): f"125_{power}" for power in (2, 3)}
+        name = powers.get(round(threshold, 6), f"{100 * threshold:.5g}")
+        super().__init__(_with_threshold("Depth_delta", name), **settings)
 
 
 class SIlog(PerImageMean):

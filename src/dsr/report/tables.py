@@ -433,7 +433,7 @@ def _notes(groups: Sequence[Group], columns: Formats) -> Iterator[str]:
         yield "Mean ± sample standard deviation over seeds; seeds are averaged within each scene, then scenes."
     if any(cell.by_scene and cell.interval for cell in cells):
         yield f"[low, high]: 95 % interval of the average, by a bootstrap over the scenes (of {LEAST} or more)."
-        yield "*: better than the second best, p < .05 by a paired bootstrap; not corrected for many tests."
+        yield "*: better than the second best, p < .05 by a paired permutation test; not corrected for many tests."
     if any(not cell.complete for cell in cells):
         yield "(k of n): an average over k of the n scenes; it is not compared with the others."
     note = implementation_note(row.label for row in rows if row.published)
