@@ -100,6 +100,17 @@ def test_holes_stay_holes_and_a_scale_is_fitted_around_them(sample: DepthSample,
     assert float((depth / full(sample) - 1).nan_to_num().abs().max()) < 0.02
 
 
+def test_zeros_of_a_fitted_depth_map_are_holes(sample: DepthSample, tmp_path: Path) -> None:
+    values = (100 * truth(sample) + 20).round().astype(np.uint16)
+    values[4:20, 3:30] = 0
+    write(tmp_path, "hall.png", values)
+    method = External(str(tmp_path), fit="affine")
+    depth = method(sample)
+    assert torch.equal(depth.isnan()[0], torch.from_numpy(values == 0))
+    assert float((depth / full(sample) - 1).nan_to_num().abs().max()) < 0.03
+    assert "whole numbers" in method.describe(sample)
+
+
 def test_line_passes_through_most_points() -> None:
     x = torch.linspace(0, 1, 101, dtype=torch.float64)
     y = 3 * x + 2
@@ -177,5 +188,7 @@ def test_two_files_of_a_scene_and_a_missing_one_are_refused(sample: DepthSample,
         External(str(tmp_path))(sample)
     for name in ("hall.npy", "hall.npz"):
         write(tmp_path, name, truth(sample))
+    assert External(str(tmp_path)).remarks("set", ["hall"], 4) == []
+    assert External(str(tmp_path)).content("set", "hall", 4) is not None
     with pytest.raises(ValueError, match=r"expected one map of hall, got hall.npy, hall.npz"):
         External(str(tmp_path))(sample)

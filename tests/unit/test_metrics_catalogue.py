@@ -202,3 +202,23 @@ def test_planes_of_a_region_have_a_planarity_error() -> None:
         assert (error["PE_orientation"] < 1e-3) or not flat
     rows = score_image(target, target, CAMERA.rays(), metrics)
     assert not any(row.metric.startswith("PE_") for row in rows)
+
+
+def test_holes_neither_hide_a_bad_plane_nor_a_bad_region() -> None:
+    v, u = torch.meshgrid(torch.arange(40).double(), torch.arange(48).double(), indexing="ij")
+    target = 1 / (0.5 + 0.002 * (u - CAMERA.cx))[None]
+    planes = (1 + (v >= 20))[None].to(torch.uint8)
+    prediction = target * (1 + 0.02 * (planes == 2) * (u.remainder(2) - 0.5))
+    holed = prediction.masked_fill(planes == 2, torch.nan)
+    glass = (planes == 2).to(torch.uint8)
+    metrics = catalogue(protocols=["boundaries", "depth", "normals"], regions=["glass"])
+    regions = {"planes": planes, "glass": glass}
+    whole, less = (
+        {row.metric: row.value for row in score_image(maps, target, CAMERA.rays(), metrics, regions=regions)}
+        for maps in (prediction, holed)
+    )
+    assert whole["PE_flatness"] > 1e-3
+    assert math.isnan(less["PE_flatness"])
+    assert (whole["PE_covered"], less["PE_covered"]) == (1, 0.5)
+    assert (whole["Depth_covered@glass"], less["Depth_covered@glass"]) == (1, 0)
+    assert less["Normal_covered@glass"] == 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from small_scenes import plane, random_scene, sample_of
@@ -178,6 +179,36 @@ def test_photo_is_resized_for_a_network_that_sees_it_alone(tmp_path: Path) -> No
         found = found if output == "orthogonal" else to_range(found, problem.camera, "disparity")
         inner = (slice(None), slice(None), slice(4, -4))  # the kernel ends at the border
         torch.testing.assert_close(found[inner], factor * (4 + ramp[:1].double())[inner], rtol=0, atol=1e-3)
+
+
+def test_content_follows_weights_that_lie_beside_the_graph(tmp_path: Path) -> None:
+    onnx = pytest.importorskip("onnx")
+    helper, kind = onnx.helper, onnx.TensorProto.FLOAT
+    found = []
+    for value in (1.0, 0.5):
+        shape = ["n", 1, "h", "w"]
+        maps = [helper.make_tensor_value_info(name, kind, shape) for name in ("depth", "out")]
+        weight = helper.make_tensor("w", kind, [256], np.full(256, value, "<f4").tobytes(), raw=True)
+        nodes = [
+            helper.make_node("ReduceMean", ["w"], ["m"], keepdims=0),
+            helper.make_node("Mul", ["depth", "m"], ["out"]),
+        ]
+        model = helper.make_model(
+            helper.make_graph(nodes, "g", maps[:1], maps[1:], [weight]),
+            opset_imports=[helper.make_opsetid("", 18)], ir_version=9,
+        )  # fmt: skip
+        beside = {"save_as_external_data": True, "location": "net.data", "size_threshold": 0}
+        (tmp_path / "net.data").unlink(missing_ok=True)
+        onnx.save_model(model, str(tmp_path / "net.onnx"), **beside)
+        found.append((
+            (tmp_path / "net.onnx").read_bytes(),
+            NetworkFile(str(tmp_path / "net.onnx"), {"depth": "up"}).content("set", "hall", 4),
+        ))  # fmt: skip
+    assert found[0][0] == found[1][0]
+    assert found[0][1] != found[1][1]
+    (tmp_path / "net.data").unlink()
+    with pytest.raises(ValueError, match=r"net.onnx: expected its weights in .*net.data"):
+        NetworkFile(str(tmp_path / "net.onnx"), {"depth": "up"})
 
 
 @pytest.mark.parametrize("name", ["bad.onnx", "bad.pt"])

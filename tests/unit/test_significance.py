@@ -27,7 +27,7 @@ def test_few_scenes_have_no_interval_and_no_significant_difference() -> None:
 
 
 def test_exact_test_is_that_of_another_library() -> None:
-    first, second = np.random.default_rng(5).normal(0, 1, (2, 9)) + [[0.8], [0]]
+    first, second = np.random.default_rng(5).normal([[0.8], [0]], 1, (2, 9))
     theirs = permutation_test((first, second), lambda a, b: np.mean(a - b), permutation_type="samples").pvalue
     assert p_of_difference(first.tolist(), second.tolist()) == pytest.approx(theirs)
 

@@ -125,6 +125,7 @@ class NetworkFile(Method):
         self._quantity, self._scaled, self._output = range_type, range is not None, output
         self._fit: Fit | None = fit  # type: ignore[assignment]  # it has been checked
         self._result, self._multiple, self.device = result, multiple, torch.device(device)
+        self._weights = self._files_of_weights() if self._path.suffix.lower() == ".onnx" else []
         self._runs: dict[int, _Run] = {}
         self._load(threads=1)  # its errors, before anything is computed
 
@@ -178,8 +179,20 @@ class NetworkFile(Method):
         return describe_fit(self._fit)
 
     def content(self, dataset: str, scene: str, scale: float) -> str:
-        """Return the SHA-256 of the network's file."""
-        return _hash(self._path, self._path.stat())
+        """Return the SHA-256 of the network's file, and of those that hold its weights."""
+        return ", ".join(_hash(file, file.stat()) for file in (self._path, *self._weights))
+
+    def _files_of_weights(self) -> list[Path]:
+        """Return the files beside an ONNX file that hold its weights, as those of more than 2 GB do."""
+        onnx = import_library("onnx", f"method.path={self._path}")
+        with refusing(f"{self._path}: expected an ONNX file, got a damaged or foreign one", Exception):
+            weights = onnx.load(str(self._path), load_external_data=False).graph.initializer
+            outside = [entry.value for each in weights for entry in each.external_data if entry.key == "location"]
+        found = [self._path.parent / name for name in dict.fromkeys(outside)]
+        for file in found:
+            if not file.is_file():
+                raise ValueError(f"{self._path}: expected its weights in {file}, there is no such file")
+        return found
 
     def _padded(self, picture: Tensor, size: tuple[int, int]) -> Tensor:
         """Return a picture continued to as many pixels as make the photo's size a multiple."""
