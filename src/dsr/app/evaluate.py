@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import hashlib
 import math
-import os
 import random
 import shutil
 from collections.abc import Iterator, Mapping
@@ -42,7 +41,7 @@ from dsr.utils.compute_device import fast_precision, pick_device
 from dsr.utils.configuration import ConfigError
 from dsr.utils.console import ConsoleProgress, note_once, open_console, print_error, show
 from dsr.utils.ratios import NATIVE, match_ratio
-from dsr.utils.versions import file_hash
+from dsr.utils.versions import hash_once
 
 _OBJECTIVE = "RMSE_v"
 
@@ -300,18 +299,12 @@ def _weights(settings: EvalConfig, recipe: Recipe) -> Path | None:
 def _hash_weights(files: list[Path]) -> str | None:
     """Return the SHA-256 of a file of weights, or of those of several and of those that they need; None without any."""
     try:
-        hashes = [_hash(each, each.stat()) for file in files for each in files_of_weights(file)]
+        hashes = [hash_once(each) for file in files for each in files_of_weights(file)]
     except (ValueError, OSError) as error:
         raise ConfigError(str(error)) from error
     if len(hashes) < 2:
         return next(iter(hashes), None)
     return hashlib.sha256("".join(hashes).encode()).hexdigest()
-
-
-@functools.cache
-def _hash(path: Path, _: os.stat_result) -> str:
-    """Return the SHA-256 of a file, which jobs of a multirun share, as long as it is the same one."""
-    return file_hash(path)
 
 
 def _known_of_maps(settings: EvalConfig, downsampling: Downsampling | Measured, source: SceneSource) -> Known:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -19,7 +18,6 @@ from dsr.io.depth_files import DEPTH_SUFFIXES, read_array_file
 from dsr.io.images import read_pixels
 from dsr.notes import Assumption
 from dsr.utils.guards import pixels_beside
-from dsr.utils.versions import file_hash
 
 Record = dict[str, str | int]
 """What identifies an input in ``info.json``: its name, its SHA-256, and a frame's number if it has one."""
@@ -189,17 +187,6 @@ def file_state(path: Path, kind: str) -> tuple[int, int]:
     if not path.is_file():
         raise ValueError(f"{path}: expected {kind}, there is none")
     return path.stat().st_size, path.stat().st_mtime_ns
-
-
-def hash_once(path: Path, kind: str) -> str:
-    """Return the SHA-256 of a file that many frames share, computed once for each :func:`file_state`."""
-    return _hash(path, file_state(path, kind))
-
-
-@functools.lru_cache(maxsize=4)
-def _hash(path: Path, _: tuple[int, int]) -> str:
-    """Return the SHA-256 of a file."""
-    return file_hash(path)
 
 
 def find_highest(paths: Sequence[Path]) -> float:

@@ -242,7 +242,7 @@ def planarity(
         spread, normal = _fit_plane(pair.prediction * factor * pair.rays, mask)
         true = _fit_plane(pair.target * pair.rays, mask)[1] if normals is None else normals[:, index].to(normal)
         angle = torch.atan2(torch.linalg.cross(normal, true).norm(dim=1), (normal * true).sum(dim=1).abs())
-        large = planes[:, index].double().mean(dim=(1, 2)) >= smallest
+        large = (planes[:, index].double().mean(dim=(1, 2)) >= smallest) & mask.flatten(1).any(dim=1)
         flatness.append(torch.where(large, spread, torch.nan))
         orientation.append(torch.where(large, angle.rad2deg(), torch.nan))
     return torch.stack(flatness, dim=1), torch.stack(orientation, dim=1)

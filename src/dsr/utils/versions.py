@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import importlib.util
 import platform
@@ -71,6 +72,17 @@ def file_hash(path: Path, progress: Task = lambda *_: None) -> str:
             digest.update(chunk)
             progress(file.tell(), total)
     return digest.hexdigest()
+
+
+def hash_once(path: Path) -> str:
+    """Return the SHA-256 of a file that is asked for often, computed once for each size and time of change."""
+    state = path.stat()
+    return _hash(path, state.st_size, state.st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=256)
+def _hash(path: Path, _size: int, _changed: int) -> str:
+    return file_hash(path)
 
 
 def hash_outside_code(targets: Iterable[str]) -> str | None:

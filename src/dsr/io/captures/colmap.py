@@ -31,11 +31,12 @@ import numpy as np
 
 from dsr.geometry.lens import Lens
 from dsr.geometry.rigid_motion import from_quaternion, invert
-from dsr.io.frames import CaptureFrame, Geometry, Record, file_state, hash_once
+from dsr.io.frames import CaptureFrame, Geometry, Record, file_state
 from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult
 from dsr.io.trajectories import intrinsics_camera
 from dsr.notes import Assumption
 from dsr.utils.guards import leads_outside, naming, natural_key, numbers_in, read_limited
+from dsr.utils.versions import hash_once
 
 _APP = "COLMAP"
 _PLACES = (".", "sparse/0", "sparse", "colmap/sparse/0")
@@ -259,7 +260,7 @@ class SparseDepth:
         """Return a hash of the file of points, and the image's name."""
         return {
             "file": f"{self.file.name}/{self.image.name}",
-            "sha256": hash_once(self.file, "points"),
+            "sha256": hash_once(self.file),
         }
 
 

@@ -31,12 +31,13 @@ import cv2
 import numpy as np
 
 from dsr.geometry.camera import Camera
-from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry, Record, file_state, hash_once
+from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry, Record, file_state
 from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult, numbered_files
 from dsr.io.trajectories import USUAL_SIZE, describe_capture, fitting_camera, pose_from_quaternion, read_text
 from dsr.notes import Assumption
 from dsr.utils.decoding import quiet_decoders
 from dsr.utils.guards import expect_pixels, numbers_in
+from dsr.utils.versions import hash_once
 
 _APP = "Stray Scanner"
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -197,7 +198,7 @@ class VideoFrame:
         return {
             "file": self.file.name,
             "frame": self.index,
-            "sha256": hash_once(self.file, "a video"),
+            "sha256": hash_once(self.file),
         }
 
 

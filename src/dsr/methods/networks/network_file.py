@@ -6,7 +6,6 @@ how the map was enlarged. The configuration declares it.
 
 from __future__ import annotations
 
-import functools
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -35,7 +34,7 @@ from dsr.sample import DepthSample
 from dsr.utils.guards import expect_one_of, refusing
 from dsr.utils.progress import Steps
 from dsr.utils.ratios import round_ratio
-from dsr.utils.versions import file_hash
+from dsr.utils.versions import hash_once
 
 _IMAGES: Mapping[str, Callable[[Tensor], Tensor]] = {
     "image": lambda rgb: rgb,
@@ -180,7 +179,7 @@ class NetworkFile(Method):
 
     def content(self, dataset: str, scene: str, scale: float) -> str:
         """Return the SHA-256 of the network's file, and of those that hold its weights."""
-        return ", ".join(_hash(file, file.stat()) for file in (self._path, *self._weights))
+        return ", ".join(hash_once(file) for file in (self._path, *self._weights))
 
     def _files_of_weights(self) -> list[Path]:
         """Return the files beside an ONNX file that hold its weights, as those of more than 2 GB do."""
@@ -255,8 +254,3 @@ def _limits(given: Any) -> Tensor:
     if isinstance(given, str) or len(given) != 2 or not given[0] < given[1]:
         raise ValueError(f"range: expected {MEASURED}, null or two numbers that rise, got {given!r}")
     return torch.tensor([float(each) for each in given], dtype=torch.float64).view(1, 2, 1, 1)
-
-
-@functools.cache
-def _hash(path: Path, _: os.stat_result) -> str:
-    return file_hash(path)

@@ -14,8 +14,6 @@ those of its features. It was trained on the 256 x 192 pixels of ARKit's lidar.
 from __future__ import annotations
 
 import contextlib
-import functools
-import hashlib
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -33,7 +31,7 @@ from dsr.sample import DepthSample
 from dsr.utils.configuration import expect_library
 from dsr.utils.guards import expect_bytes, parse_json, read_limited, refusing
 from dsr.utils.progress import Steps
-from dsr.utils.versions import file_hash
+from dsr.utils.versions import hash_once
 
 SIZE = 756
 """Side in pixels to which the authors' processor brings photos, that which has to be changed less."""
@@ -114,7 +112,7 @@ class PromptDA(Method):
 
     def content(self, dataset: str, scene: str, scale: float) -> str:
         """Return the SHA-256 of the network's files."""
-        return _hash(*((path := self._folder / name, path.stat().st_mtime_ns) for name in (CONFIG, WEIGHTS)))
+        return ", ".join(hash_once(self._folder / name) for name in (CONFIG, WEIGHTS))
 
     def _size_within(self, size: tuple[int, int]) -> tuple[int, int]:
         """Return the height and width that the network gets of a photo."""
@@ -213,8 +211,3 @@ def _silent() -> Iterator[None]:
         logging.set_verbosity(level)
         if shown:
             logging.enable_progress_bar()
-
-
-@functools.cache
-def _hash(*files: tuple[Path, int]) -> str:
-    return hashlib.sha256("".join(file_hash(path) for path, _ in files).encode()).hexdigest()
