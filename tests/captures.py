@@ -345,7 +345,7 @@ def scannet(folder, lost=()):
     return folder
 
 
-def sens(path, *, colour="jpeg", depth="zlib", scale=1000.0, lost=()):
+def sens(path, *, colour="jpeg", depth="zlib", scale=1000.0, lost=(), start=1_000_000, step=33_333):
     """Write a recording of ScanNet."""
     kinds = {"raw": 0, "png": 1, "jpeg": 2}
     parts = [struct.pack("<IQ", 4, 9), b"Structure"]
@@ -359,7 +359,7 @@ def sens(path, *, colour="jpeg", depth="zlib", scale=1000.0, lost=()):
             rgb = cv2.imencode(f".{colour}", photo(number)[..., ::-1])[1].tobytes()
         stored = np.round(scale * globals()["depth"](number)).astype("<u2").tobytes()
         stored = zlib.compress(stored) if depth == "zlib" else stored
-        told = struct.pack("<4Q", 1_000_000 + 33_333 * number, 8, len(rgb), len(stored))
+        told = struct.pack("<4Q", start + step * number, 8, len(rgb), len(stored))
         parts += [matrix.astype("<f4").tobytes(), told, rgb, stored]
     parts.append(struct.pack("<Q", 0))  # of the inertial sensor
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -173,7 +173,9 @@ def _tum(folder: Path) -> PairingResult:
         return PairingResult(())
     photos, depths = (_timed(path) for path in lists)
     partner = match_times(photos, depths)
-    pairs = [Pair(path.stem, path, partner[path], unit=_TUM_UNIT) for path in photos if path in partner]
+    pairs = [
+        Pair(path.stem, path, partner[path], unit=_TUM_UNIT, time=photos[path]) for path in photos if path in partner
+    ]
     used = {*partner, *partner.values()}
     unpaired = [path for path in (*photos, *depths) if path not in used]
     text, truth = "rgb.txt and depth.txt of TUM RGB-D: depth in 1/5000 m (--depth-unit)", folder / "groundtruth.txt"

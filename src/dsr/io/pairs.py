@@ -161,6 +161,7 @@ class Pair:
         capture: what the capture that the pair is of says about it; None if it is of none.
         confidence: where its confidence map is; None for none.
         bits: how far the layout turns values of 16 bits to the left; the unit holds after turning them back.
+        time: of the photo in seconds, if a list beside the files has it.
 
     """
 
@@ -174,6 +175,12 @@ class Pair:
     capture: CaptureFrame | None = field(default=None, compare=False)
     confidence: ConfidenceMap | None = field(default=None, compare=False)
     bits: int = 0
+    time: float | None = None
+
+    @property
+    def own_time(self) -> float | None:
+        """The time in seconds that the capture, or a list of the files, states for the frame; None if neither does."""
+        return self.time if self.capture is None or self.capture.time is None else self.capture.time
 
     @property
     def named_time(self) -> float | None:
