@@ -4,8 +4,6 @@ import json
 import pickle
 import struct
 import tracemalloc
-from dataclasses import replace
-from pathlib import Path
 
 import captures
 import numpy as np
@@ -224,17 +222,18 @@ def test_model_of_a_recording_leaves_it_its_depth_camera_and_its_times(tmp_path)
 
 
 def test_model_of_a_recording_whose_cameras_are_damaged_is_taken_with_a_warning(tmp_path):
-    pytest.importorskip("rosbags")
-    found = find_pairs_of_folder(captures.ros(tmp_path / "a.bag", 1, d=[np.nan, 0, 0, 0, 0]))
-    found = replace(found, pairs=tuple(replace(pair, rgb=Path(pair.name)) for pair in found.pairs))
-    write_binary(tmp_path / "model", "PINHOLE", [f"{pair.name}.jpg" for pair in found.pairs])
+    captures.polycam(tmp_path / "scan")
+    for path in (tmp_path / "scan").rglob("*.json"):
+        path.write_text(json.dumps({**json.loads(path.read_text()), "fx": -1.0}))
+    found = find_pairs_of_folder(tmp_path / "scan")
+    write_binary(tmp_path / "model", "PINHOLE", [pair.rgb.name for pair in found.pairs])
     for number, pair in enumerate(add_model(found, model_file(tmp_path / "model")).pairs):
         for choice in (CameraChoice(), CameraChoice(fov=60)):
             picture = read_picture(pair, Reading(camera=choice))
             np.testing.assert_allclose(picture.pose, pose(number), atol=1e-12)
             assert (picture.camera == Camera(WIDTH, HEIGHT, F, F + 1, CX - 0.5, CY - 0.5)) == (choice.fov is None)
             [warning] = [fact for fact in picture.assumptions if fact.code == "cameras-damaged"]
-            assert "camera_info: lens: expected" in str(warning)
+            assert "camera fx: expected" in str(warning)
 
 
 def test_model_of_a_recording_is_of_no_use_without_its_depth_camera(tmp_path):

@@ -13,11 +13,12 @@ from typing import Literal
 
 from dsr.io.depth_files import READ_SUFFIXES
 from dsr.io.frames import CONFIDENCE_SUFFIXES, CaptureFrame, ConfidenceMap, find_highest
+from dsr.io.photos import HEIC_SUFFIXES
 from dsr.notes import Assumption
 from dsr.utils.guards import natural_key
 
 Role = Literal["rgb", "depth", "other"]
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm")
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm", *HEIC_SUFFIXES)
 _DEPTH_ONLY = (".npy", ".npz", ".pfm", ".exr", ".depth")
 _RGB_WORDS = frozenset({"rgb", "color", "colour", "image", "images", "img", "imgs", "photo", "photos", "picture"})
 _DEPTH_WORDS = frozenset({"depth", "depths", "depthmap", "disparity", "disp", "range"})
