@@ -345,7 +345,7 @@ def scannet(folder, lost=()):
     return folder
 
 
-def sens(path, *, colour="jpeg", depth="zlib", scale=1000.0, lost=()):
+def sens(path, *, colour="jpeg", depth="zlib", scale=1000.0, lost=(), start=1_000_000, step=33_333):
     """Write a recording of ScanNet."""
     kinds = {"raw": 0, "png": 1, "jpeg": 2}
     parts = [struct.pack("<IQ", 4, 9), b"Structure"]
@@ -359,7 +359,7 @@ def sens(path, *, colour="jpeg", depth="zlib", scale=1000.0, lost=()):
             rgb = cv2.imencode(f".{colour}", photo(number)[..., ::-1])[1].tobytes()
         stored = np.round(scale * globals()["depth"](number)).astype("<u2").tobytes()
         stored = zlib.compress(stored) if depth == "zlib" else stored
-        told = struct.pack("<4Q", 1_000_000 + 33_333 * number, 8, len(rgb), len(stored))
+        told = struct.pack("<4Q", start + step * number, 8, len(rgb), len(stored))
         parts += [matrix.astype("<f4").tobytes(), told, rgb, stored]
     parts.append(struct.pack("<Q", 0))  # of the inertial sensor
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -585,7 +585,7 @@ def depth_message(kind, **values):
     return struct.pack(">II", len(unit) + 4, len(unit)) + unit
 
 
-def heic(path, levels, message=None, text="", orientation=1):
+def heic(path, levels, message=None, text="", orientation=1, told=None):
     """Write a HEIC photo with a depth map as iPhones do: a file of two pictures, the second of which is made auxiliary.
 
     Args:
@@ -593,6 +593,7 @@ def heic(path, levels, message=None, text="", orientation=1):
         message: of the map; None for disparity from 0.5 to 2.
         text: XMP of the map.
         orientation: EXIF orientation, by which readers of HEIC turn both.
+        told: what the EXIF data say in its place, which readers of HEIC leave alone.
 
     """
     import pillow_heif  # noqa: PLC0415 - an extra
@@ -606,6 +607,9 @@ def heic(path, levels, message=None, text="", orientation=1):
     path.parent.mkdir(parents=True, exist_ok=True)
     file.save(path, quality=-1, chroma=444, exif=exif.tobytes())
     content = path.read_bytes()
+    if told is not None:
+        entry = struct.pack(">HHI", 0x0112, 3, 1)
+        content = content.replace(entry + struct.pack(">H", orientation), entry + struct.pack(">H", told))
 
     def box(kind, *parts):
         body = b"".join(parts)

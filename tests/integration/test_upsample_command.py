@@ -411,6 +411,8 @@ def test_invalid_arguments_are_refused_in_one_line(pair, tmp_path, capsys, argum
         ("files/photo.png", "files/my_depth.png", "--rgb files/photo.png --depth files/my_depth.png"),
         ("color", "nothing/depth", None),
         ("color", "other", None),
+        ("other", "depth", None),
+        ("color", "other/0.png", None),
     ],
 )
 def test_photos_and_depth_maps_in_two_arguments_are_refused_with_the_options_for_them(
@@ -423,6 +425,18 @@ def test_photos_and_depth_maps_in_two_arguments_are_refused_with_the_options_for
     monkeypatch.chdir(tmp_path)
     message = refused(capsys, main(["upsample", first, second, "-o", "out", "--dry-run"]))
     assert message.endswith(given) if given else "--rgb" not in message
+
+
+def test_damaged_capture_beside_another_folder_is_named(pair, tmp_path, capsys, monkeypatch):
+    for name in ("color", "depth"):
+        (tmp_path / name).mkdir()
+    shutil.copy(pair[0], tmp_path / "color" / "0.png")
+    (tmp_path / "depth" / "scan.sens").write_bytes(bytes(100))
+    monkeypatch.chdir(tmp_path)
+    for places in (("depth", "color"), ("depth/scan.sens", "color")):
+        message = refused(capsys, main(["upsample", *places, "-o", "out", "--dry-run"]))
+        assert "depth/scan.sens: expected a recording of ScanNet" in message
+        assert "--rgb" not in message
 
 
 def test_pictures_that_do_not_fit_each_other_are_refused_in_one_line(pair, tmp_path, capsys):

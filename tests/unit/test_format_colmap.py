@@ -17,7 +17,7 @@ from dsr.geometry.lens import Lens
 from dsr.io.captures.colmap import add_model, model_file
 from dsr.io.inputs import read_picture
 from dsr.io.layouts import find_pairs_of_folder
-from dsr.io.reading import Reading
+from dsr.io.reading import CameraChoice, Reading
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 3
 F, CX, CY = 60.0, 33.0, 23.5
@@ -228,6 +228,51 @@ def test_model_of_a_recording_leaves_it_its_depth_camera_and_its_times(tmp_path)
         np.testing.assert_allclose(geometry.pose, pose(number), atol=1e-12)
         assert geometry.lens == MODELS["OPENCV"][2]
         assert after.capture.record() != before.capture.record()
+
+
+def test_model_of_a_recording_whose_cameras_are_damaged_is_taken_with_a_warning(tmp_path):
+    captures.polycam(tmp_path / "scan")
+    for path in (tmp_path / "scan").rglob("*.json"):
+        path.write_text(json.dumps({**json.loads(path.read_text()), "fx": -1.0}))
+    found = find_pairs_of_folder(tmp_path / "scan")
+    write_binary(tmp_path / "model", "PINHOLE", [pair.rgb.name for pair in found.pairs])
+    for number, pair in enumerate(add_model(found, model_file(tmp_path / "model")).pairs):
+        for choice in (CameraChoice(), CameraChoice(fov=60)):
+            picture = read_picture(pair, Reading(camera=choice))
+            np.testing.assert_allclose(picture.pose, pose(number), atol=1e-12)
+            assert (picture.camera == Camera(WIDTH, HEIGHT, F, F + 1, CX - 0.5, CY - 0.5)) == (choice.fov is None)
+            [warning] = [fact for fact in picture.assumptions if fact.code == "cameras-damaged"]
+            assert "camera fx: expected" in str(warning)
+
+
+def test_model_of_a_recording_is_of_no_use_without_its_depth_camera(tmp_path):
+    photos, depths = [captures.photo().repeat(10, 0).repeat(10, 1)], [np.full((288, 320), 1000, np.uint16)]
+    found = find_pairs_of_folder(captures.kinect(tmp_path / "scan.mkv", photos, depths, calibration=[1]))
+    write_binary(tmp_path / "model", "PINHOLE", [f"{pair.rgb.name}.jpg" for pair in found.pairs])
+    [pair] = add_model(found, model_file(tmp_path / "model")).pairs
+    with pytest.raises(ValueError, match=r"scan\.mkv: calibration\.json: "):
+        read_picture(pair, Reading())
+
+
+@pytest.mark.parametrize("kind", ["binary", "text"])
+def test_points_that_the_model_lacks_are_none_of_a_photo(folder, kind):
+    """A model of the points with even numbers, and one of none."""
+    for path in (folder / "depth").iterdir():
+        path.unlink()
+    WRITERS[kind](folder, "SIMPLE_PINHOLE", NAMES)
+    points = folder / f"points3D.{'bin' if kind == 'binary' else 'txt'}"
+    pair = find_pairs_of_folder(folder).pairs[0]
+    if kind == "text":
+        points.write_text("".join(line + "\n" for line in points.read_text().splitlines()[1::2]))
+    else:
+        each = [struct.pack("<Q3d3Bd", 10 + k, *point, 1, 2, 3, 0.5) + bytes(8) for k, point in enumerate(cloud())]
+        points.write_bytes(struct.pack("<Q", 200) + b"".join(each[::2]))
+    _, _, z, seen = observations(0)
+    found = pair.capture.depth.read()
+    np.testing.assert_allclose(np.nanmin(found), z[seen % 2 == 0].min(), rtol=1e-6)
+    assert 0 < np.isfinite(found).sum() <= (seen % 2 == 0).sum()
+    points.write_bytes(b"# none\n" if kind == "text" else bytes(8))
+    assert np.isnan(pair.capture.depth.read()).all()
 
 
 @pytest.mark.parametrize("outside", ["{}/000.png", "../{}/000.png"])

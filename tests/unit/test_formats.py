@@ -23,6 +23,9 @@ def test_command_prints_the_formats_with_a_word(capsys: pytest.CaptureFixture[st
     printed = capsys.readouterr().out
     assert "Record3D" in printed
     assert "Polycam" not in printed
+    for word in ("found", "tried", "sensor "):  # labels of the rows
+        assert main(["formats", word]) in (0, 2)
+        assert "Polycam" not in capsys.readouterr().out
     assert main(["formats"]) == 0
     printed = capsys.readouterr().out
     assert all(each.name in printed for each in FORMATS)

@@ -12,7 +12,8 @@ from PIL import Image
 from dsr.cli import main
 from dsr.io.inputs import read_picture
 from dsr.io.layouts import find_pairs_of_folder
-from dsr.io.pairs import Pair
+from dsr.io.pairs import Pair, find_pairs_of_lists
+from dsr.io.photos import read_heic, read_photo
 from dsr.io.reading import CameraChoice, Reading
 
 pytest.importorskip("pillow_heif")
@@ -122,6 +123,52 @@ def test_photo_of_a_pair_may_be_heic_and_is_turned_as_its_jpeg_would_be(tmp_path
     assert float((heic.rgb - jpeg.rgb).abs().mean()) < 0.02
     assert heic.assumptions == jpeg.assumptions
     np.testing.assert_array_equal(heic.depth_lr[0], depth.astype(np.float32))
+
+
+@pytest.mark.parametrize("told", range(1, 9))
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_photo_is_turned_back_as_its_decoder_turned_it_whatever_the_exif_data_say(tmp_path, orientation, told):
+    path = write(tmp_path / "photo.heic", orientation=orientation, told=told)
+    stored = captures.photo().repeat(4, 0).repeat(4, 1)
+    np.save(tmp_path / "depth.npy", captures.depth())
+    found = read_photo(path, captures.depth().shape)[0].astype(float)
+    if told == 1:
+        stored = read_heic(path)
+    assert found.shape == stored.shape
+    assert np.abs(found - stored).mean() < 4
+
+
+@pytest.mark.parametrize("told", [1, 6])
+def test_camera_of_a_photo_is_turned_with_it_and_not_as_the_exif_data_say(tmp_path, told):
+    numbers = 200.0, 201.0, 120.0, 90.0
+    text = captures.apple_text(numbers=numbers)
+    camera = only(write(tmp_path / "photo.heic", text, orientation=1, told=told)).camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == numbers
+    assert (camera.height, camera.width) == captures.HEIC
+    other = only(write(tmp_path / "turned.heic", text, orientation=6, told=told)).camera
+    assert (other.height, other.width) == captures.HEIC[::-1]
+
+
+@pytest.mark.parametrize("shape", ["folders", "side by side"])
+def test_heic_photos_of_a_folder_belong_to_depth_maps_of_their_names(tmp_path, shape):
+    import pillow_heif  # noqa: PLC0415
+
+    names = ("rgb/{}.heic", "depth/{}.npy") if shape == "folders" else ("{}_rgb.HEIC", "{}_depth.npy")
+    for number in range(2):
+        photo, depth = (tmp_path / name.format(number) for name in names)
+        for path in (photo, depth):
+            path.parent.mkdir(exist_ok=True)
+        pillow_heif.from_pillow(Image.fromarray(captures.photo(number))).save(photo, quality=-1, chroma=444)
+        np.save(depth, captures.depth(number))
+    found = [find_pairs_of_folder(tmp_path).pairs]
+    if shape == "folders":
+        found.append(find_pairs_of_lists([tmp_path / "rgb"], [tmp_path / "depth"]).pairs)
+    for pairs in found:
+        assert len(pairs) == 2
+        for number, pair in enumerate(pairs):
+            picture = read_picture(pair, Reading(camera=CameraChoice(fov=60)))
+            assert np.abs(255 * picture.rgb.permute(1, 2, 0).numpy() - captures.photo(number)).mean() < 3
+            np.testing.assert_allclose(picture.depth_lr[0], captures.depth(number), rtol=1e-5)
 
 
 def test_heic_photo_has_the_camera_of_its_exif_data_and_is_upsampled(tmp_path, capsys):

@@ -15,7 +15,7 @@ from dsr.cli import main
 from dsr.geometry.camera import Camera
 from dsr.io.inputs import read_picture
 from dsr.io.layouts import find_pairs_of_folder
-from dsr.io.reading import Reading
+from dsr.io.reading import CameraChoice, Reading, RigFiles
 
 pytest.importorskip("av")
 
@@ -175,6 +175,23 @@ def test_lens_of_orbbecs_wrapper_is_read_without_a_centre_of_its_own(tmp_path, c
     else:
         (plain,), (picture,) = (pictures(each) for each in (write(tmp_path / "plain.mkv"), path))
         np.testing.assert_array_equal(picture.depth_lr, plain.depth_lr)
+
+
+def test_damaged_calibration_is_named_unless_both_cameras_are_given(tmp_path):
+    calibration = changed(lambda cameras: cameras[1]["Intrinsics"]["ModelParameters"].__setitem__(2, -1.0))
+    (pair,) = find_pairs_of_folder(write(tmp_path / "scan.mkv", calibration=calibration)).pairs
+    matrix, (cx, cy, fx, fy) = matrix_of_colour(), captures.KINECT_IR
+    given = CameraChoice(intrinsics=(matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
+    with pytest.raises(ValueError, match=r"scan\.mkv: calibration\.json: "):
+        read_picture(pair, Reading(camera=given))
+    camera = {"width": 320, "height": 288, "fx": 512 * fx, "fy": 512 * fy, "cx": 512 * cx - 96.5, "cy": 512 * cy - 90.5}
+    (tmp_path / "depth.json").write_text(json.dumps(camera))
+    np.savetxt(tmp_path / "motion.txt", captures.kinect_motion())
+    rig = RigFiles(camera=tmp_path / "depth.json", extrinsics=tmp_path / "motion.txt")
+    picture = read_picture(pair, Reading(camera=given, rig=rig))
+    assert "cameras-damaged" in [fact.code for fact in picture.assumptions]
+    middle = np.nanmedian(picture.depth_lr[0, 100:140, 120:160])
+    assert middle == pytest.approx(DISTANCE, rel=0.1)
 
 
 @pytest.mark.parametrize(

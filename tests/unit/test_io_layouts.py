@@ -365,6 +365,22 @@ def test_folder_of_a_killed_program_is_deleted_by_the_next_one(folder, tmp_path)
         assert len(list(place.iterdir())) == left
 
 
+def test_zip_file_is_unpacked_where_temporary_files_cannot_be_listed(folder, tmp_path, monkeypatch):
+    path = packed(tmp_path / "scan.zip", captures.polycam(folder))
+    place = tmp_path / "temporary"
+    place.mkdir()
+    original = Path.iterdir
+
+    def listed(path):
+        if path == place:
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+        return original(path)
+
+    monkeypatch.setattr("tempfile.tempdir", str(place))
+    monkeypatch.setattr(Path, "iterdir", listed)
+    assert len(find_pairs_of_folder(path).pairs) == FRAMES
+
+
 def test_zip_file_for_which_the_disk_is_too_small_is_not_called_damaged(folder, tmp_path, monkeypatch):
     path = packed(tmp_path / "scan.zip", captures.polycam(folder))
     place = tmp_path / "temporary"

@@ -9,8 +9,10 @@ import pytest
 import realsense
 from scipy.spatial.transform import Rotation
 
+from dsr.io.inputs import read_picture
 from dsr.io.layouts import find_pairs_of_folder
 from dsr.io.pairs import Pair
+from dsr.io.reading import Reading
 from dsr.io.trajectories import read_poses, read_transform
 
 TURN = Rotation.from_euler("xyz", (10, -20, 30), degrees=True)
@@ -150,11 +152,43 @@ def test_frames_of_recordings_get_the_pose_nearest_to_their_own_time(tmp_path, k
             assert frame.name not in found
         else:
             np.testing.assert_array_equal(found[frame.name], trajectory.poses[gaps.argmin()])
-    # times of another clock count from the first frame: as many poses as frames are taken in order
-    found = write_tum(tmp_path, *(step * number + 5000.5 for number in range(len(frames)))).assign(frames)
+    for count in (len(frames), 2):  # times of another clock, also of as many poses as frames
+        with pytest.raises(ValueError, match=rf"times as those of the frames, {start:.3f} to .*, got 5000\.500"):
+            write_tum(tmp_path, *(step * number + 5000.5 for number in range(count))).assign(frames)
+
+
+def write_lists(folder, times, truth=()):
+    """Write lists of TUM RGB-D of pictures whose names are numbers; depth is 10 ms late."""
+    for kind, late in (("rgb", 0.0), ("depth", 0.01)):
+        lines = [f"{time + late} {kind}/{number:06}.png" for number, time in enumerate(times)]
+        (folder / f"{kind}.txt").write_text("\n".join(lines) + "\n")
+        for number in range(len(times)):
+            picture = captures.photo(number) if kind == "rgb" else captures.millimetres(number)
+            captures.save(folder / kind / f"{number:06}.png", picture)
+    if truth:
+        (folder / "groundtruth.txt").write_text("".join(f"{time} 0 0 0 0 0 0 1\n" for time in truth))
+    return find_pairs_of_folder(folder).pairs
+
+
+@pytest.mark.parametrize("truth", [(), (1, 2, 3)])
+def test_frames_of_tum_lists_get_the_pose_nearest_to_the_time_in_the_list(tmp_path, truth):
+    frames = write_lists(tmp_path, (1, 2, 3), truth)
+    found = write_tum(tmp_path, 1, 2, 3, 9).assign(frames)
     assert [found[frame.name][0, 3] for frame in frames] == [0, 1, 2]
-    with pytest.raises(ValueError, match="a pose for each of the 3 frames"):
-        write_tum(tmp_path, 5000.5, 5000.6).assign(frames)
+    assert read_picture(frames[1], Reading()).time == 2
+    with pytest.raises(ValueError, match="expected times as those of the frames"):
+        write_tum(tmp_path, 11, 12, 13).assign(frames)
+
+
+def test_first_frame_of_times_that_begin_at_0_has_one(tmp_path):
+    frames = find_pairs_of_folder(captures.sens(tmp_path / "a.sens", start=0)).pairs
+    found = write_tum(tmp_path, 0.066, 0.033, 0.0, 5).assign(frames)
+    assert [found[frame.name][0, 3] for frame in frames] == [2, 1, 0]
+    assert read_picture(frames[0], Reading()).time == 0
+    frames = find_pairs_of_folder(captures.sens(tmp_path / "b.sens", start=0, step=0)).pairs
+    assert [read_picture(frame, Reading()).time for frame in frames] == [None] * captures.FRAMES
+    found = write_tum(tmp_path, 105, 106, 107).assign(frames)  # in order
+    assert [found[frame.name][0, 3] for frame in frames] == [0, 1, 2]
 
 
 def test_numbers_in_names_suit_more_frames_than_a_time_that_is_one_by_chance(tmp_path):

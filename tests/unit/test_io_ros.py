@@ -1,13 +1,18 @@
 """Recordings of ROS: cameras for window, binning, rectification and distortion, lone files, and RVL."""
 
 import errno
+import os
+import shutil
 import struct
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import captures
 import cv2
 import numpy as np
 import pytest
+import yaml
 from captures import FRAMES, INTRINSICS, SIZE
 
 from dsr.geometry.camera import Camera
@@ -249,10 +254,93 @@ def packed(path, mode):
     ("mode", "said"),
     [
         ("MESSAGE", "a chunk without end, or of more than 268435456 bytes"),
-        ("FILE", "a packed file of more than 268435456 bytes"),
+        ("FILE", "packed files of more than 268435456 bytes"),
     ],
 )
 def test_packed_messages_and_files_are_not_unpacked_to_any_size(tmp_path, mode, said):
     path = packed(tmp_path / "scan", mode)
     with pytest.raises(ValueError, match=f"^{path}: expected a recording of ROS, got a damaged one .{said}"):
         find_pairs_of_folder(path)
+
+
+def zstd():
+    from rosbags.rosbag2 import storage_mcap  # noqa: PLC0415 - an extra
+
+    return storage_mcap.zstd
+
+
+def split(path, contents):
+    """Write a folder of ROS 2 of packed files that a recorder split; of a content that is a name, that file again."""
+    path.mkdir()
+    names = [each if isinstance(each, str) else f"scan_{number}.db3.zstd" for number, each in enumerate(contents)]
+    for name, content in zip(names, contents, strict=True):
+        if not isinstance(content, str):
+            (path / name).write_bytes(content)
+    told = {"version": 5, "storage_identifier": "sqlite3", "relative_file_paths": names, "message_count": 0,
+            "duration": {"nanoseconds": 0}, "starting_time": {"nanoseconds_since_epoch": 0},
+            "topics_with_message_count": [], "compression_format": "zstd", "compression_mode": "FILE"}  # fmt: skip
+    (path / "metadata.yaml").write_text(yaml.safe_dump({"rosbag2_bagfile_information": told}))
+    return path
+
+
+def streamed(count, size):
+    """Packed zeros whose header does not declare how many they are."""
+    packing = zstd().ZstdCompressor()
+    return b"".join(packing.compress(bytes(size)) for _ in range(count)) + packing.flush()
+
+
+@pytest.mark.parametrize("declared", [True, False])
+def test_files_of_a_recording_are_unpacked_to_its_allowance_together(tmp_path, monkeypatch, declared):
+    """Ten files of 60 MiB of zeros each, of which four are within 256 MiB."""
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    one = zstd().compress(bytes(60 << 20)) if declared else streamed(60, 1 << 20)
+    path, written = split(tmp_path / "scan", [one] * 10), []
+    copy = shutil.copyfileobj
+
+    def copied(source, sink):
+        copy(source, sink)
+        written.append(sink.tell())
+
+    monkeypatch.setattr("shutil.copyfileobj", copied)
+    with pytest.raises(ValueError, match=f"^{path}: .*packed files of more than 268435456 bytes"):
+        find_pairs_of_folder(path)
+    assert written == [60 << 20] * 4
+    assert not any((tmp_path / "temporary").iterdir())
+
+
+def test_packed_file_that_is_named_twice_is_refused(tmp_path):
+    path = split(tmp_path / "scan", [zstd().compress(bytes(1 << 10)), "scan_0.db3.zstd"])
+    with pytest.raises(ValueError, match=f"^{path}: .*relative_file_paths names scan_0.db3.zstd twice"):
+        find_pairs_of_folder(path)
+
+
+def test_packed_file_for_which_the_disk_is_too_small_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
+    path = split(tmp_path / "scan", [zstd().compress(bytes(1 << 20))])
+    free = shutil.disk_usage(tmp_path)._replace(free=1 << 19)
+    monkeypatch.setattr("shutil.disk_usage", lambda _: free)
+    monkeypatch.setattr("shutil.copyfileobj", lambda *_: pytest.fail("it was unpacked"))
+    with pytest.raises(FullDiskError, match=r"expected 1\.0 MB to write the file"):
+        find_pairs_of_folder(path)
+
+
+def test_full_folder_of_temporary_files_does_not_matter_to_a_recording_that_is_not_packed(tmp_path, monkeypatch):
+    path = captures.ros(tmp_path / "scan", 2)
+    free = shutil.disk_usage(tmp_path)._replace(free=0)
+    monkeypatch.setattr("shutil.disk_usage", lambda _: free)
+    assert len(find_pairs_of_folder(path).pairs) == FRAMES
+    [content] = path.glob("*.db3")
+    content.write_bytes(content.read_bytes()[:3000])
+    with pytest.raises(ValueError, match=f"^{path}: expected a recording of ROS"):
+        find_pairs_of_folder(path)
+
+
+def test_packed_recording_that_a_killed_program_unpacked_is_deleted_by_the_next_one(tmp_path):
+    path, place = captures.ros(tmp_path / "scan", 2, packed=True), tmp_path / "temporary"
+    place.mkdir()
+    code = "import os, sys; from pathlib import Path; from dsr.io.captures.bags import open_recording\n" \
+           "open_recording(Path(sys.argv[1])); {}"  # fmt: skip
+    environment = {**os.environ, "TMPDIR": str(place), "PYTHONPATH": os.pathsep.join(sys.path)}
+    for end, left in (("os.kill(os.getpid(), 9)", 1), ("os.kill(os.getpid(), 9)", 1), ("", 0)):
+        subprocess.run((sys.executable, "-c", code.format(end), str(path)), env=environment, check=False)
+        assert len(list(place.iterdir())) == left

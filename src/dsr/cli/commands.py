@@ -21,7 +21,7 @@ from dsr.app.requests import (
     ViewRequest,
 )
 from dsr.app.upsample.request import UpsampleRequest
-from dsr.io.formats import FORMATS, show
+from dsr.io.formats import FORMATS, rows, show
 from dsr.utils.options import Options, add_options, build
 
 
@@ -103,7 +103,10 @@ def _examine(request: DoctorRequest, *_: object) -> int:
 def _show_formats(request: FormatsRequest, console: Console, _: object) -> list[str]:
     """Print the formats that are read."""
     words = [word.lower() for word in request.names]
-    found = [each for each in FORMATS if not words or any(word in show([each]).lower() for word in words)]
+    found = [
+        each for each in FORMATS
+        if not words or any(word in text.lower() for word in words for text in rows(each).values())
+    ]  # fmt: skip
     if not found:
         raise ValueError(f"{' '.join(words)}: expected a word of {', '.join(each.name for each in FORMATS)}")
     console.print(show(found), markup=False, highlight=False, soft_wrap=True)

@@ -277,16 +277,18 @@ FORMATS = (
 )
 
 
+def rows(each: Format) -> dict[str, str]:
+    """Return what is said of a format by the labels of its lines, its name first; empty texts are left out."""
+    texts = {"": each.name, "export": each.export, "found by": each.found_by, "read": each.read, "tried": each.tried,
+             "sensor": each.faults, "source": each.source}  # fmt: skip
+    return {label: text.replace("`", "") for label, text in texts.items() if text}
+
+
 def show(formats: Sequence[Format] = FORMATS) -> str:
     """Return formats as text, a block each."""
-    blocks = []
-    for each in formats:
-        rows = {"export": each.export, "found by": each.found_by, "read": each.read, "tried": each.tried,
-                "sensor": each.faults, "source": each.source}  # fmt: skip
-        blocks.append(
-            "\n".join([each.name, *(f"  {name:9}{text.replace('`', '')}" for name, text in rows.items() if text)])
-        )
-    return "\n\n".join(blocks)
+    return "\n\n".join(
+        "\n".join(f"  {label:9}{text}" if label else text for label, text in rows(each).items()) for each in formats
+    )
 
 
 def markdown(formats: Sequence[Format] = FORMATS) -> list[str]:

@@ -81,7 +81,8 @@ class Geometry(NamedTuple):
     capture's own. None if it does not say. ``assumptions``: what was assumed for them. ``lens``: of the photo, and of a
     depth map without a rig, which lies in the photo's pixels; None without distortion. ``rig``: the depth map's own
     camera, of a size of its own as well; None if the map is in the photo's view. ``up``: the axis of the world that
-    points up, one of :data:`UPS`.
+    points up, one of :data:`UPS`. ``damage``: what is wrong with the capture's cameras where others take their place,
+    and no rig is known therefore; empty if nothing is.
     """
 
     camera: Camera | None = None
@@ -90,6 +91,7 @@ class Geometry(NamedTuple):
     lens: Lens | None = None
     rig: Rig | None = None
     up: str = ""
+    damage: str = ""
 
 
 @dataclass(frozen=True)
@@ -105,6 +107,7 @@ class CaptureFrame:
         photo: where the photo is, if it is no file of its own.
         depth: where the depth map is, if it is no file of its own.
         time: of the frame, in seconds; None if the capture does not say.
+        apart: whether the depth map may be that of a camera beside the photo's, so that it is of no use without that.
 
     """
 
@@ -115,6 +118,7 @@ class CaptureFrame:
     photo: Source | None = None
     depth: Source | None = None
     time: float | None = None
+    apart: bool = False
 
     def record(self) -> Record:
         """Return what identifies the description of the camera."""

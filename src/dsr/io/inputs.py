@@ -217,32 +217,39 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
         depth_lr, warped = _to_photo(pair, reading, depth_lr, rig, camera)
         all_assumptions, confidence = (*all_assumptions, *warped), None
     device_name = model_in_exif(pair.rgb) if pair.capture is None else pair.capture.app
-    own = None if pair.capture is None else pair.capture.time
-    time = pair.named_time if own is None else own
+    time = pair.named_time if pair.own_time is None else pair.own_time
     return Picture(
         rgb, depth_lr, camera, encoding, all_assumptions, geometry.pose, confidence, device_name, geometry.up, time
     )
 
 
 def read_geometry(pair: Pair, size: Size, reading: Reading) -> tuple[Geometry, list[Assumption]]:
-    """Return what a pair's capture says of its cameras; nothing, with a warning, if it is damaged and one is given.
+    """Return what a pair's capture says of its cameras.
+
+    If it is damaged and a camera is given, or a model of COLMAP, that is what the model says, else nothing, with a
+    warning.
 
     Args:
         size: of the photo.
 
     Raises:
-        ValueError: it is damaged.
+        ValueError: it is damaged, and no camera is given, or none for a depth map that is not in the photo's view.
 
     """
     if pair.capture is None:
         return Geometry(), []
     try:
-        return pair.capture.geometry(size), []
+        found = pair.capture.geometry(size)
     except ValueError as error:
         if reading.camera == CameraChoice():
             raise
-        text = "the capture's cameras are damaged: the given one is taken, and no pose or depth camera of the capture"
-        return Geometry(), [Assumption(text, str(error), "cameras-damaged", 1)]
+        found = Geometry(damage=str(error))
+    if not found.damage:
+        return found, []
+    if pair.capture.apart and reading.rig is None:
+        raise ValueError(found.damage)
+    text = "the capture's cameras are damaged: the given one is taken, and no pose or depth camera of the capture"
+    return found, [Assumption(text, found.damage, "cameras-damaged", 1)]
 
 
 def _expect_distances(path: Path, depth_lr: Tensor, holes: np.ndarray, range_type: RangeType) -> list[Assumption]:

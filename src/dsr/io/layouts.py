@@ -64,6 +64,10 @@ _LAYOUTS = (
 """A video of ScanNet++ is asked before those of a Kinect."""
 
 
+class NoPairError(ValueError):
+    """There is no pair in a place, and nothing there is damaged."""
+
+
 def find_pairs_of_folder(folder: Path, leave: Path | None = None) -> PairingResult:
     """Return the pairs in a folder of any of these layouts, or in its subfolders.
 
@@ -78,7 +82,8 @@ def find_pairs_of_folder(folder: Path, leave: Path | None = None) -> PairingResu
         leave: folder that is skipped, such as that of the results.
 
     Raises:
-        ValueError: there is no such folder, or no pair in it.
+        NoPairError: there is no pair in it.
+        ValueError: there is no such folder, or a capture in it is damaged.
 
     """
     given = folder
@@ -94,7 +99,7 @@ def find_pairs_of_folder(folder: Path, leave: Path | None = None) -> PairingResu
     found = _search(folder, folder, None if leave is None else leave.resolve(), 0)
     if not found.pairs:
         unpaired = f"; {len(found.unpaired)} pictures have no partner" if found.unpaired else ""
-        raise ValueError(
+        raise NoPairError(
             f"{given}: expected photos and depth maps that belong together, found no pair{unpaired}; "
             f"{describe_content(folder, _MAX_DEPTH)}"
         )
@@ -133,7 +138,7 @@ def _find_at(place: Path, root: Path | None = None) -> PairingResult:
     if capture is not None and (capture.pairs or place.is_file()):
         return capture
     if place.is_file():
-        raise ValueError(f"{place}: expected a folder, or a capture as {', '.join(CAPTURE_FILES)}")
+        raise NoPairError(f"{place}: expected a folder, or a capture as {', '.join(CAPTURE_FILES)}")
     found = PairingResult(())
     for layout in (_scene, _tum, _role_folders, _side_by_side):
         found = add_trajectory(place, layout(place))
@@ -173,7 +178,9 @@ def _tum(folder: Path) -> PairingResult:
         return PairingResult(())
     photos, depths = (_timed(path) for path in lists)
     partner = match_times(photos, depths)
-    pairs = [Pair(path.stem, path, partner[path], unit=_TUM_UNIT) for path in photos if path in partner]
+    pairs = [
+        Pair(path.stem, path, partner[path], unit=_TUM_UNIT, time=photos[path]) for path in photos if path in partner
+    ]
     used = {*partner, *partner.values()}
     unpaired = [path for path in (*photos, *depths) if path not in used]
     text, truth = "rgb.txt and depth.txt of TUM RGB-D: depth in 1/5000 m (--depth-unit)", folder / "groundtruth.txt"

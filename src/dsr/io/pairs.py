@@ -13,11 +13,12 @@ from typing import Literal
 
 from dsr.io.depth_files import READ_SUFFIXES
 from dsr.io.frames import CONFIDENCE_SUFFIXES, CaptureFrame, ConfidenceMap, find_highest
+from dsr.io.photos import HEIC_SUFFIXES
 from dsr.notes import Assumption
 from dsr.utils.guards import natural_key
 
 Role = Literal["rgb", "depth", "other"]
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm")
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm", *HEIC_SUFFIXES)
 _DEPTH_ONLY = (".npy", ".npz", ".pfm", ".exr", ".depth")
 _RGB_WORDS = frozenset({"rgb", "color", "colour", "image", "images", "img", "imgs", "photo", "photos", "picture"})
 _DEPTH_WORDS = frozenset({"depth", "depths", "depthmap", "disparity", "disp", "range"})
@@ -161,6 +162,7 @@ class Pair:
         capture: what the capture that the pair is of says about it; None if it is of none.
         confidence: where its confidence map is; None for none.
         bits: how far the layout turns values of 16 bits to the left; the unit holds after turning them back.
+        time: of the photo in seconds, if a list beside the files has it.
 
     """
 
@@ -174,6 +176,12 @@ class Pair:
     capture: CaptureFrame | None = field(default=None, compare=False)
     confidence: ConfidenceMap | None = field(default=None, compare=False)
     bits: int = 0
+    time: float | None = None
+
+    @property
+    def own_time(self) -> float | None:
+        """The time in seconds that the capture, or a list of the files, states for the frame; None if neither does."""
+        return self.time if self.capture is None or self.capture.time is None else self.capture.time
 
     @property
     def named_time(self) -> float | None:

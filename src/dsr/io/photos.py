@@ -1,9 +1,15 @@
-"""Photos: reading them and their EXIF data (CIPA DC-008, JEITA CP-3451), and writing pictures as PNG."""
+"""Photos: reading them and their EXIF data (CIPA DC-008, JEITA CP-3451), and writing pictures as PNG.
+
+Decoders of HEIC turn a photo as its properties ``irot`` and ``imir`` say (ISO/IEC 23008-12; libheif/box.cc of
+https://github.com/strukturag/libheif), whatever its EXIF data say.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import struct
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +45,8 @@ def read_photo(path: Path, size_lr: Size) -> tuple[np.ndarray, list[Assumption]]
     """Return the photo, (H, W, 3) uint8 RGB, turned upright only if the depth map fits so, and the assumptions."""
     orientation = orientation_of(path)
     if path.suffix.lower() in HEIC_SUFFIXES:
-        pixels = _TURNS.get(_BACK.get(orientation, orientation), np.asarray)(read_heic(path))
+        turned = 1 if orientation == 1 else turned_in_heic(path)
+        pixels = _TURNS.get(_BACK.get(turned, turned), np.asarray)(read_heic(path))
     else:
         pixels = cv2.cvtColor(read_pixels(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION), cv2.COLOR_BGR2RGB)
     if orientation == 1:
@@ -55,7 +62,7 @@ def read_photo(path: Path, size_lr: Size) -> tuple[np.ndarray, list[Assumption]]
 
 
 def read_heic(path: Path) -> np.ndarray:
-    """Return the photo of a HEIC file, (H, W, 3) uint8 RGB, upright.
+    """Return the photo of a HEIC file, (H, W, 3) uint8 RGB, turned as :func:`turned_in_heic` says.
 
     Raises:
         ValueError: it is missing, damaged or grey, or pillow-heif is missing.
@@ -66,6 +73,48 @@ def read_heic(path: Path) -> np.ndarray:
     if pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
         raise ValueError(f"{path}: expected a colour photo, got {image.mode}")
     return pixels[..., :3]
+
+
+def turned_in_heic(path: Path) -> int:
+    """Return the EXIF orientation that says how the decoder turns the photo of a HEIC file, 1 (not at all) to 8."""
+    probe = np.arange(6).reshape(2, 3, 1)
+    turned = probe
+    for kind, value in _properties(read_limited(path, MOST_FILE)):
+        if kind == b"irot":
+            turned = np.rot90(turned, value & 3)
+        elif kind == b"imir":
+            turned = turned[:, ::-1] if value & 1 else turned[::-1]
+    return next(each for each in range(1, 9) if np.array_equal(_TURNS.get(each, np.asarray)(probe), turned))
+
+
+def _properties(content: bytes) -> Iterator[tuple[bytes, int]]:
+    """Yield kind and first byte of each property of the photo of a HEIC file, in order; ends where it is damaged."""
+    with contextlib.suppress(struct.error, KeyError, IndexError):  # which the decoder refuses
+        meta = dict(_boxes(dict(_boxes(memoryview(content)))[b"meta"][4:]))
+        parts = list(_boxes(meta[b"iprp"]))
+        kinds = [each for kind, part in parts if kind == b"ipco" for each in _boxes(part)]
+        (photo,) = struct.unpack_from(">I" if meta[b"pitm"][0] else ">H", meta[b"pitm"], 4)
+        for table in (part for kind, part in parts if kind == b"ipma"):
+            head, wide, place = ">IB" if table[0] else ">HB", 1 + (table[3] & 1), 8
+            for _ in range(struct.unpack_from(">I", table, 4)[0]):
+                item, count = struct.unpack_from(head, table, place)
+                place += struct.calcsize(head)
+                for start in range(place, place + wide * count, wide) if item == photo else ():
+                    number = int.from_bytes(table[start : start + wide], "big") & (0x7FFF if wide == 2 else 0x7F)
+                    yield kinds[number - 1][0], kinds[number - 1][1][0]
+                place += wide * count
+
+
+def _boxes(content: memoryview) -> Iterator[tuple[bytes, memoryview]]:
+    """Yield kind and content of the boxes of a file (ISO/IEC 14496-12), or of those in a box."""
+    while len(content) >= 8:
+        size, kind = struct.unpack_from(">I4s", content)
+        head = 8 if size != 1 else 16
+        size = len(content) if size == 0 else size if size != 1 else struct.unpack_from(">Q", content, 8)[0]
+        if size < head:
+            return
+        yield kind, content[head:size]
+        content = content[size:]
 
 
 def open_heic(path: Path) -> Any:

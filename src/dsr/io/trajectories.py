@@ -50,28 +50,29 @@ class Trajectory:
     def assign(self, pairs: Sequence[Pair]) -> Mapping[str, Matrix]:
         """Return the poses of frames by their names, without those of frames that have none.
 
-        Of a file with times, frames get the pose nearest to the time that their capture states for them, or to that in
-        their names, within 20 ms, or that of the number in which their names end: whichever suits more frames, the
-        first of these if several do. Others are taken in order.
+        Of a file with times, frames get the pose nearest to the time that their capture or a list of them states, or
+        to that in their names, within 20 ms, or that of the number in which their names end: whichever suits more
+        frames, the first of these if several do. Those of frames without times are else taken in order.
 
         Raises:
-            ValueError: the poses are to be taken in order, and there are not as many as frames; or the names are times,
-                and no frame has a pose.
+            ValueError: the poses are to be taken in order, and there are not as many as frames; or all frames have
+                times, of their own or in their names, and no frame has a pose.
 
         """
         if self.times is not None:
             named = _known([pair.named_time for pair in pairs])
-            own = _known([None if pair.capture is None else pair.capture.time for pair in pairs])
+            own = _known([pair.own_time for pair in pairs])
             numbers = _known([_number(pair) for pair in pairs])
             ways = [(own, _MAX_GAP), *(way for way in ((named, _MAX_GAP), (numbers, 0.0)) if np.isfinite(way[0]).all())]
             found = max((self._nearest(pairs, *way) for way in ways), key=len)
             if found:
                 return found
-            if np.isfinite(named).all():
-                raise ValueError(
-                    f"{self.file}: expected times as in the names of the frames, {named.min():.3f} to "
-                    f"{named.max():.3f}, got {min(self.times):.3f} to {max(self.times):.3f}"
-                )
+            for known, where in ((own, "those of the frames"), (named, "in the names of the frames")):
+                if np.isfinite(known).all():
+                    raise ValueError(
+                        f"{self.file}: expected times as {where}, {known.min():.3f} to {known.max():.3f}, got "
+                        f"{min(self.times):.3f} to {max(self.times):.3f}"
+                    )
         if len(self.poses) != len(pairs):
             raise ValueError(
                 f"{self.file}: expected a pose for each of the {len(pairs)} frames, or their times, got "

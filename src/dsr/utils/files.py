@@ -207,7 +207,10 @@ def _create(path: Path) -> None:
 @functools.cache
 def remove_abandoned(folder: Path) -> None:
     """Delete temporary files and directories in a folder whose process is gone; once per folder and process."""
-    for path in folder.iterdir():
+    paths: list[Path] = []
+    with contextlib.suppress(OSError):  # it may be written to, but not listed
+        paths = list(folder.iterdir())
+    for path in paths:
         found = _TEMPORARY.search(path.name)
         if found and found["machine"] == machine() and not _is_running(int(found["process"])):
             with contextlib.suppress(OSError):

@@ -9,7 +9,7 @@ from pathlib import Path
 from dsr.app.upsample.request import FrameChoice, UpsampleRequest
 from dsr.io.captures.colmap import add_model
 from dsr.io.inputs import FolderUnits
-from dsr.io.layouts import find_pairs_of_folder
+from dsr.io.layouts import NoPairError, find_pairs_of_folder
 from dsr.io.pairs import (
     Pair,
     PairingResult,
@@ -88,7 +88,7 @@ def _search(choice: FrameChoice, output: Path) -> PairingResult:
         return find_pairs_of_lists(choice.rgb, choice.depth, choice.mask)
     try:
         parts = [find_pairs_of_folder(folder, output) for folder in choice.folders]
-    except ValueError as error:
+    except NoPairError as error:
         _expect_both(choice.folders, error)
         raise
     if len(parts) == 1:
@@ -104,7 +104,7 @@ def _search(choice: FrameChoice, output: Path) -> PairingResult:
     return PairingResult(tuple(pairs), facts, tuple(path for part in parts for path in part.unpaired))
 
 
-def _expect_both(places: tuple[Path, ...], error: ValueError) -> None:
+def _expect_both(places: tuple[Path, ...], error: NoPairError) -> None:
     """Say how photos and depth maps are named that came as two folders or files, where their names say so."""
     roles = {path: _role(path) for path in places if path.exists()}
     rgb, depth = ([path for path, role in roles.items() if role == wanted] for wanted in ("rgb", "depth"))
@@ -115,8 +115,10 @@ def _expect_both(places: tuple[Path, ...], error: ValueError) -> None:
         ) from error
 
 
-def _role(path: Path) -> Role:
-    """Return the role of a folder by its name, or of a file by its own and, where that says nothing, its folder's."""
+def _role(path: Path) -> Role | None:
+    """Return the role that a folder's name says, or a file's, or that of its folder; None where they say nothing."""
     path = path.resolve()
-    role = role_of(path) if path.is_file() else role_of_words(words_of(path.name)) or "rgb"
-    return _role(path.parent) if path.is_file() and role == "rgb" else role
+    if not path.is_file():
+        return role_of_words(words_of(path.name))
+    role = role_of(path)  # "rgb" of a name that says nothing
+    return role_of_words(words_of(path.stem)) or _role(path.parent) if role == "rgb" else role

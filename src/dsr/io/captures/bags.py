@@ -20,7 +20,7 @@ import numpy as np
 
 from dsr.io.captures.ros_images import decode_message
 from dsr.io.frames import Record
-from dsr.utils.files import FullDiskError, space_for
+from dsr.utils.files import FullDiskError, expect_space, owner, remove_abandoned, space_for
 from dsr.utils.guards import MOST_TEXT, bytes_of_archive, expect_bytes, opened, path_within, refusing
 
 IMAGE, COMPRESSED = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage"))
@@ -157,7 +157,8 @@ def _open(path: Path) -> Any:
         for file in path.iterdir():  # of which rosbags takes those that the description names
             path_within(path, file.name, f"{description}: relative_file_paths")
     reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-    with space_for(Path(tempfile.gettempdir()) / path.name):  # where files that are packed whole are unpacked
+    packed = path.is_dir() and any(path.glob("*.zstd"))  # files that are packed whole are unpacked into TMPDIR
+    with space_for(Path(tempfile.gettempdir()) / path.name) if packed else contextlib.nullcontext():
         reader.open()
     sizes = [chunk.datasize for each in reader.readers for chunk in getattr(each, "chunks", {}).values()]
     if max(sizes, default=0) > _CHUNK:  # a damaged number, which rosbags would read all the same
@@ -189,13 +190,15 @@ def _expect_finished(path: Path) -> None:
 
 _CHUNK = 1 << 28
 """Largest number of bytes of a chunk or a packed message of a recording; writers make chunks of a few MB."""
+_ZSTD_HEAD = 18
+"""Largest number of bytes of the header of a frame of Zstandard, which may declare its size (RFC 8878, 3.1.1.1)."""
 
 
 def _limit_chunks() -> None:
     """Make rosbags unpack nothing to more than :data:`_CHUNK`: a bzip2 chunk of 700 bytes may stand for 1 GB.
 
     Messages may be packed one by one. Files that are packed whole, which rosbags unpacks into a temporary folder, are
-    unpacked to what :func:`~dsr.utils.guards.bytes_of_archive` explains.
+    together unpacked to what :func:`~dsr.utils.guards.bytes_of_archive` explains, from this call on.
     """
     lz4: Any = importlib.import_module("lz4.frame")  # with the extra alone
     from rosbags.rosbag1 import reader  # noqa: PLC0415
@@ -217,28 +220,69 @@ def _limit_chunks() -> None:
         for name in kinds.keys() & table.keys():
             table[name] = functools.partial(bounded, kinds[name])
 
-    @contextlib.contextmanager
-    def unpacked(file: BinaryIO, mode: str) -> Iterator[_Bounded]:
-        with zstd.open(file, mode) as content:
-            yield _Bounded(content, bytes_of_archive(os.fstat(file.fileno()).st_size))
-
     zstd: Any = storage_mcap.zstd
     of_messages: Any = importlib.import_module("rosbags.rosbag2.reader")
-    of_messages.zstd = SimpleNamespace(decompress=functools.partial(bounded, kinds["zstd"]), open=unpacked)
+    allowance = _Allowance(zstd)
+    of_messages.zstd = SimpleNamespace(decompress=functools.partial(bounded, kinds["zstd"]), open=allowance.opened)
+    of_messages.TemporaryDirectory = _temporary
+
+
+def _temporary() -> tempfile.TemporaryDirectory[str]:
+    """Make a temporary folder that names this process; those of processes that are gone are deleted."""
+    remove_abandoned(Path(tempfile.gettempdir()))
+    return tempfile.TemporaryDirectory(prefix=f".dsr-{owner()}-")
+
+
+class _Allowance:
+    """Opens the files of one recording that are packed whole, and counts what all of them unpack to.
+
+    Args:
+        zstd: the module that unpacks.
+
+    """
+
+    def __init__(self, zstd: Any) -> None:
+        self._zstd = zstd
+        self._names: set[str] = set()
+        self._packed = self._count = 0
+
+    @contextlib.contextmanager
+    def opened(self, file: BinaryIO, mode: str) -> Iterator[_Bounded]:
+        """Yield the content of the next file; ValueError if it was opened before."""
+        name = Path(file.name).name
+        if name in self._names:
+            raise ValueError(f"relative_file_paths names {name} twice")
+        self._names.add(name)
+        self._packed += os.fstat(file.fileno()).st_size
+        head = file.read(_ZSTD_HEAD)
+        file.seek(0)
+        declared = self._zstd.get_frame_info(head).decompressed_size or 0
+        self.expect(self._count + declared)
+        expect_space(Path(tempfile.gettempdir()) / name, declared)
+        with self._zstd.open(file, mode) as content:
+            yield _Bounded(content, self)
+
+    def take(self, count: int) -> None:
+        """Count bytes that were unpacked; ValueError if these are too many."""
+        self._count += count
+        self.expect(self._count)
+
+    def expect(self, count: int) -> None:
+        """Raise ValueError unless the files that were opened may unpack to so many bytes."""
+        most = bytes_of_archive(self._packed)
+        if count > most:
+            raise ValueError(f"packed files of more than {most} bytes")
 
 
 @dataclass
 class _Bounded:
-    """A file that ends in a ValueError behind a number of bytes."""
+    """A file of a recording that counts what is read of it."""
 
     file: BinaryIO
-    most: int
-    count: int = 0
+    allowance: _Allowance
 
     def read(self, size: int) -> bytes:
         """Return the next bytes, at most ``size``."""
         content = self.file.read(size)
-        self.count += len(content)
-        if self.count > self.most:
-            raise ValueError(f"a packed file of more than {self.most} bytes")
+        self.allowance.take(len(content))
         return content

@@ -181,8 +181,12 @@ def _within(frame: CaptureFrame, capture: CaptureFrame) -> CaptureFrame:
 def _joined(
     model: Callable[[tuple[int, int]], Geometry], capture: Callable[[tuple[int, int]], Geometry], size: tuple[int, int]
 ) -> Geometry:
-    """Return camera, pose and lens of a model, depth camera of a capture."""
-    return model(size)._replace(rig=capture(size).rig)
+    """Return camera, pose and lens of a model, depth camera of a capture, or what is wrong with it."""
+    found = model(size)
+    try:
+        return found._replace(rig=capture(size).rig)
+    except ValueError as error:
+        return found._replace(damage=str(error))
 
 
 def _note(count: int, total: int, file: Path) -> Assumption:
@@ -239,8 +243,7 @@ class SparseDepth:
 
     def read(self) -> np.ndarray:
         """Return the depth, (h, w) float32 in the unit of the model, NaN in holes."""
-        numbers, places = _points(self.file, file_state(self.file, "points"))
-        seen = self.image.observed[np.isin(self.image.observed[:, 2], numbers)]
+        seen, places = self._seen()
         width, height = self.camera.width, self.camera.height
         step = math.sqrt(width * height / max(len(seen), 4))
         size = max(2, round(height / step)), max(2, round(width / step))
@@ -248,13 +251,22 @@ class SparseDepth:
         if not len(seen):
             return depth
         pose = _pose(str(self.file), self.image.quaternion, self.image.translation)
-        columns, rows, points = seen.T
-        z = places[np.searchsorted(numbers, points, side="right") - 1] @ pose[2, :3] + pose[2, 3]
+        columns, rows, _ = seen.T
+        z = places @ pose[2, :3] + pose[2, 3]
         inside = (z > 0) & (columns >= 0) & (rows >= 0) & (columns < width) & (rows < height)
         order = np.flatnonzero(inside)[np.argsort(-z[inside])]
         row, column = (rows[order] * size[0] / height).astype(int), (columns[order] * size[1] / width).astype(int)
         depth[row, column] = z[order]
         return depth
+
+    def _seen(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the observations of the points that the model has, (n, 3), and the places of these, (n, 3)."""
+        numbers, places = _points(self.file, file_state(self.file, "points"))
+        if not len(numbers):
+            return self.image.observed[:0], places
+        found = np.searchsorted(numbers, self.image.observed[:, 2], side="right") - 1  # -1 is that of the last one
+        known = numbers[found] == self.image.observed[:, 2]
+        return self.image.observed[known], places[found[known]]
 
     def record(self) -> Record:
         """Return a hash of the file of points, and the image's name."""

@@ -9,7 +9,7 @@ in the file (tags of https://exiftool.org/TagNames/XMP.html#apple_pdi and AVDept
     depthData:IntrinsicMatrix             column by column, pixels of the reference size
     IntrinsicMatrixReferenceWidth, -Height
 
-The photo comes upright; the matrix is of the picture before it was turned as the EXIF orientation says.
+The photo comes turned as its properties say, mostly upright; the matrix is of the picture before that.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ import numpy as np
 from dsr.geometry.camera import Camera
 from dsr.io.frames import CaptureFrame, Geometry, Record
 from dsr.io.pairs import Pair, PairingResult
-from dsr.io.photos import HEIC_SUFFIXES, decode_heic, open_heic, orientation_of, read_heic, same_aspect
+from dsr.io.photos import HEIC_SUFFIXES, decode_heic, open_heic, read_heic, same_aspect, turned_in_heic
 from dsr.io.trajectories import intrinsics_camera
 from dsr.notes import Assumption
 from dsr.utils.guards import MOST_FILE, MOST_TEXT, natural_key, numbers_in, opened, read_limited
@@ -147,7 +147,7 @@ def _geometry(path: Path, size: tuple[int, int]) -> Geometry:
     if accuracy is None or accuracy[1] != "absolute":
         known = "is relative, says the file" if accuracy else "may be relative, the file does not say"
         notes.append(Assumption(f"the depth {known}: sizes and distances mean little"))
-    camera = _camera(path, text, orientation_of(path), size)
+    camera = _camera(path, text, turned_in_heic(path), size)
     return Geometry(camera, None, tuple(notes))
 
 

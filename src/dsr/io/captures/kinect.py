@@ -203,7 +203,7 @@ def _read(path: Path, prefix: str = "") -> PairingResult:
     geometry = functools.partial(_geometry, f"{path}: calibration.json", bytes(attached[0]), size, size_lr)
     pairs = tuple(
         Pair(f"{prefix}{photo.name}", photo, depth, unit=1e-3, capture=CaptureFrame(
-            _APP, geometry, path, bytes(attached[0]), photos[photo], depths[depth], photos[photo].seconds))
+            _APP, geometry, path, bytes(attached[0]), photos[photo], depths[depth], photos[photo].seconds, apart=True))
         for photo, depth in sorted(partner.items())
     )  # fmt: skip
     note = describe_capture(f"a recording of {_APP}", "millimetres", pairs, poses=False)

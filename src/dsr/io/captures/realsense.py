@@ -27,7 +27,7 @@ import numpy as np
 from dsr.geometry.camera import Camera
 from dsr.geometry.lens import Lens
 from dsr.geometry.rigid_motion import Matrix, as_rigid, from_quaternion, invert
-from dsr.io.captures.bags import Message, connections_of, deserialize, first_message
+from dsr.io.captures.bags import Message, NamedErrors, connections_of, deserialize, first_message
 from dsr.io.frames import CaptureFrame, Geometry, Rig
 from dsr.io.pairs import Pair, PairingResult, match_times
 from dsr.io.trajectories import describe_capture, intrinsics_camera
@@ -82,9 +82,14 @@ def read(reader: Any, path: Path, prefix: str) -> PairingResult:
     if version < _OLDEST:
         raise ValueError(f"{path}: expected file_version {_OLDEST} or later of RealSense's SDK, got {version}")
     color_topic, depth_topic = (_choose(reader, path, kind) for kind in ("Color", "Depth"))
-    color, depth = (_stream(reader, path, topic) for topic in (color_topic, depth_topic))
     unit, notes = _unit(reader, path, depth_topic)
-    geometry, registered = _geometry(color, depth)
+    streams, registered, damage = None, list[Assumption](), ""
+    try:
+        with NamedErrors(path):
+            streams = _stream(reader, path, color_topic), _stream(reader, path, depth_topic)
+            geometry, registered = _geometry(*streams)
+    except ValueError as error:  # which does not matter where cameras are given
+        geometry, damage = Geometry(), str(error)
     photos, depths = (_frames(reader, path, topic) for topic in (color_topic, depth_topic))
     partner = match_times(
         {Path(f"{i:09}"): stamp for i, (_, stamp) in enumerate(photos)},
@@ -93,13 +98,14 @@ def read(reader: Any, path: Path, prefix: str) -> PairingResult:
     if not partner:
         raise ValueError(f"{path}: expected photos and depth maps within 20 ms of each other, found none")
     device = _device(reader)
-    told = repr((color, depth)).encode()
+    told = repr(streams or damage).encode()
+    apart = all(_transforms(reader, _part(topic, "stream")) for topic in (color_topic, depth_topic))
     places = Path(f"{path}{color_topic}"), Path(f"{path}{depth_topic}")
     pairs = []
     for first, second in sorted(partner.items()):
         sources = photos[int(first.name)][0], depths[int(second.name)][0]
-        own = functools.partial(_of_photo, geometry)
-        frame = CaptureFrame(device, own, path, told, *sources, time=photos[int(first.name)][1])
+        own = functools.partial(_of_photo, geometry, damage)
+        frame = CaptureFrame(device, own, path, told, *sources, time=photos[int(first.name)][1], apart=apart)
         pairs.append(Pair(f"{prefix}{int(first.name):06}", *places, unit=unit, capture=frame))
     about = describe_capture(f"a recording of {device}", f"units of {unit:g} m", pairs, poses=False)
     others = sorted(
@@ -164,9 +170,14 @@ def _stream(reader: Any, path: Path, topic: str) -> _Stream:
     return _Stream(camera, lens, reference, transform, notes)
 
 
+def _transforms(reader: Any, stream: str) -> list[str]:
+    """Return the topics of a stream's transforms."""
+    return sorted(each.topic for each in reader.connections if each.topic.startswith(f"{stream}/tf/"))
+
+
 def _transform(reader: Any, place: str, stream: str) -> tuple[str, Matrix | None]:
     """Return the number of a stream's frame of reference, and the transform from there; None if there is none."""
-    for topic in sorted(each.topic for each in reader.connections if each.topic.startswith(f"{stream}/tf/")):
+    for topic in _transforms(reader, stream):
         message = first_message(reader, topic)
         if message is None:
             continue
@@ -204,8 +215,10 @@ def _geometry(color: _Stream, depth: _Stream) -> tuple[Geometry, list[Assumption
     return geometry._replace(rig=Rig(depth.camera, transform, depth.lens)), []
 
 
-def _of_photo(geometry: Geometry, _: tuple[int, int]) -> Geometry:
-    """Return the cameras, which are those of photos of all sizes."""
+def _of_photo(geometry: Geometry, damage: str, _: tuple[int, int]) -> Geometry:
+    """Return the cameras, which are those of photos of all sizes; ValueError if they are damaged."""
+    if damage:
+        raise ValueError(damage)
     return geometry
 
 

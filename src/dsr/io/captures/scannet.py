@@ -29,6 +29,7 @@ import functools
 import struct
 import zlib
 from collections.abc import Mapping
+from dataclasses import replace
 from io import BufferedReader
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -90,7 +91,7 @@ def _read_sens(path: Path, before: str) -> PairingResult:
     size = path.stat().st_size
     with opened(path) as file:
         told = _read_header(path, file)
-        place, pairs = file.tell(), []
+        place, frames = file.tell(), list[CaptureFrame]()
         if told.frames > min(size // _FRAME.size, _MOST_FRAMES):
             raise ValueError(f"{path}: expected at most {_MOST_FRAMES} frames, got {told.frames} in {size} bytes")
         for number in range(told.frames):
@@ -104,10 +105,15 @@ def _read_sens(path: Path, before: str) -> PairingResult:
             photo = Section(path, f"color/{number}", start, lengths[0], functools.partial(_photo, told))
             depth = Section(path, f"depth/{number}", start + lengths[0], lengths[1], functools.partial(_depth, told))
             geometry = functools.partial(_geometry, f"{path}: frame {number}", told, values[:16])
-            time = 1e-6 * values[16] if values[16] else None
-            frame = CaptureFrame("ScanNet", geometry, path, content[:64] + repr(told).encode(), photo, depth, time)
-            places = path / photo.name, path / depth.name
-            pairs.append(Pair(f"{before}{number:06}", *places, unit=1 / told.scale, capture=frame))
+            about = content[:64] + repr(told).encode()
+            frames.append(CaptureFrame("ScanNet", geometry, path, about, photo, depth, 1e-6 * values[16]))
+    if not any(frame.time for frame in frames):  # as where they are not known
+        frames = [replace(frame, time=None) for frame in frames]
+    pairs = [
+        Pair(f"{before}{number:06}", path / f"color/{number}", path / f"depth/{number}", unit=1 / told.scale,
+             capture=frame)
+        for number, frame in enumerate(frames)
+    ]  # fmt: skip
     if not pairs:
         raise ValueError(f"{path}: expected frames, there is none")
     unit = "millimetres" if told.scale == 1000 else f"1/{told.scale:g} m"
