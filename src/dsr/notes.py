@@ -27,7 +27,7 @@ class Limit(NamedTuple):
 LIMITS: dict[str, Limit] = {
     "cameras-damaged": Limit(
         1,
-        "frames whose capture describes its cameras in a damaged way, where another camera is given",
+        "frames whose capture describes its cameras in a damaged way, where another camera or one of COLMAP is given",
         "a pose and a depth camera beside the photo's, which it may describe, too, are missing then",
     ),
     "edges-beside": Limit(

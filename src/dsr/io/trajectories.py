@@ -207,8 +207,10 @@ def _known(times: Sequence[float | None]) -> np.ndarray:
 
 
 def _number(pair: Pair) -> float | None:
-    """Return the last number in a frame's name."""
+    """Return the last number in a frame's name; None if it is the fraction of a time."""
     numbers = re.findall(r"\d+", pair.depth.stem)
+    if pair.named_time is not None and "." in pair.depth.stem:
+        return None
     return float(numbers[-1]) if numbers and len(numbers[-1]) < 16 else None
 
 
