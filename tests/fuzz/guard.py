@@ -129,7 +129,8 @@ def watching(*folders: Path) -> Iterator[Watch]:
         sys.meta_path.insert(0, _Finder)
         _installed = True
     more = [os.environ[name] for name in ("DSR_CACHE",) if name in os.environ]
-    watch = Watch(tuple(os.path.abspath(each) for each in (*folders, *more, tempfile.gettempdir() + "/tmp")))  # noqa: PTH100
+    temporary = [f"{tempfile.gettempdir()}/{beginning}" for beginning in ("tmp", ".dsr-")]
+    watch = Watch(tuple(os.path.abspath(each) for each in (*folders, *more, *temporary)))  # noqa: PTH100
     _current = watch
     try:
         yield watch

@@ -123,7 +123,7 @@ def test_report_elsewhere_shows_it_after_the_papers_and_ranks_by_its_direction(h
     assert "Lower is better, of PSNR, Bright higher." in text
     assert "paper" not in text.casefold()
     page = (home / "report" / "index.html").read_text()
-    assert '{"id":"PSNR_d","name":"PSNR","unit":"dB","digits":1,"higher":true}' in page
+    assert '{"id":"PSNR_d","name":"PSNR","unit":"dB","digits":1,"higher":true,' in page
     assert "PSNR_d" in (home / "report" / "metrics" / "spearman.csv").read_text()
     assert (home / "report" / "figures" / "depth_waves_x4_box_1.png").stat().st_size > 1000
 

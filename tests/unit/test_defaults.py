@@ -22,6 +22,7 @@ DIFFERENT = {
     "method/dip": {"data_loss", "data_weight", "w"},  # the class's are those of dip_v, which shares it
     "method/bilinear": {"order"},  # one function, three orders; its default is bicubic
     "method/nearest": {"order"},
+    "method/monocular": {"fit", "multiple", "output"},  # one class, of any network's file
     "method/msg": {"variant"},  # three networks of one function
     "method/msg_v": {"variant"},
     "method/msg_v_noisy": {"variant"},

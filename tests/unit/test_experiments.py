@@ -18,7 +18,7 @@ from dsr.utils.configuration import ConfigError, build, config_directories, list
 DIRECTORIES = config_directories()
 FOLDER = DIRECTORIES[0] / "experiment"
 EVALUATIONS = ("all_methods", "downsampling_mismatch", "field_benchmarks", "noise", "paper_tables",
-               "published_networks", "sensors", "visual_losses")  # fmt: skip
+               "published_networks", "reference", "sensors", "visual_losses")  # fmt: skip
 RECIPES = [name for name in list_choices("experiment", DIRECTORIES) if name not in EVALUATIONS]
 
 
