@@ -24,7 +24,7 @@ from dsr.metrics.catalogue import PROTOCOLS, catalogue, score_image
 from dsr.metrics.lpips import LPIPS
 
 SIZE = (480, 640)
-LEFT_OUT = ("field", "sensor")
+LEFT_OUT = ("field", "sensor", "plane")
 
 
 def pair() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
