@@ -150,8 +150,8 @@ def _prepare(plain: Config, node: Any, source: SceneSource | None, *, here: bool
         lpips_trunk=settings.metrics.lpips_trunk,
     )
     method = selected.build(run)
-    if method.name is not None:
-        label = method.name if label == name else label
+    if method.name is not None and label == name:
+        label = method.name
     study = Evaluation(
         source,
         downsampling,

@@ -26,7 +26,7 @@ from dsr.sample import FARTHEST, NEAREST, DepthSample
 from dsr.utils.guards import expect_one_of, natural_key, pixels_beside
 from dsr.utils.progress import Steps
 from dsr.utils.ratios import round_ratio
-from dsr.utils.versions import file_hash
+from dsr.utils.versions import hash_once
 
 INVERSE = "inverse"
 QUANTITIES = (*RANGE_TYPES, INVERSE)
@@ -133,8 +133,7 @@ class External(Method):
             kind = read_depth_file(found[0], pixels_beside(sample.camera.height, sample.camera.width)).dtype
             stored = f"predictions come as whole numbers of {self._unit or 1:g} m" if kind.kind in "iu" else ""
             stored = stored if self._quantity in ("orthogonal", "perspective") else stored.removesuffix(" m")
-        fitted = f"{self._fit} fitted to the low-resolution map" if self._fit else ""
-        return "; ".join(filter(None, (stored, fitted)))
+        return "; ".join(filter(None, (stored, describe_fit(self._fit))))
 
     def remarks(self, dataset: str, scenes: Sequence[str], scale: float) -> list[str]:
         """Return lines on files that are of no scene."""
@@ -148,7 +147,7 @@ class External(Method):
 
     def content(self, dataset: str, scene: str, scale: float) -> str | None:
         """Return the SHA-256 of a scene's file; None without one."""
-        return ", ".join(map(file_hash, self._found(self._name(dataset, scene, scale)))) or None
+        return ", ".join(map(hash_once, self._found(self._name(dataset, scene, scale)))) or None
 
     def _stem(self, sample: DepthSample) -> str:
         return self._name(sample.dataset, sample.scene, sample.scale)

@@ -29,10 +29,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dsr.metrics.depth import covered
 from dsr.metrics.formats import BEFORE_THE_PAPER, MetricFormat
-from dsr.metrics.functional import SurfacePair, masked_mean
-from dsr.metrics.metric import Metric, depth_mask
-from dsr.metrics.sensor import masked_median
+from dsr.metrics.functional import SurfacePair, masked_mean, masked_median
+from dsr.metrics.metric import Metric, depth_mask, target_mask
 
 RATIOS = tuple(np.linspace(1.05, 1.25, 10).tolist())
 """Depth Pro's thresholds, which are their own weights; MoGe's weights are 1 less."""
@@ -248,16 +248,6 @@ def planarity(
     return torch.stack(flatness, dim=1), torch.stack(orientation, dim=1)
 
 
-def covered(pair: SurfacePair) -> Tensor:
-    """Return the fraction of the true pixels that have a prediction, (B,)."""
-    return masked_mean(pair.depth_mask, pair.target_mask).squeeze(1)
-
-
-def true_mask(pair: SurfacePair) -> Tensor:
-    """Return the pixels with a truth."""
-    return pair.target_mask
-
-
 def _over_thresholds(scores: Tensor, less: float, pair: SurfacePair) -> Tensor:
     """Return the mean of (B, T) weighted by the thresholds less something, (B,); NaN for an image without a truth."""
     weights = torch.tensor(RATIOS, dtype=scores.dtype, device=scores.device) - less
@@ -316,10 +306,6 @@ def _planarity(pair: SurfacePair) -> tuple[Tensor, Tensor]:
     return flatness, orientation
 
 
-def _planes_covered(pair: SurfacePair) -> Tensor:
-    return covered(pair.within(PLANES))
-
-
 def _planarity_error(pair: SurfacePair, part: int) -> Tensor:
     return pair.derive(_planarity)[part]
 
@@ -330,12 +316,12 @@ def _shown(heading: str, unit: str, factor: float = 1e2, *, higher: bool = True,
 
 def _moge(radius: int) -> Metric:
     shown = _shown("F1", f"MoGe, {radius} px, %", column=radius == 1)
-    return Metric(f"MoGe_F1_{radius}", partial(moge_f1, radius=radius), true_mask, shown, min_size=7, whole=True)
+    return Metric(f"MoGe_F1_{radius}", partial(moge_f1, radius=radius), target_mask, shown, min_size=7, whole=True)
 
 
 def _boundary(part: int, name: str) -> Metric:
     shown = _shown("DBE", f"{name}, px", 1, higher=False)
-    return Metric(f"DBE_{name}", partial(_boundary_error, part=part), true_mask, shown, min_size=3, whole=True)
+    return Metric(f"DBE_{name}", partial(_boundary_error, part=part), target_mask, shown, min_size=3, whole=True)
 
 
 def _directed(part: int, name: str) -> Metric:
@@ -351,8 +337,8 @@ def _plane(part: int, name: str, unit: str, factor: float) -> Metric:
 
 
 METRICS: tuple[Metric, ...] = (
-    Metric("DepthPro_F1", boundary_f1, true_mask, _shown("F1", "Depth Pro, %"), whole=True),
-    Metric("DepthPro_ceiling", boundary_ceiling, true_mask, _shown("F1", "of the truth, %"), whole=True),
+    Metric("DepthPro_F1", boundary_f1, target_mask, _shown("F1", "Depth Pro, %"), whole=True),
+    Metric("DepthPro_ceiling", boundary_ceiling, target_mask, _shown("F1", "of the truth, %"), whole=True),
     *map(_moge, MOGE_RADII),
     _boundary(0, "accuracy"),
     _boundary(1, "completeness"),
@@ -361,7 +347,7 @@ METRICS: tuple[Metric, ...] = (
     _directed(2, "beyond"),
     _plane(0, "flatness", "mm", 1e3),
     _plane(1, "orientation", "deg", 1),
-    Metric("PE_covered", _planes_covered, true_mask, _shown("PE", "covered, %"), min_size=1, region=PLANES, whole=True),
-    Metric("Boundary_covered", covered, true_mask, _shown("Covered", "%"), min_size=1, whole=True),
+    Metric("PE_covered", covered, target_mask, _shown("PE", "covered, %"), min_size=1, region=PLANES, whole=True),
+    Metric("Boundary_covered", covered, target_mask, _shown("Covered", "%"), min_size=1, whole=True),
 )
 """The metrics of ``metrics=boundaries``."""

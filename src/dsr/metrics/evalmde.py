@@ -26,10 +26,11 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.surface import length
-from dsr.metrics.boundaries import boundary_f1, covered, true_mask
+from dsr.metrics.boundaries import boundary_f1
+from dsr.metrics.depth import covered
 from dsr.metrics.formats import BEFORE_THE_PAPER, MetricFormat
 from dsr.metrics.functional import SurfacePair
-from dsr.metrics.metric import Metric
+from dsr.metrics.metric import Metric, target_mask
 
 SCALES = (1, 2, 4, 8)
 RADIUS, SMALLEST_RADIUS = 32, 3
@@ -230,7 +231,7 @@ def _beyond(pair: SurfacePair, aligned: Tensor) -> Tensor:
 
 def _metric(name: str, part: Callable[[SurfacePair], Tensor], shown: MetricFormat) -> Metric:
     function = partial(SurfacePair.derive, make=part)  # SAWA-H has the parts of the same pair
-    return Metric(f"EvalMDE_{name}", function, true_mask, shown, min_size=MIN_SIZE, whole=True)
+    return Metric(f"EvalMDE_{name}", function, target_mask, shown, min_size=MIN_SIZE, whole=True)
 
 
 METRICS: tuple[Metric, ...] = (
