@@ -242,3 +242,20 @@ def test_study_asks_about_each_truth_and_strict_refuses(
     assert len({trial["dataset"] for trial in trials}) == 2
     assert "different truths" in refused(capsys, "study", "build", apart, "-o", tmp_path / "other", "--strict")
     assert not (tmp_path / "other").exists()
+
+
+def test_leaderboard_is_a_page_that_ranks_the_methods_and_their_tables(
+    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["leaderboard", str(runs), "-o", str(tmp_path / "site"), "--title", "Ours"]) == 0
+    page = (tmp_path / "site" / "index.html").read_text(encoding="utf-8")
+    standings = json.loads(re.search(r'"standings":(\[.*?\]),"scenes"', page)[1])  # type: ignore[index]
+    assert {row["method"] for row in standings} == {"Bicubic", "MSG-V"}
+    assert {row["settings"] for row in standings} == {1}
+    assert [row["rank"] for row in standings] == sorted(row["rank"] for row in standings)
+    assert {path.name for path in (tmp_path / "site").iterdir()} == {"index.html", "report.json", "tables"}
+    capsys.readouterr()
+    assert "expected a directory with runs" in refused(
+        capsys, "leaderboard", tmp_path / "nowhere", "-o", tmp_path / "other"
+    )
+    assert not (tmp_path / "other").exists()

@@ -529,3 +529,18 @@ def test_page_without_pictures_has_its_tables(opened, make_run, tmp_path):
     assert page.locator("#tables td").count() > 0
     assert page.locator("#scenes").is_hidden()
     assert "no pictures" in page.inner_text(".notes")
+
+
+def test_method_of_the_leaderboard_is_shown_at_a_click(make_run, tmp_path, opened):
+    for label in ("Bicubic", "MSG-V"):
+        make_run(tmp_path / label, method=label.lower(), label=label, scenes=SCENES, size=SIZE)
+    results = load_results([tmp_path])
+    save_page(tmp_path / "index.html", results, leaderboard=True)
+    page = opened((tmp_path / "index.html").as_uri())
+    choose(page, "left", "input")
+    assert set(column(page, 0, 1)) == {"Bicubic", "MSG-V"}
+    page.locator("#tables table").first.get_by_role("button", name="Bicubic").click()
+    settle(page)
+    shown = page.evaluate("['left', 'right'].map((side) => document.querySelector(`#scenes select.${side}`)"
+                          ".selectedOptions[0].label)")  # fmt: skip
+    assert "Bicubic" in shown

@@ -73,20 +73,8 @@ def make_leaderboard(request: LeaderboardRequest, console: Console) -> list[str]
         ValueError: as :func:`make_report`.
 
     """
-    return make_report(
-        ReportRequest(
-            runs=request.runs,
-            output=request.output,
-            methods=request.methods,
-            datasets=request.datasets,
-            scales=request.scales,
-            title=request.title,
-            leaderboard=True,
-            intervals=True,
-            parts=("tables", "page"),
-        ),
-        console,
-    )
+    parts = ("tables", "page")
+    return make_report(ReportRequest(**vars(request), leaderboard=True, intervals=True, parts=parts), console)
 
 
 def _check(output: Path) -> None:

@@ -16,15 +16,21 @@ _MOST_WORKERS = 256
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReportRequest(Options):
-    """What the report contains, and where it goes."""
+class RunsRequest(Options):
+    """Which runs are shown, and where."""
 
     runs: tuple[Path, ...] = option(..., "directories of runs, or with runs below them", "DIR", flags="runs")
-    output: Path = option(..., "where the report goes", "DIR", flags="-o --output", writes="folder")
-    study: Path | None = option(None, "what `dsr study collect` wrote", "CSV")
+    output: Path = option(..., "where the page and its files go", "DIR", flags="-o --output", writes="folder")
     methods: tuple[str, ...] = option((), "these alone, as the tables name them", "NAME")
     datasets: tuple[str, ...] = option((), "these alone", "NAME")
     scales: tuple[float, ...] = option((), "these alone", "N", flags="--scale")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportRequest(RunsRequest):
+    """What a report contains."""
+
+    study: Path | None = option(None, "what `dsr study collect` wrote", "CSV")
     light: str = option(
         FIGURE_LIGHT, f"of the figures: {LIGHT_CHOICES}; {FIGURE_LIGHT}", "NAME", rule=one_of(LIGHT_NAMES, str)
     )
@@ -52,14 +58,9 @@ class ReportRequest(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class LeaderboardRequest(Options):
-    """What a leaderboard is of, and where it goes."""
+class LeaderboardRequest(RunsRequest):
+    """What a leaderboard is of."""
 
-    runs: tuple[Path, ...] = option(..., "directories of runs, or with runs below them", "DIR", flags="runs")
-    output: Path = option(..., "where the page goes", "DIR", flags="-o --output", writes="folder")
-    methods: tuple[str, ...] = option((), "these alone, as the tables name them", "NAME")
-    datasets: tuple[str, ...] = option((), "these alone", "NAME")
-    scales: tuple[float, ...] = option((), "these alone", "N", flags="--scale")
     title: str = option("Depth super-resolution: leaderboard", "of the page")
 
 

@@ -69,6 +69,13 @@ class MetricFormat:
         return f"{self.title}, worst light" if by_light else self.title
 
 
+def column(
+    heading: str, unit: str, factor: float = 1.0, digits: int = 1, *, higher_is_better: bool = False
+) -> MetricFormat:
+    """Return the format of a column that stands before those of the paper, or in a table of its own family."""
+    return MetricFormat(heading, unit, factor, digits, higher_is_better, BEFORE_THE_PAPER)
+
+
 Formats = Mapping[str, MetricFormat]
 """Formats of metrics by their names in ``scores.csv``."""
 

@@ -17,7 +17,7 @@ from functools import partial
 from torch import Tensor
 
 from dsr.geometry.surface import normal_mask as mask_of_normals
-from dsr.metrics.formats import BEFORE_THE_PAPER, MetricFormat
+from dsr.metrics.formats import column
 from dsr.metrics.functional import SurfacePair, angle, masked_mean, masked_median
 from dsr.metrics.metric import Metric, normal_mask
 
@@ -51,22 +51,18 @@ def _true_normals(pair: SurfacePair) -> Tensor:
 
 def _within(degrees: float) -> Metric:
     name, function = f"Normal_within_{degrees:g}".replace(".", "_"), partial(within, degrees=degrees)
-    return Metric(name, function, normal_mask, _shown(f"< {degrees:g} deg", "forward, %", 1e2, higher=True))
-
-
-def _shown(heading: str, unit: str, factor: float, digits: int = 1, *, higher: bool = False) -> MetricFormat:
-    return MetricFormat(heading, unit, factor, digits, higher, BEFORE_THE_PAPER)
+    return Metric(name, function, normal_mask, column(f"< {degrees:g} deg", "forward, %", 1e2, higher_is_better=True))
 
 
 METRICS: tuple[Metric, ...] = (
-    Metric("Normal_mean", mean, normal_mask, _shown("Mean angle", "forward, deg", 1, 2)),
-    Metric("Normal_median", median, normal_mask, _shown("Median angle", "forward, deg", 1, 2)),
+    Metric("Normal_mean", mean, normal_mask, column("Mean angle", "forward, deg", 1, 2)),
+    Metric("Normal_median", median, normal_mask, column("Median angle", "forward, deg", 1, 2)),
     *map(_within, ANGLES),
     Metric(
         "Normal_covered",
         covered,
         _true_normals,
-        _shown("Covered", "normals, %", 1e2, higher=True),
+        column("Covered", "normals, %", 1e2, higher_is_better=True),
         regional=True,
         whole=True,
     ),

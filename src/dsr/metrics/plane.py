@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.surface import back_project
-from dsr.metrics.formats import BEFORE_THE_PAPER, MetricFormat
+from dsr.metrics.formats import column
 from dsr.metrics.functional import SurfacePair, masked_mean, masked_median
 from dsr.metrics.metric import Metric, depth_mask, target_mask
 
@@ -181,18 +181,14 @@ def _central_normals(points: Tensor) -> Tensor:
     return normals / normals.norm(dim=1, keepdim=True)
 
 
-def _shown(heading: str, unit: str, factor: float, digits: int, *, higher: bool = False) -> MetricFormat:
-    return MetricFormat(heading, unit, factor, digits, higher, BEFORE_THE_PAPER)
-
-
 METRICS: tuple[Metric, ...] = (
-    Metric("Plane_std", deviation, depth_mask, _shown("Std", "plane, mm", 1e3, 2), unit="cm"),
-    Metric("Plane_angle", angle, depth_mask, _shown("Angle", "plane, central, deg", 1, 1), min_size=3),
+    Metric("Plane_std", deviation, depth_mask, column("Std", "plane, mm", 1e3, 2), unit="cm"),
+    Metric("Plane_angle", angle, depth_mask, column("Angle", "plane, central, deg", 1, 1), min_size=3),
     Metric(
         "Plane_covered",
         covered,
         target_mask,
-        _shown("Covered", "plane, %", 1e2, 1, higher=True),
+        column("Covered", "plane, %", 1e2, 1, higher_is_better=True),
         unit="cm",
         regional=True,
         whole=True,

@@ -35,7 +35,7 @@ from torch import Tensor
 
 from dsr.geometry.surface import back_project
 from dsr.metrics import depth
-from dsr.metrics.formats import BEFORE_THE_PAPER, MetricFormat
+from dsr.metrics.formats import column
 from dsr.metrics.functional import SurfacePair, masked_mean
 from dsr.metrics.metric import Metric, depth_mask, target_mask
 
@@ -141,13 +141,9 @@ def _largest_around(values: Tensor) -> Tensor:
     return values
 
 
-def _shown(heading: str, unit: str, factor: float, digits: int, *, higher: bool = False) -> MetricFormat:
-    return MetricFormat(heading, unit, factor, digits, higher, BEFORE_THE_PAPER)
-
-
 def _f_score(centimetres: int) -> Metric:
     function = partial(f_score, threshold=centimetres / 100)
-    form = _shown(f"F at {centimetres} cm", "%", 1e2, 2, higher=True)
+    form = column(f"F at {centimetres} cm", "%", 1e2, 2, higher_is_better=True)
     return Metric(f"Points_F_{centimetres}cm", function, target_mask, form, min_size=1, unit="cm", whole=True)
 
 
@@ -156,20 +152,20 @@ METRICS: tuple[Metric, ...] = (
         "Points_flying",
         flying,
         depth_mask,
-        _shown("Flying", "1 % of depth, %", 1e2, 2),
+        column("Flying", "1 % of depth, %", 1e2, 2),
         min_size=1,
         unit="cm",
         regional=False,  # the outlines of a region's objects are edges of what lies outside
         whole=True,
     ),
-    Metric("Points_chamfer", chamfer, target_mask, _shown("Chamfer", "mm", 1e3, 2), min_size=1, unit="cm", whole=True),
+    Metric("Points_chamfer", chamfer, target_mask, column("Chamfer", "mm", 1e3, 2), min_size=1, unit="cm", whole=True),
     _f_score(1),
     _f_score(5),
     Metric(
         "Points_covered",
         depth.covered,
         target_mask,
-        _shown("Covered", "points, %", 1e2, 1, higher=True),
+        column("Covered", "points, %", 1e2, 1, higher_is_better=True),
         min_size=1,
         unit="cm",
         whole=True,

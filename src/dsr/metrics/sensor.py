@@ -13,7 +13,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dsr.metrics.formats import BEFORE_THE_PAPER, MetricFormat
+from dsr.metrics.formats import column
 from dsr.metrics.functional import SSIM_WINDOW, SurfacePair, angle, masked_mean, masked_median, ssim_map
 from dsr.metrics.metric import Metric
 
@@ -123,25 +123,21 @@ def _scored(pair: SurfacePair) -> Tensor:
     return pair.derive(SensorComparison).scored
 
 
-def _shown(heading: str, unit: str, factor: float, digits: int, *, higher_is_better: bool = False) -> MetricFormat:
-    return MetricFormat(heading, unit, factor, digits, higher_is_better, BEFORE_THE_PAPER)
-
-
 METRICS: tuple[Metric, ...] = (
-    Metric("Sensor_RMSE_v", rmse_v, _scored, _shown("RMSE_v", "sensor, 1/1000", 1e3, 0), whole=True),
+    Metric("Sensor_RMSE_v", rmse_v, _scored, column("RMSE_v", "sensor, 1/1000", 1e3, 0), whole=True),
     Metric(
         "Sensor_DSSIM_v",
         dssim_v,
         _scored,
-        _shown("DSSIM_v", "sensor, 1/1000", 1e3, 0),
+        column("DSSIM_v", "sensor, 1/1000", 1e3, 0),
         per_light=True,
         min_size=SSIM_WINDOW,
         whole=True,
     ),
-    Metric("Sensor_angle_mean", angle_mean, _scored, _shown("Angle", "mean, deg", 1, 1), whole=True),
-    Metric("Sensor_angle_median", angle_median, _scored, _shown("Angle", "median, deg", 1, 1), whole=True),
-    Metric("Sensor_covered", covered, _inner, _shown("Covered", "%", 1e2, 1, higher_is_better=True), whole=True),
-    Metric("Sensor_offset", offset_d, _scored, _shown("Offset", "mm", 1e3, 2), whole=True),
-    Metric("Sensor_RMSE_d", rmse_d, _scored, _shown("RMSE_d", "sensor, mm", 1e3, 2), whole=True),
+    Metric("Sensor_angle_mean", angle_mean, _scored, column("Angle", "mean, deg", 1, 1), whole=True),
+    Metric("Sensor_angle_median", angle_median, _scored, column("Angle", "median, deg", 1, 1), whole=True),
+    Metric("Sensor_covered", covered, _inner, column("Covered", "%", 1e2, 1, higher_is_better=True), whole=True),
+    Metric("Sensor_offset", offset_d, _scored, column("Offset", "mm", 1e3, 2), whole=True),
+    Metric("Sensor_RMSE_d", rmse_d, _scored, column("RMSE_d", "sensor, mm", 1e3, 2), whole=True),
 )
 """The metrics of ``metrics=sensor``."""
