@@ -192,7 +192,7 @@ def test_before_after_picture_is_at_most_2400_pixels_wide(tmp_path, drawn, size,
     camera = Camera(size[1], size[0], 30, 30, size[1] / 2, size[0] / 2)
     write_before_after(tmp_path, photo(camera), bumpy(camera.rescale(*coarse[::-1])), bumpy(camera), camera, "t")
     [(figure, dpi)] = drawn
-    assert 1200 < figure.get_figwidth() * dpi <= 2400
+    assert 800 < figure.get_figwidth() * dpi <= 2400
     assert figure.get_figheight() * dpi < 3300
     left, right, bottom, top = figure.axes[0].images[0].get_extent()
     assert (top - bottom) / (right - left) == pytest.approx(size[0] / size[1])
@@ -204,7 +204,7 @@ def test_before_after_picture_is_written_with_any_title_and_holes(tmp_path):
     depth[0, 1, 2] = torch.nan
     write_before_after(tmp_path / "b.png", photo(), bumpy(CAMERA.rescale(6, 5)), depth, CAMERA, "a_b $c$ {} \u65e5")
     assert [path.name for path in tmp_path.iterdir()] == ["b.png"]
-    assert read(tmp_path / "b.png").shape[1] == 2388
+    assert read(tmp_path / "b.png").shape[1] == 1432
 
 
 def test_detail_of_a_before_after_picture_is_where_the_surface_changed(tmp_path, drawn):

@@ -33,7 +33,9 @@ _STRIP = 1 << 21
 
 QUADRIC = "quadric decimation"
 FLATNESS = 2e-4
-"""Tolerance of a mesh that looks like the one of all pixels: less than depth cameras and their results are off by."""
+"""Tolerance of a mesh that looks like the one of all pixels, as a fraction of the depth."""
+ERROR_SHARE = 0.1
+"""The same as a fraction of the depth's expected error, if that is more."""
 
 
 class Mesh(NamedTuple):
@@ -60,7 +62,7 @@ def triangulate(
     largest_step: float = LARGEST_STEP,
     stride: int = 1,
     isolated: bool = False,
-    tolerance: float = 0.0,
+    tolerance: Tensor | None = None,
 ) -> Mesh:
     """Join neighbouring valid pixels by triangles, two per square of four pixels, except across steps in depth.
 
@@ -73,8 +75,8 @@ def triangulate(
         largest_step: relative change of depth, beyond what the slopes on both sides predict, from which a pair is cut.
         stride: every which row and column becomes vertices.
         isolated: whether vertices without a triangle are kept.
-        tolerance: by what fraction of its depth a pixel may lie beside the mesh, so that flat parts get large triangles,
-            see :mod:`dsr.geometry.adaptive_mesh`; 0 for all pixels.
+        tolerance: (1, H, W) how far in metres each pixel may lie beside the mesh, so that flat parts get large triangles,
+            see :mod:`dsr.geometry.adaptive_mesh`; None for a mesh of all pixels.
 
     Raises:
         ValueError: ``depth`` is no map of the camera's size, or a number is not positive.
@@ -86,7 +88,10 @@ def triangulate(
         raise ValueError(f"mesh: expected a positive step and stride, got {largest_step} and {stride}")
     strided = depth[0, ::stride, ::stride].detach().cpu().double().numpy()
     valid = np.isfinite(strided)
-    faces, dense = _faces(1 / strided, largest_step, tolerance)
+    allowed = None
+    if tolerance is not None:
+        allowed = tolerance[0, ::stride, ::stride].detach().cpu().double().numpy() / strided**2
+    faces, dense = _faces(1 / strided, largest_step, allowed)
     kept = valid.ravel().copy()
     if not isolated:
         kept[:] = False
@@ -116,7 +121,7 @@ def vertex_normals(mesh: Mesh) -> np.ndarray:
     return np.where(lengths > 0, total / np.where(lengths > 0, lengths, 1), towards).astype(np.float32)
 
 
-def _faces(inverse: np.ndarray, largest_step: float, tolerance: float) -> tuple[np.ndarray, int]:
+def _faces(inverse: np.ndarray, largest_step: float, allowed: np.ndarray | None) -> tuple[np.ndarray, int]:
     """Return the triangles of a map of inverse depth, (H, W), as (M, 3) indices, and how many there are of all."""
     height, width = inverse.shape
     across, down = find_connections(inverse, largest_step)
@@ -134,8 +139,8 @@ def _faces(inverse: np.ndarray, largest_step: float, tolerance: float) -> tuple[
         (~first & bottom & right, (lower_left, lower_right, upper_right)),
     )
     kept, large = np.True_, np.empty((0, 3), np.int32)
-    if tolerance > 0:
-        kept, large = join(inverse, top & bottom & left & right, tolerance)
+    if allowed is not None:
+        kept, large = join(inverse, top & bottom & left & right, allowed)
     small = [np.stack([corner[where & kept] for corner in corners], axis=1) for where, corners in choices]
     return np.concatenate((*small, large)), sum(int(np.count_nonzero(where)) for where, _ in choices)
 

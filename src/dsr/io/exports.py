@@ -200,7 +200,7 @@ def write_mesh(
     *,
     largest_step: float = LARGEST_STEP,
     most: int = MOST_FACES,
-    tolerance: float = 0.0,
+    tolerance: Tensor | None = None,
     filled: Tensor | None = None,
 ) -> Written:
     """Write the surface as a mesh with the photo's colours, cut at depth steps.
