@@ -32,7 +32,7 @@ _STRIP = 1 << 21
 """Pixels whose steps are found, and triangles whose normals are summed, at a time."""
 
 QUADRIC = "quadric decimation"
-FLATNESS = 2e-4
+FLATNESS = 3e-4
 """Tolerance of a mesh that looks like the one of all pixels, as a fraction of the depth."""
 ERROR_SHARE = 0.1
 """The same as a fraction of the depth's expected error, if that is more."""

@@ -21,7 +21,7 @@ from dsr.pictures.canvas import Canvas, colours, without_collections, write_figu
 from dsr.pictures.depth_views import limits_of, reduced, strongest_window
 
 _FEWEST_DPI, _DPI = 120, 200
-"""Least and most pixels per inch; between them, a panel has 4 pixels for 5 of the picture."""
+"""Least and most pixels per inch; between them, a panel has 3 pixels for 4 of the picture."""
 _PANEL, _TALLEST, _NARROWEST = 3.78, 4.6, 2.2
 """Maximum panel width, maximum panel height and minimum column width, inches."""
 _LEFT, _GAP, _HEADING, _BETWEEN, _BELOW = 0.3, 0.1, 0.92, 0.1, 0.62
@@ -86,7 +86,7 @@ def write_before_after(path: Path, rgb: Tensor, depth_lr: Tensor, depth: Tensor,
     sheet.colour_bar(image)
     if not (depth_lr.isfinite().all() and depth.isfinite().all()):
         sheet.text(0.99 * sheet.figure.get_figwidth(), 0.3, "pink: holes", ha="right", va="center", fontsize=11)
-    dpi = round(0.8 * max(camera.width, camera.height) / max(sheet.size))
+    dpi = round(0.75 * max(camera.width, camera.height) / max(sheet.size))
     write_figure(path, sheet.figure, min(max(dpi, _FEWEST_DPI), _DPI))
 
 

@@ -31,8 +31,8 @@ METRES = "depth_metres.tiff"
 OLD_METRES = "depth_metres.npy"
 """The same, of earlier versions."""
 ERRORS = "confidence.npz"
-_ERROR_STEPS = 2**7
-"""Expected errors are stored with so many steps below each power of two: off by less than 1 %."""
+_ERROR_STEPS = 2**6
+"""Expected errors are stored with so many steps below each power of two: off by less than 2 %."""
 _WORTH_SAYING = 1e-3
 """Smallest fraction of the pixels that is reported as left out."""
 
