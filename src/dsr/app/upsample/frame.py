@@ -23,6 +23,7 @@ from dsr.app.upsample.outputs import (
     kept_surface,
     output_encoding,
     read_previous_run,
+    stored_bytes,
 )
 from dsr.app.upsample.parts import Result, write_parts
 from dsr.app.upsample.reporting import Messages
@@ -37,11 +38,13 @@ from dsr.methods.base import MapNoise, Outliers, Surface
 from dsr.notes import CHECKS, Assumption, expect_no_warning
 from dsr.utils.guards import readable
 from dsr.utils.memory import refusing_excess
-from dsr.utils.progress import Progress
+from dsr.utils.progress import Progress, megabytes
 from dsr.utils.versions import package_versions
 
 TO_DO, COMPLETE = "to do", "complete already"
 """Outcomes of a picture that is not computed."""
+STAGES = {"reading": 0.03, "upsampling": 0.57, "writing": 0.4}
+"""Shares of the time of a phone's frame, by the names that they have in ``info.json``."""
 _WHITE = 1.5
 """Noise that is alike over fewer pixels counts as white."""
 _PACKAGES = ("dsr", "torch", "numpy", "opencv-python-headless")
@@ -120,6 +123,8 @@ class FrameWork:
             reporter.facts(earlier)
             reporter.say(f"{pair.name}: {COMPLETE}, in {target}")
             return COMPLETE
+        times = _Times(progress)
+        times.begin("reading")
         picture = self._read(pair)
         picture = replace(picture, assumptions=(*picture.assumptions, *self._frames.warnings.get(pair.name, ())))
         try:
@@ -141,18 +146,19 @@ class FrameWork:
         expect_free(target, inputs, ours=wanted.overwrite or job.earlier is not None)
         errors = any(part.errors for part in wanted.of_frame)
         surface = kept_surface(target, picture.camera, errors=errors) if job.reusable else None
-        started = time.perf_counter()
+        times.begin("upsampling", planned.seconds if surface is None else 0.0)
         if surface is not None:
             surface = surface._replace(filled=find_filled(surface.depth, picture.depth_lr))
         else:
             surface = self._upsample(picture, identified, progress)
             reporter.facts(_describe(surface.noise, given="noise" in how.arguments))
             reporter.facts([*_describe_outliers(surface.outliers), *_describe_holes(surface, how)])
-        seconds = time.perf_counter() - started
+        times.begin("writing")
         begin(target, job.settings, job.inputs, () if job.earlier is None else job.earlier.files)
-        facts = _write(job, picture, surface, planned, seconds)
+        facts, seconds = _write(job, picture, surface, planned, times)
         reporter.facts(facts)
-        reporter.say(f"{pair.name}: {planned.text}, {seconds:.1f} s -> {target}")
+        size = megabytes(stored_bytes(target))
+        reporter.say(f"{pair.name}: {planned.text}, {seconds['total']:.1f} s, {size} -> {target}")
         return "done"
 
     @functools.cached_property
@@ -177,6 +183,26 @@ class FrameWork:
         if last is not None and last[0] == pair.name:
             return last[1]
         return _without_repeats(read_picture(pair, self._request.reading, self._frames.units))
+
+
+class _Times:
+    """The seconds of the stages of a picture, which are shown as it goes through them."""
+
+    def __init__(self, progress: Progress) -> None:
+        self._progress, self._seconds = progress, dict[str, float]()
+        self._stage, self._since = "", 0.0
+
+    def begin(self, stage: str, seconds: float | None = None) -> None:
+        """Begin one of :data:`STAGES`, which takes about some seconds if that is known."""
+        self.read()
+        self._stage, self._since = stage, time.perf_counter()
+        self._progress.stage(stage, seconds)
+
+    def read(self) -> dict[str, float]:
+        """Return the seconds of each stage so far, to milliseconds, and their sum as ``total``."""
+        if self._stage:
+            self._seconds[self._stage] = round(time.perf_counter() - self._since, 3)
+        return {**self._seconds, "total": round(sum(self._seconds.values()), 3)}
 
 
 @dataclass(frozen=True)
@@ -283,9 +309,10 @@ def _describe_holes(surface: Surface, how: Upsampling) -> list[Assumption]:
     return [Assumption(text, f"{share:.1%} of the pixels; --fill all fills them, too")]
 
 
-def _write(job: _Job, picture: Picture, surface: Surface, planned: Plan, seconds: float) -> list[Assumption]:
-    """Write all parts and ``info.json``, and return notes for the user."""
-    started = time.perf_counter()
+def _write(
+    job: _Job, picture: Picture, surface: Surface, planned: Plan, times: _Times
+) -> tuple[list[Assumption], dict[str, float]]:
+    """Write all parts and ``info.json``, and return notes for the user, and the seconds of the stages."""
     wanted = job.request.results
     encoding = output_encoding(picture.encoding, wanted.format)
     title = f"{readable(job.pair.name)}, {planned.method} x{planned.scale}"
@@ -309,9 +336,9 @@ def _write(job: _Job, picture: Picture, surface: Surface, planned: Plan, seconds
         "assumptions": [str(fact) for fact in (*picture.assumptions, *facts)],
         "checks": CHECKS,
         "warnings": [fact.record() for fact in (*picture.assumptions, *facts) if fact.code],
-        "seconds": {"upsampling": round(seconds, 3), "writing": round(time.perf_counter() - started, 3)},
+        "seconds": (seconds := times.read()),
         "versions": {"python": platform.python_version(), **package_versions(_PACKAGES)},
     }
     others = [name for name in (kept.files if kept else ()) if name not in files]
     finish(job.target, job.earlier, entries, [*files, *others])
-    return facts
+    return facts, seconds

@@ -170,6 +170,13 @@ def finish(folder: Path, earlier: PreviousRun | None, entries: Mapping[str, Any]
     write_text(folder / INFO, json.dumps({"complete": True, **entries, "files": list(files)}, indent=2) + "\n")
 
 
+def stored_bytes(folder: Path) -> int:
+    """Return the size of the files of a finished run, without those that have been removed since."""
+    previous = read_previous_run(folder)
+    names = () if previous is None else (*previous.files, INFO)
+    return sum((folder / name).stat().st_size for name in names if (folder / name).is_file())
+
+
 def described(picture: Picture, encoding: Encoding) -> dict[str, Any]:
     """Return the sizes, the camera with its pose, and the files' encodings for ``info.json``."""
     return {
