@@ -233,7 +233,9 @@ STAGES = {"reading": 0.1, "upsampling": 0.5, "writing": 0.4}
 def seconds_in(line: str, what: str) -> int | None:
     """Return a named time of a line in seconds."""
     found = re.search(rf"{what} (\d+):(\d+):(\d+)", line)
-    return None if found is None else sum(60**place * int(each) for place, each in zip((2, 1, 0), found.groups()))  # fmt: skip
+    return (
+        None if found is None else sum(60**at * int(each) for at, each in zip((2, 1, 0), found.groups(), strict=True))
+    )
 
 
 def times_of_stages(now: Clock, *frames: tuple[int, ...]) -> list[tuple[int, int | None]]:
@@ -241,9 +243,9 @@ def times_of_stages(now: Clock, *frames: tuple[int, ...]) -> list[tuple[int, int
     progress, _ = _progress(now, terminal=True)
     shown = []
     for durations in progress.track(frames, "upsample", shares=STAGES):
-        for name, duration in zip(STAGES, durations, strict=True):
+        for name, seconds in zip(STAGES, durations, strict=True):
             progress.stage(name)
-            for _ in range(duration):
+            for _ in range(seconds):
                 now.seconds += 1
                 [row] = _rows(progress)
                 shown.append((seconds_in(row, "elapsed"), seconds_in(row, "remaining")))

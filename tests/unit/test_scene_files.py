@@ -14,6 +14,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from dsr.geometry.camera import Camera
+from dsr.io.depth_files import write_depth_file
 from dsr.io.open3d import write_open3d, write_rgbd
 from dsr.io.scene_files import Frame, parse_pose, to_millimetres, write_rerun, write_splatting, write_transforms
 
@@ -40,9 +41,9 @@ def make(tmp_path):
         rgb[0], rgb[2, 0] = number / 10, 1
         depth = torch.from_numpy(depth_map(number))[None]
         assert write_rgbd(folder / "rgbd", rgb, depth, camera) == []
-        np.save(folder / "depth_metres.npy", depth[0].numpy())
+        write_depth_file(folder / "depth_metres.tiff", depth[0].numpy())
         name = f"room/{number:03}"
-        return Frame(name, camera, pose, folder / "rgbd" / "color.png", folder / "depth_metres.npy")
+        return Frame(name, camera, pose, folder / "rgbd" / "color.png", folder / "depth_metres.tiff")
 
     return frame
 
@@ -318,5 +319,5 @@ def test_pose_is_read_and_none_stays_none():
 def test_damaged_depth_of_a_frame_is_refused(make):
     frame = make(0)
     np.save(frame.depth, np.zeros((2, 2), np.float32))
-    with pytest.raises(ValueError, match=r"depth_metres.npy: expected depth of 8 x 12 pixels \(height x width\), got"):
+    with pytest.raises(ValueError, match=r"depth_metres.tiff: expected depth of 8 x 12 pixels \(height x width\), got"):
         frame.read_depth()

@@ -329,7 +329,7 @@ def test_name_that_is_not_utf8_is_shown_with_escapes():
 ])  # fmt: skip
 def test_damaged_depth_of_an_earlier_result_is_made_again_and_refused_where_it_is_read(tmp_path, damage):
     folder = write_result(tmp_path / "a")
-    path = folder / "depth_metres.npy"
+    path = folder / "depth_metres.tiff"
     camera = Camera(SIZE, SIZE, 80.0, 80.0, 31.0, 32.5)
     assert kept_surface(folder, camera, errors=False) is not None
     data = path.read_bytes()

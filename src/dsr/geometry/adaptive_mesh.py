@@ -45,7 +45,7 @@ def join(inverse: np.ndarray, whole: np.ndarray, tolerance: np.ndarray) -> tuple
 
 
 def _needed(values: np.ndarray, allowed: np.ndarray, split: np.ndarray) -> np.ndarray:
-    """Return the largest change by leaving out each pixel, or one that only exists where it does, by what is allowed."""
+    """Return the largest change by leaving out a pixel, or one that only exists where it does, over what is allowed."""
     needed = np.zeros(values.shape, np.float32)
     for corner in (needed[:-1, :-1], needed[1:, :-1], needed[:-1, 1:], needed[1:, 1:]):
         corner[split] = np.inf
@@ -79,7 +79,7 @@ def _sides(values: np.ndarray, allowed: np.ndarray, needed: np.ndarray, half: in
 
 
 def _change(values: np.ndarray, ends: np.ndarray, allowed: np.ndarray) -> np.ndarray:
-    """Return the difference of values from the mean of two, whose sum is given, by what is allowed; infinite if unknown."""
+    """Return how far values are from the mean of two, given by its sum, over what is allowed; infinite if unknown."""
     return np.nan_to_num(np.abs(values - ends / 2) / allowed, nan=np.inf)
 
 

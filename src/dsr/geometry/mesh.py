@@ -75,8 +75,8 @@ def triangulate(
         largest_step: relative change of depth, beyond what the slopes on both sides predict, from which a pair is cut.
         stride: every which row and column becomes vertices.
         isolated: whether vertices without a triangle are kept.
-        tolerance: (1, H, W) how far in metres each pixel may lie beside the mesh, so that flat parts get large triangles,
-            see :mod:`dsr.geometry.adaptive_mesh`; None for a mesh of all pixels.
+        tolerance: (1, H, W) how far in metres each pixel may lie beside the mesh, so that flat parts get large
+            triangles, see :mod:`dsr.geometry.adaptive_mesh`; None for a mesh of all pixels.
 
     Raises:
         ValueError: ``depth`` is no map of the camera's size, or a number is not positive.
@@ -138,7 +138,7 @@ def _faces(inverse: np.ndarray, largest_step: float, allowed: np.ndarray | None)
         (~first & left & top, (upper_left, lower_left, upper_right)),
         (~first & bottom & right, (lower_left, lower_right, upper_right)),
     )
-    kept, large = np.True_, np.empty((0, 3), np.int32)
+    kept, large = np.ones(first.shape, bool), np.empty((0, 3), np.int32)
     if allowed is not None:
         kept, large = join(inverse, top & bottom & left & right, allowed)
     small = [np.stack([corner[where & kept] for corner in corners], axis=1) for where, corners in choices]

@@ -35,8 +35,8 @@ _STORABLE = {
 }
 """Types of value by file format; NumPy's formats take any."""
 _COMPRESSION, _PREDICTOR = cv2.IMWRITE_TIFF_COMPRESSION, 317
-"""Tags of TIFF (Adobe, TIFF 6.0, section 14, and Technical Notes 2 and 3): the compression, 8 for Deflate, and what it is
-applied to, differences of whole numbers (2) or of the bytes of floats, the first of a row before the second (3)."""
+"""Tags of TIFF (Adobe, TIFF 6.0, section 14, and Technical Notes 2 and 3): the compression, 8 for Deflate, and what it
+is applied to, differences of whole numbers (2) or of the bytes of floats, all first ones of a row before others (3)."""
 
 
 def read_depth_file(path: Path, most: int | None = None) -> np.ndarray:

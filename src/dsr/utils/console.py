@@ -119,9 +119,7 @@ class ConsoleProgress(Progress):
 
     """
 
-    def __init__(
-        self, console: Console, now: Callable[[], float] = time.monotonic, since: float | None = None
-    ) -> None:
+    def __init__(self, console: Console, now: Callable[[], float] = time.monotonic, since: float | None = None) -> None:
         self._console, self._now, self._since, self._process = console, now, since, os.getpid()
         self._tasks: list[_ConsoleTask] = []  # from the outermost to the innermost
         self._next_line = 0.0
@@ -300,7 +298,7 @@ class _ConsoleTask:
             return None
         waited = self._now() - self._updated
         if at_hand is None:
-            at_hand = max(each - waited, 0.1 * waited)
+            at_hand = _left(each, waited)
         return max(at_hand + (left - 1) * each, 1.0)
 
     def _times_of_item(self) -> tuple[float | None, float | None]:
@@ -316,7 +314,7 @@ class _ConsoleTask:
         if expected is None:
             return None, None
         names = list(self.shares)
-        rest = max(expected[self._stage] - waited, 0.1 * waited) if within is None else within
+        rest = _left(expected[self._stage], waited) if within is None else within
         return rest + sum(expected[name] for name in names[names.index(self._stage) + 1 :]), sum(expected.values())
 
     def _expected(self, seconds: float | None) -> dict[str, float] | None:
@@ -366,3 +364,8 @@ class _ConsoleTask:
         """Amount per second, 0 if unknown."""
         passed = self._updated - self._measured
         return 0.0 if self._before is None or passed <= 0 else (self.done - self._before) / passed
+
+
+def _left(expected: float, waited: float) -> float:
+    """Return the seconds that are left: what was expected, or a tenth of what it takes longer."""
+    return max(expected - waited, 0.1 * (waited - expected))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import math
 import platform
 import time
 from collections.abc import Mapping, Sequence
@@ -59,6 +60,7 @@ class FrameWork:
 
     Attributes:
         seconds: the time that the last picture of a dry run takes, on two CPU cores; None where it is not known.
+        bytes: the size of its results.
 
     Raises:
         ValueError: the file of poses is damaged, or does not fit the pictures.
@@ -69,6 +71,7 @@ class FrameWork:
         self._request, self._frames = request, frames
         self._claims = Claims(request.results.output)
         self.seconds: float | None = None
+        self.bytes = 0.0
         self._read_last: tuple[str, Picture] | None = None
         self._sequence = FrameSequence(frames.whole, self._read, request.frames.neighbours, request.frames.trajectory)
 
@@ -139,8 +142,9 @@ class FrameWork:
         job.expect_no_warning(picture.assumptions)
         reporter.facts(picture.assumptions)
         if wanted.dry_run:
-            reporter.say(f"{pair.name}: {planned.text} -> {target}")
-            self.seconds = planned.seconds
+            self.bytes, writing = wanted.cost(math.prod(size))
+            self.seconds = None if planned.seconds is None else planned.seconds + writing
+            reporter.say(f"{pair.name}: {planned.text}, about {megabytes(self.bytes)} -> {target}")
             return TO_DO
         inputs = files_of(pair, request.reading).values()
         expect_free(target, inputs, ours=wanted.overwrite or job.earlier is not None)
@@ -157,8 +161,8 @@ class FrameWork:
         begin(target, job.settings, job.inputs, () if job.earlier is None else job.earlier.files)
         facts, seconds = _write(job, picture, surface, planned, times)
         reporter.facts(facts)
-        size = megabytes(stored_bytes(target))
-        reporter.say(f"{pair.name}: {planned.text}, {seconds['total']:.1f} s, {size} -> {target}")
+        took = f"{seconds['total']:.1f} s, {megabytes(stored_bytes(target))}"
+        reporter.say(f"{pair.name}: {planned.text}, {took} -> {target}")
         return "done"
 
     @functools.cached_property

@@ -65,8 +65,10 @@ def output_encoding(encoding: Encoding, chosen: str | None) -> Encoding:
         chosen: one of :data:`dsr.app.upsample.parts.FORMATS`; None for the input's.
 
     """
-    if chosen is None and replace(encoding, suffix=IN_METRES.suffix, hole=0.0) == replace(IN_METRES, hole=0.0) and (
-        math.isnan(encoding.hole)
+    if (
+        chosen is None
+        and replace(encoding, suffix=IN_METRES.suffix, hole=0.0) == replace(IN_METRES, hole=0.0)
+        and (math.isnan(encoding.hole))
     ):
         return IN_METRES
     own = "tiff" if encoding.suffix == ".tif" else encoding.suffix[1:]

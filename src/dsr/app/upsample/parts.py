@@ -83,6 +83,17 @@ class Output(NamedTuple):
     shape: Written | None = None
 
 
+class Cost(NamedTuple):
+    """What a part takes: bytes for each pixel of the photo, and seconds for a million of them, as measured on frames.
+
+    A part that draws reduced pictures takes no more for more than some ``pixels``.
+    """
+
+    bytes: float
+    seconds: float
+    pixels: float = math.inf
+
+
 class Part(NamedTuple):
     """A part of the results.
 
@@ -92,6 +103,8 @@ class Part(NamedTuple):
         write: writes it into a picture's folder; None as the result stands for all ``files``.
         write_all: writes it of all frames together to a path.
         needs: parts of each frame that it is made of.
+        cost: what it takes.
+        dense: what it takes with a mesh of all pixels, if that is more.
         usual: whether it is written unless something else is asked for.
         large: whether ``--keep all`` writes it, too.
         shape: whether it takes as long as all the rest, and is written beside it.
@@ -106,6 +119,8 @@ class Part(NamedTuple):
     write: Callable[[Path, Result], Output | None] | None = None
     write_all: Callable[[Path, Sequence[Frame]], list[Path]] | None = None
     needs: tuple[str, ...] = ()
+    cost: Cost = Cost(1.5, 0.5)
+    dense: Cost | None = None
     usual: bool = True
     large: bool = False
     shape: bool = False
@@ -272,15 +287,19 @@ _OF_DEPTH = ("depth", "rgbd")
 PARTS: dict[str, Part] = {
     part.name: part
     for part in (
-        Part("depth", (*(f"depth.{suffix}" for suffix in (*FORMATS, "tif")), METRES, OLD_METRES), _depth),
-        Part("renderings", tuple(f"renderings/{light}.png" for light in LIGHT_NAMES), _renderings),
-        Part("normals", ("normals.png",), _normals),
-        Part("mesh", ("mesh.glb",), _mesh, shape=True, errors=True),
-        Part("before_after", ("before_after.png",), _before_after),
-        Part("confidence", ("confidence.png", ERRORS), _confidence, errors=True),
-        Part("input", ("input.npz",), _input),
-        Part("mesh_ply", ("mesh.ply",), _mesh_ply, usual=False, large=True, shape=True, errors=True),
-        Part("cloud", ("cloud.ply",), _cloud, usual=False, large=True, shape=True, errors=True),
+        Part("depth", (*(f"depth.{suffix}" for suffix in (*FORMATS, "tif")), METRES, OLD_METRES), _depth,
+             cost=Cost(2.0, 0.25)),
+        Part("renderings", tuple(f"renderings/{light}.png" for light in LIGHT_NAMES), _renderings,
+             cost=Cost(1.0, 0.4)),
+        Part("normals", ("normals.png",), _normals, cost=Cost(0.8, 0.4)),
+        Part("mesh", ("mesh.glb",), _mesh, shape=True, errors=True, cost=Cost(2.5, 0.6), dense=Cost(43, 1.5)),
+        Part("before_after", ("before_after.png",), _before_after, cost=Cost(3.3, 2.5, 7.5e5)),
+        Part("confidence", ("confidence.png", ERRORS), _confidence, errors=True, cost=Cost(2.3, 1.0)),
+        Part("input", ("input.npz",), _input, cost=Cost(0.8, 0.1, 6e5)),
+        Part("mesh_ply", ("mesh.ply",), _mesh_ply, usual=False, large=True, shape=True, errors=True,
+             cost=Cost(2.5, 0.2), dense=Cost(53, 1.0)),
+        Part("cloud", ("cloud.ply",), _cloud, usual=False, large=True, shape=True, errors=True,
+             cost=Cost(27.0, 1.4)),
         Part("rgbd", ("rgbd/color.png", "rgbd/depth.png", "rgbd/intrinsic.json"), _rgbd, usual=False),
         Part("open3d", ("open3d",), write_all=_open3d, needs=_OF_DEPTH, usual=False),
         Part("nerfstudio", ("transforms.json", "nerfstudio"), write_all=_nerfstudio, needs=_OF_DEPTH, usual=False,
@@ -356,10 +375,8 @@ class Results(Options):
     @functools.cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the parts that are asked for, in the table's order."""
-        usual = self.only
-        if usual is None:
-            kept = (part for part in PARTS.values() if part.usual or (part.large and self.keep == "all"))
-            usual = [part.name for part in kept if part.name not in self.without]
+        kept = (part for part in PARTS.values() if part.usual or (part.large and self.keep == "all"))
+        usual = tuple(part.name for part in kept if part.name not in self.without) if self.only is None else self.only
         return tuple(name for name in PARTS if name in (*usual, *self.more))
 
     @functools.cached_property
@@ -372,6 +389,13 @@ class Results(Options):
     def of_all(self) -> tuple[Part, ...]:
         """Parts of all frames together."""
         return tuple(PARTS[name] for name in self.names if PARTS[name].write_all)
+
+    def cost(self, pixels: int) -> tuple[float, float]:
+        """Return about how many bytes the results of a frame take, and how many seconds it takes to write them."""
+        each = [(self.keep == "all" and part.dense) or part.cost for part in (*self.of_frame, *self.of_all)]
+        sizes = [min(pixels, cost.pixels) for cost in each]
+        total = sum(cost.bytes * size for cost, size in zip(each, sizes, strict=True))
+        return total, sum(cost.seconds * size for cost, size in zip(each, sizes, strict=True)) / 1e6
 
 
 def write_parts(folder: Path, result: Result) -> dict[str, Output]:
@@ -409,4 +433,4 @@ def _as_stored(surface: Surface) -> Surface:
 
     rough = surface._replace(depth_error=rounded(surface.depth_error), angle_error=rounded(surface.angle_error))
     stored = {name: torch.from_numpy(values)[None].float() for name, values in rough.error_arrays().items()}
-    return surface._replace(**stored)
+    return surface._replace(depth_error=stored.get("depth_error"), angle_error=stored.get("angle_error"))

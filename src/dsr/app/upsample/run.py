@@ -119,7 +119,7 @@ def _run(request: UpsampleRequest, frames: Frames, console: Console) -> list[str
         counts += [f"{sum(map(len, problems.values()))} failed"] if problems else []
         counts = counts or ["nothing to do"]
         pictures = "1 picture" if len(found.pairs) == 1 else f"{len(found.pairs)} pictures"
-        took = "" if wanted.dry_run else f" in {clock(time.monotonic() - started)}, {megabytes(_size(targets.values()))}"
+        took = "" if wanted.dry_run else f" in {clock(time.monotonic() - started)}, {_size(targets.values())}"
         show(console, f"{pictures}: {', '.join(counts)}{took} -> {wanted.output}")
     if shard is not None and not wanted.dry_run:
         summary = {
@@ -134,13 +134,13 @@ def _run(request: UpsampleRequest, frames: Frames, console: Console) -> list[str
     return lines + scene_problems
 
 
-def _size(folders: Iterable[Path]) -> int:
-    """Return the size of the results in folders."""
+def _size(folders: Iterable[Path]) -> str:
+    """Return the size of the results in folders as text."""
     total = 0
     for folder in folders:
         with contextlib.suppress(ValueError, OSError):
             total += stored_bytes(folder)
-    return total
+    return megabytes(total)
 
 
 def _summary_of(shard: Shard) -> str:
