@@ -187,7 +187,7 @@ def test_splatting_depth_is_inverse_depth_after_scale_and_offset(make, tmp_path)
         values = cv2.imread(str(tmp_path / "g/depths" / f"{frame.stem}.png"), cv2.IMREAD_UNCHANGED)
         assert values.dtype == np.uint16
         inverse = values / 65536 * parameters[frame.stem]["scale"] + parameters[frame.stem]["offset"]
-        expected = np.nan_to_num(1 / np.load(frame.depth), nan=0)
+        expected = np.nan_to_num(1 / frame.read_depth(), nan=0)
         np.testing.assert_allclose(inverse, expected, atol=1e-5)
     assert cv2.imread(str(tmp_path / "g/depths/room_000.png"), cv2.IMREAD_UNCHANGED).max() == 65535
 
@@ -222,7 +222,7 @@ def test_splatting_without_poses_has_depth_alone_and_holes_alone_are_refused(mak
     frame = make(0, pose=None)
     write_splatting(tmp_path / "g", [frame])
     assert [file.name for file in (tmp_path / "g/sparse/0").iterdir()] == ["depth_params.json"]
-    np.save(frame.depth, np.full((8, 12), np.nan, np.float32))
+    write_depth_file(frame.depth, np.full((8, 12), np.nan, np.float32))
     with pytest.raises(ValueError, match=r"^gaussian: expected some depth, got holes alone"):
         write_splatting(tmp_path / "h", [frame])
     assert not (tmp_path / "h").exists()
@@ -318,6 +318,6 @@ def test_pose_is_read_and_none_stays_none():
 
 def test_damaged_depth_of_a_frame_is_refused(make):
     frame = make(0)
-    np.save(frame.depth, np.zeros((2, 2), np.float32))
+    write_depth_file(frame.depth, np.zeros((2, 2), np.float32))
     with pytest.raises(ValueError, match=r"depth_metres.tiff: expected depth of 8 x 12 pixels \(height x width\), got"):
         frame.read_depth()
