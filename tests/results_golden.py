@@ -295,7 +295,7 @@ def geometry() -> Iterator[tuple[str, Job]]:
     others = {
         "rescaled": camera.rescale(24, 20), "reduced": camera.reduce(24, 24), "downscaled": camera.downscale(4),
         "decimated": camera.decimate(4, 2.0), "rotated": camera.rotate90(1), "cropped": camera.crop(3, 5, 30, 40),
-        "of a field of view": dsr.Camera.from_fov(64, 48),
+        "of a field of view": dsr.Camera.from_fov(60, 64, 48),
     }  # fmt: skip
     for name, each in others.items():
         yield f"rays {name}", each.rays

@@ -20,14 +20,17 @@ if TYPE_CHECKING:
     from dsr.app.composition import compose
     from dsr.geometry.camera import Camera
     from dsr.inference.api import Upsampler, upsample, upsample_with_errors
+    from dsr.io.files import read, read_depth
 
 __version__ = "0.1.0"
-__all__ = ["Camera", "Upsampler", "__version__", "compose", "upsample", "upsample_with_errors"]
+__all__ = ["Camera", "Upsampler", "__version__", "compose", "read", "read_depth", "upsample", "upsample_with_errors"]
 
 _HOMES = {
     "Camera": "dsr.geometry.camera",
     "Upsampler": "dsr.inference.api",
     "compose": "dsr.app.composition",
+    "read": "dsr.io.files",
+    "read_depth": "dsr.io.files",
     "upsample": "dsr.inference.api",
     "upsample_with_errors": "dsr.inference.api",
 }
