@@ -158,7 +158,8 @@ class AnyRatio(Method):
                 ``noise`` is set.
 
         Returns:
-            Depth, (1, H, W) float32 in metres, and its expected errors, on the device of ``depth``; and its outliers.
+            Depth, (1, H, W) float32 in metres, its expected errors, and which depth is filled in, on the device of
+            ``depth``; and its outliers.
 
         Raises:
             ValueError: a shape or value is not as above, the sizes do not fit together or to the scale, the method has
@@ -187,6 +188,8 @@ class AnyRatio(Method):
         surface = _in_depth(found, inverse, camera, sensor)
         surface = surface._replace(outliers=count_patches(outliers))
         surface = self._restore_holes(surface, valid, camera)
+        missing = resize_nearest(~valid, size_of(rgb)).to(surface.depth.device)
+        surface = surface._replace(filled=missing & surface.depth.isfinite())
         return surface.map(lambda values: values.to(depth.device))
 
     def _at_own_size(self, inverse: Tensor, size: tuple[int, int], planned: Plan) -> tuple[Tensor, int, int | None]:

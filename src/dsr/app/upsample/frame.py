@@ -30,7 +30,7 @@ from dsr.app.upsample.request import UpsampleRequest, Upsampling, files_of, inpu
 from dsr.app.upsample.sequence import FrameSequence
 from dsr.degradation.sensors import Identified
 from dsr.evaluation.sharing import Claims
-from dsr.inference import AnyRatio, Plan, enlarged_by, find_sensor
+from dsr.inference import AnyRatio, Plan, enlarged_by, find_filled, find_sensor
 from dsr.io.inputs import Picture, read_picture
 from dsr.io.pairs import Pair
 from dsr.methods.base import MapNoise, Outliers, Surface
@@ -142,7 +142,9 @@ class FrameWork:
         errors = any(part.errors for part in wanted.of_frame)
         surface = kept_surface(target, picture.camera, errors=errors) if job.reusable else None
         started = time.perf_counter()
-        if surface is None:
+        if surface is not None:
+            surface = surface._replace(filled=find_filled(surface.depth, picture.depth_lr))
+        else:
             surface = self._upsample(picture, identified, progress)
             reporter.facts(_describe(surface.noise, given="noise" in how.arguments))
             reporter.facts([*_describe_outliers(surface.outliers), *_describe_holes(surface, how)])
