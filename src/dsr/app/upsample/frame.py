@@ -6,7 +6,7 @@ import contextlib
 import functools
 import platform
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -122,11 +122,7 @@ class FrameWork:
             return COMPLETE
         picture = self._read(pair)
         picture = replace(picture, assumptions=(*picture.assumptions, *self._frames.warnings.get(pair.name, ())))
-        try:
-            identified = find_sensor(picture.depth_lr, how.sensor, picture.device_name)
-        except ValueError as error:
-            raise ValueError(f"--{error}") from error
-        picture = _with_sensor(sequence.fuse(pair, picture), identified)
+        picture, identified = prepare(picture, how.sensor, functools.partial(sequence.fuse, pair))
         picture = align(picture, register=request.reading.register)
         size_lr = (picture.depth_lr.shape[-2], picture.depth_lr.shape[-1])
         size = (picture.camera.height, picture.camera.width)
@@ -176,7 +172,7 @@ class FrameWork:
         last, self._read_last = self._read_last, None
         if last is not None and last[0] == pair.name:
             return last[1]
-        return _without_repeats(read_picture(pair, self._request.reading, self._frames.units))
+        return without_repeats(read_picture(pair, self._request.reading, self._frames.units))
 
 
 @dataclass(frozen=True)
@@ -229,7 +225,22 @@ class _Job:
         return all(there & set(part.files) for part in self.request.results.of_frame)
 
 
-def _without_repeats(picture: Picture) -> Picture:
+def prepare(picture: Picture, sensor: str, fuse: Callable[[Picture], Picture]) -> tuple[Picture, Identified | None]:
+    """Return a picture as it was read, fused with its neighbours, and the sensor that its own depth tells.
+
+    Args:
+        sensor: see :func:`dsr.inference.find_sensor`.
+        fuse: fuses it with its neighbours.
+
+    """
+    try:
+        identified = find_sensor(picture.depth_lr, sensor, picture.device_name)
+    except ValueError as error:
+        raise ValueError(f"--{error}") from error
+    return _with_sensor(fuse(picture), identified), identified
+
+
+def without_repeats(picture: Picture) -> Picture:
     """Undo an enlargement of the depth map by repeated pixels."""
     height, width = picture.depth_lr.shape[-2:]
     block = enlarged_by(picture.depth_lr) if (height, width) == (picture.camera.height, picture.camera.width) else 1
@@ -285,26 +296,44 @@ def _describe_holes(surface: Surface, how: Upsampling) -> list[Assumption]:
 
 def _write(job: _Job, picture: Picture, surface: Surface, planned: Plan, seconds: float) -> list[Assumption]:
     """Write all parts and ``info.json``, and return notes for the user."""
-    started = time.perf_counter()
     wanted = job.request.results
-    encoding = output_encoding(picture.encoding, wanted.format)
     title = f"{readable(job.pair.name)}, {planned.method} x{planned.scale}"
-    outputs = write_parts(job.target, Result(picture, surface, encoding, title, wanted))
+    result = Result(picture, surface, output_encoding(picture.encoding, wanted.format), title, wanted)
+    kept = job.earlier if job.earlier is not None and job.same else None
+    return write_result(job.target, result, planned, seconds, job.inputs, job.settings, job.earlier, kept)
+
+
+def write_result(
+    folder: Path, result: Result, planned: Plan, seconds: float, inputs: Mapping[str, Any],
+    settings: Mapping[str, Any], earlier: PreviousRun | None = None, kept: PreviousRun | None = None,
+) -> list[Assumption]:  # fmt: skip
+    """Write the parts of a result and ``info.json``, and return notes for the user.
+
+    Args:
+        folder: of the result.
+        planned, seconds: how the result was computed, and how long that took.
+        inputs, settings: what it depends on, as values for JSON.
+        earlier: the run whose files are in the folder.
+        kept: that run, if its other files stay.
+
+    """
+    started = time.perf_counter()
+    picture, surface = result.picture, result.surface
+    outputs = write_parts(folder, result)
     files = [name for output in outputs.values() for name in output.files]
     facts = list(dict.fromkeys(note for output in outputs.values() for note in output.notes))
     shapes = {name: output.shape._asdict() for name, output in outputs.items() if output.shape is not None}
-    kept = job.earlier if job.earlier is not None and job.same else None
     counts = {**(kept.shapes if kept else {}), **shapes}
     if surface.outliers is not None:
         counts["outliers"] = surface.outliers._asdict()
     entries = {
-        "inputs": job.inputs,
-        "settings": job.settings,
+        "inputs": inputs,
+        "settings": settings,
         "method": planned.method,
         "scale": planned.scale,
         "plan": planned.text,
         "noise": surface.noise._asdict() if surface.noise else kept.noise if kept else None,
-        **described(picture, encoding),
+        **described(picture, result.encoding),
         **counts,
         "assumptions": [str(fact) for fact in (*picture.assumptions, *facts)],
         "checks": CHECKS,
@@ -313,5 +342,5 @@ def _write(job: _Job, picture: Picture, surface: Surface, planned: Plan, seconds
         "versions": {"python": platform.python_version(), **package_versions(_PACKAGES)},
     }
     others = [name for name in (kept.files if kept else ()) if name not in files]
-    finish(job.target, job.earlier, entries, [*files, *others])
+    finish(folder, earlier, entries, [*files, *others])
     return facts
