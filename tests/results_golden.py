@@ -111,7 +111,7 @@ def _upsampled(ratio: str, method: str, *, errors: bool = False, **more: Any) ->
     """Return the upsampling of the map of a ratio."""
 
     def run() -> Any:
-        found = dsr.upsample_with_errors(_photo(), _given(ratio), _camera(), method=method, device="cpu", **more)
+        found = dsr.Upsampler(method, device="cpu", **more)(_photo(), _given(ratio), _camera())
         return [found.depth, found.depth_error, found.angle_error] if errors else found.depth
 
     return run

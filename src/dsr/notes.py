@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 import warnings
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
-_OPTION = re.compile(r"--([a-z]+(?:-[a-z]+)*)")
-_ARGUMENTS = {"depth-unit": "unit"}
+_OPTION = re.compile(r"(?<!\S)--?([a-z]+(?:-[a-z]+)*)")
+_ARGUMENTS = {"depth-unit": "unit", "o": "folder"}
 """Options of the command that have another name in Python."""
 
 CHECKS = 4
@@ -336,10 +337,13 @@ def in_python(text: str) -> str:
     return _OPTION.sub(lambda option: _ARGUMENTS.get(option[1], option[1].replace("-", "_")), text)
 
 
-def warn(notes: Iterable[Assumption], stacklevel: int = 2) -> None:
-    """Give notes as Python's warnings, from the caller of the function that calls this."""
+def warn(notes: Iterable[Assumption]) -> None:
+    """Give notes as Python's warnings, from the place outside of dsr that called."""
+    level, frame = 1, inspect.currentframe()
+    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] == "dsr":
+        level, frame = level + 1, frame.f_back
     for note in notes:
-        warnings.warn(in_python(note.message), UserWarning, stacklevel + 1)
+        warnings.warn(in_python(note.message), UserWarning, level - 1)
 
 
 def read_warning(entry: Mapping[str, Any]) -> Assumption:

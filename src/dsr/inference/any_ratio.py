@@ -166,7 +166,7 @@ class AnyRatio(Method):
                 no solution, or the map's values contradict the named sensor.
 
         """
-        _check(rgb, depth, camera)
+        expect_picture(rgb, depth, camera)
         planned = self.plan(size_of(rgb), size_of(depth))  # raises ValueError for sizes or a scale that cannot be used
         self.check_working_size()
         sensor = find_sensor(depth, sensor) if isinstance(sensor, str) else sensor
@@ -345,7 +345,7 @@ def _check_options(fill: str, max_hole: float, working_size: int | None) -> None
         raise ValueError(f"working_size: expected one of {', '.join(map(str, SIZES))}, got {working_size}")
 
 
-def _check(rgb: Tensor, depth: Tensor, camera: Camera) -> None:
+def expect_picture(rgb: Tensor, depth: Tensor, camera: Camera) -> None:
     """Raise ValueError unless the photo, the depth map and the camera are valid and fit together."""
     size = (camera.height, camera.width)
     if tuple(rgb.shape) != (3, *size):
