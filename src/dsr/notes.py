@@ -343,7 +343,7 @@ def warn(notes: Iterable[Assumption]) -> None:
     while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] == "dsr":
         level, frame = level + 1, frame.f_back
     for note in notes:
-        warnings.warn(in_python(note.message), UserWarning, level - 1)
+        warnings.warn(in_python(note.message), UserWarning, level)
 
 
 def read_warning(entry: Mapping[str, Any]) -> Assumption:

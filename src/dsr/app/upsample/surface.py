@@ -19,7 +19,7 @@ from torch import Tensor
 from dsr.app.upsample.frame import write_result
 from dsr.app.upsample.outputs import begin, expect_free, output_encoding, read_previous_run
 from dsr.app.upsample.parts import Result, Results
-from dsr.app.upsample.scene import SceneResult, write_scene
+from dsr.app.upsample.scene import write_scene
 from dsr.geometry.camera import Camera
 from dsr.geometry.lights import FIGURE_LIGHT, Direction, direction_of
 from dsr.geometry.mesh import Mesh, triangulate, vertex_normals
@@ -216,7 +216,9 @@ class Surface(Generic[Array]):
         warn(note for note in notes if note.code)
         run = read_previous_run(folder)
         files = [] if run is None else [folder / name for name in run.files]
-        scene: SceneResult = write_scene(folder, {folder.name: folder}, wanted.of_all, overwrite=wanted.overwrite)
+        if not wanted.of_all:
+            return files
+        scene = write_scene(folder, {folder.name: folder}, wanted.of_all, overwrite=wanted.overwrite)
         if scene.problems:
             raise ValueError(scene.problems[0])
         return files + list(scene.files.values())
