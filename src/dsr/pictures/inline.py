@@ -8,15 +8,15 @@ from typing import Any
 import cv2
 import numpy as np
 
-from dsr.io.photos import encode_png
 from dsr.pictures.canvas import colours
 
 _HEIGHT, _WIDTH, _GAP = 220, 320, 6
 """Pixels: the panels' largest size, and what lies between them."""
+_QUALITY = 85
 
 
 def encode_row(panels: Sequence[np.ndarray]) -> bytes:
-    """Return panels in a row as a PNG, transparent between them.
+    """Return panels in a row as a WebP, transparent between them.
 
     Args:
         panels: of one aspect and any sizes, (H, W) grey or (H, W, 3) RGB in [0, 1], NaN in holes. Pixels of small ones
@@ -29,7 +29,10 @@ def encode_row(panels: Sequence[np.ndarray]) -> bytes:
     shown = [_resized(panel, size) for panel in panels]
     gap = np.zeros((size[1], _GAP, 4), np.uint8)
     row = np.concatenate([each for panel in shown for each in (gap, panel)][1:], axis=1)
-    return encode_png(row[..., [2, 1, 0, 3]])
+    done, content = cv2.imencode(".webp", row[..., [2, 1, 0, 3]], [cv2.IMWRITE_WEBP_QUALITY, _QUALITY])
+    if not done:
+        raise OSError(f"the picture of {row.shape} could not be encoded")
+    return content.tobytes()
 
 
 def _resized(panel: np.ndarray, size: tuple[int, int]) -> np.ndarray:

@@ -237,7 +237,8 @@ class Surface(Generic[Array]):
             f"photo; depth as given, {self._size(before)}; surface, {self._size(self._found.depth)}: {self._range}, "
             f"&plusmn; {1e3 * error:.2g} mm (median), by {escape(self._plan.method)}"
         )
-        source = f"data:image/png;base64,{base64.b64encode(content).decode()}"
+        about += "; pink: holes" if bool(before.isnan().any() or self._found.depth.isnan().any()) else ""
+        source = f"data:image/webp;base64,{base64.b64encode(content).decode()}"
         return (
             f'<figure style="margin:0"><img src="{source}" alt="{about}" style="max-width:100%">'
             f'<figcaption style="font-size:85%">{about}</figcaption></figure>'
