@@ -283,6 +283,14 @@ def to_range(depth: Tensor, camera: Camera, range_type: RangeType) -> Tensor:
     Returns:
         (..., H, W) in the unit of the type.
 
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.geometry.camera import to_range
+        >>> camera = dsr.Camera(64, 48, 60.0, 60.0, 31.5, 23.5, baseline=0.1)
+        >>> to_range(torch.full((1, 48, 64), 2.0), camera, "disparity")[0, 0, 0]  # 0.1 m * 60 pixels / 2 m
+        tensor(3.)
+
     """
     if range_type == "orthogonal":
         return depth

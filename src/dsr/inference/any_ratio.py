@@ -301,6 +301,14 @@ def upsampler(
     Raises:
         ValueError: there is no such method or device, or an option is not as described.
 
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.inference import upsampler
+        >>> camera, run = dsr.Camera.from_fov(60, width=32, height=24), upsampler("bicubic")
+        >>> run.upsample(torch.rand(3, 24, 32), torch.full((1, 10, 13), 2.0), camera).depth.shape  # tensors alone
+        torch.Size([1, 24, 32])
+
     """
     recipe = read_recipe(method, settings, directories)
     return AnyRatio(recipe, pick_device(device), scale, fill, max_hole, working_size)
