@@ -137,6 +137,27 @@ class Surface(NamedTuple):
         depth = function(self.depth)
         return self._replace(depth=depth, depth_error=depth_error, angle_error=angle_error, filled=filled)
 
+    def without_dubious(self, limit: float) -> Surface:
+        """Return the surface with holes where the depth is expected to be off by more than this share of it."""
+        if self.depth_error is None:
+            return self
+        dubious = self.depth_error > limit * self.depth
+        filled = None if self.filled is None else self.filled & ~dubious
+        return self._replace(depth=self.depth.masked_fill(dubious, float("nan")), filled=filled)
+
+    def shares(self, limit: float) -> dict[str, float]:
+        """Return the shares of the pixels that are ``measured``, ``filled`` and ``open``, which have no depth.
+
+        With expected errors also the share of those that have depth and are ``dubious``: expected to be off by more
+        than ``limit`` of it. Without knowing what was filled, what has depth counts as measured.
+        """
+        known = self.depth.isfinite()
+        filled = known & self.filled if self.filled is not None else known & False
+        found = {"measured": known & ~filled, "filled": filled, "open": ~known}
+        if self.depth_error is not None:
+            found["dubious"] = known & (self.depth_error > limit * self.depth)
+        return {name: float(mask.double().mean()) for name, mask in found.items()}
+
     def error_arrays(self) -> dict[str, np.ndarray]:
         """Return the expected errors by name, (H, W), as they are stored; empty without them.
 

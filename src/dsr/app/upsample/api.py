@@ -249,7 +249,7 @@ class Upsampler:
                 return picture
             near = [kept[each].picture for each in nearest(place, max(kept) + 1, neighbours, posed)]
             views = [View(each.depth_lr, camera_lr(each), each.pose) for each in near if each.pose is not None]
-            return vote(picture, views, neighbours)
+            return vote(picture, views, len(views))
 
         with naming(f"frame {place}"), speaking_python():
             picture, identified = prepare(given.picture, self._sensor, fuse)

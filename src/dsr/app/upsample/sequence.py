@@ -111,8 +111,8 @@ class FrameSequence:
         picture = self.with_pose(pair, picture)
         if not self._count or picture.pose is None:
             return picture
-        views, failed = [], 0
-        for other in self.neighbours(pair):
+        others, views, failed = self.neighbours(pair), [], 0
+        for other in others:
             try:
                 depth, camera, pose = self._frame(other)
             except (ValueError, OSError):  # it is reported as a frame of its own
@@ -120,7 +120,7 @@ class FrameSequence:
                 continue
             if pose is not None:
                 views.append(View(depth, camera, pose))
-        return vote(picture, views, self._count, failed)
+        return vote(picture, views, len(others), failed)
 
     def _frame(self, pair: Pair) -> _Frame:
         """Return what a neighbour contributes; the latest ones are kept."""
@@ -157,20 +157,21 @@ def vote(picture: Picture, views: Sequence[View], count: int, failed: int = 0) -
 
     Args:
         views: the neighbours.
-        count: how many there were to be.
+        count: how many there are, with those that could not be read.
         failed: how many of them could not be read.
 
     """
     assert picture.pose is not None  # noqa: S101 - see above
     fused = fuse_views(View(picture.depth_lr, camera_lr(picture), picture.pose), views)
     known = picture.depth_lr.isfinite()
-    others, seeing = (float(each[known].mean()) for each in (fused.others, fused.seeing))
-    detail = f"of {seeing:.1f} that see a pixel {others:.1f} agree with it"
+    agreeing, seeing = (float(each[known].mean()) for each in (fused.others, fused.seeing))
+    detail = f"of {seeing:.1f} that see a pixel {agreeing:.1f} agree with it"
     detail += f"; {failed} could not be read" if failed else ""
-    text, code = f"{count} neighbouring frames vote on the depth", "neighbours-disagree"
-    share = others / seeing if seeing else 0.0
+    who = "1 neighbouring frame votes" if count == 1 else f"{count} neighbouring frames vote"
+    text, code = f"{who} on the depth", "neighbours-disagree"
+    share = agreeing / seeing if seeing else 0.0
     note = Assumption(text, detail)
-    if share < LIMITS[code].threshold:
+    if count and share < LIMITS[code].threshold:
         note = Assumption(f"{text}, and hardly any agree with it: are the poses right?", detail, code, round(share, 3))
     return replace(picture, depth_lr=fused.depth, assumptions=(*picture.assumptions, note))
 

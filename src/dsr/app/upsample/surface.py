@@ -182,8 +182,8 @@ class Surface(Generic[Array]):
         Args:
             folder: is made if need be.
             parts: some of its parts, such as ``["depth", "mesh"]``; None for the usual ones.
-            **options: of the command, by their names: ``format``, ``max_error``, ``max_faces``, ``max_points``,
-                ``overwrite``.
+            **options: of the command, by their names: ``format``, ``max_error``, ``certain``, ``max_faces``,
+                ``max_points``, ``overwrite``.
 
         Returns:
             The files.
@@ -207,9 +207,8 @@ class Surface(Generic[Array]):
         earlier = read_previous_run(folder)
         expect_free(folder, (), ours=wanted.overwrite)
         title = f"{self._plan.method} x{self._plan.scale}"
-        result = Result(
-            self._picture, self._found, output_encoding(self._picture.encoding, wanted.format), title, wanted
-        )
+        found = self._found.without_dubious(wanted.max_error / 100) if wanted.certain else self._found
+        result = Result(self._picture, found, output_encoding(self._picture.encoding, wanted.format), title, wanted)
         settings = {"max_error": wanted.max_error / 100}
         begin(folder, settings, {}, () if earlier is None else earlier.files)
         notes = write_result(folder, result, self._plan, self._seconds, {}, settings, earlier)
@@ -265,9 +264,8 @@ class Surface(Generic[Array]):
         """Return the depth, (1, H, W), without pixels that are likely to be wrong."""
         if max_error is None:
             return self._found.depth
-        wanted = Results(output=Path(), max_error=max_error)
-        depth, _ = Result(self._picture, self._found, self._picture.encoding, "", wanted).certain
-        if depth is None:
+        depth = self._found.without_dubious(max_error / 100).depth
+        if not bool(depth.isfinite().any()):
             raise ValueError(f"max_error: expected a percentage that leaves pixels, got {max_error}")
         return depth
 
