@@ -12,7 +12,7 @@ from small_scenes import room
 from dsr.cli import main
 from dsr.geometry.camera import Camera
 
-SMALL = Camera.from_fov(128, 96)
+SMALL = Camera.from_fov(60, 128, 96)
 """Of the depth maps; the default of 60 degrees, so that no camera need be given."""
 DEPTH = room(SMALL, 17.0)[0]
 MILLIMETRES = np.round(DEPTH * 1000).astype(np.uint16)

@@ -124,7 +124,17 @@ def invert(transform: Matrix) -> Matrix:
 
 
 def relative(pose: Matrix, to: Matrix) -> Matrix:
-    """Return the transform from the frame of the camera at ``pose`` to that of the camera at ``to``."""
+    """Return the transform from the frame of the camera at ``pose`` to that of the camera at ``to``.
+
+    Example:
+        >>> import numpy as np
+        >>> from dsr.geometry.rigid_motion import relative
+        >>> aside = np.eye(4)
+        >>> aside[0, 3] = 0.5
+        >>> relative(np.eye(4), aside)[:3, 3]  # half a metre to its left
+        array([-0.5,  0. ,  0. ])
+
+    """
     return invert(to) @ pose
 
 
