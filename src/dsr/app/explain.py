@@ -16,6 +16,7 @@ from dsr.app.multirun import LAUNCHERS
 from dsr.app.schema import MOVED, NAMED, SEVERAL
 from dsr.utils.configuration import list_choices, list_groups
 from dsr.utils.console import one_line
+from dsr.utils.spelling import did_you_mean
 
 _ALIASES = {"learning_rate": "lr", "batch_size": "batch", "steps": "max_steps"}
 """Names that others have for keys."""
@@ -111,7 +112,8 @@ def explain_choice(group: str, choice: str, directories: Sequence[Path]) -> str:
     """
     if group == "model" and choice in list_choices("method", directories):
         return f"model={choice}: expected a network to train, {choice} is none; eval.py has method={choice}"
-    return f"{group}={choice}: unknown; expected one of {', '.join(list_choices(group, directories))}"
+    choices = list_choices(group, directories)
+    return f"{group}={choice}: unknown; expected one of {', '.join(choices)}{did_you_mean(choice, choices)}"
 
 
 def _explain_key(key: str, name: str, arguments: Sequence[str], directories: Sequence[Path]) -> str:
@@ -187,10 +189,12 @@ def _explain_missing(file: str, name: str, directories: Sequence[Path]) -> str:
         return f"--config-name {choice}: unknown; expected {name}"
     choices = list_choices(group, directories)
     if group == "hydra/launcher":
-        return f"{group}={choice}: unknown; expected one of {', '.join(sorted({*choices, *LAUNCHERS}))}"
+        choices = sorted({*choices, *LAUNCHERS})
+        return f"{group}={choice}: unknown; expected one of {', '.join(choices)}{did_you_mean(choice, choices)}"
     if choices:
         return explain_choice(group, choice, directories)
-    return f"{group}: no such group of choices; expected one of {', '.join(list_groups(directories))}"
+    groups = list_groups(directories)
+    return f"{group}: no such group of choices; expected one of {', '.join(groups)}{did_you_mean(group, groups)}"
 
 
 def _explain_syntax(override: str) -> str:
