@@ -133,8 +133,9 @@ def _explain_key(key: str, name: str, arguments: Sequence[str], directories: Seq
     alike = [f"{prefix}{each}={value}" for each in get_close_matches(key.rpartition(".")[2], children, 1, _ALIKE)]
     meant = _meant(key, value, name, config, directories)
     wanted = alike or meant if prefix else meant or alike  # a key of a group is one of this group first
-    beside = ", ".join(f"{prefix}{child}" for child in children)
-    return f"{key}: unknown key; expected {' or '.join(wanted) or beside or 'none'}"
+    beside = [f"{prefix}{child}" for child in children]
+    near = did_you_mean(key, beside if prefix else {*beside, *list_groups(directories)})
+    return f"{key}: unknown key; expected {' or '.join(wanted) or (', '.join(beside) or 'none') + near}"
 
 
 def _meant(key: str, value: str, name: str, config: DictConfig, directories: Sequence[Path]) -> list[str]:

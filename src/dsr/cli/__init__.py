@@ -16,10 +16,11 @@ from dsr.cli.commands import (
     REPORT,
     UPSAMPLE,
     VIEW,
+    Command,
     add_data_command,
     add_hydra_commands,
 )
-from dsr.cli.completion import COMPLETION
+from dsr.cli.completion import ABOUT, EPILOG, CompletionRequest, complete
 from dsr.cli.parser import Parser
 from dsr.cli.study import STUDY
 from dsr.data.download.collections import Collection
@@ -52,7 +53,7 @@ _COMMANDS = (
     add_hydra_commands,
     *(command.add for command in (REPORT, LEADERBOARD, STUDY)),
     add_data_command,
-    *(command.add for command in (FORMATS_COMMAND, DOCTOR, EXPORT, COMPLETION)),
+    *(command.add for command in (FORMATS_COMMAND, DOCTOR, EXPORT)),
 )
 
 
@@ -101,4 +102,7 @@ def make_parser() -> Parser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for add in _COMMANDS:
         add(commands)
+    Command(
+        "completion", ABOUT, CompletionRequest, lambda request, console, _: complete(parser, request, console), EPILOG
+    ).add(commands)
     return parser

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 from rich.console import Console
 
-from dsr.cli.commands import Command
 from dsr.cli.parser import Parser
 from dsr.data.download.collections import CATALOGUE
 from dsr.geometry.lights import LIGHT_NAMES
@@ -55,35 +54,28 @@ class CompletionRequest(Options):
     line: str | None = option(None, "print what may stand at the end of a line, instead of the script", "LINE")
 
 
-def complete(request: CompletionRequest, console: Console, _: object) -> list[str]:
-    """Print a shell's script, or the words that may stand at the end of a line, one a line."""
-    from dsr.cli import make_parser  # noqa: PLC0415 - which has this command
-
-    found = [SHELLS[request.shell]]
-    if request.line is not None:
-        last = _split(request.line)[-1]
-        found = [each for each in words_at_end(make_parser(), request.line) if each.startswith(last)]
-        if request.shell == "bash" and "=" in last:  # which begins a word of its own there
-            found = [each.rpartition("=")[2] for each in found]
-    for line in found:
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
-    return []
-
-
-COMPLETION = Command(
-    "completion",
-    "what your shell completes after `dsr`",
-    CompletionRequest,
-    complete,
-    epilog="""\
+ABOUT = "what your shell completes after `dsr`"
+EPILOG = """\
 examples:
   eval "$(dsr completion bash)"         in ~/.bashrc
   source <(dsr completion zsh)          in ~/.zshrc, after compinit
   dsr completion fish | source          in ~/.config/fish/config.fish
 
 It completes commands, options, methods, data sets, and for eval and train the choices of each group.
-""",
-)
+"""
+
+
+def complete(parser: Parser, request: CompletionRequest, console: Console) -> list[str]:
+    """Print a shell's script, or the words that may stand at the end of a line, one a line."""
+    found = [SHELLS[request.shell]]
+    if request.line is not None:
+        last = _split(request.line)[-1]
+        found = [each for each in words_at_end(parser, request.line) if each.startswith(last)]
+        if request.shell == "bash" and "=" in last:  # which begins a word of its own there
+            found = [each.rpartition("=")[2] for each in found]
+    for line in found:
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    return []
 
 
 def words_at_end(parser: Parser, line: str) -> list[str]:
