@@ -50,7 +50,7 @@ class FrameChoice(Options):
     confidence: tuple[Path, ...] = option((), "confidence maps, or a folder of them", "MAP", recorded=False)
     shard: Shard | None = option(
         None,
-        "only the K-th of N blocks of the frames, for a task of an array; see docs/sequences.md",
+        "only the K-th of N blocks of the frames, for a task of an array; see docs/folders.md",
         "K/N",
         parse=parse_shard,
         recorded=False,
