@@ -343,7 +343,7 @@ def test_disparity_offset_of_named_scenes_is_left_out(scene):
     assert found.camera.doffs == 0
     assert (len(found.notes), with_offset.load("scene").notes) == (1, ())
     assert with_offset.fingerprint("scene") != without.fingerprint("scene")
-    with pytest.raises(ValueError, match="^without_offset: .*got vintage"):
+    with pytest.raises(ValueError, match=r"^without_offset: .*got vintage"):
         Folder(str(scene.parent), without_offset=["vintage"])
 
 
