@@ -17,7 +17,7 @@ from torch import Tensor
 import dsr
 from dsr.geometry.camera import Camera
 from dsr.geometry.resampling import resize_inverse_depth
-from dsr.inference import Plan, plan_for, upsample_surface, upsampler
+from dsr.inference import Plan, find_filled, plan_for, upsample_surface, upsampler
 from dsr.inference import api as people
 from dsr.inference.plans import OWN_SIZE
 from dsr.inference.resizing import resize_nearest
@@ -286,13 +286,18 @@ def test_every_method_upsamples_any_size_and_its_holes(method: str) -> None:
     depth[:, 4:6, 5:8] = torch.nan
     quick = {"steps": 2} if method.startswith("dip") else {}
     steps: list[tuple[int, int]] = []
-    full, kept = (
-        upsample_depth(
+    surfaces = [
+        upsample_surface(
             _photo(31, 42), depth, camera, method=method, settings=quick, fill=fill,
             progress=lambda *step: steps.append(step),
         )
         for fill in ("all", "none")
-    )  # fmt: skip
+    ]  # fmt: skip
+    full, kept = (each.depth for each in surfaces)
+    missing = resize_nearest(depth.isnan(), (31, 42))
+    for surface, filled in zip(surfaces, (missing, torch.zeros_like(missing)), strict=True):
+        assert surface.filled is not None
+        assert torch.equal(surface.filled, filled)
     assert full.shape == (1, 31, 42)
     assert bool(full.isfinite().all())
     assert int(kept.isnan().sum()) == int(resize_nearest(depth.isnan(), (31, 42)).sum())
@@ -382,6 +387,26 @@ def test_pixels_that_a_method_leaves_out_stay_holes() -> None:
     certain = (share - limit).abs() > 1e-4 * limit
     assert torch.equal(cut.isnan()[certain], dubious[certain])
     torch.testing.assert_close(cut[cut.isfinite()], whole.depth[cut.isfinite()])
+
+
+@pytest.mark.parametrize(
+    ("size_lr", "options"),
+    [((96, 128), {}), ((48, 64), {"working_size": 4}), ((96, 128), {"method": "msg_v"}),
+     ((36, 49), {"method": "bicubic"})],
+)  # fmt: skip
+def test_filled_depth_is_that_whose_nearest_pixel_of_the_map_is_a_hole_or_an_outlier(
+    size_lr: tuple[int, int], options: dict[str, Any]
+) -> None:
+    camera = _camera(96, 128)
+    depth = _plane(*size_lr, camera)
+    depth[:, 4:6, 5:9], depth[:, 10:30, :25] = torch.nan, torch.nan
+    depth[:, 20:22, 40:42] = 0.01
+    surface = upsample_surface(_photo(96, 128), depth, camera, **options)
+    missing = resize_nearest(depth.isnan() | (depth < 0.05), (96, 128))
+    assert surface.filled is not None
+    assert torch.equal(surface.filled, missing & surface.depth.isfinite())
+    assert torch.equal(find_filled(surface.depth, depth), surface.filled)
+    assert 0 < int(surface.filled.sum()) < int(missing.sum())
 
 
 def test_wide_holes_stay_unless_all_are_to_be_filled() -> None:

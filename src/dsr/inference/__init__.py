@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from dsr.inference.any_ratio import AnyRatio, upsample_surface, upsampler
     from dsr.inference.api import upsample, upsample_with_errors
     from dsr.inference.plans import Plan, plan_for
+    from dsr.inference.plausibility import find_filled
     from dsr.inference.selection import Selection, select
     from dsr.inference.working_size import enlarged_by, find_sensor
 
@@ -22,6 +23,7 @@ __all__ = [
     "Plan",
     "Selection",
     "enlarged_by",
+    "find_filled",
     "find_sensor",
     "plan_for",
     "select",
@@ -35,6 +37,7 @@ _NAMES = {
     "any_ratio": ("AnyRatio", "upsample_surface", "upsampler"),
     "api": ("upsample", "upsample_with_errors"),
     "plans": ("Plan", "plan_for"),
+    "plausibility": ("find_filled",),
     "selection": ("Selection", "select"),
     "working_size": ("enlarged_by", "find_sensor"),
 }

@@ -19,6 +19,7 @@ from torch.nn import functional
 from dsr.geometry.camera import Camera
 from dsr.geometry.hole_size import degrees_per_pixel, distance_to_known
 from dsr.geometry.surface import angle_between, depth_to_normals
+from dsr.inference.resizing import resize_nearest, size_of
 from dsr.methods.base import Outliers
 
 FAR = 4.0
@@ -74,6 +75,21 @@ def find_outliers(depth: Tensor) -> Tensor:
     values = depth[0].masked_fill(~known[0], torch.nan).log().cpu().numpy().astype(np.float32)
     largest = max(1, min(LARGEST, LARGEST * max(depth.shape[-2:]) // _USUAL_WIDTH))
     return found | torch.from_numpy(_isolated(values, largest))[None].to(known.device)
+
+
+def find_filled(result: Tensor, depth: Tensor) -> Tensor:
+    """Return where a result has depth that was not measured: the nearest pixel of the map is a hole or an outlier.
+
+    Args:
+        result: (1, H, W) depth, NaN where it is missing.
+        depth: (1, h, w) the map in metres, NaN in holes.
+
+    Returns:
+        (1, H, W) bool.
+
+    """
+    missing = depth.isnan() | find_outliers(depth)
+    return resize_nearest(missing, size_of(result)).to(result.device) & result.isfinite()
 
 
 def count_patches(mask: Tensor) -> Outliers:

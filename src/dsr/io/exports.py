@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 import torch
 import trimesh
+from numpy.typing import ArrayLike
 from PIL import Image
 from torch import Tensor
 from trimesh.exchange.gltf import export_glb
@@ -78,6 +79,7 @@ def write_ply(
     normals: np.ndarray | None = None,
     faces: np.ndarray | None = None,
     *,
+    filled: np.ndarray | None = None,
     frame: str = CAMERA_FRAME,
 ) -> None:
     """Write a binary PLY file atomically.
@@ -87,11 +89,15 @@ def write_ply(
         colours: (N, 3) uint8, sRGB.
         normals: (N, 3) unit vectors; None to leave them out.
         faces: (M, 3) indices, counterclockwise from outside; None for a cloud.
+        filled: (N,) bool, whether the points were not measured: a property of that name; None to leave it out.
         frame: what the file says of the frame of the points, and of the unit.
 
     """
     corners = np.empty((0, 3), int) if faces is None else faces
-    model = trimesh.Trimesh(points, corners, vertex_normals=normals, vertex_colors=colours, process=False)
+    model = trimesh.Trimesh(
+        points, corners, vertex_normals=normals, vertex_colors=colours, process=False,
+        vertex_attributes=_attributes("filled", filled, np.uint8),
+    )  # fmt: skip
     content = export_ply(model, vertex_normal=normals is not None)
     header, mark, content = content.partition(b"element vertex")
     with replacing(path) as temporary, temporary.open("wb") as file:
@@ -99,8 +105,9 @@ def write_ply(
 
 
 def write_glb(
-    path: Path, points: np.ndarray, normals: np.ndarray, faces: np.ndarray, places: np.ndarray, photo: np.ndarray
-) -> None:
+    path: Path, points: np.ndarray, normals: np.ndarray, faces: np.ndarray, places: np.ndarray, photo: np.ndarray,
+    filled: np.ndarray | None = None,
+) -> None:  # fmt: skip
     """Write a mesh as binary glTF atomically, with the photo as its texture, as sharp as it is.
 
     The material is rough and lit from both sides, so that viewers show the shape as well as the photo.
@@ -111,14 +118,23 @@ def write_glb(
         faces: (M, 3) indices, counterclockwise from outside; one at least.
         places: (N, 2) column and row of each point in the photo, pixel centres at integers.
         photo: (H, W, 3) uint8, sRGB.
+        filled: (N,) bool, whether the points were not measured: the attribute ``_FILLED``; None to leave it out.
 
     """
     height, width = photo.shape[:2]
     place = (places + 0.5) / (width, height)
     visual = TextureVisuals(uv=np.stack((place[:, 0], 1 - place[:, 1]), axis=1), material=_material(photo))
-    model = trimesh.Trimesh(points * _TO_GLTF, faces, vertex_normals=normals * _TO_GLTF, visual=visual, process=False)
+    model = trimesh.Trimesh(
+        points * _TO_GLTF, faces, vertex_normals=normals * _TO_GLTF, visual=visual, process=False,
+        vertex_attributes=_attributes("_FILLED", filled, np.float32),
+    )  # fmt: skip
     with replacing(path) as temporary:
         temporary.write_bytes(export_glb(trimesh.Scene(model), include_normals=True))
+
+
+def _attributes(name: str, values: np.ndarray | None, dtype: type) -> dict[str, ArrayLike]:
+    """Return what trimesh takes of an attribute of the vertices that may be missing."""
+    return {} if values is None else {name: values.astype(dtype)}
 
 
 def _material(photo: np.ndarray) -> PBRMaterial:
@@ -216,7 +232,14 @@ def write_normals(path: Path, depth: Tensor, camera: Camera) -> None:
     write_png(path, picture, known)
 
 
-def write_cloud(path: Path, rgb: Tensor, depth: Tensor, camera: Camera, *, most: int = MOST_POINTS) -> Written:
+def write_mask(path: Path, mask: Tensor) -> None:
+    """Write a mask, (1, H, W) bool, as an 8-bit picture: 255 where it holds, else 0."""
+    write_png(path, 255 * mask[0].byte().cpu().numpy())
+
+
+def write_cloud(
+    path: Path, rgb: Tensor, depth: Tensor, camera: Camera, *, most: int = MOST_POINTS, filled: Tensor | None = None
+) -> Written:
     """Write the known pixels as a coloured PLY cloud with normals, in metres; x right, y down, z forward.
 
     Args:
@@ -225,6 +248,7 @@ def write_cloud(path: Path, rgb: Tensor, depth: Tensor, camera: Camera, *, most:
         depth: (1, H, W) orthogonal depth in metres, NaN in holes.
         camera: of these pixels.
         most: points; of more, those in rows and columns at equal distances are taken.
+        filled: (1, H, W) bool, depth that was not measured: a property of the points.
 
     Returns:
         The numbers of points.
@@ -232,7 +256,8 @@ def write_cloud(path: Path, rgb: Tensor, depth: Tensor, camera: Camera, *, most:
     """
     mesh = triangulate(depth, camera, isolated=True)
     chosen, normals = select_points(mesh, most, camera), vertex_normals(mesh)
-    write_ply(path, mesh.vertices[chosen], _colours(rgb, mesh.pixels[chosen]), normals[chosen])
+    pixels = mesh.pixels[chosen]
+    write_ply(path, mesh.vertices[chosen], _colours(rgb, pixels), normals[chosen], filled=_at(filled, pixels))
     fewer = len(chosen) < len(mesh.vertices)
     return Written(len(mesh.vertices), len(chosen), "leaving out rows and columns" if fewer else "")
 
@@ -245,6 +270,7 @@ def write_mesh(
     *,
     largest_step: float = LARGEST_STEP,
     most: int = MOST_FACES,
+    filled: Tensor | None = None,
 ) -> Written:
     """Write the surface as a mesh with the photo's colours, cut at depth steps.
 
@@ -258,6 +284,7 @@ def write_mesh(
         camera: of these pixels.
         largest_step: see :func:`dsr.geometry.mesh.triangulate`.
         most: triangles; a larger mesh is simplified, see :mod:`dsr.geometry.mesh`.
+        filled: (1, H, W) bool, depth that was not measured: an attribute of the vertices.
 
     Returns:
         The numbers of triangles.
@@ -276,13 +303,14 @@ def write_mesh(
     before, how = len(mesh.faces), ""
     if before > most:
         mesh, how = _reduce(mesh, depth, camera, most, largest_step)
-    normals = vertex_normals(mesh)
+    normals, missing = vertex_normals(mesh), _at(filled, mesh.pixels)
     for path in paths:
         if path.suffix.lower() == ".ply":
-            write_ply(path, mesh.vertices, _colours(rgb, mesh.pixels), normals, mesh.faces)
+            write_ply(path, mesh.vertices, _colours(rgb, mesh.pixels), normals, mesh.faces, filled=missing)
         else:
             places = project(mesh.vertices, camera)
-            write_glb(path, mesh.vertices, normals, mesh.faces, places, _bytes(rgb).transpose(1, 2, 0).copy())
+            picture = _bytes(rgb).transpose(1, 2, 0).copy()
+            write_glb(path, mesh.vertices, normals, mesh.faces, places, picture, missing)
     return Written(before, len(mesh.faces), how)
 
 
@@ -293,6 +321,11 @@ def _reduce(mesh: Mesh, depth: Tensor, camera: Camera, most: int, largest_step: 
     except ImportError:
         thinned, stride = thin(depth, camera, most, largest_step)
         return thinned, f"a stride of {stride} pixels; `pip install dsr[mesh]` simplifies and keeps more detail"
+
+
+def _at(mask: Tensor | None, pixels: np.ndarray) -> np.ndarray | None:
+    """Return a mask's values at some pixels, (N,) bool; ``pixels`` are indices of the flattened map."""
+    return None if mask is None else mask.flatten().cpu().numpy()[pixels]
 
 
 def _colours(rgb: Tensor, pixels: np.ndarray) -> np.ndarray:

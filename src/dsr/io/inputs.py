@@ -27,6 +27,7 @@ from dsr.io.units import TURNED_BACK, Told, tell
 from dsr.notes import Assumption
 from dsr.sample import FARTHEST, NEAREST
 from dsr.utils.guards import natural_key, pixels_beside
+from dsr.utils.lengths import show_length
 
 Kind = tuple[Path, str, str]
 """Folder, suffix and type of value: maps alike in them have one unit."""
@@ -431,7 +432,7 @@ def _unit(
         return Told(1.0, (Assumption("disparities are taken for pixels of the depth map"),))
     if described.depth_unit is not None:
         unit = described.depth_unit
-        return Told(unit, (Assumption(f"unit: {unit:g} m per value, says the camera file"),))
+        return Told(unit, (Assumption(f"unit: {show_length(unit)} per value, says the camera file"),))
     if pair.unit is not None:
         return Told(pair.unit, (), bits=pair.bits)
     if _is_icl(pair):

@@ -119,6 +119,8 @@ class Surface(NamedTuple):
     expected absolute error of the depth in metres and that of the normal in degrees; None for a method that does not
     say. Pixels that a method leaves out on purpose have errors and no depth. ``noise``: of the low-resolution map; None
     for a method that does not estimate it. ``outliers``: what was taken for holes before the method saw the map.
+    ``filled`` (1, H, W) bool: where there is depth that was not measured, since the nearest pixel of the map is a hole
+    or an outlier; None where that is not known.
     """
 
     depth: Tensor
@@ -126,11 +128,35 @@ class Surface(NamedTuple):
     angle_error: Tensor | None = None
     noise: MapNoise | None = None
     outliers: Outliers | None = None
+    filled: Tensor | None = None
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Surface:
         """Return the surface with a function applied to each of its maps."""
-        depth_error, angle_error = (None if each is None else function(each) for each in self[1:3])
-        return self._replace(depth=function(self.depth), depth_error=depth_error, angle_error=angle_error)
+        others = (self.depth_error, self.angle_error, self.filled)
+        depth_error, angle_error, filled = (None if each is None else function(each) for each in others)
+        depth = function(self.depth)
+        return self._replace(depth=depth, depth_error=depth_error, angle_error=angle_error, filled=filled)
+
+    def without_dubious(self, limit: float) -> Surface:
+        """Return the surface with holes where the depth is expected to be off by more than this share of it."""
+        if self.depth_error is None:
+            return self
+        dubious = self.depth_error > limit * self.depth
+        filled = None if self.filled is None else self.filled & ~dubious
+        return self._replace(depth=self.depth.masked_fill(dubious, float("nan")), filled=filled)
+
+    def shares(self, limit: float) -> dict[str, float]:
+        """Return the shares of the pixels that are ``measured``, ``filled`` and ``open``, which have no depth.
+
+        With expected errors also the share of those that have depth and are ``dubious``: expected to be off by more
+        than ``limit`` of it. Without knowing what was filled, what has depth counts as measured.
+        """
+        known = self.depth.isfinite()
+        filled = known & self.filled if self.filled is not None else known & False
+        found = {"measured": known & ~filled, "filled": filled, "open": ~known}
+        if self.depth_error is not None:
+            found["dubious"] = known & (self.depth_error > limit * self.depth)
+        return {name: float(mask.double().mean()) for name, mask in found.items()}
 
     def error_arrays(self) -> dict[str, np.ndarray]:
         """Return the expected errors by name, (H, W), as they are stored; empty without them.

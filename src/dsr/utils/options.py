@@ -24,10 +24,10 @@ from __future__ import annotations
 
 import math
 from argparse import SUPPRESS, ArgumentParser, Namespace
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
-from types import EllipsisType, NoneType
+from types import EllipsisType, MappingProxyType, NoneType
 from typing import Any, Literal, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
 
 from dsr.utils.files import obstacle
@@ -102,6 +102,7 @@ class _Option(NamedTuple):
     repeated: bool
     recorded: bool
     writes: str
+    presets: Mapping[str, Mapping[str, Any]]
 
 
 def option(
@@ -116,6 +117,7 @@ def option(
     repeated: bool = False,
     recorded: bool = True,
     writes: Literal["", "file", "folder"] = "",
+    presets: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
 ) -> Any:
     """Return a dataclass field that is an option.
 
@@ -131,9 +133,11 @@ def option(
         recorded: whether results depend on it, see :func:`recorded`.
         writes: what is written to the path that it is; nothing of another kind may be there, see
             :func:`dsr.utils.files.obstacle`.
+        presets: of its values those that stand for others: their values, as argparse reads them, by their names there.
+            They may not be given as anything else.
 
     """
-    metadata = {_KEY: _Option(help, metavar, flags, rule, parse, alone, repeated, recorded, writes)}
+    metadata = {_KEY: _Option(help, metavar, flags, rule, parse, alone, repeated, recorded, writes, presets)}
     return field(metadata=metadata) if isinstance(default, EllipsisType) else field(default=default, metadata=metadata)
 
 
@@ -286,6 +290,7 @@ def build(record: type[Record], given: Namespace) -> Record:
         ValueError: a value is not what its option expects; the message begins with the option's flag.
 
     """
+    given = _with_presets(record, given)
     values: dict[str, Any] = {}
     for each in _stated(record):
         if each.option is not None and hasattr(given, each.key):
@@ -296,6 +301,26 @@ def build(record: type[Record], given: Namespace) -> Record:
         return record(**values)
     except OptionError as error:
         raise ValueError(f"{_flag_of(record, error.name)}: {error.message}") from error
+
+
+def _with_presets(record: type[Options], given: Namespace) -> Namespace:
+    """Return what was given with what presets among it stand for.
+
+    Raises:
+        ValueError: something else was given for it.
+
+    """
+    found = Namespace(**vars(given))
+    walked = list(_walk(record))
+    flags = {each.key: each.flags[0] for each in walked}
+    for each in walked:
+        chosen = getattr(given, each.key, None)
+        for key, value in (each.option.presets.get(chosen, {}) if each.option and chosen is not None else {}).items():
+            if key in flags and getattr(given, key, value) != value:
+                came = f"{flags[key]} {getattr(given, key)}"
+                raise ValueError(f"{each.flags[0]} {chosen}: expected {flags[key]} {value} or none with it, got {came}")
+            setattr(found, key, value)
+    return found
 
 
 def _value(each: _Stated, option: _Option, came: Any) -> Any:

@@ -30,12 +30,13 @@ from dsr.app.upsample.request import UpsampleRequest, Upsampling, files_of, inpu
 from dsr.app.upsample.sequence import FrameSequence
 from dsr.degradation.sensors import Identified
 from dsr.evaluation.sharing import Claims
-from dsr.inference import AnyRatio, Plan, enlarged_by, find_sensor
+from dsr.inference import AnyRatio, Plan, enlarged_by, find_filled, find_sensor
 from dsr.io.inputs import Picture, read_picture
 from dsr.io.pairs import Pair
 from dsr.methods.base import MapNoise, Outliers, Surface
 from dsr.notes import CHECKS, Assumption, expect_no_warning
 from dsr.utils.guards import readable
+from dsr.utils.lengths import show_length
 from dsr.utils.memory import refusing_excess
 from dsr.utils.progress import Progress
 from dsr.utils.versions import package_versions
@@ -142,15 +143,21 @@ class FrameWork:
         errors = any(part.errors for part in wanted.of_frame)
         surface = kept_surface(target, picture.camera, errors=errors) if job.reusable else None
         started = time.perf_counter()
-        if surface is None:
+        if surface is not None:
+            surface = surface._replace(filled=find_filled(surface.depth, picture.depth_lr))
+        else:
             surface = self._upsample(picture, identified, progress)
             reporter.facts(_describe(surface.noise, given="noise" in how.arguments))
             reporter.facts([*_describe_outliers(surface.outliers), *_describe_holes(surface, how)])
+        if wanted.certain:
+            surface = surface.without_dubious(wanted.max_error / 100)
         seconds = time.perf_counter() - started
         begin(target, job.settings, job.inputs, () if job.earlier is None else job.earlier.files)
         facts = _write(job, picture, surface, planned, seconds)
         reporter.facts(facts)
-        reporter.say(f"{pair.name}: {planned.text}, {seconds:.1f} s -> {target}")
+        told = [*_noise_in_brief(surface.noise), *_shares_in_brief(surface.shares(wanted.max_error / 100))]
+        parts = ", ".join([f"{planned.method} x{planned.scale}", *told, f"{seconds:.1f} s"])
+        reporter.say(f"{pair.name}: {parts} -> {target}")
         return "done"
 
     @functools.cached_property
@@ -207,7 +214,10 @@ class _Job:
             what = "other inputs: " + ", ".join(str(entry.get("file")) for entry in earlier.inputs.values())
         else:
             changed = [name for name, value in self.settings.items() if earlier.settings.get(name) != value]
-            what = "other settings: " + ", ".join(f"{name} {earlier.settings.get(name)}" for name in changed)
+            said = ((name, earlier.settings.get(name)) for name in changed)
+            what = "other settings: " + ", ".join(
+                f"no {name}" if old is None else f"{name} {old}" for name, old in said
+            )
         raise ValueError(f"{self.target}: holds a result of {what}; take another -o, or --overwrite")
 
     def expect_no_warning(self, notes: Sequence[Assumption]) -> None:
@@ -257,11 +267,30 @@ def _describe(noise: MapNoise | None, *, given: bool) -> list[Assumption]:
     if noise is None or given:
         return []
     extent = f", correlated over {noise.extent:.0f} pixels" if noise.extent > _WHITE else ""
-    text = f"about {1e3 * noise.deviation:.2g} mm{extent}"
+    text = f"about {show_length(noise.deviation, 2)}{extent}"
     if noise.reduced > 1:
         text += f": worked on at 1/{noise.reduced}"
     option = "--noise" if noise.reduced == 1 else "--working-size"
     return [Assumption("noise of the depth map", f"{text}; {option} overrides it")]
+
+
+def _noise_in_brief(noise: MapNoise | None) -> list[str]:
+    """Return the noise of the input, and the size that it was worked on at because of that, in a few words each."""
+    if noise is None:
+        return []
+    reduced = [f"worked on at 1/{noise.reduced}"] if noise.reduced > 1 else []
+    return [f"noise {show_length(noise.deviation, 2)}", *reduced]
+
+
+def _shares_in_brief(shares: Mapping[str, float]) -> list[str]:
+    """Return the shares of the pixels in a few words each, less those that there are none of."""
+    words = {"open": "left open"}
+    return [f"{words.get(name, name)} {_percent(share)}" for name, share in shares.items() if share]
+
+
+def _percent(share: float) -> str:
+    """Return a share in percent, which is 0 or 100 only if it is exactly that."""
+    return f"{min(max(round(100 * share, 1), 0.1), 99.9):g}%" if 0 < share < 1 else f"{share:.0%}"
 
 
 def _describe_outliers(outliers: Outliers | None) -> list[Assumption]:
@@ -304,6 +333,7 @@ def _write(job: _Job, picture: Picture, surface: Surface, planned: Plan, seconds
         "noise": surface.noise._asdict() if surface.noise else kept.noise if kept else None,
         **described(picture, encoding),
         **counts,
+        "shares": {name: round(share, 6) for name, share in surface.shares(wanted.max_error / 100).items()},
         "assumptions": [str(fact) for fact in (*picture.assumptions, *facts)],
         "checks": CHECKS,
         "warnings": [fact.record() for fact in (*picture.assumptions, *facts) if fact.code],

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from dsr.geometry.lights import LIGHT_NAMES
 from dsr.utils.guards import MOST_FACES, MOST_POINTS
@@ -25,7 +25,10 @@ if TYPE_CHECKING:
     from dsr.methods.base import Surface
     from dsr.notes import Assumption
 
-FORMATS = ("png", "tiff", "npy", "npz", "pfm", "exr")
+_SUFFIXES = ("png", "tiff", "npy", "npz", "pfm", "exr")
+FORMATS = (*_SUFFIXES, "mm")
+"""Formats of the depth: suffixes, of which png means whole millimetres where the input is something else; ``mm`` always
+is a PNG of 16 bits in whole millimetres, 0 in holes."""
 METRES = "depth_metres.npy"
 ERRORS = "confidence.npz"
 _WORTH_SAYING = 1e-3
@@ -159,7 +162,8 @@ def _cloud(folder: Path, result: Result) -> Output:
     if depth is None:
         return Output((), notes)
     picture, most = result.picture, result.wanted.max_points
-    shape = write_cloud(folder / "cloud.ply", picture.rgb, depth, picture.camera, most=most)
+    filled = result.surface.filled
+    shape = write_cloud(folder / "cloud.ply", picture.rgb, depth, picture.camera, most=most, filled=filled)
     return Output(("cloud.ply",), (*notes, *_fewer("cloud", "points", "--max-points", shape)), shape)
 
 
@@ -171,8 +175,9 @@ def _mesh(folder: Path, result: Result) -> Output:
     if depth is None:
         return Output((), notes)
     files, picture, most = ("mesh.ply", "mesh.glb"), result.picture, result.wanted.max_faces
+    paths, filled = [folder / name for name in files], result.surface.filled
     try:
-        shape = write_mesh([folder / name for name in files], picture.rgb, depth, picture.camera, most=most)
+        shape = write_mesh(paths, picture.rgb, depth, picture.camera, most=most, filled=filled)
     except ValueError as error:
         return Output((), (*notes, Assumption("no mesh", str(error))))
     return Output(files, (*notes, *_fewer("mesh", "triangles", "--max-faces", shape)), shape)
@@ -206,6 +211,15 @@ def _confidence(folder: Path, result: Result) -> Output | None:
     write_confidence(folder / "confidence.png", surface.depth, surface.depth_error, surface.angle_error)
     with replacing(folder / ERRORS) as temporary, temporary.open("wb") as file:
         np.savez(file, allow_pickle=False, **surface.error_arrays())
+    return None
+
+
+def _filled(folder: Path, result: Result) -> Output | None:
+    from dsr.io.exports import write_mask
+
+    if result.surface.filled is None:
+        return Output(())
+    write_mask(folder / "filled.png", result.surface.filled)
     return None
 
 
@@ -251,13 +265,14 @@ _OF_DEPTH = ("depth", "rgbd")
 PARTS: dict[str, Part] = {
     part.name: part
     for part in (
-        Part("depth", (*(f"depth.{suffix}" for suffix in (*FORMATS, "tif")), METRES), _depth),
+        Part("depth", (*(f"depth.{suffix}" for suffix in (*_SUFFIXES, "tif")), METRES), _depth),
         Part("renderings", tuple(f"renderings/{light}.png" for light in LIGHT_NAMES), _renderings),
         Part("normals", ("normals.png",), _normals),
         Part("cloud", ("cloud.ply",), _cloud, shape=True, errors=True),
         Part("mesh", ("mesh.ply", "mesh.glb"), _mesh, shape=True, errors=True),
         Part("before_after", ("before_after.png",), _before_after),
         Part("confidence", ("confidence.png", ERRORS), _confidence, errors=True),
+        Part("filled", ("filled.png",), _filled),
         Part("input", ("input.npz",), _input),
         Part("rgbd", ("rgbd/color.png", "rgbd/depth.png", "rgbd/intrinsic.json"), _rgbd, usual=False),
         Part("open3d", ("open3d",), write_all=_open3d, needs=_OF_DEPTH, usual=False),
@@ -287,7 +302,10 @@ class Results(Options):
 
     output: Path = option(..., "folder of the results", "OUT", flags="-o --output", recorded=False, writes="folder")
     format: str | None = option(
-        None, f"of the depth: {', '.join(FORMATS)} (the input's)", "FORMAT", rule=one_of(FORMATS)
+        None,
+        f"of the depth: {', '.join(_SUFFIXES)} (the input's); mm: 16-bit PNG in millimetres, 0 in holes",
+        "FORMAT",
+        rule=one_of(FORMATS),
     )
     only: tuple[str, ...] | None = option(
         None, f"some of {','.join(PARTS)}", "PARTS", parse=_words, alone="parts", recorded=False
@@ -301,6 +319,18 @@ class Results(Options):
         "leave pixels out of cloud and mesh whose depth is expected to be off by more (default: 2)",
         "PERCENT",
         rule=EXPECTED_ERROR,
+    )
+    certain: bool = option(
+        False, "make holes of these pixels in the depth, too, and in all that is made of it", recorded=False
+    )
+    purpose: Literal["robot"] | None = option(
+        None,
+        "robot: nothing is filled, dubious pixels are holes, depth.png is in 16-bit millimetres with 0 for holes, its "
+        "expected errors are in confidence.npz (--fill none --certain --format mm)",
+        "robot",
+        flags="--for",
+        recorded=False,
+        presets={"robot": {"fill": "none", "certain": True, "format": "mm"}},
     )
     max_faces: int = option(
         MOST_FACES,

@@ -249,6 +249,7 @@ def settings_of(request: UpsampleRequest) -> dict[str, Any]:
     return {
         **recorded(request),
         "max_error": request.results.max_error / 100,
+        **({"certain": True} if request.results.certain else {}),
         "registered_by": None if request.reading.rig is None else "extrinsics",
         "set": request.upsampling.arguments,
         "code": hash_outside_code(_targets(request.upsampling)),

@@ -116,8 +116,8 @@ class FrameSequence:
         picture = self.with_pose(pair, picture)
         if not self._count or picture.pose is None:
             return picture
-        views, failed = [], 0
-        for other in self.neighbours(pair):
+        others, views, failed = self.neighbours(pair), [], 0
+        for other in others:
             try:
                 depth, camera, pose = self._frame(other)
             except (ValueError, OSError):  # it is reported as a frame of its own
@@ -127,11 +127,12 @@ class FrameSequence:
                 views.append(View(depth, camera, pose))
         fused = fuse_views(View(picture.depth_lr, _camera_lr(picture), picture.pose), views)
         known = picture.depth_lr.isfinite()
-        others, seeing = (float(each[known].mean()) for each in (fused.others, fused.seeing))
-        detail = f"of {seeing:.1f} that see a pixel {others:.1f} agree with it"
+        agreeing, seeing = (float(each[known].mean()) for each in (fused.others, fused.seeing))
+        detail = f"of {seeing:.1f} that see a pixel {agreeing:.1f} agree with it"
         detail += f"; {failed} could not be read" if failed else ""
-        text, code = f"{self._count} neighbouring frames vote on the depth", "neighbours-disagree"
-        share = others / seeing if seeing else 0.0
+        vote = "1 neighbouring frame votes" if len(others) == 1 else f"{len(others)} neighbouring frames vote"
+        text, code = f"{vote} on the depth", "neighbours-disagree"
+        share = agreeing / seeing if seeing else 0.0
         note = Assumption(text, detail)
         if share < LIMITS[code].threshold:
             note = Assumption(
