@@ -355,7 +355,7 @@ def test_interrupted_run_resumes(pair, tmp_path, capsys, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr("dsr.io.exports.write_normals", interrupt)
         assert of(pair, out, *BICUBIC, "--only", "depth,normals") == 130
-    assert "the same command goes on from there" in capsys.readouterr().err
+    assert "the same command continues from there" in capsys.readouterr().err
     assert info(out)["complete"] is False
     assert of(pair, out, *BICUBIC, "--only", "depth,normals") == 0
     assert info(out)["complete"] is True

@@ -263,6 +263,7 @@ def published_value(scene, method, scale=4, key="RMSE_d"):
         {"method": "mine"}, {"dataset": "icl", "scene": "plant"}, {"scene": "cube_no_texture"},
         {"scene": "cube_no_texture", "dataset": "mine", "_target_": "dsr.data.folder.Folder"},
         {"scene": "vintage", "dataset": "middlebury", "without_offset": []},
+        {"scene": "vintage", "dataset": "mine", "_target_": "dsr.data.folder.Folder", "without_offset": []},
     ],
     ids=str,
 )  # fmt: skip
