@@ -27,7 +27,9 @@ _MOST_UPLOADS, _MOST_WAITING = 4, 8
 """Uploads that are held, of which the oldest goes for another; and processes that wait for their turn."""
 _KEPT = 3600.0
 """Seconds after which an upload that nobody asked for is deleted."""
-_BETWEEN_LOOKS = 5.0
+_ABANDONED = 120.0
+"""Seconds after which a job is ended that nobody asks about; pages ask all the time, hidden ones once a minute."""
+_BETWEEN_LOOKS, _TICK = 5.0, 0.2
 _MOST_NOTES = 500
 _SPAN = 1 << 20
 """Longest line of the process, bytes."""
@@ -255,9 +257,11 @@ class Desk:
                     self._running = None
 
     def _expire(self) -> None:
-        """Delete uploads that are too old."""
+        """Delete uploads that are too old, and end waiting jobs that nobody asks about."""
         now = time.monotonic()
         for upload in list(self.uploads.values()):
+            if now - upload.asked > _ABANDONED and upload.job in self._queue:
+                self._end(upload.job)
             if now - upload.asked > self.kept and (upload.job is None or upload.job.is_over):
                 self.drop(upload.id)
 
@@ -285,15 +289,20 @@ class Desk:
         """Read what the process tells until it ends, or its time is over."""
         assert process.stdout is not None  # noqa: S101
         assert process.stdin is not None  # noqa: S101
-        late = threading.Event()
+        over, late = threading.Event(), threading.Event()
 
-        def end() -> None:
-            late.set()
-            process.kill()
+        def watch() -> None:
+            while not over.wait(_TICK):
+                if time.monotonic() - job.started > self.most_seconds:
+                    late.set()
+                    process.kill()
+                    return
+                if time.monotonic() - job.upload.asked > _ABANDONED:
+                    with self._change:
+                        self._end(job)
+                    return
 
-        timer = threading.Timer(self.most_seconds, end)
-        timer.daemon = True
-        timer.start()
+        threading.Thread(target=watch, name="time", daemon=True).start()
         with process.stdin, process.stdout:
             while line := process.stdout.readline(_SPAN):
                 with contextlib.suppress(ValueError):
@@ -302,7 +311,7 @@ class Desk:
                         with self._change:
                             job.take(told)
             code = process.wait()
-        timer.cancel()
+        over.set()
         shutil.rmtree(job.upload.folder / "scratch", ignore_errors=True)
         with self._change:
             self._conclude(job, code, late=late.is_set())

@@ -195,7 +195,7 @@ def _result(request: UpsampleRequest, folder: Path) -> None:
     viewed = read_result(target, "result")
     facts = {**(viewed.facts or {}), **_facts(read_info(target / INFO))}
     packed = pack_result(replace(viewed, facts=facts), _VERTICES, _PHOTO)
-    shown = {"content": content_of([packed], "result"), "data": data_of([packed])}
+    shown = {"content": content_of([packed], "dsr app"), "data": data_of([packed])}
     (folder / SHOWN).write_text(json.dumps(shown), encoding="utf-8")
 
 

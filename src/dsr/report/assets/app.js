@@ -9,7 +9,7 @@ const STATES = { waiting: "Waiting", running: "Working", done: "Done", failed: "
 async function ask(method, path, body, json = false) {
   let response;
   try {
-    response = await fetch(path, { method, body: json ? JSON.stringify(body) : body, headers: { [settings.header]: settings.token } });
+    response = await fetch(path, { method, keepalive: method === "DELETE", body: json ? JSON.stringify(body) : body, headers: { [settings.header]: settings.token } });
   } catch {
     throw new Error("The server does not answer; is `dsr app` still running?");
   }
@@ -113,6 +113,8 @@ class App {
     find("#range").addEventListener("change", () => this.showChoices());
     find("#smooth").addEventListener("input", () => this.showChoices());
     find(".asked").addEventListener("input", () => this.outdate());
+    addEventListener("pagehide", () => this.forget());
+    addEventListener("pageshow", (event) => { if (event.persisted) location.reload(); });
     this.showChoices();
   }
 

@@ -4,7 +4,8 @@ const NAMES = { grey: "grey", photo: "the photo", filled: "grey with filled pixe
 const UNITS = { depth: { factor: 1000, unit: "mm", title: "Expected error of the depth, mm" }, angle: { factor: 1, unit: "degrees", title: "Expected error of the normal, degrees" } };
 
 const TURN = (2 * Math.PI) / 3; // by dragging over the whole stage
-const WIDE = 720; // pixels of a stage from which on panels are beside each other
+const NARROW = 560; // pixels of a stage below which panels are one below another
+const HIGHEST = 0.82; // of the window, the height of a stage with panels, as in view.css
 
 class View {
   /**
@@ -99,30 +100,53 @@ class View {
   fitStage() {
     const [width, height] = this.result.after.size;
     this.aspect = width / height;
-    const panels = this.state.side === "apart" ? this.panels().length : 1;
-    this.stacked = panels > 1 && this.stage.clientWidth < WIDE;
-    const [across, down] = this.stacked ? [1, panels] : [panels, 1];
-    this.stage.style.aspectRatio = `${across * width} / ${down * height}`;
-    this.stage.classList.toggle("stacked", this.stacked);
-    this.stage.classList.toggle("apart", panels > 1);
+    const panels = this.state.side === "apart" ? this.panels() : [];
+    this.columns = panels.length ? this.columnsOf(panels.length) : 1;
+    const rows = Math.max(1, Math.ceil(panels.length / this.columns));
+    this.stage.style.aspectRatio = `${this.columns * width} / ${rows * height}`;
+    this.stage.classList.toggle("stacked", panels.length > 1 && this.columns === 1);
+    this.stage.classList.toggle("apart", panels.length > 0);
     const flat = find(".flat");
-    flat.hidden = panels === 1 || !this.scene.photo;
-    flat.style.width = `${100 / across}%`;
-    flat.style.height = `${100 / down}%`;
-    const names = find(".panel-names");
-    names.hidden = panels === 1;
-    names.replaceChildren(...(panels === 1 ? [] : this.panels()).map((textContent) => make("span", {}, make("span", { className: "name", textContent }))));
+    flat.hidden = !panels.length || !this.scene.photo;
+    flat.style.width = `${100 / this.columns}%`;
+    flat.style.height = `${100 / rows}%`;
+    const cells = find(".panels");
+    cells.hidden = !panels.length;
+    cells.style.gridTemplateColumns = `repeat(${this.columns}, 1fr)`;
+    cells.replaceChildren(...panels.map(({ name, surface }) => make("div", {}, make("span", { className: "name name-left", textContent: name }), surface && make("span", { className: "spot" }))));
+    this.showSpots();
   }
 
-  /** Return the names of the panels: the photo, where there is one, and the surfaces. */
+  /** Return in how many columns so many panels are largest; one below another in a narrow window, which scrolls. */
+  columnsOf(count) {
+    const [across, down] = [this.stage.clientWidth, HIGHEST * innerHeight];
+    if (across < NARROW) return 1;
+    const sizes = Array.from({ length: count }, (_, k) => Math.min(across / (k + 1), (down / Math.ceil(count / (k + 1))) * this.aspect));
+    return 1 + sizes.indexOf(Math.max(...sizes));
+  }
+
+  /** Return the panels: the photo, where there is one, the surfaces in the chosen colour, and the result in another. */
   panels() {
-    return [...(this.scene.photo ? ["photo"] : []), ...this.sides()];
+    const { colour } = this.state;
+    const surfaces = this.sides().map((surface) => ({ name: surface, surface, colour }));
+    if (!this.scene.photo) return surfaces;
+    const other = colour === "photo" ? "grey" : "photo";
+    return [{ name: "photo", surface: null }, ...surfaces.slice(0, -1), { name: `after, ${NAMES[other]}`, surface: "after", colour: other }, surfaces.at(-1)];
   }
 
   /** Return the place of a panel, from its upper left corner on, as fractions of the stage. */
   panelBox(number, count) {
-    const part = 1 / count;
-    return this.stacked ? [0, number * part, 1, part] : [number * part, 0, part, 1];
+    const [width, height] = [1 / this.columns, 1 / Math.ceil(count / this.columns)];
+    return [(number % this.columns) * width, Math.floor(number / this.columns) * height, width, height];
+  }
+
+  /** Show where the light is over each panel, while dragging moves it. */
+  showSpots() {
+    const [x, y] = this.state.light;
+    for (const spot of findAll(".panels .spot")) {
+      spot.hidden = this.state.drag !== "light";
+      Object.assign(spot.style, { left: `${50 + 50 * x}%`, top: `${50 + 50 * y}%` });
+    }
   }
 
   set(name, value) {
@@ -138,7 +162,7 @@ class View {
     this.stage.classList.toggle("lighting", this.state.drag === "light");
     this.stage.classList.toggle("errors", this.state.colour in UNITS); // the smallest errors are black, holes must not be
     if (name === "colour" || name === "side") this.showScale();
-    if (name === "side" && this.grids) this.fitStage();
+    if (this.grids && (name === "side" || this.state.side === "apart")) this.fitStage();
     this.refresh();
   }
 
@@ -150,6 +174,7 @@ class View {
   setLight(light) {
     this.state.light = light;
     showLight(find(".ball"), light, "Light");
+    this.showSpots();
     this.refresh();
   }
 
@@ -181,7 +206,7 @@ class View {
     const apart = side === "apart";
     const whole = [0, 0, 1, 1];
     let parts = second ? [{ surface: first, colour, view: whole, from: 0, to: split }, { surface: second, colour, view: whole, from: split, to: 1 }] : [{ surface: first, colour, view: whole, from: 0, to: 1 }];
-    if (apart) parts = this.panels().map((surface, k, all) => ({ surface, colour, view: this.panelBox(k, all.length), from: 0, to: 1 }));
+    if (apart) parts = this.panels().map((panel, k, all) => ({ ...panel, view: this.panelBox(k, all.length), from: 0, to: 1 }));
     this.scene.draw(parts, this.pose.uniforms, light, this.aspect);
     this.canvas.setAttribute("aria-label", `Surface of ${this.result.name}, ${second && !apart ? `${first} on the left, ${second} on the right` : this.sides().join(" beside ")}, in ${NAMES[colour]}, ${this.pose.text}, lit ${lightText(light)}`);
   }
@@ -256,8 +281,10 @@ class View {
     const panelOf = (event) => {
       const box = this.stage.getBoundingClientRect();
       const count = this.state.side === "apart" ? this.panels().length : 1;
-      const along = this.stacked ? (event.clientY - box.top) / box.height : (event.clientX - box.left) / box.width;
-      const [x, y, width, height] = this.panelBox(clamp(Math.floor(along * count), 0, count - 1), count);
+      const [columns, rows] = count > 1 ? [this.columns, Math.ceil(count / this.columns)] : [1, 1];
+      const cell = (along, cells) => clamp(Math.floor(along * cells), 0, cells - 1);
+      const number = cell((event.clientX - box.left) / box.width, columns) + columns * cell((event.clientY - box.top) / box.height, rows);
+      const [x, y, width, height] = count > 1 ? this.panelBox(number, count) : [0, 0, 1, 1];
       return { left: box.left + x * box.width, top: box.top + y * box.height, width: width * box.width, height: height * box.height };
     };
     const actions = {
