@@ -218,7 +218,9 @@ def _after(result: ViewedResult, vertices: int, limits: Mapping[str, tuple[float
 
 def _filled(depth: np.ndarray, depth_lr: np.ndarray) -> np.ndarray:
     """Return where a result, (H, W), has depth and the nearest pixel of its input, (h, w), has none, (H, W) bool."""
-    rows, columns = (((np.arange(to) + 0.5) * of / to).astype(int) for to, of in zip(depth.shape, depth_lr.shape, strict=True))
+    rows, columns = (
+        ((np.arange(to) + 0.5) * of / to).astype(int) for to, of in zip(depth.shape, depth_lr.shape, strict=True)
+    )
     return np.isfinite(depth) & ~np.isfinite(depth_lr)[np.ix_(rows, columns)]
 
 

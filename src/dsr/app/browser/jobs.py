@@ -326,5 +326,3 @@ class Desk:
         elif code and not job.problem:
             job.problem = f"the process ended ({code}); it may have needed more than {job.facts['memory']} of memory"
         job.state = "failed" if job.problem else "done"
-
-

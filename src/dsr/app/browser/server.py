@@ -18,7 +18,6 @@ import threading
 import webbrowser
 from collections.abc import Mapping
 from importlib.util import find_spec
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
@@ -112,7 +111,9 @@ def browse(request: BrowserRequest, console: Console) -> list[str]:
         thread.start()  # signals are the main thread's
         show(console, f"dsr app: {url}")
         if not _is_loopback(request.host):
-            show(console, f"warning: whoever reaches {request.host} can use it: there is neither password nor encryption")
+            show(
+                console, f"warning: whoever reaches {request.host} can use it: there is neither password nor encryption"
+            )
         show(console, "  Ctrl-C ends it; nothing that was uploaded is kept then")
         if request.open_page:
             webbrowser.open(url)
@@ -147,7 +148,9 @@ def _listen(host: str, port: int) -> socket.socket:
             raise
     except (OSError, OverflowError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise ValueError(f"--host {host} --port {port}: expected a free address of this machine, got: {reason}") from error
+        raise ValueError(
+            f"--host {host} --port {port}: expected a free address of this machine, got: {reason}"
+        ) from error
     return listening
 
 
@@ -188,7 +191,7 @@ def _routes(desk: Desk, page: str, allowed: str) -> Starlette:
     """Return what answers the requests that are let through."""
     from starlette.applications import Starlette  # noqa: PLC0415 - an extra
     from starlette.requests import ClientDisconnect  # noqa: PLC0415
-    from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Response  # noqa: PLC0415
+    from starlette.responses import FileResponse, HTMLResponse, JSONResponse  # noqa: PLC0415
     from starlette.routing import Route  # noqa: PLC0415
 
     def refused(status: int, problem: str) -> Response:
@@ -355,7 +358,9 @@ class _Guard:
         async def answer(message: Message) -> None:
             if message["type"] == "http.response.start":
                 there = {name.lower() for name, _ in message["headers"]}
-                more = [(name.encode(), value.encode()) for name, value in _HEADERS.items() if name.encode() not in there]
+                more = [
+                    (name.encode(), value.encode()) for name, value in _HEADERS.items() if name.encode() not in there
+                ]
                 message = {**message, "headers": [*message["headers"], *more]}
             await send(message)
 
@@ -388,8 +393,12 @@ class _Guard:
     def _is_own(self, host: str) -> bool:
         """Return whether a Host header names this server; a number cannot be another's name for it."""
         with contextlib.suppress(ValueError):
+            if "@" in host:
+                return False
             name = (urlsplit(f"//{host}").hostname or "").lower()
-            if name in ("localhost", self._host) or (not _is_loopback(self._host) and name == socket.gethostname().lower()):
+            if name in ("localhost", self._host) or (
+                not _is_loopback(self._host) and name == socket.gethostname().lower()
+            ):
                 return True
             return ipaddress.ip_address(name).is_loopback or not _is_loopback(self._host)
         return False

@@ -204,8 +204,8 @@ def _facts(info: Mapping[str, Any]) -> dict[str, str]:
     camera, depth = info["camera"], info["input_depth"]
     fov = math.degrees(2 * math.atan(camera["width"] / 2 / camera["fx"]))
     return {
-        "camera": f"{fov:.1f} degrees of horizontal view, focal length {camera['fx']:.0f} pixels",
-        "input's values": f"{depth['unit']:g} {'pixels' if depth['range_type'] == 'disparity' else 'm'} each, {depth['range_type']}, as {depth['dtype']}",
+        "camera as read": f"{fov:.1f} degrees wide, focal length {camera['fx']:.0f} pixels",
+        "unit as read": f"{depth['unit']:g} {'pixels' if depth['range_type'] == 'disparity' else 'm'} a value, {depth['range_type']}",
     }
 
 

@@ -100,8 +100,9 @@ class View {
   fitStage() {
     const [width, height] = this.result.after.size;
     this.aspect = width / height;
-    const panels = this.state.side === "apart" ? this.panels() : [];
-    this.columns = panels.length ? this.columnsOf(panels.length) : 1;
+    const apart = this.state.side === "apart";
+    this.columns = apart ? this.columnsOf(this.panels().length) : 1;
+    const panels = apart ? this.panels() : [];
     const rows = Math.max(1, Math.ceil(panels.length / this.columns));
     this.stage.style.aspectRatio = `${this.columns * width} / ${rows * height}`;
     this.stage.classList.toggle("stacked", panels.length > 1 && this.columns === 1);
@@ -130,8 +131,10 @@ class View {
     const { colour } = this.state;
     const surfaces = this.sides().map((surface) => ({ name: surface, surface, colour }));
     if (!this.scene.photo) return surfaces;
-    const other = colour === "photo" ? "grey" : "photo";
-    return [{ name: "photo", surface: null }, ...surfaces.slice(0, -1), { name: `after, ${NAMES[other]}`, surface: "after", colour: other }, surfaces.at(-1)];
+    const [other, name] = colour === "photo" ? ["grey", "after, in grey"] : ["photo", "after, with the photo"];
+    const [photo, second] = [{ name: "photo", surface: null }, { name, surface: "after", colour: other }];
+    // In two columns, before is above after.
+    return this.columns === 2 ? [photo, ...surfaces.slice(0, -1), second, surfaces.at(-1)] : [photo, ...surfaces, second];
   }
 
   /** Return the place of a panel, from its upper left corner on, as fractions of the stage. */
