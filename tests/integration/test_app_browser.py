@@ -225,23 +225,37 @@ def test_page_fits_the_window_and_its_texts_stand_out(webgl_browser, client, wid
     page = context.new_page()
     page.goto(f"http://127.0.0.1:{client.port}/")
     page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
-    page.evaluate(
-        "for (const part of ['.refused', '.read', '.downloads', '.frames']) document.querySelector(part).hidden = false"
-    )
-    page.evaluate(
-        """() => { document.querySelector('.refused').textContent = 'x'; const list = document.querySelector('.told-notes');
-        for (const name of ['warning', '']) list.append(Object.assign(document.createElement('li'), { className: name, textContent: 'x' })); }"""
-    )
+    page.evaluate(REVEAL)
     assert page.evaluate("document.documentElement.scrollWidth") <= width
     assert page.evaluate(FAINT) == []
     context.close()
 
 
+REVEAL = """() => {
+  const find = (selector) => document.querySelector(selector);
+  for (const part of [".refused", ".read", ".downloads", ".frames"]) find(part).hidden = false;
+  find(".refused").textContent = "x";
+  for (const className of ["warning", ""]) {
+    find(".told-notes").append(Object.assign(document.createElement("li"), { className, textContent: "x" }));
+  }
+}"""
 FAINT = """() => {
   const paint = document.createElement("canvas").getContext("2d", { willReadFrequently: true });
-  const rgba = (colour) => { paint.clearRect(0, 0, 1, 1); paint.fillStyle = colour; paint.fillRect(0, 0, 1, 1); return [...paint.getImageData(0, 0, 1, 1).data]; };
-  const light = (rgb) => rgb.slice(0, 3).map((c) => c / 255).map((c) => (c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4)).reduce((sum, c, k) => sum + c * [0.2126, 0.7152, 0.0722][k], 0);
-  const behind = (element) => { for (let each = element; each; each = each.parentElement) { const colour = rgba(getComputedStyle(each).backgroundColor); if (colour[3] === 255) return colour; } return [255, 255, 255, 255]; };
+  const rgba = (colour) => {
+    paint.clearRect(0, 0, 1, 1);
+    paint.fillStyle = colour;
+    paint.fillRect(0, 0, 1, 1);
+    return [...paint.getImageData(0, 0, 1, 1).data];
+  };
+  const linear = (c) => (c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4);
+  const light = ([r, g, b]) => 0.2126 * linear(r / 255) + 0.7152 * linear(g / 255) + 0.0722 * linear(b / 255);
+  const behind = (element) => {
+    for (let each = element; each; each = each.parentElement) {
+      const colour = rgba(getComputedStyle(each).backgroundColor);
+      if (colour[3] === 255) return colour;
+    }
+    return rgba("Canvas");
+  };
   const faint = [];
   for (const element of document.querySelectorAll("body *")) {
     if (!element.checkVisibility() || element.closest(":disabled, .setting:has(:disabled), .skip")) continue;

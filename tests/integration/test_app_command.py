@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from app_server import serving
+from app_server import Client, serving
 from small_results import waves
 
 from dsr.app.browser.jobs import Desk
@@ -130,7 +130,8 @@ def test_names_of_files_are_no_paths(client, tmp_path):
     "asked",
     [
         {"what": "result"}, {"what": "shell"}, [], {"what": "look", "choices": {"output": "/tmp"}},
-        {"what": "result", "choices": {"unit": "mm --output=/tmp/x"}}, {"what": "result", "choices": {"method": "onnx"}},
+        {"what": "result", "choices": {"unit": "mm --output=/tmp/x"}},
+        {"what": "result", "choices": {"method": "onnx"}},
         {"what": "result", "choices": {"fov": "-1"}}, {"what": "result", "choices": {"fov": 60}},
         {"what": "result", "frame": 4, "count": 3}, {"what": "result", "frame": "1", "count": 3},
         {"what": "result", "frame": True, "count": 10}, {"what": "result", "choices": []},
@@ -257,6 +258,7 @@ def test_uploads_are_deleted_after_a_while(pair, monkeypatch):
 
 
 def test_missing_libraries_are_one_line(monkeypatch, capsys):
+    monkeypatch.delitem(sys.modules, "dsr.app.browser.server")
     monkeypatch.setitem(sys.modules, "uvicorn", None)
     assert main(["app", "--no-open"]) == 2
     assert capsys.readouterr().err.strip().endswith("pip install dsr[app]")
@@ -277,9 +279,7 @@ def test_command_serves_its_page_and_leaves_nothing_at_its_end(tmp_path, pair, n
     lines = [process.stdout.readline()]
     port = int(re.search(r":(\d+)/", lines[0])[1])
     until(lambda: answers(port))
-    import app_server  # noqa: PLC0415
-
-    client = app_server.Client(port, None)
+    client = Client(port, None)
     place = client.upload(**pair)
     client.start(place)
     until(lambda: client.json("GET", place)["state"] == "running")

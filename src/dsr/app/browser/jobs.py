@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from dsr.app.browser.work import SHOWN, What
+from dsr.utils.console import one_line
 from dsr.utils.files import owner, remove_abandoned
 from dsr.utils.memory import free_memory
 from dsr.utils.progress import megabytes
@@ -249,12 +250,14 @@ class Desk:
                 if not self._queue:
                     continue
                 job = self._running = self._queue.popleft()
-                process = self._start(job)
-            try:
-                self._follow(job, process)
-            finally:
-                with self._change:
-                    self._running = None
+                try:
+                    process = self._start(job)
+                except OSError as error:  # no memory, or no space
+                    job.state, job.problem, self._running = "failed", one_line(error), None
+                    continue
+            self._follow(job, process)
+            with self._change:
+                self._running = None
 
     def _expire(self) -> None:
         """Delete uploads that are too old, and end waiting jobs that nobody asks about."""

@@ -1,9 +1,9 @@
 """The server of ``dsr app``: one page, uploads that are cut off at a limit, and what is made of them.
 
-It answers this machine alone unless another address is asked for. A page of another site can make a browser ask it, too:
-it therefore refuses names of hosts that are not its own, which a stranger's name server may point here (DNS rebinding),
-and takes nothing without the token that only its own page has. Names of files that a page sends are not used: a file is
-stored under its role with one of the suffixes that the readers know.
+It answers this machine alone unless another address is asked for. A page of another site can make a browser ask it,
+too: it therefore refuses names of hosts that are not its own, which a stranger's name server may point here (DNS
+rebinding), and takes nothing without the token that only its own page has. Names of files that a page sends are not
+used: a file is stored under its role with one of the suffixes that the readers know.
 """
 
 from __future__ import annotations
@@ -17,14 +17,13 @@ import socket
 import threading
 import webbrowser
 from collections.abc import Mapping
-from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 from urllib.parse import urlsplit
 
 from rich.console import Console
 
 from dsr.app.browser.jobs import Desk, RefusedError, Upload
-from dsr.app.browser.work import SHOWN
+from dsr.app.browser.work import SHOWN, What
 from dsr.app.requests import BrowserRequest
 from dsr.io.depth_files import READ_SUFFIXES
 from dsr.io.layouts import CAPTURE_FILES
@@ -32,12 +31,17 @@ from dsr.io.pairs import PHOTO_SUFFIXES
 from dsr.report.html_page import asset, block, fill, json_text, policy
 from dsr.report.surface_page import VIEWER
 from dsr.utils.console import show
-from dsr.utils.guards import parse_json, path_within
+from dsr.utils.guards import parse_json, path_within, refusing
+
+with refusing("`dsr app` needs the libraries starlette and uvicorn: pip install dsr[app]", ImportError):
+    import uvicorn
+    from starlette.applications import Starlette
+    from starlette.exceptions import HTTPException
+    from starlette.requests import ClientDisconnect, Request
+    from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Response
+    from starlette.routing import Route
 
 if TYPE_CHECKING:
-    from starlette.applications import Starlette
-    from starlette.requests import Request
-    from starlette.responses import Response
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 ROLES: Mapping[str, tuple[str, ...]] = {
@@ -79,22 +83,13 @@ _HEADERS = {
 }
 
 
-class _TooLargeError(Exception):
-    """An upload is larger than allowed."""
-
-
 def browse(request: BrowserRequest, console: Console) -> list[str]:
     """Serve the page until the process is interrupted.
 
     Raises:
-        ValueError: the libraries are missing.
-        OSError: the port is taken.
+        ValueError: the port is taken, or the address is not one of this machine.
 
     """
-    if find_spec("starlette") is None or find_spec("uvicorn") is None:
-        raise ValueError("`dsr app` needs the libraries starlette and uvicorn: pip install dsr[app]")
-    import uvicorn  # noqa: PLC0415 - an extra
-
     listening = _listen(request.host, request.port)
     address = listening.getsockname()
     name = f"[{address[0]}]" if ":" in address[0] else address[0]
@@ -134,7 +129,7 @@ def _listen(host: str, port: int) -> socket.socket:
     """Return a socket that listens on an address of this machine.
 
     Raises:
-        OSError: it cannot; the message has the address.
+        ValueError: it cannot.
 
     """
     try:
@@ -163,7 +158,7 @@ def make_app(desk: Desk, host: str) -> ASGIApp:
 
     """
     token = secrets.token_urlsafe(24)
-    return _Guard(_routes(desk, *_page(desk, token)), host, token)
+    return _Guard(_Answers(desk, *_page(desk, token)).application(), host, token)
 
 
 def _page(desk: Desk, token: str) -> tuple[str, str]:
@@ -187,111 +182,128 @@ def _page(desk: Desk, token: str) -> tuple[str, str]:
     return fill("app.html", parts), f"{allowed}; connect-src 'self'; frame-ancestors 'none'"
 
 
-def _routes(desk: Desk, page: str, allowed: str) -> Starlette:
-    """Return what answers the requests that are let through."""
-    from starlette.applications import Starlette  # noqa: PLC0415 - an extra
-    from starlette.requests import ClientDisconnect  # noqa: PLC0415
-    from starlette.responses import FileResponse, HTMLResponse, JSONResponse  # noqa: PLC0415
-    from starlette.routing import Route  # noqa: PLC0415
+class _Answers:
+    """What is answered to requests that are let through.
 
-    def refused(status: int, problem: str) -> Response:
-        return JSONResponse({"problem": problem}, status)
+    Args:
+        desk: what holds uploads and does the jobs.
+        page: the page.
+        allowed: its content security policy.
 
-    gone = "the upload is no longer there; choose the files again"
+    """
 
-    async def show_page(_: Request) -> Response:
-        return HTMLResponse(page, headers={"content-security-policy": allowed})
+    def __init__(self, desk: Desk, page: str, allowed: str) -> None:
+        self._desk, self._page, self._allowed = desk, page, allowed
 
-    async def open_upload(request: Request) -> Response:
-        return JSONResponse({"id": desk.open(request.query_params.get("replaces", "")).id})
+    def application(self) -> Starlette:
+        """Return what calls them."""
+        one = "/uploads/{id}"
+        return Starlette(
+            routes=[
+                Route("/", self.show_page),
+                Route("/uploads", self.open, methods=["POST"]),
+                Route(one, self.tell),
+                Route(one, self.forget, methods=["DELETE"]),
+                Route(f"{one}/job", self.submit, methods=["POST"]),
+                Route(f"{one}/job", self.cancel, methods=["DELETE"]),
+                Route(f"{one}/shown", self.send_shown),
+                Route(f"{one}/files/{{number:int}}", self.send_file),
+                Route(f"{one}/{{role}}", self.take_file, methods=["PUT"]),
+            ],
+            exception_handlers={HTTPException: _refuse},
+        )
 
-    async def take_file(request: Request) -> Response:
-        upload = desk.find(request.path_params["id"])
+    async def show_page(self, _: Request) -> Response:
+        """Answer with the page."""
+        return HTMLResponse(self._page, headers={"content-security-policy": self._allowed})
+
+    async def open(self, request: Request) -> Response:
+        """Open an upload, perhaps in place of another one."""
+        return JSONResponse({"id": self._desk.open(request.query_params.get("replaces", "")).id})
+
+    async def take_file(self, request: Request) -> Response:
+        """Store a file of an upload, which is cut off at the limit."""
+        upload = self._find(request)
         role, suffix = request.path_params["role"], request.query_params.get("suffix", "").lower()
-        if upload is None:
-            return refused(404, gone)
         if suffix not in ROLES.get(role, ()):
-            return refused(400, f"{role}: expected a file as {', '.join(ROLES.get(role, ()))}")
+            raise HTTPException(400, f"{role}: expected a file as {', '.join(ROLES.get(role, ()))}")
         path = upload.folder / f"{role}{suffix}"
         try:
             with path.open("xb") as file:
                 async for chunk in request.stream():
                     upload.size += len(chunk)
-                    if upload.size > desk.most_bytes:
-                        raise _TooLargeError
+                    if upload.size > self._desk.most_bytes:
+                        self._desk.drop(upload.id)
+                        problem = f"expected at most {self._desk.most_bytes / 1e6:g} MB (--max-upload), got more"
+                        raise HTTPException(413, problem, {"connection": "close"})
                     file.write(chunk)
-        except (_TooLargeError, ClientDisconnect, OSError) as error:
+        except (ClientDisconnect, OSError) as error:
             with contextlib.suppress(OSError):
                 path.unlink()
-            if isinstance(error, _TooLargeError):
-                desk.drop(upload.id)
-                problem = f"expected at most {desk.most_bytes / 1e6:g} MB (--max-upload), got more"
-                return JSONResponse({"problem": problem}, 413, {"connection": "close"})
-            return refused(400, f"{role}: the file could not be stored")
+            raise HTTPException(400, f"{role}: the file could not be stored") from error
         upload.files[role] = path
         return JSONResponse({})
 
-    async def submit(request: Request) -> Response:
-        upload = desk.find(request.path_params["id"])
-        if upload is None:
-            return refused(404, gone)
-        content = bytearray()
+    async def submit(self, request: Request) -> Response:
+        """Begin a job."""
+        upload, content = self._find(request), bytearray()
         async for chunk in request.stream():
             content += chunk
             if len(content) > _MOST_JSON:
-                return refused(413, "expected less")
+                raise HTTPException(413, f"expected at most {_MOST_JSON} bytes", {"connection": "close"})
         try:
             asked = parse_json(bytes(content))
-            if not isinstance(asked, dict) or asked.get("what") not in ("look", "result", "files"):
-                raise ValueError("expected what to do: look, result or files")
-            desk.submit(upload, asked["what"], [*_files_of(upload), *_arguments(asked)])
+            if not isinstance(asked, dict) or asked.get("what") not in get_args(What):
+                raise ValueError(f"expected what to do: {', '.join(get_args(What))}")
+            self._desk.submit(upload, asked["what"], [*_files_of(upload), *_arguments(asked)])
         except ValueError as error:
-            return refused(409 if isinstance(error, RefusedError) else 400, str(error))
-        return JSONResponse(desk.record(upload))
+            raise HTTPException(409 if isinstance(error, RefusedError) else 400, str(error)) from error
+        return JSONResponse(self._desk.record(upload))
 
-    async def tell(request: Request) -> Response:
-        upload = desk.find(request.path_params["id"])
-        return refused(404, gone) if upload is None else JSONResponse(desk.record(upload))
+    async def tell(self, request: Request) -> Response:
+        """Tell how far the job is."""
+        return JSONResponse(self._desk.record(self._find(request)))
 
-    async def cancel(request: Request) -> Response:
-        upload = desk.find(request.path_params["id"])
-        if upload is None:
-            return refused(404, gone)
-        desk.cancel(upload)
-        return JSONResponse(desk.record(upload))
+    async def cancel(self, request: Request) -> Response:
+        """End the job."""
+        upload = self._find(request)
+        self._desk.cancel(upload)
+        return JSONResponse(self._desk.record(upload))
 
-    async def forget(request: Request) -> Response:
-        desk.drop(request.path_params["id"])
+    async def forget(self, request: Request) -> Response:
+        """Delete an upload."""
+        self._desk.drop(request.path_params["id"])
         return JSONResponse({})
 
-    async def shown(request: Request) -> Response:
-        upload = desk.find(request.path_params["id"])
-        if upload is None or not (upload.work / SHOWN).is_file():
-            return refused(404, "there is no result")
-        return FileResponse(upload.work / SHOWN, media_type="application/json")
+    async def send_shown(self, request: Request) -> Response:
+        """Send what the page shows."""
+        path = self._find(request).work / SHOWN
+        if not path.is_file():
+            raise HTTPException(404, "there is no result")
+        return FileResponse(path, media_type="application/json")
 
-    async def download(request: Request) -> Response:
-        upload, number = desk.find(request.path_params["id"]), request.path_params["number"]
-        files = [] if upload is None else desk.record(upload).get("files", [])
-        if upload is None or number >= len(files):
-            return refused(404, "there is no such file")
+    async def send_file(self, request: Request) -> Response:
+        """Send a file to keep."""
+        upload, number = self._find(request), request.path_params["number"]
+        files = self._desk.record(upload).get("files", [])
+        if number >= len(files):
+            raise HTTPException(404, "there is no such file")
         path = path_within(upload.work, files[number], "result")
         name = path.name if path.suffix != ".zip" else "dsr-result.zip"
         return FileResponse(path, media_type="application/octet-stream", filename=name)
 
-    return Starlette(
-        routes=[
-            Route("/", show_page),
-            Route("/uploads", open_upload, methods=["POST"]),
-            Route("/uploads/{id}", tell),
-            Route("/uploads/{id}", forget, methods=["DELETE"]),
-            Route("/uploads/{id}/job", submit, methods=["POST"]),
-            Route("/uploads/{id}/job", cancel, methods=["DELETE"]),
-            Route("/uploads/{id}/shown", shown),
-            Route("/uploads/{id}/files/{number:int}", download),
-            Route("/uploads/{id}/{role}", take_file, methods=["PUT"]),
-        ]
-    )
+    def _find(self, request: Request) -> Upload:
+        """Return the upload that a request is about."""
+        upload = self._desk.find(request.path_params["id"])
+        if upload is None:
+            raise HTTPException(404, "the upload is no longer there; choose the files again")
+        return upload
+
+
+async def _refuse(_: Request, error: Exception) -> Response:
+    """Answer with the reason of a refusal."""
+    assert isinstance(error, HTTPException)  # noqa: S101
+    return JSONResponse({"problem": error.detail}, error.status_code, error.headers)
 
 
 def _files_of(upload: Upload) -> list[str]:

@@ -202,10 +202,11 @@ def _result(request: UpsampleRequest, folder: Path) -> None:
 def _facts(info: Mapping[str, Any]) -> dict[str, str]:
     """Return the camera and the unit as they were read."""
     camera, depth = info["camera"], info["input_depth"]
+    unit = "pixels" if depth["range_type"] == "disparity" else "m"
     fov = math.degrees(2 * math.atan(camera["width"] / 2 / camera["fx"]))
     return {
         "camera as read": f"{fov:.1f} degrees wide, focal length {camera['fx']:.0f} pixels",
-        "unit as read": f"{depth['unit']:g} {'pixels' if depth['range_type'] == 'disparity' else 'm'} a value, {depth['range_type']}",
+        "unit as read": f"{depth['unit']:g} {unit} a value, {depth['range_type']}",
     }
 
 
