@@ -75,7 +75,7 @@ class View {
       this.scene.dropSurface(name);
       const grid = this.grids[name];
       if (!grid) continue;
-      const mesh = buildMesh(grid, name === "after" && this.state.doubtful);
+      const mesh = buildMesh(grid, name === "after" && this.withDoubtful);
       this.triangles[name] = mesh.corners.length / 3;
       this.scene.setSurface(name, grid, mesh);
     }
@@ -152,8 +152,15 @@ class View {
     }
   }
 
+  /** Whether uncertain parts are shown; what is filled often is uncertain. */
+  get withDoubtful() {
+    return this.state.doubtful || this.state.colour === "filled";
+  }
+
   set(name, value) {
+    const before = this.withDoubtful;
     this.state[name] = value;
+    if (this.withDoubtful !== before && this.result?.doubtful && this.triangles) this.build();
     for (const button of findAll(`[data-${name}]`)) button.setAttribute("aria-pressed", String(button.dataset[name] === value));
     const apart = this.state.side === "apart";
     const both = this.sides().length === 2 && !apart;
