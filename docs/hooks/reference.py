@@ -83,7 +83,7 @@ def command_parser() -> argparse.ArgumentParser:
     """Return the parser of the ``dsr`` command."""
     from dsr import cli  # noqa: PLC0415
 
-    return cli._parser()
+    return cli.make_parser()
 
 
 def command_reference(parser: argparse.ArgumentParser) -> str:

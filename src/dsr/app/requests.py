@@ -9,7 +9,7 @@ from dsr.app.upsample.parts import EXPECTED_ERROR
 from dsr.geometry.lights import FIGURE_LIGHT, LIGHT_CHOICES, LIGHT_NAMES
 from dsr.report.study.choice import Choice
 from dsr.utils.configuration import config_directories, list_choices
-from dsr.utils.options import OptionError, Options, Rule, at_least, group, one_of, option, positive, some_of
+from dsr.utils.options import Options, Rule, at_least, group, one_of, option, positive, some_of
 
 REPORT_PARTS = ("tables", "metrics", "figures", "page")
 _MOST_WORKERS = 256
@@ -167,9 +167,7 @@ def check_method(method: str, directories: tuple[Path, ...]) -> None:
         OptionError: there is no such method in the project's or the user's directories.
 
     """
-    rule = one_of(list_choices("method", config_directories(directories)))
-    if not rule.holds(method):
-        raise OptionError("method", f"expected {rule.expected}, got {method!r}")
+    one_of(list_choices("method", config_directories(directories))).expect("method", method)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,7 +181,9 @@ class FormatsRequest(Options):
 class DoctorRequest(Options):
     """What to examine."""
 
-    directory: Path = option(..., "a scene, or a directory of scenes", "DIR", flags="directory")
+    directory: Path | None = option(
+        None, "a scene, or a directory of scenes; without one, what is installed is checked", "DIR", flags="directory"
+    )
     most: int | None = option(
         None,
         "examine at most N scenes, taken at equal distances from all",

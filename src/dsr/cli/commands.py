@@ -95,8 +95,12 @@ def _later(module: str, name: str) -> Callable[[Any, Console, object], list[str]
 
 
 def _examine(request: DoctorRequest, *_: object) -> int:
-    """Examine a directory of scenes."""
-    from dsr.doctor.examine import examine_directory  # noqa: PLC0415 - it takes seconds to import
+    """Examine a directory of scenes, or without one the machine."""
+    if request.directory is None:
+        from dsr.doctor.machine import examine_machine  # noqa: PLC0415 - it takes seconds to import
+
+        return examine_machine()
+    from dsr.doctor.examine import examine_directory  # noqa: PLC0415
 
     return examine_directory(request.directory, request.most)
 
@@ -257,7 +261,17 @@ degrees. docs/export.md has a program that runs such a file.
 )
 
 FORMATS_COMMAND = Command("formats", "what is read of which device or program", FormatsRequest, _show_formats)
-DOCTOR = Command("doctor", "check a directory of your own scenes", DoctorRequest, _examine)
+DOCTOR = Command(
+    "doctor",
+    "check what is installed, or a directory of your own scenes",
+    DoctorRequest,
+    _examine,
+    epilog="""\
+examples:
+  dsr doctor                     whether everything is here that dsr needs: exit code 0, or 2
+  dsr doctor my_scenes           units, cameras, holes: exit code 0, or 1 where something is probably wrong
+""",
+)
 
 
 _HYDRA_COMMANDS = {

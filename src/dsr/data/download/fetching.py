@@ -273,7 +273,7 @@ class _Job:
         sources: list[tuple[str, _Credentials]] = [(url, None) for url in item.urls]
         if self.mirror is not None:
             sources.insert(0, (f"{self.mirror.address}/{item.path}", self.mirror.credentials))
-        problems = []
+        problems = [] if sources else ["no address of it is known; --mirror URL names a server that has it"]
         for url, credentials in sources:
             try:
                 return self._fetch_from(url, item, credentials)
