@@ -83,6 +83,10 @@ class _Steps(Progress):
         yield report
         tell(done=0, total=0)
 
+    def stage(self, name: str, seconds: float | None = None) -> None:
+        """Tell which stage of the frame begins."""
+        tell(stage=name)
+
 
 class _Parser(ArgumentParser):
     """A parser whose errors are ValueErrors."""
