@@ -172,7 +172,7 @@ def _page(desk: Desk, token: str) -> tuple[str, str]:
         "seconds": desk.most_seconds,
         "suffixes": ROLES,
     }
-    accept = {f"{role.upper()}_FILES": ",".join(suffixes) for role, suffixes in ROLES.items()}
+    accept = {f"{role.upper()}_FILES": ",".join(ROLES[role]) for role in ("photo", "mask")}
     methods = "".join(f'<option value="{name}">{name.replace("_", " ")}</option>' for name in METHODS)
     parts = {
         "STYLE": style, "SCRIPT": script, "VIEWER": asset("viewer.html"), "METHODS": methods,

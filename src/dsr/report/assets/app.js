@@ -3,6 +3,7 @@
 const settings = block("settings");
 const DEPTH_WORDS = /depth|disp|range|tiefe/i;
 const POLL = 400; // milliseconds
+const MOST = 4; // files that are dropped at once: photo, depth map, camera, mask
 const STATES = { waiting: "Waiting", running: "Working", done: "Done", failed: "Failed", cancelled: "Cancelled" };
 
 /** Ask the server; throws an error with its reason where it refuses. */
@@ -24,9 +25,9 @@ const seconds = (value) => (value < 100 ? `${Math.round(value)} s` : `${Math.flo
 const megabytes = (size) => `${Math.round(size / 1e6)} MB`;
 
 class Files {
-  /** Hold the chosen files by role; `changed()` is called after each change. */
-  constructor(changed) {
-    this.changed = changed;
+  /** Hold the chosen files by role; `changed()` is called after each change, `refuse(problem)` where there is none. */
+  constructor(changed, refuse) {
+    Object.assign(this, { changed, refuse });
     this.by = {};
     for (const slot of findAll(".slot")) {
       const input = find("input", slot);
@@ -39,7 +40,10 @@ class Files {
     document.addEventListener("drop", (event) => {
       event.preventDefault();
       zone.classList.remove("over");
-      if (event.dataTransfer.files.length) this.put(this.sorted([...event.dataTransfer.files]));
+      const dropped = [...event.dataTransfer.files];
+      const folder = [...event.dataTransfer.items].some((item) => item.webkitGetAsEntry?.()?.isDirectory);
+      if (folder || dropped.length > MOST) this.refuse("Drop a photo and a depth map; of a folder, drop a .zip of it.");
+      else if (dropped.length) this.put(this.sorted(dropped));
     });
     find(".swap").addEventListener("click", () => this.put({ photo: this.by.depth, depth: this.by.photo }));
   }
@@ -73,7 +77,7 @@ class Files {
     const wrong = Object.entries(files).find(([role, file]) => file && !takes(role, file));
     if (wrong) {
       this.show();
-      this.changed(`${wrong[1].name}: expected a ${wrong[0] === "depth" ? "depth map" : wrong[0]} as ${settings.suffixes[wrong[0]].join(", ")}`);
+      this.refuse(`${wrong[1].name}: expected a ${wrong[0] === "depth" ? "depth map" : wrong[0]} as ${settings.suffixes[wrong[0]].join(", ")}`);
       return;
     }
     if (files.capture) for (const role of ["photo", "depth", "mask"]) this.by[role] = null;
@@ -104,7 +108,7 @@ class App {
     this.count = 1;
     this.names = [];
     this.turn = 0; // of what is asked for; what comes for an earlier one is dropped
-    this.files = new Files((problem) => this.filesChanged(problem));
+    this.files = new Files((problem) => this.filesChanged(problem), (problem) => this.refuse(problem));
     find(".asked").addEventListener("submit", (event) => { event.preventDefault(); this.compute(); });
     find(".cancel").addEventListener("click", () => this.cancel());
     find(".prepare").addEventListener("click", () => this.prepare());
@@ -226,21 +230,21 @@ class App {
 
   /** Do something that may fail, with the display of work under way. */
   async doing(work, turn) {
-    const begun = performance.now();
     this.refuse("");
     find(".cancel").hidden = false;
     find(".under-way").hidden = false;
-    this.begun = begun;
+    if (document.activeElement === document.body || document.activeElement.disabled) find(".cancel").focus();
     try {
       await work();
     } catch (error) {
       if (turn === this.turn) { this.refuse(error.message); this.say(""); }
     }
     if (turn !== this.turn) return;
-    find(".cancel").hidden = true;
     find(".under-way").hidden = true;
     find(".compute").disabled = !this.files.isComplete;
     find(".prepare").disabled = false;
+    if (document.activeElement === find(".cancel")) find(".compute").focus();
+    find(".cancel").hidden = true;
   }
 
   async compute() {
@@ -249,7 +253,6 @@ class App {
     const turn = this.turn;
     find(".compute").disabled = true;
     find(".downloads").hidden = true;
-    find(".cancel").focus();
     await this.doing(async () => {
       const job = await this.run("result", { choices: this.choices(), frame: this.frame, count: this.count }, turn);
       if (job) this.showNotes(job.notes);
@@ -297,7 +300,6 @@ class App {
     this.turn += 1;
     const turn = this.turn;
     await this.doing(async () => { if (this.upload) await ask("DELETE", `uploads/${this.upload.id}/job`); this.say("Cancelled."); }, turn);
-    find(".compute").focus();
   }
 
   // What is said.
