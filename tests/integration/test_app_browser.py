@@ -169,7 +169,7 @@ def test_phones_capture_goes_to_a_downloaded_mesh_by_keys_alone(page, tmp_path):
 
     tab_to("#capture")
     with page.expect_file_chooser() as chooser:
-        keys.press("Enter")
+        keys.press("Space")
     chooser.value.set_files(scan)
     finished(page)
     assert page.locator("[data-frame]").count() == 3
