@@ -13,6 +13,7 @@ from dsr.utils.options import Options, Rule, at_least, group, one_of, option, po
 
 REPORT_PARTS = ("tables", "metrics", "figures", "page")
 _MOST_WORKERS = 256
+_LAST_PORT = 65535
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,6 +108,32 @@ class ViewRequest(Options):
         "N",
         rule=at_least(1000),
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class BrowserRequest(Options):
+    """Where the page of ``dsr app`` is served, and what may be asked of it."""
+
+    port: int = option(
+        8765,
+        "of this machine; 0: a free one (8765)",
+        "PORT",
+        rule=Rule("0..65535", lambda port: 0 <= port <= _LAST_PORT),
+    )
+    host: str = option("127.0.0.1", "another address: whoever reaches it can use the page", "ADDRESS")
+    open_page: bool = option(True, "only serve the page", flags="--no-open")
+    max_upload: float = option(
+        512.0, "largest size of the files of an upload (512)", "MB", rule=positive("number of megabytes")
+    )
+    max_seconds: float = option(300.0, "longest time of a computation (300)", "SECONDS", rule=positive("time"))
+    max_memory: float | None = option(
+        None, "memory of a computation (default: what is free)", "GB", rule=positive("number of gigabytes")
+    )
+
+    @property
+    def memory(self) -> int | None:
+        """Bytes of memory of a computation; None for what is free."""
+        return None if self.max_memory is None else int(1e9 * self.max_memory)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,6 +8,7 @@ from typing import NoReturn
 
 from dsr.app.downloads import downloads
 from dsr.cli.commands import (
+    APP,
     DOCTOR,
     EXPORT,
     FORMATS_COMMAND,
@@ -34,6 +35,7 @@ _EXAMPLES = """\
 examples:
   dsr upsample --rgb photo.jpg --depth depth.png -o out    high-resolution depth, mesh and pictures
   dsr view out                                             its surfaces, before and after, in the browser
+  dsr app                                                  the same in the browser: drop files, look, download
   dsr fuse out -o mesh.ply                                 one mesh of the results of a sequence with poses
   dsr eval method=facets dataset=simgeo scale=8            evaluate a method; more with dsr eval --help
   dsr train model=facets trainer=smoke                     train a network; more with dsr train --help
@@ -49,7 +51,7 @@ examples:
 In a checkout of the project, `python eval.py` and `python train.py` are the same as `dsr eval` and `dsr train`.
 """
 _COMMANDS = (
-    *(command.add for command in (UPSAMPLE, VIEW, FUSE)),
+    *(command.add for command in (UPSAMPLE, VIEW, APP, FUSE)),
     add_hydra_commands,
     *(command.add for command in (REPORT, LEADERBOARD, STUDY)),
     add_data_command,

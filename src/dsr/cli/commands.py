@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from rich.console import Console
 
 from dsr.app.requests import (
+    BrowserRequest,
     DoctorRequest,
     ExportRequest,
     FormatsRequest,
@@ -164,6 +165,22 @@ examples:
   dsr view out                             a result, or a folder of results; writes out/view.html
   dsr view out --no-open -o page.html
   dsr view recordings --most 40 --vertices 100000
+""",
+)
+
+APP = Command(
+    "app",
+    "upsample in the browser: drop files, see the surfaces under one light",
+    BrowserRequest,
+    _later("dsr.app.browser.server", "browse"),
+    description="""\
+Serve a page of this machine alone, and open it: drop a photo and a depth map, or a capture, and look at photo, input
+and result side by side. The libraries are an extra: pip install dsr[app]. More in docs/app.md.""",
+    epilog="""\
+examples:
+  dsr app
+  dsr app --no-open --port 9000
+  dsr app --max-upload 2000 --max-seconds 900     for large captures
 """,
 )
 
