@@ -45,10 +45,10 @@ from torch import Tensor
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.rigid_motion import is_rotation, quaternion_of
+from dsr.io.depth_files import read_depth_file
 from dsr.io.exports import to_jpeg, world_comment, write_ply
 from dsr.io.images import read_pixels
 from dsr.io.photos import encode_png, write_png
-from dsr.utils.arrays import open_array
 from dsr.utils.files import replacing, write_text
 from dsr.utils.guards import pixels_beside, refusing
 
@@ -83,7 +83,7 @@ class Frame:
         pose: (4, 4) float64 camera-to-world transform in metres, of a camera with x right, y down, z forward; None if
             it is not known.
         colour: an 8-bit PNG.
-        depth: an NPY of (H, W) orthogonal depth in metres, NaN in holes.
+        depth: a file of (H, W) orthogonal depth in metres, NaN in holes.
         up: the axis of the world that points up, one of :data:`dsr.io.frames.UPS`.
         time: of the frame in seconds; None if it is not known.
 
@@ -109,11 +109,11 @@ class Frame:
             ValueError: the file is damaged, or not of the camera's size.
 
         """
-        values = open_array(self.depth)
+        values = read_depth_file(self.depth, pixels_beside(self.camera.height, self.camera.width))
         if values.shape != (self.camera.height, self.camera.width):
             size = f"{self.camera.height} x {self.camera.width}"
             raise ValueError(f"{self.depth}: expected depth of {size} pixels (height x width), got {values.shape}")
-        return np.array(values, np.float32)
+        return values.astype(np.float32)
 
     def read_colour(self) -> np.ndarray:
         """Return the photo, (H, W, 3) uint8, red first.

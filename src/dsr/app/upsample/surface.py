@@ -16,7 +16,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from dsr.app.upsample.frame import write_result
+from dsr.app.upsample.frame import Times, write_result
 from dsr.app.upsample.outputs import begin, expect_free, output_encoding, read_previous_run
 from dsr.app.upsample.parts import Result, Results
 from dsr.app.upsample.scene import write_scene
@@ -32,6 +32,7 @@ from dsr.methods import base
 from dsr.methods.base import MapNoise, Outliers
 from dsr.notes import warn
 from dsr.pictures.inline import encode_row
+from dsr.utils.progress import SILENT
 
 Array = TypeVar("Array", np.ndarray, Tensor)
 
@@ -210,8 +211,10 @@ class Surface(Generic[Array]):
         found = self._found.without_dubious(wanted.max_error / 100) if wanted.certain else self._found
         result = Result(self._picture, found, output_encoding(self._picture.encoding, wanted.format), title, wanted)
         settings = {"max_error": wanted.max_error / 100}
+        times = Times(SILENT, upsampling=self._seconds)
+        times.begin("writing")
         begin(folder, settings, {}, () if earlier is None else earlier.files)
-        notes = write_result(folder, result, self._plan, self._seconds, {}, settings, earlier)
+        notes, _ = write_result(folder, result, self._plan, times, {}, settings, earlier)
         warn(note for note in notes if note.code)
         run = read_previous_run(folder)
         files = [] if run is None else [folder / name for name in run.files]
