@@ -1,4 +1,4 @@
-"""Write the generated pages of the documentation: commands, configuration, Python API, weights, changes and security.
+"""Write the generated pages of the documentation: commands, options, configuration, Python API, weights and changes.
 
 MkDocs calls :func:`on_files` at every build, so these pages always agree with the code and none of them is stored.
 """
@@ -41,6 +41,13 @@ _HEAD_COMMANDS = """\
 This page is generated from the commands; `dsr COMMAND --help` prints the same text. The settings of `dsr eval`
 (`python eval.py`) and `dsr train` (`python train.py`) are in the [configuration reference](configuration.md).
 """
+_HEAD_OPTIONS = """\
+# Options of dsr upsample
+
+This page is generated from the command; `dsr upsample --help` prints the same, with examples. What is not given is read
+from the files or [assumed](../assumptions.md). The pages of [holes](../holes.md), [noise](../noise.md),
+[folders](../folders.md) and [results](../results.md) explain what the options do.
+"""
 _HEAD_CONFIGURATION = """\
 # Configuration reference
 
@@ -71,19 +78,33 @@ def generated_pages() -> dict[str, str]:
     """Return the Markdown of every generated page by its path in the site."""
     pages = {
         "reference/commands.md": command_reference(command_parser()),
+        "reference/upsample.md": option_reference(command_parser(), "dsr upsample"),
         "reference/configuration.md": configuration_reference(CONF),
         "weights.md": model_card(),
         "changelog.md": (ROOT / "CHANGELOG.md").read_text(),
         "security.md": (ROOT / "SECURITY.md").read_text(),
     }
+    pages["api/dsr.md"] = names_of_package()
     return pages | {f"api/{package}.md": f"# dsr.{package}\n\n::: dsr.{package}\n" for package in PACKAGES}
+
+
+def names_of_package() -> str:
+    """Return the reference of the names of ``dsr`` itself, wherever they are."""
+    import dsr  # noqa: PLC0415
+
+    shown = "show_root_heading: true, show_root_toc_entry: true"
+    parts = [
+        f"::: {home}.{name}\n    options: {{{shown}, heading: dsr.{name}, toc_label: {name}}}\n"
+        for name, home in sorted(dsr._HOMES.items())
+    ]
+    return "\n".join(["# dsr\n", *parts])
 
 
 def command_parser() -> argparse.ArgumentParser:
     """Return the parser of the ``dsr`` command."""
     from dsr import cli  # noqa: PLC0415
 
-    return cli._parser()
+    return cli.make_parser()
 
 
 def command_reference(parser: argparse.ArgumentParser) -> str:
@@ -93,6 +114,35 @@ def command_reference(parser: argparse.ArgumentParser) -> str:
         each.formatter_class = partial(each.formatter_class, width=100)  # type: ignore[assignment]
         sections.append(f"## {each.prog}\n\n```text\n{each.format_help().rstrip()}\n```\n")
     return "\n".join([_HEAD_COMMANDS, *sections])
+
+
+def option_reference(parser: argparse.ArgumentParser, command: str) -> str:
+    """Return the options of a command as Markdown, a table for each group that has any."""
+    parser = next(each for each in all_parsers(parser) if each.prog == command)
+    shown = argparse.HelpFormatter(command)
+    sections = []
+    for group in parser._action_groups:
+        rows = [
+            f"| {_code(shown._format_action_invocation(action))} | {_linked(_escape(action.help or ''))} |"
+            for action in group._group_actions
+            if action.dest != "help"
+        ]
+        if rows:
+            sections += [f"## {_title(group.title or '')}\n", "| option | what |", "| --- | --- |", *rows, ""]
+    for each in parser._mutually_exclusive_groups:
+        names = ", ".join(_code(action.option_strings[-1]) for action in each._group_actions)
+        sections.append(f"At most one of {names} is given.\n")
+    return "\n".join([_HEAD_OPTIONS, *sections])
+
+
+def _linked(text: str) -> str:
+    """Return a text of a command with links in place of the pages that it names."""
+    return re.sub(r"docs/(\w+\.md)", r"[\1](../\1)", text)
+
+
+def _title(text: str) -> str:
+    """Return a group's title as a heading: its first letter large, without what is in brackets."""
+    return re.sub(r" \(.*", "", text[:1].upper() + text[1:])
 
 
 def all_parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:

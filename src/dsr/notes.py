@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
+import re
+import warnings
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
+
+_OPTION = re.compile(r"(?<!\S)--?([a-z]+(?:-[a-z]+)*)")
+_ARGUMENTS = {"depth-unit": "unit", "o": "folder"}
+"""Options of the command that have another name in Python."""
 
 CHECKS = 4
 """Number of the present checks; another one where a warning is added, or a limit changes."""
@@ -32,8 +39,8 @@ LIMITS: dict[str, Limit] = {
     ),
     "edges-beside": Limit(
         3.0,
-        "pixels of the photo, at most 800 on its longer side, by which its edges lie beside those of the depth map",
-        "7 of 823 right pairs are beyond it, 2 of them one frame that does lie beside its photo",
+        "pixels of the photo, at most 800 on its longer side, between its edges and those of the depth map",
+        "7 of 823 right pairs are beyond it, 2 of them one frame that is displaced",
     ),
     "neighbours-disagree": Limit(
         0.2,
@@ -62,8 +69,8 @@ LIMITS: dict[str, Limit] = {
     ),
     "truths-differ": Limit(
         2,
-        "truths of the scenes of one name in the runs of a report or a study",
-        "scores against different truths cannot be compared",
+        "ground truths of the scenes of one name in the runs of a report or a study",
+        "scores against different ground truths cannot be compared",
     ),
     "along-the-ray": Limit(
         0.85,
@@ -110,22 +117,22 @@ LIMITS: dict[str, Limit] = {
     ),
     "far-millimetres": Limit(
         6.0,
-        "metres, of the median of whole numbers as millimetres; the unit is asked for, not warned of",
+        "metres, of the median of whole numbers as millimetres; the command asks for the unit, no warning",
         "of 71 maps of sensors none is beyond 5.2 m; stored in 1/5000 m 63 would be",
     ),
     "far-metres": Limit(
         10.0,
-        "metres, of the median of floats, if planes do not show that they are depth; asked for",
+        "metres, of the median of floats, if planes do not show that they are depth; the command asks for the unit",
         "of 71 maps of sensors none is beyond 5.2 m; disparities of Middlebury have medians of 26 to 40 px",
     ),
     "far-floats": Limit(
         30.0,
-        "metres, of the median of floats; asked for up to `float-millimetres.whole`",
+        "metres, of the median of floats; the command asks up to `float-millimetres.whole`",
         "centimetres of a table begin here; no depth camera of rooms measures so far",
     ),
     "float-millimetres": Limit(
         500.0,
-        "of the median of floats above `float-millimetres.whole` that are not whole; asked for below it",
+        "of the median of floats above `float-millimetres.whole` that are not whole; the command asks below it",
         "the Kinect v2, whose drivers store such floats, begins at 0.5 m; rooms in centimetres are mostly below 5 m",
     ),
     "baseline-short": Limit(0.001, "metres, below which it is", "phones have cameras 10 mm apart"),
@@ -148,17 +155,17 @@ LIMITS: dict[str, Limit] = {
     "edges-beside.elsewhere": Limit(
         5.0,
         "standard deviations of chance, of the agreement of edges at a displacement beyond 4 % of the size",
-        "none of 383 right pairs is told for it, from 4.5 on 2; of 182 shifted ones 171 are told, from 7 on 163",
+        "none of 383 right pairs reaches it, 2 reach 4.5; of 182 shifted ones 171 reach it, 163 reach 7",
     ),
     "edges-beside.lead": Limit(
         2.0,
         "standard deviations by which that agreement is larger than without a displacement",
-        "without it 2 of 383 right pairs more are told",
+        "without it, 2 more of 383 right pairs get the warning",
     ),
     "edges-beside.chance": Limit(
         2.8,
         "standard errors by which the photo's gradients at the displaced depth edges exceed those at a typical shift",
-        "5 of 383 right pairs are told with all these conditions, 2 of them one frame that does lie so",
+        "5 of 383 right pairs meet all these conditions, 2 of them one frame that is displaced",
     ),
     "edges-beside.others": Limit(
         2.0, "standard errors by which they exceed those at the best other shift", "as for `edges-beside.chance`"
@@ -249,7 +256,7 @@ LIMITS: dict[str, Limit] = {
     ),
     "poses.weight": Limit(
         0.5,
-        "pairs of frames that disagree wholly without motion, or as much of more pairs; fewer tell nothing apart",
+        "pairs of frames that disagree wholly without motion, or as much of more pairs; fewer distinguish nothing",
         "15 rendered sequences whose camera moves have 3.1 to 22",
     ),
     "poses-disagree.still": Limit(
@@ -323,6 +330,20 @@ class Assumption(NamedTuple):
             "value": self.value,
             "threshold": None if limit is None else limit.threshold,
         }
+
+
+def in_python(text: str) -> str:
+    """Return what is said to a user of a command as it is said to one of Python, where options are arguments."""
+    return _OPTION.sub(lambda option: _ARGUMENTS.get(option[1], option[1].replace("-", "_")), text)
+
+
+def warn(notes: Iterable[Assumption]) -> None:
+    """Give notes as Python's warnings, from the place outside of dsr that called."""
+    level, frame = 1, inspect.currentframe()
+    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] == "dsr":
+        level, frame = level + 1, frame.f_back
+    for note in notes:
+        warnings.warn(in_python(note.message), UserWarning, level)
 
 
 def read_warning(entry: Mapping[str, Any]) -> Assumption:

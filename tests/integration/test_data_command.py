@@ -135,7 +135,7 @@ def test_interrupted_command_resumes(mirror, root):
     _, errors = process.communicate(timeout=30)
     assert (process.returncode, errors) == (
         130,
-        "interrupted; what is finished is kept, the same command goes on from there\n",
+        "interrupted; what is finished is kept, the same command continues from there\n",
     )
     had = part.stat().st_size
     assert not (root / NAMES[0]).exists()

@@ -149,7 +149,7 @@ def test_interrupted_run_resumes_within_the_image(tmp_path: Path, run: Run) -> N
         process.send_signal(signal.SIGTERM)
         _, errors = process.communicate(timeout=60)
     assert process.returncode == 143
-    step = re.fullmatch(r"interrupted at step (\d+) of statue; the same command goes on from there\n", errors)
+    step = re.fullmatch(r"interrupted at step (\d+) of statue; the same command continues from there\n", errors)
     assert step is not None, errors
     assert 10 <= int(step[1]) < 60
     assert (tmp_path / "out" / "optimisation" / "statue" / "last.ckpt").is_file()
@@ -189,7 +189,7 @@ if __name__ == "__main__":
 @pytest.mark.parametrize(
     ("numbers", "workers", "end"),
     [
-        ((signal.SIGINT,), 1, "interrupted at step 3 of statue; the same command goes on from there"),
+        ((signal.SIGINT,), 1, "interrupted at step 3 of statue; the same command continues from there"),
         ((signal.SIGINT,), 2, interruption.MESSAGE),
         ((signal.SIGINT, signal.SIGINT), 1, "interrupted before the first checkpoint; the same command begins this "),
         ((signal.SIGTERM,), 1, "interrupted before the first checkpoint; the same command begins this again, "),

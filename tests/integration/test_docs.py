@@ -173,6 +173,18 @@ def test_command_reference_has_every_command_and_option(hook: ModuleType, genera
             assert [name for name in action.option_strings if name not in section] == []
 
 
+def test_option_reference_has_a_table_for_each_group_with_every_option(
+    hook: ModuleType, generated: dict[str, str]
+) -> None:
+    page = generated["reference/upsample.md"]
+    parser = next(each for each in hook.all_parsers(hook.command_parser()) if each.prog == "dsr upsample")
+    rows = dict(re.findall(r"^\| `([^`]+)` \| (.*) \|$", page, re.MULTILINE))
+    flags = {flag for shown in rows for flag in re.findall(r"(?<![\w-])--?[a-z-]+", shown)}
+    assert {flag for action in parser._actions for flag in action.option_strings} == {*flags, "-h", "--help"}
+    assert all(rows.values())
+    assert re.findall(r"^## (.*)$", page, re.MULTILINE)[0] == "What to work on"
+
+
 def leaves(node: Any, above: str = "") -> Iterator[tuple[str, Any]]:
     """Yield the dotted keys of nested mappings, with their values where these are no mappings."""
     for key, value in node.items():

@@ -308,7 +308,7 @@ def test_aligned_scores_are_a_result_of_their_own_and_say_so(tmp_path, within):
     assert [run.label for run in results.runs] == ["Bicubic", "Bicubic (alignment=affine)"]
     [summary, table] = build_tables(results)
     for notes in (summary.notes, table.notes, results.remarks):
-        assert any("Bicubic (alignment=affine) aligned to the truth" in note for note in notes)
+        assert any("Bicubic (alignment=affine) aligned to the ground truth" in note for note in notes)
     np.testing.assert_allclose(results.runs[1].prediction("a").numpy().ravel(), scale * depths[0] + shift, rtol=1e-5)
 
 
@@ -467,7 +467,7 @@ def test_interrupted_run_keeps_finished_scenes_and_resumes(tmp_path, offline):
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert errors == "interrupted; what is finished is kept, the same command goes on from there\n"
+    assert errors == "interrupted; what is finished is kept, the same command continues from there\n"
     finished = sorted(path.name for path in (tmp_path / "out" / "predictions").iterdir())
     assert finished
     assert len(finished) < 6

@@ -167,7 +167,7 @@ def test_interrupted_sweep_stops_its_jobs(sweep, tmp_path):
     code, lines = sweep(lasting, (0,), *LOCAL)
     interrupted.wait(10)
     assert code == 130
-    assert lines == ["interrupted; what is finished is kept, the same command goes on from there"]
+    assert lines == ["interrupted; what is finished is kept, the same command continues from there"]
     wait_until(lambda: not is_alive(int((tmp_path / "pid").read_text())), 10)
     assert not is_alive(int((tmp_path / "pid").read_text()))
 

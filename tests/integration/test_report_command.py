@@ -121,7 +121,7 @@ def test_report_without_truth_has_pictures_and_no_tables(
                 rest = {name: values for name, values in arrays.items() if name != "depth"}
             np.savez_compressed(file, **rest)
     assert main(["report", str(runs), "-o", str(tmp_path / "report"), "--only", "tables,metrics,page"]) == 0
-    assert "no scene has a truth to score against" in capsys.readouterr().out
+    assert "no scene has a ground truth to score against" in capsys.readouterr().out
     assert sorted(path.name for path in (tmp_path / "report").iterdir()) == ["index.html", "report.json"]
     assert "Bicubic" in (tmp_path / "report" / "index.html").read_text(encoding="utf-8")
 
@@ -187,7 +187,7 @@ def test_different_truths_are_told_and_have_tables_of_their_own(
 ) -> None:
     assert main(["report", str(apart), "-o", str(tmp_path / "report"), "--only", "tables,page"]) == 0
     told = " ".join(capsys.readouterr().out.split())
-    assert told.count("warning: simgeo x4: the runs have different truths") == 1
+    assert told.count("warning: simgeo x4: the runs have different ground truths") == 1
     assert "left out" not in told
     report = tmp_path / "report"
     (warning,) = json.loads((report / "report.json").read_text())["warnings"]
@@ -201,8 +201,8 @@ def test_different_truths_are_told_and_have_tables_of_their_own(
     averages = pd.read_csv(report / "tables" / "summary_x4_box.csv")
     assert all(" " not in str(each).replace(" (truth ", "") for each in averages["dataset"])  # none over both
     text = (report / "tables" / "all.md").read_text(encoding="utf-8")
-    assert text.count("the runs have different truths") == 3
-    assert "the runs have different truths" in (report / "index.html").read_text(encoding="utf-8")
+    assert text.count("the runs have different ground truths") == 3
+    assert "the runs have different ground truths" in (report / "index.html").read_text(encoding="utf-8")
 
 
 def test_truths_that_differ_by_rounding_are_one(
@@ -226,7 +226,7 @@ def test_strict_refuses_different_truths_unless_one_alone_is_chosen(
 ) -> None:
     command = ("report", apart, "-o", tmp_path / "report", "--only", "tables", "--strict")
     line = refused(capsys, *command)
-    assert "different truths" in line
+    assert "different ground truths" in line
     assert not (tmp_path / "report").exists()
     name = re.findall(r"simgeo \(truth [0-9a-f]{8}\)", line)[0]
     assert main([*map(str, command), "--datasets", name]) == 0
@@ -236,11 +236,11 @@ def test_study_asks_about_each_truth_and_strict_refuses(
     apart: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["study", "build", str(apart), "-o", str(tmp_path / "study")]) == 0
-    assert "warning: simgeo x4: the runs have different truths" in " ".join(capsys.readouterr().out.split())
+    assert "warning: simgeo x4: the runs have different ground truths" in " ".join(capsys.readouterr().out.split())
     trials = json.loads((tmp_path / "study" / "key.json").read_text())["trials"].values()
     assert len(trials) == 4
     assert len({trial["dataset"] for trial in trials}) == 2
-    assert "different truths" in refused(capsys, "study", "build", apart, "-o", tmp_path / "other", "--strict")
+    assert "different ground truths" in refused(capsys, "study", "build", apart, "-o", tmp_path / "other", "--strict")
     assert not (tmp_path / "other").exists()
 
 

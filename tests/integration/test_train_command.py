@@ -36,7 +36,7 @@ FOUR = (*SMOKE, "trainer.max_steps=4", "trainer.val_check_interval=2", "output_d
 
 
 def interrupted(step, home="out"):
-    return f"interrupted at step {step}; resume={home} goes on from there"
+    return f"interrupted at step {step}; resume={home} continues from there"
 
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -1005,7 +1005,7 @@ def test_resume_takes_the_runs_own_configuration_alone(smoke, tmp_path, within):
     )  # fmt: skip
     code, _, errors = within(f"resume='{smoke[1]}'", "trainer.max_steps=5", "scale=2")
     assert (code, errors) == (
-        2, ["error: resume: goes on under the run's own configuration; trainer.max_steps, scale cannot be changed"],
+        2, ["error: resume: continues with the run's own configuration; trainer.max_steps, scale cannot be changed"],
     )  # fmt: skip
     code, _, errors = within(f"resume='{smoke[1]}'")
     assert code == 2

@@ -114,7 +114,7 @@ def test_killed_training_of_two_devices_goes_on_to_the_same_weights(two, environ
     folder, _ = two
     codes, errors = as_torchrun(killer(folder, 1, "SIGTERM", (0, 1)), folder, environment, "output_dir=killed")
     assert codes == [143, 143], errors
-    assert errors == [["interrupted at step 2; resume=killed goes on from there"], []]
+    assert errors == [["interrupted at step 2; resume=killed continues from there"], []]
     program = killer(folder, 3, "SIGKILL", (0,))
     done = run_python(program, *SMALL, *TWO, "output_dir=killed", cwd=folder, env=environment)
     assert done.returncode == -9, done.stderr
@@ -132,7 +132,7 @@ def test_process_that_is_lost_ends_the_others_in_one_line(tmp_path, environment)
     assert len(errors[0]) == 1, errors
     start, end = errors[0][0].split(" (")[0], errors[0][0].rpartition("); ")[2]
     assert start == "error: another process of the training has ended"
-    assert end == "the same command goes on from the latest checkpoint"
+    assert end == "the same command continues from the latest checkpoint"
     assert errors[1] == []
 
 

@@ -253,7 +253,7 @@ def test_broken_launcher_is_one_line(command, monkeypatch):
     assert code == 2
     assert error == (
         "error: hydra/launcher: Broken ended before its jobs did (RuntimeError: a worker was killed); "
-        "what is finished is kept, the same command goes on from there\n"
+        "what is finished is kept, the same command continues from there\n"
     )
 
 

@@ -332,6 +332,21 @@ def test_fingerprint_of_a_scene_changes_with_names_and_bytes_alone(scene):
     assert source.fingerprint("scene") == prints[-1]
 
 
+def test_disparity_offset_of_named_scenes_is_left_out(scene):
+    np.save(scene / "disparity.npy", 0.5 * F / Z)
+    describe(scene, baseline=0.5, doffs=3.0)
+    with_offset, without = Folder(str(scene.parent)), Folder(str(scene.parent), without_offset=["scene"])
+    found = without.load("scene")
+    assert found.depth is not None
+    np.testing.assert_allclose(found.depth[0].numpy(), Z, rtol=1e-6)
+    np.testing.assert_allclose(with_offset.load("scene").depth[0].numpy(), 0.5 * F / (0.5 * F / Z + 3.0), rtol=1e-6)
+    assert found.camera.doffs == 0
+    assert (len(found.notes), with_offset.load("scene").notes) == (1, ())
+    assert with_offset.fingerprint("scene") != without.fingerprint("scene")
+    with pytest.raises(ValueError, match=r"^without_offset: .*got vintage"):
+        Folder(str(scene.parent), without_offset=["vintage"])
+
+
 def test_released_scenes_load_with_their_holes(shared):
     source = Folder(str(shared / "scenes"))
     assert source.scenes() == ["books", "lucy", "plant"]

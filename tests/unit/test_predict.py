@@ -274,7 +274,7 @@ def test_damaged_prediction_is_refused_or_made_anew(tmp_path, damage, overwrite)
         assert outcome.made == ["a", "b"]
         load_prediction(path)
     else:
-        with pytest.raises(StalePredictionError, match=r"b\.npz: damaged; overwrite=true makes it anew"):
+        with pytest.raises(StalePredictionError, match=r"b\.npz: damaged; overwrite=true makes it again"):
             predict(toy_study(), tmp_path)
 
 

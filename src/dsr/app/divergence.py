@@ -51,7 +51,7 @@ def expect_no_divergence(folder: Path, identity: Identity) -> None:
         return
     if before == json.loads(json.dumps(dict(identity))):
         raise ConfigError(
-            f"{folder}: the training {what}, and would again; {_ADVICE} (without {note} it goes on from its last "
+            f"{folder}: the training {what}, and would again; {_ADVICE} (without {note} it continues from its last "
             "checkpoint)"
         )
 

@@ -362,7 +362,7 @@ def _report(console: Console, folder: Path, scores: pd.DataFrame, outcome: Outco
         show(console, f"note: {', '.join(scenes)}: {note}")
     if outcome.unscored:
         unscored = ", ".join(outcome.unscored)
-        show(console, f"note: no truth to score against: {unscored}")
+        show(console, f"note: no ground truth to score against: {unscored}")
     for message in outcome.unsolved.values():
         show(console, f"no solution: {message}")
     if outcome.reused:

@@ -25,6 +25,7 @@ from dsr.io.scene_files import RGBD
 from dsr.notes import Assumption, expect_no_warning
 from dsr.utils.console import one_line, show
 from dsr.utils.guards import natural_key
+from dsr.utils.lengths import show_length
 
 _GREY = 190
 _SEEN = 2.0
@@ -72,7 +73,7 @@ def fuse(request: FuseRequest, console: Console) -> list[str]:
     ups = {read_up(read_info(folder / INFO)) for folder in frames}
     comment = world_comment(ups.pop() if len(ups) == 1 else "")
     write_ply(request.output, mesh.vertices, colours, mesh.normals, mesh.faces, frame=comment)
-    size = f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles, voxels of {1e3 * voxel:.3g} mm"
+    size = f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles, voxels of {show_length(voxel)}"
     show(console, f"{_count(frames)} -> {request.output}: {size}; in the world's frame of the poses")
     if request.score:
         show(console, f"successive results differ by {_difference(frames, max_error)} (OPW)")
@@ -90,7 +91,8 @@ def _difference(frames: Sequence[Path], max_error: float) -> str:
             depths = torch.from_numpy(np.stack((first.depth, second.depth)))[:, None]
             found.append(float(opw(depths, first.camera, (first.pose, second.pose))))
     known = [each for each in found if not math.isnan(each)]
-    return f"{1e3 * float(np.mean(known)) if known else math.nan:.3g} mm, {len(known)} pairs of a view in common"
+    mean = show_length(float(np.mean(known))) if known else "nan"
+    return f"{mean}, {len(known)} pairs of a view in common"
 
 
 def _load(folder: Path, max_error: float) -> PosedMap:

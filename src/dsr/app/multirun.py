@@ -148,7 +148,7 @@ def collected_jobs(check: Check | None = None) -> Iterator[list[JobReturn]]:
                 kind = type(launcher).__name__
                 raise ConfigError(
                     f"hydra/launcher: {kind} ended before its jobs did ({type(error).__name__}: {one_line(error)}); "
-                    "what is finished is kept, the same command goes on from there"
+                    "what is finished is kept, the same command continues from there"
                 ) from error
             jobs.extend(results)
             return results

@@ -127,7 +127,7 @@ def _write(
     parts = {"tables": tables, "metrics": metrics, "figures": figures, "page": page}
     todo = [part for part in parts if part in request.parts]
     if not scored:
-        notes.append("no scene has a truth to score against, so there are no tables and no metric study")
+        notes.append("no scene has a ground truth to score against, so there are no tables and no metric study")
         todo = [part for part in todo if part not in ("tables", "metrics")]
     for part in progress.track(todo, "report"):
         parts[part]()

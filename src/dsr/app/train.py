@@ -239,7 +239,7 @@ def _fit(plain: Config, settings: TrainConfig, prepared: _Prepared, processes: P
         raise note_divergence(folder, folder / _LAST, identity, error) from error
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
-            f"interrupted at step {trainer.global_step}; resume={folder} goes on from there"
+            f"interrupted at step {trainer.global_step}; resume={folder} continues from there"
         ) from None
     if trainer.fast_dev_run:  # type: ignore[attr-defined]
         return math.nan
@@ -290,7 +290,7 @@ def _resumed(plain: dict[str, Any]) -> dict[str, Any]:
     folder = Path(plain["resume"]).expanduser()
     others = [key for key in given_keys() if key not in _RESUMABLE]
     if others:
-        raise ConfigError(f"resume: goes on under the run's own configuration; {', '.join(others)} cannot be changed")
+        raise ConfigError(f"resume: continues with the run's own configuration; {', '.join(others)} cannot be changed")
     before = read_config(folder, plain["trust"])
     try:
         expect_stored(folder / _LAST)

@@ -17,13 +17,14 @@ import hashlib
 import os
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.data.scene_source import SceneSelection, select_scenes
+from dsr.data.scene_source import WITHOUT_OFFSET, SceneSelection, select_scenes
 from dsr.geometry.camera import Camera, RangeType, from_range
 from dsr.io.images import MAP_SUFFIXES, CameraFile, read_camera, read_map, read_mask, read_rgb
 from dsr.sample import Scene, expect_distances
@@ -42,15 +43,19 @@ class Folder:
         root: directory of the scenes.
         scenes: names of the scenes to use; None for all.
         name: name in ``scores.csv``.
+        without_offset: names of the scenes whose ``doffs`` in ``camera.json`` is replaced by 0, as the paper does with
+            Vintage; see :class:`dsr.data.middlebury.Middlebury`.
 
     Raises:
-        ValueError: the directory is missing or has no scene.
+        ValueError: the directory is missing or has no scene, or none of a name in ``without_offset``.
 
     """
 
     evaluation = False
 
-    def __init__(self, root: str, scenes: SceneSelection = None, name: str = "folder") -> None:
+    def __init__(
+        self, root: str, scenes: SceneSelection = None, name: str = "folder", without_offset: Sequence[str] = ()
+    ) -> None:
         self.name = name
         self._root = Path(root).expanduser()
         if not self._root.is_dir():
@@ -59,6 +64,9 @@ class Folder:
         if not found:
             raise ValueError(f"root: expected a folder per scene in {root}, there is none")
         self._scenes = select_scenes(sorted(found, key=natural_key), scenes)
+        self._without_offset = frozenset(without_offset)
+        if unknown := self._without_offset.difference(found):
+            raise ValueError(f"without_offset: expected names of scenes in {root}, got {', '.join(sorted(unknown))}")
 
     def scenes(self) -> list[str]:
         """Return the names of the scenes, in order."""
@@ -66,11 +74,11 @@ class Folder:
 
     def load(self, scene: str) -> Scene:
         """Return one scene; see :class:`dsr.data.scene_source.SceneSource`."""
-        return load_scene(self._root / scene, self.name)
+        return load_scene(self._root / scene, self.name, offset=scene not in self._without_offset)
 
     def fingerprint(self, scene: str) -> str:
-        """Return the SHA-256 of the scene's files."""
-        digest = hashlib.sha256()
+        """Return the SHA-256 of the scene's files, and of what is left out of them."""
+        digest = hashlib.sha256(b"without offset" if scene in self._without_offset else b"")
         for path in sorted(path for path in (self._root / scene).iterdir() if path.is_file()):
             digest.update(os.fsencode(path.name) + b"\0")
             with opened(path) as file:
@@ -79,14 +87,20 @@ class Folder:
         return digest.hexdigest()
 
 
-def load_scene(folder: Path, dataset: str) -> Scene:
+def load_scene(folder: Path, dataset: str, *, offset: bool = True) -> Scene:
     """Return the scene in ``folder``.
+
+    Args:
+        folder: with the files.
+        offset: whether ``doffs`` of ``camera.json`` counts, as it has to geometrically, or is taken for 0.
 
     Raises:
         ValueError: a file is missing, damaged, or does not fit the others; the message names it.
 
     """
     description = read_camera(folder / "camera.json")
+    if not offset:
+        description = replace(description, camera=replace(description.camera, doffs=0.0))
     camera = description.camera
     rgb_path = _first(folder, _RGB_NAMES)
     rgb = read_rgb(rgb_path)
@@ -105,7 +119,7 @@ def load_scene(folder: Path, dataset: str) -> Scene:
         names = " or ".join(f"{name}.{{npy,png,tiff,pfm}}" for name in _QUANTITIES)
         raise ValueError(f"{folder}: expected {names}, there is none")
     pixels = torch.from_numpy(rgb).permute(2, 0, 1).float() / 255
-    return Scene(dataset, folder.name, pixels, camera, depth, measured)
+    return Scene(dataset, folder.name, pixels, camera, depth, measured, notes=() if offset else (WITHOUT_OFFSET,))
 
 
 def _read_measured(path: Path, quantity: str, factor: str, description: CameraFile) -> tuple[float, Tensor]:

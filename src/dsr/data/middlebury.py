@@ -36,7 +36,7 @@ from dsr.data.download import collections
 from dsr.data.frame_files import expect_size, read_picture
 from dsr.data.preparation import Preparation, PreparedDataset, SceneRecord
 from dsr.data.reference_depth import smooth_levels
-from dsr.data.scene_source import SceneSelection
+from dsr.data.scene_source import WITHOUT_OFFSET, SceneSelection
 from dsr.geometry.camera import Camera, from_range
 from dsr.io.images import read_levels, read_map
 from dsr.sample import Scene
@@ -246,7 +246,6 @@ SCENES = {
 TRAINING_2014 = _names(collections.TRAINING_2014)
 TRAINING = {2001: SCENES[2001], 2006: SCENES[2006], 2014: TRAINING_2014}
 """Scenes to train on by year."""
-_WITHOUT_OFFSET = "depth is not metric: the disparity offset is left out, as in the paper"
 _FILES_2014 = ("im0.png", "calib.txt", "disp0.pfm", "disp0GT.pfm")
 
 
@@ -354,7 +353,7 @@ def records_2014(folder: Path, dataset: str, without_offset: Collection[str] = (
             tuple(path for path in map(place.joinpath, _FILES_2014) if path.is_file()),
             functools.partial(load_2014, place, dataset, name, offset=name not in without_offset),
             settings="without offset" if name in without_offset else "",
-            note=_WITHOUT_OFFSET if name in without_offset else "",
+            note=WITHOUT_OFFSET if name in without_offset else "",
         )
         for name, place in find_2014(folder).items()
     }

@@ -12,6 +12,8 @@ from dsr.utils.progress import Progress
 SceneSelection = Sequence[str] | Literal["found"] | None
 """Names of scenes; None for those that belong to the data set, ``found`` for all that are on disk."""
 
+WITHOUT_OFFSET = "depth is not metric: the disparity offset is left out, as in the paper"
+"""Note of a scene whose ``doffs`` is replaced by 0: z = baseline fx / d instead of baseline fx / (d + doffs)."""
 _MAX_LISTED = 60
 
 

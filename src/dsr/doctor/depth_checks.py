@@ -15,11 +15,12 @@ from typing import Literal
 import numpy as np
 from scipy import ndimage
 
-from dsr.doctor.finding import Array, Finding, Level, length, metres
+from dsr.doctor.finding import Array, Finding, Level, metres
 from dsr.geometry.camera import baseline_times_focal
 from dsr.geometry.plausible import implausible_distance, plausible_baseline
 from dsr.notes import LIMITS
 from dsr.sample import Scene
+from dsr.utils.lengths import show_length
 from dsr.utils.ratios import round_ratio
 
 _NEAR, _FAR = 0.1, 30.0
@@ -77,7 +78,7 @@ def check_units(scene: Scene) -> list[Finding]:
     """Check whether depth, baseline and measured maps are plausible in metres."""
     depth = metres(scene)
     low, middle, high = np.nanpercentile(depth, (1, 50, 99))
-    text = f"depth {length(low)} to {length(high)} (1st to 99th percentile), median {length(middle)}"
+    text = f"depth {show_length(low)} to {show_length(high)} (1st to 99th percentile), median {show_length(middle)}"
     level: Level
     level, remark = "ok", ""
     beyond = implausible_distance(low, high)
@@ -96,11 +97,13 @@ def _advise(scene: Scene, middle: float) -> str:
     fitting = [(factor, why) for factor, why in _FACTORS if _TYPICAL[0] <= middle * factor <= _TYPICAL[1]]
     if not fitting:
         return "check the unit"
-    texts = [f"x {factor:g} would make the median {length(middle * factor)} ({why})" for factor, why in fitting[:2]]
+    texts = [
+        f"x {factor:g} would make the median {show_length(middle * factor)} ({why})" for factor, why in fitting[:2]
+    ]
     where = 'set "depth_unit" in camera.json'
     baseline = scene.camera.baseline
     if baseline is not None and not plausible_baseline(baseline) and plausible_baseline(baseline * fitting[0][0]):
-        where = f'set "baseline_unit" in camera.json: the baseline of {length(baseline)} is off by the same factor'
+        where = f'set "baseline_unit" in camera.json: the baseline of {show_length(baseline)} is off by the same factor'
     return f"{', or '.join(texts)}; {where}"
 
 
@@ -109,8 +112,8 @@ def _baseline(scene: Scene) -> list[Finding]:
     baseline = scene.camera.baseline
     if baseline is None or plausible_baseline(baseline):
         return []
-    low, high = (length(LIMITS[code].threshold) for code in ("baseline-short", "baseline-long"))
-    message = f"baseline {length(baseline)}; {low} to {high} are usual"
+    low, high = (show_length(LIMITS[code].threshold) for code in ("baseline-short", "baseline-long"))
+    message = f"baseline {show_length(baseline)}; {low} to {high} are usual"
     advice = 'check "baseline_unit" in camera.json; keep it if depth computed from it is plausible'
     return [Finding("units", "note", message, advice)]
 
@@ -329,7 +332,7 @@ def _source(scene: Scene, depth: Array, rounding: Rounding) -> str:
     if valid.max() < 6e4 and np.array_equal(valid.astype(np.float16).astype(np.float64), valid):
         return "values have half precision (float16)"
     if rounding.quantity != "inverse depth":
-        return f"{rounding.quantity} comes in steps of {length(rounding.step)}"
+        return f"{rounding.quantity} comes in steps of {show_length(rounding.step)}"
     if scene.camera.baseline is None:
         return f"inverse depth comes in steps of {rounding.step:.2g} / m"
     return f"disparity comes in steps of {rounding.step * baseline_times_focal(scene.camera):.2g} px"

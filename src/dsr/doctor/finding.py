@@ -58,10 +58,3 @@ def metres(scene: Scene) -> Array:
         raise ValueError(f"{scene.name}: expected high-resolution depth, there is none; see with_depth")
     depth: Array = scene.depth[0].double().numpy()
     return depth
-
-
-def length(value: float) -> str:
-    """Format a positive length in metres with a suitable unit."""
-    if value >= 1e3:
-        return f"{value / 1e3:.3g} km"
-    return f"{value:.3g} m" if value >= 0.1 else f"{value * 1e3:.3g} mm"

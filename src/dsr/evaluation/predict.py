@@ -240,7 +240,7 @@ def _seconds_of_current(path: Path, config: Mapping[str, Any]) -> float | None:
     except FileNotFoundError:
         return None
     except (OSError, KeyError, ValueError, TypeError):
-        raise StalePredictionError(f"{path}: damaged; overwrite=true makes it anew") from None
+        raise StalePredictionError(f"{path}: damaged; overwrite=true makes it again") from None
     wanted = json.loads(json.dumps(config))
     if stored == wanted:
         return seconds

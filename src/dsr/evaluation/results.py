@@ -51,6 +51,7 @@ class Run:
         scenes: scenes with a prediction.
         unsolved: reason by scene why the method has no solution.
         formats: formats of its metrics that the run stores.
+        notes: what there is to say of the scores of a scene, by its name.
         truth: where other runs have different truths of its scenes, what tells its truths from theirs, as ``dataset``
             has it, too; empty otherwise.
 
@@ -70,6 +71,7 @@ class Run:
     scenes: tuple[str, ...]
     unsolved: Mapping[str, str] = field(default_factory=dict)
     formats: Mapping[str, MetricFormat] = field(default_factory=dict)
+    notes: Mapping[str, Sequence[str]] = field(default_factory=dict)
     truth: str = ""
 
     @property
@@ -154,7 +156,7 @@ class Results:
                 apart.setdefault((name, run.scale), {}).setdefault(run.dataset, []).append(run)
         return tuple(
             Assumption(
-                f"{name} x{scale}: the runs have different truths for scenes of the same names and are listed apart",
+                f"{name} x{scale}: the runs have different ground truths for scenes of the same names: listed apart",
                 "; ".join(
                     f"{dataset}: {runs[0].folder}{f' and {len(runs) - 1} more' if len(runs) > 1 else ''}"
                     for dataset, runs in of_truth.items()
@@ -240,7 +242,7 @@ def alignment_note(runs: Sequence[Run]) -> str:
         if run.label not in labels[run.alignment]:
             labels[run.alignment].append(run.label)
     found = [
-        f"{', '.join(of)} aligned to the truth before scoring, {ALIGNMENTS.get(how, 'unknown')} ({how})"
+        f"{', '.join(of)} aligned to the ground truth before scoring, {ALIGNMENTS.get(how, 'unknown')} ({how})"
         for how, of in labels.items()
         if how != "none"
     ]

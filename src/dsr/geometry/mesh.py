@@ -81,6 +81,15 @@ def triangulate(
     Raises:
         ValueError: ``depth`` is no map of the camera's size, or a number is not positive.
 
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.geometry.mesh import triangulate
+        >>> camera = dsr.Camera.from_fov(60, width=4, height=3)
+        >>> mesh = triangulate(torch.full((1, 3, 4), 2.0), camera)
+        >>> len(mesh.vertices), len(mesh.faces)
+        (12, 12)
+
     """
     if tuple(depth.shape) != (1, camera.height, camera.width):
         raise ValueError(f"depth: expected shape {(1, camera.height, camera.width)}, got {tuple(depth.shape)}")

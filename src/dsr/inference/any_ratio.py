@@ -21,6 +21,7 @@ from dsr.inference.defaults import DEFAULT, SIZES, USUAL_SCALE, WIDEST, Fill
 from dsr.inference.plans import OWN_SIZE, Plan, plan_for, steps_of
 from dsr.inference.plausibility import count_patches, expect_errors, find_outliers, within_measured
 from dsr.inference.resizing import at_factors, at_ratio, padded, resize_nearest, size_of
+from dsr.inference.rims import Settled, settle_holes
 from dsr.inference.working_size import (
     enlarged_by,
     find_noise,
@@ -166,7 +167,7 @@ class AnyRatio(Method):
                 no solution, or the map's values contradict the named sensor.
 
         """
-        _check(rgb, depth, camera)
+        expect_picture(rgb, depth, camera)
         planned = self.plan(size_of(rgb), size_of(depth))  # raises ValueError for sizes or a scale that cannot be used
         self.check_working_size()
         sensor = find_sensor(depth, sensor) if isinstance(sensor, str) else sensor
@@ -174,18 +175,19 @@ class AnyRatio(Method):
         given = depth.masked_fill(outliers, torch.nan).float().reciprocal()
         inverse, factor, scale = self._at_own_size(given, size_of(rgb), planned)
         valid = (given if size_of(inverse) == size_of(rgb) else inverse).isfinite()  # but for repeated pixels
+        settled, doubt = settle_holes(inverse, rgb, self._small_holes(inverse.isfinite(), camera))
         if factor > 1:
-            inverse_lr = Downsampling("box")(pad_inverse_depth(inverse, factor), factor)
+            inverse_lr = Downsampling("box")(pad_inverse_depth(settled, factor), factor)
             found = padded(
                 lambda photo, view: self._upsample(photo, inverse_lr, view, factor, progress),
                 factor, rgb, inverse_lr, camera,
             )  # fmt: skip
         elif self._scale is None and self._finds_noise:
-            found = self._at_working_size(rgb, inverse, camera, sensor, progress)
+            found = self._at_working_size(rgb, inverse, settled, camera, sensor, progress)
         else:
-            found = self._upsample(rgb, inverse, camera, scale, progress)
+            found = self._upsample(rgb, settled, camera, scale, progress)
         expect_some_depth(found.inverse, self.recipe.name)  # as good as of the depth: 0 and infinity change places
-        surface = _in_depth(found, inverse, camera, sensor)
+        surface = _in_depth(found, inverse, Settled(settled, doubt), camera, sensor)
         surface = surface._replace(outliers=count_patches(outliers))
         surface = self._restore_holes(surface, valid, camera)
         missing = resize_nearest(~valid, size_of(rgb)).to(surface.depth.device)
@@ -209,14 +211,18 @@ class AnyRatio(Method):
         return inverse, self.plan(size, size).coarsened, None
 
     def _at_working_size(
-        self, rgb: Tensor, inverse: Tensor, camera: Camera, sensor: Identified | None, progress: Steps | None
-    ) -> InverseSurface:
-        """Return high-resolution inverse depth of inverse depth, (1, h, w), whose size may be divided first."""
+        self, rgb: Tensor, measured: Tensor, inverse: Tensor, camera: Camera, sensor: Identified | None,
+        progress: Steps | None,
+    ) -> InverseSurface:  # fmt: skip
+        """Return high-resolution inverse depth of inverse depth, (1, h, w), whose size may be divided first.
+
+        The noise is that of the ``measured`` one, some of whose holes are filled in the other.
+        """
         most = max(each for each in SIZES if each == 1 or each <= _LARGEST_RATIO * inverse.shape[-1] / camera.width)
         size = self._working_size
         if size is not None and size > most:
             raise ValueError(f"working_size: expected at most {most} for this map's size and the photo's, got {size}")
-        noise = find_noise(inverse.reciprocal())
+        noise = find_noise(measured.reciprocal())
         factor = size or min(1 if noise is None else working_size_of(noise.extent), most)
         told = None if "noise" in self.recipe.settings else noise_to_tell(sensor, noise, factor)
         if factor == 1:
@@ -228,7 +234,7 @@ class AnyRatio(Method):
         )  # fmt: skip
         if noise is None or found.spread is None:  # what the network has found is of the smaller map
             return found._replace(noise=None)
-        left = limit_to_noise(found.spread, noise, float(inverse.nanmedian()))
+        left = limit_to_noise(found.spread, noise, float(measured.nanmedian()))
         return found._replace(spread=left, noise=noise._replace(reduced=factor))
 
     def _upsample(
@@ -266,12 +272,16 @@ class AnyRatio(Method):
         node = self.recipe.at()
         return bool(self.recipe.computed_at) and not (node.get("clean") or node.get("noise") == 0)
 
+    def _small_holes(self, valid: Tensor, camera: Camera) -> Tensor:
+        """Return the small holes of a map, (1, h, w), be they to be filled or not: what is beside depends on it."""
+        focal = camera.fx * valid.shape[-1] / camera.width
+        return ~valid & ~wide_holes(valid, self._max_hole / degrees_per_pixel(focal))
+
     def _restore_holes(self, surface: Surface, valid: Tensor, camera: Camera) -> Surface:
         """Return a surface without the holes of the map, (1, h, w), that are not to be filled."""
         if self._fill == "all" or bool(valid.all()):
             return surface
-        focal = camera.fx * valid.shape[-1] / camera.width
-        left = ~valid if self._fill == "none" else wide_holes(valid, self._max_hole / degrees_per_pixel(focal))
+        left = ~valid if self._fill == "none" else ~valid & ~self._small_holes(valid, camera)
         holes = resize_nearest(left, size_of(surface.depth)).to(surface.depth.device)
         return surface.map(lambda values: values.masked_fill(holes, torch.nan))
 
@@ -301,6 +311,14 @@ def upsampler(
     Raises:
         ValueError: there is no such method or device, or an option is not as described.
 
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.inference import upsampler
+        >>> camera, run = dsr.Camera.from_fov(60, width=32, height=24), upsampler("bicubic")
+        >>> run.upsample(torch.rand(3, 24, 32), torch.full((1, 10, 13), 2.0), camera).depth.shape  # tensors alone
+        torch.Size([1, 24, 32])
+
     """
     recipe = read_recipe(method, settings, directories)
     return AnyRatio(recipe, pick_device(device), scale, fill, max_hole, working_size)
@@ -320,15 +338,19 @@ def upsample_surface(
     return upsampler(scale=scale, **options).upsample(rgb, depth, camera, progress, sensor)
 
 
-def _in_depth(found: InverseSurface, inverse: Tensor, camera: Camera, sensor: Identified | None) -> Surface:
-    """Return a result as depth within what was measured, with its errors or with estimated ones."""
+def _in_depth(
+    found: InverseSurface, inverse: Tensor, settled: Settled, camera: Camera, sensor: Identified | None
+) -> Surface:
+    """Return a result as depth within what was measured and settled, with its errors or with estimated ones."""
     lowest = inverse.nan_to_num(nan=torch.inf).amin()
     infinite = found.inverse <= 0  # but what is NaN has no depth
     inverse_hr = torch.where(infinite, lowest.to(found.inverse.device), found.inverse)
-    inverse_hr = within_measured(inverse_hr, inverse)
+    inverse_hr = within_measured(inverse_hr, settled.inverse)
     spread, angle = found.spread, found.angle
     if spread is None or angle is None:
         spread, angle = expect_errors(inverse_hr, inverse.to(inverse_hr.device), camera)
+    if bool(settled.doubt.any()):
+        spread = spread + resize_nearest(settled.doubt.to(spread), size_of(spread))
     if sensor is not None:
         spread = torch.fmax(spread, left_of(sensor.least_error(inverse_hr.reciprocal()) * inverse_hr))
     result = inverse_hr.reciprocal_()
@@ -345,7 +367,7 @@ def _check_options(fill: str, max_hole: float, working_size: int | None) -> None
         raise ValueError(f"working_size: expected one of {', '.join(map(str, SIZES))}, got {working_size}")
 
 
-def _check(rgb: Tensor, depth: Tensor, camera: Camera) -> None:
+def expect_picture(rgb: Tensor, depth: Tensor, camera: Camera) -> None:
     """Raise ValueError unless the photo, the depth map and the camera are valid and fit together."""
     size = (camera.height, camera.width)
     if tuple(rgb.shape) != (3, *size):

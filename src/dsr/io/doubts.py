@@ -8,6 +8,7 @@ from torch import Tensor
 from dsr.geometry.camera import Camera, RangeType
 from dsr.geometry.plausible import implausible_distance, judge_camera, plausible_baseline
 from dsr.notes import Assumption
+from dsr.utils.lengths import show_length
 
 _SAMPLE = 100_000
 """Largest number of pixels that percentiles are taken of."""
@@ -43,10 +44,12 @@ def doubt_depth(depth_lr: Tensor, camera: Camera, range_type: RangeType) -> list
     code, doubts = implausible_distance(low, high), []
     baseline = camera.baseline
     if baseline is not None and not plausible_baseline(baseline) and (range_type != "disparity" or code is not None):
-        text = f"the baseline is {baseline:g} m: --baseline is in metres, between the two cameras of a pair"
+        text = f"the baseline is {show_length(baseline)}: --baseline is in metres, between the two cameras of a pair"
         doubts.append(Assumption(text, "", "baseline-short" if baseline < 1 else "baseline-long", baseline))
     if code is not None:
         cure = "--baseline, --depth-unit and the camera set it" if range_type == "disparity" else "--depth-unit sets it"
         text = f"the depth is {'nearer' if code == 'depth-near' else 'farther'} than any depth camera measures; {cure}"
-        doubts.append(Assumption(text, f"{low:.3g} to {high:.3g} m", code, high if code == "depth-near" else low))
+        doubts.append(
+            Assumption(text, f"{show_length(low)} to {show_length(high)}", code, high if code == "depth-near" else low)
+        )
     return doubts

@@ -71,6 +71,7 @@ def write_ply(
     normals: np.ndarray | None = None,
     faces: np.ndarray | None = None,
     *,
+    filled: np.ndarray | None = None,
     frame: str = CAMERA_FRAME,
 ) -> None:
     """Write a binary PLY file atomically.
@@ -80,11 +81,15 @@ def write_ply(
         colours: (N, 3) uint8, sRGB.
         normals: (N, 3) unit vectors; None to leave them out.
         faces: (M, 3) indices, counterclockwise from outside; None for a cloud.
+        filled: (N,) bool, whether the points were not measured: a property of that name; None to leave it out.
         frame: what the file says of the frame of the points, and of the unit.
 
     """
     corners = np.empty((0, 3), int) if faces is None else faces
-    model = trimesh.Trimesh(points, corners, vertex_normals=normals, vertex_colors=colours, process=False)
+    model = trimesh.Trimesh(
+        points, corners, vertex_normals=normals, vertex_colors=colours, process=False,
+        vertex_attributes=None if filled is None else {"filled": filled.astype(np.uint8)},
+    )  # fmt: skip
     content = export_ply(model, vertex_normal=normals is not None)
     header, mark, content = content.partition(b"element vertex")
     with replacing(path) as temporary, temporary.open("wb") as file:
@@ -171,7 +176,14 @@ def write_normals(path: Path, depth: Tensor, camera: Camera) -> None:
     write_png(path, picture, known)
 
 
-def write_cloud(path: Path, rgb: Tensor, depth: Tensor, camera: Camera, *, most: int = MOST_POINTS) -> Written:
+def write_mask(path: Path, mask: Tensor) -> None:
+    """Write a mask, (1, H, W) bool, as an 8-bit picture: 255 where it holds, else 0."""
+    write_png(path, 255 * mask[0].byte().cpu().numpy())
+
+
+def write_cloud(
+    path: Path, rgb: Tensor, depth: Tensor, camera: Camera, *, most: int = MOST_POINTS, filled: Tensor | None = None
+) -> Written:
     """Write the known pixels as a coloured PLY cloud with normals, in metres; x right, y down, z forward.
 
     Args:
@@ -180,6 +192,7 @@ def write_cloud(path: Path, rgb: Tensor, depth: Tensor, camera: Camera, *, most:
         depth: (1, H, W) orthogonal depth in metres, NaN in holes.
         camera: of these pixels.
         most: points; of more, those in rows and columns at equal distances are taken.
+        filled: (1, H, W) bool, depth that was not measured: a property of the points.
 
     Returns:
         The numbers of points.
@@ -187,7 +200,8 @@ def write_cloud(path: Path, rgb: Tensor, depth: Tensor, camera: Camera, *, most:
     """
     mesh = triangulate(depth, camera, isolated=True)
     chosen, normals = select_points(mesh, most, camera), vertex_normals(mesh)
-    write_ply(path, mesh.vertices[chosen], _colours(rgb, mesh.pixels[chosen]), normals[chosen])
+    pixels = mesh.pixels[chosen]
+    write_ply(path, mesh.vertices[chosen], _colours(rgb, pixels), normals[chosen], filled=_at(filled, pixels))
     fewer = len(chosen) < len(mesh.vertices)
     return Written(len(mesh.vertices), len(chosen), "leaving out rows and columns" if fewer else "")
 
@@ -235,14 +249,13 @@ def write_mesh(
     before, how = mesh.dense, FLAT if len(mesh.faces) < mesh.dense else ""
     if len(mesh.faces) > most:
         mesh, how = _reduce(mesh, depth, camera, most, largest_step)
-    normals = vertex_normals(mesh)
+    normals, missing = vertex_normals(mesh), _at(filled, mesh.pixels)
     for path in paths:
         if path.suffix.lower() == ".ply":
-            write_ply(path, mesh.vertices, _colours(rgb, mesh.pixels), normals, mesh.faces)
+            write_ply(path, mesh.vertices, _colours(rgb, mesh.pixels), normals, mesh.faces, filled=missing)
         else:
             places, photo = project(mesh.vertices, camera), _bytes(rgb).transpose(1, 2, 0).copy()
-            own = None if filled is None else filled.flatten().cpu().numpy()[mesh.pixels]
-            write_glb(path, mesh.vertices, normals, mesh.faces, places, photo, own)
+            write_glb(path, mesh.vertices, normals, mesh.faces, places, photo, missing)
     return Written(before, len(mesh.faces), how)
 
 
@@ -253,6 +266,11 @@ def _reduce(mesh: Mesh, depth: Tensor, camera: Camera, most: int, largest_step: 
     except ImportError:
         thinned, stride = thin(depth, camera, most, largest_step)
         return thinned, f"a stride of {stride} pixels; `pip install dsr[mesh]` simplifies and keeps more detail"
+
+
+def _at(mask: Tensor | None, pixels: np.ndarray) -> np.ndarray | None:
+    """Return a mask's values at some pixels, (N,) bool; ``pixels`` are indices of the flattened map."""
+    return None if mask is None else mask.flatten().cpu().numpy()[pixels]
 
 
 def _colours(rgb: Tensor, pixels: np.ndarray) -> np.ndarray:

@@ -38,7 +38,7 @@ class CameraChoice(Options):
     )
     intrinsics: tuple[float, float, float, float] | None = option(
         None,
-        "photo pixels",
+        "focal lengths and principal point, in pixels of the photo",
         ("FX", "FY", "CX", "CY"),
         alone="camera",
         rule=Rule(
@@ -75,7 +75,7 @@ class Reading(Options):
         None, "between the cameras, for disparity", "METRES", rule=positive("number of metres")
     )
     rig: RigFiles | None = group()
-    register: bool = option(False, "move the depth map to the photo's edges, if it lies beside them")
+    register: bool = option(False, "shift and scale the depth map to the photo's edges, if it is displaced")
     hole_value: float | None = option(None, "another value that marks missing depth", "VALUE")
     strict: bool = option(False, "refuse a picture with a warning; see docs/checks.md", recorded=False)
     min_confidence: float | None = option(

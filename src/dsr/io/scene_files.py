@@ -41,11 +41,10 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.rigid_motion import is_rotation
+from dsr.geometry.rigid_motion import is_rotation, quaternion_of
 from dsr.io.depth_files import read_depth_file
 from dsr.io.exports import to_jpeg, world_comment, write_ply
 from dsr.io.images import read_pixels
@@ -325,7 +324,7 @@ def _images(frames: Sequence[Frame]) -> str:
     for number, frame in enumerate(frames, 1):
         pose = _matrix(frame)
         to_camera = pose[:3, :3].T
-        turn = Rotation.from_matrix(to_camera).as_quat(canonical=True)[[3, 0, 1, 2]]
+        turn = quaternion_of(to_camera)[[3, 0, 1, 2]]
         lines += [f"{number} {_numbers((*turn, *(-to_camera @ pose[:3, 3])))} {number} {frame.stem}.png", ""]
     return "\n".join(lines) + "\n"
 

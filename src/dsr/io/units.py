@@ -17,6 +17,7 @@ from dsr.geometry.camera import Camera, RangeType
 from dsr.geometry.planes import InverseVotes, inverse_votes
 from dsr.io.reading import SUNRGBD_BITS
 from dsr.notes import LIMITS, Assumption
+from dsr.utils.lengths import show_length
 
 TURNED_BACK = f"bits are turned back by {SUNRGBD_BITS}, as SUN RGB-D turns them: millimetres, also in the result"
 _OVERRIDE = "--depth-unit overrides it"
@@ -135,6 +136,13 @@ class _Clues:
         return self.sparse and (known[1:] & known[:-1]).sum() < _SCATTERED * known.sum()
 
     @property
+    def compact(self) -> bool:
+        """Whether most known pixels have known pixels on all four sides, as of an object that was cut out."""
+        known = np.pad(~self.holes, 1)
+        sides = known[:-2, 1:-1] & known[2:, 1:-1] & known[1:-1, :-2] & known[1:-1, 2:]
+        return bool((sides & known[1:-1, 1:-1]).sum() > known.sum() / 2)
+
+    @property
     def sparse(self) -> bool:
         """Whether most pixels are missing."""
         return bool(self.holes.mean() > _SPARSE_FRACTION)
@@ -154,7 +162,7 @@ class _Clues:
 
     def metres(self, unit: float) -> str:
         """Return the median in a unit."""
-        return f"{self.middle * unit:.3g} m"
+        return show_length(self.middle * unit)
 
     def ask(self, why: str, *units: tuple[str, float]) -> NoReturn:
         """Raise the error that asks for one of several units, by their names for ``--depth-unit``."""
@@ -240,8 +248,8 @@ def _by_median(clues: _Clues) -> Told:
         near = float(np.percentile(clues.known, 99)) * 1e-3
         if clues.telling and near < LIMITS["near-millimetres"].threshold:
             text = "everything is near if whole numbers are millimetres: are they centimetres? --depth-unit mm or cm"
-            found.append(Assumption(text, f"99 % within {near:.2g} m", "near-millimetres", near))
-        if clues.sparse:
+            found.append(Assumption(text, f"99 % within {show_length(near, 2)}", "near-millimetres", near))
+        if clues.sparse and not clues.compact:
             text = "that is sparse, as of a laser scanner: KITTI stores 1/256 m (--depth-unit 1/256)"
             found.append(Assumption(text))
         return Told(1e-3, tuple(found))

@@ -137,6 +137,27 @@ class Surface(NamedTuple):
         depth = function(self.depth)
         return self._replace(depth=depth, depth_error=depth_error, angle_error=angle_error, filled=filled)
 
+    def without_dubious(self, limit: float) -> Surface:
+        """Return the surface with holes where the depth is expected to be off by more than this share of it."""
+        if self.depth_error is None:
+            return self
+        dubious = self.depth_error > limit * self.depth
+        filled = None if self.filled is None else self.filled & ~dubious
+        return self._replace(depth=self.depth.masked_fill(dubious, float("nan")), filled=filled)
+
+    def shares(self, limit: float) -> dict[str, float]:
+        """Return the shares of the pixels that are ``measured``, ``filled`` and ``open``, which have no depth.
+
+        With expected errors also the share of those that have depth and are ``dubious``: expected to be off by more
+        than ``limit`` of it. Without knowing what was filled, what has depth counts as measured.
+        """
+        known = self.depth.isfinite()
+        filled = known & self.filled if self.filled is not None else known & False
+        found = {"measured": known & ~filled, "filled": filled, "open": ~known}
+        if self.depth_error is not None:
+            found["dubious"] = known & (self.depth_error > limit * self.depth)
+        return {name: float(mask.double().mean()) for name, mask in found.items()}
+
     def error_arrays(self) -> dict[str, np.ndarray]:
         """Return the expected errors by name, (H, W), as they are stored; empty without them.
 
@@ -210,6 +231,24 @@ class Method(abc.ABC):
         history: of the last call of a method that iterates, one entry per recorded iteration: ``iteration`` first, then
             the method's own quantities, such as ``objective`` and ``moved``, in an order of its own. None for others.
         name: in scores and tables, of a method that takes it from its input; None for that of its file of ``conf``.
+
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.degradation.downsampling import Downsampling, make_sample
+        >>> from dsr.methods.base import Method
+        >>> from dsr.methods.classical.interpolation import Interpolation
+        >>> from dsr.sample import Scene
+        >>> class Nearer(Method):
+        ...     range_type = "orthogonal"
+        ...
+        ...     def __call__(self, sample, progress=None):
+        ...         return 0.5 * Interpolation("bicubic")(sample)
+        >>> camera, wall = dsr.Camera.from_fov(60, width=32, height=24), torch.full((1, 24, 32), 2.0)
+        >>> method, scene = Nearer(), Scene("mine", "wall", torch.rand(3, 24, 32), camera, wall)
+        >>> sample = make_sample(scene, 4, Downsampling("box"), method.range_type)
+        >>> bool((method(sample) - 1).abs().max() < 0.05)
+        True
 
     """
 

@@ -35,8 +35,10 @@ _FOLDER = "dsr.data.folder.Folder"
 """Reader of users' own folders."""
 _PAPER_SIZE = 512
 """Height and width of the paper's pictures, pixels."""
-_PAPER_SETTINGS = {"size": _PAPER_SIZE, "crop": 0.5, "fill": ["vintage"], "without_offset": ["vintage"]}
+_PAPER_SETTINGS = {"size": _PAPER_SIZE, "crop": 0.5}
 """Settings of data sets with which their scenes are the paper's; a data set lacks some."""
+_PAPER_SCENES = {"fill": ["vintage"], "without_offset": ["vintage"]}
+"""Settings of data sets that name scenes: those of the paper; a data set lacks some."""
 TITLES = {"simgeo": "SimGeo", "icl": "ICL-NUIM", "middlebury": "Middlebury"}
 PAPER_SCENES = {
     "simgeo": (
@@ -95,6 +97,7 @@ def _is_papers(run: Run, scene: str) -> bool:
         and run.downsampling == "box"
         and run.settings.get("downsampling", {}).get("range_type") is None
         and all(dataset.get(key, value) == value for key, value in _PAPER_SETTINGS.items())
+        and all((scene in dataset.get(key, names)) == (scene in names) for key, names in _PAPER_SCENES.items())
         and run.size(scene) in (None, (_PAPER_SIZE, _PAPER_SIZE))
     )
 

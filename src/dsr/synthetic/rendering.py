@@ -69,7 +69,7 @@ def load_or_render(path: Path, make: Callable[[], Rendering]) -> Rendering:
     except OSError:
         pass  # there is none
     except (ValueError, KeyError, TypeError):
-        note_once(f"{printable(str(path))}: damaged, so it is made anew")
+        note_once(f"{printable(str(path))}: damaged, so it is made again")
     rendering = make()
     with contextlib.suppress(OSError), replacing(path) as temporary:
         camera = json.dumps(asdict(rendering.camera))

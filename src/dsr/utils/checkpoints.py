@@ -123,7 +123,7 @@ class CheckpointError(ConfigError):
         what = one_line(error).removeprefix(f"{path}: ")
         what = what if type(error) is ValueError else f"{type(error).__name__}: {what}"
         text = f"expected a checkpoint of this training, got a damaged or foreign one ({what:.200})"
-        super().__init__(f"{path}: {text}; overwrite=true begins anew")
+        super().__init__(f"{path}: {text}; overwrite=true starts again")
         self._made_of = (path, error)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -454,7 +454,7 @@ class Interruption(Checkpoint):
     def _message(self) -> str:
         """Return the line of a process that ends in the middle of a step."""
         if self._path.is_file():
-            return f"interrupted; {self._path} is the latest checkpoint, the same command goes on from there"
+            return f"interrupted; {self._path} is the latest checkpoint, the same command continues from there"
         return "interrupted before the first checkpoint; the same command begins this again, what is finished is kept"
 
 

@@ -33,7 +33,7 @@ from typing import Any, NoReturn
 
 from dsr.utils import surroundings
 
-MESSAGE = "interrupted; what is finished is kept, the same command goes on from there"
+MESSAGE = "interrupted; what is finished is kept, the same command continues from there"
 """The line of an interrupted command that has nothing more precise to say."""
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _PREEMPTION: signal.Signals | None = getattr(signal, "SIGUSR2", None)

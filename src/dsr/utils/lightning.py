@@ -51,7 +51,7 @@ class LostProcessError(ConfigError):
         text = str(error).partition("]")[2] or str(error)
         reason = text.strip().partition("\n")[0].partition(". ")[0]
         super().__init__(
-            f"another process of the training has ended ({reason}); the same command goes on from the latest checkpoint"
+            f"another process of the training ended ({reason}); the same command continues from the latest checkpoint"
         )
 
 

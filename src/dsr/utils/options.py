@@ -24,13 +24,14 @@ from __future__ import annotations
 
 import math
 from argparse import SUPPRESS, ArgumentParser, Namespace
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
-from types import EllipsisType, NoneType
+from types import EllipsisType, MappingProxyType, NoneType
 from typing import Any, Literal, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
 
 from dsr.utils.files import obstacle
+from dsr.utils.spelling import did_you_mean
 
 _KEY = "option"
 
@@ -61,6 +62,7 @@ class Rule(NamedTuple):
         holds: whether a value is as expected.
         each: whether that is said of each value of a tuple.
         shown: how an error line shows a value.
+        known: names of which one is expected, if any are; an error line says which may be meant.
 
     """
 
@@ -68,6 +70,19 @@ class Rule(NamedTuple):
     holds: Callable[[Any], bool]
     each: bool = False
     shown: Callable[[Any], str] = _shown
+    known: Collection[str] = ()
+
+    def expect(self, name: str, value: Any) -> None:
+        """Check the value of an option.
+
+        Raises:
+            OptionError: it is not as expected.
+
+        """
+        for one in value if self.each else (value,):
+            if not self.holds(one):
+                meant = did_you_mean(one, self.known)
+                raise OptionError(name, f"expected {self.expected}, got {self.shown(one)}{meant}")
 
 
 def at_least(least: int) -> Rule:
@@ -82,12 +97,12 @@ def positive(what: str) -> Rule:
 
 def one_of(choices: Collection[str], shown: Callable[[Any], str] = repr) -> Rule:
     """Return the rule of a value that is one of some."""
-    return Rule(f"one of {', '.join(choices)}", lambda value: value in choices, shown=shown)
+    return Rule(f"one of {', '.join(choices)}", lambda value: value in choices, shown=shown, known=choices)
 
 
 def some_of(choices: Collection[str], shown: Callable[[Any], str] = repr) -> Rule:
     """Return the rule of a tuple with values that are each one of some."""
-    return Rule(f"some of {', '.join(choices)}", lambda value: value in choices, each=True, shown=shown)
+    return Rule(f"some of {', '.join(choices)}", lambda value: value in choices, True, shown, choices)
 
 
 class _Option(NamedTuple):
@@ -102,6 +117,7 @@ class _Option(NamedTuple):
     repeated: bool
     recorded: bool
     writes: str
+    presets: Mapping[str, Mapping[str, Any]]
 
 
 def option(
@@ -116,6 +132,7 @@ def option(
     repeated: bool = False,
     recorded: bool = True,
     writes: Literal["", "file", "folder"] = "",
+    presets: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
 ) -> Any:
     """Return a dataclass field that is an option.
 
@@ -131,9 +148,11 @@ def option(
         recorded: whether results depend on it, see :func:`recorded`.
         writes: what is written to the path that it is; nothing of another kind may be there, see
             :func:`dsr.utils.files.obstacle`.
+        presets: of its values those that stand for others: their values, as argparse reads them, by their names there.
+            They may not be given as anything else.
 
     """
-    metadata = {_KEY: _Option(help, metavar, flags, rule, parse, alone, repeated, recorded, writes)}
+    metadata = {_KEY: _Option(help, metavar, flags, rule, parse, alone, repeated, recorded, writes, presets)}
     return field(metadata=metadata) if isinstance(default, EllipsisType) else field(default=default, metadata=metadata)
 
 
@@ -227,11 +246,8 @@ class Options:
                 found = obstacle(Path(value).expanduser(), folder=each.option.writes == "folder")
                 if found is not None:
                     raise OptionError(each.name, f"expected a {each.option.writes} to write, got {found}: {value}")
-            if rule is None:
-                continue
-            for one in value if rule.each else (value,):
-                if not rule.holds(one):
-                    raise OptionError(each.name, f"expected {rule.expected}, got {rule.shown(one)}")
+            if rule is not None:
+                rule.expect(each.name, value)
 
 
 Record = TypeVar("Record", bound=Options)
@@ -272,6 +288,8 @@ def _keywords(each: _Stated, option: _Option, *, needed: bool) -> dict[str, Any]
     if get_origin(each.hint) is Literal:
         return {**keywords, "choices": kinds}
     if get_origin(each.hint) is not tuple:
+        if each.by_place and not each.required:
+            keywords |= {"nargs": "?", "default": each.default}  # of which argparse would make a path
         return {**keywords, "type": each.hint}
     if not option.repeated:
         several = "*" if each.by_place and not each.required else "+"
@@ -286,6 +304,7 @@ def build(record: type[Record], given: Namespace) -> Record:
         ValueError: a value is not what its option expects; the message begins with the option's flag.
 
     """
+    given = _with_presets(record, given)
     values: dict[str, Any] = {}
     for each in _stated(record):
         if each.option is not None and hasattr(given, each.key):
@@ -296,6 +315,28 @@ def build(record: type[Record], given: Namespace) -> Record:
         return record(**values)
     except OptionError as error:
         raise ValueError(f"{_flag_of(record, error.name)}: {error.message}") from error
+
+
+def _with_presets(record: type[Options], given: Namespace) -> Namespace:
+    """Return what was given with what presets among it stand for.
+
+    Raises:
+        ValueError: something else was given for it.
+
+    """
+    found = Namespace(**vars(given))
+    walked = list(_walk(record))
+    flags = {each.key: each.flags[0] for each in walked}
+    for each in walked:
+        if each.option is None or not each.option.presets or not hasattr(given, each.key):
+            continue
+        chosen = getattr(given, each.key)
+        for key, value in each.option.presets[chosen].items():
+            if key in flags and getattr(given, key, value) != value:
+                came = f"{flags[key]} {getattr(given, key)}"
+                raise ValueError(f"{each.flags[0]} {chosen}: expected {flags[key]} {value} or none with it, got {came}")
+            setattr(found, key, value)
+    return found
 
 
 def _value(each: _Stated, option: _Option, came: Any) -> Any:

@@ -7,7 +7,7 @@ import functools
 import math
 import platform
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,7 @@ from dsr.io.pairs import Pair
 from dsr.methods.base import MapNoise, Outliers, Surface
 from dsr.notes import CHECKS, Assumption, expect_no_warning
 from dsr.utils.guards import readable
+from dsr.utils.lengths import show_length
 from dsr.utils.memory import refusing_excess
 from dsr.utils.progress import Progress, megabytes
 from dsr.utils.versions import package_versions
@@ -126,15 +127,11 @@ class FrameWork:
             reporter.facts(earlier)
             reporter.say(f"{pair.name}: {COMPLETE}, in {target}")
             return COMPLETE
-        times = _Times(progress)
+        times = Times(progress)
         times.begin("reading")
         picture = self._read(pair)
         picture = replace(picture, assumptions=(*picture.assumptions, *self._frames.warnings.get(pair.name, ())))
-        try:
-            identified = find_sensor(picture.depth_lr, how.sensor, picture.device_name)
-        except ValueError as error:
-            raise ValueError(f"--{error}") from error
-        picture = _with_sensor(sequence.fuse(pair, picture), identified)
+        picture, identified = prepare(picture, how.sensor, functools.partial(sequence.fuse, pair))
         picture = align(picture, register=request.reading.register)
         size_lr = (picture.depth_lr.shape[-2], picture.depth_lr.shape[-1])
         size = (picture.camera.height, picture.camera.width)
@@ -157,12 +154,15 @@ class FrameWork:
             surface = self._upsample(picture, identified, progress)
             reporter.facts(_describe(surface.noise, given="noise" in how.arguments))
             reporter.facts([*_describe_outliers(surface.outliers), *_describe_holes(surface, how)])
+        if wanted.certain:
+            surface = surface.without_dubious(wanted.max_error / 100)
         times.begin("writing")
         begin(target, job.settings, job.inputs, () if job.earlier is None else job.earlier.files)
         facts, seconds = _write(job, picture, surface, planned, times)
         reporter.facts(facts)
-        took = f"{seconds['total']:.1f} s, {megabytes(stored_bytes(target))}"
-        reporter.say(f"{pair.name}: {planned.text}, {took} -> {target}")
+        told = [*_noise_in_brief(surface.noise), *_shares_in_brief(surface.shares(wanted.max_error / 100))]
+        told += [f"{seconds['total']:.1f} s", megabytes(stored_bytes(target))]
+        reporter.say(f"{pair.name}: {', '.join([f'{planned.method} x{planned.scale}', *told])} -> {target}")
         return "done"
 
     @functools.cached_property
@@ -186,14 +186,14 @@ class FrameWork:
         last, self._read_last = self._read_last, None
         if last is not None and last[0] == pair.name:
             return last[1]
-        return _without_repeats(read_picture(pair, self._request.reading, self._frames.units))
+        return without_repeats(read_picture(pair, self._request.reading, self._frames.units))
 
 
-class _Times:
-    """The seconds of the stages of a picture, which are shown as it goes through them."""
+class Times:
+    """The seconds of the stages of a picture, which are shown as it goes through them; of some they may be known."""
 
-    def __init__(self, progress: Progress) -> None:
-        self._progress, self._seconds = progress, dict[str, float]()
+    def __init__(self, progress: Progress, **seconds: float) -> None:
+        self._progress, self._seconds = progress, {stage: round(each, 3) for stage, each in seconds.items()}
         self._stage, self._since = "", 0.0
 
     def begin(self, stage: str, seconds: float | None = None) -> None:
@@ -239,7 +239,10 @@ class _Job:
             what = "other inputs: " + ", ".join(str(entry.get("file")) for entry in earlier.inputs.values())
         else:
             changed = [name for name, value in self.settings.items() if earlier.settings.get(name) != value]
-            what = "other settings: " + ", ".join(f"{name} {earlier.settings.get(name)}" for name in changed)
+            said = ((name, earlier.settings.get(name)) for name in changed)
+            what = "other settings: " + ", ".join(
+                f"no {name}" if old is None else f"{name} {old}" for name, old in said
+            )
         raise ValueError(f"{self.target}: holds a result of {what}; take another -o, or --overwrite")
 
     def expect_no_warning(self, notes: Sequence[Assumption]) -> None:
@@ -259,7 +262,22 @@ class _Job:
         return all(there & set(part.files) for part in self.request.results.of_frame)
 
 
-def _without_repeats(picture: Picture) -> Picture:
+def prepare(picture: Picture, sensor: str, fuse: Callable[[Picture], Picture]) -> tuple[Picture, Identified | None]:
+    """Return a picture as it was read, fused with its neighbours, and the sensor that its own depth tells.
+
+    Args:
+        sensor: see :func:`dsr.inference.find_sensor`.
+        fuse: fuses it with its neighbours.
+
+    """
+    try:
+        identified = find_sensor(picture.depth_lr, sensor, picture.device_name)
+    except ValueError as error:
+        raise ValueError(f"--{error}") from error
+    return _with_sensor(fuse(picture), identified), identified
+
+
+def without_repeats(picture: Picture) -> Picture:
     """Undo an enlargement of the depth map by repeated pixels."""
     height, width = picture.depth_lr.shape[-2:]
     block = enlarged_by(picture.depth_lr) if (height, width) == (picture.camera.height, picture.camera.width) else 1
@@ -289,11 +307,30 @@ def _describe(noise: MapNoise | None, *, given: bool) -> list[Assumption]:
     if noise is None or given:
         return []
     extent = f", correlated over {noise.extent:.0f} pixels" if noise.extent > _WHITE else ""
-    text = f"about {1e3 * noise.deviation:.2g} mm{extent}"
+    text = f"about {show_length(noise.deviation, 2)}{extent}"
     if noise.reduced > 1:
         text += f": worked on at 1/{noise.reduced}"
     option = "--noise" if noise.reduced == 1 else "--working-size"
     return [Assumption("noise of the depth map", f"{text}; {option} overrides it")]
+
+
+def _noise_in_brief(noise: MapNoise | None) -> list[str]:
+    """Return the noise of the input, and the size that it was worked on at because of that, in a few words each."""
+    if noise is None:
+        return []
+    reduced = [f"worked on at 1/{noise.reduced}"] if noise.reduced > 1 else []
+    return [f"noise {show_length(noise.deviation, 2)}", *reduced]
+
+
+def _shares_in_brief(shares: Mapping[str, float]) -> list[str]:
+    """Return the shares of the pixels in a few words each, less those that there are none of."""
+    words = {"open": "left open"}
+    return [f"{words.get(name, name)} {_percent(share)}" for name, share in shares.items() if share]
+
+
+def _percent(share: float) -> str:
+    """Return a share in percent, which is 0 or 100 only if it is exactly that."""
+    return f"{min(max(round(100 * share, 1), 0.1), 99.9):g}%" if 0 < share < 1 else f"{share:.0%}"
 
 
 def _describe_outliers(outliers: Outliers | None) -> list[Assumption]:
@@ -314,29 +351,48 @@ def _describe_holes(surface: Surface, how: Upsampling) -> list[Assumption]:
 
 
 def _write(
-    job: _Job, picture: Picture, surface: Surface, planned: Plan, times: _Times
+    job: _Job, picture: Picture, surface: Surface, planned: Plan, times: Times
 ) -> tuple[list[Assumption], dict[str, float]]:
     """Write all parts and ``info.json``, and return notes for the user, and the seconds of the stages."""
     wanted = job.request.results
-    encoding = output_encoding(picture.encoding, wanted.format)
     title = f"{readable(job.pair.name)}, {planned.method} x{planned.scale}"
-    outputs = write_parts(job.target, Result(picture, surface, encoding, title, wanted))
+    result = Result(picture, surface, output_encoding(picture.encoding, wanted.format), title, wanted)
+    kept = job.earlier if job.earlier is not None and job.same else None
+    return write_result(job.target, result, planned, times, job.inputs, job.settings, job.earlier, kept)
+
+
+def write_result(
+    folder: Path, result: Result, planned: Plan, times: Times, inputs: Mapping[str, Any],
+    settings: Mapping[str, Any], earlier: PreviousRun | None = None, kept: PreviousRun | None = None,
+) -> tuple[list[Assumption], dict[str, float]]:  # fmt: skip
+    """Write the parts of a result and ``info.json``, and return notes for the user, and the seconds of the stages.
+
+    Args:
+        folder: of the result.
+        planned, times: how the result was computed, and how long that took.
+        inputs, settings: what it depends on, as values for JSON.
+        earlier: the run whose files are in the folder.
+        kept: that run, if its other files stay.
+
+    """
+    picture, surface = result.picture, result.surface
+    outputs = write_parts(folder, result)
     files = [name for output in outputs.values() for name in output.files]
     facts = list(dict.fromkeys(note for output in outputs.values() for note in output.notes))
     shapes = {name: output.shape._asdict() for name, output in outputs.items() if output.shape is not None}
-    kept = job.earlier if job.earlier is not None and job.same else None
     counts = {**(kept.shapes if kept else {}), **shapes}
     if surface.outliers is not None:
         counts["outliers"] = surface.outliers._asdict()
     entries = {
-        "inputs": job.inputs,
-        "settings": job.settings,
+        "inputs": inputs,
+        "settings": settings,
         "method": planned.method,
         "scale": planned.scale,
         "plan": planned.text,
         "noise": surface.noise._asdict() if surface.noise else kept.noise if kept else None,
-        **described(picture, encoding),
+        **described(picture, result.encoding),
         **counts,
+        "shares": {name: round(share, 6) for name, share in surface.shares(result.wanted.max_error / 100).items()},
         "assumptions": [str(fact) for fact in (*picture.assumptions, *facts)],
         "checks": CHECKS,
         "warnings": [fact.record() for fact in (*picture.assumptions, *facts) if fact.code],
@@ -344,5 +400,5 @@ def _write(
         "versions": {"python": platform.python_version(), **package_versions(_PACKAGES)},
     }
     others = [name for name in (kept.files if kept else ()) if name not in files]
-    finish(job.target, job.earlier, entries, [*files, *others])
+    finish(folder, earlier, entries, [*files, *others])
     return facts, seconds

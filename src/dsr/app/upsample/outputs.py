@@ -74,7 +74,7 @@ def output_encoding(encoding: Encoding, chosen: str | None) -> Encoding:
     own = "tiff" if encoding.suffix == ".tif" else encoding.suffix[1:]
     if chosen in (None, own):
         return replace(encoding, dtype=str(storable(encoding.suffix, np.dtype(encoding.dtype))))
-    if chosen == "png":
+    if chosen in ("png", "mm"):
         return Encoding(".png", "uint16", 1e-3, 0.0, "orthogonal")
     return Encoding(f".{chosen}", "float32", 1.0, math.nan, "orthogonal")
 

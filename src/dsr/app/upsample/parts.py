@@ -25,7 +25,10 @@ if TYPE_CHECKING:
     from dsr.methods.base import Surface
     from dsr.notes import Assumption
 
-FORMATS = ("png", "tiff", "npy", "npz", "pfm", "exr")
+_SUFFIXES = ("png", "tiff", "npy", "npz", "pfm", "exr")
+FORMATS = (*_SUFFIXES, "mm")
+"""Formats of the depth: suffixes, of which png means whole millimetres where the input is something else; ``mm`` always
+is a PNG of 16 bits in whole millimetres, 0 in holes."""
 METRES = "depth_metres.tiff"
 """Depth to the bit, which is read back, stored as :data:`dsr.io.encoding.IN_METRES` says."""
 OLD_METRES = "depth_metres.npy"
@@ -179,7 +182,8 @@ def _cloud(folder: Path, result: Result) -> Output:
     if depth is None:
         return Output((), notes)
     picture, most = result.picture, result.wanted.max_points
-    shape = write_cloud(folder / "cloud.ply", picture.rgb, depth, picture.camera, most=most)
+    filled = result.surface.filled
+    shape = write_cloud(folder / "cloud.ply", picture.rgb, depth, picture.camera, most=most, filled=filled)
     return Output(("cloud.ply",), (*notes, *_fewer("cloud", "points", "--max-points", shape)), shape)
 
 
@@ -245,6 +249,15 @@ def _confidence(folder: Path, result: Result) -> Output | None:
     return None
 
 
+def _filled(folder: Path, result: Result) -> Output | None:
+    from dsr.io.exports import write_mask
+
+    if result.surface.filled is None:
+        return Output(())
+    write_mask(folder / "filled.png", result.surface.filled)
+    return None
+
+
 def _input(folder: Path, result: Result) -> None:
     from dsr.io.exports import INPUT, write_input
 
@@ -287,19 +300,20 @@ _OF_DEPTH = ("depth", "rgbd")
 PARTS: dict[str, Part] = {
     part.name: part
     for part in (
-        Part("depth", (*(f"depth.{suffix}" for suffix in (*FORMATS, "tif")), METRES, OLD_METRES), _depth,
-             cost=Cost(2.0, 0.25)),
+        Part("depth", (*(f"depth.{suffix}" for suffix in (*_SUFFIXES, "tif")), METRES, OLD_METRES), _depth,
+              cost=Cost(2.0, 0.25)),
         Part("renderings", tuple(f"renderings/{light}.png" for light in LIGHT_NAMES), _renderings,
-             cost=Cost(1.0, 0.4)),
+              cost=Cost(1.0, 0.4)),
         Part("normals", ("normals.png",), _normals, cost=Cost(0.8, 0.4)),
         Part("mesh", ("mesh.glb",), _mesh, shape=True, errors=True, cost=Cost(2.5, 0.6), dense=Cost(43, 1.5)),
         Part("before_after", ("before_after.png",), _before_after, cost=Cost(3.3, 2.5, 7.5e5)),
         Part("confidence", ("confidence.png", ERRORS), _confidence, errors=True, cost=Cost(2.3, 1.0)),
+        Part("filled", ("filled.png",), _filled, cost=Cost(0.02, 0.02)),
         Part("input", ("input.npz",), _input, cost=Cost(0.8, 0.1, 6e5)),
         Part("mesh_ply", ("mesh.ply",), _mesh_ply, usual=False, large=True, shape=True, errors=True,
-             cost=Cost(2.5, 0.2), dense=Cost(53, 1.0)),
+              cost=Cost(2.5, 0.2), dense=Cost(53, 1.0)),
         Part("cloud", ("cloud.ply",), _cloud, usual=False, large=True, shape=True, errors=True,
-             cost=Cost(27.0, 1.4)),
+              cost=Cost(27.0, 1.4)),
         Part("rgbd", ("rgbd/color.png", "rgbd/depth.png", "rgbd/intrinsic.json"), _rgbd, usual=False),
         Part("open3d", ("open3d",), write_all=_open3d, needs=_OF_DEPTH, usual=False),
         Part("nerfstudio", ("transforms.json", "nerfstudio"), write_all=_nerfstudio, needs=_OF_DEPTH, usual=False,
@@ -327,7 +341,10 @@ class Results(Options):
 
     output: Path = option(..., "folder of the results", "OUT", flags="-o --output", recorded=False, writes="folder")
     format: str | None = option(
-        None, f"of the depth: {', '.join(FORMATS)} (the input's)", "FORMAT", rule=one_of(FORMATS)
+        None,
+        f"of the depth: {', '.join(_SUFFIXES)} (the input's); mm: 16-bit PNG in millimetres, 0 in holes",
+        "FORMAT",
+        rule=one_of(FORMATS),
     )
     only: tuple[str, ...] | None = option(
         None, f"some of {','.join(PARTS)}", "PARTS", parse=_words, alone="parts", recorded=False
@@ -344,6 +361,18 @@ class Results(Options):
         "leave pixels out of cloud and mesh whose depth is expected to be off by more (default: 2)",
         "PERCENT",
         rule=EXPECTED_ERROR,
+    )
+    certain: bool = option(
+        False, "make holes of these pixels in the depth, too, and in all that is made of it", recorded=False
+    )
+    purpose: Literal["robot"] | None = option(
+        None,
+        "robot: nothing is filled, dubious pixels are holes, depth.png is in 16-bit millimetres with 0 for holes, its "
+        "expected errors are in confidence.npz (--fill none --certain --format mm)",
+        "robot",
+        flags="--for",
+        recorded=False,
+        presets={"robot": {"fill": "none", "certain": True, "format": "mm"}},
     )
     max_faces: int = option(
         MOST_FACES,

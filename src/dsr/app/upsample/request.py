@@ -50,7 +50,7 @@ class FrameChoice(Options):
     confidence: tuple[Path, ...] = option((), "confidence maps, or a folder of them", "MAP", recorded=False)
     shard: Shard | None = option(
         None,
-        "only the K-th of N blocks of the frames, for a task of an array; see docs/sequences.md",
+        "only the K-th of N blocks of the frames, for an array job; see docs/folders.md",
         "K/N",
         parse=parse_shard,
         recorded=False,
@@ -110,7 +110,7 @@ class Upsampling(Options):
         None, "standard deviation of the depth map's noise (default: estimated)", "METRES", recorded=False
     )
     smooth: float | None = option(
-        None, "0 keeps what may be noise, 2 smooths more; 1 is neutral", "0..2", recorded=False
+        None, "0 keeps what may be noise, 1 is neutral, 2 smooths more", "0..2", recorded=False
     )
     settings: tuple[tuple[str, Any], ...] = option(
         (),
@@ -140,12 +140,12 @@ class Upsampling(Options):
     )
     size: Literal["auto", "1", "2", "4", "8", "16"] = option(
         "auto",
-        "by what facets divides the map's size first; auto: as its noise suggests",
+        "divide the map's size by this before facets works on it; auto: by its noise",
         flags="--working-size",
     )
     sensor: str = option(
         "auto",
-        "what measured the depth, such as 'RealSense D435'; auto: as the depth values or the files tell",
+        "the camera that measured the depth, such as 'RealSense D435'; auto: recognised by depth values or files",
         "auto|none|NAME",
     )
 
@@ -249,6 +249,7 @@ def settings_of(request: UpsampleRequest) -> dict[str, Any]:
     return {
         **recorded(request),
         "max_error": request.results.max_error / 100,
+        **({"certain": True} if request.results.certain else {}),
         "registered_by": None if request.reading.rig is None else "extrinsics",
         "set": request.upsampling.arguments,
         "code": hash_outside_code(_targets(request.upsampling)),

@@ -22,6 +22,7 @@ from dsr.report.surface_page import ViewedResult
 from dsr.sample import expect_distances
 from dsr.utils.arrays import array_headers
 from dsr.utils.guards import TooLargeError, is_number, natural_key, parse_json, pixels_beside, read_limited
+from dsr.utils.lengths import show_length
 
 _DEEPEST = 6
 """Folders below the given one in which results are looked for."""
@@ -195,7 +196,7 @@ def _facts(info: Mapping[str, Any], depth: np.ndarray) -> dict[str, str]:
     }
     noise = info.get("noise")
     if isinstance(noise, dict) and is_number(noise.get("deviation")):
-        facts["noise of the input"] = f"about {1e3 * noise['deviation']:.2g} mm"
+        facts["noise of the input"] = f"about {show_length(noise['deviation'], 2)}"
     return facts
 
 

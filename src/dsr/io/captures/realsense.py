@@ -33,6 +33,7 @@ from dsr.io.pairs import Pair, PairingResult, match_times
 from dsr.io.trajectories import describe_capture, intrinsics_camera
 from dsr.notes import Assumption
 from dsr.utils.guards import naming, numbers_in
+from dsr.utils.lengths import show_length
 
 _VERSION = "/file_version"
 _OLDEST = 2
@@ -107,7 +108,7 @@ def read(reader: Any, path: Path, prefix: str) -> PairingResult:
         own = functools.partial(_of_photo, geometry, damage)
         frame = CaptureFrame(device, own, path, told, *sources, time=photos[int(first.name)][1], apart=apart)
         pairs.append(Pair(f"{prefix}{int(first.name):06}", *places, unit=unit, capture=frame))
-    about = describe_capture(f"a recording of {device}", f"units of {unit:g} m", pairs, poses=False)
+    about = describe_capture(f"a recording of {device}", f"units of {show_length(unit)}", pairs, poses=False)
     others = sorted(
         {each.topic for each in reader.connections if _IMAGES.fullmatch(each.topic)} - {color_topic, depth_topic}
     )

@@ -173,7 +173,7 @@ class DeepImagePrior(Method):
                 raise ValueError(f"{sample.scene}: the optimisation {error}; {_ADVICE}") from error
             except KeyboardInterrupt:
                 where = f"interrupted at step {trainer.global_step} of {sample.scene}"
-                on = "; the same command goes on from there" if folder is not None else ""
+                on = "; the same command continues from there" if folder is not None else ""
                 raise KeyboardInterrupt(where + on) from None
             depth = module.result()
         if not bool(depth.isfinite().all()):

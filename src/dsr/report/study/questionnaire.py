@@ -103,7 +103,7 @@ def build_study(
     notes += [note for each in drawn for note in each.notes]
     scenes, trials = _with_ids([each for each in drawn if each.pictures])
     if not scenes:
-        raise ValueError(f"study: expected a scene with its truth, found none; {notes[-1]}")
+        raise ValueError(f"study: expected a scene with its ground truth, found none; {notes[-1]}")
     per_person = _within("scenes per person", choice.scenes_per_person, 1, len(scenes), len(scenes))
     repeat = _within("repeat", choice.repeat, 0, per_person, 0)
     asked: dict[str, Any] = {"perPerson": per_person, "repeat": repeat, "scenes": scenes}
@@ -138,7 +138,7 @@ def _questions(results: Results, choice: Choice) -> tuple[list[Question], list[s
             questions.append(Question(problem, scene, shown))
     if not questions:
         detail = f"; {notes[-1]}" if notes else ""
-        raise ValueError(f"study: expected a scene with its truth and {_FEWEST} methods, found none{detail}")
+        raise ValueError(f"study: expected a scene with its ground truth and {_FEWEST} methods, found none{detail}")
     return questions, notes
 
 

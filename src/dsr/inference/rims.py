@@ -1,0 +1,142 @@
+"""Holes between a nearer and a farther surface: which of the two a pixel is of, as the colours of the photo have it.
+
+Stereo and structured light lose what lies beside and between near objects: the strip that one of two cameras does not
+see, the loop between an arm and a head, the gaps between the legs of a chair. What is filled in from the rim there is
+a sheet between the two surfaces, or closes the loop. So each pixel of such a hole is compared with the measured pixels
+around it, up to three times as far as the rim, as in a joint bilateral filter: the two of each surface that are nearest
+and most alike in colour stand for it. It gets the farther depth where that surface explains its colour at least as well
+as the nearer one, the nearer where that does clearly better, and what other holes get in between. Where that is of
+the same surface anyway, a pixel is left to the method, which knows slopes and its own errors.
+
+See ``benchmarks/holes.py`` for the figures.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from dsr.geometry.hole_size import distance_to_known
+from dsr.methods.inpainting import inpaint
+
+_STEP = 1.1
+"""Ratio of the depths around a pixel from which they are of two surfaces."""
+_RADIUS, _PER_STRIDE = 6, 0.25
+"""Samples from a pixel to the end of its window, beyond which every second one counts up to twice as far; and how wide
+they are apart in pixels, for each pixel to the rim and two more."""
+_CONTRAST = 0.03
+"""Standard deviation of the difference of the colours of a surface, on the scale of [0, 1]."""
+_LEAST = 1e-4
+"""Affinity of pixels of different colours."""
+_SPREAD, _CLOSE = 0.5, 0.2
+"""Distances beyond the rim over which a pixel counts less: as a witness of a surface, and for its depth."""
+_WITNESSES = 2
+_CLEARLY = 1.0
+"""Logarithm of the ratio of how well they explain a pixel from which on one surface is clearly better."""
+_DIFFERENT = 0.1
+"""Logarithm of the ratio of depths from which what would be filled in from the rim is of another surface."""
+_MOST = 1 << 14
+"""Pixels at a time."""
+_TOGETHER = 0.5
+"""Share of measured pixels whose four neighbours are measured, below which a map is one of single points."""
+
+
+class Settled(NamedTuple):
+    """A map whose holes between two surfaces are filled, and how wrong that may be.
+
+    ``inverse`` (1, h, w): inverse depth in 1/m, NaN in the other holes; ``doubt`` (1, h, w): the relative error that is
+    to be expected as a pixel may be of the other surface, 0 elsewhere.
+    """
+
+    inverse: Tensor
+    doubt: Tensor
+
+
+def settle_holes(inverse: Tensor, rgb: Tensor, holes: Tensor) -> Settled:
+    """Return a map whose holes between two surfaces are filled with the depth of one of them.
+
+    Args:
+        inverse: (1, h, w) inverse depth in 1/m, NaN in holes.
+        rgb: (3, H, W) in [0, 1], of the same view.
+        holes: (1, h, w) bool, those to fill; other holes stay as they are.
+
+    """
+    known = inverse.isfinite()
+    settled, doubt = inverse.clone(), torch.zeros_like(inverse)
+    if not bool((holes & ~known).any()) or _is_scattered(known):
+        return Settled(settled, doubt)
+    colours = functional.adaptive_avg_pool2d(rgb[None].to(inverse), (inverse.shape[-2], inverse.shape[-1]))[0]
+    away = distance_to_known(known)[0]
+    places = torch.nonzero((holes & ~known)[0])
+    for part in places.split(_MOST):
+        rows, columns = part[:, 0], part[:, 1]
+        found, doubtful = _settle(inverse[0], colours, rows, columns, away[rows, columns].to(inverse))
+        settled[0, rows, columns], doubt[0, rows, columns] = found, doubtful
+    decided = settled.isfinite() & ~known
+    if bool(decided.any()):
+        usual = inpaint(inverse[None], rgb[None])[0]
+        same = decided & ((settled / usual).log().abs() < _DIFFERENT)
+        settled, doubt = settled.masked_fill(same, math.nan), doubt.masked_fill(same, 0)
+    return Settled(settled, doubt)
+
+
+def _is_scattered(known: Tensor) -> bool:
+    """Return whether the known pixels of a map, (1, h, w), are single points, as those of a laser scanner."""
+    inner = known[:, 1:-1, 1:-1]
+    beside = known[:, :-2, 1:-1] & known[:, 2:, 1:-1] & known[:, 1:-1, :-2] & known[:, 1:-1, 2:]
+    return bool((inner & beside).sum() < _TOGETHER * inner.sum())
+
+
+def _settle(inverse: Tensor, colours: Tensor, rows: Tensor, columns: Tensor, away: Tensor) -> tuple[Tensor, Tensor]:
+    """Return inverse depth, NaN where it is not decided, and the doubt at pixels, (n,) each.
+
+    Args:
+        inverse: (h, w) the map.
+        colours: (3, h, w) the photo.
+        rows, columns, away: (n,) the pixels and their distance to the nearest known one.
+
+    """
+    steps = torch.arange(-_RADIUS, _RADIUS + 1, device=inverse.device)
+    fine = torch.cartesian_prod(steps, steps)
+    fine = fine[fine.square().sum(1) <= _RADIUS**2]
+    offsets = torch.cat((fine, 2 * fine[4 * fine.square().sum(1) > _RADIUS**2]))
+    stride = (_PER_STRIDE * (away + 2)).ceil().long()[:, None]
+    height, width = inverse.shape
+    at_row, at_column = rows[:, None] + stride * offsets[:, 0], columns[:, None] + stride * offsets[:, 1]
+    inside = (at_row >= 0) & (at_row < height) & (at_column >= 0) & (at_column < width)
+    index = at_row.clamp(0, height - 1) * width + at_column.clamp(0, width - 1)
+    values = inverse.flatten()[index]
+    known = inside & values.isfinite()
+    distance = stride * offsets.square().sum(1).to(inverse).sqrt()
+    rim = known & (distance <= 1.5 * away[:, None] + 3)
+    high = values.masked_fill(~rim, -math.inf).amax(1)
+    low = values.masked_fill(~known, math.inf).amin(1)
+    found, doubt = torch.full_like(away, math.nan), torch.zeros_like(away)
+    two = high > _STEP * low
+    if not bool(two.any()):
+        return found, doubt
+    values, known, index, distance, away = values[two], known[two], index[two], distance[two], away[two]
+    nearer = values > (high * low).sqrt()[two, None]
+    difference = colours.flatten(1)[:, index] - colours[:, rows[two], columns[two], None]
+    affinity = (difference.square().sum(0) / (-2 * _CONTRAST**2)).exp() + _LEAST
+    beyond = ((distance - away[:, None]) / (away[:, None] + 2)).clamp(min=0)
+    witness, close = ((-beyond / each).exp() * affinity for each in (_SPREAD, _CLOSE))
+    says, depths = [], []
+    for surface in (known & ~nearer, known & nearer):
+        most = min(_WITNESSES, values.shape[1])
+        says.append((witness * surface).topk(most, 1).values.mean(1).clamp(min=1e-12).log())
+        weight = close * surface
+        depths.append((weight * values.nan_to_num(0)).sum(1) / weight.sum(1))
+    better = says[0] - says[1]
+    farther, clearly = better >= 0, better < -_CLEARLY
+    result = torch.where(farther, depths[0], depths[1])
+    other = torch.where(farther, depths[1], depths[0])
+    wrong = torch.sigmoid(-better.abs() / 2)  # the witnesses of a surface are not independent of each other
+    decided = (farther | clearly) & result.isfinite()
+    found[two] = torch.where(decided, result, math.nan)
+    doubt[two] = torch.where(decided, wrong * (other / result - 1).abs().nan_to_num(0), 0).clamp(max=1)
+    return found, doubt
