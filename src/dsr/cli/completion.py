@@ -62,6 +62,7 @@ examples:
   dsr completion fish | source          in ~/.config/fish/config.fish
 
 It completes commands, options, methods, data sets, and for eval and train the choices of each group.
+Hydra's own completion has all keys, in a checkout: eval "$(python train.py -sc install=bash)", then python train.py ...
 """
 
 
