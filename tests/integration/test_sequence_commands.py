@@ -208,6 +208,8 @@ def test_neighbours_lower_the_noise_and_keep_the_pose(capture, capsys):
     assert upsample(capture, *poses, *DEPTH_ONLY, "-o", capture.parent / "one") == 0
     assert upsample(capture, *poses, "--neighbours", "4", *DEPTH_ONLY, "-o", capture.parent / "five") == 0
     assert "4 neighbouring frames vote on the depth" in capsys.readouterr().out
+    assert upsample(capture, *poses, "--neighbours", "1", *DEPTH_ONLY, "-o", capture.parent / "two") == 0
+    assert "1 neighbouring frame votes on the depth" in capsys.readouterr().out
     truth = world(CAMERA, 0.08)[1]
     noise = {
         name: np.std((np.load(capture.parent / name / "002" / "depth_metres.npy") - truth)[5:15, 20:-20])

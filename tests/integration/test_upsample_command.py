@@ -23,7 +23,8 @@ PARTS = {
     "depth": ("depth.png", "depth_metres.npy"),
     "renderings": tuple(f"renderings/e{number}.png" for number in range(1, 5)), "normals": ("normals.png",),
     "cloud": ("cloud.ply",), "mesh": ("mesh.ply", "mesh.glb"), "before_after": ("before_after.png",),
-    "confidence": ("confidence.png", "confidence.npz"), "input": ("input.npz",),
+    "confidence": ("confidence.png", "confidence.npz"), "filled": ("filled.png",),
+    "input": ("input.npz",),
 }  # fmt: skip
 BICUBIC = ("--method", "bicubic")
 DEPTH_ONLY = (*BICUBIC, "--only", "depth")
@@ -235,6 +236,55 @@ def test_other_format_is_in_metres_or_whole_millimetres(pair, tmp_path):
     assert np.median(np.load(out / "depth_metres.npy")) > 10
 
 
+def test_what_was_measured_and_what_was_filled_is_told_apart(pair, tmp_path, capsys):
+    assert of(pair, tmp_path / "out", *BICUBIC, "--only", "depth,filled,cloud") == 0
+    said = capsys.readouterr().out
+    filled = np.asarray(Image.open(tmp_path / "out" / "filled.png"))
+    expected = np.kron(pair[2] == 0, np.ones((4, 4), bool))
+    np.testing.assert_array_equal(filled, np.where(expected, 255, 0))
+    shares = info(tmp_path / "out")["shares"]
+    assert shares["filled"] == pytest.approx(6 / 256, abs=1e-6)
+    assert shares["measured"] == pytest.approx(250 / 256, abs=1e-6)
+    assert shares["open"] == 0
+    [line] = [line for line in said.splitlines() if " -> " in line]
+    assert re.fullmatch(
+        r"\S+: bicubic x4, measured 97.7%, filled 2.3%, dubious [\d.]+%, [\d.]+ s -> \S+", line.removeprefix("photo ")
+    )
+    (tmp_path / "out" / "filled.png").unlink()
+    assert of(pair, tmp_path / "out", *BICUBIC, "--only", "depth,filled,cloud") == 0  # of the stored depth
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "out" / "filled.png")), filled)
+    assert info(tmp_path / "out")["shares"] == shares
+    assert of(pair, tmp_path / "kept", *DEPTH_ONLY, "--fill", "none") == 0
+    assert info(tmp_path / "kept")["shares"]["filled"] == 0
+    assert info(tmp_path / "kept")["shares"]["open"] == pytest.approx(6 / 256, abs=1e-6)
+
+
+def test_result_for_a_robot_has_millimetres_of_certain_measured_depth_alone(pair, tmp_path, capsys):
+    values = pair[2]
+    np.save(tmp_path / "metres.npy", np.where(values == 0, np.nan, values / 1000).astype(np.float32))
+    floats = (pair[0], tmp_path / "metres.npy")
+    assert of(floats, tmp_path / "all", *BICUBIC) == 0
+    for given in (pair, floats):
+        out = tmp_path / given[1].suffix[1:]
+        assert of(given, out, *BICUBIC, "--for", "robot", "--max-error", "1") == 0
+        depth = np.asarray(Image.open(out / "depth.png"))
+        assert depth.dtype == np.uint16
+        metres = np.load(tmp_path / "all" / "depth.npy")
+        errors = np.load(out / "confidence.npz")["depth_error"].astype(np.float32)
+        certain = (errors <= 0.0099 * metres) & ~np.kron(values == 0, np.ones((4, 4), bool))
+        dubious = (errors > 0.0101 * metres) | np.kron(values == 0, np.ones((4, 4), bool))
+        assert 100 < certain.sum() < certain.size - 100
+        np.testing.assert_allclose(depth[certain], 1000 * metres[certain], atol=1.5)
+        assert not depth[dubious].any()
+        assert not np.asarray(Image.open(out / "filled.png")).any()
+    for more in (("--fill", "all"), ("--format", "exr")):
+        assert of(pair, tmp_path / "no", *BICUBIC, "--for", "robot", *more) == 2
+        error = capsys.readouterr().err.strip()
+        assert error.count("\n") == 0
+        assert f"--for robot: expected {more[0]}" in error
+        assert not (tmp_path / "no").exists()
+
+
 def test_holes_are_filled_unless_kept_on_request(pair, tmp_path):
     assert of(pair, tmp_path / "filled", *DEPTH_ONLY) == 0
     assert of(pair, tmp_path / "kept", *DEPTH_ONLY, "--fill", "none") == 0
@@ -287,7 +337,7 @@ def test_result_of_other_settings_or_inputs_is_kept_unless_overwritten(pair, tmp
     assert of(pair, out, *DEPTH_ONLY) == 0
     before = (out / "depth.png").read_bytes()
     message = refused(capsys, of(pair, out, *DEPTH_ONLY, "--fov", 70))
-    assert message == f"{out}: holds a result of other settings: fov None; take another -o, or --overwrite"
+    assert message == f"{out}: holds a result of other settings: no fov; take another -o, or --overwrite"
     Image.fromarray(pair[2] + np.uint16(100)).save(pair[1])
     message = refused(capsys, of(pair, out, *DEPTH_ONLY))
     assert message == f"{out}: holds a result of other inputs: photo.png, depth.png; take another -o, or --overwrite"
@@ -386,7 +436,7 @@ def test_sensor_is_told_from_the_depth_values_and_must_not_contradict_them(tmp_p
     [
         (("--method", "magic"), "--method: expected one of"),
         (("--sensor", "Leica"), "--sensor: expected auto, none or one of RealSense D415"),
-        (("--format", "jpg"), "--format: expected one of png, tiff, npy, npz, pfm, exr, got 'jpg'"),
+        (("--format", "jpg"), "--format: expected one of png, tiff, npy, npz, pfm, exr, mm, got 'jpg'"),
         (("--only", "depth,film"), "--only, --with, --without: expected some of depth, renderings"),
         (("--without", "film"), "--only, --with, --without: expected some of depth, renderings"),
         (("--only", ","), "expected something to be left to write"),
@@ -486,7 +536,7 @@ def test_enlarged_depth_gives_as_good_a_result(pair, tmp_path, capsys):
     assert of((photo, tmp_path / "enlarged.png"), tmp_path / "large", *DEPTH_ONLY) == 0
     said = capsys.readouterr().out
     assert "the depth map was enlarged x4 by repeating pixels, which are dropped" in said
-    assert "16 x 16 depth to 64 x 64 by bicubic x4" in said
+    assert ": bicubic x4, measured" in said
     small, large = (np.load(tmp_path / name / "depth_metres.npy") for name in ("small", "large"))
     np.testing.assert_array_equal(small, large)
 

@@ -52,6 +52,18 @@ def test_depth_too_far_too_near_or_too_sparse_is_pointed_out():
     assert any("nearer than 5 cm" in assumption.text for assumption in guess(0.01, "f4")[1])
 
 
+def test_object_that_was_cut_out_is_not_taken_for_a_laser_scan():
+    rows, columns = np.mgrid[:60, :80]
+    person = (rows - 30) ** 2 / 4 + (columns - 40) ** 2 < 100
+    lines = (rows % 6 == 0) & (columns % 2 == 0) & (rows > 20)
+    for known, scan in ((person, False), (lines, True)):
+        try:
+            told = [str(each) for each in tell("d", np.full((60, 80), 2000, "u2"), ~known).assumptions]
+        except ValueError as error:
+            told = [str(error)]
+        assert any("1/256" in each for each in told) == scan
+
+
 @pytest.mark.parametrize(
     ("text", "unit"), [("m", 1), ("cm", 0.01), ("mm", 0.001), ("0.0002", 0.0002), ("1/5000", 2e-4)]
 )

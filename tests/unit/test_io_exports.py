@@ -112,6 +112,20 @@ def test_ply_header_describes_the_axes_and_normals_face_the_camera(tmp_path):
     )
 
 
+def test_points_and_vertices_say_which_of_them_were_filled(tmp_path):
+    depth, filled = bumpy(), torch.rand(1, 18, 24) < 0.3
+    depth[0, 3] = torch.nan
+    write_cloud(tmp_path / "c.ply", photo(), depth, CAMERA, filled=filled)
+    header, _, content = (tmp_path / "c.ply").read_bytes().partition(b"end_header\n")
+    assert b"property uchar filled" in header
+    known = filled[depth.isfinite()].numpy()
+    assert [content[29 * i + 28] for i in range(17 * 24)] == known.tolist()
+    write_mesh([tmp_path / "m.ply", tmp_path / "m.glb"], photo(), bumpy(), CAMERA, filled=filled)
+    assert b"property uchar filled" in (tmp_path / "m.ply").read_bytes().partition(b"end_header\n")[0]
+    [mesh] = trimesh.load(tmp_path / "m.glb", process=False).geometry.values()
+    np.testing.assert_array_equal(mesh.vertex_attributes["_FILLED"].ravel(), filled.flatten().numpy())
+
+
 def test_ply_mesh_is_read_back_with_its_faces(tmp_path):
     write_mesh(tmp_path / "m.ply", photo(), bumpy(), CAMERA)
     mesh = triangulate(bumpy(), CAMERA)

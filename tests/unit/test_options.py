@@ -163,6 +163,31 @@ def test_group_that_may_be_left_out_is_given_as_a_whole():
         _parse("--gain", "2")
 
 
+@dataclass(frozen=True, kw_only=True)
+class Preset(Options):
+    """Options, one of which stands for others."""
+
+    purpose: Literal["cut", "keep"] | None = option(
+        None, "what for", flags="--for", presets={"cut": {"depth": 3, "sharp": True}, "keep": {}}
+    )
+    depth: int = option(1, "how deep", "N")
+    sharp: bool = option(False, "whether it is sharp")
+
+
+def test_option_stands_for_others_and_refuses_what_contradicts_it():
+    parser = ArgumentParser()
+    add_options(parser, Preset)
+
+    def given(*words):
+        made = build(Preset, parser.parse_args(words))
+        return made.depth, made.sharp
+
+    assert given() == given("--for", "keep") == (1, False)
+    assert given("--for", "cut") == given("--for", "cut", "--depth", "3") == (3, True)
+    with pytest.raises(ValueError, match=r"^--for cut: expected --depth 3 or none with it, got --depth 2$"):
+        given("--for", "cut", "--depth", "2")
+
+
 def test_recorded_are_the_options_that_results_depend_on():
     entries = recorded(_parse("--fov", "60", "--pose", "p", "--rig-camera", "c", "--workers", "3"))
     assert {"camera", "workers"} & set(entries) == set()

@@ -175,7 +175,7 @@ class AnyRatio(Method):
         given = depth.masked_fill(outliers, torch.nan).float().reciprocal()
         inverse, factor, scale = self._at_own_size(given, size_of(rgb), planned)
         valid = (given if size_of(inverse) == size_of(rgb) else inverse).isfinite()  # but for repeated pixels
-        settled, doubt = settle_holes(inverse, rgb, self._to_fill(inverse.isfinite(), camera))
+        settled, doubt = settle_holes(inverse, rgb, self._small_holes(inverse.isfinite(), camera))
         if factor > 1:
             inverse_lr = Downsampling("box")(pad_inverse_depth(settled, factor), factor)
             found = padded(
@@ -272,10 +272,8 @@ class AnyRatio(Method):
         node = self.recipe.at()
         return bool(self.recipe.computed_at) and not (node.get("clean") or node.get("noise") == 0)
 
-    def _to_fill(self, valid: Tensor, camera: Camera) -> Tensor:
-        """Return the holes of a map, (1, h, w), that are small, where any are to be filled."""
-        if self._fill == "none":
-            return torch.zeros_like(valid)
+    def _small_holes(self, valid: Tensor, camera: Camera) -> Tensor:
+        """Return the small holes of a map, (1, h, w), be they to be filled or not: what is beside depends on it."""
         focal = camera.fx * valid.shape[-1] / camera.width
         return ~valid & ~wide_holes(valid, self._max_hole / degrees_per_pixel(focal))
 
@@ -283,7 +281,7 @@ class AnyRatio(Method):
         """Return a surface without the holes of the map, (1, h, w), that are not to be filled."""
         if self._fill == "all" or bool(valid.all()):
             return surface
-        left = ~valid & ~self._to_fill(valid, camera)
+        left = ~valid if self._fill == "none" else ~valid & ~self._small_holes(valid, camera)
         holes = resize_nearest(left, size_of(surface.depth)).to(surface.depth.device)
         return surface.map(lambda values: values.masked_fill(holes, torch.nan))
 

@@ -5,7 +5,9 @@ see, the loop between an arm and a head, the gaps between the legs of a chair. W
 a sheet between the two surfaces, or closes the loop. So each pixel of such a hole is compared with the measured pixels
 around it, up to three times as far as the rim, as in a joint bilateral filter: the two of each surface that are nearest
 and most alike in colour stand for it. It gets the farther depth where that surface explains its colour at least as well
-as the nearer one, the nearer where that does clearly better, and what other holes get in between.
+as the nearer one, the nearer where that does clearly better, and what other holes get in between. Where that is of
+the same surface anyway, a pixel is left to the method, which knows slopes and its own errors.
+
 See ``benchmarks/holes.py`` for the figures.
 """
 
@@ -19,6 +21,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.hole_size import distance_to_known
+from dsr.methods.inpainting import inpaint
 
 _STEP = 1.1
 """Ratio of the depths around a pixel from which they are of two surfaces."""
@@ -34,6 +37,8 @@ _SPREAD, _CLOSE = 0.5, 0.2
 _WITNESSES = 2
 _CLEARLY = 1.0
 """Logarithm of the ratio of how well they explain a pixel from which on one surface is clearly better."""
+_DIFFERENT = 0.1
+"""Logarithm of the ratio of depths from which what would be filled in from the rim is of another surface."""
 _MOST = 1 << 14
 """Pixels at a time."""
 _TOGETHER = 0.5
@@ -71,6 +76,11 @@ def settle_holes(inverse: Tensor, rgb: Tensor, holes: Tensor) -> Settled:
         rows, columns = part[:, 0], part[:, 1]
         found, doubtful = _settle(inverse[0], colours, rows, columns, away[rows, columns].to(inverse))
         settled[0, rows, columns], doubt[0, rows, columns] = found, doubtful
+    decided = settled.isfinite() & ~known
+    if bool(decided.any()):
+        usual = inpaint(inverse[None], rgb[None])[0]
+        same = decided & ((settled / usual).log().abs() < _DIFFERENT)
+        settled, doubt = settled.masked_fill(same, math.nan), doubt.masked_fill(same, 0)
     return Settled(settled, doubt)
 
 

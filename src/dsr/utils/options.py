@@ -314,8 +314,10 @@ def _with_presets(record: type[Options], given: Namespace) -> Namespace:
     walked = list(_walk(record))
     flags = {each.key: each.flags[0] for each in walked}
     for each in walked:
-        chosen = getattr(given, each.key, None)
-        for key, value in (each.option.presets.get(chosen, {}) if each.option and chosen is not None else {}).items():
+        if each.option is None or not each.option.presets or not hasattr(given, each.key):
+            continue
+        chosen = getattr(given, each.key)
+        for key, value in each.option.presets[chosen].items():
             if key in flags and getattr(given, key, value) != value:
                 came = f"{flags[key]} {getattr(given, key)}"
                 raise ValueError(f"{each.flags[0]} {chosen}: expected {flags[key]} {value} or none with it, got {came}")

@@ -29,6 +29,11 @@ from dsr.io.trajectories import USUAL_SIZE, read_poses
 from dsr.utils.console import ConsoleProgress, show
 from dsr.utils.files import expect_targets, write_text
 
+_UNPOSED = {
+    "gaussian": ": images, depths and depth_params.json are written, and no sparse model; --poses gives one",
+    "nerfstudio": ": it stands at the origin",
+}
+"""What is written of a single frame without a pose, by part."""
 _READ_ONLY = (errno.EACCES, errno.EPERM, errno.EROFS)
 
 
@@ -51,7 +56,10 @@ def run(request: UpsampleRequest, console: Console) -> list[str]:
     frames = find_frames(request)
     for part in request.results.of_all:
         if part.poses:
-            expect_poses(part.name, _posed(request, frames))
+            posed = _posed(request, frames)
+            expect_poses(part.name, posed)
+            if not all(posed.values()):  # a single one
+                show(console, f"--with {part.name}: the frame has no pose{_UNPOSED.get(part.name, '')}")
     with contextlib.ExitStack() as stack:
         if not request.results.dry_run:
             claims = Claims(request.results.output, json.dumps(settings_of(request), sort_keys=True))
