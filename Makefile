@@ -4,6 +4,7 @@
 # make fuzz  10,000 damaged, foreign and malicious files for every reader (ARGS="--cases 1000 --seed 1")
 # make chaos commands that are killed, run out of space and run at once (ARGS="--kills 100 --seed 0")
 # make mistakes  inputs that can be computed with and are wrong: which are told (ARGS="--cases 500 --seed 0")
+# make dist  what a release consists of, built and checked, in dist
 # make docs  the documentation as a site in outputs/site
 # All of them set everything up in .venv first; they need Python >= 3.11 and nothing else.
 
@@ -16,7 +17,7 @@ ARGS ?=
 PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder --maxprocesses 8 \
 	--numprocesses $$(( $$(getconf _NPROCESSORS_ONLN) + 1 ))
 
-.PHONY: run test unit fuzz chaos mistakes lint docs benchmark clean
+.PHONY: run test unit fuzz chaos mistakes lint docs dist benchmark clean
 
 run: $(VENV)/installed
 	$(BIN)/python eval.py $(ARGS)
@@ -37,6 +38,9 @@ lint: $(VENV)/installed-dev
 
 docs: $(VENV)/installed-dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
+
+dist: $(VENV)/installed-dev
+	$(BIN)/python scripts/dist.py $(ARGS)
 
 chaos: $(VENV)/installed-dev
 	PYTHONPATH=tests $(BIN)/python -m chaos $(ARGS)

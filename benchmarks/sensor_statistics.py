@@ -298,7 +298,7 @@ def panels_of(name: str, values: Map) -> list[Panel]:
     size, top, left = flattest_window(values.depth)
     place = np.s_[top : top + size, left : left + size]
     depth = torch.from_numpy(values.depth[place].astype(np.float64))[None]
-    camera = Camera.from_fov(*values.depth.shape[::-1]).crop(top, left, size, size)
+    camera = Camera.from_fov(60, *values.depth.shape[::-1]).crop(top, left, size, size)
     relit = render_for_viewing(normals_seen_by(camera, depth))[0, 0].numpy()
     residual = residuals(values.depth[place], size)[0]
     power = (

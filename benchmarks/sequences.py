@@ -86,7 +86,7 @@ def make_frame(name: str, rgb: Tensor, depth: Matrix, camera: Camera, pose: Matr
 
 def solids(name: str, size: int, scale: int, noise: Noise) -> list[Frame]:
     """Return one of SimGeo's scenes as a camera on a path sees it."""
-    world, camera, target = build_scene(name), Camera.from_fov(size, size, 38), np.array([0.0, 0.0, 3.1])
+    world, camera, target = build_scene(name), Camera.from_fov(38, size, size), np.array([0.0, 0.0, 3.1])
     frames = []
     for number, eye in enumerate(places(*np.eye(3), float(target[2]))):
         forward = (target - eye) / np.linalg.norm(target - eye)

@@ -28,7 +28,7 @@ with dai.Pipeline() as pipeline:
     while pipeline.isRunning():
         pair = queue.get()
         photo, stored = pair["color"].getCvFrame()[..., ::-1], pair["depth"].getFrame()  # BGR; millimetres, 0 in holes
-        (fx, _, cx), (_, fy, cy), _ = pair["color"].getTransformation().getIntrinsicMatrix()
-        camera = dsr.Camera(photo.shape[1], photo.shape[0], fx, fy, cx, cy)
-        surface = upsampler(photo, stored / 1000, camera, mask=stored > 0)
+        matrix = pair["color"].getTransformation().getIntrinsicMatrix()
+        camera = dsr.Camera.from_matrix(matrix, photo.shape[1], photo.shape[0])
+        surface = upsampler(photo, stored, camera, unit="mm")
         print(f"{np.nanmedian(surface.depth):.3f} +- {np.nanmedian(surface.depth_error):.4f} m")

@@ -10,17 +10,15 @@ from pathlib import Path
 
 import numpy as np
 import ray
-from PIL import Image
 
 import dsr
 
 
 @ray.remote(num_cpus=1, max_retries=3)  # add num_gpus=1 on a cluster with GPUs
 def upsample_frame(photo: Path, target: Path, intrinsics: list[float]) -> None:
-    rgb = np.array(Image.open(photo).convert("RGB"))
-    depth = np.array(Image.open(photo.parents[1] / "depth" / photo.name), np.float32) / 1000
+    rgb, depth = dsr.read(photo), dsr.read_depth(photo.parents[1] / "depth" / photo.name, unit="mm")
     camera = dsr.Camera(rgb.shape[1], rgb.shape[0], *intrinsics)
-    np.save(target, dsr.upsample(rgb, depth, camera, mask=depth > 0))
+    np.save(target, dsr.upsample(rgb, depth, camera))
 
 
 if __name__ == "__main__":

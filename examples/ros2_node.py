@@ -25,11 +25,11 @@ class UpsampleNode(Node):
         self.pairs.registerCallback(self.upsample)
 
     def upsample(self, color: Image, depth: Image, info: CameraInfo) -> None:
-        camera = dsr.Camera(info.width, info.height, info.p[0], info.p[5], info.p[2], info.p[6])  # rectified: P, not K
+        matrix = np.reshape(info.p, (3, 4))  # of rectified pictures P, not K
+        camera = dsr.Camera.from_matrix(matrix, info.width, info.height)
         stored = self.bridge.imgmsg_to_cv2(depth)
-        metres = stored / 1000 if stored.dtype == np.uint16 else stored  # REP 118
-        photo = self.bridge.imgmsg_to_cv2(color, "rgb8")
-        surface = self.upsampler(photo, metres, camera, mask=np.isfinite(metres) & (metres > 0))
+        photo, unit = self.bridge.imgmsg_to_cv2(color, "rgb8"), "mm" if stored.dtype == np.uint16 else "m"  # REP 118
+        surface = self.upsampler(photo, stored, camera, unit=unit)
         self.publisher.publish(self.bridge.cv2_to_imgmsg(surface.depth, "32FC1", depth.header))
 
 

@@ -111,7 +111,7 @@ def _upsampled(ratio: str, method: str, *, errors: bool = False, **more: Any) ->
     """Return the upsampling of the map of a ratio."""
 
     def run() -> Any:
-        found = dsr.upsample_with_errors(_photo(), _given(ratio), _camera(), method=method, device="cpu", **more)
+        found = dsr.Upsampler(method, device="cpu", **more)(_photo(), _given(ratio), _camera())
         return [found.depth, found.depth_error, found.angle_error] if errors else found.depth
 
     return run
@@ -295,7 +295,7 @@ def geometry() -> Iterator[tuple[str, Job]]:
     others = {
         "rescaled": camera.rescale(24, 20), "reduced": camera.reduce(24, 24), "downscaled": camera.downscale(4),
         "decimated": camera.decimate(4, 2.0), "rotated": camera.rotate90(1), "cropped": camera.crop(3, 5, 30, 40),
-        "of a field of view": dsr.Camera.from_fov(64, 48),
+        "of a field of view": dsr.Camera.from_fov(60, 64, 48),
     }  # fmt: skip
     for name, each in others.items():
         yield f"rays {name}", each.rays

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from dsr.geometry.camera import Camera
+from dsr.io.depth_files import write_depth_file
 from dsr.io.exports import write_input
 
 SIZE = 64
@@ -32,7 +33,7 @@ def write_result(folder, depth=None, *, camera=CAMERA, with_input=True, with_err
     """
     depth = waves() if depth is None else depth
     folder.mkdir(parents=True, exist_ok=True)
-    np.save(folder / "depth_metres.npy", depth)
+    write_depth_file(folder / "depth_metres.tiff", depth)
     height, width = depth.shape
     if with_input:
         rgb = torch.zeros(3, height, width)
@@ -46,7 +47,7 @@ def write_result(folder, depth=None, *, camera=CAMERA, with_input=True, with_err
     entries = {
         "complete": True,
         "settings": {"max_error": max_error},
-        "files": ["depth_metres.npy"],
+        "files": ["depth_metres.tiff"],
         "method": "facets",
         "scale": 4,
         "photo_size": [width, height],

@@ -84,14 +84,27 @@ def generated_pages() -> dict[str, str]:
         "changelog.md": (ROOT / "CHANGELOG.md").read_text(),
         "security.md": (ROOT / "SECURITY.md").read_text(),
     }
+    pages["api/dsr.md"] = names_of_package()
     return pages | {f"api/{package}.md": f"# dsr.{package}\n\n::: dsr.{package}\n" for package in PACKAGES}
+
+
+def names_of_package() -> str:
+    """Return the reference of the names of ``dsr`` itself, wherever they are."""
+    import dsr  # noqa: PLC0415
+
+    shown = "show_root_heading: true, show_root_toc_entry: true"
+    parts = [
+        f"::: {home}.{name}\n    options: {{{shown}, heading: dsr.{name}, toc_label: {name}}}\n"
+        for name, home in sorted(dsr._HOMES.items())
+    ]
+    return "\n".join(["# dsr\n", *parts])
 
 
 def command_parser() -> argparse.ArgumentParser:
     """Return the parser of the ``dsr`` command."""
     from dsr import cli  # noqa: PLC0415
 
-    return cli._parser()
+    return cli.make_parser()
 
 
 def command_reference(parser: argparse.ArgumentParser) -> str:

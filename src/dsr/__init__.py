@@ -1,10 +1,10 @@
 """Guided depth super-resolution, trained, run and judged by how the surface looks.
 
 >>> import dsr
->>> camera = dsr.Camera(width=640, height=480, fx=525.0, fy=525.0, cx=319.5, cy=239.5)
+>>> camera = dsr.Camera.from_fov(60, width=640, height=480)
 
-and ``dsr.upsample(photo, depth, camera)``, see :func:`dsr.inference.api.upsample`; ``dsr.upsample_with_errors`` also
-says how far off the result may be, and ``dsr.Upsampler`` keeps the weights for many frames.
+``dsr.read`` and ``dsr.read_depth`` read files, ``dsr.upsample(photo, depth, camera)`` gives depth of the photo's size,
+and ``dsr.Upsampler`` a ``dsr.Surface`` with its normals, renderings, mesh and expected errors, see docs/python.md.
 ``dsr.compose("eval", ["method=facets"])`` composes the configuration of a command, whose nodes
 :func:`hydra.utils.instantiate` makes.
 """
@@ -18,18 +18,22 @@ import dsr.utils.threads  # noqa: F401 - for forks
 
 if TYPE_CHECKING:
     from dsr.app.composition import compose
+    from dsr.app.upsample.api import Upsampler, upsample
+    from dsr.app.upsample.surface import Surface
     from dsr.geometry.camera import Camera
-    from dsr.inference.api import Upsampler, upsample, upsample_with_errors
+    from dsr.io.files import read, read_depth
 
 __version__ = "0.1.0"
-__all__ = ["Camera", "Upsampler", "__version__", "compose", "upsample", "upsample_with_errors"]
+__all__ = ["Camera", "Surface", "Upsampler", "__version__", "compose", "read", "read_depth", "upsample"]
 
 _HOMES = {
     "Camera": "dsr.geometry.camera",
-    "Upsampler": "dsr.inference.api",
+    "Surface": "dsr.app.upsample.surface",
+    "Upsampler": "dsr.app.upsample.api",
     "compose": "dsr.app.composition",
-    "upsample": "dsr.inference.api",
-    "upsample_with_errors": "dsr.inference.api",
+    "read": "dsr.io.files",
+    "read_depth": "dsr.io.files",
+    "upsample": "dsr.app.upsample.api",
 }
 
 

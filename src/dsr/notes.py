@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
+import re
+import warnings
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
+
+_OPTION = re.compile(r"(?<!\S)--?([a-z]+(?:-[a-z]+)*)")
+_ARGUMENTS = {"depth-unit": "unit", "o": "folder"}
+"""Options of the command that have another name in Python."""
 
 CHECKS = 4
 """Number of the present checks; another one where a warning is added, or a limit changes."""
@@ -323,6 +330,20 @@ class Assumption(NamedTuple):
             "value": self.value,
             "threshold": None if limit is None else limit.threshold,
         }
+
+
+def in_python(text: str) -> str:
+    """Return what is said to a user of a command as it is said to one of Python, where options are arguments."""
+    return _OPTION.sub(lambda option: _ARGUMENTS.get(option[1], option[1].replace("-", "_")), text)
+
+
+def warn(notes: Iterable[Assumption]) -> None:
+    """Give notes as Python's warnings, from the place outside of dsr that called."""
+    level, frame = 1, inspect.currentframe()
+    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] == "dsr":
+        level, frame = level + 1, frame.f_back
+    for note in notes:
+        warnings.warn(in_python(note.message), UserWarning, level)
 
 
 def read_warning(entry: Mapping[str, Any]) -> Assumption:

@@ -90,6 +90,16 @@ class Scene:
     Raises:
         ValueError: a shape, range or unit is not as above.
 
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.sample import Scene
+        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
+        >>> depth = torch.full((1, 24, 32), 2.0, dtype=torch.float64)
+        >>> scene = Scene("mine", "wall", torch.rand(3, 24, 32), camera, depth)
+        >>> scene.camera.width
+        32
+
     """
 
     dataset: str
@@ -163,6 +173,18 @@ class DepthSample:
 
     Raises:
         ValueError: a shape, range or unit is not as above.
+
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.degradation.downsampling import Downsampling, make_sample
+        >>> from dsr.sample import Scene
+        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
+        >>> depth = torch.full((1, 24, 32), 2.0, dtype=torch.float64)
+        >>> scene = Scene("mine", "wall", torch.rand(3, 24, 32), camera, depth)
+        >>> sample = make_sample(scene, 4, Downsampling("box"), "disparity")
+        >>> sample.depth_lr.shape, sample.camera_lr.width
+        (torch.Size([1, 6, 8]), 8)
 
     """
 

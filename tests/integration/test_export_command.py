@@ -49,7 +49,7 @@ def test_exports_are_written_beside_the_frames_and_again_after_a_resumption(capt
     assert upsample(capture, "--only", "open3d", "-o", out) == 0
     said = capsys.readouterr().out
     assert f"open3d: 2 frames -> {out / 'open3d'}" in said
-    frame = {"info.json", "depth.png", "depth_metres.npy", "rgbd/color.png", "rgbd/depth.png", "rgbd/intrinsic.json"}
+    frame = {"info.json", "depth.png", "depth_metres.tiff", "rgbd/color.png", "rgbd/depth.png", "rgbd/intrinsic.json"}
     assert names_in(out / "000") == frame
     assert "open3d/trajectory.log" not in names_in(out)
     set_poses(out)

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from commands import run_python
 
+from dsr.io.depth_files import read_depth_file
+
 REPOSITORY = Path(__file__).resolve().parents[2]
 MODULE = '''
 import torch
@@ -158,7 +160,7 @@ def test_methods_are_told_what_is_known_of_the_maps(home, arguments, told):
 def test_upsample_runs_a_method_from_outside_with_settings(home):
     done = upsample(home, "--method", "constant", "--set", "offset=0.001", "-o", "picture")
     assert (done.returncode, done.stderr) == (0, "")
-    np.testing.assert_allclose(np.load(home / "picture" / "depth_metres.npy"), 1.501, rtol=1e-6)
+    np.testing.assert_allclose(read_depth_file(home / "picture" / "depth_metres.tiff"), 1.501, rtol=1e-6)
     done = upsample(home, "--method", "constant", "--set", "ofset=0.001", "-o", "other")
     assert done.returncode == 2
     assert done.stderr == "error: --set ofset: unknown key; method=constant takes offset\n"
@@ -182,7 +184,7 @@ def test_network_from_outside_is_trained_evaluated_and_used(home):
     assert "if you trust it, trust=outside.Shifted allows it" in done.stderr
     done = upsample(home, "--method", "shifted", "-o", "by_network")
     assert done.returncode == 0, done.stderr
-    assert np.load(home / "by_network" / "depth_metres.npy").shape == (32, 48)
+    assert read_depth_file(home / "by_network" / "depth_metres.tiff").shape == (32, 48)
     done = run(home, program, "method=facets", "weights=training/weights.safetensors", *small, "output_dir=runs/wrong")
     assert done.returncode == 2
     assert "expected weights of model facets, got those of shifted" in done.stderr

@@ -16,6 +16,7 @@ from small_frames import in_text, room, walk, write_recording
 from dsr.cli import main
 from dsr.geometry.camera import Camera
 from dsr.geometry.warping import warp_depth
+from dsr.io.depth_files import read_depth_file
 from dsr.metrics.temporal import opw
 
 CAMERA = Camera.centred(96, 72, 90.0)
@@ -212,7 +213,7 @@ def test_neighbours_lower_the_noise_and_keep_the_pose(capture, capsys):
     assert "1 neighbouring frame votes on the depth" in capsys.readouterr().out
     truth = world(CAMERA, 0.08)[1]
     noise = {
-        name: np.std((np.load(capture.parent / name / "002" / "depth_metres.npy") - truth)[5:15, 20:-20])
+        name: np.std((read_depth_file(capture.parent / name / "002" / "depth_metres.tiff") - truth)[5:15, 20:-20])
         for name in ("one", "five")
     }
     assert noise["five"] < 0.55 * noise["one"]
@@ -296,7 +297,7 @@ def test_results_with_poses_become_one_mesh(capture, capsys):
     said = " ".join(capsys.readouterr().out.split())
     assert "5 results -> " in said
     folders = sorted(path.parent for path in out.rglob("info.json"))
-    depths = torch.from_numpy(np.stack([np.load(each / "depth_metres.npy") for each in folders]))[:, None]
+    depths = torch.from_numpy(np.stack([read_depth_file(each / "depth_metres.tiff") for each in folders]))[:, None]
     info = [json.loads((each / "info.json").read_text()) for each in folders]
     expected = opw(depths.double(), Camera(**info[0]["camera"]), [np.array(each["pose"]) for each in info])
     found = re.search(r"successive results differ by ([\d.e-]+) mm, 4 pairs of a view in common \(OPW\)", said)
@@ -340,7 +341,7 @@ def test_results_without_poses_and_damaged_ones_are_refused(capture, capsys):
     for number, change in enumerate(({"pose": np.ones((4, 4)).tolist()}, {"camera": 3}, {"complete": False})):
         path = out / f"{number:03}" / "info.json"
         path.write_text(json.dumps({**json.loads(path.read_text()), "pose": pose(0.0).tolist(), **change}))
-    (out / "003" / "depth_metres.npy").write_bytes(b"broken")
+    (out / "003" / "depth_metres.tiff").write_bytes(b"broken")
     path = out / "003" / "info.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "pose": pose(0.0).tolist()}))
     path = out / "004" / "info.json"

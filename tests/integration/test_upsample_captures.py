@@ -9,6 +9,7 @@ from captures import FRAMES, INTRINSICS, SIZE, SIZE_LR
 from PIL import Image
 
 from dsr.cli import main
+from dsr.io.depth_files import read_depth_file
 from dsr.io.inputs import read_picture
 
 DEPTH_ONLY = ("--method", "bicubic", "--only", "depth")
@@ -43,7 +44,10 @@ def test_capture_of_a_phone_has_nothing_left_to_assume(tmp_path, capsys):
         assert [told["camera"][name] for name in ("fx", "fy", "cx", "cy")] == [INTRINSICS[0] + number, *INTRINSICS[1:]]
         assert told["input_depth"]["unit"] == 0.001
         assert (told["inputs"]["rgb"]["file"], told["inputs"]["rgb"]["frame"]) == ("rgb.mp4", number)
-        assert np.abs(np.load(out / f"{number:06}" / "depth_metres.npy") - captures.depth(number).mean()).max() < 0.3
+        assert (
+            np.abs(read_depth_file(out / f"{number:06}" / "depth_metres.tiff") - captures.depth(number).mean()).max()
+            < 0.3
+        )
     assert upsample(folder, "-o", out, *DEPTH_ONLY) == 0
     assert f"{FRAMES} complete already" in capsys.readouterr().out
 
@@ -144,7 +148,7 @@ def test_resumed_folder_of_millimetre_floats_keeps_its_unit(tmp_path, monkeypatc
     for number, metres in enumerate((1.5, 0.15, 0.18)):
         for place in (tmp_path / "whole", out):
             assert info(place / str(number))["input_depth"]["unit"] == 0.001
-            np.testing.assert_allclose(np.load(place / str(number) / "depth_metres.npy"), metres, rtol=0.03)
+            np.testing.assert_allclose(read_depth_file(place / str(number) / "depth_metres.tiff"), metres, rtol=0.03)
         told = [{**info(place / str(number)), "seconds": None} for place in (tmp_path / "whole", out)]
         assert told[0] == told[1]
 
@@ -161,7 +165,7 @@ def test_sun_rgbd_has_its_intrinsics_one_folder_up_and_turned_bits(tmp_path, cap
     assert "bits are turned back by 3, as SUN RGB-D turns them" in capsys.readouterr().out
     told = info(out)
     assert (told["camera"]["fx"], told["camera"]["cx"], told["settings"]["depth_unit"]) == (50, 31, "sunrgbd")
-    assert abs(np.load(out / "depth_metres.npy").mean() - millimetres.mean() / 1000) < 0.02
+    assert abs(read_depth_file(out / "depth_metres.tiff").mean() - millimetres.mean() / 1000) < 0.02
     np.save(scene / "depth.npy", captures.depth())
     assert "expected 16-bit values for --depth-unit sunrgbd, got float64" in refused(
         capsys, upsample(*files[:3], scene / "depth.npy", "-o", tmp_path / "x", *DEPTH_ONLY, "--depth-unit", "sunrgbd")
@@ -180,7 +184,7 @@ def test_depth_text_of_icl_nuim_is_read_beside_a_bmp(tmp_path, capsys):
     assert "distances along the rays in centimetres" in said
     told = info(out / "scene_00_0000")
     assert told["input_depth"]["range_type"] == "perspective"
-    np.testing.assert_allclose(np.load(out / "scene_00_0000" / "depth_metres.npy"), 2.5, rtol=1e-3)
+    np.testing.assert_allclose(read_depth_file(out / "scene_00_0000" / "depth_metres.tiff"), 2.5, rtol=1e-3)
     np.testing.assert_allclose(np.load(out / "scene_00_0000" / "depth.npy"), 250 * rays, rtol=1e-3)
     (tmp_path / "scene_00_0000.depth").write_text("1 2 3")
     assert "scene_00_0000.depth: expected 307200 numbers, got 3" in refused(

@@ -11,8 +11,9 @@ from small_scenes import room
 
 from dsr.cli import main
 from dsr.geometry.camera import Camera
+from dsr.io.depth_files import read_depth_file
 
-SMALL = Camera.from_fov(128, 96)
+SMALL = Camera.from_fov(60, 128, 96)
 """Of the depth maps; the default of 60 degrees, so that no camera need be given."""
 DEPTH = room(SMALL, 17.0)[0]
 MILLIMETRES = np.round(DEPTH * 1000).astype(np.uint16)
@@ -62,7 +63,7 @@ def warned(tmp_path, capsys, files, *options):
 
 
 def metres(folder):
-    return np.load(folder / "depth_metres.npy" if (folder / "depth_metres.npy").exists() else folder / "depth.npy")
+    return read_depth_file(folder / "depth_metres.tiff")
 
 
 # encodings

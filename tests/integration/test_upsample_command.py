@@ -20,11 +20,10 @@ from dsr.io.depth_files import read_depth_file, write_depth_file
 from dsr.synthetic.simgeo import render_scene
 
 PARTS = {
-    "depth": ("depth.png", "depth_metres.npy"),
+    "depth": ("depth.png", "depth_metres.tiff"),
     "renderings": tuple(f"renderings/e{number}.png" for number in range(1, 5)), "normals": ("normals.png",),
-    "cloud": ("cloud.ply",), "mesh": ("mesh.ply", "mesh.glb"), "before_after": ("before_after.png",),
-    "confidence": ("confidence.png", "confidence.npz"), "filled": ("filled.png",),
-    "input": ("input.npz",),
+    "mesh": ("mesh.glb",), "before_after": ("before_after.png",),
+    "confidence": ("confidence.png", "confidence.npz"), "filled": ("filled.png",), "input": ("input.npz",),
 }  # fmt: skip
 BICUBIC = ("--method", "bicubic")
 DEPTH_ONLY = (*BICUBIC, "--only", "depth")
@@ -77,11 +76,11 @@ def test_two_files_are_enough_and_all_assumptions_are_printed(pair, cube, tmp_pa
         "60 degrees of horizontal view assumed",
         "whole numbers are taken for millimetres (median ",
         "zeros count as holes (2.3%)",
-        "depth_metres.npy is not rounded",
+        "depth_metres.tiff is not rounded",
     ):
         assert text in said
     assert files_in(out) == {*sum(PARTS.values(), ()), "info.json"}
-    metres = np.load(out / "depth_metres.npy")
+    metres = read_depth_file(out / "depth_metres.tiff")
     assert (metres.shape, metres.dtype) == ((64, 64), np.float32)
     assert np.abs(metres - cube.depth).mean() < 0.05
     stored = np.asarray(Image.open(out / "depth.png"))
@@ -119,7 +118,7 @@ def test_expected_errors_are_estimated_for_methods_that_say_none(pair, tmp_path,
     assert files_in(out) == {*sum(PARTS.values(), ()), "info.json"}
     errors = np.load(out / "confidence.npz")
     assert all((errors[name] >= 0).all() for name in ("depth_error", "angle_error"))
-    hole = errors["depth_error"][22:26, 14:22] / np.load(out / "depth_metres.npy")[22:26, 14:22]
+    hole = errors["depth_error"][22:26, 14:22] / read_depth_file(out / "depth_metres.tiff")[22:26, 14:22]
     assert (hole > 0.02).all()
     capsys.readouterr()
     assert of(pair, out, "--method", "bicubic") == 0
@@ -153,7 +152,7 @@ def test_noise_of_an_earlier_run_is_kept_where_parts_are_added(pair, tmp_path, c
     capsys.readouterr()
     assert of(pair, out, "--only", "depth,confidence,mesh") == 0
     assert "noise of the depth map" not in capsys.readouterr().out  # nothing is computed again
-    assert (out / "mesh.ply").is_file()
+    assert (out / "mesh.glb").is_file()
     assert info(out)["noise"] == told
 
 
@@ -170,7 +169,7 @@ def test_outliers_are_holes_and_it_is_said(pair, tmp_path, capsys):
     assert "pixels: 2, patches: 2" in said
     counted = {"pixels": 2, "patches": 2}
     assert (info(clean)["outliers"], info(out)["outliers"]) == ({"pixels": 0, "patches": 0}, counted)
-    before, after = (np.load(folder / "depth_metres.npy") for folder in (clean, out))
+    before, after = (read_depth_file(folder / "depth_metres.tiff") for folder in (clean, out))
     np.testing.assert_allclose(after, before, rtol=0.1)
     assert of(pair, out, *BICUBIC, "--only", "depth,normals") == 0
     assert info(out)["outliers"] == counted
@@ -178,7 +177,7 @@ def test_outliers_are_holes_and_it_is_said(pair, tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ("suffix", "factor", "dtype"),
-    [("tiff", 1, "f4"), ("npy", 1000, "f4"), ("pfm", 1, "f4"), ("exr", 1, "f4"), ("npz", 1, "f8")],
+    [("tiff", 1000, "f4"), ("npy", 1000, "f4"), ("pfm", 1000, "f4"), ("exr", 1000, "f4"), ("npz", 1, "f8")],
 )
 def test_result_has_the_inputs_format_type_unit_and_holes(pair, tmp_path, suffix, factor, dtype):
     photo, _, values = pair
@@ -188,12 +187,26 @@ def test_result_has_the_inputs_format_type_unit_and_holes(pair, tmp_path, suffix
     out = tmp_path / "out"
     assert of((photo, depth), out, *DEPTH_ONLY, "--fill", "none") == 0
     stored = read_depth_file(out / f"depth.{suffix}")
-    plain = "depth.npy" if not (out / "depth_metres.npy").exists() else "depth_metres.npy"
-    result = np.load(out / plain)
+    result = read_depth_file(out / "depth_metres.tiff")
     assert (stored.dtype, stored.shape) == (np.dtype(dtype), (64, 64))
     np.testing.assert_allclose(stored / factor, result, rtol=1e-6)
     assert np.isnan(stored[22:26, 14:22]).all()
     assert 0 < np.isnan(stored).mean() < 0.1
+
+
+@pytest.mark.parametrize("suffix", ["tiff", "npy", "pfm", "exr"])
+def test_floats_in_metres_are_written_once_unless_a_format_is_chosen(pair, tmp_path, suffix):
+    depth, out = tmp_path / f"d.{suffix}", tmp_path / "out"
+    write_depth_file(depth, np.where(pair[2] == 0, np.nan, pair[2] / 1000).astype("f4"))
+    assert of((pair[0], depth), out, *DEPTH_ONLY) == 0
+    assert files_in(out) == {"depth_metres.tiff", "info.json"}
+    stored = {"suffix": ".tiff", "dtype": "float32", "unit": 1.0, "hole": "nan", "range_type": "orthogonal"}
+    assert (info(out)["depth_metres"], info(out)["depth_file"]) == ({"file": "depth_metres.tiff", **stored}, stored)
+    assert of((pair[0], depth), out, *DEPTH_ONLY, "--overwrite", "--format", suffix) == 0
+    assert files_in(out) == {f"depth.{suffix}", "depth_metres.tiff", "info.json"}
+    np.testing.assert_array_equal(
+        *(read_depth_file(out / f"{name}") for name in (f"depth.{suffix}", "depth_metres.tiff"))
+    )
 
 
 @pytest.mark.parametrize("dtype", ["int64", "uint64"])
@@ -231,9 +244,9 @@ def test_expected_errors_of_far_depth_are_finite(pair, tmp_path, capfd):
 def test_other_format_is_in_metres_or_whole_millimetres(pair, tmp_path):
     out = tmp_path / "out"
     assert of(pair, out, *DEPTH_ONLY, "--format", "pfm", "--depth-unit", "cm") == 0
-    assert files_in(out) == {"depth.pfm", "depth_metres.npy", "info.json"}
-    np.testing.assert_array_equal(read_depth_file(out / "depth.pfm"), np.load(out / "depth_metres.npy"))
-    assert np.median(np.load(out / "depth_metres.npy")) > 10
+    assert files_in(out) == {"depth.pfm", "depth_metres.tiff", "info.json"}
+    np.testing.assert_array_equal(read_depth_file(out / "depth.pfm"), read_depth_file(out / "depth_metres.tiff"))
+    assert np.median(read_depth_file(out / "depth_metres.tiff")) > 10
 
 
 def test_what_was_measured_and_what_was_filled_is_told_apart(pair, tmp_path, capsys):
@@ -309,7 +322,7 @@ def test_disparity_becomes_disparity_of_the_high_resolution_pixels(pair, cube, t
     numbers = [getattr(cube.camera, name) for name in ("fx", "fy", "cx", "cy")]
     out = tmp_path / "out"
     assert of((pair[0], depth), out, *DEPTH_ONLY, "--baseline", 0.1, "--intrinsics", *numbers) == 0
-    metres = np.load(out / "depth_metres.npy")
+    metres = read_depth_file(out / "depth_metres.tiff")
     assert np.abs(metres - cube.depth).mean() < 0.05
     np.testing.assert_allclose(np.load(out / "depth.npy"), 0.1 * cube.camera.fx / metres, rtol=1e-5)
 
@@ -325,7 +338,7 @@ def test_repeated_command_does_nothing_and_new_outputs_need_no_new_depth(pair, t
     assert of(pair, out, *BICUBIC, "--only", "normals") == 0
     assert (
         files_in(out)
-        == {"depth.png", "depth_metres.npy", "normals.png", "info.json"}
+        == {"depth.png", "depth_metres.tiff", "normals.png", "info.json"}
         == {*info(out)["files"], "info.json"}
     )
     assert of(pair, out, *BICUBIC, "--only", "normals,depth") == 0
@@ -343,7 +356,7 @@ def test_result_of_other_settings_or_inputs_is_kept_unless_overwritten(pair, tmp
     assert message == f"{out}: holds a result of other inputs: photo.png, depth.png; take another -o, or --overwrite"
     assert (out / "depth.png").read_bytes() == before
     assert of(pair, out, *DEPTH_ONLY, "--overwrite", "--format", "npy") == 0
-    assert files_in(out) == {"depth.npy", "depth_metres.npy", "info.json"} - {"depth_metres.npy"}
+    assert files_in(out) == {"depth.npy", "depth_metres.tiff", "info.json"}
 
 
 def test_interrupted_run_resumes(pair, tmp_path, capsys, monkeypatch):
@@ -397,13 +410,13 @@ def test_broken_picture_does_not_stop_the_others(pair, tmp_path, capsys):
         assert line.startswith(f"{name}: ")
         assert line.endswith(f" -> {out / name}")
     assert told.out.count("degrees of horizontal view assumed") == 1
-    assert f"3 pictures: 2 done, 1 failed -> {out}" in told.out
+    assert re.search(rf"3 pictures: 2 done, 1 failed in 0:00:\d\d, 0.0 MB -> {re.escape(str(out))}", told.out)
     assert files_in(out) == {
-        f"{name}/{file}" for name in ("000000", "000002") for file in ("depth.png", "depth_metres.npy", "info.json")
+        f"{name}/{file}" for name in ("000000", "000002") for file in ("depth.png", "depth_metres.tiff", "info.json")
     }
     shutil.copy(pair[1], frames / "depth" / "000001.png")
     assert upsample(frames, "-o", out, *DEPTH_ONLY) == 0
-    assert f"3 pictures: 2 complete already, 1 done -> {out}" in capsys.readouterr().out
+    assert "3 pictures: 2 complete already, 1 done in 0:00:" in capsys.readouterr().out
 
 
 def test_published_scenes_are_read_with_their_cameras(shared, tmp_path, capsys):
@@ -537,7 +550,7 @@ def test_enlarged_depth_gives_as_good_a_result(pair, tmp_path, capsys):
     said = capsys.readouterr().out
     assert "the depth map was enlarged x4 by repeating pixels, which are dropped" in said
     assert ": bicubic x4, measured" in said
-    small, large = (np.load(tmp_path / name / "depth_metres.npy") for name in ("small", "large"))
+    small, large = (read_depth_file(tmp_path / name / "depth_metres.tiff") for name in ("small", "large"))
     np.testing.assert_array_equal(small, large)
 
 
@@ -560,7 +573,7 @@ def test_noise_is_estimated_and_may_be_told(cube, tmp_path, capsys):
         if "--noise" not in options:
             estimate = float(said.split("noise of the depth map (about ")[1].split(" mm")[0])
             assert 0.2 * 10 * np.median(coarse) < estimate < 5 * 10 * np.median(coarse)
-        results[name] = np.load(tmp_path / name / "depth_metres.npy")
+        results[name] = read_depth_file(tmp_path / name / "depth_metres.tiff")
     assert info(tmp_path / "much")["settings"]["set"] == {"noise": 0.05}
     for name, other in (("own", "none"), ("own", "much"), ("none", "much"), ("own", "keep")):
         assert not np.array_equal(results[name], results[other])
@@ -594,9 +607,9 @@ def test_what_is_likely_to_be_wrong_is_left_out_of_the_mesh(pair, tmp_path, caps
     said = capsys.readouterr().out
     assert "left out of cloud and mesh (100.0% of the pixels, expected to be off by more than" in said
     assert "no mesh" in said
-    assert (tmp_path / "all" / "mesh.ply").stat().st_size > 10_000
-    assert not (tmp_path / "sure" / "mesh.ply").exists()
-    whole, kept = (np.load(tmp_path / name / "depth_metres.npy") for name in ("all", "sure"))
+    assert (tmp_path / "all" / "mesh.glb").stat().st_size > 3_000
+    assert not (tmp_path / "sure" / "mesh.glb").exists()
+    whole, kept = (read_depth_file(tmp_path / name / "depth_metres.tiff") for name in ("all", "sure"))
     np.testing.assert_array_equal(whole, kept)
 
 

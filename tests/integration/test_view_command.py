@@ -11,6 +11,7 @@ from small_results import waves, write_result
 
 from dsr.cli import main
 from dsr.geometry.camera import Camera
+from dsr.io.depth_files import write_depth_file
 from dsr.synthetic.simgeo import render_scene
 
 
@@ -122,11 +123,20 @@ def test_result_without_input_is_shown_without_before_and_says_how_to_add_it(tmp
         (lambda folder: write_result(folder, complete=False), "r/info.json: expected a complete result"),
         (lambda folder: write_result(folder, camera=large()), "expected float32 of shape (128, 128)"),
         (spoil_camera, "r/info.json: expected the photo's camera under `camera`"),
-        (lambda folder: (folder / "depth_metres.npy").unlink(), "r: expected a result with depth"),
-        (lambda folder: cut(folder / "depth_metres.npy"), "depth_metres.npy: expected a map of depths, got"),
-        (lambda folder: (folder / "depth_metres.npy").write_bytes(b""), "r/depth_metres.npy: expected a map of depths"),
-        (lambda folder: np.save(folder / "depth_metres.npy", np.full((64, 64), np.nan, "f4")), "expected depths, all"),
-        (lambda folder: np.save(folder / "depth_metres.npy", np.ones((64, 64))), "expected float32 of shape (64, 64)"),
+        (lambda folder: (folder / "depth_metres.tiff").unlink(), "r: expected a result with depth"),
+        (lambda folder: cut(folder / "depth_metres.tiff"), "depth_metres.tiff: expected a map of depths, got"),
+        (
+            lambda folder: (folder / "depth_metres.tiff").write_bytes(b""),
+            "r/depth_metres.tiff: expected a map of depths",
+        ),
+        (
+            lambda folder: write_depth_file(folder / "depth_metres.tiff", np.full((64, 64), np.nan, "f4")),
+            "expected depths, all",
+        ),
+        (
+            lambda folder: write_depth_file(folder / "depth_metres.tiff", np.ones((64, 64))),
+            "expected float32 of shape (64, 64)",
+        ),
         (lambda folder: cut(folder / "confidence.npz"), "r/confidence.npz: expected an archive of arrays"),
         (
             lambda folder: np.savez(folder / "confidence.npz", depth_error=np.ones(9)),
@@ -154,8 +164,8 @@ def test_odd_values_in_info_json_do_not_matter(tmp_path):
 def test_damaged_result_among_others_is_left_out_and_named(tmp_path, capsys):
     for name in ("a", "b", "c"):
         write_result(tmp_path / name)
-    cut(tmp_path / "b" / "depth_metres.npy")
-    assert "b/depth_metres.npy: expected" in refused(capsys, view(tmp_path, "--no-open"))
+    cut(tmp_path / "b" / "depth_metres.tiff")
+    assert "b/depth_metres.tiff: expected" in refused(capsys, view(tmp_path, "--no-open"))
     shown = content(tmp_path / "view.html")
     assert [result["name"] for result in shown["results"]] == ["a", "c"]
     assert shown["notes"] == ["1 of 3 results could not be read and are left out."]

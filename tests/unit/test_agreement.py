@@ -7,7 +7,7 @@ import torch
 from dsr.geometry.camera import Camera
 from dsr.inference.plausibility import expect_errors
 
-CAMERA = Camera.from_fov(96, 64)
+CAMERA = Camera.from_fov(60, 96, 64)
 
 
 def _plane(height: int, width: int) -> torch.Tensor:

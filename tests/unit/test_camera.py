@@ -195,7 +195,7 @@ def test_turned_camera_has_the_turned_rays(turns: int) -> None:
 
 
 def test_camera_of_a_field_of_view_spans_it_between_the_outer_edges() -> None:
-    camera = Camera.from_fov(512, 384, 60.0)
+    camera = Camera.from_fov(60.0, 512, 384)
     left, right = ((edge - camera.cx) / camera.fx for edge in (-0.5, 511.5))
     assert math.degrees(math.atan(right) - math.atan(left)) == pytest.approx(60)
     assert (camera.fy, camera.cy) == (camera.fx, 191.5)

@@ -64,7 +64,7 @@ def _plane(height: int, width: int) -> Tensor:
 def _sample(size_lr: tuple[int, int], ratio: float, error: Tensor | float = 0.0) -> DepthSample:
     """Return a plane with a relative error of its inverse depth."""
     height, width = (round(ratio * n) for n in size_lr)
-    camera = Camera.from_fov(width, height)
+    camera = Camera.from_fov(60, width, height)
     depth_lr = (_plane(*size_lr)[0] * (1 + error)).reciprocal()
     rgb = torch.rand((3, height, width), generator=torch.Generator().manual_seed(0))
     camera_lr = camera if ratio == 1 else camera.reduce(size_lr[1], size_lr[0])

@@ -256,7 +256,7 @@ def test_folder_of_a_stranger_may_link_within_itself_alone(tmp_path: Path) -> No
         expect_own(tmp_path / "run")
 
 
-@pytest.mark.parametrize("name", ["depth_metres.npy", "info.json", "renderings", "transforms.json", "exports.json"])
+@pytest.mark.parametrize("name", ["depth_metres.tiff", "info.json", "renderings", "transforms.json", "exports.json"])
 def test_upsampling_replaces_no_link_in_the_folder_of_its_results(tmp_path, capsys, name):
     captures.save(tmp_path / "photo.png", captures.photo())
     captures.save(tmp_path / "depth.png", captures.millimetres())

@@ -25,7 +25,7 @@ def _scene(slope: float = 0.5, size: int = SIZE) -> Scene:
     """Return a floor of 2 m and nearer below, or a wall at 2 m."""
     depth = (2 - slope * torch.linspace(-0.5, 1, size, dtype=torch.float64))[:, None].repeat(1, 1, size)
     rgb = torch.rand((3, size, size), generator=_generator(1))
-    return Scene("test", "room", rgb, Camera.from_fov(size, size), depth)
+    return Scene("test", "room", rgb, Camera.from_fov(60, size, size), depth)
 
 
 def _changed(scene: Scene, other: Scene) -> Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import doctest
 import math
 import subprocess
 import sys
@@ -18,7 +17,6 @@ import dsr
 from dsr.geometry.camera import Camera
 from dsr.geometry.resampling import resize_inverse_depth
 from dsr.inference import Plan, find_filled, plan_for, upsample_surface, upsampler
-from dsr.inference import api as people
 from dsr.inference.plans import OWN_SIZE
 from dsr.inference.resizing import resize_nearest
 from dsr.inference.working_size import enlarged_by
@@ -194,12 +192,6 @@ def test_invalid_picture_is_refused() -> None:
         upsample_depth(_photo(48, 64), depth.int(), camera)
     with pytest.raises(ValueError, match="device: expected auto, cpu or a device of this machine, got 'gpu'"):
         upsample_depth(_photo(48, 64), depth, camera, device="gpu")
-    with pytest.raises(ValueError, match="two NumPy arrays or two tensors, got Tensor and ndarray"):
-        dsr.upsample(_photo(48, 64), np.ones((12, 16)), camera)  # type: ignore[type-var]
-    with pytest.raises(ValueError, match=r"rgb: expected shape \(H, W, 3\), got \(3, 48, 64\)"):
-        dsr.upsample(_photo(48, 64).numpy(), np.ones((12, 16)), camera)
-    with pytest.raises(ValueError, match=r"mask: expected the depth's shape \(12, 16\), got \(48, 64\)"):
-        dsr.upsample(_photo(48, 64), depth, camera, mask=torch.ones(48, 64))
 
 
 def test_arrays_and_tensors_give_the_same_result() -> None:
@@ -356,13 +348,6 @@ def test_depth_a_little_larger_than_the_photo_is_taken(method: str) -> None:
 def test_ratios_next_to_a_factor_take_its_weights(photo: tuple[int, int], depth: tuple[int, int], factor: int) -> None:
     assert plan(photo, depth).scale == factor
     assert read_recipe("facets").weights(max(photo[1] / depth[1], 1)).name == f"facets_x{max(factor, 2)}.safetensors"
-
-
-def test_example_of_the_documentation_runs() -> None:
-    for module in (people, dsr):
-        result = doctest.testmod(module)
-        assert result.attempted > 1
-        assert result.failed == 0
 
 
 def test_import_of_the_package_loads_nothing_heavy() -> None:

@@ -163,7 +163,7 @@ def test_maps_of_sensors_in_millimetres_and_metres_are_never_asked_about(shared)
         values = read_depth_file(path)
         holes = find_holes(values, None)[0]
         for each, unit in ((values, 1e-3), (values.astype(np.float32) / 1000, 1.0)):
-            told = tell(str(path), each, holes, Camera.from_fov(values.shape[1], values.shape[0]))
+            told = tell(str(path), each, holes, Camera.from_fov(60, values.shape[1], values.shape[0]))
             assert (told.unit, told.range_type, told.bits) == (unit, None, 0)
             assert not [each for each in told.assumptions if each.code]
 

@@ -13,6 +13,7 @@ import pytest
 
 from dsr.cli import main
 from dsr.geometry.camera import Camera
+from dsr.io.depth_files import read_depth_file
 from dsr.io.inputs import read_picture
 from dsr.io.layouts import find_pairs_of_folder
 from dsr.io.reading import CameraChoice, Reading, RigFiles
@@ -152,7 +153,7 @@ def test_command_reads_a_recording(tmp_path, capsys):
     assert "Azure Kinect" in capsys.readouterr().out
     told = json.loads((out / "000000" / "info.json").read_text())
     assert told["inputs"]["depth"]["file"].startswith("scan.mkv/")
-    assert np.load(out / "000000" / "depth_metres.npy").shape == SIZE
+    assert read_depth_file(out / "000000" / "depth_metres.tiff").shape == SIZE
 
 
 def changed(change):

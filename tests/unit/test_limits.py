@@ -25,7 +25,7 @@ from dsr.evaluation.run_files import read_run
 from dsr.evaluation.store import load_prediction
 from dsr.io.captures import bags, stray
 from dsr.io.captures.record3d import find_record3d
-from dsr.io.depth_files import read_depth_file
+from dsr.io.depth_files import read_depth_file, write_depth_file
 from dsr.io.exports import read_input
 from dsr.io.images import pixels_in_header, read_mask, read_pixels
 from dsr.io.inputs import read_picture
@@ -276,7 +276,7 @@ def test_record_of_exports_that_names_files_elsewhere_is_refused_and_nothing_rem
     frame = output / "frame"
     (frame / "rgbd").mkdir(parents=True)
     cv2.imwrite(str(frame / "rgbd" / "color.png"), np.zeros((4, 4, 3), np.uint8))
-    np.save(frame / "depth_metres.npy", np.ones((4, 4), np.float32))
+    write_depth_file(frame / "depth_metres.tiff", np.ones((4, 4), np.float32))
     camera = {"width": 4, "height": 4, "fx": 4.0, "fy": 4.0, "cx": 1.5, "cy": 1.5}
     info = {"complete": True, "files": [], "camera": camera, "pose": np.eye(4).tolist()}
     (frame / "info.json").write_text(json.dumps(info))

@@ -14,6 +14,7 @@ from dsr.app.view import find_results
 from dsr.cli import main
 from dsr.data import arkitscenes, ddrnet_frames, diml, icl, rgbdd, sintel, sunrgbd, tartanair, tofmark
 from dsr.data.folder import Folder
+from dsr.io.depth_files import read_depth_file
 from dsr.io.inputs import Reading, read_picture
 from dsr.io.layouts import find_pairs_of_folder
 from dsr.io.trajectories import read_poses
@@ -208,7 +209,7 @@ def test_command_gives_each_frame_its_own_pose(folder, tmp_path, capsys, given):
         result = tmp_path / "out" / f"{number}"
         pose = np.array(json.loads((result / "info.json").read_text())["pose"])
         assert pose_numbers([pose]) == [number]
-        assert round(2 * float(np.load(result / "depth_metres.npy").min() - captures.depth().min())) == number
+        assert round(2 * float(read_depth_file(result / "depth_metres.tiff").min() - captures.depth().min())) == number
     assert [path.name for path in find_results(tmp_path / "out")] == [f"{number}" for number in range(FRAMES)]
 
 

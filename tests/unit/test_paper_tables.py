@@ -366,3 +366,15 @@ def test_families_of_metrics_have_tables_of_their_own():
     assert [name for name in found if "evalmde" in name] == ["summary_evalmde_x4_box", "mine_evalmde_x4_box"]
     assert list(found["mine_evalmde_x4_box"].columns) == ["SAWA"]
     assert list(found["mine_x4_box"].columns) == ["RMSE_d", "DSSIM_v"]
+
+
+def test_a_table_says_what_its_runs_say_of_their_maps():
+    maps, shared = "predictions come as whole numbers of 0.001 m", "its depth is not metric"
+    files = replace(run("mine", {"a": 1.0, "b": 1.0}, dataset="m"), notes={"a": [maps, shared], "b": [maps]})
+    other = replace(run("A", {"a": 1.0, "b": 1.0}, dataset="m"), notes={"a": [shared]})
+    elsewhere = replace(run("A", {"c": 1.0}, dataset="n"), notes={"c": ["of another data set"]})
+    notes = tables(files, other, elsewhere)["m_x4_box"].notes
+    assert f"mine: {maps}." in notes
+    assert f"a: {shared}." in notes
+    assert not any("another" in note for note in notes)
+    assert "- mine: predictions come as whole numbers" in to_markdown(tables(files, other)["m_x4_box"])

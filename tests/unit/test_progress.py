@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import threading
 import time
 
@@ -98,9 +99,9 @@ def test_line_about_steps_names_the_scene_that_they_belong_to(now: Clock) -> Non
             step(50, 1000)
             progress.tick()
     assert text.getvalue().splitlines() == [
-        "predict statue (0 of 2): steps: 50 of 1000, elapsed 0:00:11, remaining 0:03:29",
+        "predict statue (0 of 2, remaining 0:07:09): steps: 50 of 1000, elapsed 0:00:11, remaining 0:03:29",
         "predict statue: 1 of 2, 11.0 s, elapsed 0:00:11, remaining 0:00:11",
-        "predict room (1 of 2, remaining 0:00:00): steps: 50 of 1000, elapsed 0:00:11, remaining 0:03:29",
+        "predict room (1 of 2, remaining 0:03:29): steps: 50 of 1000, elapsed 0:00:11, remaining 0:03:29",
         "predict room: 2 of 2, 11.0 s, elapsed 0:00:22, remaining 0:00:00",
     ]
 
@@ -141,10 +142,10 @@ def test_terminal_shows_a_row_for_each_task_with_named_times(now: Clock) -> None
             step(65, 100, "loss 0.25")
             rows = _rows(progress)
         if scene == "statue":
-            assert rows[0].endswith("0 of 2 elapsed 0:04:29 remaining -:--:-- statue")
+            assert rows[0].endswith("0 of 2 elapsed 0:04:29 remaining 0:09:19 statue")
             assert rows[1].startswith("steps ")
             assert rows[1].endswith("65 of 100 elapsed 0:04:29 remaining 0:02:25 loss 0.25")
-    assert rows[0].endswith("1 of 2 elapsed 0:08:58 remaining 0:00:00 room")
+    assert rows[0].endswith("1 of 2 elapsed 0:08:58 remaining 0:02:25 room")
 
 
 def test_terminal_keeps_one_line_of_a_pass_that_took_long(now: Clock) -> None:
@@ -224,3 +225,65 @@ def test_times_and_sizes_are_written_for_readers() -> None:
     assert [clock(seconds) for seconds in (0, 269, 3600, 90061)] == ["0:00:00", "0:04:29", "1:00:00", "25:01:01"]
     assert [duration(seconds) for seconds in (40, 720, 12600)] == ["40 s", "12 min", "3.5 h"]
     assert [megabytes(size) for size in (3.2e6, 45e6, 1.3e9)] == ["3.2 MB", "45 MB", "1.3 GB"]
+
+
+STAGES = {"reading": 0.1, "upsampling": 0.5, "writing": 0.4}
+
+
+def seconds_in(line: str, what: str) -> int | None:
+    """Return a named time of a line in seconds."""
+    found = re.search(rf"{what} (\d+):(\d+):(\d+)", line)
+    return (
+        None if found is None else sum(60**at * int(each) for at, each in zip((2, 1, 0), found.groups(), strict=True))
+    )
+
+
+def times_of_stages(now: Clock, *frames: tuple[int, ...]) -> list[tuple[int, int | None]]:
+    """Return elapsed and remaining time of frames, whose stages take some seconds each, at each second."""
+    progress, _ = _progress(now, terminal=True)
+    shown = []
+    for durations in progress.track(frames, "upsample", shares=STAGES):
+        for name, seconds in zip(STAGES, durations, strict=True):
+            progress.stage(name)
+            for _ in range(seconds):
+                now.seconds += 1
+                [row] = _rows(progress)
+                shown.append((seconds_in(row, "elapsed"), seconds_in(row, "remaining")))
+    return shown
+
+
+def test_elapsed_and_remaining_time_add_up_once_a_frame_is_done(now: Clock) -> None:
+    shown = times_of_stages(now, *[(1, 5, 4)] * 4)
+    assert all(elapsed + remaining == 40 for elapsed, remaining in shown[6:-1])
+    assert shown[-1] == (40, 1)  # the last stage is not over yet
+
+
+def test_usual_shares_tell_the_rest_of_the_first_frame_once_most_of_it_is_over(now: Clock) -> None:
+    shown = times_of_stages(now, (5, 25, 20))
+    assert all(remaining is None for _, remaining in shown[:29])  # the first tenth tells too little
+    assert all(elapsed + remaining == 50 for elapsed, remaining in shown[30:-1])
+
+
+def test_remaining_time_does_not_stand_at_zero_while_a_stage_takes_longer_than_others_did(now: Clock) -> None:
+    shown = times_of_stages(now, (1, 5, 4), (1, 5, 4), (1, 5, 60))
+    assert min(remaining for _, remaining in shown if remaining is not None) >= 1
+    assert shown[-1][1] == 6  # a tenth of what the stage has taken
+
+
+def test_time_of_a_stage_that_is_known_before_counts(now: Clock) -> None:
+    progress, _ = _progress(now, terminal=True)
+    for _ in progress.track("ab", "upsample", shares=STAGES):
+        progress.stage("upsampling", 10)
+        now.seconds += 4
+        [row] = _rows(progress)
+        break
+    assert seconds_in(row, "remaining") == 6 + 8 + 20
+
+
+def test_elapsed_time_counts_from_the_beginning_of_the_command(now: Clock) -> None:
+    text = io.StringIO()
+    progress = ConsoleProgress(Console(file=text, width=120), now, since=now())
+    now.seconds += 7
+    for _ in progress.track("a", "upsample"):
+        now.seconds += 2
+    assert text.getvalue() == "upsample a: 1 of 1, 2.0 s, elapsed 0:00:09, remaining 0:00:00\n"

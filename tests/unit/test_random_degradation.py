@@ -28,7 +28,7 @@ def _scene(size: int = 128, step: bool = True) -> Scene:
     if step:
         depth[:, size // 4 : size // 2, size // 4 : size // 2] = 1.2
     rgb = torch.rand((3, size, size), generator=torch.Generator().manual_seed(0))
-    return Scene("test", "slope", rgb, Camera.from_fov(size, size), depth)
+    return Scene("test", "slope", rgb, Camera.from_fov(60, size, size), depth)
 
 
 def _generator(seed: int = 0) -> torch.Generator:

@@ -14,6 +14,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from dsr.geometry.camera import Camera
+from dsr.io.depth_files import write_depth_file
 from dsr.io.open3d import write_open3d, write_rgbd
 from dsr.io.scene_files import Frame, parse_pose, to_millimetres, write_rerun, write_splatting, write_transforms
 
@@ -40,9 +41,9 @@ def make(tmp_path):
         rgb[0], rgb[2, 0] = number / 10, 1
         depth = torch.from_numpy(depth_map(number))[None]
         assert write_rgbd(folder / "rgbd", rgb, depth, camera) == []
-        np.save(folder / "depth_metres.npy", depth[0].numpy())
+        write_depth_file(folder / "depth_metres.tiff", depth[0].numpy())
         name = f"room/{number:03}"
-        return Frame(name, camera, pose, folder / "rgbd" / "color.png", folder / "depth_metres.npy")
+        return Frame(name, camera, pose, folder / "rgbd" / "color.png", folder / "depth_metres.tiff")
 
     return frame
 
@@ -186,7 +187,7 @@ def test_splatting_depth_is_inverse_depth_after_scale_and_offset(make, tmp_path)
         values = cv2.imread(str(tmp_path / "g/depths" / f"{frame.stem}.png"), cv2.IMREAD_UNCHANGED)
         assert values.dtype == np.uint16
         inverse = values / 65536 * parameters[frame.stem]["scale"] + parameters[frame.stem]["offset"]
-        expected = np.nan_to_num(1 / np.load(frame.depth), nan=0)
+        expected = np.nan_to_num(1 / frame.read_depth(), nan=0)
         np.testing.assert_allclose(inverse, expected, atol=1e-5)
     assert cv2.imread(str(tmp_path / "g/depths/room_000.png"), cv2.IMREAD_UNCHANGED).max() == 65535
 
@@ -221,7 +222,7 @@ def test_splatting_without_poses_has_depth_alone_and_holes_alone_are_refused(mak
     frame = make(0, pose=None)
     write_splatting(tmp_path / "g", [frame])
     assert [file.name for file in (tmp_path / "g/sparse/0").iterdir()] == ["depth_params.json"]
-    np.save(frame.depth, np.full((8, 12), np.nan, np.float32))
+    write_depth_file(frame.depth, np.full((8, 12), np.nan, np.float32))
     with pytest.raises(ValueError, match=r"^gaussian: expected some depth, got holes alone"):
         write_splatting(tmp_path / "h", [frame])
     assert not (tmp_path / "h").exists()
@@ -317,6 +318,6 @@ def test_pose_is_read_and_none_stays_none():
 
 def test_damaged_depth_of_a_frame_is_refused(make):
     frame = make(0)
-    np.save(frame.depth, np.zeros((2, 2), np.float32))
-    with pytest.raises(ValueError, match=r"depth_metres.npy: expected depth of 8 x 12 pixels \(height x width\), got"):
+    write_depth_file(frame.depth, np.zeros((2, 2), np.float32))
+    with pytest.raises(ValueError, match=r"depth_metres.tiff: expected depth of 8 x 12 pixels \(height x width\), got"):
         frame.read_depth()

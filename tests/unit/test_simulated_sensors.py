@@ -102,7 +102,9 @@ def test_noise_is_drawn_from_its_generator_alone_as_float32(kind: str, size: tup
 def test_what_is_not_known_stays_unknown(kind: str) -> None:
     depth = _square(128).double().reciprocal()
     depth[:, 50:90, 30:70] = torch.nan
-    scene = Scene("test", "square", torch.rand((3, 128, 128), generator=_generator()), Camera.from_fov(128, 128), depth)
+    scene = Scene(
+        "test", "square", torch.rand((3, 128, 128), generator=_generator()), Camera.from_fov(60, 128, 128), depth
+    )
     everything = Everything(
         noises={kind: 1}, holes={"none": 1}, displaced=0, rounded=0.5, folds=0, relief=0, kernels={"nearest": 1}
     )
@@ -118,7 +120,7 @@ def test_the_occluded_band_is_as_wide_as_the_disparities_differ() -> None:
     expected[:, 60:140, 80 - 12 : 80] = True  # 24.5 (1/1 - 1/2) but for a part of a pixel, on the left
     assert torch.equal(occluded(constant * values), expected)
     assert torch.equal(occluded(-constant * values).flip(-1), occluded(constant * values.flip(-1)))
-    camera = Camera.from_fov(200, 200)
+    camera = Camera.from_fov(60, 200, 200)
     assert torch.equal(Shadows(constant / camera.fx)(values.reciprocal().double(), camera, _generator()), expected)
 
 

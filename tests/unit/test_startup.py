@@ -22,7 +22,8 @@ sys.argv = {argv!r}
 SCRIPT = "runpy.run_path(sys.argv[0], run_name='__main__')"
 MODULE = "runpy.run_module('dsr.cli', run_name='__main__')"
 COMMANDS = {
-    "dsr --help": 0, "dsr upsample --help": 0, "dsr upsample --rgb a --depth b -o out --mehtod x": 2,
+    "dsr --help": 0, "dsr --version": 0, "dsr completion bash": 0, "dsr fuse out --outptu mesh.ply": 2,
+    "dsr upsample --help": 0, "dsr upsample --rgb a --depth b -o out --mehtod x": 2,
     "dsr upsample --rgb a --depth b -o out --fov 270": 2, "dsr upsample --rgb a --depth b -o out --method nosuch": 2,
     "dsr upsample --rgb a --depth b -o out --only nosuch": 2, "dsr upsample --rgb a --depth b -o out --shard 4/3": 2,
     "dsr upsample --rgb a -o out": 2, "dsr report runs -o out --only nosuch": 2,

@@ -78,7 +78,7 @@ def test_result_with_a_depth_beyond_the_moon_is_refused(tmp_path):
     depth = np.full((64, 64), 2, np.float32)
     depth[3, 4] = 1e30
     folder = write_result(tmp_path / "out", depth, pose=np.eye(4).tolist())
-    with pytest.raises(ValueError, match=r"depth_metres\.npy: expected depths of 1e-06 to 1e\+09 m"):
+    with pytest.raises(ValueError, match=r"depth_metres\.tiff: expected depths of 1e-06 to 1e\+09 m"):
         read_result(folder, "out")
 
 

@@ -192,6 +192,18 @@ def test_pixels_with_a_large_expected_error_are_doubtful():
     assert errors[0][0, 63] == round(1 + 254 * math.log(0.01 / (1e-3 * middle)) / math.log(100))
 
 
+def test_depth_where_the_input_has_none_is_marked_as_filled():
+    depth_lr = waves(hole=False)[::4, ::4].copy()
+    depth_lr[2, 5:7] = np.nan
+    packed = pack_result(result(depth_lr=depth_lr), 10**6, 512)
+    filled = np.zeros((64, 64), bool)
+    filled[8:12, 20:28] = True
+    assert not filled[HOLE].any()
+    np.testing.assert_array_equal(unpack(packed.about["after"], packed.data["after"])[1] & 32 > 0, filled)
+    assert packed.about["filled"] == filled.mean()
+    assert pack_result(result(), 10**6, 512).about["filled"] == 0
+
+
 def test_large_result_is_reduced_and_says_so():
     packed = pack_result(result(), 1024, 512)
     about = packed.about["after"]

@@ -25,6 +25,12 @@ def compose(
         directories: of configuration files of your own.
         with_hydra: whether Hydra's own settings are there, too.
 
+    Example:
+        >>> import dsr
+        >>> config = dsr.compose("eval", ["method=tgv", "scale=4"])
+        >>> config.method.iterations, config.scale
+        (1000, 4)
+
     """
     register()
     register_resolvers()

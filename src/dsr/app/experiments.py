@@ -11,8 +11,9 @@ from pathlib import Path
 
 from omegaconf import OmegaConf
 
-from dsr.data.download.collections import CATALOGUE, data_root
+from dsr.data.download.collections import CATALOGUE
 from dsr.utils.console import note_once
+from dsr.utils.files import data_root
 
 _KEY_OF_GROUP = re.compile(r"(\w+)\.[\w.]+=")
 """An argument that sets a key of a group, such as ``method.range_type=orthogonal``."""

@@ -16,6 +16,7 @@ from dsr.app.multirun import LAUNCHERS
 from dsr.app.schema import MOVED, NAMED, SEVERAL
 from dsr.utils.configuration import list_choices, list_groups
 from dsr.utils.console import one_line
+from dsr.utils.spelling import did_you_mean
 
 _ALIASES = {"learning_rate": "lr", "batch_size": "batch", "steps": "max_steps"}
 """Names that others have for keys."""
@@ -111,7 +112,8 @@ def explain_choice(group: str, choice: str, directories: Sequence[Path]) -> str:
     """
     if group == "model" and choice in list_choices("method", directories):
         return f"model={choice}: expected a network to train, {choice} is none; eval.py has method={choice}"
-    return f"{group}={choice}: unknown; expected one of {', '.join(list_choices(group, directories))}"
+    choices = list_choices(group, directories)
+    return f"{group}={choice}: unknown; expected one of {', '.join(choices)}{did_you_mean(choice, choices)}"
 
 
 def _explain_key(key: str, name: str, arguments: Sequence[str], directories: Sequence[Path]) -> str:
@@ -131,8 +133,9 @@ def _explain_key(key: str, name: str, arguments: Sequence[str], directories: Seq
     alike = [f"{prefix}{each}={value}" for each in get_close_matches(key.rpartition(".")[2], children, 1, _ALIKE)]
     meant = _meant(key, value, name, config, directories)
     wanted = alike or meant if prefix else meant or alike  # a key of a group is one of this group first
-    beside = ", ".join(f"{prefix}{child}" for child in children)
-    return f"{key}: unknown key; expected {' or '.join(wanted) or beside or 'none'}"
+    beside = [f"{prefix}{child}" for child in children]
+    near = did_you_mean(key, beside if prefix else {*beside, *list_groups(directories)})
+    return f"{key}: unknown key; expected {' or '.join(wanted) or (', '.join(beside) or 'none') + near}"
 
 
 def _meant(key: str, value: str, name: str, config: DictConfig, directories: Sequence[Path]) -> list[str]:
@@ -187,10 +190,12 @@ def _explain_missing(file: str, name: str, directories: Sequence[Path]) -> str:
         return f"--config-name {choice}: unknown; expected {name}"
     choices = list_choices(group, directories)
     if group == "hydra/launcher":
-        return f"{group}={choice}: unknown; expected one of {', '.join(sorted({*choices, *LAUNCHERS}))}"
+        choices = sorted({*choices, *LAUNCHERS})
+        return f"{group}={choice}: unknown; expected one of {', '.join(choices)}{did_you_mean(choice, choices)}"
     if choices:
         return explain_choice(group, choice, directories)
-    return f"{group}: no such group of choices; expected one of {', '.join(list_groups(directories))}"
+    groups = list_groups(directories)
+    return f"{group}: no such group of choices; expected one of {', '.join(groups)}{did_you_mean(group, groups)}"
 
 
 def _explain_syntax(override: str) -> str:

@@ -9,10 +9,11 @@ from dsr.app.upsample.parts import EXPECTED_ERROR
 from dsr.geometry.lights import FIGURE_LIGHT, LIGHT_CHOICES, LIGHT_NAMES
 from dsr.report.study.choice import Choice
 from dsr.utils.configuration import config_directories, list_choices
-from dsr.utils.options import OptionError, Options, Rule, at_least, group, one_of, option, positive, some_of
+from dsr.utils.options import Options, Rule, at_least, group, one_of, option, positive, some_of
 
 REPORT_PARTS = ("tables", "metrics", "figures", "page")
 _MOST_WORKERS = 256
+_LAST_PORT = 65535
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,6 +111,32 @@ class ViewRequest(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
+class BrowserRequest(Options):
+    """Where the page of ``dsr app`` is served, and what may be asked of it."""
+
+    port: int = option(
+        8765,
+        "of this machine; 0: a free one (8765)",
+        "PORT",
+        rule=Rule("0..65535", lambda port: 0 <= port <= _LAST_PORT),
+    )
+    host: str = option("127.0.0.1", "another address: whoever reaches it can use the page", "ADDRESS")
+    open_page: bool = option(True, "only serve the page", flags="--no-open")
+    max_upload: float = option(
+        512.0, "largest size of the files of an upload (512)", "MB", rule=positive("number of megabytes")
+    )
+    max_seconds: float = option(300.0, "longest time of a computation (300)", "SECONDS", rule=positive("time"))
+    max_memory: float | None = option(
+        None, "memory of a computation (default: what is free)", "GB", rule=positive("number of gigabytes")
+    )
+
+    @property
+    def memory(self) -> int | None:
+        """Bytes of memory of a computation; None for what is free."""
+        return None if self.max_memory is None else int(1e9 * self.max_memory)
+
+
+@dataclass(frozen=True, kw_only=True)
 class ExportRequest(Options):
     """Which network to write, and where."""
 
@@ -140,9 +167,7 @@ def check_method(method: str, directories: tuple[Path, ...]) -> None:
         OptionError: there is no such method in the project's or the user's directories.
 
     """
-    rule = one_of(list_choices("method", config_directories(directories)))
-    if not rule.holds(method):
-        raise OptionError("method", f"expected {rule.expected}, got {method!r}")
+    one_of(list_choices("method", config_directories(directories))).expect("method", method)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,7 +181,9 @@ class FormatsRequest(Options):
 class DoctorRequest(Options):
     """What to examine."""
 
-    directory: Path = option(..., "a scene, or a directory of scenes", "DIR", flags="directory")
+    directory: Path | None = option(
+        None, "a scene, or a directory of scenes; without one, what is installed is checked", "DIR", flags="directory"
+    )
     most: int | None = option(
         None,
         "examine at most N scenes, taken at equal distances from all",

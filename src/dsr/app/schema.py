@@ -16,6 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 from dsr.utils.configuration import ConfigError, build, check_types
 from dsr.utils.guards import is_number
 from dsr.utils.ratios import NATIVE, check_scale
+from dsr.utils.spelling import did_you_mean
 
 Config = Mapping[str, Any]
 """A composed configuration as plain values."""
@@ -151,7 +152,8 @@ def _refuse_unknown(plain: Any, names: Collection[str], place: str = "") -> None
         raise ConfigError(f"{place.rstrip('.')}: expected the keys {', '.join(names)}, got {plain!r}")
     for key in plain:
         if key not in names:
-            raise ConfigError(f"{place}{key}: unknown key; expected {', '.join(names)}")
+            meant = did_you_mean(key, names if place else [*names, "experiment"])
+            raise ConfigError(f"{place}{key}: unknown key; expected {', '.join(names)}{meant}")
 
 
 @dataclass

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from rich.console import Console
 
 from dsr.app.requests import (
+    BrowserRequest,
     DoctorRequest,
     ExportRequest,
     FormatsRequest,
@@ -94,8 +95,12 @@ def _later(module: str, name: str) -> Callable[[Any, Console, object], list[str]
 
 
 def _examine(request: DoctorRequest, *_: object) -> int:
-    """Examine a directory of scenes."""
-    from dsr.doctor.examine import examine_directory  # noqa: PLC0415 - it takes seconds to import
+    """Examine a directory of scenes, or without one the machine."""
+    if request.directory is None:
+        from dsr.doctor.machine import examine_machine  # noqa: PLC0415 - it takes seconds to import
+
+        return examine_machine()
+    from dsr.doctor.examine import examine_directory  # noqa: PLC0415
 
     return examine_directory(request.directory, request.most)
 
@@ -160,6 +165,22 @@ examples:
   dsr view out                             a result, or a folder of results; writes out/view.html
   dsr view out --no-open -o page.html
   dsr view recordings --most 40 --vertices 100000
+""",
+)
+
+APP = Command(
+    "app",
+    "upsample in the browser: drop files, see the surfaces under one light",
+    BrowserRequest,
+    _later("dsr.app.browser.server", "browse"),
+    description="""\
+Serve a page of this machine alone, and open it: drop a photo and a depth map, or a capture, and look at photo, input
+and result side by side. The libraries are an extra: pip install dsr[app]. More in docs/app.md.""",
+    epilog="""\
+examples:
+  dsr app
+  dsr app --no-open --port 9000
+  dsr app --max-upload 2000 --max-seconds 900     for large captures
 """,
 )
 
@@ -240,7 +261,17 @@ degrees. docs/export.md has a program that runs such a file.
 )
 
 FORMATS_COMMAND = Command("formats", "what is read of which device or program", FormatsRequest, _show_formats)
-DOCTOR = Command("doctor", "check a directory of your own scenes", DoctorRequest, _examine)
+DOCTOR = Command(
+    "doctor",
+    "check what is installed, or a directory of your own scenes",
+    DoctorRequest,
+    _examine,
+    epilog="""\
+examples:
+  dsr doctor                     whether everything is here that dsr needs: exit code 0, or 2
+  dsr doctor my_scenes           units, cameras, holes: exit code 0, or 1 where something is probably wrong
+""",
+)
 
 
 _HYDRA_COMMANDS = {

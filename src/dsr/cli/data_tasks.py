@@ -10,9 +10,10 @@ from collections.abc import Mapping
 from rich.console import Console
 from rich.table import Table
 
-from dsr.data.download.collections import Collection, data_root, find
+from dsr.data.download.collections import Collection, find
 from dsr.data.download.fetching import Server, absent, checksums_of, get, state, verify
 from dsr.utils.console import ConsoleProgress, show
+from dsr.utils.files import data_root
 from dsr.utils.progress import megabytes
 
 

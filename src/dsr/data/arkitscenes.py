@@ -105,7 +105,9 @@ def load_frame(
         if not measured.isfinite().any():
             raise ValueError(f"{confidence_path}: expected a pixel of confidence {min_confidence}, there is none")
     height, width = _SIZE
-    camera = Camera.from_fov(width, height) if intrinsics_path is None else read_intrinsics(intrinsics_path)
+    camera = (
+        Camera.from_fov(ASSUMED_FOV, width, height) if intrinsics_path is None else read_intrinsics(intrinsics_path)
+    )
     return Scene(dataset, name, rgb, camera, depth, {width / _SIZE_LR[1]: measured})
 
 

@@ -150,7 +150,7 @@ def load_pair(rgb_path: Path, depth_path: Path, dataset: str, name: str) -> Scen
     rgb, depth = read_picture(rgb_path), read_millimetres(depth_path)
     height, width = rgb.shape[1:]
     expect_size(depth_path, tuple(depth.shape[1:]), (height, width))
-    return Scene(dataset, name, rgb, Camera.from_fov(width, height), depth)
+    return Scene(dataset, name, rgb, Camera.from_fov(ASSUMED_FOV, width, height), depth)
 
 
 def walk(root: Path) -> Iterator[tuple[Path, list[str], list[str]]]:

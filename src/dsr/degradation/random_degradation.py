@@ -75,6 +75,17 @@ class Everything:
     Raises:
         ValueError: there is no such kind, or a frequency or a fraction is out of range.
 
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.degradation.random_degradation import Everything
+        >>> from dsr.sample import Scene
+        >>> camera = dsr.Camera.from_fov(60, width=64, height=64)
+        >>> scene = Scene("mine", "wall", torch.rand(3, 64, 64), camera, torch.full((1, 64, 64), 2.0))
+        >>> sample, hints = Everything()(scene, 4, torch.Generator().manual_seed(0))
+        >>> sample.depth_lr.shape
+        torch.Size([1, 16, 16])
+
     """
 
     scales: Mapping[Any, float] | None = None

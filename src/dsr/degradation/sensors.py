@@ -269,6 +269,12 @@ def sensor_named(name: str) -> Sensor:
     Raises:
         ValueError: there is none, or none of its figures is known.
 
+    Example:
+        >>> from dsr.degradation.sensors import sensor_named
+        >>> sensor = sensor_named("Intel RealSense D435")
+        >>> sensor.kind, sensor.width
+        ('stereo', 1280)
+
     """
     found = next((each for each in SENSORS if each.name.casefold() == name.casefold()), None) or recognise(name)
     if found is None or not _has_figures(found):

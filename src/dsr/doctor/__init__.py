@@ -1,1 +1,1 @@
-"""``dsr doctor``: checks of the depth maps and cameras of scenes, with advice on how to correct them."""
+"""``dsr doctor``: checks of what is installed, and of scenes' depth maps and cameras, with advice."""

@@ -60,7 +60,7 @@ def examine_directory(folder: Path, most: int | None = None) -> int:
     verdicts: Counter[Level] = Counter()
     for name, load in ConsoleProgress(console).track(scenes, "examine", label=lambda scene: scene[0], lines=False):
         title, findings = _examine(name, load)
-        _show(console, title, findings, brief=len(scenes) > _MANY)
+        show_findings(console, title, findings, brief=len(scenes) > _MANY)
         verdicts[worst(findings)] += 1
     console.print(_summary(verdicts), style="bold", highlight=False)
     return FAULTY if verdicts["warning"] or verdicts["problem"] else FINE
@@ -84,8 +84,8 @@ def _examine(name: str, load: Callable[[], Scene]) -> tuple[str, list[Finding]]:
     return name, examine(scene)
 
 
-def _show(console: Console, title: str, findings: list[Finding], *, brief: bool) -> None:
-    """Print a scene's verdict and findings; if ``brief``, without those of level ``ok``."""
+def show_findings(console: Console, title: str, findings: list[Finding], *, brief: bool) -> None:
+    """Print the verdict and the findings of a scene or a machine; if ``brief``, without those of level ``ok``."""
     grid = Table.grid(padding=(0, 2))
     grid.add_column(no_wrap=True)
     grid.add_column(no_wrap=True)

@@ -51,6 +51,7 @@ class Run:
         scenes: scenes with a prediction.
         unsolved: reason by scene why the method has no solution.
         formats: formats of its metrics that the run stores.
+        notes: what there is to say of the scores of a scene, by its name.
         truth: where other runs have different truths of its scenes, what tells its truths from theirs, as ``dataset``
             has it, too; empty otherwise.
 
@@ -70,6 +71,7 @@ class Run:
     scenes: tuple[str, ...]
     unsolved: Mapping[str, str] = field(default_factory=dict)
     formats: Mapping[str, MetricFormat] = field(default_factory=dict)
+    notes: Mapping[str, Sequence[str]] = field(default_factory=dict)
     truth: str = ""
 
     @property

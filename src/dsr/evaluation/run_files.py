@@ -149,6 +149,7 @@ def read_run(folder: Path) -> Run:
         scenes,
         summary.unanswered,
         summary.metrics,
+        notes=summary.notes,
     )
 
 
@@ -164,6 +165,7 @@ class _Summary(BaseModel, strict=True, allow_inf_nan=False):
     label: str
     unanswered: dict[str, str] = {}
     metrics: dict[str, MetricFormat] = {}
+    notes: dict[str, list[str]] = {}
 
 
 class _Identity(BaseModel, extra="allow", strict=True):

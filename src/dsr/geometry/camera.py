@@ -6,10 +6,12 @@ ray r(u, v) = ((u - cx) / fx, (v - cy) / fy, 1).
 
 from __future__ import annotations
 
+import importlib
 import math
 from dataclasses import dataclass, replace
 from numbers import Real
-from typing import Self
+from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -37,6 +39,14 @@ class Camera:
 
     Raises:
         ValueError: a value is not finite, a size or focal length is not positive.
+
+    Example:
+        >>> import dsr
+        >>> camera = dsr.Camera(width=640, height=480, fx=525.0, fy=525.0, cx=319.5, cy=239.5)
+        >>> camera.rescale(320, 240).fx  # of the same view in fewer pixels
+        262.5
+        >>> camera.rays().shape
+        torch.Size([3, 480, 640])
 
     """
 
@@ -72,9 +82,70 @@ class Camera:
         return cls(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
     @classmethod
-    def from_fov(cls, width: int, height: int, fov: float = ASSUMED_FOV) -> Self:
-        """Return the camera with a horizontal field of view in degrees and a centred principal point."""
-        return cls.centred(width, height, width / 2 / math.tan(math.radians(fov) / 2))
+    def from_fov(cls, degrees: float, width: int, height: int) -> Self:
+        """Return the camera with a horizontal field of view in degrees and the principal point in the middle.
+
+        Raises:
+            ValueError: the field of view is not between 0 and 180 degrees.
+
+        Example:
+            >>> import dsr
+            >>> round(dsr.Camera.from_fov(60, width=640, height=480).fx)
+            554
+
+        """
+        if not _is_number(degrees) or not 0 < degrees < 180:
+            raise ValueError(f"degrees: expected a horizontal field of view above 0 and below 180, got {degrees!r:.60}")
+        return cls.centred(width, height, width / 2 / math.tan(math.radians(degrees) / 2))
+
+    @classmethod
+    def from_matrix(cls, matrix: Any, width: int, height: int) -> Self:
+        """Return the camera of a matrix of intrinsics.
+
+        Args:
+            matrix: (fx 0 cx; 0 fy cy; 0 0 1) in pixels, as nested lists, an array or a tensor; or a larger matrix that
+                begins with it, 3 x 4 as ROS's P, or 4 x 4.
+            width, height: size of its image in pixels.
+
+        Raises:
+            ValueError: it is no such matrix.
+
+        Example:
+            >>> import dsr
+            >>> dsr.Camera.from_matrix([[525, 0, 319.5], [0, 525, 239.5], [0, 0, 1]], width=640, height=480)
+            Camera(width=640, height=480, fx=525.0, fy=525.0, cx=319.5, cy=239.5, baseline=None, doffs=0.0)
+
+        """
+        try:
+            (fx, _, cx), (_, fy, cy), _ = expect_intrinsics(matrix).tolist()
+        except ValueError as error:
+            raise ValueError(f"matrix: {error}") from error
+        return cls(width, height, fx, fy, cx, cy)
+
+    @classmethod
+    def from_json(cls, path: str | Path) -> Self:
+        """Return the camera of a file that states its image's size, too: :func:`dsr.io.cameras.read_sized_camera`.
+
+        Args:
+            path: dsr's ``camera.json``, Open3D's JSON, or ``cam_params.json`` as NICE-SLAM has it.
+
+        Raises:
+            ValueError: it is missing, damaged or of another format.
+
+        Example:
+            >>> import json, tempfile
+            >>> from pathlib import Path
+            >>> import dsr
+            >>> intrinsics = {"width": 640, "height": 480, "fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5}
+            >>> with tempfile.TemporaryDirectory() as folder:
+            ...     path = Path(folder) / "camera.json"
+            ...     _ = path.write_text(json.dumps(intrinsics))
+            ...     dsr.Camera.from_json(path).fx
+            525.0
+
+        """
+        read = importlib.import_module("dsr.io.cameras").read_sized_camera  # files are read on a floor above
+        return cls(**vars(read(Path(path))))
 
     def crop(self, top: int, left: int, height: int, width: int) -> Camera:
         """Return the camera of the ``height x width`` window whose first pixel is (``top``, ``left``)."""
@@ -169,6 +240,27 @@ class Camera:
         return self.rays(dtype=dtype, device=device).square().sum(dim=0).sqrt()
 
 
+def expect_intrinsics(matrix: Any) -> np.ndarray:
+    """Return the intrinsics, (3, 3) float64, that a 3 x 3, 3 x 4 or 4 x 4 matrix begins with.
+
+    Raises:
+        ValueError: it does not begin with (fx 0 cx; 0 fy cy; 0 0 1), with fx and fy above 0.
+
+    """
+    expected = "expected a matrix (fx 0 cx; 0 fy cy; 0 0 1)"
+    try:
+        values = np.asarray(matrix.cpu() if isinstance(matrix, Tensor) else matrix, np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{expected}, got {type(matrix).__name__}") from error
+    if values.shape not in ((3, 3), (3, 4), (4, 4)):
+        raise ValueError(f"{expected} of shape (3, 3), got {values.shape}")
+    values = values[:3, :3]
+    upright = np.isfinite(values).all() and values[0, 0] > 0 and values[1, 1] > 0
+    if not upright or not np.allclose(values[2], (0, 0, 1)) or values[1, 0] != 0:
+        raise ValueError(f"{expected}, got {values.tolist()}")
+    return values
+
+
 def _is_number(value: object) -> bool:
     """Return whether a value is a finite number; true and false are none, and neither is 10**400."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, Real):
@@ -190,6 +282,14 @@ def to_range(depth: Tensor, camera: Camera, range_type: RangeType) -> Tensor:
 
     Returns:
         (..., H, W) in the unit of the type.
+
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.geometry.camera import to_range
+        >>> camera = dsr.Camera(64, 48, 60.0, 60.0, 31.5, 23.5, baseline=0.1)
+        >>> to_range(torch.full((1, 48, 64), 2.0), camera, "disparity")[0, 0, 0]  # 0.1 m * 60 pixels / 2 m
+        tensor(3.)
 
     """
     if range_type == "orthogonal":

@@ -47,6 +47,11 @@ def direction_of(light: str) -> Direction:
     Raises:
         ValueError: there is no such light.
 
+    Example:
+        >>> from dsr.geometry.lights import direction_of
+        >>> direction_of("e4")
+        (0.0, 0.0, -1.0)
+
     """
     if light not in LIGHTS:
         raise ValueError(f"light: expected one of {', '.join(LIGHT_NAMES)}, got {light!r}")

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from torch import Tensor
 
+from dsr.geometry.adaptive_mesh import join
 from dsr.geometry.camera import Camera
 
 LARGEST_STEP = 0.02
@@ -31,6 +32,10 @@ _STRIP = 1 << 21
 """Pixels whose steps are found, and triangles whose normals are summed, at a time."""
 
 QUADRIC = "quadric decimation"
+FLATNESS = 3e-4
+"""Tolerance of a mesh that looks like the one of all pixels, as a fraction of the depth."""
+ERROR_SHARE = 0.1
+"""The same as a fraction of the depth's expected error, if that is more."""
 
 
 class Mesh(NamedTuple):
@@ -40,12 +45,14 @@ class Mesh(NamedTuple):
         vertices: (N, 3) float32 in metres; x right, y down, z forward.
         faces: (M, 3) int32 indices of vertices, counterclockwise as the camera sees them.
         pixels: (N,) int64 index of each vertex in the flattened depth map.
+        dense: number of triangles if there were two per square of four pixels.
 
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     pixels: np.ndarray
+    dense: int = 0
 
 
 def triangulate(
@@ -55,6 +62,7 @@ def triangulate(
     largest_step: float = LARGEST_STEP,
     stride: int = 1,
     isolated: bool = False,
+    tolerance: Tensor | None = None,
 ) -> Mesh:
     """Join neighbouring valid pixels by triangles, two per square of four pixels, except across steps in depth.
 
@@ -67,9 +75,20 @@ def triangulate(
         largest_step: relative change of depth, beyond what the slopes on both sides predict, from which a pair is cut.
         stride: every which row and column becomes vertices.
         isolated: whether vertices without a triangle are kept.
+        tolerance: (1, H, W) how far in metres each pixel may lie beside the mesh, so that flat parts get large
+            triangles, see :mod:`dsr.geometry.adaptive_mesh`; None for a mesh of all pixels.
 
     Raises:
         ValueError: ``depth`` is no map of the camera's size, or a number is not positive.
+
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.geometry.mesh import triangulate
+        >>> camera = dsr.Camera.from_fov(60, width=4, height=3)
+        >>> mesh = triangulate(torch.full((1, 3, 4), 2.0), camera)
+        >>> len(mesh.vertices), len(mesh.faces)
+        (12, 12)
 
     """
     if tuple(depth.shape) != (1, camera.height, camera.width):
@@ -78,7 +97,10 @@ def triangulate(
         raise ValueError(f"mesh: expected a positive step and stride, got {largest_step} and {stride}")
     strided = depth[0, ::stride, ::stride].detach().cpu().double().numpy()
     valid = np.isfinite(strided)
-    faces = _faces(1 / strided, largest_step)
+    allowed = None
+    if tolerance is not None:
+        allowed = tolerance[0, ::stride, ::stride].detach().cpu().double().numpy() / strided**2
+    faces, dense = _faces(1 / strided, largest_step, allowed)
     kept = valid.ravel().copy()
     if not isolated:
         kept[:] = False
@@ -88,7 +110,7 @@ def triangulate(
     rows, columns = rows * stride, columns * stride
     z = strided.ravel()[kept]
     vertices = np.stack(((columns - camera.cx) / camera.fx * z, (rows - camera.cy) / camera.fy * z, z), axis=1)
-    return Mesh(vertices.astype(np.float32), vertex_of[faces], rows * camera.width + columns)
+    return Mesh(vertices.astype(np.float32), vertex_of[faces], rows * camera.width + columns, dense)
 
 
 def vertex_normals(mesh: Mesh) -> np.ndarray:
@@ -108,8 +130,8 @@ def vertex_normals(mesh: Mesh) -> np.ndarray:
     return np.where(lengths > 0, total / np.where(lengths > 0, lengths, 1), towards).astype(np.float32)
 
 
-def _faces(inverse: np.ndarray, largest_step: float) -> np.ndarray:
-    """Return the triangles of a map of inverse depth, (H, W), as (M, 3) indices into the flattened map."""
+def _faces(inverse: np.ndarray, largest_step: float, allowed: np.ndarray | None) -> tuple[np.ndarray, int]:
+    """Return the triangles of a map of inverse depth, (H, W), as (M, 3) indices, and how many there are of all."""
     height, width = inverse.shape
     across, down = find_connections(inverse, largest_step)
     top, bottom, left, right = across[:-1], across[1:], down[:, :-1], down[:, 1:]
@@ -125,7 +147,11 @@ def _faces(inverse: np.ndarray, largest_step: float) -> np.ndarray:
         (~first & left & top, (upper_left, lower_left, upper_right)),
         (~first & bottom & right, (lower_left, lower_right, upper_right)),
     )
-    return np.concatenate([np.stack([corner[where] for corner in corners], axis=1) for where, corners in choices])
+    kept, large = np.ones(first.shape, bool), np.empty((0, 3), np.int32)
+    if allowed is not None:
+        kept, large = join(inverse, top & bottom & left & right, allowed)
+    small = [np.stack([corner[where & kept] for corner in corners], axis=1) for where, corners in choices]
+    return np.concatenate((*small, large)), sum(int(np.count_nonzero(where)) for where, _ in choices)
 
 
 def find_connections(inverse: np.ndarray, largest_step: float = LARGEST_STEP) -> tuple[np.ndarray, np.ndarray]:

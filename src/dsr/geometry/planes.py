@@ -19,7 +19,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dsr.geometry.camera import Camera
+from dsr.geometry.camera import ASSUMED_FOV, Camera
 from dsr.notes import LIMITS
 
 Array = NDArray[np.float64]
@@ -127,7 +127,7 @@ def inverse_votes(values: Array) -> InverseVotes:
         values: (H, W) positive, in any unit, NaN in holes; of a large map, every n-th pixel is read.
 
     """
-    values, camera = thinned(values, Camera.from_fov(values.shape[1], values.shape[0]))
+    values, camera = thinned(values, Camera.from_fov(ASSUMED_FOV, values.shape[1], values.shape[0]))
     deviations, inliers = [], []
     with np.errstate(over="ignore", divide="ignore"):
         reciprocals = 1 / values

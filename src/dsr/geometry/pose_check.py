@@ -12,10 +12,9 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.rigid_motion import Matrix, invert
+from dsr.geometry.rigid_motion import Matrix, invert, quaternion_of, rotation_of_quaternion
 from dsr.geometry.tsdf import PosedMap
 from dsr.notes import LIMITS, Assumption
 
@@ -41,9 +40,9 @@ def _transposed(pose: Matrix) -> Matrix:
 
 def _scalar_first(pose: Matrix) -> Matrix:
     """Return a pose whose quaternion w x y z was read as x y z w."""
-    w, x, y, z = Rotation.from_matrix(pose[:3, :3]).as_quat()
+    w, x, y, z = quaternion_of(pose[:3, :3])
     changed = pose.copy()
-    changed[:3, :3] = Rotation.from_quat((x, y, z, w)).as_matrix()
+    changed[:3, :3] = rotation_of_quaternion((x, y, z, w))
     return changed
 
 

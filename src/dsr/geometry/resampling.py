@@ -36,6 +36,12 @@ def resize_inverse_depth(inverse: Tensor, size: tuple[int, int], jump: float = J
     Returns:
         (1, *size) in the same dtype.
 
+    Example:
+        >>> import torch
+        >>> from dsr.geometry.resampling import resize_inverse_depth
+        >>> resize_inverse_depth(torch.full((1, 6, 8), 0.5), (24, 32)).shape
+        torch.Size([1, 24, 32])
+
     """
     if tuple(inverse.shape[-2:]) == size:
         return inverse

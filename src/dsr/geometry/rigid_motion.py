@@ -10,7 +10,6 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 Matrix = NDArray[np.float64]
 
@@ -88,8 +87,32 @@ def from_quaternion(translation: Sequence[float], quaternion: Sequence[float], n
     length = math.hypot(*quaternion)
     if not abs(length - 1) <= 0.01:
         raise ValueError(f"{name}: expected a quaternion of length 1, got {length:g}")
-    turn = Rotation.from_quat(quaternion).as_matrix()
-    return as_rigid(np.column_stack((turn, np.asarray(translation, dtype=np.float64))), name)
+    return as_rigid(
+        np.column_stack((rotation_of_quaternion(quaternion), np.asarray(translation, dtype=np.float64))), name
+    )
+
+
+def rotation_of_quaternion(quaternion: Sequence[float]) -> Matrix:
+    """Return the 3 x 3 rotation of a quaternion (x, y, z, w) of any length but 0."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - a third of a second that frames without poses save
+
+    turn: Matrix = Rotation.from_quat(quaternion).as_matrix()
+    return turn
+
+
+def rotation_of_vector(vector: Sequence[float] | np.ndarray) -> Matrix:
+    """Return the 3 x 3 rotation about a vector (3,) by its length in radians."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415
+
+    turn: Matrix = Rotation.from_rotvec(vector).as_matrix()
+    return turn
+
+
+def quaternion_of(rotation: Matrix) -> np.ndarray:
+    """Return the unit quaternion (x, y, z, w) with w >= 0 of a 3 x 3 rotation."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415
+
+    return np.asarray(Rotation.from_matrix(rotation).as_quat(canonical=True))
 
 
 def invert(transform: Matrix) -> Matrix:
@@ -101,7 +124,17 @@ def invert(transform: Matrix) -> Matrix:
 
 
 def relative(pose: Matrix, to: Matrix) -> Matrix:
-    """Return the transform from the frame of the camera at ``pose`` to that of the camera at ``to``."""
+    """Return the transform from the frame of the camera at ``pose`` to that of the camera at ``to``.
+
+    Example:
+        >>> import numpy as np
+        >>> from dsr.geometry.rigid_motion import relative
+        >>> aside = np.eye(4)
+        >>> aside[0, 3] = 0.5
+        >>> relative(np.eye(4), aside)[:3, 3]  # half a metre to its left
+        array([-0.5,  0. ,  0. ])
+
+    """
     return invert(to) @ pose
 
 

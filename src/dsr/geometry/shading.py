@@ -22,6 +22,14 @@ def lights(*, dtype: torch.dtype = torch.float64, device: torch.device | str = "
     """Return the paper's lights e1..e4 in the camera frame, (4, 3) unit vectors that point from surface to light.
 
     e1, e2, e3 are orthonormal, so renderings under them are the normal map in another basis; e4 is frontal.
+
+    Example:
+        >>> from dsr.geometry.shading import lights
+        >>> (lights() @ lights().T).round(decimals=2)[:3, :3]  # e1 to e3 are orthonormal
+        tensor([[1., 0., 0.],
+                [0., 1., 0.],
+                [0., 0., 1.]], dtype=torch.float64)
+
     """
     return torch.tensor([light.direction for light in LIGHTS.values()], dtype=dtype, device=device)
 
@@ -41,7 +49,16 @@ def shade(normals: Tensor, directions: Tensor) -> Tensor:
 
 
 def render(normals: Tensor) -> Tensor:
-    """Return the renderings clip(e . n, 0, 1) under the four lights, (B, 4, H, W) in [0, 1]."""
+    """Return the renderings clip(e . n, 0, 1) under the four lights, (B, 4, H, W) in [0, 1].
+
+    Example:
+        >>> import torch
+        >>> from dsr.geometry.shading import render
+        >>> facing = torch.tensor([0.0, 0.0, -1.0]).view(1, 3, 1, 1)
+        >>> render(facing).flatten().round(decimals=2)
+        tensor([0.5800, 0.5800, 0.5800, 1.0000])
+
+    """
     return shade(normals, lights(dtype=normals.dtype, device=normals.device)).clamp(0, 1)
 
 

@@ -16,6 +16,14 @@ def back_project(depth: Tensor, rays: Tensor) -> Tensor:
     Returns:
         (B, 3, H, W) points in metres; x right, y down, z forward.
 
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.geometry.surface import back_project
+        >>> camera = dsr.Camera.from_fov(60, width=64, height=48)
+        >>> back_project(torch.full((1, 1, 48, 64), 2.0), camera.rays()[None]).shape
+        torch.Size([1, 3, 48, 64])
+
     """
     return depth * rays
 
@@ -41,6 +49,15 @@ def depth_to_normals(depth: Tensor, rays: Tensor, dtype: torch.dtype | None = No
 
     Raises:
         ValueError: the map is less than 2 pixels high or wide.
+
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.geometry.surface import depth_to_normals
+        >>> camera = dsr.Camera.from_fov(60, width=64, height=48)
+        >>> normals = depth_to_normals(torch.full((1, 1, 48, 64), 2.0), camera.rays(dtype=torch.float32)[None])
+        >>> normals[0, :, 24, 32] + 0  # a wall faces the camera
+        tensor([ 0.,  0., -1.])
 
     """
     if min(depth.shape[-2:]) < 2:

@@ -64,6 +64,16 @@ def fuse_maps(maps: Callable[[], Iterable[PosedMap]], voxel: float) -> FusedMesh
     Raises:
         ValueError: the voxels are too small for the space that the maps see, or no surface is left.
 
+    Example:
+        >>> import numpy as np
+        >>> import dsr
+        >>> from dsr.geometry.tsdf import PosedMap, fuse_maps
+        >>> camera = dsr.Camera.from_fov(60, width=64, height=48)
+        >>> wall = PosedMap(np.full((48, 64), 2.03), camera, np.eye(4))
+        >>> mesh = fuse_maps(lambda: [wall, wall], voxel=0.05)
+        >>> bool(abs(mesh.vertices[:, 2] - 2.03).max() < 1e-3)
+        True
+
     """
     if not 0 < voxel < np.inf:
         raise ValueError(f"voxel: expected a positive number of metres, got {voxel}")

@@ -56,6 +56,16 @@ def warp_depth(depth: Tensor, camera: Camera, transforms: Tensor, target: Camera
     Raises:
         ValueError: a shape is not as above.
 
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.geometry.warping import warp_depth
+        >>> camera = dsr.Camera.from_fov(60, width=64, height=48)
+        >>> back = torch.eye(4, dtype=torch.float64)[None]
+        >>> back[:, 2, 3] = 1.0  # what is at 2 m is at 3 m for a camera 1 m behind
+        >>> float(warp_depth(torch.full((1, 1, 48, 64), 2.0), camera, back, camera).nanmedian())
+        3.0
+
     """
     batch, size = depth.shape[0], (camera.height, camera.width)
     if min(size) < 2:

@@ -9,7 +9,6 @@ from dsr.inference.defaults import DEFAULT, WIDEST, Fill
 
 if TYPE_CHECKING:
     from dsr.inference.any_ratio import AnyRatio, upsample_surface, upsampler
-    from dsr.inference.api import upsample, upsample_with_errors
     from dsr.inference.plans import Plan, plan_for
     from dsr.inference.plausibility import find_filled
     from dsr.inference.selection import Selection, select
@@ -27,15 +26,12 @@ __all__ = [
     "find_sensor",
     "plan_for",
     "select",
-    "upsample",
     "upsample_surface",
-    "upsample_with_errors",
     "upsampler",
 ]
 
 _NAMES = {
     "any_ratio": ("AnyRatio", "upsample_surface", "upsampler"),
-    "api": ("upsample", "upsample_with_errors"),
     "plans": ("Plan", "plan_for"),
     "plausibility": ("find_filled",),
     "selection": ("Selection", "select"),

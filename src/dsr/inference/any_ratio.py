@@ -167,7 +167,7 @@ class AnyRatio(Method):
                 no solution, or the map's values contradict the named sensor.
 
         """
-        _check(rgb, depth, camera)
+        expect_picture(rgb, depth, camera)
         planned = self.plan(size_of(rgb), size_of(depth))  # raises ValueError for sizes or a scale that cannot be used
         self.check_working_size()
         sensor = find_sensor(depth, sensor) if isinstance(sensor, str) else sensor
@@ -311,6 +311,14 @@ def upsampler(
     Raises:
         ValueError: there is no such method or device, or an option is not as described.
 
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.inference import upsampler
+        >>> camera, run = dsr.Camera.from_fov(60, width=32, height=24), upsampler("bicubic")
+        >>> run.upsample(torch.rand(3, 24, 32), torch.full((1, 10, 13), 2.0), camera).depth.shape  # tensors alone
+        torch.Size([1, 24, 32])
+
     """
     recipe = read_recipe(method, settings, directories)
     return AnyRatio(recipe, pick_device(device), scale, fill, max_hole, working_size)
@@ -359,7 +367,7 @@ def _check_options(fill: str, max_hole: float, working_size: int | None) -> None
         raise ValueError(f"working_size: expected one of {', '.join(map(str, SIZES))}, got {working_size}")
 
 
-def _check(rgb: Tensor, depth: Tensor, camera: Camera) -> None:
+def expect_picture(rgb: Tensor, depth: Tensor, camera: Camera) -> None:
     """Raise ValueError unless the photo, the depth map and the camera are valid and fit together."""
     size = (camera.height, camera.width)
     if tuple(rgb.shape) != (3, *size):

@@ -85,6 +85,12 @@ def plan_for(
     Raises:
         ValueError: a scale that the method has no weights for, or sizes that do not fit together.
 
+    Example:
+        >>> from dsr.inference import plan_for
+        >>> from dsr.methods.recipe import read_recipe
+        >>> plan_for(read_recipe("facets"), (1440, 1920), (192, 256)).scale  # of a phone's depth
+        8
+
     """
     method, abilities, factors = recipe.name, recipe.abilities, steps_of(recipe)
     ratio = _ratio(photo_size, depth_size)

@@ -87,6 +87,16 @@ def fuse_views(reference: View, neighbours: Sequence[View]) -> Fused:
     Returns:
         The depth in the dtype of the reference.
 
+    Example:
+        >>> import numpy as np
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.inference.sequences import View, fuse_views
+        >>> camera, random = dsr.Camera.from_fov(60, width=64, height=48), torch.Generator().manual_seed(0)
+        >>> views = [View(2 + 0.01 * torch.randn((1, 48, 64), generator=random), camera, np.eye(4)) for _ in range(5)]
+        >>> bool(fuse_views(views[0], views[1:]).depth.std() < 0.6 * views[0].depth.std())
+        True
+
     """
     readings = [_own(reference), *(_seen_from(reference, view) for view in neighbours)]
     inverse, deviation = (torch.stack(each) for each in zip(*readings, strict=True))  # (N + 1, h, w)

@@ -148,6 +148,13 @@ def find_sensor(depth: Tensor, name: str = "auto", device_name: str = "") -> Ide
     Raises:
         ValueError: there is no such sensor, or the map's values keep to steps that it does not have.
 
+    Example:
+        >>> import torch
+        >>> from dsr.inference import find_sensor
+        >>> wall = torch.full((1, 48, 64), 2.0)
+        >>> find_sensor(wall) is None, find_sensor(wall, "Kinect v2").by
+        (True, 'request')
+
     """
     found = identify(depth, name, device_name)
     if found is None or found.by != "values" or found.constant is None:

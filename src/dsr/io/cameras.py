@@ -12,7 +12,7 @@ import torch
 from pydantic import BaseModel, Field
 from torch import Tensor
 
-from dsr.geometry.camera import ASSUMED_FOV, Camera
+from dsr.geometry.camera import ASSUMED_FOV, Camera, expect_intrinsics
 from dsr.geometry.plausible import may_be_of
 from dsr.geometry.warping import registered_camera, warp_depth
 from dsr.io.frames import Rig
@@ -21,7 +21,7 @@ from dsr.io.photos import Size, focal_in_exif, same_aspect
 from dsr.io.reading import CameraChoice, RigFiles
 from dsr.io.trajectories import read_transform
 from dsr.notes import Assumption
-from dsr.utils.guards import numbers_in, read_limited
+from dsr.utils.guards import naming, numbers_in, read_limited
 from dsr.utils.validation import parse_model
 
 _FILM_DIAGONAL = math.hypot(36, 24)
@@ -47,7 +47,7 @@ def find_camera(choice: CameraChoice, photo: Path, size: Size, size_lr: Size) ->
     if choice.intrinsics is not None:
         return camera_only(Camera(width, height, *choice.intrinsics)), []
     if choice.fov is not None:
-        return camera_only(Camera.from_fov(width, height, choice.fov)), []
+        return camera_only(Camera.from_fov(choice.fov, width, height)), []
     equivalent = focal_in_exif(photo)
     if equivalent is not None:
         focal = equivalent / _FILM_DIAGONAL * math.hypot(width, height)
@@ -56,7 +56,7 @@ def find_camera(choice: CameraChoice, photo: Path, size: Size, size_lr: Size) ->
             f"{equivalent:g} mm for 35 mm film = {focal:.5g} pixels",
         )
         return camera_only(Camera.centred(width, height, focal)), [assumption]
-    camera = Camera.from_fov(width, height)
+    camera = Camera.from_fov(ASSUMED_FOV, width, height)
     text = f"camera: none given, {ASSUMED_FOV:g} degrees of horizontal view assumed (--camera, --fov or --intrinsics)"
     return camera_only(camera), [Assumption(text, f"{camera.fx:.5g} pixels")]
 
@@ -78,6 +78,19 @@ def read_any_camera(path: Path) -> CameraFile | np.ndarray:
     if path.suffix.lower() != ".json" and not text.lstrip().startswith("{"):
         return _matrix(path, text)
     return _open3d(path, text) if '"intrinsic_matrix"' in text else read_camera(path)
+
+
+def read_sized_camera(path: Path) -> Camera:
+    """Return the camera of a file that states the size of its image; see :func:`read_any_camera`.
+
+    Raises:
+        ValueError: the file has none of the formats, or is a matrix alone.
+
+    """
+    content = read_any_camera(path)
+    if isinstance(content, np.ndarray):
+        raise ValueError(f"{path}: expected a camera with the size of its image, got a matrix: see Camera.from_matrix")
+    return content.camera
 
 
 def camera_only(camera: Camera) -> CameraFile:
@@ -140,7 +153,8 @@ def _matrix(path: Path, text: str) -> np.ndarray:
     if len(numbers) not in (9, 16):
         raise ValueError(f"{path}: expected JSON or a matrix of 3 x 3 or 4 x 4 numbers, got something else")
     side = math.isqrt(len(numbers))
-    return _check_matrix(path, np.array(numbers).reshape(side, side)[:3, :3])
+    with naming(path):
+        return expect_intrinsics(np.array(numbers).reshape(side, side))
 
 
 class _Open3d(BaseModel, strict=True):
@@ -154,16 +168,9 @@ class _Open3d(BaseModel, strict=True):
 def _open3d(path: Path, text: str) -> CameraFile:
     """Return the camera of Open3D's JSON."""
     stored = parse_model(_Open3d, text, path)
-    matrix = _check_matrix(path, np.array(stored.intrinsic_matrix).reshape(3, 3).T)
+    with naming(path):
+        matrix = expect_intrinsics(np.array(stored.intrinsic_matrix).reshape(3, 3).T)
     return camera_only(Camera(stored.width, stored.height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
-
-
-def _check_matrix(path: Path, matrix: np.ndarray) -> np.ndarray:
-    """Return a matrix after checking that it is one of intrinsics."""
-    upright = np.isfinite(matrix).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0
-    if not upright or not np.allclose(matrix[2], (0, 0, 1)) or matrix[1, 0] != 0:
-        raise ValueError(f"{path}: expected a matrix (fx 0 cx; 0 fy cy; 0 0 1), got {matrix.tolist()}")
-    return matrix
 
 
 def read_rig(files: RigFiles, size_lr: Size, baseline: float | None) -> Rig:

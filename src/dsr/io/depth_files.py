@@ -34,6 +34,9 @@ _STORABLE = {
     ".exr": ("float16", "float32", "uint32"),
 }
 """Types of value by file format; NumPy's formats take any."""
+_COMPRESSION, _PREDICTOR = cv2.IMWRITE_TIFF_COMPRESSION, 317
+"""Tags of TIFF (Adobe, TIFF 6.0, section 14, and Technical Notes 2 and 3): the compression, 8 for Deflate, and what it
+is applied to, differences of whole numbers (2) or of the bytes of floats, all first ones of a row before others (3)."""
 
 
 def read_depth_file(path: Path, most: int | None = None) -> np.ndarray:
@@ -96,7 +99,9 @@ def write_depth_file(path: Path, values: np.ndarray) -> None:
         elif suffix == ".exr":
             _write_exr(temporary, values)
         else:
-            written, content = cv2.imencode(suffix, values)
+            predictor = 3 if values.dtype.kind == "f" else 2
+            how = {".png": [cv2.IMWRITE_PNG_COMPRESSION, 6]}.get(suffix, [_COMPRESSION, 8, _PREDICTOR, predictor])
+            written, content = cv2.imencode(suffix, values, how)
             if not written:
                 raise ValueError(f"{path}: {values.shape[0]} x {values.shape[1]} pixels could not be encoded")
             temporary.write_bytes(content.tobytes())

@@ -38,6 +38,10 @@ class Encoding:
     range_type: RangeType
 
 
+IN_METRES = Encoding(".tiff", "float32", 1.0, math.nan, "orthogonal")
+"""How results are stored to the bit: as the distance to the camera's plane in metres, NaN in holes."""
+
+
 def turn_back_bits(name: str, values: np.ndarray, bits: int) -> np.ndarray:
     """Return values of 16 bits that were turned to the left, turned back.
 

@@ -9,7 +9,6 @@ the depth map as it was read, and of the photo, a result can be looked at anywhe
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -18,13 +17,8 @@ import cv2
 import numpy as np
 import torch
 import trimesh
-from numpy.typing import ArrayLike
-from PIL import Image
 from torch import Tensor
-from trimesh.exchange.gltf import export_glb
 from trimesh.exchange.ply import export_ply
-from trimesh.visual.material import PBRMaterial
-from trimesh.visual.texture import TextureVisuals
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.lights import LIGHT_NAMES
@@ -41,6 +35,7 @@ from dsr.geometry.mesh import (
 )
 from dsr.geometry.shading import render
 from dsr.geometry.surface import depth_to_normals
+from dsr.io.glb import write_glb
 from dsr.io.photos import write_png
 from dsr.sample import expect_distances
 from dsr.utils.arrays import array_headers, read_arrays
@@ -48,11 +43,8 @@ from dsr.utils.decoding import decode_pixels
 from dsr.utils.files import replacing
 from dsr.utils.guards import MOST_FACES, MOST_POINTS
 
-_TO_GLTF = np.array([1, -1, -1])
-_LARGEST_TEXTURE = 4096
-"""Largest side of a texture in pixels, which every viewer supports."""
-_LOSSLESS = 2**21
-"""Largest number of pixels of a texture that is stored without loss."""
+FLAT = "large triangles where the surface is flat"
+"""What makes a mesh smaller without a limit, see :mod:`dsr.geometry.adaptive_mesh`."""
 CAMERA_FRAME = "camera frame: x right, y down, z forward; metres"
 
 _STRIP = 1 << 20
@@ -96,7 +88,7 @@ def write_ply(
     corners = np.empty((0, 3), int) if faces is None else faces
     model = trimesh.Trimesh(
         points, corners, vertex_normals=normals, vertex_colors=colours, process=False,
-        vertex_attributes=_attributes("filled", filled, np.uint8),
+        vertex_attributes=None if filled is None else {"filled": filled.astype(np.uint8)},
     )  # fmt: skip
     content = export_ply(model, vertex_normal=normals is not None)
     header, mark, content = content.partition(b"element vertex")
@@ -104,59 +96,11 @@ def write_ply(
         file.writelines((header, f"comment {frame}\n".encode(), mark, content))
 
 
-def write_glb(
-    path: Path, points: np.ndarray, normals: np.ndarray, faces: np.ndarray, places: np.ndarray, photo: np.ndarray,
-    filled: np.ndarray | None = None,
-) -> None:  # fmt: skip
-    """Write a mesh as binary glTF atomically, with the photo as its texture, as sharp as it is.
-
-    The material is rough and lit from both sides, so that viewers show the shape as well as the photo.
-
-    Args:
-        points: (N, 3) in metres, in the camera frame.
-        normals: (N, 3) unit vectors.
-        faces: (M, 3) indices, counterclockwise from outside; one at least.
-        places: (N, 2) column and row of each point in the photo, pixel centres at integers.
-        photo: (H, W, 3) uint8, sRGB.
-        filled: (N,) bool, whether the points were not measured: the attribute ``_FILLED``; None to leave it out.
-
-    """
-    height, width = photo.shape[:2]
-    place = (places + 0.5) / (width, height)
-    visual = TextureVisuals(uv=np.stack((place[:, 0], 1 - place[:, 1]), axis=1), material=_material(photo))
-    model = trimesh.Trimesh(
-        points * _TO_GLTF, faces, vertex_normals=normals * _TO_GLTF, visual=visual, process=False,
-        vertex_attributes=_attributes("_FILLED", filled, np.float32),
-    )  # fmt: skip
-    with replacing(path) as temporary:
-        temporary.write_bytes(export_glb(trimesh.Scene(model), include_normals=True))
-
-
-def _attributes(name: str, values: np.ndarray | None, dtype: type) -> dict[str, ArrayLike]:
-    """Return what trimesh takes of an attribute of the vertices that may be missing."""
-    return {} if values is None else {name: values.astype(dtype)}
-
-
-def _material(photo: np.ndarray) -> PBRMaterial:
-    """Return a material that looks like the photo."""
-    height, width = photo.shape[:2]
-    shrink = min(1.0, _LARGEST_TEXTURE / max(height, width))
-    if shrink < 1:
-        size = (round(width * shrink), round(height * shrink))
-        photo = cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
-    image = Image.fromarray(photo)
-    if image.width * image.height > _LOSSLESS:  # trimesh keeps the format that an image has
-        content = io.BytesIO()
-        image.save(content, format="JPEG", quality=95)
-        image = Image.open(content)
-    return PBRMaterial(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True)
-
-
 class Written(NamedTuple):
     """How much of a surface was written.
 
     ``before`` and ``after``: triangles of the mesh, or points of the cloud, at full density and as written; ``how``:
-    what made them fewer, empty if nothing did.
+    what made them fewer, empty if nothing did; see :data:`FLAT`.
     """
 
     before: int
@@ -270,6 +214,7 @@ def write_mesh(
     *,
     largest_step: float = LARGEST_STEP,
     most: int = MOST_FACES,
+    tolerance: Tensor | None = None,
     filled: Tensor | None = None,
 ) -> Written:
     """Write the surface as a mesh with the photo's colours, cut at depth steps.
@@ -284,7 +229,8 @@ def write_mesh(
         camera: of these pixels.
         largest_step: see :func:`dsr.geometry.mesh.triangulate`.
         most: triangles; a larger mesh is simplified, see :mod:`dsr.geometry.mesh`.
-        filled: (1, H, W) bool, depth that was not measured: an attribute of the vertices.
+        tolerance: see :func:`dsr.geometry.mesh.triangulate`.
+        filled: (1, H, W) bool, where depth was not measured; a GLB file has it as the attribute ``_FILLED``.
 
     Returns:
         The numbers of triangles.
@@ -297,20 +243,19 @@ def write_mesh(
     for path in paths:  # before anything is written
         if path.suffix.lower() not in (".ply", ".glb"):
             raise ValueError(f"{path}: expected a mesh file, .ply or .glb, got {path.suffix or 'no suffix'}")
-    mesh = triangulate(depth, camera, largest_step=largest_step)
+    mesh = triangulate(depth, camera, largest_step=largest_step, tolerance=tolerance)
     if not len(mesh.faces):
         raise ValueError(f"{paths[0]}: expected neighbours of known depth to make a surface of, got none")
-    before, how = len(mesh.faces), ""
-    if before > most:
+    before, how = mesh.dense, FLAT if len(mesh.faces) < mesh.dense else ""
+    if len(mesh.faces) > most:
         mesh, how = _reduce(mesh, depth, camera, most, largest_step)
     normals, missing = vertex_normals(mesh), _at(filled, mesh.pixels)
     for path in paths:
         if path.suffix.lower() == ".ply":
             write_ply(path, mesh.vertices, _colours(rgb, mesh.pixels), normals, mesh.faces, filled=missing)
         else:
-            places = project(mesh.vertices, camera)
-            picture = _bytes(rgb).transpose(1, 2, 0).copy()
-            write_glb(path, mesh.vertices, normals, mesh.faces, places, picture, missing)
+            places, photo = project(mesh.vertices, camera), _bytes(rgb).transpose(1, 2, 0).copy()
+            write_glb(path, mesh.vertices, normals, mesh.faces, places, photo, missing)
     return Written(before, len(mesh.faces), how)
 
 

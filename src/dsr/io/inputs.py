@@ -6,21 +6,30 @@ import functools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.geometry.camera import Camera, RangeType
+from dsr.geometry.camera import ASSUMED_FOV, Camera, RangeType
 from dsr.geometry.lens import Lens, undistort
 from dsr.geometry.plausible import expect_possible
-from dsr.io.cameras import camera_only, find_camera, read_rig, scale_to_depth, scale_to_photo, to_photo
+from dsr.io.cameras import (
+    camera_only,
+    find_camera,
+    read_any_camera,
+    read_rig,
+    scale_to_depth,
+    scale_to_photo,
+    to_photo,
+)
 from dsr.io.depth_files import ICL_CAMERA, ICL_SUFFIX, read_depth_file
 from dsr.io.doubts import doubt_camera, doubt_depth
 from dsr.io.encoding import Encoding, decode, find_holes, turn_back_bits
 from dsr.io.frames import SLACK, Geometry, Rig
 from dsr.io.images import CameraFile, pixels_in_header, read_mask
-from dsr.io.pairs import Pair, words_of
+from dsr.io.pairs import Pair, find_camera_file, role_of_words, words_of
 from dsr.io.photos import Size, model_in_exif, read_photo, same_aspect
 from dsr.io.reading import SUNRGBD_BITS, CameraChoice, Reading
 from dsr.io.units import TURNED_BACK, Told, tell
@@ -179,16 +188,11 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     camera = described.camera.crop(0, 0, *size)
     if reading.baseline is not None:
         camera = replace(camera, baseline=reading.baseline)
-    hole_value = described.hole_value if reading.hole_value is None else reading.hole_value
     of_depth = camera.rescale(size_lr[1], size_lr[0]) if rig is None else rig.camera
-    range_type, range_assumptions = _range_type(pair, reading, described)
-    told = _unit(pair, reading, described, range_type, stored, FolderUnits() if units is None else units, of_depth)
-    range_type = told.range_type or range_type or "orthogonal"
-    if range_type == "disparity" and of_depth.baseline is None:
-        raise ValueError(f"{pair.depth}: disparities need the distance between the two cameras: --baseline METRES")
-    if told.bits:
-        stored = turn_back_bits(str(pair.depth), stored, told.bits)
-    holes, mark, hole_assumptions = find_holes(stored, hole_value)
+    units = FolderUnits() if units is None else units
+    found = _interpret(pair, reading, described, stored, units, of_depth)
+    stored, holes, told, range_type = found.stored, found.holes, found.told, found.range_type
+    hole_assumptions = list(found.hole_assumptions)
     if pair.mask is not None:
         holes |= ~_mask(pair.mask, size_lr)
     confidence, confidence_assumptions = _confidence(pair, reading, size_lr, holes)
@@ -196,7 +200,7 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
         raise ValueError(f"{pair.depth}: expected at least one known pixel, all are holes")
     lens_lr = lens if rig is None else rig.lens
     stored, holes, confidence, undone_lr = _undistort_depth(stored, holes, confidence, of_depth, lens_lr)
-    encoding = Encoding(_suffix(pair), str(stored.dtype), told.unit, mark, range_type)
+    encoding = Encoding(_suffix(pair), str(stored.dtype), told.unit, found.mark, range_type)
     depth_lr = decode(stored, holes, encoding, of_depth)
     hole_assumptions += _expect_distances(pair.depth, depth_lr, holes, range_type)
     doubts = [*doubt_camera(described.camera, "camera", size_lr), *doubt_depth(depth_lr, of_depth, range_type)]
@@ -206,7 +210,7 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
         *camera_assumptions,
         *undone,
         *crop_assumptions,
-        *range_assumptions,
+        *found.range_assumptions,
         *told.assumptions,
         *hole_assumptions,
         *confidence_assumptions,
@@ -222,6 +226,70 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     return Picture(
         rgb, depth_lr, camera, encoding, all_assumptions, geometry.pose, confidence, device_name, geometry.up, time
     )
+
+
+class _Interpreted(NamedTuple):
+    """What the values of a map are: they with their bits turned back, their holes, and how they count."""
+
+    stored: np.ndarray
+    holes: np.ndarray
+    mark: float
+    told: Told
+    range_type: RangeType
+    range_assumptions: list[Assumption]
+    hole_assumptions: list[Assumption]
+
+
+def _interpret(
+    pair: Pair, reading: Reading, described: CameraFile, stored: np.ndarray, units: FolderUnits, camera: Camera
+) -> _Interpreted:
+    """Return what the values of a pair's map are, (h, w), which ``camera`` has taken."""
+    range_type, range_assumptions = _range_type(pair, reading, described)
+    told = _unit(pair, reading, described, range_type, stored, units, camera)
+    range_type = told.range_type or range_type or "orthogonal"
+    if range_type == "disparity" and camera.baseline is None:
+        raise ValueError(f"{pair.depth}: disparities need the distance between the two cameras: --baseline METRES")
+    if told.bits:
+        stored = turn_back_bits(str(pair.depth), stored, told.bits)
+    hole_value = described.hole_value if reading.hole_value is None else reading.hole_value
+    holes, mark, hole_assumptions = find_holes(stored, hole_value)
+    return _Interpreted(stored, holes, mark, told, range_type, range_assumptions, hole_assumptions)
+
+
+def read_map(path: Path, reading: Reading, camera: Camera | None = None) -> tuple[Tensor, tuple[Assumption, ...]]:
+    """Return a depth map without its photo, (1, h, w) float32 in metres, NaN in holes, and what its values told.
+
+    What a camera file beside it says of the values counts, as for a pair.
+
+    Args:
+        reading: what the user says about it.
+        camera: of the same view, of any size; None for that of the file beside it, or an assumed one.
+
+    Raises:
+        ValueError: it is missing or damaged, or its unit or range type is to be given.
+
+    """
+    stored = read_depth_file(path)
+    size: Size = (stored.shape[0], stored.shape[1])
+    apart = role_of_words(words_of(path.parent.name)) == "depth"  # a folder of maps, its camera file above it
+    pair = Pair(path.stem, path, path, find_camera_file(path.parent, path.parent.parent if apart else path.parent))
+    content = None if pair.camera is None else read_any_camera(pair.camera)
+    own = content if isinstance(content, CameraFile) else None
+    if own is None:
+        own = camera_only(ICL_CAMERA if _is_icl(pair) else Camera.from_fov(ASSUMED_FOV, size[1], size[0]))
+    of_depth = scale_to_depth(str(pair.camera or path) if camera is None else "camera", camera or own.camera, size)
+    of_depth = replace(of_depth, baseline=reading.baseline or of_depth.baseline)
+    found = _interpret(pair, reading, own, stored, FolderUnits(), of_depth)
+    if found.holes.all():
+        raise ValueError(f"{path}: expected at least one known pixel, all are holes")
+    encoding = Encoding(_suffix(pair), str(found.stored.dtype), found.told.unit, found.mark, found.range_type)
+    depth = decode(found.stored, found.holes, encoding, of_depth)
+    _expect_distances(path, depth, found.holes, found.range_type)
+    notes = [*found.range_assumptions, *found.told.assumptions] if own.depth_unit is None else []
+    known = camera is not None or isinstance(content, CameraFile) or _is_icl(pair)
+    if found.range_type != "orthogonal" and not known:
+        notes.append(Assumption(f"camera: none given, {ASSUMED_FOV:g} degrees of horizontal view assumed (--camera)"))
+    return depth, (*notes, *doubt_depth(depth, of_depth, found.range_type))
 
 
 def read_geometry(pair: Pair, size: Size, reading: Reading) -> tuple[Geometry, list[Assumption]]:

@@ -41,15 +41,14 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.rigid_motion import is_rotation
+from dsr.geometry.rigid_motion import is_rotation, quaternion_of
+from dsr.io.depth_files import read_depth_file
 from dsr.io.exports import to_jpeg, world_comment, write_ply
 from dsr.io.images import read_pixels
 from dsr.io.photos import encode_png, write_png
-from dsr.utils.arrays import open_array
 from dsr.utils.files import replacing, write_text
 from dsr.utils.guards import pixels_beside, refusing
 
@@ -84,7 +83,7 @@ class Frame:
         pose: (4, 4) float64 camera-to-world transform in metres, of a camera with x right, y down, z forward; None if
             it is not known.
         colour: an 8-bit PNG.
-        depth: an NPY of (H, W) orthogonal depth in metres, NaN in holes.
+        depth: a file of (H, W) orthogonal depth in metres, NaN in holes.
         up: the axis of the world that points up, one of :data:`dsr.io.frames.UPS`.
         time: of the frame in seconds; None if it is not known.
 
@@ -110,11 +109,11 @@ class Frame:
             ValueError: the file is damaged, or not of the camera's size.
 
         """
-        values = open_array(self.depth)
+        values = read_depth_file(self.depth, pixels_beside(self.camera.height, self.camera.width))
         if values.shape != (self.camera.height, self.camera.width):
             size = f"{self.camera.height} x {self.camera.width}"
             raise ValueError(f"{self.depth}: expected depth of {size} pixels (height x width), got {values.shape}")
-        return np.array(values, np.float32)
+        return values.astype(np.float32)
 
     def read_colour(self) -> np.ndarray:
         """Return the photo, (H, W, 3) uint8, red first.
@@ -325,7 +324,7 @@ def _images(frames: Sequence[Frame]) -> str:
     for number, frame in enumerate(frames, 1):
         pose = _matrix(frame)
         to_camera = pose[:3, :3].T
-        turn = Rotation.from_matrix(to_camera).as_quat(canonical=True)[[3, 0, 1, 2]]
+        turn = quaternion_of(to_camera)[[3, 0, 1, 2]]
         lines += [f"{number} {_numbers((*turn, *(-to_camera @ pose[:3, 3])))} {number} {frame.stem}.png", ""]
     return "\n".join(lines) + "\n"
 

@@ -232,6 +232,24 @@ class Method(abc.ABC):
             the method's own quantities, such as ``objective`` and ``moved``, in an order of its own. None for others.
         name: in scores and tables, of a method that takes it from its input; None for that of its file of ``conf``.
 
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.degradation.downsampling import Downsampling, make_sample
+        >>> from dsr.methods.base import Method
+        >>> from dsr.methods.classical.interpolation import Interpolation
+        >>> from dsr.sample import Scene
+        >>> class Nearer(Method):
+        ...     range_type = "orthogonal"
+        ...
+        ...     def __call__(self, sample, progress=None):
+        ...         return 0.5 * Interpolation("bicubic")(sample)
+        >>> camera, wall = dsr.Camera.from_fov(60, width=32, height=24), torch.full((1, 24, 32), 2.0)
+        >>> method, scene = Nearer(), Scene("mine", "wall", torch.rand(3, 24, 32), camera, wall)
+        >>> sample = make_sample(scene, 4, Downsampling("box"), method.range_type)
+        >>> bool((method(sample) - 1).abs().max() < 0.05)
+        True
+
     """
 
     abilities: ClassVar[Abilities] = Abilities()

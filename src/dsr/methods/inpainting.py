@@ -25,6 +25,14 @@ def inpaint(x: Tensor, photo: Tensor | None = None) -> Tensor:
     Args:
         photo: (B, 3, H, W) in [0, 1], of any size.
 
+    Example:
+        >>> import torch
+        >>> from dsr.methods.inpainting import inpaint
+        >>> values = torch.full((1, 1, 5, 5), 0.5)
+        >>> values[..., 1:3, 1:3] = torch.nan
+        >>> inpaint(values).unique()
+        tensor([0.5000])
+
     """
     if not exporting() and bool(x.isfinite().all()):
         return x

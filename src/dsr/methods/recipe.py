@@ -269,7 +269,14 @@ class Recipe:
 
 
 def list_methods(directories: Sequence[Path] = ()) -> list[str]:
-    """Return the names of all methods."""
+    """Return the names of all methods.
+
+    Example:
+        >>> from dsr.methods.recipe import list_methods
+        >>> {"bicubic", "facets", "tgv"} <= set(list_methods())
+        True
+
+    """
     return list_choices("method", config_directories(directories))
 
 
@@ -282,6 +289,11 @@ def read_recipe(name: str, settings: Mapping[str, Any] | None = None, directorie
 
     Raises:
         ConfigError: there is no such method, or its file cannot be read.
+
+    Example:
+        >>> from dsr.methods.recipe import read_recipe
+        >>> read_recipe("tgv", {"iterations": 20}).abilities.ratios
+        'whole'
 
     """
     places = config_directories(directories)

@@ -77,7 +77,17 @@ def align(prediction: Tensor, target: Tensor, mask: Tensor | None, how: str) -> 
 
 
 def align_map(depth: Tensor, truth: Tensor | None, how: str) -> Tensor:
-    """Return a prediction, (1, H, W), aligned to its truth, see :func:`align`; as it is where there is none."""
+    """Return a prediction, (1, H, W), aligned to its truth, see :func:`align`; as it is where there is none.
+
+    Example:
+        >>> import torch
+        >>> from dsr.metrics.alignment import align_map
+        >>> truth = 1 + torch.rand((1, 24, 32), generator=torch.Generator().manual_seed(0))
+        >>> found = align_map(3 * truth, truth, "scale")
+        >>> bool((found - truth).abs().max() < 1e-5)
+        True
+
+    """
     return depth if truth is None else align(depth[None], truth[None], None, how)[0]
 
 

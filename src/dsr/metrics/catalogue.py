@@ -138,6 +138,11 @@ def catalogue(
     Raises:
         ValueError: there is no such protocol, or two metrics have one name.
 
+    Example:
+        >>> from dsr.metrics.catalogue import catalogue
+        >>> [metric.name for metric in catalogue()][:3]
+        ['RMSE_d', 'BadPix_d_1cm', 'BadPix_d_5cm']
+
     """
     if not protocols or not set(protocols) <= set(PROTOCOLS):
         raise ValueError(f"protocols: expected some of {', '.join(PROTOCOLS)}, got {', '.join(protocols) or 'none'}")

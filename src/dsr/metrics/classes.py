@@ -45,6 +45,18 @@ class PerImageMean(torchmetrics.Metric):
     Raises:
         ValueError: an unknown variant.
 
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.metrics.classes import RMSEd
+        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
+        >>> truth, metric = torch.full((1, 1, 24, 32), 2.0), RMSEd()
+        >>> for offset in (0.0, 0.1):
+        ...     metric.update(truth + offset, truth, camera)
+        >>>
+        >>> round(float(metric.compute()), 3)  # of two images
+        0.054
+
     """
 
     is_differentiable = False
@@ -341,6 +353,15 @@ class SurfaceMetrics(torchmetrics.MetricCollection):
         alignment: one of :data:`dsr.metrics.alignment.ALIGNMENTS`, of each prediction to its truth.
         **settings: as for every torchmetrics collection.
 
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.metrics.classes import DSSIMv, RMSEv, SurfaceMetrics
+        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
+        >>> truth = torch.full((1, 1, 24, 32), 2.0)
+        >>> sorted(SurfaceMetrics([RMSEv(), DSSIMv()])(truth, truth, camera))
+        ['DSSIMv', 'RMSEv']
+
     """
 
     def __init__(self, *metrics: Any, alignment: str = "none", **settings: Any) -> None:
@@ -371,6 +392,16 @@ def visual_metrics(
         protocols: names of :data:`dsr.metrics.catalogue.PROTOCOLS`.
         alignment: see :class:`SurfaceMetrics`.
         **settings: as for every torchmetrics class.
+
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.metrics.classes import visual_metrics
+        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
+        >>> truth, metrics = torch.full((1, 1, 24, 32), 2.0), visual_metrics()
+        >>> metrics.update(1.02 * truth, truth, camera)
+        >>> float(metrics.compute()["BadPix_d_1pct"])
+        1.0
 
     """
     chosen = catalogue(network, extra, protocols)

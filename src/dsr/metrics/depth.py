@@ -27,7 +27,19 @@ from dsr.metrics.metric import Metric, depth_mask, target_mask
 
 
 def abs_rel(pair: SurfacePair) -> Tensor:
-    """Return the mean of |z - t| / t, (B,); lower is better."""
+    """Return the mean of |z - t| / t, (B,); lower is better.
+
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.metrics.functional import SurfacePair
+        >>> from dsr.metrics.depth import abs_rel
+        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
+        >>> truth = torch.full((1, 1, 24, 32), 2.0)
+        >>> abs_rel(SurfacePair(1.02 * truth, truth, camera.rays()[None])).round(decimals=4)
+        tensor([0.0200])
+
+    """
     return masked_mean((pair.prediction - pair.target).abs() / pair.target, pair.depth_mask).squeeze(1)
 
 
@@ -43,6 +55,17 @@ def within_ratio(pair: SurfacePair, ratio: float) -> Tensor:
     """Return the fraction of pixels where the larger depth is less than ``ratio`` times the smaller one, (B,).
 
     The accuracy delta of Eigen et al.; higher is better.
+
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.metrics.functional import SurfacePair
+        >>> from dsr.metrics.depth import within_ratio
+        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
+        >>> truth = torch.full((1, 1, 24, 32), 2.0)
+        >>> within_ratio(SurfacePair(1.02 * truth, truth, camera.rays()[None]), 1.05)
+        tensor([1.], dtype=torch.float64)
+
     """
     return masked_mean(field.larger_ratio(pair) < ratio, pair.depth_mask).squeeze(1)
 

@@ -55,6 +55,16 @@ class SurfacePair:
     Raises:
         ValueError: shapes or types do not fit together.
 
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.metrics.functional import SurfacePair
+        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
+        >>> truth = torch.full((1, 1, 24, 32), 2.0)
+        >>> pair = SurfacePair(truth + 0.01, truth, camera.rays()[None])
+        >>> pair.prediction.shape
+        torch.Size([1, 1, 24, 32])
+
     """
 
     def __init__(
@@ -228,7 +238,19 @@ def _in_region(name: str) -> Callable[[SurfacePair], SurfacePair]:
 
 
 def rmse_d(pair: SurfacePair) -> Tensor:
-    """Return the RMS difference of the perspective depths in metres, (B,)."""
+    """Return the RMS difference of the perspective depths in metres, (B,).
+
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.metrics.functional import SurfacePair
+        >>> from dsr.metrics.functional import rmse_d
+        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
+        >>> truth = torch.full((1, 1, 24, 32), 2.0)
+        >>> rmse_d(SurfacePair(truth + 0.01, truth, camera.rays()[None])).round(decimals=3)  # along the rays
+        tensor([0.0110])
+
+    """
     return masked_mean(pair.perspective_error.square(), pair.depth_mask).sqrt().squeeze(1)
 
 
@@ -239,6 +261,16 @@ def bad_pix_d(pair: SurfacePair, threshold: float, *, relative: bool = False) ->
         pair: the two surfaces.
         threshold: in metres, or as a fraction of the target where ``relative``.
         relative: see ``threshold``.
+
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.metrics.functional import SurfacePair
+        >>> from dsr.metrics.functional import bad_pix_d
+        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
+        >>> truth = torch.full((1, 1, 24, 32), 2.0)
+        >>> bad_pix_d(SurfacePair(1.02 * truth, truth, camera.rays()[None]), 0.01, relative=True)
+        tensor([1.], dtype=torch.float64)
 
     """
     limit = pair.target * pair.ray_lengths * threshold if relative else threshold
@@ -255,7 +287,19 @@ def mse_v(pair: SurfacePair) -> Tensor:
 
 
 def rmse_v(pair: SurfacePair) -> Tensor:
-    """Return RMSE_v = sqrt(MSE_v), (B,)."""
+    """Return RMSE_v = sqrt(MSE_v), (B,).
+
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.metrics.functional import SurfacePair
+        >>> from dsr.metrics.functional import rmse_v
+        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
+        >>> truth = torch.full((1, 1, 24, 32), 2.0)
+        >>> rmse_v(SurfacePair(truth + 0.01, truth, camera.rays()[None]))  # a wall nearer by shows the same
+        tensor([0.])
+
+    """
     return mse_v(pair).sqrt()
 
 
@@ -279,6 +323,17 @@ def dssim_v(pair: SurfacePair) -> Tensor:
     Raises:
         ValueError: the map is smaller than a window.
 
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.metrics.functional import SurfacePair
+        >>> from dsr.metrics.functional import dssim_v
+        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
+        >>> truth = torch.full((1, 1, 24, 32), 2.0)
+        >>> noise = 0.01 * torch.rand(truth.shape, generator=torch.Generator().manual_seed(0))
+        >>> dssim_v(SurfacePair(truth + noise, truth, camera.rays()[None])).shape  # for each light
+        torch.Size([1, 4])
+
     """
     first, second = pair.renderings
     if min(first.shape[-2:]) < SSIM_WINDOW:
@@ -292,6 +347,17 @@ def bumpiness_d(pair: SurfacePair) -> Tensor:
 
     Metric of the 4D light field benchmark (Honauer et al. 2016), with k in px m as if its camera had seen the scene.
     Derivatives are Scharr filters, 0 on the map's outermost pixel after each.
+
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.metrics.functional import SurfacePair
+        >>> from dsr.metrics.functional import bumpiness_d
+        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
+        >>> truth = torch.full((1, 1, 24, 32), 2.0)
+        >>> bumpiness_d(SurfacePair(truth, truth, camera.rays()[None]))
+        tensor([0.])
+
     """
     difference = (BUMPINESS_DISPARITY * (1 / pair.prediction - 1 / pair.target)).to(pair.image_dtype)
     if not pair.complete:

@@ -26,7 +26,20 @@ ANGLES = (5, 7.5, 11.25, 22.5, 30)
 
 
 def mean(pair: SurfacePair) -> Tensor:
-    """Return the mean angle between the normals in degrees, (B,); 0 to 180, lower is better."""
+    """Return the mean angle between the normals in degrees, (B,); 0 to 180, lower is better.
+
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.metrics.functional import SurfacePair
+        >>> from dsr.metrics import normals
+        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
+        >>> truth = torch.full((1, 1, 24, 32), 2.0)
+        >>> tilted = truth + 0.1 * torch.linspace(-1, 1, 32)
+        >>> normals.mean(SurfacePair(tilted, truth, camera.rays()[None])).round(decimals=1)
+        tensor([5.1000])
+
+    """
     return masked_mean(angle(pair), pair.normal_mask).squeeze(1)
 
 

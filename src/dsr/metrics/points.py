@@ -96,7 +96,19 @@ def _clouds(pair: SurfacePair) -> tuple[Tensor, Tensor]:
 
 
 def chamfer(pair: SurfacePair) -> Tensor:
-    """Return the Chamfer distance in metres, (B,); lower is better. NaN without a predicted point."""
+    """Return the Chamfer distance in metres, (B,); lower is better. NaN without a predicted point.
+
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.metrics.functional import SurfacePair
+        >>> from dsr.metrics.points import chamfer
+        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
+        >>> truth = torch.full((1, 1, 24, 32), 2.0)
+        >>> chamfer(SurfacePair(truth + 0.01, truth, camera.rays()[None])).round(decimals=3)
+        tensor([0.0110])
+
+    """
     both = masked_mean(to_truth(pair), pair.depth_mask) + masked_mean(to_prediction(pair), pair.target_mask)
     return both.squeeze(1) / 2
 

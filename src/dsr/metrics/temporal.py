@@ -117,6 +117,16 @@ def opw(
     Raises:
         ValueError: a shape is not as above, or a pose is not rigid.
 
+    Example:
+        >>> import numpy as np
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.metrics.temporal import opw
+        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
+        >>> depths = torch.full((3, 1, 24, 32), 2.0, dtype=torch.float64)
+        >>> float(opw(depths, camera, [np.eye(4)] * 3))  # nothing moves, nothing flickers
+        0.0
+
     """
     known = _known(depths) if static is None else _known(depths) & static
     frames = [as_rigid(np.asarray(each), f"poses: {number}") for number, each in enumerate(poses)]

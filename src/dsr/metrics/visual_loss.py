@@ -35,6 +35,18 @@ class VisualLoss:
     Raises:
         ValueError: there is no such loss, or no network for it.
 
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.metrics.functional import SurfacePair
+        >>> from dsr.metrics.visual_loss import VisualLoss
+        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
+        >>> truth = torch.full((1, 1, 24, 32), 2.0)
+        >>> prediction = truth.clone().requires_grad_()
+        >>> loss = VisualLoss("mse_v")(SurfacePair(prediction, truth, camera.rays()[None]))
+        >>> loss.shape, loss.requires_grad
+        (torch.Size([1]), True)
+
     """
 
     name: VisualLossName = "mse_v"

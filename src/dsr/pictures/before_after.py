@@ -20,7 +20,8 @@ from dsr.io.exports import normal_strips
 from dsr.pictures.canvas import Canvas, colours, without_collections, write_figure
 from dsr.pictures.depth_views import limits_of, reduced, strongest_window
 
-_DPI = 200
+_FEWEST_DPI, _DPI = 120, 200
+"""Least and most pixels per inch; between them, a panel has 3 pixels for 4 of the picture."""
 _PANEL, _TALLEST, _NARROWEST = 3.78, 4.6, 2.2
 """Maximum panel width, maximum panel height and minimum column width, inches."""
 _LEFT, _GAP, _HEADING, _BETWEEN, _BELOW = 0.3, 0.1, 0.92, 0.1, 0.62
@@ -85,7 +86,8 @@ def write_before_after(path: Path, rgb: Tensor, depth_lr: Tensor, depth: Tensor,
     sheet.colour_bar(image)
     if not (depth_lr.isfinite().all() and depth.isfinite().all()):
         sheet.text(0.99 * sheet.figure.get_figwidth(), 0.3, "pink: holes", ha="right", va="center", fontsize=11)
-    write_figure(path, sheet.figure, _DPI)
+    dpi = round(0.75 * max(camera.width, camera.height) / max(sheet.size))
+    write_figure(path, sheet.figure, min(max(dpi, _FEWEST_DPI), _DPI))
 
 
 def _normals(depth: Tensor, camera: Camera) -> Tensor:
@@ -113,19 +115,19 @@ class _Sheet(Canvas):
 
     def __init__(self, aspect: float, title: str) -> None:
         width = min(_PANEL, _TALLEST / aspect)
-        self._size = (width, width * aspect)
+        self.size = (width, width * aspect)
         self._pitch = max(width, _NARROWEST) + _GAP
-        height = _HEADING + 3 * (self._size[1] + _BETWEEN) + _BELOW
+        height = _HEADING + 3 * (self.size[1] + _BETWEEN) + _BELOW
         super().__init__(_LEFT + 3 * self._pitch, height)
         self.text(_LEFT, height - 0.3, title, fontsize=16, va="center", weight="bold")
-        for row, label in enumerate(_ROWS if self._size[1] > 1 else ()):
+        for row, label in enumerate(_ROWS if self.size[1] > 1 else ()):
             place = self.place(row, 0)
             middle = (place.y0 + place.y1) / 2
             self.text(0.5 * _LEFT, middle, label, rotation=90, ha="center", va="center", fontsize=12)
 
     def place(self, row: int, column: int) -> Bbox:
         """Return where a panel is."""
-        width, height = self._size
+        width, height = self.size
         left = _LEFT + column * self._pitch + (self._pitch - _GAP - width) / 2
         top = self.figure.get_figheight() - _HEADING - row * (height + _BETWEEN)
         return Bbox.from_bounds(left, top - height, width, height)

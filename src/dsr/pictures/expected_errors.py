@@ -61,4 +61,4 @@ def write_confidence(
             page.text(left + _PANEL / 2, place.y1 + 0.08, f"{kind} error of the {what}", fontsize=12, ha="center")
             below = Bbox.from_bounds(left + 0.1 * _PANEL, place.y0 - 0.2, 0.8 * _PANEL, 0.1)
             page.bar(image, below, orientation="horizontal", extend="both").set_label(unit, labelpad=1)
-    write_figure(path, page.figure, _DPI)
+    write_figure(path, page.figure, _DPI, few_colours=True)

@@ -16,9 +16,10 @@ import numpy as np
 
 
 def asset(*names: str) -> str:
-    """Return the text of files of the package, one after another."""
+    """Return the text of files of the package, one after another, with the stylesheets that they import in place."""
     folder = resources.files("dsr.report") / "assets"
-    return "\n".join((folder / name).read_text(encoding="utf-8") for name in names)
+    text = "\n".join((folder / name).read_text(encoding="utf-8") for name in names)
+    return re.sub(r'@import "(\w+\.css)";', lambda found: asset(found[1]), text)
 
 
 def fill(template: str, parts: Mapping[str, str]) -> str:

@@ -26,8 +26,9 @@ LEVELS = 2**24 - 1
 """Highest level of inverse depth; 1 is the lowest, 0 is a hole."""
 ERROR_LEVELS = 255
 """Highest level of an error; 1 is the lowest, 0 is unknown."""
-RIGHT, BELOW, RIGHT_WITH_DOUBTFUL, BELOW_WITH_DOUBTFUL, DOUBTFUL = 1, 2, 4, 8, 16
-"""Flags of a pixel: joined to its right neighbour and to the one below, without and with doubtful pixels; doubtful."""
+RIGHT, BELOW, RIGHT_WITH_DOUBTFUL, BELOW_WITH_DOUBTFUL, DOUBTFUL, FILLED = 1, 2, 4, 8, 16, 32
+"""Flags of a pixel: joined to its right neighbour and to the one below, without and with doubtful pixels; doubtful;
+not measured."""
 _STRIP = 1 << 20
 """Pixels whose joints are looked for at a time."""
 
@@ -44,6 +45,7 @@ class Grid:
         doubtful: (h, w) bool, pixels that the mesh leaves out.
         certain: joints without doubtful pixels.
         errors: levels of the expected errors by name, (h, w) uint8 each.
+        filled: (h, w) bool, pixels whose depth was not measured; None where that is not known.
 
     """
 
@@ -54,6 +56,7 @@ class Grid:
     doubtful: np.ndarray
     certain: Joints
     errors: Mapping[str, np.ndarray]
+    filled: np.ndarray | None = None
 
 
 def factor_for(height: int, width: int, most: int) -> int:
@@ -163,6 +166,8 @@ def _unpredicted(levels: np.ndarray) -> np.ndarray:
 def _flags(grid: Grid) -> np.ndarray:
     """Return the flags of the pixels, (h, w) uint8."""
     flags = np.where(grid.doubtful, DOUBTFUL, 0).astype(np.uint8)
+    if grid.filled is not None:
+        flags |= np.where(grid.filled, FILLED, 0).astype(np.uint8)
     valid = np.isfinite(grid.depth)
     for (across, down), there, right, below in (
         (grid.certain, valid & ~grid.doubtful, RIGHT, BELOW),

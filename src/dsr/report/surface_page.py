@@ -35,7 +35,8 @@ from dsr.utils.guards import opened
 
 MARK = '<meta name="generator" content="dsr view">'
 """What a page begins with that a new one may replace."""
-_SCRIPTS = ("core.js", "decode.js", "mesh.js", "webgl.js", "pose.js", "view.js")
+VIEWER = ("core.js", "decode.js", "mesh.js", "webgl.js", "pose.js", "view.js")
+"""The scripts that show results in the elements of ``viewer.html``."""
 _COLOURS = "magma"
 ANGLES = (1.0, 60.0)
 """Ends of the colours of the normals' expected errors in degrees, those of ``confidence.png``."""
@@ -116,6 +117,8 @@ def pack_result(result: ViewedResult, vertices: int, photo_side: int) -> Packed:
         about[name]["size"] = [holes.shape[1], holes.shape[0]] if holes is not None else []
         about[name]["holes"] = float(np.mean(~np.isfinite(grid.depth)))
     about["doubtful"] = float(grids["after"].doubtful.mean())
+    filled = grids["after"].filled
+    about["filled"] = 0.0 if filled is None else float(filled.mean())
     if result.depth_error is not None:
         about["errors"] = {name: {"low": low, "high": high} for name, (low, high) in limits.items()}
     about["pivot"] = _pivot(result.depth, result.camera, middle)
@@ -137,8 +140,25 @@ def save_view(path: Path, results: Sequence[Packed], *, title: str, notes: Seque
         notes: remarks on the page as a whole.
 
     """
-    style, script = asset("view.css"), f'"use strict";\n{asset(*_SCRIPTS)}'
-    content = {
+    style, script = asset("view.css"), f'"use strict";\n{asset(*VIEWER, "view_page.js")}'
+    blocks = [block("content", json_text(content_of(results, title, notes)))]
+    blocks += [block(name, data, "text/plain") for name, data in data_of(results).items()]
+    parts = {
+        "MARK": MARK,
+        "POLICY": policy(style, script, "data: blob:"),
+        "TITLE": html.escape(title),
+        "STYLE": style,
+        "VIEWER": asset("viewer.html"),
+        "SCRIPT": script,
+        "STATIC": "\n".join(_static(result) for result in results),
+        "DATA": "\n".join(blocks),
+    }
+    write_text(path, fill("view.html", parts))
+
+
+def content_of(results: Sequence[Packed], title: str, notes: Sequence[str] = ()) -> dict[str, Any]:
+    """Return what the viewer is told of results, as values for JSON."""
+    return {
         "title": title,
         "notes": list(notes),
         "light": VIEWING_LIGHT,
@@ -146,19 +166,11 @@ def save_view(path: Path, results: Sequence[Packed], *, title: str, notes: Seque
         "colours": palette(_COLOURS),
         "results": [{**result.about, "thumb": _data_url(result.pictures["thumb"])} for result in results],
     }
-    blocks = [block("content", json_text(content))]
-    for number, result in enumerate(results):
-        blocks += [block(f"{name}-{number}", data, "text/plain") for name, data in result.data.items()]
-    parts = {
-        "MARK": MARK,
-        "POLICY": policy(style, script, "data: blob:"),
-        "TITLE": html.escape(title),
-        "STYLE": style,
-        "SCRIPT": script,
-        "STATIC": "\n".join(_static(result) for result in results),
-        "DATA": "\n".join(blocks),
-    }
-    write_text(path, fill("view.html", parts))
+
+
+def data_of(results: Sequence[Packed]) -> dict[str, str]:
+    """Return the surfaces and photos of results as base64 texts, by name and number: ``after-0``."""
+    return {f"{name}-{number}": data for number, result in enumerate(results) for name, data in result.data.items()}
 
 
 def is_view(path: Path) -> bool:
@@ -187,6 +199,9 @@ def _data_url(jpeg: bytes) -> str:
 def _after(result: ViewedResult, vertices: int, limits: Mapping[str, tuple[float, ...]]) -> Grid:
     """Return the surface of the result, with the errors where there are any."""
     grid = _reduce(result.depth, result.camera, vertices)
+    if result.depth_lr is not None:
+        filled = reduce_mask(_filled(result.depth, result.depth_lr), grid.factor)
+        grid = replace(grid, filled=filled & np.isfinite(grid.depth))
     if result.depth_error is None or result.angle_error is None:
         return grid
     with np.errstate(invalid="ignore"):
@@ -199,6 +214,14 @@ def _after(result: ViewedResult, vertices: int, limits: Mapping[str, tuple[float
         errors[name] = error_levels(fitted, *limits[name])
     doubtful = reduce_mask(left_out, grid.factor) & known
     return replace(grid, doubtful=doubtful, certain=certain, errors=errors)
+
+
+def _filled(depth: np.ndarray, depth_lr: np.ndarray) -> np.ndarray:
+    """Return where a result, (H, W), has depth and the nearest pixel of its input, (h, w), has none, (H, W) bool."""
+    rows, columns = (
+        ((np.arange(to) + 0.5) * of / to).astype(int) for to, of in zip(depth.shape, depth_lr.shape, strict=True)
+    )
+    return np.isfinite(depth) & ~np.isfinite(depth_lr)[np.ix_(rows, columns)]
 
 
 def _reduce(depth: np.ndarray, camera: Camera, vertices: int) -> Grid:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import re
 import statistics
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -294,6 +294,7 @@ class _Maker:
         notes = [f"{each.text}." for each in Results(tuple(self.runs)).warnings if apart]
         if note := alignment_note([run for run in self.runs if run.dataset in {place.dataset for place in places}]):
             notes.append(note)
+        notes += _remarks([run for run in self.runs if run.dataset in {place.dataset for place in places}], places)
         return PaperTable(slug, title, (*notes, *_notes(groups, columns)), columns, groups)
 
     def _group(self, about: SceneSet, labels: Sequence[str]) -> Group:
@@ -410,6 +411,22 @@ def _tested(group: Group) -> Group:
             cells[key] = replace(cell, interval=interval_of_mean(cell.by_scene), significant=beats)
         rows.append(replace(row, cells=cells))
     return replace(group, rows=tuple(rows))
+
+
+def _remarks(runs: Sequence[Run], places: Collection[Place]) -> Iterator[str]:
+    """Yield what runs say of the scenes of a table, each with the methods that it holds for, unless it is for all."""
+    labels: dict[str, dict[str, None]] = {}
+    scenes: dict[str, dict[str, None]] = {}
+    for run in runs:
+        for scene, texts in run.notes.items():
+            for text in texts if Place(run.dataset, scene) in places else ():
+                labels.setdefault(text, {})[run.label] = None
+                scenes.setdefault(text, {})[scene] = None
+    everyone = {run.label for run in runs}
+    for text, having in labels.items():
+        whose = [] if set(having) == everyone else [", ".join(having)]
+        where = [] if len(scenes[text]) == len(places) or whose else [", ".join(scenes[text])]
+        yield f"{': '.join((*whose, *where, text))}."
 
 
 def _notes(groups: Sequence[Group], columns: Formats) -> Iterator[str]:

@@ -110,6 +110,17 @@ class PatchData(lightning.LightningDataModule):
         ValueError: a data set is one to evaluate on or has too few scenes, a scene is to be trained on and validated
             with, or the scale does not divide a patch.
 
+    Example:
+        >>> from dsr.data.rendered import Procedural
+        >>> from dsr.degradation.downsampling import Downsampling
+        >>> from dsr.training.data_module import Part, PatchData
+        >>> from dsr.training.degradation import Degradation
+        >>> from dsr.training.settings import PatchSettings
+        >>> parts = [Part(Procedural(count=6, size=64))]
+        >>> data = PatchData(parts, PatchSettings(patch=32, batch=2), Degradation(4, Downsampling("box")))
+        >>> type(data).__mro__[1].__name__  # for lightning.Trainer().fit(model, data)
+        'LightningDataModule'
+
     """
 
     def __init__(

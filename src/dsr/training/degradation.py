@@ -27,6 +27,13 @@ class Degradation:
     Args:
         scale, downsampling, noise: as for :func:`dsr.degradation.downsampling.make_sample`.
 
+    Example:
+        >>> from dsr.degradation.downsampling import Downsampling
+        >>> from dsr.degradation.noise import GaussianMultiplicative
+        >>> from dsr.training.degradation import Degradation
+        >>> Degradation(4, Downsampling("box"), GaussianMultiplicative(0.01)).scale
+        4
+
     """
 
     scale: int

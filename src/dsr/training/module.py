@@ -94,6 +94,14 @@ class SuperResolution(lightning.LightningModule):
     Raises:
         ValueError: the network does not cover the whole image, or the decay is out of range.
 
+    Example:
+        >>> from dsr.methods.networks.msg_net import MSGNet
+        >>> from dsr.training.module import SuperResolution
+        >>> from dsr.training.objective import DepthObjective
+        >>> training = SuperResolution(MSGNet(4), DepthObjective(w=0.7))
+        >>> type(training.configure_optimizers()).__name__
+        'AdamW'
+
     """
 
     logs_curves = True

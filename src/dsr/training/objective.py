@@ -100,6 +100,12 @@ class DepthObjective(Objective):
     Raises:
         ValueError: there is no such depth loss, or the weight of the shading loss is negative.
 
+    Example:
+        >>> from dsr.metrics.visual_loss import VisualLoss
+        >>> from dsr.training.objective import DepthObjective
+        >>> DepthObjective("lap1", w=0.7, visual=VisualLoss("mse_v")).w
+        0.7
+
     """
 
     depth_loss: DepthLoss = "lap1"

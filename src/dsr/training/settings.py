@@ -33,6 +33,11 @@ class PatchSettings:
     Raises:
         ValueError: a value is out of range.
 
+    Example:
+        >>> from dsr.training.settings import PatchSettings
+        >>> PatchSettings(patch=64, batch=2).validation_scenes
+        4
+
     """
 
     patch: int = 96

@@ -11,7 +11,7 @@ import re
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from unicodedata import category
 
 from rich.console import Console
@@ -36,6 +36,8 @@ _FIRST_LINE, _NEXT_LINE = 3.0, 10.0
 _TICK = 0.5
 _MANY = 50
 """Largest number of items that each get a line, if the output is not a terminal."""
+_TELLING = 0.25
+"""Smallest share of the time of an item that tells how long the rest of it takes."""
 _LONG = 2.0
 """Smallest duration in seconds of an item among many that gets a line, and of a pass over items that gets a line on a
 terminal."""
@@ -113,11 +115,12 @@ class ConsoleProgress(Progress):
     Args:
         console: where it is shown.
         now: returns the time in seconds.
+        since: time from which the outermost tasks count as under way; None for their own beginning.
 
     """
 
-    def __init__(self, console: Console, now: Callable[[], float] = time.monotonic) -> None:
-        self._console, self._now, self._process = console, now, os.getpid()
+    def __init__(self, console: Console, now: Callable[[], float] = time.monotonic, since: float | None = None) -> None:
+        self._console, self._now, self._since, self._process = console, now, since, os.getpid()
         self._tasks: list[_ConsoleTask] = []  # from the outermost to the innermost
         self._next_line = 0.0
 
@@ -130,11 +133,13 @@ class ConsoleProgress(Progress):
         self, name: str, total: int | None = None, *, done: int = 0, unit: Unit = "items"
     ) -> Iterator[_ConsoleTask]:
         """Return a context in which a piece of work is shown; see :class:`dsr.utils.progress.Progress`."""
-        task = _ConsoleTask(name, total, done, unit, self._now)
+        task = _ConsoleTask(name, total, done, unit, self._now, self._tasks)
         if os.getpid() != self._process:
             yield task
             return
         outermost = not self._tasks
+        if outermost and self._since is not None:
+            task.started = self._since
         self._tasks.append(task)
         try:
             with self._display() if outermost else contextlib.nullcontext():
@@ -150,12 +155,14 @@ class ConsoleProgress(Progress):
         *,
         label: Callable[[Item], str] = str,
         lines: bool = True,
+        shares: Mapping[str, float] | None = None,
     ) -> Iterator[Item]:
         """Yield items, and show how many are done; see :class:`dsr.utils.progress.Progress`."""
         if total is None:
             items = list(items)
             total = len(items)
         with self.task(name, total) as task:
+            task.shares = dict(shares or {})
             before = self._now()
             for done, item in enumerate(items):
                 task(done, remark=label(item))
@@ -167,6 +174,11 @@ class ConsoleProgress(Progress):
                 before = now
         if lines and self._console.is_terminal and task.elapsed >= _LONG:
             self.say(f"{name}: {task.amount}, elapsed {clock(task.elapsed)}")
+
+    def stage(self, name: str, seconds: float | None = None) -> None:
+        """Say that an item begins a stage; see :class:`dsr.utils.progress.Progress`."""
+        if self._tasks and os.getpid() == self._process:
+            self._tasks[-1].begin(name, seconds)
 
     def tick(self) -> None:
         """Print a line about running work if one is due and the output is not a terminal."""
@@ -220,26 +232,48 @@ class ConsoleProgress(Progress):
 
 
 class _ConsoleTask:
-    """A piece of work under way, with its times."""
+    """A piece of work under way, with its times.
 
-    def __init__(self, name: str, total: int | None, done: int, unit: Unit, now: Callable[[], float]) -> None:
+    What is left is told from the units that are done, and for the one at hand from the task within it or the stages
+    that it goes through. It is never less than a second, or a tenth of what the unit at hand has taken beyond
+    expectation, until all is done.
+    """
+
+    def __init__(
+        self, name: str, total: int | None, done: int, unit: Unit, now: Callable[[], float], tasks: list[_ConsoleTask]
+    ) -> None:
         self.name, self.total, self.done, self.remark = name, total, done, ""
-        self._unit, self._now = unit, now
-        self._started = self._measured = self._updated = now()
+        self.shares: dict[str, float] = {}
+        self._unit, self._now, self._tasks = unit, now, tasks
+        self.started = self._measured = self._updated = now()
         self._before: int | None = (
             done if unit == "items" else None
         )  # a download first reports the bytes that were there before
+        self._stage, self._began, self._guess = "", 0.0, None  # type: str, float, float | None
+        self._spent: dict[str, float] = {}  # by the stages of the item at hand that are over
+        self._items: list[dict[str, float]] = []
 
     def __call__(self, done: int, total: int | None = None, remark: str | None = None) -> None:
         """Report how much is done; see :class:`dsr.utils.progress.Task`."""
         self._updated = self._now()
         if self._before is None or done < self.done:
             self._before, self._measured = done, self._updated
+        if done > self.done and self._stage:
+            self.begin("")
+            self._items.append(self._spent)
+            self._spent = {}
         self.done = done
         if total is not None:
             self.total = total
         if remark is not None:
             self.remark = remark
+
+    def begin(self, stage: str, seconds: float | None = None) -> None:
+        """Begin a stage; see :meth:`dsr.utils.progress.Progress.stage`."""
+        now = self._now()
+        if self._stage:
+            self._spent[self._stage] = self._spent.get(self._stage, 0.0) + now - self._began
+        self._stage, self._began, self._guess = stage, now, seconds
 
     @property
     def is_shown(self) -> bool:
@@ -249,14 +283,56 @@ class _ConsoleTask:
     @property
     def elapsed(self) -> float:
         """Seconds since the beginning."""
-        return self._now() - self._started
+        return self._now() - self.started
 
     @property
     def remaining(self) -> float | None:
-        """Seconds to the end at the speed so far; None if unknown."""
-        if self.total is None or not self._speed:
+        """Seconds to the end; None if unknown."""
+        if self.total is None:
             return None
-        return max((self.total - self.done) / self._speed - (self._now() - self._updated), 0.0)
+        left = self.total - self.done
+        if left <= 0:
+            return 0.0 if self._speed else None
+        at_hand, each = self._times_of_item()
+        if each is None:
+            return None
+        waited = self._now() - self._updated
+        if at_hand is None:
+            at_hand = _left(each, waited)
+        return max(at_hand + (left - 1) * each, 1.0)
+
+    def _times_of_item(self) -> tuple[float | None, float | None]:
+        """Return the seconds that are left for the unit at hand, and those of a whole one; None if unknown."""
+        each = 1 / self._speed if self._speed else None
+        tasks = tuple(self._tasks)
+        inner = tasks[tasks.index(self) + 1 :] if self in tasks else ()
+        within = (inner[0].remaining or None) if inner else None  # None if its steps are over, and it is not
+        if not self._stage:
+            return within, each or (None if within is None else self._now() - self._updated + within)
+        waited = self._now() - self._began
+        expected = self._expected(self._guess if within is None else waited + within)
+        if expected is None:
+            return None, None
+        names = list(self.shares)
+        rest = _left(expected[self._stage], waited) if within is None else within
+        return rest + sum(expected[name] for name in names[names.index(self._stage) + 1 :]), sum(expected.values())
+
+    def _expected(self, seconds: float | None) -> dict[str, float] | None:
+        """Return the seconds of each stage, by the items that are done, else by the one at hand and the usual shares.
+
+        Args:
+            seconds: of the stage at hand; None if unknown.
+
+        """
+        done = self._items[1:] or self._items  # the first one also loads what all need
+        if done:
+            return {name: sum(item.get(name, 0.0) for item in done) / len(done) for name in self.shares}
+        told = self._spent if seconds is None else {self._stage: seconds}
+        share = sum(self.shares[name] for name in told)
+        if share < _TELLING:
+            return None
+        whole = sum(told.values()) / share
+        return {name: told.get(name, whole * part) for name, part in self.shares.items()}
 
     @property
     def amount(self) -> str:
@@ -288,3 +364,8 @@ class _ConsoleTask:
         """Amount per second, 0 if unknown."""
         passed = self._updated - self._measured
         return 0.0 if self._before is None or passed <= 0 else (self.done - self._before) / passed
+
+
+def _left(expected: float, waited: float) -> float:
+    """Return the seconds that are left: what was expected, or a tenth of what it takes longer."""
+    return max(expected - waited, 0.1 * (waited - expected))

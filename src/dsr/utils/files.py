@@ -43,6 +43,11 @@ class TargetError(OSError):
     """What is to be written would replace what is not of its kind: a device, a pipe, a socket, a link, a folder."""
 
 
+def data_root() -> Path:
+    """Return the directory of the data sets' folders, and of weights that are fetched: $DSR_DATA, or ./data."""
+    return Path(os.environ.get("DSR_DATA") or "data").expanduser()
+
+
 def obstacle(path: Path, *, folder: bool = False) -> str | None:
     """Return what is in the place of a file, or of a folder, that is to be written, such as ``a device``.
 

@@ -31,6 +31,7 @@ from types import EllipsisType, MappingProxyType, NoneType
 from typing import Any, Literal, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
 
 from dsr.utils.files import obstacle
+from dsr.utils.spelling import did_you_mean
 
 _KEY = "option"
 
@@ -61,6 +62,7 @@ class Rule(NamedTuple):
         holds: whether a value is as expected.
         each: whether that is said of each value of a tuple.
         shown: how an error line shows a value.
+        known: names of which one is expected, if any are; an error line says which may be meant.
 
     """
 
@@ -68,6 +70,19 @@ class Rule(NamedTuple):
     holds: Callable[[Any], bool]
     each: bool = False
     shown: Callable[[Any], str] = _shown
+    known: Collection[str] = ()
+
+    def expect(self, name: str, value: Any) -> None:
+        """Check the value of an option.
+
+        Raises:
+            OptionError: it is not as expected.
+
+        """
+        for one in value if self.each else (value,):
+            if not self.holds(one):
+                meant = did_you_mean(one, self.known)
+                raise OptionError(name, f"expected {self.expected}, got {self.shown(one)}{meant}")
 
 
 def at_least(least: int) -> Rule:
@@ -82,12 +97,12 @@ def positive(what: str) -> Rule:
 
 def one_of(choices: Collection[str], shown: Callable[[Any], str] = repr) -> Rule:
     """Return the rule of a value that is one of some."""
-    return Rule(f"one of {', '.join(choices)}", lambda value: value in choices, shown=shown)
+    return Rule(f"one of {', '.join(choices)}", lambda value: value in choices, shown=shown, known=choices)
 
 
 def some_of(choices: Collection[str], shown: Callable[[Any], str] = repr) -> Rule:
     """Return the rule of a tuple with values that are each one of some."""
-    return Rule(f"some of {', '.join(choices)}", lambda value: value in choices, each=True, shown=shown)
+    return Rule(f"some of {', '.join(choices)}", lambda value: value in choices, True, shown, choices)
 
 
 class _Option(NamedTuple):
@@ -231,11 +246,8 @@ class Options:
                 found = obstacle(Path(value).expanduser(), folder=each.option.writes == "folder")
                 if found is not None:
                     raise OptionError(each.name, f"expected a {each.option.writes} to write, got {found}: {value}")
-            if rule is None:
-                continue
-            for one in value if rule.each else (value,):
-                if not rule.holds(one):
-                    raise OptionError(each.name, f"expected {rule.expected}, got {rule.shown(one)}")
+            if rule is not None:
+                rule.expect(each.name, value)
 
 
 Record = TypeVar("Record", bound=Options)
@@ -276,6 +288,8 @@ def _keywords(each: _Stated, option: _Option, *, needed: bool) -> dict[str, Any]
     if get_origin(each.hint) is Literal:
         return {**keywords, "choices": kinds}
     if get_origin(each.hint) is not tuple:
+        if each.by_place and not each.required:
+            keywords |= {"nargs": "?", "default": each.default}  # of which argparse would make a path
         return {**keywords, "type": each.hint}
     if not option.repeated:
         several = "*" if each.by_place and not each.required else "+"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Literal, Protocol, TypeVar
 
 Steps = Callable[[int, int], object]
@@ -54,6 +54,7 @@ class Progress:
         *,
         label: Callable[[Item], str] = str,
         lines: bool = True,
+        shares: Mapping[str, float] | None = None,
     ) -> Iterator[Item]:
         """Yield items, and show how many are done.
 
@@ -61,9 +62,20 @@ class Progress:
             total: number of items; None where ``items`` can be counted.
             label: returns the name of an item.
             lines: whether each item gets a line if the output is not a terminal; False if the caller prints one.
+            shares: of the time of an item, by the stages that it goes through, in their order; see :meth:`stage`. They
+                are what is expected until an item is done.
 
         """
         yield from items
+
+    def stage(self, name: str, seconds: float | None = None) -> None:
+        """Say that the item that is being worked on begins a stage.
+
+        Args:
+            name: one of the stages in ``shares`` of :meth:`track`.
+            seconds: about how long it takes, where that is known.
+
+        """
 
 
 SILENT = Progress()

@@ -12,7 +12,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import dsr
 from dsr.utils.guards import opened
 from dsr.utils.progress import Task
 
@@ -57,7 +56,7 @@ def versions() -> dict[str, Any]:
 
 def _git(*arguments: str) -> str | None:
     """Return what git says of the checkout that this package runs from; None outside of one."""
-    command = ["git", "-C", str(Path(dsr.__file__).parent), *arguments]
+    command = ["git", "-C", str(Path(__file__).parent), *arguments]
     try:
         return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()  # noqa: S603
     except (OSError, subprocess.SubprocessError):

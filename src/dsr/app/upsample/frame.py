@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import math
 import platform
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from dsr.app.upsample.outputs import (
     kept_surface,
     output_encoding,
     read_previous_run,
+    stored_bytes,
 )
 from dsr.app.upsample.parts import Result, write_parts
 from dsr.app.upsample.reporting import Messages
@@ -38,11 +40,13 @@ from dsr.notes import CHECKS, Assumption, expect_no_warning
 from dsr.utils.guards import readable
 from dsr.utils.lengths import show_length
 from dsr.utils.memory import refusing_excess
-from dsr.utils.progress import Progress
+from dsr.utils.progress import Progress, megabytes
 from dsr.utils.versions import package_versions
 
 TO_DO, COMPLETE = "to do", "complete already"
 """Outcomes of a picture that is not computed."""
+STAGES = {"reading": 0.03, "upsampling": 0.57, "writing": 0.4}
+"""Shares of the time of a phone's frame, by the names that they have in ``info.json``."""
 _WHITE = 1.5
 """Noise that is alike over fewer pixels counts as white."""
 _PACKAGES = ("dsr", "torch", "numpy", "opencv-python-headless")
@@ -57,6 +61,7 @@ class FrameWork:
 
     Attributes:
         seconds: the time that the last picture of a dry run takes, on two CPU cores; None where it is not known.
+        bytes: the size of its results.
 
     Raises:
         ValueError: the file of poses is damaged, or does not fit the pictures.
@@ -67,6 +72,7 @@ class FrameWork:
         self._request, self._frames = request, frames
         self._claims = Claims(request.results.output)
         self.seconds: float | None = None
+        self.bytes = 0.0
         self._read_last: tuple[str, Picture] | None = None
         self._sequence = FrameSequence(frames.whole, self._read, request.frames.neighbours, request.frames.trajectory)
 
@@ -121,13 +127,11 @@ class FrameWork:
             reporter.facts(earlier)
             reporter.say(f"{pair.name}: {COMPLETE}, in {target}")
             return COMPLETE
+        times = Times(progress)
+        times.begin("reading")
         picture = self._read(pair)
         picture = replace(picture, assumptions=(*picture.assumptions, *self._frames.warnings.get(pair.name, ())))
-        try:
-            identified = find_sensor(picture.depth_lr, how.sensor, picture.device_name)
-        except ValueError as error:
-            raise ValueError(f"--{error}") from error
-        picture = _with_sensor(sequence.fuse(pair, picture), identified)
+        picture, identified = prepare(picture, how.sensor, functools.partial(sequence.fuse, pair))
         picture = align(picture, register=request.reading.register)
         size_lr = (picture.depth_lr.shape[-2], picture.depth_lr.shape[-1])
         size = (picture.camera.height, picture.camera.width)
@@ -135,14 +139,15 @@ class FrameWork:
         job.expect_no_warning(picture.assumptions)
         reporter.facts(picture.assumptions)
         if wanted.dry_run:
-            reporter.say(f"{pair.name}: {planned.text} -> {target}")
-            self.seconds = planned.seconds
+            self.bytes, writing = wanted.cost(math.prod(size))
+            self.seconds = None if planned.seconds is None else planned.seconds + writing
+            reporter.say(f"{pair.name}: {planned.text}, about {megabytes(self.bytes)} -> {target}")
             return TO_DO
         inputs = files_of(pair, request.reading).values()
         expect_free(target, inputs, ours=wanted.overwrite or job.earlier is not None)
         errors = any(part.errors for part in wanted.of_frame)
         surface = kept_surface(target, picture.camera, errors=errors) if job.reusable else None
-        started = time.perf_counter()
+        times.begin("upsampling", planned.seconds if surface is None else 0.0)
         if surface is not None:
             surface = surface._replace(filled=find_filled(surface.depth, picture.depth_lr))
         else:
@@ -151,13 +156,13 @@ class FrameWork:
             reporter.facts([*_describe_outliers(surface.outliers), *_describe_holes(surface, how)])
         if wanted.certain:
             surface = surface.without_dubious(wanted.max_error / 100)
-        seconds = time.perf_counter() - started
+        times.begin("writing")
         begin(target, job.settings, job.inputs, () if job.earlier is None else job.earlier.files)
-        facts = _write(job, picture, surface, planned, seconds)
+        facts, seconds = _write(job, picture, surface, planned, times)
         reporter.facts(facts)
         told = [*_noise_in_brief(surface.noise), *_shares_in_brief(surface.shares(wanted.max_error / 100))]
-        parts = ", ".join([f"{planned.method} x{planned.scale}", *told, f"{seconds:.1f} s"])
-        reporter.say(f"{pair.name}: {parts} -> {target}")
+        told += [f"{seconds['total']:.1f} s", megabytes(stored_bytes(target))]
+        reporter.say(f"{pair.name}: {', '.join([f'{planned.method} x{planned.scale}', *told])} -> {target}")
         return "done"
 
     @functools.cached_property
@@ -181,7 +186,27 @@ class FrameWork:
         last, self._read_last = self._read_last, None
         if last is not None and last[0] == pair.name:
             return last[1]
-        return _without_repeats(read_picture(pair, self._request.reading, self._frames.units))
+        return without_repeats(read_picture(pair, self._request.reading, self._frames.units))
+
+
+class Times:
+    """The seconds of the stages of a picture, which are shown as it goes through them; of some they may be known."""
+
+    def __init__(self, progress: Progress, **seconds: float) -> None:
+        self._progress, self._seconds = progress, {stage: round(each, 3) for stage, each in seconds.items()}
+        self._stage, self._since = "", 0.0
+
+    def begin(self, stage: str, seconds: float | None = None) -> None:
+        """Begin one of :data:`STAGES`, which takes about some seconds if that is known."""
+        self.read()
+        self._stage, self._since = stage, time.perf_counter()
+        self._progress.stage(stage, seconds)
+
+    def read(self) -> dict[str, float]:
+        """Return the seconds of each stage so far, to milliseconds, and their sum as ``total``."""
+        if self._stage:
+            self._seconds[self._stage] = round(time.perf_counter() - self._since, 3)
+        return {**self._seconds, "total": round(sum(self._seconds.values()), 3)}
 
 
 @dataclass(frozen=True)
@@ -237,7 +262,22 @@ class _Job:
         return all(there & set(part.files) for part in self.request.results.of_frame)
 
 
-def _without_repeats(picture: Picture) -> Picture:
+def prepare(picture: Picture, sensor: str, fuse: Callable[[Picture], Picture]) -> tuple[Picture, Identified | None]:
+    """Return a picture as it was read, fused with its neighbours, and the sensor that its own depth tells.
+
+    Args:
+        sensor: see :func:`dsr.inference.find_sensor`.
+        fuse: fuses it with its neighbours.
+
+    """
+    try:
+        identified = find_sensor(picture.depth_lr, sensor, picture.device_name)
+    except ValueError as error:
+        raise ValueError(f"--{error}") from error
+    return _with_sensor(fuse(picture), identified), identified
+
+
+def without_repeats(picture: Picture) -> Picture:
     """Undo an enlargement of the depth map by repeated pixels."""
     height, width = picture.depth_lr.shape[-2:]
     block = enlarged_by(picture.depth_lr) if (height, width) == (picture.camera.height, picture.camera.width) else 1
@@ -310,36 +350,55 @@ def _describe_holes(surface: Surface, how: Upsampling) -> list[Assumption]:
     return [Assumption(text, f"{share:.1%} of the pixels; --fill all fills them, too")]
 
 
-def _write(job: _Job, picture: Picture, surface: Surface, planned: Plan, seconds: float) -> list[Assumption]:
-    """Write all parts and ``info.json``, and return notes for the user."""
-    started = time.perf_counter()
+def _write(
+    job: _Job, picture: Picture, surface: Surface, planned: Plan, times: Times
+) -> tuple[list[Assumption], dict[str, float]]:
+    """Write all parts and ``info.json``, and return notes for the user, and the seconds of the stages."""
     wanted = job.request.results
-    encoding = output_encoding(picture.encoding, wanted.format)
     title = f"{readable(job.pair.name)}, {planned.method} x{planned.scale}"
-    outputs = write_parts(job.target, Result(picture, surface, encoding, title, wanted))
+    result = Result(picture, surface, output_encoding(picture.encoding, wanted.format), title, wanted)
+    kept = job.earlier if job.earlier is not None and job.same else None
+    return write_result(job.target, result, planned, times, job.inputs, job.settings, job.earlier, kept)
+
+
+def write_result(
+    folder: Path, result: Result, planned: Plan, times: Times, inputs: Mapping[str, Any],
+    settings: Mapping[str, Any], earlier: PreviousRun | None = None, kept: PreviousRun | None = None,
+) -> tuple[list[Assumption], dict[str, float]]:  # fmt: skip
+    """Write the parts of a result and ``info.json``, and return notes for the user, and the seconds of the stages.
+
+    Args:
+        folder: of the result.
+        planned, times: how the result was computed, and how long that took.
+        inputs, settings: what it depends on, as values for JSON.
+        earlier: the run whose files are in the folder.
+        kept: that run, if its other files stay.
+
+    """
+    picture, surface = result.picture, result.surface
+    outputs = write_parts(folder, result)
     files = [name for output in outputs.values() for name in output.files]
     facts = list(dict.fromkeys(note for output in outputs.values() for note in output.notes))
     shapes = {name: output.shape._asdict() for name, output in outputs.items() if output.shape is not None}
-    kept = job.earlier if job.earlier is not None and job.same else None
     counts = {**(kept.shapes if kept else {}), **shapes}
     if surface.outliers is not None:
         counts["outliers"] = surface.outliers._asdict()
     entries = {
-        "inputs": job.inputs,
-        "settings": job.settings,
+        "inputs": inputs,
+        "settings": settings,
         "method": planned.method,
         "scale": planned.scale,
         "plan": planned.text,
         "noise": surface.noise._asdict() if surface.noise else kept.noise if kept else None,
-        **described(picture, encoding),
+        **described(picture, result.encoding),
         **counts,
-        "shares": {name: round(share, 6) for name, share in surface.shares(wanted.max_error / 100).items()},
+        "shares": {name: round(share, 6) for name, share in surface.shares(result.wanted.max_error / 100).items()},
         "assumptions": [str(fact) for fact in (*picture.assumptions, *facts)],
         "checks": CHECKS,
         "warnings": [fact.record() for fact in (*picture.assumptions, *facts) if fact.code],
-        "seconds": {"upsampling": round(seconds, 3), "writing": round(time.perf_counter() - started, 3)},
+        "seconds": (seconds := times.read()),
         "versions": {"python": platform.python_version(), **package_versions(_PACKAGES)},
     }
     others = [name for name in (kept.files if kept else ()) if name not in files]
-    finish(job.target, job.earlier, entries, [*files, *others])
-    return facts
+    finish(folder, earlier, entries, [*files, *others])
+    return facts, seconds

@@ -13,18 +13,17 @@ from typing import Any
 import numpy as np
 import torch
 
-from dsr.app.upsample.parts import ERRORS, FILES, METRES, PARTS
+from dsr.app.upsample.parts import ERRORS, FILES, METRES, OLD_METRES, PARTS
 from dsr.evaluation.store import load_errors
 from dsr.geometry.camera import Camera
-from dsr.io.depth_files import storable
-from dsr.io.encoding import Encoding
+from dsr.io.depth_files import read_depth_file, storable
+from dsr.io.encoding import IN_METRES, Encoding
 from dsr.io.inputs import Picture
 from dsr.methods.base import Surface
 from dsr.notes import Assumption, read_warning
 from dsr.sample import FARTHEST, NEAREST
-from dsr.utils.arrays import open_array
 from dsr.utils.files import expect_targets, write_text
-from dsr.utils.guards import parse_json, read_limited
+from dsr.utils.guards import parse_json, pixels_beside, read_limited
 
 INFO = "info.json"
 _SHAPES = tuple(part.name for part in PARTS.values() if part.shape)
@@ -58,13 +57,20 @@ class PreviousRun:
 def output_encoding(encoding: Encoding, chosen: str | None) -> Encoding:
     """Return how the result is stored: as the input in the input's format, else in metres, or in whole millimetres.
 
-    Of whole numbers of 64 bits, which a TIFF may have and no writer writes, it has 32.
+    It is :data:`dsr.io.encoding.IN_METRES` itself where the input's values are such and no format is chosen. Of whole
+    numbers of 64 bits, which a TIFF may have and no writer writes, it has 32.
 
     Args:
         encoding: the input's.
         chosen: one of :data:`dsr.app.upsample.parts.FORMATS`; None for the input's.
 
     """
+    if (
+        chosen is None
+        and replace(encoding, suffix=IN_METRES.suffix, hole=0.0) == replace(IN_METRES, hole=0.0)
+        and (math.isnan(encoding.hole))
+    ):
+        return IN_METRES
     own = "tiff" if encoding.suffix == ".tif" else encoding.suffix[1:]
     if chosen in (None, own):
         return replace(encoding, dtype=str(storable(encoding.suffix, np.dtype(encoding.dtype))))
@@ -136,11 +142,12 @@ def kept_surface(folder: Path, camera: Camera, *, errors: bool) -> Surface | Non
 
     """
     size = (camera.height, camera.width)
-    with contextlib.suppress(OSError, ValueError):
-        values = open_array(folder / METRES)
+    with contextlib.suppress(OSError, ValueError, StopIteration):
+        path = next(each for each in (folder / METRES, folder / OLD_METRES) if each.is_file())
+        values = read_depth_file(path, pixels_beside(*size))
         if values.shape != size or values.dtype != np.float32:
             return None
-        depth = torch.from_numpy(np.array(values))[None]
+        depth = torch.from_numpy(values)[None]
         if not bool((depth > 0).any()) or bool(((depth < NEAREST) | (depth > FARTHEST)).any()):
             return None
         if not errors:
@@ -165,6 +172,13 @@ def finish(folder: Path, earlier: PreviousRun | None, entries: Mapping[str, Any]
     write_text(folder / INFO, json.dumps({"complete": True, **entries, "files": list(files)}, indent=2) + "\n")
 
 
+def stored_bytes(folder: Path) -> int:
+    """Return the size of the files of a finished run, without those that have been removed since."""
+    previous = read_previous_run(folder)
+    names = () if previous is None else (*previous.files, INFO)
+    return sum((folder / name).stat().st_size for name in names if (folder / name).is_file())
+
+
 def described(picture: Picture, encoding: Encoding) -> dict[str, Any]:
     """Return the sizes, the camera with its pose, and the files' encodings for ``info.json``."""
     return {
@@ -177,6 +191,7 @@ def described(picture: Picture, encoding: Encoding) -> dict[str, Any]:
         "time": picture.time,
         "input_depth": _plain(picture.encoding),
         "depth_file": _plain(encoding),
+        "depth_metres": {"file": METRES, **_plain(IN_METRES)},
     }
 
 

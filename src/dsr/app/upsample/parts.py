@@ -29,8 +29,13 @@ _SUFFIXES = ("png", "tiff", "npy", "npz", "pfm", "exr")
 FORMATS = (*_SUFFIXES, "mm")
 """Formats of the depth: suffixes, of which png means whole millimetres where the input is something else; ``mm`` always
 is a PNG of 16 bits in whole millimetres, 0 in holes."""
-METRES = "depth_metres.npy"
+METRES = "depth_metres.tiff"
+"""Depth to the bit, which is read back, stored as :data:`dsr.io.encoding.IN_METRES` says."""
+OLD_METRES = "depth_metres.npy"
+"""The same, of earlier versions."""
 ERRORS = "confidence.npz"
+_ERROR_STEPS = 2**6
+"""Expected errors are stored with so many steps below each power of two: off by less than 2 %."""
 _WORTH_SAYING = 1e-3
 """Smallest fraction of the pixels that is reported as left out."""
 
@@ -81,6 +86,17 @@ class Output(NamedTuple):
     shape: Written | None = None
 
 
+class Cost(NamedTuple):
+    """What a part takes: bytes for each pixel of the photo, and seconds for a million of them, as measured on frames.
+
+    A part that draws reduced pictures takes no more for more than some ``pixels``.
+    """
+
+    bytes: float
+    seconds: float
+    pixels: float = math.inf
+
+
 class Part(NamedTuple):
     """A part of the results.
 
@@ -90,7 +106,10 @@ class Part(NamedTuple):
         write: writes it into a picture's folder; None as the result stands for all ``files``.
         write_all: writes it of all frames together to a path.
         needs: parts of each frame that it is made of.
+        cost: what it takes.
+        dense: what it takes with a mesh of all pixels, if that is more.
         usual: whether it is written unless something else is asked for.
+        large: whether ``--keep all`` writes it, too.
         shape: whether it takes as long as all the rest, and is written beside it.
         errors: whether it depends on the expected errors.
         poses: whether it needs a pose of each frame, where there are several.
@@ -103,7 +122,10 @@ class Part(NamedTuple):
     write: Callable[[Path, Result], Output | None] | None = None
     write_all: Callable[[Path, Sequence[Frame]], list[Path]] | None = None
     needs: tuple[str, ...] = ()
+    cost: Cost = Cost(1.5, 0.5)
+    dense: Cost | None = None
     usual: bool = True
+    large: bool = False
     shape: bool = False
     errors: bool = False
     poses: bool = False
@@ -118,15 +140,17 @@ class Part(NamedTuple):
 
 
 def _depth(folder: Path, result: Result) -> Output:
-    """Write the depth in the output's encoding, and also in metres if that is a different one."""
+    """Write the depth in metres without loss, and in the output's encoding if that is another one."""
     import numpy as np
 
     from dsr.io.depth_files import write_depth_file
-    from dsr.io.encoding import Encoding, encode
+    from dsr.io.encoding import IN_METRES, encode
     from dsr.notes import Assumption
-    from dsr.utils.files import replacing
 
     depth, encoding = result.surface.depth, result.encoding
+    write_depth_file(folder / METRES, depth[0].float().cpu().numpy())
+    if encoding is IN_METRES:
+        return Output((METRES,))
     values, lost = encode(depth, encoding, result.picture.camera)
     name = f"depth{encoding.suffix}"
     notes = []
@@ -134,10 +158,6 @@ def _depth(folder: Path, result: Result) -> Output:
         text = f"{name}: what {encoding.dtype} values of this unit cannot hold is written as a hole; {METRES} has all"
         notes.append(Assumption(text, f"{lost} pixels"))
     write_depth_file(folder / name, values)
-    if replace(encoding, hole=0.0) == Encoding(".npy", "float32", 1.0, 0.0, "orthogonal") and math.isnan(encoding.hole):
-        return Output((name,), notes)
-    with replacing(folder / METRES) as temporary:
-        np.save(temporary, depth[0].float().cpu().numpy())
     if np.dtype(encoding.dtype).kind in "iu":
         notes.append(Assumption(f"{name} is in whole numbers like the input; {METRES} is not rounded"))
     return Output((name, METRES), notes)
@@ -168,27 +188,42 @@ def _cloud(folder: Path, result: Result) -> Output:
 
 
 def _mesh(folder: Path, result: Result) -> Output:
+    """Write the meshes that are asked for."""
+    from dsr.geometry.mesh import ERROR_SHARE, FLATNESS
     from dsr.io.exports import write_mesh
     from dsr.notes import Assumption
 
     depth, notes = result.certain
     if depth is None:
         return Output((), notes)
-    files, picture, most = ("mesh.ply", "mesh.glb"), result.picture, result.wanted.max_faces
-    paths, filled = [folder / name for name in files], result.surface.filled
+    picture, wanted, filled = result.picture, result.wanted, result.surface.filled
+    files = [PARTS[name].files[0] for name in ("mesh", "mesh_ply") if name in wanted.names]
+    tolerance = None
+    if wanted.keep != "all":
+        tolerance = FLATNESS * depth
+        if (error := result.surface.depth_error) is not None:
+            tolerance = tolerance.maximum(ERROR_SHARE * error)
+    paths = [folder / name for name in files]
     try:
-        shape = write_mesh(paths, picture.rgb, depth, picture.camera, most=most, filled=filled)
+        shape = write_mesh(
+            paths, picture.rgb, depth, picture.camera, most=wanted.max_faces, tolerance=tolerance, filled=filled
+        )
     except ValueError as error:
         return Output((), (*notes, Assumption("no mesh", str(error))))
     return Output(files, (*notes, *_fewer("mesh", "triangles", "--max-faces", shape)), shape)
 
 
+def _mesh_ply(folder: Path, result: Result) -> Output:
+    return Output(()) if "mesh" in result.wanted.names else _mesh(folder, result)
+
+
 def _fewer(part: str, what: str, option: str, shape: Written) -> list[Assumption]:
-    """Return a note on a shape that has less than the depth map gives."""
+    """Return a note on a shape that a limit has made smaller."""
+    from dsr.io.exports import FLAT
     from dsr.notes import Assumption
 
     text = f"the {part} has fewer {what} than the depth map gives ({option})"
-    return [Assumption(text, str(shape))] if shape.how else []
+    return [Assumption(text, str(shape))] if shape.how not in ("", FLAT) else []
 
 
 def _before_after(folder: Path, result: Result) -> None:
@@ -210,7 +245,7 @@ def _confidence(folder: Path, result: Result) -> Output | None:
         return Output(())
     write_confidence(folder / "confidence.png", surface.depth, surface.depth_error, surface.angle_error)
     with replacing(folder / ERRORS) as temporary, temporary.open("wb") as file:
-        np.savez(file, allow_pickle=False, **surface.error_arrays())
+        np.savez_compressed(file, allow_pickle=False, **surface.error_arrays())
     return None
 
 
@@ -265,15 +300,20 @@ _OF_DEPTH = ("depth", "rgbd")
 PARTS: dict[str, Part] = {
     part.name: part
     for part in (
-        Part("depth", (*(f"depth.{suffix}" for suffix in (*_SUFFIXES, "tif")), METRES), _depth),
-        Part("renderings", tuple(f"renderings/{light}.png" for light in LIGHT_NAMES), _renderings),
-        Part("normals", ("normals.png",), _normals),
-        Part("cloud", ("cloud.ply",), _cloud, shape=True, errors=True),
-        Part("mesh", ("mesh.ply", "mesh.glb"), _mesh, shape=True, errors=True),
-        Part("before_after", ("before_after.png",), _before_after),
-        Part("confidence", ("confidence.png", ERRORS), _confidence, errors=True),
-        Part("filled", ("filled.png",), _filled),
-        Part("input", ("input.npz",), _input),
+        Part("depth", (*(f"depth.{suffix}" for suffix in (*_SUFFIXES, "tif")), METRES, OLD_METRES), _depth,
+              cost=Cost(2.0, 0.25)),
+        Part("renderings", tuple(f"renderings/{light}.png" for light in LIGHT_NAMES), _renderings,
+              cost=Cost(1.0, 0.4)),
+        Part("normals", ("normals.png",), _normals, cost=Cost(0.8, 0.4)),
+        Part("mesh", ("mesh.glb",), _mesh, shape=True, errors=True, cost=Cost(2.5, 0.6), dense=Cost(43, 1.5)),
+        Part("before_after", ("before_after.png",), _before_after, cost=Cost(3.3, 2.5, 7.5e5)),
+        Part("confidence", ("confidence.png", ERRORS), _confidence, errors=True, cost=Cost(2.3, 1.0)),
+        Part("filled", ("filled.png",), _filled, cost=Cost(0.02, 0.02)),
+        Part("input", ("input.npz",), _input, cost=Cost(0.8, 0.1, 6e5)),
+        Part("mesh_ply", ("mesh.ply",), _mesh_ply, usual=False, large=True, shape=True, errors=True,
+              cost=Cost(2.5, 0.2), dense=Cost(53, 1.0)),
+        Part("cloud", ("cloud.ply",), _cloud, usual=False, large=True, shape=True, errors=True,
+              cost=Cost(27.0, 1.4)),
         Part("rgbd", ("rgbd/color.png", "rgbd/depth.png", "rgbd/intrinsic.json"), _rgbd, usual=False),
         Part("open3d", ("open3d",), write_all=_open3d, needs=_OF_DEPTH, usual=False),
         Part("nerfstudio", ("transforms.json", "nerfstudio"), write_all=_nerfstudio, needs=_OF_DEPTH, usual=False,
@@ -284,7 +324,6 @@ PARTS: dict[str, Part] = {
     )
 }  # fmt: skip
 """All parts by their names, in the order in which they are listed."""
-_USUAL = tuple(part.name for part in PARTS.values() if part.usual)
 _MORE = tuple(part.name for part in PARTS.values() if not part.usual)
 FILES = tuple(name for part in PARTS.values() if part.write is not None for name in part.files)
 """All files that may be in the folder of a picture's results beside ``info.json``."""
@@ -313,6 +352,9 @@ class Results(Options):
     without: tuple[str, ...] = option((), "all but these", "PARTS", parse=_words, alone="parts", recorded=False)
     more: tuple[str, ...] = option(
         (), f"also these: {','.join(_MORE)}; see docs/export.md", "PARTS", flags="--with", parse=_words, recorded=False
+    )
+    keep: Literal["usual", "all"] = option(
+        "usual", "all: also mesh.ply and cloud.ply, and a mesh of every pixel, ten times the size", recorded=False
     )
     max_error: float = option(
         2.0,
@@ -362,7 +404,8 @@ class Results(Options):
     @functools.cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the parts that are asked for, in the table's order."""
-        usual = [name for name in _USUAL if name not in self.without] if self.only is None else self.only
+        kept = (part for part in PARTS.values() if part.usual or (part.large and self.keep == "all"))
+        usual = tuple(part.name for part in kept if part.name not in self.without) if self.only is None else self.only
         return tuple(name for name in PARTS if name in (*usual, *self.more))
 
     @functools.cached_property
@@ -376,6 +419,13 @@ class Results(Options):
         """Parts of all frames together."""
         return tuple(PARTS[name] for name in self.names if PARTS[name].write_all)
 
+    def cost(self, pixels: int) -> tuple[float, float]:
+        """Return about how many bytes the results of a frame take, and how many seconds it takes to write them."""
+        each = [(self.keep == "all" and part.dense) or part.cost for part in (*self.of_frame, *self.of_all)]
+        sizes = [min(pixels, cost.pixels) for cost in each]
+        total = sum(cost.bytes * size for cost, size in zip(each, sizes, strict=True))
+        return total, sum(cost.seconds * size for cost, size in zip(each, sizes, strict=True)) / 1e6
+
 
 def write_parts(folder: Path, result: Result) -> dict[str, Output]:
     """Write the parts of a picture's result, and return what each wrote.
@@ -386,6 +436,7 @@ def write_parts(folder: Path, result: Result) -> dict[str, Output]:
 
     """
     parts = result.wanted.of_frame
+    result = replace(result, surface=_as_stored(result.surface))
     with ThreadPoolExecutor(1) as beside:  # shapes take as long as all the rest
         shapes = {part.name: beside.submit(_write, part, folder, result) for part in parts if part.shape}
         others = {part.name: _write(part, folder, result) for part in parts if not part.shape}
@@ -397,3 +448,18 @@ def _write(part: Part, folder: Path, result: Result) -> Output:
     """Write a part."""
     output = part.write(folder, result) if part.write is not None else None
     return Output(part.files) if output is None else output
+
+
+def _as_stored(surface: Surface) -> Surface:
+    """Return a surface with expected errors that are stored to the bit, so that parts added later are the same."""
+    import torch
+
+    def rounded(values: Tensor | None) -> Tensor | None:
+        if values is None:
+            return None
+        mantissa, exponent = torch.frexp(values.float())
+        return torch.ldexp((_ERROR_STEPS * mantissa).round() / _ERROR_STEPS, exponent)
+
+    rough = surface._replace(depth_error=rounded(surface.depth_error), angle_error=rounded(surface.angle_error))
+    stored = {name: torch.from_numpy(values)[None].float() for name, values in rough.error_arrays().items()}
+    return surface._replace(depth_error=stored.get("depth_error"), angle_error=stored.get("angle_error"))

@@ -14,7 +14,7 @@ from dsr.app.upsample.workers import Done, attempt
 from dsr.io.images import pixels_in_header
 from dsr.io.pairs import Pair
 from dsr.io.reading import Reading
-from dsr.utils.progress import Progress, duration
+from dsr.utils.progress import Progress, duration, megabytes
 
 
 def preview(request: UpsampleRequest, frames: Frames, reporter: Messages, progress: Progress) -> Iterator[Done]:
@@ -31,6 +31,7 @@ def preview(request: UpsampleRequest, frames: Frames, reporter: Messages, progre
             else:
                 yield Done(pair, targets[pair.name], COMPLETE, None)
     total: float | None = 0.0
+    size = 0.0
     for kind in kinds.values():
         done = None
         while kind and (done is None or done.problem):  # until one of them can be read
@@ -41,10 +42,12 @@ def preview(request: UpsampleRequest, frames: Frames, reporter: Messages, progre
             reporter.say(f"  {len(kind)} more of these sizes: their headers were read, not their values")
         if done is not None and not done.problem:
             total = None if total is None or work.seconds is None else total + work.seconds * (1 + len(kind))
+            size += work.bytes * (1 + len(kind))
         for pair in kind:
             yield Done(pair, targets[pair.name], TO_DO, None)
-    if total and not frames.single:
-        reporter.say(f"in all about {duration(max(total, 1))} on two CPU cores, without reading and writing")
+    if size and not frames.single:
+        time = "" if total is None else f"{duration(max(total, 1))} on two CPU cores, and "
+        reporter.say(f"in all about {time}{megabytes(size)}")
 
 
 def _kind(pair: Pair, reading: Reading) -> tuple[object, ...]:

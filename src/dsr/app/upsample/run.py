@@ -7,12 +7,13 @@ import errno
 import json
 import time
 from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 
 from rich.console import Console
 
 from dsr.app.upsample.frames import Frames, find_frames
-from dsr.app.upsample.outputs import INFO
+from dsr.app.upsample.outputs import INFO, stored_bytes
 from dsr.app.upsample.preview import preview
 from dsr.app.upsample.reporting import Reporter, listed
 from dsr.app.upsample.request import UpsampleRequest, settings_of
@@ -28,6 +29,7 @@ from dsr.io.scene_files import expect_poses
 from dsr.io.trajectories import USUAL_SIZE, read_poses
 from dsr.utils.console import ConsoleProgress, show
 from dsr.utils.files import expect_targets, write_text
+from dsr.utils.progress import clock, megabytes
 
 _UNPOSED = {
     "gaussian": ": images, depths and depth_params.json are written, and no sparse model; --poses gives one",
@@ -96,12 +98,12 @@ def _posed(request: UpsampleRequest, frames: Frames) -> dict[str, bool]:
 def _run(request: UpsampleRequest, frames: Frames, console: Console) -> list[str]:
     """Upsample frames, and return the problems."""
     wanted, shard = request.results, request.frames.shard
-    started = time.perf_counter()
+    started = time.monotonic()
     of_all = [] if shard is not None else [*(name for part in wanted.of_all for name in part.files), EXPORTS]
     expect_targets(wanted.output, of_all if shard is None else [_summary_of(shard)])
     _show_found(console, request, frames)
     found, single = frames.found, frames.single
-    reporter, progress = Reporter(console), ConsoleProgress(console)
+    reporter, progress = Reporter(console), ConsoleProgress(console, since=started)
     problems: dict[str, list[str]] = {}
     outcomes: Counter[str] = Counter()
     targets: dict[str, Path] = {}
@@ -125,18 +127,28 @@ def _run(request: UpsampleRequest, frames: Frames, console: Console) -> list[str
         counts += [f"{sum(map(len, problems.values()))} failed"] if problems else []
         counts = counts or ["nothing to do"]
         pictures = "1 picture" if len(found.pairs) == 1 else f"{len(found.pairs)} pictures"
-        show(console, f"{pictures}: {', '.join(counts)} -> {wanted.output}")
+        took = "" if wanted.dry_run else f" in {clock(time.monotonic() - started)}, {_size(targets.values())}"
+        show(console, f"{pictures}: {', '.join(counts)}{took} -> {wanted.output}")
     if shard is not None and not wanted.dry_run:
         summary = {
             "shard": str(shard),
             "outcomes": outcomes,
             "failed": [{"problem": problem, "frames": names} for problem, names in problems.items()],
             "warnings": reporter.warnings,
-            "seconds": round(time.perf_counter() - started, 3),
+            "seconds": round(time.monotonic() - started, 3),
         }
         write_text(wanted.output / _summary_of(shard), json.dumps(summary, indent=2) + "\n")
     lines = [f"{listed(names)}: {message}" if len(found.pairs) > 1 else message for message, names in problems.items()]
     return lines + scene_problems
+
+
+def _size(folders: Iterable[Path]) -> str:
+    """Return the size of the results in folders as text."""
+    total = 0
+    for folder in folders:
+        with contextlib.suppress(ValueError, OSError):
+            total += stored_bytes(folder)
+    return megabytes(total)
 
 
 def _summary_of(shard: Shard) -> str:

@@ -64,14 +64,9 @@ class FrameSequence:
         if not self._count:
             return []
         folder, place = self.recordings[pair.depth.parent], self._places[pair.name]
-        found: list[Pair] = []
-        for distance in range(1, len(folder)):
-            for number in (place - distance, place + distance):
-                if 0 <= number < len(folder) and (self._poses is None or folder[number].name in self._poses):
-                    found.append(folder[number])
-            if len(found) >= self._count:
-                break
-        return found[: self._count]
+        poses = self._poses
+        found = nearest(place, len(folder), self._count, lambda number: poses is None or folder[number].name in poses)
+        return [folder[number] for number in found]
 
     def with_pose(self, pair: Pair, picture: Picture) -> Picture:
         """Return a frame with its pose from the file, if there is one.
@@ -125,34 +120,63 @@ class FrameSequence:
                 continue
             if pose is not None:
                 views.append(View(depth, camera, pose))
-        fused = fuse_views(View(picture.depth_lr, _camera_lr(picture), picture.pose), views)
-        known = picture.depth_lr.isfinite()
-        agreeing, seeing = (float(each[known].mean()) for each in (fused.others, fused.seeing))
-        detail = f"of {seeing:.1f} that see a pixel {agreeing:.1f} agree with it"
-        detail += f"; {failed} could not be read" if failed else ""
-        vote = "1 neighbouring frame votes" if len(others) == 1 else f"{len(others)} neighbouring frames vote"
-        text, code = f"{vote} on the depth", "neighbours-disagree"
-        share = agreeing / seeing if seeing else 0.0
-        note = Assumption(text, detail)
-        if share < LIMITS[code].threshold:
-            note = Assumption(
-                f"{text}, and hardly any agree with it: are the poses right?", detail, code, round(share, 3)
-            )
-        return replace(picture, depth_lr=fused.depth, assumptions=(*picture.assumptions, note))
+        return vote(picture, views, len(others), failed)
 
     def _frame(self, pair: Pair) -> _Frame:
         """Return what a neighbour contributes; the latest ones are kept."""
         if pair.name not in self._kept:
             picture = self._read(pair)
             pose = picture.pose if self._poses is None else self._poses.get(pair.name)
-            self._kept[pair.name] = (picture.depth_lr, _camera_lr(picture), pose)
+            self._kept[pair.name] = (picture.depth_lr, camera_lr(picture), pose)
             while len(self._kept) > self._count + 2:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(pair.name)
         return self._kept[pair.name]
 
 
-def _camera_lr(picture: Picture) -> Camera:
+def nearest(place: int, total: int, count: int, usable: Callable[[int], bool]) -> list[int]:
+    """Return the places of the frames that vote on one, the nearest first.
+
+    Args:
+        place: of the frame.
+        total: number of frames.
+        count: of those that vote, at most.
+        usable: whether a frame may.
+
+    """
+    found: list[int] = []
+    for distance in range(1, total):
+        found += [other for other in (place - distance, place + distance) if 0 <= other < total and usable(other)]
+        if len(found) >= count:
+            break
+    return found[:count]
+
+
+def vote(picture: Picture, views: Sequence[View], count: int, failed: int = 0) -> Picture:
+    """Return a frame with a pose, its depth fused with that of its neighbours.
+
+    Args:
+        views: the neighbours.
+        count: how many there are, with those that could not be read.
+        failed: how many of them could not be read.
+
+    """
+    assert picture.pose is not None  # noqa: S101 - see above
+    fused = fuse_views(View(picture.depth_lr, camera_lr(picture), picture.pose), views)
+    known = picture.depth_lr.isfinite()
+    agreeing, seeing = (float(each[known].mean()) for each in (fused.others, fused.seeing))
+    detail = f"of {seeing:.1f} that see a pixel {agreeing:.1f} agree with it"
+    detail += f"; {failed} could not be read" if failed else ""
+    who = "1 neighbouring frame votes" if count == 1 else f"{count} neighbouring frames vote"
+    text, code = f"{who} on the depth", "neighbours-disagree"
+    share = agreeing / seeing if seeing else 0.0
+    note = Assumption(text, detail)
+    if count and share < LIMITS[code].threshold:
+        note = Assumption(f"{text}, and hardly any agree with it: are the poses right?", detail, code, round(share, 3))
+    return replace(picture, depth_lr=fused.depth, assumptions=(*picture.assumptions, note))
+
+
+def camera_lr(picture: Picture) -> Camera:
     """Return the camera of a picture's depth map."""
     height, width = picture.depth_lr.shape[-2:]
     return picture.camera.rescale(width, height)

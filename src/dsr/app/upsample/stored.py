@@ -12,21 +12,22 @@ import numpy as np
 import torch
 
 from dsr.app.upsample.outputs import INFO
-from dsr.app.upsample.parts import ERRORS, METRES, Results
+from dsr.app.upsample.parts import ERRORS, METRES, OLD_METRES, Results
 from dsr.evaluation.store import load_errors
 from dsr.geometry.camera import Camera
+from dsr.io.depth_files import read_depth_file
 from dsr.io.exports import INPUT, read_input
 from dsr.io.frames import UPS
 from dsr.report.surface_page import ViewedResult
 from dsr.sample import expect_distances
-from dsr.utils.arrays import array_headers, open_array
-from dsr.utils.guards import is_number, natural_key, parse_json, read_limited
+from dsr.utils.arrays import array_headers
+from dsr.utils.guards import TooLargeError, is_number, natural_key, parse_json, pixels_beside, read_limited
 from dsr.utils.lengths import show_length
 
 _DEEPEST = 6
 """Folders below the given one in which results are looked for."""
-DEPTHS = (METRES, "depth.npy")
-"""The files that hold a result's depth in metres, the first that is there."""
+DEPTHS = (METRES, OLD_METRES, "depth.npy")
+"""The files that hold a result's depth in metres, the first that is there; the others are of earlier versions."""
 _LARGEST_INFO = 16 << 20
 
 
@@ -146,11 +147,13 @@ def read_depth(folder: Path, camera: Camera) -> np.ndarray:
         path = folder / name
         if not path.is_file():
             continue
+        size = (camera.height, camera.width)
         try:
-            stored = open_array(path)  # checks the size before anything is read
+            stored = read_depth_file(path, pixels_beside(*size))
+        except TooLargeError:
+            raise
         except (ValueError, OSError) as error:
             raise ValueError(f"{path}: expected a map of depths, got a damaged or foreign file") from error
-        size = (camera.height, camera.width)
         if stored.shape != size or stored.dtype != np.float32:
             text = f"{stored.dtype} of shape {stored.shape}"
             raise ValueError(f"{path}: expected float32 of shape {size}, the photo's, got {text}")

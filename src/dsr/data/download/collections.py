@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+
+from dsr.utils.spelling import did_you_mean
 
 MIDDLEBURY = "Its owners permit using and publishing the images and disparity maps, and ask for the citation."
 RESEARCH = "Its owners state no licence: for research, see the homepage."
@@ -307,7 +308,8 @@ def find(names: Iterable[str], catalogue: Mapping[str, Collection]) -> list[Coll
     """
     unknown = [name for name in names if name not in catalogue]
     if unknown:
-        raise ValueError(f"{', '.join(unknown)}: unknown data set; expected some of {', '.join(catalogue)}")
+        expected = f"expected some of {', '.join(catalogue)}{did_you_mean(unknown[0], catalogue)}"
+        raise ValueError(f"{', '.join(unknown)}: unknown data set; {expected}")
     return [catalogue[name] for name in dict.fromkeys(names)]
 
 
@@ -557,8 +559,3 @@ _COLLECTIONS = (
     ),
 )
 CATALOGUE: dict[str, Collection] = {collection.name: collection for collection in (*_COLLECTIONS, *FIELD)}
-
-
-def data_root() -> Path:
-    """Return the directory of the data sets' folders."""
-    return Path(os.environ.get("DSR_DATA") or "data").expanduser()

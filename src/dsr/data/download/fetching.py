@@ -56,8 +56,10 @@ _PAGE = (b"<!doctype", b"<html", b"<head")
 _BEGINNINGS: Mapping[str, tuple[bytes, ...]] = {
     ".gz": (b"\x1f\x8b",), ".jpg": (b"\xff\xd8\xff",), ".mat": (b"MATLAB", b"\x89HDF"), ".npy": (b"\x93NUMPY",),
     ".pfm": (b"Pf", b"PF"), ".pgm": (b"P2", b"P5"), ".png": (b"\x89PNG\r\n\x1a\n",), ".ppm": (b"P3", b"P6"),
-    ".zip": (b"PK",),
+    ".safetensors": (b"{",), ".zip": (b"PK",),
 }  # fmt: skip
+_COUNTED = {".safetensors": 8}
+"""Bytes before that beginning, which count something."""
 _DAMAGE = (
     zipfile.BadZipFile, tarfile.TarError, EOFError, zlib.error, lzma.LZMAError, KeyError, RuntimeError, UnicodeError,
     OSError,
@@ -273,7 +275,7 @@ class _Job:
         sources: list[tuple[str, _Credentials]] = [(url, None) for url in item.urls]
         if self.mirror is not None:
             sources.insert(0, (f"{self.mirror.address}/{item.path}", self.mirror.credentials))
-        problems = []
+        problems = [] if sources else ["no address of it is known; --mirror URL names a server that has it"]
         for url, credentials in sources:
             try:
                 return self._fetch_from(url, item, credentials)
@@ -634,10 +636,10 @@ def _expect_kind(path: Path, suffix: str, source: str) -> None:
     """Check that a file begins as one with this suffix does; ``source`` is what the message calls it."""
     with opened(path) as file:
         beginning = file.read(512)
-    expected = _BEGINNINGS.get(suffix.lower())
+    expected, skipped = _BEGINNINGS.get(suffix.lower()), _COUNTED.get(suffix.lower(), 0)
     if _is_page(beginning):
         raise ValueError(f"{source}: expected a {suffix} file, got a web page")
-    right = beginning.startswith(expected) if expected else bool(beginning) and b"\0" not in beginning
+    right = beginning.startswith(expected, skipped) if expected else bool(beginning) and b"\0" not in beginning
     if not right:
         raise ValueError(f"{source}: expected a {suffix} file, got one that begins with {beginning[:8]!r}")
 

@@ -61,6 +61,19 @@ class Bilateral(GuidedMethod):
     Raises:
         ValueError: a value is not positive.
 
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.degradation.downsampling import Downsampling, make_sample
+        >>> from dsr.sample import Scene
+        >>> from dsr.methods.classical.bilateral import Bilateral
+        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
+        >>> depth = torch.full((1, 24, 32), 2.0, dtype=torch.float64)
+        >>> scene = Scene("mine", "wall", torch.rand(3, 24, 32), camera, depth)
+        >>> sample = make_sample(scene, 4, Downsampling("box"), "orthogonal")
+        >>> bool((Bilateral()(sample) - 2).abs().max() < 1e-3)
+        True
+
     """
 
     abilities = Abilities(ratios="any", own_size=True, cost=Cost(150, 1))

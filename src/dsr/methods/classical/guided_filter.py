@@ -42,6 +42,19 @@ class GuidedFilter(GuidedMethod):
     Raises:
         ValueError: the radius or epsilon is not positive.
 
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.degradation.downsampling import Downsampling, make_sample
+        >>> from dsr.sample import Scene
+        >>> from dsr.methods.classical.guided_filter import GuidedFilter
+        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
+        >>> depth = torch.full((1, 24, 32), 2.0, dtype=torch.float64)
+        >>> scene = Scene("mine", "wall", torch.rand(3, 24, 32), camera, depth)
+        >>> sample = make_sample(scene, 4, Downsampling("box"), "disparity")
+        >>> bool((GuidedFilter()(sample) - 2).abs().max() < 1e-3)
+        True
+
     """
 
     def __init__(

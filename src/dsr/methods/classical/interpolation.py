@@ -40,6 +40,19 @@ class Interpolation(Method):
     Raises:
         ValueError: an unknown order.
 
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.degradation.downsampling import Downsampling, make_sample
+        >>> from dsr.sample import Scene
+        >>> from dsr.methods.classical.interpolation import Interpolation
+        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
+        >>> depth = torch.full((1, 24, 32), 2.0, dtype=torch.float64)
+        >>> scene = Scene("mine", "wall", torch.rand(3, 24, 32), camera, depth)
+        >>> sample = make_sample(scene, 4, Downsampling("box"), "orthogonal")
+        >>> Interpolation("bicubic")(sample).shape
+        torch.Size([1, 24, 32])
+
     """
 
     abilities = Abilities(ratios="any", cost=Cost(100))

@@ -105,6 +105,19 @@ class TotalGeneralisedVariation(Method):
     Raises:
         ValueError: a value is out of range.
 
+    Example:
+        >>> import torch
+        >>> import dsr
+        >>> from dsr.degradation.downsampling import Downsampling, make_sample
+        >>> from dsr.sample import Scene
+        >>> from dsr.methods.classical.tgv import TotalGeneralisedVariation
+        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
+        >>> depth = torch.full((1, 24, 32), 2.0, dtype=torch.float64)
+        >>> scene = Scene("mine", "wall", torch.rand(3, 24, 32), camera, depth)
+        >>> sample = make_sample(scene, 4, Downsampling("box"), "disparity")
+        >>> bool((TotalGeneralisedVariation(iterations=10)(sample) - 2).abs().max() < 1e-3)
+        True
+
     """
 
     abilities = Abilities(ratios="whole", cost=Cost(800, 60))

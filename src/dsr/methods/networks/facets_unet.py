@@ -114,6 +114,11 @@ class FacetsUNet(DisparityNetwork):
     Raises:
         ValueError: a value is out of range.
 
+    Example:
+        >>> from dsr.methods.networks.facets_unet import FacetsUNet
+        >>> sum(values.numel() for values in FacetsUNet(4).parameters()) // 1000  # thousands
+        3587
+
     """
 
     of_inverse_depth = True

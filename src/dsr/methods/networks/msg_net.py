@@ -171,6 +171,12 @@ class MSGNet(WindowedNetwork):
         scale: upsampling factor, 2, 4, 8 or 16; log2(scale) levels.
         variant: ``hui``, ``voynov`` or ``dsr``.
 
+    Example:
+        >>> import torch
+        >>> from dsr.methods.networks.msg_net import MSGNet
+        >>> MSGNet(4)(torch.rand(1, 1, 32, 32), torch.rand(1, 1, 8, 8)).shape
+        torch.Size([1, 1, 32, 32])
+
     """
 
     def __init__(self, scale: int, variant: VariantName = "voynov") -> None:

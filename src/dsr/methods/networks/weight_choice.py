@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, fields
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
 from dsr.methods.networks.weight_files import is_dsr_weights, read_header
+from dsr.methods.weights import left_out, packaged_names, packaged_weights
 from dsr.utils.configuration import ConfigError
 from dsr.utils.ratios import round_ratio
 
@@ -87,6 +87,8 @@ class WeightChoice:
         needs = f"scale {round_ratio(self.scale)} needs weights=FILE{published}"
         if files and self.packaged is None:
             return f"{needs}; its authors publish them, dsr does not come with them"
+        if isinstance(self.packaged, str) and self.packaged in left_out():
+            return f"{self.packaged} does not come with this installation; `dsr data get weights`, or weights=FILE"
         return f"dsr comes with {', '.join(packaged_names())}; {needs}"
 
     def _packaged_file(self) -> Path | None:
@@ -131,14 +133,3 @@ def nearest_scale(trained: Collection[float], scale: float) -> float:
         return scale
     whole = [each for each in trained if float(each).is_integer()]
     return min((each for each in whole if each >= scale), default=max(whole))
-
-
-def packaged_weights(name: str) -> Path | None:
-    """Return the path of the packaged weights ``name.safetensors``, or None if there are none."""
-    path = Path(str(resources.files("dsr.methods.weights"))) / f"{name}.safetensors"
-    return path if path.is_file() else None
-
-
-def packaged_names() -> list[str]:
-    """Return the names of the packaged weights."""
-    return sorted(path.stem for path in Path(str(resources.files("dsr.methods.weights"))).glob("*.safetensors"))

@@ -49,11 +49,11 @@ function lightOver(x, y) {
   return [across, down, -Math.sqrt(1 - across * across - down * down)];
 }
 
-/** Return the light over the place of an event in an element, the whole of which is the half sphere. */
-function lightAt(event, element) {
-  const box = element.getBoundingClientRect();
-  return lightOver((2 * (event.clientX - box.left)) / box.width - 1, (2 * (event.clientY - box.top)) / box.height - 1);
-}
+/** Return the light over the place of an event in a box, the whole of which is the half sphere. */
+const lightIn = (event, box) => lightOver((2 * (event.clientX - box.left)) / box.width - 1, (2 * (event.clientY - box.top)) / box.height - 1);
+
+/** Return the light over the place of an event in an element. */
+const lightAt = (event, element) => lightIn(event, element.getBoundingClientRect());
 
 /** Return where a light comes from, in words. */
 function lightText([x, y]) {

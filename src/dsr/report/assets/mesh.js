@@ -4,6 +4,7 @@ const RIGHT = 1;
 const BELOW = 2;
 const WITH_DOUBTFUL = 2; // the same two flags, two bits higher
 const DOUBTFUL = 16;
+const FILLED = 32;
 
 /** Return positions and normals of all pixels, 3 numbers each, and corners of the triangles, 3 indices each. */
 function buildMesh(grid, withDoubtful) {

@@ -54,7 +54,7 @@ class Pose {
 }
 
 /**
- * Hear what pointers do on the stage: `turn` and `move` take pixels, `light` a light, `zoom` a factor, `split` a place
+ * Hear what pointers do on the stage: `turn` and `move` take pixels, `light` the event, `zoom` a factor, `split` a place
  * of the divider, and `mode` says what dragging does.
  */
 class Pointers {
@@ -78,7 +78,7 @@ class Pointers {
     const what = event.target.closest(".divider") ? "split" : event.button > 0 || event.ctrlKey ? "move" : event.shiftKey ? "light" : this.actions.mode();
     this.fingers.set(event.pointerId, { x: event.clientX, y: event.clientY, what });
     this.stage.classList.toggle("dragging", what === "turn" || what === "move");
-    if (what === "light") this.actions.light(lightAt(event, this.stage));
+    if (what === "light") this.actions.light(event);
   }
 
   drag(event) {
@@ -91,7 +91,7 @@ class Pointers {
       const { factor, shift } = pinchOf(this.fingers, event.pointerId, before);
       this.actions.zoom(factor);
       this.actions.move(...shift);
-    } else if (finger.what === "light") this.actions.light(lightAt(event, this.stage));
+    } else if (finger.what === "light") this.actions.light(event);
     else if (finger.what === "split") this.actions.split(this.placeOf(event).x);
     else this.actions[finger.what](right, down);
   }

@@ -1,18 +1,24 @@
-// The page: choices, the surface that they show, and what is written about it.
+// The viewer: choices, the surfaces that they show, and what is written about them.
 
-const NAMES = { grey: "grey", photo: "the photo", depth: "the expected error of the depth", angle: "the expected error of the normal" };
+const NAMES = { grey: "grey", photo: "the photo", filled: "grey with filled pixels in colour", depth: "the expected error of the depth", angle: "the expected error of the normal" };
 const UNITS = { depth: { factor: 1000, unit: "mm", title: "Expected error of the depth, mm" }, angle: { factor: 1, unit: "degrees", title: "Expected error of the normal, degrees" } };
 
 const TURN = (2 * Math.PI) / 3; // by dragging over the whole stage
+const NARROW = 560; // pixels of a stage below which panels are one below another
+const HIGHEST = 0.82; // of the window, the height of a stage with panels, as in view.css
 
 class View {
-  constructor(content) {
+  /**
+   * Show results: what is told of them, a function that returns their data by name and number, and first choices.
+   */
+  constructor(content, data, choices = {}) {
     this.content = content;
+    this.data = data;
     this.palette = paletteOf(content.colours);
     this.stage = find("#stage");
     this.canvas = find("canvas", this.stage);
     this.scene = new Scene(this.canvas, this.palette, content.tones);
-    this.state = { side: "both", colour: "grey", drag: "turn", split: 0.5, light: content.light, doubtful: false, number: -1 };
+    this.state = { side: "both", colour: "grey", drag: "turn", split: 0.5, light: content.light, doubtful: false, number: -1, ...choices };
     find("#viewer").hidden = false;
     find("#stills").hidden = true;
     this.listen();
@@ -22,6 +28,15 @@ class View {
     this.set("drag", this.state.drag);
     const named = content.results.findIndex((result) => `#${encodeURIComponent(result.name)}` === location.hash);
     this.show(Math.max(named, 0));
+  }
+
+  /** Take other results in place of those that are shown; light and choices stay. */
+  take(content, data) {
+    this.content = content;
+    this.data = data;
+    this.makeChoice();
+    find("#viewer").hidden = false;
+    return this.show(0);
   }
 
   // What is shown.
@@ -34,12 +49,13 @@ class View {
     this.result = result;
     this.stage.setAttribute("aria-busy", "true");
     find(".busy").hidden = false;
-    const photo = textOf(`photo-${shown}`);
+    const photo = this.data(`photo-${shown}`);
     const names = ["after", "before"].filter((name) => result[name]);
-    const [image, ...grids] = await Promise.all([photo && decodePhoto(photo), ...names.map((name) => decodeGrid(result[name], textOf(`${name}-${shown}`)))]);
+    const [image, ...grids] = await Promise.all([photo && decodePhoto(photo), ...names.map((name) => decodeGrid(result[name], this.data(`${name}-${shown}`)))]);
     if (this.state.number !== shown) return;
     this.grids = Object.fromEntries(names.map((name, k) => [name, grids[k]]));
     this.scene.setPhoto(image);
+    find(".flat").src = photo ? `data:image/jpeg;base64,${photo}` : "";
     this.pose = new Pose(result.pivot);
     this.fitStage();
     this.build();
@@ -59,7 +75,7 @@ class View {
       this.scene.dropSurface(name);
       const grid = this.grids[name];
       if (!grid) continue;
-      const mesh = buildMesh(grid, name === "after" && this.state.doubtful);
+      const mesh = buildMesh(grid, name === "after" && this.withDoubtful);
       this.triangles[name] = mesh.corners.length / 3;
       this.scene.setSurface(name, grid, mesh);
     }
@@ -69,9 +85,9 @@ class View {
   /** Offer what the result has. */
   offer() {
     const { result, state } = this;
-    const has = { grey: true, photo: Boolean(this.scene.photo), depth: Boolean(result.errors), angle: Boolean(result.errors) };
+    const has = { grey: true, photo: Boolean(this.scene.photo), depth: Boolean(result.errors), angle: Boolean(result.errors), filled: result.filled > 0 };
     for (const button of findAll("[data-colour]")) button.hidden = !has[button.dataset.colour];
-    find(".colours").parentElement.hidden = !has.photo && !has.depth;
+    find(".colours").parentElement.hidden = !has.photo && !has.depth && !has.filled;
     find(".sides").hidden = !result.before;
     find(".doubtful").hidden = !result.doubtful;
     this.set("colour", has[state.colour] ? state.colour : "grey");
@@ -80,35 +96,95 @@ class View {
     find("#result").value = String(state.number);
   }
 
-  /** Give the stage the photo's shape, not higher than the window allows and not tiny. */
+  /** Give the stage the shape of the photo, or of its panels, not higher than the window allows and not tiny. */
   fitStage() {
     const [width, height] = this.result.after.size;
     this.aspect = width / height;
-    this.stage.style.aspectRatio = `${width} / ${height}`;
+    const apart = this.state.side === "apart";
+    this.columns = apart ? this.columnsOf(this.panels().length) : 1;
+    const panels = apart ? this.panels() : [];
+    const rows = Math.max(1, Math.ceil(panels.length / this.columns));
+    this.stage.style.aspectRatio = `${this.columns * width} / ${rows * height}`;
+    this.stage.classList.toggle("stacked", panels.length > 1 && this.columns === 1);
+    this.stage.classList.toggle("apart", panels.length > 0);
+    const flat = find(".flat");
+    flat.hidden = !panels.length || !this.scene.photo;
+    flat.style.width = `${100 / this.columns}%`;
+    flat.style.height = `${100 / rows}%`;
+    const cells = find(".panels");
+    cells.hidden = !panels.length;
+    cells.style.gridTemplateColumns = `repeat(${this.columns}, 1fr)`;
+    cells.replaceChildren(...panels.map(({ name, surface }) => make("div", {}, make("span", { className: "name name-left", textContent: name }), surface && make("span", { className: "spot" }))));
+    this.showSpots();
+  }
+
+  /** Return in how many columns so many panels are largest; one below another in a narrow window, which scrolls. */
+  columnsOf(count) {
+    const [across, down] = [this.stage.clientWidth, HIGHEST * innerHeight];
+    if (across < NARROW) return 1;
+    const sizes = Array.from({ length: count }, (_, k) => Math.min(across / (k + 1), (down / Math.ceil(count / (k + 1))) * this.aspect));
+    return 1 + sizes.indexOf(Math.max(...sizes));
+  }
+
+  /** Return the panels: the photo, where there is one, the surfaces in the chosen colour, and the result in another. */
+  panels() {
+    const { colour } = this.state;
+    const surfaces = this.sides().map((surface) => ({ name: surface, surface, colour }));
+    if (!this.scene.photo) return surfaces;
+    const [other, name] = colour === "photo" ? ["grey", "after, in grey"] : ["photo", "after, with the photo"];
+    const [photo, second] = [{ name: "photo", surface: null }, { name, surface: "after", colour: other }];
+    // In two columns, before is above after.
+    return this.columns === 2 ? [photo, ...surfaces.slice(0, -1), second, surfaces.at(-1)] : [photo, ...surfaces, second];
+  }
+
+  /** Return the place of a panel, from its upper left corner on, as fractions of the stage. */
+  panelBox(number, count) {
+    const [width, height] = [1 / this.columns, 1 / Math.ceil(count / this.columns)];
+    return [(number % this.columns) * width, Math.floor(number / this.columns) * height, width, height];
+  }
+
+  /** Show where the light is over each panel, while dragging moves it. */
+  showSpots() {
+    const [x, y] = this.state.light;
+    for (const spot of findAll(".panels .spot")) {
+      spot.hidden = this.state.drag !== "light";
+      Object.assign(spot.style, { left: `${50 + 50 * x}%`, top: `${50 + 50 * y}%` });
+    }
+  }
+
+  /** Whether uncertain parts are shown; what is filled often is uncertain. */
+  get withDoubtful() {
+    return this.state.doubtful || this.state.colour === "filled";
   }
 
   set(name, value) {
+    const before = this.withDoubtful;
     this.state[name] = value;
+    if (this.withDoubtful !== before && this.result?.doubtful && this.triangles) this.build();
     for (const button of findAll(`[data-${name}]`)) button.setAttribute("aria-pressed", String(button.dataset[name] === value));
-    const both = this.sides().length === 2;
+    const apart = this.state.side === "apart";
+    const both = this.sides().length === 2 && !apart;
     find(".divider").hidden = !both;
+    find(".name-left").hidden = apart;
     find(".name-left").textContent = this.sides()[0];
     find(".name-right").textContent = this.sides()[1] ?? "";
     find(".name-right").hidden = !both;
     this.stage.classList.toggle("lighting", this.state.drag === "light");
     this.stage.classList.toggle("errors", this.state.colour in UNITS); // the smallest errors are black, holes must not be
     if (name === "colour" || name === "side") this.showScale();
+    if (this.grids && (name === "side" || this.state.side === "apart")) this.fitStage();
     this.refresh();
   }
 
   sides() {
     if (!this.result?.before) return ["after"];
-    return this.state.side === "both" ? ["before", "after"] : [this.state.side];
+    return ["both", "apart"].includes(this.state.side) ? ["before", "after"] : [this.state.side];
   }
 
   setLight(light) {
     this.state.light = light;
     showLight(find(".ball"), light, "Light");
+    this.showSpots();
     this.refresh();
   }
 
@@ -136,10 +212,13 @@ class View {
 
   draw() {
     const [first, second] = this.sides();
-    const { colour, split, light } = this.state;
-    const parts = second ? [{ surface: first, colour, from: 0, to: split }, { surface: second, colour, from: split, to: 1 }] : [{ surface: first, colour, from: 0, to: 1 }];
+    const { colour, split, light, side } = this.state;
+    const apart = side === "apart";
+    const whole = [0, 0, 1, 1];
+    let parts = second ? [{ surface: first, colour, view: whole, from: 0, to: split }, { surface: second, colour, view: whole, from: split, to: 1 }] : [{ surface: first, colour, view: whole, from: 0, to: 1 }];
+    if (apart) parts = this.panels().map((panel, k, all) => ({ ...panel, view: this.panelBox(k, all.length), from: 0, to: 1 }));
     this.scene.draw(parts, this.pose.uniforms, light, this.aspect);
-    this.canvas.setAttribute("aria-label", `Surface of ${this.result.name}, ${this.sides().join(" on the left, ")}${second ? " on the right" : ""}, in ${NAMES[colour]}, ${this.pose.text}, lit ${lightText(light)}`);
+    this.canvas.setAttribute("aria-label", `Surface of ${this.result.name}, ${second && !apart ? `${first} on the left, ${second} on the right` : this.sides().join(" beside ")}, in ${NAMES[colour]}, ${this.pose.text}, lit ${lightText(light)}`);
   }
 
   // What is written.
@@ -151,6 +230,7 @@ class View {
       const gaps = holes ? `, ${percent(holes)} holes` : "";
       return `${name === "after" ? "After" : "Before"}: ${(width * height).toLocaleString("en")} vertices (${width} \u00d7 ${height}${reduced}${gaps}), ${this.triangles[name].toLocaleString("en")} triangles, cut at depth steps.`;
     });
+    if (this.result.filled) lines.push(`${percent(this.result.filled)} of the result is filled: the input has no depth there.`);
     if (this.result.doubtful) lines.push(`${percent(this.result.doubtful)} of the result is uncertain, and left out as in mesh.glb unless \u201cuncertain parts\u201d is ticked.`);
     find(".told").textContent = lines.join(" ");
   }
@@ -165,7 +245,13 @@ class View {
   showScale() {
     const about = UNITS[this.state.colour];
     const limits = about && this.result?.errors?.[this.state.colour];
-    find(".scale").hidden = !limits;
+    const filled = this.state.colour === "filled" && this.result?.filled;
+    find(".scale").hidden = !limits && !filled;
+    for (const part of [".scale-bar", ".ticks"]) find(part).hidden = !limits;
+    if (filled) {
+      find(".scale-title").textContent = `Orange: filled, where the input has no depth; ${percent(filled)} of the result`;
+      find(".scale-note").textContent = "";
+    }
     if (!limits) return;
     const [low, high] = [about.factor * limits.low, about.factor * limits.high];
     find(".scale-title").textContent = about.title;
@@ -202,6 +288,15 @@ class View {
       for (const button of findAll(`[data-${name}]`)) button.addEventListener("click", () => this.set(name, button.dataset[name]));
     }
     const pixels = () => Math.min(this.stage.clientWidth, this.stage.clientHeight);
+    const panelOf = (event) => {
+      const box = this.stage.getBoundingClientRect();
+      const count = this.state.side === "apart" ? this.panels().length : 1;
+      const [columns, rows] = count > 1 ? [this.columns, Math.ceil(count / this.columns)] : [1, 1];
+      const cell = (along, cells) => clamp(Math.floor(along * cells), 0, cells - 1);
+      const number = cell((event.clientX - box.left) / box.width, columns) + columns * cell((event.clientY - box.top) / box.height, rows);
+      const [x, y, width, height] = count > 1 ? this.panelBox(number, count) : [0, 0, 1, 1];
+      return { left: box.left + x * box.width, top: box.top + y * box.height, width: width * box.width, height: height * box.height };
+    };
     const actions = {
       turn: (right, down) => this.look((pose) => pose.turnBy((TURN * right) / pixels(), (TURN * down) / pixels())),
       move: (right, down) => this.look((pose) => {
@@ -210,7 +305,7 @@ class View {
         pose.moveBy(right / across, down / across, lens, width);
       }),
       zoom: (factor) => this.look((pose) => pose.zoomBy(factor)),
-      light: (light) => this.setLight(light),
+      light: (event) => this.setLight(lightIn(event, panelOf(event))),
       split: (place) => this.setSplit(place),
       mode: () => this.state.drag,
     };
@@ -228,7 +323,7 @@ class View {
     this.stage.addEventListener("keydown", (event) => this.stageKey(event));
     document.addEventListener("keydown", (event) => this.key(event));
     this.canvas.addEventListener("webglcontextlost", (event) => { event.preventDefault(); fall("The browser has taken the graphics away; load the page again to turn the surface."); });
-    new ResizeObserver(() => this.refresh()).observe(this.stage);
+    new ResizeObserver(() => { if (this.grids) this.fitStage(); this.refresh(); }).observe(this.stage);
   }
 
   look(change) {
@@ -260,8 +355,8 @@ class View {
     if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest("input, select, textarea")) return;
     const press = (selector) => () => { const button = find(selector); if (button && !button.hidden && !button.closest("[hidden]")) button.click(); };
     const actions = {
-      1: press("[data-side=before]"), 2: press("[data-side=both]"), 3: press("[data-side=after]"),
-      g: press("[data-colour=grey]"), p: press("[data-colour=photo]"), d: press("[data-colour=depth]"), n: press("[data-colour=angle]"),
+      1: press("[data-side=before]"), 2: press("[data-side=both]"), 3: press("[data-side=after]"), 4: press("[data-side=apart]"),
+      g: press("[data-colour=grey]"), p: press("[data-colour=photo]"), d: press("[data-colour=depth]"), n: press("[data-colour=angle]"), f: press("[data-colour=filled]"),
       t: press("[data-drag=turn]"), l: press("[data-drag=light]"), ",": press(".previous"), ".": press(".next"),
       "+": press(".zoom-in"), "=": press(".zoom-in"), "-": press(".zoom-out"), 0: press(".zoom-reset"),
     };
@@ -296,15 +391,3 @@ function fall(reason) {
   problem.textContent = reason;
   problem.hidden = false;
 }
-
-function start() {
-  try {
-    if (typeof DecompressionStream === "undefined") throw new Error("no DecompressionStream");
-    new View(block("content"));
-  } catch (error) {
-    fall(`The surface cannot be turned in this browser (${error.message}); here it is as pictures. A current Firefox, Chrome, Edge or Safari with WebGL 2 shows it.`);
-  }
-}
-
-addEventListener("unhandledrejection", (event) => { fall(`The surface could not be read (${event.reason?.message}).`); event.preventDefault(); });
-start();

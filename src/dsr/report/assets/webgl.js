@@ -27,7 +27,7 @@ in vec3 towards;
 in vec2 place;
 uniform vec3 light, tones;
 uniform vec2 size;
-uniform int kind; // 0 grey, 1 photo, 2 errors
+uniform int kind; // 0 grey, 1 photo, 2 errors, 3 filled pixels in colour
 uniform sampler2D photo, errors, colours;
 out vec4 colour;
 void main() {
@@ -39,11 +39,12 @@ void main() {
     int level = int(255.0 * texelFetch(errors, ivec2(place * size), 0).r + 0.5);
     matter = level == 0 ? vec3(0.5) : texelFetch(colours, ivec2(level, 0), 0).rgb;
   }
+  if (kind == 3 && texelFetch(errors, ivec2(place * size), 0).r > 0.0) matter = vec3(1.0, 0.62, 0.15) * (0.35 + 0.75 * shade);
   if (!gl_FrontFacing) matter = mix(vec3(0.10, 0.13, 0.16), vec3(0.34, 0.40, 0.46), shade);
   colour = vec4(min(matter, 1.0), 1.0);
 }`;
 
-const KINDS = { grey: 0, photo: 1, depth: 2, angle: 2 };
+const KINDS = { grey: 0, photo: 1, depth: 2, angle: 2, filled: 3 };
 const UNIFORMS = ["turn", "pivot", "offset", "lens", "size", "fit", "range", "light", "tones", "kind", "photo", "errors", "colours"];
 
 class Scene {
@@ -119,6 +120,9 @@ class Scene {
     for (const [kind, levels] of Object.entries(grid.errors)) {
       surface.errors[kind] = this.texture(gl.R8, gl.RED, grid.width, grid.height, levels, gl.NEAREST);
     }
+    if (grid.flags.some((flags) => flags & FILLED)) {
+      surface.errors.filled = this.texture(gl.R8, gl.RED, grid.width, grid.height, grid.flags.map((flags) => (flags & FILLED ? 255 : 0)), gl.NEAREST);
+    }
     this.surfaces[name] = surface;
   }
 
@@ -131,23 +135,23 @@ class Scene {
     delete this.surfaces[name];
   }
 
-  /** Fit the canvas to its element, and return the factors that keep the photo's shape in it. */
-  fit(aspect) {
+  /** Fit the canvas to its element. */
+  fit() {
     const canvas = this.canvas;
     const sharp = Math.min(devicePixelRatio || 1, 2);
     const [width, height] = [canvas.clientWidth, canvas.clientHeight].map((side) => clamp(Math.round(side * sharp), 1, this.largest));
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
-    const wide = width / height / aspect;
-    return wide > 1 ? [1 / wide, 1] : [1, wide];
   }
 
-  /** Draw parts: { surface, colour, from, to }, the last two as fractions of the width. */
+  /**
+   * Draw parts: { surface, colour, view, from, to }: the view's left, top, width and height as fractions of the canvas,
+   * and which part of its width is drawn, as fractions of it.
+   */
   draw(parts, pose, light, aspect) {
     const gl = this.gl;
     if (gl.isContextLost()) return;
-    const fit = this.fit(aspect);
+    this.fit();
     const { width, height } = this.canvas;
-    gl.viewport(0, 0, width, height);
     gl.disable(gl.SCISSOR_TEST);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     gl.enable(gl.SCISSOR_TEST);
@@ -155,13 +159,17 @@ class Scene {
     gl.uniformMatrix3fv(this.at.turn, true, pose.turn);
     gl.uniform3fv(this.at.pivot, pose.pivot);
     gl.uniform3fv(this.at.offset, pose.offset);
-    gl.uniform2fv(this.at.fit, fit);
     gl.uniform2f(this.at.range, 0.01 * pose.offset[2], pose.offset[2] + 100 * pose.pivot[2]);
     gl.uniform3fv(this.at.light, light);
     gl.uniform3fv(this.at.tones, this.tones);
-    for (const { surface: name, colour, from, to } of parts) {
-      const [left, right] = [Math.round(from * width), Math.round(to * width)];
-      if (right > left && this.surfaces[name]) this.drawPart(this.surfaces[name], colour, [left, 0, right - left, height]);
+    for (const { surface: name, colour, view: [x, y, across, down], from, to } of parts) {
+      const [start, wide, top, high] = [x * width, across * width, Math.round(y * height), Math.round(down * height)];
+      const [left, right] = [Math.round(start + from * wide), Math.round(start + to * wide)];
+      if (right <= left || !this.surfaces[name]) continue;
+      const shape = wide / high / aspect; // the photo's shape is kept
+      gl.viewport(Math.round(start), height - top - high, Math.round(wide), high);
+      gl.uniform2fv(this.at.fit, shape > 1 ? [1 / shape, 1] : [1, shape]);
+      this.drawPart(this.surfaces[name], colour, [left, height - top - high, right - left, high]);
     }
   }
 
@@ -171,7 +179,7 @@ class Scene {
     gl.scissor(...box);
     gl.uniform4fv(this.at.lens, grid.lens);
     gl.uniform2f(this.at.size, grid.width, grid.height);
-    const has = colour === "photo" ? this.photo : KINDS[colour] === 2 ? surface.errors[colour] : true;
+    const has = colour === "photo" ? this.photo : KINDS[colour] > 1 ? surface.errors[colour] : true;
     gl.uniform1i(this.at.kind, has ? KINDS[colour] : 0);
     [["photo", this.photo], ["errors", surface.errors[colour]], ["colours", this.palette]].forEach(([name, texture], unit) => {
       gl.activeTexture(gl.TEXTURE0 + unit);

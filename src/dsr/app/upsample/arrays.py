@@ -1,0 +1,181 @@
+"""Photos and depth maps of notebooks and programs: arrays, tensors and pictures in memory, one or a batch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dsr.geometry.camera import Camera
+from dsr.geometry.plausible import expect_possible
+from dsr.geometry.rigid_motion import as_rigid
+from dsr.inference.any_ratio import expect_picture
+from dsr.io.doubts import doubt_camera, doubt_depth
+from dsr.io.encoding import Encoding, decode, find_holes, turn_back_bits
+from dsr.io.files import metres_in
+from dsr.io.inputs import Picture
+from dsr.io.reading import SUNRGBD_BITS
+from dsr.notes import Assumption
+
+_METRES = Encoding(".npy", "float32", 1.0, math.nan, "orthogonal")
+
+
+@dataclass(frozen=True)
+class Given:
+    """A picture, and what its depth was given as.
+
+    Args:
+        picture: on the CPU.
+        device: of the tensor; None for an array.
+
+    """
+
+    picture: Picture
+    device: torch.device | None
+
+
+def picture_of(
+    rgb: Any, depth: Any, camera: Any, *, mask: Any = None, unit: str | float | None = None, pose: Any = None
+) -> Given:
+    """Return a picture of what a user gives; see :func:`dsr.upsample`.
+
+    Args:
+        pose: from camera to world, (4, 4) or (3, 4), metres; None for none.
+
+    Raises:
+        ValueError: something is not as there; the message begins with the argument's name.
+
+    """
+    if not isinstance(camera, Camera):
+        raise ValueError(f"camera: expected a dsr.Camera, got {_kind(camera)}; see dsr.Camera.from_matrix")
+    expect_possible(camera, "camera")
+    photo, given = _photo(rgb, camera), _values(depth, "depth")
+    stored = _as_array(given)
+    stored = stored[0] if stored.ndim == 3 and len(stored) == 1 else stored
+    if stored.ndim != 2 or not stored.size:
+        raise ValueError(f"depth: expected a map of shape (h, w), got {_kind(given)}")
+    depth_lr, encoding = _metres(stored, unit, camera)
+    if mask is not None:
+        depth_lr = depth_lr.masked_fill(~_mask(mask, stored.shape), torch.nan)
+    expect_picture(photo, depth_lr, camera)
+    place = None if pose is None else as_rigid(pose.cpu().numpy() if isinstance(pose, Tensor) else pose, "pose")
+    device = given.device if isinstance(given, Tensor) else None
+    return Given(Picture(photo, depth_lr, camera, encoding, (), place), device)
+
+
+def doubts_of(picture: Picture) -> list[Assumption]:
+    """Return warnings of a picture's camera and distances, as for files."""
+    size_lr = (picture.depth_lr.shape[-2], picture.depth_lr.shape[-1])
+    view = picture.camera.rescale(size_lr[1], size_lr[0])
+    return [*doubt_camera(picture.camera, "camera", size_lr), *doubt_depth(picture.depth_lr, view, "orthogonal")]
+
+
+class Single(NamedTuple):
+    """One picture of a batch, or the only one."""
+
+    rgb: Any
+    depth: Any
+    camera: Any
+    mask: Any
+
+
+def is_batch(rgb: Any, depth: Any) -> bool:
+    """Return whether there are several pictures: lists of them, or photos with an axis more."""
+    return isinstance(rgb, list | tuple) or isinstance(depth, list | tuple) or getattr(rgb, "ndim", 0) == 4
+
+
+def pictures_of(rgb: Any, depth: Any, camera: Any, mask: Any) -> Iterator[Single]:
+    """Yield the pictures of a batch; one camera is that of all.
+
+    Raises:
+        ValueError: there are more of one argument than of another.
+
+    """
+    parts: dict[str, Sequence[Any]] = {"rgb": rgb, "depth": depth}
+    parts |= {"camera": camera} if isinstance(camera, list | tuple) else {}
+    parts |= {"mask": mask} if mask is not None else {}
+    counts = {name: len(each) if hasattr(each, "__len__") else 1 for name, each in parts.items()}
+    if len(set(counts.values())) > 1:
+        numbers = ", ".join(f"{count} of {name}" for name, count in counts.items())
+        raise ValueError(f"{', '.join(counts)}: expected as many of each in a batch, got {numbers}")
+    for number in range(counts["rgb"]):
+        of = {name: each[number] for name, each in parts.items()}
+        yield Single(of["rgb"], of["depth"], of.get("camera", camera), of.get("mask"))
+
+
+def _photo(rgb: Any, camera: Camera) -> Tensor:
+    """Return a photo as (3, H, W) float32 in [0, 1]; the range of floats is not checked."""
+    if hasattr(rgb, "convert") and hasattr(rgb, "mode"):  # a picture of PIL, which need not be imported for it
+        rgb = rgb.convert("RGB")
+    given = _values(rgb, "rgb")
+    own, axes = ("(3, H, W)", (0, 1, 2)) if isinstance(given, Tensor) else ("(H, W, 3)", (2, 0, 1))
+    size = (camera.height, camera.width)
+    shape = tuple(given.shape[axis] for axis in axes) if given.ndim == 3 else ()
+    if shape != (3, *size):
+        which = f"with H = {size[0]} and W = {size[1]}, the camera's" if shape[:1] == (3,) else "RGB"
+        raise ValueError(f"rgb: expected a picture of shape {own}, {which}; got {_kind(given)}")
+    pixels = torch.from_numpy(_as_array(given)) if not isinstance(given, Tensor) else given.detach().cpu()
+    photo = pixels.permute(*axes).contiguous()
+    if photo.dtype in (torch.uint8, torch.uint16):
+        return photo.float().div_(255 if photo.dtype == torch.uint8 else 65535)
+    if not photo.is_floating_point():
+        raise ValueError(f"rgb: expected values of 8 or 16 bits, or floats from 0 to 1, got {_kind(given)}")
+    return photo.float()
+
+
+def _metres(stored: np.ndarray, unit: str | float | None, camera: Camera) -> tuple[Tensor, Encoding]:
+    """Return depth in metres, (1, h, w) float32, and how it was given, of values (h, w)."""
+    factor = metres_in(unit)
+    kind = f"{stored.dtype} of shape {stored.shape}"
+    if stored.dtype.kind not in "fiu" or (stored.dtype.kind in "iu" and stored.dtype.itemsize == 1):
+        raise ValueError(f"depth: expected floats, or whole numbers of 16 bits or more, got {kind}")
+    if factor is None:
+        if stored.dtype.kind != "f":
+            raise ValueError(
+                f"depth: expected floats in metres, or whole numbers with unit='mm', 'm' or 0.0002, got {kind}"
+            )
+        return torch.from_numpy(stored.astype(np.float32))[None], _METRES
+    bits = SUNRGBD_BITS if factor == "sunrgbd" else 0
+    stored = turn_back_bits("depth", stored, bits) if bits else stored
+    holes, mark, _ = find_holes(stored, None)
+    suffix = ".png" if stored.dtype == np.uint16 else ".npy"
+    encoding = Encoding(suffix, str(stored.dtype), 1e-3 if factor == "sunrgbd" else factor, mark, "orthogonal")
+    return decode(stored, holes, encoding, camera.rescale(stored.shape[1], stored.shape[0])), encoding
+
+
+def _mask(mask: Any, size: tuple[int, ...]) -> Tensor:
+    """Return a valid mask, (1, h, w) bool."""
+    values = torch.from_numpy(_as_array(_values(mask, "mask")) != 0)
+    if values.shape[-2:] != size or values.numel() != math.prod(size):
+        raise ValueError(f"mask: expected the depth's shape {size}, got {_kind(mask)}")
+    return values.reshape(1, *size)
+
+
+def _values(given: Any, name: str) -> np.ndarray | Tensor:
+    """Return what a user gives as a tensor if it is one, else as an array."""
+    if isinstance(given, Tensor):
+        return given
+    if isinstance(given, np.ndarray) or hasattr(given, "__array__") or hasattr(given, "__array_interface__"):
+        return np.asarray(given)
+    raise ValueError(f"{name}: expected a NumPy array, a tensor or a picture of PIL, got {_kind(given)}")
+
+
+def _as_array(given: np.ndarray | Tensor) -> np.ndarray:
+    """Return values as an array that torch can share: of this machine's byte order, of positive strides, writeable."""
+    if isinstance(given, Tensor):
+        given = given.detach().cpu()
+        return (given.float() if given.dtype == torch.bfloat16 else given).numpy()
+    return np.require(given, given.dtype.newbyteorder("="), ("C", "W"))
+
+
+def _kind(given: Any) -> str:
+    """Return what a user gave, for a message."""
+    shape, dtype = getattr(given, "shape", None), getattr(given, "dtype", None)
+    if shape is None or dtype is None:
+        return type(given).__name__
+    return f"{'a tensor of ' if isinstance(given, Tensor) else ''}{dtype} of shape {tuple(shape)}"

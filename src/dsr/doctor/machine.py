@@ -1,0 +1,183 @@
+"""Checks of what is installed and of the machine: ``dsr doctor`` without a directory."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+import tempfile
+import webbrowser
+from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, distribution, distributions
+from pathlib import Path
+
+import torch
+from packaging.specifiers import SpecifierSet
+from rich.text import Text
+
+from dsr.data.download.collections import CATALOGUE
+from dsr.doctor.about import Extra, extras, graphics_cards, lack, processor, requirements, version_lines
+from dsr.doctor.examine import FINE, show_findings
+from dsr.doctor.finding import Finding, Level
+from dsr.methods import weights
+from dsr.synthetic.rendering import cache_directory
+from dsr.utils.compute_device import fast_precision, pick_device
+from dsr.utils.console import USAGE_ERROR, one_line, open_console
+from dsr.utils.files import data_root
+from dsr.utils.progress import megabytes
+from dsr.utils.versions import file_hash
+
+_OPENCV = "opencv-python-headless"
+_LITTLE = 1 << 30
+"""Free bytes of a disk below which results of large photos may not fit."""
+
+
+def examine_machine() -> int:
+    """Print what is installed and whether it is in order.
+
+    Returns:
+        Exit status: 0 if everything that ``dsr upsample`` needs is there, else 2.
+
+    """
+    console, findings = open_console(), check_machine()
+    show_findings(console, "this machine", findings, brief=False)
+    missing = [each for each in findings if each.level == "problem"]
+    if not missing:
+        console.print("everything that dsr upsample needs is here", style="bold", highlight=False)
+        return FINE
+    advice = "; ".join(dict.fromkeys(each.advice for each in missing))
+    console.print(Text(f"dsr upsample needs: {advice}", "bold red"), soft_wrap=True)
+    return USAGE_ERROR
+
+
+def check_machine() -> list[Finding]:
+    """Run all checks; a ``problem`` is what ``dsr upsample`` cannot do without, a ``note`` what it can."""
+    return [finding for check in CHECKS for finding in check()]
+
+
+def check_python() -> list[Finding]:
+    """Check the version of Python, and say those of dsr and its weights."""
+    try:
+        needed = distribution("dsr").metadata["Requires-Python"]
+    except PackageNotFoundError:
+        return [Finding("dsr", "warning", "not installed, its sources are used", "pip install -e . in its folder")]
+    if SpecifierSet(needed).contains(platform.python_version(), prereleases=True):
+        return [Finding("dsr", "ok", line) for line in version_lines()[:2]]
+    message = f"Python {platform.python_version()}, not {needed}"
+    return [Finding("python", "problem", message, f"install Python {needed}, and dsr in it")]
+
+
+def check_packages() -> list[Finding]:
+    """Check that every package that dsr needs is there in a version that it works with."""
+    try:
+        needed = requirements()
+    except PackageNotFoundError:
+        return []
+    wrong = {str(each).partition(";")[0].strip(): lacking for each in needed if (lacking := lack(each)) is not None}
+    if not wrong:
+        return [Finding("packages", "ok", f"all {len(needed)} are here")]
+    names = " ".join(f"'{each}'" for each in wrong)
+    return [Finding("packages", "problem", "; ".join(wrong.values()), f"pip install {names}")]
+
+
+def check_weights() -> list[Finding]:
+    """Check the files of weights against what they have to be."""
+    known, there = weights.known(), weights.packaged_names()
+    damaged = [name for name in there if file_hash(Path(str(weights.packaged_weights(name)))) != known.get(name)]
+    if damaged or not there:
+        message = f"{', '.join(damaged)}: not what dsr comes with" if damaged else "there are none"
+        return [Finding("weights", "problem", message, "install dsr anew: pip install --force-reinstall --no-deps dsr")]
+    absent = [name for name in weights.left_out() if weights.packaged_weights(name) is None]
+    found = [Finding("weights", "ok", f"{weights.version()}, {len(there)} files as they have to be")]
+    if absent:
+        found.append(Finding("weights", "note", f"not here: {', '.join(absent)}", "dsr data get weights"))
+    return found
+
+
+def check_opencv() -> list[Finding]:
+    """Check that there is one OpenCV, that without windows, which needs no library of a desktop."""
+    names = {(each.metadata["Name"] or "").lower() for each in distributions()}
+    variants = sorted(each for each in names if each.startswith("opencv-") and "python" in each)
+    again = f"pip uninstall {' '.join(variants)}; pip install {_OPENCV}"
+    try:
+        import cv2  # noqa: PLC0415 - it may not be there
+    except ImportError as error:
+        return [Finding("opencv", "problem", f"cannot be imported: {one_line(error)}", again)]
+    if len(variants) > 1:
+        message = f"{' and '.join(variants)} write into one folder, so that which is used is a matter of chance"
+        return [Finding("opencv", "warning", message, again)]
+    return [Finding("opencv", "ok", f"{cv2.__version__}, {''.join(variants)}")]
+
+
+def check_device() -> list[Finding]:
+    """Say what is computed on, and why a graphics card is not used."""
+    try:
+        device = pick_device("auto")
+    except ValueError as error:
+        return [Finding("device", "problem", one_line(error), "unset DSR_DEVICE, or correct it")]
+    threads = f"{torch.get_num_threads()} threads, {os.cpu_count()} processors"
+    threads += ", OMP_NUM_THREADS={OMP_NUM_THREADS}".format_map(os.environ) if "OMP_NUM_THREADS" in os.environ else ""
+    found = [Finding("threads", "ok", threads)]
+    if device.type == "cuda":
+        memory = megabytes(torch.cuda.get_device_properties(device).total_memory)
+        message = f"{torch.cuda.get_device_name(device)}, {memory}, {fast_precision(device)}"
+        return [Finding("device", "ok", message), *found]
+    cards = graphics_cards()
+    if cards and not torch.cuda.is_available():
+        message = f"{', '.join(cards)}, which torch {torch.__version__} cannot use"
+        return [Finding("device", "warning", message, "install torch for CUDA, see pytorch.org/get-started"), *found]
+    return [Finding("device", "ok", f"{processor()}, {fast_precision(device)}; no graphics card is needed"), *found]
+
+
+def check_folders() -> list[Finding]:
+    """Check the working directory, the cache and the data sets: whether one can write there, and what is free."""
+    named = {"results": Path(), "cache": cache_directory(), "temporary": Path(tempfile.gettempdir())}
+    found = [_folder(name, path.absolute()) for name, path in named.items()]
+    root = data_root().absolute()
+    there = [each.name for each in CATALOGUE.values() if any((root / folder).is_dir() for folder in each.folders)]
+    of = f"{len(there)} of {len(CATALOGUE)} data sets" + (f": {', '.join(there)}" if there else "")
+    return [*found, Finding("data", "ok", f"{root}, {of}; `dsr data list` has all")]
+
+
+def _folder(name: str, path: Path) -> Finding:
+    """Return whether one can write to a folder, or make it, and how much is free."""
+    there = next(each for each in (path, *path.parents) if each.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+        level: Level = "warning" if name == "results" else "problem"
+        advice = {"cache": "set DSR_CACHE to a folder of yours", "temporary": "set TMPDIR to a folder of yours"}
+        return Finding(name, level, f"{path}: cannot be written", advice.get(name, "write results elsewhere: -o DIR"))
+    free = shutil.disk_usage(there).free
+    message = f"{path}, {megabytes(free)} free"
+    if free < _LITTLE:
+        return Finding(name, "warning", message, "free some space; results of a large photo take 1 GB")
+    return Finding(name, "ok", message)
+
+
+def check_browser() -> list[Finding]:
+    """Say whether there is a browser, which opens the pages of `dsr view`."""
+    try:
+        return [Finding("browser", "ok", webbrowser.get().__class__.__name__)]
+    except webbrowser.Error:
+        return [Finding("browser", "note", "none; `dsr view --no-open` writes a page to open elsewhere")]
+
+
+def check_extras() -> list[Finding]:
+    """List the extras: which are there, and how to get the others."""
+    try:
+        found = extras()
+    except PackageNotFoundError:
+        return []
+    return [_extra(each) for each in found]
+
+
+def _extra(extra: Extra) -> Finding:
+    """Return whether an extra is there, and how to get it."""
+    if not extra.missing:
+        return Finding("extra", "ok", f"{extra.name}: {extra.purpose}")
+    message = f"{extra.name}: {extra.purpose} ({', '.join(extra.missing)})"
+    return Finding("extra", "note", message, f"pip install 'dsr[{extra.name}]'")
+
+
+CHECKS: tuple[Callable[[], list[Finding]], ...] = (
+    check_python, check_packages, check_weights, check_opencv, check_device, check_folders, check_browser, check_extras,
+)  # fmt: skip

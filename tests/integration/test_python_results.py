@@ -1,0 +1,75 @@
+"""What ``dsr.Upsampler`` computes is what ``dsr upsample`` writes, to the bit."""
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from small_frames import in_text, room, walk, write_recording
+
+import dsr
+from dsr.cli import main
+
+CAMERA = dsr.Camera.from_fov(60, width=96, height=72)
+INTRINSICS = [str(each) for each in (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)]
+
+
+def stored(size, kind):
+    """Return a map of the room in whole millimetres: with noise, a hole and an outlier; or in steps of disparity."""
+    camera = CAMERA.rescale(*size)
+    depth = room(camera, walk(1)[0]) * (1 + 0.004 * np.random.default_rng(0).standard_normal(size[::-1]))
+    if kind == "stereo":
+        constant = 0.05 * 645 * 32  # a RealSense D435's, in its steps
+        depth = constant / np.round(constant / depth)
+    values = np.round(1000 * depth).astype(np.uint16)
+    values[8:11, 9:14] = 0
+    values[20, 30] = 200
+    return np.kron(values, np.ones((2, 2), np.uint16)) if kind == "repeated" else values
+
+
+CASES = {
+    "plain": ((48, 36), {}, []),
+    "stereo": ((48, 36), {"sensor": "RealSense D435"}, ["--sensor", "RealSense D435"]),
+    "repeated": ((48, 36), {}, []),
+    "registered": ((96, 72), {"register": True, "fill": "all"}, ["--register", "--fill", "all"]),
+    "halved": ((96, 72), {"working_size": 2, "noise": 0.01}, ["--working-size", "2", "--noise", "0.01"]),
+}
+
+
+@pytest.mark.parametrize("kind", CASES)
+def test_surface_is_that_of_the_command(tmp_path, kind):
+    size, how, options = CASES[kind]
+    photo = cv2.resize(room(CAMERA, walk(1)[0]).astype(np.float32), (96, 72))
+    photo = np.stack([255 * photo / photo.max()] * 3, -1).astype(np.uint8)
+    Image.fromarray(photo).save(tmp_path / "photo.png")
+    Image.fromarray(stored(size, kind)).save(tmp_path / "depth.png")
+    files = ["--rgb", tmp_path / "photo.png", "--depth", tmp_path / "depth.png", "-o", tmp_path / "out"]
+    main(["upsample", *map(str, files), "--only", "depth,confidence", "--intrinsics", *INTRINSICS, *options])
+    expected = np.load(tmp_path / "out" / "depth_metres.npy")
+    rgb, depth = dsr.read(tmp_path / "photo.png"), dsr.read_depth(tmp_path / "depth.png", "mm")
+    surface = dsr.Upsampler(**how)(rgb, depth, CAMERA)
+    np.testing.assert_array_equal(surface.depth, expected)
+    written = np.load(tmp_path / "out" / "confidence.npz")
+    np.testing.assert_array_equal(surface.angle_error.astype(np.float16), written["angle_error"])
+    if kind == "plain":
+        np.testing.assert_array_equal(dsr.upsample(rgb, stored(size, kind), CAMERA, unit="mm"), expected)
+
+
+@pytest.mark.parametrize("neighbours", [4, 3, 1, 9])
+def test_stream_with_poses_is_the_command_with_neighbours(tmp_path, neighbours):
+    poses = walk(7)
+    folder = write_recording(tmp_path / "recording", CAMERA.rescale(48, 36), poses)
+    (tmp_path / "poses.txt").write_text(in_text(poses))
+    files = [folder, "-o", tmp_path / "out", "--poses", tmp_path / "poses.txt", "--neighbours", neighbours]
+    main(["upsample", *map(str, files), "--method", "bicubic", "--only", "depth", "--depth-unit", "mm"])
+    camera = dsr.Camera.from_json(folder / "camera.json")
+    written = [np.array([float(f"{value:.9f}") for value in pose.ravel()]).reshape(4, 4) for pose in poses]
+    frames = [
+        (dsr.read(folder / "rgb" / f"{number:03}.png"), dsr.read_depth(folder / "depth" / f"{number:03}.png", "mm"),
+         camera, pose) for number, pose in enumerate(written)
+    ]  # fmt: skip
+    upsampler = dsr.Upsampler("bicubic")
+    surfaces = list(upsampler.stream(iter(frames), neighbours=neighbours))
+    assert len(surfaces) == len(frames)
+    for number, surface in enumerate(surfaces):
+        np.testing.assert_array_equal(surface.depth, np.load(tmp_path / "out" / f"{number:03}" / "depth_metres.npy"))
+    assert (surfaces[3].depth != upsampler(*frames[3][:3]).depth).any()
