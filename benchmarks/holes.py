@@ -55,6 +55,13 @@ class Case(NamedTuple):
     camera: Camera
 
 
+def depth_of(scene: Scene) -> Tensor:
+    """Return the true depth of a scene, (1, H, W)."""
+    if scene.depth is None:
+        raise ValueError(f"{scene.name}: expected true depth")
+    return scene.depth
+
+
 def read_scene(shared: Path, name: str, ratio: int) -> Scene:
     """Return a scene whose sides the ratio divides."""
     real = shared / "real"
@@ -64,14 +71,14 @@ def read_scene(shared: Path, name: str, ratio: int) -> Scene:
         frames = icl.find_frames(real / "icl_nuim")
         found = next(each for each in frames if each.startswith(name))
         scene = icl.load_frame(*frames[found], "icl", name)
-    height, width = (n // ratio * ratio for n in scene.depth.shape[-2:])
+    height, width = (n // ratio * ratio for n in depth_of(scene).shape[-2:])
     return scene.crop(0, 0, height, width)
 
 
 def put_rings(scene: Scene, other: Scene, ratio: int, rng: np.random.Generator) -> tuple[Scene, Tensor]:
     """Return a scene with rings before it, of another scene's colours, and what is inside of them, (1, h, w) bool."""
-    height, width = scene.depth.shape[-2:]
-    rgb, depth = scene.rgb.clone(), scene.depth.clone()
+    height, width = depth_of(scene).shape[-2:]
+    rgb, depth = scene.rgb.clone(), depth_of(scene).clone()
     inside = torch.zeros(1, height // ratio, width // ratio, dtype=torch.bool)
     rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     for _ in range(14):
@@ -124,10 +131,10 @@ def steps(depth: Tensor) -> Tensor:
 def make_case(kind: str, scene: Scene, other: Scene, ratio: int, seed: int) -> Case:
     """Return a scene with holes of a kind."""
     rng, generator = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
-    inside = None
+    inside = torch.zeros(0)
     if kind == "loops":
         scene, inside = put_rings(scene, other, ratio, rng)
-    depth = Downsampling("box")(scene.depth.reciprocal(), ratio).reciprocal()
+    depth = Downsampling("box")(depth_of(scene).reciprocal(), ratio).reciprocal()
     camera_lr = scene.camera.downscale(ratio)
     if kind == "loops":
         cut = inside
@@ -141,7 +148,9 @@ def make_case(kind: str, scene: Scene, other: Scene, ratio: int, seed: int) -> C
     else:
         cut = Blobs(0.08, 6.0)(depth, camera_lr, generator)
     cut = cut & depth.isfinite()
-    return Case(scene.rgb.float(), scene.depth.float(), depth.masked_fill(cut, torch.nan).float(), cut, scene.camera)
+    return Case(
+        scene.rgb.float(), depth_of(scene).float(), depth.masked_fill(cut, torch.nan).float(), cut, scene.camera
+    )
 
 
 def farther(inverse: Tensor, rgb: Tensor, holes: Tensor) -> Settled:
@@ -215,7 +224,7 @@ def main() -> None:
             case = make_case(kind, scene, scenes[(i + 1) % len(scenes)], options.ratio, options.seed)
             surfaces = {}
             for rule in options.rules:
-                any_ratio.settle_holes = RULES[rule]
+                any_ratio.settle_holes = RULES[rule]  # type: ignore[assignment]
                 surfaces[rule] = method.upsample(case.rgb, case.depth, case.camera)
                 found.setdefault((kind, rule), []).append(measure(case, surfaces[rule], options.ratio))
             if options.pictures is not None:
@@ -229,7 +238,7 @@ def main() -> None:
 
 def draw(path: Path, case: Case, surfaces: dict[str, Surface]) -> None:
     """Draw photo, map, results and truth side by side, in inverse depth."""
-    size = case.truth.shape[-2:]
+    size = (case.truth.shape[-2], case.truth.shape[-1])
     inverse = [resize_nearest(case.depth, size), *(each.depth for each in surfaces.values()), case.truth]
     values = [each[0].reciprocal().numpy() for each in inverse]
     low, high = np.nanpercentile(values[-1], (1, 99))

@@ -58,7 +58,7 @@ def test_strip_beside_a_near_object_is_of_what_is_behind_it() -> None:
     holes = torch.zeros_like(depth, dtype=torch.bool)
     holes[:, 10:30, 17:20], holes[:, 10:30, 40:43] = True, True
     found = settle_holes(depth.masked_fill(holes, torch.nan).reciprocal(), photo, holes)
-    torch.testing.assert_close(inpaint(found.inverse[None], photo[None])[0].reciprocal(), depth)
+    torch.testing.assert_close(inpaint(found.inverse[None], photo[None])[0].reciprocal(), depth, rtol=1e-3, atol=0)
 
 
 def test_other_holes_are_left_to_the_method() -> None:
