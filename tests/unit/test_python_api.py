@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import re
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -278,6 +279,12 @@ def test_threads_that_share_an_upsampler_get_what_they_would_get_alone() -> None
         together = list(pool.map(lambda each: upsampler(photo(), each, CAMERA).depth, maps * 2))
     for first, second in zip(alone * 2, together, strict=True):
         np.testing.assert_array_equal(first, second)
+
+
+def test_upsampler_and_surface_go_to_other_processes(surface: dsr.Surface[np.ndarray]) -> None:
+    there = pickle.loads(pickle.dumps(dsr.Upsampler(QUICK)))
+    np.testing.assert_array_equal(there(photo(), metres(), CAMERA).depth, surface.depth)
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(surface)).depth, surface.depth)
 
 
 def frames(poses: list[Any]) -> list[tuple[Any, ...]]:

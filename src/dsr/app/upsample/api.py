@@ -109,7 +109,7 @@ def upsample(
 class Upsampler:
     """A method that loads its weights once, for many pictures or the frames of a camera.
 
-    It computes what ``dsr upsample`` does. Calls from several threads take turns.
+    It computes what ``dsr upsample`` does. Calls from several threads take turns; other processes may get it pickled.
 
     Args:
         method: ``facets``; or any other method in ``conf/method``, such as ``msg_v``, ``tgv``, ``guided_filter``,
@@ -158,6 +158,12 @@ class Upsampler:
         )
         self._sensor, self._register = sensor, register
         self._lock = threading.Lock()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: each for name, each in vars(self).items() if name != "_lock"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, _lock=threading.Lock())
 
     def __call__(
         self,
