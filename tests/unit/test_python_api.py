@@ -238,7 +238,7 @@ def test_points_and_mesh_have_the_photos_colours_at_their_places(surface: dsr.Su
 def test_saved_surface_is_a_result_of_the_command(surface: dsr.Surface[np.ndarray], tmp_path: Path) -> None:
     files = surface.save(tmp_path / "out", ["depth", "renderings", "normals", "cloud", "mesh", "confidence", "input"])
     names = {path.relative_to(tmp_path / "out").as_posix() for path in files}
-    assert {"depth.png", "depth_metres.npy", "renderings/e1.png", "mesh.glb", "cloud.ply", "input.npz"} <= names
+    assert {"depth.png", "depth_metres.tiff", "renderings/e1.png", "mesh.glb", "input.npz"} <= names
     assert all(path.is_file() for path in files)
     stored = np.asarray(Image.open(tmp_path / "out" / "depth.png"))  # as it was given, in whole millimetres
     np.testing.assert_allclose(stored, 1000 * surface.depth, atol=0.5)
