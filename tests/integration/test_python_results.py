@@ -50,7 +50,7 @@ def test_surface_is_that_of_the_command(tmp_path, kind):
     surface = dsr.Upsampler(**how)(rgb, depth, CAMERA)
     np.testing.assert_array_equal(surface.depth, expected)
     written = np.load(tmp_path / "out" / "confidence.npz")
-    np.testing.assert_array_equal(surface.angle_error.astype(np.float16), written["angle_error"])
+    np.testing.assert_allclose(written["angle_error"], surface.angle_error, rtol=0.017)  # stored with 64 steps
     if kind == "plain":
         np.testing.assert_array_equal(dsr.upsample(rgb, stored(size, kind), CAMERA, unit="mm"), expected)
 
