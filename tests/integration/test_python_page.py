@@ -11,6 +11,7 @@ from PIL import Image
 from small_frames import room, walk
 
 import dsr
+from dsr.app.upsample.parts import METRES
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "python.md"
 ELSEWHERE = ("pyrealsense2", "import lightning", "from hydra", "from dsr.metrics.classes import DSSIMv")
@@ -43,7 +44,7 @@ def test_lines_of_the_page_run_from_top_to_bottom(tmp_path, monkeypatch, capsys,
     said = capsys.readouterr().out
     assert re.search(r"^\d+% of the pixels are expected", said, re.MULTILINE)
     assert len(re.findall(r"^\d\.\d{3} m$", said, re.MULTILINE)) == 3
-    assert {"depth.npy", "mesh.glb", "info.json", "input.npz"} <= {path.name for path in Path("out").iterdir()}
+    assert {METRES, "mesh.glb", "info.json", "input.npz"} <= {path.name for path in Path("out").iterdir()}
     assert Path("surface.stl").stat().st_size > 1000
     assert 0 < float(known["metrics"].compute()["RMSE_d"]) < 1000
     assert len(known["points"]) > 1000
