@@ -133,11 +133,11 @@ def test_pose_that_is_not_rigid_is_one_line(capture, tmp_path, capsys):
 def test_mesh_and_cloud_beyond_limits_are_said_and_recorded(capture, tmp_path, capsys):
     pytest.importorskip("fast_simplification", reason="pip install dsr[mesh]")
     out = tmp_path / "out"
-    limits = ("--max-faces", 500, "--max-points", 1000)
+    limits = ("--keep", "all", "--max-faces", 500, "--max-points", 1000)
     assert upsample(capture, "--only", "depth,mesh,cloud", *limits, "-o", out) == 0
     said = capsys.readouterr().out
     entries = json.loads((out / "000" / "info.json").read_text())
-    faces = trimesh.load(out / "000" / "mesh.ply", process=False).faces
+    faces = trimesh.load(out / "000" / "mesh.glb", process=False, force="mesh").faces
     points = trimesh.load(out / "000" / "cloud.ply").vertices
     assert entries["mesh"] == {"before": 2 * 47 * 63, "after": len(faces), "how": "quadric decimation"}
     assert entries["cloud"]["before"] == 48 * 64

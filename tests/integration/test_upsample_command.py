@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
+import trimesh
 from PIL import Image
 
 from dsr.app.upsample.frame import FrameWork
@@ -635,3 +636,66 @@ def test_dry_run_reads_one_frame_of_each_kind_and_sums_up_the_time(tmp_path, cap
     (folder / "2_depth.png").write_bytes(b"no picture")
     assert upsample(folder, "-o", tmp_path / "out", *DEPTH_ONLY, "--dry-run") == 2
     assert "2_depth.png: expected a picture" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def vga(tmp_path_factory):
+    """A textured photo of 640 x 480 of a curved wall and boxes, and its depth with the noise of a depth camera."""
+    folder, rng = tmp_path_factory.mktemp("vga"), np.random.default_rng(0)
+    rows, columns = np.mgrid[:480, :640]
+    depth = 2.5 + 0.4 * np.sin(columns / 90) + 0.001 * rows
+    for number in range(6):
+        y, x = rng.integers(0, 380), rng.integers(0, 500)
+        depth[y : y + 100, x : x + 140] = 1.2 + 0.2 * number
+    noisy = np.round(1000 * (depth + 0.002 * depth**2 * rng.standard_normal(depth.shape)))
+    noisy[rng.random(noisy.shape) < 0.01] = 0
+    texture = (
+        128
+        + 50 * np.sin(rows / 3) * np.cos(columns / 5)
+        + 40 * np.cos(7 * depth)
+        + 6 * rng.standard_normal(depth.shape)
+    )
+    photo = np.repeat(texture.clip(0, 255).astype(np.uint8)[..., None], 3, axis=2)
+    Image.fromarray(photo).save(folder / "photo.png")
+    Image.fromarray(noisy.astype(np.uint16)).save(folder / "depth.png")
+    return folder / "photo.png", folder / "depth.png", folder / "out"
+
+
+def test_default_results_of_a_vga_frame_are_small_and_complete(vga, capsys):
+    *pair, out = vga
+    assert of(pair, out, "--fov", 60, "--dry-run") == 0
+    [said] = re.findall(r"about ([\d.]+) MB", capsys.readouterr().out)
+    assert of(pair, out, "--fov", 60) == 0
+    sizes = {str(path.relative_to(out)): path.stat().st_size for path in out.rglob("*") if path.is_file()}
+    assert set(sizes) == {name for part in PARTS.values() for name in part} | {"info.json"}
+    assert sum(sizes.values()) < 6e6
+    assert 0.5 < sum(sizes.values()) / 1e6 / float(said) < 2
+    assert f"{sum(sizes.values()) / 1e6:.1f} MB -> {out}" in capsys.readouterr().out
+    took = info(out)["seconds"]
+    assert list(took) == ["reading", "upsampling", "writing", "total"]
+    assert took["total"] == pytest.approx(took["reading"] + took["upsampling"] + took["writing"], abs=1e-6)
+    shape = info(out)["mesh"]
+    assert shape["after"] < 0.4 * shape["before"]
+
+
+def test_parts_that_are_added_later_are_those_of_a_single_run(vga, tmp_path):
+    """Depth and expected errors are read back to the bit."""
+    *pair, first = vga
+    parts = ("mesh.glb", "depth_metres.tiff", "confidence.npz", "normals.png")
+    assert of(pair, tmp_path, "--fov", 60, "--only", "depth,confidence") == 0
+    assert of(pair, tmp_path, "--fov", 60, "--only", "mesh,normals") == 0
+    for name in parts:
+        assert (tmp_path / name).read_bytes() == (first / name).read_bytes(), name
+
+
+def test_keep_all_writes_every_pixel_and_the_files_of_other_programs(pair, tmp_path):
+    out = tmp_path / "out"
+    assert of(pair, out, *BICUBIC) == 0
+    usual = files_in(out)
+    few = info(out)["mesh"]
+    assert of(pair, out, *BICUBIC, "--keep", "all") == 0
+    assert files_in(out) == usual | {"mesh.ply", "cloud.ply"}
+    shape = info(out)["mesh"]
+    assert shape["after"] == shape["before"] == few["before"] > few["after"]
+    for name in ("mesh.ply", "mesh.glb"):
+        assert len(trimesh.load(out / name, process=False, force="mesh").faces) == shape["after"]

@@ -1,5 +1,6 @@
 """What is written beside an upsampled depth map, read back by other programs' code."""
 
+import json
 import struct
 
 import cv2
@@ -153,6 +154,53 @@ def test_glb_mesh_is_y_up_looks_along_minus_z_and_has_the_photo_as_texture(tmp_p
     np.testing.assert_allclose(colours, 255 * photo().flatten(1).T, atol=0.51)
     material = again.visual.material
     assert (material.metallicFactor, material.roughnessFactor, material.doubleSided) == (0, 1, True)
+
+
+def glb_parts(path):
+    """Return the JSON and the binary part of a GLB file."""
+    content = path.read_bytes()
+    magic, version, length, size, kind = struct.unpack("<4sIII4s", content[:20])
+    assert (magic, version, length, kind) == (b"glTF", 2, len(content), b"JSON")
+    return json.loads(content[20 : 20 + size]), content[28 + size :]
+
+
+def attribute(tree, content, name):
+    """Return an attribute of a GLB file's mesh, as the specification of glTF lays it out."""
+    accessor = tree["accessors"][tree["meshes"][0]["primitives"][0]["attributes"][name]]
+    view = tree["bufferViews"][accessor["bufferView"]]
+    dtype = {5120: "i1", 5121: "u1", 5123: "<u2", 5126: "<f4"}[accessor["componentType"]]
+    channels = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}[accessor["type"]]
+    assert view["byteOffset"] % 4 == 0
+    size = np.dtype(dtype).itemsize
+    stride = view.get("byteStride", channels * size)
+    assert stride % 4 == 0
+    return np.ndarray((accessor["count"], channels), dtype, content, view["byteOffset"], (stride, size)), accessor
+
+
+def test_glb_mesh_has_positions_of_16_bits_and_what_was_not_measured(tmp_path):
+    filled = torch.zeros(1, 18, 24, dtype=torch.bool)
+    filled[0, 5:9] = True
+    write_mesh(tmp_path / "m.glb", photo(), bumpy(), CAMERA, filled=filled)
+    tree, content = glb_parts(tmp_path / "m.glb")
+    assert tree["extensionsRequired"] == tree["extensionsUsed"] == ["KHR_mesh_quantization"]
+    positions, accessor = attribute(tree, content, "POSITION")
+    assert positions.dtype == np.uint16
+    assert (accessor["min"], accessor["max"]) == (positions.min(0).tolist(), positions.max(0).tolist())
+    node, mesh = tree["nodes"][0], triangulate(bumpy(), CAMERA)
+    placed = positions * np.array(node["scale"]) + node["translation"]
+    np.testing.assert_allclose(placed, mesh.vertices * [1, -1, -1], atol=0.51 * node["scale"][0])
+    assert attribute(tree, content, "NORMAL")[1]["normalized"] is True
+    values, _ = attribute(tree, content, "_FILLED")
+    np.testing.assert_array_equal(values[:, 0], filled[0].numpy().ravel()[mesh.pixels])
+
+
+def test_glb_mesh_from_near_to_far_has_positions_as_floats(tmp_path):
+    points = np.array([[0, 0, 0.1], [0.01, 0, 0.1], [0, 50, 100.0]])
+    normals, corners = np.tile([0.0, 0, -1], (3, 1)), np.array([[0, 2, 1]])
+    write_glb(tmp_path / "m.glb", points, normals, corners, np.zeros((3, 2)), np.zeros((4, 4, 3), np.uint8))
+    tree, content = glb_parts(tmp_path / "m.glb")
+    np.testing.assert_allclose(attribute(tree, content, "POSITION")[0], points * [1, -1, -1], rtol=1e-6)
+    assert set(tree["nodes"][0]) == {"mesh"}
 
 
 def test_large_photo_becomes_a_texture_of_a_supported_size(tmp_path):

@@ -144,8 +144,8 @@ examples:
   dsr upsample recordings --shard 3/16 -o out    the third of 16 parts, for a task of an array
   dsr upsample recordings --dry-run -o out       what would be done, and what would be assumed
 
-The results of a single pair are in OUT, those of several in OUT/NAME: depth.* as the input is stored, depth_metres.npy,
-renderings/, normals.png, cloud.ply, mesh.ply, mesh.glb, before_after.png, confidence.png, confidence.npz,
+The results of a single pair are in OUT, those of several in OUT/NAME: depth.* as the input is stored,
+depth_metres.tiff, renderings/, normals.png, mesh.glb, before_after.png, confidence.png, confidence.npz, filled.png,
 input.npz, and info.json with all settings and assumptions. Look at them with `dsr view OUT`. Run the same command again
 to continue after an interruption. More in docs/upsample.md.
 """,
