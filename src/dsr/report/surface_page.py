@@ -58,6 +58,7 @@ class ViewedResult:
         photo: (h, w, 3) uint8 of the same view and any size, None if there is none.
         depth_lr: (h, w) the input's depth in metres, NaN in holes; None if there is none.
         depth_error, angle_error: (H, W) expected errors in metres and degrees, both or none.
+        filled: (H, W) bool, where depth was not measured; None where that is not known.
         max_error: expected error of the depth, as a fraction of it, from which a pixel is left out of the mesh.
         facts: what is written below the surface, by heading.
         notes: assumptions and remarks.
@@ -71,6 +72,7 @@ class ViewedResult:
     depth_lr: np.ndarray | None = None
     depth_error: np.ndarray | None = None
     angle_error: np.ndarray | None = None
+    filled: np.ndarray | None = None
     max_error: float = math.inf
     facts: Mapping[str, str] | None = None
     notes: Sequence[str] = ()
@@ -199,9 +201,8 @@ def _data_url(jpeg: bytes) -> str:
 def _after(result: ViewedResult, vertices: int, limits: Mapping[str, tuple[float, ...]]) -> Grid:
     """Return the surface of the result, with the errors where there are any."""
     grid = _reduce(result.depth, result.camera, vertices)
-    if result.depth_lr is not None:
-        filled = reduce_mask(_filled(result.depth, result.depth_lr), grid.factor)
-        grid = replace(grid, filled=filled & np.isfinite(grid.depth))
+    if result.filled is not None:
+        grid = replace(grid, filled=reduce_mask(result.filled, grid.factor) & np.isfinite(grid.depth))
     if result.depth_error is None or result.angle_error is None:
         return grid
     with np.errstate(invalid="ignore"):
@@ -214,14 +215,6 @@ def _after(result: ViewedResult, vertices: int, limits: Mapping[str, tuple[float
         errors[name] = error_levels(fitted, *limits[name])
     doubtful = reduce_mask(left_out, grid.factor) & known
     return replace(grid, doubtful=doubtful, certain=certain, errors=errors)
-
-
-def _filled(depth: np.ndarray, depth_lr: np.ndarray) -> np.ndarray:
-    """Return where a result, (H, W), has depth and the nearest pixel of its input, (h, w), has none, (H, W) bool."""
-    rows, columns = (
-        ((np.arange(to) + 0.5) * of / to).astype(int) for to, of in zip(depth.shape, depth_lr.shape, strict=True)
-    )
-    return np.isfinite(depth) & ~np.isfinite(depth_lr)[np.ix_(rows, columns)]
 
 
 def _reduce(depth: np.ndarray, camera: Camera, vertices: int) -> Grid:

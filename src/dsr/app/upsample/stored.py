@@ -15,6 +15,7 @@ from dsr.app.upsample.outputs import INFO
 from dsr.app.upsample.parts import ERRORS, METRES, OLD_METRES, Results
 from dsr.evaluation.store import load_errors
 from dsr.geometry.camera import Camera
+from dsr.inference import find_filled
 from dsr.io.depth_files import read_depth_file
 from dsr.io.exports import INPUT, read_input
 from dsr.io.frames import UPS
@@ -75,6 +76,7 @@ def read_result(folder: Path, name: str) -> ViewedResult:
         photo, depth_lr = read_input(folder / INPUT)
     except FileNotFoundError:
         notes.append(f"without {INPUT} there is neither the photo nor the input; the same `dsr upsample` again adds it")
+    filled = None if depth_lr is None else find_filled(*(torch.from_numpy(each)[None] for each in (depth, depth_lr)))
     return ViewedResult(
         name=name,
         depth=depth,
@@ -83,6 +85,7 @@ def read_result(folder: Path, name: str) -> ViewedResult:
         depth_lr=depth_lr,
         depth_error=None if errors is None else errors[0],
         angle_error=None if errors is None else errors[1],
+        filled=None if filled is None else filled[0].numpy(),
         max_error=_max_error(info.get("settings")),
         facts=_facts(info, depth),
         notes=notes,
