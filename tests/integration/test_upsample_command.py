@@ -262,7 +262,7 @@ def test_what_was_measured_and_what_was_filled_is_told_apart(pair, tmp_path, cap
     assert shares["open"] == 0
     [line] = [line for line in said.splitlines() if " -> " in line]
     assert re.fullmatch(
-        r"\S+: bicubic x4, measured 97.7%, filled 2.3%, dubious [\d.]+%, [\d.]+ s -> \S+", line.removeprefix("photo ")
+        r"\S+: bicubic x4, measured 97.7%, filled 2.3%, dubious [\d.]+%, [\d.]+ s, [\d.]+ \w?B -> \S+", line.removeprefix("photo ")
     )
     (tmp_path / "out" / "filled.png").unlink()
     assert of(pair, tmp_path / "out", *BICUBIC, "--only", "depth,filled,cloud") == 0  # of the stored depth
@@ -283,7 +283,7 @@ def test_result_for_a_robot_has_millimetres_of_certain_measured_depth_alone(pair
         assert of(given, out, *BICUBIC, "--for", "robot", "--max-error", "1") == 0
         depth = np.asarray(Image.open(out / "depth.png"))
         assert depth.dtype == np.uint16
-        metres = np.load(tmp_path / "all" / "depth.npy")
+        metres = read_depth_file(tmp_path / "all" / "depth_metres.tiff")
         errors = np.load(out / "confidence.npz")["depth_error"].astype(np.float32)
         certain = (errors <= 0.0099 * metres) & ~np.kron(values == 0, np.ones((4, 4), bool))
         dubious = (errors > 0.0101 * metres) | np.kron(values == 0, np.ones((4, 4), bool))
