@@ -688,6 +688,39 @@ def test_parts_that_are_added_later_are_those_of_a_single_run(vga, tmp_path):
         assert (tmp_path / name).read_bytes() == (first / name).read_bytes(), name
 
 
+def test_record_still_tells_of_the_parts_that_stay_when_one_is_added(pair, tmp_path):
+    out = tmp_path / "out"
+    assert of(pair, out, *BICUBIC, "--max-error", "1") == 0
+    before = info(out)
+    assert before["shares"]["dubious"] > 0.01
+    assert any(each.startswith("left out of cloud and mesh") for each in before["assumptions"])
+    for name, missing in (("rgbd", "normals.png"), ("normals", "confidence.npz")):
+        (out / missing).unlink()
+        assert of(pair, out, *BICUBIC, "--max-error", "1", "--only", name) == 0
+        after = info(out)
+        assert after["shares"] == pytest.approx(before["shares"], abs=0.01)
+        assert set(after["assumptions"]) >= set(before["assumptions"])
+        assert len(after["assumptions"]) == len(set(after["assumptions"]))
+        assert after["seconds"]["upsampling"] >= before["seconds"]["upsampling"]
+        assert after["seconds"]["total"] >= before["seconds"]["total"]
+        assert {"mesh.glb", "depth.png"} <= set(after["files"])
+
+
+def test_mesh_of_every_pixel_replaces_one_of_large_triangles(pair, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert of(pair, out, *BICUBIC, "--with", "cloud,mesh_ply") == 0
+    few = info(out)["mesh"]
+    for again in (False, True):
+        capsys.readouterr()
+        assert of(pair, out, *BICUBIC, "--keep", "all") == 0
+        assert ("complete already" in capsys.readouterr().out) == again
+        for part, name in (("mesh_ply", "mesh.ply"), ("mesh", "mesh.glb")):
+            assert info(out)[part]["after"] == few["before"] > few["after"]
+            assert len(trimesh.load(out / name, process=False, force="mesh").faces) == few["before"]
+    assert of(pair, out, *BICUBIC) == 0
+    assert "complete already" in capsys.readouterr().out
+
+
 def test_keep_all_writes_every_pixel_and_the_files_of_other_programs(pair, tmp_path):
     out = tmp_path / "out"
     assert of(pair, out, *BICUBIC) == 0
