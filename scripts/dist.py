@@ -27,6 +27,7 @@ from dsr.utils.versions import file_hash  # noqa: E402
 MOST = 60e6
 """Bytes of the wheel."""
 _WEIGHTS = REPOSITORY / "src" / "dsr" / "methods" / "weights"
+SUMS = "SHA256SUMS"
 _STATED = {
     "src/dsr/__init__.py": '__version__ = "{}"', "CITATION.cff": "\nversion: {}\n", "docs/citation.md": "{}",
     "CHANGELOG.md": "\n## [{}]",
@@ -83,9 +84,19 @@ def check_weights() -> None:
         )
 
 
+def clear(folder: Path) -> None:
+    """Remove an earlier release from a folder, in which nothing else may be."""
+    ours = (SUMS, "dsr-*.whl", "dsr-*.tar.gz", "*.safetensors")
+    found = list(folder.iterdir()) if folder.is_dir() else []
+    if others := [path.name for path in found if not any(path.match(each) for each in ours)]:
+        raise ReleaseError(f"{folder}: expected an empty folder or one of an earlier release, got {others[0]} in it")
+    for path in found:
+        path.unlink()
+
+
 def build(folder: Path, *, offline: bool) -> Path:
     """Build the source distribution, and from it the wheel."""
-    shutil.rmtree(folder, ignore_errors=True)
+    clear(folder)
     with tempfile.TemporaryDirectory() as work:  # a copy, in which nothing of earlier builds is
         source = Path(work) / "dsr"
         names = ("src", "conf", "setup.py", "pyproject.toml", "MANIFEST.in", "constraints.txt", "eval.py", "train.py")
@@ -151,8 +162,8 @@ def finish(folder: Path) -> list[str]:
     """Put the weights that are left out into the folder, and the checksums; return a line for each file."""
     for name in sorted(left_out()):
         shutil.copy(_WEIGHTS / f"{name}.safetensors", folder)
-    files = sorted(path for path in folder.iterdir() if path.name != "SHA256SUMS")
-    (folder / "SHA256SUMS").write_text("".join(f"{file_hash(path)}  {path.name}\n" for path in files))
+    files = sorted(path for path in folder.iterdir() if path.name != SUMS)
+    (folder / SUMS).write_text("".join(f"{file_hash(path)}  {path.name}\n" for path in files))
     return [f"{path.stat().st_size / 1e6:6.1f} MB  {path}" for path in files]
 
 

@@ -68,3 +68,14 @@ def test_wheels_that_are_too_large_or_lack_weights_are_refused(dist, tmp_path):
         file.truncate(61_000_000)
     with pytest.raises(dist.ReleaseError, match="expected at most 60 MB, got 61"):
         dist.check_wheel(wheel)
+
+
+def test_a_folder_of_something_else_is_not_emptied(dist, tmp_path):
+    (tmp_path / "dsr-0.0.1.tar.gz").write_bytes(b"")
+    (tmp_path / "photo.jpg").write_bytes(b"mine")
+    with pytest.raises(dist.ReleaseError, match=r"expected an empty folder.*photo\.jpg"):
+        dist.clear(tmp_path)
+    assert len(list(tmp_path.iterdir())) == 2
+    (tmp_path / "photo.jpg").unlink()
+    dist.clear(tmp_path)
+    assert not list(tmp_path.iterdir())

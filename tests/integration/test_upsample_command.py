@@ -283,7 +283,7 @@ def test_result_for_a_robot_has_millimetres_of_certain_measured_depth_alone(pair
         assert of(given, out, *BICUBIC, "--for", "robot", "--max-error", "1") == 0
         depth = np.asarray(Image.open(out / "depth.png"))
         assert depth.dtype == np.uint16
-        metres = np.load(tmp_path / "all" / "depth.npy")
+        metres = read_depth_file(tmp_path / "all" / "depth_metres.tiff")
         errors = np.load(out / "confidence.npz")["depth_error"].astype(np.float32)
         certain = (errors <= 0.0099 * metres) & ~np.kron(values == 0, np.ones((4, 4), bool))
         dubious = (errors > 0.0101 * metres) | np.kron(values == 0, np.ones((4, 4), bool))

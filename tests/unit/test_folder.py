@@ -345,6 +345,11 @@ def test_disparity_offset_of_named_scenes_is_left_out(scene):
     assert with_offset.fingerprint("scene") != without.fingerprint("scene")
     with pytest.raises(ValueError, match=r"^without_offset: .*got vintage"):
         Folder(str(scene.parent), without_offset=["vintage"])
+    with pytest.raises(ValueError, match=r"^without_offset: expected a list"):
+        Folder(str(scene.parent), without_offset="scene")
+    describe(scene, baseline=0.5)
+    with pytest.raises(ValueError, match=r"without_offset: expected a doffs"):
+        without.load("scene")
 
 
 def test_released_scenes_load_with_their_holes(shared):

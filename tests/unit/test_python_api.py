@@ -246,14 +246,18 @@ def test_saved_surface_is_a_result_of_the_command(surface: dsr.Surface[np.ndarra
     result = read_result(folder, "out")
     np.testing.assert_array_equal(result.depth, surface.depth)
     assert (result.camera, json.loads((folder / "info.json").read_text())["method"]) == (CAMERA, QUICK)
-    with pytest.raises(ValueError, match=r"is there already.* take another folder, or overwrite"):
-        surface.save(tmp_path / "out", ["depth"])
-    assert surface.save(tmp_path / "out", ["depth"], format="npy", overwrite=True)[0].name == "depth.npy"
-    assert not (tmp_path / "out" / "mesh.glb").exists()
+    surface.save(tmp_path / "out", ["filled"])  # the same surface: a part is added
+    assert (tmp_path / "out" / "mesh.glb").exists()
+    other = dsr.Upsampler(QUICK)(photo(), metres(2), CAMERA)
+    with pytest.raises(ValueError, match=r"holds another result; take another folder, or overwrite=True"):
+        other.save(tmp_path / "out", ["depth"])
+    assert surface.save(tmp_path / "npy", ["depth"], format="npy")[0].name == "depth.npy"
     for wrong, message in (
         ({"parts": ["statue"]}, "expected some of depth"),
         ({"format": "jpg"}, "^format: expected one of"),
-        ({"colour": 1}, "^save: expected options"),
+        ({"colour": 1}, "^save: expected some of format"),
+        ({"dry_run": True}, "^save: expected some of format"),
+        ({"max_error": "3"}, "max_error"),
     ):
         with pytest.raises(ValueError, match=message):
             surface.save(tmp_path / "other", **wrong)
@@ -319,6 +323,7 @@ def test_stream_reads_no_further_than_frames_that_vote_and_names_a_wrong_one() -
     for _ in range(5):
         next(surfaces)
         ahead.append(taken[-1])
+    next(surfaces)  # though the frame after it, which votes on it, was read already
     with pytest.raises(ValueError, match=r"^frame 6: depth: expected floats in metres"):
         next(surfaces)
     assert ahead == [2, 2, 3, 4, 5]
@@ -329,3 +334,51 @@ def test_stream_reads_no_further_than_frames_that_vote_and_names_a_wrong_one() -
     with pytest.raises(ValueError, match=r"^neighbours: expected"):
         upsampler.stream([], neighbours=-1)
     assert list(upsampler.stream([])) == []
+
+
+def test_frames_without_depth_and_wrong_ones_do_not_take_others_with_them() -> None:
+    frames: list[Any] = [(photo(), millimetres(number), CAMERA, walk(8)[number]) for number in range(5)]
+    frames[2] = (photo(), np.zeros_like(millimetres()), CAMERA, walk(8)[2])
+    found = list(dsr.Upsampler(QUICK).stream(frames, unit="mm"))
+    assert [bool(np.isfinite(each.depth).any()) for each in found] == [True, True, False, True, True]
+    assert not found[2].filled.any()
+    frames[4] = (photo(), "depth.png", CAMERA, walk(8)[4])
+    seen = []
+    with pytest.raises(ValueError, match=r"^frame 4: depth: expected"):  # noqa: PT012 - those before it come first
+        for each in dsr.Upsampler(QUICK).stream(frames, unit="mm"):
+            seen.append(each)
+    assert len(seen) == 4
+
+
+def test_buffers_of_the_caller_may_be_used_again() -> None:
+    buffer = torch.zeros(3, 48, 64)
+
+    def frames() -> Any:
+        for number in range(3):
+            yield buffer.fill_(number / 4), torch.from_numpy(metres(number)), CAMERA, walk(8)[number]
+
+    assert [float(each.photo.mean()) for each in dsr.Upsampler(QUICK).stream(frames())] == [0.0, 0.25, 0.5]
+    surface = dsr.Upsampler(QUICK)(photo(), metres(), CAMERA)
+    surface.depth[:] = 7
+    assert not (surface.depth == 7).any()
+
+
+def test_masked_arrays_keep_their_mask_and_pictures_their_bits(expected: np.ndarray) -> None:
+    masked = np.ma.masked_array(np.nan_to_num(metres(), nan=9.0), np.isnan(metres()))
+    np.testing.assert_array_equal(dsr.upsample(photo(), masked, CAMERA, method=QUICK), expected)
+    deep = Image.fromarray(np.full((48, 64), 30000, np.uint16))
+    assert deep.mode == "I;16"
+    assert dsr.Upsampler(QUICK)(deep, metres(), CAMERA).photo.mean() == pytest.approx(30000 / 257, abs=0.5)
+    with pytest.raises(ValueError, match=r"^rgb: expected a picture of PIL of 8 bits"):
+        dsr.upsample(Image.fromarray(np.ones((48, 64), np.float32)), metres(), CAMERA, method=QUICK)
+
+
+def test_cameras_of_numpy_and_of_tensors_with_gradients_are_written(tmp_path: Path) -> None:
+    matrix = torch.tensor([[60.0, 0, 31.5], [0, 60, 23.5], [0, 0, 1]], requires_grad=True)
+    numbers = matrix.detach().numpy()
+    camera = dsr.Camera(np.int64(64), np.int64(48), numbers[0, 0], numbers[1, 1], numbers[0, 2], numbers[1, 2])  # type: ignore[arg-type]
+    assert camera == dsr.Camera.from_matrix(matrix, 64, 48) == dsr.Camera.from_matrix(matrix.bfloat16(), 64, 48)
+    dsr.Upsampler(QUICK)(photo(), metres(), camera).save(tmp_path / "out", ["depth"])
+    assert read_result(tmp_path / "out", "out").camera == camera
+    with pytest.raises(ValueError, match="expected a matrix"):
+        dsr.Camera.from_matrix([[60, 5, 31.5], [0, 60, 23.5], [0, 0, 1]], 64, 48)

@@ -64,6 +64,8 @@ class Folder:
         if not found:
             raise ValueError(f"root: expected a folder per scene in {root}, there is none")
         self._scenes = select_scenes(sorted(found, key=natural_key), scenes)
+        if isinstance(without_offset, str):
+            raise ValueError(f"without_offset: expected a list of names, got {without_offset!r}")
         self._without_offset = frozenset(without_offset)
         if unknown := self._without_offset.difference(found):
             raise ValueError(f"without_offset: expected names of scenes in {root}, got {', '.join(sorted(unknown))}")
@@ -100,6 +102,8 @@ def load_scene(folder: Path, dataset: str, *, offset: bool = True) -> Scene:
     """
     description = read_camera(folder / "camera.json")
     if not offset:
+        if not description.camera.doffs:
+            raise ValueError(f"{folder / 'camera.json'}: without_offset: expected a doffs to leave out, there is none")
         description = replace(description, camera=replace(description.camera, doffs=0.0))
     camera = description.camera
     rgb_path = _first(folder, _RGB_NAMES)

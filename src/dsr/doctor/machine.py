@@ -86,7 +86,7 @@ def check_weights() -> list[Finding]:
     damaged = [name for name in there if file_hash(Path(str(weights.packaged_weights(name)))) != known.get(name)]
     if damaged or not there:
         message = f"{', '.join(damaged)}: not what dsr comes with" if damaged else "there are none"
-        return [Finding("weights", "problem", message, "install dsr anew: pip install --force-reinstall --no-deps dsr")]
+        return [Finding("weights", "problem", message, "install dsr again from where it came, a checkout or a wheel")]
     absent = [name for name in weights.left_out() if weights.packaged_weights(name) is None]
     found = [Finding("weights", "ok", f"{weights.version()}, {len(there)} files as they have to be")]
     if absent:

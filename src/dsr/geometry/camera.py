@@ -60,7 +60,7 @@ class Camera:
     doffs: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check every field and take the absolute value of ``fy``."""
+        """Check every field, take the absolute value of ``fy``, and make NumPy's numbers Python's."""
         for name in ("width", "height"):
             value = getattr(self, name)
             if not _is_number(value) or not float(value).is_integer() or value < 1:
@@ -75,6 +75,9 @@ class Camera:
         if self.baseline is not None and not (_is_number(self.baseline) and self.baseline > 0):
             raise ValueError(f"camera baseline: expected a positive number of metres, got {self.baseline!r}")
         object.__setattr__(self, "fy", abs(self.fy))
+        for name, value in vars(self).items():
+            if value is not None and not isinstance(value, int | float):
+                object.__setattr__(self, name, int(value) if name in ("width", "height") else float(value))
 
     @classmethod
     def centred(cls, width: int, height: int, focal: float) -> Self:
@@ -240,23 +243,33 @@ class Camera:
         return self.rays(dtype=dtype, device=device).square().sum(dim=0).sqrt()
 
 
+_SKEW = 0.01
+"""Largest skew of a matrix of intrinsics, as a share of fx, that is taken for rounding."""
+
+
 def expect_intrinsics(matrix: Any) -> np.ndarray:
     """Return the intrinsics, (3, 3) float64, that a 3 x 3, 3 x 4 or 4 x 4 matrix begins with.
 
     Raises:
-        ValueError: it does not begin with (fx 0 cx; 0 fy cy; 0 0 1), with fx and fy above 0.
+        ValueError: it does not begin with (fx 0 cx; 0 fy cy; 0 0 1), with fx and fy above 0. A skew of up to 1 % of fx
+            is left out.
 
     """
     expected = "expected a matrix (fx 0 cx; 0 fy cy; 0 0 1)"
     try:
-        values = np.asarray(matrix.cpu() if isinstance(matrix, Tensor) else matrix, np.float64)
+        values = np.asarray(matrix.detach().cpu().double() if isinstance(matrix, Tensor) else matrix, np.float64)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{expected}, got {type(matrix).__name__}") from error
     if values.shape not in ((3, 3), (3, 4), (4, 4)):
         raise ValueError(f"{expected} of shape (3, 3), got {values.shape}")
     values = values[:3, :3]
     upright = np.isfinite(values).all() and values[0, 0] > 0 and values[1, 1] > 0
-    if not upright or not np.allclose(values[2], (0, 0, 1)) or values[1, 0] != 0:
+    if (
+        not upright
+        or not np.allclose(values[2], (0, 0, 1))
+        or values[1, 0] != 0
+        or abs(values[0, 1]) > _SKEW * values[0, 0]
+    ):
         raise ValueError(f"{expected}, got {values.tolist()}")
     return values
 

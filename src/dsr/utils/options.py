@@ -80,9 +80,16 @@ class Rule(NamedTuple):
 
         """
         for one in value if self.each else (value,):
-            if not self.holds(one):
+            if not self._allows(one):
                 meant = did_you_mean(one, self.known)
                 raise OptionError(name, f"expected {self.expected}, got {self.shown(one)}{meant}")
+
+    def _allows(self, value: Any) -> bool:
+        """Return whether a value is as expected; one of another type, which only Python gives, is not."""
+        try:
+            return self.holds(value)
+        except TypeError:
+            return False
 
 
 def at_least(least: int) -> Rule:

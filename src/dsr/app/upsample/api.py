@@ -15,6 +15,7 @@ from torch import Tensor
 from dsr.app.upsample.alignment import align
 from dsr.app.upsample.arrays import Given, doubts_of, is_batch, picture_of, pictures_of
 from dsr.app.upsample.frame import prepare, without_repeats
+from dsr.app.upsample.parts import as_stored
 from dsr.app.upsample.sequence import camera_lr, nearest, vote
 from dsr.app.upsample.surface import Array, Surface
 from dsr.degradation.sensors import Identified
@@ -24,6 +25,7 @@ from dsr.inference.defaults import DEFAULT, WIDEST, Fill
 from dsr.inference.sequences import View
 from dsr.io.files import speaking_python
 from dsr.io.inputs import Picture
+from dsr.methods import base
 from dsr.notes import warn
 from dsr.utils.guards import naming
 from dsr.utils.progress import Steps
@@ -101,8 +103,10 @@ def upsample(
         with naming(f"picture {number} of the batch"):
             surface = run(each.rgb, each.depth, each.camera, mask=each.mask, unit=unit, progress=progress)
             found.append(surface.depth)
-    if isinstance(given, list | tuple) or not found:
+    if isinstance(given, list | tuple):
         return found  # type: ignore[return-value]
+    if not found:
+        raise ValueError("rgb, depth: expected a batch of one picture at least, got none")
     return cast("Maps", torch.stack(found) if isinstance(given, Tensor) else np.stack(found))
 
 
@@ -198,7 +202,7 @@ class Upsampler:
             frames: (rgb, depth, camera) each, or (rgb, depth, camera, pose): the arguments of :func:`upsample`, and the
                 transform from the camera's frame (x right, y down, z forward) to the world's, 4 x 4, metres; None for a
                 frame without one. The depth marks its holes. Whether photos and depth fit each other is looked at in
-                the first one.
+                the first one. A frame without any measurement has a surface without depth.
             neighbours: number of frames that vote on each frame's depth, 4 for two on either side; 0 for none.
             unit: of the depth's values, see :func:`upsample`.
 
@@ -223,7 +227,7 @@ class Upsampler:
         self, frames: Iterable[tuple[Any, ...]], neighbours: int, unit: str | float | None
     ) -> Iterator[Surface[Any]]:
         """Yield surfaces; as many frames are kept as may vote on one."""
-        source, kept, place = iter(frames), dict[int, Given](), 0
+        source, kept, place = iter(frames), dict[int, Given | ValueError](), 0
 
         def read_up_to(last: int) -> None:
             while max(kept, default=place - 1) < last:
@@ -238,28 +242,41 @@ class Upsampler:
             given = kept.get(place)
             if given is None:
                 return
+            if isinstance(given, ValueError):  # read ahead, for those before it
+                raise given
             if neighbours and given.picture.pose is not None:
                 read_up_to(place + max(neighbours - place, -(-neighbours // 2)))
             yield self._voted(given, kept, place, neighbours)
             place += 1
             kept.pop(place - neighbours - 1, None)
 
-    def _voted(self, given: Given, kept: dict[int, Given], place: int, neighbours: int) -> Surface[Any]:
+    def _voted(self, given: Given, kept: dict[int, Given | ValueError], place: int, neighbours: int) -> Surface[Any]:
         """Return the surface of a frame of a stream, on whose depth others vote."""
+        pictures = {number: each.picture for number, each in kept.items() if isinstance(each, Given)}
 
         def posed(number: int) -> bool:
-            return number in kept and kept[number].picture.pose is not None
+            return number in pictures and pictures[number].pose is not None and not _is_empty(pictures[number])
 
         def fuse(picture: Picture) -> Picture:
             if not neighbours or picture.pose is None:
                 return picture
-            near = [kept[each].picture for each in nearest(place, max(kept) + 1, neighbours, posed)]
+            near = [pictures[each] for each in nearest(place, max(kept) + 1, neighbours, posed)]
             views = [View(each.depth_lr, camera_lr(each), each.pose) for each in near if each.pose is not None]
             return vote(picture, views, len(views))
 
         with naming(f"frame {place}"), speaking_python():
+            if _is_empty(given.picture):
+                return self._without_depth(given)
             picture, identified = prepare(given.picture, self._sensor, fuse)
             return self._finish(picture, identified, given, None, look=place == 0)
+
+    def _without_depth(self, given: Given) -> Surface[Any]:
+        """Return the surface of a frame in which a camera measured nothing: holes, of which nothing is known."""
+        picture = given.picture
+        size, size_lr = ((each.shape[-2], each.shape[-1]) for each in (picture.rgb, picture.depth_lr))
+        holes = torch.full((1, *size), torch.nan)
+        found = base.Surface(holes, holes, holes, filled=torch.zeros_like(holes, dtype=torch.bool))
+        return Surface(picture, found, self._run.plan(size, size_lr), 0.0, given.device)
 
     def _finish(
         self, picture: Picture, sensor: Identified | None, given: Given, progress: Steps | None, *, look: bool
@@ -275,15 +292,28 @@ class Upsampler:
         started = time.perf_counter()
         with self._lock:
             found = self._run.upsample(picture.rgb, picture.depth_lr, picture.camera, progress, sensor)
-        return Surface(picture, found, planned, time.perf_counter() - started, given.device)
+        return Surface(picture, as_stored(found), planned, time.perf_counter() - started, given.device)
 
 
-def _frame(frame: Any, number: int, unit: str | float | None) -> Given:
+def _is_empty(picture: Picture) -> bool:
+    """Return whether a depth map has no measurement."""
+    return bool(picture.depth_lr.isnan().all())
+
+
+def _frame(frame: Any, number: int, unit: str | float | None) -> Given | ValueError:
+    """Return a frame of a stream, or what is wrong with it."""
+    try:
+        return _read_frame(frame, number, unit)
+    except ValueError as error:
+        return error
+
+
+def _read_frame(frame: Any, number: int, unit: str | float | None) -> Given:
     """Return a frame of a stream."""
     with naming(f"frame {number}"), speaking_python():
         if not isinstance(frame, tuple | list) or len(frame) not in (3, 4):
             came = f"{len(frame)} of them" if isinstance(frame, tuple | list) else type(frame).__name__
             raise ValueError(f"expected (rgb, depth, camera) or (rgb, depth, camera, pose), got {came}")
         rgb, depth, camera, pose = (*frame, None)[:4]
-        given = picture_of(rgb, depth, camera, unit=unit, pose=pose)
-        return replace(given, picture=without_repeats(given.picture))
+        given = picture_of(rgb, depth, camera, unit=unit, pose=pose, empty=True)
+        return given if _is_empty(given.picture) else replace(given, picture=without_repeats(given.picture))

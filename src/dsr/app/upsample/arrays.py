@@ -40,12 +40,14 @@ class Given:
 
 
 def picture_of(
-    rgb: Any, depth: Any, camera: Any, *, mask: Any = None, unit: str | float | None = None, pose: Any = None
-) -> Given:
+    rgb: Any, depth: Any, camera: Any, *, mask: Any = None, unit: str | float | None = None, pose: Any = None,
+    empty: bool = False,
+) -> Given:  # fmt: skip
     """Return a picture of what a user gives; see :func:`dsr.upsample`.
 
     Args:
         pose: from camera to world, (4, 4) or (3, 4), metres; None for none.
+        empty: whether the depth may be all holes.
 
     Raises:
         ValueError: something is not as there; the message begins with the argument's name.
@@ -54,6 +56,9 @@ def picture_of(
     if not isinstance(camera, Camera):
         raise ValueError(f"camera: expected a dsr.Camera, got {_kind(camera)}; see dsr.Camera.from_matrix")
     expect_possible(camera, "camera")
+    if isinstance(depth, np.ma.MaskedArray):
+        known = ~np.ma.getmaskarray(depth)
+        depth, mask = depth.data, known if mask is None else known & (_as_array(_values(mask, "mask")) != 0)
     photo, given = _photo(rgb, camera), _values(depth, "depth")
     stored = _as_array(given)
     stored = stored[0] if stored.ndim == 3 and len(stored) == 1 else stored
@@ -62,8 +67,13 @@ def picture_of(
     depth_lr, encoding = _metres(stored, unit, camera)
     if mask is not None:
         depth_lr = depth_lr.masked_fill(~_mask(mask, stored.shape), torch.nan)
-    expect_picture(photo, depth_lr, camera)
-    place = None if pose is None else as_rigid(pose.cpu().numpy() if isinstance(pose, Tensor) else pose, "pose")
+    if not (empty and bool(depth_lr.isnan().all())):
+        expect_picture(photo, depth_lr, camera)
+    place = (
+        None
+        if pose is None
+        else as_rigid(pose.detach().cpu().double().numpy() if isinstance(pose, Tensor) else pose, "pose")
+    )
     device = given.device if isinstance(given, Tensor) else None
     return Given(Picture(photo, depth_lr, camera, encoding, (), place), device)
 
@@ -111,7 +121,7 @@ def pictures_of(rgb: Any, depth: Any, camera: Any, mask: Any) -> Iterator[Single
 def _photo(rgb: Any, camera: Camera) -> Tensor:
     """Return a photo as (3, H, W) float32 in [0, 1]; the range of floats is not checked."""
     if hasattr(rgb, "convert") and hasattr(rgb, "mode"):  # a picture of PIL, which need not be imported for it
-        rgb = rgb.convert("RGB")
+        rgb = _of_pil(rgb)
     given = _values(rgb, "rgb")
     own, axes = ("(3, H, W)", (0, 1, 2)) if isinstance(given, Tensor) else ("(H, W, 3)", (2, 0, 1))
     size = (camera.height, camera.width)
@@ -125,7 +135,16 @@ def _photo(rgb: Any, camera: Camera) -> Tensor:
         return photo.float().div_(255 if photo.dtype == torch.uint8 else 65535)
     if not photo.is_floating_point():
         raise ValueError(f"rgb: expected values of 8 or 16 bits, or floats from 0 to 1, got {_kind(given)}")
-    return photo.float()
+    return photo.float().clone()  # the caller may use its buffer again
+
+
+def _of_pil(rgb: Any) -> Any:
+    """Return a picture of PIL as RGB, (H, W, 3) uint16 for one of 16 bits; Pillow itself would clip it to 8."""
+    if rgb.mode.startswith("I;16"):
+        return np.repeat(np.asarray(rgb)[..., None], 3, axis=-1)
+    if rgb.mode in ("I", "F"):
+        raise ValueError(f"rgb: expected a picture of PIL of 8 bits, or of mode I;16, got mode {rgb.mode}")
+    return rgb.convert("RGB")
 
 
 def _metres(stored: np.ndarray, unit: str | float | None, camera: Camera) -> tuple[Tensor, Encoding]:

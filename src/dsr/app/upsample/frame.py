@@ -26,7 +26,7 @@ from dsr.app.upsample.outputs import (
     read_previous_run,
     stored_bytes,
 )
-from dsr.app.upsample.parts import PARTS, Result, write_parts
+from dsr.app.upsample.parts import PARTS, Result, as_stored, write_parts
 from dsr.app.upsample.reporting import Messages
 from dsr.app.upsample.request import UpsampleRequest, Upsampling, files_of, inputs_with_neighbours, settings_of
 from dsr.app.upsample.sequence import FrameSequence
@@ -153,7 +153,7 @@ class FrameWork:
             times.keep(job.earlier.seconds)
             surface = surface._replace(filled=find_filled(surface.depth, picture.depth_lr))
         else:
-            surface = self._upsample(picture, identified, progress)
+            surface = as_stored(self._upsample(picture, identified, progress))
             reporter.facts(_describe(surface.noise, given="noise" in how.arguments))
             reporter.facts([*_describe_outliers(surface.outliers), *_describe_holes(surface, how)])
             if wanted.certain:

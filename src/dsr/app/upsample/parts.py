@@ -436,7 +436,7 @@ def write_parts(folder: Path, result: Result) -> dict[str, Output]:
 
     """
     parts = result.wanted.of_frame
-    result = replace(result, surface=_as_stored(result.surface))
+    result = replace(result, surface=as_stored(result.surface))
     with ThreadPoolExecutor(1) as beside:  # shapes take as long as all the rest
         shapes = {part.name: beside.submit(_write, part, folder, result) for part in parts if part.shape}
         others = {part.name: _write(part, folder, result) for part in parts if not part.shape}
@@ -450,7 +450,7 @@ def _write(part: Part, folder: Path, result: Result) -> Output:
     return Output(part.files) if output is None else output
 
 
-def _as_stored(surface: Surface) -> Surface:
+def as_stored(surface: Surface) -> Surface:
     """Return a surface with expected errors that are stored to the bit, so that parts added later are the same."""
     import torch
 

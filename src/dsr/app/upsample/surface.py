@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import functools
+import hashlib
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -35,6 +36,8 @@ from dsr.pictures.inline import encode_row
 from dsr.utils.progress import SILENT
 
 Array = TypeVar("Array", np.ndarray, Tensor)
+_OPTIONS = ("format", "max_error", "certain", "max_faces", "max_points", "keep", "overwrite")
+"""What :meth:`Surface.save` takes of the options of ``dsr upsample``."""
 
 
 class Points(NamedTuple):
@@ -162,7 +165,7 @@ class Surface(Generic[Array]):
     def mesh(self, max_error: float | None = Results.max_error) -> trimesh.Trimesh:
         """Return the surface as triangles with the photo's colours, cut at depth steps, at full density.
 
-        ``dsr upsample`` writes the same to ``mesh.ply``, with fewer triangles if there are very many.
+        ``dsr upsample --keep all`` writes the same to ``mesh.ply``, with fewer triangles if there are very many.
 
         Args:
             max_error: see :meth:`points`.
@@ -181,10 +184,10 @@ class Surface(Generic[Array]):
         """Write what ``dsr upsample`` writes, for ``dsr view``, ``dsr fuse`` and other programs; see docs/export.md.
 
         Args:
-            folder: is made if need be.
+            folder: is made if need be. To a folder of this surface parts are added; any other is refused.
             parts: some of its parts, such as ``["depth", "mesh"]``; None for the usual ones.
             **options: of the command, by their names: ``format``, ``max_error``, ``certain``, ``max_faces``,
-                ``max_points``, ``overwrite``.
+                ``max_points``, ``keep``, ``overwrite``.
 
         Returns:
             The files.
@@ -195,26 +198,28 @@ class Surface(Generic[Array]):
 
         """
         with speaking_python():
-            try:
-                only = None if parts is None else tuple(parts)
-                wanted = Results(output=Path(folder), only=only, **options)
-            except TypeError as error:
-                raise ValueError(f"save: expected options of `dsr upsample`, got {', '.join(options)}") from error
-            return self._save(wanted)
+            if unknown := sorted(options.keys() - set(_OPTIONS)):
+                raise ValueError(f"save: expected some of {', '.join(_OPTIONS)}, got {', '.join(unknown)}")
+            only = None if parts is None else tuple(parts)
+            return self._save(Results(output=Path(folder), only=only, **options))
 
     def _save(self, wanted: Results) -> list[Path]:
         """Write results."""
         folder = wanted.output
-        earlier = read_previous_run(folder)
-        expect_free(folder, (), ours=wanted.overwrite)
+        earlier, inputs = read_previous_run(folder), self._identity
+        settings = {"max_error": wanted.max_error / 100}
+        same = earlier is not None and earlier.complete and (earlier.inputs, earlier.settings) == (inputs, settings)
+        if earlier is not None and not same and not wanted.overwrite:
+            raise ValueError(f"{folder}: holds another result; take another folder, or overwrite=True")
+        expect_free(folder, (), ours=wanted.overwrite or same)
         title = f"{self._plan.method} x{self._plan.scale}"
         found = self._found.without_dubious(wanted.max_error / 100) if wanted.certain else self._found
         result = Result(self._picture, found, output_encoding(self._picture.encoding, wanted.format), title, wanted)
-        settings = {"max_error": wanted.max_error / 100}
         times = Times(SILENT, upsampling=self._seconds)
         times.begin("writing")
-        begin(folder, settings, {}, () if earlier is None else earlier.files)
-        notes, _ = write_result(folder, result, self._plan, times, {}, settings, earlier)
+        begin(folder, settings, inputs, () if earlier is None else earlier.files)
+        kept = earlier if same else None
+        notes, _ = write_result(folder, result, self._plan, times, inputs, settings, earlier, kept)
         warn(note for note in notes if note.code)
         run = read_previous_run(folder)
         files = [] if run is None else [folder / name for name in run.files]
@@ -224,6 +229,12 @@ class Surface(Generic[Array]):
         if scene.problems:
             raise ValueError(scene.problems[0])
         return files + list(scene.files.values())
+
+    @functools.cached_property
+    def _identity(self) -> dict[str, dict[str, str]]:
+        """What a folder of results has for its inputs: a hash of the surface."""
+        content = hashlib.sha256(self._found.depth.numpy().tobytes() + _bytes(self._picture.rgb).tobytes())
+        return {"surface": {"sha256": content.hexdigest()}}
 
     def __repr__(self) -> str:
         return f"Surface({self._size(self._found.depth)}, {self._range}, {self._plan.method} x{self._plan.scale})"
@@ -278,7 +289,7 @@ class Surface(Generic[Array]):
 
     def _give(self, values: Tensor) -> Array:
         """Return a map, (1, H, W), as the depth map was given."""
-        return cast("Array", values[0].numpy() if self._device is None else values.to(self._device))
+        return cast("Array", values[0].numpy().copy() if self._device is None else values.to(self._device, copy=True))
 
 
 def _direction(light: str | Direction | Sequence[float]) -> list[float]:
