@@ -8,7 +8,8 @@ import warnings
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
-_OPTION = re.compile(r"(?<!\S)--?([a-z]+(?:-[a-z]+)*)")
+_OPTION = re.compile(r"(?<!\S)(?:--([a-z]+(?:-[a-z]+)*)|-(o))(?!\w|[-/\\.]\S)")
+"""An option of the command, which is a word of its own and no part of a path."""
 _ARGUMENTS = {"depth-unit": "unit", "o": "folder"}
 """Options of the command that have another name in Python."""
 
@@ -334,7 +335,7 @@ class Assumption(NamedTuple):
 
 def in_python(text: str) -> str:
     """Return what is said to a user of a command as it is said to one of Python, where options are arguments."""
-    return _OPTION.sub(lambda option: _ARGUMENTS.get(option[1], option[1].replace("-", "_")), text)
+    return _OPTION.sub(lambda found: _ARGUMENTS.get(name := found[1] or found[2], name.replace("-", "_")), text)
 
 
 def warn(notes: Iterable[Assumption]) -> None:

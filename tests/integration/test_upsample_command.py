@@ -262,7 +262,8 @@ def test_what_was_measured_and_what_was_filled_is_told_apart(pair, tmp_path, cap
     assert shares["open"] == 0
     [line] = [line for line in said.splitlines() if " -> " in line]
     assert re.fullmatch(
-        r"\S+: bicubic x4, measured 97.7%, filled 2.3%, dubious [\d.]+%, [\d.]+ s, [\d.]+ \w?B -> \S+", line.removeprefix("photo ")
+        r"\S+: bicubic x4, measured 97.7%, filled 2.3%, dubious [\d.]+%, [\d.]+ s, [\d.]+ MB -> \S+",
+        line.removeprefix("photo "),
     )
     (tmp_path / "out" / "filled.png").unlink()
     assert of(pair, tmp_path / "out", *BICUBIC, "--only", "depth,filled,cloud") == 0  # of the stored depth
@@ -686,6 +687,39 @@ def test_parts_that_are_added_later_are_those_of_a_single_run(vga, tmp_path):
     assert of(pair, tmp_path, "--fov", 60, "--only", "mesh,normals") == 0
     for name in parts:
         assert (tmp_path / name).read_bytes() == (first / name).read_bytes(), name
+
+
+def test_record_still_tells_of_the_parts_that_stay_when_one_is_added(pair, tmp_path):
+    out = tmp_path / "out"
+    assert of(pair, out, *BICUBIC, "--max-error", "1") == 0
+    before = info(out)
+    assert before["shares"]["dubious"] > 0.01
+    assert any(each.startswith("left out of cloud and mesh") for each in before["assumptions"])
+    for name, missing in (("rgbd", "normals.png"), ("normals", "confidence.npz")):
+        (out / missing).unlink()
+        assert of(pair, out, *BICUBIC, "--max-error", "1", "--only", name) == 0
+        after = info(out)
+        assert after["shares"] == before["shares"]
+        assert set(after["assumptions"]) >= set(before["assumptions"])
+        assert len(after["assumptions"]) == len(set(after["assumptions"]))
+        assert after["seconds"]["upsampling"] >= before["seconds"]["upsampling"]
+        assert after["seconds"]["total"] >= before["seconds"]["total"]
+        assert {"mesh.glb", "depth.png"} <= set(after["files"])
+
+
+def test_mesh_of_every_pixel_replaces_one_of_large_triangles(pair, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert of(pair, out, *BICUBIC, "--with", "cloud,mesh_ply") == 0
+    few = info(out)["mesh"]
+    for again in (False, True):
+        capsys.readouterr()
+        assert of(pair, out, *BICUBIC, "--keep", "all") == 0
+        assert ("complete already" in capsys.readouterr().out) == again
+        for part, name in (("mesh_ply", "mesh.ply"), ("mesh", "mesh.glb")):
+            assert info(out)[part]["after"] == few["before"] > few["after"]
+            assert len(trimesh.load(out / name, process=False, force="mesh").faces) == few["before"]
+    assert of(pair, out, *BICUBIC) == 0
+    assert "complete already" in capsys.readouterr().out
 
 
 def test_keep_all_writes_every_pixel_and_the_files_of_other_programs(pair, tmp_path):

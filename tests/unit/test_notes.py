@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from dsr.notes import LIMITS, Assumption, expect_no_warning, read_warning
+from dsr.notes import LIMITS, Assumption, expect_no_warning, in_python, read_warning
 
 PAGES = Path(__file__).resolve().parents[2] / "docs"
 
@@ -49,3 +49,18 @@ def test_strict_takes_a_warning_for_an_error() -> None:
         expect_no_warning(
             "a.png", [Assumption("edges apart", code="poses"), Assumption("told"), Assumption("b", code="poses")]
         )
+
+
+@pytest.mark.parametrize(
+    ("told", "in_words_of_python"),
+    [
+        ("take another -o, or --overwrite", "take another folder, or overwrite"),
+        ("--max-hole: expected 1, got -inf", "max_hole: expected 1, got -inf"),
+        ("x: --depth-unit is m", "x: unit is m"),
+        ("/tmp/scan -final/x.png: damaged", "/tmp/scan -final/x.png: damaged"),
+        ("/tmp/scan --final/x --two.png: damaged", "/tmp/scan --final/x --two.png: damaged"),
+        ("see --sensor.", "see sensor."),
+    ],
+)
+def test_only_options_are_told_as_arguments(told: str, in_words_of_python: str) -> None:
+    assert in_python(told) == in_words_of_python

@@ -287,3 +287,30 @@ def test_elapsed_time_counts_from_the_beginning_of_the_command(now: Clock) -> No
     for _ in progress.track("a", "upsample"):
         now.seconds += 2
     assert text.getvalue() == "upsample a: 1 of 1, 2.0 s, elapsed 0:00:09, remaining 0:00:00\n"
+
+
+def test_items_that_fail_while_they_are_read_do_not_make_the_rest_look_short(now: Clock) -> None:
+    progress, text = _progress(now)
+    for name in progress.track("afgb", "upsample", shares=STAGES):
+        for stage, seconds in zip(STAGES, (1, 5, 4), strict=True):
+            progress.stage(stage)
+            now.seconds += seconds
+            if name == "f":
+                break
+        if name == "g":
+            break
+    lines = text.getvalue().splitlines()
+    assert [seconds_in(line, "remaining") for line in lines] == [30, 20]
+
+
+def test_stage_that_is_left_out_tells_nothing_about_the_others(now: Clock) -> None:
+    progress, _ = _progress(now, terminal=True)
+    shown = []
+    for kept in progress.track((True, True, True, False, True), "upsample", shares=STAGES):
+        for stage, seconds in zip(STAGES, (1, 0 if kept else 5, 4), strict=True):
+            progress.stage(stage, 0.0 if stage == "upsampling" and kept else None)
+            [row] = _rows(progress)
+            shown.append(seconds_in(row, "remaining"))
+            now.seconds += seconds
+    assert shown[:6] == [None, None, None, 20, 19, 19]
+    assert shown[-3:] == [10, 9, 4]

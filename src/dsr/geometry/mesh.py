@@ -75,8 +75,9 @@ def triangulate(
         largest_step: relative change of depth, beyond what the slopes on both sides predict, from which a pair is cut.
         stride: every which row and column becomes vertices.
         isolated: whether vertices without a triangle are kept.
-        tolerance: (1, H, W) how far in metres each pixel may lie beside the mesh, so that flat parts get large
-            triangles, see :mod:`dsr.geometry.adaptive_mesh`; None for a mesh of all pixels.
+        tolerance: (1, H, W) how far in metres each pixel lies beside the mesh, mostly and by about twice that at
+            most, so that flat parts get large triangles, see :func:`dsr.geometry.adaptive_mesh.join`; None for a mesh
+            of all pixels.
 
     Raises:
         ValueError: ``depth`` is no map of the camera's size, or a number is not positive.

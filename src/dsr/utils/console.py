@@ -250,7 +250,7 @@ class _ConsoleTask:
             done if unit == "items" else None
         )  # a download first reports the bytes that were there before
         self._stage, self._began, self._guess = "", 0.0, None  # type: str, float, float | None
-        self._spent: dict[str, float] = {}  # by the stages of the item at hand that are over
+        self._spent: dict[str, float] = {}  # by the stages of the item at hand that are over; 0 if left out
         self._items: list[dict[str, float]] = []
 
     def __call__(self, done: int, total: int | None = None, remark: str | None = None) -> None:
@@ -260,7 +260,8 @@ class _ConsoleTask:
             self._before, self._measured = done, self._updated
         if done > self.done and self._stage:
             self.begin("")
-            self._items.append(self._spent)
+            if self.shares.keys() <= self._spent.keys():  # one that failed tells nothing
+                self._items.append(self._spent)
             self._spent = {}
         self.done = done
         if total is not None:
@@ -272,7 +273,8 @@ class _ConsoleTask:
         """Begin a stage; see :meth:`dsr.utils.progress.Progress.stage`."""
         now = self._now()
         if self._stage:
-            self._spent[self._stage] = self._spent.get(self._stage, 0.0) + now - self._began
+            took = 0.0 if self._guess == 0 else now - self._began
+            self._spent[self._stage] = self._spent.get(self._stage, 0.0) + took
         self._stage, self._began, self._guess = stage, now, seconds
 
     @property
@@ -303,7 +305,8 @@ class _ConsoleTask:
 
     def _times_of_item(self) -> tuple[float | None, float | None]:
         """Return the seconds that are left for the unit at hand, and those of a whole one; None if unknown."""
-        each = 1 / self._speed if self._speed else None
+        usual = self._expected(None) if self._items else None
+        each = sum(usual.values()) if usual else 1 / self._speed if self._speed else None
         tasks = tuple(self._tasks)
         inner = tasks[tasks.index(self) + 1 :] if self in tasks else ()
         within = (inner[0].remaining or None) if inner else None  # None if its steps are over, and it is not
@@ -323,11 +326,14 @@ class _ConsoleTask:
         Args:
             seconds: of the stage at hand; None if unknown.
 
+        Stages that were left out tell nothing, unless all items leave them out.
+
         """
         done = self._items[1:] or self._items  # the first one also loads what all need
         if done:
-            return {name: sum(item.get(name, 0.0) for item in done) / len(done) for name in self.shares}
-        told = self._spent if seconds is None else {self._stage: seconds}
+            taken = {name: [item[name] for item in done if item[name]] for name in self.shares}
+            return {name: sum(each) / max(len(each), 1) for name, each in taken.items()}
+        told = {self._stage: seconds} if seconds else {name: took for name, took in self._spent.items() if took}
         share = sum(self.shares[name] for name in told)
         if share < _TELLING:
             return None

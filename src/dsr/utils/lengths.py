@@ -15,5 +15,6 @@ def show_length(metres: float, digits: int = 3) -> str:
         ['12 km', '2.5 m', '8.3 mm', '0.04 mm']
 
     """
+    metres = float(f"{metres:.{digits}g}")  # so that the unit is that of what is shown
     value, unit = (metres / 1e3, "km") if metres >= 1e3 else (metres, "m") if metres >= 0.1 else (metres * 1e3, "mm")
-    return f"{value:.{digits}g} {unit}"
+    return f"{value:.9g} {unit}"

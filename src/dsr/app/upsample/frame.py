@@ -26,13 +26,14 @@ from dsr.app.upsample.outputs import (
     read_previous_run,
     stored_bytes,
 )
-from dsr.app.upsample.parts import Result, as_stored, write_parts
+from dsr.app.upsample.parts import PARTS, Result, as_stored, write_parts
 from dsr.app.upsample.reporting import Messages
 from dsr.app.upsample.request import UpsampleRequest, Upsampling, files_of, inputs_with_neighbours, settings_of
 from dsr.app.upsample.sequence import FrameSequence
 from dsr.degradation.sensors import Identified
 from dsr.evaluation.sharing import Claims
 from dsr.inference import AnyRatio, Plan, enlarged_by, find_filled, find_sensor
+from dsr.io.exports import FLAT
 from dsr.io.inputs import Picture, read_picture
 from dsr.io.pairs import Pair
 from dsr.methods.base import MapNoise, Outliers, Surface
@@ -148,14 +149,15 @@ class FrameWork:
         errors = any(part.errors for part in wanted.of_frame)
         surface = kept_surface(target, picture.camera, errors=errors) if job.reusable else None
         times.begin("upsampling", planned.seconds if surface is None else 0.0)
-        if surface is not None:
+        if surface is not None and job.earlier is not None:
+            times.keep(job.earlier.seconds)
             surface = surface._replace(filled=find_filled(surface.depth, picture.depth_lr))
         else:
             surface = as_stored(self._upsample(picture, identified, progress))
             reporter.facts(_describe(surface.noise, given="noise" in how.arguments))
             reporter.facts([*_describe_outliers(surface.outliers), *_describe_holes(surface, how)])
-        if wanted.certain:
-            surface = surface.without_dubious(wanted.max_error / 100)
+            if wanted.certain:
+                surface = surface.without_dubious(wanted.max_error / 100)
         times.begin("writing")
         begin(target, job.settings, job.inputs, () if job.earlier is None else job.earlier.files)
         facts, seconds = _write(job, picture, surface, planned, times)
@@ -194,7 +196,7 @@ class Times:
 
     def __init__(self, progress: Progress, **seconds: float) -> None:
         self._progress, self._seconds = progress, {stage: round(each, 3) for stage, each in seconds.items()}
-        self._stage, self._since = "", 0.0
+        self._stage, self._since, self._kept = "", 0.0, {}  # type: str, float, Mapping[str, float]
 
     def begin(self, stage: str, seconds: float | None = None) -> None:
         """Begin one of :data:`STAGES`, which takes about some seconds if that is known."""
@@ -206,7 +208,22 @@ class Times:
         """Return the seconds of each stage so far, to milliseconds, and their sum as ``total``."""
         if self._stage:
             self._seconds[self._stage] = round(time.perf_counter() - self._since, 3)
-        return {**self._seconds, "total": round(sum(self._seconds.values()), 3)}
+        return _with_total(self._seconds)
+
+    def keep(self, seconds: Mapping[str, float]) -> None:
+        """Count the seconds of an earlier run, whose result is kept, in :meth:`together`."""
+        self._kept = seconds
+
+    def together(self, seconds: Mapping[str, float]) -> dict[str, float]:
+        """Return what :meth:`read` returned with the seconds of an earlier run whose result is kept, if any."""
+        stages = dict.fromkeys((*self._kept, *seconds))
+        return _with_total({name: self._kept.get(name, 0.0) + seconds.get(name, 0.0) for name in stages})
+
+
+def _with_total(seconds: Mapping[str, float]) -> dict[str, float]:
+    """Return the seconds of stages, to milliseconds, with their sum as ``total``."""
+    found = {name: round(each, 3) for name, each in seconds.items() if name != "total"}
+    return {**found, "total": round(sum(found.values()), 3)}
 
 
 @dataclass(frozen=True)
@@ -253,13 +270,20 @@ class _Job:
             expect_no_warning(str(where), notes, brief=several)
 
     def is_done(self) -> bool:
-        """Return whether all requested parts exist, and were checked as now if no warning is allowed."""
+        """Return whether all requested parts exist as wanted, and were checked as now if no warning is allowed.
+
+        A mesh of large triangles is none of every pixel; the other one serves for both.
+        """
         if not self.reusable or self.earlier is None:
             return False
         if self.request.reading.strict and self.earlier.checks != CHECKS:
             return False
+        wanted = self.request.results
         there = {name for name in self.earlier.files if (self.target / name).is_file()}
-        return all(there & set(part.files) for part in self.request.results.of_frame)
+        shapes = [self.earlier.shapes.get(part.name) for part in wanted.of_frame]
+        if wanted.keep == "all" and any(isinstance(shape, dict) and shape.get("how") == FLAT for shape in shapes):
+            return False
+        return all(there & set(part.files) for part in wanted.of_frame)
 
 
 def prepare(picture: Picture, sensor: str, fuse: Callable[[Picture], Picture]) -> tuple[Picture, Identified | None]:
@@ -379,10 +403,18 @@ def write_result(
     outputs = write_parts(folder, result)
     files = [name for output in outputs.values() for name in output.files]
     facts = list(dict.fromkeys(note for output in outputs.values() for note in output.notes))
-    shapes = {name: output.shape._asdict() for name, output in outputs.items() if output.shape is not None}
-    counts = {**(kept.shapes if kept else {}), **shapes}
+    shapes = {
+        name: output.shape._asdict()
+        for output in outputs.values() if output.shape is not None
+        for name in outputs if set(PARTS[name].files) & set(output.files)
+    }  # fmt: skip
+    counts = {name: shape for name, shape in (kept.shapes if kept else {}).items() if name not in outputs} | shapes
     if surface.outliers is not None:
         counts["outliers"] = surface.outliers._asdict()
+    others = [name for name in (kept.files if kept else ()) if name not in files]
+    told = (*picture.assumptions, *facts)
+    said = [each for each in (kept.said if kept and others else ()) if not each.startswith(tuple(n.text for n in told))]
+    shares = {name: round(share, 6) for name, share in surface.shares(result.wanted.max_error / 100).items()}
     entries = {
         "inputs": inputs,
         "settings": settings,
@@ -392,13 +424,12 @@ def write_result(
         "noise": surface.noise._asdict() if surface.noise else kept.noise if kept else None,
         **described(picture, result.encoding),
         **counts,
-        "shares": {name: round(share, 6) for name, share in surface.shares(result.wanted.max_error / 100).items()},
-        "assumptions": [str(fact) for fact in (*picture.assumptions, *facts)],
+        "shares": {**(kept.shares if kept else {}), **shares},
+        "assumptions": [*map(str, told), *said],
         "checks": CHECKS,
-        "warnings": [fact.record() for fact in (*picture.assumptions, *facts) if fact.code],
-        "seconds": (seconds := times.read()),
+        "warnings": [fact.record() for fact in told if fact.code],
+        "seconds": times.together(seconds := times.read()),
         "versions": {"python": platform.python_version(), **package_versions(_PACKAGES)},
     }
-    others = [name for name in (kept.files if kept else ()) if name not in files]
     finish(folder, earlier, entries, [*files, *others])
     return facts, seconds

@@ -41,6 +41,9 @@ class PreviousRun:
         shapes: numbers of points and triangles of its cloud and mesh, and of its outliers.
         warnings: that it gave.
         checks: number of the checks that gave them, see :data:`dsr.notes.CHECKS`.
+        said: its assumptions and notes, without warnings.
+        shares: of the pixels, see :meth:`dsr.methods.base.Surface.shares`.
+        seconds: of its stages.
 
     """
 
@@ -52,6 +55,9 @@ class PreviousRun:
     shapes: Mapping[str, Any] = field(default_factory=dict)
     warnings: tuple[Assumption, ...] = ()
     checks: object = None
+    said: tuple[str, ...] = ()
+    shares: Mapping[str, float] = field(default_factory=dict)
+    seconds: Mapping[str, float] = field(default_factory=dict)
 
 
 def output_encoding(encoding: Encoding, chosen: str | None) -> Encoding:
@@ -105,6 +111,9 @@ def read_previous_run(folder: Path) -> PreviousRun | None:
             {name: entries[name] for name in (*_SHAPES, "outliers") if name in entries},
             tuple(read_warning(each) for each in entries.get("warnings", ())),
             entries.get("checks"),
+            tuple(text for text in map(str, entries.get("assumptions", ())) if not text.startswith("warning: ")),
+            _numbers(entries, "shares"),
+            {stage: seconds for stage, seconds in _numbers(entries, "seconds").items() if stage != "total"},
         )
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path}: expected a file of `dsr upsample`, got something else; take another -o") from error
@@ -138,7 +147,7 @@ def kept_surface(folder: Path, camera: Camera, *, errors: bool) -> Surface | Non
     Args:
         folder: the result's folder.
         camera: the photo's.
-        errors: whether its expected errors are needed.
+        errors: whether its expected errors are needed, which are loaded if they are there.
 
     """
     size = (camera.height, camera.width)
@@ -150,12 +159,18 @@ def kept_surface(folder: Path, camera: Camera, *, errors: bool) -> Surface | Non
         depth = torch.from_numpy(values)[None]
         if not bool((depth > 0).any()) or bool(((depth < NEAREST) | (depth > FARTHEST)).any()):
             return None
-        if not errors:
-            return Surface(depth)
-        expected = load_errors(folder / ERRORS)
+        expected = None
+        with contextlib.nullcontext() if errors else contextlib.suppress(OSError, ValueError):
+            expected = load_errors(folder / ERRORS)
         if expected is not None and all(each.shape == depth.shape for each in expected):
             return Surface(depth, *expected)
+        return None if errors else Surface(depth)
     return None
+
+
+def _numbers(entries: Mapping[str, Any], name: str) -> dict[str, float]:
+    """Return the numbers of an entry of ``info.json`` by their names."""
+    return {key: float(value) for key, value in dict(entries.get(name, {})).items()}
 
 
 def begin(folder: Path, settings: Mapping[str, Any], inputs: Mapping[str, Any], files: Sequence[str]) -> None:
