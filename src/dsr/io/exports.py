@@ -16,9 +16,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
-import trimesh
 from torch import Tensor
-from trimesh.exchange.ply import export_ply
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.lights import LIGHT_NAMES
@@ -85,6 +83,9 @@ def write_ply(
         frame: what the file says of the frame of the points, and of the unit.
 
     """
+    import trimesh  # noqa: PLC0415 - half a second that most results save
+    from trimesh.exchange.ply import export_ply  # noqa: PLC0415
+
     corners = np.empty((0, 3), int) if faces is None else faces
     model = trimesh.Trimesh(
         points, corners, vertex_normals=normals, vertex_colors=colours, process=False,

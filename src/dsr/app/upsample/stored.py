@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -19,11 +19,13 @@ from dsr.inference import find_filled
 from dsr.io.depth_files import read_depth_file
 from dsr.io.exports import INPUT, read_input
 from dsr.io.frames import UPS
-from dsr.report.surface_page import ViewedResult
 from dsr.sample import expect_distances
 from dsr.utils.arrays import array_headers
 from dsr.utils.guards import TooLargeError, is_number, natural_key, parse_json, pixels_beside, read_limited
 from dsr.utils.lengths import show_length
+
+if TYPE_CHECKING:
+    from dsr.report.surface_page import ViewedResult
 
 _DEEPEST = 6
 """Folders below the given one in which results are looked for."""
@@ -63,6 +65,8 @@ def read_result(folder: Path, name: str) -> ViewedResult:
         ValueError: the folder holds no complete result, or a file is damaged.
 
     """
+    from dsr.report.surface_page import ViewedResult  # noqa: PLC0415 - pages need Matplotlib
+
     info = read_info(folder / INFO)
     camera = read_camera(folder / INFO, info)
     depth = read_depth(folder, camera)
