@@ -29,7 +29,7 @@ def page(webgl_browser, client):
     made.on("pageerror", lambda error: wrong.append(str(error)))
     own = (f"http://127.0.0.1:{client.port}/", "data:", "blob:")
     made.on("request", lambda request: None if request.url.startswith(own) else wrong.append(request.url))
-    made.goto(own[0])
+    made.goto(client.page)
     yield made
     context.close()
     assert wrong == []
@@ -223,12 +223,26 @@ def test_wrong_and_large_files_are_refused_before_they_are_sent_and_work_can_be_
     assert page.is_enabled(".compute")
 
 
+def test_page_hides_its_token_and_loads_again_in_its_tab_alone(webgl_browser, client):
+    context = webgl_browser.new_context(viewport=DESKTOP)
+    page, own = context.new_page(), f"http://127.0.0.1:{client.port}/"
+    page.goto(client.page)
+    assert page.url == own
+    page.reload()
+    page.wait_for_selector(".compute")
+    assert page.url == own
+    other = context.new_page()
+    assert other.goto(own).status == 403
+    assert "dsr app" in other.inner_text("body")
+    context.close()
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [360, 1280, 1920])
 def test_page_fits_the_window_and_its_texts_stand_out(webgl_browser, client, width, scheme):
     context = webgl_browser.new_context(viewport={"width": width, "height": 800}, color_scheme=scheme)
     page = context.new_page()
-    page.goto(f"http://127.0.0.1:{client.port}/")
+    page.goto(client.page)
     page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
     page.evaluate(REVEAL)
     assert page.evaluate("document.documentElement.scrollWidth") <= width

@@ -1,6 +1,10 @@
 // The page of `dsr app`: files and settings go to the server, and what it makes of them is shown by the viewer.
 
 const settings = block("settings");
+history.replaceState(null, "", location.pathname); // the token is not for the history
+try {
+  sessionStorage.setItem("token", settings.token); // for loading the page again
+} catch { /* the browser keeps nothing: it has to be opened again by its address */ }
 const DEPTH_WORDS = /depth|disp|range|tiefe/i;
 const POLL = 400; // milliseconds
 const MOST = 4; // files that are dropped at once: photo, depth map, camera, mask
