@@ -223,6 +223,36 @@ def test_wrong_and_large_files_are_refused_before_they_are_sent_and_work_can_be_
     assert page.is_enabled(".compute")
 
 
+def test_work_goes_on_after_a_cancelled_look_and_after_the_server_has_deleted_the_files(page, client, tmp_path):
+    page.set_input_files("#capture", captures.record3d(tmp_path / "scan.r3d"))
+    page.click(".cancel")
+    assert finished(page)[0] == "Cancelled."
+    page.select_option("#method", "bicubic")
+    page.click(".compute")
+    assert "3 frames" in finished(page)[0]
+    page.fill("#frame", "2")
+    for name in list(client.desk.uploads):
+        client.desk.drop(name)
+    computed(page)
+    assert f"focal length {captures.INTRINSICS[0] + 1:.0f} pixels" in page.inner_text(".facts")
+
+
+def test_page_that_is_left_while_it_sends_leaves_no_files(webgl_browser, client, pair):
+    context = webgl_browser.new_context(viewport=DESKTOP)
+    page, held = context.new_page(), []
+    page.goto(client.page)
+    page.route("**/depth?*", held.append)
+    drop(page, *pair)
+    before = set(client.desk.uploads)
+    with page.expect_request("**/depth?*"):
+        page.click(".compute")
+    (name,) = set(client.desk.uploads) - before
+    page.goto("about:blank")
+    page.wait_for_timeout(500)
+    assert client.desk.find(name) is None
+    context.close()
+
+
 def test_page_hides_its_token_and_loads_again_in_its_tab_alone(webgl_browser, client):
     context = webgl_browser.new_context(viewport=DESKTOP)
     page, own = context.new_page(), f"http://127.0.0.1:{client.port}/"

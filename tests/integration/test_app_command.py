@@ -198,6 +198,8 @@ def test_notes_and_warnings_are_those_of_the_command(client, pair, capsys, tmp_p
 
 def test_frame_of_a_capture_is_chosen(client, tmp_path):
     place = client.upload(capture=captures.record3d(tmp_path / "scan.r3d"))
+    assert "one frame" in client.run(place, choices=QUICK)["problem"]  # before any is computed
+    assert client.json("GET", place)["total"] == 0
     looked = client.run(place, "look")
     assert (looked["count"], len(looked["names"]), len(looked["thumbs"])) == (3, 3, 3)
     job = client.run(place, choices=QUICK, frame=3, count=looked["count"])
@@ -206,6 +208,18 @@ def test_frame_of_a_capture_is_chosen(client, tmp_path):
     middle = float(re.search(r"median ([\d.]+) m", facts["depth"])[1])
     assert middle == pytest.approx(np.median(captures.depth(2)), abs=0.02)
     assert f"focal length {captures.INTRINSICS[0] + 2:.0f} pixels" in facts["camera as read"]
+
+
+def test_frames_of_long_names_are_told_and_what_cannot_be_read_is_a_failure(client, tmp_path, monkeypatch):
+    with zipfile.ZipFile(tmp_path / "many.zip", "w") as packed:
+        for number in range(1200):
+            for kind, suffix, content in (("rgb", "jpg", b"x"), ("depth", "png", b"x")):
+                packed.writestr(f"{kind}/{chr(0x10400) * 100}{number:05}.{suffix}", content)
+    job = client.run(client.upload(capture=tmp_path / "many.zip"), "look")
+    assert (job["state"], job["count"], len(set(job["names"]))) == ("done", 1200, 1200)
+    monkeypatch.setattr("dsr.app.browser.jobs._SPAN", 50)
+    job = client.run(client.upload(capture=tmp_path / "many.zip"), "look")
+    assert (job["state"], bool(job["problem"])) == ("failed", True)
 
 
 def link(path):
