@@ -171,6 +171,7 @@ def _listen(host: str, port: int) -> socket.socket:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             listening.bind(address)
+            listening.listen()  # from here on no other account can take the port, and a browser waits for the server
         except OSError:
             listening.close()
             raise
