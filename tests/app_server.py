@@ -3,7 +3,6 @@
 import contextlib
 import http.client
 import json
-import re
 import socket
 import threading
 import time
@@ -15,14 +14,15 @@ from dsr.app.browser.jobs import Desk
 from dsr.app.browser.server import make_app
 
 HEADER = "x-dsr-token"
+TOKEN, ONCE = "the-token", "another-one"
 
 
 class Client:
-    """Asks a server; ``token`` is that of its page."""
+    """Asks a server; ``token`` is that of its page, whose address is ``page``."""
 
-    def __init__(self, port, desk):
-        self.port, self.desk = port, desk
-        self.token = re.search(r'"token":"([^"]+)"', self.ask("GET", "/", token=None)[1].decode())[1]
+    def __init__(self, port, desk, token):
+        self.port, self.desk, self.token = port, desk, token
+        self.page = f"http://127.0.0.1:{port}/?token={token}"
 
     def ask(self, method, path, body=None, token="", **headers):
         """Return status, content and headers of the answer."""
@@ -76,11 +76,12 @@ def serving(host="127.0.0.1", most_bytes=10**7, most_seconds=200.0, **more):
     """Return a context in which the application answers on a free port, with a client for it."""
     listening = socket.create_server(("127.0.0.1", 0))
     desk = Desk(most_bytes, most_seconds, **more)
-    server = uvicorn.Server(uvicorn.Config(make_app(desk, host), lifespan="off", ws="none", log_level="warning"))
+    app = make_app(desk, host, TOKEN, ONCE)
+    server = uvicorn.Server(uvicorn.Config(app, lifespan="off", ws="none", log_level="warning"))
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]})
     thread.start()
     try:
-        yield Client(listening.getsockname()[1], desk)
+        yield Client(listening.getsockname()[1], desk, TOKEN)
     finally:
         server.should_exit = True
         desk.close()

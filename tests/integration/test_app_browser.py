@@ -29,7 +29,7 @@ def page(webgl_browser, client):
     made.on("pageerror", lambda error: wrong.append(str(error)))
     own = (f"http://127.0.0.1:{client.port}/", "data:", "blob:")
     made.on("request", lambda request: None if request.url.startswith(own) else wrong.append(request.url))
-    made.goto(own[0])
+    made.goto(client.page)
     yield made
     context.close()
     assert wrong == []
@@ -223,12 +223,60 @@ def test_wrong_and_large_files_are_refused_before_they_are_sent_and_work_can_be_
     assert page.is_enabled(".compute")
 
 
+def test_work_goes_on_after_a_cancelled_look_and_after_the_files_were_deleted(webgl_browser, client, tmp_path):
+    context = webgl_browser.new_context(viewport=DESKTOP)
+    page = context.new_page()
+    page.goto(client.page)
+    page.set_input_files("#capture", captures.record3d(tmp_path / "scan.r3d"))
+    page.click(".cancel")
+    assert finished(page)[0] == "Cancelled."
+    page.select_option("#method", "bicubic")
+    page.click(".compute")
+    assert "3 frames" in finished(page)[0]
+    page.fill("#frame", "2")
+    for name in list(client.desk.uploads):
+        client.desk.drop(name)
+    computed(page)
+    assert f"focal length {captures.INTRINSICS[0] + 1:.0f} pixels" in page.inner_text(".facts")
+    context.close()
+
+
+def test_page_that_is_left_while_it_sends_leaves_no_files(webgl_browser, client, pair):
+    context = webgl_browser.new_context(viewport=DESKTOP)
+    page = context.new_page()
+    page.goto(client.page)
+    page.route("**/depth?*", lambda route: None)
+    drop(page, *pair)
+    before = set(client.desk.uploads)
+    with page.expect_request("**/depth?*"):
+        page.click(".compute")
+    (name,) = set(client.desk.uploads) - before
+    page.goto("about:blank")
+    page.wait_for_timeout(500)
+    assert client.desk.find(name) is None
+    context.close()
+
+
+def test_page_hides_its_token_and_loads_again_in_its_tab_alone(webgl_browser, client):
+    context = webgl_browser.new_context(viewport=DESKTOP)
+    page, own = context.new_page(), f"http://127.0.0.1:{client.port}/"
+    page.goto(client.page)
+    assert page.url == own
+    page.reload()
+    page.wait_for_selector(".compute")
+    assert page.url == own
+    other = context.new_page()
+    assert other.goto(own).status == 403
+    assert "dsr app" in other.inner_text("body")
+    context.close()
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [360, 1280, 1920])
 def test_page_fits_the_window_and_its_texts_stand_out(webgl_browser, client, width, scheme):
     context = webgl_browser.new_context(viewport={"width": width, "height": 800}, color_scheme=scheme)
     page = context.new_page()
-    page.goto(f"http://127.0.0.1:{client.port}/")
+    page.goto(client.page)
     page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
     page.evaluate(REVEAL)
     assert page.evaluate("document.documentElement.scrollWidth") <= width

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from app_server import Client, serving
+from app_server import ONCE, Client, serving
 from small_results import waves
 
 from dsr.app.browser.jobs import Desk
@@ -50,9 +50,9 @@ def is_gone(process):
 
 def test_only_its_own_page_is_answered(client):
     local = f"127.0.0.1:{client.port}"
-    assert client.ask("GET", "/")[0] == 200
+    page = f"/?token={client.token}"
     for host in (f"localhost:{client.port}", f"[::1]:{client.port}", local):
-        assert client.ask("GET", "/", Host=host)[0] == 200
+        assert client.ask("GET", page, Host=host)[0] == 200
     for host in (
         "evil.example",
         f"evil.example:{client.port}",
@@ -62,9 +62,9 @@ def test_only_its_own_page_is_answered(client):
         "[",
         "@127.0.0.1",
     ):
-        assert client.ask("GET", "/", Host=host)[0] == 421
+        assert client.ask("GET", page, Host=host)[0] == 421
     for more in (
-        {"Origin": "http://evil.example"}, {"Origin": "null"}, {"Origin": "http://127.0.0.1:1"},
+        {"Origin": "http://evil.example"}, {"Origin": "null"}, {"Origin": "http://127.0.0.1:1"}, {"Origin": "http://["},
         {"Sec_Fetch_Site": "cross-site"}, {"Sec_Fetch_Site": "same-site"}, {"token": None}, {"token": "guess"},
     ):  # fmt: skip
         assert client.ask("POST", "/uploads", **more)[0] == 403
@@ -76,13 +76,23 @@ def test_only_its_own_page_is_answered(client):
 
 def test_numbers_are_hosts_of_a_server_that_others_reach_and_foreign_names_are_not():
     with serving("0.0.0.0") as open_to_all:
-        assert open_to_all.ask("GET", "/", Host="192.168.1.9:80")[0] == 200
-        assert open_to_all.ask("GET", "/", Host=socket.gethostname())[0] == 200
-        assert open_to_all.ask("GET", "/", Host="evil.example")[0] == 421
+        page = f"/?token={open_to_all.token}"
+        assert open_to_all.ask("GET", page, Host="192.168.1.9:80")[0] == 200
+        assert open_to_all.ask("GET", page, Host=socket.gethostname())[0] == 200
+        assert open_to_all.ask("GET", page, Host="evil.example")[0] == 421
+
+
+def test_page_is_for_those_who_know_the_token(client):
+    for path in ("/", "/?token=", "/?token=guess", f"/?token={client.token}x", "/?token=%ff", "/?token=%ed%a0%80"):
+        status, content, headers = client.ask("GET", path, token=None)
+        assert (status, client.token in content.decode()) == (403, False)
+        assert "unsafe" not in headers["content-security-policy"]
+    assert [client.ask("GET", f"/?token={ONCE}", token=None)[0] for _ in range(2)] == [200, 403]
+    assert client.token in client.ask("GET", f"/?token={client.token}", token=None)[1].decode()
 
 
 def test_page_has_everything_in_it_and_may_ask_this_server_alone(client):
-    _, content, headers = client.ask("GET", "/")
+    _, content, headers = client.ask("GET", f"/?token={client.token}")
     page = content.decode()
     assert re.findall(r'(?:src|href)="(?!#|data:)([^"]*)"', page) == []
     rules = dict(part.strip().split(" ", 1) for part in headers["content-security-policy"].split(";"))
@@ -122,7 +132,8 @@ def test_names_of_files_are_no_paths(client, tmp_path):
     before = client.files()
     client.send(place, "photo", ".PNG", b"x")
     assert client.files() - before == {"photo.png"}
-    assert client.ask("PUT", f"{place}/photo?suffix=.png", b"y")[0] == 400  # it is there
+    assert client.ask("PUT", f"{place}/photo?suffix=.png", b"y")[0] == 409
+    assert "photo.png" in client.files()
     assert client.ask("GET", f"{place}/files/0")[0] == 404
     assert client.ask("GET", "/uploads/..%2F..%2Fetc/shown")[0] == 404
 
@@ -187,6 +198,8 @@ def test_notes_and_warnings_are_those_of_the_command(client, pair, capsys, tmp_p
 
 def test_frame_of_a_capture_is_chosen(client, tmp_path):
     place = client.upload(capture=captures.record3d(tmp_path / "scan.r3d"))
+    assert "one frame" in client.run(place, choices=QUICK)["problem"]  # before any is computed
+    assert client.json("GET", place)["total"] == 0
     looked = client.run(place, "look")
     assert (looked["count"], len(looked["names"]), len(looked["thumbs"])) == (3, 3, 3)
     job = client.run(place, choices=QUICK, frame=3, count=looked["count"])
@@ -195,6 +208,19 @@ def test_frame_of_a_capture_is_chosen(client, tmp_path):
     middle = float(re.search(r"median ([\d.]+) m", facts["depth"])[1])
     assert middle == pytest.approx(np.median(captures.depth(2)), abs=0.02)
     assert f"focal length {captures.INTRINSICS[0] + 2:.0f} pixels" in facts["camera as read"]
+
+
+def test_frames_of_long_names_are_told_and_what_cannot_be_read_is_a_failure(client, tmp_path, monkeypatch):
+    with zipfile.ZipFile(tmp_path / "many.zip", "w") as packed:
+        for number in range(1500):
+            for kind, suffix, content in (("rgb", "jpg", b"x"), ("depth", "png", b"x")):
+                packed.writestr(f"{kind}/{chr(0x10400) * 60}{number:05}.{suffix}", content)
+    job = client.run(client.upload(capture=tmp_path / "many.zip"), "look")
+    assert job["state"] == "done", job["problem"]
+    assert (job["count"], len(set(job["names"]))) == (1500, 1500)
+    monkeypatch.setattr("dsr.app.browser.jobs._SPAN", 50)
+    job = client.run(client.upload(capture=tmp_path / "many.zip"), "look")
+    assert (job["state"], bool(job["problem"])) == ("failed", True)
 
 
 def link(path):
@@ -264,7 +290,7 @@ def test_missing_libraries_are_one_line(monkeypatch, capsys):
     monkeypatch.delitem(sys.modules, "dsr.app.browser.server")
     monkeypatch.setitem(sys.modules, "uvicorn", None)
     assert main(["app", "--no-open"]) == 2
-    assert capsys.readouterr().err.strip().endswith("pip install dsr[app]")
+    assert capsys.readouterr().err.strip().endswith("pip install -e '.[app]' in a checkout")
 
 
 def test_port_that_is_taken_is_one_line(capsys):
@@ -275,20 +301,23 @@ def test_port_that_is_taken_is_one_line(capsys):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="needs signals of POSIX")
-@pytest.mark.parametrize(("number", "host"), [(signal.SIGINT, "127.0.0.1"), (signal.SIGTERM, "0.0.0.0")])
-def test_command_serves_its_page_and_leaves_nothing_at_its_end(tmp_path, pair, number, host):
+@pytest.mark.parametrize(
+    ("number", "host", "code"),
+    [("SIGINT", "127.0.0.1", 130), ("SIGTERM", "0.0.0.0", 143), ("SIGHUP", "127.0.0.1", 143)],
+)
+def test_command_serves_its_page_and_leaves_nothing_at_its_end(tmp_path, pair, number, host, code):
     command = [sys.executable, "-m", "dsr", "app", "--no-open", "--port", "0", "--host", host]
     process = subprocess.Popen(command, env={**os.environ, "TMPDIR": str(tmp_path)}, stdout=subprocess.PIPE, text=True)
     lines = [process.stdout.readline()]
-    port = int(re.search(r":(\d+)/", lines[0])[1])
-    until(lambda: answers(port))
-    client = Client(port, None)
+    port, token = re.search(r":(\d+)/\?token=(\S+)", lines[0]).groups()
+    client = Client(int(port), None, token)
+    until(lambda: answers(client.port))
     place = client.upload(**pair)
     client.start(place)
     until(lambda: client.json("GET", place)["state"] == "running")
     assert any(tmp_path.iterdir())
-    process.send_signal(number)
-    assert process.wait(60) == 128 + number
+    process.send_signal(getattr(signal, number))
+    assert process.wait(60) == code
     assert ("warning" in process.stdout.read()) == (host != "127.0.0.1")
     process.stdout.close()
     assert list(tmp_path.iterdir()) == []

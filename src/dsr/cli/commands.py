@@ -175,7 +175,8 @@ APP = Command(
     _later("dsr.app.browser.server", "browse"),
     description="""\
 Serve a page of this machine alone, and open it: drop a photo and a depth map, or a capture, and look at photo, input
-and result side by side. The libraries are an extra: pip install dsr[app]. More in docs/app.md.""",
+and result side by side. The libraries are an extra: pip install -e '.[app]' in a checkout. More in
+docs/app.md.""",
     epilog="""\
 examples:
   dsr app

@@ -66,6 +66,7 @@ class Job:
     Attributes:
         facts: what the process told, the last of each name.
         notes: notes on the input, each with whether it is a warning.
+        names: those of the frames.
         thumbs: small pictures of frames.
 
     """
@@ -78,6 +79,7 @@ class Job:
     problem: str = ""
     facts: dict[str, Any] = field(default_factory=dict)
     notes: list[dict[str, Any]] = field(default_factory=list)
+    names: list[str] = field(default_factory=list)
     thumbs: list[dict[str, Any]] = field(default_factory=list)
     started: float = 0.0
     ended: float = 0.0
@@ -106,15 +108,20 @@ class Job:
             "done": done,
             "total": total,
             "notes": list(self.notes),
+            "names": list(self.names),
             "thumbs": list(self.thumbs),
             **facts,
         }
 
-    def take(self, told: dict[str, Any]) -> None:
-        """Take what the process tells."""
+    def take(self, told: Any) -> None:
+        """Take what the process tells; TypeError if it is no object."""
+        if not isinstance(told, dict):
+            raise TypeError("expected an object")
         if "note" in told:
             if len(self.notes) < _MOST_NOTES and told not in self.notes:
                 self.notes.append(told)
+        elif "names" in told:
+            self.names += map(str, told["names"])
         elif "thumb" in told:
             self.thumbs.append(told)
         elif "problem" in told:
@@ -292,7 +299,7 @@ class Desk:
         """Read what the process tells until it ends, or its time is over."""
         assert process.stdout is not None  # noqa: S101
         assert process.stdin is not None  # noqa: S101
-        over, late = threading.Event(), threading.Event()
+        over, late, damaged = threading.Event(), threading.Event(), False
 
         def watch() -> None:
             while not over.wait(_TICK):
@@ -308,18 +315,18 @@ class Desk:
         threading.Thread(target=watch, name="time", daemon=True).start()
         with process.stdin, process.stdout:
             while line := process.stdout.readline(_SPAN):
-                with contextlib.suppress(ValueError):
-                    told = json.loads(line)
-                    if isinstance(told, dict):
-                        with self._change:
-                            job.take(told)
+                try:
+                    with self._change:
+                        job.take(json.loads(line))
+                except (ValueError, TypeError):  # it is cut off, too long, or nothing that the process says
+                    damaged = True
             code = process.wait()
         over.set()
         shutil.rmtree(job.upload.folder / "scratch", ignore_errors=True)
         with self._change:
-            self._conclude(job, code, late=late.is_set())
+            self._conclude(job, code, late=late.is_set(), damaged=damaged)
 
-    def _conclude(self, job: Job, code: int, *, late: bool) -> None:
+    def _conclude(self, job: Job, code: int, *, late: bool, damaged: bool) -> None:
         """Say what became of a job."""
         if job.is_over:
             return
@@ -328,4 +335,6 @@ class Desk:
             job.problem = f"it took more than {self.most_seconds:g} s (--max-seconds), and was ended"
         elif code and not job.problem:
             job.problem = f"the process ended ({code}); it may have needed more than {job.facts['memory']} of memory"
+        elif not job.problem and (damaged or (job.what == "look" and "count" not in job.facts)):
+            job.problem = "what the process told of the files could not be read"
         job.state = "failed" if job.problem else "done"

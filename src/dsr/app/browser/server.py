@@ -1,8 +1,9 @@
 """The server of ``dsr app``: one page, uploads that are cut off at a limit, and what is made of them.
 
-It answers this machine alone unless another address is asked for. A page of another site can make a browser ask it,
-too: it therefore refuses names of hosts that are not its own, which a stranger's name server may point here (DNS
-rebinding), and takes nothing without the token that only its own page has. Names of files that a page sends are not
+It answers this machine alone unless another address is asked for. Other accounts of the machine reach it, too: its page
+is for those who know the token in the address that it prints. A page of another site can make a browser ask it: it
+therefore refuses names of hosts that are not its own, which a stranger's name server may point here (DNS rebinding),
+and takes nothing without the token, which that page has not. Names of files that a page sends are not
 used: a file is stored under its role with one of the suffixes that the readers know.
 """
 
@@ -13,10 +14,11 @@ import ipaddress
 import json
 import re
 import secrets
+import signal
 import socket
 import threading
 import webbrowser
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, get_args
 from urllib.parse import urlsplit
 
@@ -33,7 +35,7 @@ from dsr.report.surface_page import VIEWER
 from dsr.utils.console import show
 from dsr.utils.guards import parse_json, path_within, refusing
 
-with refusing("`dsr app` needs the libraries starlette and uvicorn: pip install dsr[app]", ImportError):
+with refusing("`dsr app` needs starlette and uvicorn: pip install -e '.[app]' in a checkout", ImportError):
     import uvicorn
     from starlette.applications import Starlette
     from starlette.exceptions import HTTPException
@@ -73,6 +75,17 @@ _MOST_FRAMES = 10**9
 _TOKEN = "x-dsr-token"  # noqa: S105 - the name of a header
 _ENDING = 3.0
 """Seconds that the server has to end."""
+_KEPT_SCRIPT = """\
+const token = sessionStorage.getItem("token");
+sessionStorage.removeItem("token");
+if (token) location.replace(`/?token=${encodeURIComponent(token)}`);"""
+"""Loads the page again with the token that the page has left for that, once."""
+_CLOSED = f"""<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><title>dsr app</title></head><body>
+<p>This page opens at the address, with a token in it, that <code>dsr app</code> prints in its terminal.</p>
+<script>{_KEPT_SCRIPT}</script></body></html>
+"""
+"""What is shown to those who come without the token."""
 _HEADERS = {
     "cache-control": "no-store",
     "cross-origin-opener-policy": "same-origin",
@@ -90,13 +103,37 @@ def browse(request: BrowserRequest, console: Console) -> list[str]:
         ValueError: the port is taken, or the address is not one of this machine.
 
     """
+    with _ending_as_told():
+        return _serve(request, console)
+
+
+@contextlib.contextmanager
+def _ending_as_told() -> Iterator[None]:
+    """Within this context a closed terminal is a SIGTERM, and an interruption says what becomes of the files."""
+    hangup = getattr(signal, "SIGHUP", None)  # Windows has none
+    before = None if hangup is None else signal.getsignal(hangup)
+    if before == signal.SIG_IGN or threading.current_thread() is not threading.main_thread():
+        hangup = None  # nohup's command outlives the terminal
+    try:
+        if hangup is not None:
+            signal.signal(hangup, lambda *_: signal.raise_signal(signal.SIGTERM))
+        yield
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt("ended; the files that were uploaded, and their results, are deleted") from None
+    finally:
+        if hangup is not None:
+            signal.signal(hangup, before or signal.SIG_DFL)
+
+
+def _serve(request: BrowserRequest, console: Console) -> list[str]:
+    """Serve the page until the process is interrupted."""
     listening = _listen(request.host, request.port)
     address = listening.getsockname()
     name = f"[{address[0]}]" if ":" in address[0] else address[0]
-    url = f"http://{name}:{address[1]}/"
+    url, token, once = f"http://{name}:{address[1]}/?token=", secrets.token_urlsafe(24), secrets.token_urlsafe(24)
     desk = Desk(int(request.max_upload * 1e6), request.max_seconds, request.memory)
     try:
-        app = make_app(desk, request.host)
+        app = make_app(desk, request.host, token, once if request.open_page else "")
         config = uvicorn.Config(
             app, lifespan="off", ws="none", log_level="warning", access_log=False, server_header=False,
             limit_concurrency=64, timeout_graceful_shutdown=1,
@@ -104,19 +141,15 @@ def browse(request: BrowserRequest, console: Console) -> list[str]:
         server = uvicorn.Server(config)
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, name="server", daemon=True)
         thread.start()  # signals are the main thread's
-        show(console, f"dsr app: {url}")
+        show(console, f"dsr app: {url}{token}")
         if not _is_loopback(request.host):
-            show(
-                console, f"warning: whoever reaches {request.host} can use it: there is neither password nor encryption"
-            )
+            show(console, f"warning: whoever reads what is sent to {request.host} can use it: it is not encrypted")
         show(console, "  Ctrl-C ends it; nothing that was uploaded is kept then")
         if request.open_page:
-            webbrowser.open(url)
+            webbrowser.open(f"{url}{once}")  # other accounts see the arguments of the browser's process
         try:
             while thread.is_alive():
                 thread.join(0.2)
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt("ended; the files that were uploaded, and their results, are deleted") from None
         finally:
             server.should_exit = True
     finally:
@@ -138,6 +171,7 @@ def _listen(host: str, port: int) -> socket.socket:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             listening.bind(address)
+            listening.listen()  # from here on no other account can take the port, and a browser waits for the server
         except OSError:
             listening.close()
             raise
@@ -149,16 +183,17 @@ def _listen(host: str, port: int) -> socket.socket:
     return listening
 
 
-def make_app(desk: Desk, host: str) -> ASGIApp:
+def make_app(desk: Desk, host: str, token: str, once: str = "") -> ASGIApp:
     """Return the application.
 
     Args:
         desk: what holds uploads and does the jobs.
         host: the address that it is asked at.
+        token: what those know who may use it: ``/?token=...`` is its page.
+        once: another token that opens the page a single time; empty for none.
 
     """
-    token = secrets.token_urlsafe(24)
-    return _Guard(_Answers(desk, *_page(desk, token)).application(), host, token)
+    return _Guard(_Answers(desk, *_page(desk, token), token, once).application(), host, token)
 
 
 def _page(desk: Desk, token: str) -> tuple[str, str]:
@@ -189,11 +224,13 @@ class _Answers:
         desk: what holds uploads and does the jobs.
         page: the page.
         allowed: its content security policy.
+        token: what opens it.
+        once: what opens it a single time; empty for nothing.
 
     """
 
-    def __init__(self, desk: Desk, page: str, allowed: str) -> None:
-        self._desk, self._page, self._allowed = desk, page, allowed
+    def __init__(self, desk: Desk, page: str, allowed: str, token: str, once: str) -> None:
+        self._desk, self._page, self._allowed, self._token, self._once = desk, page, allowed, token, once
 
     def application(self) -> Starlette:
         """Return what calls them."""
@@ -213,8 +250,13 @@ class _Answers:
             exception_handlers={HTTPException: _refuse},
         )
 
-    async def show_page(self, _: Request) -> Response:
-        """Answer with the page."""
+    async def show_page(self, request: Request) -> Response:
+        """Answer with the page; without the token with where that is told."""
+        given = request.query_params.get("token", "")
+        if self._once and _is_same(given, self._once):
+            self._once = ""
+        elif not _is_same(given, self._token):
+            return HTMLResponse(_CLOSED, 403, {"content-security-policy": policy("", _KEPT_SCRIPT, "'none'")})
         return HTMLResponse(self._page, headers={"content-security-policy": self._allowed})
 
     async def open(self, request: Request) -> Response:
@@ -237,6 +279,8 @@ class _Answers:
                         problem = f"expected at most {self._desk.most_bytes / 1e6:g} MB (--max-upload), got more"
                         raise HTTPException(413, problem, {"connection": "close"})
                     file.write(chunk)
+        except FileExistsError as error:
+            raise HTTPException(409, f"{role}: it is there already") from error
         except (ClientDisconnect, OSError) as error:
             with contextlib.suppress(OSError):
                 path.unlink()
@@ -396,9 +440,9 @@ class _Guard:
         if scope["method"] in ("GET", "HEAD"):
             return None
         origin = headers.get("origin")
-        if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
+        if origin is not None and not _is_of(origin, host):
             return 403, "asked by another site"
-        if not secrets.compare_digest(headers.get(_TOKEN, "").encode(), self._token.encode()):
+        if not _is_same(headers.get(_TOKEN, ""), self._token):
             return 403, "asked by another page than that of this server; load the page again"
         return None
 
@@ -414,6 +458,18 @@ class _Guard:
                 return True
             return ipaddress.ip_address(name).is_loopback or not _is_loopback(self._host)
         return False
+
+
+def _is_of(origin: str, host: str) -> bool:
+    """Return whether an Origin header names a host."""
+    with contextlib.suppress(ValueError):
+        return urlsplit(origin).netloc.lower() == host.lower()
+    return False
+
+
+def _is_same(given: str, token: str) -> bool:
+    """Return whether a token is the right one, in a time that does not tell how much of it is."""
+    return secrets.compare_digest(given.encode(errors="surrogatepass"), token.encode())
 
 
 def _is_loopback(host: str) -> bool:

@@ -18,14 +18,14 @@ from argparse import ArgumentParser, ArgumentTypeError
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NoReturn
+from typing import TYPE_CHECKING, Any, Literal, NoReturn, TextIO
 
 from rich.console import Console
 
 from dsr.app.upsample.reporting import Reporter
 from dsr.app.upsample.request import UpsampleRequest
 from dsr.notes import Assumption
-from dsr.utils.console import one_line, printable
+from dsr.utils.console import one_line, printable, shorten
 from dsr.utils.interruption import start
 from dsr.utils.memory import refusing_excess
 from dsr.utils.options import add_options, build
@@ -41,21 +41,30 @@ SHOWN, ARCHIVE = "shown.json", "result.zip"
 RESULT = "result"
 _QUICK = "depth,confidence,input"
 """The parts that the page shows."""
-_MOST_NAMES = 5000
-"""Frames whose names the page shows; of more it has their numbers."""
+_MOST_NAMES, _NAMES, _LONGEST_NAME = 5000, 100, 400
+"""Frames whose names the page shows; of more it has their numbers; names of a line, and characters of a name."""
+_LONGEST_NOTE = 10_000
 _THUMBS, _THUMB = 12, 200
 """Frames of which there is a small picture, and its longer side in pixels."""
 _VERTICES, _PHOTO = 400_000, 2048
 """Most vertices of a surface on the page, and the longer side of the photo in pixels."""
 _LARGEST_FILE = 8 << 30
+_OUTPUT: list[TextIO] = []
+"""Where :func:`tell` writes."""
 _PACKED = (".png", ".glb", ".npz", ".jpg")
 """Suffixes of files that another compression would not make smaller."""
 
 
 def tell(**facts: Any) -> None:
     """Tell the server something."""
-    sys.stdout.write(f"{json.dumps(facts)}\n")
-    sys.stdout.flush()
+    _OUTPUT[-1].write(f"{json.dumps(facts)}\n")
+    _OUTPUT[-1].flush()
+
+
+def _keep_output() -> None:
+    """Leave the standard output to :func:`tell` alone: what libraries print goes where errors go."""
+    _OUTPUT.append(os.fdopen(os.dup(1), "w", encoding="ascii"))
+    os.dup2(2, 1)
 
 
 class _Told(Reporter):
@@ -67,7 +76,7 @@ class _Told(Reporter):
     def facts(self, facts: Sequence[Assumption]) -> None:
         """Tell of notes."""
         for fact in facts:
-            tell(note=printable(fact.message), warning=bool(fact.code))
+            tell(note=shorten(printable(fact.message), _LONGEST_NOTE), warning=bool(fact.code))
 
 
 class _Steps(Progress):
@@ -99,6 +108,7 @@ class _Parser(ArgumentParser):
 def main() -> int:
     """Do what the arguments say: what, the folder for it, bytes of memory, and the arguments of ``dsr upsample``."""
     what, folder, memory, *arguments = sys.argv[1:]
+    _keep_output()
     _limit(int(memory))
     threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
@@ -143,7 +153,10 @@ def _look(request: UpsampleRequest, _: Path) -> None:
     frames = find_frames(request)
     whole = frames.whole
     _tell_found(frames)
-    tell(count=len(whole), names=[printable(pair.name) for pair in whole[:_MOST_NAMES]])
+    tell(count=len(whole))
+    names = [shorten(printable(pair.name), _LONGEST_NAME) for pair in whole[:_MOST_NAMES]]
+    for first in range(0, len(names), _NAMES):
+        tell(names=names[first : first + _NAMES])
     if len(whole) > 1:
         step = max(1, len(whole) // _THUMBS)
         for number in range(0, len(whole), step):
@@ -178,14 +191,12 @@ def _upsample(request: UpsampleRequest) -> Path:
 
     frames = find_frames(request)
     _tell_found(frames)
-    targets = []
-    for done in work_through(request, frames, _Told(), _Steps()):
-        if done.problem is not None:
-            raise ValueError(done.problem)
-        targets.append(done.target)
-    if len(targets) != 1:
-        raise ValueError(f"expected one frame, got {len(targets)}")
-    return targets[0]
+    if len(frames.found.pairs) != 1:
+        raise ValueError(f"expected one frame, got {len(frames.found.pairs)}")
+    (done,) = work_through(request, frames, _Told(), _Steps())
+    if done.problem is not None:
+        raise ValueError(done.problem)
+    return done.target
 
 
 def _result(request: UpsampleRequest, folder: Path) -> None:

@@ -1,6 +1,10 @@
 // The page of `dsr app`: files and settings go to the server, and what it makes of them is shown by the viewer.
 
 const settings = block("settings");
+history.replaceState(null, "", location.pathname); // the token is not for the history
+try {
+  sessionStorage.setItem("token", settings.token); // for loading the page again
+} catch { /* the browser keeps nothing: it has to be opened again by its address */ }
 const DEPTH_WORDS = /depth|disp|range|tiefe/i;
 const POLL = 400; // milliseconds
 const MOST = 4; // files that are dropped at once: photo, depth map, camera, mask
@@ -15,7 +19,7 @@ async function ask(method, path, body, json = false) {
     throw new Error("The server does not answer; is `dsr app` still running?");
   }
   const answer = await response.json().catch(() => ({}));
-  if (!response.ok) throw new Error(answer.problem ?? `The server answers ${response.status}.`);
+  if (!response.ok) throw Object.assign(new Error(answer.problem ?? `The server answers ${response.status}.`), { status: response.status });
   return answer;
 }
 
@@ -104,7 +108,8 @@ class Files {
 
 class App {
   constructor() {
-    this.upload = null; // { id }, of the files as they are
+    this.upload = null; // { id, partial }, of the files as they are; partial until all are sent
+    this.looked = false; // whether the frames of the capture are known
     this.count = 1;
     this.names = [];
     this.turn = 0; // of what is asked for; what comes for an earlier one is dropped
@@ -151,6 +156,7 @@ class App {
     this.turn += 1;
     const turn = this.turn;
     this.forget();
+    this.looked = false;
     this.refuse(problem);
     find(".compute").disabled = Boolean(problem) || !this.files.isComplete;
     this.offerFrames(1, [], []);
@@ -162,12 +168,18 @@ class App {
     if (!this.files.by.capture) return;
     await this.doing(async () => {
       find(".compute").disabled = true;
-      const job = await this.run("look", {}, turn);
-      if (job?.state !== "done") return;
-      this.offerFrames(job.count ?? 1, job.names ?? [], job.thumbs);
-      this.say(job.count > 1 ? `${job.count} frames; choose one, then Compute.` : "Ready to compute.");
+      if (await this.look(turn)) this.say(this.count > 1 ? `${this.count} frames; choose one, then Compute.` : "Ready to compute.");
     }, turn);
     if (turn === this.turn) find(".compute").disabled = false;
+  }
+
+  /** Find the frames of the capture; return whether they are known. */
+  async look(turn) {
+    const job = await this.run("look", {}, turn);
+    if (job?.state !== "done") return false;
+    this.looked = true;
+    this.offerFrames(job.count, job.names, job.thumbs);
+    return true;
   }
 
   offerFrames(count, names, thumbs) {
@@ -200,22 +212,37 @@ class App {
 
   /** Send the files, unless the server has them. */
   async send(turn) {
-    if (this.upload) return;
+    if (this.upload && !this.upload.partial) return;
     this.say("Sending the files \u2026");
-    const { id } = await ask("POST", "uploads");
+    const { id } = await ask("POST", `uploads?replaces=${this.upload?.id ?? ""}`);
+    if (turn !== this.turn) { await ask("DELETE", `uploads/${id}`); return; }
+    const upload = this.upload = { id, partial: true };
     for (const [role, file] of Object.entries(this.files.by)) {
       if (file) await ask("PUT", `uploads/${id}/${role}?suffix=${encodeURIComponent(suffixOf(file.name))}`, file);
+      if (turn !== this.turn) return;
     }
-    if (turn === this.turn) this.upload = { id };
-    else await ask("DELETE", `uploads/${id}`);
+    upload.partial = false;
+  }
+
+  /** Begin a job; what the server has deleted meanwhile is sent again, once. */
+  async begin(what, more, turn) {
+    for (let again = what !== "files"; ; again = false) {
+      await this.send(turn);
+      if (turn !== this.turn) return null;
+      try {
+        return await ask("POST", `uploads/${this.upload.id}/job`, { what, ...more }, true);
+      } catch (error) {
+        if (!again || error.status !== 404 || turn !== this.turn) throw error;
+        this.upload = null;
+      }
+    }
   }
 
   /** Have the server do something, and return its job at the end; nothing if something else was asked for since. */
   async run(what, more, turn) {
-    await this.send(turn);
+    let job = await this.begin(what, more, turn);
     if (turn !== this.turn) return null;
     const path = `uploads/${this.upload.id}`;
-    let job = await ask("POST", `${path}/job`, { what, ...more }, true);
     while (turn === this.turn && (job.state === "waiting" || job.state === "running")) {
       this.tell(job);
       await new Promise((done) => setTimeout(done, POLL));
@@ -237,7 +264,11 @@ class App {
     try {
       await work();
     } catch (error) {
-      if (turn === this.turn) { this.refuse(error.message); this.say(""); }
+      if (turn === this.turn) {
+        if (error.status === 404) this.forget(); // it is sent again by Compute
+        this.refuse(error.status === 404 ? "The server has deleted the files meanwhile; Compute sends them again." : error.message);
+        this.say("");
+      }
     }
     if (turn !== this.turn) return;
     find(".under-way").hidden = true;
@@ -254,6 +285,10 @@ class App {
     find(".compute").disabled = true;
     find(".downloads").hidden = true;
     await this.doing(async () => {
+      if (this.files.by.capture && !this.looked) {
+        if (!await this.look(turn)) return;
+        if (this.count > 1) { this.say(`${this.count} frames; choose one, then Compute.`); return; }
+      }
       const job = await this.run("result", { choices: this.choices(), frame: this.frame, count: this.count }, turn);
       if (job) this.showNotes(job.notes);
       if (job?.state !== "done") return;
