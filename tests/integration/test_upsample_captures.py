@@ -58,7 +58,7 @@ def test_archive_of_record3d_is_given_as_a_file(tmp_path):
     told = info(out / "000001")
     assert told["inputs"]["depth"]["file"] == "scan.r3d/rgbd/1.depth"
     assert told["depth_file"] == {
-        "suffix": ".npy", "dtype": "float32", "unit": 1.0, "hole": "nan", "range_type": "orthogonal",
+        "suffix": ".tiff", "dtype": "float32", "unit": 1.0, "hole": "nan", "range_type": "orthogonal",
     }  # fmt: skip
     np.testing.assert_allclose(told["pose"], captures.pose(1), atol=1e-6)
 

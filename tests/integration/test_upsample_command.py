@@ -262,7 +262,7 @@ def test_what_was_measured_and_what_was_filled_is_told_apart(pair, tmp_path, cap
     assert shares["open"] == 0
     [line] = [line for line in said.splitlines() if " -> " in line]
     assert re.fullmatch(
-        r"\S+: bicubic x4, measured 97.7%, filled 2.3%, dubious [\d.]+%, [\d.]+ s, [\d.]+ MB -> \S+",
+        r"\S+: bicubic x4, measured 97.7%, filled 2.3%, dubious [\d.]+%, [\d.]+ s, [\d.]+ \w?B -> \S+",
         line.removeprefix("photo "),
     )
     (tmp_path / "out" / "filled.png").unlink()
@@ -412,7 +412,7 @@ def test_broken_picture_does_not_stop_the_others(pair, tmp_path, capsys):
         assert line.startswith(f"{name}: ")
         assert line.endswith(f" -> {out / name}")
     assert told.out.count("degrees of horizontal view assumed") == 1
-    assert re.search(rf"3 pictures: 2 done, 1 failed in 0:00:\d\d, 0.0 MB -> {re.escape(str(out))}", told.out)
+    assert re.search(rf"3 pictures: 2 done, 1 failed in 0:00:\d\d, \d+ kB -> {re.escape(str(out))}", told.out)
     assert files_in(out) == {
         f"{name}/{file}" for name in ("000000", "000002") for file in ("depth.png", "depth_metres.tiff", "info.json")
     }

@@ -224,7 +224,7 @@ def test_part_of_counts_the_steps_of_earlier_stages() -> None:
 def test_times_and_sizes_are_written_for_readers() -> None:
     assert [clock(seconds) for seconds in (0, 269, 3600, 90061)] == ["0:00:00", "0:04:29", "1:00:00", "25:01:01"]
     assert [duration(seconds) for seconds in (40, 720, 12600)] == ["40 s", "12 min", "3.5 h"]
-    assert [megabytes(size) for size in (3.2e6, 45e6, 1.3e9)] == ["3.2 MB", "45 MB", "1.3 GB"]
+    assert [megabytes(size) for size in (31e3, 3.2e6, 45e6, 1.3e9)] == ["31 kB", "3.2 MB", "45 MB", "1.3 GB"]
 
 
 STAGES = {"reading": 0.1, "upsampling": 0.5, "writing": 0.4}

@@ -135,5 +135,7 @@ def clock(seconds: float) -> str:
 
 
 def megabytes(size: float) -> str:
-    """Return a number of bytes: 3.2 MB, 45 MB, 1.3 GB."""
+    """Return a number of bytes: 31 kB, 3.2 MB, 45 MB, 1.3 GB."""
+    if size < 5e4:
+        return f"{size / 1e3:.0f} kB"
     return f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.{0 if size >= 1e7 else 1}f} MB"
