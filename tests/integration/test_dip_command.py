@@ -98,7 +98,8 @@ def test_steps_have_lines_with_named_times_off_a_terminal(tmp_path: Path, run: R
     )
     assert (code, errors) == (0, "")
     times = r"elapsed \d:\d\d:\d\d, remaining \d:\d\d:\d\d"
-    steps = rf"^predict statue \(0 of 1(?:, remaining \d:\d\d:\d\d)?\): steps: (\d) of 4, {times}(?:, loss \d+\.\d{{4}})?$"
+    outer = r"predict statue \(0 of 1(?:, remaining \d:\d\d:\d\d)?\)"
+    steps = rf"^{outer}: steps: (\d) of 4, {times}(?:, loss \d+\.\d{{4}})?$"
     assert list(dict.fromkeys(re.findall(steps, output, re.MULTILINE))) == ["1", "2", "3"]
 
 

@@ -120,7 +120,9 @@ class BrowserRequest(Options):
         "PORT",
         rule=Rule("0..65535", lambda port: 0 <= port <= _LAST_PORT),
     )
-    host: str = option("127.0.0.1", "another address: with the token in the address, others can use the page", "ADDRESS")
+    host: str = option(
+        "127.0.0.1", "another address: with the token in the address, others can use the page", "ADDRESS"
+    )
     open_page: bool = option(True, "only serve the page", flags="--no-open")
     max_upload: float = option(
         512.0, "largest size of the files of an upload (512)", "MB", rule=positive("number of megabytes")
