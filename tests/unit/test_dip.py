@@ -161,7 +161,9 @@ def test_interrupted_optimisation_gives_bit_identical_results(tmp_path: Path, st
     settings = {"steps": 50, "stopping": stopping, "patience": 15, "validate_every": 20, "metrics": visual_metrics}
     whole = _prior(workspace=tmp_path / "whole", **settings)(sample)
     stopper = Stopper(33)
-    with pytest.raises(KeyboardInterrupt, match="interrupted at step 33 of step; the same command continues from there"):
+    with pytest.raises(
+        KeyboardInterrupt, match="interrupted at step 33 of step; the same command continues from there"
+    ):
         _prior(workspace=tmp_path / "parts", display=stopper, **settings)(sample)
     last = tmp_path / "parts" / "optimisation" / "step" / "last.ckpt"
     assert last.is_file()

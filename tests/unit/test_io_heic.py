@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from dsr.cli import main
+from dsr.io.depth_files import read_depth_file
 from dsr.io.inputs import read_picture
 from dsr.io.layouts import find_pairs_of_folder
 from dsr.io.pairs import Pair, find_pairs_of_lists
@@ -88,7 +89,7 @@ def test_depth_that_is_relative_is_said_to_be(tmp_path, capsys):
     path, out = write(tmp_path / "photo.heic", captures.apple_text(accuracy="relative")), tmp_path / "out"
     assert main(["upsample", str(path), "-o", str(out), "--method", "bicubic", "--only", "depth"]) == 0
     assert "the depth is relative" in capsys.readouterr().out
-    assert np.load(out / "photo" / "depth.npy").shape == captures.HEIC
+    assert read_depth_file(out / "photo" / "depth_metres.tiff").shape == captures.HEIC
 
 
 def test_photos_of_a_folder_are_found_among_those_without_depth(tmp_path):
