@@ -8,7 +8,6 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-import dsr
 from dsr.app import run_directory as rundir
 from dsr.app.composition import compose
 from dsr.app.run_directory import (
@@ -251,7 +250,7 @@ def test_versions_have_packages_commit_and_accelerator():
 
 
 def test_versions_outside_of_a_checkout_have_no_commit(monkeypatch, tmp_path):
-    monkeypatch.setattr(dsr, "__file__", str(tmp_path / "dsr" / "__init__.py"))
+    monkeypatch.setattr("dsr.utils.versions.__file__", str(tmp_path / "dsr" / "utils" / "versions.py"))
     assert versions()["git_commit"] is None
 
 
