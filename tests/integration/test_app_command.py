@@ -307,7 +307,9 @@ def test_port_that_is_taken_is_one_line(capsys):
 )
 def test_command_serves_its_page_and_leaves_nothing_at_its_end(tmp_path, pair, number, host, code):
     command = [sys.executable, "-m", "dsr", "app", "--no-open", "--port", "0", "--host", host]
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # which the tests themselves may ignore, under nohup
     process = subprocess.Popen(command, env={**os.environ, "TMPDIR": str(tmp_path)}, stdout=subprocess.PIPE, text=True)
+    signal.signal(signal.SIGHUP, before)
     lines = [process.stdout.readline()]
     port, token = re.search(r":(\d+)/\?token=(\S+)", lines[0]).groups()
     client = Client(int(port), None, token)
