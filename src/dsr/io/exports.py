@@ -34,7 +34,7 @@ from dsr.geometry.mesh import (
 from dsr.geometry.shading import render
 from dsr.geometry.surface import depth_to_normals
 from dsr.io.glb import write_glb
-from dsr.io.photos import write_png
+from dsr.io.photos import to_jpeg, write_png
 from dsr.sample import expect_distances
 from dsr.utils.arrays import array_headers, read_arrays
 from dsr.utils.decoding import decode_pixels
@@ -319,20 +319,6 @@ def read_input(path: Path) -> tuple[np.ndarray, np.ndarray]:
     depth = arrays["depth_lr"]
     expect_distances(str(path), torch.from_numpy(depth[np.isfinite(depth)]))
     return _decode(path, arrays["photo"]), np.where(np.isfinite(depth), depth, np.float32(np.nan))
-
-
-def to_jpeg(pixels: np.ndarray, longest: int, quality: int) -> bytes:
-    """Encode a picture, (H, W, 3) uint8, as a JPEG, reduced if its longer side has more than ``longest`` pixels."""
-    height, width = pixels.shape[:2]
-    shrink = min(1.0, longest / max(height, width))
-    if shrink < 1:
-        size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
-        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
-    options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
-    done, content = cv2.imencode(".jpg", np.ascontiguousarray(pixels[..., ::-1]), options)
-    if not done:
-        raise OSError(f"the picture of {pixels.shape} could not be encoded")
-    return content.tobytes()
 
 
 def _decode(path: Path, content: np.ndarray) -> np.ndarray:

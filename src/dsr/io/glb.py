@@ -8,16 +8,14 @@ each attribute begins, and each of its elements, at a multiple of four bytes.
 
 from __future__ import annotations
 
-import io
 import json
 import struct
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-from PIL import Image
 
+from dsr.io.photos import encode_png, to_jpeg
 from dsr.utils.files import replacing
 
 _TO_GLTF = np.array([1, -1, -1])
@@ -103,17 +101,9 @@ def _quantised(points: np.ndarray, nearest: float) -> tuple[np.ndarray, dict[str
 
 def _texture(photo: np.ndarray) -> tuple[str, bytes]:
     """Return the type and the bytes of a picture, at most as large as viewers support."""
-    height, width = photo.shape[:2]
-    shrink = min(1.0, _LARGEST_TEXTURE / max(height, width))
-    if shrink < 1:
-        size = (round(width * shrink), round(height * shrink))
-        photo = cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
-    content = io.BytesIO()
-    if photo.shape[0] * photo.shape[1] <= _LOSSLESS:
-        Image.fromarray(photo).save(content, format="PNG")
-        return "image/png", content.getvalue()
-    Image.fromarray(photo).save(content, format="JPEG", quality=_QUALITY)
-    return "image/jpeg", content.getvalue()
+    if photo.shape[0] * photo.shape[1] <= _LOSSLESS and max(photo.shape) <= _LARGEST_TEXTURE:
+        return "image/png", encode_png(np.ascontiguousarray(photo[..., ::-1]))
+    return "image/jpeg", to_jpeg(photo, _LARGEST_TEXTURE, _QUALITY)
 
 
 class _File:

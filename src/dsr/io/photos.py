@@ -6,6 +6,7 @@ https://github.com/strukturag/libheif), whatever its EXIF data say.
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import io
 import struct
@@ -214,3 +215,22 @@ def encode_png(picture: np.ndarray) -> bytes:
     if not done:
         raise OSError(f"the picture of {picture.shape} could not be encoded")
     return encoded.tobytes()
+
+
+def to_jpeg(pixels: np.ndarray, longest: int, quality: int) -> bytes:
+    """Encode a picture, (H, W, 3) uint8, as a JPEG, reduced if its longer side has more than ``longest`` pixels."""
+    height, width = pixels.shape[:2]
+    shrink = min(1.0, longest / max(height, width))
+    if shrink < 1:
+        size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
+        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
+    done, content = cv2.imencode(".jpg", np.ascontiguousarray(pixels[..., ::-1]), options)
+    if not done:
+        raise OSError(f"the picture of {pixels.shape} could not be encoded")
+    return content.tobytes()
+
+
+def data_url(content: bytes, kind: str = "jpeg") -> str:
+    """Return the bytes of a picture as the address of itself, for pages."""
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"

@@ -46,9 +46,9 @@ from torch import Tensor
 from dsr.geometry.camera import Camera
 from dsr.geometry.rigid_motion import is_rotation, quaternion_of
 from dsr.io.depth_files import read_depth_file
-from dsr.io.exports import to_jpeg, world_comment, write_ply
+from dsr.io.exports import world_comment, write_ply
 from dsr.io.images import read_pixels
-from dsr.io.photos import encode_png, write_png
+from dsr.io.photos import encode_png, to_jpeg, write_png
 from dsr.utils.files import replacing, write_text
 from dsr.utils.guards import pixels_beside, refusing
 

@@ -16,7 +16,8 @@ import torch
 from dsr.geometry.camera import Camera
 from dsr.geometry.lights import VIEWING_LIGHT
 from dsr.geometry.shading import VIEWING_TONES, render_for_viewing
-from dsr.io.exports import normal_strips, to_jpeg
+from dsr.io.exports import normal_strips
+from dsr.io.photos import data_url, to_jpeg
 from dsr.pictures.canvas import HOLE_COLOUR
 from dsr.pictures.depth_views import reduced
 from dsr.report.html_page import asset, block, fill, json_text, palette, policy
@@ -166,7 +167,7 @@ def content_of(results: Sequence[Packed], title: str, notes: Sequence[str] = ())
         "light": VIEWING_LIGHT,
         "tones": VIEWING_TONES,
         "colours": palette(_COLOURS),
-        "results": [{**result.about, "thumb": _data_url(result.pictures["thumb"])} for result in results],
+        "results": [{**result.about, "thumb": data_url(result.pictures["thumb"])} for result in results],
     }
 
 
@@ -189,13 +190,9 @@ def _static(result: Packed) -> str:
         if key in result.pictures:
             pink = holes if result.about[key]["holes"] else ""
             alt = f"{name}, {text}, as a grey surface lit from the upper left{pink}"
-            picture = f'<img src="{_data_url(result.pictures[key])}" alt="{alt}">'
+            picture = f'<img src="{data_url(result.pictures[key])}" alt="{alt}">'
             figures.append(f"<figure>{picture}<figcaption>{text}{pink}</figcaption></figure>")
     return f'<section class="still"><h2>{name}</h2><div class="pair">{"".join(figures)}</div></section>'
-
-
-def _data_url(jpeg: bytes) -> str:
-    return f"data:image/jpeg;base64,{base64.b64encode(jpeg).decode()}"
 
 
 def _after(result: ViewedResult, vertices: int, limits: Mapping[str, tuple[float, ...]]) -> Grid:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-import math
 import os
 import sys
 import threading
@@ -33,6 +32,7 @@ from dsr.utils.progress import Progress, Task, Unit
 
 if TYPE_CHECKING:
     from dsr.app.upsample.frames import Frames
+    from dsr.geometry.camera import Camera
     from dsr.io.pairs import Pair
 
 What = Literal["look", "result", "files"]
@@ -165,15 +165,12 @@ def _look(request: UpsampleRequest, _: Path) -> None:
 
 def _thumb_of(pair: Pair) -> str:
     """Return a small picture of a frame as a data URL; empty where the photo cannot be read."""
-    import base64  # noqa: PLC0415
-
-    from dsr.io.exports import to_jpeg  # noqa: PLC0415
-    from dsr.io.photos import read_photo  # noqa: PLC0415
+    from dsr.io.photos import data_url, read_photo, to_jpeg  # noqa: PLC0415
 
     with contextlib.suppress(ValueError, OSError):
         photo = None if pair.capture is None else pair.capture.photo
         pixels = read_photo(pair.rgb, (3, 4))[0] if photo is None else photo.read()
-        return f"data:image/jpeg;base64,{base64.b64encode(to_jpeg(pixels, _THUMB, 80)).decode()}"
+        return data_url(to_jpeg(pixels, _THUMB, 80))
     return ""
 
 
@@ -208,19 +205,20 @@ def _result(request: UpsampleRequest, folder: Path) -> None:
     target = _upsample(request)
     tell(stage="preparing the surfaces")
     viewed = read_result(target, "result")
-    facts = {**(viewed.facts or {}), **_facts(read_info(target / INFO))}
+    facts = {**(viewed.facts or {}), **_facts(viewed.camera, read_info(target / INFO))}
     packed = pack_result(replace(viewed, facts=facts), _VERTICES, _PHOTO)
     shown = {"content": content_of([packed], "dsr app"), "data": data_of([packed])}
     (folder / SHOWN).write_text(json.dumps(shown), encoding="utf-8")
 
 
-def _facts(info: Mapping[str, Any]) -> dict[str, str]:
+def _facts(camera: Camera, info: Mapping[str, Any]) -> dict[str, str]:
     """Return the camera and the unit as they were read."""
-    camera, depth = info["camera"], info["input_depth"]
+    from dsr.geometry.plausible import view_of  # noqa: PLC0415
+
+    depth = info["input_depth"]
     unit = "pixels" if depth["range_type"] == "disparity" else "m"
-    fov = math.degrees(2 * math.atan(camera["width"] / 2 / camera["fx"]))
     return {
-        "camera as read": f"{fov:.1f} degrees wide, focal length {camera['fx']:.0f} pixels",
+        "camera as read": f"{view_of(camera):.1f} degrees wide, focal length {camera.fx:.0f} pixels",
         "unit as read": f"{depth['unit']:g} {unit} a value, {depth['range_type']}",
     }
 

@@ -160,9 +160,12 @@ class FrameWork:
                 surface = surface.without_dubious(wanted.max_error / 100)
         times.begin("writing")
         begin(target, job.settings, job.inputs, () if job.earlier is None else job.earlier.files)
-        facts, seconds = _write(job, picture, surface, planned, times)
+        title = f"{readable(pair.name)}, {planned.method} x{planned.scale}"
+        result = Result(picture, surface, output_encoding(picture.encoding, wanted.format), title, wanted)
+        kept = job.earlier if job.same else None
+        facts, seconds = write_result(target, result, planned, times, job.inputs, job.settings, job.earlier, kept)
         reporter.facts(facts)
-        told = [*_noise_in_brief(surface.noise), *_shares_in_brief(surface.shares(wanted.max_error / 100))]
+        told = [*_noise_in_brief(surface.noise), *_shares_in_brief(result.shares)]
         told += [f"{seconds['total']:.1f} s", megabytes(stored_bytes(target))]
         reporter.say(f"{pair.name}: {', '.join([f'{planned.method} x{planned.scale}', *told])} -> {target}")
         return "done"
@@ -374,17 +377,6 @@ def _describe_holes(surface: Surface, how: Upsampling) -> list[Assumption]:
     return [Assumption(text, f"{share:.1%} of the pixels; --fill all fills them, too")]
 
 
-def _write(
-    job: _Job, picture: Picture, surface: Surface, planned: Plan, times: Times
-) -> tuple[list[Assumption], dict[str, float]]:
-    """Write all parts and ``info.json``, and return notes for the user, and the seconds of the stages."""
-    wanted = job.request.results
-    title = f"{readable(job.pair.name)}, {planned.method} x{planned.scale}"
-    result = Result(picture, surface, output_encoding(picture.encoding, wanted.format), title, wanted)
-    kept = job.earlier if job.earlier is not None and job.same else None
-    return write_result(job.target, result, planned, times, job.inputs, job.settings, job.earlier, kept)
-
-
 def write_result(
     folder: Path, result: Result, planned: Plan, times: Times, inputs: Mapping[str, Any],
     settings: Mapping[str, Any], earlier: PreviousRun | None = None, kept: PreviousRun | None = None,
@@ -414,7 +406,7 @@ def write_result(
     others = [name for name in (kept.files if kept else ()) if name not in files]
     told = (*picture.assumptions, *facts)
     said = [each for each in (kept.said if kept and others else ()) if not each.startswith(tuple(n.text for n in told))]
-    shares = {name: round(share, 6) for name, share in surface.shares(result.wanted.max_error / 100).items()}
+    shares = {name: round(share, 6) for name, share in result.shares.items()}
     entries = {
         "inputs": inputs,
         "settings": settings,

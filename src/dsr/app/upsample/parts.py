@@ -7,7 +7,7 @@ import importlib.util
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -46,7 +46,7 @@ class Result:
 
     Args:
         picture: the input.
-        surface: the depth with its expected errors.
+        surface: the depth with its expected errors, see :func:`as_stored`.
         encoding: how the depth file stores it.
         title: the title of the before-and-after picture.
         wanted: the options of the results.
@@ -60,19 +60,20 @@ class Result:
     wanted: Results
 
     @functools.cached_property
+    def shares(self) -> dict[str, float]:
+        """The shares of the pixels, see :meth:`dsr.methods.base.Surface.shares`."""
+        return self.surface.shares(self.wanted.max_error / 100)
+
+    @functools.cached_property
     def certain(self) -> tuple[Tensor | None, tuple[Assumption, ...]]:
         """The depth, (1, H, W), without pixels that are likely to be wrong, None if none is left; and notes."""
         from dsr.notes import Assumption
 
-        depth, notes = self.surface.depth, list[Assumption]()
-        if self.surface.depth_error is not None:
-            limit = self.wanted.max_error / 100
-            doubtful = self.surface.depth_error > limit * depth
-            depth = depth.masked_fill(doubtful, math.nan)
-            share = float(doubtful.float().mean())
-            if share >= _WORTH_SAYING:
-                text = f"{share:.1%} of the pixels, expected to be off by more than {limit:.1%} of their depth"
-                notes.append(Assumption("left out of cloud and mesh", text))
+        limit, notes = self.wanted.max_error / 100, list[Assumption]()
+        depth, share = self.surface.without_dubious(limit).depth, self.shares.get("dubious", 0.0)
+        if share >= _WORTH_SAYING:
+            text = f"{share:.1%} of the pixels, expected to be off by more than {limit:.1%} of their depth"
+            notes.append(Assumption("left out of cloud and mesh", text))
         if bool(depth.isfinite().any()):
             return depth, tuple(notes)
         return None, (*notes, Assumption("no cloud and no mesh", "no pixel is left"))
@@ -436,7 +437,6 @@ def write_parts(folder: Path, result: Result) -> dict[str, Output]:
 
     """
     parts = result.wanted.of_frame
-    result = replace(result, surface=as_stored(result.surface))
     with ThreadPoolExecutor(1) as beside:  # shapes take as long as all the rest
         shapes = {part.name: beside.submit(_write, part, folder, result) for part in parts if part.shape}
         others = {part.name: _write(part, folder, result) for part in parts if not part.shape}

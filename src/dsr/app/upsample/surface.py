@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import functools
 import hashlib
 import os
@@ -29,6 +28,7 @@ from dsr.inference import Plan
 from dsr.io.exports import normal_strips
 from dsr.io.files import speaking_python
 from dsr.io.inputs import Picture
+from dsr.io.photos import data_url
 from dsr.methods import base
 from dsr.methods.base import MapNoise, Outliers
 from dsr.notes import warn
@@ -253,7 +253,7 @@ class Surface(Generic[Array]):
             f"&plusmn; {1e3 * error:.2g} mm (median), by {escape(self._plan.method)}"
         )
         about += "; pink: holes" if bool(before.isnan().any() or self._found.depth.isnan().any()) else ""
-        source = f"data:image/webp;base64,{base64.b64encode(content).decode()}"
+        source = data_url(content, "webp")
         return (
             f'<figure style="margin:0"><img src="{source}" alt="{about}" style="max-width:100%">'
             f'<figcaption style="font-size:85%">{about}</figcaption></figure>'
