@@ -92,7 +92,7 @@ def names_of_package() -> str:
     """Return the reference of the names of ``dsr`` itself, wherever they are."""
     import dsr  # noqa: PLC0415
 
-    shown = "show_root_heading: true, show_root_toc_entry: true"
+    shown = "show_root_heading: true, show_root_toc_entry: true, skip_local_inventory: true"
     parts = [
         f"::: {home}.{name}\n    options: {{{shown}, heading: dsr.{name}, toc_label: {name}}}\n"
         for name, home in sorted(dsr._HOMES.items())
