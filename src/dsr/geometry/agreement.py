@@ -19,7 +19,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, ndimage
+from scipy import ndimage
 from torch import Tensor
 
 from dsr.geometry.edges import JUMP, WORKING_SIZE, Array
@@ -312,14 +312,15 @@ def transform(outlines: Outlines) -> Fields:
     """Return the Fourier transforms of outlines."""
     strength, direction = outlines
     norm = float(np.linalg.norm(strength))
-    return Fields(fft.fft2(strength - strength.mean()), fft.fft2(direction), norm)
+    strong, directed = (np.fft.fft2(each).astype(np.complex64) for each in (strength - strength.mean(), direction))
+    return Fields(strong, directed, norm)
 
 
 def compare(depth: Fields, photo: Fields) -> Agreement:
     """Return the agreement of the edges of a depth map with those of a photo on the same grid."""
     v, u, fast, beyond = _displacements(*depth.strength.shape)
     spectrum = _ANY_DIRECTION * depth.strength.conj() * photo.strength + depth.direction.conj() * photo.direction
-    scores = fft.ifft2(spectrum * fast).real / max(depth.norm * photo.norm, 1e-9)
+    scores = np.fft.ifft2(spectrum * fast).real / max(depth.norm * photo.norm, 1e-9)
     best = ndimage.maximum_filter(scores, 2 * _REACH + 1, mode="wrap")
     others = best[beyond]
     mean, spread = float(others.mean()), max(float(others.std()), 1e-6)

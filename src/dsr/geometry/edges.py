@@ -10,9 +10,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, ndimage
+from scipy import ndimage
 
 from dsr.notes import LIMITS
 
@@ -118,17 +119,17 @@ def edge_gradients(photo: Array, smooth: float = 0.7) -> tuple[Array, Array]:
 def mean_gradients(edges: Edges, gradients: tuple[Array, Array], radius: int) -> Array:
     """Return the mean gradient at the edges for every shift down and right up to a radius, (2 r + 1, 2 r + 1)."""
     largest = np.max([gradient.shape for gradient in gradients], axis=0)
-    size = tuple(fft.next_fast_len(int(n) + radius + 1, real=True) for n in largest)  # no shift wraps around
-    total = 0
+    size = tuple(cv2.getOptimalDFTSize(int(n) + radius + 1) for n in largest)  # no shift wraps around
+    total = np.zeros((size[0], size[1] // 2 + 1), complex)
     for (rows, columns), gradient in zip((edges.right, edges.below), gradients, strict=True):
         there = np.zeros(size)
         here = tuple(
             np.clip(np.rint(place).astype(np.intp), 0, n - 1) for place, n in zip((rows, columns), size, strict=True)
         )
         np.add.at(there, here, 1.0)
-        total = total + fft.rfft2(gradient, size) * np.conj(fft.rfft2(there))
+        total += np.fft.rfft2(gradient, size) * np.conj(np.fft.rfft2(there))
     shifts = np.arange(-radius, radius + 1)
-    return fft.irfft2(total, size)[np.ix_(shifts, shifts)] / max(edges.count, 1)
+    return np.fft.irfft2(total, size)[np.ix_(shifts, shifts)] / max(edges.count, 1)
 
 
 def sum_by_tile(

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy import ndimage, optimize
+from scipy import ndimage
 from torch import Tensor
 from torch.nn import functional
 
@@ -241,6 +241,8 @@ def _refine(
     comparison: _Comparison, gradients: tuple[Array, Array], start: tuple[float, float, float], *, scaling: bool
 ) -> tuple[float, float, float]:
     """Return down, right and scale with the largest gradients near a start, to fractions of a pixel."""
+    from scipy import optimize  # noqa: PLC0415 - a quarter of a second, which registered maps save
+
     reach = max(comparison.size) / 2  # pixels by which the border moves for twice the scale
 
     def loss(x: Array) -> float:

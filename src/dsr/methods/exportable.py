@@ -7,20 +7,37 @@ those that need one of them.
 
 from __future__ import annotations
 
+import functools
+import sys
+from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
+P = ParamSpec("P")
+T = TypeVar("T")
+
 
 def exporting() -> bool:
-    """Return whether a network is being turned into a graph."""
-    return bool(torch.onnx.is_in_onnx_export())
+    """Return whether a network is being turned into a graph, without importing what does so: it takes a while."""
+    return "torch.onnx" in sys.modules and bool(torch.onnx.is_in_onnx_export())
 
 
-@torch.jit.script
+def _scripted(function: Callable[P, T]) -> Callable[P, T]:
+    """Return a function with loops that a graph keeps; it is compiled at its first call, which takes a while."""
+    compiled: Callable[[], Callable[P, T]] = functools.cache(lambda: torch.jit.script(function))
+
+    @functools.wraps(function)
+    def call(*arguments: P.args, **named: P.kwargs) -> T:
+        return compiled()(*arguments, **named)
+
+    return call
+
+
+@_scripted
 def fill_in_graph(values: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Fill the holes of maps as :func:`dsr.methods.inpainting.inpaint` does, as a loop in the graph.
 
@@ -43,7 +60,6 @@ def fill_in_graph(values: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     return values, weight
 
 
-@torch.jit.script
 def neighbours_of(x: Tensor) -> Tensor:
     """Return the eight neighbours of each pixel, row by row, (B, C, h, w) to (B, 8, C, h, w); 0 beyond the border."""
     height, width = x.shape[-2], x.shape[-1]
@@ -57,7 +73,7 @@ def neighbours_of(x: Tensor) -> Tensor:
     return torch.stack(around, dim=1)
 
 
-@torch.jit.script
+@_scripted
 def fill_by_colour_in_graph(x: Tensor, affinity: Tensor, alike: float) -> Tensor:
     """Fill the holes of a map as :func:`dsr.methods.inpainting.inpaint` does with a photo.
 
