@@ -26,6 +26,7 @@ MISSPELT = {
     "export --onnx f.onnx --method msgv": "msg_v",
     "data get midlebury": "middlebury", "eval method=facts": "facets", "eval dataset=simgoe": "simgeo",
     "eval -m method=bicubic,facts": "facets", "eval +experimnt=facets_x4": "experiment", "completion fihs": "fish",
+    "upsample --rgb a --depth b -o out --unit mm": "--depth-unit",
 }  # fmt: skip
 
 

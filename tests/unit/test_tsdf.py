@@ -38,6 +38,14 @@ def test_fused_mesh_lies_on_the_sphere_and_faces_outward():
     assert len(mesh.faces) > 3000
 
 
+def test_surface_in_a_layer_of_voxels_is_found():
+    """At 2 m, where voxels of 5 cm and blocks of eight begin, distances are exactly 0."""
+    wall = PosedMap(np.full((80, 96), 2.0), CAMERA, np.eye(4))
+    mesh = fuse_maps(lambda: [wall], 0.05)
+    assert np.abs(mesh.vertices[:, 2] - 2).max() < 1e-3
+    assert len(mesh.faces) > 500
+
+
 def test_layers_of_blocks_are_joined():
     mesh = fuse_maps(lambda: [seen(0)], 0.02)
     edges = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)

@@ -69,9 +69,9 @@ def fuse_maps(maps: Callable[[], Iterable[PosedMap]], voxel: float) -> FusedMesh
         >>> import dsr
         >>> from dsr.geometry.tsdf import PosedMap, fuse_maps
         >>> camera = dsr.Camera.from_fov(60, width=64, height=48)
-        >>> wall = PosedMap(np.full((48, 64), 2.03), camera, np.eye(4))
+        >>> wall = PosedMap(np.full((48, 64), 2.0), camera, np.eye(4))
         >>> mesh = fuse_maps(lambda: [wall, wall], voxel=0.05)
-        >>> bool(abs(mesh.vertices[:, 2] - 2.03).max() < 1e-3)
+        >>> bool(abs(mesh.vertices[:, 2] - 2.0).max() < 1e-3)
         True
 
     """
@@ -201,10 +201,11 @@ def _march(volume: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray] | No
     cells = high - low < _STEEPEST
     known = np.isfinite(volume)
     values = np.where(known, volume, 1.0)
+    values[values == 0] = -np.finfo(np.float32).eps  # a surface in a layer of voxels, where no sign would change
     if not cells.any() or not (values.min() < 0 < values.max()):
         return None
     places, faces, normals, _ = marching_cubes(values, 0.0, gradient_direction="ascent")
-    middle = np.floor(places[faces].mean(1)).astype(np.intp)
+    middle = np.floor(places[faces].mean(1)).astype(np.intp).clip(max=np.array(cells.shape) - 1)
     faces = faces[cells[tuple(middle.T)]]
     used = np.unique(faces)
     if not len(used):
