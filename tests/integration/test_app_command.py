@@ -161,7 +161,7 @@ def test_pair_becomes_what_the_command_makes_of_it(client, pair, tmp_path):
     assert all(str(client.desk.folder) not in note["note"] for note in job["notes"])
     shown = client.json("GET", f"{place}/shown")["content"]["results"][0]
     assert shown["facts"]["camera as read"].startswith("70.0 degrees")
-    assert shown["facts"]["unit as read"].startswith("0.002 m")
+    assert shown["facts"]["unit as read"].startswith("2 mm per value")
     assert shown["filled"] > 0
 
     job = client.run(place, "files")

@@ -214,12 +214,13 @@ def _result(request: UpsampleRequest, folder: Path) -> None:
 def _facts(camera: Camera, info: Mapping[str, Any]) -> dict[str, str]:
     """Return the camera and the unit as they were read."""
     from dsr.geometry.plausible import view_of  # noqa: PLC0415
+    from dsr.utils.lengths import show_length  # noqa: PLC0415
 
     depth = info["input_depth"]
-    unit = "pixels" if depth["range_type"] == "disparity" else "m"
+    unit = f"{depth['unit']:g} pixels" if depth["range_type"] == "disparity" else show_length(depth["unit"])
     return {
         "camera as read": f"{view_of(camera):.1f} degrees wide, focal length {camera.fx:.0f} pixels",
-        "unit as read": f"{depth['unit']:g} {unit} a value, {depth['range_type']}",
+        "unit as read": f"{unit} per value, {depth['range_type']}",
     }
 
 
