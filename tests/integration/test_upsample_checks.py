@@ -72,12 +72,12 @@ def metres(folder):
 @pytest.mark.parametrize(
     ("values", "said"),
     [
-        (MILLIMETRES, "whole numbers are taken for millimetres"),
-        (MILLIMETRES * np.uint16(5), "whole numbers are taken for 1/5000 m: values are multiples of 5"),
+        (MILLIMETRES, "whole numbers are read as millimetres"),
+        (MILLIMETRES * np.uint16(5), "whole numbers are read as 1/5000 m: values are multiples of 5"),
         ((MILLIMETRES << 3) | (MILLIMETRES >> 13), "values are multiples of 8: bits are turned back by 3"),
-        (DEPTH.astype(np.float32), "floats are taken for metres"),
-        (DEPTH.astype(np.float32) * 1000, "floats this large are taken for millimetres"),
-        (MILLIMETRES.astype(np.float32), "floats this large are taken for millimetres"),
+        (DEPTH.astype(np.float32), "floats are read as metres"),
+        (DEPTH.astype(np.float32) * 1000, "floats this large are read as millimetres"),
+        (MILLIMETRES.astype(np.float32), "floats this large are read as millimetres"),
     ],
 )
 def test_what_values_tell_is_read_so_with_its_reason(tmp_path, capsys, values, said):
@@ -166,7 +166,7 @@ def test_an_option_answers_what_was_asked(tmp_path, capsys):
 def test_values_that_fall_with_distance_are_disparities_where_the_baseline_is_known(tmp_path, capsys):
     codes, printed = warned(tmp_path, capsys, write(tmp_path, DISPARITY), "--baseline", BASELINE)
     assert codes == []
-    assert "values are taken for disparities in pixels of the depth map: values fall with distance" in printed
+    assert "values are read as disparities in pixels of the depth map: values fall with distance" in printed
     assert np.median(metres(tmp_path / "out")) == pytest.approx(np.median(DEPTH), rel=0.02)
 
 

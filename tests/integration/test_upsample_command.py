@@ -75,7 +75,7 @@ def test_two_files_are_enough_and_all_assumptions_are_printed(pair, cube, tmp_pa
     said = capsys.readouterr().out
     for text in (
         "60 degrees of horizontal view assumed",
-        "whole numbers are taken for millimetres (median ",
+        "whole numbers are read as millimetres (median ",
         "zeros count as holes (2.3%)",
         "depth_metres.tiff is not rounded",
     ):
@@ -160,13 +160,13 @@ def test_noise_of_an_earlier_run_is_kept_where_parts_are_added(pair, tmp_path, c
 def test_outliers_are_holes_and_it_is_said(pair, tmp_path, capsys):
     clean, out = tmp_path / "clean", tmp_path / "out"
     assert of(pair, clean, *DEPTH_ONLY) == 0
-    assert "taken for holes" not in capsys.readouterr().out
+    assert "treated as holes" not in capsys.readouterr().out
     values = pair[2].copy()
     values[10, 9], values[3, 12] = 25, 64000  # mm
     Image.fromarray(values).save(pair[1])
     assert of(pair, out, *DEPTH_ONLY) == 0
     said = capsys.readouterr().out
-    assert said.count("taken for holes") == 1
+    assert said.count("treated as holes") == 1
     assert "pixels: 2, patches: 2" in said
     counted = {"pixels": 2, "patches": 2}
     assert (info(clean)["outliers"], info(out)["outliers"]) == ({"pixels": 0, "patches": 0}, counted)
@@ -425,7 +425,7 @@ def test_published_scenes_are_read_with_their_cameras(shared, tmp_path, capsys):
     assert upsample(shared / "scenes", "-o", tmp_path / "out", "--dry-run") == 0
     said = capsys.readouterr().out
     assert "3 pairs of photo and depth map\n  camera: camera.json beside the pictures\n" in said
-    assert "taken for disparities, by the file's name" in said
+    assert "read as disparities, by the file's name" in said
     assert said.endswith(f"3 pictures: 3 to do -> {tmp_path / 'out'}\n")
     assert not (tmp_path / "out").exists()
 

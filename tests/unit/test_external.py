@@ -145,7 +145,7 @@ def test_names_follow_a_template_and_other_files_are_told(sample: DepthSample, t
     ("change", "settings", "message"),
     [
         (lambda z: z * 1000, {}, r"hall.npy: .* the median is .* another unit"),
-        (lambda z: 4 - z, {}, r"correlation is -.*disparity taken for depth"),
+        (lambda z: 4 - z, {}, r"correlation is -.*disparity read as depth"),
         (lambda z: -z, {}, r"hall.npy: expected at least one known pixel, .*negative"),
         (lambda z: z * np.nan, {}, r"hall.npy: expected at least one known pixel, got all holes"),
         (lambda z: z * np.inf, {}, r"hall.npy: expected at least one known pixel, got all holes"),

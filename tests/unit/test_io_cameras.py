@@ -59,7 +59,7 @@ def test_camera_file_of_the_photo_is_used_silently(tmp_path, name, content):
 def test_matrix_of_sun_rgbd_or_scannet_is_in_photo_pixels(tmp_path, text):
     camera, assumptions = found(tmp_path, file=written(tmp_path, "intrinsics.txt", text))
     assert camera == Camera(**OWN)
-    assert assumptions == ["camera: the matrix is taken for one of the photo's pixels"]
+    assert assumptions == ["camera: the matrix is read in pixels of the photo"]
 
 
 def test_matrix_in_depth_map_pixels_is_recognised_and_scaled(tmp_path):

@@ -79,7 +79,7 @@ def test_camera_unit_and_pose_of_each_frame_come_from_the_layout(folder, layout)
         np.testing.assert_allclose(picture.depth_lr[0], expected, atol=6e-4)
         assert abs(255 * picture.rgb.permute(1, 2, 0).numpy() - captures.photo(number)).mean() < 4
         np.testing.assert_allclose(picture.pose, captures.pose(number), atol=1e-6)
-        assert "taken for millimetres" not in said(picture)
+        assert "read as millimetres" not in said(picture)
     again = read_picture(pickle.loads(pickle.dumps(find_pairs_of_folder(place).pairs[1])), Reading())
     np.testing.assert_array_equal(again.depth_lr, pictures[1].depth_lr)
 

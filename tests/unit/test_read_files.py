@@ -119,7 +119,7 @@ def test_wrong_argument_is_named(tmp_path: Path, change: dict, message: str) -> 
 
 def test_photo_is_turned_only_where_the_depth_map_has_its_aspect_then(tmp_path: Path) -> None:
     pair = write_pair(tmp_path, millimetres(), orientation=6)
-    with pytest.warns(UserWarning, match="orientation is left out"):
+    with pytest.warns(UserWarning, match="orientation is ignored"):
         as_stored = dsr.read(pair.rgb)
     assert (as_stored.dtype, as_stored.shape) == (np.uint8, (*SIZE, 3))
     np.testing.assert_array_equal(as_stored, Image.open(pair.rgb))

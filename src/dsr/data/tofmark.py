@@ -213,7 +213,7 @@ def _told(path: Path, role: str, found: Mapping[str, np.ndarray], chosen: Mappin
             if re.search(words, names[name]):
                 return name
     if len(fitting) > 1 and role != "intensity":
-        raise ValueError(f"{path}: expected one variable for {role}, which is not told among {', '.join(fitting)}")
+        raise ValueError(f"{path}: expected one variable for {role}, it may be any of {', '.join(fitting)}")
     return fitting[0] if fitting and role != "intensity" else None
 
 

@@ -211,7 +211,7 @@ def find_fault(agreement: Agreement) -> Assumption | None:
     if alike and agreement.moved.min() >= LIMITS["poses-far"].threshold:
         nearest = float(agreement.moved.min())
         return Assumption(
-            "under the poses the camera is far away in the next frame, which looks alike: are they in millimetres?",
+            "under the poses the camera is far away in the next frame, which looks similar: are they in millimetres?",
             f"{nearest:.3g} times as far as what it sees; {float(np.median(without)):.0%} of the pixels are unchanged",
             "poses-far",
             round(nearest, 1),

@@ -244,7 +244,7 @@ FORMATS = (
     ),
     Format(
         "Replica of NICE-SLAM",
-        "a rendered scene, or what another program writes alike",
+        "a rendered scene, or another program's in the same layout",
         "`results/frame*.jpg`, `results/depth*.png`, and `traj.txt` or `cam_params.json`",
         "depth in 1/`scale` m (1/6553.5); intrinsics (`cam_params.json`, here or one folder up); poses",
         "written by its format",

@@ -177,7 +177,7 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     given = reading.camera != CameraChoice()
     lens = geometry.lens if geometry.camera is not None and not given else None
     if given and geometry.lens is not None and geometry.lens.bends:
-        text = "the lens distortion that the capture states is left: the camera is given"
+        text = "the lens distortion that the capture states is not undone: the camera is given"
         camera_assumptions = [*camera_assumptions, Assumption(text, str(geometry.lens))]
     pixels, undone = _undistort_photo(pixels, described.camera, lens)
     pixels, crop_assumptions = _crop_to_multiple(pixels, pair.factor, size_lr)
@@ -317,7 +317,7 @@ def read_geometry(pair: Pair, size: Size, reading: Reading) -> tuple[Geometry, l
         return found, []
     if pair.capture.apart and reading.rig is None:
         raise ValueError(found.damage)
-    text = "the capture's cameras are damaged: the given one is taken, and no pose or depth camera of the capture"
+    text = "the capture's cameras are damaged: the given one is used, and no pose or depth camera of the capture"
     return found, [Assumption(text, found.damage, "cameras-damaged", 1)]
 
 
@@ -479,13 +479,13 @@ def _range_type(pair: Pair, reading: Reading, described: CameraFile) -> tuple[Ra
     if reading.range_type is not None:
         return reading.range_type, []
     if _DISPARITY_WORDS & set(words_of(pair.depth.stem)):
-        return "disparity", [Assumption("values are taken for disparities, by the file's name")]
+        return "disparity", [Assumption("values are read as disparities, by the file's name")]
     if _is_icl(pair):
         text = "values are distances along the rays in centimetres, as in ICL-NUIM's .depth"
         return "perspective", [Assumption(text)]
     if described.range_type in (None, "orthogonal"):
         return described.range_type, []
-    return described.range_type, [Assumption(f"values are of range type {described.range_type}, says the camera file")]
+    return described.range_type, [Assumption(f"values are of range type {described.range_type}, by the camera file")]
 
 
 def _unit(
@@ -497,10 +497,10 @@ def _unit(
         turned = reading.unit == "sunrgbd"
         return Told(reading.metres, (Assumption(TURNED_BACK),) if turned else (), bits=SUNRGBD_BITS if turned else 0)
     if range_type == "disparity":
-        return Told(1.0, (Assumption("disparities are taken for pixels of the depth map"),))
+        return Told(1.0, (Assumption("disparities are read in pixels of the depth map"),))
     if described.depth_unit is not None:
         unit = described.depth_unit
-        return Told(unit, (Assumption(f"unit: {show_length(unit)} per value, says the camera file"),))
+        return Told(unit, (Assumption(f"unit: {show_length(unit)} per value, by the camera file"),))
     if pair.unit is not None:
         return Told(pair.unit, (), bits=pair.bits)
     if _is_icl(pair):

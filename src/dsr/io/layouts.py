@@ -129,7 +129,7 @@ def _search(folder: Path, root: Path, leave: Path | None, depth: int) -> Pairing
 
 def _alike(folder: Path) -> tuple[Assumption, ...]:
     """Return notes on the captures that a folder looks like, and that its pairs were not read as."""
-    return tuple(Assumption(f"{text}: read without what it says of camera, unit and poses") for text in lacking(folder))
+    return tuple(Assumption(f"{text}: read without its camera, unit and poses") for text in lacking(folder))
 
 
 def _find_at(place: Path, root: Path | None = None) -> PairingResult:
@@ -234,7 +234,7 @@ def _role_folders(folder: Path) -> PairingResult:
     found = find_pairs_of_two_folders(named["rgb"][0], named["depth"][0], ())
     extra = [path.name for paths in (named["rgb"], named["depth"]) for path in paths[1:]]
     text = f"folders {named['rgb'][0].name} and {named['depth'][0].name}"
-    assumption = Assumption(text + (f"; not looked at: {', '.join(extra)}" if extra else ""))
+    assumption = Assumption(text + (f"; not read: {', '.join(extra)}" if extra else ""))
     return replace(found, assumptions=(assumption, *found.assumptions))
 
 

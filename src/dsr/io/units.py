@@ -231,7 +231,7 @@ def _by_steps(clues: _Clues) -> Told | None:
 
 def _whole(clues: _Clues, label: str, unit: float, why: str) -> Assumption:
     """Return the note on a unit of whole numbers."""
-    return Assumption(f"whole numbers are taken for {label}: {why}; {_OVERRIDE}", f"median {clues.metres(unit)}")
+    return Assumption(f"whole numbers are read as {label}: {why}; {_OVERRIDE}", f"median {clues.metres(unit)}")
 
 
 def _by_median(clues: _Clues) -> Told:
@@ -242,7 +242,7 @@ def _by_median(clues: _Clues) -> Told:
         if clues.telling and middle * 1e-3 > LIMITS["far-millimetres"].threshold:
             why = f"as millimetres that is far for a depth camera; {others}"
             clues.ask(why, ("mm", 1e-3), ("1/5000", 1 / 5000))
-        found = [Assumption("whole numbers are taken for millimetres", f"median {clues.metres(1e-3)}")]
+        found = [Assumption("whole numbers are read as millimetres", f"median {clues.metres(1e-3)}")]
         if middle * 1e-3 > LIMITS["far-metres"].threshold:
             found.append(Assumption(f"that is far for a sensor: {others} (--depth-unit), SUN RGB-D sunrgbd"))
         near = float(np.percentile(clues.known, 99)) * 1e-3
@@ -256,7 +256,7 @@ def _by_median(clues: _Clues) -> Told:
     for unit, label in _OTHER_UNITS:
         if _MIN_MEDIAN <= middle * unit <= _MAX_MEDIAN:
             why = f"as millimetres the median would be {clues.metres(1e-3)}, now {clues.metres(unit)}"
-            return Told(unit, (Assumption(f"whole numbers are taken for {label}", why),))
+            return Told(unit, (Assumption(f"whole numbers are read as {label}", why),))
     raise ValueError(
         f"{clues.name}: no usual unit makes its median of {middle:g} a distance; give one with --depth-unit"
     )
@@ -274,8 +274,8 @@ def _tell_floats(clues: _Clues) -> Told:
     whole = clues.telling and bool((clues.known == np.round(clues.known)).all())
     sure = "float-millimetres.whole" if whole or not clues.telling else "float-millimetres"
     if middle > LIMITS[sure].threshold:
-        return Told(1e-3, (Assumption("floats this large are taken for millimetres", f"median {middle:.4g}"),))
-    found = [Assumption("floats are taken for metres", f"median {clues.metres(1.0)}")]
+        return Told(1e-3, (Assumption("floats this large are read as millimetres", f"median {middle:.4g}"),))
+    found = [Assumption("floats are read as metres", f"median {clues.metres(1.0)}")]
     if middle < _MIN_MEDIAN:
         found.append(Assumption("the depth is nearer than 5 cm: is it in metres? --depth-unit gives another unit"))
     return Told(1.0, tuple(found))
@@ -345,5 +345,5 @@ def _tell_falling(clues: _Clues) -> Told | None:
             f"depth: {why}, as disparity and inverse depth do; inverse depth of a network has no metric unit"
         )
     label = "pixels" if fitting[0] == 1 else "1/256 pixel"
-    text = f"values are taken for disparities in {label} of the depth map: {why}; --range-type overrides it"
+    text = f"values are read as disparities in {label} of the depth map: {why}; --range-type overrides it"
     return Told(fitting[0], (Assumption(text),), "disparity")

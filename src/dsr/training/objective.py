@@ -228,8 +228,7 @@ class SurfaceObjective(Objective):
             )
         if not told:
             raise ValueError(
-                f"degradation: expected everything or another distribution with the hints that {type(net).__name__} is "
-                "told, got plain"
+                f"degradation: expected everything or another distribution with hints, for {type(net).__name__}, got plain"
             )
 
     def __call__(self, answer: Answer, batch: Batch) -> dict[str, Tensor]:

@@ -64,7 +64,7 @@ class Job:
     """One run of the process.
 
     Attributes:
-        facts: what the process told, the last of each name.
+        facts: what the process has sent, the last of each name.
         notes: notes on the input, each with whether it is a warning.
         names: those of the frames.
         thumbs: small pictures of frames.
@@ -336,5 +336,5 @@ class Desk:
         elif code and not job.problem:
             job.problem = f"the process ended ({code}); it may have needed more than {job.facts['memory']} of memory"
         elif not job.problem and (damaged or (job.what == "look" and "count" not in job.facts)):
-            job.problem = "what the process told of the files could not be read"
+            job.problem = "the process's list of files could not be read"
         job.state = "failed" if job.problem else "done"

@@ -361,10 +361,10 @@ def _percent(share: float) -> str:
 
 
 def _describe_outliers(outliers: Outliers | None) -> list[Assumption]:
-    """Return a note on depth that was taken for holes, if there is any."""
+    """Return a note on depth that was treated as holes, if there is any."""
     if outliers is None or not outliers.pixels:
         return []
-    text = "depth far from everything around it, or nearer than 5 cm, is taken for holes"
+    text = "depth far from everything around it, or nearer than 5 cm, is treated as holes"
     return [Assumption(text, f"pixels: {outliers.pixels}, patches: {outliers.patches}")]
 
 

@@ -108,7 +108,7 @@ class Surface(Generic[Array]):
 
     @property
     def outliers(self) -> Outliers | None:
-        """What of the depth map that was given was taken for holes."""
+        """What of the depth map that was given was treated as holes."""
         return self._found.outliers
 
     @property

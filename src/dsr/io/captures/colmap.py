@@ -191,7 +191,7 @@ def _joined(
 
 def _note(count: int, total: int, file: Path) -> Assumption:
     """Return what was taken from a model."""
-    text = f"cameras and poses of {_APP}: {file.parent.name}/{file.name}; its unit is taken for the metre"
+    text = f"cameras and poses of {_APP}: {file.parent.name}/{file.name}; its unit is assumed to be the metre"
     return Assumption(text, f"{count} of {total} photos")
 
 

@@ -145,7 +145,7 @@ def _geometry(path: Path, size: tuple[int, int]) -> Geometry:
     accuracy = re.search(r"depthData:Accuracy\W{1,3}(\w+)", text)
     notes = []
     if accuracy is None or accuracy[1] != "absolute":
-        known = "is relative, says the file" if accuracy else "may be relative, the file does not say"
+        known = "is relative, as the file states" if accuracy else "may be relative, the file does not say"
         notes.append(Assumption(f"the depth {known}: sizes and distances mean little"))
     camera = _camera(path, text, turned_in_heic(path), size)
     return Geometry(camera, None, tuple(notes))

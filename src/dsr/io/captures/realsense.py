@@ -113,7 +113,7 @@ def read(reader: Any, path: Path, prefix: str) -> PairingResult:
         {each.topic for each in reader.connections if _IMAGES.fullmatch(each.topic)} - {color_topic, depth_topic}
     )
     if others:
-        notes.append(Assumption(f"topics that are not looked at: {', '.join(others)}"))
+        notes.append(Assumption(f"topics that are not read: {', '.join(others)}"))
     lone = [places[0]] * (len(photos) - len(pairs)) + [places[1]] * (len(depths) - len(pairs))
     return PairingResult(tuple(pairs), (about, *registered, *notes), tuple(lone))
 
@@ -207,7 +207,7 @@ def _geometry(color: _Stream, depth: _Stream) -> tuple[Geometry, list[Assumption
     notes = (*color.notes, *depth.notes)
     geometry = Geometry(color.camera, None, notes, color.lens)
     if color.transform is None or depth.transform is None or color.reference != depth.reference:
-        text = "the recording has no transform from depth to colour: depth is taken for registered to the photo"
+        text = "the recording has no transform from depth to colour: depth is assumed to be registered to the photo"
         return geometry, [Assumption(text)]
     transform = color.transform @ invert(depth.transform)
     own, other = ((c.width, c.height, c.fx, c.fy, c.cx, c.cy) for c in (color.camera, depth.camera))
