@@ -330,9 +330,9 @@ def identify(depth: Tensor, name: str = "auto", device_name: str = "") -> Identi
                 f"of one of its other modes, got {constant:.0f} m"
             )
         return Identified(named, "request", constant)
-    told = recognise(device_name)
-    if told is not None and _has_figures(told) and (constant is None or _mismatch(told, constant) <= _ALIKE):
-        return Identified(told, "file", constant)
+    named = recognise(device_name)
+    if named is not None and _has_figures(named) and (constant is None or _mismatch(named, constant) <= _ALIKE):
+        return Identified(named, "file", constant)
     if constant is None:
         return None
     best = min((each for each in SENSORS if each.step is not None), key=lambda each: _mismatch(each, constant, _USUAL))

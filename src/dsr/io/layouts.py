@@ -187,9 +187,9 @@ def _tum(folder: Path) -> PairingResult:
     if truth.is_file() and pairs:
         poses = _tum_poses(truth, [depths[pair.depth] for pair in pairs])
         text += f"; poses: {truth.name}, of {sum(pose is not None for pose in poses)} of {len(pairs)} frames"
-        told = [b"" if pose is None else pose.tobytes() for pose in poses]
+        described = [b"" if pose is None else pose.tobytes() for pose in poses]
         frames = [CaptureFrame("TUM RGB-D", partial(_tum_geometry, pose), truth, each)
-                  for pose, each in zip(poses, told, strict=True)]  # fmt: skip
+                  for pose, each in zip(poses, described, strict=True)]  # fmt: skip
         pairs = [replace(pair, capture=frame) for pair, frame in zip(pairs, frames, strict=True)]
     return PairingResult(tuple(pairs), (Assumption(text),), tuple(unpaired))
 

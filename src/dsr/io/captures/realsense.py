@@ -99,14 +99,14 @@ def read(reader: Any, path: Path, prefix: str) -> PairingResult:
     if not partner:
         raise ValueError(f"{path}: expected photos and depth maps within 20 ms of each other, found none")
     device = _device(reader)
-    told = repr(streams or damage).encode()
+    described = repr(streams or damage).encode()
     apart = all(_transforms(reader, _part(topic, "stream")) for topic in (color_topic, depth_topic))
     places = Path(f"{path}{color_topic}"), Path(f"{path}{depth_topic}")
     pairs = []
     for first, second in sorted(partner.items()):
         sources = photos[int(first.name)][0], depths[int(second.name)][0]
         own = functools.partial(_of_photo, geometry, damage)
-        frame = CaptureFrame(device, own, path, told, *sources, time=photos[int(first.name)][1], apart=apart)
+        frame = CaptureFrame(device, own, path, described, *sources, time=photos[int(first.name)][1], apart=apart)
         pairs.append(Pair(f"{prefix}{int(first.name):06}", *places, unit=unit, capture=frame))
     about = describe_capture(f"a recording of {device}", f"units of {show_length(unit)}", pairs, poses=False)
     others = sorted(

@@ -78,13 +78,13 @@ def _read(path: Path, prefix: str = "") -> PairingResult:
     partner = match_times(named["rgb"], named["depth"])
     if not partner:
         raise ValueError(f"{path}: expected photos and depth maps within 20 ms of each other, found none")
-    told = repr(info).encode()
+    described = repr(info).encode()
     place = f"{path}{PurePosixPath(photo_topic).parent / 'camera_info'}"
     pairs = []
     for first, second in sorted(partner.items()):
         photo, depth = photos[int(first.name)][0], depths[int(second.name)][0]
         geometry = functools.partial(_geometry, place, info)
-        frame = CaptureFrame("ROS", geometry, path, told, photo, depth, named["rgb"][first])
+        frame = CaptureFrame("ROS", geometry, path, described, photo, depth, named["rgb"][first])
         name = f"{prefix}{int(first.name):06}"
         pairs.append(
             Pair(name, Path(f"{path}{photo_topic}"), Path(f"{path}{depth_topic}"), unit=_UNITS[kind], capture=frame)
