@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 _LIDAR = "bent edges, nothing thin"
 _KINECT1 = "stairs far away, smeared edges, shadows beside near things"
-_STEREO = "blobs, guesses on blank walls, glass believed"
+_STEREO = "blobs, guesses on blank walls, wrong depth on glass"
 _FLIGHT = "flying pixels, noise on dark surfaces, rounded corners"
 
 
