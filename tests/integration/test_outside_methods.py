@@ -37,7 +37,7 @@ class Constant(Method):
         return torch.full(size, float(sample.depth_lr.nanmean()) + self.offset, dtype=sample.depth_lr.dtype)
 
 
-class Told(Constant):
+class Hinted(Constant):
     """Prints the hints on the maps."""
 
     def __init__(self, kernel: str | None = None, edges: str = "auto", clean: bool = False) -> None:
