@@ -4,7 +4,7 @@
         [--hints] [--device cpu]
 
 ``WEIGHTS`` are of trainings of ``model=facets``. Figures with _v are in 1/1000, DSSIM_v and LPIPS_v of the worst light;
-one pass without augmentation. ``--hints`` tells the network what ``eval.py`` does, the kernel and that there is no
+one pass without augmentation. ``--hints`` gives the network what ``eval.py`` gives, the kernel and that there is no
 noise, where that holds, and ``edges=soft`` on the field's benchmarks.
 """
 
@@ -47,7 +47,7 @@ PAPER = tuple(metric for metric in PROTOCOLS["paper"] if not metric.perceptual)
 
 
 class Runner:
-    """The method with the weights that suit a map, told what ``eval.py`` tells it."""
+    """The method with the weights that suit a map, with the hints that ``eval.py`` gives."""
 
     def __init__(self, weights: list[Path], *, hints: bool, device: str) -> None:
         self.device = device
@@ -59,13 +59,13 @@ class Runner:
     ) -> torch.Tensor:
         """Return the high-resolution depth, (1, H, W)."""
         weights = self.files[min(scale for scale in self.files if 1.05 * scale >= sample.scale)]
-        told = (kernel, "soft" if soft else "sharp", clean) if self.hints else ()
-        return self._method(weights, self.device, *told)(sample)
+        facts = (kernel, "soft" if soft else "sharp", clean) if self.hints else ()
+        return self._method(weights, self.device, *facts)(sample)
 
     @staticmethod
     @functools.cache
     def _method(weights: Path, device: str, kernel: Any = None, edges: Edges = "auto", clean: bool = False) -> AnyMap:
-        """Return the method that is told these facts."""
+        """Return the method with these facts."""
         return AnyMap(weights, edges=edges, kernel=kernel, clean=clean, device=device)
 
 

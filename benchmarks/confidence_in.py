@@ -1,4 +1,4 @@
-"""Measure three uses of a confidence map: none, holes in place of unsure pixels, and the noise of each level told.
+"""Measure three uses of a confidence map: none, holes in place of unsure pixels, and the noise of each level given.
 
     python benchmarks/confidence_in.py [--scenes DIR] [--scale 8] [--seed 1]
 
@@ -79,14 +79,14 @@ def uses(scene: Scene, depth_lr: Tensor, levels: Tensor, method: AnyMap, scale: 
     for level in levels.unique():
         here = (levels == level)[None]
         noise[here] = error[here & (known > 0)].abs().median() / 0.6745
-    answer = method._answer  # the way past the estimate, to tell a noise of each pixel
+    answer = method._answer  # the way past the estimate, to give a noise of each pixel
     try:
         method._answer = lambda rgb, inverse, _, progress: answer(rgb, inverse, noise, progress)  # type: ignore[method-assign]
-        told = method.surface(sample).depth
+        hinted = method.surface(sample).depth
     finally:
         method._answer = answer  # type: ignore[method-assign]
     sample = DepthSample("confidence", "depth", scene.rgb, holes, scene.camera, camera_lr, scale)
-    return {"not used": plain, "holes": method.surface(sample).depth, "noise told": told}
+    return {"not used": plain, "holes": method.surface(sample).depth, "noise given": hinted}
 
 
 def main() -> None:

@@ -4,7 +4,7 @@
 
 Every frame of ``DIR``, or each of some rendered ones, is stored in each encoding as the mistakes of ``tests/mistakes``
 are, and read as the command reads it, without any option but the camera. *Read rightly* means that unit and range type
-are, *refused* that one line asks for what cannot be told, *silent* that one of the two is wrong, and nothing is said.
+are, *refused* that a line asks for what cannot be decided, *silent* that one of the two is wrong, and no line says so.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ and 8 with noise and holes as sensors have them, and rendered scenes, at 1/1, 1/
 made of them: the photo is mirrored, turned (by 90 degrees, and resized to what it was), taken from another scene, or
 photo and depth are cropped on opposite sides by 10 to 25 % of the size, so that they are shifted. Each goes through
 what ``dsr upsample`` does with a picture. Edges exist in a right pair, and what remains of it after the crop, if its
-:class:`dsr.geometry.agreement.Verdict` is ``telling``, which depends on its edges and not on how they agree. The
+:class:`dsr.geometry.agreement.Verdict` is ``conclusive``, which depends on its edges and not on how they agree. The
 thresholds were chosen on Middlebury and every other rendered scene; the rest is reported separately. Lists of 12
 pairs, in the same and in another order, follow.
 """
@@ -95,7 +95,7 @@ class Outcome(NamedTuple):
     code: str
     margin: float
     significance: float
-    telling: bool
+    conclusive: bool
 
 
 def degraded(dataset: str, scene: Scene, scales: tuple[int, ...]) -> Iterator[Right]:
@@ -192,7 +192,7 @@ def rendered(job: tuple[int, Path | None]) -> list[Right]:
 
 
 def examine(rgb: Tensor, depth: Tensor, *, right: bool = False) -> Outcome:
-    """Return what ``dsr upsample`` finds; in a wrong pair its displacement only where nothing else is told."""
+    """Return what ``dsr upsample`` finds; in a wrong pair its displacement only where nothing else is detected."""
     verdict = judge(depth[0].numpy(), rgb)
     if verdict is not None and not right and (verdict.turned or verdict.apart or verdict.other):
         code = verdict.statement
@@ -201,8 +201,8 @@ def examine(rgb: Tensor, depth: Tensor, *, right: bool = False) -> Outcome:
         picture = Picture(rgb, depth, camera, Encoding(".npy", "float32", 1.0, np.nan, "orthogonal"), ())
         code = "".join(note.code for note in align(picture, register=False).assumptions)
     if verdict is None:
-        return Outcome(code, -99.0, 99.0, telling=False)
-    return Outcome(code, verdict.margin, verdict.as_given.significance, telling=verdict.telling)
+        return Outcome(code, -99.0, 99.0, conclusive=False)
+    return Outcome(code, verdict.margin, verdict.as_given.significance, conclusive=verdict.conclusive)
 
 
 def outcomes(job: tuple[Right, Tensor]) -> dict[str, Outcome]:
@@ -216,8 +216,8 @@ def outcomes(job: tuple[Right, Tensor]) -> dict[str, Outcome]:
     found["other"] = examine(_resized(other, pair.rgb.shape[1:]), pair.depth)
     found["shifted"] = examine(*_cropped(pair, shifted=True))
     as_right = judge(_cropped(pair, shifted=False)[1][0].numpy(), _cropped(pair, shifted=False)[0])
-    telling = as_right is not None and as_right.telling
-    found["shifted"] = found["shifted"]._replace(telling=found[""].telling and telling)
+    conclusive = as_right is not None and as_right.conclusive
+    found["shifted"] = found["shifted"]._replace(conclusive=found[""].conclusive and conclusive)
     return found
 
 
@@ -300,28 +300,28 @@ def table(pairs: list[Right], results: list[dict[str, Outcome]]) -> Iterator[str
     for name, group in groups.items():
         alarms = [result[""].code for _, result in group if result[""].code]
         beside = alarms.count("edges-beside")
-        telling = [result for _, result in group if result[""].telling]
-        told = [
-            f"{sum(bool(result[kind].code) for result in telling)} of {len(telling)}" if telling else ""
+        conclusive = [result for _, result in group if result[""].conclusive]
+        detected = [
+            f"{sum(bool(result[kind].code) for result in conclusive)} of {len(conclusive)}" if conclusive else ""
             for kind in KINDS
         ]
         cry = f"{len(alarms) - beside}" + (f" (+ {beside} shifted)" if beside else "")
-        yield f"| {name} | {len(group)} | {cry} | {len(telling)} | " + " | ".join(told) + " |"
+        yield f"| {name} | {len(group)} | {cry} | {len(conclusive)} | " + " | ".join(detected) + " |"
 
 
 def curves(pairs: list[Right], results: list[dict[str, Outcome]]) -> dict[str, list[tuple[float, float, float]]]:
-    """Return threshold, share of right pairs with a false alarm, share of wrong ones told where edges exist."""
+    """Return threshold, share of right pairs with a false alarm, share of wrong ones detected where edges exist."""
     own = [result for pair, result in zip(pairs, results, strict=True) if not pair.developed]
-    telling = [result for result in own if result[""].telling]
+    conclusive = [result for result in own if result[""].conclusive]
     found: dict[str, list[tuple[float, float, float]]] = {"photo-turned": [], "photo-other": []}
     for threshold in np.arange(0, 12.1, 0.5):
         false = np.mean([result[""].margin >= threshold for result in own])
-        told = np.mean([result[kind].margin >= threshold for result in telling for kind in TURNS])
-        found["photo-turned"].append((threshold, false, told))
+        detected = np.mean([result[kind].margin >= threshold for result in conclusive for kind in TURNS])
+        found["photo-turned"].append((threshold, false, detected))
     for threshold in np.arange(-1, 6.1, 0.25):
-        false = np.mean([result[""].telling and result[""].significance < threshold for result in own])
-        told = np.mean([result["other"].significance < threshold for result in telling])
-        found["photo-other"].append((threshold, false, told))
+        false = np.mean([result[""].conclusive and result[""].significance < threshold for result in own])
+        detected = np.mean([result["other"].significance < threshold for result in conclusive])
+        found["photo-other"].append((threshold, false, detected))
     return found
 
 
@@ -334,11 +334,13 @@ def draw(found: dict[str, list[tuple[float, float, float]]], path: Path) -> None
     FigureCanvasAgg(figure)
     axes = figure.subplots()
     for code, points in found.items():
-        _, false, told = np.array(points).T
-        axes.plot(100 * false, 100 * told, ".-", label=code)
+        _, false, detected = np.array(points).T
+        axes.plot(100 * false, 100 * detected, ".-", label=code)
         at = min(points, key=lambda point: abs(point[0] - LIMITS[code].threshold))
         axes.plot(100 * at[1], 100 * at[2], "ko", markersize=8, fillstyle="none")
-    axes.set(xlim=(-0.1, 6), ylim=(60, 100.5), xlabel="right pairs with a false alarm, %", ylabel="wrong pairs told, %")
+    axes.set(
+        xlim=(-0.1, 6), ylim=(60, 100.5), xlabel="right pairs with a false alarm, %", ylabel="wrong pairs detected, %"
+    )
     axes.legend(loc="lower right")
     axes.grid(alpha=0.3)
     figure.savefig(path, dpi=90)
@@ -373,8 +375,8 @@ def main() -> None:
               lists(pairs, developed=developed))  # fmt: skip
     found = curves(pairs, results)
     for code, points in found.items():
-        print(f"\n| `{code}` from | false alarms | told |\n| --- | --- | --- |")
-        print("\n".join(f"| {threshold:g} | {false:.1%} | {told:.1%} |" for threshold, false, told in points))
+        print(f"\n| `{code}` from | false alarms | detected |\n| --- | --- | --- |")
+        print("\n".join(f"| {threshold:g} | {false:.1%} | {detected:.1%} |" for threshold, false, detected in points))
     if arguments.picture is not None:
         draw(found, arguments.picture)
 

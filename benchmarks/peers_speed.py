@@ -98,7 +98,7 @@ def dornet(checkouts: Path) -> tuple[nn.Module, Callable[[nn.Module, Tensor, Ten
 
 AUTHORS = {"pgsr": pgsr, "dctnet": dctnet, "dornet": dornet, "fdkn": fdkn, "svlrm": svlrm}
 NEEDED = {"dctnet": "kornia", "dornet": "mmcv"}
-"""Libraries that the authors' networks need, and that dsr does without."""
+"""Libraries that the authors' networks need, and that dsr does not."""
 
 
 def scene(size: int) -> tuple[Tensor, Tensor]:

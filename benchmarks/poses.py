@@ -1,4 +1,4 @@
-"""Whether poses that are read wrongly are told: by the camera's motion and by what is wrong, and false alarms.
+"""Whether poses that are read wrongly are noticed: by the camera's motion and by what is wrong, and false alarms.
 
     python benchmarks/poses.py [--scenes 20] [--size 160] [--right] [--sequence FOLDER]
 
@@ -185,7 +185,7 @@ def recordings(arguments: argparse.Namespace) -> Iterator[tuple[str, Recording]]
 
 
 def outcome(recording: Recording, groups: Sequence[Sequence[int]], maps: dict[int, np.ndarray], wrong: str) -> str:
-    """Return what is told of poses that are wrong in a way."""
+    """Return what is said of poses that are wrong in a way."""
     change = WRONG[wrong]
     found = find_fault(
         compare(
@@ -221,7 +221,7 @@ def main() -> None:
             found = outcome(recording, groups, maps, wrong)
             counts.setdefault(kind, {}).setdefault(wrong, Counter())[found] += 1
         seconds = max(seconds, (time.perf_counter() - started) / len(measured))
-    print("told rightly / that they disagree / wrongly / silent")
+    print("named rightly / that they disagree / wrongly / silent")
     print(f"| poses | {' | '.join(counts)} |")
     print("| --- |" + " --- |" * len(counts))
     for wrong in measured:

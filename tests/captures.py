@@ -359,8 +359,8 @@ def sens(path, *, colour="jpeg", depth="zlib", scale=1000.0, lost=(), start=1_00
             rgb = cv2.imencode(f".{colour}", photo(number)[..., ::-1])[1].tobytes()
         stored = np.round(scale * globals()["depth"](number)).astype("<u2").tobytes()
         stored = zlib.compress(stored) if depth == "zlib" else stored
-        told = struct.pack("<4Q", start + step * number, 8, len(rgb), len(stored))
-        parts += [matrix.astype("<f4").tobytes(), told, rgb, stored]
+        reported = struct.pack("<4Q", start + step * number, 8, len(rgb), len(stored))
+        parts += [matrix.astype("<f4").tobytes(), reported, rgb, stored]
     parts.append(struct.pack("<Q", 0))  # of the inertial sensor
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(b"".join(parts))
@@ -423,9 +423,9 @@ def scanner_app(folder, name="{:05}".format):
     folder.mkdir(parents=True, exist_ok=True)
     for number in range(FRAMES + 1):
         stem = name(number)
-        told = {"intrinsics": [fx + number, 0, cx, 0, fy, cy, 0, 0, 1], "time": 1.5, "frame_index": number}
-        told["cameraPoseARFrame"] = (pose(number) @ FLIP).ravel().tolist()
-        (folder / f"frame_{stem}.json").write_text(json.dumps(told))
+        reported = {"intrinsics": [fx + number, 0, cx, 0, fy, cy, 0, 0, 1], "time": 1.5, "frame_index": number}
+        reported["cameraPoseARFrame"] = (pose(number) @ FLIP).ravel().tolist()
+        (folder / f"frame_{stem}.json").write_text(json.dumps(reported))
         save(folder / f"depth_{stem}.png", millimetres(number))
         save(folder / f"conf_{stem}.png", levels())
         if number < FRAMES:
@@ -585,7 +585,7 @@ def depth_message(kind, **values):
     return struct.pack(">II", len(unit) + 4, len(unit)) + unit
 
 
-def heic(path, levels, message=None, text="", orientation=1, told=None):
+def heic(path, levels, message=None, text="", orientation=1, reported=None):
     """Write a HEIC photo with a depth map as iPhones do: a file of two pictures, the second of which is made auxiliary.
 
     Args:
@@ -593,7 +593,7 @@ def heic(path, levels, message=None, text="", orientation=1, told=None):
         message: of the map; None for disparity from 0.5 to 2.
         text: XMP of the map.
         orientation: EXIF orientation, by which readers of HEIC turn both.
-        told: what the EXIF data say in its place, which readers of HEIC leave alone.
+        reported: what the EXIF data say in its place, which readers of HEIC leave alone.
 
     """
     import pillow_heif  # noqa: PLC0415 - an extra
@@ -607,9 +607,9 @@ def heic(path, levels, message=None, text="", orientation=1, told=None):
     path.parent.mkdir(parents=True, exist_ok=True)
     file.save(path, quality=-1, chroma=444, exif=exif.tobytes())
     content = path.read_bytes()
-    if told is not None:
+    if reported is not None:
         entry = struct.pack(">HHI", 0x0112, 3, 1)
-        content = content.replace(entry + struct.pack(">H", orientation), entry + struct.pack(">H", told))
+        content = content.replace(entry + struct.pack(">H", orientation), entry + struct.pack(">H", reported))
 
     def box(kind, *parts):
         body = b"".join(parts)

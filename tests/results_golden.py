@@ -102,7 +102,7 @@ def upsampling() -> Iterator[tuple[str, Job]]:
     for method in ("facets", "msg_v"):
         yield f"{method} repeated", _repeated(method)
     for scale in (2, 4, 8, 16):
-        yield f"facets told x{scale}", _told(scale)
+        yield f"facets told x{scale}", _hinted(scale)
     for size in (1.15, 1.35, 1.5):
         yield f"nearly own size {size}", _of_size(round(64 / size))
 
@@ -128,7 +128,7 @@ def _repeated(method: str) -> Job:
     return lambda: dsr.upsample(_photo(), large, _camera(), method=method, device="cpu")
 
 
-def _told(scale: int) -> Job:
+def _hinted(scale: int) -> Job:
     """Return what facets makes of block means that it knows to be some."""
 
     def run() -> Tensor:

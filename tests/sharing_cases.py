@@ -64,7 +64,7 @@ class Logged(Method):
         return sample.depth_lr.repeat_interleave(SCALE, 1).repeat_interleave(SCALE, 2)
 
 
-class Told(Progress):
+class Recorded(Progress):
     """Remembers the lines of text."""
 
     def __init__(self):
@@ -125,17 +125,17 @@ def test_stale_prediction_ends_the_work_of_all_workers(tmp_path):
 
 
 def test_scene_of_a_killed_worker_is_done_by_another(tmp_path):
-    marker, told = tmp_path / "killed", Told()
+    marker, reported = tmp_path / "killed", Recorded()
 
     def before(scene):
         if scene == "scene3" and not marker.exists():
             marker.touch()
             os.kill(os.getpid(), signal.SIGKILL)
 
-    outcome = evaluate(study_of(tmp_path / "log", before), tmp_path / "killed_run", TWO, told)
+    outcome = evaluate(study_of(tmp_path / "log", before), tmp_path / "killed_run", TWO, reported)
     evaluate(study_of(tmp_path / "calm.log"), tmp_path / "calm", ALONE)
     assert (outcome.made, outcome.failures) == (SCENES, {})
-    assert told.lines == ["scene3: the worker was ended before it had a result; another one begins it again"]
+    assert reported.lines == ["scene3: the worker was ended before it had a result; another one begins it again"]
     scores = [(tmp_path / name / "scores.csv").read_bytes() for name in ("killed_run", "calm")]
     assert scores[0] == scores[1]
     counts = [scene for scene, _ in calls(tmp_path / "log")]
@@ -207,10 +207,10 @@ def test_worker_that_stops_at_a_signal_ends_without_a_word_and_another_begins_ag
             raise KeyboardInterrupt("saved")
         return item.upper()
 
-    told = Told()
-    with Pool(1, work, lambda item: "lost", told.say) as pool:
+    reported = Recorded()
+    with Pool(1, work, lambda item: "lost", reported.say) as pool:
         assert list(pool.results(["a"])) == [("a", "A")]
-    assert told.lines == ["a: the worker was ended before it had a result; another one begins it again"]
+    assert reported.lines == ["a: the worker was ended before it had a result; another one begins it again"]
     assert capfd.readouterr().err == ""
 
 
@@ -249,12 +249,12 @@ def draw(_, number):
 
 def test_part_of_a_report_whose_worker_is_killed_is_drawn_by_another(tmp_path):
     items = [None, *((number, tmp_path / "killed") for number in range(6))]
-    told = Told()
-    with WorkerPool(object(), 2, told.say) as work:
+    reported = Recorded()
+    with WorkerPool(object(), 2, reported.say) as work:
         values, others = work.map(draw, items), work.map(draw, items[::-1])
         assert list(others) == [5, 4, 3, 2, 1, 0, None]
         assert list(values) == [None, 0, 1, 2, 3, 4, 5]
-    [line] = told.lines
+    [line] = reported.lines
     assert line == "a part of the report: the worker was ended before it had a result; another one begins it again"
 
 

@@ -54,7 +54,7 @@ def write_result(folder, depth=None, *, camera=CAMERA, with_input=True, with_err
         "input_size": [width // 4, height // 4],
         "camera": asdict(camera),
         "noise": {"deviation": 0.0021, "extent": 2.0},
-        "assumptions": ["whole numbers are taken for millimetres (median 2.1 m)"],
+        "assumptions": ["whole numbers are read as millimetres (median 2.1 m)"],
         **info,
     }
     (folder / "info.json").write_text(json.dumps(entries))

@@ -277,12 +277,12 @@ LIMITS: dict[str, Limit] = {
     ),
     "far-millimetres.5": Limit(
         0.5,
-        "metres, of the median of multiples of 5 in 1/5000 m, below which they are not taken for it",
+        "metres, of the median of multiples of 5 in 1/5000 m, below which they are not read as such",
         "the nearest median of 110 maps of sensors and data sets is 0.6 m",
     ),
     "far-millimetres.10": Limit(
         0.3,
-        "metres, of the median of multiples of 10 in 0.1 mm, below which they are not taken for it",
+        "metres, of the median of multiples of 10 in 0.1 mm, below which they are not read as such",
         "half of the nearest median of 110 maps of sensors and data sets, 0.6 m",
     ),
 }

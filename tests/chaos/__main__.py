@@ -80,15 +80,15 @@ class Session:
             counts.update(["kills", hit.strike.number.name, hit.place, *twice])
             self.tally.ready = max(self.tally.ready, hit.ready)
             problems = [*(f"{hit.strike}, {hit.place}: {line}" for line in hit.problems), *problems]
-        told = "; ".join(f"{hit.strike} {hit.place}" for hit in hits) or "no strike met it"
-        self._conclude(case.name, case.scenario.name, told, problems)
+        reported = "; ".join(f"{hit.strike} {hit.place}" for hit in hits) or "no strike met it"
+        self._conclude(case.name, case.scenario.name, reported, problems)
 
     def fill(self, case: disks.DiskCase) -> None:
         """Run a case of a full disk."""
         problems = disks.run_case(self.campaign, case)
         self.tally.counts[case.scenario.name].update(["disk"])
-        told = "> /dev/full" if case.fraction is None else f"{case.fraction:.0%} of the space"
-        self._conclude(case.name, case.scenario.name, told, problems)
+        reported = "> /dev/full" if case.fraction is None else f"{case.fraction:.0%} of the space"
+        self._conclude(case.name, case.scenario.name, reported, problems)
 
     def pair(self, case: together.PairCase) -> None:
         """Run two commands at once."""
@@ -96,13 +96,13 @@ class Session:
         self.tally.counts[case.scenario.name].update(["pair"])
         self._conclude(case.name, case.scenario.name, f"the second after {case.delay:.2f}", problems)
 
-    def _conclude(self, name: str, scenario: str, told: str, problems: list[str]) -> None:
+    def _conclude(self, name: str, scenario: str, reported: str, problems: list[str]) -> None:
         """Print a line, and keep what is not clean."""
         left = ""
         if name.startswith("kill") and self.tally.kills:
             left = f", about {self.seconds * (self.options.kills / self.tally.kills - 1) / 60:.0f} min of kills left"
         verdict = "UNCLEAN" if problems else "clean"
-        print(f"[{self.seconds / 60:5.1f} min{left}] {name} {scenario}: {told}: {verdict}", flush=True)
+        print(f"[{self.seconds / 60:5.1f} min{left}] {name} {scenario}: {reported}: {verdict}", flush=True)
         for line in problems:
             print(f"    {line}", flush=True)
         if problems:

@@ -85,7 +85,7 @@ def judge(read: Callable[[Place], Any], place: Place, refusals: tuple[type[BaseE
     with (
         _captured() as printed,
         watching(place.input, place.out) as watch,
-        warnings.catch_warnings(record=True) as told,
+        warnings.catch_warnings(record=True) as reported,
     ):
         warnings.simplefilter("default")
         try:
@@ -105,7 +105,7 @@ def judge(read: Callable[[Place], Any], place: Place, refusals: tuple[type[BaseE
     seconds, megabytes = time.process_time() - started, _end_memory(before)
     problems += [f"does what a reader must not: {each}" for each in watch.seen[:3]]
     problems += [f"leaves {name!r} beside its folders" for name in place.strangers()]
-    problems += [f"warns: {each.message!s:.200}" for each in told if not issubclass(each.category, _SILENT)][:2]
+    problems += [f"warns: {each.message!s:.200}" for each in reported if not issubclass(each.category, _SILENT)][:2]
     problems += [f"prints {printed[0]:.200}"] if printed else []
     problems += [f"takes {megabytes:.0f} MB"] if megabytes > MEGABYTES else []
     for line in lines:

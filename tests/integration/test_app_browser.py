@@ -289,7 +289,7 @@ REVEAL = """() => {
   for (const part of [".refused", ".read", ".downloads", ".frames"]) find(part).hidden = false;
   find(".refused").textContent = "x";
   for (const className of ["warning", ""]) {
-    find(".told-notes").append(Object.assign(document.createElement("li"), { className, textContent: "x" }));
+    find(".job-notes").append(Object.assign(document.createElement("li"), { className, textContent: "x" }));
   }
 }"""
 FAINT = """() => {
@@ -334,7 +334,7 @@ def test_real_pairs_of_a_phone_and_of_a_depth_camera(page, shared, photo, depth,
     page.select_option("#method", "bicubic")
     computed(page)
     assert size in page.inner_text(".facts")
-    assert page.locator(".told-notes li").count() > 0
+    assert page.locator(".job-notes li").count() > 0
     seen = panels(page)
     assert middle(seen["after"]).mean() > 30
     assert seen["after"].std() > 5

@@ -187,12 +187,12 @@ def test_pair_becomes_what_the_command_makes_of_it(client, pair, tmp_path):
 
 def test_notes_and_warnings_are_those_of_the_command(client, pair, capsys, tmp_path):
     place = client.upload(**pair)
-    told = client.run(place, choices={**QUICK, "unit": "1/100000"})["notes"]
+    reported = client.run(place, choices={**QUICK, "unit": "1/100000"})["notes"]
     command = ["upsample", "--rgb", str(pair["photo"]), "--depth", str(pair["depth"]), "--method", "bicubic"]
     assert main([*command, "--depth-unit", "1/100000", "--only", "depth,input", "-o", str(tmp_path / "out")]) == 0
     printed = capsys.readouterr().out
-    assert any(note["warning"] for note in told)
-    for note in told:
+    assert any(note["warning"] for note in reported)
+    for note in reported:
         assert f"  {'warning: ' if note['warning'] else ''}{note['note']}" in printed.splitlines()
 
 
@@ -210,7 +210,7 @@ def test_frame_of_a_capture_is_chosen(client, tmp_path):
     assert f"focal length {captures.INTRINSICS[0] + 2:.0f} pixels" in facts["camera as read"]
 
 
-def test_frames_of_long_names_are_told_and_what_cannot_be_read_is_a_failure(client, tmp_path, monkeypatch):
+def test_frames_of_long_names_are_reported_and_what_cannot_be_read_is_a_failure(client, tmp_path, monkeypatch):
     with zipfile.ZipFile(tmp_path / "many.zip", "w") as packed:
         for number in range(1500):
             for kind, suffix, content in (("rgb", "jpg", b"x"), ("depth", "png", b"x")):

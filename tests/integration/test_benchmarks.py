@@ -93,7 +93,7 @@ def test_flatness_is_the_published_one(shared: Path) -> None:
     assert filtered.startswith("| bilateral filter of OpenCV | 15.8 |")
 
 
-def test_benchmark_of_poses_counts_what_is_told() -> None:
+def test_benchmark_of_poses_counts_what_is_noticed() -> None:
     lines = run_benchmark("poses.py", "--scenes", "1", "--size", "48", "--right").splitlines()
     (row,) = [line for line in lines if line.startswith("| right |")]
     assert re.fullmatch(r"\| right( \| \d / \d / \d / \d){7} \|", row)

@@ -209,14 +209,14 @@ def test_step_longer_than_the_grace_is_saved_at_ctrl_c_and_no_checkpoint_named_t
     arguments = ("method=dip_v", scenes, f"workers={workers}", "output_dir=out")
     done = run_python(str(tmp_path / "slow.py"), *QUICK, *arguments, cwd=tmp_path)
     assert done.returncode == 128 + numbers[0], done.stderr
-    *told, line = done.stderr.splitlines()
+    *reported, line = done.stderr.splitlines()
     assert line.startswith(end)
     saved = [torch.load(path, weights_only=True)["global_step"] for path in (tmp_path / "out").rglob("last.ckpt")]
     if numbers == (signal.SIGINT,):
-        assert told == ["stopping after this step (Ctrl-C again stops at once)"]
+        assert reported == ["stopping after this step (Ctrl-C again stops at once)"]
         assert 3 in saved
     else:
-        assert (told, saved) == ([], [])
+        assert (reported, saved) == ([], [])
 
 
 def test_oracle_is_named_in_scores_and_table(tmp_path: Path, run: Run) -> None:

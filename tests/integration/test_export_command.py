@@ -79,14 +79,14 @@ def test_frames_without_poses_are_refused_before_anything_is_computed(
     assert not (tmp_path / "out").exists()
 
 
-def test_single_frame_without_a_pose_is_told_to_give_no_scene(capture, tmp_path, capsys):
+def test_single_frame_without_a_pose_is_reported_to_give_no_scene(capture, tmp_path, capsys):
     files = ("--rgb", capture / "rgb" / f"{FRAMES[0]}.png", "--depth", capture / "depth" / f"{FRAMES[0]}.png")
     assert upsample(*files, "--only", "gaussian", "--dry-run", "-o", tmp_path / "o") == 0
     said = capsys.readouterr().out.splitlines()
     assert said[0].startswith("--with gaussian: the frame has no pose: images, depths")
 
 
-def test_result_that_a_link_leads_elsewhere_is_told_and_not_taken_for_one_without_a_pose(capture, tmp_path, capsys):
+def test_result_that_a_link_leads_elsewhere_is_reported_and_not_read_as_one_without_a_pose(capture, tmp_path, capsys):
     out, other = tmp_path / "out", tmp_path / "other"
     assert upsample(capture, "--only", "depth,rgbd", "-o", out) == 0
     set_poses(out)

@@ -73,7 +73,7 @@ def eventful(config):
 eventful.__module__ = "__main__"  # is sent to the jobs' processes as it is
 
 
-def expect_told(lines, *, killed):
+def expect_reported(lines, *, killed):
     assert lines[0] == "error: 2 of 4 jobs failed", lines
     assert lines[1] == "error: seed=1: seed: not this one"
     assert lines[2].startswith(f"error: seed=2: ended without a result ({killed}); what it finished is kept; see ")
@@ -84,7 +84,7 @@ def expect_told(lines, *, killed):
 def test_jobs_of_submitit_come_back_when_one_is_killed_and_one_requeued(sweep, tmp_path):
     code, lines = sweep(eventful, range(4), *LOCAL)
     assert code == 2
-    expect_told(lines, killed="FINISHED")
+    expect_reported(lines, killed="FINISHED")
     assert (tmp_path / "begun-3").read_text() == "begun\n" * 2
 
 
@@ -104,7 +104,9 @@ def one_node_slurm(shared, monkeypatch, tmp_path_factory):
         monkeypatch.setenv("SLURM_CONF", began.stdout.strip())
         yield
         drain = 'for i in $(seq 150); do [ -n "$(squeue -h -t R,CG)" ] || break; sleep 0.2; done'
-        subprocess.run(["bash", "-c", drain], check=True, timeout=60)  # else its end is told to the next test's Slurm
+        subprocess.run(
+            ["bash", "-c", drain], check=True, timeout=60
+        )  # else its end is reported to the next test's Slurm
     finally:
         subprocess.run(["bash", script, "stop", folder], check=True, timeout=60)
 
@@ -122,7 +124,7 @@ def test_jobs_of_slurm_come_back_when_one_is_killed_and_one_requeued(sweep, tmp_
         finally:
             process.kill()
     assert code == 2
-    expect_told(lines, killed="FAILED")
+    expect_reported(lines, killed="FAILED")
     assert (tmp_path / "begun-3").read_text() == "begun\n" * 2
 
 

@@ -37,12 +37,12 @@ class Constant(Method):
         return torch.full(size, float(sample.depth_lr.nanmean()) + self.offset, dtype=sample.depth_lr.dtype)
 
 
-class Told(Constant):
-    """Says what it was told of the maps."""
+class Hinted(Constant):
+    """Prints the hints on the maps."""
 
     def __init__(self, kernel: str | None = None, edges: str = "auto", clean: bool = False) -> None:
         super().__init__()
-        print(f"told {kernel} {edges} {clean}")
+        print(f"hints {kernel} {edges} {clean}")
 
 
 class Shifted(DisparityNetwork):
@@ -65,8 +65,8 @@ FILES = {
     "conf/method/constant.yaml": (
         "# @package _global_\nlabel: Constant\nmethod:\n  _target_: outside.Constant\n  offset: 0.0\n"
     ),
-    "conf/method/told.yaml": (
-        "# @package _global_\nlabel: Told\nmethod:\n  _target_: outside.Told\n  kernel: null\n  edges: auto\n"
+    "conf/method/hinted.yaml": (
+        "# @package _global_\nlabel: Hinted\nmethod:\n  _target_: outside.Hinted\n  kernel: null\n  edges: auto\n"
     ),
     "conf/model/shifted.yaml": (
         "net:\n  _target_: outside.Shifted\n  scale: ${scale}\n"
@@ -140,7 +140,7 @@ def test_changed_code_of_a_method_from_outside_makes_another_run(home):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "reported"),
     [
         (
             ("-m", "downsampling=box,bicubic", "noise=none,gaussian_multiplicative",
@@ -150,11 +150,11 @@ def test_changed_code_of_a_method_from_outside_makes_another_run(home):
         (("method.edges=soft", "method.kernel=nearest", "output_dir=runs/said"), ["nearest soft True"]),
     ],
 )  # fmt: skip
-def test_methods_are_told_what_is_known_of_the_maps(home, arguments, told):
-    done = evaluate(home, "method=told", *arguments)
+def test_methods_get_what_is_known_of_the_maps(home, arguments, reported):
+    done = evaluate(home, "method=hinted", *arguments)
     assert (done.returncode, done.stderr) == (0, "")
-    lines = [line.removeprefix("told ") for line in done.stdout.splitlines() if line.startswith("told ")]
-    assert lines == (2 * told if "-m" in arguments else told)  # a multirun checks its jobs first
+    lines = [line.removeprefix("hints ") for line in done.stdout.splitlines() if line.startswith("hints ")]
+    assert lines == (2 * reported if "-m" in arguments else reported)  # a multirun checks its jobs first
 
 
 def test_upsample_runs_a_method_from_outside_with_settings(home):

@@ -182,13 +182,13 @@ def with_truth(run: Path, change: Callable[[torch.Tensor], torch.Tensor]) -> Non
         replace(sample, depth=change(sample.depth)).save(path)
 
 
-def test_different_truths_are_told_and_have_tables_of_their_own(
+def test_different_truths_are_reported_and_have_tables_of_their_own(
     apart: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["report", str(apart), "-o", str(tmp_path / "report"), "--only", "tables,page"]) == 0
-    told = " ".join(capsys.readouterr().out.split())
-    assert told.count("warning: simgeo x4: the runs have different ground truths") == 1
-    assert "left out" not in told
+    reported = " ".join(capsys.readouterr().out.split())
+    assert reported.count("warning: simgeo x4: the runs have different ground truths") == 1
+    assert "left out" not in reported
     report = tmp_path / "report"
     (warning,) = json.loads((report / "report.json").read_text())["warnings"]
     assert (warning["code"], warning["value"]) == ("truths-differ", 2)

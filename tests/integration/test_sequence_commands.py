@@ -390,12 +390,12 @@ def in_millimetres(matrix):
 @pytest.mark.parametrize(
     ("change", "name"), [(np.linalg.inv, "from world to camera"), (in_millimetres, "in millimetres")]
 )
-def test_poses_that_are_read_wrongly_are_told_once_and_in_every_info(walked, capsys, change, name):
+def test_poses_that_are_read_wrongly_are_reported_once_and_in_every_info(walked, capsys, change, name):
     out = walked.parent / "out"
     assert upsample(walked, *poses_of(walked, change), *DEPTH_ONLY, "-o", out) == 0
-    told = " ".join(capsys.readouterr().out.split())
-    assert told.count("warning: the poses are probably") == 1
-    assert re.search(rf"the poses are probably {name} \(as given, .* \d+% .* \d+%\)", told)
+    reported = " ".join(capsys.readouterr().out.split())
+    assert reported.count("warning: the poses are probably") == 1
+    assert re.search(rf"the poses are probably {name} \(as given, .* \d+% .* \d+%\)", reported)
     for number in range(6):
         (warning,) = info(out / f"{number:03}")["warnings"]
         assert warning["code"] == "poses"
@@ -451,7 +451,7 @@ def test_neighbours_that_agree_are_counted_without_the_frame_itself(walked, caps
     assert (warning["code"], warning["value"]) == ("neighbours-disagree", 0.0)
 
 
-def test_frames_without_a_pose_are_told_and_strict_refuses_them(walked, capsys):
+def test_frames_without_a_pose_are_reported_and_strict_refuses_them(walked, capsys):
     def write(*numbers):
         rows = [(*each[:3, 3], *Rotation.from_matrix(each[:3, :3]).as_quat()) for each in walk(6)]
         lines = [f"{number} " + " ".join(map(str, rows[number % 6])) for number in numbers]
@@ -460,9 +460,9 @@ def test_frames_without_a_pose_are_told_and_strict_refuses_them(walked, capsys):
     command = (walked, "--poses", walked.parent / "poses.txt", *DEPTH_ONLY)
     write(0, 1, 2, 3)
     assert upsample(*command, "-o", walked.parent / "fewer") == 0
-    told = " ".join(capsys.readouterr().out.split())
-    assert "poses.txt: 4 poses for 6 frames" in told
-    assert told.count("warning: poses.txt has no pose of this frame (2 of 6 frames have none)") == 1
+    reported = " ".join(capsys.readouterr().out.split())
+    assert "poses.txt: 4 poses for 6 frames" in reported
+    assert reported.count("warning: poses.txt has no pose of this frame (2 of 6 frames have none)") == 1
     found = {number: [each["code"] for each in info(walked.parent / "fewer" / f"{number:03}")["warnings"]]
              for number in range(6)}  # fmt: skip
     assert found == {0: [], 1: [], 2: [], 3: [], 4: ["poses-missing"], 5: ["poses-missing"]}
@@ -470,9 +470,9 @@ def test_frames_without_a_pose_are_told_and_strict_refuses_them(walked, capsys):
     assert "4 done, 2 failed" in " ".join(capsys.readouterr().out.split())
     write(*range(8))
     assert upsample(*command, "-o", walked.parent / "more") == 0
-    told = capsys.readouterr().out
-    assert "8 poses for 6 frames" in " ".join(told.split())
-    assert "warning" not in told
+    reported = capsys.readouterr().out
+    assert "8 poses for 6 frames" in " ".join(reported.split())
+    assert "warning" not in reported
     write(100, 101)
     assert "expected a pose for each of the 6 frames" in error_of(capsys, upsample(*command, "-o", walked.parent / "x"))
 
@@ -492,7 +492,7 @@ def test_columns_in_place_of_rows_are_named(walked, capsys):
     assert "are rows and columns exchanged?" in error_of(capsys, upsample(*command))
 
 
-def test_fuse_tells_wrong_poses_and_strict_refuses_them(walked, capsys):
+def test_fuse_reports_wrong_poses_and_strict_refuses_them(walked, capsys):
     out, mesh = walked.parent / "out", walked.parent / "mesh.ply"
     fuse = ["fuse", str(out), "-o", str(mesh), "--voxel", "0.05"]
     assert upsample(walked, *poses_of(walked, np.array), *DEPTH_ONLY, "-o", out) == 0

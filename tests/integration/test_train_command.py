@@ -844,14 +844,14 @@ def test_error_of_the_training_itself_is_not_one_of_the_checkpoint(tmp_path, wit
     (tmp_path / "act").write_text("{}['of mine']")
     with pytest.raises(KeyError, match="of mine"):
         within("resume=out", "trust=own_errors.Own")
-    for line, told in (
+    for line, reported in (
         ("torch.empty(1 << 60)", "error: not enough memory; "),
         ("[each.data.fill_(torch.nan) for each in trainer.model.parameters()]", "error: out: the training diverged at"),
     ):
         (tmp_path / "act").write_text(line)
         code, _, errors = within("resume=out", "trust=own_errors.Own")
         assert code == 2
-        assert errors[-1].startswith(told)
+        assert errors[-1].startswith(reported)
 
 
 LINKS = {

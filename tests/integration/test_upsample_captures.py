@@ -39,11 +39,14 @@ def test_capture_of_a_phone_has_nothing_left_to_assume(tmp_path, capsys):
     assert "assumed" not in said
     assert "taken for" not in said
     for number in range(FRAMES):
-        told = info(out / f"{number:06}")
-        np.testing.assert_allclose(told["pose"], captures.pose(number), atol=1e-6)
-        assert [told["camera"][name] for name in ("fx", "fy", "cx", "cy")] == [INTRINSICS[0] + number, *INTRINSICS[1:]]
-        assert told["input_depth"]["unit"] == 0.001
-        assert (told["inputs"]["rgb"]["file"], told["inputs"]["rgb"]["frame"]) == ("rgb.mp4", number)
+        reported = info(out / f"{number:06}")
+        np.testing.assert_allclose(reported["pose"], captures.pose(number), atol=1e-6)
+        assert [reported["camera"][name] for name in ("fx", "fy", "cx", "cy")] == [
+            INTRINSICS[0] + number,
+            *INTRINSICS[1:],
+        ]
+        assert reported["input_depth"]["unit"] == 0.001
+        assert (reported["inputs"]["rgb"]["file"], reported["inputs"]["rgb"]["frame"]) == ("rgb.mp4", number)
         assert (
             np.abs(read_depth_file(out / f"{number:06}" / "depth_metres.tiff") - captures.depth(number).mean()).max()
             < 0.3
@@ -55,12 +58,12 @@ def test_capture_of_a_phone_has_nothing_left_to_assume(tmp_path, capsys):
 def test_archive_of_record3d_is_given_as_a_file(tmp_path):
     out = tmp_path / "out"
     assert upsample(captures.record3d(tmp_path / "scan.r3d"), "-o", out, *DEPTH_ONLY, "--fill", "none") == 0
-    told = info(out / "000001")
-    assert told["inputs"]["depth"]["file"] == "scan.r3d/rgbd/1.depth"
-    assert told["depth_file"] == {
+    reported = info(out / "000001")
+    assert reported["inputs"]["depth"]["file"] == "scan.r3d/rgbd/1.depth"
+    assert reported["depth_file"] == {
         "suffix": ".tiff", "dtype": "float32", "unit": 1.0, "hole": "nan", "range_type": "orthogonal",
     }  # fmt: skip
-    np.testing.assert_allclose(told["pose"], captures.pose(1), atol=1e-6)
+    np.testing.assert_allclose(reported["pose"], captures.pose(1), atol=1e-6)
 
 
 def test_least_confidence_makes_holes_and_is_kept_with_the_settings(tmp_path, capsys):
@@ -70,9 +73,9 @@ def test_least_confidence_makes_holes_and_is_kept_with_the_settings(tmp_path, ca
     stored = np.asarray(Image.open(out / "1000" / "depth.png"))
     assert (stored[:, :8] == 0).all()
     assert (stored[:, 8:] > 0).all()
-    told = info(out / "1000")
-    assert told["settings"]["min_confidence"] == 0.5
-    assert set(told["inputs"]) == {"rgb", "depth", "confidence", "capture"}
+    reported = info(out / "1000")
+    assert reported["settings"]["min_confidence"] == 0.5
+    assert set(reported["inputs"]) == {"rgb", "depth", "confidence", "capture"}
 
 
 @pytest.fixture
@@ -149,8 +152,8 @@ def test_resumed_folder_of_millimetre_floats_keeps_its_unit(tmp_path, monkeypatc
         for place in (tmp_path / "whole", out):
             assert info(place / str(number))["input_depth"]["unit"] == 0.001
             np.testing.assert_allclose(read_depth_file(place / str(number) / "depth_metres.tiff"), metres, rtol=0.03)
-        told = [{**info(place / str(number)), "seconds": None} for place in (tmp_path / "whole", out)]
-        assert told[0] == told[1]
+        reported = [{**info(place / str(number)), "seconds": None} for place in (tmp_path / "whole", out)]
+        assert reported[0] == reported[1]
 
 
 def test_sun_rgbd_has_its_intrinsics_one_folder_up_and_turned_bits(tmp_path, capsys):
@@ -163,8 +166,12 @@ def test_sun_rgbd_has_its_intrinsics_one_folder_up_and_turned_bits(tmp_path, cap
     files = ("--rgb", scene / "image" / "a.jpg", "--depth", scene / "depth" / "b.png")
     assert upsample(*files, "-o", out, *DEPTH_ONLY, "--depth-unit", "sunrgbd", "--fill", "none") == 0
     assert "bits are turned back by 3, as SUN RGB-D turns them" in capsys.readouterr().out
-    told = info(out)
-    assert (told["camera"]["fx"], told["camera"]["cx"], told["settings"]["depth_unit"]) == (50, 31, "sunrgbd")
+    reported = info(out)
+    assert (reported["camera"]["fx"], reported["camera"]["cx"], reported["settings"]["depth_unit"]) == (
+        50,
+        31,
+        "sunrgbd",
+    )
     assert abs(read_depth_file(out / "depth_metres.tiff").mean() - millimetres.mean() / 1000) < 0.02
     np.save(scene / "depth.npy", captures.depth())
     assert "expected 16-bit values for --depth-unit sunrgbd, got float64" in refused(
@@ -182,8 +189,8 @@ def test_depth_text_of_icl_nuim_is_read_beside_a_bmp(tmp_path, capsys):
     said = capsys.readouterr().out
     assert "camera: that of ICL-NUIM" in said
     assert "distances along the rays in centimetres" in said
-    told = info(out / "scene_00_0000")
-    assert told["input_depth"]["range_type"] == "perspective"
+    reported = info(out / "scene_00_0000")
+    assert reported["input_depth"]["range_type"] == "perspective"
     np.testing.assert_allclose(read_depth_file(out / "scene_00_0000" / "depth_metres.tiff"), 2.5, rtol=1e-3)
     np.testing.assert_allclose(np.load(out / "scene_00_0000" / "depth.npy"), 250 * rays, rtol=1e-3)
     (tmp_path / "scene_00_0000.depth").write_text("1 2 3")
@@ -197,7 +204,7 @@ def test_broken_frame_of_a_capture_does_not_stop_the_others(tmp_path, capsys):
     path = folder / "keyframes" / "corrected_cameras" / "1001.json"
     path.write_text(json.dumps(captures.polycam_camera(1, fx=float("nan"))))
     assert upsample(folder, "-o", out, *DEPTH_ONLY) == 2
-    told = capsys.readouterr()
-    assert told.err == f"error: 1001: {path}: camera fx: expected a finite number, got nan\n"
-    assert f"{FRAMES} pictures: {FRAMES - 1} done, 1 failed" in told.out
+    reported = capsys.readouterr()
+    assert reported.err == f"error: 1001: {path}: camera fx: expected a finite number, got nan\n"
+    assert f"{FRAMES} pictures: {FRAMES - 1} done, 1 failed" in reported.out
     assert tuple(info(out / "1002")["photo_size"]) == SIZE[::-1]

@@ -72,22 +72,22 @@ def metres(folder):
 @pytest.mark.parametrize(
     ("values", "said"),
     [
-        (MILLIMETRES, "whole numbers are taken for millimetres"),
-        (MILLIMETRES * np.uint16(5), "whole numbers are taken for 1/5000 m: values are multiples of 5"),
+        (MILLIMETRES, "whole numbers are read as millimetres"),
+        (MILLIMETRES * np.uint16(5), "whole numbers are read as 1/5000 m: values are multiples of 5"),
         ((MILLIMETRES << 3) | (MILLIMETRES >> 13), "values are multiples of 8: bits are turned back by 3"),
-        (DEPTH.astype(np.float32), "floats are taken for metres"),
-        (DEPTH.astype(np.float32) * 1000, "floats this large are taken for millimetres"),
-        (MILLIMETRES.astype(np.float32), "floats this large are taken for millimetres"),
+        (DEPTH.astype(np.float32), "floats are read as metres"),
+        (DEPTH.astype(np.float32) * 1000, "floats this large are read as millimetres"),
+        (MILLIMETRES.astype(np.float32), "floats this large are read as millimetres"),
     ],
 )
-def test_what_values_tell_is_read_so_with_its_reason(tmp_path, capsys, values, said):
+def test_what_values_show_is_read_so_with_its_reason(tmp_path, capsys, values, said):
     codes, printed = warned(tmp_path, capsys, write(tmp_path, values))
     assert codes == []
     assert said in printed
     assert np.median(metres(tmp_path / "out")) == pytest.approx(np.median(DEPTH), rel=0.01)
 
 
-def test_told_units_are_overridden_by_the_option_that_the_line_names(tmp_path, capsys):
+def test_inferred_units_are_overridden_by_the_option_that_the_line_names(tmp_path, capsys):
     for number, values in enumerate((MILLIMETRES * np.uint16(5), (MILLIMETRES << 3) | (MILLIMETRES >> 13))):
         folder = tmp_path / str(number)
         folder.mkdir()
@@ -98,7 +98,7 @@ def test_told_units_are_overridden_by_the_option_that_the_line_names(tmp_path, c
         capsys.readouterr()
 
 
-def test_sizes_and_cameras_of_known_data_sets_tell_the_unit(tmp_path, capsys):
+def test_sizes_and_cameras_of_known_data_sets_give_the_unit(tmp_path, capsys):
     unrounded = np.round(cv2.resize(DEPTH, HD) * 5000).astype(np.uint16)
     intrinsics = ("--intrinsics", 481.2, 480, 319.5, 239.5)
     _, printed = warned(tmp_path, capsys, write(tmp_path, unrounded, HD), *intrinsics)
@@ -166,7 +166,7 @@ def test_an_option_answers_what_was_asked(tmp_path, capsys):
 def test_values_that_fall_with_distance_are_disparities_where_the_baseline_is_known(tmp_path, capsys):
     codes, printed = warned(tmp_path, capsys, write(tmp_path, DISPARITY), "--baseline", BASELINE)
     assert codes == []
-    assert "values are taken for disparities in pixels of the depth map: values fall with distance" in printed
+    assert "values are read as disparities in pixels of the depth map: values fall with distance" in printed
     assert np.median(metres(tmp_path / "out")) == pytest.approx(np.median(DEPTH), rel=0.02)
 
 
@@ -298,7 +298,7 @@ def test_result_of_other_checks_is_checked_again_where_no_warning_is_allowed(tmp
     assert "field of view" in refused(capsys, upsample(*files, "--strict"))
 
 
-def test_what_most_of_the_maps_of_a_folder_tell_applies_to_all_of_them(tmp_path, capsys):
+def test_what_most_of_the_maps_of_a_folder_show_applies_to_all_of_them(tmp_path, capsys):
     along_the_ray = DEPTH * SMALL.ray_lengths().numpy()
     wall = np.full_like(DEPTH, 3.0)  # flat however it is read: it tells nothing, and is read like the others
     for name, maps, expected in (

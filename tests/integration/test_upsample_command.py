@@ -75,7 +75,7 @@ def test_two_files_are_enough_and_all_assumptions_are_printed(pair, cube, tmp_pa
     said = capsys.readouterr().out
     for text in (
         "60 degrees of horizontal view assumed",
-        "whole numbers are taken for millimetres (median ",
+        "whole numbers are read as millimetres (median ",
         "zeros count as holes (2.3%)",
         "depth_metres.tiff is not rounded",
     ):
@@ -87,30 +87,30 @@ def test_two_files_are_enough_and_all_assumptions_are_printed(pair, cube, tmp_pa
     stored = np.asarray(Image.open(out / "depth.png"))
     assert stored.dtype == np.uint16
     np.testing.assert_array_equal(stored, np.round(metres.astype(float) * 1000))
-    told = info(out)
-    assert (told["complete"], told["scale"], told["method"], told["settings"]["method"]) == (
+    reported = info(out)
+    assert (reported["complete"], reported["scale"], reported["method"], reported["settings"]["method"]) == (
         True,
         4,
         "facets",
         "facets",
     )
-    assert told["depth_file"] == {
+    assert reported["depth_file"] == {
         "suffix": ".png",
         "dtype": "uint16",
         "unit": 0.001,
         "hole": 0,
         "range_type": "orthogonal",
     }
-    assert told["photo_size"] == [64, 64]
-    assert Camera(**told["camera"]).fx == pytest.approx(32 / np.tan(np.pi / 6))
+    assert reported["photo_size"] == [64, 64]
+    assert Camera(**reported["camera"]).fx == pytest.approx(32 / np.tan(np.pi / 6))
     assert "noise of the depth map (about " in said
-    assert 0 <= told["noise"]["deviation"] < 0.02
-    assert told["noise"]["extent"] >= 1
+    assert 0 <= reported["noise"]["deviation"] < 0.02
+    assert reported["noise"]["extent"] >= 1
     errors = np.load(out / "confidence.npz")
     assert {name: (each.shape, bool((each > 0).all())) for name, each in errors.items()} == {
         "depth_error": ((64, 64), True), "angle_error": ((64, 64), True),
     }  # fmt: skip
-    assert told["files"] == [name for names in PARTS.values() for name in names]
+    assert reported["files"] == [name for names in PARTS.values() for name in names]
 
 
 def test_expected_errors_are_estimated_for_methods_that_say_none(pair, tmp_path, capsys):
@@ -148,25 +148,25 @@ def test_wide_holes_stay_holes_and_it_is_said(pair, tmp_path, capsys):
 def test_noise_of_an_earlier_run_is_kept_where_parts_are_added(pair, tmp_path, capsys):
     out = tmp_path / "out"
     assert of(pair, out, "--only", "depth,confidence") == 0
-    told = info(out)["noise"]
-    assert told["deviation"] > 0
+    reported = info(out)["noise"]
+    assert reported["deviation"] > 0
     capsys.readouterr()
     assert of(pair, out, "--only", "depth,confidence,mesh") == 0
     assert "noise of the depth map" not in capsys.readouterr().out  # nothing is computed again
     assert (out / "mesh.glb").is_file()
-    assert info(out)["noise"] == told
+    assert info(out)["noise"] == reported
 
 
 def test_outliers_are_holes_and_it_is_said(pair, tmp_path, capsys):
     clean, out = tmp_path / "clean", tmp_path / "out"
     assert of(pair, clean, *DEPTH_ONLY) == 0
-    assert "taken for holes" not in capsys.readouterr().out
+    assert "treated as holes" not in capsys.readouterr().out
     values = pair[2].copy()
     values[10, 9], values[3, 12] = 25, 64000  # mm
     Image.fromarray(values).save(pair[1])
     assert of(pair, out, *DEPTH_ONLY) == 0
     said = capsys.readouterr().out
-    assert said.count("taken for holes") == 1
+    assert said.count("treated as holes") == 1
     assert "pixels: 2, patches: 2" in said
     counted = {"pixels": 2, "patches": 2}
     assert (info(clean)["outliers"], info(out)["outliers"]) == ({"pixels": 0, "patches": 0}, counted)
@@ -250,7 +250,7 @@ def test_other_format_is_in_metres_or_whole_millimetres(pair, tmp_path):
     assert np.median(read_depth_file(out / "depth_metres.tiff")) > 10
 
 
-def test_what_was_measured_and_what_was_filled_is_told_apart(pair, tmp_path, capsys):
+def test_what_was_measured_and_what_was_filled_is_distinguished(pair, tmp_path, capsys):
     assert of(pair, tmp_path / "out", *BICUBIC, "--only", "depth,filled,cloud") == 0
     said = capsys.readouterr().out
     filled = np.asarray(Image.open(tmp_path / "out" / "filled.png"))
@@ -398,21 +398,21 @@ def test_broken_picture_does_not_stop_the_others(pair, tmp_path, capsys):
     (frames / "rgb" / "000007.png").touch()
     out = tmp_path / "out"
     code = upsample(frames, "-o", out, *DEPTH_ONLY)
-    told = capsys.readouterr()
+    reported = capsys.readouterr()
     assert code == 2
-    assert told.err == (
+    assert reported.err == (
         f"error: 000001: {frames}/depth/000001.png: expected a picture, got a damaged or foreign file of 60 bytes\n"
     )
     assert (
         "3 pairs of photo and depth map\n  folders rgb and depth\n  1 without a partner, left out: 000007.png"
-        in told.out
+        in reported.out
     )
     for name in ("000000", "000002"):
-        [line] = [line for line in told.out.splitlines() if name in line]
+        [line] = [line for line in reported.out.splitlines() if name in line]
         assert line.startswith(f"{name}: ")
         assert line.endswith(f" -> {out / name}")
-    assert told.out.count("degrees of horizontal view assumed") == 1
-    assert re.search(rf"3 pictures: 2 done, 1 failed in 0:00:\d\d, \d+ kB -> {re.escape(str(out))}", told.out)
+    assert reported.out.count("degrees of horizontal view assumed") == 1
+    assert re.search(rf"3 pictures: 2 done, 1 failed in 0:00:\d\d, \d+ kB -> {re.escape(str(out))}", reported.out)
     assert files_in(out) == {
         f"{name}/{file}" for name in ("000000", "000002") for file in ("depth.png", "depth_metres.tiff", "info.json")
     }
@@ -425,12 +425,12 @@ def test_published_scenes_are_read_with_their_cameras(shared, tmp_path, capsys):
     assert upsample(shared / "scenes", "-o", tmp_path / "out", "--dry-run") == 0
     said = capsys.readouterr().out
     assert "3 pairs of photo and depth map\n  camera: camera.json beside the pictures\n" in said
-    assert "taken for disparities, by the file's name" in said
+    assert "read as disparities, by the file's name" in said
     assert said.endswith(f"3 pictures: 3 to do -> {tmp_path / 'out'}\n")
     assert not (tmp_path / "out").exists()
 
 
-def test_sensor_is_told_from_the_depth_values_and_must_not_contradict_them(tmp_path, capsys):
+def test_sensor_is_recognised_by_the_depth_values_and_must_not_contradict_them(tmp_path, capsys):
     v, u = np.mgrid[:240, :320]
     waves = cv2.GaussianBlur(np.random.default_rng(0).standard_normal(v.shape), (0, 0), 2.7)
     counts = np.round(1024 * (0.15 + 0.85 * (0.7 * u / 320 + 0.3 * v / 240) + 0.004 * waves / waves.std()))
@@ -556,7 +556,7 @@ def test_enlarged_depth_gives_as_good_a_result(pair, tmp_path, capsys):
     np.testing.assert_array_equal(small, large)
 
 
-def test_noise_is_estimated_and_may_be_told(cube, tmp_path, capsys):
+def test_noise_is_estimated_and_may_be_given(cube, tmp_path, capsys):
     coarse = cube.depth.reshape(16, 4, 16, 4).mean((1, 3))
     noise = np.random.default_rng(0).normal(size=coarse.shape)
     np.save(tmp_path / "noisy.npy", coarse * (1 + 0.01 * noise))
@@ -689,7 +689,7 @@ def test_parts_that_are_added_later_are_those_of_a_single_run(vga, tmp_path):
         assert (tmp_path / name).read_bytes() == (first / name).read_bytes(), name
 
 
-def test_record_still_tells_of_the_parts_that_stay_when_one_is_added(pair, tmp_path):
+def test_record_still_lists_the_parts_that_stay_when_one_is_added(pair, tmp_path):
     out = tmp_path / "out"
     assert of(pair, out, *BICUBIC, "--max-error", "1") == 0
     before = info(out)

@@ -1,4 +1,4 @@
-"""Photos and depth maps that do not belong together are told by ``dsr upsample``, and right ones are not."""
+"""Photos and depth maps that do not belong together get a warning of ``dsr upsample``, and right ones do not."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def upsample(options, out: Path, *more):
     return main(["upsample", *options, "-o", str(out), "--method", "bicubic", "--only", "depth", *more])
 
 
-def told(out: Path):
+def reported(out: Path):
     """Return the warnings of a result by code."""
     found = json.loads((out / "info.json").read_text())["warnings"]
     assert all(each["threshold"] == LIMITS[each["code"]].threshold for each in found)
@@ -70,58 +70,58 @@ def expect_refused(options, out: Path, capsys):
 
 @pytest.mark.parametrize("turn", TURNS)
 @pytest.mark.parametrize("number", [0, 3])
-def test_mirrored_and_turned_photos_are_told(rendered, number, turn, tmp_path, capsys):
+def test_mirrored_and_turned_photos_are_reported(rendered, number, turn, tmp_path, capsys):
     photo, depth = rendered[number]
     options = write(tmp_path / "in", [(TURNS[turn](photo), depth)])
     assert upsample(options, tmp_path / "out") == 0
     said = capsys.readouterr().out
-    warning = told(tmp_path / "out")["photo-turned"]
+    warning = reported(tmp_path / "out")["photo-turned"]
     assert f"warning: {warning['message']}" in said
     assert warning["value"] >= warning["threshold"]
     expect_refused(options, tmp_path / "strict", capsys)
 
 
 @pytest.mark.parametrize("number", range(len(SCENES)))
-def test_photo_of_another_scene_is_told(rendered, number, tmp_path, capsys):
+def test_photo_of_another_scene_is_reported(rendered, number, tmp_path, capsys):
     photo, depth = rendered[number - 1][0], rendered[number][1]
     options = write(tmp_path / "in", [(photo, depth)])
     assert upsample(options, tmp_path / "out") == 0
-    [warning] = told(tmp_path / "out").values()
+    [warning] = reported(tmp_path / "out").values()
     assert warning["code"] == "photo-other"
     assert warning["value"] < warning["threshold"]
     expect_refused(options, tmp_path / "strict", capsys)
 
 
 @pytest.mark.parametrize(("axis", "pixels"), [(1, 32), (0, 24), (1, 8)])
-def test_photo_beside_its_depth_map_is_told_with_the_pixels_of_the_photo(rendered, axis, pixels, tmp_path, capsys):
+def test_photo_beside_its_depth_map_is_reported_with_the_pixels_of_the_photo(rendered, axis, pixels, tmp_path, capsys):
     photo, depth = rendered[3]
     moved = photo[:, pixels:] if axis else photo[pixels:]
     options = write(tmp_path / "in", [(moved, depth[:, : -pixels // 2] if axis else depth[: -pixels // 2])])
     assert upsample(options, tmp_path / "out") == 0
-    warning = told(tmp_path / "out")["edges-beside"]
+    warning = reported(tmp_path / "out")["edges-beside"]
     assert warning["value"] == pytest.approx(pixels, rel=0.15)
     assert warning["value"] >= warning["threshold"]
     expect_refused(options, tmp_path / "strict", capsys)
 
 
-def test_lists_in_another_order_are_told_once_before_the_work(rendered, tmp_path, capsys):
+def test_lists_in_another_order_are_reported_once_before_the_work(rendered, tmp_path, capsys):
     photos, depths = zip(*rendered, strict=True)
     options = write(tmp_path / "in", zip(photos[1:] + photos[:1], depths, strict=True))
     assert upsample(options, tmp_path / "out") == 0
     said = capsys.readouterr().out
     for number in range(len(rendered)):
-        warning = told(tmp_path / "out" / f"{number:02}_photo")["photo-order"]
+        warning = reported(tmp_path / "out" / f"{number:02}_photo")["photo-order"]
         assert warning["value"] == 4
         assert said.count(warning["message"]) == 1
     expect_refused(options, tmp_path / "strict", capsys)
     assert upsample(options, tmp_path / "block", "--shard", "2/2") == 0  # of which no frame fits another
-    assert told(tmp_path / "block" / "03_photo")["photo-order"]["value"] == 4
+    assert reported(tmp_path / "block" / "03_photo")["photo-order"]["value"] == 4
 
 
 def test_right_pairs_are_left_alone(rendered, tmp_path):
     options = write(tmp_path / "in", rendered)
     assert upsample(options, tmp_path / "out", "--strict") == 0
-    assert not any(told(path.parent) for path in (tmp_path / "out").rglob("info.json"))
+    assert not any(reported(path.parent) for path in (tmp_path / "out").rglob("info.json"))
 
 
 def test_near_duplicate_frames_are_left_alone_in_any_order(rendered, tmp_path):
@@ -142,7 +142,7 @@ def test_near_duplicate_frames_are_left_alone_in_any_order(rendered, tmp_path):
         assert upsample(options, tmp_path / f"out_{name}") == 0
         results = list((tmp_path / f"out_{name}").rglob("info.json"))
         assert len(results) == len(moved)
-        assert not any("photo-order" in told(path.parent) for path in results)
+        assert not any("photo-order" in reported(path.parent) for path in results)
 
 
 @pytest.mark.parametrize("case", ["flat wall", "noise on a wall", "photo without edges", "noise in the photo"])
@@ -160,7 +160,7 @@ def test_nothing_is_said_where_nothing_can_be_known(rendered, case, tmp_path):
         depth = depth[::4, ::4]
     options = write(tmp_path / "in", [(photo, depth), (photo, depth)])
     assert upsample(options, tmp_path / "out", "--strict") == 0
-    assert not any(told(path.parent) for path in (tmp_path / "out").rglob("info.json"))
+    assert not any(reported(path.parent) for path in (tmp_path / "out").rglob("info.json"))
 
 
 def test_damaged_frames_do_not_keep_the_others_from_being_compared(rendered, tmp_path, capsys):
@@ -169,7 +169,7 @@ def test_damaged_frames_do_not_keep_the_others_from_being_compared(rendered, tmp
     (tmp_path / "in" / "00_depth.png").write_bytes(b"no picture")
     assert upsample(options, tmp_path / "out") == 2
     assert "00_depth.png" in capsys.readouterr().err
-    values = [told(tmp_path / "out" / f"{number:02}_photo")["photo-order"]["value"] for number in (1, 2, 3)]
+    values = [reported(tmp_path / "out" / f"{number:02}_photo")["photo-order"]["value"] for number in (1, 2, 3)]
     assert values == [2, 2, 2]
     assert not (tmp_path / "out" / "00_photo").exists()
 
@@ -192,15 +192,15 @@ def test_real_sensors_frames_are_judged(shared, name, tmp_path, capsys):
         else photo[..., ::-1]
     )
     assert upsample(write(tmp_path / "right", [(photo, depth)]), tmp_path / "out") == 0
-    assert not {"photo-turned", "photo-other", "photo-order"} & set(told(tmp_path / "out"))
+    assert not {"photo-turned", "photo-other", "photo-order"} & set(reported(tmp_path / "out"))
     for turn in ("mirrored left to right", "turned by 180 degrees"):
         options = write(tmp_path / "wrong", [(TURNS[turn](photo), depth)])
         assert upsample(options, tmp_path / turn) == 0
-        assert "photo-turned" in told(tmp_path / turn)
+        assert "photo-turned" in reported(tmp_path / turn)
     expect_refused(options, tmp_path / "strict", capsys)
 
 
-def test_real_lists_in_another_order_are_told(shared, tmp_path):
+def test_real_lists_in_another_order_are_reported(shared, tmp_path):
     names = sorted(path.name.split("_")[0] for path in (shared / "modern/RGBDD/RGB").iterdir())[:14]
     photos = [str(shared / f"modern/RGBDD/RGB/{name}_RGB.jpg") for name in names]
     depths = [str(shared / f"modern/RGBDD/Depth/{name}_HR_gt.png") for name in names]
@@ -209,4 +209,4 @@ def test_real_lists_in_another_order_are_told(shared, tmp_path):
         options = ["--rgb", *order, "--depth", *depths, "--depth-unit", "mm"]
         assert upsample(options, out, "--shard", "1/14") == 0  # all are compared, one is worked on
         (info,) = out.rglob("info.json")
-        assert ("photo-order" in told(info.parent)) == (name != "right")
+        assert ("photo-order" in reported(info.parent)) == (name != "right")

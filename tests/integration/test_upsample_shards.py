@@ -106,12 +106,12 @@ def test_two_shards_at_once_give_one_folder(folder, tmp_path):
 def test_bad_shards_are_refused_in_one_line(folder, tmp_path, capsys):
     for shard in ("17/16", "0/16", "-1/2", "3", "1/0", "1/2/3", "a/b", "²/3"):
         assert upsample(folder, f"--shard={shard}", "-o", tmp_path / "out") == 2
-        (told,) = capsys.readouterr().err.strip().splitlines()
-        assert told == f"error: --shard: expected K/N with K from 1 to N, such as 3/16, got {shard!r}"
+        (reported,) = capsys.readouterr().err.strip().splitlines()
+        assert reported == f"error: --shard: expected K/N with K from 1 to N, such as 3/16, got {shard!r}"
     assert not (tmp_path / "out").exists()
 
 
-def test_warnings_of_a_shard_are_in_its_summary_and_told_again_once_it_is_complete(folder, tmp_path, capsys):
+def test_warnings_of_a_shard_are_in_its_summary_and_reported_again_once_it_is_complete(folder, tmp_path, capsys):
     options = (*FAST[:-2], "--fov", "4", "-o", tmp_path / "out")
     for _ in range(2):
         assert upsample(folder, "--shard", "2/2", *options) == 0

@@ -106,8 +106,8 @@ def test_several_workers_write_what_one_writes(folder, tmp_path, capsys):
         first, second = (tmp_path / run / name for run in ("one", "two"))
         assert (first / "depth.png").read_bytes() == (second / "depth.png").read_bytes()
         assert (first / "before_after.png").is_file() == (second / "before_after.png").is_file()
-        told, other = (json.loads((place / "info.json").read_text()) for place in (first, second))
-        assert {**told, "seconds": 0} == {**other, "seconds": 0}
+        reported, other = (json.loads((place / "info.json").read_text()) for place in (first, second))
+        assert {**reported, "seconds": 0} == {**other, "seconds": 0}
     assert main(["upsample", str(folder), "-o", str(tmp_path / "two"), *FAST]) == 2
     assert "4 complete already" in capsys.readouterr().out
 

@@ -141,12 +141,12 @@ def test_holes_and_what_lies_beside_the_photo_are_the_background(shown):
 def test_number_of_triangles_is_that_of_dsrs_mesh(shown):
     depth = torch.from_numpy(waves())[None].double()
     doubtful = torch.from_numpy(errors()) > 0.02 * depth
-    told = lambda: shown.page.locator(".told").inner_text()  # noqa: E731
+    reported = lambda: shown.page.locator(".amounts").inner_text()  # noqa: E731
     count = lambda depth: f"{len(triangulate(depth, CAMERA).faces):,} triangles"  # noqa: E731
     certain = count(depth.masked_fill(doubtful, torch.nan))
-    assert f"After: 4,096 vertices (64 \u00d7 64, 4.7 % holes), {certain}" in told()
+    assert f"After: 4,096 vertices (64 \u00d7 64, 4.7 % holes), {certain}" in reported()
     shown.page.locator(".doubtful input").check()
-    assert count(depth) in told()
+    assert count(depth) in reported()
     assert count(depth) != certain
 
 
@@ -234,7 +234,7 @@ def at_row(picture):
     return picture[picture.shape[0] // 3]
 
 
-def test_back_of_the_surface_is_told_from_its_front(shown):
+def test_back_of_the_surface_is_distinguished_from_its_front(shown):
     shown.press("3", "p")
     shown.page.locator("#stage").focus()
     back = shown.press(*["ArrowRight"] * 36).seen()  # by 180 degrees
@@ -281,7 +281,7 @@ def test_results_are_chosen_by_list_strip_and_keys_and_names_are_text(window, pa
     page.wait_for_selector(".stage[data-shown='1']")
     assert page.locator(".sides").is_hidden()
     assert page.locator("[data-colour=depth]").is_hidden()
-    assert "After: 4,096 vertices (64 \u00d7 64)" in page.locator(".told").inner_text()
+    assert "After: 4,096 vertices (64 \u00d7 64)" in page.locator(".amounts").inner_text()
     assert page.url.endswith("#b")
     shown.press(".")
     page.wait_for_selector(".stage[data-shown='0']")

@@ -188,7 +188,7 @@ def test_numbers_out_of_range_and_a_folder_that_is_not_there_are_refused(tmp_pat
     assert "none: expected the folder of a result of `dsr upsample`" in refused(capsys, view(tmp_path / "none"))
 
 
-def test_machine_without_browser_is_told_where_the_page_is(tmp_path, capsys, monkeypatch):
+def test_machine_without_browser_gets_a_line_where_the_page_is(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(webbrowser, "open", lambda _: False)
     assert view(write_result(tmp_path / "r")) == 0
     assert "there is no browser to open it with" in capsys.readouterr().out

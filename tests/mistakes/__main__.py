@@ -1,4 +1,4 @@
-"""Make mistakes with real frames, and count which are told; and make none, and count false alarms.
+"""Make mistakes with real frames, and count which are noticed; and make none, and count false alarms.
 
 ``make mistakes ARGS="--cases 500 --seed 0"``. Every case is a command, `dsr upsample` with the fastest method.
 With ``DSR_SHARED`` the frames are those of all data sets and sensors there, otherwise rendered ones.

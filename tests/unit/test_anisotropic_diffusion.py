@@ -138,11 +138,11 @@ def test_result_is_deterministic_and_independent_of_the_truth() -> None:
 
 
 def test_progress_ends_at_the_maximum_number_of_steps() -> None:
-    told: list[tuple[int, int]] = []
+    reported: list[tuple[int, int]] = []
     AnisotropicDiffusion(steps=120, tolerance=0.0)(
-        sample_of(*random_scene(8, 8)), lambda done, most: told.append((done, most))
+        sample_of(*random_scene(8, 8)), lambda done, most: reported.append((done, most))
     )
-    assert told == [(50, 120), (100, 120), (120, 120)]
+    assert reported == [(50, 120), (100, 120), (120, 120)]
 
 
 @pytest.mark.parametrize(

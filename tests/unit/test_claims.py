@@ -20,7 +20,7 @@ NAMES = list(map(str, range(40)))
 
 
 class Command:
-    """A process that takes part, and claims what it is asked for, until it is told to leave or is killed."""
+    """A process that takes part, and claims what it is asked for, until it is asked to leave or is killed."""
 
     def __init__(self, folder, host, settings=None, begin=None):
         self._here, there = FORK.Pipe()
@@ -286,7 +286,7 @@ def test_directory_that_was_made_for_claims_is_gone_with_them_unless_it_is_used(
     assert [path.name for path in (tmp_path / "new" / "run").iterdir()] == ["file"]
 
 
-def test_birth_tells_an_ended_process_even_before_it_is_collected():
+def test_birth_identifies_an_ended_process_even_before_it_is_collected():
     assert birth(os.getpid()) not in (None, "")
     with subprocess.Popen(["sleep", "60"]) as process:
         started = birth(process.pid)

@@ -261,7 +261,7 @@ def test_auto_is_the_device_of_the_environment(monkeypatch: pytest.MonkeyPatch, 
     assert pick_device("cpu") == CPU
 
 
-def test_unknown_device_of_the_environment_is_told_with_the_variable(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unknown_device_of_the_environment_is_reported_with_the_variable(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DSR_DEVICE", "abacus")
     with pytest.raises(ConfigError, match=r"^\$DSR_DEVICE: expected auto, .*, got 'abacus'"):
         pick_device("auto")

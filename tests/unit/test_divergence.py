@@ -104,17 +104,19 @@ def test_no_checkpoint_is_kept_of_a_step_in_doubt(tmp_path):
 def test_note_of_a_divergence_refuses_the_same_settings_and_no_others(tmp_path):
     torch.save({"global_step": 20}, tmp_path / "last.ckpt")
     error = DivergenceError("diverged at step 30: the loss is nan, at a learning rate of 2")
-    told = str(note_divergence(tmp_path, tmp_path / "last.ckpt", {"scale": 4, "trainer": {"steps": 40}}, error))
-    assert told.startswith(f"{tmp_path}: the training diverged at step 30: the loss is nan, at a learning rate of 2; ")
-    assert f"{tmp_path / 'last.ckpt'} of step 20 is kept; a lower model.optimizer.lr" in told
+    reported = str(note_divergence(tmp_path, tmp_path / "last.ckpt", {"scale": 4, "trainer": {"steps": 40}}, error))
+    assert reported.startswith(
+        f"{tmp_path}: the training diverged at step 30: the loss is nan, at a learning rate of 2; "
+    )
+    assert f"{tmp_path / 'last.ckpt'} of step 20 is kept; a lower model.optimizer.lr" in reported
     with pytest.raises(ConfigError, match=r"diverged at step 30: .*, and would again"):
         expect_no_divergence(tmp_path, {"scale": 4, "trainer": {"steps": 40}})
     expect_no_divergence(tmp_path, {"scale": 8, "trainer": {"steps": 40}})
 
 
 def test_divergence_without_a_checkpoint_says_so(tmp_path):
-    told = str(note_divergence(tmp_path, tmp_path / "last.ckpt", {}, DivergenceError("diverged")))
-    assert "it has no earlier checkpoint" in told
+    reported = str(note_divergence(tmp_path, tmp_path / "last.ckpt", {}, DivergenceError("diverged")))
+    assert "it has no earlier checkpoint" in reported
 
 
 @pytest.mark.parametrize("content", ["", "[]", "{", json.dumps({"what": 1})])

@@ -403,7 +403,7 @@ def test_cards_that_face_the_camera_are_not_an_enlarged_map(sound):
 # planes
 
 
-def test_distance_along_the_ray_is_told_from_orthogonal_depth(straight, sound):
+def test_distance_along_the_ray_is_distinguished_from_orthogonal_depth(straight, sound):
     rays = CAMERA.ray_lengths().numpy()
     for scene in (straight, sound):
         level, message, advice = only(changed(scene, lambda z: z * rays), "planes")

@@ -81,7 +81,7 @@ def server(monkeypatch, serve):
 
 
 class Watcher(Progress):
-    """Keeps what it is told; ``stop_at`` bytes of a transfer are an interruption."""
+    """Keeps what it gets; ``stop_at`` bytes of a transfer are an interruption."""
 
     def __init__(self, stop_at=None):
         self.lines, self.names, self.stop_at = [], [], stop_at

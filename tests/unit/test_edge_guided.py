@@ -136,9 +136,9 @@ def test_holes_are_kept_or_filled_and_their_surroundings_stay_a_plane(fill: bool
 def test_result_is_deterministic_and_its_progress_reported() -> None:
     sample = _sample(_step(96, 10.0)[0])
     method = EdgeGuided(iterations=30)
-    told: list[tuple[int, int]] = []
-    first = method(sample, lambda done, most: told.append((done, most)))
-    assert told[-1] == (60, 60)
+    reported: list[tuple[int, int]] = []
+    first = method(sample, lambda done, most: reported.append((done, most)))
+    assert reported[-1] == (60, 60)
     assert [entry["iteration"] for entry in method.history] == sorted({e["iteration"] for e in method.history})
     assert torch.equal(first, method(sample))
 

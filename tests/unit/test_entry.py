@@ -232,7 +232,7 @@ def test_check_of_a_job_sees_its_configuration_as_the_job_does(command):
 
 
 @pytest.mark.slow
-def test_jobs_that_fail_in_processes_of_a_launcher_are_told(command):
+def test_jobs_that_fail_in_processes_of_a_launcher_are_reported(command):
     def job(config):
         if config.scale == 4:
             raise ConfigError("scale: not this one")

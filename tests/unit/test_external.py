@@ -119,7 +119,7 @@ def test_line_passes_through_most_points() -> None:
     assert fit_line(x, 5 * x, shift=False) == pytest.approx((5, 0))
 
 
-def test_map_of_another_size_is_resized_only_when_told(sample: DepthSample, tmp_path: Path) -> None:
+def test_map_of_another_size_is_resized_only_when_asked(sample: DepthSample, tmp_path: Path) -> None:
     write(tmp_path, "hall.npy", truth(sample)[::2, ::2])
     with pytest.raises(ValueError, match=r"hall.npy: expected 32 x 48 pixels .* got 16 x 24; .*resize=nearest"):
         External(str(tmp_path))(sample)
@@ -129,7 +129,7 @@ def test_map_of_another_size_is_resized_only_when_told(sample: DepthSample, tmp_
     assert External(str(tmp_path), resize="bilinear")(sample).shape == (1, 32, 48)
 
 
-def test_names_follow_a_template_and_other_files_are_told(sample: DepthSample, tmp_path: Path) -> None:
+def test_names_follow_a_template_and_other_files_are_reported(sample: DepthSample, tmp_path: Path) -> None:
     (tmp_path / "set" / "x4").mkdir(parents=True)
     write(tmp_path, "set/x4/hall_pred.npy", truth(sample))
     write(tmp_path, "set/x4/cellar_pred.npy", truth(sample))
@@ -145,7 +145,7 @@ def test_names_follow_a_template_and_other_files_are_told(sample: DepthSample, t
     ("change", "settings", "message"),
     [
         (lambda z: z * 1000, {}, r"hall.npy: .* the median is .* another unit"),
-        (lambda z: 4 - z, {}, r"correlation is -.*disparity taken for depth"),
+        (lambda z: 4 - z, {}, r"correlation is -.*disparity read as depth"),
         (lambda z: -z, {}, r"hall.npy: expected at least one known pixel, .*negative"),
         (lambda z: z * np.nan, {}, r"hall.npy: expected at least one known pixel, got all holes"),
         (lambda z: z * np.inf, {}, r"hall.npy: expected at least one known pixel, got all holes"),
@@ -162,7 +162,7 @@ def test_map_that_cannot_be_right_is_refused_by_name(
         External(str(tmp_path), **settings)(sample)  # type: ignore[arg-type]
 
 
-def test_unlikely_map_is_taken_when_told(sample: DepthSample, tmp_path: Path) -> None:
+def test_unlikely_map_is_taken_when_asked(sample: DepthSample, tmp_path: Path) -> None:
     write(tmp_path, "hall.npy", 10 * truth(sample))
     torch.testing.assert_close(External(str(tmp_path), check=False)(sample), 10 * full(sample))
 

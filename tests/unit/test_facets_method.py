@@ -21,8 +21,8 @@ from dsr.methods.networks.weight_files import files_of_weights, save_network
 from dsr.sample import DepthSample
 
 
-class Told(nn.Module):
-    """A network that returns a plane, whatever it gets, and remembers what it was told."""
+class Recording(nn.Module):
+    """A network that returns a plane, whatever it gets, and remembers its hints."""
 
     def __init__(self, scale: int = 4) -> None:
         super().__init__()
@@ -38,7 +38,7 @@ class Told(nn.Module):
         return Answer(plane, torch.full_like(plane, 0.01), torch.full_like(plane, math.radians(3)))
 
 
-class Sure(Told):
+class Sure(Recording):
     """Expects next to no errors."""
 
     def answer(self, rgb: Tensor, disparity: Tensor, noise: Tensor | None, hints: Tensor, progress: object) -> Answer:
@@ -46,7 +46,7 @@ class Sure(Told):
         return replace(answer, spread=torch.full_like(answer.spread, 1e-5))
 
 
-class Reporting(Told):
+class Reporting(Recording):
     """Reports three steps."""
 
     def answer(self, rgb: Tensor, disparity: Tensor, noise: Tensor | None, hints: Tensor, progress: object) -> Answer:
@@ -77,7 +77,7 @@ def _sample(size_lr: tuple[int, int], ratio: float, error: Tensor | float = 0.0)
      ((6, 8), 16, 16)],
 )  # fmt: skip
 def test_photo_is_resized_to_the_next_factor_and_the_result_to_the_photo(size_lr, ratio, factor) -> None:
-    net, sample = Told(max(factor, 2)), _sample(size_lr, ratio)
+    net, sample = Recording(max(factor, 2)), _sample(size_lr, ratio)
     surface = AnyMap(net).surface(sample)  # type: ignore[arg-type]
     [(rgb, disparity, noise, hints)] = net.calls
     even = tuple(n + n % 2 if factor == 1 else n for n in size_lr)
@@ -101,17 +101,17 @@ def test_photo_is_resized_to_the_next_factor_and_the_result_to_the_photo(size_lr
 
 def test_noise_is_described_in_metres_and_low_resolution_pixels() -> None:
     draws = torch.randn((1, 60, 80), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    white = AnyMap(Told()).surface(_sample((60, 80), 4, 0.004 * draws)).noise  # type: ignore[arg-type]
+    white = AnyMap(Recording()).surface(_sample((60, 80), 4, 0.004 * draws)).noise  # type: ignore[arg-type]
     assert white.deviation == pytest.approx(0.004 / 0.55, rel=0.06)
     assert white.extent == pytest.approx(1, abs=0.2)
     wide = 5 * functional.avg_pool2d(draws[None], 5, stride=1, padding=2)[0]
-    alike = AnyMap(Told()).surface(_sample((60, 80), 4, 0.004 * wide)).noise  # type: ignore[arg-type]
+    alike = AnyMap(Recording()).surface(_sample((60, 80), 4, 0.004 * wide)).noise  # type: ignore[arg-type]
     assert alike.extent == pytest.approx(5, abs=1)
 
 
-def test_settings_are_told_to_the_network() -> None:
+def test_settings_are_given_to_the_network() -> None:
     sample = _sample((12, 16), 4)
-    net = Told()
+    net = Recording()
     AnyMap(net, noise=0.01, edges="soft", kernel="bicubic").surface(sample)  # type: ignore[arg-type]
     [(_, _, noise, hints)] = net.calls
     expected = torch.zeros(1, FACTS)
@@ -121,9 +121,9 @@ def test_settings_are_told_to_the_network() -> None:
 
 
 @pytest.mark.parametrize("smooth", [0.0, 2.0])
-def test_smooth_tells_more_or_less_noise_than_estimated(smooth: float) -> None:
+def test_smooth_gives_more_or_less_noise_than_estimated(smooth: float) -> None:
     draws = torch.randn((1, 24, 32), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    sample, net = _sample((24, 32), 4, 0.004 * draws), Told()
+    sample, net = _sample((24, 32), 4, 0.004 * draws), Recording()
     AnyMap(net, smooth=smooth).surface(sample)  # type: ignore[arg-type]
     [(_, _, first, _), (_, _, second, hints)] = net.calls
     assert first is None
@@ -133,7 +133,7 @@ def test_smooth_tells_more_or_less_noise_than_estimated(smooth: float) -> None:
 
 
 def test_smooth_scales_a_given_noise_without_another_pass() -> None:
-    net, sample = Told(), _sample((12, 16), 4)
+    net, sample = Recording(), _sample((12, 16), 4)
     AnyMap(net, noise=0.01, smooth=2).surface(sample)  # type: ignore[arg-type]
     [(_, _, noise, _)] = net.calls
     torch.testing.assert_close(noise, (0.02 * _plane(12, 16)).float())
@@ -146,7 +146,7 @@ def test_progress_of_two_passes_is_one() -> None:
 
 
 def test_what_lies_behind_infinity_is_a_hole() -> None:
-    net, sample = Told(), _sample((12, 16), 4)
+    net, sample = Recording(), _sample((12, 16), 4)
     negative = net.answer(torch.zeros(1, 3, 48, 64), torch.zeros(1, 1, 12, 16), None, torch.zeros(1, FACTS), None)
     negative.disparity[..., 3, 5] = -0.1
     net.answer = lambda *_: negative  # type: ignore[method-assign]
@@ -172,7 +172,7 @@ def test_method_is_built_from_a_file_and_values_are_checked(tmp_path: Path) -> N
 
 
 def test_clean_box_means_have_weights_of_their_own(tmp_path: Path) -> None:
-    """Only where everything is told that they were trained for."""
+    """Only where all hints are given that they were trained for."""
     nets = {}
     for number, name in enumerate(("facets_x2", "facets_x2_clean")):
         torch.manual_seed(number)
@@ -180,7 +180,7 @@ def test_clean_box_means_have_weights_of_their_own(tmp_path: Path) -> None:
     files = {name: tmp_path / f"{name}.safetensors" for name in nets}
     save_network(files["facets_x2_clean"], nets["facets_x2_clean"], "facets")
     save_network(files["facets_x2"], nets["facets_x2"], "facets", clean=files["facets_x2_clean"])
-    told: dict[str, Any] = {"kernel": "box", "edges": "sharp", "clean": True}
+    reported: dict[str, Any] = {"kernel": "box", "edges": "sharp", "clean": True}
 
     def used(**settings: Any) -> str:
         found = AnyMap(files["facets_x2"], **settings)._net.state_dict()
@@ -188,7 +188,7 @@ def test_clean_box_means_have_weights_of_their_own(tmp_path: Path) -> None:
             name for name, net in nets.items() if torch.equal(net.state_dict()["photo.weight"], found["photo.weight"])
         )
 
-    assert used(**told) == "facets_x2_clean"
+    assert used(**reported) == "facets_x2_clean"
     others = (
         {"kernel": "bicubic"},
         {"edges": "soft"},
@@ -197,11 +197,11 @@ def test_clean_box_means_have_weights_of_their_own(tmp_path: Path) -> None:
         {"noise": 0.001},
         {"smooth": 2.0},
     )
-    assert {used(**told | other) for other in others} == {"facets_x2"}
+    assert {used(**reported | other) for other in others} == {"facets_x2"}
     assert files_of_weights(files["facets_x2"]) == list(files.values())
     files["facets_x2_clean"].unlink()
     with pytest.raises(FileNotFoundError, match=r"expected facets_x2_clean\.safetensors beside it, for clean maps"):
-        AnyMap(files["facets_x2"], **told)
+        AnyMap(files["facets_x2"], **reported)
 
 
 def test_dubious_pixels_may_be_left_as_holes() -> None:

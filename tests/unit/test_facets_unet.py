@@ -106,10 +106,10 @@ def test_hints_and_noise_change_the_result() -> None:
     net = _net()
     nothing = net.answer(rgb, values).disparity
     facts = torch.zeros(1, FACTS)
-    assert torch.equal(net.answer(rgb, values, torch.full_like(values, 0.01), facts).disparity, nothing)  # not told
+    assert torch.equal(net.answer(rgb, values, torch.full_like(values, 0.01), facts).disparity, nothing)  # not given
     facts[0, 0] = 1
-    told = net.answer(rgb, values, None, facts).disparity
-    assert not torch.allclose(told, nothing, rtol=1e-6, atol=0)
+    reported = net.answer(rgb, values, None, facts).disparity
+    assert not torch.allclose(reported, nothing, rtol=1e-6, atol=0)
     facts[0, -1] = 1
     little, much = (net.answer(rgb, values, torch.full_like(values, level), facts).disparity for level in (1e-3, 1e-2))
     assert not torch.allclose(little, much, rtol=1e-6, atol=0)

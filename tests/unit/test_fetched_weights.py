@@ -69,7 +69,7 @@ def test_other_files_are_refused(mirror, stripped, capsys):
     ("more", "said"),
     [([], "no address of it is known"), (["--mirror", "http://127.0.0.1:9"], "no connection to 127.0.0.1:9")],
 )
-def test_offline_is_told_in_one_line(more, said, capsys):
+def test_offline_is_reported_in_one_line(more, said, capsys):
     assert main(["data", "get", "weights", *more]) == 2
     [line] = capsys.readouterr().err.splitlines()
     assert line.startswith(f"error: weights/{NAME}.safetensors: ")

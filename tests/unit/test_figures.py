@@ -69,12 +69,12 @@ def change(path, **arrays):
 
 def test_figures_are_written_as_pdf_and_png(tmp_path, results, monkeypatch):
     monkeypatch.setattr(canvas, "_DPI", 60)  # for speed
-    told = []
-    paths = Figures(tmp_path / "new", WorkerPool(results)).save(lambda *progress: told.append(progress))
+    reported = []
+    paths = Figures(tmp_path / "new", WorkerPool(results)).save(lambda *progress: reported.append(progress))
     names = ["renderings_simgeo_x4_box_1", "depth_simgeo_x4_box_1", "errors_simgeo_x4_box_1", "lights"]
     assert [path.name for path in paths] == [f"{name}.{kind}" for name in names for kind in ("pdf", "png")]
     assert sorted(tmp_path.joinpath("new").iterdir()) == sorted(paths)
-    assert told == [(number, 4, name) for number, name in enumerate(names)]
+    assert reported == [(number, 4, name) for number, name in enumerate(names)]
     pdf = paths[0].read_bytes()
     assert b"/CIDFontType2" in pdf  # TrueType, which keeps text selectable, and not outlines
     assert b"/Type3" not in pdf

@@ -31,7 +31,7 @@ MISSPELT = {
 
 
 @pytest.mark.parametrize("line", MISSPELT)
-def test_misspelt_words_are_told_with_the_one_that_is_meant(line, capsys, tmp_path, monkeypatch):
+def test_misspelt_words_are_reported_with_the_one_that_is_meant(line, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["dsr", *line.split()])
     try:
@@ -42,7 +42,7 @@ def test_misspelt_words_are_told_with_the_one_that_is_meant(line, capsys, tmp_pa
     assert (code, last.rpartition("did you mean ")[2]) == (2, f"{MISSPELT[line]}?")
 
 
-def test_words_like_none_are_told_without_a_guess(capsys):
+def test_words_like_none_are_reported_without_a_guess(capsys):
     with pytest.raises(SystemExit):
         main(["zzz"])
     assert "did you mean" not in capsys.readouterr().err

@@ -120,8 +120,8 @@ def write_text(folder, kind, names, points=True):
         quaternion, shift = entries(place)
         head = " ".join(f"{float(value):.17g}" for value in (*quaternion, *shift))
         columns, rows, _, seen = observations(place)
-        told = [f"{u:.17g} {v:.17g} {10 + k}" for u, v, k in zip(columns, rows, seen, strict=True)]
-        lines += [f"{place + 1} {head} 7 {name}", " ".join([*told, "1 2 -1"]) if points else ""]
+        reported = [f"{u:.17g} {v:.17g} {10 + k}" for u, v, k in zip(columns, rows, seen, strict=True)]
+        lines += [f"{place + 1} {head} 7 {name}", " ".join([*reported, "1 2 -1"]) if points else ""]
     (folder / "images.txt").write_text("\n".join(lines) + "\n")
     if points:
         text = "".join(f"{10 + k} {x:.17g} {y:.17g} {z:.17g} 1 2 3 0.5 1 2\n" for k, (x, y, z) in enumerate(cloud()))
@@ -290,10 +290,10 @@ def test_model_elsewhere_is_given_by_poses(folder, tmp_path, given, capsys):
     command = ("upsample", folder, "--poses", tmp_path / given, "--method", "bicubic", "--only", "nerfstudio")
     assert main([*map(str, command), "-o", str(tmp_path / "out")]) == 0
     assert "cameras and poses of COLMAP" in capsys.readouterr().out
-    told = json.loads((tmp_path / "out/001/info.json").read_text())
-    np.testing.assert_allclose(told["pose"], pose(1), atol=1e-9)
-    assert [told["camera"][name] for name in ("fx", "fy", "cx", "cy")] == [F, F + 1, CX - 0.5, CY - 0.5]
-    assert told["inputs"]["poses"]["file"] == "images.bin"
+    reported = json.loads((tmp_path / "out/001/info.json").read_text())
+    np.testing.assert_allclose(reported["pose"], pose(1), atol=1e-9)
+    assert [reported["camera"][name] for name in ("fx", "fy", "cx", "cy")] == [F, F + 1, CX - 0.5, CY - 0.5]
+    assert reported["inputs"]["poses"]["file"] == "images.bin"
     assert len(json.loads((tmp_path / "out/transforms.json").read_text())["frames"]) == FRAMES
 
 

@@ -89,8 +89,8 @@ def test_real_frames_have_the_planes_that_were_measured(shared):
     data = StereoBoard(str(folder))
     assert data.scenes() == ["8", "14", "19", "25", "31"]
     for name in data.scenes():
-        told, scene = facts["frames"][name], data.load(name)
-        assert (list(BOARDS[name].normal), BOARDS[name].distance) == (told["normal"], told["distance"])
+        reported, scene = facts["frames"][name], data.load(name)
+        assert (list(BOARDS[name].normal), BOARDS[name].distance) == (reported["normal"], reported["distance"])
         plane = torch.from_numpy(cv2.imread(str(folder / f"plane/{name}.png"), cv2.IMREAD_UNCHANGED) / 1e4)
         both = (plane > 0) & scene.depth[0].isfinite()
         assert int(both.sum()) >= int((plane > 0).sum()) - 1

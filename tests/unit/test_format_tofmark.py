@@ -1,4 +1,4 @@
-"""ToFMark: pictures whose scale the caller gives, .mat files whose variables are told, samples gathered in blocks."""
+"""ToFMark: pictures whose scale the caller gives, .mat files whose variables are found, samples gathered in blocks."""
 
 import struct
 
@@ -193,7 +193,7 @@ def test_truth_may_be_missing_and_holes_may_be_nan(tmp_path):
         ({"a": TRUTH, "b": SPARSE}, "a 22 x 40, b 22 x 40"),
         ({"intensity": GREY}, "intensity 22 x 40"),
         ({"intensity": GREY, "tof": SPARSE[:20]}, "tof 20 x 40"),
-        ({"intensity": GREY, "u": TRUTH, "v": TRUTH, "tof": SPARSE}, "not told among u, v"),
+        ({"intensity": GREY, "u": TRUTH, "v": TRUTH, "tof": SPARSE}, "it may be any of u, v"),
         ({"intensity": GREY, "tof": -SPARSE, "gt": -TRUTH}, "expected positive depth"),
         ({"intensity": GREY * np.nan, "gt": TRUTH}, "expected an image"),
         ({"intensity": GREY * 1e9, "gt": TRUTH}, "expected an image"),

@@ -139,7 +139,7 @@ def test_aliases_of_a_few_values_are_read(tmp_path):
     assert read_recipe("good", directories=[tmp_path]).at(4)["second"] == [1, 2]
 
 
-def test_wrong_value_in_the_file_of_a_method_is_told_with_the_method(tmp_path):
+def test_wrong_value_in_the_file_of_a_method_is_reported_with_the_method(tmp_path):
     (tmp_path / "method").mkdir()
     (tmp_path / "method" / "mine.yaml").write_text("defaults: [tgv]\nname: mine\nsharpness: sharp\n")
     with pytest.raises(ValueError, match=r"^method=mine: sharpness: expected a number.*, got 'sharp'$"):

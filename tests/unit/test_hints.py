@@ -18,10 +18,10 @@ def _plane(height: int, width: int) -> Tensor:
 
 def test_each_fact_has_a_place_of_its_own() -> None:
     assert not bool(encode_facts().any())
-    told = [encode_facts(kernel) for kernel in KERNELS]
-    told += [encode_facts(soft=soft) for soft in (False, True)] + [encode_facts(noise=True)]
-    assert torch.equal(torch.stack(told), torch.eye(FACTS))
-    assert torch.equal(encode_facts("bicubic", soft=True, noise=True), told[3] + told[6] + told[7])
+    reported = [encode_facts(kernel) for kernel in KERNELS]
+    reported += [encode_facts(soft=soft) for soft in (False, True)] + [encode_facts(noise=True)]
+    assert torch.equal(torch.stack(reported), torch.eye(FACTS))
+    assert torch.equal(encode_facts("bicubic", soft=True, noise=True), reported[3] + reported[6] + reported[7])
     with pytest.raises(ValueError, match=r"kernel: expected one of box, nearest, .*, got sinc"):
         encode_facts("sinc")
 

@@ -97,11 +97,11 @@ def test_step_that_ctrl_c_has_met_is_done_however_long_it_takes(tmp_path: Path) 
         "    READY\n"
         "    until = time.monotonic() + 2\n"
         "    while time.monotonic() < until: pass\n"
-        "    interruption.stop('saved' if noted.requested else 'not told')"
+        "    interruption.stop('saved' if noted.requested else 'not reported')"
     )
-    told = "stopping after this step (Ctrl-C again stops at once)\n"
+    reported = "stopping after this step (Ctrl-C again stops at once)\n"
     script = script_of(step)
-    assert run(tmp_path, script, signal.SIGINT)[:2] == (130, f"{told}saved\n")
+    assert run(tmp_path, script, signal.SIGINT)[:2] == (130, f"{reported}saved\n")
     code, errors, seconds = run(tmp_path, script.replace("+ 2", "+ 60"), signal.SIGINT, signal.SIGINT)
     assert (code, errors) == (130, "late\n")
     assert seconds < 5

@@ -59,13 +59,13 @@ def test_camera_file_of_the_photo_is_used_silently(tmp_path, name, content):
 def test_matrix_of_sun_rgbd_or_scannet_is_in_photo_pixels(tmp_path, text):
     camera, assumptions = found(tmp_path, file=written(tmp_path, "intrinsics.txt", text))
     assert camera == Camera(**OWN)
-    assert assumptions == ["camera: the matrix is taken for one of the photo's pixels"]
+    assert assumptions == ["camera: the matrix is read in pixels of the photo"]
 
 
 def test_matrix_in_depth_map_pixels_is_recognised_and_scaled(tmp_path):
     camera, assumptions = found(tmp_path, file=written(tmp_path, "k.txt", "15 0 7.5 0 15 5.5 0 0 1"))
     assert camera == Camera(64, 48, 60, 60, 31.5, 23.5)
-    assert "depth map's pixels" in assumptions[0]
+    assert "pixels of the depth map" in assumptions[0]
     assert "16 x 12 pixels is scaled to the photo's 64 x 48" in assumptions[1]
 
 
@@ -144,7 +144,7 @@ def test_exif_rotation_is_applied_only_where_depth_fits_it_alone(tmp_path, orien
     plain = np.asarray(Image.open(path).convert("RGB")).astype(int)
     as_stored, assumptions = read_photo(path, COARSE)
     assert np.abs(as_stored - plain).max() <= 2
-    assert "left out" in assumptions[0].text
+    assert "ignored" in assumptions[0].text
     upright, assumptions = read_photo(path, COARSE[::-1])
     if orientation < 5:
         assert upright.shape == (48, 64, 3)

@@ -1,4 +1,4 @@
-"""What stored values mean: units told from medians, holes, range types, and back to the file."""
+"""What stored values mean: units from medians, holes, range types, and back to the file."""
 
 import math
 
@@ -10,15 +10,15 @@ from dsr.geometry.camera import Camera
 from dsr.io.depth_files import read_depth_file
 from dsr.io.encoding import Encoding, decode, encode, find_holes
 from dsr.io.reading import parse_unit
-from dsr.io.units import tell
+from dsr.io.units import interpret
 
 CAMERA = Camera(4, 3, 5.0, 6.0, 1.0, 1.5, baseline=0.1)
 
 
 def guess(middle, dtype):
     values = np.full((3, 3), middle, dtype)
-    told = tell("d", values, np.zeros((3, 3), bool))
-    return told.unit, told.assumptions
+    reported = interpret("d", values, np.zeros((3, 3), bool))
+    return reported.unit, reported.assumptions
 
 
 @pytest.mark.parametrize(
@@ -45,9 +45,11 @@ def test_depth_too_far_too_near_or_too_sparse_is_pointed_out():
     assert any("1/5000" in assumption.text for assumption in guess(12_000, "u2")[1])
     assert not any("1/5000" in assumption.text for assumption in guess(9_000, "u2")[1])
     sparse = np.arange(9).reshape(3, 3) > 2
-    assert any("1/256" in assumption.text for assumption in tell("d", np.full((3, 3), 2000, "u2"), sparse).assumptions)
+    assert any(
+        "1/256" in assumption.text for assumption in interpret("d", np.full((3, 3), 2000, "u2"), sparse).assumptions
+    )
     assert not any(
-        "1/256" in assumption.text for assumption in tell("d", np.full((3, 3), 2000, "u2"), ~sparse).assumptions
+        "1/256" in assumption.text for assumption in interpret("d", np.full((3, 3), 2000, "u2"), ~sparse).assumptions
     )
     assert any("nearer than 5 cm" in assumption.text for assumption in guess(0.01, "f4")[1])
 
@@ -58,10 +60,10 @@ def test_object_that_was_cut_out_is_not_taken_for_a_laser_scan():
     lines = (rows % 6 == 0) & (columns % 2 == 0) & (rows > 20)
     for known, scan in ((person, False), (lines, True)):
         try:
-            told = [str(each) for each in tell("d", np.full((60, 80), 2000, "u2"), ~known).assumptions]
+            reported = [str(each) for each in interpret("d", np.full((60, 80), 2000, "u2"), ~known).assumptions]
         except ValueError as error:
-            told = [str(error)]
-        assert any("1/256" in each for each in told) == scan
+            reported = [str(error)]
+        assert any("1/256" in each for each in reported) == scan
 
 
 @pytest.mark.parametrize(
@@ -163,12 +165,12 @@ def test_maps_of_sensors_in_millimetres_and_metres_are_never_asked_about(shared)
         values = read_depth_file(path)
         holes = find_holes(values, None)[0]
         for each, unit in ((values, 1e-3), (values.astype(np.float32) / 1000, 1.0)):
-            told = tell(str(path), each, holes, Camera.from_fov(60, values.shape[1], values.shape[0]))
-            assert (told.unit, told.range_type, told.bits) == (unit, None, 0)
-            assert not [each for each in told.assumptions if each.code]
+            reported = interpret(str(path), each, holes, Camera.from_fov(60, values.shape[1], values.shape[0]))
+            assert (reported.unit, reported.range_type, reported.bits) == (unit, None, 0)
+            assert not [each for each in reported.assumptions if each.code]
 
 
-def test_bits_of_sun_rgbd_are_told_from_its_own_files(shared):
+def test_bits_of_sun_rgbd_are_recognised_by_its_own_files(shared):
     for path in (shared / "real" / "sunrgbd").glob("*/depth*/*.png"):
         values = read_depth_file(path)
-        assert tell(str(path), values, find_holes(values, None)[0]).bits == 3
+        assert interpret(str(path), values, find_holes(values, None)[0]).bits == 3

@@ -126,27 +126,27 @@ def test_photo_of_a_pair_may_be_heic_and_is_turned_as_its_jpeg_would_be(tmp_path
     np.testing.assert_array_equal(heic.depth_lr[0], depth.astype(np.float32))
 
 
-@pytest.mark.parametrize("told", range(1, 9))
+@pytest.mark.parametrize("reported", range(1, 9))
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_photo_is_turned_back_as_its_decoder_turned_it_whatever_the_exif_data_say(tmp_path, orientation, told):
-    path = write(tmp_path / "photo.heic", orientation=orientation, told=told)
+def test_photo_is_turned_back_as_its_decoder_turned_it_whatever_the_exif_data_say(tmp_path, orientation, reported):
+    path = write(tmp_path / "photo.heic", orientation=orientation, reported=reported)
     stored = captures.photo().repeat(4, 0).repeat(4, 1)
     np.save(tmp_path / "depth.npy", captures.depth())
     found = read_photo(path, captures.depth().shape)[0].astype(float)
-    if told == 1:
+    if reported == 1:
         stored = read_heic(path)
     assert found.shape == stored.shape
     assert np.abs(found - stored).mean() < 4
 
 
-@pytest.mark.parametrize("told", [1, 6])
-def test_camera_of_a_photo_is_turned_with_it_and_not_as_the_exif_data_say(tmp_path, told):
+@pytest.mark.parametrize("reported", [1, 6])
+def test_camera_of_a_photo_is_turned_with_it_and_not_as_the_exif_data_say(tmp_path, reported):
     numbers = 200.0, 201.0, 120.0, 90.0
     text = captures.apple_text(numbers=numbers)
-    camera = only(write(tmp_path / "photo.heic", text, orientation=1, told=told)).camera
+    camera = only(write(tmp_path / "photo.heic", text, orientation=1, reported=reported)).camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == numbers
     assert (camera.height, camera.width) == captures.HEIC
-    other = only(write(tmp_path / "turned.heic", text, orientation=6, told=told)).camera
+    other = only(write(tmp_path / "turned.heic", text, orientation=6, reported=reported)).camera
     assert (other.height, other.width) == captures.HEIC[::-1]
 
 

@@ -89,7 +89,7 @@ def test_camera_file_sets_range_type_and_hole_value(make):
     assert float(picture.depth_lr[0, 0, 0]) == pytest.approx(float(2 / corner))
     assert bool(picture.depth_lr[0, 0, 4].isnan())
     assert picture.encoding.hole == 9
-    assert any("perspective, says the camera file" in text for text in texts(picture))
+    assert any("perspective, by the camera file" in text for text in texts(picture))
     assert float(read(pair, range_type="orthogonal").depth_lr[0, 0, 0]) == 2
 
 

@@ -151,8 +151,8 @@ def test_command_reads_a_recording(tmp_path, capsys):
     path, out = write(tmp_path / "scan.mkv"), tmp_path / "out"
     assert main(["upsample", str(path), "-o", str(out), "--method", "bicubic", "--only", "depth"]) == 0
     assert "Azure Kinect" in capsys.readouterr().out
-    told = json.loads((out / "000000" / "info.json").read_text())
-    assert told["inputs"]["depth"]["file"].startswith("scan.mkv/")
+    reported = json.loads((out / "000000" / "info.json").read_text())
+    assert reported["inputs"]["depth"]["file"].startswith("scan.mkv/")
     assert read_depth_file(out / "000000" / "depth_metres.tiff").shape == SIZE
 
 

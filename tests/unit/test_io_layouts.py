@@ -79,12 +79,12 @@ def test_camera_unit_and_pose_of_each_frame_come_from_the_layout(folder, layout)
         np.testing.assert_allclose(picture.depth_lr[0], expected, atol=6e-4)
         assert abs(255 * picture.rgb.permute(1, 2, 0).numpy() - captures.photo(number)).mean() < 4
         np.testing.assert_allclose(picture.pose, captures.pose(number), atol=1e-6)
-        assert "taken for millimetres" not in said(picture)
+        assert "read as millimetres" not in said(picture)
     again = read_picture(pickle.loads(pickle.dumps(find_pairs_of_folder(place).pairs[1])), Reading())
     np.testing.assert_array_equal(again.depth_lr, pictures[1].depth_lr)
 
 
-def test_recordings_of_scannet_in_a_folder_are_told_apart_and_each_says_its_unit(folder):
+def test_recordings_of_scannet_in_a_folder_are_distinguished_and_each_says_its_unit(folder):
     captures.sens(folder / "a.sens")
     captures.sens(folder / "b.sens", scale=5000.0)
     found = find_pairs_of_folder(folder)
@@ -297,8 +297,8 @@ def test_maps_of_scannetpp_that_are_damaged_or_compressed_together_are_refused(f
 def test_frames_of_scanner_app_without_json_or_with_a_broken_one(folder):
     captures.scanner_app(folder)
     (folder / "frame_00000.json").unlink()
-    told = json.loads((folder / "frame_00001.json").read_text())
-    (folder / "frame_00001.json").write_text(json.dumps({**told, "intrinsics": [1, 2]}))
+    reported = json.loads((folder / "frame_00001.json").read_text())
+    (folder / "frame_00001.json").write_text(json.dumps({**reported, "intrinsics": [1, 2]}))
     found = find_pairs_of_folder(folder)
     assert [path.name for path in found.unpaired] == ["depth_00003.png"]
     picture = read_picture(found.pairs[0], Reading())

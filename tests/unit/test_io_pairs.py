@@ -146,7 +146,7 @@ def test_one_of_several_depth_folders_is_used_and_the_others_are_named(tmp_path)
     touch(tmp_path, "image/0001.jpg", "depth/0000001-000000000001.png", "depth_filled/0001.png", "intrinsics.txt")
     found = find_pairs_of_folder(tmp_path)
     assert pairs(found, tmp_path) == [("image/0001.jpg", "depth/0000001-000000000001.png")]
-    assert found.assumptions[0].text == "folders image and depth; not looked at: depth_filled"
+    assert found.assumptions[0].text == "folders image and depth; not read: depth_filled"
 
 
 @pytest.mark.parametrize(

@@ -276,10 +276,10 @@ def split(path, contents):
     for name, content in zip(names, contents, strict=True):
         if not isinstance(content, str):
             (path / name).write_bytes(content)
-    told = {"version": 5, "storage_identifier": "sqlite3", "relative_file_paths": names, "message_count": 0,
+    reported = {"version": 5, "storage_identifier": "sqlite3", "relative_file_paths": names, "message_count": 0,
             "duration": {"nanoseconds": 0}, "starting_time": {"nanoseconds_since_epoch": 0},
             "topics_with_message_count": [], "compression_format": "zstd", "compression_mode": "FILE"}  # fmt: skip
-    (path / "metadata.yaml").write_text(yaml.safe_dump({"rosbag2_bagfile_information": told}))
+    (path / "metadata.yaml").write_text(yaml.safe_dump({"rosbag2_bagfile_information": reported}))
     return path
 
 

@@ -92,7 +92,7 @@ def test_slurm_job_has_ended_only_after_several_answers_in_a_row(squeue, monkeyp
     assert states("FAILED") == [{"7_0": "FAILED"}]
 
 
-def test_reason_that_jobs_are_pending_is_told_once(squeue, monkeypatch, caplog):
+def test_reason_that_jobs_are_pending_is_reported_once(squeue, monkeypatch, caplog):
     monkeypatch.setattr(slurm, "_ASK", (0.0, 0.0))
     caplog.set_level("INFO", "dsr.app.slurm")
     waiting = slurm._Waiting("slurm")

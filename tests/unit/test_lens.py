@@ -131,7 +131,7 @@ def capture(tmp_path):
     matrix[:3, :3], matrix[:3, 3] = TURN, SHIFT
     rig = Rig(CAMERA, matrix, Lens("kannala_brandt", FISHEYE))
     geometry = Geometry(CAMERA, lens=Lens("brown_conrady", BROWN), rig=rig)
-    frame = CaptureFrame("Test", lambda _: geometry, tmp_path / "told.json", b"")
+    frame = CaptureFrame("Test", lambda _: geometry, tmp_path / "described.json", b"")
     return Pair("x", tmp_path / "photo.png", tmp_path / "depth.png", unit=1e-3, capture=frame)
 
 

@@ -55,7 +55,7 @@ def _meta_is_not_autocast() -> Iterator[None]:
 
 
 def _batch() -> Batch:
-    """Return two patches with holes on the CPU, of one of which the kernel is told."""
+    """Return two patches with holes on the CPU, of one of which the kernel is given."""
     disparity, photo = step(64)
     patch = to_tensors(sample_of(disparity, photo))
     patch["disparity_lr"][0, 3:5, 4] = torch.nan

@@ -213,7 +213,7 @@ def test_unknown_truth_reaches_no_score() -> None:
     assert _scores(pair_of(changed, truth)) == _scores(pair_of(prediction, truth))
 
 
-def test_holes_of_a_prediction_miss_the_edges_there_and_are_told() -> None:
+def test_holes_of_a_prediction_miss_the_edges_there_and_are_reported() -> None:
     _, truth = steps()
     prediction = truth.copy()
     full = _scores(pair_of(prediction, truth))

@@ -26,7 +26,7 @@ def test_documentation_says_what_to_do_about_every_warning() -> None:
     assert [code for code in LIMITS if "." not in code and f"`{code}`" not in page] == []
 
 
-def test_warning_is_told_and_recorded_with_its_threshold() -> None:
+def test_warning_is_reported_and_recorded_with_its_threshold() -> None:
     warning = Assumption("edges apart", "6 px", "edges-beside", 6.0)
     assert str(warning) == "warning: edges apart (6 px)"
     assert warning.record() == {
@@ -47,12 +47,12 @@ def test_strict_takes_a_warning_for_an_error() -> None:
     expect_no_warning("a.png", [])
     with pytest.raises(ValueError, match=r"a\.png: edges apart, and 1 more"):
         expect_no_warning(
-            "a.png", [Assumption("edges apart", code="poses"), Assumption("told"), Assumption("b", code="poses")]
+            "a.png", [Assumption("edges apart", code="poses"), Assumption("plain"), Assumption("b", code="poses")]
         )
 
 
 @pytest.mark.parametrize(
-    ("told", "in_words_of_python"),
+    ("reported", "in_words_of_python"),
     [
         ("take another -o, or --overwrite", "take another folder, or overwrite"),
         ("--max-hole: expected 1, got -inf", "max_hole: expected 1, got -inf"),
@@ -62,5 +62,5 @@ def test_strict_takes_a_warning_for_an_error() -> None:
         ("see --sensor.", "see sensor."),
     ],
 )
-def test_only_options_are_told_as_arguments(told: str, in_words_of_python: str) -> None:
-    assert in_python(told) == in_words_of_python
+def test_only_options_are_named_as_arguments(reported: str, in_words_of_python: str) -> None:
+    assert in_python(reported) == in_words_of_python

@@ -228,7 +228,7 @@ def test_scenes_of_other_datasets_are_grouped_by_holes_in_their_truth(shares, ti
     assert sets.get("Other scenes without missing measurements", ["a", "b", "c"]) == sorted({"a", "b", "c"} - {*holes})
 
 
-def test_holes_of_the_truth_are_told_from_those_of_a_prediction(make_run, tmp_path):
+def test_holes_of_the_truth_are_distinguished_from_those_of_a_prediction(make_run, tmp_path):
     folder = make_run(tmp_path, dataset="m", scenes=("a", "b"))
     runs = [run("A", {"a": 1.0, "b": 2.0}, dataset="m", share=0.9)]
     runs = [Run(**{**vars(each), "folder": folder}) for each in runs]

@@ -579,7 +579,7 @@ def _degraded(scenes: list[Scene], everything: Everything, batch: int = 2, size:
     return Patches([scenes], _settings(patch=size, batch=batch, **changes), X4, count=36, everything=everything)
 
 
-def test_degraded_patches_are_pure_functions_of_their_number_and_tell_what_they_are() -> None:
+def test_degraded_patches_are_pure_functions_of_their_number_and_describe_themselves() -> None:
     scenes = [_scene(number) for number in range(3)]
     first, again = (_degraded(scenes, Everything(soft=0.5)) for _ in range(2))
     for index in (7, 0, 3):
@@ -590,8 +590,8 @@ def test_degraded_patches_are_pure_functions_of_their_number_and_tell_what_they_
     for patch in found:
         assert patch["depth"].shape == (1, SIZE, SIZE)
         assert patch["noise"].shape == patch["disparity_lr"].shape == (1, SIZE // 4, SIZE // 4)
-        told = patch["facts"][5:7]
-        assert not bool(told.any()) or bool(told[int(patch["soft"])])
+        reported = patch["facts"][5:7]
+        assert not bool(reported.any()) or bool(reported[int(patch["soft"])])
 
 
 def test_all_patches_of_a_batch_have_one_factor() -> None:

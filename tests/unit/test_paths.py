@@ -86,9 +86,9 @@ def test_lists_of_tum_name_no_pictures_outside(folder, tmp_path, capsys, kind, n
     path = folder / f"{kind}.txt"
     given = str(tmp_path / "private" / "1.png") if name == "absolute" else name
     path.write_text(path.read_text().replace(f"{kind}/1.png", given))
-    told = refused(capsys, "upsample", folder, "-o", tmp_path / "out", "--dry-run")
-    assert told.startswith(f"{path}: line 3: expected a name within {folder}, got {given!r}")
-    assert ("name the folder that has the files themselves" in told) == (name == "link/1.png")
+    reported = refused(capsys, "upsample", folder, "-o", tmp_path / "out", "--dry-run")
+    assert reported.startswith(f"{path}: line 3: expected a name within {folder}, got {given!r}")
+    assert ("name the folder that has the files themselves" in reported) == (name == "link/1.png")
     assert not (tmp_path / "out").exists()
 
 
@@ -103,8 +103,8 @@ def test_recording_of_ros_takes_no_files_outside(folder, tmp_path, capsys):
     [file] = scan.glob("*.db3")
     file.rename(tmp_path / "private" / file.name)
     file.symlink_to(tmp_path / "private" / file.name)
-    told = refused(capsys, "upsample", scan, "-o", tmp_path / "out", "--dry-run")
-    assert told.startswith(f"{scan}/metadata.yaml: relative_file_paths: expected a name within {scan}, got")
+    reported = refused(capsys, "upsample", scan, "-o", tmp_path / "out", "--dry-run")
+    assert reported.startswith(f"{scan}/metadata.yaml: relative_file_paths: expected a name within {scan}, got")
 
 
 def hostile_run(make_run, tmp_path, name, *, file):
@@ -126,8 +126,8 @@ def hostile_run(make_run, tmp_path, name, *, file):
 )
 def test_run_that_names_scenes_outside_is_neither_read_nor_published(make_run, tmp_path, capsys, command, file, place):
     run = hostile_run(make_run, tmp_path, "../../../private/x", file=file)
-    told = refused(capsys, *command, tmp_path / "runs", "-o", tmp_path / "out")
-    assert told == f"{run}/{place}: expected a name within {run}, got '../../../private/x'"
+    reported = refused(capsys, *command, tmp_path / "runs", "-o", tmp_path / "out")
+    assert reported == f"{run}/{place}: expected a name within {run}, got '../../../private/x'"
     assert not (tmp_path / "out").exists()
 
 

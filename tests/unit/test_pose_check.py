@@ -1,4 +1,4 @@
-"""Poses that are read wrongly are told by the depth maps, and nothing is said where these cannot tell."""
+"""Poses that are read wrongly are noticed by the depth maps, and nothing is said where these cannot show it."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def wall(camera: Camera, pose: Matrix) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("name", "change"), WRONG, ids=[name for name, _ in WRONG])
-def test_wrong_reading_is_told_by_its_name_with_figures(name: str, change: Callable[[Matrix], Matrix]) -> None:
+def test_wrong_reading_is_reported_by_its_name_with_figures(name: str, change: Callable[[Matrix], Matrix]) -> None:
     found = checked(walk(8), change)
     assert found is not None
     assert found.code == "poses"
@@ -91,7 +91,7 @@ def test_right_poses_are_silent(poses: list[Matrix]) -> None:
 
 
 @pytest.mark.parametrize(("name", "change"), WRONG, ids=[name for name, _ in WRONG])
-def test_wall_along_which_the_camera_moves_tells_nothing(name: str, change: Callable[[Matrix], Matrix]) -> None:
+def test_wall_along_which_the_camera_moves_shows_nothing(name: str, change: Callable[[Matrix], Matrix]) -> None:
     del name
     poses = [np.eye(4) for _ in range(12)]
     for number, pose in enumerate(poses):

@@ -258,7 +258,7 @@ def test_elapsed_and_remaining_time_add_up_once_a_frame_is_done(now: Clock) -> N
     assert shown[-1] == (40, 1)  # the last stage is not over yet
 
 
-def test_usual_shares_tell_the_rest_of_the_first_frame_once_most_of_it_is_over(now: Clock) -> None:
+def test_usual_shares_give_the_rest_of_the_first_frame_once_most_of_it_is_over(now: Clock) -> None:
     shown = times_of_stages(now, (5, 25, 20))
     assert all(remaining is None for _, remaining in shown[:29])  # the first tenth tells too little
     assert all(elapsed + remaining == 50 for elapsed, remaining in shown[30:-1])
@@ -303,7 +303,7 @@ def test_items_that_fail_while_they_are_read_do_not_make_the_rest_look_short(now
     assert [seconds_in(line, "remaining") for line in lines] == [30, 20]
 
 
-def test_stage_that_is_left_out_tells_nothing_about_the_others(now: Clock) -> None:
+def test_stage_that_is_left_out_says_nothing_about_the_others(now: Clock) -> None:
     progress, _ = _progress(now, terminal=True)
     shown = []
     for kept in progress.track((True, True, True, False, True), "upsample", shares=STAGES):

@@ -1,4 +1,4 @@
-"""Random degradations: reproducible, of the stated size and shape, and told truly by the hints."""
+"""Random degradations: reproducible, of the stated size and shape, and described truly by the hints."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_a_degradation_is_a_function_of_its_generator(scale: int) -> None:
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_clean_maps_are_those_of_the_kernel_and_hints_tell_it(kernel: str) -> None:
+def test_clean_maps_are_those_of_the_kernel_and_hints_name_it(kernel: str) -> None:
     everything = replace(CLEAN, kernels={kernel: 1})
     found = set()
     for seed in range(20):
@@ -76,7 +76,7 @@ def test_clean_maps_are_those_of_the_kernel_and_hints_tell_it(kernel: str) -> No
     assert found == {torch.reciprocal, torch.Tensor.clone} or kernel == "nearest"
 
 
-def test_nothing_is_told_where_nothing_is_to_be_told() -> None:
+def test_there_are_no_hints_where_there_are_to_be_none() -> None:
     for seed in range(10):
         _, hints = replace(Everything(), told=0)(_scene(), 4, _generator(seed))
         assert not bool(hints.facts.any())
@@ -84,7 +84,7 @@ def test_nothing_is_told_where_nothing_is_to_be_told() -> None:
 
 
 @pytest.mark.parametrize("kind", ["white", "correlated", "waves", "structured", "flight", "lidar", "stereo"])
-def test_noise_is_told_as_large_as_it_is(kind: str) -> None:
+def test_hint_of_the_noise_is_as_large_as_it_is(kind: str) -> None:
     everything = replace(CLEAN, noises={kind: 1}, kernels={"box": 1})
     for seed in range(6):
         sample, hints = everything(_scene(256, step=False), 2, _generator(seed))
@@ -193,7 +193,7 @@ def test_relief_is_in_the_truth_and_its_means_in_the_map() -> None:
         assert float(hints.noise.max()) < 1e-6, "the map has no noise"
     assert 3 < rough < 20
     same, _ = replace(everything, noises={"white": 1})(scene, 1, _generator())
-    assert same.depth is scene.depth, "at factor 1 relief could not be told from noise"
+    assert same.depth is scene.depth, "at factor 1 relief could not be distinguished from noise"
 
 
 @pytest.mark.parametrize(

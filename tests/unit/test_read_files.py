@@ -49,12 +49,12 @@ def test_depth_is_that_of_the_command_whose_unit_is_given(tmp_path: Path, unit: 
     assert int(np.isnan(found).sum()) == 15
 
 
-def test_unit_that_the_values_tell_is_a_warning_and_one_that_they_do_not_an_error(tmp_path: Path) -> None:
+def test_unit_that_the_values_show_is_a_warning_and_one_that_they_do_not_an_error(tmp_path: Path) -> None:
     pair = write_pair(tmp_path, millimetres())
     with pytest.warns(UserWarning, match="millimetres") as caught:
-        told = dsr.read_depth(pair.depth)
+        reported = dsr.read_depth(pair.depth)
     assert [Path(each.filename).name for each in caught] == [Path(__file__).name]
-    np.testing.assert_array_equal(told, dsr.read_depth(pair.depth, "mm"))
+    np.testing.assert_array_equal(reported, dsr.read_depth(pair.depth, "mm"))
     far = write_pair(tmp_path, 20 * millimetres().astype(np.float32) / 1000, "far.npy")
     with pytest.raises(ValueError, match=rf"^{far.depth}: expected unit .* or ") as error:
         dsr.read_depth(far.depth)
@@ -119,7 +119,7 @@ def test_wrong_argument_is_named(tmp_path: Path, change: dict, message: str) -> 
 
 def test_photo_is_turned_only_where_the_depth_map_has_its_aspect_then(tmp_path: Path) -> None:
     pair = write_pair(tmp_path, millimetres(), orientation=6)
-    with pytest.warns(UserWarning, match="orientation is left out"):
+    with pytest.warns(UserWarning, match="orientation is ignored"):
         as_stored = dsr.read(pair.rgb)
     assert (as_stored.dtype, as_stored.shape) == (np.uint8, (*SIZE, 3))
     np.testing.assert_array_equal(as_stored, Image.open(pair.rgb))

@@ -121,7 +121,7 @@ def test_shadings_are_stored_side_by_side_from_minus_one_to_one():
     assert shading_picture(np.array([[[-1.0, 0.0, 1.0]]])).tolist() == [[0, 128, 255]]
 
 
-def test_mask_tells_a_hole_from_a_depth_without_a_normal():
+def test_mask_distinguishes_a_hole_from_a_depth_without_a_normal():
     depth, normal = np.array([[False, True, True]]), np.array([[False, False, True]])
     assert mask_picture(depth, normal).tolist() == [[0, 128, 255]]
     assert mask_picture(normal | True, normal | True) is None

@@ -1,4 +1,4 @@
-"""Runs are read from their directories alone: ordered, told apart, and what cannot be read is left out and said."""
+"""Runs are read from their directories alone: ordered, distinguished, and what cannot be read is left out and said."""
 
 import json
 import os

@@ -83,7 +83,7 @@ def test_name_says_what_differs_from_the_defaults(kind, overrides, name):
     assert name_of(kind, *overrides.split()) == name
 
 
-def test_what_a_name_cannot_say_is_told_apart_by_a_hash():
+def test_what_a_name_cannot_say_is_distinguished_by_a_hash():
     names = {name_of("eval", "dataset=folder", f"dataset.root={root}") for root in ("/a/my/scenes", "/b/my/scenes")}
     assert len(names) == 2
     assert all(re.fullmatch(r"msg_v_x4_folder_root-my-scenes_seed0-[0-9a-f]{8}", name) for name in names)

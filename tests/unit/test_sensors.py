@@ -75,8 +75,8 @@ def test_page_has_the_table_and_every_source():
         assert stated == [(pytest.approx(1000 * deviation), distance) for distance, deviation in sensor.spread or ()]
     behaviours = {name: row[1:] for row in rows for name in row[0].split(", ") if name in BY_NAME and len(row) == 5}
     for sensor in SENSORS:
-        for told in (sensor.edges, sensor.dark, sensor.shiny, sensor.clear):
-            assert told is None or told in behaviours[sensor.name]
+        for reported in (sensor.edges, sensor.dark, sensor.shiny, sensor.clear):
+            assert reported is None or reported in behaviours[sensor.name]
         assert set(sensor.sources.values()) <= {row[-1] for row in rows}
 
 
@@ -123,7 +123,7 @@ def as_stored(depth, unit):
 
 @pytest.mark.parametrize(("constant", "step"), [(43.5, 1 / 8), (33.7, 1 / 32), (66.2, 1 / 8), (43.5, 1.0)])
 @pytest.mark.parametrize("unit", [1e-3, 1e-4])
-def test_values_of_a_stereo_camera_tell_its_constant(constant, step, unit):
+def test_values_of_a_stereo_camera_give_its_constant(constant, step, unit):
     disparity = np.round(constant * slanted(0.5, 4.0) / step) * step
     depth = as_stored(constant / disparity, unit)
     depth[:, 100:150] = torch.nan
@@ -159,7 +159,7 @@ def test_other_maps_have_no_steps_of_disparity(unit):
         ("sunrgbd/open3d_sample/SUN_depth.png", 1e-3 / 8, 8 * 0.075 * 570.3),
     ],
 )
-def test_values_of_real_cameras_tell_their_constants(shared, file, unit, constant):
+def test_values_of_real_cameras_give_their_constants(shared, file, unit, constant):
     stored = cv2.imread(str(shared / "real" / file), cv2.IMREAD_UNCHANGED)
     depth = torch.from_numpy(stored.astype(np.float64) * unit)[None].float()
     found = recognise_values(depth.masked_fill(depth == 0, torch.nan))
@@ -170,7 +170,7 @@ def test_values_of_real_cameras_tell_their_constants(shared, file, unit, constan
 @pytest.mark.parametrize(
     "file", ["iphone_lidar/arkit_depth.png", "rgbdd_real/DepthLR/20200509112638_LR_fill_depth.png"]
 )
-def test_values_of_time_of_flight_tell_none(shared, file):
+def test_values_of_time_of_flight_give_none(shared, file):
     stored = cv2.imread(str(shared / "real" / file), cv2.IMREAD_UNCHANGED)
     assert recognise_values(torch.from_numpy(stored.astype(np.float32))[None] / 1000) is None
 
@@ -235,16 +235,16 @@ def test_stated_error_is_never_less_than_the_disparity_allows():
         assert bool((found["D435"].depth_error > found["none"].depth_error).any())
 
 
-def test_correlated_noise_of_a_stereo_camera_is_told_as_it_grows():
+def test_correlated_noise_of_a_stereo_camera_is_given_as_it_grows():
     depth = counted(1024, 1e-3, noise=0.004)
     camera, rgb = Camera.centred(640, 480, 600.0), torch.full((3, 480, 640), 0.5)
     found = find_noise(depth)
     assert found.extent == pytest.approx(9, rel=0.2)
     assert found.deviation == pytest.approx(0.004 * found.distance**2, rel=0.2)
-    told = {"noise": found.deviation / found.distance**2, "noise_growth": 2.0}
+    reported = {"noise": found.deviation / found.distance**2, "noise_growth": 2.0}
     sensed, set_here, unset = (
         upsample_surface(rgb, depth, camera, sensor=sensor, settings=settings).depth
-        for sensor, settings in (("D435", {}), ("none", told), ("none", {}))
+        for sensor, settings in (("D435", {}), ("none", reported), ("none", {}))
     )
     torch.testing.assert_close(sensed, set_here)
     assert not torch.equal(sensed, unset)

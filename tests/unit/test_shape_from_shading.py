@@ -269,13 +269,13 @@ def test_batch_equals_its_problems_one_at_a_time() -> None:
 
 
 def test_iteration_stops_at_convergence_and_reports_progress() -> None:
-    told: list[tuple[int, int]] = []
+    reported: list[tuple[int, int]] = []
     truth = _sphere(32)
     method = ShapeFromShading(iterations=60, tolerance=3e-3)
-    method(_sample(truth, _lit(truth)), lambda done, most: told.append((done, most)))
+    method(_sample(truth, _lit(truth)), lambda done, most: reported.append((done, most)))
     steps = len(method.history)
     assert 2 < steps < 60
-    assert told == [*((done, 60) for done in range(1, steps + 1)), (60, 60)]
+    assert reported == [*((done, 60) for done in range(1, steps + 1)), (60, 60)]
     assert [entry["iteration"] for entry in method.history] == list(range(1, steps + 1))
     last, before = method.history[-1], method.history[-2]
     assert last["residual"] < 3e-3

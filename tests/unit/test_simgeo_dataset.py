@@ -108,9 +108,9 @@ def test_damaged_cache_file_is_replaced_and_it_is_said(cache, calls, damage, cap
     assert capfd.readouterr() == ("", "")
     assert_rendered(SimGeo(size=SIZE).load(NAME))
     assert len(calls) == 2
-    told = capfd.readouterr().err
-    assert told.startswith(f"note: {file}: damaged")
-    assert told.count("\n") == 1
+    reported = capfd.readouterr().err
+    assert reported.startswith(f"note: {file}: damaged")
+    assert reported.count("\n") == 1
     SimGeo(size=SIZE).load(NAME)
     assert len(calls) == 2
     assert [path.name for path in file.parent.iterdir()] == [f"{NAME}.npz"]

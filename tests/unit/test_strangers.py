@@ -170,7 +170,9 @@ def test_interruption_of_a_trainings_start_is_no_other_error(tmp_path):
     trainer = make_trainer(torch.device("cpu"), 1, 1, callbacks=[], logger=False, default_root_dir=tmp_path)
     with pytest.raises(KeyboardInterrupt) as interrupted:
         fit(trainer, OneWeight(), _Interrupted())
-    assert isinstance(interrupted.value.__cause__, RuntimeError)  # that of Lightning's teardown, which must not be told
+    assert isinstance(
+        interrupted.value.__cause__, RuntimeError
+    )  # that of Lightning's teardown, which must not be printed
 
 
 @pytest.mark.parametrize("rows", [[[1e308, 1e308, 0], [1e308, -1e308, 0], [0, 0, 1]], [[1e200, 0, 0]] * 3])
@@ -196,7 +198,7 @@ def test_damaged_exif_data_of_a_photo_are_ignored_without_a_warning(tmp_path):
     assert focal_in_exif(path) == 28
     content = path.read_bytes()
     path.write_bytes(content[:35] + b"\xff" + content[36:])  # of the place of the first directory
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as reported:
         warnings.simplefilter("always")
         assert focal_in_exif(path) is None
-    assert told == []
+    assert reported == []

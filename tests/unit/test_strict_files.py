@@ -108,7 +108,7 @@ def test_metadata_of_record3d_with_a_value_that_is_no_number_are_refused(tmp_pat
 def test_camera_of_polycam_with_a_value_that_is_no_number_is_refused(tmp_path, key, value):
     captures.polycam(tmp_path)
     pair = find_polycam(tmp_path).pairs[0]
-    path = pair.capture.told_by
+    path = pair.capture.description
     entries = {name: json.dumps(each) for name, each in json.loads(path.read_text()).items()} | {key: value}
     path.write_text("{" + ", ".join(f'"{name}": {text}' for name, text in entries.items()) + "}")
     refusal(path, pair.capture.geometry, (8, 8))

@@ -23,7 +23,7 @@ CAMERA = Camera(width=16, height=12, fx=20.0, fy=20.0, cx=7.5, cy=5.5, baseline=
 
 
 def _batch(camera: Camera = CAMERA, *, soft: float = 0.0) -> Batch:
-    """Return a slope, downsampled by 4, of which nothing is told."""
+    """Return a slope, downsampled by 4, without hints."""
     across = torch.linspace(2, 3, camera.width, dtype=torch.float64)
     depth = across.expand(1, camera.height, camera.width).contiguous()
     rgb = torch.rand((3, camera.height, camera.width), generator=torch.Generator().manual_seed(0))
@@ -78,8 +78,8 @@ def test_the_likelihood_is_best_where_the_expected_error_is_the_mean_error() -> 
     for name, truth in (("spread", off), ("angle", tilt)):
         found = []
         for factor in (0.8, 1.0, 1.25):
-            told = {"spread": 0.1, "angle": 0.1} | {name: factor * float(truth)}
-            found.append(float(SurfaceObjective()(_answer(batch, disparity, **told), batch)[name]))
+            reported = {"spread": 0.1, "angle": 0.1} | {name: factor * float(truth)}
+            found.append(float(SurfaceObjective()(_answer(batch, disparity, **reported), batch)[name]))
         assert found[1] < min(found[0], found[2]), name
 
 

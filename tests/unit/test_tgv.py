@@ -249,10 +249,10 @@ def test_single_valid_pixel_of_a_flat_map_fills_it() -> None:
 
 
 def test_iteration_stops_at_convergence_and_reports_progress() -> None:
-    told: list[tuple[int, int]] = []
+    reported: list[tuple[int, int]] = []
     sample = sample_of(plane())
-    TotalGeneralisedVariation(iterations=5000)(sample, lambda done, most: told.append((done, most)))
-    assert told == [(50, 5000), (5000, 5000)]
+    TotalGeneralisedVariation(iterations=5000)(sample, lambda done, most: reported.append((done, most)))
+    assert reported == [(50, 5000), (5000, 5000)]
     coarse, photo = _normals(1, 1, 4, 6).sigmoid(), _normals(1, 3, 16, 24, seed=1).sigmoid()
     found = TotalGeneralisedVariation(iterations=5000, tolerance=2e-3).minimise(photo, coarse, 4)
     assert 50 * len(found.moved) == found.iterations < 5000

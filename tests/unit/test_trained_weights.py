@@ -71,7 +71,7 @@ def test_loading_draws_nothing_from_the_random_generator(tmp_path: Path) -> None
     assert torch.equal(torch.get_rng_state(), before)
 
 
-def test_file_is_told_from_a_published_one_by_its_content(tmp_path: Path) -> None:
+def test_file_is_distinguished_from_a_published_one_by_its_content(tmp_path: Path) -> None:
     save_network(tmp_path / "w.pth", MSGNet(4, "dsr"), "msg_v")
     torch.save({"model_state_dict": {}}, tmp_path / "w.caffemodel")
     assert is_dsr_weights(tmp_path / "w.pth")

@@ -473,19 +473,19 @@ def test_validation_logs_the_mean_over_the_scenes_in_the_units_of_tables(tmp_pat
 
 
 def test_a_network_that_takes_hints_is_validated_as_it_is_evaluated(tmp_path: Path) -> None:
-    """That is, told the kernel, sharp steps, and that there is no noise."""
+    """That is, the kernel, sharp steps, and that there is no noise."""
     torch.manual_seed(0)
     net = FacetsUNet(2, 8, 8, 4)
     with torch.no_grad():
         for parameter in net.parameters():
             parameter.add_(0.1 * torch.randn(parameter.shape))
     module = SuperResolution(copy.deepcopy(net), SurfaceObjective(), validation_sets=("a",))
-    [logged] = _trainer(tmp_path).validate(module, _loader(WholeScenes([_scene(3)], X2, told=True)), verbose=False)
+    [logged] = _trainer(tmp_path).validate(module, _loader(WholeScenes([_scene(3)], X2, hinted=True)), verbose=False)
     sample = X2.sample(_scene(3))
     assert sample.depth is not None
 
-    def rmse(**told: Any) -> float:
-        depth = AnyMap(net.eval(), **told)(sample)
+    def rmse(**hinted: Any) -> float:
+        depth = AnyMap(net.eval(), **hinted)(sample)
         return float(scores.rmse_v(SurfacePair(depth[None], sample.depth[None], CAMERA.rays()[None])))  # type: ignore[index]
 
     assert logged["val/RMSE_v"] == pytest.approx(1000 * rmse(kernel="box", edges="sharp", clean=True), rel=1e-4)

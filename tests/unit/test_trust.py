@@ -104,7 +104,7 @@ def test_several_targets_are_named_at_once(tmp_path):
 
 
 @pytest.mark.parametrize("trust", [True, "mine.Net", ["other.Net", "mine.Net"]])
-def test_person_at_the_keyboard_allows_a_target_and_is_told(tmp_path, capsys, trust):
+def test_person_at_the_keyboard_allows_a_target_and_gets_a_line(tmp_path, capsys, trust):
     folder = write(tmp_path / "run", model__net___target_="mine.Net")
     assert read_config(folder, trust)["model"]["net"]["_target_"] == "mine.Net"
     note = f"note: {folder / 'config.yaml'}: model.net._target_ mine.Net is not dsr's; it is run, as you allow\n"

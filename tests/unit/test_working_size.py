@@ -1,4 +1,4 @@
-"""The noise of a sensor's map is told from shape, and the map is worked on at the size that it suggests."""
+"""The noise of a sensor's map is distinguished from shape, and the map is worked on at the size that it suggests."""
 
 from __future__ import annotations
 
@@ -105,8 +105,10 @@ def test_waves_of_a_sensor_are_averaged_and_size_can_be_chosen() -> None:
 def test_maps_that_are_known_to_be_clean_are_worked_on_as_they_are() -> None:
     depth, camera = noisy(20), Camera.centred(SIZE[1], SIZE[0], 600.0)
     rgb = torch.full((3, *SIZE), 0.5)
-    told = upsample_surface(rgb, depth, camera, settings={"noise": 0.0})
-    assert torch.equal(told.depth, upsample_surface(rgb, depth, camera, working_size=1, settings={"noise": 0.0}).depth)
+    reported = upsample_surface(rgb, depth, camera, settings={"noise": 0.0})
+    assert torch.equal(
+        reported.depth, upsample_surface(rgb, depth, camera, working_size=1, settings={"noise": 0.0}).depth
+    )
 
 
 def test_board_before_a_stereo_camera_is_worked_on_at_an_eighth_or_less(shared: Path) -> None:

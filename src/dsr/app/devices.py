@@ -37,7 +37,7 @@ class Processes:
 
     Args:
         count: of processes, and so of devices.
-        rank: number of this one; 0 writes files and speaks to the user.
+        rank: number of this one; 0 writes files and prints.
         environment: what Lightning learns of the processes from.
 
     """
@@ -48,7 +48,7 @@ class Processes:
 
     @property
     def first(self) -> bool:
-        """Whether this is the process that writes files and speaks to the user."""
+        """Whether this is the process that writes files and prints."""
         return self.rank == 0
 
     @contextlib.contextmanager

@@ -308,7 +308,7 @@ def _hash_weights(files: list[Path]) -> str | None:
 
 
 def _known_of_maps(settings: EvalConfig, downsampling: Downsampling | Measured, source: SceneSource) -> Known:
-    """Return what is known of low-resolution maps, for methods that can be told; nothing of those of a sensor."""
+    """Return what is known of low-resolution maps, for methods that take it; nothing of those of a sensor."""
     if not isinstance(downsampling, Downsampling):
         return Known()
     soft = getattr(source, "soft_edges", False)

@@ -138,7 +138,7 @@ class Job:
         return DelayedSubmission(self)
 
     def ended(self, problem: str) -> JobReturn:
-        """Return what becomes of a job that ended without a result, and why."""
+        """Return how a job ended that left no result, and why."""
         return JobReturn(overrides=self.overrides, status=JobStatus.COMPLETED, _return_value=JobResult.failed(problem))
 
 
@@ -273,7 +273,7 @@ class _Waiting:
         self._cluster = cluster
         self._begun = self._asked = time.monotonic()
         self._without_result: dict[str, int] = {}
-        self._told: set[str] = set()
+        self._logged: set[str] = set()
 
     def states(self, handles: Sequence[Any]) -> Mapping[str, str]:
         """Return the states of jobs that have certainly ended without a result, by their numbers."""
@@ -284,7 +284,7 @@ class _Waiting:
         self._asked = now
         if self._cluster == "slurm":
             answer = _slurm_states([handle.job_id for handle in handles])
-            self._tell([reason for state, reason in answer.values() if state == "PENDING"])
+            self._log_reasons([reason for state, reason in answer.values() if state == "PENDING"])
             states = {name: state for name, (state, _) in answer.items()}
         else:
             states = {handle.job_id: handle.state for handle in handles if handle.done()}
@@ -292,11 +292,11 @@ class _Waiting:
         self._without_result = {name: self._without_result.get(name, 0) + 1 for name in ended}
         return {name: state for name, state in ended.items() if self._without_result[name] >= _CONFIRMATIONS}
 
-    def _tell(self, reasons: Sequence[str]) -> None:
-        """Tell why jobs are pending, once for each reason; some, such as ``PartitionConfig``, do not pass."""
+    def _log_reasons(self, reasons: Sequence[str]) -> None:
+        """Log why jobs are pending, once for each reason; some, such as ``PartitionConfig``, do not pass."""
         for reason in dict.fromkeys(reasons):
-            if reason not in self._told | _NO_REASONS:
-                self._told.add(reason)
+            if reason not in self._logged | _NO_REASONS:
+                self._logged.add(reason)
                 _log.info(f"Jobs pending in Slurm: {reasons.count(reason)} ({reason})")
 
 

@@ -343,7 +343,7 @@ def _module(settings: TrainConfig, net: DisparityNetwork, data: PatchData, metri
     with keyed():
         module = build("model", {key: value for key, value in node.items() if key not in given}, given, names["model"])
         module.logs_curves = False  # a callback of the configuration does
-        module.objective.check(net, data.patches.patch, told=names["degradation"] != "plain")
+        module.objective.check(net, data.patches.patch, hinted=names["degradation"] != "plain")
     try:
         module.configure_optimizers()
     except (ValueError, TypeError) as error:

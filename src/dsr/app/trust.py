@@ -215,7 +215,7 @@ def _targets_in(directory: Path) -> dict[str, frozenset[str]]:
     for file in sorted(directory.glob("*/*.yaml")):
         try:
             content = yaml.safe_load(read_limited(file))
-        except (OSError, ValueError, RecursionError, yaml.YAMLError):  # told where it is composed
+        except (OSError, ValueError, RecursionError, yaml.YAMLError):  # reported where it is composed
             continue
         named = {target for _, target in imported(content)} if isinstance(content, dict) else set()
         extra = content.get("extra") if isinstance(content, dict) else None

@@ -1,4 +1,4 @@
-"""The parser of ``dsr`` and of its commands: what is misspelt is told with the name that is meant."""
+"""The parser of ``dsr`` and of its commands: what is misspelt is named with what is meant."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Parser(argparse.ArgumentParser):
         super().error(printable(message))
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse; an unknown option is told before what is missing, which it may stand for."""
+        """Parse; an unknown option is reported before what is missing, which it may stand for."""
         for unknown in self._unknown(sys.argv[1:] if args is None else args):
             self.error(f"unknown option {unknown}{did_you_mean(unknown, self.options)}")
         return super().parse_known_args(args, namespace)

@@ -118,7 +118,7 @@ def load_frame(rgb_path: Path, levels_path: Path, dataset: str, name: str) -> Sc
     return Scene(dataset, name, rgb, camera, depth, unit=unit)
 
 
-NOTE = "depth is not metric: the camera is invented, and levels are taken for disparity"
+NOTE = "depth is not metric: the camera is invented, and levels are read as disparity"
 
 
 class EightBit(PreparedDataset):

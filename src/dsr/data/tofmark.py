@@ -144,7 +144,7 @@ def read_matrices(
         there is not.
 
     Raises:
-        ValueError: the file is missing or damaged, or its variables are not told; the message lists them.
+        ValueError: the file is missing or damaged, or its variables are not certain; the message lists them.
 
     """
     found = read_variables(path)
@@ -155,9 +155,9 @@ def read_matrices(
         if name not in found:
             raise ValueError(f"{path}: expected the variable {name}, got {_listed(found)}")
     for role in _ROLES:
-        told = chosen.get(role) or _told(path, role, found, chosen)
-        if told is not None:
-            chosen[role] = told
+        fitting = chosen.get(role) or _fitting_variable(path, role, found, chosen)
+        if fitting is not None:
+            chosen[role] = fitting
     if "intensity" not in chosen or len(chosen) == 1:
         raise ValueError(f"{path}: expected an intensity image and depth or samples of its size, got {_listed(found)}")
     rgb = _picture(path, chosen["intensity"], found[chosen["intensity"]])
@@ -198,7 +198,7 @@ def _metres(path: Path, values: Tensor, known: Tensor, depth_range: tuple[float,
     return torch.where(known, near + (values * 255 - 1) / 254 * (far - near), torch.nan)
 
 
-def _told(path: Path, role: str, found: Mapping[str, np.ndarray], chosen: Mapping[str, str]) -> str | None:
+def _fitting_variable(path: Path, role: str, found: Mapping[str, np.ndarray], chosen: Mapping[str, str]) -> str | None:
     """Return the variable that fits a role by its size and best by its name; None where none fits."""
     size = found[chosen["intensity"]].shape[:2] if "intensity" in chosen else None
     names = {name: re.sub(r"[^a-z0-9]", "", name.rpartition(".")[2].lower()) for name in found}
@@ -213,7 +213,7 @@ def _told(path: Path, role: str, found: Mapping[str, np.ndarray], chosen: Mappin
             if re.search(words, names[name]):
                 return name
     if len(fitting) > 1 and role != "intensity":
-        raise ValueError(f"{path}: expected one variable for {role}, which is not told among {', '.join(fitting)}")
+        raise ValueError(f"{path}: expected one variable for {role}, it may be any of {', '.join(fitting)}")
     return fitting[0] if fitting and role != "intensity" else None
 
 

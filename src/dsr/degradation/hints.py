@@ -1,4 +1,4 @@
-"""Hints: what a network may be told of a low-resolution map, and the noise of a map around each pixel."""
+"""Hints: what a network may be given of a low-resolution map, and the noise of a map around each pixel."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _WINDOW = 9
 class Hints(NamedTuple):
     """What is known of a low-resolution map.
 
-    ``noise`` (1, h, w): the standard deviation of the logarithm of its inverse depth, 0 where not told. ``facts``
+    ``noise`` (1, h, w): the standard deviation of the logarithm of its inverse depth, 0 where not given. ``facts``
     (``FACTS``,): those of :func:`encode_facts`.
     """
 
@@ -35,7 +35,7 @@ def encode_facts(kernel: str | None = None, soft: bool | None = None, *, noise: 
     Args:
         kernel: the kernel that made it, one of ``KERNELS``, as the first five.
         soft: whether its depth steps are soft, as the next two: sharp, soft.
-        noise: whether its noise is told, as the last.
+        noise: whether its noise is given, as the last.
 
     Raises:
         ValueError: there is no such kernel.
@@ -52,8 +52,8 @@ def encode_facts(kernel: str | None = None, soft: bool | None = None, *, noise: 
     return facts
 
 
-def told_kernels(facts: Tensor) -> list[str | None]:
-    """Return the kernel that the facts of each map tell, (B, ``FACTS``); None where they tell none."""
+def known_kernels(facts: Tensor) -> list[str | None]:
+    """Return the kernel in the facts of each map, (B, ``FACTS``); None where there is none."""
     kernels = facts[:, : len(KERNELS)].tolist()
     return [KERNELS[each.index(max(each))] if any(each) else None for each in kernels]
 

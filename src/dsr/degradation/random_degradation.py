@@ -59,7 +59,7 @@ class Everything:
         folds: fraction of the truths whose surfaces get folds and dents of 2 to 24 pixels in places, as of cloth, which
             the photo shows, more or less, as light and shade.
         relief: fraction of the truths that get fine relief, or the steps of a file's levels, before downsampling; none
-            at factor 1, where it could not be told from noise.
+            at factor 1, where it could not be distinguished from noise.
         displaced: fraction of the noisy maps that are displaced against the photo, by up to one low-resolution pixel.
         rounded: fraction of the maps that are rounded to levels.
         soft: fraction of the patches whose truth has soft depth steps: blurred, and where the scene is large enough for
@@ -70,7 +70,7 @@ class Everything:
         clear: fraction of the sensors' maps, those whose kind of noise is one of ``SENSOR_NOISES``, in which clear,
             mirroring or glossy objects stand. The truth is their surface, the map what a sensor sees. None if depth
             steps are soft, as their edges are not.
-        told: fraction of the maps of which a hint tells the kernel, and the noise, and the steps, independently.
+        told: fraction of the maps of which a hint gives the kernel, and the noise, and the steps, independently.
 
     Raises:
         ValueError: there is no such kind, or a frequency or a fraction is out of range.

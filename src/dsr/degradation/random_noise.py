@@ -42,7 +42,7 @@ def _waves(values: Tensor, _: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def _longest(values: Tensor) -> float:
-    """Return the longest waves of a map in pixels: longer ones could not be told from its shape.
+    """Return the longest waves of a map in pixels: longer ones could not be distinguished from its shape.
 
     With what is added to them, and planes taken off, the longest measure about 45 pixels.
     """

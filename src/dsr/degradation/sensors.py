@@ -75,7 +75,7 @@ _D400_EXTENT = "measured before a board with a D435: 37 px of a photo of 2.14 ti
 _GRASP = "Sajjan et al., ClearGrasp, ICRA 2020"
 _L515 = "Intel, L515's product page, in librealsense issue 5808: at 1 m and 9 m on 95 % reflectivity"
 _AZURE = "Microsoft, Azure Kinect DK depth camera (azure-docs, articles/kinect-dk): random error and invalidation"
-_KURILLO = "Kurillo et al., Evaluating the Accuracy of the Azure Kinect and Kinect v2, Sensors 2022: alike to 2.5 m"
+_KURILLO = "Kurillo et al., Evaluating the Accuracy of the Azure Kinect and Kinect v2, Sensors 2022: similar to 2.5 m"
 _FANKHAUSER = "Fankhauser et al., Kinect v2 for Mobile Robot Navigation, ICAR 2015: 1.5 - 0.5 z + 0.3 z^2, mm for m"
 _SARBOLANDI = "Sarbolandi et al., Kinect Range Sensing: Structured-Light versus Time-of-Flight Kinect, CVIU 2015"
 _CORTI = "Corti et al., A metrological characterization of the Kinect V2 time-of-flight camera, RAS 2016"
@@ -330,9 +330,9 @@ def identify(depth: Tensor, name: str = "auto", device_name: str = "") -> Identi
                 f"of one of its other modes, got {constant:.0f} m"
             )
         return Identified(named, "request", constant)
-    told = recognise(device_name)
-    if told is not None and _has_figures(told) and (constant is None or _mismatch(told, constant) <= _ALIKE):
-        return Identified(told, "file", constant)
+    named = recognise(device_name)
+    if named is not None and _has_figures(named) and (constant is None or _mismatch(named, constant) <= _ALIKE):
+        return Identified(named, "file", constant)
     if constant is None:
         return None
     best = min((each for each in SENSORS if each.step is not None), key=lambda each: _mismatch(each, constant, _USUAL))

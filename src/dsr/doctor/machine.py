@@ -51,7 +51,7 @@ def examine_machine() -> int:
 
 
 def check_machine() -> list[Finding]:
-    """Run all checks; a ``problem`` is what ``dsr upsample`` cannot do without, a ``note`` what it can."""
+    """Run all checks; a ``problem`` is what ``dsr upsample`` needs, a ``note`` what it does not."""
     return [finding for check in CHECKS for finding in check()]
 
 

@@ -1,4 +1,4 @@
-"""Read the directories of evaluations, and tell apart runs of equal names.
+"""Read the directories of evaluations, and distinguish runs of equal names.
 
 Only files are read: ``scores.csv``, ``summary.json``, ``versions.json``, predictions and stored scenes.
 """
@@ -286,7 +286,7 @@ class _Truth(NamedTuple):
             return None
 
     def equals(self, other: _Truth) -> bool:
-        """Return whether two truths are the same but for rounding; one that cannot be read is told elsewhere."""
+        """Return whether two truths are the same but for rounding; one that cannot be read is reported elsewhere."""
         if self.checksum == other.checksum:
             return True
         try:

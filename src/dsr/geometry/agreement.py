@@ -158,7 +158,7 @@ class Verdict:
         )
 
     @property
-    def telling(self) -> bool:
+    def conclusive(self) -> bool:
         """Whether edges exist: whether a photo of the same would surely agree."""
         return self.contours and self.as_given.spread < LIMITS["photo-other.spread"].threshold
 
@@ -166,7 +166,7 @@ class Verdict:
     def other(self) -> bool:
         """Whether the photo is probably of something else."""
         by_chance = self.as_given.significance < LIMITS["photo-other"].threshold
-        return by_chance and self.telling and not self.turned and not self.apart
+        return by_chance and self.conclusive and not self.turned and not self.apart
 
     def __str__(self) -> str:
         """Return what was found, for people."""

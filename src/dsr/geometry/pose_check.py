@@ -93,7 +93,7 @@ _GAPS = (0, 1, 3, 10, 30)
 _GROUPS = 4
 """Groups of frames of a sequence."""
 _TIE = 0.9
-"""Readings whose evidence is at least this much of the best one's cannot be told from it."""
+"""Readings whose evidence is at least this much of the best one's cannot be distinguished from it."""
 _MOST_NAMES = 3
 """Readings that a message names."""
 
@@ -182,7 +182,7 @@ def _compare(frame: Reduced, other: Reduced) -> tuple[np.ndarray, np.ndarray]:
 
 
 def find_fault(agreement: Agreement) -> Assumption | None:
-    """Return a warning where frames disagree under the poses as given; None where they agree, or tell too little.
+    """Return a warning where frames disagree under the poses as given; None where they agree, or show too little.
 
     A pair of frames counts as much as they disagree without motion.
     """
@@ -211,7 +211,7 @@ def find_fault(agreement: Agreement) -> Assumption | None:
     if alike and agreement.moved.min() >= LIMITS["poses-far"].threshold:
         nearest = float(agreement.moved.min())
         return Assumption(
-            "under the poses the camera is far away in the next frame, which looks alike: are they in millimetres?",
+            "under the poses the camera is far away in the next frame, which looks similar: are they in millimetres?",
             f"{nearest:.3g} times as far as what it sees; {float(np.median(without)):.0%} of the pixels are unchanged",
             "poses-far",
             round(nearest, 1),

@@ -26,9 +26,9 @@ from dsr.inference.working_size import (
     enlarged_by,
     find_noise,
     find_sensor,
+    known_noise,
     left_of,
     limit_to_noise,
-    noise_to_tell,
     reduce_by_medians,
     working_size_of,
 )
@@ -53,7 +53,7 @@ class AnyRatio(Method):
     is, unless a scale is given; for other methods it is first downsampled by ``scale``, by averaging the inverse depth
     of its valid pixels; if it was enlarged by repeating pixels, the repeated ones are dropped instead. The averages may
     cross depth steps, as in the networks' training.
-    Patches that are far from everything around them are taken for holes, and the result stays within what is measured
+    Patches that are far from everything around them are treated as holes, and the result stays within what is measured
     around each pixel, see :mod:`dsr.inference.plausibility`.
     (With a tenth of the map missing, RMSE_v on Lucy is 0.127, against 0.142 or more with means, medians or planes of
     one surface.)
@@ -155,7 +155,7 @@ class AnyRatio(Method):
             sensor: what measured the map: of :func:`~dsr.inference.find_sensor`, or its argument; None for none. No
                 expected error is less than what remains of the least noise that the sensor is known to have. Where it
                 counts disparity, and the noise of the map is correlated over 5 pixels or more, ``facets`` without a
-                scale is told how strong the noise is and that it grows with the square of the distance, unless
+                scale is given how strong the noise is and that it grows with the square of the distance, unless
                 ``noise`` is set.
 
         Returns:
@@ -224,12 +224,12 @@ class AnyRatio(Method):
             raise ValueError(f"working_size: expected at most {most} for this map's size and the photo's, got {size}")
         noise = find_noise(measured.reciprocal())
         factor = size or min(1 if noise is None else working_size_of(noise.extent), most)
-        told = None if "noise" in self.recipe.settings else noise_to_tell(sensor, noise, factor)
+        known = None if "noise" in self.recipe.settings else known_noise(sensor, noise, factor)
         if factor == 1:
-            return self._upsample(rgb, inverse, camera, None, progress, told)
+            return self._upsample(rgb, inverse, camera, None, progress, known)
         inverse_lr = reduce_by_medians(pad_inverse_depth(inverse, factor), factor)
         found = padded(
-            lambda photo, view: self._upsample(photo, inverse_lr, view, None, progress, told),
+            lambda photo, view: self._upsample(photo, inverse_lr, view, None, progress, known),
             factor * camera.width / inverse.shape[-1], rgb, inverse_lr, camera,
         )  # fmt: skip
         if noise is None or found.spread is None:  # what the network has found is of the smaller map
@@ -267,7 +267,7 @@ class AnyRatio(Method):
     def _finds_noise(self) -> bool:
         """Whether the method may work at a size that the map's noise suggests.
 
-        It has to have weights for several ratios of the sizes, and not to be told that there is no noise.
+        It has to have weights for several ratios of the sizes, and no setting that there is no noise.
         """
         node = self.recipe.at()
         return bool(self.recipe.computed_at) and not (node.get("clean") or node.get("noise") == 0)

@@ -69,7 +69,7 @@ def select(recipe: Recipe, scale: float, weights: Path | None = None, *, measure
         scale: ratio of the photo's width to the depth map's.
         weights: a file of weights, or a directory with published ones; None for those that the method names.
         measured: whether the maps are a sensor's own. Of a method without packaged weights for their ratio, those for
-            another one are taken; of a model of downsampling, it is told that it needs weights.
+            another one are taken; of a model of downsampling, the error says that it needs weights.
 
     """
     node = recipe.at()  # with the scale as the run names it

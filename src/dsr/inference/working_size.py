@@ -3,8 +3,8 @@
 A network takes waves that are wider than it looks at for the shape of the surface. At a size at which neighbours'
 noise is independent again it averages them, and the details that are lost were drowned in the noise.
 
-The noise is told from shape by what becomes of it in larger and larger windows, less a plane in inverse depth. Noise
-stays alike over the same number of pixels, while bends of surfaces are alike over a third of the window, whatever it
+Noise is told apart from shape by how it changes in larger and larger windows, less a plane in inverse depth. Noise
+is correlated over the same number of pixels, while bends of surfaces are over a third of the window, whatever it
 is. The flattest tenth of the windows counts. A surface that is covered with bumps may look the same. The noise of a
 sensor, however, is never as smooth as a bumpy surface, since depth is counted in steps, and no window is free of it.
 """
@@ -99,7 +99,7 @@ class _Planes(NamedTuple):
 
 
 def find_noise(depth: Tensor) -> MapNoise | None:
-    """Return the noise of a sensor's map; None where it has none that can be told from shape.
+    """Return the noise of a sensor's map; None where it has none that differs from shape.
 
     Args:
         depth: (1, h, w) in metres, NaN in holes.
@@ -164,8 +164,8 @@ def find_sensor(depth: Tensor, name: str = "auto", device_name: str = "") -> Ide
     return found if steps >= _NOISY else None
 
 
-def noise_to_tell(sensor: Identified | None, noise: MapNoise | None, factor: int) -> NoiseLaw | None:
-    """Return the noise that a method is told because it may take it for shape; None for noise that it judges better.
+def known_noise(sensor: Identified | None, noise: MapNoise | None, factor: int) -> NoiseLaw | None:
+    """Return the noise that a method is given because it may take it for shape; None for noise that it judges better.
 
     That is correlated noise of a sensor that counts disparity.
 

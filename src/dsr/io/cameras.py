@@ -140,7 +140,7 @@ def _camera_of_matrix(path: Path, matrix: np.ndarray, size: Size, size_lr: Size)
         cx, cy = matrix[0, 2], matrix[1, 2]
         if may_be_of(cx, cy, width, height):
             camera = Camera(width, height, matrix[0, 0], matrix[1, 1], cx, cy)
-            return camera_only(camera), [Assumption(f"camera: the matrix is taken for one of the {name}'s pixels")]
+            return camera_only(camera), [Assumption(f"camera: the matrix is read in pixels of the {name}")]
     raise ValueError(
         f"{path}: expected a principal point near the middle of the photo, {size[1]} x {size[0]} pixels (width x "
         f"height), or of the depth map, {size_lr[1]} x {size_lr[0]}; got {cx:g}, {cy:g}"

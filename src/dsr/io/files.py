@@ -68,7 +68,7 @@ def read_depth(
 ) -> np.ndarray:
     """Read a depth map as ``dsr upsample`` does, see docs/upsample.md.
 
-    What is not given is read from a camera file beside the map, or told by its values, with a warning that says how.
+    What is not given is read from a camera file beside the map, or inferred from the values, with a warning.
 
     Args:
         path: PNG, TIFF, NPY, NPZ, PFM, OpenEXR, or ICL-NUIM's text.
@@ -98,7 +98,7 @@ def read_depth(
                [1.502, 1.503]], dtype=float32)
 
     """
-    with speaking_python():
+    with python_messages():
         reading = Reading(unit=metres_in(unit), range_type=range_type, baseline=baseline, hole_value=hole_value)
         found, notes = read_map(Path(path), reading, camera)
     warn(notes)
@@ -118,7 +118,7 @@ def metres_in(unit: str | float | None) -> float | Literal["sunrgbd"] | None:
 
 
 @contextmanager
-def speaking_python() -> Iterator[None]:
+def python_messages() -> Iterator[None]:
     """Name arguments in place of a command's options in the message of a ValueError from within."""
     try:
         yield

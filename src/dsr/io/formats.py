@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 _LIDAR = "bent edges, nothing thin"
 _KINECT1 = "stairs far away, smeared edges, shadows beside near things"
-_STEREO = "blobs, guesses on blank walls, glass believed"
+_STEREO = "blobs, guesses on blank walls, wrong depth on glass"
 _FLIGHT = "flying pixels, noise on dark surfaces, rounded corners"
 
 
@@ -244,7 +244,7 @@ FORMATS = (
     ),
     Format(
         "Replica of NICE-SLAM",
-        "a rendered scene, or what another program writes alike",
+        "a rendered scene, or another program's in the same layout",
         "`results/frame*.jpg`, `results/depth*.png`, and `traj.txt` or `cam_params.json`",
         "depth in 1/`scale` m (1/6553.5); intrinsics (`cam_params.json`, here or one folder up); poses",
         "written by its format",

@@ -103,7 +103,7 @@ class CaptureFrame:
         geometry: returns camera and pose for a photo of (height, width) pixels, or raises a ValueError that names the
             file.
         told_by: file that describes camera and pose.
-        told: the part of it that this frame depends on, which identifies it in ``info.json``.
+        content: the part of it that this frame depends on, which identifies it in ``info.json``.
         photo: where the photo is, if it is no file of its own.
         depth: where the depth map is, if it is no file of its own.
         time: of the frame, in seconds; None if the capture does not say.
@@ -113,8 +113,8 @@ class CaptureFrame:
 
     app: str
     geometry: Callable[[tuple[int, int]], Geometry]
-    told_by: Path
-    told: bytes
+    description: Path
+    content: bytes
     photo: Source | None = None
     depth: Source | None = None
     time: float | None = None
@@ -122,7 +122,7 @@ class CaptureFrame:
 
     def record(self) -> Record:
         """Return what identifies the description of the camera."""
-        return {"file": self.told_by.name, "sha256": hashlib.sha256(self.told).hexdigest()}
+        return {"file": self.description.name, "sha256": hashlib.sha256(self.content).hexdigest()}
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ from dsr.io.images import CameraFile, pixels_in_header, read_mask
 from dsr.io.pairs import Pair, find_camera_file, role_of_words, words_of
 from dsr.io.photos import Size, model_in_exif, read_photo, same_aspect
 from dsr.io.reading import SUNRGBD_BITS, CameraChoice, Reading
-from dsr.io.units import TURNED_BACK, Told, tell
+from dsr.io.units import TURNED_BACK, Meaning, interpret
 from dsr.notes import Assumption
 from dsr.sample import FARTHEST, NEAREST
 from dsr.utils.guards import natural_key, pixels_beside
@@ -49,7 +49,7 @@ _DOUBTED = 8
 
 
 class FolderUnits:
-    """Tells the unit and range type of each kind of map from the first by name that has a known pixel.
+    """The unit and range type of each kind of map from the first by name that has a known pixel.
 
     The guess depends on the pairs alone, not on their order, nor on which of them were read or finished before.
 
@@ -60,10 +60,12 @@ class FolderUnits:
 
     def __init__(self, pairs: Sequence[Pair] = ()) -> None:
         self._pairs = pairs
-        self._told: dict[tuple[Kind, bool], Told] = {}
+        self._meanings: dict[tuple[Kind, bool], Meaning] = {}
 
-    def tell(self, pair: Pair, stored: np.ndarray, hole_value: float | None, camera: Camera, *, may_fall: bool) -> Told:
-        """Return what the values of a map tell; see :func:`dsr.io.units.tell`.
+    def interpret(
+        self, pair: Pair, stored: np.ndarray, hole_value: float | None, camera: Camera, *, may_fall: bool
+    ) -> Meaning:
+        """Return what the values of a map mean; see :func:`dsr.io.units.interpret`.
 
         Args:
             pair: the map's pair.
@@ -77,18 +79,22 @@ class FolderUnits:
 
         """
         kind = _kind(pair, stored)
-        if (kind, may_fall) not in self._told:
+        if (kind, may_fall) not in self._meanings:
             path, first = next(self._maps(kind, hole_value), (pair.depth, stored))
-            told = tell(str(path), first, find_holes(first, hole_value)[0], camera, may_fall=may_fall)
-            if any(note.code for note in told.assumptions):
+            meaning = interpret(str(path), first, find_holes(first, hole_value)[0], camera, may_fall=may_fall)
+            if any(note.code for note in meaning.assumptions):
                 every = max(len(self._in_order) // _DOUBTED, 1)
                 for _, other in self._maps(kind, hole_value, every):
-                    notes = tell(str(path), other, find_holes(other, hole_value)[0], camera, may_fall=False).assumptions
+                    notes = interpret(
+                        str(path), other, find_holes(other, hole_value)[0], camera, may_fall=False
+                    ).assumptions
                     if not any(note.code for note in notes):  # the first one is an exception
-                        told = told._replace(assumptions=tuple(note for note in told.assumptions if not note.code))
+                        meaning = meaning._replace(
+                            assumptions=tuple(note for note in meaning.assumptions if not note.code)
+                        )
                         break
-            self._told[kind, may_fall] = told
-        return self._told[kind, may_fall]
+            self._meanings[kind, may_fall] = meaning
+        return self._meanings[kind, may_fall]
 
     def _maps(self, kind: Kind, hole_value: float | None, every: int = 1) -> Iterator[tuple[Path, np.ndarray]]:
         """Yield those of every so many maps that are of a kind and have a known pixel."""
@@ -173,11 +179,11 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     pixels, assumptions = _photo(pair, size_lr)
     geometry, doubted = read_geometry(pair, (pixels.shape[0], pixels.shape[1]), reading)
     described, camera_assumptions = _camera(pair, reading, geometry, (pixels.shape[0], pixels.shape[1]), size_lr)
-    expect_possible(described.camera, _told_by(pair, reading))
+    expect_possible(described.camera, _camera_source(pair, reading))
     given = reading.camera != CameraChoice()
     lens = geometry.lens if geometry.camera is not None and not given else None
     if given and geometry.lens is not None and geometry.lens.bends:
-        text = "the lens distortion that the capture states is left: the camera is given"
+        text = "the lens distortion that the capture states is not undone: the camera is given"
         camera_assumptions = [*camera_assumptions, Assumption(text, str(geometry.lens))]
     pixels, undone = _undistort_photo(pixels, described.camera, lens)
     pixels, crop_assumptions = _crop_to_multiple(pixels, pair.factor, size_lr)
@@ -191,7 +197,7 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     of_depth = camera.rescale(size_lr[1], size_lr[0]) if rig is None else rig.camera
     units = FolderUnits() if units is None else units
     found = _interpret(pair, reading, described, stored, units, of_depth)
-    stored, holes, told, range_type = found.stored, found.holes, found.told, found.range_type
+    stored, holes, meaning, range_type = found.stored, found.holes, found.meaning, found.range_type
     hole_assumptions = list(found.hole_assumptions)
     if pair.mask is not None:
         holes |= ~_mask(pair.mask, size_lr)
@@ -200,7 +206,7 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
         raise ValueError(f"{pair.depth}: expected at least one known pixel, all are holes")
     lens_lr = lens if rig is None else rig.lens
     stored, holes, confidence, undone_lr = _undistort_depth(stored, holes, confidence, of_depth, lens_lr)
-    encoding = Encoding(_suffix(pair), str(stored.dtype), told.unit, found.mark, range_type)
+    encoding = Encoding(_suffix(pair), str(stored.dtype), meaning.unit, found.mark, range_type)
     depth_lr = decode(stored, holes, encoding, of_depth)
     hole_assumptions += _expect_distances(pair.depth, depth_lr, holes, range_type)
     doubts = [*doubt_camera(described.camera, "camera", size_lr), *doubt_depth(depth_lr, of_depth, range_type)]
@@ -211,7 +217,7 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
         *undone,
         *crop_assumptions,
         *found.range_assumptions,
-        *told.assumptions,
+        *meaning.assumptions,
         *hole_assumptions,
         *confidence_assumptions,
         *undone_lr,
@@ -234,7 +240,7 @@ class _Interpreted(NamedTuple):
     stored: np.ndarray
     holes: np.ndarray
     mark: float
-    told: Told
+    meaning: Meaning
     range_type: RangeType
     range_assumptions: list[Assumption]
     hole_assumptions: list[Assumption]
@@ -245,19 +251,19 @@ def _interpret(
 ) -> _Interpreted:
     """Return what the values of a pair's map are, (h, w), which ``camera`` has taken."""
     range_type, range_assumptions = _range_type(pair, reading, described)
-    told = _unit(pair, reading, described, range_type, stored, units, camera)
-    range_type = told.range_type or range_type or "orthogonal"
+    meaning = _unit(pair, reading, described, range_type, stored, units, camera)
+    range_type = meaning.range_type or range_type or "orthogonal"
     if range_type == "disparity" and camera.baseline is None:
         raise ValueError(f"{pair.depth}: disparities need the distance between the two cameras: --baseline METRES")
-    if told.bits:
-        stored = turn_back_bits(str(pair.depth), stored, told.bits)
+    if meaning.bits:
+        stored = turn_back_bits(str(pair.depth), stored, meaning.bits)
     hole_value = described.hole_value if reading.hole_value is None else reading.hole_value
     holes, mark, hole_assumptions = find_holes(stored, hole_value)
-    return _Interpreted(stored, holes, mark, told, range_type, range_assumptions, hole_assumptions)
+    return _Interpreted(stored, holes, mark, meaning, range_type, range_assumptions, hole_assumptions)
 
 
 def read_map(path: Path, reading: Reading, camera: Camera | None = None) -> tuple[Tensor, tuple[Assumption, ...]]:
-    """Return a depth map without its photo, (1, h, w) float32 in metres, NaN in holes, and what its values told.
+    """Return a depth map without its photo, (1, h, w) float32 in metres, NaN in holes, and what its values mean.
 
     What a camera file beside it says of the values counts, as for a pair.
 
@@ -282,10 +288,10 @@ def read_map(path: Path, reading: Reading, camera: Camera | None = None) -> tupl
     found = _interpret(pair, reading, own, stored, FolderUnits(), of_depth)
     if found.holes.all():
         raise ValueError(f"{path}: expected at least one known pixel, all are holes")
-    encoding = Encoding(_suffix(pair), str(found.stored.dtype), found.told.unit, found.mark, found.range_type)
+    encoding = Encoding(_suffix(pair), str(found.stored.dtype), found.meaning.unit, found.mark, found.range_type)
     depth = decode(found.stored, found.holes, encoding, of_depth)
     _expect_distances(path, depth, found.holes, found.range_type)
-    notes = [*found.range_assumptions, *found.told.assumptions] if own.depth_unit is None else []
+    notes = [*found.range_assumptions, *found.meaning.assumptions] if own.depth_unit is None else []
     known = camera is not None or isinstance(content, CameraFile) or _is_icl(pair)
     if found.range_type != "orthogonal" and not known:
         notes.append(Assumption(f"camera: none given, {ASSUMED_FOV:g} degrees of horizontal view assumed (--camera)"))
@@ -317,7 +323,7 @@ def read_geometry(pair: Pair, size: Size, reading: Reading) -> tuple[Geometry, l
         return found, []
     if pair.capture.apart and reading.rig is None:
         raise ValueError(found.damage)
-    text = "the capture's cameras are damaged: the given one is taken, and no pose or depth camera of the capture"
+    text = "the capture's cameras are damaged: the given one is used, and no pose or depth camera of the capture"
     return found, [Assumption(text, found.damage, "cameras-damaged", 1)]
 
 
@@ -404,7 +410,7 @@ def _camera(
     if reading.camera != CameraChoice():
         return find_camera(reading.camera, pair.rgb, size, size_lr)
     if pair.capture is not None and geometry.camera is not None:
-        content, scaled = scale_to_photo(pair.capture.told_by, camera_only(geometry.camera), size)
+        content, scaled = scale_to_photo(pair.capture.description, camera_only(geometry.camera), size)
         return content, [*geometry.assumptions, *scaled]
     if pair.camera is None and _is_icl(pair) and size == size_lr:
         return camera_only(ICL_CAMERA), [Assumption("camera: that of ICL-NUIM")]
@@ -422,7 +428,7 @@ def _rig(pair: Pair, reading: Reading, geometry: Geometry, size_lr: Size) -> Rig
         return read_rig(reading.rig, size_lr, reading.baseline)
     if pair.capture is None or geometry.rig is None:
         return None
-    camera = scale_to_depth(str(pair.capture.told_by), geometry.rig.camera, size_lr)
+    camera = scale_to_depth(str(pair.capture.description), geometry.rig.camera, size_lr)
     return geometry.rig._replace(camera=replace(camera, baseline=reading.baseline or camera.baseline))
 
 
@@ -432,7 +438,7 @@ def _to_photo(
     """Return a depth camera's map in the photo's view, and notes."""
     given = reading.rig is not None
     doubts = doubt_camera(rig.camera, "--depth-camera" if given else "depth camera")
-    warped, note = to_photo(depth_lr, rig, photo, "--extrinsics" if given else _told_by(pair, reading))
+    warped, note = to_photo(depth_lr, rig, photo, "--extrinsics" if given else _camera_source(pair, reading))
     return warped, [*doubts, note]
 
 
@@ -455,11 +461,11 @@ def _undistort_depth(
     return undistort(stored, camera, lens, 0), undistort(holes, camera, lens, hole=True), confidence, [note]
 
 
-def _told_by(pair: Pair, reading: Reading) -> str:
+def _camera_source(pair: Pair, reading: Reading) -> str:
     """Return what says where the photo's principal point is."""
     if reading.camera.intrinsics is not None:
         return "--intrinsics"
-    capture = None if pair.capture is None else pair.capture.told_by
+    capture = None if pair.capture is None else pair.capture.description
     return str(reading.camera.file or capture or pair.camera or pair.rgb)
 
 
@@ -479,31 +485,31 @@ def _range_type(pair: Pair, reading: Reading, described: CameraFile) -> tuple[Ra
     if reading.range_type is not None:
         return reading.range_type, []
     if _DISPARITY_WORDS & set(words_of(pair.depth.stem)):
-        return "disparity", [Assumption("values are taken for disparities, by the file's name")]
+        return "disparity", [Assumption("values are read as disparities, by the file's name")]
     if _is_icl(pair):
         text = "values are distances along the rays in centimetres, as in ICL-NUIM's .depth"
         return "perspective", [Assumption(text)]
     if described.range_type in (None, "orthogonal"):
         return described.range_type, []
-    return described.range_type, [Assumption(f"values are of range type {described.range_type}, says the camera file")]
+    return described.range_type, [Assumption(f"values are of range type {described.range_type}, by the camera file")]
 
 
 def _unit(
     pair: Pair, reading: Reading, described: CameraFile, range_type: RangeType | None,
     stored: np.ndarray, units: FolderUnits, camera: Camera,
-) -> Told:  # fmt: skip
+) -> Meaning:  # fmt: skip
     """Return metres per value, or pixels per value of disparities, and the assumptions."""
     if reading.metres is not None:
         turned = reading.unit == "sunrgbd"
-        return Told(reading.metres, (Assumption(TURNED_BACK),) if turned else (), bits=SUNRGBD_BITS if turned else 0)
+        return Meaning(reading.metres, (Assumption(TURNED_BACK),) if turned else (), bits=SUNRGBD_BITS if turned else 0)
     if range_type == "disparity":
-        return Told(1.0, (Assumption("disparities are taken for pixels of the depth map"),))
+        return Meaning(1.0, (Assumption("disparities are read in pixels of the depth map"),))
     if described.depth_unit is not None:
         unit = described.depth_unit
-        return Told(unit, (Assumption(f"unit: {show_length(unit)} per value, says the camera file"),))
+        return Meaning(unit, (Assumption(f"unit: {show_length(unit)} per value, by the camera file"),))
     if pair.unit is not None:
-        return Told(pair.unit, (), bits=pair.bits)
+        return Meaning(pair.unit, (), bits=pair.bits)
     if _is_icl(pair):
-        return Told(1e-2, ())
+        return Meaning(1e-2, ())
     hole_value = described.hole_value if reading.hole_value is None else reading.hole_value
-    return units.tell(pair, stored, hole_value, camera, may_fall=range_type is None)
+    return units.interpret(pair, stored, hole_value, camera, may_fall=range_type is None)

@@ -129,7 +129,7 @@ def _search(folder: Path, root: Path, leave: Path | None, depth: int) -> Pairing
 
 def _alike(folder: Path) -> tuple[Assumption, ...]:
     """Return notes on the captures that a folder looks like, and that its pairs were not read as."""
-    return tuple(Assumption(f"{text}: read without what it says of camera, unit and poses") for text in lacking(folder))
+    return tuple(Assumption(f"{text}: read without its camera, unit and poses") for text in lacking(folder))
 
 
 def _find_at(place: Path, root: Path | None = None) -> PairingResult:
@@ -187,9 +187,9 @@ def _tum(folder: Path) -> PairingResult:
     if truth.is_file() and pairs:
         poses = _tum_poses(truth, [depths[pair.depth] for pair in pairs])
         text += f"; poses: {truth.name}, of {sum(pose is not None for pose in poses)} of {len(pairs)} frames"
-        told = [b"" if pose is None else pose.tobytes() for pose in poses]
+        described = [b"" if pose is None else pose.tobytes() for pose in poses]
         frames = [CaptureFrame("TUM RGB-D", partial(_tum_geometry, pose), truth, each)
-                  for pose, each in zip(poses, told, strict=True)]  # fmt: skip
+                  for pose, each in zip(poses, described, strict=True)]  # fmt: skip
         pairs = [replace(pair, capture=frame) for pair, frame in zip(pairs, frames, strict=True)]
     return PairingResult(tuple(pairs), (Assumption(text),), tuple(unpaired))
 
@@ -234,7 +234,7 @@ def _role_folders(folder: Path) -> PairingResult:
     found = find_pairs_of_two_folders(named["rgb"][0], named["depth"][0], ())
     extra = [path.name for paths in (named["rgb"], named["depth"]) for path in paths[1:]]
     text = f"folders {named['rgb'][0].name} and {named['depth'][0].name}"
-    assumption = Assumption(text + (f"; not looked at: {', '.join(extra)}" if extra else ""))
+    assumption = Assumption(text + (f"; not read: {', '.join(extra)}" if extra else ""))
     return replace(found, assumptions=(assumption, *found.assumptions))
 
 

@@ -58,12 +58,8 @@ def read_photo(path: Path, size_lr: Size) -> tuple[np.ndarray, list[Assumption]]
         return pixels, []
     size: Size = (pixels.shape[0], pixels.shape[1])
     if orientation >= 5 and not same_aspect(size, size_lr) and same_aspect(size[::-1], size_lr):
-        return _TURNS[orientation](pixels), [
-            Assumption("the photo is turned as its EXIF data say: so the depth map fits")
-        ]
-    return pixels, [
-        Assumption("the photo's EXIF orientation is left out: the depth map is taken to lie as the file does")
-    ]
+        return _TURNS[orientation](pixels), [Assumption("the photo is turned by its EXIF data, as the depth map is")]
+    return pixels, [Assumption("the photo's EXIF orientation is ignored: the depth map is assumed to fit it as stored")]
 
 
 def read_heic(path: Path) -> np.ndarray:

@@ -1,8 +1,8 @@
-"""What the stored values of a depth map tell of their unit and range type; asked for where two readings are as likely.
+"""The unit and range type of a depth map by its stored values; asked for where two readings are as likely.
 
 The clues are the median, the range, steps that all values are multiples of, the size and the camera of known data sets,
 single pixels as of a laser scanner, and the planes of the map (:func:`dsr.geometry.planes.inverse_votes`). A map of few
-different values tells nothing but its median.
+different values shows nothing but its median.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _SPARSE_FRACTION, _SCATTERED = 0.6, 0.6
 """Fraction of holes above which whole numbers may come from a laser scanner; and do, if fewer of the known pixels than
 the second have a known one below."""
 _FEWEST_LEVELS = 16
-"""Number of different values below which a map tells nothing but its median."""
+"""Number of different values below which a map shows nothing but its median."""
 _SAMPLE = 200_000
 """Largest number of values that are looked at."""
 _MOST = 0.99
@@ -51,10 +51,10 @@ _KITTI_WIDTHS, _KITTI_HEIGHTS = range(1216, 1243), range(350, 377)
 """Of KITTI's pictures, whose depth and disparity is stored in 1/256 (its devkit)."""
 
 
-class Told(NamedTuple):
-    """What values tell: metres (pixels) per value, the assumptions, and what else is not as usual.
+class Meaning(NamedTuple):
+    """What values mean: metres (pixels) per value, the assumptions, and what else is not as usual.
 
-    ``range_type``: ``disparity`` where the values are; None where they tell of none. ``bits``: how far they were turned
+    ``range_type``: ``disparity`` where the values are; None where they show none. ``bits``: how far they were turned
     to the left; the unit holds after turning them back.
     """
 
@@ -64,10 +64,10 @@ class Told(NamedTuple):
     bits: int = 0
 
 
-def tell(
+def interpret(
     name: str, values: np.ndarray, holes: np.ndarray, camera: Camera | None = None, *, may_fall: bool = True
-) -> Told:
-    """Return what the values of a map tell.
+) -> Meaning:
+    """Return what the values of a map mean.
 
     Args:
         name: name of the file, for the error.
@@ -84,7 +84,7 @@ def tell(
     if holes.all():
         raise ValueError(f"{name}: expected at least one known pixel, all are holes")
     clues = _Clues(name, values, holes, camera, may_fall)
-    return _tell_floats(clues) if values.dtype.kind == "f" else _tell_whole(clues)
+    return _interpret_floats(clues) if values.dtype.kind == "f" else _interpret_whole(clues)
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class _Clues:
         return float(self.values[~self.holes].min())
 
     @functools.cached_property
-    def telling(self) -> bool:
+    def conclusive(self) -> bool:
         """Whether there are enough different values."""
         return np.unique(self.known).size >= _FEWEST_LEVELS
 
@@ -127,7 +127,7 @@ class _Clues:
     def votes(self) -> InverseVotes:
         """What the planes say."""
         known = np.where(self.holes, np.nan, self.values.astype(np.float64))
-        return inverse_votes(known) if self.telling else InverseVotes(0, 0)
+        return inverse_votes(known) if self.conclusive else InverseVotes(0, 0)
 
     @property
     def scattered(self) -> bool:
@@ -170,19 +170,19 @@ class _Clues:
         raise ValueError(f"{self.name}: expected {readings}: {why}")
 
 
-def _tell_whole(clues: _Clues) -> Told:
-    """Return what whole numbers tell."""
-    if clues.lowest < clues.highest < _LEVELS and not (clues.telling and clues.may_fall and clues.votes.verdict):
+def _interpret_whole(clues: _Clues) -> Meaning:
+    """Return what whole numbers mean."""
+    if clues.lowest < clues.highest < _LEVELS and not (clues.conclusive and clues.may_fall and clues.votes.verdict):
         raise ValueError(
             f"{clues.name}: expected --depth-unit cm (median {clues.metres(1e-2)}), or --range-type disparity with "
             f"--baseline METRES: whole numbers up to {clues.highest:g} are too small for millimetres"
         )
-    if not clues.telling:
+    if not clues.conclusive:
         return _by_median(clues)
     if clues.values.dtype == np.uint16 and clues.multiples(1 << SUNRGBD_BITS, 0.9):
         note = Assumption(f"values are multiples of 8: {TURNED_BACK}; {_OVERRIDE}")
-        return Told(1e-3, (note,), bits=SUNRGBD_BITS)
-    falling = _tell_falling(clues)
+        return Meaning(1e-3, (note,), bits=SUNRGBD_BITS)
+    falling = _interpret_falling(clues)
     if falling is not None:
         return falling
     for step in (_LEVELS, _LEVELS + 1):
@@ -194,17 +194,19 @@ def _tell_whole(clues: _Clues) -> Told:
     return _by_data_set(clues) or _by_steps(clues) or _by_median(clues)
 
 
-def _by_data_set(clues: _Clues) -> Told | None:
+def _by_data_set(clues: _Clues) -> Meaning | None:
     """Return the unit of a data set with such a size or camera; None if there is none."""
     height, width = clues.values.shape
     camera = clues.camera
     for known_width, fx, fy, unit, name in _KNOWN_CAMERAS:
         if camera is not None and camera.width == known_width and np.allclose((camera.fx, camera.fy), (fx, fy), 1e-4):
-            return Told(unit, (_whole(clues, "1/5000 m", unit, f"the camera is that of {name}"),))
+            return Meaning(unit, (_whole(clues, "1/5000 m", unit, f"the camera is that of {name}"),))
     if (width, height) == _REPLICA and clues.middle / 6553.5 > 0.5:
-        return Told(1 / 6553.5, (_whole(clues, "1/6553.5 m", 1 / 6553.5, "1200 x 680 is the size of Replica's maps"),))
+        return Meaning(
+            1 / 6553.5, (_whole(clues, "1/6553.5 m", 1 / 6553.5, "1200 x 680 is the size of Replica's maps"),)
+        )
     if clues.of_kitti and clues.sparse:
-        return Told(1 / 256, (_whole(clues, "1/256 m", 1 / 256, "size and holes are those of KITTI's maps"),))
+        return Meaning(1 / 256, (_whole(clues, "1/256 m", 1 / 256, "size and holes are those of KITTI's maps"),))
     if clues.of_kitti:
         clues.ask("KITTI's maps have this size, and store 1/256 m", ("1/256", 1 / 256), ("mm", 1e-3), ("cm", 1e-2))
     if clues.scattered:
@@ -214,7 +216,7 @@ def _by_data_set(clues: _Clues) -> Told | None:
     return None
 
 
-def _by_steps(clues: _Clues) -> Told | None:
+def _by_steps(clues: _Clues) -> Meaning | None:
     """Return the unit of millimetres that are stored more finely than they are; None where they are near then."""
     for step, name, unit in ((5, "1/5000", 1 / 5000), (10, "0.0001", 1e-4)):
         if not clues.multiples(step):
@@ -223,7 +225,7 @@ def _by_steps(clues: _Clues) -> Told | None:
         fine, coarse = nearest <= clues.middle * unit, clues.middle * 1e-3 <= LIMITS["far-millimetres"].threshold
         why = f"values are multiples of {step}, as of millimetres stored in {name} m"
         if fine and not coarse:
-            return Told(unit, (_whole(clues, f"{name} m", unit, why),))
+            return Meaning(unit, (_whole(clues, f"{name} m", unit, why),))
         if not coarse or (fine and step == 5):  # sensors have steps of a centimetre, too
             clues.ask(why, ("mm", 1e-3), (name, unit))
     return None
@@ -231,54 +233,54 @@ def _by_steps(clues: _Clues) -> Told | None:
 
 def _whole(clues: _Clues, label: str, unit: float, why: str) -> Assumption:
     """Return the note on a unit of whole numbers."""
-    return Assumption(f"whole numbers are taken for {label}: {why}; {_OVERRIDE}", f"median {clues.metres(unit)}")
+    return Assumption(f"whole numbers are read as {label}: {why}; {_OVERRIDE}", f"median {clues.metres(unit)}")
 
 
-def _by_median(clues: _Clues) -> Told:
+def _by_median(clues: _Clues) -> Meaning:
     """Return the unit of whole numbers that makes their median a distance."""
     middle = clues.middle
     if _MIN_MEDIAN <= middle * 1e-3 <= _MAX_MEDIAN:
         others = "TUM RGB-D and ICL-NUIM store 1/5000 m"
-        if clues.telling and middle * 1e-3 > LIMITS["far-millimetres"].threshold:
+        if clues.conclusive and middle * 1e-3 > LIMITS["far-millimetres"].threshold:
             why = f"as millimetres that is far for a depth camera; {others}"
             clues.ask(why, ("mm", 1e-3), ("1/5000", 1 / 5000))
-        found = [Assumption("whole numbers are taken for millimetres", f"median {clues.metres(1e-3)}")]
+        found = [Assumption("whole numbers are read as millimetres", f"median {clues.metres(1e-3)}")]
         if middle * 1e-3 > LIMITS["far-metres"].threshold:
             found.append(Assumption(f"that is far for a sensor: {others} (--depth-unit), SUN RGB-D sunrgbd"))
         near = float(np.percentile(clues.known, 99)) * 1e-3
-        if clues.telling and near < LIMITS["near-millimetres"].threshold:
+        if clues.conclusive and near < LIMITS["near-millimetres"].threshold:
             text = "everything is near if whole numbers are millimetres: are they centimetres? --depth-unit mm or cm"
             found.append(Assumption(text, f"99 % within {show_length(near, 2)}", "near-millimetres", near))
         if clues.sparse and not clues.compact:
             text = "that is sparse, as of a laser scanner: KITTI stores 1/256 m (--depth-unit 1/256)"
             found.append(Assumption(text))
-        return Told(1e-3, tuple(found))
+        return Meaning(1e-3, tuple(found))
     for unit, label in _OTHER_UNITS:
         if _MIN_MEDIAN <= middle * unit <= _MAX_MEDIAN:
             why = f"as millimetres the median would be {clues.metres(1e-3)}, now {clues.metres(unit)}"
-            return Told(unit, (Assumption(f"whole numbers are taken for {label}", why),))
+            return Meaning(unit, (Assumption(f"whole numbers are read as {label}", why),))
     raise ValueError(
         f"{clues.name}: no usual unit makes its median of {middle:g} a distance; give one with --depth-unit"
     )
 
 
-def _tell_floats(clues: _Clues) -> Told:
-    """Return what floats tell."""
+def _interpret_floats(clues: _Clues) -> Meaning:
+    """Return what floats mean."""
     middle = clues.middle
-    if clues.telling:
+    if clues.conclusive:
         _expect_metric(clues)
-        falling = _tell_falling(clues)
+        falling = _interpret_falling(clues)
         if falling is not None:
             return falling
         _expect_one_reading(clues)
-    whole = clues.telling and bool((clues.known == np.round(clues.known)).all())
-    sure = "float-millimetres.whole" if whole or not clues.telling else "float-millimetres"
+    whole = clues.conclusive and bool((clues.known == np.round(clues.known)).all())
+    sure = "float-millimetres.whole" if whole or not clues.conclusive else "float-millimetres"
     if middle > LIMITS[sure].threshold:
-        return Told(1e-3, (Assumption("floats this large are taken for millimetres", f"median {middle:.4g}"),))
-    found = [Assumption("floats are taken for metres", f"median {clues.metres(1.0)}")]
+        return Meaning(1e-3, (Assumption("floats this large are read as millimetres", f"median {middle:.4g}"),))
+    found = [Assumption("floats are read as metres", f"median {clues.metres(1.0)}")]
     if middle < _MIN_MEDIAN:
         found.append(Assumption("the depth is nearer than 5 cm: is it in metres? --depth-unit gives another unit"))
-    return Told(1.0, tuple(found))
+    return Meaning(1.0, tuple(found))
 
 
 def _expect_metric(clues: _Clues) -> None:
@@ -326,7 +328,7 @@ def _expect_one_reading(clues: _Clues) -> None:
         clues.ask("floats of this size are as often centimetres as millimetres", ("cm", 1e-2), ("mm", 1e-3))
 
 
-def _tell_falling(clues: _Clues) -> Told | None:
+def _interpret_falling(clues: _Clues) -> Meaning | None:
     """Return what values that fall with distance are; None if they do not.
 
     Raises:
@@ -345,5 +347,5 @@ def _tell_falling(clues: _Clues) -> Told | None:
             f"depth: {why}, as disparity and inverse depth do; inverse depth of a network has no metric unit"
         )
     label = "pixels" if fitting[0] == 1 else "1/256 pixel"
-    text = f"values are taken for disparities in {label} of the depth map: {why}; --range-type overrides it"
-    return Told(fitting[0], (Assumption(text),), "disparity")
+    text = f"values are read as disparities in {label} of the depth map: {why}; --range-type overrides it"
+    return Meaning(fitting[0], (Assumption(text),), "disparity")

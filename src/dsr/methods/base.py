@@ -106,7 +106,7 @@ class MapNoise(NamedTuple):
 
 
 class Outliers(NamedTuple):
-    """Pixels of a low-resolution map that were taken for holes, and the number of patches that they form."""
+    """Pixels of a low-resolution map that were treated as holes, and the number of patches that they form."""
 
     pixels: int
     patches: int
@@ -118,7 +118,7 @@ class Surface(NamedTuple):
     ``depth`` (1, H, W): orthogonal depth in metres, NaN where missing. ``depth_error``, ``angle_error`` (1, H, W): the
     expected absolute error of the depth in metres and that of the normal in degrees; None for a method that does not
     say. Pixels that a method leaves out on purpose have errors and no depth. ``noise``: of the low-resolution map; None
-    for a method that does not estimate it. ``outliers``: what was taken for holes before the method saw the map.
+    for a method that does not estimate it. ``outliers``: what was treated as holes before the method saw the map.
     ``filled`` (1, H, W) bool: where there is depth that was not measured, since the nearest pixel of the map is a hole
     or an outlier; None where that is not known.
     """

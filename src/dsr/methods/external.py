@@ -307,7 +307,7 @@ def _expect_likeness(path: Path, depth: Tensor, sample: DepthSample) -> None:
         return
     agreement = float(torch.corrcoef(torch.stack((own, theirs)))[0, 1].nan_to_num())
     if agreement < _LEAST_AGREEMENT:
-        what = "disparity taken for depth" if agreement < -_LEAST_AGREEMENT else "another scene"
+        what = "disparity read as depth" if agreement < -_LEAST_AGREEMENT else "another scene"
         raise ValueError(
             f"{path}: expected a map like the low-resolution one, their correlation is {agreement:.2f}: {what}? "
             "method.check=false takes it"

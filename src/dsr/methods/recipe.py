@@ -207,14 +207,14 @@ class Recipe:
         """
         run = run or Run()
         node = {key: value for key, value in self.at(factor).items() if key not in decided or key in self.settings}
-        told = {
+        asked = {
             key: value for key, value in run.known._asdict().items() if value is not None and node.get(key) in _OPEN
         }
         given = {key: value for key, value in vars(run).items() if key != "known"}
-        given = {**given, **told, **decided, "scale": factor}
+        given = {**given, **asked, **decided, "scale": factor}
         if self.abilities.needs is not None:
             given |= {"weights": self.weights(factor), "networks": self._networks}
-        own = {key: value for key, value in node.items() if key not in (*self.of_run, _NETWORK, *told)}
+        own = {key: value for key, value in node.items() if key not in (*self.of_run, _NETWORK, *asked)}
         method: Method = build("method", own, given, self.name)
         return method
 

@@ -58,14 +58,16 @@ class WholeScenes(Dataset[Batch]):
         scenes: scenes with a true depth.
         degradation: how their low-resolution maps are made.
         seed: seed of the noise.
-        told: whether there are hints on the maps, the same as ``eval.py`` gives.
+        hinted: whether there are hints on the maps, the same as ``eval.py`` gives.
 
     """
 
-    def __init__(self, scenes: Sequence[Scene], degradation: Degradation, seed: int = 0, *, told: bool = False) -> None:
+    def __init__(
+        self, scenes: Sequence[Scene], degradation: Degradation, seed: int = 0, *, hinted: bool = False
+    ) -> None:
         self._samples = [degradation.sample(scene, seed) for scene in scenes]
         self._facts = None
-        if told:
+        if hinted:
             kernel = degradation.downsampling.assumed_model().kernel
             self._facts = encode_facts(kernel, soft=False, noise=degradation.noise is None)
 
@@ -256,7 +258,7 @@ class PatchData(lightning.LightningDataModule):
         return self.val_dataloader()
 
     def _whole(self, scenes: Sequence[Scene]) -> WholeScenes:
-        return WholeScenes(scenes, self._degradation, self._seed, told=self._everything is not None)
+        return WholeScenes(scenes, self._degradation, self._seed, hinted=self._everything is not None)
 
     def _load_patches(self) -> Patches:
         if self._cut is None:

@@ -61,13 +61,13 @@ class Objective(abc.ABC):
         """
 
     @abc.abstractmethod
-    def check(self, net: DisparityNetwork, patch: int, *, told: bool) -> None:
+    def check(self, net: DisparityNetwork, patch: int, *, hinted: bool) -> None:
         """Check that a network can be trained with this loss.
 
         Args:
             net: the network.
             patch: height and width of the patches in pixels.
-            told: whether there are hints on the maps.
+            hinted: whether there are hints on the maps.
 
         Raises:
             ValueError: it cannot.
@@ -145,7 +145,7 @@ class DepthObjective(Objective):
         """Return the loss of some :meth:`arguments`; ``lpips`` looks for AlexNet's weights."""
         return cls(visual=make_visual_loss(visual), **arguments)
 
-    def check(self, net: DisparityNetwork, patch: int, *, told: bool) -> None:
+    def check(self, net: DisparityNetwork, patch: int, *, hinted: bool) -> None:
         """Refuse a network that states its errors, and patches that are too small for the visual loss."""
         if net.states_errors:
             raise ValueError(
@@ -219,17 +219,16 @@ class SurfaceObjective(Objective):
         """Return the constructor's arguments."""
         return dict(vars(self))
 
-    def check(self, net: DisparityNetwork, patch: int, *, told: bool) -> None:
+    def check(self, net: DisparityNetwork, patch: int, *, hinted: bool) -> None:
         """Refuse a network that does not state its errors, and maps without hints."""
         if not net.states_errors:
             choices = ", ".join(_DEPTH_LOSSES)
             raise ValueError(
                 f"depth_loss: expected one of {choices} for {type(net).__name__}, which states no errors, got surface"
             )
-        if not told:
+        if not hinted:
             raise ValueError(
-                f"degradation: expected everything or another distribution with the hints that {type(net).__name__} is "
-                "told, got plain"
+                f"degradation: expected everything or another one with hints, for {type(net).__name__}, got plain"
             )
 
     def __call__(self, answer: Answer, batch: Batch) -> dict[str, Tensor]:

@@ -139,8 +139,8 @@ class Patches(Dataset[Batch]):
         scene, _ = augment(cropped, self._settings, random)
         generator = torch.Generator().manual_seed(int(random.integers(2**63)))
         sample, hints = everything(scene, scale, generator, soft=soft)
-        told = {"noise": hints.noise, "facts": hints.facts, "soft": torch.tensor(float(soft))}
-        return {**to_tensors(sample), **told}
+        known = {"noise": hints.noise, "facts": hints.facts, "soft": torch.tensor(float(soft))}
+        return {**to_tensors(sample), **known}
 
     def _window(self, group: int, random: np.random.Generator, size: int | None = None) -> tuple[int, int, int]:
         """Return a random window of a group: the number of the scene, the top and the left.

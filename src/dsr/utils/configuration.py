@@ -293,7 +293,7 @@ def _expect_moderate(path: Path) -> None:
         values = _count(yaml.compose(content, Loader=yaml.SafeLoader), {})
     except TooLargeError as error:
         raise ValueError(str(error)) from error
-    except (ValueError, RecursionError, yaml.YAMLError):  # told where it is composed
+    except (ValueError, RecursionError, yaml.YAMLError):  # reported where it is composed
         return
     if values > _MOST_VALUES:
         raise ValueError(f"{path}: expected at most {_MOST_VALUES} values, got more by its aliases")

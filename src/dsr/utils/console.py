@@ -234,7 +234,7 @@ class ConsoleProgress(Progress):
 class _ConsoleTask:
     """A piece of work under way, with its times.
 
-    What is left is told from the units that are done, and for the one at hand from the task within it or the stages
+    What is left is estimated from the units that are done, and for this one from the task within it or the stages
     that it goes through. It is never less than a second, or a tenth of what the unit at hand has taken beyond
     expectation, until all is done.
     """
@@ -333,12 +333,12 @@ class _ConsoleTask:
         if done:
             taken = {name: [item[name] for item in done if item[name]] for name in self.shares}
             return {name: sum(each) / max(len(each), 1) for name, each in taken.items()}
-        told = {self._stage: seconds} if seconds else {name: took for name, took in self._spent.items() if took}
-        share = sum(self.shares[name] for name in told)
+        known = {self._stage: seconds} if seconds else {name: took for name, took in self._spent.items() if took}
+        share = sum(self.shares[name] for name in known)
         if share < _TELLING:
             return None
-        whole = sum(told.values()) / share
-        return {name: told.get(name, whole * part) for name, part in self.shares.items()}
+        whole = sum(known.values()) / share
+        return {name: known.get(name, whole * part) for name, part in self.shares.items()}
 
     @property
     def amount(self) -> str:

@@ -61,7 +61,7 @@ def obstacle(path: Path, *, folder: bool = False) -> str | None:
     """
     try:
         mode = path.lstat().st_mode
-    except (OSError, ValueError):  # told by what writes
+    except (OSError, ValueError):  # reported by what writes
         return None
     if stat.S_ISLNK(mode):
         return None if folder and path.is_dir() else f"a link to {path.readlink()}"

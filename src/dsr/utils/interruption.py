@@ -43,7 +43,7 @@ _GRACE = 4.0
 _BETWEEN_LOOKS = 0.5
 """Seconds between two looks of a worker after its parent, and of a process that is to end after its work."""
 _SILENCE = 1.0
-"""Seconds after Ctrl-C from which on a step that is still being done is told of."""
+"""Seconds after Ctrl-C from which on a step that is still being done is reported."""
 _SHOW_CURSOR = b"\x1b[?25h"
 """The control sequence of terminals that undoes what a progress display hides."""
 
@@ -138,7 +138,7 @@ def start(module: str, function: str) -> NoReturn:
     install()
     surroundings.close()
     sys.stdout = _without(sys.stdout, errno.EPIPE)
-    sys.stderr = _without(sys.stderr, errno.EPIPE, errno.ENOSPC)  # what cannot be told must not change the exit code
+    sys.stderr = _without(sys.stderr, errno.EPIPE, errno.ENOSPC)  # what cannot be printed must not change the exit code
     code: object = 0
     try:
         code = getattr(importlib.import_module(module), function)()
@@ -431,7 +431,7 @@ def _watch(pipe: int) -> None:
     A step that Ctrl-C has met is waited for however long it takes.
     """
     grace = 2 * _GRACE if _State.silent else _GRACE  # another process may need this one to complete its step
-    came, deadline, told = 0.0, 0.0, _State.silent
+    came, deadline, announced = 0.0, 0.0, _State.silent
     while True:
         left = max(min(deadline - time.monotonic(), _BETWEEN_LOOKS), 0) if came else None
         if select.select([pipe], [], [], left)[0]:
@@ -444,8 +444,8 @@ def _watch(pipe: int) -> None:
             came, deadline = time.monotonic(), time.monotonic() + grace
         elif (_State.deferred is not None or _State.pools) and is_ctrl_c() and not _State.silent:
             deadline = time.monotonic() + grace
-            if not told and time.monotonic() - came >= _SILENCE:
-                told = True
+            if not announced and time.monotonic() - came >= _SILENCE:
+                announced = True
                 with contextlib.suppress(OSError):
                     os.write(2, b"stopping after this step (Ctrl-C again stops at once)\n")
         elif time.monotonic() >= deadline:

@@ -23,7 +23,7 @@ class OutOfMemoryError(ValueError):
 
 def free_memory() -> int:
     """Return the bytes of memory that are free; where the system does not tell it, those of a large machine."""
-    return _told("MemAvailable:")
+    return _meminfo("MemAvailable:")
 
 
 def expect_memory(name: str, value: object, needed: float) -> None:
@@ -38,7 +38,7 @@ def expect_memory(name: str, value: object, needed: float) -> None:
         OutOfMemoryError: it has less; the message begins with ``name``.
 
     """
-    there, needed = _told("MemTotal:"), min(needed, _MOST)
+    there, needed = _meminfo("MemTotal:"), min(needed, _MOST)
     if needed > there:
         size = f"at least {megabytes(needed)} of memory, of which there are {megabytes(there)}"
         raise OutOfMemoryError(f"{name}: expected less, {value} needs {size}")
@@ -61,7 +61,7 @@ def _is_of_allocator(error: Exception) -> bool:
     return foreign and any(text in str(error) for text in _OF_ALLOCATORS)
 
 
-def _told(name: str) -> int:
+def _meminfo(name: str) -> int:
     """Return what the system tells of its memory, in bytes."""
     try:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()

@@ -279,7 +279,7 @@ def _add(place: Any, record: type[Options], alone: dict[tuple[int, str], Any], *
 
 
 def _keywords(each: _Stated, option: _Option, *, needed: bool) -> dict[str, Any]:
-    """Return what argparse is told of an option; what isn't given is absent from what it returns."""
+    """Return argparse's arguments of an option; what isn't given is absent from what it returns."""
     keywords: dict[str, Any] = {"help": option.help.replace("%", "%%"), "default": SUPPRESS}
     if needed and each.required and not each.by_place:
         keywords["required"] = True

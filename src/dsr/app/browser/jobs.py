@@ -64,7 +64,7 @@ class Job:
     """One run of the process.
 
     Attributes:
-        facts: what the process told, the last of each name.
+        facts: what the process has sent, the last of each name.
         notes: notes on the input, each with whether it is a warning.
         names: those of the frames.
         thumbs: small pictures of frames.
@@ -113,23 +113,23 @@ class Job:
             **facts,
         }
 
-    def take(self, told: Any) -> None:
-        """Take what the process tells; TypeError if it is no object."""
-        if not isinstance(told, dict):
+    def take(self, message: Any) -> None:
+        """Take a message of the process; TypeError if it is no object."""
+        if not isinstance(message, dict):
             raise TypeError("expected an object")
-        if "note" in told:
-            if len(self.notes) < _MOST_NOTES and told not in self.notes:
-                self.notes.append(told)
-        elif "names" in told:
-            self.names += map(str, told["names"])
-        elif "thumb" in told:
-            self.thumbs.append(told)
-        elif "problem" in told:
-            self.problem = str(told["problem"])
+        if "note" in message:
+            if len(self.notes) < _MOST_NOTES and message not in self.notes:
+                self.notes.append(message)
+        elif "names" in message:
+            self.names += map(str, message["names"])
+        elif "thumb" in message:
+            self.thumbs.append(message)
+        elif "problem" in message:
+            self.problem = str(message["problem"])
         else:
-            if told.get("done") == 0 or "done" not in self.facts:
+            if message.get("done") == 0 or "done" not in self.facts:
                 self.steps_since = time.monotonic()
-            self.facts |= told
+            self.facts |= message
 
 
 class Desk:
@@ -296,7 +296,7 @@ class Desk:
         return job.process
 
     def _follow(self, job: Job, process: subprocess.Popen[bytes]) -> None:
-        """Read what the process tells until it ends, or its time is over."""
+        """Read the process's messages until it ends, or its time is over."""
         assert process.stdout is not None  # noqa: S101
         assert process.stdin is not None  # noqa: S101
         over, late, damaged = threading.Event(), threading.Event(), False
@@ -336,5 +336,5 @@ class Desk:
         elif code and not job.problem:
             job.problem = f"the process ended ({code}); it may have needed more than {job.facts['memory']} of memory"
         elif not job.problem and (damaged or (job.what == "look" and "count" not in job.facts)):
-            job.problem = "what the process told of the files could not be read"
+            job.problem = "the process's list of files could not be read"
         job.state = "failed" if job.problem else "done"

@@ -103,13 +103,13 @@ def browse(request: BrowserRequest, console: Console) -> list[str]:
         ValueError: the port is taken, or the address is not one of this machine.
 
     """
-    with _ending_as_told():
+    with _ending_by_signal():
         return _serve(request, console)
 
 
 @contextlib.contextmanager
-def _ending_as_told() -> Iterator[None]:
-    """Within this context a closed terminal is a SIGTERM, and an interruption says what becomes of the files."""
+def _ending_by_signal() -> Iterator[None]:
+    """Within this context a closed terminal is a SIGTERM, and an interruption says that the files are deleted."""
     hangup = getattr(signal, "SIGHUP", None)  # Windows has none
     before = None if hangup is None else signal.getsignal(hangup)
     if before == signal.SIG_IGN or threading.current_thread() is not threading.main_thread():
@@ -239,7 +239,7 @@ class _Answers:
             routes=[
                 Route("/", self.show_page),
                 Route("/uploads", self.open, methods=["POST"]),
-                Route(one, self.tell),
+                Route(one, self.status),
                 Route(one, self.forget, methods=["DELETE"]),
                 Route(f"{one}/job", self.submit, methods=["POST"]),
                 Route(f"{one}/job", self.cancel, methods=["DELETE"]),
@@ -251,7 +251,7 @@ class _Answers:
         )
 
     async def show_page(self, request: Request) -> Response:
-        """Answer with the page; without the token with where that is told."""
+        """Answer with the page; without the token with where to find it."""
         given = request.query_params.get("token", "")
         if self._once and _is_same(given, self._once):
             self._once = ""
@@ -304,8 +304,8 @@ class _Answers:
             raise HTTPException(409 if isinstance(error, RefusedError) else 400, str(error)) from error
         return JSONResponse(self._desk.record(upload))
 
-    async def tell(self, request: Request) -> Response:
-        """Tell how far the job is."""
+    async def status(self, request: Request) -> Response:
+        """Answer with how far the job is."""
         return JSONResponse(self._desk.record(self._find(request)))
 
     async def cancel(self, request: Request) -> Response:

@@ -1,6 +1,6 @@
 """The process of ``dsr app`` that opens what was uploaded: it looks for frames, upsamples one, or writes all its files.
 
-It does what ``dsr upsample`` does with the same arguments. What it has to tell is lines of JSON on its standard output,
+It does what ``dsr upsample`` does with the same arguments. It reports in lines of JSON on its standard output,
 one object each, such as ``{"note": ..., "warning": ...}``. It ends with the process that started it.
 """
 
@@ -50,51 +50,51 @@ _VERTICES, _PHOTO = 400_000, 2048
 """Most vertices of a surface on the page, and the longer side of the photo in pixels."""
 _LARGEST_FILE = 8 << 30
 _OUTPUT: list[TextIO] = []
-"""Where :func:`tell` writes."""
+"""Where :func:`send` writes."""
 _PACKED = (".png", ".glb", ".npz", ".jpg")
 """Suffixes of files that another compression would not make smaller."""
 
 
-def tell(**facts: Any) -> None:
-    """Tell the server something."""
+def send(**facts: Any) -> None:
+    """Send facts to the server."""
     _OUTPUT[-1].write(f"{json.dumps(facts)}\n")
     _OUTPUT[-1].flush()
 
 
 def _keep_output() -> None:
-    """Leave the standard output to :func:`tell` alone: what libraries print goes where errors go."""
+    """Leave the standard output to :func:`send` alone: what libraries print goes where errors go."""
     _OUTPUT.append(os.fdopen(os.dup(1), "w", encoding="ascii"))
     os.dup2(2, 1)
 
 
-class _Told(Reporter):
-    """Tells the server of notes; what else is said is about the command's files."""
+class _Sender(Reporter):
+    """Sends notes to the server; what else is said is about the command's files."""
 
     def __init__(self) -> None:
         super().__init__(Console(file=io.StringIO()))
 
     def facts(self, facts: Sequence[Assumption]) -> None:
-        """Tell of notes."""
+        """Send notes."""
         for fact in facts:
-            tell(note=shorten(printable(fact.message), _LONGEST_NOTE), warning=bool(fact.code))
+            send(note=shorten(printable(fact.message), _LONGEST_NOTE), warning=bool(fact.code))
 
 
 class _Steps(Progress):
-    """Tells the server how many steps of the frame are done."""
+    """Sends how many steps of the frame are done."""
 
     @contextlib.contextmanager
     def task(self, name: str, total: int | None = None, *, done: int = 0, unit: Unit = "items") -> Iterator[Task]:
-        """Return a context in which the steps are told."""
+        """Return a context in which the steps are sent."""
 
         def report(done: int, total: int | None = total, remark: str | None = None) -> None:
-            tell(done=done, total=total)
+            send(done=done, total=total)
 
         yield report
-        tell(done=0, total=0)
+        send(done=0, total=0)
 
     def stage(self, name: str, seconds: float | None = None) -> None:
-        """Tell which stage of the frame begins."""
-        tell(stage=name)
+        """Send which stage of the frame begins."""
+        send(stage=name)
 
 
 class _Parser(ArgumentParser):
@@ -116,7 +116,7 @@ def main() -> int:
             request = _request(Path(folder), arguments, None if what == "files" else _QUICK)
             _TASKS[what](request, Path(folder))
     except (ValueError, OSError, ArgumentTypeError) as error:
-        tell(problem=one_line(error))
+        send(problem=one_line(error))
     return 0
 
 
@@ -152,15 +152,15 @@ def _look(request: UpsampleRequest, _: Path) -> None:
 
     frames = find_frames(request)
     whole = frames.whole
-    _tell_found(frames)
-    tell(count=len(whole))
+    _send_found(frames)
+    send(count=len(whole))
     names = [shorten(printable(pair.name), _LONGEST_NAME) for pair in whole[:_MOST_NAMES]]
     for first in range(0, len(names), _NAMES):
-        tell(names=names[first : first + _NAMES])
+        send(names=names[first : first + _NAMES])
     if len(whole) > 1:
         step = max(1, len(whole) // _THUMBS)
         for number in range(0, len(whole), step):
-            tell(thumb=_thumb_of(whole[number]), frame=number + 1)
+            send(thumb=_thumb_of(whole[number]), frame=number + 1)
 
 
 def _thumb_of(pair: Pair) -> str:
@@ -174,11 +174,11 @@ def _thumb_of(pair: Pair) -> str:
     return ""
 
 
-def _tell_found(frames: Frames) -> None:
+def _send_found(frames: Frames) -> None:
     """Tell what is said about all frames together."""
-    _Told().facts(frames.found.assumptions)
+    _Sender().facts(frames.found.assumptions)
     if frames.found.unpaired:
-        tell(note=f"files without a partner, left out: {len(frames.found.unpaired)}", warning=False)
+        send(note=f"files without a partner, left out: {len(frames.found.unpaired)}", warning=False)
 
 
 def _upsample(request: UpsampleRequest) -> Path:
@@ -187,10 +187,10 @@ def _upsample(request: UpsampleRequest) -> Path:
     from dsr.app.upsample.workers import work_through  # noqa: PLC0415
 
     frames = find_frames(request)
-    _tell_found(frames)
+    _send_found(frames)
     if len(frames.found.pairs) != 1:
         raise ValueError(f"expected one frame, got {len(frames.found.pairs)}")
-    (done,) = work_through(request, frames, _Told(), _Steps())
+    (done,) = work_through(request, frames, _Sender(), _Steps())
     if done.problem is not None:
         raise ValueError(done.problem)
     return done.target
@@ -203,7 +203,7 @@ def _result(request: UpsampleRequest, folder: Path) -> None:
     from dsr.report.surface_page import content_of, data_of, pack_result  # noqa: PLC0415
 
     target = _upsample(request)
-    tell(stage="preparing the surfaces")
+    send(stage="preparing the surfaces")
     viewed = read_result(target, "result")
     facts = {**(viewed.facts or {}), **_facts(viewed.camera, read_info(target / INFO))}
     packed = pack_result(replace(viewed, facts=facts), _VERTICES, _PHOTO)
@@ -229,11 +229,11 @@ def _files(request: UpsampleRequest, folder: Path) -> None:
     from dsr.app.upsample.stored import read_result  # noqa: PLC0415
     from dsr.report.surface_page import pack_result, save_view  # noqa: PLC0415
 
-    tell(stage="writing cloud, mesh and pictures")
+    send(stage="writing cloud, mesh and pictures")
     target = _upsample(request)
     packed = pack_result(read_result(target, "result"), _VERTICES, _PHOTO)
     save_view(target / "view.html", [packed], title="Depth before and after")
-    tell(stage="packing the files")
+    send(stage="packing the files")
     with zipfile.ZipFile(folder / ARCHIVE, "w", compresslevel=1) as archive:
         for path in sorted(target.rglob("*")):
             name = path.relative_to(target)
@@ -241,7 +241,7 @@ def _files(request: UpsampleRequest, folder: Path) -> None:
                 kind = zipfile.ZIP_STORED if path.suffix in _PACKED else zipfile.ZIP_DEFLATED
                 archive.write(path, Path("dsr-result") / name, kind)
     files = [path for path in (folder / ARCHIVE, target / "mesh.glb", target / "mesh.ply") if path.is_file()]
-    tell(files=[path.relative_to(folder).as_posix() for path in files], sizes=[path.stat().st_size for path in files])
+    send(files=[path.relative_to(folder).as_posix() for path in files], sizes=[path.stat().st_size for path in files])
 
 
 _TASKS: dict[str, Callable[[UpsampleRequest, Path], None]] = {"look": _look, "result": _result, "files": _files}

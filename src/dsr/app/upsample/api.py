@@ -23,7 +23,7 @@ from dsr.geometry.camera import Camera
 from dsr.inference import upsampler
 from dsr.inference.defaults import DEFAULT, WIDEST, Fill
 from dsr.inference.sequences import View
-from dsr.io.files import speaking_python
+from dsr.io.files import python_messages
 from dsr.io.inputs import Picture
 from dsr.methods import base
 from dsr.notes import warn
@@ -123,7 +123,7 @@ class Upsampler:
         fill: which holes are filled: ``all``, only ``small`` ones, or ``none``. The others stay NaN.
         max_hole: width of the widest hole that counts as small, in degrees of view; one of 5 pixels always does.
         working_size: by what ``facets`` divides the map's size first, 1, 2, 4, 8 or 16; None as its noise suggests.
-        sensor: what measured the depth, such as ``RealSense D435``; ``auto`` as its values tell, ``none`` for none.
+        sensor: what measured the depth, such as ``RealSense D435``; ``auto`` by its values, ``none`` for none.
         register: whether to move the depth map to the photo's edges, if it lies beside them.
         **settings: the method's arguments, by their names in its file in ``conf/method``, such as ``noise=0.002`` of
             ``facets``, the standard deviation of the map's noise in metres, if it is known.
@@ -185,7 +185,7 @@ class Upsampler:
             ValueError: as there.
 
         """
-        with speaking_python():
+        with python_messages():
             given = picture_of(rgb, depth, camera, mask=mask, unit=unit)
             picture, identified = prepare(without_repeats(given.picture), self._sensor, lambda each: each)
             return self._finish(picture, identified, given, progress, look=True)
@@ -264,7 +264,7 @@ class Upsampler:
             views = [View(each.depth_lr, camera_lr(each), each.pose) for each in near if each.pose is not None]
             return vote(picture, views, len(views))
 
-        with naming(f"frame {place}"), speaking_python():
+        with naming(f"frame {place}"), python_messages():
             if _is_empty(given.picture):
                 return self._without_depth(given)
             picture, identified = prepare(given.picture, self._sensor, fuse)
@@ -310,7 +310,7 @@ def _frame(frame: Any, number: int, unit: str | float | None) -> Given | ValueEr
 
 def _read_frame(frame: Any, number: int, unit: str | float | None) -> Given:
     """Return a frame of a stream."""
-    with naming(f"frame {number}"), speaking_python():
+    with naming(f"frame {number}"), python_messages():
         if not isinstance(frame, tuple | list) or len(frame) not in (3, 4):
             came = f"{len(frame)} of them" if isinstance(frame, tuple | list) else type(frame).__name__
             raise ValueError(f"expected (rgb, depth, camera) or (rgb, depth, camera, pose), got {came}")

@@ -165,9 +165,9 @@ class FrameWork:
         kept = job.earlier if job.same else None
         facts, seconds = write_result(target, result, planned, times, job.inputs, job.settings, job.earlier, kept)
         reporter.facts(facts)
-        told = [*_noise_in_brief(surface.noise), *_shares_in_brief(result.shares)]
-        told += [f"{seconds['total']:.1f} s", megabytes(stored_bytes(target))]
-        reporter.say(f"{pair.name}: {', '.join([f'{planned.method} x{planned.scale}', *told])} -> {target}")
+        brief = [*_noise_in_brief(surface.noise), *_shares_in_brief(result.shares)]
+        brief += [f"{seconds['total']:.1f} s", megabytes(stored_bytes(target))]
+        reporter.say(f"{pair.name}: {', '.join([f'{planned.method} x{planned.scale}', *brief])} -> {target}")
         return "done"
 
     @functools.cached_property
@@ -361,10 +361,10 @@ def _percent(share: float) -> str:
 
 
 def _describe_outliers(outliers: Outliers | None) -> list[Assumption]:
-    """Return a note on depth that was taken for holes, if there is any."""
+    """Return a note on depth that was treated as holes, if there is any."""
     if outliers is None or not outliers.pixels:
         return []
-    text = "depth far from everything around it, or nearer than 5 cm, is taken for holes"
+    text = "depth far from everything around it, or nearer than 5 cm, is treated as holes"
     return [Assumption(text, f"pixels: {outliers.pixels}, patches: {outliers.patches}")]
 
 
@@ -404,8 +404,9 @@ def write_result(
     if surface.outliers is not None:
         counts["outliers"] = surface.outliers._asdict()
     others = [name for name in (kept.files if kept else ()) if name not in files]
-    told = (*picture.assumptions, *facts)
-    said = [each for each in (kept.said if kept and others else ()) if not each.startswith(tuple(n.text for n in told))]
+    notes = (*picture.assumptions, *facts)
+    texts = tuple(note.text for note in notes)
+    said = [each for each in (kept.said if kept and others else ()) if not each.startswith(texts)]
     shares = {name: round(share, 6) for name, share in result.shares.items()}
     entries = {
         "inputs": inputs,
@@ -417,9 +418,9 @@ def write_result(
         **described(picture, result.encoding),
         **counts,
         "shares": {**(kept.shares if kept else {}), **shares},
-        "assumptions": [*map(str, told), *said],
+        "assumptions": [*map(str, notes), *said],
         "checks": CHECKS,
-        "warnings": [fact.record() for fact in told if fact.code],
+        "warnings": [fact.record() for fact in notes if fact.code],
         "seconds": times.together(seconds := times.read()),
         "versions": {"python": platform.python_version(), **package_versions(_PACKAGES)},
     }

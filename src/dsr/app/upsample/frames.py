@@ -64,7 +64,7 @@ def find_frames(request: UpsampleRequest) -> Frames:
         found = replace(found, pairs=_by_number(found.pairs))
     if choice.model is not None:
         found = add_model(found, choice.model)
-        if not any(pair.capture is not None and pair.capture.told_by == choice.model for pair in found.pairs):
+        if not any(pair.capture is not None and pair.capture.description == choice.model for pair in found.pairs):
             raise ValueError(f"{choice.model}: expected images named as the photos, such as {found.pairs[0].rgb.name}")
     whole = found.pairs
     single = len(whole) == 1 and not choice.folders and not choice.rgb[0].is_dir()

@@ -51,7 +51,7 @@ def preview(request: UpsampleRequest, frames: Frames, reporter: Messages, progre
 
 
 def _kind(pair: Pair, reading: Reading) -> tuple[object, ...]:
-    """Return what pictures have to have in common for one to speak for the others; a lost file has its own kind."""
+    """Return what pictures have to have in common for one to stand for the others; a lost file has its own kind."""
     files: dict[str, Path] = files_of(pair, reading)
     lost = tuple(path for path in files.values() if not path.exists())
     return pixels_in_header(pair.rgb), pixels_in_header(pair.depth), pair.rgb.suffix, pair.depth.suffix, *files, *lost

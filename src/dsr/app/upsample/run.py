@@ -82,10 +82,10 @@ def _posed(request: UpsampleRequest, frames: Frames) -> dict[str, bool]:
     def posed(pair: Pair) -> bool:
         info = frames.target(request.results.output, pair) / INFO
         try:
-            told, _ = read_geometry(pair, pixels_in_header(pair.rgb) or USUAL_SIZE, request.reading)
+            geometry, _ = read_geometry(pair, pixels_in_header(pair.rgb) or USUAL_SIZE, request.reading)
         except (ValueError, OSError):
             return True
-        if told.pose is not None:
+        if geometry.pose is not None:
             return True
         try:
             return read_info(info).get("pose") is not None

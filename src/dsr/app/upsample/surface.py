@@ -26,7 +26,7 @@ from dsr.geometry.mesh import Mesh, triangulate, vertex_normals
 from dsr.geometry.shading import render_for_viewing, shade
 from dsr.inference import Plan
 from dsr.io.exports import normal_strips
-from dsr.io.files import speaking_python
+from dsr.io.files import python_messages
 from dsr.io.inputs import Picture
 from dsr.io.photos import data_url
 from dsr.methods import base
@@ -108,7 +108,7 @@ class Surface(Generic[Array]):
 
     @property
     def outliers(self) -> Outliers | None:
-        """What of the depth map that was given was taken for holes."""
+        """What of the depth map that was given was treated as holes."""
         return self._found.outliers
 
     @property
@@ -197,7 +197,7 @@ class Surface(Generic[Array]):
                 of another.
 
         """
-        with speaking_python():
+        with python_messages():
             if unknown := sorted(options.keys() - set(_OPTIONS)):
                 raise ValueError(f"save: expected some of {', '.join(_OPTIONS)}, got {', '.join(unknown)}")
             only = None if parts is None else tuple(parts)

@@ -440,7 +440,7 @@ def unpack(archive: Path, target: Path, moved: Task, contains: Sequence[str] = (
     copies of the files that they lead to; those to directories are left out.
 
     Args:
-        moved: is told how many bytes are unpacked, and of how many.
+        moved: gets how many bytes are unpacked, and of how many.
         contains: what the archive must have.
 
     Returns:
@@ -657,10 +657,10 @@ def _adopted(item: Item, root: Path) -> Entry | None:
 def _misses(collection: Collection, root: Path, checksums: Checksums) -> Iterator[str]:
     """Yield what the user has not put in place, or has taken away."""
     folder = root / collection.folders[0]
-    told = f"{collection.instruction(root)}, then `dsr data verify {collection.name}`"
+    advice = f"{collection.instruction(root)}, then `dsr data verify {collection.name}`"
     for pattern in collection.patterns:
         if not any(_matches(collection, root, pattern)):
-            yield f"{folder}: expected {pattern}, there is none: {told}"
+            yield f"{folder}: expected {pattern}, there is none: {advice}"
     for name in checksums:
         if name.startswith(f"{collection.folders[0]}/") and not (root / name).is_file():
             yield f"{root / name}: expected a file as recorded, there is none"

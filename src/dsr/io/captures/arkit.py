@@ -87,9 +87,9 @@ def find_arkitscenes(folder: Path) -> PairingResult | None:
         intrinsics, motion = _intrinsics(folder / f"{kind}_intrinsics", stem), _nearest(motions, stem)
         place = f"{folder / 'lowres_wide.traj'}: frame {stem}"
         geometry = functools.partial(_geometry, place, intrinsics, motion)
-        told = (b"" if intrinsics is None else read_limited(intrinsics, _LARGEST_PINCAM)) + repr(motion).encode()
+        described = (b"" if intrinsics is None else read_limited(intrinsics, _LARGEST_PINCAM)) + repr(motion).encode()
         time = _time(stem) if math.isfinite(_time(stem)) else None
-        frame = CaptureFrame(_ARKITSCENES, geometry, intrinsics or folder / "lowres_wide.traj", told, time=time)
+        frame = CaptureFrame(_ARKITSCENES, geometry, intrinsics or folder / "lowres_wide.traj", described, time=time)
         path = folder / "confidence" / f"{stem}.png"
         known = ConfidenceMap(path, HIGHEST_LEVEL) if path.is_file() else None
         pairs.append(Pair(stem, photos[stem], depths[stem], unit=1e-3, capture=frame, confidence=known))
@@ -208,9 +208,9 @@ def _camera_of(frames: Path, kind: str, depth: Path) -> bool:
 
 def _polycam_geometry(path: Path, _: tuple[int, int]) -> Geometry:
     """Return camera and pose of a frame."""
-    told = parse_model(_PolycamCamera, read_text(path, _LARGEST_JSON), path, f"expected {_POLYCAM}'s camera; ")
-    camera = intrinsics_camera(str(path), (told.height, told.width), (told.fx, told.fy, told.cx, told.cy))
-    rows = [[getattr(told, f"t_{row}{column}") for column in range(4)] for row in range(3)]
+    stored = parse_model(_PolycamCamera, read_text(path, _LARGEST_JSON), path, f"expected {_POLYCAM}'s camera; ")
+    camera = intrinsics_camera(str(path), (stored.height, stored.width), (stored.fx, stored.fy, stored.cx, stored.cy))
+    rows = [[getattr(stored, f"t_{row}{column}") for column in range(4)] for row in range(3)]
     pose = check_pose(str(path), np.array([*rows, [0, 0, 0, 1]], dtype=np.float64), opengl=True)
     return Geometry(camera, pose, up="y")
 
@@ -226,16 +226,16 @@ def find_scanner_app(folder: Path) -> PairingResult | None:
     """Return the frames of an export of all data of 3D Scanner App; None if the folder is none."""
     if not has_name(folder, "frame_", ".json"):
         return None
-    told, photos = (numbered_files(folder, (suffix,), "frame_") for suffix in (".json", ".jpg"))
+    frames, photos = (numbered_files(folder, (suffix,), "frame_") for suffix in (".json", ".jpg"))
     depths = numbered_files(folder, (".exr",), "frame_") | numbered_files(folder, (".png",), "depth_")
-    if not photos or not depths or not told:
+    if not photos or not depths or not frames:
         return None
-    if b"cameraPoseARFrame" not in read_limited(next(iter(told.values())), _LARGEST_JSON):
+    if b"cameraPoseARFrame" not in read_limited(next(iter(frames.values())), _LARGEST_JSON):
         return None
     confidences = numbered_files(folder, (".png",), "conf_")
     pairs = []
     for number in sorted(photos.keys() & depths.keys()):
-        path = told.get(number)
+        path = frames.get(number)
         content = b"" if path is None else read_limited(path, _LARGEST_JSON)
         geometry = functools.partial(_scanner_geometry, path)
         frame = CaptureFrame(_SCANNER, geometry, path or folder / f"frame_{number:05}.json", content)
@@ -254,8 +254,8 @@ def _scanner_geometry(path: Path | None, size: tuple[int, int]) -> Geometry:
     """Return camera and pose of a frame."""
     if path is None:
         return Geometry(assumptions=(Assumption("no camera and no pose: there is no JSON of the frame"),))
-    told = parse_model(_ScannerFrame, read_text(path, _LARGEST_JSON), path, f"expected {_SCANNER}'s frame; ")
-    fx, _, cx, _, fy, cy = told.intrinsics[:6]
+    stored = parse_model(_ScannerFrame, read_text(path, _LARGEST_JSON), path, f"expected {_SCANNER}'s frame; ")
+    fx, _, cx, _, fy, cy = stored.intrinsics[:6]
     camera = fitting_camera(str(path), (size, USUAL_SIZE), (fx, fy, cx, cy))
-    pose = check_pose(str(path), np.reshape(told.pose, (4, 4)), opengl=True)
+    pose = check_pose(str(path), np.reshape(stored.pose, (4, 4)), opengl=True)
     return Geometry(camera, pose, up="y")

@@ -109,9 +109,9 @@ class Model:
             raise ValueError(
                 f"{self.file}: image {image.name!r:.80}: expected a camera of the model, got {image.camera}"
             )
-        told = (image.quaternion, image.translation, camera)
-        geometry = functools.partial(_geometry, f"{self.file}: image {image.name!r:.80}", *told)
-        return CaptureFrame(_APP, geometry, self.file, repr(told).encode())
+        placed = (image.quaternion, image.translation, camera)
+        geometry = functools.partial(_geometry, f"{self.file}: image {image.name!r:.80}", *placed)
+        return CaptureFrame(_APP, geometry, self.file, repr(placed).encode())
 
 
 def model_file(place: Path) -> Path | None:
@@ -175,7 +175,7 @@ def add_model(found: PairingResult, file: Path) -> PairingResult:
 def _within(frame: CaptureFrame, capture: CaptureFrame) -> CaptureFrame:
     """Return what a model says of a frame of a capture, which has its pictures, its depth camera and its time."""
     geometry = functools.partial(_joined, frame.geometry, capture.geometry)
-    return replace(capture, geometry=geometry, told_by=frame.told_by, told=frame.told + capture.told)
+    return replace(capture, geometry=geometry, description=frame.description, content=frame.content + capture.content)
 
 
 def _joined(
@@ -191,7 +191,7 @@ def _joined(
 
 def _note(count: int, total: int, file: Path) -> Assumption:
     """Return what was taken from a model."""
-    text = f"cameras and poses of {_APP}: {file.parent.name}/{file.name}; its unit is taken for the metre"
+    text = f"cameras and poses of {_APP}: {file.parent.name}/{file.name}; its unit is assumed to be the metre"
     return Assumption(text, f"{count} of {total} photos")
 
 

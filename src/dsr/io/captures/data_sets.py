@@ -106,11 +106,11 @@ def find_scannet(folder: Path) -> PairingResult | None:
     if not both:
         return None
     camera = functools.partial(_scannet_camera, [path for path in matrices if path.is_file()])
-    told = b"".join(read_limited(path, _LARGEST_TEXT) for path in matrices if path.is_file())
+    described = b"".join(read_limited(path, _LARGEST_TEXT) for path in matrices if path.is_file())
     pairs = []
     for number in both:
         path = folder / "pose" / f"{photos[number].stem}.txt"
-        frame = _frame("ScanNet", path if path.is_file() else None, path, camera, told)
+        frame = _frame("ScanNet", path if path.is_file() else None, path, camera, described)
         pairs.append(Pair(photos[number].stem, photos[number], depths[number], unit=1e-3, capture=frame))
     lone = [each[number] for each in (photos, depths) for number in each if number not in both]
     note = describe_capture("an export of ScanNet", "millimetres", pairs, poses=(folder / "pose").is_dir())
@@ -156,10 +156,12 @@ def find_replica(folder: Path) -> PairingResult | None:
     return PairingResult(tuple(pairs), (note,), tuple(lone))
 
 
-def _frame(app: str, path: Path | None, expected: Path, camera: _CameraOf | None, told: bytes = b"") -> CaptureFrame:
+def _frame(
+    app: str, path: Path | None, expected: Path, camera: _CameraOf | None, described: bytes = b""
+) -> CaptureFrame:
     """Return a frame with the pose in a file, if there is one, and what tells its camera, if anything does."""
     content = b"" if path is None else read_limited(path, _LARGEST_TEXT)
-    return CaptureFrame(app, functools.partial(_geometry, path, camera), expected, told + content)
+    return CaptureFrame(app, functools.partial(_geometry, path, camera), expected, described + content)
 
 
 def _geometry(path: Path | None, camera: _CameraOf | None, size: tuple[int, int]) -> Geometry:

@@ -91,7 +91,7 @@ def find_heic(place: Path) -> PairingResult | None:
         return None
     pairs = [
         Pair(path.stem, path, path / "depth", unit=1.0, capture=CaptureFrame(
-            _APP, functools.partial(_geometry, path), path, _told(path),
+            _APP, functools.partial(_geometry, path), path, _depth_xmp(path),
             HeicImage(path, "photo"), HeicImage(path, "depth")))
         for path in sorted(found, key=natural_key)
     ]  # fmt: skip
@@ -116,12 +116,12 @@ def _first_map(path: Path, image: Any) -> Any:
 
 def _read_depth(path: Path, stored: Any) -> np.ndarray:
     """Return depth in metres, (h, w) float32, NaN where it is none."""
-    values, told = decode_heic(path, stored), stored.info["metadata"] or {}
-    kind = told.get("representation_type")
+    values, metadata = decode_heic(path, stored), stored.info["metadata"] or {}
+    kind = metadata.get("representation_type")
     names = ("d_min", "d_max") if kind == _DISPARITY else ("z_near", "z_far")
-    if kind not in (_INVERSE_DEPTH, _DISPARITY, _DEPTH) or not all(name in told for name in names):
-        raise ValueError(f"{path}: expected a depth map with the range of its values, got {told!s:.120}")
-    low, high = (float(told[name]) for name in names)
+    if kind not in (_INVERSE_DEPTH, _DISPARITY, _DEPTH) or not all(name in metadata for name in names):
+        raise ValueError(f"{path}: expected a depth map with the range of its values, got {metadata!s:.120}")
+    low, high = (float(metadata[name]) for name in names)
     share = values.astype(np.float64) / np.iinfo(values.dtype).max
     with np.errstate(all="ignore"):
         if kind == _INVERSE_DEPTH:
@@ -131,7 +131,7 @@ def _read_depth(path: Path, stored: Any) -> np.ndarray:
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.nan).astype(np.float32)
 
 
-def _told(path: Path) -> bytes:
+def _depth_xmp(path: Path) -> bytes:
     """Return the XMP text about the depth map; empty if there is none."""
     content = read_limited(path, MOST_FILE)
     place = content.find(b"http://ns.apple.com/depthData/")
@@ -141,11 +141,11 @@ def _told(path: Path) -> bytes:
 
 def _geometry(path: Path, size: tuple[int, int]) -> Geometry:
     """Return the camera of a photo of (height, width)."""
-    text = _told(path).decode(errors="replace")
+    text = _depth_xmp(path).decode(errors="replace")
     accuracy = re.search(r"depthData:Accuracy\W{1,3}(\w+)", text)
     notes = []
     if accuracy is None or accuracy[1] != "absolute":
-        known = "is relative, says the file" if accuracy else "may be relative, the file does not say"
+        known = "is relative, as the file states" if accuracy else "may be relative, the file does not say"
         notes.append(Assumption(f"the depth {known}: sizes and distances mean little"))
     camera = _camera(path, text, turned_in_heic(path), size)
     return Geometry(camera, None, tuple(notes))

@@ -217,10 +217,10 @@ def _times(path: Path, container: Any) -> dict[str, list[Packet]]:
     kinds = {"color": tracks["color"].metadata.get("K4A_COLOR_MODE", "MJPG").partition("_")[0], "depth": _DEPTH}
     if kinds["color"] not in ("MJPG", *_COLOURS):
         raise ValueError(f"{path}: expected photos as MJPG, {', '.join(_COLOURS)}, got {kinds['color']:.40}")
-    told = container.metadata.get("K4A_DEPTH_DELAY_NS", "0")
-    delay = numbers_in([told])
+    text = container.metadata.get("K4A_DEPTH_DELAY_NS", "0")
+    delay = numbers_in([text])
     if not delay:
-        raise ValueError(f"{path}: K4A_DEPTH_DELAY_NS: expected a whole number, got {told:.40}")
+        raise ValueError(f"{path}: K4A_DEPTH_DELAY_NS: expected a whole number, got {text:.40}")
     late = {"color": 0.0, "depth": 1e-9 * delay[0]}
     roles = {track.index: role for role, track in tracks.items()}
     found: dict[str, list[Packet]] = {role: [] for role in tracks}

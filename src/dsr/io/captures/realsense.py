@@ -99,21 +99,21 @@ def read(reader: Any, path: Path, prefix: str) -> PairingResult:
     if not partner:
         raise ValueError(f"{path}: expected photos and depth maps within 20 ms of each other, found none")
     device = _device(reader)
-    told = repr(streams or damage).encode()
+    described = repr(streams or damage).encode()
     apart = all(_transforms(reader, _part(topic, "stream")) for topic in (color_topic, depth_topic))
     places = Path(f"{path}{color_topic}"), Path(f"{path}{depth_topic}")
     pairs = []
     for first, second in sorted(partner.items()):
         sources = photos[int(first.name)][0], depths[int(second.name)][0]
         own = functools.partial(_of_photo, geometry, damage)
-        frame = CaptureFrame(device, own, path, told, *sources, time=photos[int(first.name)][1], apart=apart)
+        frame = CaptureFrame(device, own, path, described, *sources, time=photos[int(first.name)][1], apart=apart)
         pairs.append(Pair(f"{prefix}{int(first.name):06}", *places, unit=unit, capture=frame))
     about = describe_capture(f"a recording of {device}", f"units of {show_length(unit)}", pairs, poses=False)
     others = sorted(
         {each.topic for each in reader.connections if _IMAGES.fullmatch(each.topic)} - {color_topic, depth_topic}
     )
     if others:
-        notes.append(Assumption(f"topics that are not looked at: {', '.join(others)}"))
+        notes.append(Assumption(f"topics that are not read: {', '.join(others)}"))
     lone = [places[0]] * (len(photos) - len(pairs)) + [places[1]] * (len(depths) - len(pairs))
     return PairingResult(tuple(pairs), (about, *registered, *notes), tuple(lone))
 
@@ -207,7 +207,7 @@ def _geometry(color: _Stream, depth: _Stream) -> tuple[Geometry, list[Assumption
     notes = (*color.notes, *depth.notes)
     geometry = Geometry(color.camera, None, notes, color.lens)
     if color.transform is None or depth.transform is None or color.reference != depth.reference:
-        text = "the recording has no transform from depth to colour: depth is taken for registered to the photo"
+        text = "the recording has no transform from depth to colour: depth is assumed to be registered to the photo"
         return geometry, [Assumption(text)]
     transform = color.transform @ invert(depth.transform)
     own, other = ((c.width, c.height, c.fx, c.fy, c.cx, c.cy) for c in (color.camera, depth.camera))

@@ -78,13 +78,13 @@ def _read(path: Path, prefix: str = "") -> PairingResult:
     partner = match_times(named["rgb"], named["depth"])
     if not partner:
         raise ValueError(f"{path}: expected photos and depth maps within 20 ms of each other, found none")
-    told = repr(info).encode()
+    described = repr(info).encode()
     place = f"{path}{PurePosixPath(photo_topic).parent / 'camera_info'}"
     pairs = []
     for first, second in sorted(partner.items()):
         photo, depth = photos[int(first.name)][0], depths[int(second.name)][0]
         geometry = functools.partial(_geometry, place, info)
-        frame = CaptureFrame("ROS", geometry, path, told, photo, depth, named["rgb"][first])
+        frame = CaptureFrame("ROS", geometry, path, described, photo, depth, named["rgb"][first])
         name = f"{prefix}{int(first.name):06}"
         pairs.append(
             Pair(name, Path(f"{path}{photo_topic}"), Path(f"{path}{depth_topic}"), unit=_UNITS[kind], capture=frame)
@@ -93,7 +93,7 @@ def _read(path: Path, prefix: str = "") -> PairingResult:
     notes = [Assumption(f"a recording of ROS: photos of {photo_topic}, depth in {unit} of {depth_topic}")]
     others = sorted(topic for topic, kind in topics.items() if kind[0] and topic not in (photo_topic, depth_topic))
     if others:
-        notes.append(Assumption(f"topics that are not looked at: {', '.join(others)}"))
+        notes.append(Assumption(f"topics that are not read: {', '.join(others)}"))
     lone = [Path(f"{path}{photo_topic}")] * (len(photos) - len(pairs))
     lone += [Path(f"{path}{depth_topic}")] * (len(depths) - len(pairs))
     return PairingResult(tuple(pairs), tuple(notes), tuple(lone))
@@ -189,7 +189,7 @@ def _geometry(place: str, info: _Info | None, _: tuple[int, int]) -> Geometry:
     if info is None:
         return Geometry(None, None, (Assumption("the recording has no camera_info beside the photo's topic"),))
     if not info.numbers[0]:  # as sensor_msgs says
-        return Geometry(None, None, (Assumption("the camera is not calibrated, says the recording's camera_info"),))
+        return Geometry(None, None, (Assumption("the camera is not calibrated, by the recording's camera_info"),))
     if min(info.height, info.width) < 1:
         raise ValueError(f"{place}: expected a positive width and height, got {info.width} x {info.height}")
     camera = intrinsics_camera(place, (info.height, info.width), info.numbers)

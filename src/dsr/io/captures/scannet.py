@@ -90,33 +90,33 @@ def _read_sens(path: Path, before: str) -> PairingResult:
     """Return the frames of a file; ``before`` begins their names."""
     size = path.stat().st_size
     with opened(path) as file:
-        told = _read_header(path, file)
+        header = _read_header(path, file)
         place, frames = file.tell(), list[CaptureFrame]()
-        if told.frames > min(size // _FRAME.size, _MOST_FRAMES):
-            raise ValueError(f"{path}: expected at most {_MOST_FRAMES} frames, got {told.frames} in {size} bytes")
-        for number in range(told.frames):
+        if header.frames > min(size // _FRAME.size, _MOST_FRAMES):
+            raise ValueError(f"{path}: expected at most {_MOST_FRAMES} frames, got {header.frames} in {size} bytes")
+        for number in range(header.frames):
             file.seek(place)
             content = file.read(_FRAME.size)
             values = _FRAME.unpack(content.ljust(_FRAME.size, b"\0"))
             lengths, start = values[18:], place + _FRAME.size
             place = start + sum(lengths)
             if len(content) < _FRAME.size or place > size or max(lengths) > PHOTO_LIMIT or not min(lengths):
-                raise ValueError(f"{path}: expected {told.frames} frames, it is damaged or ends in frame {number}")
-            photo = Section(path, f"color/{number}", start, lengths[0], functools.partial(_photo, told))
-            depth = Section(path, f"depth/{number}", start + lengths[0], lengths[1], functools.partial(_depth, told))
-            geometry = functools.partial(_geometry, f"{path}: frame {number}", told, values[:16])
-            about = content[:64] + repr(told).encode()
+                raise ValueError(f"{path}: expected {header.frames} frames, it is damaged or ends in frame {number}")
+            photo = Section(path, f"color/{number}", start, lengths[0], functools.partial(_photo, header))
+            depth = Section(path, f"depth/{number}", start + lengths[0], lengths[1], functools.partial(_depth, header))
+            geometry = functools.partial(_geometry, f"{path}: frame {number}", header, values[:16])
+            about = content[:64] + repr(header).encode()
             frames.append(CaptureFrame("ScanNet", geometry, path, about, photo, depth, 1e-6 * values[16]))
     if not any(frame.time for frame in frames):  # as where they are not known
         frames = [replace(frame, time=None) for frame in frames]
     pairs = [
-        Pair(f"{before}{number:06}", path / f"color/{number}", path / f"depth/{number}", unit=1 / told.scale,
+        Pair(f"{before}{number:06}", path / f"color/{number}", path / f"depth/{number}", unit=1 / header.scale,
              capture=frame)
         for number, frame in enumerate(frames)
     ]  # fmt: skip
     if not pairs:
         raise ValueError(f"{path}: expected frames, there is none")
-    unit = "millimetres" if told.scale == 1000 else f"1/{told.scale:g} m"
+    unit = "millimetres" if header.scale == 1000 else f"1/{header.scale:g} m"
     return PairingResult(tuple(pairs), (describe_capture("a recording of ScanNet", unit, pairs, poses=True),))
 
 
@@ -143,27 +143,27 @@ def _read_header(path: Path, file: BufferedReader) -> _Sens:
     return _Sens(numbers, (colour, depth), (high, wide), (low, narrow), scale, count)
 
 
-def _photo(told: _Sens, content: bytes) -> np.ndarray:
+def _photo(header: _Sens, content: bytes) -> np.ndarray:
     """Return the photo in the bytes of a frame."""
-    if told.compression[0]:
+    if header.compression[0]:
         return decode_photo(content)
-    if len(content) != 3 * told.photo[0] * told.photo[1]:
-        raise ValueError(f"expected {told.photo[1]} x {told.photo[0]} colours, got {len(content)} bytes")
-    return np.frombuffer(content, np.uint8).reshape(*told.photo, 3)
+    if len(content) != 3 * header.photo[0] * header.photo[1]:
+        raise ValueError(f"expected {header.photo[1]} x {header.photo[0]} colours, got {len(content)} bytes")
+    return np.frombuffer(content, np.uint8).reshape(*header.photo, 3)
 
 
-def _depth(told: _Sens, content: bytes) -> np.ndarray:
+def _depth(header: _Sens, content: bytes) -> np.ndarray:
     """Return the depth map in the bytes of a frame, (h, w) uint16."""
-    size = 2 * told.depth[0] * told.depth[1]
-    values = inflate(content, size) if told.compression[1] else content
+    size = 2 * header.depth[0] * header.depth[1]
+    values = inflate(content, size) if header.compression[1] else content
     if len(values) != size:
-        raise ValueError(f"expected {told.depth[1]} x {told.depth[0]} values of 16 bits, got {len(values)} bytes")
-    return np.frombuffer(values, "<u2").reshape(told.depth)
+        raise ValueError(f"expected {header.depth[1]} x {header.depth[0]} values of 16 bits, got {len(values)} bytes")
+    return np.frombuffer(values, "<u2").reshape(header.depth)
 
 
-def _geometry(place: str, told: _Sens, values: tuple[float, ...], _: tuple[int, int]) -> Geometry:
+def _geometry(place: str, header: _Sens, values: tuple[float, ...], _: tuple[int, int]) -> Geometry:
     """Return camera and pose of a frame."""
-    camera, matrix = intrinsics_camera(place, told.photo, told.intrinsics), np.reshape(values, (4, 4))
+    camera, matrix = intrinsics_camera(place, header.photo, header.intrinsics), np.reshape(values, (4, 4))
     if not np.isfinite(matrix).all():
         return Geometry(camera, None, (_NO_POSE,))
     return Geometry(camera, as_rigid(matrix, place))

@@ -75,11 +75,11 @@ def find_stray(folder: Path) -> PairingResult | None:
             unpaired.append(depth)
             continue
         row = rows.get(number, {})
-        told = (odometry if row else matrix, repr((text, sorted(row.items()))).encode())
+        described = (odometry if row else matrix, repr((text, sorted(row.items()))).encode())
         geometry = functools.partial(_geometry, folder, number, row, text)
         source = None if photo else VideoFrame(video, number)
         time = next((value for value in numbers_in([row.get("timestamp", "")]) if math.isfinite(value)), None)
-        frame = CaptureFrame(_APP, geometry, *told, photo=source, time=time)
+        frame = CaptureFrame(_APP, geometry, *described, photo=source, time=time)
         known = ConfidenceMap(confidence[number], HIGHEST_LEVEL) if number in confidence else None
         rgb = photo or video / f"{number:06}"
         pairs.append(Pair(f"{number:06}", rgb, depth, unit=1e-3, capture=frame, confidence=known))

@@ -95,7 +95,7 @@ def predict_edge_map(
     if len(examples.low) == 0:
         raise NoSolutionError(
             f"edge-guided upsampling: the edges of a map of {lr.shape[0]} x {lr.shape[1]} pixels do not recur "
-            f"at 1/{scale} of its size, so nothing tells how high-resolution ones look"
+            f"at 1/{scale} of its size, so nothing shows how high-resolution ones look"
         )
     places = _patch_centres(edges)
     distances, indices = find_nearest(extract_patches(edges, places), examples, candidates, sharp_weight)

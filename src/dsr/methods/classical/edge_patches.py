@@ -192,8 +192,8 @@ def label(
     moved = 0.0
     for done in range(1, iterations + 1):
         beliefs = unary + torch.cat((messages, silence))[heard].sum(dim=1)
-        told = beliefs[sources] - messages.roll(len(pairs), 0)  # less the target's message
-        new = (told[:, :, None] + both).amin(dim=1)
+        others = beliefs[sources] - messages.roll(len(pairs), 0)  # less the target's message
+        new = (others[:, :, None] + both).amin(dim=1)
         step = (new - new.amin(dim=1, keepdim=True) - messages) * _MOVE
         messages = messages + step
         moved = float(step.abs().max()) / unit if len(step) else 0.0

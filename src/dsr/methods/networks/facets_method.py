@@ -1,4 +1,4 @@
-"""The method around :class:`~dsr.methods.networks.facets_unet.FacetsUNet`: maps of any ratio, told or estimated noise.
+"""The method around :class:`~dsr.methods.networks.facets_unet.FacetsUNet`: maps of any ratio, given or estimated noise.
 
 There are weights for maps whose size is the photo's over 1 and 2, over 4, over 8 and over 16. For any other ratio the
 photo is resized to a multiple of the map, and the result to the photo's size.
@@ -42,7 +42,7 @@ _ROUNDED = 16
 class AnyMap(Method):
     """A method for maps of any ratio, kernel and noise.
 
-    Of maps that are told to be box means without noise, with sharp depth steps, the result is computed with the weights
+    Of maps known to be box means without noise, with sharp depth steps, the result is computed with the weights
     for them, if the file of weights names one with such weights.
 
     Args:
@@ -117,7 +117,7 @@ class AnyMap(Method):
         return self._upsample(sample, self._noise, progress)
 
     def upsample_inverse(self, problem: InverseSample, progress: Steps | None = None) -> InverseSurface:
-        """Return the same as inverse depth, told the noise that is known of the map, unless the method was."""
+        """Return the same as inverse depth, with the noise that is known of the map, unless the method has one."""
         return InverseSurface.of(self._upsample(problem.in_depth(), self._noise or problem.noise, progress))
 
     @torch.no_grad()
@@ -160,7 +160,7 @@ class AnyMap(Method):
         return 1 if self._net.serves(self._net.scale, 1) and ratio <= 1 + _TOLERANCE else self._net.scale
 
     def _answer(self, rgb: Tensor, inverse: Tensor, noise: Tensor | None, progress: Steps | None) -> Answer:
-        """Return the network's answer, told the noise if there is any to tell."""
+        """Return the network's answer, with the noise if it is given."""
         facts = self._facts.to(self._device).clone()
         facts[0, -1] = noise is not None
         return self._net.answer(rgb, inverse, None if noise is None else noise.float(), facts, progress)
@@ -212,7 +212,7 @@ def _rounding(inverse: Tensor, focal: float) -> tuple[Tensor, Tensor]:
 
     That of depth is relative: a quarter of the step to the next value, the mean of errors that are equally likely up to
     half a step. That of the normal, in radians, is the tilt of a surface that gains it up to the next other value. Both
-    are (B, 1, h, w), and 0 where the values around a pixel differ, from which the truth can be told more exactly.
+    are (B, 1, h, w), and 0 where the values around a pixel differ, from which the truth can be determined more exactly.
 
     """
     known = inverse.isfinite()

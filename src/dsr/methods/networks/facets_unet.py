@@ -11,9 +11,9 @@ planes of the 3 x 3 low-resolution pixels around them, and can start from its we
   How rough the whole map is, at four resolutions, is an input, as are the hints: both scale and shift the features of
   each block (Perez et al., *FiLM*, AAAI 2018), and mix its weights from two sets, so that noisy maps do not cost clean
   ones their weights (Yang et al., *CondConv*, NeurIPS 2019).
-- **Hints.** The network may be told what is known of the map: the noise of each pixel (Zhang et al., *FFDNet*, TIP
+- **Hints.** The network may be given what is known of the map: the noise of each pixel (Zhang et al., *FFDNet*, TIP
   2018), the kernel that made it, and whether depth steps are sharp. Each hint may be missing.
-- **Exact means.** Where the kernel is told, its residual is added to the result twice (back-projection: Irani, Peleg,
+- **Exact means.** Where the kernel is known, its residual is added to the result twice (back-projection: Irani, Peleg,
   *Improving Resolution by Image Registration*, CVGIP 1991), multiplied by a factor that the network chooses per pixel.
 - **Maps of the photo's own size.** They are averaged over 2 x 2 pixels for the trunk, and seen at full resolution by
   the layers that choose the planes. The weights are those of factor 2.
@@ -36,7 +36,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.degradation.downsampling import Downsampling
-from dsr.degradation.hints import FACTS, told_kernels
+from dsr.degradation.hints import FACTS, known_kernels
 from dsr.methods.classical.finite_differences import repeat_blocks
 from dsr.methods.exportable import every, exporting, median_in_graph, quantiles_in_graph
 from dsr.methods.inpainting import inpaint
@@ -207,20 +207,20 @@ class FacetsUNet(DisparityNetwork):
 
     @staticmethod
     def prepare(batch: Mapping[str, Any]) -> dict[str, Any]:
-        """Return patches with ``filled``, inverse depth without holes, and ``kernels``, those that are told."""
+        """Return patches with ``filled``, inverse depth without holes, and ``kernels``, those that are known."""
         if "filled" in batch:
             return dict(batch)
-        kernels = told_kernels(batch["facts"]) if "facts" in batch else None
+        kernels = known_kernels(batch["facts"]) if "facts" in batch else None
         return {**batch, "filled": inpaint(batch["disparity_lr"] + batch["doffs"], batch["rgb"]), "kernels": kernels}
 
     def answer_patches(self, batch: Mapping[str, Any]) -> Answer:
-        """Return inverse depth, times baseline and focal length, and its expected errors, told the hints if any."""
+        """Return inverse depth, times baseline and focal length, and its expected errors, with the hints if any."""
         batch = self.prepare(batch)
         inverse, hints = batch["disparity_lr"] + batch["doffs"], (batch.get("noise"), batch.get("facts"))
         return self.answer(batch["rgb"], inverse, *hints, filled=batch["filled"], kernels=batch["kernels"])
 
     def answer_scene(self, batch: Mapping[str, Tensor]) -> Tensor:
-        """Return high-resolution disparity, told the hints if any."""
+        """Return high-resolution disparity, with the hints if any."""
         return self.answer_patches(batch).disparity - batch["doffs"]
 
     def answer(
@@ -243,7 +243,7 @@ class FacetsUNet(DisparityNetwork):
             hints: (B, ``FACTS``) what is known of the maps; None for nothing.
             progress: called after each band of rows that is done.
             filled: the disparity without holes; None to inpaint it.
-            kernels: those that the hints tell; None to read them.
+            kernels: those that the hints give; None to read them.
 
         Raises:
             ValueError: the photo's size is not a multiple of the map's by a factor of the network.
@@ -257,7 +257,7 @@ class FacetsUNet(DisparityNetwork):
         if hints is None:
             hints, kernels = disparity.new_zeros((batch, FACTS)), [None] * batch
         if kernels is None:
-            kernels = told_kernels(hints)
+            kernels = known_kernels(hints)
         if noise is None:
             noise = torch.zeros_like(values)
         result, errors = self(rgb, values, known, noise, hints, kernels, progress)
@@ -282,7 +282,7 @@ class FacetsUNet(DisparityNetwork):
             known: (B, 1, h, w) bool, false where a value was filled in.
             noise: (B, 1, h, w) standard deviation of the logarithm of the values, where that is known.
             hints: (B, ``FACTS``).
-            kernels: those that the hints tell.
+            kernels: those that the hints give.
             progress: called after each band of rows.
 
         """
@@ -299,13 +299,13 @@ class FacetsUNet(DisparityNetwork):
                 parts.append(torch.zeros_like(rgb[:, :3]))
             around, smoothed = stencil(values), smooth(values, weight, _LEVELS)
             lr_input = _lr_input(around, smoothed, weight, noise, hints)
-            told = torch.cat((hints.float(), _roughness([around, *smoothed], weight)), dim=1)
+            cues = torch.cat((hints.float(), _roughness([around, *smoothed], weight)), dim=1)
         photo, bands = torch.cat(parts, dim=1), self._split(values.shape[-2], rgb.shape)
         kept = [self._see(photo, scale, bands[0])] if len(bands) == 1 else None
         seen = kept or (self._see(photo, scale, band) for band in bands)
         features = [pyramid[-1][..., band.inner, :] for pyramid, band in zip(seen, bands, strict=True)]
         x = functional.relu(self.coarse(lr_input.to(dtype)).add_(concatenate(features, dim=-2)), inplace=True)
-        kind, shares = functional.relu(self.hints(told.to(dtype))), self.shares(told.to(dtype)).sigmoid()
+        kind, shares = functional.relu(self.hints(cues.to(dtype))), self.shares(cues.to(dtype)).sigmoid()
         for number, (block, modulate) in enumerate(zip(self.trunk, self.modulation, strict=True)):
             if number == _BEFORE:
                 x = x + self.wide(x)
@@ -398,15 +398,15 @@ def _lr_input(around: Stencil, smoothed: list[Stencil], weight: Tensor, noise: T
     wide = torch.cat(
         [torch.cat((around.value - each.value, each.slopes[:, :, 1], each.bend), dim=1) for each in smoothed], dim=1
     ).float()
-    told = hints[:, -1:, None, None].float().expand_as(weight)
-    level = torch.where(told > 0, torch.log10(noise.float().clamp(min=1e-5) / 1e-3), 0)
+    noise_known = hints[:, -1:, None, None].float().expand_as(weight)
+    level = torch.where(noise_known > 0, torch.log10(noise.float().clamp(min=1e-5) / 1e-3), 0)
     parts = (
         torch.asinh(differences / _FAINT) / 3,
         differences / _STRONG,
         turns,
         torch.asinh(wide / _FAINT) / 3,
         weight.float() - 0.5,
-        told,
+        noise_known,
         level,
     )
     return torch.cat(parts, dim=1)

@@ -70,9 +70,9 @@ class DisparityNetwork(nn.Module, abc.ABC):
     Attributes:
         scale: upsampling factor.
         of_inverse_depth: whether it takes inverse depth in place of disparity, which may have an offset.
-        states_errors: whether its answers have expected errors, and it is told what is known of the maps.
+        states_errors: whether its answers have expected errors, and it is given what is known of the maps.
         covers: whether the output covers the whole image; some published networks leave out a row and a column.
-        method: target and arguments of the method that runs it as validations do: one pass, told what is known of maps.
+        method: target and arguments of the method that runs it as validations do: one pass, with what is known of maps.
 
     """
 

@@ -1,4 +1,4 @@
-"""Prompt Depth Anything: a foundation network of photos that a low-resolution depth map tells the metric depth.
+"""Prompt Depth Anything: a foundation network of photos, with the metric depth of a low-resolution map.
 
 Lin, Peng, Chen, Peng, Sun, Liu, Bao, Feng, Zhou, Kang, *Prompting Depth Anything for 4K Resolution Accurate Metric
 Depth Estimation*, CVPR 2025. The network is that of Hugging Face's ``transformers``
@@ -199,7 +199,7 @@ def _read_config(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 
 @contextlib.contextmanager
 def _silent() -> Iterator[None]:
-    """Silence the progress and the notes of transformers, which are told as errors here."""
+    """Silence the progress and the notes of transformers, which are reported as errors here."""
     from transformers.utils import logging  # noqa: PLC0415 - it comes with an extra
 
     level, shown = logging.get_verbosity(), logging.is_progress_bar_enabled()

@@ -56,7 +56,7 @@ class Files {
     return Boolean(this.by.capture || (this.by.photo && this.by.depth));
   }
 
-  /** Return dropped files by role, as their names and sizes tell. */
+  /** Return dropped files by role, by their names and sizes. */
   sorted(files) {
     const found = {};
     const camera = files.find((file) => takes("camera", file));
@@ -244,7 +244,7 @@ class App {
     if (turn !== this.turn) return null;
     const path = `uploads/${this.upload.id}`;
     while (turn === this.turn && (job.state === "waiting" || job.state === "running")) {
-      this.tell(job);
+      this.showJob(job);
       await new Promise((done) => setTimeout(done, POLL));
       if (turn !== this.turn) return null;
       job = await ask("GET", path);
@@ -349,7 +349,7 @@ class App {
   }
 
   /** Show how far a job is. */
-  tell(job) {
+  showJob(job) {
     const [bar, times] = [find("progress"), find(".times")];
     const waiting = job.state === "waiting";
     this.say(waiting ? `Waiting; ${job.before} before this` : { look: "Looking into the capture \u2026", result: "Computing \u2026", files: "Writing the files \u2026" }[job.what]);
@@ -368,7 +368,7 @@ class App {
   showNotes(notes) {
     find(".read").hidden = !notes.length;
     const ordered = [...notes.filter(({ warning }) => warning), ...notes.filter(({ warning }) => !warning)];
-    find(".told-notes").replaceChildren(...ordered.map(({ note, warning }) => make("li", { className: warning ? "warning" : "", textContent: `${warning ? "Warning: " : ""}${note}` })));
+    find(".job-notes").replaceChildren(...ordered.map(({ note, warning }) => make("li", { className: warning ? "warning" : "", textContent: `${warning ? "Warning: " : ""}${note}` })));
   }
 }
 

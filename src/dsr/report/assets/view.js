@@ -9,7 +9,7 @@ const HIGHEST = 0.82; // of the window, the height of a stage with panels, as in
 
 class View {
   /**
-   * Show results: what is told of them, a function that returns their data by name and number, and first choices.
+   * Show results: their facts, a function that returns their data by name and number, and first choices.
    */
   constructor(content, data, choices = {}) {
     this.content = content;
@@ -79,7 +79,7 @@ class View {
       this.triangles[name] = mesh.corners.length / 3;
       this.scene.setSurface(name, grid, mesh);
     }
-    this.tell();
+    this.showAmounts();
   }
 
   /** Offer what the result has. */
@@ -223,7 +223,7 @@ class View {
 
   // What is written.
 
-  tell() {
+  showAmounts() {
     const lines = ["after", "before"].filter((name) => this.grids[name]).map((name) => {
       const { width, height, size, factor, holes } = this.result[name];
       const reduced = factor > 1 ? `, reduced from ${size[0]} \u00d7 ${size[1]} by ${factor} each way` : "";
@@ -232,7 +232,7 @@ class View {
     });
     if (this.result.filled) lines.push(`${percent(this.result.filled)} of the result is filled: the input has no depth there.`);
     if (this.result.doubtful) lines.push(`${percent(this.result.doubtful)} of the result is uncertain, and left out as in mesh.glb unless \u201cuncertain parts\u201d is ticked.`);
-    find(".told").textContent = lines.join(" ");
+    find(".amounts").textContent = lines.join(" ");
   }
 
   describe() {
