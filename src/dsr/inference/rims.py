@@ -106,11 +106,14 @@ def _settle(inverse: Tensor, colours: Tensor, rows: Tensor, columns: Tensor, awa
     offsets = torch.cat((fine, 2 * fine[4 * fine.square().sum(1) > _RADIUS**2]))
     stride = (_PER_STRIDE * (away + 2)).ceil().long()[:, None]
     height, width = inverse.shape
-    at_row, at_column = rows[:, None] + stride * offsets[:, 0], columns[:, None] + stride * offsets[:, 1]
-    inside = (at_row >= 0) & (at_row < height) & (at_column >= 0) & (at_column < width)
-    index = at_row.clamp(0, height - 1) * width + at_column.clamp(0, width - 1)
-    values = inverse.flatten()[index]
-    known = inside & values.isfinite()
+    across = torch.arange(-2 * _RADIUS, 2 * _RADIUS + 1, device=inverse.device)
+    at_row, at_column = rows[:, None] + stride * across, columns[:, None] + stride * across
+    at_row = torch.where((at_row >= 0) & (at_row < height), width * at_row, -2 * inverse.numel())
+    at_column.masked_fill_((at_column < 0) | (at_column >= width), -2 * inverse.numel())
+    index = at_row[:, offsets[:, 0] + 2 * _RADIUS].add_(at_column[:, offsets[:, 1] + 2 * _RADIUS])
+    index.clamp_(min=-1)  # the last one of these: what lies outside
+    values = functional.pad(inverse.flatten(), (0, 1), value=math.nan)[index]
+    known = values.isfinite()
     distance = stride * offsets.square().sum(1).to(inverse).sqrt()
     rim = known & (distance <= 1.5 * away[:, None] + 3)
     high = values.masked_fill(~rim, -math.inf).amax(1)
@@ -121,7 +124,7 @@ def _settle(inverse: Tensor, colours: Tensor, rows: Tensor, columns: Tensor, awa
         return found, doubt
     values, known, index, distance, away = values[two], known[two], index[two], distance[two], away[two]
     nearer = values > (high * low).sqrt()[two, None]
-    difference = colours.flatten(1)[:, index] - colours[:, rows[two], columns[two], None]
+    difference = functional.pad(colours.flatten(1), (0, 1))[:, index] - colours[:, rows[two], columns[two], None]
     affinity = (difference.square().sum(0) / (-2 * _CONTRAST**2)).exp() + _LEAST
     beyond = ((distance - away[:, None]) / (away[:, None] + 2)).clamp(min=0)
     witness, close = ((-beyond / each).exp() * affinity for each in (_SPREAD, _CLOSE))
