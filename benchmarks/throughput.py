@@ -1,15 +1,15 @@
 """Frames a second of ``dsr upsample`` per core, with one and with two workers, and where the time goes.
 
-    python benchmarks/throughput.py [--frames 24] [--rounds 3] [--rgb PHOTO --depth MAP] [--method facets]
-                                   [--only depth] [--device cpu]
-    python benchmarks/throughput.py --profile
+    python benchmarks/throughput.py [--frames 24] [--rounds 3] [--rgb PHOTO --depth MAP] [--ratio 4]
+                                   [--method facets] [--only depth] [--device cpu]
+    python benchmarks/throughput.py --profile [--ratio 1]
     python benchmarks/throughput.py --list 100000
 
-Frames are a photo of 640 x 480 and a noisy map of 160 x 120 in millimetres, rendered unless a pair is given, each under
-a name of its own. One worker runs on one core, two on two, in turns, and the fastest round of each counts; what a sixth
-of the frames takes is taken off, for the time to start. Seconds of a core are those in which a process has one, so they
-depend less than those on the clock on what else runs. ``--profile`` says instead where one worker's time goes, and
-``--list`` how long it takes to list small files.
+Frames are a photo of 640 x 480 and a noisy map of 160 x 120, or with ``--ratio 1`` of 640 x 480, in millimetres,
+rendered unless a pair is given, each under a name of its own. One worker runs on one core, two on two, in turns, and
+the fastest round of each counts; what a sixth of the frames takes is taken off, for the time to start. Seconds of a
+core are those in which a process has one, so they depend less than those on the clock on what else runs. ``--profile``
+says instead where one worker's time goes, and ``--list`` how long it takes to list small files.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ STEPS = ("read_picture", "inputs_with_neighbours", "align", "write_parts")
 """Functions that :mod:`dsr.app.upsample.frame` spends a frame's time with; the last one writes the parts."""
 
 
-def render(folder: Path) -> tuple[Path, Path]:
-    """Write a photo of 640 x 480 and a noisy map of 160 x 120."""
+def render(folder: Path, ratio: int) -> tuple[Path, Path]:
+    """Write a photo of 640 x 480 and a noisy map that is smaller by a ratio, or of the same size."""
     import torch  # noqa: PLC0415
 
     from dsr.degradation.downsampling import Downsampling, make_sample  # noqa: PLC0415 - seconds to import
@@ -48,12 +48,14 @@ def render(folder: Path) -> tuple[Path, Path]:
     camera = make_camera(scene.viewpoint, 640).crop(80, 0, 480, 640)
     rgb, depth = made.rgb[80:560], made.depth[80:560]
     photo = torch.from_numpy(np.ascontiguousarray(rgb)).permute(2, 0, 1).float() / 255
-    sample = make_sample(
-        Scene("throughput", "frame", photo, camera, torch.from_numpy(depth.copy())[None]),
-        4, Downsampling("box"), "disparity", Kinect(),
-    )  # fmt: skip
+    true = torch.from_numpy(depth.copy())[None]
+    if ratio == 1:
+        depth_lr = Kinect()(true, torch.Generator().manual_seed(0))
+    else:
+        scene_maps = Scene("throughput", "frame", photo, camera, true)
+        depth_lr = make_sample(scene_maps, ratio, Downsampling("box"), "disparity", Kinect()).depth_lr
     cv2.imwrite(str(folder / "photo.jpg"), rgb[..., ::-1])
-    millimetres = (1e3 * sample.depth_lr[0].nan_to_num(0)).round().clamp(0, 65535).numpy().astype(np.uint16)
+    millimetres = (1e3 * depth_lr[0].nan_to_num(0)).round().clamp(0, 65535).numpy().astype(np.uint16)
     cv2.imwrite(str(folder / "map.png"), millimetres)
     return folder / "photo.jpg", folder / "map.png"
 
@@ -165,6 +167,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rgb", type=Path)
     parser.add_argument("--depth", type=Path)
+    parser.add_argument("--ratio", type=int, default=4, choices=(1, 2, 4, 8), help="of the rendered pair's sizes")
     parser.add_argument("--frames", type=int, default=24)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--method", default="facets")
@@ -180,7 +183,7 @@ def main() -> None:
         if options.list:
             measure_listing(folder, options.list)
             return
-        pair = (options.rgb, options.depth) if options.rgb and options.depth else render(folder)
+        pair = (options.rgb, options.depth) if options.rgb and options.depth else render(folder, options.ratio)
         for name, count in (("many", options.frames), ("few", 6)):
             for number in range(count):
                 for kind, path in zip(("rgb", "depth"), pair, strict=True):

@@ -19,6 +19,7 @@ from dsr.cli import main
 from dsr.geometry.camera import Camera
 from dsr.io.depth_files import read_depth_file, write_depth_file
 from dsr.synthetic.simgeo import render_scene
+from dsr.utils.progress import megabytes
 
 PARTS = {
     "depth": ("depth.png", "depth_metres.tiff"),
@@ -418,7 +419,9 @@ def test_broken_picture_does_not_stop_the_others(pair, tmp_path, capsys):
     }
     shutil.copy(pair[1], frames / "depth" / "000001.png")
     assert upsample(frames, "-o", out, *DEPTH_ONLY) == 0
-    assert "3 pictures: 2 complete already, 1 done in 0:00:" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "3 pictures: 2 complete already, 1 done in 0:00:" in said
+    assert f", {megabytes(sum((out / name).stat().st_size for name in files_in(out)))} -> {out}\n" in said
 
 
 def test_published_scenes_are_read_with_their_cameras(shared, tmp_path, capsys):

@@ -10,8 +10,9 @@ import time
 import pytest
 from rich.console import Console
 
+from dsr.app.upsample.frame import Times
 from dsr.utils.console import ConsoleProgress
-from dsr.utils.progress import SILENT, clock, duration, megabytes, part_of
+from dsr.utils.progress import SILENT, Progress, clock, duration, megabytes, part_of
 
 
 class Clock:
@@ -278,6 +279,41 @@ def test_time_of_a_stage_that_is_known_before_counts(now: Clock) -> None:
         [row] = _rows(progress)
         break
     assert seconds_in(row, "remaining") == 6 + 8 + 20
+
+
+def test_stage_that_takes_longer_than_planned_makes_the_next_ones_longer(now: Clock) -> None:
+    progress, _ = _progress(now, terminal=True)
+    for _ in progress.track("ab", "upsample", shares=STAGES):
+        progress.stage("upsampling", 10)
+        now.seconds += 30
+        [row] = _rows(progress)
+        break
+    upsampling = 30 + 2  # a tenth of what it has taken longer
+    whole = upsampling / STAGES["upsampling"]
+    left = 2 + STAGES["writing"] * whole
+    assert seconds_in(row, "remaining") == round(left + whole)
+
+
+def test_planned_seconds_grow_with_the_work_beside_a_frame() -> None:
+    stages: list[tuple[str, float | None]] = []
+
+    class Stages(Progress):
+        def stage(self, name: str, seconds: float | None = None) -> None:
+            stages.append((name, seconds))
+
+    times = Times(Stages())
+    times.begin("reading")
+    with times.computing():  # 0.05 s of a core in 0.2 s
+        until = time.thread_time() + 0.05
+        while time.thread_time() < until:
+            pass
+        time.sleep(0.15)
+    times.begin("upsampling", 10)
+    times.begin("writing")
+    planned = dict(stages)
+    assert planned["reading"] is planned["writing"] is None
+    assert planned["upsampling"] is not None
+    assert planned["upsampling"] >= 35
 
 
 def test_elapsed_time_counts_from_the_beginning_of_the_command(now: Clock) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from dsr.app.upsample.parts import PARTS, Results
-from dsr.app.upsample.request import FrameChoice, UpsampleRequest, Upsampling, settings_of
+from dsr.app.upsample.request import FrameChoice, UpsampleRequest, Upsampling
 from dsr.io.reading import CameraChoice, Reading
 from dsr.utils.options import OptionError
 
@@ -54,7 +54,7 @@ def test_settings_are_all_options_that_a_result_depends_on():
         upsampling=Upsampling(settings=(("noise_growth", 1.0),), noise=0.01, device="cuda"),
         results=results(max_error=1.0, overwrite=True),
     )
-    settings = settings_of(request)
+    settings = request.settings
     assert (settings["depth_unit"], settings["intrinsics"]) == ("sunrgbd", [1.0, 2.0, 3.0, 4.0])
     assert settings["hole_value"] is None  # NaN is a hole anyway
     assert (settings["set"], settings["max_error"]) == ({"noise_growth": 1.0, "noise": 0.01}, 0.01)

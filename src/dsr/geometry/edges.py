@@ -8,6 +8,7 @@ shift. Its significance is estimated from tiles of the image, because the pixels
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -116,20 +117,22 @@ def edge_gradients(photo: Array, smooth: float = 0.7) -> tuple[Array, Array]:
     return ratios[0], ratios[1]
 
 
-def mean_gradients(edges: Edges, gradients: tuple[Array, Array], radius: int) -> Array:
-    """Return the mean gradient at the edges for every shift down and right up to a radius, (2 r + 1, 2 r + 1)."""
+def mean_gradients(each: Iterable[Edges], gradients: tuple[Array, Array], radius: int) -> Iterator[Array]:
+    """Yield the mean gradient at some edges for every shift down and right up to a radius, (2 r + 1, 2 r + 1)."""
     largest = np.max([gradient.shape for gradient in gradients], axis=0)
-    size = tuple(cv2.getOptimalDFTSize(int(n) + radius + 1) for n in largest)  # no shift wraps around
-    total = np.zeros((size[0], size[1] // 2 + 1), complex)
-    for (rows, columns), gradient in zip((edges.right, edges.below), gradients, strict=True):
-        there = np.zeros(size)
-        here = tuple(
-            np.clip(np.rint(place).astype(np.intp), 0, n - 1) for place, n in zip((rows, columns), size, strict=True)
-        )
-        np.add.at(there, here, 1.0)
-        total += np.fft.rfft2(gradient, size) * np.conj(np.fft.rfft2(there))
+    height, width = (cv2.getOptimalDFTSize(int(n) + radius + 1) for n in largest)  # no shift wraps around
+    spectra = [np.fft.rfft2(gradient, (height, width)) for gradient in gradients]
     shifts = np.arange(-radius, radius + 1)
-    return np.fft.irfft2(total, size)[np.ix_(shifts, shifts)] / max(edges.count, 1)
+    for edges in each:
+        total = np.zeros((height, width // 2 + 1), complex)
+        for (rows, columns), spectrum in zip((edges.right, edges.below), spectra, strict=True):
+            row, column = (
+                np.clip(np.rint(place).astype(np.intp), 0, n - 1) for place, n in ((rows, height), (columns, width))
+            )
+            there = np.bincount(row * width + column, minlength=height * width).reshape(height, width)
+            total += spectrum * np.conj(np.fft.rfft2(there))
+        near = np.fft.ifft(total, axis=0)[shifts]
+        yield np.fft.irfft(near, width, axis=1)[:, shifts] / max(edges.count, 1)
 
 
 def sum_by_tile(

@@ -133,7 +133,7 @@ def find_displacement(depth_lr: Tensor, rgb: Tensor) -> Displacement | None:
         return None
     blurred = _blurred(comparison)
     radius = _radius(comparison.size, comparison.pixel)
-    coarse = [_best_shift(comparison, blurred, radius, scale) for scale in _SCALES]
+    coarse = _best_shifts(comparison, blurred, radius)
     shift = _refine(comparison, blurred, coarse[_SCALES.index(1.0)][1:], scaling=False)
     starts = {max(coarse)[1:], shift}
     similar = max((_refine(comparison, blurred, start, scaling=True) for start in starts),
@@ -219,16 +219,19 @@ def _blurred(comparison: _Comparison) -> tuple[Array, Array]:
     return right, below
 
 
-def _best_shift(
-    comparison: _Comparison, gradients: tuple[Array, Array], radius: int, scale: float
-) -> tuple[float, float, float, float]:
-    """Return the largest mean gradient of the shifts by every second pixel, and down, right and scale."""
+def _best_shifts(
+    comparison: _Comparison, gradients: tuple[Array, Array], radius: int
+) -> list[tuple[float, float, float, float]]:
+    """Return for each scale the largest mean gradient of shifts by every second pixel, down, right and the scale."""
     right, below = (each[::_COARSE, ::_COARSE] for each in gradients)
-    edges = comparison.scaled(scale)
-    mean = mean_gradients(Edges(edges.right / _COARSE, edges.below / _COARSE), (right, below), radius // _COARSE)
-    row, column = np.unravel_index(mean.argmax(), mean.shape)
-    down, across = (float(_COARSE * (place - radius // _COARSE)) for place in (row, column))
-    return float(mean.max()), down, across, scale
+    scaled = (comparison.scaled(scale) for scale in _SCALES)
+    coarse = (Edges(edges.right / _COARSE, edges.below / _COARSE) for edges in scaled)
+    found = []
+    for scale, mean in zip(_SCALES, mean_gradients(coarse, (right, below), radius // _COARSE), strict=True):
+        row, column = np.unravel_index(mean.argmax(), mean.shape)
+        down, across = (float(_COARSE * (place - radius // _COARSE)) for place in (row, column))
+        found.append((float(mean.max()), down, across, scale))
+    return found
 
 
 def _is_better(similar: Array, shift: Array) -> bool:
@@ -270,7 +273,7 @@ def _judge(comparison: _Comparison, found: tuple[float, float, float], radius: i
     """Return a displacement in pixels of the map, and whether it is significant."""
     down, right, scale = found
     sums = comparison.sums(*found)
-    mean = mean_gradients(comparison.scaled(scale), comparison.gradients, radius)
+    [mean] = mean_gradients([comparison.scaled(scale)], comparison.gradients, radius)
     median = float(np.median(mean))
     shifts = np.arange(-radius, radius + 1)
     apart = max(APART, round(2 * comparison.pixel))

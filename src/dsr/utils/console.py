@@ -313,7 +313,8 @@ class _ConsoleTask:
         if not self._stage:
             return within, each or (None if within is None else self._now() - self._updated + within)
         waited = self._now() - self._began
-        expected = self._expected(self._guess if within is None else waited + within)
+        guess = self._guess and waited + _left(self._guess, waited)  # later stages take longer, too
+        expected = self._expected(guess if within is None else waited + within)
         if expected is None:
             return None, None
         names = list(self.shares)

@@ -42,7 +42,7 @@ def check_together(
     """
     order, posed = Order(), set[Path]()
     found: dict[str, list[Assumption]] = {pair.name: [] for pair in pairs}
-    sampled = {pair.name for pair in _sample(pairs)}
+    sampled = {pair.name for pair in _sample(pairs)} if len(pairs) > 1 else set[str]()
     for group in alike(pairs):
         bent: list[list[Assumption]] = []
         looked = [pair for pair in group if pair.name in sampled] or [group[len(group) // 2]]

@@ -7,7 +7,7 @@ import functools
 import math
 import platform
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from dsr.app.upsample.outputs import (
 )
 from dsr.app.upsample.parts import PARTS, Result, as_stored, write_parts
 from dsr.app.upsample.reporting import Messages
-from dsr.app.upsample.request import UpsampleRequest, Upsampling, files_of, inputs_with_neighbours, settings_of
+from dsr.app.upsample.request import UpsampleRequest, Upsampling, files_of, inputs_with_neighbours
 from dsr.app.upsample.sequence import FrameSequence
 from dsr.degradation.sensors import Identified
 from dsr.evaluation.sharing import Claims
@@ -50,6 +50,8 @@ STAGES = {"reading": 0.03, "upsampling": 0.57, "writing": 0.4}
 """Shares of the time of a phone's frame, by the names that they have in ``info.json``."""
 _WHITE = 1.5
 """Noise that is alike over fewer pixels counts as white."""
+_TELLING = 0.02
+"""Least seconds of a core that tell how much work there is beside."""
 _PACKAGES = ("dsr", "torch", "numpy", "opencv-python-headless")
 
 
@@ -62,7 +64,7 @@ class FrameWork:
 
     Attributes:
         seconds: the time that the last picture of a dry run takes, on two CPU cores; None where it is not known.
-        bytes: the size of its results.
+        bytes: the size of its results, or that of the last picture that is complete.
 
     Raises:
         ValueError: the file of poses is damaged, or does not fit the pictures.
@@ -115,7 +117,7 @@ class FrameWork:
     def _job(self, pair: Pair, target: Path) -> _Job:
         """Return what there is to do for a picture."""
         depends_on = inputs_with_neighbours(self._request, pair, self._sequence.neighbours(pair))
-        return _Job(self._request, pair, target, self._settings, depends_on, read_previous_run(target))
+        return _Job(self._request, pair, target, self._request.settings, depends_on, read_previous_run(target))
 
     def _work(self, job: _Job, reporter: Messages, progress: Progress) -> str:
         """Upsample a picture that no other command is at, and return the outcome."""
@@ -123,8 +125,9 @@ class FrameWork:
         how, wanted = request.upsampling, request.results
         job.expect_agreement()
         if job.is_done():
-            earlier = job.earlier.warnings if job.earlier is not None else ()
+            earlier, files = ((), ()) if job.earlier is None else (job.earlier.warnings, job.earlier.files)
             job.expect_no_warning(earlier)
+            self.bytes = stored_bytes(target, files)
             reporter.facts(earlier)
             reporter.say(f"{pair.name}: {COMPLETE}, in {target}")
             return COMPLETE
@@ -133,7 +136,8 @@ class FrameWork:
         picture = self._read(pair)
         picture = replace(picture, assumptions=(*picture.assumptions, *self._frames.warnings.get(pair.name, ())))
         picture, identified = prepare(picture, how.sensor, functools.partial(sequence.fuse, pair))
-        picture = align(picture, register=request.reading.register)
+        with times.computing():
+            picture = align(picture, register=request.reading.register)
         size_lr = (picture.depth_lr.shape[-2], picture.depth_lr.shape[-1])
         size = (picture.camera.height, picture.camera.width)
         planned = self._upsampler.plan(size, size_lr)
@@ -163,10 +167,12 @@ class FrameWork:
         title = f"{readable(pair.name)}, {planned.method} x{planned.scale}"
         result = Result(picture, surface, output_encoding(picture.encoding, wanted.format), title, wanted)
         kept = job.earlier if job.same else None
-        facts, seconds = write_result(target, result, planned, times, job.inputs, job.settings, job.earlier, kept)
+        facts, seconds, self.bytes = write_result(
+            target, result, planned, times, job.inputs, job.settings, job.earlier, kept
+        )
         reporter.facts(facts)
         brief = [*_noise_in_brief(surface.noise), *_shares_in_brief(result.shares)]
-        brief += [f"{seconds['total']:.1f} s", megabytes(stored_bytes(target))]
+        brief += [f"{seconds['total']:.1f} s", megabytes(self.bytes)]
         reporter.say(f"{pair.name}: {', '.join([f'{planned.method} x{planned.scale}', *brief])} -> {target}")
         return "done"
 
@@ -174,11 +180,6 @@ class FrameWork:
     def _upsampler(self) -> AnyRatio:
         """The method, whose weights are loaded once."""
         return self._request.upsampling.upsampler()
-
-    @functools.cached_property
-    def _settings(self) -> dict[str, Any]:
-        """The settings that all results depend on; to find them, files of the configuration are read."""
-        return settings_of(self._request)
 
     def _upsample(self, picture: Picture, sensor: Identified | None, progress: Progress) -> Surface:
         """Compute the high-resolution depth with its expected errors, on the CPU."""
@@ -200,12 +201,22 @@ class Times:
     def __init__(self, progress: Progress, **seconds: float) -> None:
         self._progress, self._seconds = progress, {stage: round(each, 3) for stage, each in seconds.items()}
         self._stage, self._since, self._kept = "", 0.0, {}  # type: str, float, Mapping[str, float]
+        self._slower = 1.0
 
     def begin(self, stage: str, seconds: float | None = None) -> None:
-        """Begin one of :data:`STAGES`, which takes about some seconds if that is known."""
+        """Begin one of :data:`STAGES`, which takes about some seconds on idle cores if that is known."""
         self.read()
         self._stage, self._since = stage, time.perf_counter()
-        self._progress.stage(stage, seconds)
+        self._progress.stage(stage, None if seconds is None else seconds * self._slower)
+
+    @contextlib.contextmanager
+    def computing(self) -> Iterator[None]:
+        """Observe by a computation of one thread how much longer it takes beside other work than on an idle core."""
+        started, used = time.perf_counter(), time.thread_time()
+        yield
+        passed, used = time.perf_counter() - started, time.thread_time() - used
+        if used >= _TELLING:
+            self._slower = max(passed / used, 1.0)
 
     def read(self) -> dict[str, float]:
         """Return the seconds of each stage so far, to milliseconds, and their sum as ``total``."""
@@ -380,8 +391,8 @@ def _describe_holes(surface: Surface, how: Upsampling) -> list[Assumption]:
 def write_result(
     folder: Path, result: Result, planned: Plan, times: Times, inputs: Mapping[str, Any],
     settings: Mapping[str, Any], earlier: PreviousRun | None = None, kept: PreviousRun | None = None,
-) -> tuple[list[Assumption], dict[str, float]]:  # fmt: skip
-    """Write the parts of a result and ``info.json``, and return notes for the user, and the seconds of the stages.
+) -> tuple[list[Assumption], dict[str, float], int]:  # fmt: skip
+    """Write the parts of a result and ``info.json``, and return notes, the seconds of the stages, and the size.
 
     Args:
         folder: of the result.
@@ -424,5 +435,4 @@ def write_result(
         "seconds": times.together(seconds := times.read()),
         "versions": {"python": platform.python_version(), **package_versions(_PACKAGES)},
     }
-    finish(folder, earlier, entries, [*files, *others])
-    return facts, seconds
+    return facts, seconds, finish(folder, earlier, entries, [*files, *others])

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from dsr.app.upsample.parts import ERRORS, FILES, METRES, OLD_METRES, PARTS
+from dsr.app.upsample.parts import ERRORS, FILES, METRES, PARTS
 from dsr.evaluation.store import load_errors
 from dsr.geometry.camera import Camera
 from dsr.io.depth_files import read_depth_file, storable
@@ -151,9 +151,8 @@ def kept_surface(folder: Path, camera: Camera, *, errors: bool) -> Surface | Non
 
     """
     size = (camera.height, camera.width)
-    with contextlib.suppress(OSError, ValueError, StopIteration):
-        path = next(each for each in (folder / METRES, folder / OLD_METRES) if each.is_file())
-        values = read_depth_file(path, pixels_beside(*size))
+    with contextlib.suppress(OSError, ValueError):
+        values = read_depth_file(folder / METRES, pixels_beside(*size))
         if values.shape != size or values.dtype != np.float32:
             return None
         depth = torch.from_numpy(values)[None]
@@ -179,19 +178,18 @@ def begin(folder: Path, settings: Mapping[str, Any], inputs: Mapping[str, Any], 
     write_text(folder / INFO, json.dumps(entries, indent=2) + "\n")
 
 
-def finish(folder: Path, earlier: PreviousRun | None, entries: Mapping[str, Any], files: Sequence[str]) -> None:
-    """Write ``info.json`` of a finished run, and remove files of an earlier run that do not belong to it."""
+def finish(folder: Path, earlier: PreviousRun | None, entries: Mapping[str, Any], files: Sequence[str]) -> int:
+    """Write ``info.json`` of a finished run, remove other files of an earlier one, and return the size of the files."""
     for name in () if earlier is None else earlier.files:
         if name not in files and name in FILES:
             (folder / name).unlink(missing_ok=True)
     write_text(folder / INFO, json.dumps({"complete": True, **entries, "files": list(files)}, indent=2) + "\n")
+    return stored_bytes(folder, files)
 
 
-def stored_bytes(folder: Path) -> int:
-    """Return the size of the files of a finished run, without those that have been removed since."""
-    previous = read_previous_run(folder)
-    names = () if previous is None else (*previous.files, INFO)
-    return sum((folder / name).stat().st_size for name in names if (folder / name).is_file())
+def stored_bytes(folder: Path, files: Iterable[str]) -> int:
+    """Return the size of ``info.json`` and of the files of a finished run that have not been removed since."""
+    return sum((folder / name).stat().st_size for name in (*files, INFO) if (folder / name).is_file())
 
 
 def described(picture: Picture, encoding: Encoding) -> dict[str, Any]:

@@ -31,8 +31,6 @@ FORMATS = (*_SUFFIXES, "mm")
 is a PNG of 16 bits in whole millimetres, 0 in holes."""
 METRES = "depth_metres.tiff"
 """Depth to the bit, which is read back, stored as :data:`dsr.io.encoding.IN_METRES` says."""
-OLD_METRES = "depth_metres.npy"
-"""The same, of earlier versions."""
 ERRORS = "confidence.npz"
 _ERROR_STEPS = 2**6
 """Expected errors are stored with so many steps below each power of two: off by less than 2 %."""
@@ -301,7 +299,7 @@ _OF_DEPTH = ("depth", "rgbd")
 PARTS: dict[str, Part] = {
     part.name: part
     for part in (
-        Part("depth", (*(f"depth.{suffix}" for suffix in (*_SUFFIXES, "tif")), METRES, OLD_METRES), _depth,
+        Part("depth", (*(f"depth.{suffix}" for suffix in (*_SUFFIXES, "tif")), METRES), _depth,
               cost=Cost(2.0, 0.25)),
         Part("renderings", tuple(f"renderings/{light}.png" for light in LIGHT_NAMES), _renderings,
               cost=Cost(1.0, 0.4)),

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -243,17 +244,17 @@ class UpsampleRequest(Options):
             )
         self.upsampling.check_slowly()
 
-
-def settings_of(request: UpsampleRequest) -> dict[str, Any]:
-    """Return the settings that a result depends on, as values for JSON."""
-    return {
-        **recorded(request),
-        "max_error": request.results.max_error / 100,
-        **({"certain": True} if request.results.certain else {}),
-        "registered_by": None if request.reading.rig is None else "extrinsics",
-        "set": request.upsampling.arguments,
-        "code": hash_outside_code(_targets(request.upsampling)),
-    }
+    @functools.cached_property
+    def settings(self) -> Mapping[str, Any]:
+        """The settings that a result depends on, as values for JSON; the method's files are read for them."""
+        return {
+            **recorded(self),
+            "max_error": self.results.max_error / 100,
+            **({"certain": True} if self.results.certain else {}),
+            "registered_by": None if self.reading.rig is None else "extrinsics",
+            "set": self.upsampling.arguments,
+            "code": hash_outside_code(_targets(self.upsampling)),
+        }
 
 
 def _targets(how: Upsampling) -> list[str]:

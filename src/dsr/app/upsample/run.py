@@ -7,16 +7,15 @@ import errno
 import json
 import time
 from collections import Counter
-from collections.abc import Iterable
 from pathlib import Path
 
 from rich.console import Console
 
 from dsr.app.upsample.frames import Frames, find_frames
-from dsr.app.upsample.outputs import INFO, stored_bytes
+from dsr.app.upsample.outputs import INFO
 from dsr.app.upsample.preview import preview
 from dsr.app.upsample.reporting import Reporter, listed
-from dsr.app.upsample.request import UpsampleRequest, settings_of
+from dsr.app.upsample.request import UpsampleRequest
 from dsr.app.upsample.scene import EXPORTS, write_scene
 from dsr.app.upsample.stored import read_info
 from dsr.app.upsample.workers import work_through
@@ -64,7 +63,7 @@ def run(request: UpsampleRequest, console: Console) -> list[str]:
                 show(console, f"--with {part.name}: the frame has no pose{_UNPOSED.get(part.name, '')}")
     with contextlib.ExitStack() as stack:
         if not request.results.dry_run:
-            claims = Claims(request.results.output, json.dumps(settings_of(request), sort_keys=True))
+            claims = Claims(request.results.output, json.dumps(request.settings, sort_keys=True))
             try:
                 stack.enter_context(claims)
             except OSError as error:
@@ -107,12 +106,14 @@ def _run(request: UpsampleRequest, frames: Frames, console: Console) -> list[str
     problems: dict[str, list[str]] = {}
     outcomes: Counter[str] = Counter()
     targets: dict[str, Path] = {}
+    size = 0.0
     scene_problems: list[str] = []
     through = preview if wanted.dry_run else work_through
     for done in through(request, frames, reporter, progress):
         if done.problem is None:
             outcomes[done.outcome] += 1
             targets[done.pair.name] = done.target
+            size += done.bytes
         else:
             problems.setdefault(done.problem, []).append(done.pair.name)
     if targets and wanted.of_all and not wanted.dry_run and shard is None:
@@ -127,7 +128,7 @@ def _run(request: UpsampleRequest, frames: Frames, console: Console) -> list[str
         counts += [f"{sum(map(len, problems.values()))} failed"] if problems else []
         counts = counts or ["nothing to do"]
         pictures = "1 picture" if len(found.pairs) == 1 else f"{len(found.pairs)} pictures"
-        took = "" if wanted.dry_run else f" in {clock(time.monotonic() - started)}, {_size(targets.values())}"
+        took = "" if wanted.dry_run else f" in {clock(time.monotonic() - started)}, {megabytes(size)}"
         show(console, f"{pictures}: {', '.join(counts)}{took} -> {wanted.output}")
     if shard is not None and not wanted.dry_run:
         summary = {
@@ -140,15 +141,6 @@ def _run(request: UpsampleRequest, frames: Frames, console: Console) -> list[str
         write_text(wanted.output / _summary_of(shard), json.dumps(summary, indent=2) + "\n")
     lines = [f"{listed(names)}: {message}" if len(found.pairs) > 1 else message for message, names in problems.items()]
     return lines + scene_problems
-
-
-def _size(folders: Iterable[Path]) -> str:
-    """Return the size of the results in folders as text."""
-    total = 0
-    for folder in folders:
-        with contextlib.suppress(ValueError, OSError):
-            total += stored_bytes(folder)
-    return megabytes(total)
 
 
 def _summary_of(shard: Shard) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from dsr.app.upsample.outputs import INFO
 from dsr.app.upsample.parts import METRES, Part
-from dsr.app.upsample.stored import DEPTHS, read_camera, read_info, read_up
+from dsr.app.upsample.stored import read_camera, read_info, read_up
 from dsr.io.scene_files import RGBD, Frame, parse_pose
 from dsr.utils.files import write_text
 from dsr.utils.guards import is_number, parse_json, path_within, read_limited
@@ -80,9 +80,8 @@ def read_frame(name: str, folder: Path) -> Frame:
     """
     path = folder / INFO
     info = read_info(path)
-    depth = next((folder / each for each in DEPTHS if (folder / each).is_file()), None)
-    colour = folder / "rgbd" / RGBD[0]
-    if depth is None or not colour.is_file():
+    depth, colour = folder / METRES, folder / "rgbd" / RGBD[0]
+    if not (depth.is_file() and colour.is_file()):
         raise ValueError(f"{folder}: expected {METRES} and rgbd/{RGBD[0]} of this run, one is missing")
     pose, time = parse_pose(f"{path}: pose", info.get("pose")), info.get("time")
     time = time if is_number(time) else None

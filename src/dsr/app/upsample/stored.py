@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from dsr.app.upsample.outputs import INFO
-from dsr.app.upsample.parts import ERRORS, METRES, OLD_METRES, Results
+from dsr.app.upsample.parts import ERRORS, METRES, Results
 from dsr.evaluation.store import load_errors
 from dsr.geometry.camera import Camera
 from dsr.inference import find_filled
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 
 _DEEPEST = 6
 """Folders below the given one in which results are looked for."""
-DEPTHS = (METRES, OLD_METRES, "depth.npy")
-"""The files that hold a result's depth in metres, the first that is there; the others are of earlier versions."""
 _LARGEST_INFO = 16 << 20
 
 
@@ -150,28 +148,25 @@ def read_depth(folder: Path, camera: Camera) -> np.ndarray:
         ValueError: the file is missing, damaged or foreign, or has no depth.
 
     """
-    for name in DEPTHS:
-        path = folder / name
-        if not path.is_file():
-            continue
-        size = (camera.height, camera.width)
-        try:
-            stored = read_depth_file(path, pixels_beside(*size))
-        except TooLargeError:
-            raise
-        except (ValueError, OSError) as error:
-            raise ValueError(f"{path}: expected a map of depths, got a damaged or foreign file") from error
-        if stored.shape != size or stored.dtype != np.float32:
-            text = f"{stored.dtype} of shape {stored.shape}"
-            raise ValueError(f"{path}: expected float32 of shape {size}, the photo's, got {text}")
-        if min(size) < 2:
-            raise ValueError(f"{path}: expected a map of at least 2 x 2 pixels, got {size}")
-        depth = np.where(np.isfinite(stored) & (stored > 0), stored, np.float32(math.nan))
-        if not np.isfinite(depth).any():
-            raise ValueError(f"{path}: expected depths, all pixels are holes")
-        expect_distances(str(path), torch.from_numpy(depth))
-        return depth
-    raise ValueError(f"{folder}: expected a result with depth, got one without {METRES}; run it with --only depth")
+    path, size = folder / METRES, (camera.height, camera.width)
+    if not path.is_file():
+        raise ValueError(f"{folder}: expected a result with depth, got one without {METRES}; run it with --only depth")
+    try:
+        stored = read_depth_file(path, pixels_beside(*size))
+    except TooLargeError:
+        raise
+    except (ValueError, OSError) as error:
+        raise ValueError(f"{path}: expected a map of depths, got a damaged or foreign file") from error
+    if stored.shape != size or stored.dtype != np.float32:
+        text = f"{stored.dtype} of shape {stored.shape}"
+        raise ValueError(f"{path}: expected float32 of shape {size}, the photo's, got {text}")
+    if min(size) < 2:
+        raise ValueError(f"{path}: expected a map of at least 2 x 2 pixels, got {size}")
+    depth = np.where(np.isfinite(stored) & (stored > 0), stored, np.float32(math.nan))
+    if not np.isfinite(depth).any():
+        raise ValueError(f"{path}: expected depths, all pixels are holes")
+    expect_distances(str(path), torch.from_numpy(depth))
+    return depth
 
 
 def read_errors(path: Path, camera: Camera) -> tuple[np.ndarray, np.ndarray]:

@@ -219,7 +219,7 @@ class Surface(Generic[Array]):
         times.begin("writing")
         begin(folder, settings, inputs, () if earlier is None else earlier.files)
         kept = earlier if same else None
-        notes, _ = write_result(folder, result, self._plan, times, inputs, settings, earlier, kept)
+        notes, *_ = write_result(folder, result, self._plan, times, inputs, settings, earlier, kept)
         warn(note for note in notes if note.code)
         run = read_previous_run(folder)
         files = [] if run is None else [folder / name for name in run.files]

@@ -24,12 +24,13 @@ _work: FrameWork | None = None
 
 
 class Done(NamedTuple):
-    """A picture that was worked on: what became of it, or the problem in one line."""
+    """A picture that was worked on: the outcome with the size of its results, or the problem in one line."""
 
     pair: Pair
     target: Path
     outcome: str
     problem: str | None
+    bytes: float = 0.0
 
 
 def work_through(request: UpsampleRequest, frames: Frames, reporter: Reporter, progress: Progress) -> Iterator[Done]:
@@ -100,6 +101,6 @@ def attempt(work: FrameWork, pair: Pair, target: Path, reporter: Messages, progr
     """Upsample a picture, and return what became of it."""
     try:
         with refusing_excess():
-            return Done(pair, target, work(pair, target, reporter, progress), None)
+            return Done(pair, target, work(pair, target, reporter, progress), None, work.bytes)
     except (ValueError, OSError) as error:  # the others go on
         return Done(pair, target, "", one_line(error))
