@@ -5,8 +5,8 @@
 Reads the runs of ``eval.py``, best of ``metrics=suite``, of several methods over several data sets. For each scene and
 factor, the methods are ranked by each metric; Kendall's tau-b of two rankings is 1 where they are the same and 0 where
 they have nothing in common. Writes ``agreement.csv`` (mean tau over scenes, every metric with every other),
-``table.md`` (with a few that stand for the families) and ``agreement.png``. Scenes with fewer than five methods
-that have both metrics do not count, nor do metrics without values of 10 scenes.
+``table.md`` (with a few that stand for the families) and ``agreement.png``. Of metrics with
+values of five methods or more in 10 scenes or more; scenes that lack one of these do not count.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import argparse
 import sys
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -32,25 +31,30 @@ BESIDE = (
 """Metrics that the table sets beside all others, of those that are there."""
 SUITE = ("paper", "depth", "normals", "points", "boundaries", "evalmde")
 """Families of metrics of an image with a dense truth."""
+SCENE = ["dataset", "scene", "scale", "downsampling"]
 LEAST_METHODS, LEAST_SCENES = 5, 10
 HIGH = 0.7
 """Tau from which on a figure is bold."""
 
 
-def agreement(matrix: pd.DataFrame) -> pd.DataFrame:
-    """Return Kendall's tau of the rankings of the methods by every two metrics, mean over scenes.
+def agreement(matrix: pd.DataFrame) -> tuple[pd.DataFrame, int]:
+    """Return Kendall's tau of the rankings of methods by every two metrics, and of how many scenes it is the mean.
+
+    All of it is of the same scenes: those that have all metrics that enough scenes have.
 
     Args:
         matrix: of :func:`dsr.report.correlations.metric_matrix`, each column such that lower is better.
 
     """
-    total = pd.DataFrame(0.0, matrix.columns, matrix.columns)
-    count = total.copy()
-    for _, scene in matrix.groupby(level=["dataset", "scene", "scale", "downsampling"]):
-        tau = scene.corr(method="kendall", min_periods=LEAST_METHODS)
-        total += tau.fillna(0)
-        count += tau.notna()
-    return (total / count).where(count >= LEAST_SCENES)
+    by_scene = matrix.groupby(level=SCENE)
+    there = by_scene.count() >= LEAST_METHODS
+    kept = there.columns[there.sum() >= LEAST_SCENES]
+    scenes = there.index[there[kept].all(axis=1)]
+    taus = [by_scene.get_group(scene)[kept].corr(method="kendall") for scene in scenes]
+    by_metric = pd.concat(taus).groupby(level=0, sort=False)
+    tau = by_metric.mean().where(by_metric.count() >= LEAST_SCENES)  # one that does not vary in a scene has none there
+    varying = tau.index[tau.notna().sum() > 1]
+    return tau.loc[varying, varying], len(scenes)
 
 
 def write(folder: Path, tau: pd.DataFrame, heads: dict[str, str]) -> None:
@@ -87,13 +91,10 @@ def main(arguments: list[str]) -> None:
     matrix = metric_matrix(results)
     shown = {name: each for name, each in results.formats.items() if name in matrix and each.family in SUITE}
     better = pd.Series({name: -1 if each.higher_is_better else 1 for name, each in shown.items()})
-    tau = agreement(matrix[list(shown)] * better)
-    alone = np.eye(len(tau), dtype=bool)
-    kept = [name for name in tau if tau.loc[name].where(~alone[tau.columns.get_loc(name)]).notna().any()]
-    write(asked.output, tau.loc[kept, kept], {name: f"{shown[name].family}: {shown[name].title}" for name in kept})
-    scenes = matrix.groupby(level=["dataset", "scene", "scale", "downsampling"]).size()
+    tau, scenes = agreement(matrix[list(shown)] * better)
+    write(asked.output, tau, {name: f"{shown[name].family}: {shown[name].title}" for name in tau})
     methods = matrix.index.get_level_values("label").nunique()
-    print(f"{len(scenes)} scenes, {methods} methods, {len(matrix)} results, {len(kept)} metrics")
+    print(f"{scenes} scenes, {methods} methods, {len(tau)} metrics")
 
 
 if __name__ == "__main__":

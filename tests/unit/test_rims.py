@@ -50,15 +50,6 @@ def test_hole_that_shows_neither_surface_is_doubtful() -> None:
     assert errors[0] < 0.1 < errors[1]
 
 
-def test_hole_of_a_photo_without_colours_is_doubtful_though_the_method_fills_it() -> None:
-    photo, given, _ = _ring(BLUE)
-    holes = ~given.isfinite()
-    for colours, least, most in ((torch.full_like(photo, 0.5), 0.02, 1.0), (_ring(RED)[0], 0.0, 1e-3)):
-        found = settle_holes(given.reciprocal(), colours, holes)
-        assert not bool(found.inverse[holes].isfinite().any())
-        assert bool(((found.doubt[holes] >= least) & (found.doubt[holes] <= most)).all())
-
-
 def test_strip_beside_a_near_object_is_of_what_is_behind_it() -> None:
     depth = torch.full((1, 40, 60), FAR)
     depth[:, 10:30, 20:40] = NEAR

@@ -66,24 +66,22 @@ def settle_holes(inverse: Tensor, rgb: Tensor, holes: Tensor) -> Settled:
 
     """
     known = inverse.isfinite()
-    settled, wrong, gap = inverse.clone(), torch.zeros_like(inverse), torch.zeros_like(inverse)
+    settled, doubt = inverse.clone(), torch.zeros_like(inverse)
     if not bool((holes & ~known).any()) or _is_scattered(known):
-        return Settled(settled, gap)
+        return Settled(settled, doubt)
     colours = functional.adaptive_avg_pool2d(rgb[None].to(inverse), (inverse.shape[-2], inverse.shape[-1]))[0]
     away = distance_to_known(known)[0]
     places = torch.nonzero((holes & ~known)[0])
     for part in places.split(_MOST):
         rows, columns = part[:, 0], part[:, 1]
-        found = _settle(inverse[0], colours, rows, columns, away[rows, columns].to(inverse))
-        for whole, values in zip((settled, wrong, gap), found, strict=True):
-            whole[0, rows, columns] = values
+        found, doubtful = _settle(inverse[0], colours, rows, columns, away[rows, columns].to(inverse))
+        settled[0, rows, columns], doubt[0, rows, columns] = found, doubtful
     decided = settled.isfinite() & ~known
     if bool(decided.any()):
         usual = inpaint(inverse[None], rgb[None])[0]
         same = decided & ((settled / usual).log().abs() < _DIFFERENT)
-        settled = settled.masked_fill(same, math.nan)
-        wrong = torch.where(same, wrong.square(), wrong)  # two ways agree
-    return Settled(settled, (wrong * gap).clamp(max=1))
+        settled, doubt = settled.masked_fill(same, math.nan), doubt.masked_fill(same, 0)
+    return Settled(settled, doubt)
 
 
 def _is_scattered(known: Tensor) -> bool:
@@ -93,10 +91,8 @@ def _is_scattered(known: Tensor) -> bool:
     return bool((inner & beside).sum() < _TOGETHER * inner.sum())
 
 
-def _settle(
-    inverse: Tensor, colours: Tensor, rows: Tensor, columns: Tensor, away: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return inverse depth of pixels, (n,), NaN where it is not decided; how likely it is wrong, and by how much then.
+def _settle(inverse: Tensor, colours: Tensor, rows: Tensor, columns: Tensor, away: Tensor) -> tuple[Tensor, Tensor]:
+    """Return inverse depth, NaN where it is not decided, and the doubt at pixels, (n,) each.
 
     Args:
         inverse: (h, w) the map.
@@ -119,10 +115,10 @@ def _settle(
     rim = known & (distance <= 1.5 * away[:, None] + 3)
     high = values.masked_fill(~rim, -math.inf).amax(1)
     low = values.masked_fill(~known, math.inf).amin(1)
-    found, wrong, gap = torch.full_like(away, math.nan), torch.zeros_like(away), torch.zeros_like(away)
+    found, doubt = torch.full_like(away, math.nan), torch.zeros_like(away)
     two = high > _STEP * low
     if not bool(two.any()):
-        return found, wrong, gap
+        return found, doubt
     values, known, index, distance, away = values[two], known[two], index[two], distance[two], away[two]
     nearer = values > (high * low).sqrt()[two, None]
     difference = colours.flatten(1)[:, index] - colours[:, rows[two], columns[two], None]
@@ -139,8 +135,8 @@ def _settle(
     farther, clearly = better >= 0, better < -_CLEARLY
     result = torch.where(farther, depths[0], depths[1])
     other = torch.where(farther, depths[1], depths[0])
+    wrong = torch.sigmoid(-better.abs() / 2)  # the witnesses of a surface are not independent of each other
     decided = (farther | clearly) & result.isfinite()
     found[two] = torch.where(decided, result, math.nan)
-    wrong[two] = torch.sigmoid(-better.abs() / 2)  # the witnesses of a surface are not independent of each other
-    gap[two] = (other / result - 1).abs().nan_to_num(0)
-    return found, wrong, gap
+    doubt[two] = torch.where(decided, wrong * (other / result - 1).abs().nan_to_num(0), 0).clamp(max=1)
+    return found, doubt

@@ -102,7 +102,7 @@ class CaptureFrame:
         app: name of the app or data set, for messages.
         geometry: returns camera and pose for a photo of (height, width) pixels, or raises a ValueError that names the
             file.
-        told_by: file that describes camera and pose.
+        description: file that describes camera and pose.
         content: the part of it that this frame depends on, which identifies it in ``info.json``.
         photo: where the photo is, if it is no file of its own.
         depth: where the depth map is, if it is no file of its own.

@@ -22,5 +22,5 @@ def did_you_mean(given: object, known: Iterable[str]) -> str:
 
 
 def _words(name: str) -> set[str]:
-    """Return the words of a name in lower case."""
-    return set(re.findall(r"[^\W_]+", name.lower()))
+    """Return the words of a name in lower case, without a plural's s."""
+    return {word.rstrip("s") for word in re.findall(r"[^\W_]+", name.lower())}

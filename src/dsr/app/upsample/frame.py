@@ -26,7 +26,7 @@ from dsr.app.upsample.outputs import (
     read_previous_run,
     stored_bytes,
 )
-from dsr.app.upsample.parts import PARTS, Result, as_stored, write_parts
+from dsr.app.upsample.parts import METRES, PARTS, Result, as_stored, write_parts
 from dsr.app.upsample.reporting import Messages
 from dsr.app.upsample.request import UpsampleRequest, Upsampling, files_of, inputs_with_neighbours
 from dsr.app.upsample.sequence import FrameSequence
@@ -294,6 +294,8 @@ class _Job:
             return False
         wanted = self.request.results
         there = {name for name in self.earlier.files if (self.target / name).is_file()}
+        if METRES not in there and any(part.name == "depth" for part in wanted.of_frame):
+            return False
         shapes = [self.earlier.shapes.get(part.name) for part in wanted.of_frame]
         if wanted.keep == "all" and any(isinstance(shape, dict) and shape.get("how") == FLAT for shape in shapes):
             return False
