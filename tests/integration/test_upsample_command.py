@@ -362,6 +362,17 @@ def test_result_of_other_settings_or_inputs_is_kept_unless_overwritten(pair, tmp
     assert files_in(out) == {"depth.npy", "depth_metres.tiff", "info.json"}
 
 
+def test_depth_of_which_a_file_is_missing_is_written_again(pair, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert of(pair, out, *DEPTH_ONLY) == 0
+    (out / "depth_metres.tiff").unlink()
+    assert of(pair, out, *DEPTH_ONLY) == 0
+    assert "complete already" not in capsys.readouterr().out
+    assert files_in(out) == {"depth.png", "depth_metres.tiff", "info.json"}
+    assert of(pair, out, *DEPTH_ONLY) == 0
+    assert "complete already" in capsys.readouterr().out
+
+
 def test_interrupted_run_resumes(pair, tmp_path, capsys, monkeypatch):
     out = tmp_path / "out"
 

@@ -27,6 +27,7 @@ MISSPELT = {
     "data get midlebury": "middlebury", "eval method=facts": "facets", "eval dataset=simgoe": "simgeo",
     "eval -m method=bicubic,facts": "facets", "eval +experimnt=facets_x4": "experiment", "completion fihs": "fish",
     "upsample --rgb a --depth b -o out --unit mm": "--depth-unit",
+    "upsample --rgb a --depth b -o out --depth-units mm": "--depth-unit",
 }  # fmt: skip
 
 
