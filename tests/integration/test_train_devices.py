@@ -131,7 +131,7 @@ def test_process_that_is_lost_ends_the_others_in_one_line(tmp_path, environment)
     assert codes == [2, -9], errors
     assert len(errors[0]) == 1, errors
     start, end = errors[0][0].split(" (")[0], errors[0][0].rpartition("); ")[2]
-    assert start == "error: another process of the training has ended"
+    assert start == "error: another process of the training ended"
     assert end == "the same command continues from the latest checkpoint"
     assert errors[1] == []
 
