@@ -5,8 +5,8 @@
 Reads the runs of ``eval.py``, best of ``metrics=suite``, of several methods over several data sets. For each scene and
 factor, the methods are ranked by each metric; Kendall's tau-b of two rankings is 1 where they are the same and 0 where
 they have nothing in common. Writes ``agreement.csv`` (mean tau over scenes, every metric with every other),
-``table.md`` (with a few that stand for the families) and ``agreement.png``. Of metrics with
-values of five methods or more in 10 scenes or more; scenes that lack one of these do not count.
+``table.md`` (with a few that stand for the families) and ``agreement.png``. A metric counts if 10 scenes or more have
+its values for five methods or more, and a scene if it has all metrics that count.
 """
 
 from __future__ import annotations

@@ -50,8 +50,8 @@ STAGES = {"reading": 0.03, "upsampling": 0.57, "writing": 0.4}
 """Shares of the time of a phone's frame, by the names that they have in ``info.json``."""
 _WHITE = 1.5
 """Noise that is alike over fewer pixels counts as white."""
-_TELLING = 0.02
-"""Least seconds of a core that tell how much work there is beside."""
+_MEASURABLE = 0.02
+"""Least seconds of a core from which the load of the machine is estimated."""
 _PACKAGES = ("dsr", "torch", "numpy", "opencv-python-headless")
 
 
@@ -215,7 +215,7 @@ class Times:
         started, used = time.perf_counter(), time.thread_time()
         yield
         passed, used = time.perf_counter() - started, time.thread_time() - used
-        if used >= _TELLING:
+        if used >= _MEASURABLE:
             self._slower = max(passed / used, 1.0)
 
     def read(self) -> dict[str, float]:
