@@ -244,7 +244,7 @@ def _refine(
     comparison: _Comparison, gradients: tuple[Array, Array], start: tuple[float, float, float], *, scaling: bool
 ) -> tuple[float, float, float]:
     """Return down, right and scale with the largest gradients near a start, to fractions of a pixel."""
-    from scipy import optimize  # noqa: PLC0415 - a quarter of a second, which registered maps save
+    from scipy import optimize  # noqa: PLC0415 - a quarter of a second where no edges are compared
 
     reach = max(comparison.size) / 2  # pixels by which the border moves for twice the scale
 
