@@ -13,9 +13,12 @@ from torch import Tensor
 
 from dsr.data.rendered import Procedural
 from dsr.geometry.camera import Camera
-from dsr.inference import upsample_surface
+from dsr.inference import select, upsample_surface
 from dsr.inference.working_size import find_noise, limit_to_noise, reduce_by_medians, working_size_of
 from dsr.methods.base import MapNoise
+from dsr.methods.recipe import Run, read_recipe
+from dsr.sample import DepthSample
+from dsr.utils.compute_device import fast_precision
 
 SIZE = (480, 640)
 
@@ -81,10 +84,31 @@ def test_medians_of_planes_are_planes_and_blocks_that_are_mostly_holes_are_holes
 def test_calm_errors_are_no_larger_than_the_noise_leaves_and_others_stay() -> None:
     spread = torch.full((1, 8, 8), 0.02)
     spread[0, 0, 0] = 0.2
-    limited = limit_to_noise(spread, MapNoise(0.01, 20, 1.0), 1.0)
-    assert float(limited[0, 4, 4]) == pytest.approx(0.6 * np.sqrt(2 / np.pi) * 0.01)
+    measured = torch.ones(1, 4, 4)
+    limited = limit_to_noise(spread, MapNoise(0.01, 20, 1.0), measured)
+    assert float(limited[0, 4, 4]) == pytest.approx(0.45 * np.sqrt(2 / np.pi) * 0.01)
     assert float(limited[0, 0, 0]) == pytest.approx(0.2)
-    assert torch.equal(limit_to_noise(spread, MapNoise(1.0, 20, 1.0), 1.0), spread)
+    assert torch.equal(limit_to_noise(spread, MapNoise(1.0, 20, 1.0), measured), spread)
+    spread[0, 2:], measured[0, 1:] = 1.0, torch.nan  # most of the map is a hole, of which more is expected
+    unsure = limit_to_noise(spread, MapNoise(0.01, 20, 1.0), measured)
+    assert float(unsure[0, 1, 4]) == float(limited[0, 1, 4])
+    assert float(unsure[0, 6, 4]) == 1
+
+
+def test_evaluation_works_on_a_sensor_map_at_the_size_that_upsample_chooses() -> None:
+    camera = Camera.centred(SIZE[1], SIZE[0], 600.0)
+    run = Run(precision=fast_precision(torch.device("cpu")))
+    sample = DepthSample("set", "room", torch.full((3, *SIZE), 0.5), noisy(20), camera, camera, 1)
+    surface = select(read_recipe("facets"), 1, measured=True).build(run).surface(sample)
+    expected = upsample_surface(sample.rgb, sample.depth_lr, camera, device="cpu", fill="all")
+    assert surface.noise is not None
+    assert surface.noise.reduced > 1
+    for found, wanted in ((surface.depth, expected.depth), (surface.depth_error, expected.depth_error)):
+        assert found is not None
+        assert wanted is not None
+        assert torch.equal(found, wanted)
+    assert select(read_recipe("facets"), 1).direct
+    assert select(read_recipe("facets", {"noise": 0}), 1, measured=True).direct
 
 
 def test_waves_of_a_sensor_are_averaged_and_size_can_be_chosen() -> None:

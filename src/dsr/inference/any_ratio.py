@@ -26,6 +26,7 @@ from dsr.inference.working_size import (
     enlarged_by,
     find_noise,
     find_sensor,
+    is_correlated,
     known_noise,
     left_of,
     limit_to_noise,
@@ -117,7 +118,7 @@ class AnyRatio(Method):
 
         """
         size = self._working_size
-        if size not in (None, 1) and not (self._scale is None and self._finds_noise):
+        if size not in (None, 1) and not (self._scale is None and finds_noise(self.recipe)):
             raise ValueError(
                 f"working_size: expected facets without a scale, for maps that may have noise, to take {size}"
             )
@@ -125,6 +126,10 @@ class AnyRatio(Method):
     def plan(self, size: tuple[int, int], size_lr: tuple[int, int]) -> Plan:
         """Return the plan for a photo and a depth map of these heights and widths."""
         return plan_for(self.recipe, size, size_lr, self._scale)
+
+    def surface(self, sample: DepthSample, progress: Steps | None = None) -> Surface:
+        """Return the high-resolution depth with its expected errors, as :meth:`upsample` does."""
+        return self.upsample(sample.rgb, sample.depth_lr, sample.camera, progress)
 
     def describe(self, sample: DepthSample) -> str:
         """Return in one line how the method is run, for a note beside the scores."""
@@ -182,7 +187,7 @@ class AnyRatio(Method):
                 lambda photo, view: self._upsample(photo, inverse_lr, view, factor, progress),
                 factor, rgb, inverse_lr, camera,
             )  # fmt: skip
-        elif self._scale is None and self._finds_noise:
+        elif self._scale is None and finds_noise(self.recipe):
             found = self._at_working_size(rgb, inverse, settled, camera, sensor, progress)
         else:
             found = self._upsample(rgb, settled, camera, scale, progress)
@@ -226,16 +231,18 @@ class AnyRatio(Method):
         factor = size or min(1 if noise is None else working_size_of(noise.extent), most)
         known = None if "noise" in self.recipe.settings else known_noise(sensor, noise, factor)
         if factor == 1:
-            return self._upsample(rgb, inverse, camera, None, progress, known)
-        inverse_lr = reduce_by_medians(pad_inverse_depth(inverse, factor), factor)
-        found = padded(
-            lambda photo, view: self._upsample(photo, inverse_lr, view, None, progress, known),
-            factor * camera.width / inverse.shape[-1], rgb, inverse_lr, camera,
-        )  # fmt: skip
-        if noise is None or found.spread is None:  # what the network has found is of the smaller map
-            return found._replace(noise=None)
-        left = limit_to_noise(found.spread, noise, float(measured.nanmedian()))
-        return found._replace(spread=left, noise=noise._replace(reduced=factor))
+            found = self._upsample(rgb, inverse, camera, None, progress, known)
+        else:
+            inverse_lr = reduce_by_medians(pad_inverse_depth(inverse, factor), factor)
+            found = padded(
+                lambda photo, view: self._upsample(photo, inverse_lr, view, None, progress, known),
+                factor * camera.width / inverse.shape[-1], rgb, inverse_lr, camera,
+            )  # fmt: skip
+            # what the network has found is of the smaller map
+            found = found._replace(noise=noise and noise._replace(reduced=factor))
+        if noise is None or found.spread is None or not is_correlated(noise, factor):
+            return found
+        return found._replace(spread=limit_to_noise(found.spread, noise, measured))
 
     def _upsample(
         self, rgb: Tensor, inverse: Tensor, camera: Camera, scale: int | None, progress: Steps | None,
@@ -263,15 +270,6 @@ class AnyRatio(Method):
         """The factors of the calls that give each factor; none for a method of any ratio."""
         return steps_of(self.recipe)
 
-    @functools.cached_property
-    def _finds_noise(self) -> bool:
-        """Whether the method may work at a size that the map's noise suggests.
-
-        It has to have weights for several ratios of the sizes, and no setting that there is no noise.
-        """
-        node = self.recipe.at()
-        return bool(self.recipe.computed_at) and not (node.get("clean") or node.get("noise") == 0)
-
     def _small_holes(self, valid: Tensor, camera: Camera) -> Tensor:
         """Return the small holes of a map, (1, h, w), be they to be filled or not: what is beside depends on it."""
         focal = camera.fx * valid.shape[-1] / camera.width
@@ -284,6 +282,15 @@ class AnyRatio(Method):
         left = ~valid if self._fill == "none" else ~valid & ~self._small_holes(valid, camera)
         holes = resize_nearest(left, size_of(surface.depth)).to(surface.depth.device)
         return surface.map(lambda values: values.masked_fill(holes, torch.nan))
+
+
+def finds_noise(recipe: Recipe) -> bool:
+    """Return whether a method may work at a size that the map's noise suggests.
+
+    It has to have weights for several ratios of the sizes, and no setting that there is no noise.
+    """
+    node = recipe.at()
+    return bool(recipe.computed_at) and not (node.get("clean") or node.get("noise") == 0)
 
 
 def upsampler(

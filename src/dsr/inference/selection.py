@@ -1,4 +1,4 @@
-"""Choose how an evaluation runs its method: itself, or as ``dsr upsample`` does at scales that it is not made for."""
+"""Choose how an evaluation runs its method: itself, or as ``dsr upsample`` does."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from dsr.inference.any_ratio import AnyRatio
+from dsr.inference.any_ratio import AnyRatio, finds_noise
 from dsr.inference.defaults import Fill
 from dsr.inference.plans import steps_of
 from dsr.methods.base import Method
@@ -23,7 +23,7 @@ class Selection:
     Args:
         recipe: the method, with its weights.
         scale: ratio of the photo's width to the depth map's.
-        direct: whether it takes the scale itself; else photo and result are resized around it.
+        direct: whether it is run at this scale itself; else as ``dsr upsample`` runs it, which may resize both.
 
     """
 
@@ -69,11 +69,13 @@ def select(recipe: Recipe, scale: float, weights: Path | None = None, *, measure
         scale: ratio of the photo's width to the depth map's.
         weights: a file of weights, or a directory with published ones; None for those that the method names.
         measured: whether the maps are a sensor's own. Of a method without packaged weights for their ratio, those for
-            another one are taken; of a model of downsampling, the error says that it needs weights.
+            another one are taken, and one that chooses its working size by the map's noise does so, as in
+            ``dsr upsample``; of a model of downsampling, the error says that it needs weights.
 
     """
     node = recipe.at()  # with the scale as the run names it
     choice = WeightChoice.of(node.get("weights"), scale)
     packaged = measured and weights is None and choice.packaged is not None
-    direct = recipe.abilities.takes(scale) and not (packaged and not choice.exists())
+    as_upsample = packaged and (finds_noise(recipe) or not choice.exists())
+    direct = recipe.abilities.takes(scale) and not as_upsample
     return Selection(recipe.with_weights(weights), scale, direct)

@@ -20,6 +20,7 @@ from torch.nn import functional
 
 from dsr.degradation.sensors import Identified, identify
 from dsr.inference.defaults import SIZES
+from dsr.inference.resizing import resize_nearest, size_of
 from dsr.methods.base import MapNoise, NoiseLaw
 
 _LARGEST_BLOCK = 16
@@ -50,9 +51,9 @@ _LEVEL = 0.4
 """Least noise of any window over that of the tenth in order: 0.55 to 0.95 for sensors, 0.1 for bumpy surfaces."""
 _LENGTHS = 2.3
 """Correlation lengths over the factor: noise of that full width is nearly independent after it."""
-_LEFT = 0.6
-"""Standard deviation of the result's error over that of the noise of a map that was worked on at a smaller size. It is
-alike, a little, even over the distances over which the network averages: 0.5 to 0.75 before an exact plane."""
+_LEFT = 0.45
+"""Standard deviation of the result's error over that of correlated noise of the map, where surfaces are calm: 0.35 to
+0.7 before an exact plane, 0.3 to 0.65 for simulated sensors."""
 _CALM, _UNSURE = 1.5, 4.0
 """Expected errors over their median up to which they are of noise, and from which on they are of something else."""
 _LARGE = 2**19
@@ -181,6 +182,11 @@ def known_noise(sensor: Identified | None, noise: MapNoise | None, factor: int) 
     return noise.deviation / noise.distance**2, 2.0
 
 
+def is_correlated(noise: MapNoise, factor: int) -> bool:
+    """Return whether noise is correlated over more pixels than a network finds, at a map's size over a factor."""
+    return factor > 1 or noise.extent >= _CORRELATED
+
+
 def working_size_of(extent: float) -> int:
     """Return by what the size of a map is divided whose noise is alike over some pixels: a power of 2, 4 or more, or 1.
 
@@ -208,7 +214,7 @@ def left_of(deviation: T) -> T:
     return _LEFT * math.sqrt(2 / math.pi) * deviation
 
 
-def limit_to_noise(spread: Tensor, noise: MapNoise, inverse: float) -> Tensor:
+def limit_to_noise(spread: Tensor, noise: MapNoise, measured: Tensor) -> Tensor:
     """Return expected relative errors, (1, H, W), that are no more than the noise of the map leaves, where all is calm.
 
     At a smaller size a network takes the noise for that of neighbours which it knows nothing of.
@@ -216,11 +222,12 @@ def limit_to_noise(spread: Tensor, noise: MapNoise, inverse: float) -> Tensor:
     Args:
         spread: of the network.
         noise: of the map at its own size.
-        inverse: the map's median, in 1/m.
+        measured: (1, h, w) inverse depth of the map in 1/m, NaN in holes, of which more is expected.
 
     """
-    left = left_of(noise.deviation) * inverse
-    median = spread.nanmedian()
+    left = left_of(noise.deviation) * measured.nanmedian().to(spread)
+    known = resize_nearest(measured.isfinite(), size_of(spread)).to(spread.device)
+    median = spread.masked_fill(~known, torch.nan).nanmedian()
     share = ((_UNSURE - spread / median) / (_UNSURE - _CALM)).clamp(0, 1)
     return spread * torch.lerp(torch.ones_like(spread), (left / median).clamp(max=1).expand_as(spread), share)
 
