@@ -1,4 +1,4 @@
-"""Choose how an evaluation runs its method: itself, or as ``dsr upsample`` does at scales that it is not made for."""
+"""Choose how an evaluation runs its method: directly, or as in ``dsr upsample`` at scales that it does not support."""
 
 from __future__ import annotations
 
