@@ -238,7 +238,7 @@ def _resized(photo: Tensor, size: tuple[int, ...]) -> Tensor:
 
 
 def _tiny(rgb: Tensor) -> np.ndarray:
-    """Return a few values that tell scenes apart."""
+    """Return a small thumbnail as a vector of unit length, by which scenes are distinguished."""
     values = functional.interpolate(rgb[None], (12, 16), mode="area").double().numpy().ravel()
     values -= values.mean()
     return values / max(float(np.linalg.norm(values)), 1e-9)

@@ -67,7 +67,7 @@ line and exit code 2.
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the generated pages to those that MkDocs found."""
-    from mkdocs.structure.files import File  # noqa: PLC0415 - the tests of the pages do without MkDocs
+    from mkdocs.structure.files import File  # noqa: PLC0415 - the tests of the pages run without MkDocs
 
     for path, content in generated_pages().items():
         files.append(File.generated(config, path, content=content))

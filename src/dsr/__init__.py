@@ -1,4 +1,4 @@
-"""Guided depth super-resolution, trained, run and judged by how the surface looks.
+"""Guided depth super-resolution: training, upsampling, and evaluation by the look of the surface.
 
 >>> import dsr
 >>> camera = dsr.Camera.from_fov(60, width=640, height=480)

@@ -1,4 +1,4 @@
-"""What is said about input: what was assumed about it, and warnings of what can hardly be right, with all limits."""
+"""Notes on input: assumptions that were made, and warnings of implausible values, with the limits of all warnings."""
 
 from __future__ import annotations
 
@@ -334,7 +334,7 @@ class Assumption(NamedTuple):
 
 
 def in_python(text: str) -> str:
-    """Return what is said to a user of a command as it is said to one of Python, where options are arguments."""
+    """Return a message of a command in the wording for Python, where options are arguments."""
     return _OPTION.sub(lambda found: _ARGUMENTS.get(name := found[1] or found[2], name.replace("-", "_")), text)
 
 

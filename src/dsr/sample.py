@@ -1,4 +1,4 @@
-"""The records that flow through everything: a scene as a data set has it, and a sample as a method gets it.
+"""The central records: a scene, as a data set provides it, and a sample, the input of a method.
 
 Depth is orthogonal depth (distance to the image plane) in metres. A hole is NaN, never 0.
 """

@@ -1,1 +1,1 @@
-"""Configuration and commands: the only part that knows Hydra."""
+"""Configuration and commands: the only subpackage that uses Hydra."""

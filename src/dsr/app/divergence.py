@@ -1,4 +1,4 @@
-"""What is left of a training that diverged: its last checkpoint, and a note so that it does not diverge again."""
+"""Diverged trainings: their last checkpoint, and a note in the run's directory, by which a repetition is refused."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _ADVICE = (
 
 
 def note_divergence(folder: Path, last: Path, identity: Identity, error: DivergenceError) -> ConfigError:
-    """Write down that a training diverged, and return the error that says what is left and what may help.
+    """Record that a training diverged, and return the error, which names the last checkpoint and possible remedies.
 
     Args:
         folder: the run's directory.

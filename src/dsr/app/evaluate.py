@@ -79,7 +79,7 @@ def plan(config: DictConfig) -> list[Plan]:
 
 
 def objective(scores: pd.DataFrame) -> float:
-    """Return what sweepers minimise: the mean over the scenes of RMSE_v, or of the first metric if that is not there.
+    """Return the objective of sweepers: the mean over the scenes of RMSE_v, or of the first metric without it.
 
     Args:
         scores: the content of ``scores.csv``.

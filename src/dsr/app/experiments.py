@@ -1,4 +1,4 @@
-"""What experiments (``conf/experiment``) need beyond Hydra.
+"""Support for experiments (``conf/experiment``) that Hydra lacks.
 
 Sweeps over the data sets that are on this machine, and sweeps that the command line overrides.
 """

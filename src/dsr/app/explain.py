@@ -27,7 +27,7 @@ _OTHERS = {"eval": "train", "train": "eval"}
 
 
 def explain_arguments(arguments: Sequence[str]) -> str | None:
-    """Explain in one line which argument Hydra would not refuse in one, None if there is none.
+    """Return an error of one line for an argument on which Hydra would fail with more, None if there is none.
 
     Args:
         arguments: command-line arguments, Hydra's options and overrides.

@@ -83,7 +83,7 @@ def _network(settings: MetricsConfig, extra: Sequence[Metric]) -> LPIPS | None:
 
 @functools.cache
 def perceptual_network(trunk: str | None) -> LPIPS | None:
-    """Return the LPIPS network; without a trunk, print one line that says what to do, and return None."""
+    """Return the LPIPS network; without weights of its trunk, print one line of advice, and return None."""
     try:
         return load_lpips(None if trunk is None else Path(trunk).expanduser())
     except OSError as error:

@@ -1,4 +1,4 @@
-"""The jobs of a multirun, by whichever launcher and in whichever process: checked first, and what became of them."""
+"""The jobs of a multirun, with any launcher: all are checked before the first runs, and failures are summarised."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _MADE_BY = "instantiate_launcher"
 
 @dataclass(frozen=True)
 class Plan:
-    """What a job will do, as far as it is known beforehand.
+    """The outline of a job, as far as it is known beforehand.
 
     Args:
         folder: the directory of its run.

@@ -1,4 +1,4 @@
-"""What the commands are asked: checked without what answers it, which takes seconds to import."""
+"""Options of the commands, checked before the modules that carry them out are imported, which takes seconds."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class ReportRequest(RunsRequest):
 
 @dataclass(frozen=True, kw_only=True)
 class LeaderboardRequest(RunsRequest):
-    """What a leaderboard is of."""
+    """Options of a leaderboard."""
 
     title: str = option("Depth super-resolution: leaderboard", "of the page")
 
@@ -112,7 +112,7 @@ class ViewRequest(Options):
 
 @dataclass(frozen=True, kw_only=True)
 class BrowserRequest(Options):
-    """Where the page of ``dsr app`` is served, and what may be asked of it."""
+    """Address of the page of ``dsr app``, and limits of its uploads and computations."""
 
     port: int = option(
         8765,
@@ -134,7 +134,7 @@ class BrowserRequest(Options):
 
     @property
     def memory(self) -> int | None:
-        """Bytes of memory of a computation; None for what is free."""
+        """Memory limit of a computation in bytes; None for all that is free."""
         return None if self.max_memory is None else int(1e9 * self.max_memory)
 
 

@@ -1,4 +1,4 @@
-"""The names of runs, which say what their configurations have that the command's defaults have not.
+"""The names of runs, composed of the settings that differ from the command's defaults.
 
 A name consists of the method or model, the scale, in evaluations the data set, the choices and settings that differ
 from the defaults, and the seed: ``msg_v_x8_w0.72_seed0``. The defaults of a choice's settings are those of its file.
@@ -43,7 +43,7 @@ _LONGEST, _LONGEST_VALUE = 100, 60
 
 
 def run_name(kind: str, config: Config, identity: Identity) -> tuple[str, bool]:
-    """Return the name of a run, and whether it says everything that the configuration has.
+    """Return the name of a run, and whether it contains every setting that differs from the defaults.
 
     Args:
         kind: ``eval`` or ``train``.

@@ -329,7 +329,7 @@ class TrainConfig(RunConfig):
 
     @property
     def more_of_trainer(self) -> dict[str, Any]:
-        """The trainer's node without what dsr computes with; the limit of gradients is only checked here."""
+        """The trainer's node without the keys that dsr handles itself; the limit of gradients is only checked here."""
         return {key: value for key, value in self.trainer.items() if key not in _TRAINER or key == "gradient_clip_val"}
 
     @property

@@ -31,7 +31,7 @@ _PROBES = 3
 
 
 class FirstValidation(Callback):
-    """Validates before the first step, without any effect on the steps; what the network is then may be its best.
+    """Validates before the first step, without any effect on the steps; these initial weights may be the best ones.
 
     Args:
         best: keeps the best checkpoint; by itself only after steps.

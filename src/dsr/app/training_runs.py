@@ -73,7 +73,7 @@ def _check_types(file: Path, config: Mapping[Any, Any]) -> None:
 
 
 def studies_of_run(plain: Config, given: Sequence[str]) -> Iterator[tuple[dict[str, Any], SceneSource | None]]:
-    """Yield what ``eval.py run=RUN_DIR`` evaluates: configurations, with data sets (None for the configuration's own).
+    """Yield the evaluations of ``eval.py run=RUN_DIR``: configuration and data set (None for the configuration's own).
 
     Args:
         plain: the composed configuration of ``eval.py``.

@@ -1,4 +1,4 @@
-"""What the configuration in a run's directory may name, as somebody else may have written it.
+"""Which targets and files a run's ``config.yaml`` may name: it may have been written by somebody else.
 
 A ``_target_`` is imported and called with the arguments beside it. A person who types one, or keeps it in a directory
 of their own (``--config-dir``), decides that; a ``config.yaml`` in a directory that came from elsewhere does not. Such
@@ -53,7 +53,7 @@ class Trust:
 
     @classmethod
     def of(cls, value: Any, directories: Sequence[Path] = ()) -> Trust:
-        """Return what the key ``trust`` and the user's own configuration directories allow.
+        """Return the targets that the key ``trust`` and the user's own configuration directories allow.
 
         Args:
             value: of the key: null or false, true, a target, or a list of them.
@@ -108,7 +108,7 @@ def read_plain_yaml(path: Path) -> dict[str, Any]:
 
 
 def expect_trusted(path: Path, config: Config, trust: Trust) -> None:
-    """Check the targets and the names in a run's configuration; tell on the console which others are allowed.
+    """Check the targets and names in a run's configuration; print a note for each foreign target that is allowed.
 
     Args:
         path: the file, for messages.

@@ -1,4 +1,4 @@
-"""The commands of ``dsr``: what each is asked, and what answers, which imports what is slow after the checks."""
+"""The commands of ``dsr``: the options of each and the function behind it, which is imported after the checks."""
 
 from __future__ import annotations
 

@@ -80,7 +80,7 @@ def complete(parser: Parser, request: CompletionRequest, console: Console) -> li
 
 
 def words_at_end(parser: Parser, line: str) -> list[str]:
-    """Return what may be in place of a line's last word: commands, options, or values where their names are known."""
+    """Return the completions of a line's last word: commands, options, or values where their names are known."""
     *before, last = _split(line)[1:] or [""]
     for word in before:
         parser = parser.commands.get(word, parser)

@@ -1,4 +1,4 @@
-"""The parser of ``dsr`` and of its commands: what is misspelt is named with what is meant."""
+"""The parser of ``dsr`` and of its commands, whose errors suggest the right spelling."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Parser(argparse.ArgumentParser):
         self.register("type", Path, _path)
 
     def error(self, message: str) -> NoReturn:
-        """End with the usage and what is wrong, which repeats arguments, without an address's password."""
+        """Exit with the usage and the error, which repeats arguments, without an address's password."""
         super().error(printable(message))
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:

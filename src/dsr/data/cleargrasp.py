@@ -1,4 +1,4 @@
-"""``dataset=cleargrasp`` and ``dataset=cleargrasp_synthetic``: glass and clear plastic, and where it really is.
+"""``dataset=cleargrasp`` and ``dataset=cleargrasp_synthetic``: glass and clear plastic, with true depth.
 
 Sajjan et al., "ClearGrasp: 3D Shape Estimation of Transparent Objects for Manipulation", ICRA 2020; README.md,
 ``eval_depth_completion/eval_depth_completion.py`` and ``z-ignore-scripts-helper/data_processing_script.py`` of
@@ -165,7 +165,7 @@ def load_rendering(rgb_path: Path, depth_path: Path, mask_path: Path, dataset: s
 
 
 def orthogonal(camera: Camera) -> Tensor:
-    """Return what the stored depth of a rendered picture is to be multiplied with, (1, H, W) float64."""
+    """Return the factors from the stored depth of a rendered picture to orthogonal depth, (1, H, W) float64."""
     columns, rows = torch.arange(camera.width, dtype=torch.float64), torch.arange(camera.height, dtype=torch.float64)
     across, down = (
         (pixels / size - 0.5) * angle

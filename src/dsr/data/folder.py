@@ -79,7 +79,7 @@ class Folder:
         return load_scene(self._root / scene, self.name, offset=scene not in self._without_offset)
 
     def fingerprint(self, scene: str) -> str:
-        """Return the SHA-256 of the scene's files, and of what is left out of them."""
+        """Return the SHA-256 of the scene's files, and of whether their offset is left out."""
         digest = hashlib.sha256(b"without offset" if scene in self._without_offset else b"")
         for path in sorted(path for path in (self._root / scene).iterdir() if path.is_file()):
             digest.update(os.fsencode(path.name) + b"\0")

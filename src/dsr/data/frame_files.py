@@ -174,7 +174,7 @@ def walk(root: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
 
 
 def in_natural_order(found: Mapping[str, Found]) -> dict[str, Found]:
-    """Return what was found by name, in the order of the names with their numbers by value."""
+    """Return a mapping sorted by its names, with numbers in them by value."""
     return {name: found[name] for name in sorted(found, key=natural_key)}
 
 

@@ -1,4 +1,4 @@
-"""How reference depth is made ready: resized by surface, its holes inpainted, its whole levels made smooth.
+"""Preparation of reference depth: resizing within surfaces, inpainting of holes, smoothing of integer levels.
 
 *Resizing.* Depth is resized as follows. A new pixel belongs to the surface of the old pixel at its centre; where that
 is missing, so is the new pixel. The new depth is that of a plane fitted to the old pixels around it, by weighted least

@@ -133,7 +133,7 @@ def read_samples(path: Path) -> tuple[Tensor, Tensor]:
 def read_matrices(
     path: Path, variables: Mapping[str, str] | None = None
 ) -> tuple[Tensor, Tensor | None, Tensor | None]:
-    """Return what a ``.mat`` file holds: the picture, the true depth and the samples.
+    """Read a ``.mat`` file: the picture, the true depth and the samples.
 
     Args:
         path: the file, of MATLAB 5 or 7.3.

@@ -39,7 +39,7 @@ class _State(NamedTuple):
 
 
 def add_glass(scene: Scene, generator: torch.Generator, kinds: Mapping[str, float] = KINDS) -> tuple[Scene, Tensor]:
-    """Return a scene with up to four clear, mirroring or glossy objects, and what a sensor sees of it.
+    """Return a scene with up to four clear, mirroring or glossy objects, and the depth that a sensor measures there.
 
     Args:
         scene: a scene with a true depth.

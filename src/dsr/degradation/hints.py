@@ -30,7 +30,7 @@ class Hints(NamedTuple):
 
 
 def encode_facts(kernel: str | None = None, soft: bool | None = None, *, noise: bool = False) -> Tensor:
-    """Return what is known of a map as numbers, (``FACTS``,): all 0 if nothing is.
+    """Encode known properties of a map as numbers, (``FACTS``,): all 0 if nothing is known.
 
     Args:
         kernel: the kernel that made it, one of ``KERNELS``, as the first five.

@@ -115,7 +115,7 @@ def occluded(disparity: Tensor) -> Tensor:
 
 
 def no_holes() -> None:
-    """Return no holes; what ``holes=none`` names."""
+    """Return no holes, for ``holes=none``."""
     return
 
 

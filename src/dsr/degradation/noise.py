@@ -224,7 +224,7 @@ class Kinect:
 
 
 def no_noise() -> None:
-    """Return no noise; what ``noise=none`` names."""
+    """Return no noise, for ``noise=none``."""
     return
 
 

@@ -49,7 +49,7 @@ SENSOR_NOISES = ("waves", "structured", "flight", "lidar", "stereo")
 
 @dataclass(frozen=True)
 class Everything:
-    """The distribution.
+    """The distribution of random degradations.
 
     Args:
         scales: relative frequency of each factor; None for that of the run.
@@ -70,7 +70,7 @@ class Everything:
         clear: fraction of the sensors' maps, those whose kind of noise is one of ``SENSOR_NOISES``, in which clear,
             mirroring or glossy objects stand. The truth is their surface, the map what a sensor sees. None if depth
             steps are soft, as their edges are not.
-        told: fraction of the maps of which a hint gives the kernel, and the noise, and the steps, independently.
+        told: fraction of the maps whose kernel is stated by a hint; likewise, independently, for noise and steps.
 
     Raises:
         ValueError: there is no such kind, or a frequency or a fraction is out of range.
@@ -233,5 +233,5 @@ class Everything:
 
 
 def plain() -> None:
-    """Return no distribution: maps are made by downsampling and noise alone; what ``degradation=plain`` names."""
+    """Return no distribution, for ``degradation=plain``: maps are made by downsampling and noise alone."""
     return

@@ -289,7 +289,7 @@ def _has_figures(sensor: Sensor) -> bool:
 
 
 class Identified(NamedTuple):
-    """A map's sensor, and by what it is known.
+    """The sensor of a map, and what identified it: the request, the file or the values.
 
     ``constant``: f B over the step of disparity that the map's values show, in metres; None where they show none.
     """
@@ -304,7 +304,7 @@ class Identified(NamedTuple):
 
 
 def identify(depth: Tensor, name: str = "auto", device_name: str = "") -> Identified | None:
-    """Return the sensor of a map: the named one, else what its values and the device's name tell.
+    """Return the sensor of a map: the named one, else the one identified by its values and the device's name.
 
     Where these contradict each other the values count: a device's name may be that of the photo's camera.
 
@@ -340,8 +340,8 @@ def identify(depth: Tensor, name: str = "auto", device_name: str = "") -> Identi
 
 
 _NEAR, _ALIKE = 0.02, 0.06
-"""Relative difference up to which steps tell a sensor, and beyond which they contradict one; cameras of a type differ
-by 2 %."""
+"""Relative difference up to which steps identify a sensor, and beyond which they contradict one; cameras of a type
+differ by 2 %."""
 _USUAL = (1.0, 848 / 1280, 0.6, 0.5)
 _PARTS = (*_USUAL, 2 / 3, 480 / 1280, 424 / 1280, 0.2)
 """Focal lengths of stereo cameras' modes over that of the native width: 848, 640 x 480 (cropped), 640 x 360 and others;

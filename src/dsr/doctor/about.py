@@ -1,4 +1,4 @@
-"""What is installed: ``dsr --version``, and the extras of the package. Nothing heavy is imported for it."""
+"""Installed versions for ``dsr --version``, and the package's extras, without importing any heavy package."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _CONTRIBUTORS = ("dev", "docs")
 
 
 class Extra(NamedTuple):
-    """An extra: its name, what it is for, and its requirements that are not there."""
+    """An extra of the package: its name, its purpose, and its missing requirements."""
 
     name: str
     purpose: str
@@ -39,7 +39,7 @@ class Extra(NamedTuple):
 
 
 def version_lines() -> list[str]:
-    """Return what an error report needs to know: versions of dsr, Python, torch and the weights, and the device."""
+    """Return the lines for an error report: versions of dsr, Python, torch and the weights, and the device."""
     torch = package_versions(["torch"])["torch"]
     return [
         f"dsr {dsr.__version__}, results {RESULTS}, weights {weights.version()}",
@@ -49,7 +49,7 @@ def version_lines() -> list[str]:
 
 
 def graphics_cards() -> list[str]:
-    """Return the names of NVIDIA's graphics cards, as their driver tells them, whether or not torch can use them."""
+    """Return the names of NVIDIA's graphics cards as the driver reports them, whether or not torch can use them."""
     program = shutil.which("nvidia-smi")
     if program is None:
         return []
@@ -70,7 +70,7 @@ def processor() -> str:
 
 
 def requirements(extra: str = "") -> list[Requirement]:
-    """Return what the package needs on this machine, or what an extra of it needs beyond.
+    """Return the requirements of the package on this machine, or the additional ones of an extra.
 
     Raises:
         PackageNotFoundError: the package is not installed.

@@ -39,7 +39,7 @@ def check_size(scene: Scene) -> list[Finding]:
 
 
 def check_registration(scene: Scene) -> list[Finding]:
-    """Check whether the photo shows what the depth map shows, and its edges coincide with the depth edges."""
+    """Check whether photo and depth map show the same scene, and whether their edges coincide."""
     verdict = judge(metres(scene), scene.rgb)
     if verdict is None:
         return [Finding("registration", "note", "no edges in the depth map or in the photo for this check")]

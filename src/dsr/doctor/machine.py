@@ -51,12 +51,12 @@ def examine_machine() -> int:
 
 
 def check_machine() -> list[Finding]:
-    """Run all checks; a ``problem`` is what ``dsr upsample`` needs, a ``note`` what it does not."""
+    """Run all checks; a ``problem`` affects ``dsr upsample``, a ``note`` does not."""
     return [finding for check in CHECKS for finding in check()]
 
 
 def check_python() -> list[Finding]:
-    """Check the version of Python, and say those of dsr and its weights."""
+    """Check the version of Python, and report those of dsr and its weights."""
     try:
         needed = distribution("dsr").metadata["Requires-Python"]
     except PackageNotFoundError:
@@ -81,7 +81,7 @@ def check_packages() -> list[Finding]:
 
 
 def check_weights() -> list[Finding]:
-    """Check the files of weights against what they have to be."""
+    """Check the files of weights against their recorded hashes."""
     known, there = weights.known(), weights.packaged_names()
     damaged = [name for name in there if file_hash(Path(str(weights.packaged_weights(name)))) != known.get(name)]
     if damaged or not there:
@@ -110,7 +110,7 @@ def check_opencv() -> list[Finding]:
 
 
 def check_device() -> list[Finding]:
-    """Say what is computed on, and why a graphics card is not used."""
+    """Report the computing device, and why a graphics card is not used."""
     try:
         device = pick_device("auto")
     except ValueError as error:
@@ -130,7 +130,7 @@ def check_device() -> list[Finding]:
 
 
 def check_folders() -> list[Finding]:
-    """Check the working directory, the cache and the data sets: whether one can write there, and what is free."""
+    """Check the working directory, the cache and the data sets: whether they are writable, and the free space."""
     named = {"results": Path(), "cache": cache_directory(), "temporary": Path(tempfile.gettempdir())}
     found = [_folder(name, path.absolute()) for name, path in named.items()]
     root = data_root().absolute()

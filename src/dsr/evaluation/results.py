@@ -51,9 +51,9 @@ class Run:
         scenes: scenes with a prediction.
         unsolved: reason by scene why the method has no solution.
         formats: formats of its metrics that the run stores.
-        notes: what there is to say of the scores of a scene, by its name.
-        truth: where other runs have different truths of its scenes, what tells its truths from theirs, as ``dataset``
-            has it, too; empty otherwise.
+        notes: remarks on the scores of a scene, by its name.
+        truth: identifies its ground truth where other runs have a different one for the same scenes, as in
+            ``dataset``; empty otherwise.
 
     """
 
@@ -148,7 +148,7 @@ class Results:
 
     @property
     def warnings(self) -> tuple[Assumption, ...]:
-        """What says that scenes of one name have different truths."""
+        """Warnings of scenes with the same name but different ground truths."""
         apart: dict[tuple[str, float], dict[str, list[Run]]] = {}
         for run in self.runs:
             if run.truth:

@@ -236,7 +236,7 @@ def _distinguish(runs: Sequence[Run]) -> list[Run]:
 
 
 def _by_truth(runs: Sequence[Run]) -> list[Run]:
-    """Append what tells their truths apart to the data sets' names of runs with different ones of the same scenes.
+    """Append a hash of the ground truth to the data set's name of runs that have different ones for the same scenes.
 
     Example: "garden (truth 5f3c01ab)".
     """

@@ -1,4 +1,4 @@
-"""The scenes of a run, worked through by several processes, each scene by one: of this command, and of others.
+"""Sharing the scenes of a run among several processes, of this command and of others; each scene is done once.
 
 ``.claims/`` in that directory exists while one of them is at work. Each command has a file of a member there, which
 says with which settings it works; those with others are refused until it has left or is gone.

@@ -1,4 +1,4 @@
-"""Triangles of a depth map that are as large as its surface is flat, of vertices that are pixels of the map.
+"""Adaptive triangulation of a depth map: large triangles where the surface is flat; vertices are pixels of the map.
 
 A hierarchy of right triangles (Evans, Kirkpatrick and Townsend, *Right-Triangulated Irregular Networks*, Algorithmica
 2001): a triangle is halved from its right angle to the middle of its longest side, as long as leaving out the pixel in

@@ -1,4 +1,4 @@
-"""Whether a photo and a depth map show the same: how well their edges agree, against what chance would give.
+"""Test whether a photo and a depth map show the same scene: agreement of their edges, compared with chance.
 
 Both are reduced to a small grid. An edge is a strength and a direction: where the logarithm of depth jumps, or a hole
 begins, as sensors leave shadows along silhouettes; and where the photo changes more than around it. The agreement at a
@@ -114,11 +114,11 @@ class Agreement(NamedTuple):
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the edges of a photo and a depth map say about whether both belong together.
+    """Evidence from edges on whether a photo and a depth map belong together.
 
     Args:
         as_given: their agreement.
-        way: what would have to have been done to one of them for the best agreement of the other ways.
+        way: the mirroring or rotation of one of them with the best agreement.
         better: the agreement of that way.
         contours: whether the depth map has enough of them.
         size: height and width of the photo in pixels.
@@ -204,7 +204,7 @@ class Verdict:
 
 
 def judge(depth: Array, rgb: Tensor) -> Verdict | None:
-    """Compare the edges of a depth map with those of a photo, as they are, mirrored and turned.
+    """Compare the edges of a depth map with those of a photo: as given, mirrored and rotated.
 
     Args:
         depth: (h, w) in any unit of depth or of its reciprocal, NaN in holes.

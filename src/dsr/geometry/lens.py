@@ -61,7 +61,7 @@ class Lens:
 
     @property
     def bends(self) -> bool:
-        """Whether it distorts at all: a fisheye does without coefficients, too."""
+        """Whether it distorts at all: a fisheye lens does even if all coefficients are 0."""
         return any(self.coefficients) or self.model in _FISHEYES
 
 

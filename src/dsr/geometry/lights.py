@@ -1,4 +1,4 @@
-"""The lights of all renderings, in the one place that decides them; without torch, which takes seconds to import.
+"""The light directions of all renderings, without importing torch, which takes seconds.
 
 A direction is a unit vector from the surface to the light in the camera frame: x right, y down, z forward. Metrics,
 pictures, the pages' scripts and the command lines take names and directions from here.

@@ -1,4 +1,4 @@
-"""What planes tell of the values of a map: whether they are distances along the axis or the ray, or fall with distance.
+"""Range type of a depth map from its planes: distances along the axis or the ray, or values that fall with distance.
 
 Planes become curved if distance along the ray is read as orthogonal depth: a plane is linear in 1 / z over the image.
 If the values s follow z = s / |r|**k, with k = 0 for orthogonal depth, 1 for distance along the ray, and -1 for
@@ -7,7 +7,7 @@ is linear in a, b, c and, as |r| changes little within a window, in k: 1 / s = a
 fit to windows of many sizes and positions estimates k. Windows with a good fit are planar and vote.
 
 Disparity and inverse depth, of any scale, are linear over a plane themselves, and their reciprocals are not. No camera
-is needed to tell that.
+is needed to distinguish them.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ class InverseVotes(NamedTuple):
 
 
 def range_votes(values: Array, camera: Camera, step: float = 0.0) -> RangeVotes:
-    """Count what the planar windows of a map support; see :func:`plane_votes`."""
+    """Count the planar windows of a map that support each range type; see :func:`plane_votes`."""
     votes = plane_votes(values, camera, step)
     flat, ray, reverse = (int((np.abs(votes - k) < _NEAR).sum()) for k in (0, 1, -1))
     return RangeVotes(votes.size, flat, ray, reverse)

@@ -1,4 +1,4 @@
-"""What of a camera, and of distances, can hardly be right, or not at all: decided here for every command."""
+"""Implausible and impossible cameras, baselines and distances: the checks that all commands share."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Remark(NamedTuple):
 
 
 def judge_camera(camera: Camera, size_lr: tuple[int, int] | None = None) -> list[Remark]:
-    """Return what can hardly be right of a camera; nothing for a usual one.
+    """Return remarks on implausible values of a camera; none for a usual one.
 
     Args:
         camera: the camera.

@@ -1,8 +1,8 @@
-"""Whether the poses of frames fit their depth maps, or would if they were read in another way.
+"""Check whether the poses of frames fit their depth maps, or would under another convention of poses.
 
 The points of one depth map are moved into the view of another: where they see the same surfaces, the depths agree. That
-is measured under the poses as given, under each of :data:`READINGS`, and without any motion, which says how much the
-frames tell: before a wall, or of a camera that stands still, all readings agree.
+is measured under the poses as given, under each of :data:`READINGS`, and without any motion, which shows how
+informative the frames are: before a wall, or of a camera that stands still, all readings agree.
 """
 
 from __future__ import annotations

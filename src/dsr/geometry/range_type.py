@@ -1,4 +1,4 @@
-"""What the values of a depth map measure: depth along the axis, along the ray, or disparity."""
+"""Range types of depth maps: depth along the axis, distance along the ray, or disparity."""
 
 from typing import Literal, get_args
 

@@ -54,7 +54,7 @@ _SAME_SURFACE = 0.02
 
 @dataclass(frozen=True)
 class Displacement:
-    """Where the photo shows what a depth map shows: p -> c + scale (p - c) + (right, down).
+    """The mapping from pixels of a depth map to those of the photo: p -> c + scale (p - c) + (right, down).
 
     Args:
         right, down: shift from depth edges to the photo's edges, in pixels of the depth map.
@@ -235,7 +235,7 @@ def _best_shifts(
 
 
 def _is_better(similar: Array, shift: Array) -> bool:
-    """Return whether gradients by tile speak for a change of scale: significantly, or plausibly and by much."""
+    """Return whether the gradients of the tiles support a change of scale: significantly, or plausibly and by much."""
     errors = standard_errors(similar - shift)
     return errors > _ABOVE_SHIFT or (errors > 1 and similar.sum() > _MUCH * shift.sum())
 

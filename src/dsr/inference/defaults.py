@@ -1,4 +1,4 @@
-"""What an upsampling is asked, and what it does unless something else is: light, unlike what does it."""
+"""Choices of an upsampling and their defaults, in a module that imports nothing heavy."""
 
 from typing import Literal
 

@@ -1,9 +1,10 @@
-"""What depth can be: outliers, results beyond what was measured, and errors expected by agreement with the input.
+"""Plausible depth: removal of outliers, limits of results, and expected errors from the agreement with the input.
 
-Of methods that do not say any, errors are expected as follows. The result, averaged over low-resolution pixels, is
-compared with the input averaged over 3 x 3 pixels: they differ by the noise that the method has copied, by what it has
-smoothed, and at depth steps, where results are worst. In holes the expected error grows with the angular distance from
-the nearest measured pixel. This is a rough estimate, which sorts the pixels better than it states their errors.
+The expected errors of methods that predict none are estimated as follows. The result, averaged over low-resolution
+pixels, is compared with the input averaged over 3 x 3 pixels: they differ by noise that the method has copied, by
+detail that it has smoothed, and at depth steps, where results are worst. In holes the expected error grows with the
+angular distance from the nearest measured pixel. This is a rough estimate, which sorts the pixels better than it states
+their errors.
 """
 
 from __future__ import annotations
@@ -31,14 +32,14 @@ _USUAL_WIDTH = 640
 _NEAREST, _USUAL_DEPTH = 0.05, 0.2
 """Depth in metres up to which a value is a sensor's end, in a map whose median is at least the second."""
 RADIUS = 24
-"""Pixels around each one from which what is measured there tells what may be: of the map for outliers, of the photo for
-a result."""
+"""Pixels around each one whose measured values bound the plausible ones: of the map for outliers, of the photo for a
+result."""
 _NEARBY, _ALIKE = 64, 1.5
 """Pixels around a patch in which another surface explains it, and the ratio of their depths up to which it does."""
 _ROUNDING = 1e-3
 """Relative excess that is left to a result, so that flat surfaces stay as a method rounds them."""
 _SPARSE = 1 / 16
-"""Share of measured pixels in a window, below which it says nothing of a hole."""
+"""Share of measured pixels in a window below which it does not limit the depth in a hole."""
 
 _WINDOW = 5
 """Low-resolution pixels over which differences are averaged."""
@@ -99,12 +100,12 @@ def count_patches(mask: Tensor) -> Outliers:
 
 
 def within_measured(result: Tensor, given: Tensor, radius: int = RADIUS) -> Tensor:
-    """Return inverse depth kept to what planes through the measured values around each pixel allow.
+    """Return inverse depth clamped to the range that planes through the measured values around each pixel allow.
 
     A plane's inverse depth is linear in the pixel, so that it leaves the values in a window, of which at least half
     lies inside the map, by no more than half of their range. Holes are wider to cross: where one is further than a
     third of the radius from measured pixels, the window is three times as large. No depth becomes more than twice as
-    far as all around it. Where no pixel in the window is measured, or too few to speak of a hole, nothing changes.
+    far as all around it. Where the window has no measured pixel, or too few, nothing changes.
 
     Args:
         result: (1, H, W) inverse depth in 1/m, NaN in holes.

@@ -1,4 +1,4 @@
-"""Run methods on inverse depth of other sizes than they are made for: the photo and the result are resized instead."""
+"""Run methods on inverse depth of sizes that they do not support, by resizing the photo and the result."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def at_factors(
 def padded(
     run: Callable[[Tensor, Camera], InverseSurface], ratio: float, rgb: Tensor, inverse: Tensor, camera: Camera
 ) -> InverseSurface:
-    """Return what ``run`` makes of the photo, padded to ``ratio`` times the size of the map; cropped again."""
+    """Apply ``run`` to the photo padded to ``ratio`` times the size of the map, and crop the result."""
     height, width = (max(round(ratio * n), m) for n, m in zip(size_of(inverse), size_of(rgb), strict=True))
     found = run(_pad_photo(rgb, (height, width)), Camera(width, height, camera.fx, camera.fy, camera.cx, camera.cy))
     return found.map(lambda values: values[..., : camera.height, : camera.width])

@@ -1,4 +1,4 @@
-"""Holes between a nearer and a farther surface: which of the two a pixel is of, as the colours of the photo have it.
+"""Holes between a nearer and a farther surface: each pixel is assigned to one of them by the colours of the photo.
 
 Stereo and structured light lose what lies beside and between near objects: the strip that one of two cameras does not
 see, the loop between an arm and a head, the gaps between the legs of a chair. What is filled in from the rim there is

@@ -1,4 +1,4 @@
-"""Choose how an evaluation runs its method: itself, or as ``dsr upsample`` does."""
+"""Choose how an evaluation runs its method: directly, or as ``dsr upsample`` does."""
 
 from __future__ import annotations
 

@@ -1,12 +1,14 @@
-"""The size at which a sensor's map is worked on: where its noise is alike over many pixels, a fraction of its own.
+"""The size at which a sensor's map is upsampled: smaller than the map where its noise is correlated over many pixels.
 
-A network takes waves that are wider than it looks at for the shape of the surface. At a size at which neighbours'
-noise is independent again it averages them, and the details that are lost were drowned in the noise.
+A network takes correlated noise that is wider than its receptive field for the shape of the surface. At a size at which
+the noise of neighbouring pixels is independent again the network averages it; the details that are lost there were
+hidden by the noise anyway.
 
-Noise is told apart from shape by how it changes in larger and larger windows, less a plane in inverse depth. Noise
-is correlated over the same number of pixels, while bends of surfaces are over a third of the window, whatever it
-is. The flattest tenth of the windows counts. A surface that is covered with bumps may look the same. The noise of a
-sensor, however, is never as smooth as a bumpy surface, since depth is counted in steps, and no window is free of it.
+Noise is distinguished from shape by its correlation in windows of increasing size, after a plane in inverse depth is
+subtracted: noise is correlated over the same number of pixels in each, while bends of surfaces are over a third of
+the window, whatever its size. The flattest tenth of the windows counts. A surface that is covered with bumps may look
+the same. The noise of a sensor, however, is never as smooth as a bumpy surface, since depth is counted in steps, and no
+window is free of it.
 """
 
 from __future__ import annotations
@@ -139,7 +141,7 @@ def find_noise(depth: Tensor) -> MapNoise | None:
 def find_sensor(depth: Tensor, name: str = "auto", device_name: str = "") -> Identified | None:
     """Return the sensor of a map, see :func:`dsr.degradation.sensors.identify`.
 
-    Its values alone tell it only where the map has a sensor's noise: computed disparity may have the same steps.
+    The values alone identify it only where the map has a sensor's noise: computed disparity may have the same steps.
 
     Args:
         depth: (1, h, w) in metres, NaN in holes, as it was read.
@@ -188,7 +190,7 @@ def is_correlated(noise: MapNoise, factor: int) -> bool:
 
 
 def working_size_of(extent: float) -> int:
-    """Return by what the size of a map is divided whose noise is alike over some pixels: a power of 2, 4 or more, or 1.
+    """Return the divisor of the map's size for noise that is correlated over some pixels: a power of 2 from 4 on, or 1.
 
     Args:
         extent: full width at half maximum of the noise's autocorrelation, in pixels.

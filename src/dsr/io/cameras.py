@@ -29,7 +29,7 @@ _FILM_DIAGONAL = math.hypot(36, 24)
 
 
 def find_camera(choice: CameraChoice, photo: Path, size: Size, size_lr: Size) -> tuple[CameraFile, list[Assumption]]:
-    """Return the camera of a photo's pixels, with what its file says about depth, and the assumptions.
+    """Return the camera of a photo's pixels, with the depth encoding from its file, and the assumptions.
 
     Args:
         choice: what the user says about the camera.

@@ -1,4 +1,4 @@
-"""Warnings of what a picture's camera, baseline and distances can hardly be, by the rules of the doctor."""
+"""Warnings of an implausible camera, baseline or distances of a picture, by the rules of ``dsr doctor``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Decoding and encoding of the values of depth files: unit, holes, range type; :mod:`dsr.io.units` tells which."""
+"""Decoding and encoding of the values of depth files: unit, holes, range type; :mod:`dsr.io.units` identifies them."""
 
 from __future__ import annotations
 

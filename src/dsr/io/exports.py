@@ -58,7 +58,7 @@ _MOST_PIXELS = 1 << 28
 
 
 def world_comment(up: str) -> str:
-    """Return what a PLY file says of its frame, the world with the axis ``up``, see :data:`dsr.io.frames.UPS`."""
+    """Return a PLY file's comment on its frame, the world with the axis ``up``, see :data:`dsr.io.frames.UPS`."""
     return f"world frame of the poses{f': {up} up' if up else ''}; metres"
 
 

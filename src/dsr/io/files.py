@@ -106,7 +106,7 @@ def read_depth(
 
 
 def metres_in(unit: str | float | None) -> float | Literal["sunrgbd"] | None:
-    """Return metres per value, or ``sunrgbd``, of what a user names as the unit; see :func:`read_depth`."""
+    """Return metres per value, or ``sunrgbd``, for the unit that a user gives; see :func:`read_depth`."""
     if unit is None:
         return None
     if unit == "sunrgbd":

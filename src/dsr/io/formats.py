@@ -1,7 +1,7 @@
-"""What is read of captures and layouts, a row a device, program or data set; docs/captures.md shows the same table.
+"""Table of the captures and layouts that dsr reads, a row per device, program or data set, as in docs/captures.md.
 
-A row also says which files a layout's reader, in :mod:`dsr.io.captures` or :mod:`dsr.io.layouts`, needs to recognise
-it; of a folder that has some of them, :mod:`dsr.io.captures.known` tells which ones it lacks.
+A row also lists the files by which a reader in :mod:`dsr.io.captures` or :mod:`dsr.io.layouts` recognises the layout;
+for a folder that has only some of them, :mod:`dsr.io.captures.known` names those that are missing.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ class Format(NamedTuple):
         tried: the files that it was tried with: real ones, or ones that an independent program wrote.
         faults: of the sensor; empty where any sensor may have been used.
         source: address of the writer's own description or code.
-        marks: patterns of files from its folder on, of which one tells it from other layouts; ``*`` in the last part
-            stands for anything. Empty for what is a single file, or has no names of its own.
-        needs: names of its parts, each with patterns of which one has to be there.
+        marks: patterns of paths below its folder, any of which distinguishes it from other layouts; ``*`` in the last
+            part stands for anything. Empty for single files, and for layouts without characteristic names.
+        needs: names of its parts, each with patterns of which one has to match.
 
     """
 
@@ -278,7 +278,7 @@ FORMATS = (
 
 
 def rows(each: Format) -> dict[str, str]:
-    """Return what is said of a format by the labels of its lines, its name first; empty texts are left out."""
+    """Return the description of a format, text by label, its name first; empty texts are left out."""
     texts = {"": each.name, "export": each.export, "found by": each.found_by, "read": each.read, "tried": each.tried,
              "sensor": each.faults, "source": each.source}  # fmt: skip
     return {label: text.replace("`", "") for label, text in texts.items() if text}

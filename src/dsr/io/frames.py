@@ -74,7 +74,7 @@ class Rig(NamedTuple):
 
 
 class Geometry(NamedTuple):
-    """What a capture says of a frame's cameras.
+    """Cameras, lenses and poses of a frame as its capture states them.
 
     ``camera``: of a size of its own, which is scaled to the photo's; None if it does not say. ``pose``: camera to
     world, (4, 4) float64 in metres, rigid, of the camera's frame x right, y down, z forward; the world's frame is the
@@ -179,7 +179,7 @@ def read_values(path: Path, most: int | None = None) -> np.ndarray:
 
 
 def file_state(path: Path, kind: str) -> tuple[int, int]:
-    """Return size and time of a file, which tell whether it was replaced.
+    """Return size and modification time of a file, which change if it is replaced.
 
     Args:
         kind: what it should be, for the message.

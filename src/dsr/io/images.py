@@ -165,7 +165,7 @@ def read_numbers(path: Path, count: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class CameraFile:
-    """What a ``camera.json`` says.
+    """The content of a ``camera.json``.
 
     Args:
         camera: in pixels and metres.

@@ -65,7 +65,7 @@ class FolderUnits:
     def interpret(
         self, pair: Pair, stored: np.ndarray, hole_value: float | None, camera: Camera, *, may_fall: bool
     ) -> Meaning:
-        """Return what the values of a map mean; see :func:`dsr.io.units.interpret`.
+        """Identify unit and range type of the stored values of a map; see :func:`dsr.io.units.interpret`.
 
         Args:
             pair: the map's pair.
@@ -299,7 +299,7 @@ def read_map(path: Path, reading: Reading, camera: Camera | None = None) -> tupl
 
 
 def read_geometry(pair: Pair, size: Size, reading: Reading) -> tuple[Geometry, list[Assumption]]:
-    """Return what a pair's capture says of its cameras.
+    """Return the cameras, lenses and pose of a pair as its capture states them.
 
     If it is damaged and a camera is given, or a model of COLMAP, that is what the model says, else nothing, with a
     warning.

@@ -74,7 +74,7 @@ def find_pairs_of_folder(folder: Path, leave: Path | None = None) -> PairingResu
     The layouts are: a capture (:mod:`dsr.io.captures`), which may be a single file, too; a scene of dsr (``rgb.png``,
     ``camera.json`` and ``depth*`` or ``disparity*``); lists of TUM RGB-D (``rgb.txt`` and ``depth.txt``,
     https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats); two folders named for photos and depth maps; and
-    files side by side, told apart by their names or by what they hold; to these a model of COLMAP or a trajectory of
+    files side by side, distinguished by their names or contents; to these a model of COLMAP or a trajectory of
     Open3D may add poses. Of photos beside a model without depth maps, its points are the depth.
 
     Args:

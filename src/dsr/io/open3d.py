@@ -11,7 +11,7 @@ http://redwood-data.org/indoor/fileformat.html.
 The n-th pose, by the first of the three numbers, is that of the n-th photo, by the numbers in the names.
 
 Depth is 16-bit PNG in millimetres, 0 in holes, which ``open3d.geometry.RGBDImage.create_from_color_and_depth`` takes
-with its default ``depth_scale=1000``; its ``depth_trunc`` leaves out what is beyond 3 m unless it is told otherwise.
+with its default ``depth_scale=1000``; its ``depth_trunc`` leaves out what is beyond 3 m by default.
 Intrinsics are those of ``open3d.io.read_pinhole_camera_intrinsic``: ``intrinsic_matrix`` column by column, with pixel
 centres at integers. ``trajectory.log`` has a line of three numbers and a camera-to-world matrix for each frame, of a
 camera with x right, y down, z forward, as in dsr (https://www.open3d.org/docs/release, file formats and the

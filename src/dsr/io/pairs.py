@@ -207,7 +207,7 @@ class PairingResult:
 
 
 def join(parts: Iterable[PairingResult]) -> PairingResult:
-    """Return what several recordings of a folder have, with each assumption once."""
+    """Join the pairs of several recordings of a folder, with each assumption once."""
     parts = tuple(parts)
     notes = dict.fromkeys(note for part in parts for note in part.assumptions)
     pairs = tuple(pair for part in parts for pair in part.pairs)

@@ -1,4 +1,4 @@
-"""What a user says about the files: checked without what reads them, which takes seconds to import."""
+"""Options about input files: units, cameras, poses; checked before the readers are imported, which takes seconds."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _LARGEST_UNIT = 1e6
 
 @dataclass(frozen=True, kw_only=True)
 class CameraChoice(Options):
-    """What the user says about the photo's camera: at most one of the three, the intrinsics in the photo's pixels."""
+    """Options of the photo's camera: at most one of the three; intrinsics are in the photo's pixels."""
 
     file: Path | None = option(
         None,
@@ -50,7 +50,7 @@ class CameraChoice(Options):
 
 @dataclass(frozen=True, kw_only=True)
 class RigFiles(Options):
-    """What the user says about a depth map that another camera than the photo's took."""
+    """Options of a depth map that was taken by another camera than the photo's."""
 
     camera: Path = option(
         ..., "camera file of a depth camera elsewhere", "FILE", flags="--depth-camera", recorded=False
@@ -60,7 +60,7 @@ class RigFiles(Options):
 
 @dataclass(frozen=True, kw_only=True)
 class Reading(Options):
-    """What the user says about the files; None where it is to be read from the files or assumed."""
+    """Options about the input files; None where a value is to be read from the files or assumed."""
 
     camera: CameraChoice = group(CameraChoice)
     unit: float | Literal["sunrgbd"] | None = option(

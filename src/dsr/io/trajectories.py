@@ -293,7 +293,7 @@ def fitting_camera(source: str, sizes: Sequence[tuple[int, int]], numbers: Seque
 
 
 def describe_capture(app: str, unit: str, pairs: Sequence[Pair], *, poses: bool) -> Assumption:
-    """Return what a capture says itself, as a line for the user.
+    """Return a line for the user about the metadata of a capture.
 
     Args:
         app: what it is a capture of.

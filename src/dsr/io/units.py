@@ -1,4 +1,4 @@
-"""The unit and range type of a depth map by its stored values; asked for where two readings are as likely.
+"""Unit and range type of a depth map, identified from its stored values; an error where two are equally likely.
 
 The clues are the median, the range, steps that all values are multiples of, the size and the camera of known data sets,
 single pixels as of a laser scanner, and the planes of the map (:func:`dsr.geometry.planes.inverse_votes`). A map of few
@@ -52,7 +52,7 @@ _KITTI_WIDTHS, _KITTI_HEIGHTS = range(1216, 1243), range(350, 377)
 
 
 class Meaning(NamedTuple):
-    """What values mean: metres (pixels) per value, the assumptions, and what else is not as usual.
+    """The meaning of stored values: metres (pixels) per value, assumptions, range type, and rotated bits.
 
     ``range_type``: ``disparity`` where the values are; None where they show none. ``bits``: how far they were turned
     to the left; the unit holds after turning them back.
@@ -67,7 +67,7 @@ class Meaning(NamedTuple):
 def interpret(
     name: str, values: np.ndarray, holes: np.ndarray, camera: Camera | None = None, *, may_fall: bool = True
 ) -> Meaning:
-    """Return what the values of a map mean.
+    """Identify the unit and the range type of the stored values of a map.
 
     Args:
         name: name of the file, for the error.

@@ -1,4 +1,4 @@
-"""What a picture with colours in place of a depth map probably is: grey or coloured for viewing, or a photo."""
+"""Recognise pictures that are no depth maps: depth in grey or colours for viewing, or a photo."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ of a map's colours."""
 
 
 def describe_picture(values: np.ndarray) -> str:
-    """Return what a picture of several channels, or of 8 bits, probably is.
+    """Describe what a picture of several channels, or of 8 bits, probably shows.
 
     Args:
         values: (H, W) or (H, W, C) as they are stored.

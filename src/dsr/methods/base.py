@@ -259,7 +259,7 @@ class Method(abc.ABC):
 
     @classmethod
     def abilities_of(cls, node: Node) -> Abilities:
-        """Return what the method can do that a node of the configuration describes."""
+        """Return the abilities of the method that a node of the configuration describes."""
         return cls.abilities
 
     @property
@@ -283,7 +283,7 @@ class Method(abc.ABC):
         """
 
     def surface(self, sample: DepthSample, progress: Steps | None = None) -> Surface:
-        """Return the result of a call, with the expected errors of a method that says them."""
+        """Return the result of a call, with the expected errors of a method that predicts them."""
         return Surface(self(sample, progress))
 
     def upsample_inverse(self, problem: InverseSample, progress: Steps | None = None) -> InverseSurface:
@@ -291,15 +291,15 @@ class Method(abc.ABC):
         return InverseSurface.of(self.surface(problem.in_depth(), progress))
 
     def describe(self, sample: DepthSample) -> str:
-        """Return what is to be said of how a sample is upsampled, beside its scores; nothing by default."""
+        """Return a note on how a sample is upsampled, shown beside its scores; empty by default."""
         return ""
 
     def content(self, dataset: str, scene: str, scale: float) -> str | None:
-        """Return a hash of what a scene's result depends on beside the sample and the settings; None for nothing."""
+        """Return a hash of the inputs of a scene's result besides sample and settings; None for no others."""
         return None
 
     def remarks(self, dataset: str, scenes: Sequence[str], scale: float) -> list[str]:
-        """Return what is to be said before the scenes of a data set are upsampled, a line each; nothing by default."""
+        """Return notes to print before the scenes of a data set are upsampled, a line each; none by default."""
         return []
 
     def count_steps(self, height: int, width: int) -> int:

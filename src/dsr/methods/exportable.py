@@ -1,4 +1,4 @@
-"""What the networks compute differently while they are turned into an ONNX graph, with the same values.
+"""Operations that networks replace by equivalent ones during the export to ONNX.
 
 A graph has no loop that ends when nothing is missing, unless it is written as one, and no tensor in it has a size that
 depends on values, such as that of the known pixels of a map. While a network is exported, the functions here replace
@@ -22,7 +22,7 @@ T = TypeVar("T")
 
 
 def exporting() -> bool:
-    """Return whether a network is being turned into a graph, without importing what does so: it takes a while."""
+    """Return whether a network is being exported, without importing the exporter, which takes a while."""
     return "torch.onnx" in sys.modules and bool(torch.onnx.is_in_onnx_export())
 
 

@@ -1,4 +1,4 @@
-"""Maps that another program predicted, one file a scene: they are judged and drawn as every other method's result.
+"""Depth maps predicted by another program, one file per scene, evaluated and shown like the results of a method.
 
 A monocular network's map has no scale, and often no shift. Such a map is fitted to the low-resolution one, robustly and
 without the truth, see :func:`fit_line`: in its own quantity, so that relative inverse depth, as of MiDaS and Depth
@@ -126,7 +126,7 @@ class External(Method):
         return depth.to(sample.depth_lr.device)
 
     def describe(self, sample: DepthSample) -> str:
-        """Return what the scene's map came as, where that costs precision or the map was changed."""
+        """Return a note on the scene's map if its format costs precision, or if it was changed."""
         found = self._found(self._stem(sample))
         stored = ""
         if len(found) == 1:
@@ -203,7 +203,7 @@ class External(Method):
 
 
 def describe_fit(fit: str | None) -> str:
-    """Return what is said beside the scores of a map that was fitted; nothing without a fit."""
+    """Return the note on a fitted map that is shown beside its scores; empty without a fit."""
     return f"{fit} fitted to the low-resolution map" if fit else ""
 
 

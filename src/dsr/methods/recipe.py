@@ -40,7 +40,7 @@ _ALONE: Mapping[str, Any] = {"scale": 4, "seed": 0, "downsampling": None}
 
 
 class Known(NamedTuple):
-    """What is known of low-resolution maps; None for what is not.
+    """Known properties of low-resolution maps; None for unknown ones.
 
     ``kernel``: of their downsampling; ``edges``: whether the scenes' depth steps are sharp or soft; ``clean``: whether
     they have no noise.
@@ -53,7 +53,7 @@ class Known(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """What a run gives to a method, which gets what the signature of its class names.
+    """Settings of a run for its method, which gets those that the signature of its class names.
 
     Args:
         device: where to compute.

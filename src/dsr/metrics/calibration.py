@@ -185,10 +185,10 @@ def ause(expected: Tensor, measured: Tensor, steps: int = STEPS) -> Tensor:
 
 
 def off_auc(expected: Tensor, measured: Tensor, threshold: float = OFF) -> Tensor:
-    """Return how well expected errors tell pixels that are off from the others: the area under the ROC curve.
+    """Return how well expected errors separate pixels with large errors from the others: the area under the ROC curve.
 
-    It is the probability that of a pixel that is off by more than a threshold and one that is not the former has the
-    larger expected error; equal ones count half.
+    It is the probability that a pixel whose measured error exceeds the threshold has a larger expected error than one
+    whose measured error does not; equal expected errors count half.
 
     Args:
         expected: expected absolute errors, of any shape and unit; NaN where there is none.

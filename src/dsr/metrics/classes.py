@@ -315,9 +315,9 @@ class AUSE(PerImageMean):
 
 
 class OffAUC(PerImageMean):
-    """How well expected errors tell the pixels that are off by more than a threshold in metres, 0.02.
+    """How well expected errors separate pixels with errors above a threshold, 0.02 m, from the others: ROC AUC.
 
-    NaN if in one of the images none is, or all are.
+    NaN if one of the images has no pixel above the threshold, or none below it.
     """
 
     def __init__(self, threshold: float = OFF, **settings: Any) -> None:

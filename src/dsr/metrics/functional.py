@@ -120,7 +120,7 @@ class SurfacePair:
         camera: Camera | Tensor | None = None,
         mask: Tensor | None = None,
     ) -> SurfacePair:
-        """Return a pair as it is, or that of a prediction, a target and their camera: what classes of metrics take.
+        """Return a given pair, or make one of a prediction, a target and their camera, as metric classes accept either.
 
         Args:
             preds: the pair, or (B, 1, H, W) predicted orthogonal depth in metres.
@@ -144,7 +144,7 @@ class SurfacePair:
         return cls(preds, target, rays, mask)
 
     def derive(self, make: Callable[[SurfacePair], _Derived]) -> _Derived:
-        """Return ``make(self)``, which is called once: quantities of their own that several metrics share."""
+        """Return ``make(self)``, computed once per pair: for quantities that several metrics share."""
         if make not in self._derived:
             self._derived[make] = make(self)
         derived: _Derived = self._derived[make]

@@ -1,4 +1,4 @@
-"""Metrics of a sensor before something flat: a wall without a known place, or a board whose plane is the truth.
+"""Metrics of depth maps of a flat target: a wall at an unknown place, or a board whose plane is the ground truth.
 
 :class:`PlaneFit` needs no truth: it has what Intel's Depth Quality Tool shows, ``tools/depth-quality`` of
 IntelRealSense/librealsense (cacc8e7), ``rs-depth-quality.cpp`` and ``depth-metrics.h``. A map that is wrong as a whole

@@ -1,4 +1,4 @@
-"""Metrics of a depth map refined from a real sensor's against a truth that was measured, too.
+"""Metrics of refined depth maps of real sensors, against a ground truth that is also measured.
 
 Neither map is perfect: the sensor has a constant bias, which is not shape, the truth ends at ragged borders, and a few
 pixels of either belong to another surface. Therefore the scored pixels are those at least four pixels away from unknown

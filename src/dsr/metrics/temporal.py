@@ -56,7 +56,7 @@ def flicker(depths: Tensor, static: Tensor | None = None) -> Tensor:
 
 
 def temporal_noise(depths: Tensor, static: Tensor | None = None) -> Tensor:
-    """Return the median over the pixels of what :func:`flicker` has the mean of.
+    """Return the median over the pixels of the deviation over time whose mean is :func:`flicker`.
 
     Intel's tool counts pixels that never have a depth as 0, so that a map with holes in half of them has no noise. Here
     they are left out.

@@ -1,4 +1,4 @@
-"""What pictures show of a depth map: its normals, renderings, range of colours, fewer pixels, the strongest window."""
+"""Views of a depth map for pictures: normals, renderings, colour range, reduction, the window of largest values."""
 
 from __future__ import annotations
 

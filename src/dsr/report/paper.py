@@ -128,7 +128,7 @@ def average_of(dataset: str, scenes: Iterable[str]) -> str:
 
 
 def implementation_note(methods: Iterable[str]) -> str:
-    """Return what to know of our values of some methods, by their names in the paper; empty for nothing."""
+    """Return notes on our values of some methods, by their names in the paper; empty for none."""
     own = sorted(set(REIMPLEMENTED).intersection(methods), key=REIMPLEMENTED.index)
     return f"{', '.join(own)}: dsr's own implementation, not the one that the paper ran." if own else ""
 

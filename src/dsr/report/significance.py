@@ -1,4 +1,4 @@
-"""How sure a mean over scenes is, and whether one method's is really better than another's.
+"""Confidence intervals of means over scenes, and significance of the differences between methods.
 
 The interval is the percentile interval of the bootstrap, expanded for few scenes (Efron, Tibshirani, *An Introduction
 to the Bootstrap*, 1993, chapter 13; Hesterberg, *What Teachers Should Know About the Bootstrap*, The American

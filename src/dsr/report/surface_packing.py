@@ -1,4 +1,4 @@
-"""Surfaces as compact data for the page: inverse depth in 24 bits, what is joined to what, and expected errors.
+"""Surfaces as compact data for web pages: inverse depth in 24 bits, connectivity of pixels, and expected errors.
 
 Inverse depth is linear in the pixel on every plane, so the upper left, upper and left neighbours predict a pixel of a
 plane exactly. Only the deviation from this prediction is stored, compressed in zlib's format (RFC 1950), which browsers
@@ -123,7 +123,7 @@ def error_levels(errors: np.ndarray, low: float, high: float) -> np.ndarray:
 
 
 def pack_grid(grid: Grid) -> tuple[dict[str, Any], str]:
-    """Return what the page needs to know of a surface, and its data as base64.
+    """Return the header of a surface for the page, and its data as base64.
 
     The data are bytes compressed by zlib, in planes of h x w bytes: the high, middle and low byte of the deviation of
     inverse depth from its prediction modulo 2**24, the flags, and the levels of each error in order.

@@ -160,7 +160,7 @@ def save_view(path: Path, results: Sequence[Packed], *, title: str, notes: Seque
 
 
 def content_of(results: Sequence[Packed], title: str, notes: Sequence[str] = ()) -> dict[str, Any]:
-    """Return what the viewer shows of results, as values for JSON."""
+    """Return the data of results for the viewer, as values for JSON."""
     return {
         "title": title,
         "notes": list(notes),

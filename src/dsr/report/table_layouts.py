@@ -114,12 +114,12 @@ class Style:
         return text if cell.complete else f"{text} ({cell.scenes} of {cell.of})"
 
     def row(self, row: Row, facts: Sequence[Fact], columns: Formats, *, first: bool) -> list[str]:
-        """Format our values of a row, behind what it is; the scene is named in the first row of a group."""
+        """Format our values of a row, after its identifying columns; only the first row of a group names the scene."""
         return [*self.facts(row, facts, first=first),
                 *(self.text(each, row.cells.get(key), row.seeds) for key, each in columns.items())]  # fmt: skip
 
     def facts(self, row: Row, facts: Sequence[Fact], *, first: bool) -> list[str]:
-        """Format what a row is."""
+        """Format the columns that identify a row."""
         values = ("" if fact.name == "scene" and not first else fact.value(row) for fact in facts)
         return [self.missing if value is None else self.escape(str(value)) for value in values]
 

@@ -167,7 +167,7 @@ class PaperTable:
 
 
 class Fact(NamedTuple):
-    """A column that says what a row is, before the columns of values. A CSV file has all of them.
+    """A column that identifies a row, before the columns of values. A CSV file has all of them.
 
     Args:
         name: of the column.
@@ -345,10 +345,10 @@ def _values(runs: Sequence[Run], formats: Formats) -> Values:
 
 
 def _truth_is_complete(results: Results) -> Callable[[Place], bool]:
-    """Return what tells whether a scene's truth has no hole.
+    """Return a function that determines whether a scene's ground truth has no holes.
 
-    Where some method's scores rest on every pixel it has none. Otherwise the stored scene decides; without it the holes
-    are taken for the truth's.
+    It has none where the scores of some method cover every pixel. Otherwise the stored scene decides; without it, the
+    missing pixels are taken for holes of the truth.
     """
     scores = pd.concat([run.scores.assign(dataset=run.dataset) for run in results.runs])
     depth = scores[scores["metric"] == "RMSE_d"]

@@ -165,7 +165,7 @@ def log_config(logger: Logger | None, text: str) -> None:
 
 
 def log_settings(logger: Logger | None, table: Mapping[str, Any], config: Mapping[str, Any]) -> None:
-    """Log what a training was made with.
+    """Log the settings of a training.
 
     Args:
         logger: of the training.

@@ -29,7 +29,7 @@ _PATCHES_FOR_W = 64
 
 
 class Objective(abc.ABC):
-    """What a training minimises."""
+    """The loss of a training."""
 
     @property
     @abc.abstractmethod
@@ -39,7 +39,7 @@ class Objective(abc.ABC):
     @property
     @abc.abstractmethod
     def facts(self) -> dict[str, str | float]:
-        """What the header of weights says of the loss."""
+        """Entries of the loss in the header of weights files."""
 
     @abc.abstractmethod
     def arguments(self) -> dict[str, Any]:
@@ -132,7 +132,7 @@ class DepthObjective(Objective):
 
     @property
     def facts(self) -> dict[str, str | float]:
-        """What the header of weights says of the loss."""
+        """Entries of the loss in the header of weights files."""
         visual = self.visual.name if self.w else "none"
         return {"loss": self.depth_loss, "visual": visual, "w": self.w, "shading": self.shading}
 
@@ -184,7 +184,7 @@ class DepthObjective(Objective):
 
 @dataclass(frozen=True)
 class SurfaceObjective(Objective):
-    """The loss of a network that says how sure it is: K Lap_1 + RMSE_v, and the likelihoods of its expected errors.
+    """The loss of a network with expected errors: K Lap_1 + RMSE_v, and the likelihoods of its expected errors.
 
     Lap_1 compares disparities divided by the truth's median. RMSE_v is that of each image, and not its square, so that
     noisy maps do not outweigh clean ones. The RMSE of the divided disparities is added, with a larger weight where the
@@ -212,7 +212,7 @@ class SurfaceObjective(Objective):
 
     @property
     def facts(self) -> dict[str, str | float]:
-        """What the header of weights says of the loss."""
+        """Entries of the loss in the header of weights files."""
         return {"loss": "surface", "depth": self.depth, "soft": self.soft, "sharp": self.sharp, "errors": self.errors}
 
     def arguments(self) -> dict[str, Any]:

@@ -154,7 +154,7 @@ class Resumed(Callback):
         self.restoring = False
 
     def setup(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, stage: str) -> None:
-        """Find what the states of this training's optimiser and schedule are like."""
+        """Record the structure of this training's optimiser and schedule states."""
         made: Any = pl_module.configure_optimizers()
         self._optimizer, node = (made["optimizer"], made["lr_scheduler"]) if isinstance(made, Mapping) else (made, None)
         self._schedules = [] if node is None else [node["scheduler"]]
@@ -198,7 +198,7 @@ class Resumed(Callback):
         del self._optimizer, self._schedules, self._new, self._own  # which take several times the weights' memory
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Note that all is restored but what has been tried."""
+        """Note that the restoration is complete, apart from the values that were tried."""
         self.restoring = False
 
 

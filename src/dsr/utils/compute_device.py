@@ -22,7 +22,7 @@ def fast_precision(device: torch.device) -> str:
 
 
 def known_true(flags: Tensor) -> bool:
-    """Return whether all are set, as far as can be told without waiting for a device: false for those of a GPU."""
+    """Return whether all flags are set; False for those on a GPU, since reading them would wait for it."""
     return flags.device.type == "cpu" and bool(flags.all())
 
 

@@ -37,7 +37,7 @@ _TICK = 0.5
 _MANY = 50
 """Largest number of items that each get a line, if the output is not a terminal."""
 _TELLING = 0.25
-"""Smallest share of the time of an item that tells how long the rest of it takes."""
+"""Smallest share of the time of an item from which the time of the rest is estimated."""
 _LONG = 2.0
 """Smallest duration in seconds of an item among many that gets a line, and of a pass over items that gets a line on a
 terminal."""
@@ -83,7 +83,7 @@ def shorten(text: str, most: int = _LONGEST) -> str:
 
 
 def printable(text: str) -> str:
-    """Return a text as everything is shown that commands say.
+    """Return a text in the form in which commands print texts.
 
     It is without the characters that control a terminal or turn text, which names of files may have, and without the
     names and passwords of addresses, see :func:`without_credentials`.
@@ -260,7 +260,7 @@ class _ConsoleTask:
             self._before, self._measured = done, self._updated
         if done > self.done and self._stage:
             self.begin("")
-            if self.shares.keys() <= self._spent.keys():  # one that failed tells nothing
+            if self.shares.keys() <= self._spent.keys():  # the time of one that failed is of no use
                 self._items.append(self._spent)
             self._spent = {}
         self.done = done
@@ -327,7 +327,7 @@ class _ConsoleTask:
         Args:
             seconds: of the stage at hand; None if unknown.
 
-        Stages that were left out tell nothing, unless all items leave them out.
+        Items that left a stage out do not count in its mean, which is 0 if all items left it out.
 
         """
         done = self._items[1:] or self._items  # the first one also loads what all need

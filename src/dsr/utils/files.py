@@ -40,7 +40,7 @@ _KINDS = {
 
 
 class TargetError(OSError):
-    """What is to be written would replace what is not of its kind: a device, a pipe, a socket, a link, a folder."""
+    """An output would replace something of another kind: a device, a pipe, a socket, a link or a folder."""
 
 
 def data_root() -> Path:
@@ -49,7 +49,7 @@ def data_root() -> Path:
 
 
 def obstacle(path: Path, *, folder: bool = False) -> str | None:
-    """Return what is in the place of a file, or of a folder, that is to be written, such as ``a device``.
+    """Return the kind of thing in the place of a file or folder to be written, such as ``a device``.
 
     Args:
         path: where it is to be.
@@ -69,7 +69,7 @@ def obstacle(path: Path, *, folder: bool = False) -> str | None:
 
 
 def expect_target(path: Path, *, folder: bool = False) -> None:
-    """Check that a file, or a folder, can be written without replacing what is of another kind.
+    """Check that a file, or a folder, can be written without replacing something of another kind.
 
     Raises:
         TargetError: there is something else, see :func:`obstacle`.
@@ -229,7 +229,7 @@ def owner() -> str:
 
 @functools.cache
 def machine() -> str:
-    """Return a short name of what numbers processes: the machine, or the container on it."""
+    """Return a short name of the machine, or of the container on it, within which process numbers are unique."""
     try:
         numbering = str(Path("/proc/self/ns/pid").readlink())
     except OSError:
@@ -238,10 +238,10 @@ def machine() -> str:
 
 
 def birth(process: int) -> str | None:
-    """Return when a process of this machine was started, which tells it from a later one of its number.
+    """Return when a process of this machine was started, which distinguishes it from a later one with the same number.
 
     Returns:
-        A text that the process keeps, empty where the system does not tell it; None if the process has ended.
+        A text that stays the same for the process, empty where the system does not report it; None if it has ended.
 
     """
     try:

@@ -1,4 +1,4 @@
-"""Guards against hostile files: how much one may make of itself in memory, and what its numbers, JSON and names may be.
+"""Guards against hostile files: limits of the memory that one takes, and checks of its numbers, JSON and names.
 
 A few kilobytes of compressed zeros declare gigabytes. What is allowed grows with what can explain it: a map's size with
 its photo's, otherwise the unpacked size with the size of the file. Real photos and maps stay far below.
@@ -80,9 +80,9 @@ def pixels_of_file(size: int) -> int:
 
 
 def pixels_beside(height: int, width: int) -> int:
-    """Return how many pixels a map may have that belongs to a photo or map of this size.
+    """Return the largest number of pixels of a map that is read beside a photo or map of this size.
 
-    It is more than fits, so that the reader can tell the two sizes.
+    It allows more than fits, so that the message of a map that is too large can state both sizes.
     """
     return min(MOST_PIXELS, max(_FLOOR, _PER_PHOTO * height * width))
 
@@ -239,7 +239,7 @@ def readable(name: str) -> str:
 
 
 def parse_json(text: str | bytes, *, finite: bool = True) -> Any:
-    """Return what JSON holds: Python's reader, without what is no JSON or cannot be computed with.
+    """Parse JSON strictly: without NaN and infinity, and without numbers that no float can hold.
 
     Args:
         finite: whether NaN and infinity, which Python writes and JSON does not have, are refused.

@@ -49,7 +49,7 @@ _SHOW_CURSOR = b"\x1b[?25h"
 
 
 class Deferred:
-    """Tells whether a signal has come that was only noted.
+    """Records a signal instead of acting on it at once; ``requested`` is set once one has come.
 
     Args:
         message: returns the line that the process ends with if the signal is not acted upon in time.
@@ -187,12 +187,12 @@ def install() -> None:
 
 
 def ignore_warnings_of_numbers() -> None:
-    """Leave out NumPy's warnings of numbers, which are checked for what they became, but for those in users' code."""
+    """Suppress NumPy's floating-point warnings, except in users' code: dsr checks the results instead."""
     warnings.filterwarnings("ignore", category=RuntimeWarning, module=r"(dsr|numpy)\b")
 
 
 def silence() -> None:
-    """End this process without a line at a signal: it is one of several of a command, another one of which has it."""
+    """End this process silently at a signal: another process of the same command prints the line."""
     _State.silent = True
 
 

@@ -1,4 +1,4 @@
-"""How much memory there is, and refusals, in one line, of what does not fit in it."""
+"""Free memory, and errors of one line where something does not fit in it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from dsr.utils.progress import megabytes
 
 _NO_LIMIT = 1 << 40
-"""Bytes of memory where the system does not tell."""
+"""Bytes of memory assumed where the system does not report them."""
 _MOST = 1e300
 """Bytes that a message can still name."""
 _ADVICE = "not enough memory; a smaller size, scale or batch, or fewer workers need less"
@@ -18,11 +18,11 @@ _OF_ALLOCATORS = ("allocate memory", "not enough memory", "Insufficient memory",
 
 
 class OutOfMemoryError(ValueError):
-    """There is not enough memory for what was asked for."""
+    """There is not enough memory for the request."""
 
 
 def free_memory() -> int:
-    """Return the bytes of memory that are free; where the system does not tell it, those of a large machine."""
+    """Return the bytes of memory that are free; those of a large machine where the system does not report them."""
     return _meminfo("MemAvailable:")
 
 
@@ -62,7 +62,7 @@ def _is_of_allocator(error: Exception) -> bool:
 
 
 def _meminfo(name: str) -> int:
-    """Return what the system tells of its memory, in bytes."""
+    """Return an entry of Linux's ``/proc/meminfo``, in bytes."""
     try:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
         return 1024 * next(int(line.split()[1]) for line in lines if line.startswith(name))

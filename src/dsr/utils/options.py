@@ -305,7 +305,7 @@ def _keywords(each: _Stated, option: _Option, *, needed: bool) -> dict[str, Any]
 
 
 def build(record: type[Record], given: Namespace) -> Record:
-    """Return a record of what was given on the command line.
+    """Return a record of the options given on the command line.
 
     Raises:
         ValueError: a value is not what its option expects; the message begins with the option's flag.

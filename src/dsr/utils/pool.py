@@ -1,4 +1,4 @@
-"""Worker processes that outlive each other: one that is killed is replaced, and its item is given to another, once.
+"""Fault-tolerant worker processes: one that is killed is replaced, and its item is retried once.
 
 Forked workers begin at once, share what this process has loaded, and take functions that cannot be pickled; spawned
 ones are new interpreters. Whatever this process has computed before, forked ones do not hang, see

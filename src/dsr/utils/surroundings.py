@@ -1,4 +1,4 @@
-"""What the directory that a command is run in has no say in, as it may hold a stranger's files: code and settings.
+"""Keep code and settings in the working directory from being loaded, since it may hold a stranger's files.
 
 Python, the loader of libraries and matplotlib all look there under some circumstances: Python for modules where it runs
 ``-m`` or ``-c``, as worker processes are started; the loader, in processes that this one starts, where

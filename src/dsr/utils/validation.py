@@ -24,7 +24,7 @@ Content = TypeVar("Content", bound=BaseModel)
 
 
 def parse_model(model: type[Content], content: str | bytes, place: object, expected: str = "") -> Content:
-    """Return what JSON holds as a model.
+    """Parse JSON into a model.
 
     Args:
         place: where it is from, for the message.

@@ -1,4 +1,4 @@
-"""What identifies a result: versions of what computes it, and hashes of files and of code outside of the package."""
+"""Identification of results: versions of the software, and hashes of files and of code outside of the package."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def package_versions(names: Iterable[str] = _PACKAGES) -> dict[str, str]:
 
 
 def versions() -> dict[str, Any]:
-    """Return the versions of packages, Python and the project's checkout, and what the machine computes with."""
+    """Return the versions of packages, Python and the project's checkout, the accelerator and the number of threads."""
     import torch  # noqa: PLC0415
 
     return {

@@ -1,1 +1,1 @@
-"""The command behind ``dsr app``: a page of this machine's own server, on which ``dsr upsample`` is used."""
+"""The command behind ``dsr app``: a local web page that runs ``dsr upsample`` on uploaded files."""

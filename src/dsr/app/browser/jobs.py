@@ -1,4 +1,4 @@
-"""What ``dsr app`` holds: uploads in a private temporary folder, and one process at a time that opens them."""
+"""Uploads of ``dsr app``, in a private temporary folder, and its jobs: one process at a time opens them."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Upload:
 
     @property
     def work(self) -> Path:
-        """The folder of what is made of the files."""
+        """The folder of the results."""
         return self.folder / "made"
 
 
@@ -219,7 +219,7 @@ class Desk:
             before = self._queue.index(job) + (self._running is not None) if job in self._queue else 0
             record = job.record(before)
         inside = f"{upload.folder}{os.sep}"
-        text = json.dumps(record)  # where files lie here tells nobody anything
+        text = json.dumps(record)  # the page does not show this machine's paths
         for place in (json.dumps(inside)[1:-1], json.dumps(f"{os.path.realpath(upload.folder)}{os.sep}")[1:-1]):
             text = text.replace(place, "")
         plain: dict[str, Any] = json.loads(text)

@@ -1,9 +1,9 @@
-"""The server of ``dsr app``: one page, uploads that are cut off at a limit, and what is made of them.
+"""The server of ``dsr app``: one page, uploads of limited size, and their results.
 
 It answers this machine alone unless another address is asked for. Other accounts of the machine reach it, too: its page
 is for those who know the token in the address that it prints. A page of another site can make a browser ask it: it
 therefore refuses names of hosts that are not its own, which a stranger's name server may point here (DNS rebinding),
-and takes nothing without the token, which that page has not. Names of files that a page sends are not
+and accepts nothing without the token, which such a page does not have. Names of files that a page sends are not
 used: a file is stored under its role with one of the suffixes that the readers know.
 """
 
@@ -468,7 +468,7 @@ def _is_of(origin: str, host: str) -> bool:
 
 
 def _is_same(given: str, token: str) -> bool:
-    """Return whether a token is the right one, in a time that does not tell how much of it is."""
+    """Return whether a token is the right one, in constant time."""
     return secrets.compare_digest(given.encode(errors="surrogatepass"), token.encode())
 
 

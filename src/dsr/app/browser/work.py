@@ -106,7 +106,7 @@ class _Parser(ArgumentParser):
 
 
 def main() -> int:
-    """Do what the arguments say: what, the folder for it, bytes of memory, and the arguments of ``dsr upsample``."""
+    """Run one job; the arguments: its kind, its folder, the memory limit in bytes, and those of ``dsr upsample``."""
     what, folder, memory, *arguments = sys.argv[1:]
     _keep_output()
     _limit(int(memory))
@@ -147,7 +147,7 @@ def _request(folder: Path, arguments: Sequence[str], parts: str | None) -> Upsam
 
 
 def _look(request: UpsampleRequest, _: Path) -> None:
-    """Tell which frames there are, and send small pictures of some."""
+    """List the frames, and send thumbnails of some."""
     from dsr.app.upsample.frames import find_frames  # noqa: PLC0415 - it takes seconds to import
 
     frames = find_frames(request)
@@ -175,7 +175,7 @@ def _thumb_of(pair: Pair) -> str:
 
 
 def _send_found(frames: Frames) -> None:
-    """Tell what is said about all frames together."""
+    """Send the notes that concern all frames together."""
     _Sender().facts(frames.found.assumptions)
     if frames.found.unpaired:
         send(note=f"files without a partner, left out: {len(frames.found.unpaired)}", warning=False)

@@ -1,4 +1,4 @@
-"""Whether photo and depth map belong together, for ``dsr upsample``: warnings, or with ``--register`` a cure."""
+"""Alignment of photo and depth map for ``dsr upsample``: warnings, or with ``--register`` a correction."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ _METRES = Encoding(".npy", "float32", 1.0, math.nan, "orthogonal")
 
 @dataclass(frozen=True)
 class Given:
-    """A picture, and what its depth was given as.
+    """A picture, and whether its depth was given as an array or a tensor.
 
     Args:
         picture: on the CPU.
@@ -43,7 +43,7 @@ def picture_of(
     rgb: Any, depth: Any, camera: Any, *, mask: Any = None, unit: str | float | None = None, pose: Any = None,
     empty: bool = False,
 ) -> Given:  # fmt: skip
-    """Return a picture of what a user gives; see :func:`dsr.upsample`.
+    """Convert the user's arguments to a picture; see :func:`dsr.upsample`.
 
     Args:
         pose: from camera to world, (4, 4) or (3, 4), metres; None for none.

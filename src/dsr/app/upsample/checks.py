@@ -1,4 +1,4 @@
-"""What some frames tell of all of them, for ``dsr upsample``: warnings that are found once, and apply to all."""
+"""Checks of a sample of the frames of ``dsr upsample``, with warnings that apply to all similar frames."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _HALF = 2**-10
 def check_together(
     pairs: Sequence[Pair], reading: Reading, read: Callable[[Pair], Picture], sequence: FrameSequence
 ) -> dict[str, tuple[Assumption, ...]]:
-    """Return the warnings that some frames give rise to, by the name of each frame that they apply to.
+    """Return the warnings from checks of a sample of the frames, by the name of each frame that they apply to.
 
     Frames of one folder are alike in what their values are, and their poses; a frame that is alone in its folder is
     like those in other folders beside it.
@@ -70,7 +70,7 @@ def check_together(
 
 
 def alike(pairs: Sequence[Pair]) -> Iterable[list[Pair]]:
-    """Return the frames that are alike, as those of a folder are, in their order."""
+    """Group frames that are alike, which are those of one folder, in their order."""
     folders = Counter(pair.depth.parent for pair in pairs)
     groups: dict[Path, list[Pair]] = {}
     for pair in pairs:

@@ -80,7 +80,7 @@ class FrameWork:
         self._sequence = FrameSequence(frames.whole, self._read, request.frames.neighbours, request.frames.trajectory)
 
     def check_together(self, jobs: Sequence[tuple[Pair, Path]]) -> Frames:
-        """Return the frames with what is wrong with them together, if there is something to do.
+        """Return the frames with the warnings that concern several of them, if any frame is to be done.
 
         Args:
             jobs: the pictures to work on, each with the folder of its results.
@@ -196,7 +196,7 @@ class FrameWork:
 
 
 class Times:
-    """The seconds of the stages of a picture, which are shown as it goes through them; of some they may be known."""
+    """Measures the seconds of each stage of a picture and shows its progress; some may be known beforehand."""
 
     def __init__(self, progress: Progress, **seconds: float) -> None:
         self._progress, self._seconds = progress, {stage: round(each, 3) for stage, each in seconds.items()}
@@ -204,7 +204,7 @@ class Times:
         self._slower = 1.0
 
     def begin(self, stage: str, seconds: float | None = None) -> None:
-        """Begin one of :data:`STAGES`, which takes about some seconds on idle cores if that is known."""
+        """Begin one of :data:`STAGES`; ``seconds`` is its estimated duration on idle cores, if known."""
         self.read()
         self._stage, self._since = stage, time.perf_counter()
         self._progress.stage(stage, None if seconds is None else seconds * self._slower)
@@ -229,7 +229,7 @@ class Times:
         self._kept = seconds
 
     def together(self, seconds: Mapping[str, float]) -> dict[str, float]:
-        """Return what :meth:`read` returned with the seconds of an earlier run whose result is kept, if any."""
+        """Return the seconds from :meth:`read` plus those of an earlier run whose result is kept, if any."""
         stages = dict.fromkeys((*self._kept, *seconds))
         return _with_total({name: self._kept.get(name, 0.0) + seconds.get(name, 0.0) for name in stages})
 
@@ -303,7 +303,7 @@ class _Job:
 
 
 def prepare(picture: Picture, sensor: str, fuse: Callable[[Picture], Picture]) -> tuple[Picture, Identified | None]:
-    """Return a picture as it was read, fused with its neighbours, and the sensor that its own depth tells.
+    """Return a picture fused with its neighbours, and the sensor identified from its own depth as read.
 
     Args:
         sensor: see :func:`dsr.inference.find_sensor`.

@@ -30,11 +30,11 @@ class Frames:
     """Frames to work on, and what they depend on.
 
     Args:
-        found: the frames to work on, and what is said about them.
+        found: the frames to work on, and notes on them.
         whole: all frames that were found; poses, neighbours and units depend on them.
         single: whether there is a single picture, whose results are in the output folder itself.
-        units: what the values of all of them tell.
-        warnings: what is wrong with frames together, by the name of each; see :mod:`dsr.app.upsample.checks`.
+        units: units and range types, identified from the values of all of them.
+        warnings: warnings from checks of several frames, by the name of each; see :mod:`dsr.app.upsample.checks`.
 
     """
 

@@ -120,7 +120,7 @@ def read_previous_run(folder: Path) -> PreviousRun | None:
 
 
 def expect_free(folder: Path, inputs: Iterable[Path], *, ours: bool) -> None:
-    """Check that a result would not overwrite its input, or files that no earlier run wrote, or what is no file.
+    """Check that a result would not overwrite its input, files that no earlier run wrote, or things that are no files.
 
     Args:
         folder: the result's folder.

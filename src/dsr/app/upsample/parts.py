@@ -1,4 +1,4 @@
-"""What ``dsr upsample`` writes: one table, which its options, its checks and its folders read."""
+"""The table of all outputs of ``dsr upsample``, which its options, checks and result folders are based on."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _WORTH_SAYING = 1e-3
 
 @dataclass(frozen=True)
 class Result:
-    """A result to write, and what is wanted of it.
+    """A result to write, and the parts that are requested.
 
     Args:
         picture: the input.
@@ -409,7 +409,7 @@ class Results(Options):
 
     @functools.cached_property
     def of_frame(self) -> tuple[Part, ...]:
-        """Parts of each frame, and those that others are made of."""
+        """Parts that are written for each frame, including those that other parts need."""
         needed = {need for name in self.names for need in PARTS[name].needs}
         return tuple(part for part in PARTS.values() if part.write and part.name in {*self.names, *needed})
 
@@ -427,7 +427,7 @@ class Results(Options):
 
 
 def write_parts(folder: Path, result: Result) -> dict[str, Output]:
-    """Write the parts of a picture's result, and return what each wrote.
+    """Write the parts of a picture's result, and return a description of each.
 
     Args:
         folder: the result's folder, created if it is missing.

@@ -1,4 +1,4 @@
-"""What ``dsr upsample --dry-run`` says: one frame of each kind is read, of the others at most the headers."""
+"""The report of ``dsr upsample --dry-run``, which reads one frame of each kind, and at most headers of the others."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from dsr.utils.progress import Progress, duration, megabytes
 
 
 def preview(request: UpsampleRequest, frames: Frames, reporter: Messages, progress: Progress) -> Iterator[Done]:
-    """Say what would be done, and how long it would take; as :func:`dsr.app.upsample.workers.work_through` does it."""
+    """Report what :func:`dsr.app.upsample.workers.work_through` would do, and how long it would take."""
     reading = request.reading
     targets = {pair.name: frames.target(request.results.output, pair) for pair in frames.found.pairs}
     work = FrameWork(request, frames)

@@ -42,7 +42,7 @@ class Record:
         self._said.append(tuple(facts))
 
     def replay(self, reporter: Messages) -> None:
-        """Report what was kept, in its order."""
+        """Report the kept lines, in their order."""
         for each in self._said:
             if isinstance(each, str):
                 reporter.say(each)

@@ -170,11 +170,11 @@ class Upsampling(Options):
 
     @property
     def working_size(self) -> int | None:
-        """By what the map's size is divided first; None where its noise decides."""
+        """The divisor of the map's size before upsampling; None to choose it by the noise."""
         return None if self.size == "auto" else int(self.size)
 
     def check_slowly(self) -> None:
-        """Check what takes seconds: that the method accepts its arguments, and the name of the sensor.
+        """Run the checks that take seconds: that the method accepts its arguments, and the name of the sensor.
 
         Raises:
             ValueError: it does not, or there is no such sensor; the message begins with the option.

@@ -1,4 +1,4 @@
-"""Frames of a sequence for ``dsr upsample``: their poses, whether these can be right, and neighbours that vote."""
+"""Frames of a sequence for ``dsr upsample``: their poses, checks of these, and fusion with neighbouring frames."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ class FrameSequence:
         return self._poses is not None
 
     def fault(self, recording: Sequence[Pair]) -> Assumption | None:
-        """Return what is wrong with the poses of a recording, by some of its frames."""
+        """Return a warning if the poses of a recording do not fit a sample of its frames."""
         frames = [pair for pair in recording if self._poses is None or pair.name in self._poses]
 
         def load(number: int) -> PosedMap | None:

@@ -1,4 +1,4 @@
-"""Results of ``dsr upsample`` as they lie in folders: read for looking at them, for a mesh, and for exports."""
+"""Readers of the result folders of ``dsr upsample``, for ``dsr view``, ``dsr fuse`` and exports."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``dsr.Surface``: a result with all that may be asked of it."""
+"""``dsr.Surface``: an upsampled depth map with its normals, renderings, points, mesh and expected errors."""
 
 from __future__ import annotations
 
@@ -181,7 +181,7 @@ class Surface(Generic[Array]):
         return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=normals, vertex_colors=colours, process=False)
 
     def save(self, folder: str | os.PathLike[str], parts: Sequence[str] | None = None, **options: Any) -> list[Path]:
-        """Write what ``dsr upsample`` writes, for ``dsr view``, ``dsr fuse`` and other programs; see docs/export.md.
+        """Write the files of ``dsr upsample``, for ``dsr view``, ``dsr fuse`` and other programs; see docs/export.md.
 
         Args:
             folder: is made if need be. To a folder of this surface parts are added; any other is refused.

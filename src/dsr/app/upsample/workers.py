@@ -98,7 +98,7 @@ def _name_of(job: _Job) -> str:
 
 
 def attempt(work: FrameWork, pair: Pair, target: Path, reporter: Messages, progress: Progress) -> Done:
-    """Upsample a picture, and return what became of it."""
+    """Upsample a picture, and return the outcome: the result, or the error as one line."""
     try:
         with refusing_excess():
             return Done(pair, target, work(pair, target, reporter, progress), None, work.bytes)

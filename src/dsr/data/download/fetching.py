@@ -118,7 +118,7 @@ class Checksums(dict[str, Entry]):
         write_text(self.path, json.dumps(plain, indent=1) + "\n")
 
     def record_found(self, entries: Mapping[str, Entry], progress: Progress) -> None:
-        """Record what was there without a record, and say so."""
+        """Record files that exist without a record, and report them."""
         names = list(entries)
         few = ", ".join(names) if len(names) < 4 else f"{names[0]}, {names[1]} and {len(names) - 2} more"
         try:
@@ -165,7 +165,7 @@ def get(
     accept_changed: bool = False,
     keep_archives: bool = False,
 ) -> list[str]:
-    """Fetch what is not there, or not as recorded.
+    """Fetch files that are missing or differ from their record.
 
     An interruption keeps what has come of a file beside it, ``.part``, and the next call goes on from there.
 

@@ -186,7 +186,7 @@ def unpack(path: Path) -> Path:
 
 
 def inflate(content: bytes, size: int, bits: int = zlib.MAX_WBITS) -> bytes:
-    """Return what compressed data unpack to.
+    """Return compressed data unpacked.
 
     Args:
         size: number of bytes that is expected.

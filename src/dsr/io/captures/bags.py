@@ -109,7 +109,7 @@ class NamedErrors:
 
 
 def state_of(path: Path) -> tuple[int, ...]:
-    """Return sizes and times of the files of a recording, which tell whether it was replaced."""
+    """Return sizes and modification times of the files of a recording, which change if it is replaced."""
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     for file in files:
         if file.exists() and not file.is_file() and not file.is_dir():  # a pipe would be waited for
@@ -171,7 +171,7 @@ _MAGIC = b"#ROSBAG V2.0\n"
 
 
 def _expect_finished(path: Path) -> None:
-    """Check that a ``.bag`` is one, and has its index: the first record tells its place.
+    """Check that a ``.bag`` file is a ROS recording with an index, whose position is in the first record.
 
     http://wiki.ros.org/Bags/Format/2.0
     """

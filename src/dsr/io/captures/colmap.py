@@ -103,7 +103,7 @@ class Model:
     images: Sequence[_Image]
 
     def frame(self, image: _Image) -> CaptureFrame:
-        """Return what the model says of an image."""
+        """Return the frame of an image, with camera and pose from the model."""
         camera = self.cameras.get(image.camera)
         if camera is None:
             raise ValueError(

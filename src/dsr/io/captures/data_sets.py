@@ -159,7 +159,7 @@ def find_replica(folder: Path) -> PairingResult | None:
 def _frame(
     app: str, path: Path | None, expected: Path, camera: _CameraOf | None, described: bytes = b""
 ) -> CaptureFrame:
-    """Return a frame with the pose in a file, if there is one, and what tells its camera, if anything does."""
+    """Return a frame with the pose from a file and the function that gives its camera, if there are any."""
     content = b"" if path is None else read_limited(path, _LARGEST_TEXT)
     return CaptureFrame(app, functools.partial(_geometry, path, camera), expected, described + content)
 

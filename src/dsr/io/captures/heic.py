@@ -152,7 +152,7 @@ def _geometry(path: Path, size: tuple[int, int]) -> Geometry:
 
 
 def _camera(path: Path, text: str, orientation: int, size: tuple[int, int]) -> Camera | None:
-    """Return the camera that the text about the depth map tells; None if there is none."""
+    """Return the camera in the XMP text of the depth map; None if it has none."""
     matrix = re.search(r"depthData:IntrinsicMatrix>(.*?)</depthData:IntrinsicMatrix>", text, re.DOTALL)
     sides = dict(re.findall(r"depthData:IntrinsicMatrixReference(Width|Height)\W{1,3}(\d{1,6})\b", text))
     if matrix is None or len(sides) < 2:

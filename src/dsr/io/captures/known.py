@@ -1,4 +1,4 @@
-"""Which files a folder lacks that looks like a capture of :data:`dsr.io.formats.FORMATS`, and what it holds instead."""
+"""Missing files of a folder that resembles a capture of :data:`dsr.io.formats.FORMATS`, and a list of its contents."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _KINDS = 6
 
 
 def lacking(folder: Path) -> list[str]:
-    """Return which layouts a folder looks like, and what it lacks for each: ``like ScanNet, without depth/``."""
+    """Return the layouts that a folder resembles, each with its missing files: ``like ScanNet, without depth/``."""
     return [
         f"like {each.name}, without {', '.join(missing)}"
         for each in FORMATS
@@ -36,7 +36,7 @@ def _has(folder: Path, patterns: tuple[str, ...]) -> bool:
 
 
 def describe_content(folder: Path, deep: int) -> str:
-    """Return how many files of which kinds a folder holds, and which layouts it nearly has, in a line.
+    """Describe a folder in one line: the numbers of its files by kind, and the layouts that it nearly matches.
 
     Args:
         folder: the folder.

@@ -234,7 +234,7 @@ class _Player:
         """Open the video at its first frame."""
         if not self._path.is_file():
             raise ValueError(f"{self._path}: expected a video, there is none")
-        os.environ.setdefault(_LOG_LEVEL, _SILENT)  # read once; its threads may speak after they were asked
+        os.environ.setdefault(_LOG_LEVEL, _SILENT)  # read once; its threads may print messages later
         with quiet_decoders(), _environment(_OPTIONS, _ALL_FRAMES):
             capture = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG)
         width, height = (capture.get(key) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))

@@ -43,7 +43,7 @@ class Stopping(Protocol):
         ...
 
     def state(self) -> dict[str, Tensor]:
-        """Return what a checkpoint has to keep."""
+        """Return the state for a checkpoint."""
         ...
 
     def restore(self, state: dict[str, Tensor]) -> None:

@@ -1,4 +1,4 @@
-"""Facets with context: a network for low-resolution maps of any kernel and noise, which says how sure it is.
+"""Facets with context: a network for low-resolution maps of any kernel and noise, which predicts its expected errors.
 
 It is :mod:`dsr.methods.networks.facets`, where low-resolution pixels propose planes and high-resolution pixels mix the
 planes of the 3 x 3 low-resolution pixels around them, and can start from its weights. What is new:
@@ -81,7 +81,7 @@ _SLOPE, _ROUGH = 6.0, 0.5
 _QUANTILES = (0.1, 0.5)
 _ROUGHNESS = len(_QUANTILES) * (1 + _LEVELS)
 _SAMPLES = 2**16
-"""About how many low-resolution pixels tell how rough a map is."""
+"""About how many low-resolution pixels the roughness of a map is measured at."""
 _BAND = 2**20
 """Pixels of the photo that are processed at a time, beside the trunk, which sees the whole map."""
 _MARGIN = 4

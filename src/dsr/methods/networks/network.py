@@ -32,7 +32,7 @@ _UNKNOWN = torch.tensor(math.nan)
 
 @dataclass(frozen=True)
 class Answer:
-    """What a network says of images, all (B, 1, H, W).
+    """The outputs of a network for a batch of images, all (B, 1, H, W).
 
     Args:
         disparity: in the unit of the input.
@@ -139,11 +139,11 @@ class DisparityNetwork(nn.Module, abc.ABC):
 
     @staticmethod
     def prepare(batch: Mapping[str, Any]) -> dict[str, Any]:
-        """Return patches with what a step would have to wait for a GPU to compute; a training's loader calls it."""
+        """Prepare patches in a training's loader: precompute values for which a step would have to wait for the GPU."""
         return dict(batch)
 
     def answer_patches(self, batch: Mapping[str, Any]) -> Answer:
-        """Return what a training compares with the truth, in float32.
+        """Return the outputs that a training compares with the truth, in float32.
 
         Args:
             batch: patches as of :func:`dsr.training.degradation.to_tensors`, with a batch axis, perhaps prepared.
@@ -152,7 +152,7 @@ class DisparityNetwork(nn.Module, abc.ABC):
         return Answer(self.upsample(batch["rgb"], batch["disparity_lr"], batch["min_max"]).float())
 
     def answer_scene(self, batch: Mapping[str, Tensor]) -> Tensor:
-        """Return what a validation scores, high-resolution disparity, (B, 1, H, W).
+        """Return high-resolution disparity to be scored by a validation, (B, 1, H, W).
 
         Args:
             batch: a scene as of :class:`dsr.training.data_module.WholeScenes`, with a batch axis.
@@ -195,7 +195,7 @@ class RangeNetwork(DisparityNetwork):
         return dict(batch) if "filled" in batch else {**batch, "filled": inpaint(batch["disparity_lr"])}
 
     def answer_patches(self, batch: Mapping[str, Any]) -> Answer:
-        """Return what a training compares with the truth, in float32."""
+        """Return the outputs that a training compares with the truth, in float32."""
         filled = self.prepare(batch)["filled"]
         stages = self.in_range(filled, batch["min_max"], lambda values: self.compute_stages(batch["rgb"], values))
         return Answer(stages[-1].float(), stages=tuple(each.float() for each in stages[:-1]))
@@ -319,7 +319,7 @@ class NetworkUpsampler(Method):
         return from_range(disparity, sample.camera, "disparity").to(sample.depth_lr.device)
 
     def upsample_inverse(self, problem: InverseSample, progress: Steps | None = None) -> InverseSurface:
-        """Return what the network makes of inverse depth, which may be its own result."""
+        """Return the network's upsampled inverse depth."""
         rgb, inverse = (each.to(self.device)[None] for each in (problem.rgb, problem.inverse))
         return InverseSurface(self.upsample_disparity(rgb, inverse, progress)[0])
 

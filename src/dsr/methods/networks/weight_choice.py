@@ -39,7 +39,7 @@ class WeightChoice:
 
     @classmethod
     def of(cls, node: Any, scale: float) -> WeightChoice:
-        """Return what a method's node ``weights`` says, which may be a path alone."""
+        """Return the choice that a method's node ``weights`` describes; the node may be a path alone."""
         if not isinstance(node, Mapping):
             return cls(scale, node)
         names = {each.name for each in fields(cls)}

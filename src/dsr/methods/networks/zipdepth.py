@@ -83,7 +83,7 @@ class Norm(nn.Module):
 
 
 class ConvNorm(nn.Module):
-    """A convolution, its normalisation, and what is positive of it."""
+    """A convolution, its normalisation, and a ReLU."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int, stride: int = 1) -> None:
         """Make the layers."""

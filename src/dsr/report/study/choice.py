@@ -1,4 +1,4 @@
-"""Which questions a study asks, and the texts of its page: checked without what draws them."""
+"""Options of a user study: its questions and the texts of its page; checked before drawing code is imported."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dsr.utils.options import Options, one_of, option
 
 @dataclass(frozen=True, kw_only=True)
 class Choice(Options):
-    """Selection of the questions, and texts of the page; what is empty selects all, methods by label or by name."""
+    """Selection of the questions, methods by label or by name, and texts of the page; an empty choice selects all."""
 
     light: str = option(STUDY_LIGHT, f"of the renderings: {LIGHT_CHOICES}; {STUDY_LIGHT}", rule=one_of(LIGHT_NAMES))
     scales: tuple[float, ...] = option((), "these alone", "N", flags="--scale")

@@ -50,7 +50,7 @@ class Peer(PeerUpsampler):
 
     @classmethod
     def abilities_of(cls, node: Node) -> Abilities:
-        """Return what the network that a node names can do."""
+        """Return the abilities of the network that a node names."""
         network = PEERS.get(str(node.get("peer")))
         return cls.abilities if network is None else replace(cls.abilities, cost=network.cost)
 
