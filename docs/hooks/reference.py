@@ -1,4 +1,4 @@
-"""Write the generated pages of the documentation: commands, options, configuration, Python API, weights and changes.
+"""Write the generated pages of the documentation: commands, options, configuration, Python API and changes.
 
 MkDocs calls :func:`on_files` at every build, so these pages always agree with the code and none of them is stored.
 """
@@ -80,7 +80,6 @@ def generated_pages() -> dict[str, str]:
         "reference/commands.md": command_reference(command_parser()),
         "reference/upsample.md": option_reference(command_parser(), "dsr upsample"),
         "reference/configuration.md": configuration_reference(CONF),
-        "weights.md": model_card(),
         "changelog.md": (ROOT / "CHANGELOG.md").read_text(),
         "security.md": (ROOT / "SECURITY.md").read_text(),
     }
@@ -230,9 +229,3 @@ def _escape(text: str) -> str:
 def _code(text: str) -> str:
     """Return a value as code, nothing for none."""
     return f"`{text}`" if text else ""
-
-
-def model_card() -> str:
-    """Return the card of the packaged weights with its links adapted to the site."""
-    card = (ROOT / "src/dsr/methods/weights/README.md").read_text()
-    return re.sub(r"\]\((?:\.\./)+docs/", "](", card)

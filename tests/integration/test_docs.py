@@ -21,8 +21,8 @@ from dsr.app.schema import EvalConfig, TrainConfig, plain_config, register
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
-CARD = ROOT / "src/dsr/methods/weights/README.md"
-PAGES = (ROOT / "README.md", CARD, *sorted(DOCS.glob("*.md")))
+CARD = DOCS / "weights.md"
+PAGES = (ROOT / "README.md", ROOT / "src/dsr/methods/weights/README.md", *sorted(DOCS.glob("*.md")))
 EXTENDING = DOCS / "extend.md"
 """Its commands use the modules that it contains; a test runs them."""
 
@@ -214,6 +214,15 @@ def test_configuration_reference_has_every_key_and_default(path: Path, generated
     assert list(rows) == list(expected)
     scalars = {key: value for key, value in expected.items() if key != "defaults" and value not in (None, {}, "")}
     assert {key: yaml.safe_load(rows[key]) for key in scalars} == scalars
+
+
+def test_model_card_describes_the_weights_that_are_here() -> None:
+    from dsr.methods import weights  # noqa: PLC0415
+
+    card = CARD.read_text()
+    files = card.partition("### Files")[2].partition("\n### ")[0]
+    assert f"weights `{weights.version()}`" in card
+    assert set(re.findall(r"^\| `(\w+)` \|", files, re.MULTILINE)) == set(weights.known())
 
 
 def test_citation_has_what_the_format_requires() -> None:
