@@ -6,11 +6,13 @@
 Holes are cut into low-resolution maps, box means of the inverse depth of scenes of Middlebury 2014 and ICL-NUIM:
 ``loops`` (a ring of another photo's colours is put before the scene, and what is seen through it is lost), ``gaps``
 (what lies between nearer surfaces of the scene itself), ``shadows`` of a second camera or projector 5 to 20 cm beside
-the first, ``steps`` (a pixel on both sides of depth steps) and ``blobs``. Of the high-resolution pixels under
-holes: the mean relative error of those that are filled, the share that is off by more than 5 %, the share that is left
-open, and the share of sheets: filled pixels that are off by more than 5 % and lie between the nearer and the farther
-surface around them, by 5 % of their depth from both. ``expected`` is the mean expected error, ``left in`` the share
-of the pixels expected to be off by up to 2 % that is off by more than 5 %; ``elsewhere`` the error of all others.
+the first, ``steps`` (a pixel on both sides of depth steps), ``slopes`` (discs in smooth slopes, around which the range
+of depth is large, without a step), ``blobs``, and ``floors`` (blobs; the photo lies on a floor that recedes to five
+times its least distance). Of the high-resolution pixels under holes: the mean relative error of those that are filled,
+the share that is off by more than 5 %, the share that is left open, and the share of sheets: filled pixels that are off
+by more than 5 % and lie between the nearer and the farther surface around them, by 5 % of their depth from both.
+``expected`` is the mean expected error, ``dubious`` the share of filled pixels that are expected to be off by more than
+2 %, ``left in`` the share of the others that is off by more than 5 %; ``elsewhere`` the error outside of the holes.
 """
 
 from __future__ import annotations
@@ -37,10 +39,12 @@ from dsr.inference.rims import Settled, settle_holes
 from dsr.methods.base import Surface
 from dsr.sample import Scene
 
-KINDS = ("loops", "gaps", "shadows", "steps", "blobs")
+KINDS = ("loops", "gaps", "shadows", "steps", "slopes", "blobs", "floors")
 
 STEP = 1.15
 """Ratio of two depths from which they are two surfaces."""
+BEND = 0.01
+"""Second difference of inverse depth, relative to it, up to which a surface is smooth."""
 OFF = 0.05
 SCENES = ("Adirondack", "Motorcycle", "Playtable", "living", "office")
 
@@ -128,12 +132,36 @@ def steps(depth: Tensor) -> Tensor:
     return (far / near)[0] > STEP
 
 
+def slopes(depth: Tensor, rng: np.random.Generator) -> Tensor:
+    """Return discs of 3 to 9 pixels around which the depth, (1, h, w), has a range of 10 % without step or crease."""
+    pool = torch.nn.functional.max_pool2d
+    inverse = torch.nn.functional.pad(depth.double().reciprocal()[None], (1, 1, 1, 1), value=torch.nan)[0]
+    middle = inverse[:, 1:-1, 1:-1]
+    bends = (inverse[:, 2:, 1:-1] + inverse[:, :-2, 1:-1], inverse[:, 1:-1, 2:] + inverse[:, 1:-1, :-2])
+    smooth = torch.stack([(each / middle - 2).abs() < BEND for each in bends]).all(0)
+    rows, columns = torch.meshgrid(*map(torch.arange, depth.shape[-2:]), indexing="ij")
+    cut = torch.zeros_like(smooth)
+    for radius in (1.5, 2.5, 3.5, 4.5):
+        reach = int(2 * radius) + 3
+        away = ((~smooth).double()[None], middle[None].nan_to_num(0), -middle[None].nan_to_num(torch.inf))
+        rough, high, low = (pool(each, 2 * reach + 1, 1, reach)[0] for each in away)
+        places = torch.nonzero(((rough == 0) & (high > -1.1 * low))[0])
+        for row, column in places[torch.from_numpy(rng.permutation(len(places)))].tolist()[:200]:
+            distance = ((rows - row).square() + (columns - column).square()).sqrt()[None]
+            if not bool((cut & (distance < reach + 5)).any()):
+                cut |= distance <= radius
+    return cut
+
+
 def make_case(kind: str, scene: Scene, other: Scene, ratio: int, seed: int) -> Case:
     """Return a scene with holes of a kind."""
     rng, generator = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
     inside = torch.zeros(0)
     if kind == "loops":
         scene, inside = put_rings(scene, other, ratio, rng)
+    if kind == "floors":
+        rows = torch.linspace(0.2, 1, depth_of(scene).shape[1])[:, None].expand(depth_of(scene).shape)
+        scene = Scene(scene.dataset, scene.name, scene.rgb, scene.camera, rows.reciprocal())
     depth = Downsampling("box")(depth_of(scene).reciprocal(), ratio).reciprocal()
     camera_lr = scene.camera.downscale(ratio)
     if kind == "loops":
@@ -145,6 +173,8 @@ def make_case(kind: str, scene: Scene, other: Scene, ratio: int, seed: int) -> C
         cut = cut & (torch.nn.functional.avg_pool2d(cut[None].float(), 3, 1, 1)[0] > 0.3)
     elif kind == "steps":
         cut = steps(depth)
+    elif kind == "slopes":
+        cut = slopes(depth, rng)
     else:
         cut = Blobs(0.08, 6.0)(depth, camera_lr, generator)
     cut = cut & depth.isfinite()
@@ -199,6 +229,7 @@ def measure(case: Case, surface: Surface, ratio: int) -> dict[str, float]:
         "sheets": 100 * float(sheet.float().mean()),
         "expected": 100 * float(expected.clamp(max=1).mean()),
         "left in": 100 * float((off > OFF)[expected <= 0.02].float().mean()),
+        "dubious": 100 * float((expected > 0.02).float().mean()),
         "elsewhere": 100 * float((surface.depth[kept] / case.truth[kept] - 1).abs().mean()),
     }
 

@@ -50,6 +50,23 @@ def test_hole_that_shows_neither_surface_is_doubtful() -> None:
     assert errors[0] < 0.1 < errors[1]
 
 
+@pytest.mark.parametrize("shape", ["ring", "floor", "hill", "outliers"])
+def test_undecided_hole_is_doubtful_at_a_step_and_not_on_a_slope(shape: str) -> None:
+    rows, columns = torch.meshgrid(torch.arange(60.0), torch.arange(80.0), indexing="ij")
+    squared = (rows % 20 - 10).square() + (columns % 20 - 10).square()
+    few = torch.rand(rows.shape, generator=torch.Generator().manual_seed(0)) < 0.01
+    depth = {
+        "ring": torch.where(squared < 50, NEAR, FAR),
+        "floor": 1 / (0.25 + rows / 80),
+        "hill": 1 / (0.5 + (rows / 60).square() + (columns / 80).square()),
+        "outliers": torch.where(few, NEAR, 1.5 * NEAR),
+    }[shape]
+    holes = (squared < 12)[None]
+    found = settle_holes(depth[None].masked_fill(holes, torch.nan).reciprocal(), torch.full((3, 60, 80), 0.5), holes)
+    doubtful = (found.doubt[holes] > 0.02).float().mean()
+    assert doubtful > 0.95 if shape == "ring" else doubtful < 0.02
+
+
 def test_strip_beside_a_near_object_is_of_what_is_behind_it() -> None:
     depth = torch.full((1, 40, 60), FAR)
     depth[:, 10:30, 20:40] = NEAR

@@ -6,7 +6,9 @@ a sheet between the two surfaces, or closes the loop. So each pixel of such a ho
 around it, up to three times as far as the rim, as in a joint bilateral filter: the two of each surface that are nearest
 and most alike in colour stand for it. It gets the farther depth where that surface explains its colour at least as well
 as the nearer one, the nearer where that does clearly better, and what other holes get in between. Where that is of
-the same surface anyway, a pixel is left to the method, which knows slopes and its own errors.
+the same surface anyway, a pixel is left to the method, which knows slopes and its own errors. The probability that a
+pixel is of the other surface counts in its expected error; for those left to the method only if the depths around them
+have a step, as those of a slope are all of one surface.
 
 See ``benchmarks/holes.py`` for the figures.
 """
@@ -39,6 +41,9 @@ _CLEARLY = 1.0
 """Logarithm of the ratio of how well they explain a pixel from which on one surface is clearly better."""
 _DIFFERENT = 0.1
 """Logarithm of the ratio of depths from which what would be filled in from the rim is of another surface."""
+_LEVELS, _APART, _PART = 19, 5, 0.5
+"""Quantiles of the depths around a pixel, from 5 to 95 %; these have a step if two that are so many apart, a quarter of
+the depths, have more than this part of the range between them."""
 _MOST = 1 << 14
 """Pixels at a time."""
 _TOGETHER = 0.5
@@ -66,7 +71,7 @@ def settle_holes(inverse: Tensor, rgb: Tensor, holes: Tensor) -> Settled:
 
     """
     known = inverse.isfinite()
-    settled, doubt = inverse.clone(), torch.zeros_like(inverse)
+    settled, doubt, of_method = inverse.clone(), torch.zeros_like(inverse), torch.zeros_like(inverse)
     if not bool((holes & ~known).any()) or _is_scattered(known):
         return Settled(settled, doubt)
     colours = functional.adaptive_avg_pool2d(rgb[None].to(inverse), (inverse.shape[-2], inverse.shape[-1]))[0]
@@ -74,14 +79,15 @@ def settle_holes(inverse: Tensor, rgb: Tensor, holes: Tensor) -> Settled:
     places = torch.nonzero((holes & ~known)[0])
     for part in places.split(_MOST):
         rows, columns = part[:, 0], part[:, 1]
-        found, doubtful = _settle(inverse[0], colours, rows, columns, away[rows, columns].to(inverse))
-        settled[0, rows, columns], doubt[0, rows, columns] = found, doubtful
+        found = _settle(inverse[0], colours, rows, columns, away[rows, columns].to(inverse))
+        for whole, values in zip((settled, doubt, of_method), found, strict=True):
+            whole[0, rows, columns] = values
     decided = settled.isfinite() & ~known
     if bool(decided.any()):
         usual = inpaint(inverse[None], rgb[None])[0]
         same = decided & ((settled / usual).log().abs() < _DIFFERENT)
-        settled, doubt = settled.masked_fill(same, math.nan), doubt.masked_fill(same, 0)
-    return Settled(settled, doubt)
+        settled = settled.masked_fill(same, math.nan)
+    return Settled(settled, torch.where(settled.isfinite(), doubt, of_method))
 
 
 def _is_scattered(known: Tensor) -> bool:
@@ -91,8 +97,10 @@ def _is_scattered(known: Tensor) -> bool:
     return bool((inner & beside).sum() < _TOGETHER * inner.sum())
 
 
-def _settle(inverse: Tensor, colours: Tensor, rows: Tensor, columns: Tensor, away: Tensor) -> tuple[Tensor, Tensor]:
-    """Return inverse depth, NaN where it is not decided, and the doubt at pixels, (n,) each.
+def _settle(
+    inverse: Tensor, colours: Tensor, rows: Tensor, columns: Tensor, away: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return inverse depth at pixels, NaN where it is not decided, its doubt and that of the method's, (n,) each.
 
     Args:
         inverse: (h, w) the map.
@@ -115,10 +123,10 @@ def _settle(inverse: Tensor, colours: Tensor, rows: Tensor, columns: Tensor, awa
     rim = known & (distance <= 1.5 * away[:, None] + 3)
     high = values.masked_fill(~rim, -math.inf).amax(1)
     low = values.masked_fill(~known, math.inf).amin(1)
-    found, doubt = torch.full_like(away, math.nan), torch.zeros_like(away)
+    found, doubt, of_method = torch.full_like(away, math.nan), torch.zeros_like(away), torch.zeros_like(away)
     two = high > _STEP * low
     if not bool(two.any()):
-        return found, doubt
+        return found, doubt, of_method
     values, known, index, distance, away = values[two], known[two], index[two], distance[two], away[two]
     nearer = values > (high * low).sqrt()[two, None]
     difference = colours.flatten(1)[:, index] - colours[:, rows[two], columns[two], None]
@@ -138,5 +146,18 @@ def _settle(inverse: Tensor, colours: Tensor, rows: Tensor, columns: Tensor, awa
     wrong = torch.sigmoid(-better.abs() / 2)  # the witnesses of a surface are not independent of each other
     decided = (farther | clearly) & result.isfinite()
     found[two] = torch.where(decided, result, math.nan)
-    doubt[two] = torch.where(decided, wrong * (other / result - 1).abs().nan_to_num(0), 0).clamp(max=1)
-    return found, doubt
+    gap = (other / result - 1).abs().nan_to_num(0)
+    doubt[two] = (wrong * gap).clamp(max=1)
+    gap = gap.masked_fill(~_has_step(values, known), 0)
+    of_method[two] = (torch.where(decided, wrong.square(), wrong) * gap).clamp(max=1)  # decided: two ways agree
+    return found, doubt, of_method
+
+
+def _has_step(values: Tensor, known: Tensor) -> Tensor:
+    """Return where the known ones of inverse depths, (n, k), are of two surfaces, not of a slope, (n,)."""
+    ordered = values.masked_fill(~known, math.inf).sort(1).values
+    places = torch.linspace(0.05, 0.95, _LEVELS, device=values.device) * (known.sum(1, keepdim=True) - 1)
+    quantiles = ordered.gather(1, places.long()).log()
+    part = (quantiles[:, _APART:] - quantiles[:, :-_APART]).amax(1)
+    whole = quantiles[:, -1] - quantiles[:, 0]
+    return (whole > math.log(_STEP)) & (part > _PART * whole)
