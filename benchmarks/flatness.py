@@ -103,7 +103,7 @@ def main() -> None:
         def result(capture: Capture, name: str = name) -> Tensor:
             return run_method(capture, name, shared, options.device)
 
-        print(row_of(read_recipe(name).label, result, floors, frames), flush=True)
+        print(row_of(read_recipe(name).label or name, result, floors, frames), flush=True)
 
 
 if __name__ == "__main__":

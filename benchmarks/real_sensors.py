@@ -11,6 +11,18 @@
 - ``rgbdd``: a phone's time-of-flight map against another sensor's: RMSE_v, angle, stated over true error.
 - ``floors``: the mean angle between the normals of a floor and their mean, before a phone and a stereo camera.
 - ``phone``: a simulated phone, mean angle between normals.
+- ``edges``: a simulated phone, at the truth's size, and two scenes of Middlebury 2014 before a simulated stereo camera:
+  the mean and the 90th percentile (p90) of the distance in pixels from the result's depth boundaries to the truth's
+  (``to``) and back (``from``), of :func:`dsr.metrics.boundaries.depth_boundary_error`. Holes are filled by the method,
+  or from the nearest pixel, and results are clipped to the truth's range.
+- ``creases``: the mean angle between normals where the truth's turn by more than 30 degrees within 6 pixels, the same
+  on the rest, both away from depth steps, and the share of the creases in %: ``ddrnet``, and ICL-NUIM before a
+  simulated structured-light camera.
+- ``flicker``: still cameras, ICL-NUIM and Middlebury before simulated structured light and stereo, five frames each:
+  the mean standard deviation of a point's depth over frames, of the input in mm, and of the results as a fraction of
+  that: of single frames, and of three frames fused before the method.
+- ``stated``: stated over true error of simulated sensors of all kinds, by source and ratio: geometric means of it, and
+  of the factor by which it is off, either way.
 - ``clean``: box means of Lucy and Plant at x4 without noise, untold: RMSE_v in 1/1000.
 - ``glass``: clear objects before a stereo camera, beside their painted twins: in the objects, the share of pixels off
   by more than 20 mm in %, the share of these stated to be off by less than 5 mm, and how well the stated error sorts
@@ -24,9 +36,11 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -34,24 +48,47 @@ import torch
 import yaml
 from captures import CAPTURES, Capture, ddrnet, ddrnet_frames, rgbdd_real, without_truth
 from flatness import FLOORS, flatness, given
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
+from torch.nn.functional import pad
 
 from dsr.data.cleargrasp import ClearGrasp
+from dsr.data.icl import ICL
+from dsr.data.middlebury import Middlebury
+from dsr.data.rendered import Procedural
 from dsr.data.stereo_board import StereoBoard
+from dsr.degradation import random_fields, random_noise
+from dsr.degradation.downsampling import scene_generator
+from dsr.degradation.noise import Kinect
+from dsr.degradation.random_degradation import Everything
+from dsr.degradation.random_fields import field_of, near_steps, window_maxima
+from dsr.geometry.surface import angle_between, depth_to_normals
 from dsr.inference import upsample_surface
+from dsr.inference.defaults import Fill
+from dsr.inference.sequences import View, fuse_views
 from dsr.methods.base import Surface
 from dsr.methods.classical.bilateral import filter_bilateral
+from dsr.metrics import functional
+from dsr.metrics.boundaries import depth_boundaries, depth_boundary_error
 from dsr.metrics.calibration import OFF, off_auc, stated_ratio
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.plane import PlaneComparison, angle, deviation
-from dsr.metrics.sensor import LARGEST_ERROR
-from dsr.sample import DepthSample
+from dsr.metrics.sensor import LARGEST_ERROR, SensorComparison
+from dsr.sample import DepthSample, Scene
 
 FILTERS = ((19, 0.03, 3.0), (41, 0.05, 9.0), (81, 0.06, 18.0))
 SURE = 0.005
 """Metres: pixels stated to be off by less are believed."""
 CONF = Path(__file__).resolve().parent.parent / "conf"
-PARTS = ("board", "ddrnet", "rgbdd", "floors", "phone", "glass", "clean")
+PARTS = ("board", "ddrnet", "rgbdd", "floors", "phone", "edges", "creases", "flicker", "stated", "glass", "clean")
+FILLED = ("edges",)
+"""Parts that measure results whose holes are filled, as what is beside a hole has no boundary."""
+CREASE, REACH, STEP = 30.0, 3, 0.02
+"""Degrees by which normals differ across a crease, pixels to either side, and a depth step between neighbours."""
+STILL, FUSED, HIDES = 5, 3, 0.05
+"""Frames of a still camera, how many are fused, and the range of a point's readings, over depth, of two surfaces."""
+DRAWS = 2
+"""Simulated sensors of each kind, of ``edges`` and ``flicker``."""
 CLEAN = ("lucy_box", "plant_box")
 Method = Callable[[DepthSample], Surface]
 
@@ -103,14 +140,18 @@ def score_capture(capture: Capture, surface: Surface) -> dict[str, float]:
 def smoothed(capture: Capture, deviation: float = 2.0) -> Capture:
     """Return a capture whose truth is smoothed by a masked Gaussian."""
     assert capture.truth is not None  # noqa: S101 - for the type checker
-    depth = capture.truth.depth[0].double().numpy()
-    known = np.isfinite(depth)
-    total, weight = (
-        cv2.GaussianBlur(each, (0, 0), deviation) for each in (np.where(known, depth, 0), known.astype(np.float64))
-    )
-    blurred = np.where(known, total / np.where(known, weight, 1), np.nan)
-    truth = capture.truth._replace(depth=torch.from_numpy(blurred)[None])
+    truth = capture.truth._replace(depth=blurred(capture.truth.depth, deviation))
     return Capture(capture.sample, capture.windows, truth, capture.noisy, capture.measured, capture.keep_holes)
+
+
+def blurred(depth: Tensor, deviation: float) -> Tensor:
+    """Return depth, (1, H, W), smoothed by a masked Gaussian."""
+    values = depth[0].double().numpy()
+    known = np.isfinite(values)
+    total, weight = (
+        cv2.GaussianBlur(each, (0, 0), deviation) for each in (np.where(known, values, 0), known.astype(np.float64))
+    )
+    return torch.from_numpy(np.where(known, total / np.where(known, weight, 1), np.nan))[None]
 
 
 class Glass(NamedTuple):
@@ -183,6 +224,174 @@ def angle_of_phone(shared: Path, method: Method) -> dict[str, float]:
     return {"angle": scores["angle"]}
 
 
+def middlebury(shared: Path, *names: str) -> list[Scene]:
+    """Return scenes of Middlebury 2014, about 740 pixels wide."""
+    source = Middlebury(str(shared / "real" / "middlebury2014"), names, size=None)
+    return [source.load(name) for name in names]
+
+
+def icl(shared: Path) -> list[Scene]:
+    """Return the frames of ICL-NUIM."""
+    source = ICL(str(shared / "real" / "icl_nuim"), "found", size=None)
+    return [source.load(name) for name in source.scenes()]
+
+
+def simulated(scene: Scene, kind: str, scale: int = 1, draw: int = 0) -> DepthSample:
+    """Return a scene with the map of a simulated sensor in whole millimetres, box means but for its noise."""
+    sensor = Everything(
+        kernels={"box": 1}, noises={kind: 1}, holes={"none": 1}, folds=0, relief=0, displaced=0, rounded=0, soft=0,
+        photo=0, textured=0, told=0,
+    )  # fmt: skip
+    height, width = (n // scale * scale for n in scene.rgb.shape[-2:])
+    sample, _ = sensor(scene.crop(0, 0, height, width), scale, scene_generator(draw, scene.name, kind, scale))
+    return replace(sample, depth_lr=(1e3 * sample.depth_lr).round().clamp(min=1) / 1e3)
+
+
+def filled(depth: Tensor) -> Tensor:
+    """Return depth, (1, H, W), with the nearest known value in each hole."""
+    places = distance_transform_edt(~depth[0].isfinite().numpy(), return_distances=False, return_indices=True)
+    return depth[:, places[0], places[1]]
+
+
+def score_edges(result: Tensor, truth: Tensor) -> dict[str, float]:
+    """Score where the depth boundaries of a result are; where the truth, (1, H, W), is unknown, neither has any."""
+    known = truth.isfinite()
+    height, width = truth.shape[-2:]
+    resized = cv2.resize(filled(result)[0].double().numpy(), (width, height), interpolation=cv2.INTER_AREA)
+    shown = torch.from_numpy(resized)[None].clamp(truth[known].min(), truth[known].max()).masked_fill(~known, torch.nan)
+    both = depth_boundaries(shown[None]), depth_boundaries(truth[None])
+    (to, back), (far_to, far_back) = (depth_boundary_error(*both, quantile) for quantile in (None, 0.9))
+    return {"to": float(to), "to_p90": float(far_to), "from": float(back), "from_p90": float(far_back)}
+
+
+def scores_of_edges(shared: Path, method: Method, count: int | None) -> dict[str, float]:
+    """Return the distances of depth boundaries, by source."""
+    phone = CAPTURES["simulated_phone"](shared)
+    assert phone.truth is not None  # noqa: S101 - for the type checker
+    rows = {"phone": [score_edges(method(phone.sample).depth, phone.truth.depth)], "stereo": []}
+    for scene in middlebury(shared, "motorcycle", "playroom")[:count]:
+        assert scene.depth is not None  # noqa: S101 - for the type checker
+        samples = [simulated(scene, "stereo", draw=draw) for draw in range(DRAWS)]
+        rows["stereo"] += [score_edges(method(each).depth, scene.depth) for each in samples]
+    return by_source(rows)
+
+
+def find_creases(truth: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the creases of a truth, (1, H, W), and the rest without them, depth steps and borders, (1, H, W) bool."""
+    normals = depth_to_normals(blurred(truth, 1.5)[None], rays[None])[0]
+    turn = torch.zeros_like(truth, dtype=torch.float64)
+    for dim in (-2, -1):
+        inside = turn.narrow(dim, REACH, turn.shape[dim] - 2 * REACH)
+        sides = [normals.narrow(dim, start, inside.shape[dim]) for start in (0, 2 * REACH)]
+        inside.copy_(torch.maximum(inside, angle_between(*sides).nan_to_num(0)))
+    beside = near_steps(truth, 1, STEP) | truth.isnan()
+    calm = window_maxima(pad(beside.double(), (1, 1, 1, 1), value=1), 2 * REACH)[..., 1:-1, 1:-1] == 0
+    return calm & (turn > CREASE), calm & (turn <= CREASE)
+
+
+def score_creases(result: Tensor, truth: Tensor, rays: Tensor, *, measured: bool) -> dict[str, float]:
+    """Score normals at creases and elsewhere; for a measured truth as :mod:`dsr.metrics.sensor` compares them."""
+    pair = SurfacePair(result[None].double(), truth[None].double(), rays[None])
+    if measured:
+        comparison = pair.derive(SensorComparison)
+        off = functional.angle(comparison.surfaces).masked_fill(~comparison.scored, torch.nan)[0]
+    else:
+        off = angle_between(*(depth_to_normals(each[None].double(), rays[None]) for each in (result, truth)))[0]
+    creases, rest = find_creases(truth.double(), rays)
+    share = 100 * float(creases.sum() / truth.isfinite().sum())
+    return {"crease": float(off[creases].nanmean()), "rest": float(off[rest].nanmean()), "share": share}
+
+
+def scores_of_creases(shared: Path, method: Method, count: int | None) -> dict[str, float]:
+    """Return the angles at creases and elsewhere, by source."""
+    rows: dict[str, list[dict[str, float]]] = {"ddrnet": [], "icl": []}
+    for name in ddrnet_frames(shared).scenes()[:count]:
+        capture = ddrnet(name, (), shared)
+        assert capture.truth is not None  # noqa: S101 - for the type checker
+        truth = capture.truth
+        result = method(capture.sample).depth
+        rows["ddrnet"].append(score_creases(result, truth.depth, truth.camera.rays(), measured=True))
+    for scene in icl(shared)[:count]:
+        assert scene.depth is not None  # noqa: S101 - for the type checker
+        seen = Kinect()(scene.depth, scene_generator(0, scene.name)).float()
+        result = method(without_truth(scene.name, scene.rgb, seen, scene.camera)).depth
+        rows["icl"].append(score_creases(result, scene.depth, scene.camera.rays(), measured=False))
+    return by_source(rows)
+
+
+def still(scene: Scene, kind: str, draw: int) -> Iterator[DepthSample]:
+    """Yield the frames of a still camera: one sensor, whose constants are drawn once, and new fields of noise."""
+    for frame in range(STILL):
+        fresh = scene_generator(draw, scene.name, kind, "frame", frame)
+
+        def anew(like: Tensor, sigma: float | tuple[float, float], _: object, fresh: torch.Generator = fresh) -> Tensor:
+            return field_of(like, sigma, fresh)
+
+        with patch.object(random_fields, "field_of", anew), patch.object(random_noise, "field_of", anew):
+            yield simulated(scene, kind, draw=draw)
+
+
+def score_flicker(frames: Sequence[DepthSample], method: Method) -> dict[str, float]:
+    """Score how still the results of a still camera are, see the module; mm is that of the input."""
+    views = [View(each.depth_lr, each.camera_lr, np.eye(4)) for each in frames]
+    given_maps = torch.stack([each.depth_lr for each in frames])
+    single = torch.stack([method(each).depth for each in frames])
+    fused = []
+    for start in range(STILL - FUSED + 1):
+        near = views[start : start + FUSED]
+        middle = near.pop(FUSED // 2)
+        depth_lr = fuse_views(middle, near).depth
+        fused.append(method(replace(frames[start + FUSED // 2], depth_lr=depth_lr)).depth)
+    edge = FUSED // 2
+    pairs = {"single": (single, given_maps), "fused": (torch.stack(fused), given_maps[edge:-edge])}
+    calm = given_maps.amax(dim=0) - given_maps.amin(dim=0) < HIDES * given_maps.amin(dim=0)  # NaN is not
+    static = calm & torch.cat((single, pairs["fused"][0])).isfinite().all(dim=0)
+    means = {name: [float(each.double().std(dim=0)[static].mean()) for each in pair] for name, pair in pairs.items()}
+    return {"mm": 1e3 * means["single"][1]} | {name: now / before for name, (now, before) in means.items()}
+
+
+def scores_of_flicker(shared: Path, method: Method, count: int | None) -> dict[str, float]:
+    """Return the flicker of still cameras, by kind of noise, as geometric means."""
+    scenes = [icl(shared)[0], *middlebury(shared, "piano")][:count]
+    rows = {
+        kind: [score_flicker(list(still(each, kind, draw)), method) for each in scenes for draw in range(DRAWS)]
+        for kind in ("structured", "stereo")
+    }
+    return by_source(rows, geometric=True)
+
+
+def scores_of_stated(shared: Path, method: Method, count: int | None) -> dict[str, float]:
+    """Return stated over true errors, by source and ratio, as geometric means; none of a method that states none."""
+    random_scenes = Procedural(3, seed=1)
+    sources = {
+        "middlebury": middlebury(shared, "motorcycle", "playroom"),
+        "icl": icl(shared),
+        "procedural": [random_scenes.load(name) for name in random_scenes.scenes()],
+    }
+    rows: dict[str, list[dict[str, float]]] = {}
+    for name, scenes in sources.items():
+        for scale in (1, 4):
+            found = rows.setdefault(f"{name}_x{scale}", [])
+            for sample in (simulated(each, kind, scale) for each in scenes[:count] for kind in random_noise.NOISES):
+                surface = method(sample)
+                if surface.depth_error is None:
+                    return {}
+                assert sample.depth is not None  # noqa: S101 - for the type checker
+                ratio = float(stated_ratio(surface.depth_error, (surface.depth - sample.depth).abs()))
+                found.append({"": ratio, "off": max(ratio, 1 / ratio)})
+    return by_source(rows, geometric=True)
+
+
+def by_source(rows: Mapping[str, Sequence[dict[str, float]]], *, geometric: bool = False) -> dict[str, float]:
+    """Return the means of each source's rows, with its name before theirs."""
+    found = {}
+    for source, each in rows.items():
+        logs = [{key: float(np.log(value)) for key, value in row.items()} for row in each] if geometric else each
+        for key, value in (mean(logs) if logs else {}).items():
+            found[f"{source}_{key}".rstrip("_")] = float(np.exp(value)) if geometric else value
+    return found
+
+
 def measure(part: str, method: Method, shared: Path, count: int | None) -> dict[str, float]:
     """Return the scores of a method in one part, means over its frames."""
     if part == "board":
@@ -202,6 +411,12 @@ def measure(part: str, method: Method, shared: Path, count: int | None) -> dict[
     whole = {"floors": angles_of_floors, "phone": angle_of_phone, "clean": scores_of_clean}
     if part in whole:
         return whole[part](shared, method)
+    some = {
+        "edges": scores_of_edges, "creases": scores_of_creases, "flicker": scores_of_flicker,
+        "stated": scores_of_stated,
+    }  # fmt: skip
+    if part in some:
+        return some[part](shared, method, count)
     return mean([score_glass(each, method(each.sample)) for each in glasses(shared)[:count]])
 
 
@@ -216,11 +431,11 @@ def filtered(sample: DepthSample, window: int, of_depth: float, of_place: float)
     return Surface(filter_bilateral(enlarged, window, of_depth, of_place), None, None, None)
 
 
-def upsampled(sample: DepthSample, name: str, device: str, weights: Path | None = None) -> Surface:
+def upsampled(sample: DepthSample, name: str, device: str, weights: Path | None = None, fill: Fill = "none") -> Surface:
     """Return what ``dsr upsample`` computes, for a method of :func:`with_weights` with those of its folder."""
     return upsample_surface(
         sample.rgb, sample.depth_lr, sample.camera, method=name, directories=(weights,) if weights else (),
-        device=device, fill="none",
+        device=device, fill=fill,
     )  # fmt: skip
 
 
@@ -242,11 +457,16 @@ def main() -> None:
         for each in FILTERS:
             methods[f"bilateral {each}"] = lambda sample, each=each: filtered(sample, *each)  # type: ignore[misc]
     names = [with_weights(options.weights)] if options.weights else options.methods.split(",")
-    for name in filter(None, names):
-        methods[name] = lambda sample, name=name: upsampled(sample, name, options.device, options.weights)  # type: ignore[misc]
     for part in options.only.split(","):
+        fill = "all" if part in FILLED else "none"
+        for name in filter(None, names):
+            methods[name] = lambda sample, name=name, fill=fill: upsampled(  # type: ignore[misc]
+                sample, name, options.device, options.weights, fill
+            )
         for label, method in methods.items():
             scores = measure(part, method, options.shared, options.frames)
+            if not scores:
+                continue
             print(f"{part:<8} {label:<24} " + "  ".join(f"{k} {v:.4g}" for k, v in scores.items()), flush=True)
 
 

@@ -7,7 +7,8 @@ On SimGeo's solids, rendered from seven places along a path, with the noise of a
 procedural scenes likewise, whose relief is finer than the noise; and on the six frames of DDRNet's sensor, whose poses
 are found by rigid alignment (ICP), as they have none. RMSE_v is that
 of the paper; flicker is the standard deviation over three successive results of the depth of a point, in millimetres:
-the median over the points that all three see. On DDRNet's frames the person moves, so flicker is of what ICP can align.
+the median over the points that all three see. The input is the map itself, enlarged by cubic interpolation. On DDRNet's
+frames the person moves, so flicker is of what ICP can align.
 """
 
 from __future__ import annotations
@@ -151,6 +152,12 @@ def flicker(results: Sequence[Tensor], frames: Sequence[Frame]) -> float:
     return 1e3 * float(stack.std(0)[near & stack.isfinite().all(0)].median())
 
 
+def enlarged(frame: Frame) -> Tensor:
+    """Return a frame's own map at the photo's size, (1, H, W)."""
+    size = (frame.camera.width, frame.camera.height)
+    return torch.from_numpy(cv2.resize(frame.depth_lr[0].numpy(), size, interpolation=cv2.INTER_CUBIC))[None]
+
+
 def score(result: Tensor, frame: Frame, *, measured: bool) -> float:
     """Return RMSE_v; for a measured truth over the pixels that :mod:`dsr.metrics.sensor` scores."""
     truth = frame.truth.double()
@@ -169,7 +176,10 @@ def measure(frames: Sequence[Frame], method: str, device: str, *, measured: bool
     """Return RMSE_v and flicker by the way of fusing."""
     middle = range((len(frames) - RESULTS) // 2, (len(frames) - RESULTS) // 2 + RESULTS)
     singles = [upsample_surface(f.rgb, f.depth_lr, f.camera, method=method, device=device) for f in frames]
-    ways: dict[str, list[Tensor]] = {"1 frame": [singles[place].depth for place in middle]}
+    ways: dict[str, list[Tensor]] = {
+        "input": [enlarged(frames[place]) for place in middle],
+        "1 frame": [singles[place].depth for place in middle],
+    }
     for count in (3, 5):
         groups = [window(frames, place, count) for place in middle]
         ways[f"{count} frames, before"] = [before(group, method, device) for group in groups]

@@ -129,3 +129,15 @@ def test_pairs_have_their_published_rows(shared: Path, tmp_path: Path) -> None:
     rows = ("ddrnet raw", "iphone_lidar", "books raw")
     assert {name: measured[name] for name in rows} == {name: expected[name] for name in rows}
     assert measured["rendered"][0] == "8"
+
+
+def test_real_sensors_have_a_row_of_creases_for_each_method(shared: Path) -> None:
+    arguments = ("--only", "creases", "--frames", "1", "--methods", "nearest")
+    printed = run_benchmark("real_sensors.py", "--shared", str(shared), *arguments).splitlines()
+    assert [line.split()[:2] for line in printed] == [["creases", "input"], ["creases", "nearest"]]
+    raw, result = (
+        {name: float(value) for name, value in re.findall(r"  (\w+) ([\d.]+)", line[24:])} for line in printed
+    )
+    shares = ("ddrnet_share", "icl_share")
+    assert all(3 < raw[name] < 10 and raw[name] == result[name] for name in shares)
+    assert all(0 < result[name] < 90 for name in result)

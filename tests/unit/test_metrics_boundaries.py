@@ -125,8 +125,13 @@ def test_boundary_error_is_a_distance() -> None:
     found, true = np.zeros((40, 60)), np.zeros((40, 60))
     true[:, 30], found[:, 33], found[:, 45] = 1, 1, 1  # the second is of no true boundary
     assert [each.item() for each in boundaries.depth_boundary_error(_mask(found), _mask(true))] == [3, 3]
-    found[:, 33] = 0
+    found[:4, 33], found[:4, 29] = 0, 1  # a tenth of it
+    for quantile in (0, 0.5, 1):
+        errors = boundaries.depth_boundary_error(_mask(found), _mask(true), quantile)
+        assert [each.item() for each in errors] == ([1, 1] if quantile == 0 else [3, 3])
+    found[:4, 29] = found[:, 33] = 0
     assert [each.item() for each in boundaries.depth_boundary_error(_mask(found), _mask(true))] == [10, 10]
+    assert [each.item() for each in boundaries.depth_boundary_error(_mask(found), _mask(true), 0.9)] == [10, 10]
     found[0, 39] = 1  # completeness has no limit
     accuracy, completeness = boundaries.depth_boundary_error(_mask(found), _mask(true))
     assert accuracy.item() == 9
