@@ -1,5 +1,6 @@
 """Frames that vote: less noise, occlusions and movement left out, holes filled by agreement."""
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -54,6 +55,20 @@ def test_five_frames_have_less_than_half_the_noise_and_their_deviation_says_so()
     assert float(after) < 0.45 * float(before)
     assert float(fused.deviation[inner].mean()) == pytest.approx(float(after), rel=0.5)
     assert float((fused.depth - truth)[inner].mean().abs()) < 0.005
+
+
+def test_noise_that_neighbouring_pixels_share_is_averaged_over_frames():
+    camera, random = Camera.centred(320, 240, 300.0), np.random.default_rng(0)
+    wall = 0.4 + 0.0003 * np.mgrid[:240, :320][1]
+    frames = []
+    for _ in range(5):
+        waves = cv2.GaussianBlur(random.standard_normal(wall.shape), (0, 0), 5)
+        depth = 1 / (wall + 0.008 * waves / waves.std())  # a standard deviation of about 2 %
+        frames.append(View(torch.from_numpy(np.round(1e3 * depth) / 1e3)[None], camera, np.eye(4)))
+    fused = fuse_views(frames[0], frames[1:])
+    before, after = (float((each.depth[0].reciprocal() - torch.from_numpy(wall)).std()) for each in (frames[0], fused))
+    assert after < 0.55 * before
+    assert float((fused.votes == 5).double().mean()) > 0.9
 
 
 def test_surfaces_that_hide_each_other_do_not_mix():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from dsr.data.rendered import Procedural
 from dsr.geometry.camera import Camera
-from dsr.inference import select, upsample_surface
+from dsr.inference import Selection, select, upsample_surface
 from dsr.inference.working_size import find_noise, limit_to_noise, reduce_by_medians, working_size_of
 from dsr.methods.base import MapNoise
 from dsr.methods.recipe import Run, read_recipe
@@ -109,6 +110,45 @@ def test_evaluation_works_on_a_sensor_map_at_the_size_that_upsample_chooses() ->
         assert torch.equal(found, wanted)
     assert select(read_recipe("facets"), 1).direct
     assert select(read_recipe("facets", {"noise": 0}), 1, measured=True).direct
+
+
+def test_notes_of_an_evaluation_name_a_smaller_size_only() -> None:
+    camera, rgb = Camera.centred(SIZE[1], SIZE[0], 600.0), torch.full((3, *SIZE), 0.5)
+    method = select(read_recipe("facets"), 1, measured=True).build(Run())
+    notes = [method.describe(DepthSample("set", "room", rgb, noisy(width), camera, camera, 1)) for width in (20, 3)]
+    assert notes == ["480 x 640 depth to 480 x 640 by facets x1, worked on at 1/8", ""]
+
+
+def test_weights_of_a_sensor_map_belong_to_the_run(tmp_path: Path) -> None:
+    files = select(read_recipe("facets"), 1, measured=True).files()
+    assert {"facets_x2", "facets_x4", "facets_x8", "facets_x16"} <= {file.stem for file in files}
+    own = tmp_path / "own.safetensors"
+    shutil.copyfile(next(file for file in files if file.stem == "facets_x2"), own)
+    selected = select(read_recipe("facets"), 1, own, measured=True)
+    assert selected.files() == [own]
+    assert not selected.direct
+
+
+def test_errors_of_correlated_noise_are_limited_at_the_map_s_own_size() -> None:
+    depth, camera = noisy(8.5, 0.002), Camera.centred(SIZE[1], SIZE[0], 600.0)
+    noise = find_noise(depth)
+    assert noise is not None
+    surface = upsample_surface(torch.full((3, *SIZE), 0.5), depth, camera)
+    assert surface.noise is not None
+    assert surface.noise.reduced == 1
+    assert surface.depth_error is not None
+    stated = float((surface.depth_error / surface.depth**2).nanmedian())
+    left = 0.36 * noise.deviation / noise.distance**2
+    assert stated < 1.18 * left  # 1.26 of it is what the network states
+
+
+def test_evaluated_method_that_states_no_errors_has_none() -> None:
+    camera = Camera.centred(48, 36, 50.0)
+    depth = 2 + torch.linspace(0, 1, 48, dtype=torch.float64).expand(1, 36, 48)
+    sample = DepthSample("set", "hall", torch.full((3, 36, 48), 0.5), depth, camera, camera, 1)
+    surface = Selection(read_recipe("msg_v"), 1, direct=False).build(Run()).surface(sample)
+    assert surface.depth_error is None
+    assert surface.depth.dtype == torch.float64
 
 
 def test_waves_of_a_sensor_are_averaged_and_size_can_be_chosen() -> None:

@@ -236,7 +236,7 @@ def _distinguish(runs: Sequence[Run]) -> list[Run]:
 
 
 def _by_truth(runs: Sequence[Run]) -> list[Run]:
-    """Append a hash of the ground truth to the data set's name of runs that have different ones for the same scenes.
+    """Mark runs that have different ground truths for the same scenes, by its hash after the data set's name.
 
     Example: "garden (truth 5f3c01ab)".
     """

@@ -1,4 +1,4 @@
-"""Check whether the poses of frames fit their depth maps, or would under another convention of poses.
+"""Check whether the poses of frames fit their depth maps, or would under another convention or unit.
 
 The points of one depth map are moved into the view of another: where they see the same surfaces, the depths agree. That
 is measured under the poses as given, under each of :data:`READINGS`, and without any motion, which shows how

@@ -54,7 +54,7 @@ _SAME_SURFACE = 0.02
 
 @dataclass(frozen=True)
 class Displacement:
-    """The mapping from pixels of a depth map to those of the photo: p -> c + scale (p - c) + (right, down).
+    """Where the photo shows a point of the depth map, in pixels of the map: p -> c + scale (p - c) + (right, down).
 
     Args:
         right, down: shift from depth edges to the photo's edges, in pixels of the depth map.

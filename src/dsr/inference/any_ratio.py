@@ -23,17 +23,17 @@ from dsr.inference.plausibility import count_patches, expect_errors, find_outlie
 from dsr.inference.resizing import at_factors, at_ratio, padded, resize_nearest, size_of
 from dsr.inference.rims import Settled, settle_holes
 from dsr.inference.working_size import (
+    CORRELATED,
     enlarged_by,
     find_noise,
     find_sensor,
-    is_correlated,
     known_noise,
     left_of,
     limit_to_noise,
     reduce_by_medians,
     working_size_of,
 )
-from dsr.methods.base import InverseSurface, Method, NoiseLaw, Surface, expect_some_depth
+from dsr.methods.base import InverseSurface, MapNoise, Method, NoiseLaw, Surface, expect_some_depth
 from dsr.methods.recipe import Recipe, Run, read_recipe
 from dsr.sample import DepthSample, expect_distances
 from dsr.utils.compute_device import fast_precision, pick_device
@@ -118,7 +118,7 @@ class AnyRatio(Method):
 
         """
         size = self._working_size
-        if size not in (None, 1) and not (self._scale is None and finds_noise(self.recipe)):
+        if size not in (None, 1) and not self._may_reduce:
             raise ValueError(
                 f"working_size: expected facets without a scale, for maps that may have noise, to take {size}"
             )
@@ -127,17 +127,23 @@ class AnyRatio(Method):
         """Return the plan for a photo and a depth map of these heights and widths."""
         return plan_for(self.recipe, size, size_lr, self._scale)
 
-    def surface(self, sample: DepthSample, progress: Steps | None = None) -> Surface:
-        """Return the high-resolution depth with its expected errors, as :meth:`upsample` does."""
-        return self.upsample(sample.rgb, sample.depth_lr, sample.camera, progress)
-
     def describe(self, sample: DepthSample) -> str:
-        """Return in one line how the method is run, for a note beside the scores."""
-        return self.plan(size_of(sample.rgb), size_of(sample.depth_lr)).way
+        """Return in one line how the method is run, for a note beside the scores; nothing if it takes the map as is."""
+        planned = self.plan(size_of(sample.rgb), size_of(sample.depth_lr))
+        if not self._may_reduce:
+            return planned.way
+        inverse, _, _ = self._at_own_size(_invert(sample.depth_lr)[0], size_of(sample.rgb), planned)
+        _, factor = self._choose_size(inverse, sample.camera)
+        return f"{planned.way}, worked on at 1/{factor}" if factor > 1 else ""
 
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
         """Return the high-resolution depth, (1, H, W) in metres, NaN where missing."""
-        return self.upsample(sample.rgb, sample.depth_lr, sample.camera, progress).depth.to(sample.depth_lr)
+        return self.surface(sample, progress).depth
+
+    def surface(self, sample: DepthSample, progress: Steps | None = None) -> Surface:
+        """Return the high-resolution depth in the dtype of the sample's, with the method's own errors."""
+        surface = self.upsample(sample.rgb, sample.depth_lr, sample.camera, progress, estimate_errors=False)
+        return surface._replace(depth=surface.depth.to(sample.depth_lr))
 
     def upsample(
         self,
@@ -146,6 +152,8 @@ class AnyRatio(Method):
         camera: Camera,
         progress: Steps | None = None,
         sensor: Identified | str | None = "auto",
+        *,
+        estimate_errors: bool = True,
     ) -> Surface:
         """Upsample a depth map to the photo's size, with the expected errors.
 
@@ -162,6 +170,7 @@ class AnyRatio(Method):
                 counts disparity, and the noise of the map is correlated over 5 pixels or more, ``facets`` without a
                 scale is given how strong the noise is and that it grows with the square of the distance, unless
                 ``noise`` is set.
+            estimate_errors: whether there are expected errors for a method that states none.
 
         Returns:
             Depth, (1, H, W) float32 in metres, its expected errors, and which depth is filled in, on the device of
@@ -176,8 +185,7 @@ class AnyRatio(Method):
         planned = self.plan(size_of(rgb), size_of(depth))  # raises ValueError for sizes or a scale that cannot be used
         self.check_working_size()
         sensor = find_sensor(depth, sensor) if isinstance(sensor, str) else sensor
-        outliers = find_outliers(depth)
-        given = depth.masked_fill(outliers, torch.nan).float().reciprocal()
+        given, outliers = _invert(depth)
         inverse, factor, scale = self._at_own_size(given, size_of(rgb), planned)
         valid = (given if size_of(inverse) == size_of(rgb) else inverse).isfinite()  # but for repeated pixels
         settled, doubt = settle_holes(inverse, rgb, self._small_holes(inverse.isfinite(), camera))
@@ -187,12 +195,12 @@ class AnyRatio(Method):
                 lambda photo, view: self._upsample(photo, inverse_lr, view, factor, progress),
                 factor, rgb, inverse_lr, camera,
             )  # fmt: skip
-        elif self._scale is None and finds_noise(self.recipe):
+        elif self._may_reduce:
             found = self._at_working_size(rgb, inverse, settled, camera, sensor, progress)
         else:
             found = self._upsample(rgb, settled, camera, scale, progress)
         expect_some_depth(found.inverse, self.recipe.name)  # as good as of the depth: 0 and infinity change places
-        surface = _in_depth(found, inverse, Settled(settled, doubt), camera, sensor)
+        surface = _in_depth(found, inverse, Settled(settled, doubt), camera, sensor, estimate=estimate_errors)
         surface = surface._replace(outliers=count_patches(outliers))
         surface = self._restore_holes(surface, valid, camera)
         missing = resize_nearest(~valid, size_of(rgb)).to(surface.depth.device)
@@ -223,12 +231,7 @@ class AnyRatio(Method):
 
         The noise is that of the ``measured`` one, some of whose holes are filled in the other.
         """
-        most = max(each for each in SIZES if each == 1 or each <= _LARGEST_RATIO * inverse.shape[-1] / camera.width)
-        size = self._working_size
-        if size is not None and size > most:
-            raise ValueError(f"working_size: expected at most {most} for this map's size and the photo's, got {size}")
-        noise = find_noise(measured.reciprocal())
-        factor = size or min(1 if noise is None else working_size_of(noise.extent), most)
+        noise, factor = self._choose_size(measured, camera)
         known = None if "noise" in self.recipe.settings else known_noise(sensor, noise, factor)
         if factor == 1:
             found = self._upsample(rgb, inverse, camera, None, progress, known)
@@ -240,9 +243,18 @@ class AnyRatio(Method):
             )  # fmt: skip
             # what the network has found is of the smaller map
             found = found._replace(noise=noise and noise._replace(reduced=factor))
-        if noise is None or found.spread is None or not is_correlated(noise, factor):
+        if noise is None or found.spread is None or (factor == 1 and noise.extent < CORRELATED):
             return found
         return found._replace(spread=limit_to_noise(found.spread, noise, measured))
+
+    def _choose_size(self, inverse: Tensor, camera: Camera) -> tuple[MapNoise | None, int]:
+        """Return the noise of inverse depth, (1, h, w), and by what its size is to be divided."""
+        most = max(each for each in SIZES if each == 1 or each <= _LARGEST_RATIO * inverse.shape[-1] / camera.width)
+        size = self._working_size
+        if size is not None and size > most:
+            raise ValueError(f"working_size: expected at most {most} for this map's size and the photo's, got {size}")
+        noise = find_noise(inverse.reciprocal())
+        return noise, size or min(1 if noise is None else working_size_of(noise.extent), most)
 
     def _upsample(
         self, rgb: Tensor, inverse: Tensor, camera: Camera, scale: int | None, progress: Steps | None,
@@ -264,6 +276,11 @@ class AnyRatio(Method):
                 set_here = text.partition(":")[0] in self.recipe.settings
                 raise ValueError(text if set_here else f"method={self.recipe.name}: {text}") from error
         return self._methods[factor]
+
+    @property
+    def _may_reduce(self) -> bool:
+        """Whether the working size may be smaller than the map's."""
+        return self._scale is None and finds_noise(self.recipe)
 
     @functools.cached_property
     def _steps(self) -> Mapping[int, tuple[int, ...]]:
@@ -345,15 +362,24 @@ def upsample_surface(
     return upsampler(scale=scale, **options).upsample(rgb, depth, camera, progress, sensor)
 
 
+def _invert(depth: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the inverse of depth, (1, h, w), without the outliers; and where these are."""
+    outliers = find_outliers(depth)
+    return depth.masked_fill(outliers, torch.nan).float().reciprocal(), outliers
+
+
 def _in_depth(
-    found: InverseSurface, inverse: Tensor, settled: Settled, camera: Camera, sensor: Identified | None
-) -> Surface:
-    """Return a result as depth within what was measured and settled, with its errors or with estimated ones."""
+    found: InverseSurface, inverse: Tensor, settled: Settled, camera: Camera, sensor: Identified | None, *,
+    estimate: bool,
+) -> Surface:  # fmt: skip
+    """Return a result as depth within what was measured and settled, with its errors or, on request, estimated ones."""
     lowest = inverse.nan_to_num(nan=torch.inf).amin()
     infinite = found.inverse <= 0  # but what is NaN has no depth
     inverse_hr = torch.where(infinite, lowest.to(found.inverse.device), found.inverse)
     inverse_hr = within_measured(inverse_hr, settled.inverse)
     spread, angle = found.spread, found.angle
+    if (spread is None or angle is None) and not estimate:
+        return Surface(inverse_hr.reciprocal_())
     if spread is None or angle is None:
         spread, angle = expect_errors(inverse_hr, inverse.to(inverse_hr.device), camera)
     if bool(settled.doubt.any()):

@@ -23,7 +23,7 @@ class Selection:
     Args:
         recipe: the method, with its weights.
         scale: ratio of the photo's width to the depth map's.
-        direct: whether it is run at this scale itself; else as ``dsr upsample`` runs it, which may resize both.
+        direct: whether it is run at this scale itself; else as in ``dsr upsample``, which may resize photo and map.
 
     """
 
@@ -38,8 +38,12 @@ class Selection:
             ConfigError: one is missing.
 
         """
-        factors = {self.scale} if self.direct else {step for steps in steps_of(self.recipe).values() for step in steps}
-        return [file for factor in sorted(factors) if (file := self.recipe.weights(factor)) is not None]
+        factors: set[float] = {self.scale}
+        if not self.direct:
+            steps = steps_of(self.recipe).values()
+            factors = {step for each in steps for step in each} or set(self.recipe.computed_at)
+        found = (self.recipe.weights(factor) for factor in sorted(factors))
+        return list(dict.fromkeys(file for file in found if file is not None))
 
     def build(self, run: Run) -> Method:
         """Build the method.
@@ -68,14 +72,14 @@ def select(recipe: Recipe, scale: float, weights: Path | None = None, *, measure
     Args:
         scale: ratio of the photo's width to the depth map's.
         weights: a file of weights, or a directory with published ones; None for those that the method names.
-        measured: whether the maps are a sensor's own. Of a method without packaged weights for their ratio, those for
-            another one are taken, and one that chooses its working size by the map's noise does so, as in
-            ``dsr upsample``; of a model of downsampling, the error says that it needs weights.
+        measured: whether the maps are a sensor's own. A method that can choose its working size by the map's noise does
+            so; of one without packaged weights for their ratio, those for another one are taken. Of a model of
+            downsampling, the error says that it needs weights.
 
     """
     node = recipe.at()  # with the scale as the run names it
     choice = WeightChoice.of(node.get("weights"), scale)
-    packaged = measured and weights is None and choice.packaged is not None
-    as_upsample = packaged and (finds_noise(recipe) or not choice.exists())
+    lacking = weights is None and choice.packaged is not None and not choice.exists()
+    as_upsample = measured and (lacking or finds_noise(recipe))
     direct = recipe.abilities.takes(scale) and not as_upsample
     return Selection(recipe.with_weights(weights), scale, direct)

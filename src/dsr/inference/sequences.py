@@ -13,12 +13,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.rigid_motion import Matrix, as_rigid, relative
 from dsr.geometry.warping import source_pixels, warp_depth
+from dsr.inference.working_size import find_noise
 from dsr.methods.noise_level import estimate_sensor_noise
 
 _DEVIATIONS = 3.0
@@ -39,8 +41,8 @@ class View:
         depth: (1, h, w) orthogonal depth in metres, NaN in holes.
         camera: camera of these pixels.
         pose: transform from the camera's frame (x right, y down, z forward) to the world's, 4 x 4, metres.
-        deviation: (1, h, w) expected standard deviation of each pixel in metres; None to estimate it from the map, as
-            one number for inverse depth.
+        deviation: (1, h, w) expected standard deviation of each pixel in metres; None to estimate it, as one number for
+            the inverse depth of all views.
 
     Raises:
         ValueError: a shape is not as above, or the pose is not rigid.
@@ -98,7 +100,8 @@ def fuse_views(reference: View, neighbours: Sequence[View]) -> Fused:
         True
 
     """
-    readings = [_own(reference), *(_seen_from(reference, view) for view in neighbours)]
+    noise = _noise_of([reference, *neighbours])
+    readings = [_own(reference, noise), *(_seen_from(reference, view, noise) for view in neighbours)]
     inverse, deviation = (torch.stack(each) for each in zip(*readings, strict=True))  # (N + 1, h, w)
     centre = _most_voted(inverse, deviation)
     for _ in range(_PASSES):
@@ -115,22 +118,31 @@ def fuse_views(reference: View, neighbours: Sequence[View]) -> Fused:
     return Fused(*(each[None].to(reference.depth) for each in (depth, spread, *counts)))
 
 
-def _own(view: View) -> tuple[Tensor, Tensor]:
+def _noise_of(views: Sequence[View]) -> float:
+    """Return the median standard deviation of the inverse depth of views that state none; they are of one sensor."""
+    found = []
+    for depth in (view.depth for view in views if view.deviation is None):
+        noise = find_noise(depth)  # differs little between neighbouring pixels, where the other estimate looks
+        correlated = 0.0 if noise is None else noise.deviation / noise.distance**2
+        found.append(max(correlated, estimate_sensor_noise(depth.double().reciprocal()[None])))
+    return float(np.median(found)) if found else 0.0
+
+
+def _own(view: View, noise: float) -> tuple[Tensor, Tensor]:
     """Return a view's inverse depth and the standard deviation of it, (h, w) float64 each."""
     inverse = view.depth[0].double().reciprocal()
     inverse = inverse.masked_fill(~inverse.isfinite(), torch.nan)
     least = _LEAST_NOISE * float(inverse.nanmedian().nan_to_num(1.0))
     if view.deviation is None:
-        noise = max(estimate_sensor_noise(inverse[None, None]), least)
-        return inverse, torch.full_like(inverse, noise)
+        return inverse, torch.full_like(inverse, max(noise, least))
     return inverse, (view.deviation[0].double() * inverse.square()).clamp(min=least)
 
 
-def _seen_from(reference: View, view: View) -> tuple[Tensor, Tensor]:
+def _seen_from(reference: View, view: View, noise: float) -> tuple[Tensor, Tensor]:
     """Return another view's inverse depth and its standard deviation as the reference sees it, (h, w) each."""
     move = torch.from_numpy(relative(view.pose, reference.pose))[None]
     depth = warp_depth(view.depth[None].double().cpu(), view.camera, move, reference.camera)
-    _, deviation = _own(view)
+    _, deviation = _own(view, noise)
     u, v = source_pixels(depth, view.camera, move, reference.camera)
     rows, columns = (
         place[0].nan_to_num(0).round().long().clamp(0, n - 1)

@@ -30,7 +30,7 @@ _LARGEST_BLOCK = 16
 T = TypeVar("T", float, Tensor)
 _NOISY = 0.4
 """Standard deviation of a sensor's disparity in its steps, at least; rounding alone has 0.29."""
-_CORRELATED = 5.0
+CORRELATED = 5.0
 """Pixels over which noise is correlated that a network takes for shape in part."""
 _WINDOWS = (8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384)
 """Pixels."""
@@ -179,14 +179,9 @@ def known_noise(sensor: Identified | None, noise: MapNoise | None, factor: int) 
 
     """
     counts = sensor is not None and sensor.sensor.stereo_constant is not None
-    if not counts or noise is None or noise.extent < max(_CORRELATED, factor):
+    if not counts or noise is None or noise.extent < max(CORRELATED, factor):
         return None
     return noise.deviation / noise.distance**2, 2.0
-
-
-def is_correlated(noise: MapNoise, factor: int) -> bool:
-    """Return whether noise is correlated over more pixels than a network finds, at a map's size over a factor."""
-    return factor > 1 or noise.extent >= _CORRELATED
 
 
 def working_size_of(extent: float) -> int:
@@ -217,9 +212,9 @@ def left_of(deviation: T) -> T:
 
 
 def limit_to_noise(spread: Tensor, noise: MapNoise, measured: Tensor) -> Tensor:
-    """Return expected relative errors, (1, H, W), that are no more than the noise of the map leaves, where all is calm.
+    """Return expected relative errors, (1, H, W), reduced to what the noise of the map leaves, where all is calm.
 
-    At a smaller size a network takes the noise for that of neighbours which it knows nothing of.
+    A network that does not know over how many pixels noise is correlated expects more of it to remain.
 
     Args:
         spread: of the network.

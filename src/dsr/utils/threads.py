@@ -1,4 +1,4 @@
-"""OpenMP threads are ended before a fork and restarted on demand, since a forked process would hang without them.
+"""OpenMP threads are ended before a fork and restarted on demand; a forked process would wait for those it lacks.
 
 GNU's OpenMP, that of torch on Linux, needs this; others notice a fork. ``import dsr`` imports this module, so that it
 holds for dsr's own workers, those of data loaders and the user's.

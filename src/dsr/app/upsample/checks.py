@@ -70,7 +70,7 @@ def check_together(
 
 
 def alike(pairs: Sequence[Pair]) -> Iterable[list[Pair]]:
-    """Group frames that are alike, which are those of one folder, in their order."""
+    """Group frames by folder, in their order; one that is alone in its folder, with those of the folders beside it."""
     folders = Counter(pair.depth.parent for pair in pairs)
     groups: dict[Path, list[Pair]] = {}
     for pair in pairs:
