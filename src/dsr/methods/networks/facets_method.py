@@ -31,6 +31,8 @@ _TOLERANCE = 0.02
 """A map is taken for one of the photo's own size up to this relative difference."""
 CAUTION = 1.1
 """Measured errors over expected ones on rendered scenes that are not trained on, see ``benchmarks/confidence.py``."""
+CAUTION_IF_CLEAN = 0.85
+"""The same of the weights for box means without noise."""
 _PER_DEGREE = 0.012
 """Relative error of depth in holes that the network does not expect, per degree from the nearest measured pixel. On
 Middlebury 2014 and ICL-NUIM with holes cut into them it expects 2 % everywhere, and depth is off by 3 % at 0.5 to 1
@@ -98,9 +100,11 @@ class AnyMap(Method):
             raise ValueError(f"noise_growth: expected noise with it, got {noise_growth} and no noise")
         if max_error is not None and not max_error > 0:
             raise ValueError(f"max_error: expected a positive share of the depth, got {max_error}")
+        self._caution = CAUTION
         if isinstance(weights, str | Path):
-            for_clean = cleanly and (kernel, edges) == ("box", "sharp")
-            weights = _load(Path(weights), model, precision, networks, clean=for_clean)
+            for_clean = clean_weights(Path(weights)) if cleanly and (kernel, edges) == ("box", "sharp") else None
+            self._caution = CAUTION if for_clean is None else CAUTION_IF_CLEAN
+            weights = _load(for_clean or Path(weights), model, precision, networks)
         self._max_error = max_error
         self._net = weights.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs
         self._device, self._smooth = torch.device(device), smooth
@@ -145,7 +149,7 @@ class AnyMap(Method):
         result = resize_inverse_depth(answer.disparity[inside][0], (size[0], size[1]))
         depth = torch.where(result > 0, result, torch.nan).reciprocal().to(sample.depth_lr.device)
         errors = (_resize(each[inside], (size[0], size[1]))[0].to(depth) for each in (answer.spread, answer.angle))
-        spread, angle = (CAUTION * each for each in errors)
+        spread, angle = (self._caution * each for each in errors)
         focal = sample.camera_lr.fx
         more = (each.to(depth) for each in (*_rounding(inverse, focal), _guessing(inverse, focal)))
         rounding, tilt, guessing = (_resize(each, (size[0], size[1]))[0] for each in more)
@@ -166,11 +170,8 @@ class AnyMap(Method):
         return self._net.answer(rgb, inverse, None if noise is None else noise.float(), facts, progress)
 
 
-def _load(
-    path: Path, model: str, precision: Precision, networks: Mapping[str, type[DisparityNetwork]], *, clean: bool
-) -> FacetsUNet:
-    """Return the network of a file, or of the one for clean maps of box means that the file names."""
-    path = (clean and clean_weights(path)) or path
+def _load(path: Path, model: str, precision: Precision, networks: Mapping[str, type[DisparityNetwork]]) -> FacetsUNet:
+    """Return the network of a file."""
     net = load_network(path, networks, None, model)
     if not isinstance(net, FacetsUNet):
         raise ValueError(
