@@ -15,8 +15,8 @@ from torch import Tensor
 from dsr.data.rendered import Procedural
 from dsr.geometry.camera import Camera
 from dsr.inference import Selection, select, upsample_surface
-from dsr.inference.working_size import find_noise, limit_to_noise, reduce_by_medians, working_size_of
-from dsr.methods.base import MapNoise
+from dsr.inference.working_size import find_noise, limit_to_noise, mix_where_calm, reduce_by_medians, working_size_of
+from dsr.methods.base import InverseSurface, MapNoise
 from dsr.methods.recipe import Run, read_recipe
 from dsr.sample import DepthSample
 from dsr.utils.compute_device import fast_precision
@@ -149,6 +149,17 @@ def test_evaluated_method_that_states_no_errors_has_none() -> None:
     surface = Selection(read_recipe("msg_v"), 1, direct=False).build(Run()).surface(sample)
     assert surface.depth_error is None
     assert surface.depth.dtype == torch.float64
+
+
+def test_result_is_the_smoother_one_where_both_are_calm() -> None:
+    one, two = torch.full((1, 8, 8), 0.5), torch.full((1, 8, 8), 0.6)
+    spread = torch.full((1, 8, 8), 0.01)
+    spread[0, 0, 0] = 0.1
+    found, smoother = (InverseSurface(each, spread, torch.full_like(one, 5.0)) for each in (one, two))
+    mixed = mix_where_calm(found, smoother, torch.ones(1, 4, 4))
+    assert float(mixed.inverse[0, 0, 0]) == 0.5
+    assert torch.equal(mixed.inverse[0, 1:], two[0, 1:])
+    assert mix_where_calm(found, InverseSurface(two), torch.ones(1, 4, 4)) is found
 
 
 def test_waves_of_a_sensor_are_averaged_and_size_can_be_chosen() -> None:

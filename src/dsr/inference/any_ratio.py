@@ -30,6 +30,7 @@ from dsr.inference.working_size import (
     known_noise,
     left_of,
     limit_to_noise,
+    mix_where_calm,
     reduce_by_medians,
     working_size_of,
 )
@@ -237,10 +238,17 @@ class AnyRatio(Method):
             found = self._upsample(rgb, inverse, camera, None, progress, known)
         else:
             inverse_lr = reduce_by_medians(pad_inverse_depth(inverse, factor), factor)
+            ratio = factor * camera.width / inverse.shape[-1]
             found = padded(
                 lambda photo, view: self._upsample(photo, inverse_lr, view, None, progress, known),
-                factor * camera.width / inverse.shape[-1], rgb, inverse_lr, camera,
+                ratio, rgb, inverse_lr, camera,
             )  # fmt: skip
+            if ratio > USUAL_SCALE:  # weights for larger ratios leave more waves on calm surfaces
+                smoother = padded(
+                    lambda photo, view: at_ratio(self._method(USUAL_SCALE), photo, inverse_lr, view, None, known),
+                    ratio, rgb, inverse_lr, camera,
+                )  # fmt: skip
+                found = mix_where_calm(found, smoother, measured)
             # what the network has found is of the smaller map
             found = found._replace(noise=noise and noise._replace(reduced=factor))
         if noise is None or found.spread is None or (factor == 1 and noise.extent < CORRELATED):

@@ -23,7 +23,7 @@ from torch.nn import functional
 from dsr.degradation.sensors import Identified, identify
 from dsr.inference.defaults import SIZES
 from dsr.inference.resizing import resize_nearest, size_of
-from dsr.methods.base import MapNoise, NoiseLaw
+from dsr.methods.base import InverseSurface, MapNoise, NoiseLaw
 
 _LARGEST_BLOCK = 16
 
@@ -223,10 +223,33 @@ def limit_to_noise(spread: Tensor, noise: MapNoise, measured: Tensor) -> Tensor:
 
     """
     left = left_of(noise.deviation) * measured.nanmedian().to(spread)
+    share, median = _find_calm(spread, measured)
+    return spread * torch.lerp(torch.ones_like(spread), (left / median).clamp(max=1).expand_as(spread), share)
+
+
+def mix_where_calm(found: InverseSurface, smoother: InverseSurface, measured: Tensor) -> InverseSurface:
+    """Return a result, (1, H, W), and where all is calm a smoother one; both state their errors.
+
+    Args:
+        measured: see :func:`limit_to_noise`.
+
+    """
+    if found.spread is None or smoother.spread is None or found.angle is None or smoother.angle is None:
+        return found
+    share = _find_calm(torch.maximum(found.spread, smoother.spread), measured)[0].nan_to_num(0)
+    return InverseSurface(
+        torch.lerp(found.inverse, smoother.inverse, share),
+        torch.lerp(found.spread, smoother.spread, share),
+        torch.lerp(found.angle, smoother.angle, share),
+        found.noise,
+    )
+
+
+def _find_calm(spread: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
+    """Return how calm all is by the expected relative errors, from 0 to 1, and their median over measured pixels."""
     known = resize_nearest(measured.isfinite(), size_of(spread)).to(spread.device)
     median = spread.masked_fill(~known, torch.nan).nanmedian()
-    share = ((_UNSURE - spread / median) / (_UNSURE - _CALM)).clamp(0, 1)
-    return spread * torch.lerp(torch.ones_like(spread), (left / median).clamp(max=1).expand_as(spread), share)
+    return ((_UNSURE - spread / median) / (_UNSURE - _CALM)).clamp(0, 1), median
 
 
 def _sum_up(inverse: Tensor) -> Tensor:
