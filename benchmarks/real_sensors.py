@@ -93,6 +93,7 @@ CREASE, REACH, STEP = 30.0, 3, 0.02
 STILL, FUSED, HIDES = 5, 3, 0.05
 """Frames of a still camera, how many are fused, and the range of a point's readings, over depth, of two surfaces."""
 CLEAR = {"vessel": 0.75, "ball": 0.1, "box": 0.15}
+"""Kinds of clear objects, those that are bodies, and their relative frequency."""
 CLEAR_SCENES = 12
 DRAWS = 2
 """Simulated sensors of each kind, of ``edges`` and ``flicker``."""

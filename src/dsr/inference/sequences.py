@@ -9,6 +9,7 @@ most of the frames that see something there agree on.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -63,6 +64,13 @@ class View:
             raise ValueError(f"deviation: expected shape {shape}, got {tuple(self.deviation.shape)}")
         object.__setattr__(self, "pose", as_rigid(self.pose, "pose"))
 
+    @functools.cached_property
+    def noise(self) -> float:
+        """Standard deviation of inverse depth in 1/m, estimated from the map; one frame votes on several."""
+        found = find_noise(self.depth)  # differs little between neighbouring pixels, where the other estimate looks
+        correlated = 0.0 if found is None else found.deviation / found.distance**2
+        return max(correlated, estimate_sensor_noise(self.depth.double().reciprocal()[None]))
+
 
 class Fused(NamedTuple):
     """Depth on which frames voted.
@@ -100,7 +108,8 @@ def fuse_views(reference: View, neighbours: Sequence[View]) -> Fused:
         True
 
     """
-    noise = _noise_of([reference, *neighbours])
+    estimated = [view.noise for view in (reference, *neighbours) if view.deviation is None]
+    noise = float(np.median(estimated)) if estimated else 0.0  # they are of one sensor
     readings = [_own(reference, noise), *(_seen_from(reference, view, noise) for view in neighbours)]
     inverse, deviation = (torch.stack(each) for each in zip(*readings, strict=True))  # (N + 1, h, w)
     centre = _most_voted(inverse, deviation)
@@ -116,16 +125,6 @@ def fuse_views(reference: View, neighbours: Sequence[View]) -> Fused:
     depth = centre.reciprocal()
     spread = spread.masked_fill(depth.isnan(), torch.nan)
     return Fused(*(each[None].to(reference.depth) for each in (depth, spread, *counts)))
-
-
-def _noise_of(views: Sequence[View]) -> float:
-    """Return the median standard deviation of the inverse depth of views that state none; they are of one sensor."""
-    found = []
-    for depth in (view.depth for view in views if view.deviation is None):
-        noise = find_noise(depth)  # differs little between neighbouring pixels, where the other estimate looks
-        correlated = 0.0 if noise is None else noise.deviation / noise.distance**2
-        found.append(max(correlated, estimate_sensor_noise(depth.double().reciprocal()[None])))
-    return float(np.median(found)) if found else 0.0
 
 
 def _own(view: View, noise: float) -> tuple[Tensor, Tensor]:

@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from torch import Tensor
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.pose_check import check
@@ -18,9 +17,6 @@ from dsr.io.inputs import Picture
 from dsr.io.pairs import Pair
 from dsr.io.trajectories import read_poses
 from dsr.notes import LIMITS, Assumption
-
-_Frame = tuple[Tensor, Camera, np.ndarray | None]
-"""Depth map, camera of its pixels, and pose."""
 
 
 class FrameSequence:
@@ -57,7 +53,7 @@ class FrameSequence:
         for pair in pairs:
             self.recordings.setdefault(pair.depth.parent, []).append(pair)
         self._places = {pair.name: place for folder in self.recordings.values() for place, pair in enumerate(folder)}
-        self._kept: OrderedDict[str, _Frame] = OrderedDict()
+        self._kept: OrderedDict[str, View | None] = OrderedDict()
 
     def neighbours(self, pair: Pair) -> list[Pair]:
         """Return the neighbours of a frame, the nearest first; those of its own folder that have a pose."""
@@ -99,10 +95,10 @@ class FrameSequence:
 
         def load(number: int) -> PosedMap | None:
             try:
-                depth, camera, pose = self._frame(frames[number])
+                view = self._view(frames[number])
             except (ValueError, OSError, MemoryError):  # it is reported as a frame of its own
                 return None
-            return None if pose is None else PosedMap(depth[0].double().numpy(), camera, pose)
+            return None if view is None else PosedMap(view.depth[0].double().numpy(), view.camera, view.pose)
 
         return check(len(frames), load)
 
@@ -114,20 +110,20 @@ class FrameSequence:
         others, views, failed = self.neighbours(pair), [], 0
         for other in others:
             try:
-                depth, camera, pose = self._frame(other)
+                view = self._view(other)
             except (ValueError, OSError):  # it is reported as a frame of its own
                 failed += 1
                 continue
-            if pose is not None:
-                views.append(View(depth, camera, pose))
+            if view is not None:
+                views.append(view)
         return vote(picture, views, len(others), failed)
 
-    def _frame(self, pair: Pair) -> _Frame:
-        """Return what a neighbour contributes; the latest ones are kept."""
+    def _view(self, pair: Pair) -> View | None:
+        """Return what a neighbour contributes, nothing without a pose; the latest ones are kept."""
         if pair.name not in self._kept:
             picture = self._read(pair)
             pose = picture.pose if self._poses is None else self._poses.get(pair.name)
-            self._kept[pair.name] = (picture.depth_lr, camera_lr(picture), pose)
+            self._kept[pair.name] = None if pose is None else View(picture.depth_lr, camera_lr(picture), pose)
             while len(self._kept) > self._count + 2:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(pair.name)
