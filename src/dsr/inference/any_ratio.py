@@ -248,7 +248,7 @@ class AnyRatio(Method):
                     lambda photo, view: at_ratio(self._method(USUAL_SCALE), photo, inverse_lr, view, None, known),
                     ratio, rgb, inverse_lr, camera,
                 )  # fmt: skip
-                found = mix_where_calm(found, smoother, measured)
+                found = mix_where_calm(found, smoother, measured, reach=round(ratio / 4))
             # what the network has found is of the smaller map
             found = found._replace(noise=noise and noise._replace(reduced=factor))
         if noise is None or found.spread is None or (factor == 1 and noise.extent < CORRELATED):

@@ -227,16 +227,20 @@ def limit_to_noise(spread: Tensor, noise: MapNoise, measured: Tensor) -> Tensor:
     return spread * torch.lerp(torch.ones_like(spread), (left / median).clamp(max=1).expand_as(spread), share)
 
 
-def mix_where_calm(found: InverseSurface, smoother: InverseSurface, measured: Tensor) -> InverseSurface:
+def mix_where_calm(found: InverseSurface, smoother: InverseSurface, measured: Tensor, reach: int) -> InverseSurface:
     """Return a result, (1, H, W), and where all is calm a smoother one; both state their errors.
 
     Args:
         measured: see :func:`limit_to_noise`.
+        reach: pixels of the result over which the one turns into the other.
 
     """
     if found.spread is None or smoother.spread is None or found.angle is None or smoother.angle is None:
         return found
     share = _find_calm(torch.maximum(found.spread, smoother.spread), measured)[0].nan_to_num(0)
+    window = 2 * reach + 1  # a mean of minima is nowhere more than the share itself
+    share = -functional.max_pool2d(-share, window, stride=1, padding=reach)
+    share = functional.avg_pool2d(share, window, stride=1, padding=reach, count_include_pad=False)
     return InverseSurface(
         torch.lerp(found.inverse, smoother.inverse, share),
         torch.lerp(found.spread, smoother.spread, share),
