@@ -152,14 +152,15 @@ def test_evaluated_method_that_states_no_errors_has_none() -> None:
 
 
 def test_result_is_the_smoother_one_where_both_are_calm() -> None:
-    one, two = torch.full((1, 8, 8), 0.5), torch.full((1, 8, 8), 0.6)
-    spread = torch.full((1, 8, 8), 0.01)
-    spread[0, 0, 0] = 0.1
+    one, two = torch.full((1, 8, 16), 0.5), torch.full((1, 8, 16), 0.6)
+    spread = torch.full((1, 8, 16), 0.01)
+    spread[..., :3] = 0.1
     found, smoother = (InverseSurface(each, spread, torch.full_like(one, 5.0)) for each in (one, two))
-    mixed = mix_where_calm(found, smoother, torch.ones(1, 4, 4))
-    assert float(mixed.inverse[0, 0, 0]) == 0.5
-    assert torch.equal(mixed.inverse[0, 1:], two[0, 1:])
-    assert mix_where_calm(found, InverseSurface(two), torch.ones(1, 4, 4)) is found
+    mixed = mix_where_calm(found, smoother, torch.ones(1, 4, 8), reach=2).inverse
+    assert torch.equal(mixed[..., :3], one[..., :3])
+    assert torch.equal(mixed[..., 7:], two[..., 7:])
+    assert bool((mixed[..., 2:7].diff() > 0).all())  # gradually, away from what is unsure
+    assert mix_where_calm(found, InverseSurface(two), torch.ones(1, 4, 8), reach=2) is found
 
 
 def test_waves_of_a_sensor_are_averaged_and_size_can_be_chosen() -> None:
