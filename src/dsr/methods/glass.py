@@ -1,0 +1,199 @@
+"""Glass, mirrors and gloss: where the depth of a sensor is probably not that of the surface which the photo shows.
+
+A sensor sees through clear objects, and mirrors deceive it; its depth there is smooth, and looks right. What gives it
+away is that photo and map contradict each other: the map has holes amid a surface, away from depth steps, and the photo
+texture, rims and highlights, beside which a sensor loses nothing elsewhere. :class:`GlassFinder` knows each pixel by 20
+such features, none of which depends on the unit of depth, the exposure or the strength of the noise, and has two small
+layers. It was trained on simulated objects alone (:mod:`dsr.degradation.glass`) by ``scripts/train_glass.py``.
+
+A larger network that sees photo and map as they are, a U-net of 1.1 million parameters, learnt the simulation and found
+nothing in real photos.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+
+import safetensors.torch
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from dsr.methods.weights import packaged_weights
+
+GRID = 320
+"""Pixels of the longer side of the grid on which features are computed."""
+FEATURES = 20
+_LAYERS = (32, 16)
+_HOLES, _AMID, _TEXTURE, _ROUGHNESS, _NEAR = (2, 4, 8, 16), (4, 8, 16), (3, 6, 12), (3, 8), (3, 8, 16)
+"""Pixels of the grid: standard deviations of means of holes, of holes amid a surface, of the photo's texture and of the
+map's roughness; and reaches of depth steps."""
+_AMID_REACH, _AMID_STEP = 16, 0.06
+"""A hole is amid a surface if the logarithms of the depths so near differ by less."""
+_BEHIND = 0.06
+"""Relative error of depth that was measured through a clear object."""
+_PERHAPS, _PROBABLY = 0.1, 0.3
+"""Probabilities of glass from which it is expected in part, and in full: those of simulated objects, in the scenes of
+whose training they are more common than elsewhere."""
+
+
+class GlassFinder(nn.Module):
+    """The probability that measured depth is wrong as in glass, by features of a pixel.
+
+    Attributes:
+        middle, scale: (FEATURES,) what features are normalised by.
+
+    """
+
+    middle: Tensor
+    scale: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        sizes = (FEATURES, *_LAYERS)
+        layers: list[nn.Module] = []
+        for inside, outside in itertools.pairwise(sizes):
+            layers += [nn.Linear(inside, outside), nn.ReLU()]
+        self.layers = nn.Sequential(*layers, nn.Linear(sizes[-1], 1))
+        self.register_buffer("middle", torch.zeros(FEATURES))
+        self.register_buffer("scale", torch.ones(FEATURES))
+
+    def normalise(self, features: Tensor) -> Tensor:
+        """Return features, (..., FEATURES), in the range of those of the training."""
+        return ((features - self.middle) / self.scale).clamp(-4, 4)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Return logits, (...), of normalised features, (..., FEATURES)."""
+        return self.layers(features)[..., 0]
+
+
+@functools.cache
+def glass_finder(device: torch.device) -> GlassFinder:
+    """Return the trained one, on a device."""
+    path = packaged_weights("glass")
+    if path is None:
+        raise FileNotFoundError("weights/glass.safetensors: there is no such file; install dsr again")
+    finder = GlassFinder().eval().requires_grad_(False)
+    finder.load_state_dict(safetensors.torch.load(path.read_bytes()))
+    return finder.to(device)
+
+
+def probability_of_glass(rgb: Tensor, inverse: Tensor) -> Tensor:
+    """Return how probable it is that depth is not that of the surface which the photo shows, as in glass.
+
+    Args:
+        rgb: (3, H, W) the photo, in [0, 1].
+        inverse: (1, h, w) inverse depth as measured, in 1/m, of the same view; NaN in holes.
+
+    Returns:
+        (1, H, W) float32, 0 without a measured pixel.
+
+    Example:
+        >>> import torch
+        >>> from dsr.methods.glass import probability_of_glass
+        >>> wall = probability_of_glass(torch.rand(3, 48, 64), torch.full((1, 24, 32), 0.5))
+        >>> wall.shape, bool(wall.max() < 0.1)
+        (torch.Size([1, 48, 64]), True)
+
+    """
+    height, width = rgb.shape[-2:]
+    if not bool(inverse.isfinite().any()):
+        return rgb.new_zeros(1, height, width)
+    finder = glass_finder(rgb.device)
+    features = glass_features(rgb, inverse.to(rgb))
+    found = finder(finder.normalise(features.movedim(0, -1))).sigmoid()
+    return _resize(found[None], (height, width))
+
+
+def expect_glass(rgb: Tensor, inverse: Tensor) -> Tensor:
+    """Return the relative error of depth to expect because of glass, (1, H, W); see :func:`probability_of_glass`."""
+    share = (probability_of_glass(rgb, inverse) - _PERHAPS) / (_PROBABLY - _PERHAPS)
+    return _BEHIND * share.clamp(0, 1)
+
+
+def glass_features(rgb: Tensor, inverse: Tensor, grid: int = GRID) -> Tensor:
+    """Return the features of a photo, (3, H, W), and inverse depth, (1, h, w) with a known pixel: (FEATURES, g, g').
+
+    Args:
+        rgb, inverse: see :func:`probability_of_glass`.
+        grid: pixels of the longer side of the result.
+
+    """
+    height, width = rgb.shape[-2:]
+    size = tuple(max(16, round(n * grid / max(height, width))) for n in (height, width))
+    photo = functional.interpolate(rgb[None].float(), size, mode="bilinear", antialias=True, align_corners=False)[0]
+    logs, weight = _on_grid(inverse.float(), size)
+    known = weight > 0.5
+    holes = 1 - weight
+    steps = {reach: _range_around(logs, known, reach) for reach in {*_NEAR, _AMID_REACH}}
+    around = steps[_AMID_REACH]
+    amid = holes * ((around >= 0) & (around < _AMID_STEP))
+    close = holes * ((steps[8] >= 0) & (steps[8] < 2 / 3 * _AMID_STEP))
+    grey = photo.mean(dim=0, keepdim=True)
+    texture = [_blur((grey - _blur(grey, 1.5)).square(), each).clamp(min=0).sqrt() + 1e-3 for each in _TEXTURE]
+    covered = known.to(logs)
+    smooth = _blur(logs * covered, 2) / _blur(covered, 2).clamp(min=1e-3)
+    rough = ((logs - smooth) * covered).clamp(-0.05, 0.05).square()
+    roughness = [
+        (_blur(rough, each) / _blur(covered, each).clamp(min=0.05)).clamp(min=0).sqrt() + 1e-4 for each in _ROUGHNESS
+    ]
+    usual = roughness[1][known].median()
+    colourful = photo.amax(dim=0, keepdim=True) - photo.amin(dim=0, keepdim=True)
+    found = [
+        *(_blur(holes, each) for each in _HOLES),
+        *(_blur(amid, each) for each in _AMID),
+        _blur(close, 4),
+        *((each / texture[1].median()).log() / 2 for each in texture),
+        *((each / usual).log() / 2 for each in roughness),
+        *(steps[reach].clamp(0, 1).sqrt() for reach in _NEAR),
+        grey - _blur(grey, 6),
+        grey - _blur(grey, 16),
+        colourful - _blur(colourful, 16),
+        3 * (photo - _blur(photo, 12)).abs().mean(dim=0, keepdim=True),
+    ]
+    return torch.cat(found)
+
+
+def _on_grid(inverse: Tensor, size: tuple[int, ...]) -> tuple[Tensor, Tensor]:
+    """Return logarithms of inverse depth on the grid and which part of each pixel is known, (1, g, g') each."""
+    known = inverse.isfinite()
+    values = torch.where(known, inverse, 1).clamp(min=1e-6).log()[None]
+    weight = known.to(values)[None]
+    mode = "area" if inverse.shape[-1] > size[1] else "nearest-exact"
+    logs, weight = (functional.interpolate(each, size, mode=mode)[0] for each in (values, weight))
+    return torch.where(weight > 0, logs / weight.clamp(min=1e-3), 0), weight
+
+
+def _range_around(logs: Tensor, known: Tensor, reach: int) -> Tensor:
+    """Return by how much the known values of windows differ, (1, g, g'); much less than 0 where there is none."""
+    total = torch.zeros_like(logs)
+    for sign in (1, -1):
+        highest = (sign * logs).masked_fill(~known, -1e3)
+        for window, padding in (((2 * reach + 1, 1), (reach, 0)), ((1, 2 * reach + 1), (0, reach))):
+            highest = functional.max_pool2d(highest, window, 1, padding)
+        total += highest
+    return total
+
+
+def _blur(values: Tensor, deviation: float) -> Tensor:
+    """Return values, (c, g, g'), smoothed by a Gaussian; wide ones on a coarser grid."""
+    size, factor = values.shape[-2:], max(1, int(deviation / 1.5))
+    found = functional.avg_pool2d(values, factor, ceil_mode=True, count_include_pad=False) if factor > 1 else values
+    reach = max(1, math.ceil(2.5 * deviation / factor))
+    offsets = torch.arange(-reach, reach + 1, device=values.device) * (factor / deviation)
+    taps = (-offsets.square() / 2).exp()
+    taps = (taps / taps.sum()).to(values)
+    for kernel, padding in ((taps[:, None], (0, 0, reach, reach)), (taps[None], (reach, reach, 0, 0))):
+        padded = functional.pad(found[:, None], padding, mode="replicate")
+        found = functional.conv2d(padded, kernel[None, None])[:, 0]
+    return found if factor == 1 else _enlarge(found, factor)[..., : size[0], : size[1]]
+
+
+def _enlarge(values: Tensor, factor: int) -> Tensor:
+    return functional.interpolate(values[None], scale_factor=factor, mode="bilinear", align_corners=False)[0]
+
+
+def _resize(values: Tensor, size: tuple[int, int]) -> Tensor:
+    return functional.interpolate(values[None], size, mode="bilinear", align_corners=False)[0]
