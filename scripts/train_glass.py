@@ -134,9 +134,10 @@ class GlassTraining(lightning.LightningModule):
         """Return the mean negative log-likelihood."""
         features, wrong, weight = batch
         shown = self.finder.normalise(features.float())
-        shown = (shown + 0.1 * torch.randn_like(shown)) * (torch.rand_like(shown) > 0.2)
-        loss = functional.binary_cross_entropy_with_logits(self.finder(shown), wrong.float(), reduction="none")
-        loss = (weight * loss).mean()
+        shown = (shown + 0.1 * torch.randn_like(shown)) * (torch.rand_like(shown) > 0.05)
+        found = self.finder(shown)
+        target = wrong[:, None].float().expand_as(found)
+        loss = functional.binary_cross_entropy_with_logits(found, target, weight[:, None])
         self.log("train/loss", loss, prog_bar=True)
         return loss
 
@@ -152,7 +153,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", type=int, default=1400)
     parser.add_argument("--rendered", type=int, default=RENDERED)
-    parser.add_argument("--steps", type=int, default=4000)
+    parser.add_argument("--steps", type=int, default=1500)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("-o", "--output", type=Path, default=WEIGHTS)
     options = parser.parse_args()

@@ -35,6 +35,7 @@ from dsr.inference.working_size import (
     working_size_of,
 )
 from dsr.methods.base import InverseSurface, MapNoise, Method, NoiseLaw, Surface, expect_some_depth
+from dsr.methods.glass import expect_glass
 from dsr.methods.recipe import Recipe, Run, read_recipe
 from dsr.sample import DepthSample, expect_distances
 from dsr.utils.compute_device import fast_precision, pick_device
@@ -201,7 +202,8 @@ class AnyRatio(Method):
         else:
             found = self._upsample(rgb, settled, camera, scale, progress)
         expect_some_depth(found.inverse, self.recipe.name)  # as good as of the depth: 0 and infinity change places
-        surface = _in_depth(found, inverse, Settled(settled, doubt), camera, sensor, estimate=estimate_errors)
+        glass = expect_glass(rgb.to(found.inverse.device), inverse)
+        surface = _in_depth(found, inverse, Settled(settled, doubt), glass, camera, sensor, estimate=estimate_errors)
         surface = surface._replace(outliers=count_patches(outliers))
         surface = self._restore_holes(surface, valid, camera)
         missing = resize_nearest(~valid, size_of(rgb)).to(surface.depth.device)
@@ -377,8 +379,8 @@ def _invert(depth: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _in_depth(
-    found: InverseSurface, inverse: Tensor, settled: Settled, camera: Camera, sensor: Identified | None, *,
-    estimate: bool,
+    found: InverseSurface, inverse: Tensor, settled: Settled, glass: Tensor, camera: Camera,
+    sensor: Identified | None, *, estimate: bool,
 ) -> Surface:  # fmt: skip
     """Return a result as depth within what was measured and settled, with its errors or, on request, estimated ones."""
     lowest = inverse.nan_to_num(nan=torch.inf).amin()
@@ -392,6 +394,7 @@ def _in_depth(
         spread, angle = expect_errors(inverse_hr, inverse.to(inverse_hr.device), camera)
     if bool(settled.doubt.any()):
         spread = spread + resize_nearest(settled.doubt.to(spread), size_of(spread))
+    spread = torch.fmax(spread, glass)
     if sensor is not None:
         spread = torch.fmax(spread, left_of(sensor.least_error(inverse_hr.reciprocal()) * inverse_hr))
     result = inverse_hr.reciprocal_()
