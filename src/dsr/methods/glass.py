@@ -3,8 +3,8 @@
 A sensor sees through clear objects, and mirrors deceive it; its depth there is smooth, and looks right. What gives it
 away is that photo and map contradict each other: the map has holes amid a surface, away from depth steps, and the photo
 texture, rims and highlights, beside which a sensor loses nothing elsewhere. :class:`GlassFinder` knows each pixel by 26
-such features, on a grid of at most 320 x 320 pixels, and is the mean of four small networks, as one alone varies. It was
-trained on simulated objects alone (:mod:`dsr.degradation.glass`) by ``scripts/train_glass.py``.
+such features, on a grid of at most 320 x 320 pixels, and is the mean of four small networks, as one alone varies.
+It was trained on simulated objects alone (:mod:`dsr.degradation.glass`) by ``scripts/train_glass.py``.
 
 What does not find real glass: a U-net of 1.1 million parameters that sees photo and map as they are, the same features
 with convolutions, or without the six that depend on brightness and on the strength of the noise.
@@ -32,6 +32,9 @@ _HOLES, _AMID, _TEXTURE, _ROUGHNESS, _NEAR = (2, 4, 8, 16), (4, 8, 16), (3, 6, 1
 map's roughness; and reaches of depth steps."""
 _AMID_REACH, _AMID_STEP = 16, 0.06
 """A hole is amid a surface if the logarithms of the depths so near differ by less."""
+_WIDE = 20
+"""Half the width of holes that are no sign of glass: what is out of a sensor's range, or was cut away."""
+_BURNT, _DARK = 0.9, 0.1
 _BEHIND = 0.06
 """Relative error of depth that was measured through a clear object."""
 _PERHAPS, _PROBABLY = 0.1, 0.3
@@ -128,7 +131,7 @@ def glass_features(rgb: Tensor, inverse: Tensor, grid: int = GRID) -> Tensor:
     photo = functional.interpolate(rgb[None].float(), size, mode="bilinear", antialias=True, align_corners=False)[0]
     logs, weight = _on_grid(inverse.float(), size)
     known = weight > 0.5
-    holes = 1 - weight
+    holes = (1 - weight).masked_fill(_is_wide(~known), 0)
     steps = {reach: _range_around(logs, known, reach) for reach in {*_NEAR, _AMID_REACH}}
     around = steps[_AMID_REACH]
     amid = holes * ((around >= 0) & (around < _AMID_STEP))
@@ -157,8 +160,8 @@ def glass_features(rgb: Tensor, inverse: Tensor, grid: int = GRID) -> Tensor:
         grey - _blur(grey, 16),
         colourful,
         colourful - _blur(colourful, 16),
-        _blur((grey > 0.9).to(grey), 4),
-        _blur((grey < 0.1).to(grey), 4),
+        _blur((grey > _BURNT).to(grey), 4),
+        _blur((grey < _DARK).to(grey), 4),
         3 * (photo - _blur(photo, 12)).abs().mean(dim=0, keepdim=True),
     ]
     return torch.cat(found)
@@ -174,15 +177,24 @@ def _on_grid(inverse: Tensor, size: tuple[int, ...]) -> tuple[Tensor, Tensor]:
     return torch.where(weight > 0, logs / weight.clamp(min=1e-3), 0), weight
 
 
+def _is_wide(holes: Tensor) -> Tensor:
+    """Return the parts of holes, (1, g, g') bool, that squares of a width fit into, and what is beside them."""
+    inner = -_highest_around(-holes.float(), _WIDE)
+    return _highest_around(inner, _WIDE + 2) > 0
+
+
 def _range_around(logs: Tensor, known: Tensor, reach: int) -> Tensor:
     """Return by how much the known values of windows differ, (1, g, g'); much less than 0 where there is none."""
-    total = torch.zeros_like(logs)
-    for sign in (1, -1):
-        highest = (sign * logs).masked_fill(~known, -1e3)
-        for window, padding in (((2 * reach + 1, 1), (reach, 0)), ((1, 2 * reach + 1), (0, reach))):
-            highest = functional.max_pool2d(highest, window, 1, padding)
-        total += highest
-    return total
+    highest, lowest = (_highest_around((sign * logs).masked_fill(~known, -1e3), reach) for sign in (1, -1))
+    return highest + lowest
+
+
+def _highest_around(values: Tensor, reach: int) -> Tensor:
+    """Return the highest value of the window around each pixel, (1, g, g')."""
+    window = 2 * reach + 1
+    for size, padding in (((window, 1), (reach, 0)), ((1, window), (0, reach))):
+        values = functional.max_pool2d(values, size, 1, padding)
+    return values
 
 
 def _blur(values: Tensor, deviation: float) -> Tensor:
