@@ -35,7 +35,7 @@ from dsr.methods.glass import GRID, GlassFinder, glass_features  # noqa: E402
 from dsr.sample import AllHolesError, Scene  # noqa: E402
 from dsr.utils.files import replacing  # noqa: E402
 
-WEIGHTS = REPOSITORY / "src" / "dsr" / "methods" / "weights" / "glass.safetensors"
+WEIGHTS = REPOSITORY / "src" / "dsr" / "methods" / "glass.safetensors"
 RENDERED = 400
 """Scenes, each of which is used several times."""
 KINDS = {"vessel": 0.55, "ball": 0.08, "box": 0.12, "pane": 0.08, "mirror": 0.07, "gloss": 0.1}

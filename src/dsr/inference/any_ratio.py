@@ -202,8 +202,8 @@ class AnyRatio(Method):
         else:
             found = self._upsample(rgb, settled, camera, scale, progress)
         expect_some_depth(found.inverse, self.recipe.name)  # as good as of the depth: 0 and infinity change places
-        glass = expect_glass(rgb.to(found.inverse.device), inverse)
-        surface = _in_depth(found, inverse, Settled(settled, doubt), glass, camera, sensor, estimate=estimate_errors)
+        photo = None if is_told_clean(self.recipe) else rgb.to(found.inverse.device)
+        surface = _in_depth(found, inverse, Settled(settled, doubt), photo, camera, sensor, estimate=estimate_errors)
         surface = surface._replace(outliers=count_patches(outliers))
         surface = self._restore_holes(surface, valid, camera)
         missing = resize_nearest(~valid, size_of(rgb)).to(surface.depth.device)
@@ -316,8 +316,13 @@ def finds_noise(recipe: Recipe) -> bool:
 
     It has to have weights for several ratios of the sizes, and no setting that there is no noise.
     """
+    return bool(recipe.computed_at) and not is_told_clean(recipe)
+
+
+def is_told_clean(recipe: Recipe) -> bool:
+    """Return whether a method has a setting that its maps have no noise, so that no sensor measured them."""
     node = recipe.at()
-    return bool(recipe.computed_at) and not (node.get("clean") or node.get("noise") == 0)
+    return bool(node.get("clean")) or node.get("noise") == 0
 
 
 def upsampler(
@@ -379,10 +384,13 @@ def _invert(depth: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _in_depth(
-    found: InverseSurface, inverse: Tensor, settled: Settled, glass: Tensor, camera: Camera,
+    found: InverseSurface, inverse: Tensor, settled: Settled, photo: Tensor | None, camera: Camera,
     sensor: Identified | None, *, estimate: bool,
 ) -> Surface:  # fmt: skip
-    """Return a result as depth within what was measured and settled, with its errors or, on request, estimated ones."""
+    """Return a result as depth within what was measured and settled, with its errors or, on request, estimated ones.
+
+    A sensor may have seen through glass of the photo, (3, H, W); None where there was no sensor.
+    """
     lowest = inverse.nan_to_num(nan=torch.inf).amin()
     infinite = found.inverse <= 0  # but what is NaN has no depth
     inverse_hr = torch.where(infinite, lowest.to(found.inverse.device), found.inverse)
@@ -394,7 +402,8 @@ def _in_depth(
         spread, angle = expect_errors(inverse_hr, inverse.to(inverse_hr.device), camera)
     if bool(settled.doubt.any()):
         spread = spread + resize_nearest(settled.doubt.to(spread), size_of(spread))
-    spread = torch.fmax(spread, glass)
+    if photo is not None:
+        spread = torch.fmax(spread, expect_glass(photo, inverse))
     if sensor is not None:
         spread = torch.fmax(spread, left_of(sensor.least_error(inverse_hr.reciprocal()) * inverse_hr))
     result = inverse_hr.reciprocal_()
