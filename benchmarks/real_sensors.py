@@ -26,7 +26,8 @@
 - ``clean``: box means of Lucy and Plant at x4 without noise, untold: RMSE_v in 1/1000.
 - ``glass``: clear objects before a stereo camera, beside their painted twins: in the objects, the share of pixels off
   by more than 20 mm in %, the share of these stated to be off by less than 5 mm, and how well the stated error sorts
-  pixels into these and the others (area under the curve; 0.5 is chance).
+  pixels into these and the others (area under the curve; 0.5 is chance), the same of all pixels (``AUC_all``); and the
+  share of the objects' pixels that ``--for robot`` leaves with such depth.
 - ``clear``: the same for clear objects as trainings have them, in procedural scenes before a simulated stereo camera;
   means of the scenes in which it is defined.
 
@@ -54,6 +55,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn.functional import pad
 
+from dsr.app.upsample.parts import Results
 from dsr.data.cleargrasp import ClearGrasp
 from dsr.data.icl import ICL
 from dsr.data.middlebury import Middlebury
@@ -199,13 +201,16 @@ def clear_objects(count: int | None) -> list[Glass]:
 def score_glass(scene: Glass, surface: Surface) -> dict[str, float]:
     """Score a result in the clear objects."""
     inside = scene.mask & scene.twin.isfinite() & surface.depth.isfinite()
-    off = (surface.depth - scene.twin).abs()[inside]
-    wrong = off > OFF
-    found = {"wrong": 100 * float(wrong.double().mean())}
+    off = (surface.depth - scene.twin).abs()
+    wrong = inside & (off > OFF)
+    found = {"wrong": 100 * float(wrong[inside].double().mean())}
     if surface.depth_error is not None:
-        error = surface.depth_error[inside]
+        error = surface.depth_error
         found["believed"] = 100 * float((error[wrong] < SURE).double().mean())
-        found["AUC"] = float(off_auc(error, off, OFF))
+        found["AUC"] = float(off_auc(error[inside], off[inside], OFF))
+        found["AUC_all"] = float(off_auc(error, off, OFF))
+        left = wrong & surface.without_dubious(Results.max_error / 100).depth.isfinite()
+        found["robot"] = 100 * float(left.sum() / (scene.mask & scene.twin.isfinite()).sum())
     return found
 
 

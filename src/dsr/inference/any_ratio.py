@@ -35,7 +35,7 @@ from dsr.inference.working_size import (
     working_size_of,
 )
 from dsr.methods.base import InverseSurface, MapNoise, Method, NoiseLaw, Surface, expect_some_depth
-from dsr.methods.glass import expect_glass
+from dsr.methods.glass import BEHIND, expect_glass
 from dsr.methods.recipe import Recipe, Run, read_recipe
 from dsr.sample import DepthSample, expect_distances
 from dsr.utils.compute_device import fast_precision, pick_device
@@ -402,12 +402,14 @@ def _in_depth(
         spread, angle = expect_errors(inverse_hr, inverse.to(inverse_hr.device), camera)
     if bool(settled.doubt.any()):
         spread = spread + resize_nearest(settled.doubt.to(spread), size_of(spread))
-    if photo is not None:
-        spread = torch.fmax(spread, expect_glass(photo, inverse))
+    glass = None if photo is None else expect_glass(photo, inverse)
+    if glass is not None:
+        spread = torch.fmax(spread, glass)
     if sensor is not None:
         spread = torch.fmax(spread, left_of(sensor.least_error(inverse_hr.reciprocal()) * inverse_hr))
     result = inverse_hr.reciprocal_()
-    return Surface(result, spread * result, angle, found.noise)
+    share = None if glass is None else float((glass >= BEHIND).double().mean())
+    return Surface(result, spread * result, angle, found.noise, glass=share)
 
 
 def _check_options(fill: str, max_hole: float, working_size: int | None) -> None:

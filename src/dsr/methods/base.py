@@ -120,7 +120,8 @@ class Surface(NamedTuple):
     say. Pixels that a method leaves out on purpose have errors and no depth. ``noise``: of the low-resolution map; None
     for a method that does not estimate it. ``outliers``: what was treated as holes before the method saw the map.
     ``filled`` (1, H, W) bool: where there is depth that was not measured, since the nearest pixel of the map is a hole
-    or an outlier; None where that is not known.
+    or an outlier; None where that is not known. ``glass``: the share of the pixels that probably show glass, mirrors
+    or gloss, of which a larger error is expected; None where nobody looked.
     """
 
     depth: Tensor
@@ -129,6 +130,7 @@ class Surface(NamedTuple):
     noise: MapNoise | None = None
     outliers: Outliers | None = None
     filled: Tensor | None = None
+    glass: float | None = None
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Surface:
         """Return the surface with a function applied to each of its maps."""

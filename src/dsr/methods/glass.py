@@ -35,7 +35,7 @@ _AMID_REACH, _AMID_STEP = 16, 0.06
 _WIDE = 20
 """Half the width of holes that are no sign of glass: what is out of a sensor's range, or was cut away."""
 _BURNT, _DARK = 0.9, 0.1
-_BEHIND = 0.06
+BEHIND = 0.06
 """Relative error of depth that was measured through a clear object."""
 _PERHAPS, _PROBABLY = 0.1, 0.3
 """Probabilities of glass from which it is expected in part, and in full: those of simulated objects, in the scenes of
@@ -112,7 +112,7 @@ def probability_of_glass(rgb: Tensor, inverse: Tensor) -> Tensor:
 def expect_glass(rgb: Tensor, inverse: Tensor) -> Tensor:
     """Return the relative error of depth to expect because of glass, (1, H, W); see :func:`probability_of_glass`."""
     share = (probability_of_glass(rgb, inverse) - _PERHAPS) / (_PROBABLY - _PERHAPS)
-    return _BEHIND * share.clamp(0, 1)
+    return BEHIND * share.clamp(0, 1)
 
 
 def glass_features(rgb: Tensor, inverse: Tensor, grid: int = GRID) -> Tensor:

@@ -37,6 +37,7 @@ from dsr.io.exports import FLAT
 from dsr.io.inputs import Picture, read_picture
 from dsr.io.pairs import Pair
 from dsr.methods.base import MapNoise, Outliers, Surface
+from dsr.methods.glass import BEHIND
 from dsr.notes import CHECKS, Assumption, expect_no_warning
 from dsr.utils.guards import readable
 from dsr.utils.lengths import show_length
@@ -52,6 +53,8 @@ _WHITE = 1.5
 """Noise that is alike over fewer pixels counts as white."""
 _MEASURABLE = 0.02
 """Least seconds of a core from which the load of the machine is estimated."""
+_GLASS = 0.005
+"""Share of the pixels that look like glass from which it is said."""
 _PACKAGES = ("dsr", "torch", "numpy", "opencv-python-headless")
 
 
@@ -159,7 +162,9 @@ class FrameWork:
         else:
             surface = as_stored(self._upsample(picture, identified, progress))
             reporter.facts(_describe(surface.noise, given="noise" in how.arguments))
-            reporter.facts([*_describe_outliers(surface.outliers), *_describe_holes(surface, how)])
+            reporter.facts(
+                [*_describe_outliers(surface.outliers), *_describe_glass(surface.glass), *_describe_holes(surface, how)]
+            )
             if wanted.certain:
                 surface = surface.without_dubious(wanted.max_error / 100)
         times.begin("writing")
@@ -379,6 +384,14 @@ def _describe_outliers(outliers: Outliers | None) -> list[Assumption]:
         return []
     text = "depth far from everything around it, or nearer than 5 cm, is treated as holes"
     return [Assumption(text, f"pixels: {outliers.pixels}, patches: {outliers.patches}")]
+
+
+def _describe_glass(share: float | None) -> list[Assumption]:
+    """Return a note on what looks like glass, if there is enough of it."""
+    if share is None or share < _GLASS:
+        return []
+    text = "photo and depth contradict each other as in glass, mirrors and gloss, where the depth is not to be trusted"
+    return [Assumption(text, f"{share:.1%} of the pixels, whose expected error is at least {BEHIND:.0%}")]
 
 
 def _describe_holes(surface: Surface, how: Upsampling) -> list[Assumption]:
