@@ -17,7 +17,7 @@ from dsr.inference.working_size import find_noise
 
 BY_NAME = {each.name: each for each in SENSORS}
 PAGE = Path(__file__).parents[2] / "docs" / "sensors.md"
-FIGURES = ("stereo_constant", "step", "noise", "extent", "spread", "edges", "dark", "shiny", "clear")
+FIGURES = ("stereo_constant", "step", "noise", "extent", "spread", "offset", "edges", "dark", "shiny", "clear")
 
 
 STATED = {
@@ -63,16 +63,17 @@ def test_each_figure_has_a_source_and_each_source_a_figure(name):
 def test_page_has_the_table_and_every_source():
     lines = [line for line in PAGE.read_text().splitlines() if line.startswith("|")]
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
-    figures = {row[0]: row[1:] for row in rows if row[0] in BY_NAME and len(row) == 8}
+    figures = {row[0]: row[1:] for row in rows if row[0] in BY_NAME and len(row) == 9}
     assert list(figures) == list(BY_NAME)
-    for name, (kind, width, constant, step, noise, extent, spread) in figures.items():
+    for name, (kind, width, constant, step, noise, extent, spread, offset) in figures.items():
         sensor = BY_NAME[name]
         assert (kind, int(width)) == (sensor.kind, sensor.width)
         assert Fraction(step or 0) == (sensor.step or 0)
         for cell, figure in ((constant, sensor.stereo_constant), (noise, sensor.noise), (extent, sensor.extent)):
             assert float(cell or 0) == pytest.approx(figure or 0, rel=5e-3)
-        stated = [tuple(map(float, pair.split(" at "))) for pair in spread.split(", ") if pair]
-        assert stated == [(pytest.approx(1000 * deviation), distance) for distance, deviation in sensor.spread or ()]
+        for cell, figures_at in ((spread, sensor.spread), (offset, sensor.offset)):
+            stated = [tuple(map(float, pair.split(" at "))) for pair in cell.split(", ") if pair]
+            assert stated == [(pytest.approx(1000 * figure), distance) for distance, figure in figures_at or ()]
     behaviours = {name: row[1:] for row in rows for name in row[0].split(", ") if name in BY_NAME and len(row) == 5}
     for sensor in SENSORS:
         for reported in (sensor.edges, sensor.dark, sensor.shiny, sensor.clear):
@@ -233,6 +234,19 @@ def test_stated_error_is_never_less_than_the_disparity_allows():
         expected = torch.maximum(found["none"].depth_error, least)
         torch.testing.assert_close(found["D435"].depth_error, expected, rtol=5e-3, atol=1e-7)
         assert bool((found["D435"].depth_error > found["none"].depth_error).any())
+
+
+def test_systematic_error_of_a_known_sensor_is_added_to_the_stated_one():
+    camera, rgb = Camera.centred(160, 120, 150.0), torch.full((3, 120, 160), 0.5)
+    depth = as_stored(1 / slanted(0.4, 6.0)[::4, ::4], 1e-3)
+    names = ("none", "Kinect v2", "Azure Kinect")
+    found = {each: upsample_surface(rgb, depth, camera, method="bicubic", sensor=each) for each in names}
+    z = found["none"].depth
+    for name, metres in (("Kinect v2", 0 * z), ("Azure Kinect", 0.011 + 0.001 * z.clamp(0.5, 5.5))):
+        assert torch.equal(found[name].depth, z)
+        random = torch.maximum(found["none"].depth_error, 0.45 * math.sqrt(2 / math.pi) * least_error(BY_NAME[name], z))
+        torch.testing.assert_close(found[name].depth_error, torch.hypot(random, metres / 2), rtol=5e-3, atol=1e-7)
+    assert torch.equal(found["none"].angle_error, found["Azure Kinect"].angle_error)
 
 
 def test_correlated_noise_of_a_stereo_camera_is_given_as_it_grows():

@@ -34,6 +34,8 @@ class Sensor:
         extent: over how many pixels of its map the noise is alike.
         spread: standard deviation of one frame's depth on a bright wall by distance, pairs of metres, nearest first; it
             grows linearly between them, and from 0 to the first.
+        offset: limit of the systematic error of depth by distance, likewise, which all pixels of a surface may share;
+            nearer than the first it is that of the first.
         edges: what it does at depth steps.
         dark: on dark surfaces.
         shiny: on glossy and mirroring ones.
@@ -51,6 +53,7 @@ class Sensor:
     noise: float | None = None
     extent: float | None = None
     spread: tuple[tuple[float, float], ...] | None = None
+    offset: tuple[tuple[float, float], ...] | None = None
     edges: str | None = None
     dark: str | None = None
     shiny: str | None = None
@@ -74,6 +77,7 @@ _D400_NOISE = "A. Grunnet-Jepsen (Intel) in librealsense issue 3904: 0.032 at be
 _D400_EXTENT = "measured before a board with a D435: 37 px of a photo of 2.14 times its focal length; the window has 9"
 _GRASP = "Sajjan et al., ClearGrasp, ICRA 2020"
 _L515 = "Intel, L515's product page, in librealsense issue 5808: at 1 m and 9 m on 95 % reflectivity"
+_AZURE_OFFSET = "Microsoft, Azure Kinect DK hardware specifications: typically < 11 mm + 0.1 %, without multipath"
 _AZURE = "Microsoft, Azure Kinect DK depth camera (azure-docs, articles/kinect-dk): random error and invalidation"
 _KURILLO = "Kurillo et al., Evaluating the Accuracy of the Azure Kinect and Kinect v2, Sensors 2022: similar to 2.5 m"
 _FANKHAUSER = "Fankhauser et al., Kinect v2 for Mobile Robot Navigation, ICAR 2015: 1.5 - 0.5 z + 0.3 z^2, mm for m"
@@ -177,7 +181,8 @@ SENSORS = (
         1024,
         r"\bl515",
         spread=((1.0, 0.0025), (9.0, 0.0155)),
-        sources=MappingProxyType({"spread": _L515}),
+        offset=((1.0, 0.005), (9.0, 0.014)),
+        sources=MappingProxyType({"spread": _L515, "offset": _L515}),
     ),
     Sensor(
         "Azure Kinect",
@@ -185,10 +190,13 @@ SENSORS = (
         640,
         r"azure|kinect 4|\bk4a|femto.?bolt",
         spread=((1.0, 0.0013), (2.0, 0.0017), (2.5, 0.0021)),
+        offset=((0.5, 0.0115), (5.5, 0.0165)),
         edges="values between both sides of a step, or missing; so are concave corners",
         dark="noisier, or missing",
         shiny="missing where the light saturates",
-        sources=MappingProxyType({"spread": _KURILLO, **dict.fromkeys(("edges", "dark", "shiny"), _AZURE)}),
+        sources=MappingProxyType(
+            {"spread": _KURILLO, "offset": _AZURE_OFFSET, **dict.fromkeys(("edges", "dark", "shiny"), _AZURE)}
+        ),
     ),
     Sensor(
         "Kinect v2",
@@ -302,6 +310,14 @@ class Identified(NamedTuple):
         """Return :func:`least_error`, in the mode of the sensor that the map's values show."""
         return least_error(self.sensor, depth, self.constant)
 
+    def offset_error(self, depth: Tensor) -> Tensor:
+        """Return the expected absolute systematic error of depth, in its unit, metres; 0 where no limit is known.
+
+        It is half of the sensor's limit: the mean of offsets that are equally likely up to it.
+        """
+        limit = self.sensor.offset
+        return torch.zeros_like(depth) if limit is None else _interpolate(depth, limit) / 2
+
 
 def identify(depth: Tensor, name: str = "auto", device_name: str = "") -> Identified | None:
     """Return the sensor of a map: the named one, else the one identified by its values and the device's name.
@@ -383,10 +399,14 @@ def least_error(sensor: Sensor, depth: Tensor, constant: float | None = None) ->
         steps = max((sensor.noise or 0.0) / sensor.step, 12**-0.5)
         least = depth.square() * (steps / constant)
     if sensor.spread is not None:
-        distances, spreads = zip((0.0, 0.0), *sensor.spread, strict=True)
-        found = np.interp(depth.detach().double().cpu().numpy(), distances, spreads)
-        least = torch.maximum(least, torch.from_numpy(found).to(depth))
+        least = torch.maximum(least, _interpolate(depth, ((0.0, 0.0), *sensor.spread)))
     return least
+
+
+def _interpolate(depth: Tensor, points: tuple[tuple[float, float], ...]) -> Tensor:
+    """Return values at distances, linear between points and constant beyond them."""
+    distances, values = zip(*points, strict=True)
+    return torch.from_numpy(np.interp(depth.detach().double().cpu().numpy(), distances, values)).to(depth)
 
 
 _CONSTANTS = (16.0, 4096.0)

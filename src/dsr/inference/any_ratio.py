@@ -168,7 +168,8 @@ class AnyRatio(Method):
             camera: the photo's; only interpolation and deep image priors depend on it.
             progress: is called with the number of parts done and their total.
             sensor: what measured the map: of :func:`~dsr.inference.find_sensor`, or its argument; None for none. No
-                expected error is less than what remains of the least noise that the sensor is known to have. Where it
+                expected error is less than what remains of the least noise that the sensor is known to have; a
+                systematic error of which its maker states a limit is added to it, as independent errors add. Where it
                 counts disparity, and the noise of the map is correlated over 5 pixels or more, ``facets`` without a
                 scale is given how strong the noise is and that it grows with the square of the distance, unless
                 ``noise`` is set.
@@ -406,7 +407,9 @@ def _in_depth(
     if glass is not None:
         spread = torch.fmax(spread, glass)
     if sensor is not None:
-        spread = torch.fmax(spread, left_of(sensor.least_error(inverse_hr.reciprocal()) * inverse_hr))
+        depth = inverse_hr.reciprocal()
+        spread = torch.fmax(spread, left_of(sensor.least_error(depth) * inverse_hr))
+        spread = torch.hypot(spread, sensor.offset_error(depth) * inverse_hr)
     result = inverse_hr.reciprocal_()
     share = None if glass is None else float((glass >= BEHIND).double().mean())
     return Surface(result, spread * result, angle, found.noise, glass=share)
