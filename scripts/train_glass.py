@@ -70,7 +70,7 @@ def pixels_of(scene: Scene, generator: torch.Generator) -> Pixels | None:
     except AllHolesError:
         return None
     grid = int(GRID * draw_scale(generator))
-    features = glass_features(sample.rgb, sample.depth_lr.float().reciprocal(), grid)
+    features = glass_features(sample.rgb, sample.depth_lr.float().reciprocal(), grid, wide=None)
     object_, truth, measured = (
         functional.interpolate(each[None], features.shape[-2:], mode="nearest-exact").flatten()
         for each in ((full.depth != scene.depth).float(), full.depth, sample.depth_lr.float())

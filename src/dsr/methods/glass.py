@@ -32,8 +32,9 @@ _HOLES, _AMID, _TEXTURE, _ROUGHNESS, _NEAR = (2, 4, 8, 16), (4, 8, 16), (3, 6, 1
 map's roughness; and reaches of depth steps."""
 _AMID_REACH, _AMID_STEP = 16, 0.06
 """A hole is amid a surface if the logarithms of the depths so near differ by less."""
-_WIDE = 20
-"""Half the width of holes that are no sign of glass: what is out of a sensor's range, or was cut away."""
+WIDE = 20
+"""Half the width of holes that are no sign of glass: what is out of a sensor's range, or was cut away. Objects of the
+training may be as large, so that it leaves none out."""
 _BURNT, _DARK = 0.9, 0.1
 BEHIND = 0.06
 """Relative error of depth that was measured through a clear object."""
@@ -115,12 +116,13 @@ def expect_glass(rgb: Tensor, inverse: Tensor) -> Tensor:
     return BEHIND * share.clamp(0, 1)
 
 
-def glass_features(rgb: Tensor, inverse: Tensor, grid: int = GRID) -> Tensor:
+def glass_features(rgb: Tensor, inverse: Tensor, grid: int = GRID, wide: int | None = WIDE) -> Tensor:
     """Return the features of a photo, (3, H, W), and inverse depth, (1, h, w) with a known pixel: (FEATURES, g, g').
 
     Args:
         rgb, inverse: see :func:`probability_of_glass`.
         grid: pixels of the longer side of the result.
+        wide: half the width of holes that do not count; None if all do.
 
     """
     height, width = rgb.shape[-2:]
@@ -128,7 +130,7 @@ def glass_features(rgb: Tensor, inverse: Tensor, grid: int = GRID) -> Tensor:
     photo = functional.interpolate(rgb[None].float(), size, mode="bilinear", antialias=True, align_corners=False)[0]
     logs, weight = _on_grid(inverse.float(), size)
     known = weight > 0.5
-    holes = (1 - weight).masked_fill(_is_wide(~known), 0)
+    holes = 1 - weight if wide is None else (1 - weight).masked_fill(_is_wide(~known, wide), 0)
     steps = {reach: _range_around(logs, known, reach) for reach in {*_NEAR, _AMID_REACH}}
     around = steps[_AMID_REACH]
     amid = holes * ((around >= 0) & (around < _AMID_STEP))
@@ -174,10 +176,10 @@ def _on_grid(inverse: Tensor, size: tuple[int, ...]) -> tuple[Tensor, Tensor]:
     return torch.where(weight > 0, logs / weight.clamp(min=1e-3), 0), weight
 
 
-def _is_wide(holes: Tensor) -> Tensor:
+def _is_wide(holes: Tensor, reach: int) -> Tensor:
     """Return the parts of holes, (1, g, g') bool, that squares of a width fit into, and what is beside them."""
-    inner = -_highest_around(-holes.float(), _WIDE)
-    return _highest_around(inner, _WIDE + 2) > 0
+    inner = -_highest_around(-holes.float(), reach)
+    return _highest_around(inner, reach + 2) > 0
 
 
 def _range_around(logs: Tensor, known: Tensor, reach: int) -> Tensor:
