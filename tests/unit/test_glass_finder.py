@@ -82,9 +82,11 @@ def test_stated_errors_of_all_methods_know_glass_unless_the_map_is_told_to_be_cl
         assert surface.depth_error is not None
         torch.testing.assert_close(surface.depth_error[:, :24], 0.06 * surface.depth[:, :24])
         assert float(surface.depth_error[:, 26:].max()) < 0.06
+        assert surface.glass == 0.5
     clean = upsample_surface(rgb, depth, camera, settings={"noise": 0.0}, device="cpu")
     assert clean.depth_error is not None
     assert float(clean.depth_error.max()) < 0.06
+    assert clean.glass is None
 
 
 @pytest.mark.filterwarnings("ignore")  # Lightning's
