@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
+import torch
 import trimesh
 from PIL import Image
 
@@ -175,6 +176,22 @@ def test_outliers_are_holes_and_it_is_said(pair, tmp_path, capsys):
     np.testing.assert_allclose(after, before, rtol=0.1)
     assert of(pair, out, *BICUBIC, "--only", "depth,normals") == 0
     assert info(out)["outliers"] == counted
+
+
+def test_glass_is_said_and_a_robot_gets_no_depth_there(pair, tmp_path, capsys, monkeypatch):
+    def half(photo, _):
+        glass = torch.zeros(1, *photo.shape[-2:])
+        glass[..., :16] = 0.06
+        return glass
+
+    monkeypatch.setattr("dsr.inference.any_ratio.expect_glass", half)
+    assert of(pair, tmp_path / "out", *BICUBIC, "--for", "robot", "--max-error", "5") == 0
+    said = capsys.readouterr().out
+    assert said.count("as in glass") == 1
+    assert "25.0% of the pixels" in said
+    depth = np.asarray(Image.open(tmp_path / "out" / "depth.png"))
+    assert not depth[:, :16].any()
+    assert depth[:, 16:].any()
 
 
 @pytest.mark.parametrize(
