@@ -49,7 +49,7 @@ WRONG = 0.02
 INSIDE, OUTSIDE = 600, 900
 """Pixels of each scene to learn from: of objects, and of the rest."""
 MOST = 200.0
-"""Pixels that one of them stands for, at most."""
+"""Pixels that one of them stands for, at most; its weight in the loss is the root of that."""
 Pixels = tuple[Tensor, Tensor, Tensor]
 
 

@@ -51,6 +51,7 @@ from dsr.inference.any_ratio import upsample_surface
 from dsr.inference.plausibility import find_outliers, within_measured
 from dsr.inference.sequences import View, fuse_views
 from dsr.inference.working_size import find_noise, find_sensor
+from dsr.methods.glass import probability_of_glass
 from dsr.methods.inpainting import inpaint
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.msg_net import MSGNet
@@ -171,6 +172,10 @@ def sensors() -> Iterator[tuple[str, Job]]:
     for strength in (1e-3, 2e-3, 3e-3, 4e-3, 6e-3):
         counted = ((348 / (348 / _waves(2, strength)).round()) * 1e4).round() / 1e4  # a Kinect's steps
         yield f"sensor at {strength}", lambda d=counted: _numbers(getattr(find_sensor(d), "constant", None))
+    lost = _waves(1).clone()
+    lost[:, 40:90, 60:66], lost[:, 60:68, 60:100] = torch.nan, torch.nan
+    yield "glass", lambda: probability_of_glass(rgb, lost.reciprocal().float())
+    yield "Azure Kinect", surface(3, sensor="Azure Kinect")
     speckled = _waves(1).clone()
     speckled[:, 40:44, 60:64] = 0.2
     speckled[:, 100:103, 20:24] = 30

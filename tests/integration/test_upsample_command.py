@@ -187,8 +187,9 @@ def test_glass_is_said_and_a_robot_gets_no_depth_there(pair, tmp_path, capsys, m
     monkeypatch.setattr("dsr.inference.any_ratio.expect_glass", half)
     assert of(pair, tmp_path / "out", *BICUBIC, "--for", "robot", "--max-error", "5") == 0
     said = capsys.readouterr().out
-    assert said.count("as in glass") == 1
+    assert said.count("disagree as they do on glass") == 1
     assert "25.0% of the pixels" in said
+    assert info(tmp_path / "out")["shares"]["glass"] == 0.25
     depth = np.asarray(Image.open(tmp_path / "out" / "depth.png"))
     assert not depth[:, :16].any()
     assert depth[:, 16:].any()

@@ -14,9 +14,8 @@ from torch.nn import functional
 
 from dsr.degradation.hints import FACTS
 from dsr.geometry.camera import Camera
-from dsr.methods.networks import facets_method
-from dsr.methods.networks.facets_method import CAUTION, CAUTION_IF_CLEAN, AnyMap
-from dsr.methods.networks.facets_unet import LEAST_LOG_ERROR, FacetsUNet
+from dsr.methods.networks.facets_method import CAUTION, AnyMap
+from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.network import Answer
 from dsr.methods.networks.weight_files import files_of_weights, save_network
 from dsr.sample import DepthSample
@@ -218,30 +217,6 @@ def test_dubious_pixels_may_be_left_as_holes() -> None:
     assert torch.equal(cut.depth[kept], whole.depth[kept])
     with pytest.raises(ValueError, match="max_error: expected a positive share of the depth, got 0"):
         AnyMap(net, max_error=0)
-
-
-def test_surest_errors_of_clean_maps_follow_the_bend_of_the_map(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Surest(Recording):
-        def answer(self, *given: Any) -> Answer:
-            answer = super().answer(*given)
-            spread = torch.full_like(answer.spread, math.exp(LEAST_LOG_ERROR))
-            spread[..., 80:] = 0.01  # where the network expects more, it says it
-            return replace(answer, spread=spread)
-
-    monkeypatch.setattr(facets_method, "clean_weights", lambda path: path)
-    monkeypatch.setattr(facets_method, "_load", lambda *_: Surest())
-    method = AnyMap(Path("weights"), clean=True, kernel="box", edges="sharp")
-    usual = AnyMap(Path("weights"), kernel="box", edges="sharp").surface(_sample((24, 32), 4))
-    bend = torch.zeros(1, 24, 32)
-    bend[..., 0] = 1e-4
-    straight, bent = (method.surface(_sample((24, 32), 4, error)) for error in (0.0, bend))
-    for errors in ("depth_error", "angle_error"):
-        exact, near, least = (getattr(each, errors) for each in (straight, bent, usual))
-        assert float((exact / least)[..., :80].max()) < 0.01
-        torch.testing.assert_close(exact[..., 80:], CAUTION_IF_CLEAN / CAUTION * least[..., 80:])
-        torch.testing.assert_close(near[..., 60:], exact[..., 60:])  # far from the bend
-        assert float((near / exact)[..., :4].min()) > 100
-        assert bool((near <= least).all())
 
 
 def test_flat_parts_of_rounded_maps_are_at_best_as_sure_as_the_rounding() -> None:

@@ -36,22 +36,60 @@ def test_features_do_not_depend_on_the_unit_of_depth() -> None:
     torch.testing.assert_close(glass_features(rgb, 1e3 * inverse), found, rtol=1e-3, atol=2e-3)
 
 
-def test_holes_amid_a_texture_are_glass_and_a_bare_wall_or_a_cut_map_is_not() -> None:
+def _contradiction(*, textured: bool, holes: bool) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return a photo and a wall; amid them a patch with texture and a highlight, and a patch that is lost in part."""
     rgb, inverse = torch.full((3, 240, 320), 0.5), torch.full((1, 240, 320), 0.5)
-    calm = float(probability_of_glass(rgb, inverse)[0, 120, 160])
-    rgb[:, 100:140, 140:180] += 0.3 * (torch.rand(1, 40, 40, generator=torch.Generator().manual_seed(0)) - 0.5)
-    rgb[:, 104:108, 150:170] = 0.95
-    inverse[0, 104:136, 150:156] = torch.nan
-    inverse[0, 120:128, 150:174] = torch.nan
-    assert float(probability_of_glass(rgb, inverse)[0, 100:140, 140:180].max()) > 3 * calm
-    cut = torch.full((1, 240, 320), 0.5)
-    cut[:, :, :160] = torch.nan
-    assert float(expect_glass(torch.full((3, 240, 320), 0.5), cut)[..., 200:].max()) == 0
-    assert float(probability_of_glass(rgb, torch.full_like(inverse, torch.nan)).max()) == 0
+    if textured:
+        noise = torch.rand(1, 40, 40, generator=torch.Generator().manual_seed(0))
+        rgb[:, 100:140, 140:180] += 0.3 * (noise - 0.5)
+        rgb[:, 104:108, 150:170] = 0.95
+    if holes:
+        inverse[0, 104:136, 150:156] = torch.nan
+        inverse[0, 120:128, 150:174] = torch.nan
+    return rgb, inverse
+
+
+def test_texture_and_holes_together_are_glass() -> None:
+    both, texture, holes = (
+        float(probability_of_glass(*_contradiction(textured=textured, holes=holes)).max())
+        for textured, holes in ((True, True), (True, False), (False, True))
+    )
+    assert both > 0.15
+    assert texture == 0
+    assert both > 2 * holes
+
+
+@pytest.mark.parametrize("share", [0.9, 0.5, 0.2])
+def test_single_missing_or_measured_pixels_are_no_glass(share: float) -> None:
+    rgb, inverse = _contradiction(textured=True, holes=False)
+    lost = torch.rand(inverse.shape, generator=torch.Generator().manual_seed(1)) > share
+    assert float((expect_glass(rgb, inverse.masked_fill(lost, torch.nan)) > 0.02).float().mean()) < 0.01
+
+
+def test_what_is_cut_away_is_no_glass() -> None:
+    rgb, inverse = _contradiction(textured=True, holes=False)
+    inverse[..., :130] = torch.nan
+    assert float(probability_of_glass(rgb, inverse).max()) == 0
+    narrow = inverse.clone()
+    narrow[..., :105] = 0.5
+    assert float(probability_of_glass(rgb, narrow).max()) > 0
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
+def test_probabilities_have_single_precision_and_no_gradient(dtype: torch.dtype) -> None:
+    rgb, inverse = _contradiction(textured=True, holes=True)
+    with torch.inference_mode():
+        probability_of_glass(rgb, inverse)
+    found = probability_of_glass(rgb.to(dtype).requires_grad_(), inverse)
+    assert found.dtype == torch.float32
+    assert not found.requires_grad
+    assert float(found.max()) > 0.1
+    assert float(probability_of_glass(rgb.to(dtype), torch.full_like(inverse, torch.nan)).max()) == 0
+    assert probability_of_glass(rgb[:, :3, :4], inverse[:, :1, :2]).shape == (1, 3, 4)
 
 
 def test_wrong_depth_of_simulated_vessels_is_ranked_first_and_expected_to_be_wrong() -> None:
-    source, aucs = Procedural(12, size=256, seed=5), []
+    source, aucs = Procedural(6, size=256, seed=5), []
     for number, name in enumerate(source.scenes()):
         scene, generator = source.load(name), torch.Generator().manual_seed(number)
         full, seen = add_glass(scene, generator, {"vessel": 1})
@@ -66,14 +104,18 @@ def test_wrong_depth_of_simulated_vessels_is_ranked_first_and_expected_to_be_wro
         found = probability_of_glass(rgb, inverse)
         assert found.shape == wrong.shape
         aucs.append(float(off_auc(found[known].double(), wrong[known].double(), 0.5)))
-    assert len(aucs) >= 4
+    assert len(aucs) >= 3
     assert sum(aucs) / len(aucs) > 0.8
 
 
 def test_stated_errors_of_all_methods_know_glass_unless_the_map_is_told_to_be_clean(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    rgb, depth, camera = torch.rand(3, 48, 64), torch.full((1, 48, 64), 2.0), Camera.from_fov(60, width=64, height=48)
+    rgb, depth, camera = (
+        torch.full((3, 48, 64), 0.5),
+        torch.full((1, 48, 64), 2.0),
+        Camera.from_fov(60, width=64, height=48),
+    )
     glass = torch.zeros(1, 48, 64)
     glass[:, :24] = 0.06
     monkeypatch.setattr("dsr.inference.any_ratio.expect_glass", lambda *_: glass)
@@ -89,6 +131,7 @@ def test_stated_errors_of_all_methods_know_glass_unless_the_map_is_told_to_be_cl
     assert clean.glass is None
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # Lightning's
 def test_training_script_writes_weights_that_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)

@@ -310,13 +310,13 @@ class Identified(NamedTuple):
         """Return :func:`least_error`, in the mode of the sensor that the map's values show."""
         return least_error(self.sensor, depth, self.constant)
 
-    def offset_error(self, depth: Tensor) -> Tensor:
-        """Return the expected absolute systematic error of depth, in its unit, metres; 0 where no limit is known.
+    def offset_error(self, depth: Tensor) -> Tensor | None:
+        """Return the expected absolute systematic error of depth, in its unit, metres; None where no limit is known.
 
         It is half of the sensor's limit: the mean of offsets that are equally likely up to it.
         """
         limit = self.sensor.offset
-        return torch.zeros_like(depth) if limit is None else _interpolate(depth, limit) / 2
+        return None if limit is None else _interpolate(depth, limit) / 2
 
 
 def identify(depth: Tensor, name: str = "auto", device_name: str = "") -> Identified | None:

@@ -11,6 +11,8 @@ from torch import Tensor
 
 _NARROW = 2.5
 """Pixels; a hole whose pixels are nearer than that to measured ones is not wide, however coarse the map is."""
+_TOGETHER = 0.5
+"""Share of measured pixels whose four neighbours are measured, below which a map is one of single points."""
 
 
 def distance_to_known(known: Tensor) -> Tensor:
@@ -53,6 +55,13 @@ def wide_holes(known: Tensor, width: float) -> Tensor:
     if not bool(core.any()):
         return torch.zeros_like(known)
     return ~known & (_distance(~core) <= radius + 0.5)
+
+
+def is_scattered(known: Tensor) -> bool:
+    """Return whether the known pixels of a map, (1, h, w), are single points, as those of a laser scanner."""
+    inner = known[:, 1:-1, 1:-1]
+    beside = known[:, :-2, 1:-1] & known[:, 2:, 1:-1] & known[:, 1:-1, :-2] & known[:, 1:-1, 2:]
+    return bool((inner & beside).sum() < _TOGETHER * inner.sum())
 
 
 def _distance(mask: Tensor) -> Tensor:

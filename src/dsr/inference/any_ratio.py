@@ -35,7 +35,7 @@ from dsr.inference.working_size import (
     working_size_of,
 )
 from dsr.methods.base import InverseSurface, MapNoise, Method, NoiseLaw, Surface, expect_some_depth
-from dsr.methods.glass import BEHIND, expect_glass
+from dsr.methods.glass import NOTED, expect_glass
 from dsr.methods.recipe import Recipe, Run, read_recipe
 from dsr.sample import DepthSample, expect_distances
 from dsr.utils.compute_device import fast_precision, pick_device
@@ -409,9 +409,10 @@ def _in_depth(
     if sensor is not None:
         depth = inverse_hr.reciprocal()
         spread = torch.fmax(spread, left_of(sensor.least_error(depth) * inverse_hr))
-        spread = torch.hypot(spread, sensor.offset_error(depth) * inverse_hr)
+        offset = sensor.offset_error(depth)
+        spread = spread if offset is None else torch.hypot(spread, offset * inverse_hr)
     result = inverse_hr.reciprocal_()
-    share = None if glass is None else float((glass >= BEHIND).double().mean())
+    share = None if glass is None else float((glass > NOTED).double().mean())
     return Surface(result, spread * result, angle, found.noise, glass=share)
 
 

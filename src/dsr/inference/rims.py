@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.geometry.hole_size import distance_to_known
+from dsr.geometry.hole_size import distance_to_known, is_scattered
 from dsr.methods.inpainting import inpaint
 
 _STEP = 1.1
@@ -46,8 +46,6 @@ _LEVELS, _APART, _PART = 19, 5, 0.5
 the depths, have more than this part of the range between them."""
 _MOST = 1 << 14
 """Pixels at a time."""
-_TOGETHER = 0.5
-"""Share of measured pixels whose four neighbours are measured, below which a map is one of single points."""
 
 
 class Settled(NamedTuple):
@@ -72,7 +70,7 @@ def settle_holes(inverse: Tensor, rgb: Tensor, holes: Tensor) -> Settled:
     """
     known = inverse.isfinite()
     settled, doubt, of_method = inverse.clone(), torch.zeros_like(inverse), torch.zeros_like(inverse)
-    if not bool((holes & ~known).any()) or _is_scattered(known):
+    if not bool((holes & ~known).any()) or is_scattered(known):
         return Settled(settled, doubt)
     colours = functional.adaptive_avg_pool2d(rgb[None].to(inverse), (inverse.shape[-2], inverse.shape[-1]))[0]
     away = distance_to_known(known)[0]
@@ -88,13 +86,6 @@ def settle_holes(inverse: Tensor, rgb: Tensor, holes: Tensor) -> Settled:
         same = decided & ((settled / usual).log().abs() < _DIFFERENT)
         settled = settled.masked_fill(same, math.nan)
     return Settled(settled, torch.where(settled.isfinite(), doubt, of_method))
-
-
-def _is_scattered(known: Tensor) -> bool:
-    """Return whether the known pixels of a map, (1, h, w), are single points, as those of a laser scanner."""
-    inner = known[:, 1:-1, 1:-1]
-    beside = known[:, :-2, 1:-1] & known[:, 2:, 1:-1] & known[:, 1:-1, :-2] & known[:, 1:-1, 2:]
-    return bool((inner & beside).sum() < _TOGETHER * inner.sum())
 
 
 def _settle(

@@ -151,14 +151,16 @@ class Surface(NamedTuple):
         """Return the shares of the pixels that are ``measured``, ``filled`` and ``open``, which have no depth.
 
         With expected errors also the share of those that have depth and are ``dubious``: expected to be off by more
-        than ``limit`` of it. Without knowing what was filled, what has depth counts as measured.
+        than ``limit`` of it; and of those that are probably ``glass``. Without knowing what was filled, what has depth
+        counts as measured.
         """
         known = self.depth.isfinite()
         filled = known & self.filled if self.filled is not None else known & False
         found = {"measured": known & ~filled, "filled": filled, "open": ~known}
         if self.depth_error is not None:
             found["dubious"] = known & (self.depth_error > limit * self.depth)
-        return {name: float(mask.double().mean()) for name, mask in found.items()}
+        glass = {} if self.glass is None else {"glass": self.glass}
+        return {name: float(mask.double().mean()) for name, mask in found.items()} | glass
 
     def error_arrays(self) -> dict[str, np.ndarray]:
         """Return the expected errors by name, (H, W), as they are stored; empty without them.

@@ -1,13 +1,10 @@
 """Glass, mirrors and gloss: where the depth of a sensor is probably not that of the surface which the photo shows.
 
 A sensor sees through clear objects, and mirrors deceive it; its depth there is smooth, and looks right. What gives it
-away is that photo and map contradict each other: the map has holes amid a surface, away from depth steps, and the photo
-texture, rims and highlights, beside which a sensor loses nothing elsewhere. :class:`GlassFinder` knows each pixel by 26
-such features, on a grid of at most 320 x 320 pixels, and is the mean of four small networks, as one alone varies.
-It was trained on simulated objects alone (:mod:`dsr.degradation.glass`) by ``scripts/train_glass.py``.
-
-What found less: a U-net of 1.1 million parameters that sees photo and map as they are, after 2,000 steps, nothing in
-real photos; the same without the six features that depend on brightness or on the strength of the noise, half as much.
+away is that photo and map contradict each other: the map has holes amid a surface, away from depth steps, where the
+photo has texture, rims and highlights, beside which a sensor loses nothing elsewhere. :class:`GlassFinder` judges each
+pixel by 26 such features, on a grid of at most 320 x 320 pixels: an object is found best if it is 5 to 20 % of the
+photo wide. It was trained by ``scripts/train_glass.py`` on the objects of :mod:`dsr.degradation.glass`.
 """
 
 from __future__ import annotations
@@ -21,23 +18,30 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from dsr.geometry.hole_size import is_scattered, wide_holes
+
 _WEIGHTS = Path(__file__).with_suffix(".safetensors")
 GRID = 320
 """Pixels of the longer side of the grid on which features are computed."""
 FEATURES = 26
-_LAYERS = (48, 32)
-_MEMBERS = 4
+"""Of a pixel, without units: means of holes, texture, roughness, depth steps, brightness and saturation."""
+_LAYERS, _MEMBERS = (48, 32), 4
+"""Sizes of the hidden layers of a network, and how many networks there are."""
 _HOLES, _AMID, _TEXTURE, _ROUGHNESS, _NEAR = (2, 4, 8, 16), (4, 8, 16), (3, 6, 12), (3, 8), (3, 8, 16)
 """Pixels of the grid: standard deviations of means of holes, of holes amid a surface, of the photo's texture and of the
 map's roughness; and reaches of depth steps."""
 _AMID_REACH, _AMID_STEP = 16, 0.06
 """A hole is amid a surface if the logarithms of the depths so near differ by less."""
-WIDE = 20
-"""Half the width of holes that are no sign of glass: what is out of a sensor's range, or was cut away. Objects of the
-training may be as large, so that it leaves none out."""
+WIDE = 40.0
+"""Width of holes of the grid that are no sign of glass, as what is out of a sensor's range or was cut away is."""
+_EVIDENCE = 0.02
+"""Mean of the holes around a pixel, at least; where a sensor loses nothing, texture is taken for glass."""
 _BURNT, _DARK = 0.9, 0.1
-BEHIND = 0.06
+"""Grey levels above and below which a pixel counts as burnt out and as dark."""
+_BEHIND = 0.06
 """Relative error of depth that was measured through a clear object."""
+NOTED = 0.02
+"""Relative error because of glass from which a pixel counts as glass."""
 _PERHAPS, _PROBABLY = 0.1, 0.3
 """Probabilities of glass from which it is expected in part, and in full: those of simulated objects, in the scenes of
 whose training they are more common than elsewhere."""
@@ -59,7 +63,11 @@ class GlassFinder(nn.Module):
         first, second = _LAYERS
         self.members = nn.ModuleList(
             nn.Sequential(
-                nn.Linear(FEATURES, first), nn.ReLU(), nn.Linear(first, second), nn.ReLU(), nn.Linear(second, 1)
+                nn.Linear(FEATURES, first),
+                nn.ReLU(inplace=True),
+                nn.Linear(first, second),
+                nn.ReLU(inplace=True),
+                nn.Linear(second, 1),
             )
             for _ in range(_MEMBERS)
         )
@@ -78,11 +86,14 @@ class GlassFinder(nn.Module):
 @functools.cache
 def glass_finder(device: torch.device) -> GlassFinder:
     """Return the trained one, on a device."""
-    finder = GlassFinder().eval().requires_grad_(False)
-    finder.load_state_dict(safetensors.torch.load(_WEIGHTS.read_bytes()))
-    return finder.to(device)
+    with torch.inference_mode(mode=False), torch.device("meta"):  # draws no random numbers
+        finder = GlassFinder().eval().requires_grad_(False)
+    state = safetensors.torch.load(_WEIGHTS.read_bytes())
+    finder.load_state_dict({name: value.to(device) for name, value in state.items()}, assign=True)
+    return finder.requires_grad_(False)
 
 
+@torch.no_grad()
 def probability_of_glass(rgb: Tensor, inverse: Tensor) -> Tensor:
     """Return how probable it is that depth is not that of the surface which the photo shows, as in glass.
 
@@ -91,46 +102,56 @@ def probability_of_glass(rgb: Tensor, inverse: Tensor) -> Tensor:
         inverse: (1, h, w) inverse depth as measured, in 1/m, of the same view; NaN in holes.
 
     Returns:
-        (1, H, W) float32, 0 without a measured pixel.
+        (1, H, W) float32; 0 where no hole is near, and everywhere in a map of single points.
 
     Example:
         >>> import torch
         >>> from dsr.methods.glass import probability_of_glass
         >>> wall = probability_of_glass(torch.rand(3, 48, 64), torch.full((1, 24, 32), 0.5))
-        >>> wall.shape, bool(wall.max() < 0.1)
-        (torch.Size([1, 48, 64]), True)
+        >>> wall.shape, float(wall.max())
+        (torch.Size([1, 48, 64]), 0.0)
 
     """
     height, width = rgb.shape[-2:]
-    if not bool(inverse.isfinite().any()):
-        return rgb.new_zeros(1, height, width)
-    finder = glass_finder(rgb.device)
-    features = glass_features(rgb, inverse.to(rgb))
-    found = finder(finder.normalise(features.movedim(0, -1))).mean(dim=-1).sigmoid()
+    inverse = inverse.to(rgb.device, torch.float32)
+    size = _grid_size(height, width, GRID)
+    known = inverse.isfinite()
+    if is_scattered(known) or not bool(_on_grid(inverse, size)[1].gt(0.5).any()):
+        return torch.zeros(1, height, width, device=rgb.device)
+    near = _blur(_holes(known, size, WIDE), _HOLES[-1])[0] > _EVIDENCE
+    found = torch.zeros(size, device=rgb.device)
+    if bool(near.any()):
+        finder = glass_finder(rgb.device)
+        features = glass_features(rgb, inverse)[:, near].T
+        found[near] = finder(finder.normalise(features)).mean(dim=-1).sigmoid()
     return _resize(found[None], (height, width))
 
 
 def expect_glass(rgb: Tensor, inverse: Tensor) -> Tensor:
-    """Return the relative error of depth to expect because of glass, (1, H, W); see :func:`probability_of_glass`."""
-    share = (probability_of_glass(rgb, inverse) - _PERHAPS) / (_PROBABLY - _PERHAPS)
-    return BEHIND * share.clamp(0, 1)
-
-
-def glass_features(rgb: Tensor, inverse: Tensor, grid: int = GRID, wide: int | None = WIDE) -> Tensor:
-    """Return the features of a photo, (3, H, W), and inverse depth, (1, h, w) with a known pixel: (FEATURES, g, g').
+    """Return the relative error of depth to expect because of glass, (1, H, W), 0 to 0.06.
 
     Args:
         rgb, inverse: see :func:`probability_of_glass`.
-        grid: pixels of the longer side of the result.
-        wide: half the width of holes that do not count; None if all do.
 
     """
-    height, width = rgb.shape[-2:]
-    size = tuple(max(16, round(n * grid / max(height, width))) for n in (height, width))
+    share = (probability_of_glass(rgb, inverse) - _PERHAPS) / (_PROBABLY - _PERHAPS)
+    return _BEHIND * share.clamp(0, 1)
+
+
+def glass_features(rgb: Tensor, inverse: Tensor, grid: int = GRID, wide: float | None = WIDE) -> Tensor:
+    """Return the features of the pixels of a grid, (FEATURES, g, g') float32, whose sides are 16 or more.
+
+    Args:
+        rgb, inverse: see :func:`probability_of_glass`; at least half of a pixel of the grid is known.
+        grid: pixels of its longer side.
+        wide: width of holes that do not count, in pixels of the grid; None if all count.
+
+    """
+    size = _grid_size(rgb.shape[-2], rgb.shape[-1], grid)
     photo = functional.interpolate(rgb[None].float(), size, mode="bilinear", antialias=True, align_corners=False)[0]
     logs, weight = _on_grid(inverse.float(), size)
     known = weight > 0.5
-    holes = 1 - weight if wide is None else (1 - weight).masked_fill(_is_wide(~known, wide), 0)
+    holes = _holes(inverse.isfinite(), size, wide)
     steps = {reach: _range_around(logs, known, reach) for reach in {*_NEAR, _AMID_REACH}}
     around = steps[_AMID_REACH]
     amid = holes * ((around >= 0) & (around < _AMID_STEP))
@@ -166,20 +187,40 @@ def glass_features(rgb: Tensor, inverse: Tensor, grid: int = GRID, wide: int | N
     return torch.cat(found)
 
 
-def _on_grid(inverse: Tensor, size: tuple[int, ...]) -> tuple[Tensor, Tensor]:
+def _on_grid(inverse: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Return logarithms of inverse depth on the grid and which part of each pixel is known, (1, g, g') each."""
     known = inverse.isfinite()
     values = torch.where(known, inverse, 1).clamp(min=1e-6).log()[None]
     weight = known.to(values)[None]
-    mode = "area" if inverse.shape[-1] > size[1] else "nearest-exact"
-    logs, weight = (functional.interpolate(each, size, mode=mode)[0] for each in (values, weight))
+    logs, weight = (functional.interpolate(each, size, mode=_mode(inverse, size))[0] for each in (values, weight))
     return torch.where(weight > 0, logs / weight.clamp(min=1e-3), 0), weight
 
 
-def _is_wide(holes: Tensor, reach: int) -> Tensor:
-    """Return the parts of holes, (1, g, g') bool, that squares of a width fit into, and what is beside them."""
-    inner = -_highest_around(-holes.float(), reach)
-    return _highest_around(inner, reach + 2) > 0
+def _grid_size(height: int, width: int, longer: int) -> tuple[int, int]:
+    """Return the size of the grid of a photo, whose longer side is given."""
+    rows, columns = (max(16, round(n * longer / max(height, width))) for n in (height, width))
+    return rows, columns
+
+
+def _holes(known: Tensor, size: tuple[int, int], wide: float | None) -> Tensor:
+    """Return which part of each pixel of the grid is a hole, (1, g, g'), without single pixels and what is wide.
+
+    Args:
+        known: (1, h, w) bool.
+        size: of the grid.
+        wide: width of holes that do not count, in pixels of the grid; None if all count.
+
+    """
+    missing = (~known).float()
+    if min(known.shape[-2:]) > 2:  # opened by 3 x 3 pixels
+        missing = _highest_around(-_highest_around(-missing, 1), 1)
+    found = functional.interpolate(missing[None], size, mode=_mode(known, size))[0]
+    return found if wide is None else found.masked_fill(wide_holes(found < 0.5, wide), 0)
+
+
+def _mode(values: Tensor, size: tuple[int, int]) -> str:
+    """Return how a map is brought to a size: by means, or by repeating pixels."""
+    return "area" if values.shape[-1] > size[1] else "nearest-exact"
 
 
 def _range_around(logs: Tensor, known: Tensor, reach: int) -> Tensor:
@@ -211,8 +252,10 @@ def _blur(values: Tensor, deviation: float) -> Tensor:
 
 
 def _enlarge(values: Tensor, factor: int) -> Tensor:
+    """Return values, (c, g, g'), enlarged by a factor."""
     return functional.interpolate(values[None], scale_factor=factor, mode="bilinear", align_corners=False)[0]
 
 
 def _resize(values: Tensor, size: tuple[int, int]) -> Tensor:
+    """Return values, (c, g, g'), at a size."""
     return functional.interpolate(values[None], size, mode="bilinear", align_corners=False)[0]

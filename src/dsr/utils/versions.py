@@ -15,7 +15,7 @@ from typing import Any
 from dsr.utils.guards import opened
 from dsr.utils.progress import Task
 
-RESULTS = 5
+RESULTS = 6
 """Version of what predicts and trains, raised with each change of its results, so that older predictions are not used
 again. ``tests/golden/test_results.py`` notices such a change."""
 SCENES = 1

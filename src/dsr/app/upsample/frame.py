@@ -37,7 +37,7 @@ from dsr.io.exports import FLAT
 from dsr.io.inputs import Picture, read_picture
 from dsr.io.pairs import Pair
 from dsr.methods.base import MapNoise, Outliers, Surface
-from dsr.methods.glass import BEHIND
+from dsr.methods.glass import NOTED
 from dsr.notes import CHECKS, Assumption, expect_no_warning
 from dsr.utils.guards import readable
 from dsr.utils.lengths import show_length
@@ -369,7 +369,7 @@ def _noise_in_brief(noise: MapNoise | None) -> list[str]:
 
 def _shares_in_brief(shares: Mapping[str, float]) -> list[str]:
     """Return the shares of the pixels in a few words each, less those that there are none of."""
-    words = {"open": "left open"}
+    words = {"open": "left open", "glass": "like glass"}
     return [f"{words.get(name, name)} {_percent(share)}" for name, share in shares.items() if share]
 
 
@@ -390,8 +390,8 @@ def _describe_glass(share: float | None) -> list[Assumption]:
     """Return a note on what looks like glass, if there is enough of it."""
     if share is None or share < _GLASS:
         return []
-    text = "photo and depth contradict each other as in glass, mirrors and gloss, where the depth is not to be trusted"
-    return [Assumption(text, f"{share:.1%} of the pixels, whose expected error is at least {BEHIND:.0%}")]
+    text = "photo and depth disagree as they do on glass, mirrors and gloss; do not trust the depth there"
+    return [Assumption(text, f"{share:.1%} of the pixels, expected to be off by more than {NOTED:.0%}")]
 
 
 def _describe_holes(surface: Surface, how: Upsampling) -> list[Assumption]:

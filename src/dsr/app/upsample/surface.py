@@ -112,6 +112,11 @@ class Surface(Generic[Array]):
         return self._found.outliers
 
     @property
+    def glass(self) -> float | None:
+        """The share of the pixels that are probably glass, mirrors or gloss; None of a map told to be clean."""
+        return self._found.glass
+
+    @property
     def photo(self) -> Array:
         """The photo: (H, W, 3) uint8 as an array, (3, H, W) float32 in [0, 1] as a tensor."""
         rgb = self._picture.rgb

@@ -6,7 +6,6 @@ photo is resized to a multiple of the map, and the result to the photo's size.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal, get_args
@@ -20,9 +19,7 @@ from dsr.degradation.hints import encode_facts, local_noise, relative_error
 from dsr.geometry.hole_size import degrees_per_pixel, distance_to_known
 from dsr.geometry.resampling import pad_inverse_depth, resize_inverse_depth
 from dsr.methods.base import Abilities, Cost, InverseSample, InverseSurface, MapNoise, Method, NoiseLaw, Surface
-from dsr.methods.classical.finite_differences import repeat_blocks
-from dsr.methods.networks.facets_planes import stencil
-from dsr.methods.networks.facets_unet import LEAST_LOG_ERROR, FacetsUNet
+from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.network import DTYPES, Answer, DisparityNetwork, Precision
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import clean_weights, load_network
@@ -34,13 +31,8 @@ _TOLERANCE = 0.02
 """A map is taken for one of the photo's own size up to this relative difference."""
 CAUTION = 1.1
 """Measured errors over expected ones on rendered scenes that are not trained on, see ``benchmarks/confidence.py``."""
-CAUTION_IF_CLEAN = 0.92
-"""The same of the weights for box means without noise, on 36 procedural scenes that are not trained on, x4 and x8."""
-_EXACT, _BENDS, _STRAIGHT = 3.5e-5, {1: 0.1, 3: 0.07, 7: 0.17, 15: 0.05}, 1e-12
-"""Relative error of depth where those weights state the least that they can: a product of powers of the bend around,
-relative to the value, by the size of the window in which the largest of a map's bends counts, in its pixels; where the
-map is straight up to rounding, the bend is ``_STRAIGHT``. Fitted to the same scenes, as they are and rounded to
-float32."""
+CAUTION_IF_CLEAN = 0.85
+"""The same of the weights for box means without noise."""
 _PER_DEGREE = 0.012
 """Relative error of depth in holes that the network does not expect, per degree from the nearest measured pixel. On
 Middlebury 2014 and ICL-NUIM with holes cut into them it expects 2 % everywhere, and depth is off by 3 % at 0.5 to 1
@@ -108,10 +100,10 @@ class AnyMap(Method):
             raise ValueError(f"noise_growth: expected noise with it, got {noise_growth} and no noise")
         if max_error is not None and not max_error > 0:
             raise ValueError(f"max_error: expected a positive share of the depth, got {max_error}")
-        self._for_clean = False
+        self._caution = CAUTION
         if isinstance(weights, str | Path):
             for_clean = clean_weights(Path(weights)) if cleanly and (kernel, edges) == ("box", "sharp") else None
-            self._for_clean = for_clean is not None
+            self._caution = CAUTION if for_clean is None else CAUTION_IF_CLEAN
             weights = _load(for_clean or Path(weights), model, precision, networks)
         self._max_error = max_error
         self._net = weights.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs
@@ -156,9 +148,9 @@ class AnyMap(Method):
         inside = (..., slice(factor * rows), slice(factor * columns))
         result = resize_inverse_depth(answer.disparity[inside][0], (size[0], size[1]))
         depth = torch.where(result > 0, result, torch.nan).reciprocal().to(sample.depth_lr.device)
+        errors = (_resize(each[inside], (size[0], size[1]))[0].to(depth) for each in (answer.spread, answer.angle))
+        spread, angle = (self._caution * each for each in errors)
         focal = sample.camera_lr.fx
-        stated = _calibrate(answer, padded, factor * focal, clean=self._for_clean)
-        spread, angle = (_resize(each[inside], (size[0], size[1]))[0].to(depth) for each in stated)
         more = (each.to(depth) for each in (*_rounding(inverse, focal), _guessing(inverse, focal)))
         rounding, tilt, guessing = (_resize(each, (size[0], size[1]))[0] for each in more)
         spread, angle = torch.maximum(spread, rounding) + guessing, torch.maximum(angle, tilt)
@@ -205,33 +197,6 @@ def _describe_noise(given: Tensor, answer: Answer) -> MapNoise:
     variance = error.square().sum() / count
     depth = given[given.isfinite()].median().reciprocal()
     return MapNoise(float(variance.sqrt() * depth), _extent(error, known, float(variance)), float(depth))
-
-
-def _calibrate(answer: Answer, inverse: Tensor, focal: float, *, clean: bool) -> tuple[Tensor, Tensor]:
-    """Return the expected errors of a network, those of depth relative and of normals in radians, as they are measured.
-
-    Where the weights for clean maps state the least that they can, surfaces are planes, of which the result is as exact
-    as the map is straight around; a normal is off by no more than neighbouring pixels that are off by as much.
-
-    Args:
-        answer: of the network.
-        inverse: (B, 1, h, w) the map.
-        focal: the focal length in pixels of the result.
-        clean: whether the weights are those for clean maps.
-
-    """
-    caution = CAUTION_IF_CLEAN if clean else CAUTION
-    spread, angle = (caution * each.to(inverse) for each in (answer.spread, answer.angle))
-    if not clean:
-        return spread, angle
-    bend = stencil(inverse).bend / inverse  # NaN around holes
-    exact = torch.full_like(bend, _EXACT)
-    for size, power in _BENDS.items():
-        exact = exact * (functional.max_pool2d(bend, size, stride=1, padding=size // 2) + _STRAIGHT) ** power
-    exact = repeat_blocks(exact, spread.shape[-1] // bend.shape[-1])
-    least = answer.spread <= 1.001 * math.exp(LEAST_LOG_ERROR)
-    spread = torch.where(least, torch.fmin(spread, exact), spread)
-    return spread, torch.where(least, torch.minimum(angle, focal * spread), angle)
 
 
 def _guessing(inverse: Tensor, focal: float) -> Tensor:

@@ -60,8 +60,6 @@ from dsr.utils.progress import Steps
 
 _SHARED = ("coarse", "hints", "modulation", "shares", "trunk", "wide", "planes", "blend")
 """Layers at the low resolution."""
-LEAST_LOG_ERROR = -12.0
-"""Logarithm of the least expected error that is stated."""
 _LEVELS = 3
 """Smoothed copies of the map."""
 _LR_CHANNELS = 10 + 4 * _LEVELS + 3
@@ -263,7 +261,7 @@ class FacetsUNet(DisparityNetwork):
         if noise is None:
             noise = torch.zeros_like(values)
         result, errors = self(rgb, values, known, noise, hints, kernels, progress)
-        spread, angle = errors.clamp(LEAST_LOG_ERROR, 4).exp().split(1, dim=1)
+        spread, angle = errors.clamp(-12, 4).exp().split(1, dim=1)
         return Answer(result * unit, spread, angle)
 
     def forward(
