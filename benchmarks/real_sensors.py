@@ -66,8 +66,9 @@ from dsr.degradation.downsampling import scene_generator
 from dsr.degradation.glass import add_glass
 from dsr.degradation.noise import Kinect
 from dsr.degradation.random_degradation import Everything
-from dsr.degradation.random_fields import field_of, near_steps, window_maxima
+from dsr.degradation.random_fields import field_of, near_steps
 from dsr.geometry.surface import angle_between, depth_to_normals
+from dsr.geometry.windows import window_maxima
 from dsr.inference import upsample_surface
 from dsr.inference.defaults import Fill
 from dsr.inference.sequences import View, fuse_views

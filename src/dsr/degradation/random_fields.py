@@ -13,6 +13,7 @@ from scipy import ndimage
 from torch import Tensor
 from torch.nn import functional
 
+from dsr.geometry.windows import window_maxima
 from dsr.sample import Scene
 
 
@@ -119,19 +120,6 @@ def near_steps(values: Tensor, reach: int, jump: float = 0.04) -> Tensor:
     high = window_maxima(values.nan_to_num(-math.inf), reach)
     low = -window_maxima((-values).nan_to_num(-math.inf), reach)
     return high > (1 + jump) * low
-
-
-def window_maxima(values: Tensor, reach: int) -> Tensor:
-    """Return the largest values within ``reach`` rows and columns, (1, h, w)."""
-    result = functional.pad(values, (reach,) * 4, value=-math.inf)
-    for dim in (-2, -1):
-        size = 1
-        while size < 2 * reach + 1:  # of windows twice as large, until they are large enough
-            shift = min(size, 2 * reach + 1 - size)
-            rest = result.shape[dim] - shift
-            result = torch.maximum(result.narrow(dim, 0, rest), result.narrow(dim, shift, rest))
-            size += shift
-    return result
 
 
 def add_relief(scene: Scene, generator: torch.Generator) -> Scene:

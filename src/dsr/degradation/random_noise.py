@@ -17,9 +17,9 @@ from dsr.degradation.random_fields import (
     power,
     uniform,
     waves_of,
-    window_maxima,
     window_means,
 )
+from dsr.geometry.windows import window_maxima
 
 
 def _white(values: Tensor, _: Tensor, generator: torch.Generator) -> Tensor:

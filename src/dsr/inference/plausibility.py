@@ -20,6 +20,7 @@ from torch.nn import functional
 from dsr.geometry.camera import Camera
 from dsr.geometry.hole_size import degrees_per_pixel, distance_to_known
 from dsr.geometry.surface import angle_between, depth_to_normals
+from dsr.geometry.windows import window_maxima
 from dsr.inference.resizing import resize_nearest, size_of
 from dsr.methods.base import Outliers
 
@@ -135,8 +136,8 @@ def within_measured(result: Tensor, given: Tensor, radius: int = RADIUS) -> Tens
 
 def _bounds(given: Tensor, known: Tensor, reach: int) -> tuple[Tensor, Tensor]:
     """Return the smallest and largest value that the windows allow, (1, h, w), infinite where none is known."""
-    high = _running_max(given.masked_fill(~known, -torch.inf), reach)
-    low = -_running_max((-given).masked_fill(~known, -torch.inf), reach)
+    high = window_maxima(given.masked_fill(~known, -torch.inf), reach)
+    low = -window_maxima((-given).masked_fill(~known, -torch.inf), reach)
     margin = (high - low) / 2
     lowest, highest = torch.maximum(low - margin, low / 2), high + margin
     none = ~high.isfinite()
@@ -151,21 +152,6 @@ def _share(known: Tensor, reach: int) -> Tensor:
     window = (2 * reach + 1, 2 * reach + 1)
     found = cv2.boxFilter(known[0].cpu().numpy().astype(np.float32), -1, window, borderType=cv2.BORDER_REFLECT)
     return torch.from_numpy(found)[None].to(known.device)
-
-
-def _running_max(values: Tensor, reach: int) -> Tensor:
-    """Return the largest value in the square windows of 2 reach + 1 pixels, (1, h, w)."""
-    for dim in (-2, -1):
-        size, width, done = values.shape[dim], 2 * reach + 1, 1
-        padding = (reach, reach) if dim == -1 else (0, 0, reach, reach)
-        values = functional.pad(values, padding, value=-torch.inf)
-        while done < width:  # the maximum of ``done`` pixels from each on
-            step = min(done, width - done)
-            length = values.shape[dim] - step
-            values = torch.maximum(values.narrow(dim, 0, length), values.narrow(dim, step, length))
-            done += step
-        values = values.narrow(dim, 0, size)
-    return values
 
 
 def _isolated(values: np.ndarray, largest: int) -> np.ndarray:
@@ -194,7 +180,7 @@ def _isolated(values: np.ndarray, largest: int) -> np.ndarray:
 def _largest_around(values: np.ndarray) -> np.ndarray:
     """Return the largest value in the window around each pixel, (h, w), NaN in holes; minus infinity for none."""
     filled = torch.from_numpy(np.nan_to_num(values, nan=-np.inf))[None]
-    return _running_max(filled, RADIUS)[0].numpy()
+    return window_maxima(filled, RADIUS)[0].numpy()
 
 
 def _around(box: np.ndarray, margin: int) -> tuple[slice, slice]:

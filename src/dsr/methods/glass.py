@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.geometry.hole_size import is_scattered, wide_holes
+from dsr.geometry.windows import window_maxima
 
 _WEIGHTS = Path(__file__).with_suffix(".safetensors")
 GRID = 320
@@ -213,7 +214,7 @@ def _holes(known: Tensor, size: tuple[int, int], wide: float | None) -> Tensor:
     """
     missing = (~known).float()
     if min(known.shape[-2:]) > 2:  # opened by 3 x 3 pixels
-        missing = _highest_around(-_highest_around(-missing, 1), 1)
+        missing = window_maxima(-window_maxima(-missing, 1), 1)
     found = functional.interpolate(missing[None], size, mode=_mode(known, size))[0]
     return found if wide is None else found.masked_fill(wide_holes(found < 0.5, wide), 0)
 
@@ -225,16 +226,8 @@ def _mode(values: Tensor, size: tuple[int, int]) -> str:
 
 def _range_around(logs: Tensor, known: Tensor, reach: int) -> Tensor:
     """Return by how much the known values of windows differ, (1, g, g'); much less than 0 where there is none."""
-    highest, lowest = (_highest_around((sign * logs).masked_fill(~known, -1e3), reach) for sign in (1, -1))
+    highest, lowest = (window_maxima((sign * logs).masked_fill(~known, -1e3), reach) for sign in (1, -1))
     return highest + lowest
-
-
-def _highest_around(values: Tensor, reach: int) -> Tensor:
-    """Return the highest value of the window around each pixel, (1, g, g')."""
-    window = 2 * reach + 1
-    for size, padding in (((window, 1), (reach, 0)), ((1, window), (0, reach))):
-        values = functional.max_pool2d(values, size, 1, padding)
-    return values
 
 
 def _blur(values: Tensor, deviation: float) -> Tensor:

@@ -1,0 +1,28 @@
+"""Largest values of the windows around pixels."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+
+def window_maxima(values: Tensor, reach: int) -> Tensor:
+    """Return the largest values within some rows and columns of each pixel, (1, h, w).
+
+    Args:
+        values: (1, h, w), without NaN.
+        reach: rows and columns to each side.
+
+    """
+    result = functional.pad(values, (reach,) * 4, value=-math.inf)
+    for dim in (-2, -1):
+        size = 1
+        while size < 2 * reach + 1:  # of windows twice as large, until they are large enough
+            shift = min(size, 2 * reach + 1 - size)
+            rest = result.shape[dim] - shift
+            result = torch.maximum(result.narrow(dim, 0, rest), result.narrow(dim, shift, rest))
+            size += shift
+    return result
