@@ -118,8 +118,10 @@ def check_wheel(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as packed:
         names = packed.namelist()
     there = {Path(name).stem for name in names if name.endswith(".safetensors")}
-    if there != weights.known().keys() - left_out():
-        raise ReleaseError(f"{wheel}: expected the weights of methods that compute by default, got {sorted(there)}")
+    if there != {"glass", *weights.known()} - left_out():
+        raise ReleaseError(
+            f"{wheel}: expected the weights of methods that compute by default and glass, got {sorted(there)}"
+        )
     missing = [
         str(path) for path in (REPOSITORY / "conf").rglob("*.yaml")
         if f"dsr/{path.relative_to(REPOSITORY).as_posix()}" not in names
