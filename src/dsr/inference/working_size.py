@@ -21,6 +21,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.degradation.sensors import Identified, identify
+from dsr.geometry.windows import window_maxima
 from dsr.inference.defaults import SIZES
 from dsr.inference.resizing import resize_nearest, size_of
 from dsr.methods.base import InverseSurface, MapNoise, NoiseLaw
@@ -238,9 +239,8 @@ def mix_where_calm(found: InverseSurface, smoother: InverseSurface, measured: Te
     if found.spread is None or smoother.spread is None or found.angle is None or smoother.angle is None:
         return found
     share = _find_calm(torch.maximum(found.spread, smoother.spread), measured)[0].nan_to_num(0)
-    window = 2 * reach + 1  # a mean of minima is nowhere more than the share itself
-    share = -functional.max_pool2d(-share, window, stride=1, padding=reach)
-    share = functional.avg_pool2d(share, window, stride=1, padding=reach, count_include_pad=False)
+    least = -window_maxima(-share, reach)  # a mean of minima is nowhere more than the share itself
+    share = functional.avg_pool2d(least, 2 * reach + 1, stride=1, padding=reach, count_include_pad=False)
     return InverseSurface(
         torch.lerp(found.inverse, smoother.inverse, share),
         torch.lerp(found.spread, smoother.spread, share),

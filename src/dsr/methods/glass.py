@@ -145,7 +145,8 @@ def glass_features(rgb: Tensor, inverse: Tensor, grid: int = GRID, wide: float |
     Args:
         rgb, inverse: see :func:`probability_of_glass`; at least half of a pixel of the grid is known.
         grid: pixels of its longer side.
-        wide: width of holes that do not count, in pixels of the grid; None if all count.
+        wide: width of holes that do not count, in pixels of the grid, as those thinner than three pixels of the map do
+            not; None if all count, as in the training, whose objects may be as large.
 
     """
     size = _grid_size(rgb.shape[-2], rgb.shape[-1], grid)
@@ -204,16 +205,17 @@ def _grid_size(height: int, width: int, longer: int) -> tuple[int, int]:
 
 
 def _holes(known: Tensor, size: tuple[int, int], wide: float | None) -> Tensor:
-    """Return which part of each pixel of the grid is a hole, (1, g, g'), without single pixels and what is wide.
+    """Return which part of each pixel of the grid is a hole that counts, (1, g, g').
 
     Args:
         known: (1, h, w) bool.
         size: of the grid.
-        wide: width of holes that do not count, in pixels of the grid; None if all count.
+        wide: width of holes that do not count, in pixels of the grid, as those thinner than three pixels of the map do
+            not; None if all count.
 
     """
     missing = (~known).float()
-    if min(known.shape[-2:]) > 2:  # opened by 3 x 3 pixels
+    if wide is not None and min(known.shape[-2:]) > 2:
         missing = window_maxima(-window_maxima(-missing, 1), 1)
     found = functional.interpolate(missing[None], size, mode=_mode(known, size))[0]
     return found if wide is None else found.masked_fill(wide_holes(found < 0.5, wide), 0)
