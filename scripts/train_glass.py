@@ -1,7 +1,7 @@
 """Train what finds glass: ``python scripts/train_glass.py [--scenes 4200] [--workers 2] [-o FILE]``.
 
 Rendered scenes get clear, mirroring and glossy objects, three quarters of them, and before all of them stands a
-simulated sensor; some of their pixels are learnt from. About 15 minutes on two cores, most of it for the scenes, and
+simulated sensor; some of their pixels are learnt from. About 20 minutes on two cores, most of it for the scenes, and
 8 more to render 400 of them the first time. Equal options give equal weights.
 """
 

@@ -3,8 +3,8 @@
 A sensor sees through clear objects, and mirrors deceive it; its depth there is smooth, and looks right. What gives it
 away is that photo and map contradict each other: the map has holes amid a surface, away from depth steps, where the
 photo has texture, rims and highlights, beside which a sensor loses nothing elsewhere. :class:`GlassFinder` judges each
-pixel by 26 such features, on a grid of at most 320 x 320 pixels: an object is found best if it is 5 to 20 % of the
-photo wide. It was trained by ``scripts/train_glass.py`` on the objects of :mod:`dsr.degradation.glass`.
+pixel by 26 such features, on a grid of at most 320 x 320 pixels. It was trained by ``scripts/train_glass.py`` on the
+objects of :mod:`dsr.degradation.glass`, 6 to 70 % as wide as the grid.
 """
 
 from __future__ import annotations
