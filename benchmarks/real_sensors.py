@@ -18,9 +18,9 @@
 - ``creases``: the mean angle between normals where the truth's turn by more than 30 degrees within 6 pixels, the same
   on the rest, both away from depth steps, and the share of the creases in %: ``ddrnet``, and ICL-NUIM before a
   simulated structured-light camera.
-- ``flicker``: still cameras, ICL-NUIM and Middlebury before simulated structured light and stereo, five frames each:
+- ``flicker``: still cameras, ICL-NUIM and Middlebury before simulated structured light and stereo, seven frames each:
   the mean standard deviation of a point's depth over frames, of the input in mm, and of the results as a fraction of
-  that: of single frames, and of three frames fused before the method.
+  that: of single frames, and of three and of five frames fused before the method.
 - ``stated``: stated over true error of simulated sensors of all kinds, by source and ratio: geometric means of it, and
   of the factor by which it is off, either way.
 - ``clean``: box means of Lucy and Plant at x4 without noise, untold: RMSE_v in 1/1000.
@@ -93,7 +93,7 @@ FILLED = ("edges",)
 """Parts that measure results whose holes are filled, as what is beside a hole has no boundary."""
 CREASE, REACH, STEP = 30.0, 3, 0.02
 """Degrees by which normals differ across a crease, pixels to either side, and a depth step between neighbours."""
-STILL, FUSED, HIDES = 5, 3, 0.05
+STILL, FUSED, HIDES = 7, (3, 5), 0.05
 """Frames of a still camera, how many are fused, and the range of a point's readings, over depth, of two surfaces."""
 CLEAR = {"vessel": 0.75, "ball": 0.1, "box": 0.15}
 """Kinds of clear objects, those that are bodies, and their relative frequency."""
@@ -365,16 +365,17 @@ def score_flicker(frames: Sequence[DepthSample], method: Method) -> dict[str, fl
     views = [View(each.depth_lr, each.camera_lr, np.eye(4)) for each in frames]
     given_maps = torch.stack([each.depth_lr for each in frames])
     single = torch.stack([method(each).depth for each in frames])
-    fused = []
-    for start in range(STILL - FUSED + 1):
-        near = views[start : start + FUSED]
-        middle = near.pop(FUSED // 2)
-        depth_lr = fuse_views(middle, near).depth
-        fused.append(method(replace(frames[start + FUSED // 2], depth_lr=depth_lr)).depth)
-    edge = FUSED // 2
-    pairs = {"single": (single, given_maps), "fused": (torch.stack(fused), given_maps[edge:-edge])}
+    edge = max(FUSED) // 2
+    pairs = {"single": (single, given_maps)}
+    for count in FUSED:
+        fused = []
+        for middle in range(edge, STILL - edge):
+            near = views[middle - count // 2 : middle + count // 2 + 1]
+            depth_lr = fuse_views(near.pop(count // 2), near).depth
+            fused.append(method(replace(frames[middle], depth_lr=depth_lr)).depth)
+        pairs[f"fused{count}"] = (torch.stack(fused), given_maps[edge:-edge])
     calm = given_maps.amax(dim=0) - given_maps.amin(dim=0) < HIDES * given_maps.amin(dim=0)  # NaN is not
-    static = calm & torch.cat((single, pairs["fused"][0])).isfinite().all(dim=0)
+    static = calm & torch.cat([each for each, _ in pairs.values()]).isfinite().all(dim=0)
     means = {name: [float(each.double().std(dim=0)[static].mean()) for each in pair] for name, pair in pairs.items()}
     return {"mm": 1e3 * means["single"][1]} | {name: now / before for name, (now, before) in means.items()}
 

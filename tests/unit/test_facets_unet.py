@@ -14,7 +14,7 @@ from dsr.degradation.downsampling import Downsampling
 from dsr.degradation.hints import FACTS, KERNELS, encode_facts
 from dsr.methods.networks import facets_planes, facets_unet
 from dsr.methods.networks.facets import Facets
-from dsr.methods.networks.facets_layers import enlarge
+from dsr.methods.networks.facets_layers import enlarge, enlarge_and_join
 from dsr.methods.networks.facets_planes import (
     NEIGHBOURS,
     average_planes,
@@ -232,20 +232,38 @@ def test_gradients_of_mixed_planes_are_those_of_differences(monkeypatch: pytest.
     torch.testing.assert_close(others, found[:, NEIGHBOURS:])
 
 
-@pytest.mark.parametrize("width", [0, 5])
-def test_results_of_a_convolution_are_shuffled_before_features(width: int) -> None:
-    generator = torch.Generator().manual_seed(width)
+def test_results_of_a_convolution_are_shuffled() -> None:
+    generator = torch.Generator().manual_seed(0)
     conv = nn.Conv2d(3, 12, 1).double().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     x = torch.randn((2, 3, 4, 5), generator=generator, dtype=torch.float64, requires_grad=True)
-    features = [torch.randn((2, width, 8, 10), generator=generator, dtype=torch.float64, requires_grad=True)][:width]
-    expected = torch.cat((functional.pixel_shuffle(conv(x), 2), *features), dim=1)
-    found = enlarge(conv, x, *features)
+    expect_equal_with_gradients(
+        enlarge(conv, x), functional.pixel_shuffle(conv(x), 2), [x, conv.weight, conv.bias], generator
+    )
+
+
+def test_two_convolutions_and_the_shuffle_between_them_are_one() -> None:
+    generator = torch.Generator().manual_seed(1)
+    up, join = nn.Conv2d(3, 12, 1), nn.Conv2d(3 + 2, 4, 3, padding=1)
+    up, join = (each.double().to(memory_format=torch.channels_last) for each in (up, join))  # type: ignore[call-overload]
+    x, features = (
+        torch.randn(shape, generator=generator, dtype=torch.float64, requires_grad=True)
+        for shape in ((2, 3, 4, 5), (2, 2, 8, 10))
+    )
+    expected = join(torch.cat((functional.pixel_shuffle(up(x), 2), features), dim=1))
+    inputs = [x, features, up.weight, up.bias, join.weight, join.bias]
+    expect_equal_with_gradients(enlarge_and_join(up, join, x, features), expected, inputs, generator)
+
+
+def expect_equal_with_gradients(
+    found: torch.Tensor, expected: torch.Tensor, inputs: list[torch.Tensor], generator: torch.Generator
+) -> None:
+    """Expect the same values and gradients, those of parameters in their layout, as several devices expect it."""
     torch.testing.assert_close(found, expected)
     factors = torch.randn(found.shape, generator=generator, dtype=torch.float64)
-    inputs = [x, conv.weight, conv.bias, *features]
     gradients = [torch.autograd.grad((each * factors).sum(), inputs) for each in (found, expected)]
     torch.testing.assert_close(*gradients)
-    assert gradients[0][1].stride() == conv.weight.stride()  # which several devices expect
+    pairs = [pair for pair in zip(gradients[0], inputs, strict=True) if isinstance(pair[1], nn.Parameter)]
+    assert all(gradient.stride() == parameter.stride() for gradient, parameter in pairs)
 
 
 def test_mixed_planes_are_planes_at_each_pixel_weighted_by_a_softmax() -> None:

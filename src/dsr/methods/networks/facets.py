@@ -25,7 +25,7 @@ from dsr.degradation.downsampling import check_scale
 from dsr.methods.networks.facets_layers import (
     HEAD,
     Residual,
-    enlarge,
+    enlarge_and_join,
     make_pyramid,
     mean_colour,
     photo_input,
@@ -101,7 +101,7 @@ class Facets(NormalisedNetwork):
         x = self.trunk(functional.relu(pyramid[-1] + self.coarse(_lr_input(around).to(dtype))))
         planes = self._propose_planes(self.planes(x), around)
         for up, join, features in zip(self.up, self.join, reversed(pyramid[:-1]), strict=True):
-            x = functional.relu(join(enlarge(up, x, features)), inplace=True)
+            x = functional.relu(enlarge_and_join(up, join, x, features), inplace=True)
         return mix_planes(planes, self.choice(x), self.scale)
 
     def _propose_planes(self, output: Tensor, around: Stencil) -> Tensor:

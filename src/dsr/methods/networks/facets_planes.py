@@ -221,32 +221,44 @@ def mix_planes(planes: Tensor, choice: Tensor, scale: int) -> Tensor:
 def mix_planes_apart(planes: Tensor, found: Tensor, scale: int) -> tuple[Tensor, Tensor]:
     """Return the mixture of the planes around each high-resolution pixel, (B, 1, H, W), and the other channels.
 
+    What is mixed are the differences to a pixel's own first plane, in the type of ``found``, at least float32: planes
+    are reproduced in the precision of ``planes``, without an array of all of them in it.
+
     Args:
         planes: (B, facets, 3, h, w).
         found: (B, 9 * facets + n, H, W): logits as for :func:`mix_planes`, and n more channels, which are returned in
-            the type of the planes.
+            at least float32.
         scale: H / h.
 
     """
     batch, facets, _, height, width = planes.shape
     s, count = scale, NEIGHBOURS * facets
+
+    def side_by_side(values: Tensor) -> Tensor:
+        """Return values of the pixels of each low-resolution pixel, (B, s s, h w), as (B, 1, s h, s w)."""
+        blocks = values.view(batch, s, s, height, width).permute(0, 3, 1, 4, 2)
+        return blocks.reshape(batch, 1, height * s, width * s)
+
     # of the high-resolution pixels from the centre of their low-resolution pixel, in low-resolution pixels
     offsets = (torch.arange(s, dtype=planes.dtype, device=planes.device) + 0.5) / s - 0.5
-    prior = spline_logits(offsets).repeat_interleave(facets, dim=0).view(count, s * s, 1)
-    near = gather_neighbours(planes).reshape(batch, count, 3, height, width)
     ones = torch.ones(s, s, dtype=offsets.dtype, device=offsets.device)
     basis = torch.stack((ones, ones * offsets, ones * offsets[:, None]), dim=-1).view(s * s, 3)
+    dtype = torch.promote_types(found.dtype, torch.float32)
     with torch.autocast(planes.device.type, enabled=False):
+        first = planes[:, 0]
+        prior = spline_logits(offsets).repeat_interleave(facets, dim=0).view(count, s * s, 1).to(dtype)
+        near = (gather_neighbours(planes) - first[:, None, None]).reshape(batch, count, 3, height, width).to(dtype)
+        base = side_by_side(basis @ first.flatten(2))
+        basis = basis.to(dtype)
         if not exporting():
             mixed, others = _MixPlanes.apply(near, found, prior, basis)
-            return mixed, others
+            return base + mixed, others
         # the pixels of a low-resolution pixel become an axis of their own
         logits = found[:, :count].reshape(batch, count, height, s, width, s).permute(0, 1, 3, 5, 2, 4)
         logits = logits.reshape(batch, count, s * s, height * width)
-        weights = (logits.to(planes.dtype) + prior).softmax(dim=1)
+        weights = (logits.to(dtype) + prior).softmax(dim=1)
         mixed = (weights * (basis @ near.flatten(3))).sum(dim=1)
-        mixed = mixed.view(batch, s, s, height, width).permute(0, 3, 1, 4, 2)
-        return mixed.reshape(batch, 1, height * s, width * s), found[:, count:].to(planes.dtype)
+        return base + side_by_side(mixed), found[:, count:].to(dtype)
 
 
 class _MixPlanes(torch.autograd.Function):

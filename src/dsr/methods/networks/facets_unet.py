@@ -47,7 +47,7 @@ from dsr.methods.networks.facets_layers import (
     MixedResidual,
     concatenate,
     convolve_together,
-    enlarge,
+    enlarge_and_join,
     make_pyramid,
     photo_input,
     scale_down,
@@ -343,7 +343,7 @@ class FacetsUNet(DisparityNetwork):
     def _choose(self, x: Tensor, planes: Tensor, pyramid: list[Tensor], scale: int) -> tuple[Tensor, Tensor, Tensor]:
         """Return the mixture of planes, the logarithms of the expected errors, (B, 2, H, W), and residuals' factors."""
         for up, join, features in zip(self.up, self.join, reversed(pyramid[:-1]), strict=True):
-            x = functional.relu(join(enlarge(up, x, features)), inplace=True)
+            x = functional.relu(enlarge_and_join(up, join, x, features), inplace=True)
         found = convolve_together((self.choice, self.errors, self.gate), x)
         mixed, others = mix_planes_apart(planes, found, scale)
         errors, gate = others.float().split((2, 1), dim=1)
@@ -364,9 +364,8 @@ class FacetsUNet(DisparityNetwork):
     def _blend_planes(self, planes: Tensor, logits: Tensor) -> Tensor:
         """Return planes averaged with those around them, (B, facets, 3, h, w)."""
         logits = logits.to(planes.dtype).unflatten(1, (self.facets, len(_REACHES), NEIGHBOURS))
-        own = logits.new_zeros(NEIGHBOURS)
-        own[NEIGHBOURS // 2] = _OWN
-        weights = (logits + own[:, None, None]).softmax(dim=3)
+        before, own, after = logits.split((NEIGHBOURS // 2, 1, NEIGHBOURS // 2), dim=3)
+        weights = torch.cat((before, own + _OWN, after), dim=3).softmax(dim=3)
         for step, reach in enumerate(_REACHES):
             planes = average_planes(planes, weights[:, :, step], reach)
         return planes
