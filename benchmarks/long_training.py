@@ -33,7 +33,7 @@ import yaml
 from real_sensors import measure, upsampled, with_weights
 
 from dsr.methods.networks.trained import NETWORKS
-from dsr.methods.networks.weight_files import load_network, read_header, save_network
+from dsr.methods.networks.weight_files import LINKS, load_network, read_header, save_network
 from dsr.utils.files import replacing, write_text
 
 HERE = Path(__file__).resolve().parent
@@ -84,7 +84,7 @@ def keep(run: Path, weights: Path, share: float) -> None:
         for name, old in before.state_dict().items():
             if old.is_floating_point():
                 state[name].lerp_(old, 1 - share)
-        links = {key: weights.parent / header[key] if key in header else None for key in ("shared", "clean")}
+        links = {key: weights.parent / header[key] if key in header else None for key in LINKS}
         with replacing(moved) as temporary:
             save_network(temporary, net, header["model"], read_header(trained)["facts"], half=True, **links)
     copy(moved, weights)

@@ -171,24 +171,27 @@ def test_method_is_built_from_a_file_and_values_are_checked(tmp_path: Path) -> N
             AnyMap(tmp_path / "weights", **settings)  # type: ignore[arg-type]
 
 
-def test_clean_box_means_have_weights_of_their_own(tmp_path: Path) -> None:
-    """Only where all hints are given that they were trained for."""
+def test_some_maps_without_noise_have_weights_of_their_own(tmp_path: Path) -> None:
+    """Only where all hints are given that they were trained for; those for soft steps share the common ones' layers."""
     nets = {}
-    for number, name in enumerate(("facets_x2", "facets_x2_clean")):
+    for number, name in enumerate(("facets_x2", "facets_x2_clean", "facets_x2_soft")):
         torch.manual_seed(number)
         nets[name] = FacetsUNet(2, 8, 8, 4).eval()
     files = {name: tmp_path / f"{name}.safetensors" for name in nets}
-    save_network(files["facets_x2_clean"], nets["facets_x2_clean"], "facets")
-    save_network(files["facets_x2"], nets["facets_x2"], "facets", clean=files["facets_x2_clean"])
+    common, clean, soft = files.values()
+    save_network(clean, nets["facets_x2_clean"], "facets")
+    save_network(common, nets["facets_x2"], "facets", clean=clean, soft=soft)
+    save_network(soft, nets["facets_x2_soft"], "facets", shared=common)
     reported: dict[str, Any] = {"kernel": "box", "edges": "sharp", "clean": True}
 
     def used(**settings: Any) -> str:
-        found = AnyMap(files["facets_x2"], **settings)._net.state_dict()
+        found = AnyMap(common, **settings)._net.state_dict()
         return next(
             name for name, net in nets.items() if torch.equal(net.state_dict()["photo.weight"], found["photo.weight"])
         )
 
     assert used(**reported) == "facets_x2_clean"
+    assert used(kernel="bicubic", edges="soft", clean=True) == "facets_x2_soft"
     others = (
         {"kernel": "bicubic"},
         {"edges": "soft"},
@@ -198,10 +201,15 @@ def test_clean_box_means_have_weights_of_their_own(tmp_path: Path) -> None:
         {"smooth": 2.0},
     )
     assert {used(**reported | other) for other in others} == {"facets_x2"}
-    assert files_of_weights(files["facets_x2"]) == list(files.values())
-    files["facets_x2_clean"].unlink()
+    assert {used(kernel="bicubic", edges="soft", **other) for other in ({"noise": 0.001}, {})} == {"facets_x2"}
+    assert files_of_weights(common) == [common, clean, soft]
+    assert files_of_weights(soft) == [soft, common, clean]
+    clean.unlink()
     with pytest.raises(FileNotFoundError, match=r"expected facets_x2_clean\.safetensors beside it, for clean maps"):
-        AnyMap(files["facets_x2"], **reported)
+        AnyMap(common, **reported)
+    soft.unlink()
+    with pytest.raises(FileNotFoundError, match=r"facets_x2_soft\.safetensors beside it, for maps with soft depth"):
+        AnyMap(common, kernel="bicubic", edges="soft", clean=True)
 
 
 def test_dubious_pixels_may_be_left_as_holes() -> None:

@@ -178,12 +178,12 @@ def enlarge_and_join(up: nn.Module, join: nn.Module, x: Tensor, features: Tensor
         return cast(Tensor, join(torch.cat((enlarge(up, x), features), dim=1)))
     dtype = torch.promote_types(x.dtype, torch.float32)
     weight, bias = (_BySubPixel.apply(each).to(dtype) for each in (up.weight, up.bias))
-    own, others = join.weight.to(dtype).split((len(bias) // 4, features.shape[1]), dim=1)
+    own, others = join.get_parameter("weight").to(dtype).split((len(bias) // 4, features.shape[1]), dim=1)
     shuffled = torch.cat((weight.flatten(1), bias[:, None]), dim=1).T.unflatten(1, (2, 2, -1)).permute(0, 3, 1, 2)
     whole = functional.conv2d(shuffled, own, padding=2).to(x.dtype)
     ones = torch.ones_like(x[:, :1])
     enlarged = functional.conv_transpose2d(torch.cat((x, ones), dim=1), whole, stride=2, padding=1)
-    return functional.conv2d(features, others.to(x.dtype), join.bias, padding=1).add_(enlarged)
+    return functional.conv2d(features, others.to(x.dtype), join.get_parameter("bias"), padding=1).add_(enlarged)
 
 
 class _BySubPixel(torch.autograd.Function):

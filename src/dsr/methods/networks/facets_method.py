@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Literal, get_args
 
 import torch
@@ -22,7 +23,7 @@ from dsr.methods.base import Abilities, Cost, InverseSample, InverseSurface, Map
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.network import DTYPES, Answer, DisparityNetwork, Precision
 from dsr.methods.networks.trained import NETWORKS
-from dsr.methods.networks.weight_files import clean_weights, load_network
+from dsr.methods.networks.weight_files import load_network, special_weights
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 
@@ -33,6 +34,10 @@ CAUTION = 1.1
 """Measured errors over expected ones on rendered scenes that are not trained on, see ``benchmarks/confidence.py``."""
 CAUTION_IF_CLEAN = 0.85
 """The same of the weights for box means without noise."""
+_KINDS: Mapping[tuple[Kernel | None, Edges], Literal["clean", "soft"]] = MappingProxyType(
+    {("box", "sharp"): "clean", ("bicubic", "soft"): "soft"}
+)
+"""Kinds of maps without noise for which there may be further weights, by their kernel and depth steps."""
 _PER_DEGREE = 0.012
 """Relative error of depth in holes that the network does not expect, per degree from the nearest measured pixel. On
 Middlebury 2014 and ICL-NUIM with holes cut into them it expects 2 % everywhere, and depth is off by 3 % at 0.5 to 1
@@ -44,8 +49,8 @@ _ROUNDED = 16
 class AnyMap(Method):
     """A method for maps of any ratio, kernel and noise.
 
-    Of maps known to be box means without noise, with sharp depth steps, the result is computed with the weights
-    for them, if the file of weights names one with such weights.
+    Maps known to be without noise, and either box means with sharp depth steps or bicubic with soft ones, are computed
+    with weights of their own, if the file of weights names a file with such weights.
 
     Args:
         weights: file that ``train.py model=facets`` wrote, or a network, which is used as it is.
@@ -102,9 +107,10 @@ class AnyMap(Method):
             raise ValueError(f"max_error: expected a positive share of the depth, got {max_error}")
         self._caution = CAUTION
         if isinstance(weights, str | Path):
-            for_clean = clean_weights(Path(weights)) if cleanly and (kernel, edges) == ("box", "sharp") else None
-            self._caution = CAUTION if for_clean is None else CAUTION_IF_CLEAN
-            weights = _load(for_clean or Path(weights), model, precision, networks)
+            kind = _KINDS.get((kernel, edges)) if cleanly else None
+            special = None if kind is None else special_weights(Path(weights), kind)
+            self._caution = CAUTION_IF_CLEAN if special is not None and kind == "clean" else CAUTION
+            weights = _load(special or Path(weights), model, precision, networks)
         self._max_error = max_error
         self._net = weights.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs
         self._device, self._smooth = torch.device(device), smooth

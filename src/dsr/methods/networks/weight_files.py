@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, Literal
 
 import safetensors
 import safetensors.torch
@@ -19,8 +20,11 @@ FORMAT = "dsr-network-1"
 _KEY = "dsr"
 _LARGEST_ARGUMENT = 4096
 """Largest whole number among the arguments of a network in a file of weights."""
-_SHARED, _CLEAN = "shared", "clean"
-"""Keys of the file beside it from which a file takes the tensors that it does not have, and of that for clean maps."""
+_SHARED = "shared"
+LINKS: Mapping[str, str] = MappingProxyType(
+    {_SHARED: "whose layers it shares", "clean": "for clean maps", "soft": "for maps with soft depth steps"}
+)
+"""Keys of the files beside a file that it needs, and what for: tensors that it does not have, or maps of some kind."""
 
 
 def save_network(
@@ -32,6 +36,7 @@ def save_network(
     half: bool = False,
     shared: Path | None = None,
     clean: Path | None = None,
+    soft: Path | None = None,
 ) -> None:
     """Write a network's weights; equal networks and facts give equal bytes.
 
@@ -41,7 +46,8 @@ def save_network(
         facts: further plain values for readers of the file, such as data, steps and scores.
         half: whether to store the kernels of convolutions in half precision; biases and normalisations are not.
         shared: another file of weights, of the same folder; tensors that it has, too, are not written again.
-        clean: another file of weights, of the same folder, for clean maps of box means; see :func:`clean_weights`.
+        clean: another file of weights, of the same folder, for clean maps of box means; see :func:`special_weights`.
+        soft: the same for clean bicubic maps of scenes with soft depth steps.
 
     """
     header = {
@@ -55,8 +61,7 @@ def save_network(
         name: value.detach().to("cpu", torch.float16 if half and value.dim() > 1 else value.dtype).contiguous()
         for name, value in net.state_dict().items()
     }
-    if clean is not None:
-        header[_CLEAN] = clean.name
+    header |= {key: other.name for key, other in (("clean", clean), ("soft", soft)) if other is not None}
     if shared is not None:
         header[_SHARED] = shared.name
         there = _read_tensors(shared)
@@ -143,15 +148,15 @@ def load_network(
     return net
 
 
-def clean_weights(path: Path) -> Path | None:
-    """Return the file of weights for maps that are box means without noise, if the file names one beside it.
+def special_weights(path: Path, kind: Literal["clean", "soft"]) -> Path | None:
+    """Return the file of weights for maps of a kind, see :func:`save_network`, if the file names one beside it.
 
     Raises:
         FileNotFoundError: there is no such file, or the other one is missing.
         ValueError: the file is damaged or not a dsr weights file.
 
     """
-    return _beside(path, read_header(path), _CLEAN)
+    return _beside(path, read_header(path), kind)
 
 
 def files_of_weights(path: Path) -> list[Path]:
@@ -164,9 +169,12 @@ def files_of_weights(path: Path) -> list[Path]:
     """
     if not is_dsr_weights(path):
         return [path]
-    header = read_header(path)
-    others = [other for key in (_SHARED, _CLEAN) if (other := _beside(path, header, key)) is not None]
-    return [path, *(file for other in others for file in files_of_weights(other))]
+    found = [path]
+    for each in found:  # which grows: files may need each other
+        header = read_header(each)
+        others = (_beside(each, header, key) for key in LINKS)
+        found += [other for other in others if other is not None and other not in found]
+    return found
 
 
 def _beside(path: Path, header: Mapping[str, Any], key: str) -> Path | None:
@@ -175,8 +183,7 @@ def _beside(path: Path, header: Mapping[str, Any], key: str) -> Path | None:
         return None
     other = path.with_name(Path(str(header[key])).name)
     if not other.is_file():
-        use = "whose layers it shares" if key == _SHARED else "for clean maps"
-        raise FileNotFoundError(f"{path}: expected {other.name} beside it, {use}; there is none")
+        raise FileNotFoundError(f"{path}: expected {other.name} beside it, {LINKS[key]}; there is none")
     return other
 
 
