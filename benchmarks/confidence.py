@@ -1,9 +1,10 @@
 """How right the expected errors of ``method=facets`` are: deciles, and what is left without the least confident pixels.
 
-    python benchmarks/confidence.py --shared DIR [--scale 4] [--draws 2] [--clean] [--weights FILE] [--picture FILE.png]
+    python benchmarks/confidence.py --shared DIR [--scale 4] [--draws 2] [--clean box] [--weights FILE] [--picture FILE]
 
 On SimGeo, ICL-NUIM, Lucy and Plant, on which nothing is trained, each scene with several random degradations of all
-kinds that the network is trained on, or with ``--clean`` its box means without noise, known to be such.
+kinds that the network is trained on, or with ``--clean`` its map without noise, known to be such: box means, or bicubic
+maps of scenes with soft depth steps, at half their size.
 A ratio of 1 is right; the picture shows all deciles and the sparsification curve.
 """
 
@@ -13,6 +14,7 @@ import argparse
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Literal
 
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -27,24 +29,30 @@ from dsr.degradation.random_degradation import Everything
 from dsr.methods.recipe import Run, read_recipe
 from dsr.metrics.calibration import error_ratios, measured_errors, squared_error_share
 from dsr.sample import DepthSample
+from dsr.training.augmentation import soften
 
+CLEAN = {"box": "sharp", "bicubic": "soft"}
+"""Depth steps of the maps without noise, by their kernel."""
 KEPT = 0.8
 """Fraction of the pixels whose share of the squared error is printed."""
 _FRACTIONS = [i / 20 for i in range(1, 21)]
 
 
-def samples(shared: Path, scale: int, draws: int) -> Iterator[DepthSample]:
-    """Yield the scenes with random degradations; with none, 0 draws, once as box means."""
+def samples(shared: Path, scale: int, draws: int, clean: Literal["box", "bicubic"] | None) -> Iterator[DepthSample]:
+    """Yield the scenes with random degradations, or once without noise."""
     generator = torch.Generator().manual_seed(0)
     icl = ICL(str(shared / "real" / "icl_nuim"), "found")
     sources: tuple[SceneSource, ...] = (SimGeo(), icl, Folder(str(shared / "scenes"), ["lucy", "plant"]))
     for source in sources:
         for name in source.scenes():
             scene = source.load(name)
+            if clean == "bicubic":
+                scene = soften(scene)
             height, width = (scale * (n // scale) for n in scene.rgb.shape[-2:])
             scene = scene.crop(0, 0, height, width)
-            if not draws:
-                yield make_sample(scene, scale, Downsampling("box"), "disparity")
+            if clean is not None:
+                yield make_sample(scene, scale, Downsampling(clean), "disparity")
+                continue
             for _ in range(draws):
                 yield Everything(told=0)(scene, scale, generator)[0]
 
@@ -55,17 +63,17 @@ def main() -> None:
     parser.add_argument("--shared", type=Path, default=Path(os.environ.get("DSR_SHARED", "../shared")))
     parser.add_argument("--scale", type=int, default=4)
     parser.add_argument("--draws", type=int, default=2)
-    parser.add_argument("--clean", action="store_true")
+    parser.add_argument("--clean", choices=CLEAN)
     parser.add_argument("--weights", type=Path)
     parser.add_argument("--picture", type=Path)
     parser.add_argument("--device", default="cpu")
     arguments = parser.parse_args()
-    given = {"clean": True, "kernel": "box", "edges": "sharp"} if arguments.clean else {}
+    given = {"clean": True, "kernel": arguments.clean, "edges": CLEAN[arguments.clean]} if arguments.clean else {}
     recipe = read_recipe("facets", given).with_weights(arguments.weights)
     method = recipe.build(arguments.scale, Run(device=arguments.device))
     expected: dict[str, list[torch.Tensor]] = {"depth": [], "normal": []}
     measured: dict[str, list[torch.Tensor]] = {"depth": [], "normal": []}
-    for sample in samples(arguments.shared, arguments.scale, 0 if arguments.clean else arguments.draws):
+    for sample in samples(arguments.shared, arguments.scale, arguments.draws, arguments.clean):
         surface = method.surface(sample)
         if sample.depth is None or surface.depth_error is None or surface.angle_error is None:
             raise TypeError(f"{sample.scene}: expected a truth and expected errors")

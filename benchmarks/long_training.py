@@ -84,9 +84,9 @@ def keep(run: Path, weights: Path, share: float) -> None:
         for name, old in before.state_dict().items():
             if old.is_floating_point():
                 state[name].lerp_(old, 1 - share)
-        links = {key: weights.parent / header[key] if key in header else None for key in LINKS}
+        links = {key: weights.parent / header[key] for key in LINKS if key in header}
         with replacing(moved) as temporary:
-            save_network(temporary, net, header["model"], read_header(trained)["facts"], half=True, **links)
+            save_network(temporary, net, header["model"], read_header(trained)["facts"], half=True, links=links)
     copy(moved, weights)
 
 

@@ -20,7 +20,8 @@
   simulated structured-light camera.
 - ``flicker``: still cameras, ICL-NUIM and Middlebury before simulated structured light and stereo, seven frames each:
   the mean standard deviation of a point's depth over frames, of the input in mm, and of the results as a fraction of
-  that: of single frames, and of three and of five frames fused before the method.
+  that: of single frames, and of three and of five frames fused before the method, three successive results each; the
+  mean of independent noise would have 0.38 and 0.23.
 - ``stated``: stated over true error of simulated sensors of all kinds, by source and ratio: geometric means of it, and
   of the factor by which it is off, either way.
 - ``clean``: box means of Lucy and Plant at x4 without noise, untold: RMSE_v in 1/1000.

@@ -282,7 +282,9 @@ def dsr_weights(folder: Path) -> None:
 
     net = MSGNet(2, "dsr")
     save_network(folder / "base.safetensors", net, "msg_v", {"steps": 4})
-    save_network(folder / "weights.safetensors", net, "msg_v", {"steps": 4}, shared=folder / "base.safetensors")
+    save_network(
+        folder / "weights.safetensors", net, "msg_v", {"steps": 4}, links={"shared": folder / "base.safetensors"}
+    )
 
 
 def torch_weights(folder: Path) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import safetensors.torch
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -179,9 +180,11 @@ def test_some_maps_without_noise_have_weights_of_their_own(tmp_path: Path) -> No
         nets[name] = FacetsUNet(2, 8, 8, 4).eval()
     files = {name: tmp_path / f"{name}.safetensors" for name in nets}
     common, clean, soft = files.values()
+    nets["facets_x2_soft"].share(nets["facets_x2"])
     save_network(clean, nets["facets_x2_clean"], "facets")
-    save_network(common, nets["facets_x2"], "facets", clean=clean, soft=soft)
-    save_network(soft, nets["facets_x2_soft"], "facets", shared=common)
+    save_network(common, nets["facets_x2"], "facets", links={"clean": clean, "soft": soft})
+    save_network(soft, nets["facets_x2_soft"], "facets", links={"shared": common})
+    assert "coarse.weight" not in safetensors.torch.load(soft.read_bytes())
     reported: dict[str, Any] = {"kernel": "box", "edges": "sharp", "clean": True}
 
     def used(**settings: Any) -> str:
@@ -192,6 +195,10 @@ def test_some_maps_without_noise_have_weights_of_their_own(tmp_path: Path) -> No
 
     assert used(**reported) == "facets_x2_clean"
     assert used(kernel="bicubic", edges="soft", clean=True) == "facets_x2_soft"
+    common_trunk, soft_trunk = (
+        AnyMap(common, kernel="bicubic", edges=edges, clean=True)._net.coarse.weight for edges in ("sharp", "soft")
+    )
+    assert torch.equal(common_trunk, soft_trunk)
     others = (
         {"kernel": "bicubic"},
         {"edges": "soft"},
@@ -203,12 +210,12 @@ def test_some_maps_without_noise_have_weights_of_their_own(tmp_path: Path) -> No
     assert {used(**reported | other) for other in others} == {"facets_x2"}
     assert {used(kernel="bicubic", edges="soft", **other) for other in ({"noise": 0.001}, {})} == {"facets_x2"}
     assert files_of_weights(common) == [common, clean, soft]
-    assert files_of_weights(soft) == [soft, common, clean]
+    assert files_of_weights(soft) == [soft, common]
     clean.unlink()
-    with pytest.raises(FileNotFoundError, match=r"expected facets_x2_clean\.safetensors beside it, for clean maps"):
+    with pytest.raises(FileNotFoundError, match=r"expected facets_x2_clean\.safetensors beside it, for box means"):
         AnyMap(common, **reported)
     soft.unlink()
-    with pytest.raises(FileNotFoundError, match=r"facets_x2_soft\.safetensors beside it, for maps with soft depth"):
+    with pytest.raises(FileNotFoundError, match=r"facets_x2_soft\.safetensors beside it, for bicubic maps"):
         AnyMap(common, kernel="bicubic", edges="soft", clean=True)
 
 

@@ -232,13 +232,20 @@ def test_gradients_of_mixed_planes_are_those_of_differences(monkeypatch: pytest.
     torch.testing.assert_close(others, found[:, NEIGHBOURS:])
 
 
-def test_results_of_a_convolution_are_shuffled() -> None:
-    generator = torch.Generator().manual_seed(0)
+@pytest.mark.parametrize("width", [0, 5])
+def test_results_of_a_convolution_are_shuffled_before_features(width: int) -> None:
+    generator = torch.Generator().manual_seed(width)
     conv = nn.Conv2d(3, 12, 1).double().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     x = torch.randn((2, 3, 4, 5), generator=generator, dtype=torch.float64, requires_grad=True)
-    expect_equal_with_gradients(
-        enlarge(conv, x), functional.pixel_shuffle(conv(x), 2), [x, conv.weight, conv.bias], generator
-    )
+    features = [torch.randn((2, width, 8, 10), generator=generator, dtype=torch.float64, requires_grad=True)][:width]
+    expected = torch.cat((functional.pixel_shuffle(conv(x), 2), *features), dim=1)
+    found = enlarge(conv, x, *features)
+    torch.testing.assert_close(found, expected)
+    factors = torch.randn(found.shape, generator=generator, dtype=torch.float64)
+    inputs = [x, conv.weight, conv.bias, *features]
+    gradients = [torch.autograd.grad((each * factors).sum(), inputs) for each in (found, expected)]
+    torch.testing.assert_close(*gradients)
+    assert gradients[0][1].stride() == conv.weight.stride()  # which several devices expect
 
 
 def test_two_convolutions_and_the_shuffle_between_them_are_one() -> None:
@@ -250,20 +257,27 @@ def test_two_convolutions_and_the_shuffle_between_them_are_one() -> None:
         for shape in ((2, 3, 4, 5), (2, 2, 8, 10))
     )
     expected = join(torch.cat((functional.pixel_shuffle(up(x), 2), features), dim=1))
-    inputs = [x, features, up.weight, up.bias, join.weight, join.bias]
-    expect_equal_with_gradients(enlarge_and_join(up, join, x, features), expected, inputs, generator)
-
-
-def expect_equal_with_gradients(
-    found: torch.Tensor, expected: torch.Tensor, inputs: list[torch.Tensor], generator: torch.Generator
-) -> None:
-    """Expect the same values and gradients, those of parameters in their layout, as several devices expect it."""
+    found = enlarge_and_join(up, join, x, features)
     torch.testing.assert_close(found, expected)
     factors = torch.randn(found.shape, generator=generator, dtype=torch.float64)
-    gradients = [torch.autograd.grad((each * factors).sum(), inputs) for each in (found, expected)]
+    parameters = [*up.parameters(), *join.parameters()]
+    gradients = [torch.autograd.grad((each * factors).sum(), [x, features, *parameters]) for each in (found, expected)]
     torch.testing.assert_close(*gradients)
-    pairs = [pair for pair in zip(gradients[0], inputs, strict=True) if isinstance(pair[1], nn.Parameter)]
-    assert all(gradient.stride() == parameter.stride() for gradient, parameter in pairs)
+    assert [each.stride() for each in gradients[0][2:]] == [each.stride() for each in parameters]
+
+
+@pytest.mark.parametrize("width", [1, 4])
+def test_mixing_in_single_precision_keeps_planes_and_logits(width: int) -> None:
+    generator = torch.Generator().manual_seed(2)
+    planes = torch.zeros((1, 2, 3, 3, width), dtype=torch.float64)  # all of them are of one
+    planes[:, :, 2] = 0.5
+    planes[:, :, 0] = 7 + 0.5 * torch.arange(3, dtype=torch.float64)[:, None]
+    found = torch.randn((1, 2 * NEIGHBOURS, 6, 2 * width), generator=generator)
+    before = found.clone()
+    mixed = mix_planes(planes, found, 2)
+    expected = 7 + 0.5 * (torch.arange(6, dtype=torch.float64) / 2 - 0.25)[:, None].expand(6, 2 * width)
+    torch.testing.assert_close(mixed[0, 0], expected, rtol=0, atol=1e-14)
+    assert torch.equal(found, before)
 
 
 def test_mixed_planes_are_planes_at_each_pixel_weighted_by_a_softmax() -> None:
@@ -357,7 +371,7 @@ def test_layers_at_the_low_resolution_are_shared_and_not_trained(tmp_path: Path)
         net.share(Facets(4, width=8, blocks=4))
     # a file beside the other's has only what differs
     for name, each, shared in (("x4", first, None), ("x8", net, tmp_path / "x4"), ("whole", net, None)):
-        save_network(tmp_path / name, each, "facets", half=True, shared=shared)
+        save_network(tmp_path / name, each, "facets", half=True, links={} if shared is None else {"shared": shared})
     assert (tmp_path / "x8").stat().st_size < 0.7 * (tmp_path / "whole").stat().st_size
     whole, parts = (load_network(tmp_path / name, NETWORKS, 8, "facets").state_dict() for name in ("whole", "x8"))
     for name, value in whole.items():

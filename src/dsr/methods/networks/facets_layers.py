@@ -142,48 +142,53 @@ def convolve_together(convs: Sequence[nn.Conv2d], x: Tensor) -> Tensor:
     return functional.conv2d(x, weight, bias, padding=convs[0].padding)
 
 
-def enlarge(conv: nn.Module, x: Tensor) -> Tensor:
-    """Return the sub-pixel shuffle of a 1 x 1 convolution's results.
+def enlarge(conv: nn.Module, x: Tensor, *features: Tensor) -> Tensor:
+    """Return the sub-pixel shuffle of a 1 x 1 convolution's results, with the features behind them.
 
     Args:
         conv: a 1 x 1 convolution with a bias, to 4 C channels.
         x: (B, channels, h, w).
+        features: (B, n, 2 h, 2 w), or none.
 
     Returns:
-        (B, C, 2 h, 2 w), the channels of a pixel side by side in memory.
+        (B, C + n, 2 h, 2 w), the channels of a pixel side by side in memory.
 
     """
     if exporting():
-        return functional.pixel_shuffle(conv(x), 2)
+        return torch.cat((functional.pixel_shuffle(conv(x), 2), *features), dim=1)
     x = functional.conv2d(x, *(_BySubPixel.apply(each) for each in (conv.weight, conv.bias)))
-    enlarged: Tensor = _Interleave.apply(x)
+    enlarged: Tensor = _Interleave.apply(x, *features)
     return enlarged
 
 
 def enlarge_and_join(up: nn.Module, join: nn.Module, x: Tensor, features: Tensor) -> Tensor:
     """Return a 3 x 3 convolution of the sub-pixel shuffle of a 1 x 1 convolution's results, with features behind them.
 
-    Both are linear: of ``x`` they are one transposed convolution, 4 x 4 and two pixels apart, and neither the shuffled
-    results nor those with the features are ever in memory. The first bias is the weight of a channel of ones, as beyond
-    the border it is 0.
+    Both convolutions are linear: in float32 and above, their effect on ``x`` is computed as one transposed convolution,
+    without the arrays between them. The bias of the first becomes the weight of a channel of ones, which, like all
+    others, has no effect beyond the border. In lower precisions, whose matrix products prefer even numbers of channels,
+    that would be slower and less exact.
 
     Args:
         up: a 1 x 1 convolution with a bias, to 4 C channels.
-        join: a 3 x 3 convolution with a bias, from C + n channels.
+        join: a 3 x 3 convolution with a bias, from C + n channels to D.
         x: (B, channels, h, w).
         features: (B, n, 2 h, 2 w).
 
+    Returns:
+        (B, D, 2 h, 2 w).
+
     """
-    if exporting():  # a graph has to know the weights of a transposed convolution
-        return cast(Tensor, join(torch.cat((enlarge(up, x), features), dim=1)))
-    dtype = torch.promote_types(x.dtype, torch.float32)
-    weight, bias = (_BySubPixel.apply(each).to(dtype) for each in (up.weight, up.bias))
-    own, others = join.get_parameter("weight").to(dtype).split((len(bias) // 4, features.shape[1]), dim=1)
-    shuffled = torch.cat((weight.flatten(1), bias[:, None]), dim=1).T.unflatten(1, (2, 2, -1)).permute(0, 3, 1, 2)
-    whole = functional.conv2d(shuffled, own, padding=2).to(x.dtype)
-    ones = torch.ones_like(x[:, :1])
-    enlarged = functional.conv_transpose2d(torch.cat((x, ones), dim=1), whole, stride=2, padding=1)
-    return functional.conv2d(features, others.to(x.dtype), join.get_parameter("bias"), padding=1).add_(enlarged)
+    if exporting() or x.dtype.itemsize < torch.float32.itemsize:  # a graph has to know the weights of a convolution
+        return cast(Tensor, join(enlarge(up, x, features)))
+    weight, bias = (_BySubPixel.apply(each) for each in (up.weight, up.bias))
+    own, others = join.get_parameter("weight").split((len(bias) // 4, features.shape[1]), dim=1)
+    first = torch.cat((weight.flatten(1), bias[:, None]), dim=1)  # (4 C, channels + 1)
+    shuffled = first.T.unflatten(1, (2, 2, -1)).permute(0, 3, 1, 2)  # (channels + 1, C, 2, 2)
+    whole = functional.conv2d(shuffled, own, padding=2)  # (channels + 1, D, 4, 4)
+    extended = torch.cat((x, torch.ones_like(x[:, :1])), dim=1)
+    enlarged = functional.conv_transpose2d(extended, whole, stride=2, padding=1)
+    return functional.conv2d(features, others, join.get_parameter("bias"), padding=1).add_(enlarged)
 
 
 class _BySubPixel(torch.autograd.Function):
@@ -205,25 +210,30 @@ class _BySubPixel(torch.autograd.Function):
 
 
 class _Interleave(torch.autograd.Function):
-    """Sub-pixels side by side, (B, 4 C, h, w), as (B, C, 2 h, 2 w), in one copy."""
+    """Sub-pixels side by side, (B, 4 C, h, w), as (B, C, 2 h, 2 w), with features behind them, in one copy."""
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor) -> Tensor:
-        """Return (B, C, 2 h, 2 w)."""
+    def forward(ctx: Any, x: Tensor, *features: Tensor) -> Tensor:
+        """Return (B, C + n, 2 h, 2 w)."""
         batch, channels, height, width = x.shape
-        size = (batch, channels // 4, 2 * height, 2 * width)
+        ctx.counts = [channels // 4, *(each.shape[1] for each in features)]
+        size = (batch, sum(ctx.counts), 2 * height, 2 * width)
         found = torch.empty(size, dtype=x.dtype, device=x.device, memory_format=torch.channels_last)
-        _sub_pixels(found).copy_(x.unflatten(1, (2, 2, -1)))
+        own, *others = found.split(ctx.counts, dim=1)
+        _sub_pixels(own).copy_(x.unflatten(1, (2, 2, -1)))
+        for other, each in zip(others, features, strict=True):
+            other.copy_(each)
         return found
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> Tensor:
-        """Return the gradient of the sub-pixels."""
-        batch, count, height, width = gradient.shape
-        of_x = gradient.new_empty(batch, height // 2, width // 2, 4 * count).permute(0, 3, 1, 2)
-        of_x.unflatten(1, (2, 2, -1)).copy_(_sub_pixels(gradient))
-        return of_x
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, ...]:
+        """Return the gradients of all."""
+        own, *others = gradient.split(ctx.counts, dim=1)
+        batch, count, height, width = own.shape
+        of_x = own.new_empty(batch, height // 2, width // 2, 4 * count).permute(0, 3, 1, 2)
+        of_x.unflatten(1, (2, 2, -1)).copy_(_sub_pixels(own))
+        return of_x, *others
 
 
 def _sub_pixels(values: Tensor) -> Tensor:

@@ -32,12 +32,10 @@ _TOLERANCE = 0.02
 """A map is taken for one of the photo's own size up to this relative difference."""
 CAUTION = 1.1
 """Measured errors over expected ones on rendered scenes that are not trained on, see ``benchmarks/confidence.py``."""
-CAUTION_IF_CLEAN = 0.85
-"""The same of the weights for box means without noise."""
-_KINDS: Mapping[tuple[Kernel | None, Edges], Literal["clean", "soft"]] = MappingProxyType(
-    {("box", "sharp"): "clean", ("bicubic", "soft"): "soft"}
+SPECIAL: Mapping[tuple[Kernel | None, Edges], tuple[Literal["clean", "soft"], float]] = MappingProxyType(
+    {("box", "sharp"): ("clean", 0.85), ("bicubic", "soft"): ("soft", 1.1)}
 )
-"""Kinds of maps without noise for which there may be further weights, by their kernel and depth steps."""
+"""Of maps without noise, by kernel and depth steps: which further weights there may be, and ``CAUTION`` for them."""
 _PER_DEGREE = 0.012
 """Relative error of depth in holes that the network does not expect, per degree from the nearest measured pixel. On
 Middlebury 2014 and ICL-NUIM with holes cut into them it expects 2 % everywhere, and depth is off by 3 % at 0.5 to 1
@@ -107,10 +105,10 @@ class AnyMap(Method):
             raise ValueError(f"max_error: expected a positive share of the depth, got {max_error}")
         self._caution = CAUTION
         if isinstance(weights, str | Path):
-            kind = _KINDS.get((kernel, edges)) if cleanly else None
-            special = None if kind is None else special_weights(Path(weights), kind)
-            self._caution = CAUTION_IF_CLEAN if special is not None and kind == "clean" else CAUTION
-            weights = _load(special or Path(weights), model, precision, networks)
+            kind, caution = SPECIAL.get((kernel, edges), (None, CAUTION)) if cleanly else (None, CAUTION)
+            if kind is not None and (special := special_weights(Path(weights), kind)) is not None:
+                weights, self._caution = special, caution
+            weights = _load(Path(weights), model, precision, networks)
         self._max_error = max_error
         self._net = weights.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs
         self._device, self._smooth = torch.device(device), smooth

@@ -221,8 +221,8 @@ def mix_planes(planes: Tensor, choice: Tensor, scale: int) -> Tensor:
 def mix_planes_apart(planes: Tensor, found: Tensor, scale: int) -> tuple[Tensor, Tensor]:
     """Return the mixture of the planes around each high-resolution pixel, (B, 1, H, W), and the other channels.
 
-    What is mixed are the differences to a pixel's own first plane, in the type of ``found``, at least float32: planes
-    are reproduced in the precision of ``planes``, without an array of all of them in it.
+    What is mixed are the differences to the first plane of the pixel's own low-resolution pixel, in the type of
+    ``found``, at least float32; that plane is added in the type of ``planes``, in which it is reproduced exactly.
 
     Args:
         planes: (B, facets, 3, h, w).
@@ -271,7 +271,9 @@ class _MixPlanes(torch.autograd.Function):
         mixed = near.new_empty(found.shape[0], 1, *found.shape[-2:])
         logits, target, kept = _blocks(found[:, :count], s), _blocks(mixed, s), []
         for part in _chunks(near.shape[0] * count * s * s, height, width):
-            weights = logits[part].to(near.dtype, memory_format=torch.contiguous_format).flatten(4).flatten(2, 3)
+            weights = (
+                logits[part].to(near.dtype, memory_format=torch.contiguous_format, copy=True).flatten(4).flatten(2, 3)
+            )
             weights = weights.add_(prior).softmax(dim=1)
             if any(ctx.needs_input_grad):
                 kept.append(weights)

@@ -22,9 +22,13 @@ _LARGEST_ARGUMENT = 4096
 """Largest whole number among the arguments of a network in a file of weights."""
 _SHARED = "shared"
 LINKS: Mapping[str, str] = MappingProxyType(
-    {_SHARED: "whose layers it shares", "clean": "for clean maps", "soft": "for maps with soft depth steps"}
+    {
+        _SHARED: "whose layers it shares",
+        "clean": "for box means without noise",
+        "soft": "for bicubic maps without noise, with soft depth steps",
+    }
 )
-"""Keys of the files beside a file that it needs, and what for: tensors that it does not have, or maps of some kind."""
+"""Keys of the files beside a file that it names, and what they are for."""
 
 
 def save_network(
@@ -34,9 +38,7 @@ def save_network(
     facts: Mapping[str, Any] | None = None,
     *,
     half: bool = False,
-    shared: Path | None = None,
-    clean: Path | None = None,
-    soft: Path | None = None,
+    links: Mapping[str, Path] = MappingProxyType({}),
 ) -> None:
     """Write a network's weights; equal networks and facts give equal bytes.
 
@@ -45,9 +47,8 @@ def save_network(
         model: name of the model in ``conf/model/``, such as ``msg_v``.
         facts: further plain values for readers of the file, such as data, steps and scores.
         half: whether to store the kernels of convolutions in half precision; biases and normalisations are not.
-        shared: another file of weights, of the same folder; tensors that it has, too, are not written again.
-        clean: another file of weights, of the same folder, for clean maps of box means; see :func:`special_weights`.
-        soft: the same for clean bicubic maps of scenes with soft depth steps.
+        links: other files of weights, of the same folder, by keys of ``LINKS``. Tensors that the ``shared`` one has,
+            too, are not written again; the others are for maps of some kind, see :func:`special_weights`.
 
     """
     header = {
@@ -61,10 +62,9 @@ def save_network(
         name: value.detach().to("cpu", torch.float16 if half and value.dim() > 1 else value.dtype).contiguous()
         for name, value in net.state_dict().items()
     }
-    header |= {key: other.name for key, other in (("clean", clean), ("soft", soft)) if other is not None}
-    if shared is not None:
-        header[_SHARED] = shared.name
-        there = _read_tensors(shared)
+    header |= {key: other.name for key, other in links.items()}
+    if _SHARED in links:
+        there = _read_tensors(links[_SHARED])
         tensors = {
             name: value
             for name, value in tensors.items()
@@ -149,7 +149,7 @@ def load_network(
 
 
 def special_weights(path: Path, kind: Literal["clean", "soft"]) -> Path | None:
-    """Return the file of weights for maps of a kind, see :func:`save_network`, if the file names one beside it.
+    """Return the file of weights for maps of a kind, see ``LINKS``, if the file names one beside it.
 
     Raises:
         FileNotFoundError: there is no such file, or the other one is missing.
@@ -169,12 +169,12 @@ def files_of_weights(path: Path) -> list[Path]:
     """
     if not is_dsr_weights(path):
         return [path]
-    found = [path]
-    for each in found:  # which grows: files may need each other
-        header = read_header(each)
-        others = (_beside(each, header, key) for key in LINKS)
-        found += [other for other in others if other is not None and other not in found]
-    return found
+    header, found = read_header(path), {path: None}
+    for other in (_beside(path, header, key) for key in LINKS):
+        if other is not None:
+            shared = _beside(other, read_header(other), _SHARED)
+            found |= dict.fromkeys(each for each in (other, shared) if each is not None)
+    return list(found)
 
 
 def _beside(path: Path, header: Mapping[str, Any], key: str) -> Path | None:
