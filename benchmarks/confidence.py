@@ -47,7 +47,7 @@ def samples(shared: Path, scale: int, draws: int, clean: Literal["box", "bicubic
         for name in source.scenes():
             scene = source.load(name)
             if clean == "bicubic":
-                scene = soften(scene)
+                scene = soften(scene.crop(0, 0, *(n // 2 * 2 for n in scene.rgb.shape[-2:])))
             height, width = (scale * (n // scale) for n in scene.rgb.shape[-2:])
             scene = scene.crop(0, 0, height, width)
             if clean is not None:

@@ -33,7 +33,7 @@ _TOLERANCE = 0.02
 CAUTION = 1.1
 """Measured errors over expected ones on rendered scenes that are not trained on, see ``benchmarks/confidence.py``."""
 SPECIAL: Mapping[tuple[Kernel | None, Edges], tuple[Literal["clean", "soft"], float]] = MappingProxyType(
-    {("box", "sharp"): ("clean", 0.85), ("bicubic", "soft"): ("soft", 1.1)}
+    {("box", "sharp"): ("clean", 0.85), ("bicubic", "soft"): ("soft", CAUTION)}
 )
 """Of maps without noise, by kernel and depth steps: which further weights there may be, and ``CAUTION`` for them."""
 _PER_DEGREE = 0.012
