@@ -14,7 +14,6 @@ import argparse
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal
 
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -24,21 +23,22 @@ from dsr.data.folder import Folder
 from dsr.data.icl import ICL
 from dsr.data.rendered import SimGeo
 from dsr.data.scene_source import SceneSource
-from dsr.degradation.downsampling import Downsampling, make_sample
+from dsr.degradation.downsampling import Downsampling, Kernel, make_sample
 from dsr.degradation.random_degradation import Everything
+from dsr.methods.networks.facets_method import SPECIAL
 from dsr.methods.recipe import Run, read_recipe
 from dsr.metrics.calibration import error_ratios, measured_errors, squared_error_share
 from dsr.sample import DepthSample
 from dsr.training.augmentation import soften
 
-CLEAN = {"box": "sharp", "bicubic": "soft"}
+CLEAN = dict(SPECIAL.keys())
 """Depth steps of the maps without noise, by their kernel."""
 KEPT = 0.8
 """Fraction of the pixels whose share of the squared error is printed."""
 _FRACTIONS = [i / 20 for i in range(1, 21)]
 
 
-def samples(shared: Path, scale: int, draws: int, clean: Literal["box", "bicubic"] | None) -> Iterator[DepthSample]:
+def samples(shared: Path, scale: int, draws: int, clean: Kernel | None) -> Iterator[DepthSample]:
     """Yield the scenes with random degradations, or once without noise."""
     generator = torch.Generator().manual_seed(0)
     icl = ICL(str(shared / "real" / "icl_nuim"), "found")
