@@ -1,0 +1,64 @@
+"""Situations that people reported of programs like this one, each with the values that must come out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from dsr.cli import main
+
+WIDTH, HEIGHT, FOCAL = 320, 240, 288.0
+CAMERA = ["--intrinsics", "288", "288", "159.5", "119.5"]
+
+
+def scene(width=WIDTH, height=HEIGHT, focal=FOCAL, shift=0.0):
+    """Return the exact depth (height, width) in metres and the photo (height, width, 3), uint8 RGB.
+
+    A chequered slanted wall with a box and a ball in front of it, seen by a camera ``shift`` metres to the right.
+    """
+    u, v = np.meshgrid(np.arange(width), np.arange(height))
+    x, y = (u - (width - 1) / 2) / focal, (v - (height - 1) / 2) / focal
+    depth = (3.2 - 0.15 * shift) / (1 + 0.15 * x)
+    squares = np.floor(4 * (shift + x * depth)) + np.floor(4 * y * depth)
+    photo = np.stack([150 + 50 * (squares % 2)] * 3, -1) * (1.0, 0.9, 0.75)
+    box = (np.abs(shift + 1.7 * x + 0.6) < 0.3) & (np.abs(1.7 * y - 0.2) < 0.4)
+    depth, photo = np.where(box, 1.7, depth), np.where(box[..., None], (60, 90, 200), photo)
+    centre, radius = np.array([0.45 - shift, 0.3, 2.0]), 0.45
+    along = x * centre[0] + y * centre[1] + centre[2]
+    norm = x * x + y * y + 1
+    root = along**2 - norm * (centre @ centre - radius**2)
+    near = (along - np.sqrt(np.maximum(root, 0))) / norm
+    depth, photo = np.where(root > 0, near, depth), np.where((root > 0)[..., None], (220, 60, 50), photo)
+    return depth, photo.astype(np.uint8)
+
+
+def coarse(depth, by=4):
+    """Return the means of squares of ``by`` pixels."""
+    height, width = depth.shape
+    return depth.reshape(height // by, by, width // by, by).mean((1, 3))
+
+
+def millimetres(depth):
+    return np.round(1000 * depth).astype(np.uint16)
+
+
+def write(path: Path, picture):
+    """Write a depth map, or a photo in RGB, in the format that the name has."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), picture[..., ::-1] if picture.ndim == 3 else picture)
+    return path
+
+
+def upsample(out: Path, *options, method="bicubic"):
+    """Run ``dsr upsample`` and return its exit code."""
+    return main(["upsample", *map(str, options), "-o", str(out), "--method", method, "--only", "depth"])
+
+
+def mean_error(out: Path, truth):
+    """Return the mean absolute error in millimetres of the pixels that both know, and the known fraction."""
+    depth = cv2.imread(str(next(out.rglob("depth_metres.tiff"))), cv2.IMREAD_UNCHANGED)
+    assert depth.shape == truth.shape
+    known = np.isfinite(depth) & np.isfinite(truth)
+    return 1000 * np.abs(depth - truth)[known].mean(), np.isfinite(depth).mean()
