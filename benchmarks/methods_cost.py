@@ -27,7 +27,7 @@ from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.methods.recipe import Run, read_recipe
 
 METHODS = (
-    "bicubic,bilateral,guided_filter,joint_bilateral,fast_global_smoother,anisotropic_diffusion,tgv,srfs,eg,"
+    "bicubic,bilateral,guided_filter,joint_bilateral,fast_global_smoother,tgv,srfs,eg,"
     "pdn,dg,sparse_to_dense,ddrnet,msg_v,facets"
 )
 

@@ -13,7 +13,6 @@ LAYOUTS = {
     "nyu": ("RGB/1000.jpg", "Depth/1000.npy"),
     "rgbdd": ("RGB/20200509112638_RGB.jpg", "Depth/20200509112638_HR_gt.png"),
     "ddrnet": ("color_map/a.png", "depth_map/a.png", "high_quality_depth/a.png"),
-    "diml": ("test/HR/room/color/in_01_c.png", "test/HR/room/depth_filled/in_01_depth_filled.png"),
 }
 
 

@@ -149,7 +149,7 @@ def test_plan_describes_the_steps() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (((48, 64), (12, 16), 4, "fcets"), "method: expected one of anisotropic_diffusion, .*, tgv, .*got 'fcets'"),
+        (((48, 64), (12, 16), 4, "fcets"), "method: expected one of bicubic, .*, tgv, .*got 'fcets'"),
         (((48, 64), (12, 16), 2, "facets_box"), "scale: expected one of 4, 8, 16, 32 for facets_box, got 2"),
         (((48, 64), (12, 16), 8, "msg_v_noisy"), "scale: expected one of 4, 16 for msg_v_noisy, got 8"),
         (((48, 64), (12, 16), 0, "bicubic"), "scale: expected a positive whole number, got 0"),

@@ -12,7 +12,7 @@ import pytest
 
 from dsr.app.view import find_results
 from dsr.cli import main
-from dsr.data import arkitscenes, ddrnet_frames, diml, icl, rgbdd, sintel, sunrgbd, tartanair, tofmark
+from dsr.data import arkitscenes, ddrnet_frames, icl, rgbdd, sintel, sunrgbd, tartanair, tofmark
 from dsr.data.folder import Folder
 from dsr.io.depth_files import read_depth_file
 from dsr.io.inputs import Reading, read_picture
@@ -247,7 +247,6 @@ DATA_SETS = {
     "rgbdd": (rgbdd.find_frames, ("RGB/{}_RGB.jpg", "Depth/{}_HR_gt.png")),
     "arkitscenes": (arkitscenes.find_frames,
                     ("wide/7_{}.5.png", "highres_depth/7_{}.5.png", "lowres_depth/7_{}.5.png")),
-    "diml": (diml.find_frames, ("color/in_{}_c.png", "depth_filled/in_{}_depth_filled.png")),
 }  # fmt: skip
 
 

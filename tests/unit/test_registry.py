@@ -37,7 +37,7 @@ def test_recipe_builds_a_method_by_name() -> None:
 
 
 def test_unknown_method_is_refused_with_those_that_there_are(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"method: expected one of anisotropic_diffusion, .*tgv, .*got 'tvg'"):
+    with pytest.raises(ConfigError, match=r"method: expected one of bicubic, .*tgv, .*got 'tvg'"):
         read_recipe("tvg")
     (tmp_path / "method").mkdir()
     (tmp_path / "method" / "mine.yaml").write_text("defaults: [tgv]\niterations: 7\n")

@@ -37,7 +37,7 @@ def _sample(width: int, height: int, hole: bool = False) -> DepthSample:
     [
         ("bicubic", (1, 1.5, 2, 3)), ("guided_filter", (1, 1.5, 2, 3)), ("joint_bilateral", (1, 1.5, 2, 3)),
         ("fast_global_smoother", (1, 1.5, 2, 3)), ("bilateral", (1, 1.5, 2, 3)), ("dornet", (1, 1.5, 2, 3)),
-        ("tgv", (1, 2, 3)), ("anisotropic_diffusion", (1, 2, 3)), ("dip", (1, 2, 3)), ("dip_v_warm", (2,)),
+        ("tgv", (1, 2, 3)), ("dip", (1, 2, 3)), ("dip_v_warm", (2,)),
         ("facets_box", (2,)), ("srfs", (2,)), ("eg", (2,)),
     ],
 )  # fmt: skip
@@ -46,18 +46,18 @@ def test_methods_take_the_scales_that_they_are_made_for(name: str, scales: tuple
     assert tuple(scale for scale in (1, 1.5, 2, 3) if abilities.takes(scale)) == scales
 
 
-SETTINGS: dict[str, Any] = {"tgv": {"iterations": 50}, "anisotropic_diffusion": {"steps": 50}}
+SETTINGS: dict[str, Any] = {"tgv": {"iterations": 50}}
 
 
 ANY_RATIO = ("nearest", "bilinear", "bicubic", "guided_filter", "joint_bilateral", "fast_global_smoother", "bilateral")
-WHOLE_RATIOS = ("tgv", "anisotropic_diffusion")
 
 
 @pytest.mark.parametrize(
     ("name", "size"),
     [
         *itertools.product(ANY_RATIO, [(48, 36), (18, 13), (16, 12)]),
-        *itertools.product(WHOLE_RATIOS, [(48, 36), (16, 12)]),
+        ("tgv", (48, 36)),
+        ("tgv", (16, 12)),
     ],
 )
 def test_methods_reproduce_a_wall_at_any_ratio_that_they_take(name: str, size: tuple[int, int]) -> None:
@@ -69,16 +69,15 @@ def test_methods_reproduce_a_wall_at_any_ratio_that_they_take(name: str, size: t
     torch.testing.assert_close(depth, torch.full_like(depth, 2.0), rtol=0.05, atol=0)
 
 
-@pytest.mark.parametrize("name", ["tgv", "anisotropic_diffusion"])
-def test_method_that_reproduces_block_means_only_fills_holes_at_a_scale_of_1(name: str) -> None:
+def test_method_that_reproduces_block_means_only_fills_holes_at_a_scale_of_1() -> None:
     sample = _sample(48, 36, hole=True)
-    depth = read_recipe(name, SETTINGS[name]).build(4)(sample)
+    depth = read_recipe("tgv", SETTINGS["tgv"]).build(4)(sample)
     valid = sample.mask_lr
     torch.testing.assert_close(depth[valid], sample.depth_lr[valid], rtol=1e-5, atol=0)
     assert bool(depth.isfinite().all())
 
 
-@pytest.mark.parametrize("name", ["tgv", "anisotropic_diffusion", "eg", "srfs"])
+@pytest.mark.parametrize("name", ["tgv", "eg", "srfs"])
 def test_method_of_whole_scales_refuses_another_by_itself(name: str) -> None:
     with pytest.raises(ValueError, match=r"^hall: expected a whole scale for this method, got 1\.5$"):
         read_recipe(name).build(4)(_sample(32, 24))

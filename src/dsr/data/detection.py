@@ -12,10 +12,7 @@ from dsr.data import (
     arkitscenes,
     cleargrasp,
     ddrnet_frames,
-    diml,
-    diode,
     eight_bit,
-    eth3d,
     hammer,
     ibims,
     icl,
@@ -44,13 +41,10 @@ _FRAMES: tuple[tuple[Callable[[Path], Mapping[str, tuple[Any, ...]]], Callable[.
     (rgbdd.find_frames, load_pair, "rgbdd"),
     (nyu.find_files, nyu.load_files, "nyu"),
     (arkitscenes.find_frames, arkitscenes.load_frame, "arkitscenes"),
-    (diml.find_frames, load_pair, "diml"),
     (cleargrasp.find_captures, cleargrasp.load_capture, "cleargrasp"),
     (cleargrasp.find_renderings, cleargrasp.load_rendering, "cleargrasp_synthetic"),
     (ibims.find_pictures, ibims.load_pictures, "ibims"),
     (hammer.find_frames, hammer.load_frame, "hammer"),
-    (diode.find_frames, diode.load_frame, "diode"),
-    (eth3d.find_frames, eth3d.load_frame, "eth3d"),
     *(
         (functools.partial(eight_bit.find_frames, dataset=benchmark), eight_bit.load_frame, benchmark)
         for benchmark in eight_bit.BENCHMARKS

@@ -282,19 +282,6 @@ FIELD = (
         "below {folder}",
         patterns=("**/highres_depth/*.png", "**/lowres_depth/*.png"),
     ),
-    Collection(
-        "diml",
-        "DIML/CVL RGB-D, rooms before a Kinect v2",
-        "https://dimlrgbd.github.io/",
-        RESEARCH,
-        "J. Cho, D. Min, Y. Kim, K. Sohn: DIML/CVL RGB-D dataset: 2M RGB-D images of natural indoor and outdoor "
-        "scenes. arXiv 2110.11590, 2021.",
-        ("diml",),
-        None,
-        manual="fetch the indoor sample data from its homepage and put test and train, with HR or LR in each, anywhere "
-        "below {folder}",
-        patterns=("**/color/*_c.png", "**/depth_filled/*_depth_filled.png"),
-    ),
 )
 """The collections."""
 
@@ -467,37 +454,6 @@ _COLLECTIONS = (
                 contains=("SUNRGBD",),
             ),
         ),
-    ),
-    Collection(
-        "diode",
-        "DIODE, rooms and streets before a laser scanner, 771 images to evaluate on",
-        "https://diode-dataset.org/",
-        "MIT licence, as the code beside it.",
-        "I. Vasiljevic, N. Kolkin, S. Zhang, R. Luo, H. Wang, F. Z. Dai, A. F. Daniele, M. Mostajabi, S. Basart, M. R. "
-        "Walter, G. Shakhnarovich: DIODE: a dense indoor and outdoor depth dataset. arXiv 1908.00463, 2019.",
-        ("diode",),
-        2.6e9,
-        (
-            Item(
-                "diode/val.tar.gz",
-                ("http://diode-dataset.s3.amazonaws.com/val.tar.gz",),
-                unpack_to="diode",
-                contains=("val",),
-            ),
-        ),
-    ),
-    Collection(
-        "eth3d",
-        "ETH3D, buildings and rooms before a laser scanner, 454 photos of 13 scenes",
-        "https://www.eth3d.net/datasets",
-        "Creative Commons BY-NC-SA 4.0.",
-        "T. Schöps, J. L. Schönberger, S. Galliani, T. Sattler, K. Schindler, M. Pollefeys, A. Geiger: A multi-view "
-        "stereo benchmark with high-resolution images and multi-camera videos. CVPR 2017.",
-        ("eth3d",),
-        None,
-        manual="fetch the archives SCENE_dslr_jpg.7z and SCENE_dslr_depth.7z of its high-resolution multi-view "
-        "training scenes and unpack both of each scene into {folder}",
-        patterns=("*/images/dslr_images/*.JPG", "*/ground_truth_depth/dslr_images/*.JPG"),
     ),
     Collection(
         "tofmark",
