@@ -29,7 +29,7 @@ from dsr.utils.guards import (
     read_limited,
     refusing,
 )
-from dsr.utils.picture_headers import picture_size
+from dsr.utils.picture_headers import format_not_read, picture_size
 from dsr.utils.validation import Number, Whole, parse_model
 
 MAP_SUFFIXES = (".npy", ".png", ".tiff", ".tif", ".pfm")
@@ -330,5 +330,8 @@ def read_pixels(path: Path, flags: int, most: int | None = None) -> np.ndarray:
     content = _content(path)
     pixels = decode_pixels(path, content, flags, most)
     if pixels is None:
+        kind = format_not_read(content, stored=flags == cv2.IMREAD_UNCHANGED)
+        if kind:
+            raise ValueError(f"{path}: expected PNG, JPEG, TIFF, BMP, WebP or PNM, got {kind}, which is not read here")
         raise ValueError(f"{path}: expected a picture, got a damaged or foreign file of {len(content)} bytes")
     return pixels
