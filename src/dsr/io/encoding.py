@@ -69,13 +69,13 @@ def find_holes(
     """Return where a stored map is missing, the value that most of its holes have, and the assumptions.
 
     Whole numbers are holes at 0 and at the largest number of their type, those of 16 bits also from 65000 on if the
-    next smaller one is below 50000, floats at 0, below 0, at NaN and at infinity, and both at ``hole_value``
-    and, unless that is 0, at :func:`far_marks`.
+    next smaller one is below 50000, floats at 0, below 0, at NaN and at infinity, and both at ``hole_value`` and at
+    :func:`far_marks`.
 
     Args:
         values: (h, w) as stored.
         hole_value: additional value of holes; None for none.
-        above: what far marks are larger than: any disparity.
+        above: what far marks are larger than: the largest disparity, infinity for none.
 
     """
     if values.dtype.kind in "iu":
@@ -93,7 +93,7 @@ def find_holes(
     if hole_value is not None:
         kinds = {f"{hole_value:g}": values == hole_value, **kinds}
     holes = np.logical_or.reduce(list(kinds.values()))
-    for value in far_marks(values, ~holes) if hole_value != 0 else ():
+    for value in far_marks(values, ~holes):
         if value <= above:
             break
         name = f"{value:g}, far beyond all others (--hole-value 0 keeps them),"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -257,8 +258,9 @@ def _interpret(
     if meaning.bits:
         stored = turn_back_bits(str(pair.depth), stored, meaning.bits)
     hole_value = described.hole_value if reading.hole_value is None else reading.hole_value
-    widest = stored.shape[1] / meaning.unit if range_type == "disparity" else 0.0
-    holes, mark, hole_assumptions = find_holes(stored, hole_value, above=widest)
+    above = stored.shape[1] / meaning.unit if range_type == "disparity" else 0.0
+    above = math.inf if reading.hole_value == 0 else above
+    holes, mark, hole_assumptions = find_holes(stored, hole_value, above=above)
     if range_type == "disparity" and reading.metres is None and meaning.unit == 1:
         expect_narrow(str(pair.depth), stored[~holes], camera)
     return _Interpreted(stored, holes, mark, meaning, range_type, range_assumptions, hole_assumptions)

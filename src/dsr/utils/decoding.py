@@ -25,6 +25,8 @@ _GREY_AND_OPACITY = 4
 def decode_pixels(place: str | Path, content: bytes, flags: int, most: int | None = None) -> np.ndarray | None:
     """Return the pixels of an encoded picture as OpenCV decodes them; None if it is damaged or none.
 
+    With IMREAD_UNCHANGED, holes of a TIFF of GDAL are 0 or NaN, and grey with opacity has one channel if it is opaque.
+
     Args:
         place: its name, for messages.
         content: a PNG, JPEG, TIFF, BMP, WebP or portable map.
