@@ -79,7 +79,7 @@ def _only_page(place: str | Path, content: bytes, *, upright: bool) -> tuple[byt
     alone = bytearray(content)
     struct.pack_into(order + ("Q" if big else "I"), alone, 8 if big else 4, page.at)
     if page.orientation_at and not upright:
-        struct.pack_into(order + "H", alone, page.orientation_at, 1)
+        alone[page.orientation_at : page.orientation_at + 2] = struct.pack(order + "H", 1)
     try:
         return bytes(alone), float(bytes(page.tags.get(_GDAL_NODATA, ())).strip(b"\0 "))
     except ValueError:
