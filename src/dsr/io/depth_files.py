@@ -147,24 +147,36 @@ def _read_exr(path: Path, most: int | None) -> np.ndarray:
             quiet = contextlib.redirect_stdout(io.StringIO())
             with quiet_decoders(), quiet, OpenEXR.File(str(path), separate_channels=True, header_only=header) as file:
                 if header:
-                    return [_exr_size(part.header) for part in file.parts]
+                    return [_exr_windows(part.header) for part in file.parts]
                 return [(name, channel.pixels) for name, channel in file.channels().items()]
 
-    sizes = read(header=True)
-    for height, width, _ in sizes:
-        expect_pixels(path, height, width, MOST_PIXELS if most is None else most)
-    expect_bytes(path, sum(size for *_, size in sizes), bytes_of_archive(path.stat().st_size))
+    most = MOST_PIXELS if most is None else most
+    parts = read(header=True)
+    for window, display, _ in parts:
+        for rows, columns in (window, display):
+            expect_pixels(path, len(rows), len(columns), most)
+    expect_bytes(path, sum(size for *_, size in parts), bytes_of_archive(path.stat().st_size))
     channels = dict(read(header=False))
-    return channels[_depth_channel(path, channels)]
+    values = channels[_depth_channel(path, channels)]
+    (rows, columns), display, _ = parts[0]
+    if (rows, columns) == display or values.shape != (len(rows), len(columns)) or 0 in map(len, display):
+        return values
+    shown = np.full([len(each) for each in display], np.nan if values.dtype.kind == "f" else 0, values.dtype)
+    inside = [np.isin(each, there) for each, there in zip(display, (rows, columns), strict=True)]
+    within = [np.isin(each, there) for each, there in zip((rows, columns), display, strict=True)]
+    shown[np.ix_(*inside)] = values[np.ix_(*within)]
+    return shown
 
 
-def _exr_size(header: Mapping[str, Any]) -> tuple[int, int, int]:
-    """Return height, width and bytes in memory of a part's channels, or of its tiles if those are larger."""
-    (left, top), (right, bottom) = (corner.astype(int).tolist() for corner in header["dataWindow"])
+def _exr_windows(header: Mapping[str, Any]) -> tuple[tuple[range, range], tuple[range, range], int]:
+    """Return rows and columns of a part's data and display, and bytes of its channels, or of its tiles if larger."""
+    windows = []
+    for name in ("dataWindow", "displayWindow"):
+        (left, top), (right, bottom) = (corner.astype(int).tolist() for corner in header[name])
+        windows.append((range(top, bottom + 1), range(left, right + 1)))
     tile = header.get("tiles")
-    height, width = max(0, bottom - top + 1), max(0, right - left + 1)
-    pixels = max(height * width, 0 if tile is None else int(tile.xSize) * int(tile.ySize))
-    return height, width, 4 * len(header["channels"]) * pixels
+    pixels = max(len(windows[0][0]) * len(windows[0][1]), 0 if tile is None else int(tile.xSize) * int(tile.ySize))
+    return windows[0], windows[1], 4 * len(header["channels"]) * pixels
 
 
 def _depth_channel(path: Path, channels: Mapping[str, np.ndarray]) -> str:

@@ -16,6 +16,10 @@ from dsr.sample import FARTHEST, NEAREST
 _FULL, _NEARLY_FULL = 65000, 50000
 """Whole numbers of 16 bits from the first on are a sensor's end, not a distance, if there are none from the second on
 up to it."""
+_FAR_MARKS = (*(10**k - 1 for k in (4, 5, 6)), *(2**k - 1 for k in range(12, 17)), 65504)
+"""Usual marks of holes and of a renderer's far plane, in steps of 1, 10, 100, 1000 or 5000 to the unit of a map."""
+_MANY, _SHARE = 4, 1e-4
+"""Pixels, and share of the map, that at least have a mark, and have none."""
 
 
 @dataclass(frozen=True)
@@ -59,15 +63,19 @@ def turn_back_bits(name: str, values: np.ndarray, bits: int) -> np.ndarray:
     return (values >> bits) | (values << (16 - bits))
 
 
-def find_holes(values: np.ndarray, hole_value: float | None) -> tuple[np.ndarray, float, list[Assumption]]:
+def find_holes(
+    values: np.ndarray, hole_value: float | None, *, above: float = 0.0
+) -> tuple[np.ndarray, float, list[Assumption]]:
     """Return where a stored map is missing, the value that most of its holes have, and the assumptions.
 
     Whole numbers are holes at 0 and at the largest number of their type, those of 16 bits also from 65000 on if the
-    next smaller one is below 50000, floats at 0, below 0, at NaN and at infinity, and both at ``hole_value``.
+    next smaller one is below 50000, floats at 0, below 0, at NaN and at infinity, and both at ``hole_value`` and at
+    :func:`far_marks`.
 
     Args:
         values: (h, w) as stored.
         hole_value: additional value of holes; None for none.
+        above: what far marks are larger than: the largest disparity, infinity for none.
 
     """
     if values.dtype.kind in "iu":
@@ -85,6 +93,12 @@ def find_holes(values: np.ndarray, hole_value: float | None) -> tuple[np.ndarray
     if hole_value is not None:
         kinds = {f"{hole_value:g}": values == hole_value, **kinds}
     holes = np.logical_or.reduce(list(kinds.values()))
+    for value in far_marks(values, ~holes):
+        if value <= above:
+            break
+        name = f"{value:g}, far beyond all others (--hole-value 0 keeps them),"
+        kinds[name] = values == value
+        holes |= kinds[name]
     found = {name: float(mask.mean()) for name, mask in kinds.items() if mask.any()}
     assumptions = [
         Assumption(
@@ -93,6 +107,31 @@ def find_holes(values: np.ndarray, hole_value: float | None) -> tuple[np.ndarray
         for name, fraction in found.items()
     ]
     return holes, _mark(values, found, hole_value), assumptions
+
+
+def far_marks(values: np.ndarray, known: np.ndarray) -> list[float]:
+    """Return the values of a map, (h, w), that many known pixels share and that lie far beyond all smaller ones."""
+    marks, rest = list[float](), values[known]
+    while rest.size:
+        highest = float(rest.max())
+        smaller = rest[rest < highest]
+        if min(smaller.size, rest.size - smaller.size) < max(_MANY, _SHARE * values.size):
+            break
+        usual = any(np.isclose(highest * steps, _FAR_MARKS, 1e-6, 0).any() for steps in (1, 10, 100, 1000, 5000))
+        exact = not usual and np.unique(smaller).size < 16  # boards, which may be at any distances
+        if highest < float(smaller.max()) * (1.5 if usual else 100 if exact else 10):
+            break
+        marks.append(highest)
+        rest = smaller
+    return marks
+
+
+def expect_known(name: object, values: np.ndarray, holes: np.ndarray) -> None:
+    """Raise ValueError if all of a map's values, (h, w), are holes; the message begins with its name."""
+    if holes.all():
+        negative = float((values < 0).mean())
+        what = f"{negative:.0%} are negative (along an axis that points backwards?), the others holes"
+        raise ValueError(f"{name}: expected at least one known pixel, {what if negative else 'all are holes'}")
 
 
 def _at_sensors_end(values: np.ndarray) -> np.ndarray:

@@ -29,7 +29,7 @@ from dsr.utils.guards import (
     read_limited,
     refusing,
 )
-from dsr.utils.picture_headers import picture_size
+from dsr.utils.picture_headers import format_not_read, picture_size
 from dsr.utils.validation import Number, Whole, parse_model
 
 MAP_SUFFIXES = (".npy", ".png", ".tiff", ".tif", ".pfm")
@@ -50,12 +50,7 @@ def pixels_in_header(path: Path) -> tuple[int, int] | None:
 
 
 def read_rgb(path: Path) -> np.ndarray:
-    """Return a picture as uint8 RGB, (H, W, 3).
-
-    Raises:
-        ValueError: it is missing, damaged or no picture.
-
-    """
+    """Return a picture as uint8 RGB, (H, W, 3)."""
     picture = read_pixels(path, cv2.IMREAD_COLOR)
     return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
 
@@ -75,12 +70,7 @@ def read_map(path: Path, most: int | None = None) -> np.ndarray:
 
 
 def read_values(path: Path, most: int | None = None) -> np.ndarray:
-    """Return a one-channel map in the type that it is stored in, (H, W); see :func:`read_map`.
-
-    Raises:
-        ValueError: as for :func:`read_map`.
-
-    """
+    """Return a one-channel map in the type that it is stored in, (H, W); see :func:`read_map`."""
     return expect_depth_values(path, read_array(path, most))
 
 
@@ -100,12 +90,7 @@ def read_array(path: Path, most: int | None = None) -> np.ndarray:
 
 
 def expect_depth_values(path: Path, values: np.ndarray) -> np.ndarray:
-    """Return the values of a depth file.
-
-    Raises:
-        ValueError: they are not (H, W), or no floats or whole numbers of 16 bits or more.
-
-    """
+    """Return the values of a depth file if they are (H, W), floats or whole numbers of 16 bits or more."""
     if values.ndim != 2:
         what = f": {describe_picture(values)}" if values.dtype in (np.uint8, np.uint16) else ""
         raise ValueError(f"{path}: expected one channel (height x width), got shape {values.shape}{what}")
@@ -118,12 +103,7 @@ def expect_depth_values(path: Path, values: np.ndarray) -> np.ndarray:
 
 
 def read_levels(path: Path) -> np.ndarray:
-    """Return an 8-bit one-channel picture as it is, (H, W) uint8: disparities of older benchmarks.
-
-    Raises:
-        ValueError: it is missing, damaged, or has other values.
-
-    """
+    """Return an 8-bit one-channel picture as it is, (H, W) uint8: disparities of older benchmarks."""
     levels = read_pixels(path, cv2.IMREAD_UNCHANGED)
     if levels.ndim != 2 or levels.dtype != np.uint8:
         raise ValueError(f"{path}: expected one channel of 8 bits, got {levels.dtype} of shape {levels.shape}")
@@ -318,17 +298,12 @@ def _load_npy(path: Path, most: int | None) -> np.ndarray:
 
 
 def read_pixels(path: Path, flags: int, most: int | None = None) -> np.ndarray:
-    """Return the pixels of a picture file as OpenCV decodes them.
-
-    Args:
-        most: largest number of pixels; None for what the size of the file explains.
-
-    Raises:
-        ValueError: it is missing, damaged, too large or no picture.
-
-    """
+    """Return the pixels of a picture file; see :func:`dsr.utils.decoding.decode_pixels`."""
     content = _content(path)
     pixels = decode_pixels(path, content, flags, most)
     if pixels is None:
+        kind = format_not_read(content, stored=flags == cv2.IMREAD_UNCHANGED)
+        if kind:
+            raise ValueError(f"{path}: expected PNG, JPEG, TIFF, BMP, WebP or PNM, got {kind}, which is not read here")
         raise ValueError(f"{path}: expected a picture, got a damaged or foreign file of {len(content)} bytes")
     return pixels

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,13 +27,13 @@ from dsr.io.cameras import (
 )
 from dsr.io.depth_files import ICL_CAMERA, ICL_SUFFIX, read_depth_file
 from dsr.io.doubts import doubt_camera, doubt_depth
-from dsr.io.encoding import Encoding, decode, find_holes, turn_back_bits
+from dsr.io.encoding import Encoding, decode, expect_known, find_holes, turn_back_bits
 from dsr.io.frames import SLACK, Geometry, Rig
 from dsr.io.images import CameraFile, pixels_in_header, read_mask
 from dsr.io.pairs import Pair, find_camera_file, role_of_words, words_of
 from dsr.io.photos import Size, model_in_exif, read_photo, same_aspect
 from dsr.io.reading import SUNRGBD_BITS, CameraChoice, Reading
-from dsr.io.units import TURNED_BACK, Meaning, interpret
+from dsr.io.units import TURNED_BACK, Meaning, expect_narrow, interpret
 from dsr.notes import Assumption
 from dsr.sample import FARTHEST, NEAREST
 from dsr.utils.guards import natural_key, pixels_beside
@@ -202,8 +203,7 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     if pair.mask is not None:
         holes |= ~_mask(pair.mask, size_lr)
     confidence, confidence_assumptions = _confidence(pair, reading, size_lr, holes)
-    if holes.all():
-        raise ValueError(f"{pair.depth}: expected at least one known pixel, all are holes")
+    expect_known(pair.depth, stored, holes)
     lens_lr = lens if rig is None else rig.lens
     stored, holes, confidence, undone_lr = _undistort_depth(stored, holes, confidence, of_depth, lens_lr)
     encoding = Encoding(_suffix(pair), str(stored.dtype), meaning.unit, found.mark, range_type)
@@ -258,7 +258,11 @@ def _interpret(
     if meaning.bits:
         stored = turn_back_bits(str(pair.depth), stored, meaning.bits)
     hole_value = described.hole_value if reading.hole_value is None else reading.hole_value
-    holes, mark, hole_assumptions = find_holes(stored, hole_value)
+    above = stored.shape[1] / meaning.unit if range_type == "disparity" else 0.0
+    above = math.inf if reading.hole_value == 0 else above
+    holes, mark, hole_assumptions = find_holes(stored, hole_value, above=above)
+    if range_type == "disparity" and reading.metres is None and meaning.unit == 1:
+        expect_narrow(str(pair.depth), stored[~holes], camera)
     return _Interpreted(stored, holes, mark, meaning, range_type, range_assumptions, hole_assumptions)
 
 
@@ -286,8 +290,7 @@ def read_map(path: Path, reading: Reading, camera: Camera | None = None) -> tupl
     of_depth = scale_to_depth(str(pair.camera or path) if camera is None else "camera", camera or own.camera, size)
     of_depth = replace(of_depth, baseline=reading.baseline or of_depth.baseline)
     found = _interpret(pair, reading, own, stored, FolderUnits(), of_depth)
-    if found.holes.all():
-        raise ValueError(f"{path}: expected at least one known pixel, all are holes")
+    expect_known(path, found.stored, found.holes)
     encoding = Encoding(_suffix(pair), str(found.stored.dtype), found.meaning.unit, found.mark, found.range_type)
     depth = decode(found.stored, found.holes, encoding, of_depth)
     _expect_distances(path, depth, found.holes, found.range_type)

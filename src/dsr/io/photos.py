@@ -26,6 +26,8 @@ from dsr.utils.guards import MOST_FILE, expect_pixels, read_limited, refusing
 
 _MODEL, _ORIENTATION, _EXIF_IFD, _EXIF_FOCAL_35 = 0x0110, 0x0112, 0x8769, 0xA405
 _ASPECT_TOLERANCE = 0.02
+_BITS, _DARK = (8, 10, 12, 14), 64
+"""Bits that a photo of 16 may use, and what its values of 8 bits are below then."""
 HEIC_SUFFIXES = (".heic", ".heif")
 _TURNS: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     2: lambda pixels: pixels[:, ::-1],
@@ -48,18 +50,27 @@ Size = tuple[int, int]
 
 def read_photo(path: Path, size_lr: Size) -> tuple[np.ndarray, list[Assumption]]:
     """Return the photo, (H, W, 3) uint8 RGB, turned upright only if the depth map fits so, and the assumptions."""
-    orientation = orientation_of(path)
+    orientation, found = orientation_of(path), list[Assumption]()
     if path.suffix.lower() in HEIC_SUFFIXES:
         turned = 1 if orientation == 1 else turned_in_heic(path)
         pixels = _TURNS.get(_BACK.get(turned, turned), np.asarray)(read_heic(path))
     else:
-        pixels = cv2.cvtColor(read_pixels(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION), cv2.COLOR_BGR2RGB)
+        flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+        pixels = cv2.cvtColor(read_pixels(path, flags), cv2.COLOR_BGR2RGB)
+        deep = read_pixels(path, flags | cv2.IMREAD_ANYDEPTH) if pixels.max() < _DARK else pixels
+        if deep.dtype == np.uint16 and deep.any():
+            bits = next(bits for bits in _BITS if deep.max() < 1 << bits)
+            pixels = (deep[..., ::-1] // 2 ** (bits - 8)).astype(np.uint8)
+            text = f"the photo uses {bits} of its 16 bits and is brightened accordingly"
+            found = [Assumption(text, f"up to {deep.max()}")]
     if orientation == 1:
-        return pixels, []
+        return pixels, found
     size: Size = (pixels.shape[0], pixels.shape[1])
     if orientation >= 5 and not same_aspect(size, size_lr) and same_aspect(size[::-1], size_lr):
-        return _TURNS[orientation](pixels), [Assumption("the photo is turned by its EXIF data, as the depth map is")]
-    return pixels, [Assumption("the photo's EXIF orientation is ignored: the depth map is assumed to fit it as stored")]
+        found.append(Assumption("the photo is turned by its EXIF data, as the depth map is"))
+        return _TURNS[orientation](pixels), found
+    found.append(Assumption("the photo's EXIF orientation is ignored: the depth map is assumed to fit it as stored"))
+    return pixels, found
 
 
 def read_heic(path: Path) -> np.ndarray:

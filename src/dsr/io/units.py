@@ -13,8 +13,9 @@ from typing import NamedTuple, NoReturn
 
 import numpy as np
 
-from dsr.geometry.camera import Camera, RangeType
+from dsr.geometry.camera import Camera, RangeType, baseline_times_focal
 from dsr.geometry.planes import InverseVotes, inverse_votes
+from dsr.io.encoding import expect_known
 from dsr.io.reading import SUNRGBD_BITS
 from dsr.notes import LIMITS, Assumption
 from dsr.utils.lengths import show_length
@@ -47,6 +48,10 @@ _KNOWN_CAMERAS: tuple[tuple[int, float, float, float, str], ...] = (
 """Width, focal lengths, metres per value, and the data set whose published calibration that is."""
 _REPLICA = 1200, 680
 """Width and height of Replica's renderings, which store 1/6553.5 m (NICE-SLAM, configs/Replica)."""
+_FIXED_POINT = ((8, "OAK"), (16, "OpenCV's StereoSGBM"), (32, "OAK"), (256, "KITTI"))
+"""Steps to a pixel in which disparities are stored, and by whom."""
+_MOST_NARROW = 99.9
+"""Percentile of disparities in pixels that lies below the width of their map."""
 _KITTI_WIDTHS, _KITTI_HEIGHTS = range(1216, 1243), range(350, 377)
 """Of KITTI's pictures, whose depth and disparity is stored in 1/256 (its devkit)."""
 
@@ -81,8 +86,7 @@ def interpret(
             message names both, with the option for each.
 
     """
-    if holes.all():
-        raise ValueError(f"{name}: expected at least one known pixel, all are holes")
+    expect_known(name, values, holes)
     clues = _Clues(name, values, holes, camera, may_fall)
     return _interpret_floats(clues) if values.dtype.kind == "f" else _interpret_whole(clues)
 
@@ -339,13 +343,30 @@ def _interpret_falling(clues: _Clues) -> Meaning | None:
         return None
     votes = clues.votes
     why = f"values fall with distance (straight over {votes.falling} of {votes.falling + votes.rising} planes)"
-    width = clues.values.shape[1]
-    fitting = [unit for unit in (1.0, 1 / 256) if clues.highest * unit < width and (unit == 1 or clues.highest > width)]
-    if clues.camera is None or clues.camera.baseline is None or not fitting:
+    if clues.camera is None or clues.camera.baseline is None:
         raise ValueError(
             f"{clues.name}: expected --range-type disparity with --baseline METRES, or --range-type orthogonal for "
             f"depth: {why}, as disparity and inverse depth do; inverse depth of a network has no metric unit"
         )
-    label = "pixels" if fitting[0] == 1 else "1/256 pixel"
+    of_kitti = clues.of_kitti and clues.highest > clues.camera.width
+    if not of_kitti:
+        expect_narrow(clues.name, clues.known, clues.camera)
+    label = "1/256 pixel" if of_kitti else "pixels"
     text = f"values are read as disparities in {label} of the depth map: {why}; --range-type overrides it"
-    return Meaning(fitting[0], (Assumption(text),), "disparity")
+    return Meaning(1 / 256 if of_kitti else 1.0, (Assumption(text),), "disparity")
+
+
+def expect_narrow(name: str, known: np.ndarray, camera: Camera) -> None:
+    """Raise ValueError if disparities, as pixels, exceed the width of their map; it names the fixed-point units."""
+    if not known.size or (highest := float(np.percentile(known, _MOST_NARROW))) < camera.width:
+        return
+    middle = float(np.median(known))
+    fitting = [
+        f"--depth-unit 1/{steps} ({whose}: median {show_length(baseline_times_focal(camera) * steps / middle)})"
+        for steps, whose in _FIXED_POINT
+        if highest < steps * camera.width
+    ]
+    raise ValueError(
+        f"{name}: expected {' or '.join(fitting) or '--depth-unit PIXELS'}: disparities up to {highest:g} are "
+        f"impossible in pixels of a map of width {camera.width}; --depth-unit 1 if they are right"
+    )

@@ -23,6 +23,8 @@ def describe_picture(values: np.ndarray) -> str:
     """
     if values.ndim == 2:
         return "a picture for viewing, or disparities of an old benchmark"
+    if values.ndim == 3 and values.shape[2] == 2:
+        return "grey that is transparent in places"
     if values.ndim != 3 or values.shape[2] not in (3, 4) or not values.size:
         return "no map"
     pixels = values[..., :3].reshape(-1, 3)

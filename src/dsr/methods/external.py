@@ -7,6 +7,7 @@ Anything, is fitted in inverse depth.
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Sequence
@@ -19,7 +20,7 @@ from torch import Tensor
 
 from dsr.geometry.camera import RANGE_TYPES, Camera, from_range, to_range
 from dsr.io.depth_files import DEPTH_SUFFIXES, read_depth_file
-from dsr.io.encoding import find_holes
+from dsr.io.encoding import expect_known, find_holes
 from dsr.io.reading import parse_unit
 from dsr.methods.base import Abilities, Cost, Method
 from dsr.sample import FARTHEST, NEAREST, DepthSample
@@ -179,13 +180,10 @@ class External(Method):
         free = self._fit is not None and self._quantity in (INVERSE, "disparity")  # 0 may be the farthest point
         if whole and self._unit is None and self._fit is None:
             raise ValueError(f"{path}: expected method.unit=mm, or another one, for {stored.dtype} values, got none")
-        holes = ~np.isfinite(stored) if free else find_holes(stored, self._hole_value)[0]
+        holes = ~np.isfinite(stored) if free else find_holes(stored, self._hole_value, above=math.inf)[0]
         if free and self._hole_value is not None:
             holes |= stored == self._hole_value
-        if holes.all():
-            negative = not whole and bool((stored < 0).any())
-            came = "all are negative or none: depth along the other direction of the axis?" if negative else "all holes"
-            raise ValueError(f"{path}: expected at least one known pixel, got {came}")
+        expect_known(path, stored, holes)
         values = torch.from_numpy(np.where(holes, np.nan, stored.astype(np.float64)))[None] * (self._unit or 1.0)
         size = (camera.height, camera.width)
         if tuple(values.shape[-2:]) == size:

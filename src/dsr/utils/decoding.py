@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import struct
 import threading
 from pathlib import Path
 
@@ -11,14 +12,20 @@ import cv2
 import numpy as np
 
 from dsr.utils.guards import expect_bytes, expect_pixels, pixels_of_file
-from dsr.utils.picture_headers import picture_size
+from dsr.utils.picture_headers import picture_size, tiff_pages
 
 _BYTES_PER_PIXEL = 16
 """Bytes in memory for each allowed pixel: four channels of float32."""
+_RAW, _GDAL_NODATA = (32803, 34892), 42113
+"""Photometric interpretations of TIFF: a mosaic of colours, and linear raw values; GDAL's tag, a number as text."""
+_GREY_AND_OPACITY = 4
+"""Colour type of PNG."""
 
 
 def decode_pixels(place: str | Path, content: bytes, flags: int, most: int | None = None) -> np.ndarray | None:
     """Return the pixels of an encoded picture as OpenCV decodes them; None if it is damaged or none.
+
+    With IMREAD_UNCHANGED, holes of a TIFF of GDAL are 0 or NaN, and grey with opacity has one channel if it is opaque.
 
     Args:
         place: its name, for messages.
@@ -37,11 +44,46 @@ def decode_pixels(place: str | Path, content: bytes, flags: int, most: int | Non
     expect_bytes(
         place, header.bytes_per_pixel * max(header.height * header.width, header.tile), _BYTES_PER_PIXEL * most
     )
+    no_data = None
+    if content[:2] in (b"II", b"MM"):
+        content, no_data = _only_page(place, content, upright=not flags & cv2.IMREAD_IGNORE_ORIENTATION)
     try:
         with _QUIET_STDERR:
-            return cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+            pixels = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     except cv2.error:
         return None
+    if flags == cv2.IMREAD_UNCHANGED and pixels is not None:
+        if no_data is not None:
+            pixels[pixels == no_data] = 0 if pixels.dtype.kind in "iu" else np.nan
+        if content[:4] == b"\x89PNG" and content[25] == _GREY_AND_OPACITY:  # which OpenCV makes four channels of
+            opaque = pixels[..., 3].min() == 256**pixels.itemsize - 1
+            pixels = pixels[..., 0] if opaque else pixels[..., [0, 3]]
+    return pixels
+
+
+def _only_page(place: str | Path, content: bytes, *, upright: bool) -> tuple[bytes, float | None]:
+    """Return a TIFF whose first page is the only one that is no thumbnail, and the value of its holes, or None.
+
+    Args:
+        upright: whether its orientation is kept, which OpenCV applies whatever the flags say.
+
+    """
+    pages = tiff_pages(io.BytesIO(content))
+    if any(page.tags.get(262, (0,))[0] in _RAW for page in pages):
+        raise ValueError(f"{place}: expected a developed photo, got a raw one (DNG or the like), which is not read")
+    if len(pages) > 1:
+        sizes = ", ".join(f"{page.tags[256][0]} x {page.tags[257][0]}" for page in pages)
+        raise ValueError(f"{place}: expected a TIFF of one page, got {len(pages)}: {sizes} (width x height)")
+    (page,) = pages
+    order, big = "<" if content[:1] == b"I" else ">", b"+" in content[2:4]
+    alone = bytearray(content)
+    struct.pack_into(order + ("Q" if big else "I"), alone, 8 if big else 4, page.at)
+    if page.orientation_at and not upright:
+        alone[page.orientation_at : page.orientation_at + 2] = struct.pack(order + "H", 1)
+    try:
+        return bytes(alone), float(bytes(page.tags.get(_GDAL_NODATA, ())).strip(b"\0 "))
+    except ValueError:
+        return bytes(alone), None
 
 
 class _QuietStderr:

@@ -6,18 +6,20 @@ BITMAPINFOHEADER. WebP: RFC 9649. Portable maps: https://netpbm.sourceforge.net/
 
 from __future__ import annotations
 
+import contextlib
+import io
 import re
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import IO
+from typing import IO, NamedTuple
 
 _START_OF_FRAME = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
 _WITHOUT_LENGTH = {0x01, *range(0xD0, 0xD9)}
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 4, 4: 4, 6: 4}
-_TAGS = {256: "width", 257: "height", 258: "bits", 277: "channels", 322: "tile_width", 323: "tile_height"}
-_TAG_TYPES = {1: "B", 3: "H", 4: "I", 16: "Q"}
-_MOST_SEGMENTS, _MOST_TAGS, _MOST_CHUNKS = 4096, 4096, 1 << 16
+_ORIENTATION, _TAGS = 274, {254, 255, 256, 257, 258, 259, 262, 274, 277, 322, 323, 330, 339, 42113}
+_TAG_TYPES = {1: "B", 2: "B", 3: "H", 4: "I", 13: "I", 16: "Q", 18: "Q"}
+_MOST_SEGMENTS, _MOST_TAGS, _MOST_VALUES, _MOST_PAGES, _MOST_CHUNKS = 4096, 4096, 64, 64, 1 << 16
 _LARGEST_PNM_HEADER = 1 << 12
 _PNM = re.compile(rb"P[1-6](?:\s+|#[^\n]*\n)+(\d{1,9})(?:\s+|#[^\n]*\n)+(\d{1,9})\s")
 
@@ -102,31 +104,58 @@ def _bmp(file: IO[bytes]) -> PictureSize | None:
     return PictureSize(abs(height), abs(width), 4)
 
 
-def _tiff(file: IO[bytes]) -> PictureSize | None:
-    """Read the first directory; of a tag that is there twice, the larger value."""
+def _tiff(file: IO[bytes]) -> PictureSize:
+    tags = tiff_pages(file)[0].tags
+    tile = tags.get(322, (0,))[0] * tags.get(323, (0,))[0]
+    sample = max(1, -(-tags.get(258, (1,))[0] // 8))
+    return PictureSize(tags[257][0], tags[256][0], sample * max(1, tags.get(277, (1,))[0]), tile)
+
+
+class TiffPage(NamedTuple):
+    """A page of a TIFF: the places of its directory and of its orientation (0 for none) in the file, and its tags.
+
+    Of a tag that is there twice, the larger values count; texts are their bytes.
+    """
+
+    at: int
+    orientation_at: int
+    tags: dict[int, tuple[int, ...]]
+
+
+def tiff_pages(file: IO[bytes]) -> list[TiffPage]:
+    """Return the pages of a TIFF and its sub-images, but for thumbnails, overviews and masks of them."""
     file.seek(0)
     order = {b"II": "<", b"MM": ">"}[file.read(2)]
-    (version,) = struct.unpack(order + "H", file.read(2))
-    big = version == 43
-    word, count_code, step = ("Q", "Q", 20) if big else ("I", "H", 12)
-    file.seek(8 if big else 4)
-    (at,) = struct.unpack(order + word, file.read(struct.calcsize(word)))
-    file.seek(at)
-    (count,) = struct.unpack(order + count_code, file.read(struct.calcsize(count_code)))
-    entry = struct.Struct(f"{order}HH{word}{struct.calcsize(word)}s")
-    found: dict[str, int] = {}
-    for tag, kind, length, value in entry.iter_unpack(file.read(step * min(count, _MOST_TAGS))):
-        if tag in _TAGS and kind in _TAG_TYPES:
-            name, code = _TAGS[tag], order + _TAG_TYPES[kind]
-            if length * struct.calcsize(code) > len(value):  # the values lie elsewhere
-                file.seek(struct.unpack(order + word, value)[0])
-                value = file.read(struct.calcsize(code))  # noqa: PLW2901 - of all samples, the first
-            found[name] = max(found.get(name, 0), struct.unpack_from(code, value)[0])
-    if count > _MOST_TAGS or not {"width", "height"} <= found.keys():
-        return None
-    tile = found.get("tile_width", 0) * found.get("tile_height", 0)
-    sample = max(1, -(-found.get("bits", 1) // 8))
-    return PictureSize(found["height"], found["width"], sample * max(1, found.get("channels", 1)), tile)
+
+    def read(at: int, code: str) -> tuple[int, ...]:
+        file.seek(at)
+        return struct.unpack(order + code, file.read(struct.calcsize(order + code)))
+
+    word, count_code, size, step = ("Q", "Q", 8, 20) if read(2, "H") == (43,) else ("I", "H", 4, 12)
+    ahead, seen, pages = [*read(size, word)], {0}, list[TiffPage]()
+    while ahead and len(seen) <= _MOST_PAGES:
+        at = ahead.pop(0)
+        if at in seen:
+            continue
+        seen.add(at)
+        with contextlib.suppress(struct.error, ValueError, OverflowError, OSError):  # pages behind a damaged one
+            (count,) = read(at, count_code)
+            start, orientation_at, tags = at + struct.calcsize(order + count_code), 0, dict[int, tuple[int, ...]]()
+            if count > _MOST_TAGS:
+                continue
+            for place in range(start, start + step * count, step):
+                tag, kind, length = read(place, "HH" + word)
+                if tag not in _TAGS or kind not in _TAG_TYPES:
+                    continue
+                value_at, bytes_each = place + 4 + size, struct.calcsize(order + _TAG_TYPES[kind])
+                if length * bytes_each > size:  # the values lie elsewhere
+                    (value_at,) = read(value_at, word)
+                tags[tag] = max(tags.get(tag, ()), read(value_at, f"{min(length, _MOST_VALUES)}{_TAG_TYPES[kind]}"))
+                orientation_at = value_at if tag == _ORIENTATION else orientation_at
+            if tags.get(256) and tags.get(257):
+                pages.append(TiffPage(at, orientation_at, tags))
+            ahead += [*tags.get(330, ()), *read(start + step * count, word)]
+    return [page for page in pages if not page.tags.get(254, (0,))[0] & ~2 and page.tags.get(255) != (2,)] or pages
 
 
 def _webp(file: IO[bytes]) -> PictureSize | None:
@@ -163,3 +192,32 @@ _READERS: dict[bytes, Callable[[IO[bytes]], PictureSize | None]] = {
     b"RIFF": _webp,
     **dict.fromkeys((b"P1", b"P2", b"P3", b"P4", b"P5", b"P6"), _pnm),
 }
+_NOT_READ = {
+    b"#?": "Radiance HDR", b"v/1\x01": "OpenEXR", b"\x93NUMPY": "a NumPy array", b"PK\3\4": "an archive", b"PF": "PFM",
+    b"GIF8": "GIF", b"8BPS": "Photoshop", b"%PDF": "PDF", b"P7": "PAM", b"Pf": "PFM", b"\xff\x0a": "JPEG XL",
+    b"\0\0\0\x0cJXL ": "JPEG XL", b"\0\0\0\x0cjP  ": "JPEG 2000", b"\xff\x4f\xff\x51": "JPEG 2000",
+    b"FUJIFILM": "a raw photo", b"IIU\0": "a raw photo",
+}  # fmt: skip
+_BRANDS = {b"avi": "AVIF", b"hei": "HEIC", b"hev": "HEIC", b"mif": "HEIC", b"crx": "a raw photo"}
+_COMPRESSIONS = {1, 5, 6, 7, 8, 32773, 32946}
+"""Of TIFF, which OpenCV reads."""
+
+
+def format_not_read(content: bytes, *, stored: bool) -> str:
+    """Return what a picture is that OpenCV cannot decode; empty if it is damaged, or of an unknown format.
+
+    Args:
+        content: of the file.
+        stored: whether its values were wanted as they are, and not in 8 bits.
+
+    """
+    if content[4:8] == b"ftyp":
+        return _BRANDS.get(content[8:11], "a video")
+    if content[:2] in (b"II", b"MM") and picture_size(io.BytesIO(content)) is not None:
+        tags = tiff_pages(io.BytesIO(content))[0].tags
+        bits, floats, compression = tags.get(258, (1,))[0], tags.get(339, (1,))[0] == 3, tags.get(259, (1,))[0]
+        if compression not in _COMPRESSIONS:
+            return f"a TIFF with compression {compression}"
+        if (bits > 16 and not stored) or (bits < 32 and floats):
+            return f"a TIFF of {bits}-bit {'floats' if floats else 'values'}"
+    return next((name for magic, name in _NOT_READ.items() if content.startswith(magic)), "")

@@ -16,11 +16,11 @@ from dsr.geometry.plausible import expect_possible
 from dsr.geometry.rigid_motion import as_rigid
 from dsr.inference.any_ratio import expect_picture
 from dsr.io.doubts import doubt_camera, doubt_depth
-from dsr.io.encoding import Encoding, decode, find_holes, turn_back_bits
+from dsr.io.encoding import Encoding, decode, far_marks, find_holes, turn_back_bits
 from dsr.io.files import metres_in
 from dsr.io.inputs import Picture
 from dsr.io.reading import SUNRGBD_BITS
-from dsr.notes import Assumption
+from dsr.notes import Assumption, warn
 
 _METRES = Encoding(".npy", "float32", 1.0, math.nan, "orthogonal")
 
@@ -158,6 +158,10 @@ def _metres(stored: np.ndarray, unit: str | float | None, camera: Camera) -> tup
             raise ValueError(
                 f"depth: expected floats in metres, or whole numbers with unit='mm', 'm' or 0.0002, got {kind}"
             )
+        marks = far_marks(stored, np.isfinite(stored))
+        if marks:
+            stored = np.where(np.isin(stored, marks), np.nan, stored)
+            warn([Assumption(f"depth: {marks[-1]:g} m and more, far beyond all other values, counts as holes")])
         return torch.from_numpy(stored.astype(np.float32))[None], _METRES
     bits = SUNRGBD_BITS if factor == "sunrgbd" else 0
     stored = turn_back_bits("depth", stored, bits) if bits else stored
