@@ -6,8 +6,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 from dsr.cli import main
+from dsr.evaluation.run_files import load_results
+from dsr.report.leaderboard import standings
+from dsr.report.page.content import problem_data
+from dsr.report.tables import build_tables
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 288.0
 CAMERA = ["--intrinsics", "288", "288", "159.5", "119.5"]
@@ -62,3 +67,33 @@ def mean_error(out: Path, truth):
     assert depth.shape == truth.shape
     known = np.isfinite(depth) & np.isfinite(truth)
     return 1000 * np.abs(depth - truth)[known].mean(), np.isfinite(depth).mean()
+
+
+@pytest.mark.parametrize(
+    ("runs", "shared", "seeds"),
+    [
+        ([("One", 0, "abc"), ("One", 0, "ab"), ("Two", 0, "ab")], "ab", 1),
+        ([("One", 0, "ab"), ("One", 1, "abc"), ("Two", 0, "abc")], "abc", 1),
+        ([("One", 0, "ab"), ("One", 1, "abc"), ("Two", 0, "ab")], "ab", 2),
+        ([("One", 0, "ab"), ("One", 1, "bc"), ("Two", 0, "bc")], "bc", 1),
+        ([("One", 0, "a"), ("Two", 0, "bc")], "", 1),
+    ],
+)
+def test_report_averages_over_the_scenes_that_all_methods_have(make_run, tmp_path, runs, shared, seeds):
+    for number, (label, seed, scenes) in enumerate(runs):
+        make_run(tmp_path / str(number), label=label, seed=seed, scenes=tuple(scenes))
+    results = load_results([tmp_path])
+    page = problem_data(results, results.problems()[0])
+    average = build_tables(results)[-1].groups[-1]
+    for method, mean, row in zip(("One", "Two"), page["means"], average.rows, strict=True):
+        own = {each["scene"]: each["values"]["RMSE_d"][0] for each in page["rows"] if each["method"] == method}
+        cell = row.cells["RMSE_d"]
+        assert mean["counts"].get("RMSE_d", len(page["scenes"])) == cell.scenes == len(shared)
+        assert mean["seeds"] == row.seeds == (seeds if method == "One" else 1)
+        assert (cell.spread is None) == (row.seeds == 1)
+        if shared:
+            expected = pytest.approx(np.mean([own[scene] for scene in shared]))
+            [place] = [each for each in standings(results) if each["method"] == method]
+            assert mean["values"]["RMSE_d"][0] == cell.mean == place["values"]["RMSE_d"][0] == expected
+        else:
+            assert mean["values"] == {}
