@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+import tomllib
+from importlib.metadata import distribution
 from pathlib import Path
 
 import cv2
@@ -13,6 +16,7 @@ from dsr.evaluation.run_files import load_results
 from dsr.report.leaderboard import standings
 from dsr.report.page.content import problem_data
 from dsr.report.tables import build_tables
+from dsr.utils import versions
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 288.0
 CAMERA = ["--intrinsics", "288", "288", "159.5", "119.5"]
@@ -97,3 +101,16 @@ def test_report_averages_over_the_scenes_that_all_methods_have(make_run, tmp_pat
             assert mean["values"]["RMSE_d"][0] == cell.mean == place["values"]["RMSE_d"][0] == expected
         else:
             assert mean["values"] == {}
+
+
+def test_nobody_is_sent_to_the_dsr_of_pypi(monkeypatch):
+    root = Path(__file__).resolve().parents[2]
+    texts = [path for name in ("src", "conf", "docs") for path in (root / name).rglob("*.[pym][yda]*")]
+    found = [str(path) for path in (*texts, root / "README.md") if re.search(r"\bdsr\[[a-z]+[],]", path.read_text())]
+    assert len(texts) > 400
+    assert found == []
+    name = tomllib.loads((root / "pyproject.toml").read_text())["project"]["name"]
+    assert (name, distribution(name).version) == (versions.DISTRIBUTION, versions.package_versions()["dsr"])
+    assert versions.how_to_install("mesh") == "pip install -e '.[mesh]' in a checkout"
+    monkeypatch.setattr(versions, "__file__", "/site-packages/dsr/utils/versions.py")
+    assert versions.how_to_install("onnx") == f"pip install '{name}[onnx]'"
