@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import tomllib
 from importlib.metadata import distribution
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 from dsr.cli import main
+from dsr.data import detection
 from dsr.evaluation.run_files import load_results
 from dsr.report.leaderboard import standings
 from dsr.report.page.content import problem_data
@@ -114,3 +116,27 @@ def test_nobody_is_sent_to_the_dsr_of_pypi(monkeypatch):
     assert versions.how_to_install("mesh") == "pip install -e '.[mesh]' in a checkout"
     monkeypatch.setattr(versions, "__file__", "/site-packages/dsr/utils/versions.py")
     assert versions.how_to_install("onnx") == f"pip install '{name}[onnx]'"
+
+
+def test_make_benchmark_runs_the_scripts_that_need_no_arguments():
+    root = Path(__file__).resolve().parents[2]
+    [names] = re.findall(r"for name in ([\w ]+); do \$\(BIN\)/python benchmarks/", (root / "Makefile").read_text())
+    ratios = (root / "docs/speed.md").read_text().partition("## Ratios")[2].partition("\n## ")[0]
+    assert set(names.split()) == set(re.findall(r"benchmarks/(\w+)_speed\.py", ratios))
+    texts = [(root / f"benchmarks/{name}_speed.py").read_text() for name in names.split()]
+    assert not any("required=True" in text for text in texts)
+
+
+def test_doctor_knows_every_data_set_of_recorded_scenes(shared, tmp_path):
+    root = Path(__file__).resolve().parents[2]
+    known = {name for *_, name in detection._FRAMES}
+    own = {"folder", "simgeo", "procedural", "mixture", "paper_train", "rgbdd_real"}  # of the user, rendered, of others
+    choices = {path.stem for path in (root / "conf/dataset").glob("*.yaml") if not path.stem.startswith("middlebury")}
+    assert choices - own <= known
+    board = shared / "real/stereo_board"
+    assert [name for name, _ in detection.find_scenes(board)] == ["8", "14", "19", "25", "31"]
+    for folder in ("color", "depth"):  # a recording of somebody else
+        (tmp_path / folder).mkdir()
+        shutil.copy(board / folder / "14.png", tmp_path / folder / "8.png")
+    write(tmp_path / "color/8.png", np.zeros((1080, 1920, 3), np.uint8))
+    assert list(detection.find_scenes(tmp_path)) == []
