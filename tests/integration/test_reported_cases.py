@@ -11,10 +11,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 
+import dsr
 from dsr.cli import main
 from dsr.data import detection
 from dsr.evaluation.run_files import load_results
+from dsr.metrics.boundaries import METRICS
+from dsr.metrics.catalogue import score_image
 from dsr.report.leaderboard import standings
 from dsr.report.page.content import problem_data
 from dsr.report.tables import build_tables
@@ -140,3 +144,27 @@ def test_doctor_knows_every_data_set_of_recorded_scenes(shared, tmp_path):
         shutil.copy(board / folder / "14.png", tmp_path / folder / "8.png")
     write(tmp_path / "color/8.png", np.zeros((1080, 1920, 3), np.uint8))
     assert list(detection.find_scenes(tmp_path)) == []
+
+
+def boundary_errors(prediction, truth, edges=None):
+    """Return accuracy and completeness of depth boundaries as eval.py scores them."""
+    maps = [torch.from_numpy(each)[None] for each in (prediction, truth)]
+    regions = {} if edges is None else {"edges": torch.from_numpy(edges.astype(np.uint8))[None]}
+    rays = dsr.Camera.from_fov(60, width=WIDTH, height=HEIGHT).rays()
+    found = {each.metric: each.value for each in score_image(*maps, rays, METRICS, regions=regions)}
+    return found["DBE_accuracy"], found["DBE_completeness"]
+
+
+def test_boundary_errors_are_to_the_annotated_boundaries():
+    """Executed: ``compute_depth_boundary_error`` of Koch's v0.9 in bulatko/DepthART b2bc093, 0 for holes."""
+    truth, _ = scene()
+    prediction = cv2.resize(coarse(truth), (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
+    edges = np.zeros(truth.shape, bool)
+    edges[:, 1:] = np.abs(np.diff(truth)) > 0.4
+    edges[60, 20:200] = edges[60:200, 200] = True  # a picture on the wall
+    assert boundary_errors(prediction, truth, edges) == pytest.approx((1.0701604531461808, 11.598171099980945))
+    truth[:40], prediction[60:180, 60:140] = np.nan, np.nan
+    assert boundary_errors(prediction, truth, edges) == pytest.approx((1.0172272469100552, 19.141785662587306))
+    band = cv2.dilate(edges.astype(np.uint8), np.ones((9, 9), np.uint8))  # about outlines, as that of ClearGrasp
+    for others in (band, np.zeros_like(edges)):
+        assert boundary_errors(prediction, truth, others) == boundary_errors(prediction, truth)
