@@ -22,7 +22,7 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(REPOSITORY / "src"))
 
 from dsr.methods import weights  # noqa: E402
-from dsr.utils.versions import file_hash  # noqa: E402
+from dsr.utils.versions import DISTRIBUTION, file_hash  # noqa: E402
 
 MOST = 60e6
 """Bytes of the wheel."""
@@ -86,7 +86,7 @@ def check_weights() -> None:
 
 def clear(folder: Path) -> None:
     """Remove an earlier release from a folder, in which nothing else may be."""
-    ours = (SUMS, "dsr-*.whl", "dsr-*.tar.gz", "*.safetensors")
+    ours = (SUMS, f"{DISTRIBUTION}-*.whl", f"{DISTRIBUTION}-*.tar.gz", "*.safetensors")
     found = list(folder.iterdir()) if folder.is_dir() else []
     if others := [path.name for path in found if not any(path.match(each) for each in ours)]:
         raise ReleaseError(f"{folder}: expected an empty folder or one of an earlier release, got {others[0]} in it")

@@ -71,7 +71,7 @@ def test_wheels_that_are_too_large_or_lack_weights_are_refused(dist, tmp_path):
 
 
 def test_a_folder_of_something_else_is_not_emptied(dist, tmp_path):
-    (tmp_path / "dsr-0.0.1.tar.gz").write_bytes(b"")
+    (tmp_path / "depthsr-0.0.1.tar.gz").write_bytes(b"")
     (tmp_path / "photo.jpg").write_bytes(b"mine")
     with pytest.raises(dist.ReleaseError, match=r"expected an empty folder.*photo\.jpg"):
         dist.clear(tmp_path)

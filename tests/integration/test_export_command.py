@@ -131,7 +131,7 @@ def test_pose_that_is_not_rigid_is_one_line(capture, tmp_path, capsys):
 
 
 def test_mesh_and_cloud_beyond_limits_are_said_and_recorded(capture, tmp_path, capsys):
-    pytest.importorskip("fast_simplification", reason="pip install dsr[mesh]")
+    pytest.importorskip("fast_simplification", reason="pip install -e '.[mesh]'")
     out = tmp_path / "out"
     limits = ("--keep", "all", "--max-faces", 500, "--max-points", 1000)
     assert upsample(capture, "--only", "depth,mesh,cloud", *limits, "-o", out) == 0
@@ -165,5 +165,5 @@ def test_refusals_write_nothing(arguments, text, capture, tmp_path, capsys):
 def test_missing_rerun_is_one_line_before_anything_is_computed(capture, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
     assert upsample(capture, "--with", "rerun", "-o", tmp_path / "out") == 2
-    assert "rerun-sdk, which `pip install dsr[rerun]` installs" in capsys.readouterr().err
+    assert "rerun-sdk; pip install -e '.[rerun]' in a checkout" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

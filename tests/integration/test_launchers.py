@@ -26,7 +26,7 @@ ONE_NODE = (
 
 
 def needs(module):
-    return pytest.mark.skipif(importlib.util.find_spec(module) is None, reason="pip install dsr[cluster]")
+    return pytest.mark.skipif(importlib.util.find_spec(module) is None, reason="pip install -e '.[cluster]'")
 
 
 @pytest.fixture

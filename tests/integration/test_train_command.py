@@ -416,7 +416,7 @@ def test_usage_error_is_one_line_with_exit_code_2_and_writes_nothing(tmp_path, w
 def test_logger_that_is_not_installed_is_named_before_anything_is_written(tmp_path, within, name):
     if importlib.util.find_spec(name) is not None:
         pytest.skip(f"{name} is installed")
-    line = f"error: logger={name}: expected {name}, which is not installed; pip install dsr[{name}]"
+    line = f"error: logger={name}: expected {name}, which is not installed; pip install -e '.[{name}]' in a checkout"
     assert within(*SMOKE, f"logger={name}") == (2, "", [line])
     assert tree(tmp_path) == []
 

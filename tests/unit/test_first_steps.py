@@ -16,7 +16,7 @@ from dsr.cli import main, make_parser
 from dsr.cli.completion import words_at_end
 from dsr.doctor import about, machine
 from dsr.methods import weights
-from dsr.utils.versions import file_hash
+from dsr.utils.versions import DISTRIBUTION, file_hash
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 MISSPELT = {
@@ -68,7 +68,7 @@ def test_every_extra_for_users_has_a_purpose():
 
 
 def test_requirements_are_those_of_the_metadata():
-    without = {Requirement(each).name for each in requires("dsr") if "extra ==" not in each}
+    without = {Requirement(each).name for each in requires(DISTRIBUTION) if "extra ==" not in each}
     assert {each.name for each in about.requirements()} == without
     assert {each.name for each in about.requirements("onnx")} == {"onnx", "onnxruntime"}
 

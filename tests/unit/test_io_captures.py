@@ -286,10 +286,10 @@ def test_missing_package_is_named_with_the_extra_that_has_it(folder, monkeypatch
     for module in ("lzfse", "rosbags.highlevel"):
         monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(
-        ValueError, match=r"rgbd/0.depth: LZFSE data need the package lzfse: pip install 'dsr\[captures\]'"
+        ValueError, match=r"rgbd/0.depth: LZFSE data need the package lzfse: pip install -e '.\[captures\]'"
     ):
         read_all(folder)
-    with pytest.raises(ValueError, match=r"need the package rosbags: pip install 'dsr\[captures\]'"):
+    with pytest.raises(ValueError, match=r"need the package rosbags: pip install -e '.\[captures\]'"):
         find_pairs_of_folder(folder / "bag")
 
 

@@ -214,5 +214,5 @@ def test_truncated_file_is_refused(tmp_path):
 def test_package_that_is_missing_is_named(tmp_path, monkeypatch):
     path = write(tmp_path / "photo.heic")
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
-    with pytest.raises(ValueError, match=r"need the package pillow-heif: pip install 'dsr\[captures\]'"):
+    with pytest.raises(ValueError, match=r"need the package pillow-heif: pip install -e '.\[captures\]'"):
         only(path)

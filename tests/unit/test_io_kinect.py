@@ -240,5 +240,5 @@ def test_frames_of_a_recording_that_was_cut_off_are_read_up_to_there(tmp_path):
 def test_package_that_is_missing_is_named(tmp_path, monkeypatch):
     path = write(tmp_path / "scan.mkv")
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(ValueError, match=r"need the package av: pip install 'dsr\[captures\]'"):
+    with pytest.raises(ValueError, match=r"need the package av: pip install -e '.\[captures\]'"):
         find_pairs_of_folder(path)

@@ -28,8 +28,8 @@ def test_launcher_that_is_not_installed_names_the_extra(monkeypatch, name):
     library = LAUNCHERS[name].rpartition(".")[2]
     with pytest.raises(ConfigError) as refusal:
         expect_launcher(["-m", f"hydra/launcher={name}"])
-    message = f"hydra/launcher={name}: expected {library}, which is not installed; pip install dsr[cluster]"
-    assert str(refusal.value) == message
+    message = f"hydra/launcher={name}: expected {library}, which is not installed; pip install -e '.[cluster]' in a"
+    assert str(refusal.value) == f"{message} checkout"
 
 
 @pytest.mark.parametrize(

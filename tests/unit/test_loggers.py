@@ -65,7 +65,7 @@ def test_layout_of_tensorboard_begins_with_looks(tmp_path):
 
 def test_run_of_mlflow_has_values_settings_and_pictures_and_goes_on(tmp_path, monkeypatch):
     if importlib.util.find_spec("mlflow") is None:
-        pytest.skip("pip install dsr[mlflow]")
+        pytest.skip("pip install -e '.[mlflow]'")
     from mlflow.tracking import MlflowClient  # noqa: PLC0415
 
     monkeypatch.setenv("MLFLOW_ALLOW_FILE_STORE", "true")
@@ -86,7 +86,7 @@ def test_run_of_mlflow_has_values_settings_and_pictures_and_goes_on(tmp_path, mo
 
 def test_run_of_wandb_without_the_service_is_in_files_of_the_run(tmp_path, monkeypatch):
     if importlib.util.find_spec("wandb") is None:
-        pytest.skip("pip install dsr[wandb]")
+        pytest.skip("pip install -e '.[wandb]'")
     logger = loggers.wandb(tmp_path, mode="offline")
     logger.log_metrics({"train/loss": 0.5}, 9)
     log_picture(logger, "renderings/a_0", torch.zeros(3, 8, 8, dtype=torch.uint8), 20)
@@ -101,7 +101,7 @@ def test_run_of_wandb_without_the_service_is_in_files_of_the_run(tmp_path, monke
 def test_logger_that_is_not_installed_is_named_with_its_extra(tmp_path, monkeypatch, name):
     monkeypatch.setitem(__import__("sys").modules, name, None)
     with pytest.raises(
-        ValueError, match=rf"^logger={name}: expected {name}, which is not installed; pip install dsr\[{name}\]$"
+        ValueError, match=rf"^logger={name}: expected {name}, which is not installed; pip install -e '.\[{name}\]' in a"
     ):
         getattr(loggers, name)(tmp_path)
 

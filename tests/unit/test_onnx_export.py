@@ -19,8 +19,8 @@ from dsr.methods.networks.pdn import PrimalDualNetwork
 from dsr.methods.networks.sparse_to_dense import SparseToDense
 from dsr.methods.networks.trained import NETWORKS
 
-onnx = pytest.importorskip("onnx", reason="pip install dsr[onnx]")
-onnxruntime = pytest.importorskip("onnxruntime", reason="pip install dsr[onnx]")
+onnx = pytest.importorskip("onnx", reason="pip install -e '.[onnx]'")
+onnxruntime = pytest.importorskip("onnxruntime", reason="pip install -e '.[onnx]'")
 
 SMALL = {
     "facets": (lambda: FacetsUNet(4, 8, 8, 3), 4),
@@ -144,7 +144,7 @@ def test_folder_in_place_of_the_file_is_refused(tmp_path):
 def test_missing_library_is_named_with_its_extra(library, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, library, None)
     net, scale = random_network("dg")
-    with pytest.raises(ValueError, match=rf"^--onnx: expected the library {library}, which `pip install dsr\[onnx\]`"):
+    with pytest.raises(ValueError, match=rf"^--onnx: expected the library {library}; pip install -e '.\[onnx\]'"):
         write_onnx(tmp_path / "net.onnx", OnnxGraph(net, scale), {})
     assert list(tmp_path.iterdir()) == []
 

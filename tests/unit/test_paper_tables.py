@@ -132,12 +132,12 @@ def test_single_method_is_not_marked_as_best():
     assert cell_of(tables(run("A", {"a": 1.0}))["simgeo_x4_box"], "a", "A").rank == 0
 
 
-def test_average_over_fewer_scenes_is_labelled_and_not_ranked():
-    runs = [run("A", {"a": 1.0, "b": 9.0}, dataset="m"), run("B", {"a": 2.0, "b": 10.0}, dataset="m")]
+def test_average_is_over_the_scenes_in_common_and_labelled():
+    runs = [run("A", {"a": 1.0, "b": 9.0}, dataset="m"), run("B", {"a": 2.0, "b": 1.0}, dataset="m")]
     table = tables(*runs, run("C", {"a": 0.5}, dataset="m"))["m_x4_box"]
-    partial = cell_of(table, "m,", "C")
-    assert (partial.mean, partial.scenes, partial.of, partial.rank) == (pytest.approx(0.5), 1, 2, 0)
-    assert [cell_of(table, "m,", label).rank for label in "AB"] == [1, 2]
+    cells = [cell_of(table, "m,", label) for label in "ABC"]
+    assert [cell.mean for cell in cells] == pytest.approx([1.0, 2.0, 0.5])
+    assert [(cell.scenes, cell.of, cell.rank) for cell in cells] == [(1, 2, 2), (1, 2, 0), (1, 2, 1)]
     assert any(note.startswith("(k of n)") for note in table.notes)
 
 

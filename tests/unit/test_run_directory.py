@@ -8,6 +8,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+import dsr
 from dsr.app import run_directory as rundir
 from dsr.app.composition import compose
 from dsr.app.run_directory import (
@@ -256,7 +257,7 @@ def test_versions_outside_of_a_checkout_have_no_commit(monkeypatch, tmp_path):
 
 def test_missing_package_is_recorded_as_such():
     found = package_versions(["dsr", "no-such-package-here"])
-    assert found == {"dsr": importlib.metadata.version("dsr"), "no-such-package-here": "not installed"}
+    assert found == {"dsr": dsr.__version__, "no-such-package-here": "not installed"}
 
 
 @pytest.mark.parametrize(("name", "reason"), [

@@ -230,7 +230,7 @@ def test_splatting_without_poses_has_depth_alone_and_holes_alone_are_refused(mak
 
 def read_recording(path):
     """Return the columns of a recording by entity and name, as rerun reads them."""
-    chunk = pytest.importorskip("rerun.chunk", reason="pip install dsr[rerun]")
+    chunk = pytest.importorskip("rerun.chunk", reason="pip install -e '.[rerun]'")
     columns = {}
     for part in chunk.RrdReader(str(path)).stream():
         batch = part.to_record_batch()
@@ -242,7 +242,7 @@ def read_recording(path):
 def test_rerun_recording_is_read_back(make, tmp_path):
     frames = [make(0), make(1, pose=None)]
     path = tmp_path / "scene.rrd"
-    pytest.importorskip("rerun", reason="pip install dsr[rerun]")
+    pytest.importorskip("rerun", reason="pip install -e '.[rerun]'")
     assert write_rerun(path, frames) == [path]
     assert [each.name for each in tmp_path.iterdir() if each.is_file()] == ["scene.rrd"]
     columns = read_recording(path)
@@ -270,7 +270,7 @@ def test_rerun_recording_is_read_back(make, tmp_path):
                                            (("y", ""), (3, 2, 5))])  # fmt: skip
 def test_rerun_world_has_the_captures_axes(make, tmp_path, ups, axes):
     """The numbers are rerun's: 1 up, 2 down, 3 right, 4 left, 5 forward, 6 back."""
-    pytest.importorskip("rerun", reason="pip install dsr[rerun]")
+    pytest.importorskip("rerun", reason="pip install -e '.[rerun]'")
     write_rerun(tmp_path / "s.rrd", [replace(make(number), up=up) for number, up in enumerate(ups)])
     columns = read_recording(tmp_path / "s.rrd")
     [[coordinates]] = columns["/", "ViewCoordinates:xyz"]
@@ -280,7 +280,7 @@ def test_rerun_world_has_the_captures_axes(make, tmp_path, ups, axes):
 
 @pytest.mark.parametrize("start", [12.5, 1305031102.25])
 def test_rerun_timeline_is_the_frames_times(make, tmp_path, start):
-    pytest.importorskip("rerun", reason="pip install dsr[rerun]")
+    pytest.importorskip("rerun", reason="pip install -e '.[rerun]'")
     write_rerun(tmp_path / "s.rrd", [replace(make(number), time=start + number / 2) for number in range(2)])
     times = read_recording(tmp_path / "s.rrd")["/camera/depth", "time"]
     seconds = [each.timestamp() if isinstance(each, datetime) else each.total_seconds() for each in times]
@@ -289,7 +289,7 @@ def test_rerun_timeline_is_the_frames_times(make, tmp_path, start):
 
 def test_rerun_without_the_library_names_the_extra(make, tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "rerun", None)
-    with pytest.raises(ValueError, match=r"^rerun: expected the library rerun-sdk, which `pip install dsr\[rerun\]`"):
+    with pytest.raises(ValueError, match=r"^rerun: expected the library rerun-sdk; pip install -e '.\[rerun\]'"):
         write_rerun(tmp_path / "scene.rrd", [make(0)])
     assert not (tmp_path / "scene.rrd").exists()
 

@@ -7,6 +7,7 @@ from importlib.metadata import PackageNotFoundError, metadata
 
 from dsr.data.download.collections import CATALOGUE, Collection, Item
 from dsr.methods import weights
+from dsr.utils.versions import DISTRIBUTION
 
 _URL = "Weights"
 """The label under which ``project.urls`` of pyproject.toml has the address of the release's files."""
@@ -21,7 +22,7 @@ def downloads() -> Mapping[str, Collection]:
 def _weights(names: list[str]) -> Collection:
     """Return weights to fetch from the release, or from a mirror."""
     try:
-        stated = metadata("dsr").get_all("Project-URL") or []
+        stated = metadata(DISTRIBUTION).get_all("Project-URL") or []
     except PackageNotFoundError:
         stated = []
     address = dict(each.split(", ", 1) for each in stated).get(_URL, "").rstrip("/")

@@ -224,9 +224,7 @@ def _run_claimed(prepared: _Prepared) -> pd.DataFrame:
     for remark in study.method.remarks(study.source.name, study.source.scenes(), study.scale):
         note_once(remark)
     try:
-        outcome = predict(
-            study, folder, progress, overwrite=settings.overwrite, workers=workers, meanwhile=_import_report
-        )
+        outcome = predict(study, folder, progress, overwrite=settings.overwrite, workers=workers)
     except StalePredictionError as error:
         raise ConfigError(str(error)) from error
     metrics = chosen_metrics(settings.metrics, regions_of(study.source))
@@ -255,13 +253,9 @@ def _workers(settings: EvalConfig, device: torch.device, scenes: int, *, alone: 
     return choose_workers(count, threads, scenes, torch.get_num_threads(), together=forks and not alone)
 
 
-def _import_report() -> None:
-    """Import what draws and logs, while workers predict."""
-
-
 def _save_dashboard(folder: Path) -> None:
     """Write the run's TensorBoard log."""
-    from dsr.report.dashboard import save_dashboard  # noqa: PLC0415 - see _import_report
+    from dsr.report.dashboard import save_dashboard  # noqa: PLC0415 - slow to import
 
     save_dashboard(folder)
 
@@ -340,7 +334,7 @@ def _illustrate(
     folder: Path, label: str, formats: Formats, sample: DepthSample, depth: torch.Tensor, scores: Mapping[str, float]
 ) -> None:
     """Draw the result of a scene, and its expected errors if there are any."""
-    from dsr.pictures.expected_errors import write_confidence  # noqa: PLC0415 - see _import_report
+    from dsr.pictures.expected_errors import write_confidence  # noqa: PLC0415 - slow to import
     from dsr.pictures.panels import save_picture  # noqa: PLC0415
 
     save_picture(folder / "pictures" / f"{sample.scene}.png", sample, depth, scores, label, formats)

@@ -34,7 +34,7 @@ LAUNCHERS = {
     "submitit_local": "hydra_plugins.hydra_submitit_launcher",
     "submitit_slurm": "hydra_plugins.hydra_submitit_launcher",
 }
-"""The launchers that ``pip install dsr[cluster]`` brings, and what each needs."""
+"""The launchers that ``pip install -e '.[cluster]'`` brings, and what each needs."""
 _MADE_BY = "instantiate_launcher"
 """The method of Hydra's plugins with which sweepers make their launcher."""
 

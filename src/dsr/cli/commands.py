@@ -247,7 +247,7 @@ EXPORT = Command(
     _later("dsr.app.export", "export_onnx"),
     description="""\
 Write a method's network as an ONNX file, which takes a photo and a depth map of any size, and check it with
-onnxruntime. The libraries are an extra: pip install dsr[onnx].""",
+onnxruntime. The libraries are an extra: pip install -e '.[onnx]' in a checkout.""",
     epilog="""\
 examples:
   dsr export --onnx facets_x4.onnx

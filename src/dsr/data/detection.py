@@ -20,17 +20,28 @@ from dsr.data import (
     nyu,
     rgbdd,
     sintel,
+    stereo_board,
     sunrgbd,
     tartanair,
     tofmark,
 )
+from dsr.data.download.collections import CATALOGUE
 from dsr.data.folder import load_scene
 from dsr.data.frame_files import load_pair
 from dsr.sample import Scene
 from dsr.utils.guards import natural_key
+from dsr.utils.versions import file_hash
 
 Loader = Callable[[], Scene]
 _YEARS = {"view1.png": 2006, "im2.png": 2003, "im2.ppm": 2001}
+
+
+def _boards(folder: Path) -> dict[str, tuple[Path, Path, str]]:
+    """Return the frames of ``stereo_board`` by their checksums: recordings of others have files of the same names."""
+    pinned = {item.sha256 for item in CATALOGUE["stereo_board"].items}
+    return {name: files for name, files in stereo_board.find_frames(folder).items() if file_hash(files[0]) in pinned}
+
+
 _FRAMES: tuple[tuple[Callable[[Path], Mapping[str, tuple[Any, ...]]], Callable[..., Scene], str], ...] = (
     (icl.find_frames, icl.load_frame, "icl"),
     (sunrgbd.find_frames, sunrgbd.load_frame, "sunrgbd"),
@@ -45,6 +56,7 @@ _FRAMES: tuple[tuple[Callable[[Path], Mapping[str, tuple[Any, ...]]], Callable[.
     (cleargrasp.find_renderings, cleargrasp.load_rendering, "cleargrasp_synthetic"),
     (ibims.find_pictures, ibims.load_pictures, "ibims"),
     (hammer.find_frames, hammer.load_frame, "hammer"),
+    (_boards, stereo_board.load_frame, "stereo_board"),
     *(
         (functools.partial(eight_bit.find_frames, dataset=benchmark), eight_bit.load_frame, benchmark)
         for benchmark in eight_bit.BENCHMARKS

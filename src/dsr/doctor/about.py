@@ -13,7 +13,7 @@ from packaging.requirements import Requirement
 
 import dsr
 from dsr.methods import weights
-from dsr.utils.versions import RESULTS, package_versions
+from dsr.utils.versions import DISTRIBUTION, RESULTS, package_versions
 
 EXTRAS = {
     "app": "`dsr app`, a page of this machine that upsamples what is dropped on it",
@@ -76,7 +76,7 @@ def requirements(extra: str = "") -> list[Requirement]:
         PackageNotFoundError: the package is not installed.
 
     """
-    found = [Requirement(line) for line in distribution("dsr").requires or ()]
+    found = [Requirement(line) for line in distribution(DISTRIBUTION).requires or ()]
     needed = [each for each in found if each.marker is None or each.marker.evaluate({"extra": ""})]
     if not extra:
         return needed
@@ -101,7 +101,7 @@ def extras() -> list[Extra]:
         PackageNotFoundError: it is not installed.
 
     """
-    names = distribution("dsr").metadata.get_all("Provides-Extra") or []
+    names = distribution(DISTRIBUTION).metadata.get_all("Provides-Extra") or []
     return [
         Extra(name, EXTRAS.get(name, ""), tuple(lacking for each in requirements(name) if (lacking := lack(each))))
         for name in sorted(names)

@@ -25,7 +25,7 @@ from dsr.utils.compute_device import fast_precision, pick_device
 from dsr.utils.console import USAGE_ERROR, one_line, open_console
 from dsr.utils.files import data_root
 from dsr.utils.progress import megabytes
-from dsr.utils.versions import file_hash
+from dsr.utils.versions import DISTRIBUTION, file_hash, how_to_install
 
 _OPENCV = "opencv-python-headless"
 _LITTLE = 1 << 30
@@ -58,7 +58,7 @@ def check_machine() -> list[Finding]:
 def check_python() -> list[Finding]:
     """Check the version of Python, and report those of dsr and its weights."""
     try:
-        needed = distribution("dsr").metadata["Requires-Python"]
+        needed = distribution(DISTRIBUTION).metadata["Requires-Python"]
     except PackageNotFoundError:
         return [Finding("dsr", "warning", "not installed, its sources are used", "pip install -e . in its folder")]
     if SpecifierSet(needed).contains(platform.python_version(), prereleases=True):
@@ -175,7 +175,7 @@ def _extra(extra: Extra) -> Finding:
     if not extra.missing:
         return Finding("extra", "ok", f"{extra.name}: {extra.purpose}")
     message = f"{extra.name}: {extra.purpose} ({', '.join(extra.missing)})"
-    return Finding("extra", "note", message, f"pip install 'dsr[{extra.name}]'")
+    return Finding("extra", "note", message, how_to_install(extra.name))
 
 
 CHECKS: tuple[Callable[[], list[Finding]], ...] = (

@@ -137,7 +137,6 @@ def predict(
     *,
     overwrite: bool = False,
     workers: Workers = ALONE,
-    meanwhile: Callable[[], None] | None = None,
 ) -> Outcome:
     """Write the samples and predictions of all scenes without one.
 
@@ -148,7 +147,6 @@ def predict(
         progress: display of the completed scenes, and of the method's steps within a scene.
         overwrite: whether stored predictions are recomputed, but for those that another process stores meanwhile.
         workers: how many scenes are predicted at a time, each in a process of its own.
-        meanwhile: function that is called while the first scenes are predicted; None for none.
 
     Raises:
         StalePredictionError: a stored prediction has another configuration and ``overwrite`` is not set.
@@ -170,7 +168,7 @@ def predict(
             return result
 
         scenes = study.source.scenes()
-        found = share(scenes, claims, "predict", ready, work, _lost, workers, progress, meanwhile)
+        found = share(scenes, claims, "predict", ready, work, _lost, workers, progress)
     return _outcome(found)
 
 

@@ -356,7 +356,6 @@ def share(
     lost: Callable[[str], _R],
     workers: Workers,
     progress: Progress,
-    meanwhile: Callable[[], None] | None = None,
 ) -> dict[str, _R]:
     """Work through scenes, but for those that other commands work on; wait for these.
 
@@ -367,7 +366,6 @@ def share(
         work: function that makes it, and leaves it where ``ready`` finds it.
         lost: function that returns the result of a scene whose workers were killed.
         workers: how many at a time.
-        meanwhile: function that is called while workers are busy, or else at once; None for none.
 
     Returns:
         The results by scene, in the order of ``scenes``.
@@ -375,8 +373,6 @@ def share(
     """
     found: dict[str, _R] = {}
     if workers.count == 1 or len(scenes) < 2:
-        if meanwhile is not None:
-            meanwhile()
         with computing_threads(workers.threads):
             attempts = _attempts(scenes, claims, name, ready)
             for scene, attempt in progress.track(attempts, name, len(scenes), label=_scene_of):
@@ -397,10 +393,7 @@ def share(
             return work(scene, Progress()) if result is None else result
 
     with Pool(workers.count, attempt_once, lost, progress.say, threads=workers.threads) as pool:
-        results = pool.results(scenes)
-        if meanwhile is not None:
-            meanwhile()
-        for scene, result in progress.track(results, name, len(scenes), label=_scene_of):
+        for scene, result in progress.track(pool.results(scenes), name, len(scenes), label=_scene_of):
             found[scene] = result
     return {scene: found[scene] for scene in scenes}
 

@@ -40,6 +40,7 @@ from dsr.utils.arrays import array_headers, read_arrays
 from dsr.utils.decoding import decode_pixels
 from dsr.utils.files import replacing
 from dsr.utils.guards import MOST_FACES, MOST_POINTS
+from dsr.utils.versions import how_to_install
 
 FLAT = "large triangles where the surface is flat"
 """What makes a mesh smaller without a limit, see :mod:`dsr.geometry.adaptive_mesh`."""
@@ -266,7 +267,7 @@ def _reduce(mesh: Mesh, depth: Tensor, camera: Camera, most: int, largest_step: 
         return simplify(mesh, most, camera), QUADRIC
     except ImportError:
         thinned, stride = thin(depth, camera, most, largest_step)
-        return thinned, f"a stride of {stride} pixels; `pip install dsr[mesh]` simplifies and keeps more detail"
+        return thinned, f"a stride of {stride} pixels; {how_to_install('mesh')} simplifies and keeps more detail"
 
 
 def _at(mask: Tensor | None, pixels: np.ndarray) -> np.ndarray | None:

@@ -27,7 +27,7 @@ def read(path: str | os.PathLike[str], depth: np.ndarray | None = None) -> np.nd
     the depth map's aspect only then.
 
     Args:
-        path: JPEG, PNG, TIFF, BMP, WebP, PPM, or HEIC (``pip install 'dsr[captures]'``).
+        path: JPEG, PNG, TIFF, BMP, WebP, PPM, or HEIC (``pip install -e '.[captures]'``).
         depth: (h, w) the depth map; None for one that lies as the file does, with a warning if the file is to be
             turned.
 

@@ -23,6 +23,7 @@ from dsr.io.images import read_pixels
 from dsr.notes import Assumption
 from dsr.utils.files import replacing
 from dsr.utils.guards import MOST_FILE, expect_pixels, read_limited, refusing
+from dsr.utils.versions import how_to_install
 
 _MODEL, _ORIENTATION, _EXIF_IFD, _EXIF_FOCAL_35 = 0x0110, 0x0112, 0x8769, 0xA405
 _ASPECT_TOLERANCE = 0.02
@@ -131,7 +132,7 @@ def _boxes(content: memoryview) -> Iterator[tuple[bytes, memoryview]]:
 
 def open_heic(path: Path) -> Any:
     """Return the photo of a HEIC file, pillow-heif's image, whose pixels are not decoded yet; ValueError if damaged."""
-    with refusing(f"{path}: HEIC photos need the package pillow-heif: pip install 'dsr[captures]'", ImportError):
+    with refusing(f"{path}: HEIC photos need the package pillow-heif: {how_to_install('captures')}", ImportError):
         import pillow_heif  # noqa: PLC0415 - an extra
     content = read_limited(path, MOST_FILE)
     with refusing(f"{path}: expected a HEIC photo, got a damaged one", *_DAMAGED):

@@ -51,6 +51,7 @@ from dsr.io.images import read_pixels
 from dsr.io.photos import encode_png, to_jpeg, write_png
 from dsr.utils.files import replacing, write_text
 from dsr.utils.guards import pixels_beside, refusing
+from dsr.utils.versions import how_to_install
 
 RGBD = ("color.png", "depth.png", "intrinsic.json")
 SCENE = "nerfstudio"
@@ -377,7 +378,7 @@ def write_rerun(path: Path, frames: Sequence[Frame]) -> list[Path]:
         ValueError: the library is not installed.
 
     """
-    with refusing("rerun: expected the library rerun-sdk, which `pip install dsr[rerun]` installs", ImportError):
+    with refusing(f"rerun: expected the library rerun-sdk; {how_to_install('rerun')}", ImportError):
         rerun = importlib.import_module("rerun")
     recording = rerun.RecordingStream("dsr")
     with replacing(path) as temporary:

@@ -13,7 +13,7 @@ of the same two pixels is above the same threshold. This is scale-invariant and 
   1.25.
 - iBims-1 (Koch et al., *Evaluation of CNN-based Single-Image Depth Estimation Methods*, ECCV Workshops 2018; its Python
   v0.9, in bulatko/DepthART b2bc093, ``mde/capsules/meter/ibims_official/evaluate_ibims_error_metrics.py``): depth
-  boundary error, directed depth error, planarity error.
+  boundary error, to annotated boundaries where a scene has them; directed depth error, planarity error.
 
 Unknown truth is left out of both maps. A prediction has no edges at its holes: true edges there are missed, but false
 ones cannot be there, and the directed errors leave holes out as their authors do. Therefore the fraction of the true
@@ -28,6 +28,7 @@ from functools import partial
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from dsr.metrics.depth import covered
 from dsr.metrics.formats import BEFORE_THE_PAPER, MetricFormat
@@ -41,6 +42,10 @@ DBE_RANGE = 10.0
 """Pixels; predicted boundaries further from a true one are no boundaries of it."""
 DDE_PLANE = 3.0
 """Metres from the camera to the plane that the directed depth error is about."""
+EDGES = "edges"
+"""The region with annotated depth boundaries, see :class:`dsr.sample.Scene`; a band about outlines is none."""
+_BAND = 5
+"""Width and height in pixels of squares that a band has and lines have not."""
 PLANES = "planes"
 """The region with numbered planes, see :class:`dsr.sample.Scene`."""
 PLANE_SHARE = 0.05
@@ -281,8 +286,14 @@ def _fit_plane(points: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _boundary_errors(pair: SurfacePair) -> tuple[Tensor, Tensor]:
+    """Return the errors to the annotated boundaries, without a mask, as iBims-1; else to the truth's own."""
     prediction, target = pair.derive(known_maps)
-    return depth_boundary_error(depth_boundaries(prediction), depth_boundaries(target))
+    edges = pair.regions.get(EDGES, torch.zeros_like(target)) > 0
+    band = avg_pool2d(edges.float(), _BAND, stride=1, padding=_BAND // 2) > 1 - 1e-3
+    annotated = (edges.flatten(1).any(dim=1) & ~band.flatten(1).any(dim=1)).view(-1, 1, 1, 1)
+    given = pair.given[0].where((pair.given[0] > 0) & pair.given[0].isfinite(), torch.nan)
+    found = depth_boundaries(torch.where(annotated, given, prediction))
+    return depth_boundary_error(found, torch.where(annotated, edges, depth_boundaries(target)))
 
 
 def _boundary_error(pair: SurfacePair, part: int) -> Tensor:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import pandas as pd
 
 from dsr.evaluation.results import Results
 from dsr.metrics.formats import by_family
-from dsr.report.tables import in_shown_units
+from dsr.report.tables import cells_of, values_of
 
 
 def standings(results: Results) -> list[dict[str, Any]]:
@@ -29,7 +28,10 @@ def standings(results: Results) -> list[dict[str, Any]]:
     ranks: dict[str, list[float]] = {label: [] for label in results.methods()}
     means: dict[str, dict[str, list[float]]] = {label: {} for label in ranks}
     for problem in results.problems():
-        table = _means(results, problem)
+        values = values_of(results.of(problem), formats)
+        places = list(dict.fromkeys(place for scenes in values.values() for place in scenes))
+        averages = {name: cells_of(values, list(values), places, name) for name in formats}
+        table = pd.DataFrame({name: {label: cell.mean for label, cell in of.items()} for name, of in averages.items()})
         if table.empty:
             continue
         for label, row in table.iterrows():
@@ -59,20 +61,3 @@ def standings(results: Results) -> list[dict[str, Any]]:
         if own
     ]
     return sorted(rows, key=lambda row: (row["settings"] < total, row["rank"]))
-
-
-def _means(results: Results, problem: Any) -> pd.DataFrame:
-    """Return the mean of each metric, method x metric, over the scenes that all methods have, and over seeds."""
-    tables: dict[str, list[pd.DataFrame]] = {}
-    for run in results.of(problem):
-        if not run.scores.empty:
-            tables.setdefault(run.label, []).append(in_shown_units(run.scores, results.formats))
-    of_method = {label: pd.concat(own) for label, own in tables.items()}
-    if not of_method:
-        return pd.DataFrame()
-    common = set.intersection(*(set(own.index) for own in of_method.values()))
-    found = {}
-    for label, own in of_method.items():
-        scored = own[own.index.isin(common)].replace([math.inf, -math.inf], math.nan)
-        found[label] = scored.mean().where(scored.notna().all())
-    return pd.DataFrame(found).T

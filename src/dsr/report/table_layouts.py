@@ -101,8 +101,8 @@ class Style:
 
     def text(self, column: MetricFormat, cell: Cell | None, seeds: int) -> str:
         """Format a cell; the number of seeds is added if it differs from that of the row."""
-        if cell is None:
-            return self.missing
+        if cell is None or not cell.scenes:
+            return self.missing if cell is None else f"{self.missing} (0 of {cell.of})"
         before, after = self.marks[cell.rank]
         text = f"{before}{self.number(shown(column, cell.mean))}{after}" + self.star * cell.significant
         if cell.spread is not None:
@@ -334,9 +334,8 @@ def _compared(facts: Sequence[Fact], columns: Formats, group: Group) -> Iterator
 
 def _plain(column: MetricFormat, cell: Cell | None) -> str:
     """Format a mean, with the number of scenes if some are missing."""
-    if cell is None:
-        return MISSING
-    return shown(column, cell.mean) + ("" if cell.complete else f" ({cell.scenes} of {cell.of})")
+    text = shown(column, cell.mean) if cell is not None and cell.scenes else MISSING
+    return text if cell is None or cell.complete else f"{text} ({cell.scenes} of {cell.of})"
 
 
 def _against(key: str, column: MetricFormat, row: Row) -> tuple[str, str]:

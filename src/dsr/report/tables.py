@@ -3,8 +3,9 @@
 The model is Voynov et al., *Perceptual Deep Depth Super-Resolution* (ICCV 2019): its summary table and those of its
 supplement. A table has no layout; :mod:`dsr.report.table_layouts` writes it.
 
-Scores are averaged over the seeds within each scene, then over scenes. A spread is the sample standard deviation over
-seeds; for an average over scenes, over the averages of the seeds that have all of its scenes.
+Scores are averaged over the seeds within each scene, then over the scenes that all methods with the metric have. A
+spread is the sample standard deviation over seeds; for an average over scenes, over the averages of the seeds that have
+all of its scenes.
 """
 
 from __future__ import annotations
@@ -53,14 +54,14 @@ class Cell:
     """One value of a table, in its column's unit.
 
     Args:
-        mean: mean over seeds, then over scenes.
+        mean: mean over seeds, then over scenes; NaN if the methods have no scene in common.
         spread: sample standard deviation over seeds; None for one seed.
         seeds: number of seeds of the spread; 0 for values without seeds.
-        scenes, of: number of scenes with a value, and of all scenes of the row.
+        scenes, of: number of averaged scenes, and of all scenes of the row.
         interval: 95 % confidence interval of a percentage of answers, or of a mean over scenes.
-        by_scene: value of each scene; NaN for missing ones.
+        by_scene: value of each averaged scene.
         significant: whether it is the best, and better than the second best, by a paired test over the scenes.
-        rank: 1 for the best displayed value, 2 for the second best; 0 for others and for incomplete averages.
+        rank: 1 for the best displayed value, 2 for the second best; 0 for others.
 
     """
 
@@ -82,7 +83,7 @@ class Cell:
 
     @property
     def complete(self) -> bool:
-        """Whether all scenes of the row have a value."""
+        """Whether all scenes of the row are averaged."""
         return self.scenes == self.of
 
 
@@ -224,7 +225,7 @@ def build_tables(results: Results, study: pd.DataFrame | None = None, *, interva
     for scale, downsampling in dict.fromkeys((run.scale, run.downsampling) for run in results.runs):
         runs = [run for run in results.runs if (run.scale, run.downsampling) == (scale, downsampling)]
         formats = results.formats
-        values = _values(runs, formats)
+        values = values_of(runs, formats)
         make = _Maker(scale, downsampling, results.methods(), values, runs, study, formats, intervals)
         places = list(dict.fromkeys(place for scenes in make.values.values() for place in scenes))
         if not places:
@@ -303,11 +304,10 @@ class _Maker:
         scenes = [place.scene for place in about.places]
         rows = []
         degradation = (about, self.scale, self.downsampling)
+        cells = {key: cells_of(self.values, labels, about.places, key) for key in self.formats}
         for label in labels:
             runs = [run for run in here if run.label == label]
-            own = [self.values[label].get(place, {}) for place in about.places]
-            cells = {key: _cell([scene.get(key, {}) for scene in own]) for key in self.formats}
-            valid = {key: cell for key, cell in cells.items() if cell is not None} | self._study_cells(about, label)
+            valid = {key: of[label] for key, of in cells.items() if label in of} | self._study_cells(about, label)
             row = paper_row(about.published, runs, scenes) if valid else None
             seeds = max([1, *(cell.seeds for cell in valid.values())])
             rows.append(Row(label, *degradation, seeds, runs, valid, self._columns_of(row)))
@@ -331,7 +331,7 @@ class _Maker:
         return {key: Cell(mean, None, 0, count, len(about.places), ci) for key, (mean, count, ci) in found.items()}
 
 
-def _values(runs: Sequence[Run], formats: Formats) -> Values:
+def values_of(runs: Sequence[Run], formats: Formats) -> Values:
     """Collect the scores of the tables."""
     found: dict[str, dict[Place, dict[str, dict[int, float]]]] = {}
     for run in runs:
@@ -364,29 +364,41 @@ def _truth_is_complete(results: Results) -> Callable[[Place], bool]:
     return complete
 
 
-def _cell(scenes: Sequence[Mapping[int, float]]) -> Cell | None:
-    """Average one method's values of a metric over seeds, then over scenes; None without values."""
-    valid = [by_seed for by_seed in scenes if by_seed]
-    if not valid:
-        return None
-    mean = statistics.fmean(statistics.fmean(by_seed.values()) for by_seed in valid)
-    seeds = set.intersection(*map(set, valid))  # seeds that have all of these scenes
-    averages = [statistics.fmean(by_seed[seed] for by_seed in valid) for seed in sorted(seeds)]
-    spread = statistics.stdev(averages) if len(averages) > 1 else None
-    by_scene = tuple(statistics.fmean(each.values()) if each else math.nan for each in scenes)
-    return Cell(mean, spread, max(len(averages), 1), len(valid), len(scenes), by_scene=by_scene)
+def cells_of(values: Values, labels: Sequence[str], places: Sequence[Place], metric: str) -> dict[str, Cell]:
+    """Average a metric over seeds, then over the scenes of ``places`` that all methods with the metric there have.
+
+    Returns:
+        Cells by label, without the methods that have no value there.
+
+    """
+    found = {label: [values.get(label, {}).get(place, {}).get(metric, {}) for place in places] for label in labels}
+    found = {label: scenes for label, scenes in found.items() if any(scenes)}
+    shared = [number for number, scene in enumerate(zip(*found.values(), strict=True)) if all(scene)]
+    if not shared:
+        return dict.fromkeys(found, Cell(math.nan, scenes=0, of=len(places)))
+    cells = {}
+    for label, scenes in found.items():
+        valid = [scenes[number] for number in shared]
+        by_scene = tuple(statistics.fmean(by_seed.values()) for by_seed in valid)
+        seeds = set.intersection(*map(set, valid))  # seeds that have all of these scenes
+        averages = [statistics.fmean(by_seed[seed] for by_seed in valid) for seed in sorted(seeds)]
+        spread = statistics.stdev(averages) if len(averages) > 1 else None
+        counts = max(len(averages), 1), len(valid), len(places)
+        cells[label] = Cell(statistics.fmean(by_scene), spread, *counts, by_scene=by_scene)
+    return cells
 
 
 def _ranked(group: Group, columns: Formats) -> Group:
     """Return the group with the best and second best marked.
 
-    Values are compared as displayed, so equal texts share a rank. Averages over a subset of the scenes are not ranked,
-    and a single value is not ranked.
+    Values are compared as displayed, so equal texts share a rank. A single value is not ranked, nor are percentages of
+    the user study over fewer scenes than the others'.
     """
     ranks: dict[tuple[str, str], int] = {}
     for name, column in columns.items():
         cells = {row.label: row.cells[name] for row in group.rows if name in row.cells}
-        values = {label: float(shown(column, cell.mean)) for label, cell in cells.items() if cell.complete}
+        most = max([1, *(cell.scenes for cell in cells.values())])
+        values = {label: float(shown(column, cell.mean)) for label, cell in cells.items() if cell.scenes == most}
         order = sorted(set(values.values()), reverse=column.higher_is_better)[:2] if len(values) > 1 else []
         ranks |= {(label, name): order.index(value) + 1 for label, value in values.items() if value in order}
     rows = [
@@ -402,7 +414,7 @@ def _tested(group: Group) -> Group:
     for row in group.rows:
         cells = dict(row.cells)
         for key, cell in row.cells.items():
-            if not (cell.complete and cell.by_scene):
+            if not cell.by_scene:
                 continue
             others = [other.cells[key] for other in group.rows if other is not row and key in other.cells]
             second = [other.by_scene for other in others if other.rank == 2 and other.by_scene]
@@ -452,7 +464,9 @@ def _notes(groups: Sequence[Group], columns: Formats) -> Iterator[str]:
         yield f"[low, high]: 95 % interval of the average, by a bootstrap over the scenes (of {LEAST} or more)."
         yield "*: better than the second best, p < .05 by a paired permutation test; not corrected for many tests."
     if any(not cell.complete for cell in cells):
-        yield "(k of n): an average over k of the n scenes; it is not compared with the others."
+        yield "(k of n): an average over k of the n scenes, those that all methods with this metric have."
+    if not all(cell.scenes for cell in cells):
+        yield "(0 of n): no average, because the methods have no scene in common."
     note = implementation_note(row.label for row in rows if row.published)
     if note:
         yield note

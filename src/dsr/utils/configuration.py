@@ -23,6 +23,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 import yaml
 
 from dsr.utils.guards import TooLargeError, read_limited
+from dsr.utils.versions import how_to_install
 
 Node = Mapping[str, Any]
 """A node of the configuration: ``_target_``, perhaps ``_partial_``, and arguments of the target."""
@@ -48,7 +49,7 @@ def expect_library(key: str, module: str, extra: str) -> None:
     """Check that a library is installed, without importing it."""
     if importlib.util.find_spec(module) is None:
         library = module.rpartition(".")[2]
-        raise ConfigError(f"{key}: expected {library}, which is not installed; pip install dsr[{extra}]")
+        raise ConfigError(f"{key}: expected {library}, which is not installed; {how_to_install(extra)}")
 
 
 def build(group: str, node: Mapping[str, Any], given: Mapping[str, Any] | None = None, name: str | None = None) -> Any:

@@ -15,6 +15,8 @@ from typing import Any
 from dsr.utils.guards import opened
 from dsr.utils.progress import Task
 
+DISTRIBUTION = "depthsr"
+"""The name in pyproject.toml; the dsr of PyPI is another project."""
 RESULTS = 6
 """Version of what predicts and trains, raised with each change of its results, so that older predictions are not used
 again. ``tests/golden/test_results.py`` notices such a change."""
@@ -28,12 +30,20 @@ _PACKAGES = (
 _CHUNK = 1 << 20
 
 
+@functools.cache
+def how_to_install(extra: str) -> str:
+    """Return the command that installs an extra of pyproject.toml, for messages."""
+    if (Path(__file__).resolve().parents[3] / "pyproject.toml").is_file():
+        return f"pip install -e '.[{extra}]' in a checkout"
+    return f"pip install '{DISTRIBUTION}[{extra}]'"
+
+
 def package_versions(names: Iterable[str] = _PACKAGES) -> dict[str, str]:
     """Return the versions of packages; "not installed" where there is none."""
     found = {}
     for name in names:
         try:
-            found[name] = version(name)
+            found[name] = version(DISTRIBUTION if name == "dsr" else name)
         except PackageNotFoundError:
             found[name] = "not installed"
     return found

@@ -34,8 +34,9 @@ from dsr.report.html_page import asset, block, fill, json_text, policy
 from dsr.report.surface_page import VIEWER
 from dsr.utils.console import show
 from dsr.utils.guards import parse_json, path_within, refusing
+from dsr.utils.versions import how_to_install
 
-with refusing("`dsr app` needs starlette and uvicorn: pip install -e '.[app]' in a checkout", ImportError):
+with refusing(f"`dsr app` needs starlette and uvicorn: {how_to_install('app')}", ImportError):
     import uvicorn
     from starlette.applications import Starlette
     from starlette.exceptions import HTTPException

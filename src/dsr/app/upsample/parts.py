@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 from dsr.geometry.lights import LIGHT_NAMES
 from dsr.utils.guards import MOST_FACES, MOST_POINTS
 from dsr.utils.options import Options, Rule, at_least, one_of, option
+from dsr.utils.versions import how_to_install
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -134,8 +135,7 @@ class Part(NamedTuple):
         """Raise ValueError if the library is not installed."""
         if self.library is not None and importlib.util.find_spec(self.library[0]) is None:
             _, package, extra = self.library
-            install = f"`pip install dsr[{extra}]`"
-            raise ValueError(f"--with {self.name}: expected the library {package}, which {install} installs")
+            raise ValueError(f"--with {self.name}: expected the library {package}; {how_to_install(extra)}")
 
 
 def _depth(folder: Path, result: Result) -> Output:

@@ -36,6 +36,7 @@ from dsr.utils.guards import (
     read_member,
     refusing,
 )
+from dsr.utils.versions import how_to_install
 
 _CHUNK = 1 << 20
 _MOST_FILES, _MOST_FOLDERS = 200_000, 1000
@@ -237,7 +238,7 @@ def decode_lzfse(content: bytes, size: tuple[int, int], dtype: str) -> np.ndarra
             f"expected {size[1]} x {size[0]} values of {np.dtype(dtype)} ({expected} bytes), "
             f"got LZFSE data of {declared}"
         )
-    with refusing("LZFSE data need the package lzfse: pip install 'dsr[captures]'", ImportError):
+    with refusing(f"LZFSE data need the package lzfse: {how_to_install('captures')}", ImportError):
         import lzfse  # noqa: PLC0415 - an extra
     with refusing("expected LZFSE data, got damaged ones", lzfse.error, MemoryError):
         values = lzfse.decompress(content)

@@ -22,6 +22,7 @@ from dsr.io.captures.ros_images import decode_message
 from dsr.io.frames import Record
 from dsr.utils.files import FullDiskError, expect_space, owner, remove_abandoned, space_for
 from dsr.utils.guards import MOST_TEXT, bytes_of_archive, expect_bytes, opened, path_within, refusing
+from dsr.utils.versions import how_to_install
 
 IMAGE, COMPRESSED = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage"))
 
@@ -146,7 +147,7 @@ def _close() -> None:
 
 def _open(path: Path) -> Any:
     """Open a recording."""
-    with refusing(f"{path}: recordings of ROS need the package rosbags: pip install 'dsr[captures]'", ImportError):
+    with refusing(f"{path}: recordings of ROS need the package rosbags: {how_to_install('captures')}", ImportError):
         from rosbags.highlevel import AnyReader  # noqa: PLC0415 - an extra
         from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
     _limit_chunks()

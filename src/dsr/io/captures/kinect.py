@@ -38,6 +38,7 @@ from dsr.io.pairs import Pair, PairingResult, join, match_times
 from dsr.io.trajectories import describe_capture, intrinsics_camera
 from dsr.utils.guards import expect_pixels, naming, natural_key, numbers_in, opened, refusing
 from dsr.utils.validation import Number, Whole, parse_model
+from dsr.utils.versions import how_to_install
 
 _APP = "Azure Kinect"
 _HEAD = 1 << 20
@@ -303,7 +304,7 @@ def _lens(place: str, camera: _Camera) -> Lens:
 @contextmanager
 def _demuxing(path: Path) -> Iterator[None]:
     """Raise a ValueError that names the recording in place of PyAV's errors."""
-    with refusing(f"{path}: recordings of {_APP} need the package av: pip install 'dsr[captures]'", ImportError):
+    with refusing(f"{path}: recordings of {_APP} need the package av: {how_to_install('captures')}", ImportError):
         import av  # noqa: PLC0415 - an extra
     with refusing(f"{path}: expected a recording of {_APP}, got a damaged or foreign file", av.FFmpegError):
         yield

@@ -46,6 +46,7 @@ from dsr.io.trajectories import USUAL_SIZE, describe_capture, fitting_camera, in
 from dsr.notes import Assumption
 from dsr.utils.guards import natural_key, opened, read_limited, refusing
 from dsr.utils.validation import describe
+from dsr.utils.versions import how_to_install
 
 _BEGINNING, _HEADER, _FRAME = struct.Struct("<IQ"), struct.Struct("<64f2i4IfQ"), struct.Struct("<16f4Q")
 _VERSION = 4
@@ -246,7 +247,7 @@ def _sections(path: Path) -> dict[int, Section]:
 
 def _map(content: bytes) -> np.ndarray:
     """Return a map in millimetres, (192, 256): uint16 as LZ4, or float32 in metres as raw deflate."""
-    with refusing("LZ4 data need the package lz4: pip install 'dsr[captures]'", ImportError):
+    with refusing(f"LZ4 data need the package lz4: {how_to_install('captures')}", ImportError):
         import lz4.block  # noqa: PLC0415 - an extra
     count = _MAP[0] * _MAP[1]
     with contextlib.suppress(lz4.block.LZ4BlockError, MemoryError):

@@ -56,8 +56,8 @@ class NetworkFile(Method):
     """A method that is a network's file.
 
     Args:
-        path: ``.onnx``, which needs ``pip install dsr[onnx]``, or TorchScript, one of ``TORCHSCRIPT``. TorchScript is a
-            program: only load one that you trust.
+        path: ``.onnx``, which needs ``pip install -e '.[onnx]'``, or TorchScript, one of ``TORCHSCRIPT``. TorchScript
+            is a program: only load one that you trust.
         inputs: one of ``CONTENTS`` for each input, by name; of TorchScript in the order of its arguments. Pictures are
             (1, C, H, W) float32.
         range_type: what the depth inputs measure, and the type that the low-resolution map is averaged in:

@@ -27,6 +27,7 @@ from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.network import DisparityNetwork
 from dsr.utils.files import replacing
 from dsr.utils.guards import refusing
+from dsr.utils.versions import how_to_install
 
 INPUTS = ("photo", "inverse_depth", "valid")
 RESULT = "inverse_depth_hr"
@@ -202,5 +203,5 @@ def _compare(session: Any, graph: OnnxGraph) -> float:
 
 def import_library(name: str, wanted_by: str) -> Any:
     """Return a library of the extra ``onnx``; ``wanted_by`` is what the user gave that needs it."""
-    with refusing(f"{wanted_by}: expected the library {name}, which `pip install dsr[onnx]` installs", ImportError):
+    with refusing(f"{wanted_by}: expected the library {name}; {how_to_install('onnx')}", ImportError):
         return importlib.import_module(name)

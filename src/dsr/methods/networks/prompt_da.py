@@ -2,9 +2,9 @@
 
 Lin, Peng, Chen, Peng, Sun, Liu, Bao, Feng, Zhou, Kang, *Prompting Depth Anything for 4K Resolution Accurate Metric
 Depth Estimation*, CVPR 2025. The network is that of Hugging Face's ``transformers``
-(PromptDepthAnythingForDepthEstimation, ``pip install dsr[transformers]``), the weights are its authors'. What its image
-processor does is done here in torch, as in transformers' models/prompt_depth_anything: the photo is resized by Pillow's
-bicubic kernel to multiples of the patches and normalised as for ImageNet, the result by a bicubic kernel with
+(PromptDepthAnythingForDepthEstimation, ``pip install -e '.[transformers]'``), the weights are its authors'. What its
+image processor does is done here in torch, as in transformers' models/prompt_depth_anything: the photo is resized by
+Pillow's bicubic kernel to multiples of the patches and normalised as for ImageNet, the result by a bicubic kernel with
 a = -0.75 to the photo's size. The processor resizes photos of 8 bits and rounds, this does not.
 
 The network itself brings the prompt's minimum and maximum to 0 and 1, its result back, and the prompt, of any size, to

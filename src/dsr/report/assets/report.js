@@ -44,19 +44,17 @@ function overview(problem, metrics) {
     const [best] = ranked(problem.means, metric);
     const items = rows.map((row) => {
       const value = row.values[metric.id][0];
-      const partial = row.counts && metric.id in row.counts;
       const fill = make("span", { className: "fill" });
       fill.style.width = `${(100 * value) / largest}%`;
-      const isBest = !partial && Number(value.toFixed(metric.digits)) === best;
-      return make("li", { className: isBest ? "best" : "", title: partial ? `over ${row.counts[metric.id]} of ${problem.scenes.length} scenes` : "" },
+      return make("li", { className: Number(value.toFixed(metric.digits)) === best ? "best" : "" },
         make("span", { className: "label", textContent: row.method, title: row.method }),
         make("span", { className: "track" }, fill),
-        make("span", { className: "value", textContent: number(value, metric.digits) + (partial ? "\u2020" : "") }));
+        make("span", { className: "value", textContent: number(value, metric.digits) }));
     });
     return make("div", { className: "chart" }, make("h4", {}, `${metric.name} `, make("small", { textContent: metric.unit })), make("ul", {}, ...items));
   });
   return make("section", {},
-    make("h3", {}, problemName(problem), make("small", { textContent: ` \u00b7 mean over ${plural(problem.scenes.length, "scene")}` })),
+    make("h3", {}, problemName(problem), make("small", { textContent: ` \u00b7 ${meanOver(problem)}` })),
     make("div", { className: "charts" }, ...charts));
 }
 

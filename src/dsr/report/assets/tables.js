@@ -71,11 +71,19 @@ function compare(a, b, down) {
   return down ? -order : order;
 }
 
+/** Return over how many scenes the means of a problem are: those that all methods with a metric have. */
+function meanOver(problem) {
+  const total = problem.scenes.length;
+  const counts = problem.means.flatMap((row) => [...Object.keys(row.values), ...Object.keys(row.counts)].map((id) => row.counts[id] ?? total));
+  const [least, most] = [Math.min(total, ...counts), counts.length ? Math.max(...counts) : total];
+  if (least === total) return `mean over ${plural(total, "scene")}`;
+  if (most === 0) return `no mean: the methods have none of the ${plural(total, "scene")} in common`;
+  return `mean over the ${least === most ? most : `${least} to ${most}`} of ${plural(total, "scene")} that all methods have`;
+}
+
 /** Return the two best shown values of a column: what is shown alike shares its place. */
 function ranked(rows, metric) {
-  const shown = rows
-    .filter((row) => row.values[metric.id] && !(row.counts && metric.id in row.counts))
-    .map((row) => Number(row.values[metric.id][0].toFixed(metric.digits)));
+  const shown = rows.filter((row) => row.values[metric.id]).map((row) => Number(row.values[metric.id][0].toFixed(metric.digits)));
   const places = [...new Set(shown)].sort((a, b) => (metric.higher ? b - a : a - b));
   return shown.length > 1 ? places.slice(0, 2) : [];
 }
@@ -87,13 +95,13 @@ function scoreCell(row, metric, places, total, published) {
   const cell = make("span");
   if (values) {
     const text = number(values[0], metric.digits);
-    const place = row.counts && metric.id in row.counts ? -1 : places.indexOf(Number(values[0].toFixed(metric.digits)));
+    const place = places.indexOf(Number(values[0].toFixed(metric.digits)));
     cell.append(make("span", { textContent: text, className: ["best", "second"][place] ?? "" }));
     if (values.length > 1) cell.append(make("small", { textContent: ` \u00b1 ${number(values[1], metric.digits)}` }));
-    if (row.counts && metric.id in row.counts) {
-      cell.append(make("small", { textContent: ` (${row.counts[metric.id]} of ${total})`, title: "over the scenes that it has" }));
-    }
   } else cell.append(missing());
+  if (row.counts && metric.id in row.counts) {
+    cell.append(make("small", { textContent: ` (${row.counts[metric.id]} of ${total})`, title: "over the scenes that all methods have" }));
+  }
   if (published) {
     const text = paper === undefined ? DASH : number(paper, paperDigits(paper, metric));
     cell.append(make("span", { className: "paper", textContent: text }));
@@ -185,10 +193,10 @@ function showTables(data, entries, open) {
   };
   data.problems.forEach((problem, index) => {
     const seeds = Math.max(...problem.means.map((row) => row.seeds));
-    const used = families.filter((family) => data.metrics.some((metric) => metric.family === family && problem.means.some((row) => row.values[metric.id])));
+    const used = families.filter((family) => data.metrics.some((metric) => metric.family === family && problem.rows.some((row) => row.values[metric.id])));
     const others = used.slice(1).map((family) => make("details", {}, make("summary", {}, family[0].toUpperCase() + family.slice(1)), ...both(problem, index, family)));
     home.append(make("div", { className: "block" },
-      make("h3", {}, problemName(problem), make("small", { textContent: ` \u00b7 mean over ${plural(problem.scenes.length, "scene")}${seeds > 1 ? `, mean \u00b1 standard deviation over up to ${seeds} seeds` : ""}` })),
+      make("h3", {}, problemName(problem), make("small", { textContent: ` \u00b7 ${meanOver(problem)}${seeds > 1 ? `, mean \u00b1 standard deviation over up to ${seeds} seeds` : ""}` })),
       ...(used.length ? both(problem, index, used[0]) : []), ...others));
   });
   const foot = make("p", { className: "foot", hidden: true, textContent: "Below ours, the published values." });
@@ -245,15 +253,13 @@ function showTimes(data) {
     const show = (seconds) => (isMissing(seconds) ? null : number(seconds, seconds < 0.0995 ? 3 : seconds < 9.95 ? 2 : 1));
     const scenes = [...new Set(timed.flatMap((method) => Object.keys(problem.seconds[method])))];
     const of = (method, scene) => problem.seconds[method][scene];
-    const mean = (method) => {
-      const values = Object.values(problem.seconds[method]);
-      return values.reduce((sum, value) => sum + value, 0) / values.length;
-    };
+    const shared = scenes.filter((scene) => timed.every((method) => !isMissing(of(method, scene))));
+    const mean = (method) => (shared.length ? shared.reduce((sum, scene) => sum + of(method, scene), 0) / shared.length : null);
     const columns = [
       { title: "Scene", word: true, value: (row) => row.scene },
       ...timed.map((method) => ({ title: method, value: (row) => of(method, row.scene), cell: (row) => show(of(method, row.scene)) })),
     ];
-    const foot = ["mean", ...timed.map((method) => show(mean(method)))];
+    const foot = [shared.length < scenes.length ? `mean over ${shared.length} of ${scenes.length} scenes` : "mean", ...timed.map((method) => show(mean(method)))];
     const table = sortable(columns, scenes.map((scene) => ({ scene })), { caption: `${problemName(problem)}: seconds`, foot });
     home.append(make("div", { className: "block" }, make("h3", { textContent: problemName(problem) }), table.element));
   }

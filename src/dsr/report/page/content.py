@@ -12,8 +12,8 @@ import pandas as pd
 
 from dsr.evaluation.results import BenchmarkSetting, Results, Run
 from dsr.metrics.formats import Formats, by_family
-from dsr.report.paper import Place, SceneSet, average_of, paper_row
-from dsr.report.tables import FACTS, Row, in_shown_units
+from dsr.report.paper import SceneSet, average_of, paper_row
+from dsr.report.tables import FACTS, Fact, Row, cells_of, values_of
 from dsr.utils.guards import natural_key
 
 _FOLDERS = {"tables": (".csv", ".md", ".tex"), "metrics": (".csv",), "figures": (".pdf",)}
@@ -32,82 +32,52 @@ def metrics_data(results: Results) -> list[dict[str, Any]]:
 def problem_data(results: Results, problem: BenchmarkSetting) -> dict[str, Any]:
     """Return the scores of a setting in the paper's units, per scene and on average, with the published values."""
     runs = results.of(problem)
-    methods = list(dict.fromkeys(run.label for run in runs))
-    formats = results.formats
-    wide = {id(run): _by_scene(run, formats) for run in runs}
-    scenes = list(dict.fromkeys(scene for run in runs for scene in wide[id(run)].index))
-    places = [Place(problem.dataset, scene) for scene in scenes]
+    methods, formats = list(dict.fromkeys(run.label for run in runs)), results.formats
     of_method = {method: [run for run in runs if run.label == method] for method in methods}
-    single = [
-        (Row(method, SceneSet(place.scene, (place,), average=False), *problem[1:], len(own), own_runs), own)
-        for place in places
-        for method, own_runs in of_method.items()
-        if (own := [table.loc[place.scene] for run in own_runs if place.scene in (table := wide[id(run)]).index])
-    ]
-    facts = [fact for fact in FACTS if fact.name != "seeds" and fact.shown([row for row, _ in single])]
-    rows = [
-        {
-            **{fact.name: fact.value(row) for fact in facts},
-            "seeds": row.seeds,
-            "values": _over_seeds(own),
-            "paper": _published(row.about.title, row.runs, [row.about.title], formats),
-        }
-        for row, own in single
-    ]
-    means = []
-    for method, own_runs in of_method.items():
-        mean = Row(method, SceneSet("mean", tuple(places)), *problem[1:], len(own_runs), own_runs)
-        words = {fact.name: fact.value(mean) for fact in facts if fact.name != "scene"}
-        means.append(words | _mean_row(own_runs, scenes, [wide[id(run)] for run in own_runs], formats))
+    scores = values_of(runs, formats)
+    places = tuple(dict.fromkeys(place for method in methods for place in scores.get(method, ())))
+    scenes = [place.scene for place in places]
+    sets = [SceneSet(place.scene, (place,), place.scene, average=False) for place in places]
+    rows: list[Row] = []
+    for about in (*sets, SceneSet("mean", places, average_of(problem.dataset, scenes))):
+        cells = {key: cells_of(scores, methods, about.places, key) for key in formats}
+        for method, own in of_method.items():
+            if about.average or about.places[0] in scores.get(method, ()):
+                valid = {key: of[method] for key, of in cells.items() if method in of}
+                seeds = max([1, *(cell.seeds for cell in valid.values())])
+                rows.append(Row(method, about, *problem[1:], seeds, own, valid))
+    single = [row for row in rows if not row.about.average]
+    facts = [fact for fact in FACTS if fact.name != "seeds" and fact.shown(single)]
     return {
         "dataset": problem.dataset,
         "scale": problem.scale,
         "downsampling": problem.downsampling,
         "methods": methods,
         "scenes": scenes,
-        "means": means,
-        "rows": rows,
+        "means": [_row(row, facts, formats) for row in rows if row.about.average],
+        "rows": [_row(row, facts, formats) for row in single],
         "facts": [{"name": fact.name, "word": not fact.number} for fact in facts],
         "seconds": _seconds(runs, methods),
     }
 
 
-def _by_scene(run: Run, formats: Formats) -> pd.DataFrame:
-    """Return the scores of a run, scene x metric, in the units of tables."""
-    table = in_shown_units(run.scores, formats)
-    table.index = table.index.map(str)
-    return table
+def _row(row: Row, facts: Sequence[Fact], formats: Formats) -> dict[str, Any]:
+    """Return a row; ``values`` are means with spreads, ``counts`` the numbers of scenes of incomplete averages."""
+    cells = {key: cell for key, cell in row.cells.items() if cell.scenes}
+    counts = {key: cell.scenes for key, cell in row.cells.items() if not cell.complete}
+    return {
+        **{fact.name: fact.value(row) for fact in facts},
+        "seeds": row.seeds,
+        "values": {key: [each for each in (cell.mean, cell.spread) if each is not None] for key, cell in cells.items()},
+        "counts": counts,
+        "paper": {} if counts else _published(row, formats),
+    }
 
 
-def _over_seeds(series: Sequence[pd.Series]) -> dict[str, list[float]]:
-    """Return by metric the mean over seeds and, for several seeds, their sample standard deviation."""
-    values: dict[str, list[float]] = {}
-    together = pd.DataFrame(list(series)).astype(float)
-    for name in together:
-        valid = together[name].dropna()
-        if len(valid):
-            mean = float(valid.mean())
-            values[str(name)] = [mean] if len(valid) < 2 else [mean, float(valid.std(ddof=1))]
-    return {name: numbers for name, numbers in values.items() if all(map(math.isfinite, numbers))}
-
-
-def _mean_row(runs: Sequence[Run], scenes: list[str], tables: list[pd.DataFrame], formats: Formats) -> dict[str, Any]:
-    """Return a method's averages over scenes; ``counts`` has the number of scenes of each incomplete metric."""
-    values = _over_seeds([table.mean() for table in tables])
-    seen: dict[str, set[str]] = {name: set() for name in values}
-    for table in tables:
-        for name in values:
-            if name in table:
-                seen[name] |= set(table.index[table[name].notna()])
-    counts = {name: len(found) for name, found in seen.items() if len(found) < len(scenes)}
-    paper = {} if counts else _published(average_of(runs[0].dataset, scenes), runs, scenes, formats)
-    return {"seeds": len(tables), "values": values, "counts": counts, "paper": paper}
-
-
-def _published(name: str, runs: Sequence[Run], scenes: Sequence[str], formats: Formats) -> dict[str, float]:
+def _published(row: Row, formats: Formats) -> dict[str, float]:
     """Return the paper's values by metric; empty where they do not apply."""
-    row = paper_row(name, runs, scenes)
-    return {} if row is None else {name: float(row[name]) for name in formats if pd.notna(row.get(name))}
+    paper = paper_row(row.about.published, row.runs, [place.scene for place in row.about.places])
+    return {} if paper is None else {name: float(paper[name]) for name in formats if pd.notna(paper.get(name))}
 
 
 def _seconds(runs: Iterable[Run], methods: Iterable[str]) -> dict[str, dict[str, float]]:

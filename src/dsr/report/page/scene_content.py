@@ -241,12 +241,12 @@ def calibration_data(views: Sequence[View]) -> list[dict[str, Any]]:
         views: the scenes of one setting. Those without ground truth are left out.
 
     Returns:
-        A row per method: ``method``; ``scenes``, their number; ``depth`` and ``angle``, each with the ``ratios`` of
-        :func:`dsr.metrics.calibration.error_ratios`, the ``share`` of the squared error in the most confident 80 % of
-        the pixels, and the ``least`` possible one; None for a value that is undefined.
+        A row per method: ``method``; ``scenes``, the number of scenes that all of them have; ``depth`` and ``angle``,
+        each with the ``ratios`` of :func:`dsr.metrics.calibration.error_ratios`, the ``share`` of the squared error in
+        the most confident 80 % of the pixels, and the ``least`` possible one; None for a value that is undefined.
 
     """
-    found: dict[str, list[Tensor]] = {}
+    found: dict[str, dict[str, Tensor]] = {}
     step = 0
     for view in views:
         confident = replace(view, runs=tuple(run for run in view.runs if _is_confident(run, view.scene)))
@@ -256,9 +256,13 @@ def calibration_data(views: Sequence[View]) -> list[dict[str, Any]]:
         step = step or math.ceil(stored.depth.numel() * len(views) / _MOST_PIXELS)
         for result in results_of(confident, stored, []):
             if result.errors is not None:
-                found.setdefault(result.label, []).append(_errors(result, result.errors, stored, stored.depth, step))
+                errors = _errors(result, result.errors, stored, stored.depth, step)
+                found.setdefault(result.label, {})[view.scene] = errors
+    shared = [scene for scene in next(iter(found.values()), ()) if all(scene in of for of in found.values())]
     return [
-        {"method": label, "scenes": len(parts), **_agreement(torch.cat(parts, dim=1))} for label, parts in found.items()
+        {"method": label, "scenes": len(shared), **_agreement(torch.cat([of[scene] for scene in shared], dim=1))}
+        for label, of in found.items()
+        if shared
     ]
 
 
