@@ -317,6 +317,8 @@ def test_a_negative_depth_map_is_called_negative(tmp_path, capsys, name, options
     line = error_of(capsys, tmp_path, path, *options)
     assert name in line
     assert "67% are negative" in line
+
+
 @pytest.mark.parametrize(
     ("runs", "shared", "seeds"),
     [
