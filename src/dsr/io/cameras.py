@@ -21,7 +21,7 @@ from dsr.io.photos import Size, focal_in_exif, same_aspect
 from dsr.io.reading import CameraChoice, RigFiles
 from dsr.io.trajectories import read_transform
 from dsr.notes import Assumption
-from dsr.utils.guards import naming, numbers_in, read_limited
+from dsr.utils.guards import naming, numbers_in, read_text, split_numbers
 from dsr.utils.validation import parse_model
 
 _FILM_DIAGONAL = math.hypot(36, 24)
@@ -72,9 +72,7 @@ def read_any_camera(path: Path) -> CameraFile | np.ndarray:
         ValueError: the file has none of these formats.
 
     """
-    if not path.is_file():
-        raise ValueError(f"{path}: expected a camera file, there is none")
-    text = read_limited(path).decode("utf-8", "replace")
+    text = read_text(path)
     if path.suffix.lower() != ".json" and not text.lstrip().startswith("{"):
         return _matrix(path, text)
     return _open3d(path, text) if '"intrinsic_matrix"' in text else read_camera(path)
@@ -149,7 +147,7 @@ def _camera_of_matrix(path: Path, matrix: np.ndarray, size: Size, size_lr: Size)
 
 def _matrix(path: Path, text: str) -> np.ndarray:
     """Return the intrinsics (3, 3) that a text holds."""
-    numbers = numbers_in(text.replace(",", " ").replace(";", " ").split())
+    numbers = numbers_in(split_numbers(text))
     if len(numbers) not in (9, 16):
         raise ValueError(f"{path}: expected JSON or a matrix of 3 x 3 or 4 x 4 numbers, got something else")
     side = math.isqrt(len(numbers))

@@ -47,7 +47,7 @@ from dsr.io.pairs import (
 from dsr.io.photos import HEIC_SUFFIXES
 from dsr.io.trajectories import read_poses
 from dsr.notes import Assumption
-from dsr.utils.guards import MOST_TABLE, natural_key, numbers_in, path_within, read_limited
+from dsr.utils.guards import natural_key, numbers_in, path_within, read_text, split_numbers
 
 _DEPTH_LR = re.compile(r"(depth|disparity)_lr(\d+)")
 _TUM_UNIT = 1 / 5000
@@ -211,12 +211,12 @@ def _tum_geometry(pose: Matrix | None, _: tuple[int, int]) -> Geometry:
 def _timed(path: Path) -> dict[Path, float]:
     """Return the files in a list of TUM RGB-D, with their times in seconds."""
     times: dict[Path, float] = {}
-    for number, line in enumerate(read_limited(path, MOST_TABLE).decode("utf-8", "replace").splitlines(), 1):
+    for number, line in enumerate(read_text(path).splitlines(), 1):
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
-        time = numbers_in(words[:1])
-        if not time or len(words) < 2:
+        time = numbers_in(split_numbers(words[0]))
+        if len(time) != 1 or len(words) < 2:
             raise ValueError(f"{path}: line {number}: expected a time and a file name, got {line!r:.60}")
         times[path_within(path.parent, words[1], f"{path}: line {number}")] = time[0]
     return times
