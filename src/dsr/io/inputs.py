@@ -319,6 +319,8 @@ def read_geometry(pair: Pair, size: Size, reading: Reading) -> tuple[Geometry, l
         if reading.camera == CameraChoice():
             raise
         found = Geometry(damage=str(error))
+    if found.apart and reading.rig is None:
+        raise ValueError(found.apart)
     if not found.damage:
         return found, []
     if pair.capture.apart and reading.rig is None:

@@ -36,6 +36,7 @@ from dsr.io.pairs import (
     find_camera_file,
     find_pairs_of_two_folders,
     has_pictures,
+    is_registered,
     list_pictures,
     make_names_unique,
     match_pairs,
@@ -225,7 +226,7 @@ def _timed(path: Path) -> dict[Path, float]:
 def _role_folders(folder: Path) -> PairingResult:
     """Return the pairs of two subfolders whose names say that they hold photos and depth maps."""
     named: dict[str, list[Path]] = {"rgb": [], "depth": [], "other": []}
-    for path in sorted(folder.iterdir(), key=lambda path: (len(path.name), path.name)):
+    for path in sorted(folder.iterdir(), key=lambda path: (not is_registered(path.name), len(path.name), path.name)):
         role = role_of_words(words_of(path.name)) if path.is_dir() else None
         if role is not None and has_pictures(path):
             named[role].append(path)
