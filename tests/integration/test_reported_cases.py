@@ -6,8 +6,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 from dsr.cli import main
+from dsr.io.inputs import read_picture
+from dsr.io.layouts import find_pairs_of_folder
+from dsr.io.reading import Reading
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 288.0
 CAMERA = ["--intrinsics", "288", "288", "159.5", "119.5"]
@@ -62,3 +66,188 @@ def mean_error(out: Path, truth):
     assert depth.shape == truth.shape
     known = np.isfinite(depth) & np.isfinite(truth)
     return 1000 * np.abs(depth - truth)[known].mean(), np.isfinite(depth).mean()
+
+
+def read(place, **options):
+    """Return the first frame of a folder or recording as ``dsr upsample`` reads it."""
+    return read_picture(find_pairs_of_folder(place).pairs[0], Reading(**options))
+
+
+def lr_error(picture, truth):
+    """Return the mean absolute error of a low-resolution depth map in millimetres, and the known fraction."""
+    depth = picture.depth_lr[0].numpy()
+    return 1000 * np.nanmean(np.abs(depth - truth)), np.isfinite(depth).mean()
+
+
+def write_bag(path, pictures, transforms=(), *, version=2, plugin="SQLITE3", extrinsics=None):
+    """Write a recording of ROS.
+
+    Args:
+        path: of the file of ROS 1, or of the folder of ROS 2.
+        pictures: by topic the picture, its frame, and the camera's fx, cx, cy, width and height, None without one.
+        transforms: /tf_static: parent, child, translation and quaternion of each.
+        version: of ROS.
+        plugin: that stores ROS 2.
+        extrinsics: topic of RealSense's message, with the translation.
+
+    """
+    rosbag1, rosbag2 = pytest.importorskip("rosbags.rosbag1"), pytest.importorskip("rosbags.rosbag2")
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # noqa: PLC0415 - an extra
+
+    store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
+    realsense = "std_msgs/Header header\nfloat64[9] rotation\nfloat64[3] translation"
+    store.register(get_types_from_msg(realsense, "realsense2_camera_msgs/msg/Extrinsics"))
+    if version == 1:
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+    kinds = {name.rpartition("/")[2]: kind for name, kind in store.types.items()}
+    kinds["Time"] = store.types["builtin_interfaces/msg/Time"]
+
+    def header(frame):
+        return kinds["Header"](stamp=kinds["Time"](100, 0), frame_id=frame, **({"seq": 0} if version == 1 else {}))
+
+    messages = {}
+    for topic, (picture, frame, camera) in pictures.items():
+        encoding = {"uint16": "16UC1", "float32": "32FC1", "float64": "64FC1"}.get(str(picture.dtype), "rgb8")
+        data = np.frombuffer(np.ascontiguousarray(picture).tobytes(), np.uint8)
+        image = {"height": picture.shape[0], "width": picture.shape[1], "encoding": encoding, "is_bigendian": 0}
+        messages[topic] = kinds["Image"](header(frame), **image, step=len(data) // picture.shape[0], data=data)
+        if camera is not None:
+            focal, cx, cy, width, height = camera
+            arrays = {"d": np.zeros(5), "k": np.array([focal, 0, cx, 0, focal, cy, 0, 0, 1.0]), "r": np.eye(3).ravel(),
+                      "p": np.array([focal, 0, cx, 0, 0, focal, cy, 0, 0, 0, 1.0, 0])}  # fmt: skip
+            info = {"height": height, "width": width, "distortion_model": "plumb_bob", "binning_x": 0, "binning_y": 0}
+            arrays = {name.upper() if version == 1 else name: values for name, values in arrays.items()}
+            roi = kinds["RegionOfInterest"](0, 0, 0, 0, False)
+            place = topic.rpartition("/")[0] + "/camera_info"
+            messages[place] = kinds["CameraInfo"](header=header(frame), roi=roi, **info, **arrays)
+    if transforms:
+        tree = [
+            kinds["TransformStamped"](
+                header(parent), child, kinds["Transform"](kinds["Vector3"](*shift), kinds["Quaternion"](*turn))
+            )
+            for parent, child, shift, turn in transforms
+        ]
+        messages["/tf_static"] = kinds["TFMessage"](tree)
+    if extrinsics is not None:
+        topic, shift = extrinsics
+        messages[topic] = kinds["Extrinsics"](header("camera"), np.eye(3).ravel(), np.array(shift, float))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    plugins = rosbag2.StoragePlugin
+    writer = rosbag1.Writer(path) if version == 1 else rosbag2.Writer(path, version=9, storage_plugin=plugins[plugin])
+    with writer:
+        for topic, message in messages.items():
+            connection = writer.add_connection(topic, message.__msgtype__, typestore=store)
+            pack = store.serialize_ros1 if version == 1 else store.serialize_cdr
+            writer.write(connection, 100 * 10**9, pack(message, message.__msgtype__))
+
+
+OPTICAL = (-0.5, 0.5, -0.5, 0.5)
+"""Rotation from the axes of an optical frame to those of a robot."""
+COLOUR, DEPTH = "camera_color_optical_frame", "camera_depth_optical_frame"
+PHOTO_INFO, DEPTH_INFO = (288.0, 159.5, 119.5, 320, 240), (96.0, 79.5, 59.5, 160, 120)
+TREE = (
+    ("camera_link", "camera_color_frame", (0, 0.03, 0), (0, 0, 0, 1)),
+    ("camera_color_frame", COLOUR, (0, 0, 0), OPTICAL),
+    ("camera_link", "camera_depth_frame", (0, 0, 0), (0, 0, 0, 1)),
+    ("/camera_depth_frame", f"/{DEPTH}", (0, 0, 0), OPTICAL),
+)
+"""The depth camera is 30 mm to the right of the photo's: a robot's y points to the left."""
+EXTRINSICS = ("/camera/extrinsics/depth_to_color", (0.03, 0, 0))
+
+
+@pytest.mark.parametrize(
+    ("version", "plugin", "transforms", "extrinsics"),
+    [(2, "SQLITE3", TREE, None), (2, "MCAP", TREE, None), (1, "", TREE, None), (2, "MCAP", (), EXTRINSICS),
+     (1, "", (), EXTRINSICS)],
+)  # fmt: skip
+def test_unregistered_depth_of_a_recording_is_warped_by_its_transform(
+    tmp_path, version, plugin, transforms, extrinsics
+):
+    truth, photo = scene()
+    apart = millimetres(scene(160, 120, 96.0, shift=0.03)[0])
+    pictures = {
+        "/camera/color/image_raw": (photo, COLOUR, PHOTO_INFO),
+        "/camera/depth/image_rect_raw": (apart, DEPTH, DEPTH_INFO),
+    }
+    bag = tmp_path / "a.bag" if version == 1 else tmp_path / "a"
+    write_bag(bag, pictures, transforms, version=version, plugin=plugin, extrinsics=extrinsics)
+    picture = read(bag)
+    height, width = picture.depth_lr.shape[1:]
+    error, known = lr_error(picture, cv2.resize(truth, (width, height), interpolation=cv2.INTER_AREA))
+    assert error < 25
+    assert known > 0.9
+
+
+@pytest.mark.parametrize("info", [DEPTH_INFO, None])
+def test_unregistered_depth_without_a_transform_is_refused_by_its_frames(tmp_path, capsys, info):
+    truth, photo = scene()
+    apart = millimetres(scene(160, 120, 96.0, shift=0.03)[0])
+    pictures = {
+        "/camera/color/image_raw": (photo, COLOUR, PHOTO_INFO),
+        "/camera/depth/image_rect_raw": (apart, DEPTH, info),
+    }
+    write_bag(tmp_path / "a", pictures)
+    assert upsample(tmp_path / "out", tmp_path / "a") == 2
+    [error] = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error:")]
+    assert COLOUR in error
+    assert DEPTH in error
+    (tmp_path / "depth.txt").write_text("96 0 79.5\n0 96 59.5\n0 0 1\n")
+    (tmp_path / "motion.txt").write_text("1 0 0 0.03\n0 1 0 0\n0 0 1 0\n")
+    rig = ("--depth-camera", tmp_path / "depth.txt", "--extrinsics", tmp_path / "motion.txt")
+    assert upsample(tmp_path / "out", tmp_path / "a", *rig) == 0
+    assert mean_error(tmp_path / "out", truth)[0] < 45
+
+
+@pytest.mark.parametrize(
+    ("registered", "frame", "info", "other"),
+    [
+        ("/depth_to_rgb/image_raw", COLOUR, PHOTO_INFO, "/depth/image_raw"),
+        ("/depth_to_rgb/image_raw", COLOUR, None, "/depth/image_raw"),
+        ("/camera/stereo/image_raw", f"/robot/{COLOUR}", None, "/camera/aligned_depth_to_infra1/image_raw"),
+        ("/camera/depth/image_raw", DEPTH, PHOTO_INFO, "/camera/a/image_raw"),
+        ("/camera/aligned_depth_to_color/image_raw", DEPTH, None, "/camera/a/image_raw"),
+    ],
+)
+def test_registered_topic_of_depth_is_taken(tmp_path, registered, frame, info, other):
+    truth, photo = scene()
+    pictures = {
+        "/camera/color/image_raw": (photo, COLOUR, PHOTO_INFO),
+        registered: (millimetres(coarse(truth)), frame, info),
+        other: (millimetres(scene(160, 120, 96.0, shift=0.03)[0]), "camera_infra1_optical_frame", DEPTH_INFO),
+    }
+    write_bag(tmp_path / "a", pictures)
+    assert lr_error(read(tmp_path / "a"), coarse(truth)) < (0.5, 2)
+
+
+@pytest.mark.parametrize(
+    ("photo_name", "raw", "registered"),
+    [
+        ("color/{}.png", "depth/{}.png", "aligned_depth/{}.png"),
+        ("rgb/{}.png", "depth_raw/{}.png", "depth_registered/{}.png"),
+        ("image/{}.png", "depth/{}.png", "depth_to_rgb/{}.png"),
+        ("{}_color.png", "{}_depth.png", "{}_depth_aligned.png"),
+        ("{}_rgb.png", "{}_depth_raw.png", "{}_depth_registered.png"),
+        ("color.png", "depth.png", "aligned_depth.png"),
+    ],
+)
+def test_registered_depth_of_a_folder_is_taken(tmp_path, photo_name, raw, registered):
+    truth, photo = scene()
+    depth = millimetres(coarse(truth))
+    for number in range(2):
+        write(tmp_path / "in" / photo_name.format(number), photo)
+        write(tmp_path / "in" / raw.format(number), np.roll(depth, 3, 1))
+        write(tmp_path / "in" / registered.format(number), depth)
+    assert lr_error(read(tmp_path / "in"), coarse(truth)) < (0.5, 2)
+
+
+def test_encoding_of_a_topic_that_is_not_read_is_named(tmp_path, capsys):
+    truth, photo = scene()
+    pictures = {
+        "/camera/color/image_raw": (photo, COLOUR, PHOTO_INFO),
+        "/camera/depth/image_raw": (truth, COLOUR, None),
+    }
+    write_bag(tmp_path / "a", pictures)
+    assert upsample(tmp_path / "out", tmp_path / "a") == 2
+    error = capsys.readouterr().err
+    assert "64FC1" in error
+    assert "16UC1" in error
