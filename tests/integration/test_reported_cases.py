@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import json
+import math
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from dsr.cli import main
+from dsr.io.cameras import read_any_camera
 from dsr.io.inputs import read_picture
 from dsr.io.layouts import find_pairs_of_folder
+from dsr.io.pairs import Pair
 from dsr.io.reading import Reading
+from dsr.io.trajectories import read_poses
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 288.0
 CAMERA = ["--intrinsics", "288", "288", "159.5", "119.5"]
@@ -251,3 +257,162 @@ def test_encoding_of_a_topic_that_is_not_read_is_named(tmp_path, capsys):
     error = capsys.readouterr().err
     assert "64FC1" in error
     assert "16UC1" in error
+
+
+POSE = np.array([[1.0, 0, 0, 0.2], [0, 1, 0, 0.1], [0, 0, 1, 0.3], [0, 0, 0, 1]])
+GL = np.diag([1.0, -1, -1, 1])
+OF_ALL = {"fl_x": 288.0, "fl_y": 288.0, "cx": 160.0, "cy": 120.0, "w": 320, "h": 240, "camera_model": "OPENCV"}
+YAML = """%YAML:1.0
+---
+camera_name: "1"
+image_width: 320
+image_height: 240
+camera_matrix:
+   rows: 3
+   cols: 3
+   data: [ 288., 0., 159.5, 0.,
+       288., 119.5, 0., 0., 1. ]
+distortion_coefficients:
+   rows: 1
+   cols: 5
+   data: [ 0., 0., 0., 0., 0. ]
+"""
+FOV = {name: math.degrees(2 * math.atan(side / 2 / FOCAL)) for name, side in (("fov_x", 320), ("fov_y", 240))}
+
+
+@pytest.mark.parametrize(
+    ("photo_name", "depth_name", "calibration", "content"),
+    [
+        ("images/f_1.png", "depths/f_1.png", "transforms.json", {**OF_ALL, "frames": [{}]}),
+        ("images/f_1.png", "maps/other.png", "transforms.json",
+         {"frames": [OF_ALL | {"depth_file_path": "maps/other.png"}]}),
+        ("images/r_0.png", "depth/r_0.png", "transforms.json",
+         {"camera_angle_x": math.radians(FOV["fov_x"]), "frames": [{"file_path": "./images/r_0"}]}),
+        ("nerfstudio/images/f_1.png", "nerfstudio/depths/f_1.png", "transforms.json", {**OF_ALL, "frames": [{}]}),
+        ("rgb/7.jpg", "depth/7.png", "calib/7.yaml", YAML),
+        ("rgb/7.jpg", "depth/7.png", "color_camera_info.yaml", YAML),
+        ("rgb/7.jpg", "depth/7.png", "calibration.txt", "288 288 159.5 119.5\n"),
+        ("image.jpg", "depth.npy", "fov.json", FOV),
+    ],
+)  # fmt: skip
+def test_calibration_beside_the_pictures_is_read(tmp_path, photo_name, depth_name, calibration, content):
+    truth, photo = scene()
+    write(tmp_path / photo_name, photo)
+    if depth_name.endswith("npy"):
+        np.save(tmp_path / depth_name, truth)
+    else:
+        write(tmp_path / depth_name, millimetres(coarse(truth)))
+    if calibration == "transforms.json":
+        content["frames"] = [
+            {"file_path": photo_name, "transform_matrix": (POSE @ GL).tolist(), **each} for each in content["frames"]
+        ]
+    (tmp_path / calibration).parent.mkdir(exist_ok=True)
+    (tmp_path / calibration).write_text(content if isinstance(content, str) else json.dumps(content))
+    picture = read(tmp_path / "nerfstudio" if "nerfstudio" in photo_name else tmp_path)
+    camera = picture.camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx((288, 288, 159.5, 119.5))
+    assert not any("60 degrees" in str(note) for note in picture.assumptions)
+    if calibration == "transforms.json":
+        np.testing.assert_allclose(picture.pose, POSE)
+
+
+def test_scene_that_is_exported_to_nerfstudio_is_read_again(tmp_path):
+    truth, photo = scene()
+    write(tmp_path / "in" / "rgb.png", photo)
+    write(tmp_path / "in" / "depth.png", millimetres(coarse(truth)))
+    options = ("--rgb", tmp_path / "in" / "rgb.png", "--depth", tmp_path / "in" / "depth.png", *CAMERA)
+    assert (
+        main(
+            ["upsample", *map(str, options), "-o", str(tmp_path / "out"), "--method", "bicubic", "--with", "nerfstudio"]
+        )
+        == 0
+    )
+    for place in (tmp_path / "out", tmp_path / "out" / "nerfstudio"):
+        picture = read(place)
+        camera = picture.camera
+        assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx((288, 288, 159.5, 119.5))
+        np.testing.assert_allclose(picture.pose, np.eye(4))
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [("transforms.json", "{}"), ("calibration.txt", "P0: 1 2 3"), ("calib/1.yaml", YAML.replace("[ 0.,", "[ 0.1,")),
+     ("camera.xml", "<camera/>"), ("intrinsics.yaml", "fx: 3"), ("fov.json", '{"fov_x": "wide"}')],
+)  # fmt: skip
+def test_calibration_that_is_not_read_is_named(tmp_path, name, content):
+    truth, photo = scene()
+    write(tmp_path / "rgb/1.png", photo)
+    write(tmp_path / "depth/1.png", millimetres(coarse(truth)))
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text(content)
+    notes = find_pairs_of_folder(tmp_path).assumptions
+    assert any("not read" in str(note) and name.split("/")[0] in str(note) for note in notes)
+
+
+MATRIX = "288 0 159.5\n0 288 119.5\n0 0 1\n"
+CAMERA_JSON = json.dumps({"width": 320, "height": 240, "fx": 288.0, "fy": 288.0, "cx": 159.5, "cy": 119.5})
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le"])
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [("camera.json", CAMERA_JSON), ("k.txt", MATRIX), ("k.txt", MATRIX.replace(".", ",")), ("k.yaml", YAML)],
+)
+def test_camera_of_any_encoding_is_read(tmp_path, name, content, encoding):
+    (tmp_path / name).write_bytes(content.encode(encoding))
+    camera = read_any_camera(tmp_path / name)
+    numbers = (camera[0, 0], camera[0, 2]) if isinstance(camera, np.ndarray) else (camera.camera.fx, camera.camera.cx)
+    assert numbers == (288, 159.5)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_lists_that_windows_wrote_are_read(tmp_path, encoding):
+    truth, photo = scene()
+    for kind, picture in (("rgb", photo), ("depth", 5 * millimetres(coarse(truth)))):
+        write(tmp_path / kind / "1305031102.175304.png", picture)
+        line = f"# list\r\n1305031102,175304 {kind}\\1305031102.175304.png\r\n"
+        (tmp_path / f"{kind}.txt").write_bytes(line.encode(encoding))
+    (tmp_path / "groundtruth.txt").write_bytes("1305031102.175304 0.5 0 0 0 0 0 1\r\n".encode(encoding))
+    picture = read(tmp_path)
+    assert lr_error(picture, coarse(truth)) < (0.5, 2)
+    assert picture.pose[0, 3] == 0.5
+
+
+LINES = [f"{number} {0.05 * number} 0 0 0 0 0 1" for number in range(3)]
+BY_ID = [f"{100.5 + number} {0.05 * number} 0 0 0 0 0 1 {number}" for number in range(3)]
+ROWS = [f"1 0 0 {0.05 * number} 0 1 0 0 0 0 1 0" for number in range(3)]
+
+
+@pytest.mark.parametrize(
+    ("lines", "known"),
+    [
+        (LINES, "012"),
+        (["#timestamp x y z qx qy qz qw id", *(f"{line} {number + 1}" for number, line in enumerate(LINES))], "012"),
+        (BY_ID, "012"),
+        ([line.replace(".", ",") for line in BY_ID], "012"),
+        ([line.replace(" ", ";").replace(".", ",") for line in LINES], "012"),
+        ([LINES[0], "1 nan nan nan nan nan nan nan", LINES[2]], "02"),
+        ([LINES[0], "1 0 0 0 0 0 0 0", LINES[2]], "02"),
+        ([ROWS[0], " ".join(["-inf"] * 12), ROWS[2]], "02"),
+    ],
+)
+def test_poses_with_ids_decimal_commas_and_lost_frames_are_read(tmp_path, lines, known):
+    (tmp_path / "poses.txt").write_text("\n".join(lines) + "\n")
+    pairs = [Pair(str(number), Path(f"{number:06}.png"), Path(f"{number:06}.png")) for number in range(3)]
+    poses = read_poses(tmp_path / "poses.txt").assign(pairs)
+    assert {name: pose[0, 3] for name, pose in poses.items()} == {each: 0.05 * int(each) for each in known}
+
+
+@pytest.mark.parametrize("orientation", [5, 6, 7, 8])
+def test_camera_of_the_sensor_is_turned_with_the_photo(tmp_path, orientation):
+    truth, photo = scene()
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.fromarray(photo).save(tmp_path / "rgb.jpg", exif=exif)
+    upright = {5: truth.T, 6: truth.T[:, ::-1], 7: truth[::-1, ::-1].T, 8: truth.T[::-1]}[orientation]
+    write(tmp_path / "depth.png", millimetres(coarse(upright)))
+    camera = {"width": 320, "height": 240, "fx": 288.0, "fy": 290.0, "cx": 150.0, "cy": 110.0}
+    (tmp_path / "camera.json").write_text(json.dumps(camera))
+    camera = read(tmp_path).camera
+    cx, cy = {5: (110, 150), 6: (129, 150), 7: (129, 169), 8: (110, 169)}[orientation]
+    assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (240, 320, 290, 288, cx, cy)

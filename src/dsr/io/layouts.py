@@ -5,6 +5,7 @@ Which app made a capture, by what lies in its folder.
 
 from __future__ import annotations
 
+import contextlib
 import re
 from dataclasses import replace
 from functools import partial
@@ -14,6 +15,7 @@ import cv2
 import numpy as np
 
 from dsr.geometry.rigid_motion import Matrix
+from dsr.io.cameras import read_any_camera
 from dsr.io.captures.archive import unpack
 from dsr.io.captures.arkit import find_arkitscenes, find_polycam, find_scanner_app
 from dsr.io.captures.colmap import add_model, find_colmap, model_file
@@ -21,6 +23,7 @@ from dsr.io.captures.data_sets import find_replica, find_scannet, find_seven_sce
 from dsr.io.captures.heic import find_heic
 from dsr.io.captures.kinect import find_kinect
 from dsr.io.captures.known import describe_content, lacking
+from dsr.io.captures.nerfstudio import add_transforms
 from dsr.io.captures.record3d import find_record3d
 from dsr.io.captures.ros import find_ros
 from dsr.io.captures.scannet import find_scannetpp, find_sens
@@ -52,6 +55,9 @@ from dsr.utils.guards import natural_key, numbers_in, path_within, read_text, sp
 
 _DEPTH_LR = re.compile(r"(depth|disparity)_lr(\d+)")
 _TUM_UNIT = 1 / 5000
+_CALIBRATIONS = {"poses", "calib", "calibration", "camera", "cameras", "intrinsic", "intrinsics", "fov", "transforms"}
+_TEXTS = ("", ".json", ".txt", ".yaml", ".yml", ".xml", ".csv")
+"""Words in the names of calibrations, and suffixes; "" for folders."""
 _MAX_DEPTH = 3
 """Levels of subfolders that are searched."""
 
@@ -151,8 +157,31 @@ def _find_at(place: Path, root: Path | None = None) -> PairingResult:
             model = model_file(place)
             if model is not None and all(pair.capture is None for pair in found.pairs):
                 found = add_model(found, model)
+            elif camera is None:
+                found = _add_calibration(place, found)
             return replace(found, assumptions=(*_alike(place), *found.assumptions))
-    return find_colmap(place) or found
+    return add_transforms(place, PairingResult(())) or find_colmap(place) or found
+
+
+def _add_calibration(folder: Path, found: PairingResult) -> PairingResult:
+    """Return pairs with the cameras of nerfstudio, RTAB-Map, ETH3D or MoGe, and a note of files that are not read."""
+    listed = add_transforms(folder, found)
+    if listed is not None:
+        return listed
+    files = {}
+    for pattern in ("calibration.txt", "fov.json", "*.yaml", "*calib*/*.yaml"):
+        for path in folder.glob(pattern):
+            with contextlib.suppress(ValueError, OSError):  # a file of something else
+                if role_of_words(words_of(path.stem)) != "depth" and read_any_camera(path) is not None:
+                    files[path.stem] = path
+    only = next(iter(files.values())) if len(files) == 1 else None
+    pairs = tuple(replace(pair, camera=files.get(pair.rgb.stem, only)) for pair in found.pairs)
+    words = {"poses"} if any(pair.camera for pair in pairs) else _CALIBRATIONS
+    used = {path.parent for pair in pairs for path in (pair.rgb, pair.depth)}
+    others = sorted(path for path in folder.iterdir() if path.suffix in _TEXTS and path not in used)
+    unread = [path.name for path in others if words & set(words_of(path.stem))]
+    notes = [Assumption(f"not read: {', '.join(unread)} (--camera, --poses)")] if unread else []
+    return replace(found, pairs=pairs, assumptions=(*found.assumptions, *notes))
 
 
 def _scene(folder: Path) -> PairingResult:

@@ -112,12 +112,7 @@ def read_limited(path: Path, most: int = MOST_TEXT) -> bytes:
 
 
 def read_text(path: Path, most: int = MOST_TABLE) -> str:
-    """Return the text of a user's file; see :func:`read_limited` and :func:`decode_text`.
-
-    Raises:
-        ValueError: there is no such file.
-
-    """
+    """Return the text of a user's file, see :func:`decode_text`; ValueError if there is none."""
     if not path.is_file():
         raise ValueError(f"{path}: expected a file, there is none")
     return decode_text(read_limited(path, most))

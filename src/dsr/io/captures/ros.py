@@ -106,8 +106,8 @@ def _read(path: Path, prefix: str = "") -> PairingResult:
     unit = "millimetres" if kind == "u" else "metres"
     notes = [Assumption(f"a recording of ROS: photos of {photo_topic.name}, depth in {unit} of {depth_topic.name}")]
     if registered and not same:
-        text = f"depth of the frame {depth_topic.frame} is registered to photos of {photo_topic.frame}"
-        notes.append(Assumption(f"{text}, by its camera_info or its topic's name"))
+        text = f"depth of the frame {depth_topic.frame!r} counts as registered to photos of {photo_topic.frame!r}"
+        notes.append(Assumption(text))
     others = [each.name for each in topics if each.role and each not in (photo_topic, depth_topic)]
     if others:
         notes.append(Assumption(f"topics that are not read: {', '.join(others)}"))
@@ -116,10 +116,7 @@ def _read(path: Path, prefix: str = "") -> PairingResult:
 
 
 class _Topic(NamedTuple):
-    """A topic of images: role (``rgb``, ``depth`` or empty), encoding and frame by its first message, and their number.
-
-    ``info``: of the topic ``camera_info`` beside it; None if there is none.
-    """
+    """Topic of images: role (``rgb``, ``depth`` or empty), encoding, frame, number of messages, its camera_info."""
 
     name: str
     role: str
@@ -194,12 +191,12 @@ def _are_registered(photo: _Topic, depth: _Topic) -> bool:
                 views.append((unit.fx, unit.fy, unit.cx, unit.cy))
     if len(views) == 2:
         return np.allclose(views[0], views[1], rtol=0, atol=_ALIKE)
-    return _have_same_frame(photo, depth) or is_registered(depth.name)
+    return _have_same_frame(photo, depth) or not (photo.frame and depth.frame) or is_registered(depth.name)
 
 
 def _have_same_frame(photo: _Topic, depth: _Topic) -> bool:
-    """Return whether frames differ by the namespace at most, or one has no name."""
-    return len({each.frame.rpartition("/")[2] for each in (photo, depth)} - {""}) < 2
+    """Return whether two topics are of one frame, which may be without its namespace in one of them."""
+    return photo.frame != "" and photo.frame.rpartition("/")[2] == depth.frame.rpartition("/")[2]
 
 
 def _transform(reader: Any, photo: _Topic, depth: _Topic) -> Matrix | None:
@@ -219,7 +216,7 @@ def _transform(reader: Any, photo: _Topic, depth: _Topic) -> Matrix | None:
             if start == frame and end not in reached:
                 reached[end] = motion @ reached[frame]
                 queue.append(end)
-    if photo.frame in reached:
+    if photo.frame and photo.frame in reached:
         return reached[photo.frame]
     for each in reader.connections:
         names = _EXTRINSICS.fullmatch(each.topic)
