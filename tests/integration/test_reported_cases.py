@@ -6,6 +6,7 @@ import json
 import math
 from pathlib import Path
 
+import captures
 import cv2
 import numpy as np
 import pytest
@@ -416,3 +417,15 @@ def test_camera_of_the_sensor_is_turned_with_the_photo(tmp_path, orientation):
     camera = read(tmp_path).camera
     cx, cy = {5: (110, 150), 6: (129, 150), 7: (129, 169), 8: (110, 169)}[orientation]
     assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (240, 320, 290, 288, cx, cy)
+
+
+def test_frames_and_notes_of_several_archives_are_those_of_each(tmp_path):
+    captures.record3d(tmp_path / "b" / "1.r3d")
+    captures.record3d(tmp_path / "b" / "2.r3d", poses=captures.record3d_metadata()["poses"][:1] * captures.FRAMES)
+    each = [find_pairs_of_folder(tmp_path / "b" / f"{number}.r3d").assumptions for number in (1, 2)]
+    assert set(find_pairs_of_folder(tmp_path / "b").assumptions) == {*each[0], *each[1]}
+    captures.sens(tmp_path / "one" / "a.sens")
+    for name in ("a", "b"):
+        captures.sens(tmp_path / "two" / f"{name}.sens")
+    one, two = ({pair.name for pair in find_pairs_of_folder(tmp_path / place).pairs} for place in ("one", "two"))
+    assert one == {name for name in two if name.startswith("a/")}
