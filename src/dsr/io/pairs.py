@@ -26,8 +26,8 @@ _OTHER_WORDS = frozenset(
     {"mask", "masks", "confidence", "conf", "ir", "infrared", "normal", "normals", "label", "labels"}
 )
 _CONFIDENCE_WORDS = frozenset({"confidence", "conf"})
-_FILLERS = frozenset({"raw", "align", "aligned", "registered", "map", "to", "frame", "in"})
-_REGISTERED = re.compile(r"\b(align|aligned|registered|depths? (to|in|2) (rgb|colou?r|image))\b")
+_FILLERS = frozenset({"raw", "align", "aligned", "registered", "transformed", "warped", "map", "to", "frame", "in"})
+_REGISTERED = re.compile(r"\b(align|aligned|registered|transformed|warped|depths? (to|in|2) (rgb|colou?r|image))\b")
 _SECONDS_BY_DIGITS = {10: 1.0, 13: 1e-3, 16: 1e-6, 19: 1e-9}
 """Times since 1970 as whole seconds, milli-, micro- and nanoseconds."""
 _MAX_GAP = 0.02

@@ -6,7 +6,6 @@ and poses of OpenGL's camera.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import math
 from dataclasses import replace
@@ -32,7 +31,7 @@ def add_transforms(folder: Path, found: PairingResult) -> PairingResult | None:
         return None
     pairs, count = {pair.rgb: pair for pair in found.pairs}, 0
     photos = {path.with_suffix(""): path for path in pairs}  # for names without suffixes
-    with contextlib.suppress(ValueError, TypeError, KeyError, AttributeError):  # of another program
+    try:
         entries = parse_json(read_text(file))
         unit = entries.get("depth_unit_scale_factor")
         for view in entries["frames"]:
@@ -47,15 +46,19 @@ def add_transforms(folder: Path, found: PairingResult) -> PairingResult | None:
             frame = CaptureFrame("nerfstudio", geometry, file, repr(stated).encode())
             own = unit if is_number(unit) and unit > 0 else pair.unit
             pairs[photo], count = replace(pair, depth=depth or pair.depth, unit=own, capture=frame), count + 1
+    except (ValueError, TypeError, KeyError, AttributeError):  # of another program
+        return None
     if not count:
         return None
-    note = Assumption(f"cameras and poses: {_NAME}, in metres", f"{count} of {len(pairs)} photos")
+    text = f"cameras and poses: {_NAME}; its unit is assumed to be the metre"
+    note = Assumption(text, f"{count} of {len(pairs)} photos")
     return replace(found, pairs=tuple(pairs.values()), assumptions=(*found.assumptions, note))
 
 
 def _geometry(place: str, view: dict[str, Any], size: tuple[int, int]) -> Geometry:
     """Return camera, lens and pose of a frame, of which the entries may be anything."""
-    with refusing(f"{place}: expected numbers of a camera and a pose of 4 x 4", TypeError, KeyError, ArithmeticError):
+    expected = f"{place}: expected numbers of a camera and a pose of 4 x 4"
+    with refusing(expected, ValueError, TypeError, KeyError, ArithmeticError):
         width, height = int(view.get("w", size[1])), int(view.get("h", size[0]))
         fx = view["fl_x"] if "fl_x" in view else width / 2 / math.tan(view["camera_angle_x"] / 2)
         centre = view.get("cx", width / 2) - 0.5, view.get("cy", height / 2) - 0.5
