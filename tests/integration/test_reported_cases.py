@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import math
 import re
 import shutil
 import struct
@@ -10,6 +12,7 @@ import zlib
 from importlib.metadata import distribution
 from pathlib import Path
 
+import captures
 import cv2
 import numpy as np
 import OpenEXR
@@ -22,9 +25,15 @@ import dsr
 from dsr.cli import main
 from dsr.data import detection
 from dsr.evaluation.run_files import load_results
+from dsr.io.cameras import read_any_camera
 from dsr.io.depth_files import read_depth_file
 from dsr.io.encoding import far_marks
+from dsr.io.inputs import read_picture
+from dsr.io.layouts import find_pairs_of_folder
+from dsr.io.pairs import Pair
 from dsr.io.photos import read_photo
+from dsr.io.reading import Reading
+from dsr.io.trajectories import read_poses
 from dsr.metrics.boundaries import METRICS
 from dsr.metrics.catalogue import score_image
 from dsr.report.leaderboard import standings
@@ -408,3 +417,359 @@ def test_boundary_errors_are_to_the_annotated_boundaries():
     band = cv2.dilate(edges.astype(np.uint8), np.ones((9, 9), np.uint8))  # about outlines, as that of ClearGrasp
     for others in (band, np.zeros_like(edges)):
         assert boundary_errors(prediction, truth, others) == boundary_errors(prediction, truth)
+
+
+def read(place, **options):
+    """Return the first frame of a folder or recording as ``dsr upsample`` reads it."""
+    return read_picture(find_pairs_of_folder(place).pairs[0], Reading(**options))
+
+
+def lr_error(picture, truth):
+    """Return the mean absolute error of a low-resolution depth map in millimetres, and the known fraction."""
+    depth = picture.depth_lr[0].numpy()
+    return 1000 * np.nanmean(np.abs(depth - truth)), np.isfinite(depth).mean()
+
+
+def write_bag(path, pictures, transforms=(), *, version=2, plugin="SQLITE3", extrinsics=None):
+    """Write a recording of ROS.
+
+    Args:
+        path: of the file of ROS 1, or of the folder of ROS 2.
+        pictures: by topic the picture, its frame, and the camera's fx, cx, cy, width and height, None without one.
+        transforms: /tf_static: parent, child, translation and quaternion of each.
+        version: of ROS.
+        plugin: that stores ROS 2.
+        extrinsics: topic of RealSense's message, with the translation.
+
+    """
+    rosbag1, rosbag2 = pytest.importorskip("rosbags.rosbag1"), pytest.importorskip("rosbags.rosbag2")
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # noqa: PLC0415 - an extra
+
+    store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
+    realsense = "std_msgs/Header header\nfloat64[9] rotation\nfloat64[3] translation"
+    store.register(get_types_from_msg(realsense, "realsense2_camera_msgs/msg/Extrinsics"))
+    if version == 1:
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+    kinds = {name.rpartition("/")[2]: kind for name, kind in store.types.items()}
+    kinds["Time"] = store.types["builtin_interfaces/msg/Time"]
+
+    def header(frame):
+        return kinds["Header"](stamp=kinds["Time"](100, 0), frame_id=frame, **({"seq": 0} if version == 1 else {}))
+
+    messages = {}
+    for topic, (picture, frame, camera) in pictures.items():
+        encoding = {"uint16": "16UC1", "float32": "32FC1", "float64": "64FC1"}.get(str(picture.dtype), "rgb8")
+        data = np.frombuffer(np.ascontiguousarray(picture).tobytes(), np.uint8)
+        image = {"height": picture.shape[0], "width": picture.shape[1], "encoding": encoding, "is_bigendian": 0}
+        messages[topic] = kinds["Image"](header(frame), **image, step=len(data) // picture.shape[0], data=data)
+        if camera is not None:
+            focal, cx, cy, width, height = camera
+            arrays = {"d": np.zeros(5), "k": np.array([focal, 0, cx, 0, focal, cy, 0, 0, 1.0]), "r": np.eye(3).ravel(),
+                      "p": np.array([focal, 0, cx, 0, 0, focal, cy, 0, 0, 0, 1.0, 0])}  # fmt: skip
+            info = {"height": height, "width": width, "distortion_model": "plumb_bob", "binning_x": 0, "binning_y": 0}
+            arrays = {name.upper() if version == 1 else name: values for name, values in arrays.items()}
+            roi = kinds["RegionOfInterest"](0, 0, 0, 0, False)
+            place = topic.rpartition("/")[0] + "/camera_info"
+            messages[place] = kinds["CameraInfo"](header=header(frame), roi=roi, **info, **arrays)
+    if transforms:
+        tree = [
+            kinds["TransformStamped"](
+                header(parent), child, kinds["Transform"](kinds["Vector3"](*shift), kinds["Quaternion"](*turn))
+            )
+            for parent, child, shift, turn in transforms
+        ]
+        messages["/tf_static"] = kinds["TFMessage"](tree)
+    if extrinsics is not None:
+        topic, shift = extrinsics
+        messages[topic] = kinds["Extrinsics"](header("camera"), np.eye(3).ravel(), np.array(shift, float))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    plugins = rosbag2.StoragePlugin
+    writer = rosbag1.Writer(path) if version == 1 else rosbag2.Writer(path, version=9, storage_plugin=plugins[plugin])
+    with writer:
+        for topic, message in messages.items():
+            connection = writer.add_connection(topic, message.__msgtype__, typestore=store)
+            pack = store.serialize_ros1 if version == 1 else store.serialize_cdr
+            writer.write(connection, 100 * 10**9, pack(message, message.__msgtype__))
+
+
+OPTICAL = (-0.5, 0.5, -0.5, 0.5)
+"""Rotation from the axes of an optical frame to those of a robot."""
+COLOUR, DEPTH = "camera_color_optical_frame", "camera_depth_optical_frame"
+PHOTO_INFO, DEPTH_INFO = (288.0, 159.5, 119.5, 320, 240), (96.0, 79.5, 59.5, 160, 120)
+TREE = (
+    ("camera_link", "camera_color_frame", (0, 0.03, 0), (0, 0, 0, 1)),
+    ("camera_color_frame", COLOUR, (0, 0, 0), OPTICAL),
+    ("camera_link", "camera_depth_frame", (0, 0, 0), (0, 0, 0, 1)),
+    ("/camera_depth_frame", f"/{DEPTH}", (0, 0, 0), OPTICAL),
+)
+"""The depth camera is 30 mm to the right of the photo's: a robot's y points to the left."""
+EXTRINSICS = ("/camera/extrinsics/depth_to_color", (0.03, 0, 0))
+
+
+@pytest.mark.parametrize(
+    ("version", "plugin", "transforms", "extrinsics"),
+    [(2, "SQLITE3", TREE, None), (2, "MCAP", TREE, None), (1, "", TREE, None), (2, "MCAP", (), EXTRINSICS),
+     (1, "", (), EXTRINSICS)],
+)  # fmt: skip
+def test_unregistered_depth_of_a_recording_is_warped_by_its_transform(
+    tmp_path, version, plugin, transforms, extrinsics
+):
+    truth, photo = scene()
+    apart = millimetres(scene(160, 120, 96.0, shift=0.03)[0])
+    pictures = {
+        "/camera/color/image_raw": (photo, COLOUR, PHOTO_INFO),
+        "/camera/depth/image_rect_raw": (apart, DEPTH, DEPTH_INFO),
+    }
+    bag = tmp_path / "a.bag" if version == 1 else tmp_path / "a"
+    write_bag(bag, pictures, transforms, version=version, plugin=plugin, extrinsics=extrinsics)
+    picture = read(bag)
+    height, width = picture.depth_lr.shape[1:]
+    error, known = lr_error(picture, cv2.resize(truth, (width, height), interpolation=cv2.INTER_AREA))
+    assert error < 25
+    assert known > 0.9
+
+
+@pytest.mark.parametrize("info", [DEPTH_INFO, None])
+def test_unregistered_depth_without_a_transform_is_refused_by_its_frames(tmp_path, capsys, info):
+    truth, photo = scene()
+    apart = millimetres(scene(160, 120, 96.0, shift=0.03)[0])
+    pictures = {
+        "/camera/color/image_raw": (photo, COLOUR, PHOTO_INFO),
+        "/camera/depth/image_rect_raw": (apart, DEPTH, info),
+    }
+    write_bag(tmp_path / "a", pictures)
+    assert upsample(tmp_path / "out", tmp_path / "a") == 2
+    [error] = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error:")]
+    assert COLOUR in error
+    assert DEPTH in error
+    (tmp_path / "depth.txt").write_text("96 0 79.5\n0 96 59.5\n0 0 1\n")
+    (tmp_path / "motion.txt").write_text("1 0 0 0.03\n0 1 0 0\n0 0 1 0\n")
+    rig = ("--depth-camera", tmp_path / "depth.txt", "--extrinsics", tmp_path / "motion.txt")
+    assert upsample(tmp_path / "out", tmp_path / "a", *rig) == 0
+    assert mean_error(tmp_path / "out", truth)[0] < 45
+
+
+@pytest.mark.parametrize(
+    ("registered", "frame", "info", "other"),
+    [
+        ("/depth_to_rgb/image_raw", COLOUR, PHOTO_INFO, "/depth/image_raw"),
+        ("/depth_to_rgb/image_raw", COLOUR, None, "/depth/image_raw"),
+        ("/camera/stereo/image_raw", f"/robot/{COLOUR}", None, "/camera/aligned_depth_to_infra1/image_raw"),
+        ("/camera/depth/image_raw", DEPTH, PHOTO_INFO, "/camera/a/image_raw"),
+        ("/camera/aligned_depth_to_color/image_raw", DEPTH, None, "/camera/a/image_raw"),
+    ],
+)
+def test_registered_topic_of_depth_is_taken(tmp_path, registered, frame, info, other):
+    truth, photo = scene()
+    pictures = {
+        "/camera/color/image_raw": (photo, COLOUR, PHOTO_INFO),
+        registered: (millimetres(coarse(truth)), frame, info),
+        other: (millimetres(scene(160, 120, 96.0, shift=0.03)[0]), "camera_infra1_optical_frame", DEPTH_INFO),
+    }
+    write_bag(tmp_path / "a", pictures)
+    assert lr_error(read(tmp_path / "a"), coarse(truth)) < (0.5, 2)
+
+
+@pytest.mark.parametrize(
+    ("photo_name", "raw", "registered"),
+    [
+        ("color/{}.png", "depth/{}.png", "aligned_depth/{}.png"),
+        ("rgb/{}.png", "depth_raw/{}.png", "depth_registered/{}.png"),
+        ("image/{}.png", "depth/{}.png", "depth_to_rgb/{}.png"),
+        ("{}_color.png", "{}_depth.png", "{}_depth_aligned.png"),
+        ("{}_rgb.png", "{}_depth_raw.png", "{}_depth_registered.png"),
+        ("color.png", "depth.png", "aligned_depth.png"),
+    ],
+)
+def test_registered_depth_of_a_folder_is_taken(tmp_path, photo_name, raw, registered):
+    truth, photo = scene()
+    depth = millimetres(coarse(truth))
+    for number in range(2):
+        write(tmp_path / "in" / photo_name.format(number), photo)
+        write(tmp_path / "in" / raw.format(number), np.roll(depth, 3, 1))
+        write(tmp_path / "in" / registered.format(number), depth)
+    assert lr_error(read(tmp_path / "in"), coarse(truth)) < (0.5, 2)
+
+
+def test_encoding_of_a_topic_that_is_not_read_is_named(tmp_path, capsys):
+    truth, photo = scene()
+    pictures = {
+        "/camera/color/image_raw": (photo, COLOUR, PHOTO_INFO),
+        "/camera/depth/image_raw": (truth, COLOUR, None),
+    }
+    write_bag(tmp_path / "a", pictures)
+    assert upsample(tmp_path / "out", tmp_path / "a") == 2
+    error = capsys.readouterr().err
+    assert "64FC1" in error
+    assert "16UC1" in error
+
+
+POSE = np.array([[1.0, 0, 0, 0.2], [0, 1, 0, 0.1], [0, 0, 1, 0.3], [0, 0, 0, 1]])
+GL = np.diag([1.0, -1, -1, 1])
+OF_ALL = {"fl_x": 288.0, "fl_y": 288.0, "cx": 160.0, "cy": 120.0, "w": 320, "h": 240, "camera_model": "OPENCV"}
+YAML = """%YAML:1.0
+---
+camera_name: "1"
+image_width: 320
+image_height: 240
+camera_matrix:
+   rows: 3
+   cols: 3
+   data: [ 288., 0., 159.5, 0.,
+       288., 119.5, 0., 0., 1. ]
+distortion_coefficients:
+   rows: 1
+   cols: 5
+   data: [ 0., 0., 0., 0., 0. ]
+"""
+FOV = {name: math.degrees(2 * math.atan(side / 2 / FOCAL)) for name, side in (("fov_x", 320), ("fov_y", 240))}
+
+
+@pytest.mark.parametrize(
+    ("photo_name", "depth_name", "calibration", "content"),
+    [
+        ("images/f_1.png", "depths/f_1.png", "transforms.json", {**OF_ALL, "frames": [{}]}),
+        ("images/f_1.png", "maps/other.png", "transforms.json",
+         {"frames": [OF_ALL | {"depth_file_path": "maps/other.png"}]}),
+        ("images/r_0.png", "depth/r_0.png", "transforms.json",
+         {"camera_angle_x": math.radians(FOV["fov_x"]), "frames": [{"file_path": "./images/r_0"}]}),
+        ("nerfstudio/images/f_1.png", "nerfstudio/depths/f_1.png", "transforms.json", {**OF_ALL, "frames": [{}]}),
+        ("rgb/7.jpg", "depth/7.png", "calib/7.yaml", YAML),
+        ("rgb/7.jpg", "depth/7.png", "color_camera_info.yaml", YAML),
+        ("rgb/7.jpg", "depth/7.png", "calibration.txt", "288 288 159.5 119.5\n"),
+        ("image.jpg", "depth.npy", "fov.json", FOV),
+    ],
+)  # fmt: skip
+def test_calibration_beside_the_pictures_is_read(tmp_path, photo_name, depth_name, calibration, content):
+    truth, photo = scene()
+    write(tmp_path / photo_name, photo)
+    if depth_name.endswith("npy"):
+        np.save(tmp_path / depth_name, truth)
+    else:
+        write(tmp_path / depth_name, millimetres(coarse(truth)))
+    if calibration == "transforms.json":
+        content["frames"] = [
+            {"file_path": photo_name, "transform_matrix": (POSE @ GL).tolist(), **each} for each in content["frames"]
+        ]
+    (tmp_path / calibration).parent.mkdir(exist_ok=True)
+    (tmp_path / calibration).write_text(content if isinstance(content, str) else json.dumps(content))
+    picture = read(tmp_path / "nerfstudio" if "nerfstudio" in photo_name else tmp_path)
+    camera = picture.camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx((288, 288, 159.5, 119.5))
+    assert not any("60 degrees" in str(note) for note in picture.assumptions)
+    if calibration == "transforms.json":
+        np.testing.assert_allclose(picture.pose, POSE)
+
+
+def test_scene_that_is_exported_to_nerfstudio_is_read_again(tmp_path):
+    truth, photo = scene()
+    write(tmp_path / "in" / "rgb.png", photo)
+    write(tmp_path / "in" / "depth.png", millimetres(coarse(truth)))
+    options = ("--rgb", tmp_path / "in" / "rgb.png", "--depth", tmp_path / "in" / "depth.png", *CAMERA)
+    assert (
+        main(
+            ["upsample", *map(str, options), "-o", str(tmp_path / "out"), "--method", "bicubic", "--with", "nerfstudio"]
+        )
+        == 0
+    )
+    for place in (tmp_path / "out", tmp_path / "out" / "nerfstudio"):
+        picture = read(place)
+        camera = picture.camera
+        assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx((288, 288, 159.5, 119.5))
+        np.testing.assert_allclose(picture.pose, np.eye(4))
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [("transforms.json", "{}"), ("calibration.txt", "P0: 1 2 3"), ("calib/1.yaml", YAML.replace("[ 0.,", "[ 0.1,")),
+     ("camera.xml", "<camera/>"), ("intrinsics.yaml", "fx: 3"), ("fov.json", '{"fov_x": "wide"}')],
+)  # fmt: skip
+def test_calibration_that_is_not_read_is_named(tmp_path, name, content):
+    truth, photo = scene()
+    write(tmp_path / "rgb/1.png", photo)
+    write(tmp_path / "depth/1.png", millimetres(coarse(truth)))
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text(content)
+    notes = find_pairs_of_folder(tmp_path).assumptions
+    assert any("not read" in str(note) and name.split("/")[0] in str(note) for note in notes)
+
+
+MATRIX = "288 0 159.5\n0 288 119.5\n0 0 1\n"
+CAMERA_JSON = json.dumps({"width": 320, "height": 240, "fx": 288.0, "fy": 288.0, "cx": 159.5, "cy": 119.5})
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le"])
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [("camera.json", CAMERA_JSON), ("k.txt", MATRIX), ("k.txt", MATRIX.replace(".", ",")), ("k.yaml", YAML)],
+)
+def test_camera_of_any_encoding_is_read(tmp_path, name, content, encoding):
+    (tmp_path / name).write_bytes(content.encode(encoding))
+    camera = read_any_camera(tmp_path / name)
+    numbers = (camera[0, 0], camera[0, 2]) if isinstance(camera, np.ndarray) else (camera.camera.fx, camera.camera.cx)
+    assert numbers == (288, 159.5)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_lists_that_windows_wrote_are_read(tmp_path, encoding):
+    truth, photo = scene()
+    for kind, picture in (("rgb", photo), ("depth", 5 * millimetres(coarse(truth)))):
+        write(tmp_path / kind / "1305031102.175304.png", picture)
+        line = f"# list\r\n1305031102,175304 {kind}\\1305031102.175304.png\r\n"
+        (tmp_path / f"{kind}.txt").write_bytes(line.encode(encoding))
+    (tmp_path / "groundtruth.txt").write_bytes("1305031102.175304 0.5 0 0 0 0 0 1\r\n".encode(encoding))
+    picture = read(tmp_path)
+    assert lr_error(picture, coarse(truth)) < (0.5, 2)
+    assert picture.pose[0, 3] == 0.5
+
+
+LINES = [f"{number} {0.05 * number} 0 0 0 0 0 1" for number in range(3)]
+BY_ID = [f"{100.5 + number} {0.05 * number} 0 0 0 0 0 1 {number}" for number in range(3)]
+ROWS = [f"1 0 0 {0.05 * number} 0 1 0 0 0 0 1 0" for number in range(3)]
+
+
+@pytest.mark.parametrize(
+    ("lines", "known"),
+    [
+        (LINES, "012"),
+        (["#timestamp x y z qx qy qz qw id", *(f"{line} {number + 1}" for number, line in enumerate(LINES))], "012"),
+        (BY_ID, "012"),
+        ([line.replace(".", ",") for line in BY_ID], "012"),
+        ([line.replace(" ", ";").replace(".", ",") for line in LINES], "012"),
+        ([LINES[0], "1 nan nan nan nan nan nan nan", LINES[2]], "02"),
+        ([LINES[0], "1 0 0 0 0 0 0 0", LINES[2]], "02"),
+        ([ROWS[0], " ".join(["-inf"] * 12), ROWS[2]], "02"),
+    ],
+)
+def test_poses_with_ids_decimal_commas_and_lost_frames_are_read(tmp_path, lines, known):
+    (tmp_path / "poses.txt").write_text("\n".join(lines) + "\n")
+    pairs = [Pair(str(number), Path(f"{number:06}.png"), Path(f"{number:06}.png")) for number in range(3)]
+    poses = read_poses(tmp_path / "poses.txt").assign(pairs)
+    assert {name: pose[0, 3] for name, pose in poses.items()} == {each: 0.05 * int(each) for each in known}
+
+
+@pytest.mark.parametrize("orientation", [5, 6, 7, 8])
+def test_camera_of_the_sensor_is_turned_with_the_photo(tmp_path, orientation):
+    truth, photo = scene()
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.fromarray(photo).save(tmp_path / "rgb.jpg", exif=exif)
+    upright = {5: truth.T, 6: truth.T[:, ::-1], 7: truth[::-1, ::-1].T, 8: truth.T[::-1]}[orientation]
+    write(tmp_path / "depth.png", millimetres(coarse(upright)))
+    camera = {"width": 320, "height": 240, "fx": 288.0, "fy": 290.0, "cx": 150.0, "cy": 110.0}
+    (tmp_path / "camera.json").write_text(json.dumps(camera))
+    camera = read(tmp_path).camera
+    cx, cy = {5: (110, 150), 6: (129, 150), 7: (129, 169), 8: (110, 169)}[orientation]
+    assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (240, 320, 290, 288, cx, cy)
+
+
+def test_frames_and_notes_of_several_archives_are_those_of_each(tmp_path):
+    captures.record3d(tmp_path / "b" / "1.r3d")
+    captures.record3d(tmp_path / "b" / "2.r3d", poses=captures.record3d_metadata()["poses"][:1] * captures.FRAMES)
+    each = [find_pairs_of_folder(tmp_path / "b" / f"{number}.r3d").assumptions for number in (1, 2)]
+    assert set(find_pairs_of_folder(tmp_path / "b").assumptions) == {*each[0], *each[1]}
+    captures.sens(tmp_path / "one" / "a.sens")
+    for name in ("a", "b"):
+        captures.sens(tmp_path / "two" / f"{name}.sens")
+    one, two = ({pair.name for pair in find_pairs_of_folder(tmp_path / place).pairs} for place in ("one", "two"))
+    assert one == {name for name in two if name.startswith("a/")}

@@ -91,7 +91,7 @@ def test_camera_of_another_resolution_is_scaled_about_the_outer_edge(tmp_path):
         ("k.txt", "1 2 3", "expected JSON or a matrix"),
         ("k.txt", "60 0 310 0 61 240 0 0 1", "expected a principal point near the middle"),
         ("k.txt", "-60 0 31 0 61 24 0 0 1", r"expected a matrix \(fx 0 cx"),
-        ("missing.txt", None, "expected a camera file, there is none"),
+        ("missing.txt", None, "expected a file, there is none"),
     ],
 )
 def test_camera_file_that_does_not_fit_is_refused_by_name(tmp_path, name, content, message):

@@ -99,7 +99,7 @@ def test_poses_are_read_in_every_format(tmp_path, content):
         ("1 2\n", "got lines of 2 numbers"),
         (text(MATRIX)[:-40], "expected lines of 8 numbers"),
         (TUM.format(time=0).rsplit(" ", 1)[0] + " 3\n", "pose 1: expected a quaternion of length 1"),
-        (TUM.format(time=0).replace("0.1", "nan", 1) + "\n", "pose 1: expected finite numbers"),
+        (TUM.format(time=0).replace("0.1", "nan", 1) + "\n", "expected poses of finite numbers"),
         (TUM.format(time="nan") + "\n", "expected finite times"),
         (text(MATRIX) + text(np.diag([1.0, 1.0, 2.0, 1.0])), "pose 2: expected a rigid transform"),
         ("x y z\n", "line 1: expected numbers"),

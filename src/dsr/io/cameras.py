@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -17,11 +18,11 @@ from dsr.geometry.plausible import may_be_of
 from dsr.geometry.warping import registered_camera, warp_depth
 from dsr.io.frames import Rig
 from dsr.io.images import CameraFile, Pixels, read_camera
-from dsr.io.photos import Size, focal_in_exif, same_aspect
+from dsr.io.photos import Size, focal_in_exif, orientation_of, same_aspect
 from dsr.io.reading import CameraChoice, RigFiles
-from dsr.io.trajectories import read_transform
+from dsr.io.trajectories import intrinsics_camera, read_transform
 from dsr.notes import Assumption
-from dsr.utils.guards import naming, numbers_in, read_limited
+from dsr.utils.guards import naming, numbers_in, parse_json, read_text, refusing, split_numbers
 from dsr.utils.validation import parse_model
 
 _FILM_DIAGONAL = math.hypot(36, 24)
@@ -43,7 +44,7 @@ def find_camera(choice: CameraChoice, photo: Path, size: Size, size_lr: Size) ->
     """
     height, width = size
     if choice.file is not None:
-        return _fit_to_photo(choice.file, read_any_camera(choice.file), size, size_lr)
+        return _fit_to_photo(choice.file, read_any_camera(choice.file), size, size_lr, photo)
     if choice.intrinsics is not None:
         return camera_only(Camera(width, height, *choice.intrinsics)), []
     if choice.fov is not None:
@@ -66,17 +67,22 @@ def read_any_camera(path: Path) -> CameraFile | np.ndarray:
 
     The formats are dsr's ``camera.json``; Open3D's JSON (``width``, ``height`` and ``intrinsic_matrix``, nine numbers
     column by column, https://www.open3d.org/docs/release/python_api/open3d.camera.PinholeCameraIntrinsic.html);
-    and text of 3 x 3 or 4 x 4 numbers, as SUN RGB-D and ScanNet have it.
+    MoGe's JSON (``fov_x`` and ``fov_y`` in degrees), a matrix for pictures of 1 x 1; YAML of OpenCV, ROS and RTAB-Map;
+    and text of 3 x 3 or 4 x 4 numbers, as SUN RGB-D and ScanNet have it, or of fx fy cx cy, as ETH3D has it.
 
     Raises:
         ValueError: the file has none of these formats.
 
     """
-    if not path.is_file():
-        raise ValueError(f"{path}: expected a camera file, there is none")
-    text = read_limited(path).decode("utf-8", "replace")
+    text = read_text(path)
+    if "camera_matrix:" in text:
+        return _of_yaml(path, text)
     if path.suffix.lower() != ".json" and not text.lstrip().startswith("{"):
         return _matrix(path, text)
+    if '"fov_x"' in text:
+        with refusing(f"{path}: expected fov_x and fov_y in degrees", ValueError, TypeError, KeyError, ArithmeticError):
+            fx, fy = (0.5 / math.tan(math.radians(parse_json(text)[name]) / 2) for name in ("fov_x", "fov_y"))
+            return expect_intrinsics(np.array([[fx, 0, 0.5], [0, fy, 0.5], [0, 0, 1]]))
     return _open3d(path, text) if '"intrinsic_matrix"' in text else read_camera(path)
 
 
@@ -99,13 +105,22 @@ def camera_only(camera: Camera) -> CameraFile:
 
 
 def _fit_to_photo(
-    path: Path, content: CameraFile | np.ndarray, size: Size, size_lr: Size
+    path: Path, content: CameraFile | np.ndarray, size: Size, size_lr: Size, photo: Path
 ) -> tuple[CameraFile, list[Assumption]]:
     """Return the camera of a file for the pixels of the photo, and the assumptions."""
     if isinstance(content, np.ndarray):
         content, assumptions = _camera_of_matrix(path, content, size, size_lr)
     else:
         assumptions = []
+    camera, orientation = content.camera, 1
+    if not same_aspect((camera.height, camera.width), size) and same_aspect((camera.width, camera.height), size):
+        orientation = orientation_of(photo)
+    if orientation >= 5:  # the photo is turned, the camera is that of the sensor
+        cx = camera.height - 1 - camera.cy if orientation in (6, 7) else camera.cy
+        cy = camera.width - 1 - camera.cx if orientation in (7, 8) else camera.cx
+        turned = replace(camera, width=camera.height, height=camera.width, fx=camera.fy, fy=camera.fx, cx=cx, cy=cy)
+        content = replace(content, camera=turned)
+        assumptions.append(Assumption("camera: turned as the photo is by its EXIF data"))
     content, scaled = scale_to_photo(path, content, size)
     return content, [*assumptions, *scaled]
 
@@ -136,8 +151,11 @@ def scale_to_photo(path: Path, content: CameraFile, size: Size) -> tuple[CameraF
 
 def _camera_of_matrix(path: Path, matrix: np.ndarray, size: Size, size_lr: Size) -> tuple[CameraFile, list[Assumption]]:
     """Return the camera of a matrix: of the photo's pixels, or else of the depth map's, by its principal point."""
+    cx, cy = matrix[0, 2], matrix[1, 2]
+    if max(cx, cy) <= 1:  # of a picture of 1 x 1 whose corner is (0, 0)
+        camera = Camera(1, 1, matrix[0, 0], matrix[1, 1], cx - 0.5, cy - 0.5)
+        return camera_only(camera.rescale(size[1], size[0])), []
     for name, (height, width) in (("photo", size), ("depth map", size_lr)):
-        cx, cy = matrix[0, 2], matrix[1, 2]
         if may_be_of(cx, cy, width, height):
             camera = Camera(width, height, matrix[0, 0], matrix[1, 1], cx, cy)
             return camera_only(camera), [Assumption(f"camera: the matrix is read in pixels of the {name}")]
@@ -149,12 +167,28 @@ def _camera_of_matrix(path: Path, matrix: np.ndarray, size: Size, size_lr: Size)
 
 def _matrix(path: Path, text: str) -> np.ndarray:
     """Return the intrinsics (3, 3) that a text holds."""
-    numbers = numbers_in(text.replace(",", " ").replace(";", " ").split())
+    numbers = numbers_in(split_numbers(text))
+    if len(numbers) == 4:
+        numbers = [numbers[0], 0, numbers[2], 0, *numbers[1::2], 0, 0, 1]
     if len(numbers) not in (9, 16):
         raise ValueError(f"{path}: expected JSON or a matrix of 3 x 3 or 4 x 4 numbers, got something else")
     side = math.isqrt(len(numbers))
     with naming(path):
         return expect_intrinsics(np.array(numbers).reshape(side, side))
+
+
+def _of_yaml(path: Path, text: str) -> CameraFile:
+    """Return the camera of OpenCV's YAML, whose header and tags other readers refuse."""
+    found = re.findall(r"^(\w+):.*(?:\n[ \t]+(?!data:).*)*\n[ \t]+data:\s*\[([^\]]*)\]", text, re.MULTILINE)
+    lists = {key: numbers_in(split_numbers(values)) for key, values in found}
+    sizes = dict(re.findall(r"^image_(width|height):\s*(\d{1,6})\b", text, re.MULTILINE))
+    if len(lists.get("camera_matrix", ())) != 9 or len(sizes) < 2:
+        raise ValueError(f"{path}: expected image_width, image_height and 9 numbers of camera_matrix, got others")
+    if any(lists.get("distortion_coefficients", ())):
+        raise ValueError(f"{path}: expected a camera without lens distortion, got distortion_coefficients")
+    fx, _, cx, _, fy, cy, *_ = lists["camera_matrix"]
+    size = int(sizes["height"]), int(sizes["width"])
+    return camera_only(intrinsics_camera(str(path), size, (fx, fy, cx, cy)))
 
 
 class _Open3d(BaseModel, strict=True):

@@ -115,7 +115,7 @@ FORMATS = (
         "ROS 1 and 2",
         "`rosbag record`, `ros2 bag record` of a colour and a depth topic with their `camera_info`",
         "`*.bag`, `*.mcap`, `*.db3`; a folder of them, or of `*.zstd`, with `metadata.yaml`",
-        "depth in mm (16UC1), m (32FC1), compressedDepth (PNG, RVL); intrinsics, distortion (`camera_info`); time",
+        "depth in mm (16UC1), m (32FC1), compressedDepth (PNG, RVL), warped by `/tf_static`; `camera_info`; time",
         "written by rosbags",
         "",
         "https://docs.ros.org/en/api/sensor_msgs/html/index-msg.html",

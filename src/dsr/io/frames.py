@@ -82,7 +82,8 @@ class Geometry(NamedTuple):
     depth map without a rig, which lies in the photo's pixels; None without distortion. ``rig``: the depth map's own
     camera, of a size of its own as well; None if the map is in the photo's view. ``up``: the axis of the world that
     points up, one of :data:`UPS`. ``damage``: what is wrong with the capture's cameras where others take their place,
-    and no rig is known therefore; empty if nothing is.
+    and no rig is known therefore; empty if nothing is. ``apart``: why a depth map that is not in the photo's view is of
+    no use without a given rig; empty if it is.
     """
 
     camera: Camera | None = None
@@ -92,6 +93,7 @@ class Geometry(NamedTuple):
     rig: Rig | None = None
     up: str = ""
     damage: str = ""
+    apart: str = ""
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,9 @@ from dsr.utils.guards import (
     parse_json,
     pixels_of_file,
     read_limited,
+    read_text,
     refusing,
+    split_numbers,
 )
 from dsr.utils.picture_headers import format_not_read, picture_size
 from dsr.utils.validation import Number, Whole, parse_model
@@ -36,7 +38,7 @@ MAP_SUFFIXES = (".npy", ".png", ".tiff", ".tif", ".pfm")
 _METRES = {"m": 1.0, "mm": 1e-3}
 _LONGEST = 40
 """Largest number of bytes of a number and the blank behind it."""
-_TEXT = re.compile(rb"[-+.\deEnaifNAIF\s,]*")
+_TEXT = re.compile(r"[-+.\deEnaifNAIF\s,]*")
 
 
 def pixels_in_header(path: Path) -> tuple[int, int] | None:
@@ -135,9 +137,9 @@ def read_numbers(path: Path, count: int) -> np.ndarray:
     size = path.stat().st_size
     if size > _LONGEST * count:
         raise ValueError(f"{path}: expected {count} numbers, got {size} bytes, too many for that")
-    content = read_limited(path, size)
+    content = read_text(path, size)
     with refusing(f"{path}: expected {count} numbers, got text or bytes that are none", ValueError):
-        values = np.array(content.replace(b",", b" ").split() if _TEXT.fullmatch(content) else "", dtype=np.float64)
+        values = np.array(split_numbers(content) if _TEXT.fullmatch(content) else "", dtype=np.float64)
     if values.size != count:
         raise ValueError(f"{path}: expected {count} numbers, got {values.size}")
     return values
@@ -168,9 +170,7 @@ def read_camera(path: Path) -> CameraFile:
         ValueError: it is missing or damaged, or a key is missing, unknown or out of range.
 
     """
-    if not path.is_file():
-        raise ValueError(f"{path}: expected a camera file, there is none")
-    content = read_limited(path)
+    content = read_text(path)
     if (params := _params_in(content)) is not None:
         return _read_params(path, content, params)
     entries = parse_model(_CameraJson, content, path).model_dump(exclude_unset=True, exclude_none=True)
@@ -181,7 +181,7 @@ def read_camera(path: Path) -> CameraFile:
     return CameraFile(camera, *map(entries.get, ("range_type", "depth_unit", "hole_value")))
 
 
-def _params_in(content: bytes) -> type[_Params | _NestedParams] | None:
+def _params_in(content: str) -> type[_Params | _NestedParams] | None:
     """Return how JSON has the keys of NICE-SLAM's ``cam_params.json``, nested or not; None if it has none of them."""
     try:
         entries = parse_json(content)
@@ -192,7 +192,7 @@ def _params_in(content: bytes) -> type[_Params | _NestedParams] | None:
     return _NestedParams if isinstance(entries.get("camera"), dict) else _Params if _SCALES & entries.keys() else None
 
 
-def _read_params(path: Path, content: bytes, kind: type[_Params | _NestedParams]) -> CameraFile:
+def _read_params(path: Path, content: str, kind: type[_Params | _NestedParams]) -> CameraFile:
     """Return the camera of a ``cam_params.json``, and the unit that its scale says."""
     read = parse_model(kind, content, path)
     params = read.camera if isinstance(read, _NestedParams) else read

@@ -322,6 +322,8 @@ def read_geometry(pair: Pair, size: Size, reading: Reading) -> tuple[Geometry, l
         if reading.camera == CameraChoice():
             raise
         found = Geometry(damage=str(error))
+    if found.apart and reading.rig is None:
+        raise ValueError(found.apart)
     if not found.damage:
         return found, []
     if pair.capture.apart and reading.rig is None:
@@ -421,7 +423,8 @@ def _camera(
         content, assumed = find_camera(reading.camera, pair.rgb, size, size_lr)
         return content, [*geometry.assumptions, *assumed]
     described, assumptions = find_camera(CameraChoice(file=pair.camera), pair.rgb, size, size_lr)
-    found = Assumption(f"camera: {pair.camera.name} beside the pictures")
+    own = pair.camera.stem == pair.rgb.stem  # one of each photo
+    found = Assumption(f"camera: {pair.camera.parent.name if own else pair.camera.name} beside the pictures")
     return described, [*geometry.assumptions, found, *assumptions]
 
 

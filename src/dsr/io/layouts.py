@@ -5,6 +5,7 @@ Which app made a capture, by what lies in its folder.
 
 from __future__ import annotations
 
+import contextlib
 import re
 from dataclasses import replace
 from functools import partial
@@ -14,6 +15,7 @@ import cv2
 import numpy as np
 
 from dsr.geometry.rigid_motion import Matrix
+from dsr.io.cameras import read_any_camera
 from dsr.io.captures.archive import unpack
 from dsr.io.captures.arkit import find_arkitscenes, find_polycam, find_scanner_app
 from dsr.io.captures.colmap import add_model, find_colmap, model_file
@@ -21,6 +23,7 @@ from dsr.io.captures.data_sets import find_replica, find_scannet, find_seven_sce
 from dsr.io.captures.heic import find_heic
 from dsr.io.captures.kinect import find_kinect
 from dsr.io.captures.known import describe_content, lacking
+from dsr.io.captures.nerfstudio import add_transforms
 from dsr.io.captures.record3d import find_record3d
 from dsr.io.captures.ros import find_ros
 from dsr.io.captures.scannet import find_scannetpp, find_sens
@@ -36,6 +39,7 @@ from dsr.io.pairs import (
     find_camera_file,
     find_pairs_of_two_folders,
     has_pictures,
+    is_registered,
     list_pictures,
     make_names_unique,
     match_pairs,
@@ -47,10 +51,13 @@ from dsr.io.pairs import (
 from dsr.io.photos import HEIC_SUFFIXES
 from dsr.io.trajectories import read_poses
 from dsr.notes import Assumption
-from dsr.utils.guards import MOST_TABLE, natural_key, numbers_in, path_within, read_limited
+from dsr.utils.guards import natural_key, numbers_in, path_within, read_text, split_numbers
 
 _DEPTH_LR = re.compile(r"(depth|disparity)_lr(\d+)")
 _TUM_UNIT = 1 / 5000
+_CALIBRATIONS = {"poses", "calib", "calibration", "camera", "cameras", "intrinsic", "intrinsics", "fov", "transforms"}
+_TEXTS = ("", ".json", ".txt", ".yaml", ".yml", ".xml", ".csv")
+"""Words in the names of calibrations, and suffixes; "" for folders."""
 _MAX_DEPTH = 3
 """Levels of subfolders that are searched."""
 
@@ -150,8 +157,31 @@ def _find_at(place: Path, root: Path | None = None) -> PairingResult:
             model = model_file(place)
             if model is not None and all(pair.capture is None for pair in found.pairs):
                 found = add_model(found, model)
+            elif camera is None:
+                found = _add_calibration(place, found)
             return replace(found, assumptions=(*_alike(place), *found.assumptions))
-    return find_colmap(place) or found
+    return add_transforms(place, PairingResult(())) or find_colmap(place) or found
+
+
+def _add_calibration(folder: Path, found: PairingResult) -> PairingResult:
+    """Return pairs with the cameras of nerfstudio, RTAB-Map, ETH3D or MoGe, and a note of files that are not read."""
+    listed = add_transforms(folder, found)
+    if listed is not None:
+        return listed
+    files = {}
+    for pattern in ("calibration.txt", "fov.json", "*.yaml", "*calib*/*.yaml"):
+        for path in folder.glob(pattern):
+            with contextlib.suppress(ValueError, OSError):  # a file of something else
+                if role_of_words(words_of(path.stem)) != "depth" and read_any_camera(path) is not None:
+                    files[path.stem] = path
+    only = next(iter(files.values())) if len(files) == 1 else None
+    pairs = tuple(replace(pair, camera=files.get(pair.rgb.stem, only)) for pair in found.pairs)
+    words = {"poses"} if any(pair.camera for pair in pairs) else _CALIBRATIONS
+    used = {path.parent for pair in pairs for path in (pair.rgb, pair.depth)}
+    others = sorted(path for path in folder.iterdir() if path.suffix in _TEXTS and path not in used)
+    unread = [path.name for path in others if words & set(words_of(path.stem))]
+    notes = [Assumption(f"not read: {', '.join(unread)} (--camera, --poses)")] if unread else []
+    return replace(found, pairs=pairs, assumptions=(*found.assumptions, *notes))
 
 
 def _scene(folder: Path) -> PairingResult:
@@ -211,12 +241,12 @@ def _tum_geometry(pose: Matrix | None, _: tuple[int, int]) -> Geometry:
 def _timed(path: Path) -> dict[Path, float]:
     """Return the files in a list of TUM RGB-D, with their times in seconds."""
     times: dict[Path, float] = {}
-    for number, line in enumerate(read_limited(path, MOST_TABLE).decode("utf-8", "replace").splitlines(), 1):
+    for number, line in enumerate(read_text(path).splitlines(), 1):
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
-        time = numbers_in(words[:1])
-        if not time or len(words) < 2:
+        time = numbers_in(split_numbers(words[0]))
+        if len(time) != 1 or len(words) < 2:
             raise ValueError(f"{path}: line {number}: expected a time and a file name, got {line!r:.60}")
         times[path_within(path.parent, words[1], f"{path}: line {number}")] = time[0]
     return times
@@ -225,7 +255,7 @@ def _timed(path: Path) -> dict[Path, float]:
 def _role_folders(folder: Path) -> PairingResult:
     """Return the pairs of two subfolders whose names say that they hold photos and depth maps."""
     named: dict[str, list[Path]] = {"rgb": [], "depth": [], "other": []}
-    for path in sorted(folder.iterdir(), key=lambda path: (len(path.name), path.name)):
+    for path in sorted(folder.iterdir(), key=lambda path: (not is_registered(path.name), len(path.name), path.name)):
         role = role_of_words(words_of(path.name)) if path.is_dir() else None
         if role is not None and has_pictures(path):
             named[role].append(path)

@@ -34,10 +34,10 @@ from dsr.geometry.camera import Camera
 from dsr.io.frames import CaptureFrame, Geometry
 from dsr.io.pairs import Pair, PairingResult
 from dsr.io.scene_files import RGBD, Frame, one_camera, to_millimetres, write_colour, write_sixteen_bits
-from dsr.io.trajectories import check_pose, order_of, read_text
+from dsr.io.trajectories import check_pose, order_of
 from dsr.notes import Assumption
 from dsr.utils.files import replacing, write_text
-from dsr.utils.guards import numbers_in
+from dsr.utils.guards import numbers_in, read_text
 
 _APP = "Open3D"
 _TRAJECTORIES = ("scene/trajectory.log", "trajectory.log")

@@ -26,7 +26,8 @@ _OTHER_WORDS = frozenset(
     {"mask", "masks", "confidence", "conf", "ir", "infrared", "normal", "normals", "label", "labels"}
 )
 _CONFIDENCE_WORDS = frozenset({"confidence", "conf"})
-_FILLERS = frozenset({"raw", "aligned", "registered", "map", "to", "frame", "in"})
+_FILLERS = frozenset({"raw", "align", "aligned", "registered", "transformed", "warped", "map", "to", "frame", "in"})
+_REGISTERED = re.compile(r"\b(align|aligned|registered|transformed|warped|depths? (to|in|2) (rgb|colou?r|image))\b")
 _SECONDS_BY_DIGITS = {10: 1.0, 13: 1e-3, 16: 1e-6, 19: 1e-9}
 """Times since 1970 as whole seconds, milli-, micro- and nanoseconds."""
 _MAX_GAP = 0.02
@@ -68,6 +69,11 @@ def role_of_words(words: Iterable[str]) -> Role | None:
     return "rgb" if words & _RGB_WORDS else None
 
 
+def is_registered(name: str) -> bool:
+    """Return whether the name of a depth map, a folder or a topic says that its depth is registered to the photo."""
+    return _REGISTERED.search(" ".join(words_of(name))) is not None
+
+
 def key_of(path: Path) -> tuple[str, ...]:
     """Return the words of a name without those that say its role, which are equal for the two files of a pair."""
     words = words_of(path.stem)
@@ -100,8 +106,11 @@ def match_names(photos: Iterable[Path], depths: Iterable[Path]) -> list[tuple[Pa
 
     A pair has the same name but for words such as color and depth and for leading zeros; where a name is a time, the
     nearest within 20 ms that no other pair takes. A single photo and a single depth map are a pair whatever they are
-    called.
+    called. Of two depth maps of one name that which the name calls registered is taken.
     """
+    depths = list(depths)
+    registered = {key_of(path) for path in depths if is_registered(path.stem)}
+    depths = [path for path in depths if is_registered(path.stem) or key_of(path) not in registered]
     photos, depths = in_order(photos), in_order(depths)
     if len(photos) == len(depths) == 1:
         return [(photos[0], depths[0])]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from dsr.geometry.plausible import may_be_of
 from dsr.geometry.rigid_motion import Matrix, as_rigid, from_quaternion, is_rotation
 from dsr.io.pairs import Pair
 from dsr.notes import Assumption
-from dsr.utils.guards import naming, numbers_in, parse_json, read_limited, refusing
+from dsr.utils.guards import naming, numbers_in, parse_json, read_text, refusing, split_numbers
 
 _LARGEST_FILE = 256 << 20
 _MAX_GAP = 0.02
@@ -38,14 +38,16 @@ class Trajectory:
 
     Args:
         file: the file.
-        poses: camera to world, 4 x 4, metres, in order.
+        poses: camera to world, 4 x 4, metres, in order; None where tracking was lost: NaN, infinite or all 0.
         times: time of each in seconds, or its frame's number; None where the file has none.
+        ids: number of each frame, RTAB-Map's ninth column; None where the file has none.
 
     """
 
     file: Path
-    poses: tuple[Matrix, ...]
+    poses: tuple[Matrix | None, ...]
     times: tuple[float, ...] | None = None
+    ids: tuple[float, ...] | None = None
 
     def assign(self, pairs: Sequence[Pair]) -> Mapping[str, Matrix]:
         """Return the poses of frames by their names, without those of frames that have none.
@@ -64,9 +66,11 @@ class Trajectory:
             own = _known([pair.own_time for pair in pairs])
             numbers = _known([_number(pair) for pair in pairs])
             ways = [(own, _MAX_GAP), *(way for way in ((named, _MAX_GAP), (numbers, 0.0)) if np.isfinite(way[0]).all())]
-            found = max((self._nearest(pairs, *way) for way in ways), key=len)
-            if found:
-                return found
+            found = [self._nearest(pairs, *way) for way in ways]
+            if self.ids is not None:
+                found.append(replace(self, times=self.ids)._nearest(pairs, numbers, 0.0))
+            if best := max(found, key=len):
+                return best
             for known, where in ((own, "those of the frames"), (named, "in the names of the frames")):
                 if np.isfinite(known).all():
                     raise ValueError(
@@ -78,7 +82,7 @@ class Trajectory:
                 f"{self.file}: expected a pose for each of the {len(pairs)} frames, or their times, got "
                 f"{len(self.poses)} poses"
             )
-        return {pair.name: pose for pair, pose in zip(pairs, self.poses, strict=True)}
+        return {pair.name: pose for pair, pose in zip(pairs, self.poses, strict=True) if pose is not None}
 
     def _nearest(self, pairs: Sequence[Pair], wanted: np.ndarray, gap: float) -> Mapping[str, Matrix]:
         """Return the poses nearest in time by the names of the frames; of those that have one."""
@@ -106,7 +110,7 @@ def read_transform(path: Path) -> Matrix:
         ValueError: the file is missing or holds something else, or the transform is not rigid.
 
     """
-    text = _text(path)
+    text = read_text(path, _LARGEST_FILE)
     if path.suffix.lower() == ".json" or text.lstrip().startswith(("{", "[")):
         matrix = as_rigid(_matrix_of_json(path, text), str(path))
     else:
@@ -125,7 +129,7 @@ def read_transform(path: Path) -> Matrix:
 def read_poses(path: Path) -> Trajectory:
     """Read poses from camera to world, in metres.
 
-    The formats are that of TUM RGB-D (``timestamp tx ty tz qx qy qz qw`` in each line,
+    The formats are that of TUM RGB-D (``timestamp tx ty tz qx qy qz qw`` in each line, and RTAB-Map's ``id``,
     https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats); matrices of 12 or 16 numbers in each line, as
     KITTI's odometry has them; and matrices of four lines each, as in Redwood's and Open3D's ``.log``, whose lines of
     three whole numbers before each matrix number the poses. Lines that begin with ``#`` are comments.
@@ -137,28 +141,38 @@ def read_poses(path: Path) -> Trajectory:
             the pose.
 
     """
-    content = _numbers(path, _text(path))
+    content = _numbers(path, read_text(path, _LARGEST_FILE))
     rows = [row for row in content if len(row) != 3]
     lengths = {len(row) for row in rows}
-    if lengths == {8}:
-        poses = tuple(
-            from_quaternion(row[1:4], row[4:], f"{path}: pose {number}") for number, row in enumerate(rows, 1)
-        )
-        times = tuple(row[0] for row in rows)
-        if not all(map(math.isfinite, times)):
-            raise ValueError(f"{path}: expected finite times, got another")
-        order = order_of(times)
-        return Trajectory(path, tuple(poses[place] for place in order), tuple(times[place] for place in order))
+    timed = lengths in ({8}, {9})
     if lengths == {4} and len(rows) % 4 == 0:
         rows = np.reshape(rows, (-1, 16)).tolist()
-    elif lengths not in ({12}, {16}):
+    elif not timed and lengths not in ({12}, {16}):
         raise ValueError(
-            f"{path}: expected lines of 8 numbers (time, translation, quaternion), of 12 or 16 (a matrix), or four "
-            f"lines of 4 for each matrix, got lines of {', '.join(map(str, sorted(lengths))) or 'no'} numbers"
+            f"{path}: expected lines of 8 numbers (time, translation, quaternion) or 9 (and an id), of 12 or 16 (a "
+            f"matrix), or four lines of 4 for each matrix, got lines of {', '.join(map(str, sorted(lengths))) or 'no'} "
+            "numbers"
         )
-    poses = tuple(as_rigid(np.reshape(row, (-1, 4)), f"{path}: pose {number}") for number, row in enumerate(rows, 1))
-    numbers = [row[0] for row in content if len(row) == 3]
-    return Trajectory(path, tuple(poses[place] for place in order_of(numbers)) if len(numbers) == len(poses) else poses)
+    poses: list[Matrix | None] = []
+    for number, row in enumerate(rows, 1):
+        numbers, place = row[1:8] if timed else row[:12], f"{path}: pose {number}"
+        if not np.isfinite(numbers).all() or not any(numbers):
+            poses.append(None)
+        elif timed:
+            poses.append(from_quaternion(row[1:4], row[4:8], place))
+        else:
+            poses.append(as_rigid(np.reshape(row, (-1, 4)), place))
+    if not any(pose is not None for pose in poses):
+        raise ValueError(f"{path}: expected poses of finite numbers, got none")
+    times = [row[0] for row in rows] if timed else [row[0] for row in content if len(row) == 3]
+    if timed and not all(map(math.isfinite, times)):
+        raise ValueError(f"{path}: expected finite times, got another")
+    order = order_of(times) if len(times) == len(poses) else list(range(len(poses)))
+    poses = [poses[place] for place in order]
+    if not timed:
+        return Trajectory(path, tuple(poses))
+    ids = tuple(rows[place][8] for place in order) if lengths == {9} else None
+    return Trajectory(path, tuple(poses), tuple(times[place] for place in order), ids)
 
 
 def order_of(numbers: Sequence[float]) -> list[int]:
@@ -167,19 +181,12 @@ def order_of(numbers: Sequence[float]) -> list[int]:
     return sorted(places, key=numbers.__getitem__) if len(set(numbers)) == len(numbers) else list(places)
 
 
-def _text(path: Path) -> str:
-    """Return the text of a file of moderate size."""
-    if not path.is_file():
-        raise ValueError(f"{path}: expected a file, there is none")
-    return read_limited(path, _LARGEST_FILE).decode(errors="replace")
-
-
 def _numbers(path: Path, text: str) -> list[list[float]]:
     """Return the numbers in each line that has any."""
     rows = []
     for number, line in enumerate(text.splitlines(), 1):
-        words = re.split(r"[\s,;]+", line.partition("#")[0].strip())
-        if words == [""]:
+        words = split_numbers(line.partition("#")[0])
+        if not words:
             continue
         if not (values := numbers_in(words)):
             raise ValueError(f"{path}: line {number}: expected numbers, got {line!r:.60}")
@@ -304,15 +311,3 @@ def describe_capture(app: str, unit: str, pairs: Sequence[Pair], *, poses: bool)
     parts = ["intrinsics", *(["poses"] if poses else [])]
     parts += ["confidence"] if any(pair.confidence is not None for pair in pairs) else []
     return Assumption(f"{app}: depth in {unit}; from the capture: {', '.join(parts)}")
-
-
-def read_text(path: Path, limit: int = 1 << 26) -> str:
-    """Return the text of a file of a capture.
-
-    Raises:
-        ValueError: it is missing or larger than ``limit`` bytes.
-
-    """
-    if not path.is_file():
-        raise ValueError(f"{path}: expected a file of the capture, there is none")
-    return read_limited(path, limit).decode("utf-8-sig", errors="replace")

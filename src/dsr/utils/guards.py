@@ -44,6 +44,7 @@ _MOST_DIGITS = 300
 _LONGEST = 100
 """Characters of a name that a message shows."""
 _TURNS = re.compile("([0-9]+|/)")
+_WITH_COMMA = re.compile(r"[-+]?(\d+(,\d+)?(e[-+]?\d+)?|nan|inf)", re.ASCII | re.IGNORECASE)
 NaturalKey = tuple[tuple[str | tuple[int, str], ...], str]
 """Texts and numbers of a name in turns, numbers as their number of digits and the digits, ``/`` as -1; and the name."""
 
@@ -108,6 +109,18 @@ def read_limited(path: Path, most: int = MOST_TEXT) -> bytes:
     with opened(path) as file:
         expect_bytes(path, path.stat().st_size, most)
         return file.read(most)
+
+
+def read_text(path: Path, most: int = MOST_TABLE) -> str:
+    """Return the text of a user's file, see :func:`decode_text`; ValueError if there is none."""
+    if not path.is_file():
+        raise ValueError(f"{path}: expected a file, there is none")
+    return decode_text(read_limited(path, most))
+
+
+def decode_text(content: bytes) -> str:
+    """Return text in UTF-8 or UTF-16, as the byte order mark or the zeros in it show; the mark is left out."""
+    return content.decode(json.detect_encoding(content), "replace")
 
 
 @contextlib.contextmanager
@@ -208,6 +221,14 @@ def numbers_in(words: Iterable[str]) -> list[float]:
         return []
 
 
+def split_numbers(text: str) -> list[str]:
+    """Return the words between blanks, commas and semicolons; if no word has a point, a comma inside a word is one."""
+    words = text.replace(";", " ").split()
+    if all(_WITH_COMMA.fullmatch(word) for word in words):
+        return [word.replace(",", ".") for word in words]
+    return text.replace(";", " ").replace(",", " ").split()
+
+
 @contextlib.contextmanager
 def naming(place: object) -> Iterator[None]:
     """Begin the message of a ValueError that comes from within with the place that it is about, such as a file."""
@@ -297,6 +318,8 @@ def path_within(folder: Path, name: str, source: object, form: str = "{}") -> Pa
     if leads_outside(name):
         raise OutsideError(expected)
     path = folder / form.format(name)
+    if "\\" in name and not path.exists():  # of a list that Windows wrote
+        path = folder / form.format(name.replace("\\", "/"))
     real = Path(os.path.realpath(path))  # unlike resolve, it takes loops
     if not real.is_relative_to(os.path.realpath(folder)):
         raise OutsideError(f"{expected}, a link to {real}; name the folder that has the files themselves, or copy them")

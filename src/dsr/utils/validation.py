@@ -8,6 +8,8 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 
+from dsr.utils.guards import decode_text
+
 
 def _whole(value: Any) -> Any:
     """Return a whole float, such as 640.0, as int and anything else as it is."""
@@ -35,7 +37,7 @@ def parse_model(model: type[Content], content: str | bytes, place: object, expec
 
     """
     try:
-        return model.model_validate_json(content)
+        return model.model_validate_json(decode_text(content) if isinstance(content, bytes) else content)
     except ValidationError as error:
         raise ValueError(f"{place}: {expected}{describe(error, model.model_fields)}") from error
 

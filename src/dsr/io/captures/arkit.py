@@ -51,10 +51,9 @@ from dsr.io.trajectories import (
     describe_capture,
     fitting_camera,
     intrinsics_camera,
-    read_text,
 )
 from dsr.notes import Assumption
-from dsr.utils.guards import natural_key, numbers_in, read_limited
+from dsr.utils.guards import natural_key, numbers_in, read_limited, read_text
 from dsr.utils.validation import parse_model
 
 _ARKITSCENES = "ARKitScenes"

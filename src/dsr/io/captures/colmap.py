@@ -35,7 +35,7 @@ from dsr.io.frames import CaptureFrame, Geometry, Record, file_state
 from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult
 from dsr.io.trajectories import intrinsics_camera
 from dsr.notes import Assumption
-from dsr.utils.guards import leads_outside, naming, natural_key, numbers_in, read_limited
+from dsr.utils.guards import decode_text, leads_outside, naming, natural_key, numbers_in, read_limited
 from dsr.utils.versions import hash_once
 
 _APP = "COLMAP"
@@ -378,7 +378,7 @@ def _images_of_bytes(path: Path, content: bytes) -> list[_Image]:
 
 def _lines(content: bytes) -> Iterator[str]:
     """Yield the lines of a text without comments; empty ones count."""
-    for line in io.TextIOWrapper(io.BytesIO(content), "utf-8", "replace"):
+    for line in io.StringIO(decode_text(content), newline=None):
         if not line.startswith("#"):
             yield line.rstrip("\n")
 

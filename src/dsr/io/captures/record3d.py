@@ -26,7 +26,7 @@ from pydantic import BaseModel, Field, ValidationError
 
 from dsr.io.captures.archive import PHOTO_LIMIT, Archive, Member, decode_lzfse, decode_photo
 from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry
-from dsr.io.pairs import Pair, PairingResult, numbered_files
+from dsr.io.pairs import Pair, PairingResult, join, numbered_files
 from dsr.io.trajectories import describe_capture, intrinsics_camera, pose_from_quaternion
 from dsr.notes import Assumption
 from dsr.utils.guards import natural_key
@@ -67,9 +67,7 @@ def find_record3d(folder: Path) -> PairingResult | None:
         return _read_archive(Archive(folder), "") if folder.suffix.lower() == ".r3d" else None
     scans = [path for path in folder.iterdir() if path.suffix.lower() == ".r3d" and path.is_file()]
     if scans:
-        parts = [_read_archive(Archive(path), path.stem) for path in sorted(scans, key=natural_key)]
-        pairs = tuple(pair for part in parts for pair in part.pairs)
-        return PairingResult(pairs, parts[0].assumptions, tuple(path for part in parts for path in part.unpaired))
+        return join(_read_archive(Archive(path), path.stem) for path in sorted(scans, key=natural_key))
     if (folder / "rgbd").is_dir() and (folder / "metadata").is_file():
         return _read_archive(Archive(folder), "")
     if (folder / "metadata.json").is_file() and any((folder / "depth").glob("*.exr")):

@@ -4,28 +4,36 @@ The files in such a folder may be packed (``.zstd``). Messages of sensor_msgs: I
 http://docs.ros.org/en/api/sensor_msgs/html/index-msg.html; depth is in millimetres as whole numbers and in metres as
 floats, https://ros.org/reps/rep-0118.html.
 
-Of the topics of depth one named *aligned* or *registered* is taken before others, then one with more messages, then the
-first by name; of those of colour one named *color*, *colour* or *rgb*, then the same. The photo's camera is that of the
-topic ``camera_info`` beside it, for its window and binning and with its distortion; of photos of a topic of
-``image_rect`` its P, without. Photo and depth map are paired by the times in their headers, within 20 ms. Poses are
-not read.
+Depth that is registered to the photos, by the cameras, frame_id or else the topic's name, is taken before other depth,
+photos of a topic named *color*, *colour* or *rgb* before others; then topics with more messages, then the first one.
+Depth of another camera is warped to the photo by /tf_static, /tf or RealSense's ``extrinsics``. A camera is that of the
+topic ``camera_info`` beside the images, for its window and binning and with its distortion; of a topic of
+``image_rect`` its P, without. Photo and depth map are paired by the times in their headers, within 20 ms. Poses are not
+read.
 
 Recordings of RealSense's SDK are those of :mod:`dsr.io.captures.realsense`.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import itertools
+import re
 import struct
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from dsr.geometry.lens import Lens
+from dsr.geometry.rigid_motion import Matrix, as_rigid, from_quaternion, invert
 from dsr.io.captures import realsense
 from dsr.io.captures.bags import COMPRESSED, IMAGE, Message, NamedErrors, connections_of, first_message, open_recording
 from dsr.io.captures.ros_images import COLOURS, DEPTHS
-from dsr.io.frames import CaptureFrame, Geometry
-from dsr.io.pairs import Pair, PairingResult, join, match_times
+from dsr.io.frames import CaptureFrame, Geometry, Rig
+from dsr.io.pairs import Pair, PairingResult, is_registered, join, match_times
 from dsr.io.trajectories import intrinsics_camera
 from dsr.notes import Assumption
 from dsr.utils.guards import naming, natural_key
@@ -35,7 +43,12 @@ FILES = (".bag", ".mcap", ".db3")
 _FILES_2 = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
 """Those beside ``metadata.yaml``."""
 _UNITS = {"u": 1e-3, "f": 1.0}
-_PREFERRED = {"depth": ("aligned", "registered"), "rgb": ("color", "colour", "rgb")}
+_COLOUR_NAMES = ("color", "colour", "rgb")
+_ALIKE = 2e-3
+"""Difference of focal lengths and centres, over the picture's size, up to which two cameras are the same."""
+_MOST_TRANSFORMS = 10_000
+"""Largest number of messages that are searched for a transform."""
+_EXTRINSICS = re.compile(r"(.*/)extrinsics/(\w+)_to_(\w+)")
 
 _LENSES = {
     "plumb_bob": "brown_conrady",
@@ -69,43 +82,60 @@ def _read(path: Path, prefix: str = "") -> PairingResult:
         if realsense.is_recording(reader):
             return realsense.read(reader, path, prefix)
         topics = _topics(reader)
-        photo_topic, depth_topic = _choose(path, topics, "rgb"), _choose(path, topics, "depth")
-        photos, depths = _times(reader, path, photo_topic), _times(reader, path, depth_topic)
-        info = _camera_info(reader, photo_topic)
+        photo_topic, depth_topic = _choose(path, topics)
+        photos, depths = (_times(reader, path, each.name) for each in (photo_topic, depth_topic))
         kind = depths[0][0].read().dtype.kind
+        registered, same = _are_registered(photo_topic, depth_topic), _have_same_frame(photo_topic, depth_topic)
+        motion = np.eye(4) if same else None if registered else _transform(reader, photo_topic, depth_topic)
     named = {kind: {Path(f"{i:09}"): stamp for i, (_, stamp) in enumerate(each)} for kind, each in
              (("rgb", photos), ("depth", depths))}  # fmt: skip
     partner = match_times(named["rgb"], named["depth"])
     if not partner:
         raise ValueError(f"{path}: expected photos and depth maps within 20 ms of each other, found none")
-    described = repr(info).encode()
-    place = f"{path}{PurePosixPath(photo_topic).parent / 'camera_info'}"
+    described = repr(photo_topic.info if registered else (photo_topic, depth_topic, motion)).encode()
+    geometry = functools.partial(_camera, path, photo_topic)
+    if not registered:
+        geometry = functools.partial(_apart, path, photo_topic, depth_topic, motion)
+    places = Path(f"{path}{photo_topic.name}"), Path(f"{path}{depth_topic.name}")
     pairs = []
     for first, second in sorted(partner.items()):
         photo, depth = photos[int(first.name)][0], depths[int(second.name)][0]
-        geometry = functools.partial(_geometry, place, info)
-        frame = CaptureFrame("ROS", geometry, path, described, photo, depth, named["rgb"][first])
-        name = f"{prefix}{int(first.name):06}"
-        pairs.append(
-            Pair(name, Path(f"{path}{photo_topic}"), Path(f"{path}{depth_topic}"), unit=_UNITS[kind], capture=frame)
-        )
+        time = named["rgb"][first]
+        frame = CaptureFrame("ROS", geometry, path, described, photo, depth, time, apart=not registered)
+        pairs.append(Pair(f"{prefix}{int(first.name):06}", *places, unit=_UNITS[kind], capture=frame))
     unit = "millimetres" if kind == "u" else "metres"
-    notes = [Assumption(f"a recording of ROS: photos of {photo_topic}, depth in {unit} of {depth_topic}")]
-    others = sorted(topic for topic, kind in topics.items() if kind[0] and topic not in (photo_topic, depth_topic))
+    notes = [Assumption(f"a recording of ROS: photos of {photo_topic.name}, depth in {unit} of {depth_topic.name}")]
+    if registered and not same:
+        text = f"depth of the frame {depth_topic.frame!r} counts as registered to photos of {photo_topic.frame!r}"
+        notes.append(Assumption(text))
+    others = [each.name for each in topics if each.role and each not in (photo_topic, depth_topic)]
     if others:
         notes.append(Assumption(f"topics that are not read: {', '.join(others)}"))
-    lone = [Path(f"{path}{photo_topic}")] * (len(photos) - len(pairs))
-    lone += [Path(f"{path}{depth_topic}")] * (len(depths) - len(pairs))
+    lone = [places[0]] * (len(photos) - len(pairs)) + [places[1]] * (len(depths) - len(pairs))
     return PairingResult(tuple(pairs), tuple(notes), tuple(lone))
 
 
-def _topics(reader: Any) -> dict[str, tuple[str, int]]:
-    """Return, for each topic of images, its role (``rgb``, ``depth`` or empty) by its first message, and the count."""
-    topics: dict[str, tuple[str, int]] = {}
-    for topic in sorted({each.topic for each in reader.connections if each.msgtype in (IMAGE, COMPRESSED)}):
-        message = first_message(reader, topic)
+class _Topic(NamedTuple):
+    """Topic of images: role (``rgb``, ``depth`` or empty), encoding, frame, number of messages, its camera_info."""
+
+    name: str
+    role: str
+    encoding: str
+    frame: str
+    messages: int
+    info: _Info | None
+
+
+def _topics(reader: Any) -> list[_Topic]:
+    """Return the topics of images that have messages, by name."""
+    topics = []
+    for name in sorted({each.topic for each in reader.connections if each.msgtype in (IMAGE, COMPRESSED)}):
+        message = first_message(reader, name)
         if message is not None:
-            topics[topic] = _role(message), sum(each.msgcount for each in connections_of(reader, topic))
+            role, frame = _role(message), message.header.frame_id.strip("/")
+            count = sum(each.msgcount for each in connections_of(reader, name))
+            encoding = message.encoding if hasattr(message, "encoding") else message.format
+            topics.append(_Topic(name, role, encoding, frame, count, _camera_info(reader, name, role)))
     return topics
 
 
@@ -120,14 +150,24 @@ def _role(message: Any) -> str:
     return "" if encoding in ("mono8", "8uc1", "16uc1", "mono16") else "rgb"
 
 
-def _choose(path: Path, topics: dict[str, tuple[str, int]], role: str) -> str:
-    """Return the topic of a role, see the module's text."""
-    found = [topic for topic, (kind, _) in topics.items() if kind == role]
-    if not found:
-        what = "photos (sensor_msgs/Image of colour, or CompressedImage)" if role == "rgb" else \
-            "depth (sensor_msgs/Image of 16UC1 or 32FC1)"  # fmt: skip
-        raise ValueError(f"{path}: expected a topic of {what}, got {', '.join(sorted(topics)) or 'no images'}")
-    return min(found, key=lambda topic: (not any(word in topic for word in _PREFERRED[role]), -topics[topic][1], topic))
+def _choose(path: Path, topics: Sequence[_Topic]) -> tuple[_Topic, _Topic]:
+    """Return the topics of photos and depth, see the module's text."""
+    photos, depths = ([each for each in topics if each.role == role] for role in ("rgb", "depth"))
+    read = {f"photos ({', '.join(COLOURS)}, or CompressedImage)": photos, f"depth ({', '.join(DEPTHS)})": depths}
+    for what, found in read.items():
+        if not found:
+            got = ", ".join(f"{each.name} of {each.encoding:.40}" for each in topics) or "no images"
+            raise ValueError(f"{path}: expected a topic of {what}, got {got}")
+
+    def order(both: tuple[_Topic, _Topic]) -> tuple[Any, ...]:
+        photo, depth = both
+        return (
+            not _are_registered(photo, depth), photo.frame != depth.frame,
+            not any(word in photo.name for word in _COLOUR_NAMES), -photo.messages, photo.name,
+            not is_registered(depth.name), -depth.messages, depth.name,
+        )  # fmt: skip
+
+    return min(itertools.product(photos, depths), key=order)
 
 
 def _times(reader: Any, path: Path, topic: str) -> list[tuple[Message, float]]:
@@ -139,6 +179,53 @@ def _times(reader: Any, path: Path, topic: str) -> list[tuple[Message, float]]:
         stamp = seconds + 1e-9 * nanoseconds if seconds else 1e-9 * time
         found.append((Message(path, connection.topic, time, same), stamp))
     return found
+
+
+def _are_registered(photo: _Topic, depth: _Topic) -> bool:
+    """Return whether depth is in the photo's pixels: by the cameras of both, else by their frames, or depth's name."""
+    views = []
+    for topic in (photo, depth):
+        with contextlib.suppress(ValueError):  # which is reported where the camera is needed
+            if (camera := _camera(Path(), topic, (0, 0)).camera) is not None:
+                unit = camera.rescale(1, 1)
+                views.append((unit.fx, unit.fy, unit.cx, unit.cy))
+    if len(views) == 2:
+        return np.allclose(views[0], views[1], rtol=0, atol=_ALIKE)
+    return _have_same_frame(photo, depth) or not (photo.frame and depth.frame) or is_registered(depth.name)
+
+
+def _have_same_frame(photo: _Topic, depth: _Topic) -> bool:
+    """Return whether two topics are of one frame, which may be without its namespace in one of them."""
+    return photo.frame != "" and photo.frame.rpartition("/")[2] == depth.frame.rpartition("/")[2]
+
+
+def _transform(reader: Any, photo: _Topic, depth: _Topic) -> Matrix | None:
+    """Return the transform from the depth camera's frame to the photo camera's; None if the recording has none."""
+    motions: dict[tuple[str, str], Matrix] = {}  # from a frame to another one
+    tree = [each for each in reader.connections if each.topic.rpartition("/")[2] in ("tf", "tf_static")]
+    for connection, _, raw in itertools.islice(reader.messages(tree), _MOST_TRANSFORMS) if tree else ():
+        for each in reader.deserialize(raw, connection.msgtype).transforms:
+            ends = each.child_frame_id.strip("/"), each.header.frame_id.strip("/")
+            shift, turn = each.transform.translation, each.transform.rotation
+            with contextlib.suppress(ValueError):  # of a frame that may be on no way to the photo's
+                motions[ends] = from_quaternion((shift.x, shift.y, shift.z), (turn.x, turn.y, turn.z, turn.w), "tf")
+                motions[ends[::-1]] = invert(motions[ends])
+    reached = {depth.frame: np.eye(4)}
+    for frame in (queue := [depth.frame]):
+        for (start, end), motion in motions.items():
+            if start == frame and end not in reached:
+                reached[end] = motion @ reached[frame]
+                queue.append(end)
+    if photo.frame and photo.frame in reached:
+        return reached[photo.frame]
+    for each in reader.connections:
+        names = _EXTRINSICS.fullmatch(each.topic)
+        if names and all(topic.name.startswith(f"{names[1]}{stream}/") for topic, stream in
+                         ((depth, names[2]), (photo, names[3]))):  # fmt: skip
+            for _, _, raw in reader.messages([each]):
+                numbers = np.frombuffer(raw[-96:], "<f8")  # which end RealSense's message: the rotation by columns
+                return as_rigid(np.column_stack((numbers[:9].reshape(3, 3).T, numbers[9:])), each.topic)
+    return None
 
 
 class _Info(NamedTuple):
@@ -158,16 +245,16 @@ class _Info(NamedTuple):
     distortion: tuple[float, ...]
 
 
-def _camera_info(reader: Any, photo_topic: str) -> _Info | None:
-    """Return the content of the topic beside the photo's; None if there is none.
+def _camera_info(reader: Any, topic: str, role: str) -> _Info | None:
+    """Return the content of the topic beside that of images, for photos or above it; None if there is none.
 
-    Photos of a rectified topic have the camera that P states, and no distortion.
+    Images of a rectified topic have the camera that P states, and no distortion.
     """
-    for place in PurePosixPath(photo_topic).parents:
+    for place in PurePosixPath(topic.removesuffix("/compressedDepth").removesuffix("/compressed")).parents:
         info = first_message(reader, str(place / "camera_info"))
         if info is not None:
             k, d, p = (info.K, info.D, info.P) if hasattr(info, "K") else (info.k, info.d, info.p)
-            rectified = "image_rect" in photo_topic
+            rectified = "image_rect" in topic
             matrix = (p[0], p[5], p[2], p[6]) if rectified and p[0] else (k[0], k[4], k[2], k[5])
             roi = info.roi
             return _Info(
@@ -179,15 +266,33 @@ def _camera_info(reader: Any, photo_topic: str) -> _Info | None:
                 info.distortion_model,
                 () if rectified else tuple(map(float, d)),
             )
-        if len(place.parts) < 3:
+        if role == "depth" or len(place.parts) < 3:
             return None
     return None
 
 
-def _geometry(place: str, info: _Info | None, _: tuple[int, int]) -> Geometry:
-    """Return the camera of a recording."""
+def _apart(path: Path, photo: _Topic, depth: _Topic, motion: Matrix | None, size: tuple[int, int]) -> Geometry:
+    """Return the cameras of a recording whose depth is not in the photo's pixels."""
+    found = _camera(path, photo, size)
+    own = Geometry() if motion is None else _camera(path, depth, size)
+    if motion is None or own.camera is None:
+        missing = "transform between them (tf_static, extrinsics)" if motion is None else "camera_info of the depth"
+        text = (
+            f"{path}{depth.name}: expected depth that is registered to the photos, got depth of the frame "
+            f"{depth.frame!r} and photos of {photo.frame!r}, and the recording has no {missing}; --depth-camera and "
+            "--extrinsics give both"
+        )
+        return found._replace(apart=text)
+    rig = Rig(own.camera, motion, own.lens)
+    return found._replace(rig=rig, assumptions=(*found.assumptions, *own.assumptions))
+
+
+def _camera(path: Path, topic: _Topic, _: tuple[int, int]) -> Geometry:
+    """Return the camera and the lens of a topic."""
+    info, what = topic.info, "photo" if topic.role == "rgb" else "depth map"
+    place = f"{path}{PurePosixPath(topic.name).parent / 'camera_info'}"
     if info is None:
-        return Geometry(None, None, (Assumption("the recording has no camera_info beside the photo's topic"),))
+        return Geometry(None, None, (Assumption(f"the recording has no camera_info beside the {what}'s topic"),))
     if not info.numbers[0]:  # as sensor_msgs says
         return Geometry(None, None, (Assumption("the camera is not calibrated, by the recording's camera_info"),))
     if min(info.height, info.width) < 1:
@@ -206,5 +311,5 @@ def _geometry(place: str, info: _Info | None, _: tuple[int, int]) -> Geometry:
             return Geometry(camera, lens=Lens(_LENSES[info.model], info.distortion))
     if not any(info.distortion):
         return Geometry(camera)
-    text = f"the photo's lens distortion is not undone: its model {info.model!r:.40} is not known"
+    text = f"the {what}'s lens distortion is not undone: its model {info.model!r:.40} is not known"
     return Geometry(camera, None, (Assumption(text),))

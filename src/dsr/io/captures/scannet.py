@@ -44,7 +44,7 @@ from dsr.io.frames import CaptureFrame, Geometry
 from dsr.io.pairs import Pair, PairingResult, join, numbered_files
 from dsr.io.trajectories import USUAL_SIZE, describe_capture, fitting_camera, intrinsics_camera
 from dsr.notes import Assumption
-from dsr.utils.guards import natural_key, opened, read_limited, refusing
+from dsr.utils.guards import natural_key, opened, read_text, refusing
 from dsr.utils.validation import describe
 from dsr.utils.versions import how_to_install
 
@@ -73,7 +73,7 @@ def find_sens(place: Path) -> PairingResult | None:
     files = [path for path in files if path.is_file()]
     if not files:
         return None
-    return join(_read_sens(path, f"{path.stem}/" if len(files) > 1 else "") for path in files)
+    return join(_read_sens(path, f"{path.stem}/") for path in files)
 
 
 class _Sens(NamedTuple):
@@ -200,7 +200,7 @@ def find_scannetpp(folder: Path) -> PairingResult | None:
         return None
     with refusing(f"{path}: expected intrinsics and poses of frames as JSON, got something else", RecursionError):
         try:
-            entries = _ENTRIES.validate_json(read_limited(path, _LARGEST_JSON))
+            entries = _ENTRIES.validate_json(read_text(path, _LARGEST_JSON))
         except ValidationError as error:
             raise ValueError(f"{path}: expected ScanNet++'s intrinsics and poses; {describe(error)}") from error
     depths = depths or _sections(packed)

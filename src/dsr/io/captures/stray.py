@@ -33,10 +33,10 @@ import numpy as np
 from dsr.geometry.camera import Camera
 from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry, Record, file_state
 from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult, numbered_files
-from dsr.io.trajectories import USUAL_SIZE, describe_capture, fitting_camera, pose_from_quaternion, read_text
+from dsr.io.trajectories import USUAL_SIZE, describe_capture, fitting_camera, pose_from_quaternion
 from dsr.notes import Assumption
 from dsr.utils.decoding import quiet_decoders
-from dsr.utils.guards import expect_pixels, numbers_in
+from dsr.utils.guards import expect_pixels, numbers_in, read_text
 from dsr.utils.versions import hash_once
 
 _APP = "Stray Scanner"

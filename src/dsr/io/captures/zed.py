@@ -25,9 +25,9 @@ import numpy as np
 
 from dsr.io.frames import CaptureFrame, Geometry
 from dsr.io.pairs import Pair, PairingResult
-from dsr.io.trajectories import describe_capture, intrinsics_camera, read_text
+from dsr.io.trajectories import describe_capture, intrinsics_camera
 from dsr.notes import Assumption
-from dsr.utils.guards import numbers_in, refusing
+from dsr.utils.guards import numbers_in, read_text, refusing
 
 _APP = "ZED"
 _RESOLUTIONS = {
