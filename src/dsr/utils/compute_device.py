@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import os
+from collections.abc import Callable, Mapping
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
 
 from dsr.utils.configuration import ConfigError
 
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
 _FAST_ON_CPU = ("_is_avx512_bf16_supported", "_is_amx_tile_supported")
 """What a CPU has where convolutions in bfloat16 are faster, also with gradients (``benchmarks/train_speed.py``)."""
 
@@ -19,6 +25,27 @@ def fast_precision(device: torch.device) -> str:
         return "bfloat16" if torch.cuda.is_bf16_supported(including_emulation=False) else "float32"
     flags = (getattr(torch.cpu, name, lambda: False) for name in _FAST_ON_CPU)
     return "bfloat16" if device.type == "cpu" and any(flag() for flag in flags) else "float32"
+
+
+def widened(value: Any) -> Any:
+    """Return float16 and bfloat16 tensors, also those of a mapping, in float32; anything else as it is."""
+    if isinstance(value, Mapping):
+        return {name: widened(each) for name, each in value.items()}
+    return value.float() if isinstance(value, Tensor) and value.dtype in (torch.float16, torch.bfloat16) else value
+
+
+def in_own_precision(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Let a metric or a loss compute without ``torch.autocast``, and in float32 where its arguments have 16 bits."""
+
+    @functools.wraps(function)
+    def computed(*given: _P.args, **named: _P.kwargs) -> _R:
+        with contextlib.ExitStack() as stack:
+            for kind in ("cpu", "cuda", "mps", "xpu"):
+                if torch.is_autocast_enabled(kind):
+                    stack.enter_context(torch.autocast(kind, enabled=False))
+            return function(*map(widened, given), **widened(named))
+
+    return computed
 
 
 def known_true(flags: Tensor) -> bool:
