@@ -146,10 +146,22 @@ def _read(config: DictConfig, *, here: bool = True) -> tuple[dict[str, Any], Tra
     """Return the configuration, perhaps of the run to resume, its checked settings and the device to train on."""
     plain = _resumed(plain_config(config))
     settings = TrainConfig.of(plain)
+    _set_accumulation(settings)
     device = pick_device(settings.device) if here else torch.device("cpu")
     if settings.precision == "auto":
         plain["precision"] = settings.precision = fast_precision(device)
     return plain, settings, device
+
+
+def _set_accumulation(settings: TrainConfig) -> None:
+    """Take the batches of a step from Lightning's scheduler: a training is one epoch, so that they never change."""
+    for name, node in settings.callbacks.items():
+        if isinstance(node, Mapping) and str(node.get("_target_")).endswith(".GradientAccumulationScheduler"):
+            if settings.accumulate > 1:
+                raise ConfigError(f"callbacks.{name}: expected trainer.accumulate_grad_batches=1 beside it")
+            scheduler = build(f"callbacks.{name}", node)
+            settings.trainer["accumulate_grad_batches"] = scheduler.get_accumulate_grad_batches(0)
+            settings.callbacks = {other: each for other, each in settings.callbacks.items() if other != name}
 
 
 @dataclass(frozen=True)

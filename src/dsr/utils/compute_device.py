@@ -53,16 +53,21 @@ def known_true(flags: Tensor) -> bool:
     return flags.device.type == "cpu" and bool(flags.all())
 
 
-def pick_device(name: str) -> torch.device:
-    """Return the device of that name; ``auto`` is $DSR_DEVICE, else the first GPU where there is one, else the CPU."""
+def pick_device(name: str, fast_on: str = "any") -> torch.device:
+    """Return the device of that name; on a GPU, convolutions in float32 no longer use TF32.
+
+    ``auto`` is $DSR_DEVICE, else the first GPU where there is one and the method is ``fast_on`` any, else the CPU.
+    """
     given_by = "device"
     if name == "auto" and os.environ.get("DSR_DEVICE"):
         given_by, name = "$DSR_DEVICE", os.environ["DSR_DEVICE"]
     if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        name = "cuda" if fast_on == "any" and torch.cuda.is_available() else "cpu"
     try:
         device = torch.device(name)
         torch.zeros(1, device=device).item()
     except (RuntimeError, AssertionError) as error:  # torch asserts that it was built for CUDA
         raise ConfigError(f"{given_by}: expected auto, cpu or a device of this machine, got {name!r}") from error
+    if device.type == "cuda":
+        torch.backends.cudnn.allow_tf32 = False
     return device
