@@ -17,6 +17,7 @@ from zipfile import BadZipFile
 
 import lightning
 import torch
+from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import TensorBoardLogger
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
@@ -51,7 +52,7 @@ from dsr.utils.configuration import ConfigError, build, check
 from dsr.utils.console import USAGE_ERROR, ConsoleProgress, without_credentials
 from dsr.utils.files import replacing
 from dsr.utils.guards import expect_stored
-from dsr.utils.lightning import fit
+from dsr.utils.lightning import fit, naming_callbacks
 from dsr.utils.progress import SILENT, Progress, duration
 from dsr.utils.torch_files import read_torch_file
 
@@ -233,7 +234,9 @@ def _fit(plain: Config, settings: TrainConfig, prepared: _Prepared, processes: P
     idle = processes.count > 1 and has_idle_layers(module, data.example_batch())
     trainer = None
     try:
-        trainer, best = training_trainer(settings, folder, device, progress, processes, idle=idle)
+        scored: Any = module.metrics[0]
+        known = [f"val/{name}" for name in scored]
+        trainer, best, own = training_trainer(settings, folder, device, progress, processes, known=known, idle=idle)
         if first:
             _open_log(trainer, plain, module)
             _announce(progress, settings, prepared, processes.count)
@@ -245,14 +248,7 @@ def _fit(plain: Config, settings: TrainConfig, prepared: _Prepared, processes: P
     facts = _facts(plain, module, data.patches)
     if first:
         _describe(trainer, plain, facts, resumed=resume is not None)
-    try:
-        fit(trainer, module, data, resume)
-    except DivergenceError as error:
-        raise note_divergence(folder, folder / _LAST, identity, error) from error
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(
-            f"interrupted at step {trainer.global_step}; resume={folder} continues from there"
-        ) from None
+    _fit_steps(trainer, own, prepared, new=new)
     if trainer.fast_dev_run:  # type: ignore[attr-defined]
         return math.nan
     if first:
@@ -260,6 +256,26 @@ def _fit(plain: Config, settings: TrainConfig, prepared: _Prepared, processes: P
     progress.say(f"weights: {weights}")
     score = best.best_model_score if settings.keep == "best" else trainer.callback_metrics.get(MONITOR)
     return math.nan if score is None else float(score)
+
+
+def _fit_steps(
+    trainer: lightning.Trainer, callbacks: Mapping[str, Callback], prepared: _Prepared, *, new: bool
+) -> None:
+    """Train; an error of one of the configuration's callbacks names it."""
+    folder = prepared.folder
+    try:
+        with naming_callbacks(callbacks):
+            fit(trainer, prepared.module, prepared.data, prepared.resume)
+    except DivergenceError as error:
+        raise note_divergence(folder, folder / _LAST, prepared.identity, error) from error
+    except ConfigError:
+        if new and not trainer.global_step:
+            _discard(trainer, folder)
+        raise
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(
+            f"interrupted at step {trainer.global_step}; resume={folder} continues from there"
+        ) from None
 
 
 def _expect_trainable(folder: Path, plain: Config, identity: Identity, tolerated: Sequence[str]) -> None:
