@@ -31,6 +31,7 @@ from dsr.app.schema import Config, Identity, TrainConfig, given_keys, plain_conf
 from dsr.app.trainer import (
     MONITOR,
     has_idle_layers,
+    naming_callbacks,
     seconds_per_step,
     seconds_per_validation,
     seconds_to_prepare,
@@ -52,7 +53,7 @@ from dsr.utils.configuration import ConfigError, build, check
 from dsr.utils.console import USAGE_ERROR, ConsoleProgress, without_credentials
 from dsr.utils.files import replacing
 from dsr.utils.guards import expect_stored
-from dsr.utils.lightning import fit, naming_callbacks
+from dsr.utils.lightning import fit
 from dsr.utils.progress import SILENT, Progress, duration
 from dsr.utils.torch_files import read_torch_file
 

@@ -6,7 +6,6 @@ import contextlib
 import csv
 import logging
 import time
-import traceback
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -21,7 +20,6 @@ from lightning.pytorch.plugins.environments import ClusterEnvironment, Lightning
 from dsr.utils import interruption
 from dsr.utils.checkpoints import AtomicCheckpoints, CheckpointError, DivergenceError, Interruption, Resumed
 from dsr.utils.configuration import ConfigError
-from dsr.utils.console import one_line
 from dsr.utils.files import FullDiskError, replacing, space_for
 from dsr.utils.guards import MOST_TABLE, read_limited
 from dsr.utils.progress import Progress, Task
@@ -35,7 +33,7 @@ _SECONDS_BETWEEN_LOSSES = 0.2
 """Between two losses that are fetched from the device to be shown, each of which waits for it."""
 
 
-_OF_NEITHER = (OSError, FullDiskError, ConfigError, DivergenceError, MemoryError, torch.OutOfMemoryError)
+NOT_OF_A_CALLBACK = (OSError, FullDiskError, ConfigError, DivergenceError, MemoryError, torch.OutOfMemoryError)
 """Errors of a training that neither its checkpoint nor its callbacks have a part in."""
 _LOST = ("Connection closed", "Connection reset", "Broken pipe")
 """What gloo says when another process is gone."""
@@ -300,28 +298,13 @@ def fit(
             if any(each.requested for each in trainer.callbacks if isinstance(each, Interruption)):  # type: ignore[attr-defined]
                 raise KeyboardInterrupt from error  # the first process has saved the step
             raise LostProcessError(error) from error
-        if resume is None or not resumed.restoring or isinstance(error, _OF_NEITHER):
+        if resume is None or not resumed.restoring or isinstance(error, NOT_OF_A_CALLBACK):
             raise
         raise CheckpointError(resume, error) from error
     finally:
         interruption.reinstall()  # Lightning ignores SIGINT after an interruption
     if trainer.interrupted:
         raise KeyboardInterrupt
-
-
-@contextlib.contextmanager
-def naming_callbacks(callbacks: Mapping[str, Callback]) -> Iterator[None]:
-    """Turn an error that one of Lightning's or dsr's callbacks raises into a ConfigError that names it."""
-    try:
-        yield
-    except _OF_NEITHER:
-        raise
-    except Exception as error:
-        subjects = {id(frame.f_locals.get("self")) for frame, _ in traceback.walk_tb(error.__traceback__)}
-        for name, each in callbacks.items():
-            if id(each) in subjects and type(each).__module__.startswith(("lightning.", "dsr.")):
-                raise ConfigError(f"callbacks.{name}: {one_line(error)}") from error
-        raise
 
 
 def _follows_interruption(error: BaseException | None) -> bool:
