@@ -143,6 +143,7 @@ def _prepare(plain: Config, node: Any, source: SceneSource | None, *, here: bool
         seed=settings.seed,
         downsampling=downsampling.assumed_model(),
         known=_known_of_maps(settings, downsampling, source),
+        alignment=settings.metrics.alignment,
         metrics=functools.partial(metric_collection, settings.metrics),
         workspace=folder,
         display=progress,

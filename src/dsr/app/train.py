@@ -9,6 +9,7 @@ import math
 import os
 import shutil
 import sys
+import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,7 +32,6 @@ from dsr.app.schema import Config, Identity, TrainConfig, given_keys, plain_conf
 from dsr.app.trainer import (
     MONITOR,
     has_idle_layers,
-    naming_callbacks,
     seconds_per_step,
     seconds_per_validation,
     seconds_to_prepare,
@@ -50,10 +50,10 @@ from dsr.utils import interruption
 from dsr.utils.checkpoints import CheckpointError, DivergenceError
 from dsr.utils.compute_device import fast_precision, pick_device
 from dsr.utils.configuration import ConfigError, build, check
-from dsr.utils.console import USAGE_ERROR, ConsoleProgress, without_credentials
+from dsr.utils.console import USAGE_ERROR, ConsoleProgress, one_line, without_credentials
 from dsr.utils.files import replacing
 from dsr.utils.guards import expect_stored
-from dsr.utils.lightning import fit
+from dsr.utils.lightning import NOT_OF_A_CALLBACK, fit
 from dsr.utils.progress import SILENT, Progress, duration
 from dsr.utils.torch_files import read_torch_file
 
@@ -262,21 +262,25 @@ def _fit(plain: Config, settings: TrainConfig, prepared: _Prepared, processes: P
 def _fit_steps(
     trainer: lightning.Trainer, callbacks: Mapping[str, Callback], prepared: _Prepared, *, new: bool
 ) -> None:
-    """Train; an error of one of the configuration's callbacks names it."""
+    """Train; an error that one of Lightning's or dsr's callbacks raises is of the configuration."""
     folder = prepared.folder
     try:
-        with naming_callbacks(callbacks):
-            fit(trainer, prepared.module, prepared.data, prepared.resume)
+        fit(trainer, prepared.module, prepared.data, prepared.resume)
     except DivergenceError as error:
         raise note_divergence(folder, folder / _LAST, prepared.identity, error) from error
-    except ConfigError:
-        if new and not trainer.global_step:
-            _discard(trainer, folder)
-        raise
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
             f"interrupted at step {trainer.global_step}; resume={folder} continues from there"
         ) from None
+    except Exception as error:
+        subjects = {id(frame.f_locals.get("self")) for frame, _ in traceback.walk_tb(error.__traceback__)}
+        theirs = [name for name, each in callbacks.items() if type(each).__module__.startswith(("lightning.", "dsr."))]
+        name = next((name for name in theirs if id(callbacks[name]) in subjects), None)
+        if name is None or isinstance(error, NOT_OF_A_CALLBACK):
+            raise
+        if new and not trainer.global_step:
+            _discard(trainer, folder)
+        raise ConfigError(f"callbacks.{name}: {one_line(error)}") from error
 
 
 def _expect_trainable(folder: Path, plain: Config, identity: Identity, tolerated: Sequence[str]) -> None:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import time
-import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import lightning
@@ -22,15 +20,7 @@ from dsr.training.degradation import Batch
 from dsr.training.module import SuperResolution
 from dsr.utils.checkpoints import Interruption, OwnFiles
 from dsr.utils.configuration import ConfigError, build
-from dsr.utils.console import one_line
-from dsr.utils.lightning import (
-    NOT_OF_A_CALLBACK,
-    ListedScores,
-    StepProgress,
-    ValidationTable,
-    make_trainer,
-    without_chatter,
-)
+from dsr.utils.lightning import ListedScores, StepProgress, ValidationTable, make_trainer, without_chatter
 from dsr.utils.progress import SILENT, Progress
 from dsr.utils.spelling import did_you_mean
 
@@ -144,21 +134,6 @@ def training_trainer(
         make=lambda **given: build("trainer", node, {key: value for key, value in given.items() if key not in node}),
     )
     return trainer, best, own
-
-
-@contextlib.contextmanager
-def naming_callbacks(callbacks: Mapping[str, Callback]) -> Iterator[None]:
-    """Turn an error that one of Lightning's or dsr's callbacks raises into a ConfigError that names it."""
-    try:
-        yield
-    except NOT_OF_A_CALLBACK:
-        raise
-    except Exception as error:
-        subjects = {id(frame.f_locals.get("self")) for frame, _ in traceback.walk_tb(error.__traceback__)}
-        for name, each in callbacks.items():
-            if id(each) in subjects and type(each).__module__.startswith(("lightning.", "dsr.")):
-                raise ConfigError(f"callbacks.{name}: {one_line(error)}") from error
-        raise
 
 
 def seconds_per_step(module: SuperResolution, batch: Batch, precision: str = "float32") -> float:
