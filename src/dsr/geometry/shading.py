@@ -11,7 +11,6 @@ from torch.nn import functional
 
 from dsr.geometry.lights import LIGHT_NAMES, LIGHTS, VIEWING_LIGHT
 from dsr.geometry.surface import depth_to_normals
-from dsr.utils.compute_device import in_own_precision
 
 _SHORTEST, _LONGEST = 128, 256
 """The longer side of a panel is at least and at most so long, pixels."""
@@ -35,7 +34,6 @@ def lights(*, dtype: torch.dtype = torch.float64, device: torch.device | str = "
     return torch.tensor([light.direction for light in LIGHTS.values()], dtype=dtype, device=device)
 
 
-@in_own_precision
 def shade(normals: Tensor, directions: Tensor) -> Tensor:
     """Return the unclipped Lambertian shading e . n.
 

@@ -28,7 +28,7 @@ from dsr.geometry.camera import Camera
 from dsr.geometry.shading import lights, shade
 from dsr.geometry.surface import angle_between, depth_to_normals, length, normal_mask
 from dsr.sample import CENTIMETRES, Unit
-from dsr.utils.compute_device import known_true, widened
+from dsr.utils.compute_device import in_own_precision, known_true, widened
 
 _Derived = TypeVar("_Derived")
 SSIM_WINDOW = 7
@@ -182,7 +182,7 @@ class SurfacePair:
     def shadings(self) -> tuple[Tensor, Tensor]:
         """The two maps of e . n for the four lights, (B, 4, H, W), unclipped; 0 where invalid."""
         directions = lights(dtype=self.image_dtype, device=self.target.device)
-        first, second = (shade(normals, directions) for normals in self.normals)
+        first, second = (in_own_precision(shade)(normals, directions) for normals in self.normals)
         return self._blank(first), self._blank(second)
 
     @cached_property
