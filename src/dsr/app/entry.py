@@ -194,6 +194,7 @@ def _expect_choices(name: str, arguments: Sequence[str], directories: Sequence[P
         group, at, _ = key.lstrip("+").partition("@")
         if _LIST.search(choice) and group in {*groups, "hydra/launcher", "hydra/sweeper"} - {*SEVERAL}:
             each = f"; -m {key}=A,B runs each of several" if group in groups else ""
+            each += f", metrics.protocols={choice} computes all of them" if group == "metrics" else ""
             fail(f"{argument}: expected one choice, got a list{each}")
         if equals and not at and not elsewhere and group in groups and key != "experiment":
             _expect_choice(argument, group, choice, directories)

@@ -120,10 +120,10 @@ class _Prepared:
 def _prepare(plain: Config, node: Any, source: SceneSource | None, *, here: bool = True) -> _Prepared:
     """Check and build all that an evaluation needs, and write nothing."""
     settings = EvalConfig.of(plain)
-    device = pick_device(settings.device) if here else torch.device("cpu")
     source = source or _source(settings)
     name, scale = settings.names["method"], _scale(settings, source)
     recipe = Recipe(name, OmegaConf.create(node), user_directories(), plain)
+    device = pick_device(settings.device, recipe.abilities.fast_on) if here else torch.device("cpu")
     own = {key: value for key, value in plain["method"].items() if key not in recipe.of_run}
     plain = {**plain, "method": own, "precision": _precision(settings, recipe, device), "scale": scale}
     settings = EvalConfig.of(plain)
@@ -143,6 +143,7 @@ def _prepare(plain: Config, node: Any, source: SceneSource | None, *, here: bool
         seed=settings.seed,
         downsampling=downsampling.assumed_model(),
         known=_known_of_maps(settings, downsampling, source),
+        alignment=settings.metrics.alignment,
         metrics=functools.partial(metric_collection, settings.metrics),
         workspace=folder,
         display=progress,

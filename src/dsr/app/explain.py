@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from collections.abc import Iterator, Sequence
 from difflib import get_close_matches
@@ -13,15 +14,23 @@ from omegaconf import DictConfig, OmegaConf
 
 from dsr.app.composition import compose
 from dsr.app.multirun import LAUNCHERS
-from dsr.app.schema import MOVED, NAMED, SEVERAL
-from dsr.utils.configuration import list_choices, list_groups
+from dsr.app.schema import MOVED, NAMED, SET_BY_DSR, SEVERAL
+from dsr.utils.configuration import ConfigError, list_choices, list_groups, load_target
 from dsr.utils.console import one_line
 from dsr.utils.spelling import did_you_mean
 
-_ALIASES = {"learning_rate": "lr", "batch_size": "batch", "steps": "max_steps"}
+_ALIASES = {
+    "learning_rate": ("lr",), "batch_size": ("batch",), "steps": ("max_steps",),
+    "ckpt_path": ("resume", "run"), "resume_from_checkpoint": ("resume", "run"), "checkpoint": ("resume", "run"),
+}  # fmt: skip
 """Names that others have for keys."""
 _ALIKE = 0.8
 """How alike a mistyped key is to the one that is meant, of 1."""
+_PLUGINS = {
+    "hydra/sweeper": {"optuna": "optuna", "ax": "ax", "nevergrad": "nevergrad"},
+    "hydra/launcher": {"ray": "ray", "ray_aws": "ray", "rq": "rq"},
+}
+"""Choices of Hydra that come with a package of their own, by the middle of its name."""
 _OTHERS = {"eval": "train", "train": "eval"}
 """The other command of each."""
 
@@ -64,6 +73,7 @@ def explain(error: Exception, name: str, arguments: Sequence[str], directories: 
         key, values = several.groups()
         texts = [f"{key}: got several values; -m runs each of them"]
         single = key in list_groups(directories)
+        texts += [f"metrics.protocols=[{values}] computes all of them"] if key == "metrics" else []
         texts += [] if single and key not in SEVERAL else [f"{key}=[{values}] is a list"]
         texts += [] if single else [f"'{key}=\"{values}\"' a text"]
         return ", ".join(texts)
@@ -130,12 +140,30 @@ def _explain_key(key: str, name: str, arguments: Sequence[str], directories: Seq
     config = _composed_for(key, name, arguments, directories)
     prefix, node = _innermost(config, key)
     children = [str(child) for child in node if child not in ("_target_", "_partial_", "names")]
+    last = key.removeprefix(prefix)
     alike = [f"{prefix}{each}={value}" for each in get_close_matches(key.rpartition(".")[2], children, 1, _ALIKE)]
     meant = _meant(key, value, name, config, directories)
     wanted = alike or meant if prefix else meant or alike  # a key of a group is one of this group first
     beside = [f"{prefix}{child}" for child in children]
-    near = did_you_mean(key, beside if prefix else {*beside, *list_groups(directories)})
+    more = _arguments(prefix, node, last)
+    if last in more and not alike and not (meant and last in config):
+        return f"{key}: unknown key; expected +{key}={value}, as it adds an argument of {node['_target_']}"
+    if prefix:
+        known = {**{each: f"+{prefix}{each}" for each in more}, **dict(zip(children, beside, strict=True))}
+        near = re.sub(r"mean (.*)\?", lambda found: f"mean {known[found[1]]}?", did_you_mean(last, known))
+    else:
+        near = did_you_mean(key, {*beside, *list_groups(directories)})
     return f"{key}: unknown key; expected {' or '.join(wanted) or (', '.join(beside) or 'none') + near}"
+
+
+def _arguments(prefix: str, node: DictConfig, wanted: str) -> list[str]:
+    """Return the names of the arguments that the target of a node takes, the wanted one of a target that takes any."""
+    try:
+        taken = inspect.signature(load_target(prefix, dict(node))).parameters
+    except (ConfigError, ValueError):  # without a target, or of one without a signature
+        return []
+    names = [wanted if each.kind is each.VAR_KEYWORD else name for name, each in taken.items()]
+    return [name for name in names if prefix != "trainer." or name not in SET_BY_DSR]
 
 
 def _meant(key: str, value: str, name: str, config: DictConfig, directories: Sequence[Path]) -> list[str]:
@@ -148,7 +176,7 @@ def _meant(key: str, value: str, name: str, config: DictConfig, directories: Seq
     last = key.rpartition(".")[2]
     known = list(_places(OmegaConf.to_container(config)))
     ends = {place.rpartition(".")[2] for place in known}
-    last = _ALIASES[last] if _ALIASES.get(last) in ends else last
+    last = next((each for each in _ALIASES.get(last, ()) if each in ends), last)
     places = [place for place in known if place.rpartition(".")[2] == last]
     if places:
         return [f"{place}={value}" for place in places]
@@ -189,8 +217,11 @@ def _explain_missing(file: str, name: str, directories: Sequence[Path]) -> str:
     if not group:
         return f"--config-name {choice}: unknown; expected {name}"
     choices = list_choices(group, directories)
-    if group == "hydra/launcher":
-        choices = sorted({*choices, *LAUNCHERS})
+    if group in _PLUGINS:
+        if choice in _PLUGINS[group]:
+            package = f"hydra-{_PLUGINS[group][choice]}-{group.removeprefix('hydra/')}"
+            return f"{group}={choice}: expected a plugin that is installed; pip install {package}"
+        choices = sorted({*choices, *(LAUNCHERS if group == "hydra/launcher" else ()), "basic", *_PLUGINS[group]})
         return f"{group}={choice}: unknown; expected one of {', '.join(choices)}{did_you_mean(choice, choices)}"
     if choices:
         return explain_choice(group, choice, directories)

@@ -56,7 +56,7 @@ MOVED = {
     "model.visual": "model.objective.w",
 }  # fmt: skip
 """Keys by other names: what Lightning and torch have names for, and arguments of the trainer that have their own."""
-_SET_BY_DSR = ("plugins", "use_distributed_sampler", "num_nodes", "default_root_dir", "enable_checkpointing",
+SET_BY_DSR = ("plugins", "use_distributed_sampler", "num_nodes", "default_root_dir", "enable_checkpointing",
                "barebones", "inference_mode", "max_epochs", "min_epochs", "max_time")  # fmt: skip
 """Arguments of the trainer that dsr's trainings have values of their own for."""
 _GROUPS = (
@@ -299,7 +299,7 @@ class TrainConfig(RunConfig):
             if key in MOVED:
                 raise ConfigError(f"{key}: unknown key; expected {MOVED[key]}")
         for key in self.trainer:
-            if key in _SET_BY_DSR:
+            if key in SET_BY_DSR:
                 raise ConfigError(f"trainer.{key}: unknown key; dsr sets it itself, a training has trainer.max_steps")
         if isinstance(self.trainer.get("profiler"), str):
             raise ConfigError(

@@ -9,6 +9,7 @@ import math
 import os
 import shutil
 import sys
+import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from zipfile import BadZipFile
 
 import lightning
 import torch
+from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import TensorBoardLogger
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
@@ -48,10 +50,10 @@ from dsr.utils import interruption
 from dsr.utils.checkpoints import CheckpointError, DivergenceError
 from dsr.utils.compute_device import fast_precision, pick_device
 from dsr.utils.configuration import ConfigError, build, check
-from dsr.utils.console import USAGE_ERROR, ConsoleProgress, without_credentials
+from dsr.utils.console import USAGE_ERROR, ConsoleProgress, one_line, without_credentials
 from dsr.utils.files import replacing
 from dsr.utils.guards import expect_stored
-from dsr.utils.lightning import fit
+from dsr.utils.lightning import NOT_OF_A_CALLBACK, fit
 from dsr.utils.progress import SILENT, Progress, duration
 from dsr.utils.torch_files import read_torch_file
 
@@ -146,10 +148,22 @@ def _read(config: DictConfig, *, here: bool = True) -> tuple[dict[str, Any], Tra
     """Return the configuration, perhaps of the run to resume, its checked settings and the device to train on."""
     plain = _resumed(plain_config(config))
     settings = TrainConfig.of(plain)
+    _set_accumulation(settings)
     device = pick_device(settings.device) if here else torch.device("cpu")
     if settings.precision == "auto":
         plain["precision"] = settings.precision = fast_precision(device)
     return plain, settings, device
+
+
+def _set_accumulation(settings: TrainConfig) -> None:
+    """Take the batches of a step from Lightning's scheduler: a training is one epoch, so that they never change."""
+    for name, node in settings.callbacks.items():
+        if isinstance(node, Mapping) and str(node.get("_target_")).endswith(".GradientAccumulationScheduler"):
+            if settings.accumulate > 1:
+                raise ConfigError(f"callbacks.{name}: expected trainer.accumulate_grad_batches=1 beside it")
+            scheduler = build(f"callbacks.{name}", node)
+            settings.trainer["accumulate_grad_batches"] = scheduler.get_accumulate_grad_batches(0)
+            settings.callbacks = {other: each for other, each in settings.callbacks.items() if other != name}
 
 
 @dataclass(frozen=True)
@@ -221,7 +235,9 @@ def _fit(plain: Config, settings: TrainConfig, prepared: _Prepared, processes: P
     idle = processes.count > 1 and has_idle_layers(module, data.example_batch())
     trainer = None
     try:
-        trainer, best = training_trainer(settings, folder, device, progress, processes, idle=idle)
+        scored: Any = module.metrics[0]
+        known = [f"val/{name}" for name in scored]
+        trainer, best, own = training_trainer(settings, folder, device, progress, processes, known=known, idle=idle)
         if first:
             _open_log(trainer, plain, module)
             _announce(progress, settings, prepared, processes.count)
@@ -233,14 +249,7 @@ def _fit(plain: Config, settings: TrainConfig, prepared: _Prepared, processes: P
     facts = _facts(plain, module, data.patches)
     if first:
         _describe(trainer, plain, facts, resumed=resume is not None)
-    try:
-        fit(trainer, module, data, resume)
-    except DivergenceError as error:
-        raise note_divergence(folder, folder / _LAST, identity, error) from error
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(
-            f"interrupted at step {trainer.global_step}; resume={folder} continues from there"
-        ) from None
+    _fit_steps(trainer, own, prepared, new=new)
     if trainer.fast_dev_run:  # type: ignore[attr-defined]
         return math.nan
     if first:
@@ -248,6 +257,30 @@ def _fit(plain: Config, settings: TrainConfig, prepared: _Prepared, processes: P
     progress.say(f"weights: {weights}")
     score = best.best_model_score if settings.keep == "best" else trainer.callback_metrics.get(MONITOR)
     return math.nan if score is None else float(score)
+
+
+def _fit_steps(
+    trainer: lightning.Trainer, callbacks: Mapping[str, Callback], prepared: _Prepared, *, new: bool
+) -> None:
+    """Train; an error that one of Lightning's or dsr's callbacks raises is of the configuration."""
+    folder = prepared.folder
+    try:
+        fit(trainer, prepared.module, prepared.data, prepared.resume)
+    except DivergenceError as error:
+        raise note_divergence(folder, folder / _LAST, prepared.identity, error) from error
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(
+            f"interrupted at step {trainer.global_step}; resume={folder} continues from there"
+        ) from None
+    except Exception as error:
+        subjects = {id(frame.f_locals.get("self")) for frame, _ in traceback.walk_tb(error.__traceback__)}
+        theirs = [name for name, each in callbacks.items() if type(each).__module__.startswith(("lightning.", "dsr."))]
+        name = next((name for name in theirs if id(callbacks[name]) in subjects), None)
+        if name is None or isinstance(error, NOT_OF_A_CALLBACK):
+            raise
+        if new and not trainer.global_step:
+            _discard(trainer, folder)
+        raise ConfigError(f"callbacks.{name}: {one_line(error)}") from error
 
 
 def _expect_trainable(folder: Path, plain: Config, identity: Identity, tolerated: Sequence[str]) -> None:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import lightning
 import torch
-from lightning.pytorch.callbacks import Callback, ModelCheckpoint
+from lightning.pytorch.callbacks import Callback, DeviceStatsMonitor, LearningRateMonitor, ModelCheckpoint, ProgressBar
 from lightning.pytorch.utilities.seed import isolate_rng
 
 from dsr.app.devices import Processes
@@ -19,9 +19,10 @@ from dsr.training.data_module import PatchData
 from dsr.training.degradation import Batch
 from dsr.training.module import SuperResolution
 from dsr.utils.checkpoints import Interruption, OwnFiles
-from dsr.utils.configuration import build
+from dsr.utils.configuration import ConfigError, build
 from dsr.utils.lightning import ListedScores, StepProgress, ValidationTable, make_trainer, without_chatter
 from dsr.utils.progress import SILENT, Progress
+from dsr.utils.spelling import did_you_mean
 
 MONITOR = "val/RMSE_v"
 VALIDATION = "validation.csv"
@@ -65,9 +66,10 @@ def training_trainer(
     progress: Progress,
     processes: Processes,
     *,
+    known: Sequence[str] = (),
     idle: bool = False,
-) -> tuple[lightning.Trainer, ModelCheckpoint]:
-    """Return the trainer, and the callback that keeps the best checkpoint.
+) -> tuple[lightning.Trainer, ModelCheckpoint, Mapping[str, Callback]]:
+    """Return the trainer, the callback that keeps the best checkpoint, and those of the configuration by name.
 
     Args:
         config: of the training.
@@ -75,11 +77,12 @@ def training_trainer(
         device: to train on.
         progress: shows the steps.
         processes: of the training.
+        known: names of the metrics of a validation, ``val/NAME``.
         idle: whether some layers have no part in some steps, see :func:`has_idle_layers`; several devices have to
             know.
 
     Raises:
-        ConfigError: the log cannot be written, such as without an optional package.
+        ConfigError: the log cannot be written, such as without an optional package, or a callback is set wrongly.
 
     """
     checkpoints = folder / "checkpoints"
@@ -89,9 +92,21 @@ def training_trainer(
     latest = ModelCheckpoint(
         checkpoints, "last", enable_version_counter=False, save_on_train_epoch_end=False
     )  # save_last=True keeps the best's
+    own = {name: build(f"callbacks.{name}", node) for name, node in config.callbacks.items()}
+    for name, each in own.items():
+        monitor = str(getattr(each, "monitor", None))
+        if monitor.startswith("val/") and monitor not in known:
+            near = did_you_mean(monitor, known)
+            raise ConfigError(f"callbacks.{name}.monitor: expected one of {', '.join(known)}, got {monitor}{near}")
+        if isinstance(each, LearningRateMonitor | DeviceStatsMonitor) and not config.logger:
+            raise ConfigError(f"callbacks.{name}: expected a logger to write to, such as logger=csv, got none")
+        if isinstance(each, ProgressBar):
+            raise ConfigError(f"callbacks.{name}: expected none that shows progress, dsr does it itself; leave it out")
+        if isinstance(each, ModelCheckpoint) and each.state_key in (best.state_key, latest.state_key):
+            each.__class__ = type(type(each).__name__, (type(each),), {"state_key": f"callbacks.{name}"})
     callbacks = [
         OwnFiles(checkpoints, progress.say),
-        *(build(f"callbacks.{name}", node) for name, node in config.callbacks.items()),
+        *own.values(),
         ValidationTable(folder / VALIDATION),
         ListedScores(best),
         best,
@@ -118,7 +133,7 @@ def training_trainer(
         default_root_dir=folder,
         make=lambda **given: build("trainer", node, {key: value for key, value in given.items() if key not in node}),
     )
-    return trainer, best
+    return trainer, best, own
 
 
 def seconds_per_step(module: SuperResolution, batch: Batch, precision: str = "float32") -> float:

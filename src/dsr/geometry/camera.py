@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib
 import math
-from dataclasses import dataclass, replace
+from dataclasses import FrozenInstanceError, dataclass, replace
 from numbers import Real
 from pathlib import Path
 from typing import Any, Self
@@ -16,6 +16,7 @@ from typing import Any, Self
 import numpy as np
 import torch
 from torch import Tensor
+from torch.utils.data._utils.collate import default_collate_fn_map
 
 from dsr.geometry.range_type import RANGE_TYPES, RangeType
 
@@ -25,7 +26,7 @@ ASSUMED_FOV = 60.0
 """Horizontal field of view in degrees, about that of a phone's main camera and of a depth camera's colour sensor."""
 
 
-@dataclass(frozen=True)
+@dataclass(unsafe_hash=True)
 class Camera:
     """A pinhole camera, optionally the left one of a rectified stereo pair.
 
@@ -78,6 +79,11 @@ class Camera:
         for name, value in vars(self).items():
             if value is not None and not isinstance(value, int | float):
                 object.__setattr__(self, name, int(value) if name in ("width", "height") else float(value))
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Refuse another value; Lightning and torchmetrics copy a batch by setting each field of a copy again."""
+        if name not in self.__dataclass_fields__ or vars(self).setdefault(name, value) is not value:
+            raise FrozenInstanceError(f"cannot assign to field {name!r}")
 
     @classmethod
     def centred(cls, width: int, height: int, focal: float) -> Self:
@@ -243,6 +249,7 @@ class Camera:
         return self.rays(dtype=dtype, device=device).square().sum(dim=0).sqrt()
 
 
+default_collate_fn_map[Camera] = lambda batch, **_: list(batch)  # of a DataLoader, for metrics
 _SKEW = 0.01
 """Largest skew of a matrix of intrinsics, as a share of fx, that is taken for rounding."""
 

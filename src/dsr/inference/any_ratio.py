@@ -361,7 +361,7 @@ def upsampler(
 
     """
     recipe = read_recipe(method, settings, directories)
-    return AnyRatio(recipe, pick_device(device), scale, fill, max_hole, working_size)
+    return AnyRatio(recipe, pick_device(device, recipe.abilities.fast_on), scale, fill, max_hole, working_size)
 
 
 def upsample_surface(

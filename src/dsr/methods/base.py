@@ -68,6 +68,7 @@ class Abilities:
         optimises: whether it optimises a network for each picture.
         tolerant: whether convolutions in bfloat16 change its scores in the fourth digit only.
         assumes_downsampling: whether it takes the model of the downsampling, as its argument ``downsampling``.
+        fast_on: where ``device=auto`` runs it; ``cpu`` for a method that a GPU slows down.
         cost: its rough cost.
 
     """
@@ -79,6 +80,7 @@ class Abilities:
     optimises: bool = False
     tolerant: bool = False
     assumes_downsampling: bool = False
+    fast_on: Literal["any", "cpu"] = "any"
     cost: Cost = Cost(1000)
 
     @property

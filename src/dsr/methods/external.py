@@ -65,6 +65,7 @@ class External(Method):
         resize: how a map of another size is brought to the photo's; None to refuse it.
         check: whether maps are refused that cannot be of the scene, or in the unit: of another median, or unlike the
             low-resolution map.
+        alignment: of the predictions to the truths, see :mod:`dsr.metrics.alignment`; with one, any median is taken.
 
     Raises:
         ValueError: a value is not one of these, or there is no such directory.
@@ -85,6 +86,7 @@ class External(Method):
         resize: str | None = None,
         *,
         check: bool = True,
+        alignment: str = "none",
     ) -> None:
         for key, value, known in (
             ("range_type", range_type, QUANTITIES),
@@ -106,7 +108,7 @@ class External(Method):
         except ValueError as error:
             raise ValueError(f"unit: {error}") from None
         self._fit: Fit | None = fit  # type: ignore[assignment]  # it has been checked
-        self._resize, self._check = resize, check
+        self._resize, self._check, self._metric = resize, check, alignment == "none"
 
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
         """Return the map of the sample's scene, (1, H, W) orthogonal depth in metres, NaN in holes.
@@ -123,7 +125,7 @@ class External(Method):
         if not bool(depth.isfinite().any()):
             raise ValueError(f"{path}: expected a depth, no value is one between {NEAREST:g} and {FARTHEST:g} m")
         if self._check:
-            _expect_likeness(path, depth, sample)
+            _expect_likeness(path, depth, sample, metric=self._metric)
         return depth.to(sample.depth_lr.device)
 
     def describe(self, sample: DepthSample) -> str:
@@ -178,7 +180,7 @@ class External(Method):
         stored = read_depth_file(path, pixels_beside(camera.height, camera.width))
         whole = stored.dtype.kind in "iu"
         free = self._fit is not None and self._quantity in (INVERSE, "disparity")  # 0 may be the farthest point
-        if whole and self._unit is None and self._fit is None:
+        if whole and self._unit is None and self._fit is None and self._metric:
             raise ValueError(f"{path}: expected method.unit=mm, or another one, for {stored.dtype} values, got none")
         holes = ~np.isfinite(stored) if free else find_holes(stored, self._hole_value, above=math.inf)[0]
         if free and self._hole_value is not None:
@@ -287,8 +289,8 @@ def _reduce(values: Tensor, smaller: Tensor) -> Tensor:
     return torch.where(share >= 0.5, pool(torch.where(known, values, 0), size) / share, torch.nan)
 
 
-def _expect_likeness(path: Path, depth: Tensor, sample: DepthSample) -> None:
-    """Raise a ValueError if a map cannot be of the sample's scene."""
+def _expect_likeness(path: Path, depth: Tensor, sample: DepthSample, *, metric: bool) -> None:
+    """Raise a ValueError if a map, perhaps metric, cannot be of the sample's scene."""
     coarse = 1 / sample.depth_lr.to("cpu", torch.float64)
     reduced = _reduce(1 / depth, coarse)
     known = reduced.isfinite() & coarse.isfinite()
@@ -296,7 +298,7 @@ def _expect_likeness(path: Path, depth: Tensor, sample: DepthSample) -> None:
     if own.numel() < 2:
         return
     off = float(theirs.median() / own.median())
-    if not 1 / _MOST_OFF < off < _MOST_OFF:
+    if metric and not 1 / _MOST_OFF < off < _MOST_OFF:
         raise ValueError(
             f"{path}: expected depths like the low-resolution map's, the median is {off:.3g} times theirs: another "
             "unit, or method.fit=affine for a map without a scale? method.check=false takes it"

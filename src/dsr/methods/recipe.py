@@ -61,6 +61,7 @@ class Run:
         seed: of random numbers.
         downsampling: the assumed model.
         known: what is known of the maps, for arguments that the method's node leaves open, by null or ``auto``.
+        alignment: of the predictions to the truths that scores are computed after.
         metrics, workspace, display, about, lpips_trunk: see :class:`~dsr.methods.dip.upsampler.DeepImagePrior`.
 
     """
@@ -70,6 +71,7 @@ class Run:
     seed: int = 0
     downsampling: Downsampling = field(default_factory=lambda: Downsampling("box"))
     known: Known = field(default_factory=Known)
+    alignment: str = "none"
     metrics: Any = None
     workspace: Path | None = None
     display: Any = None

@@ -34,6 +34,7 @@ from dsr.metrics.depth import covered
 from dsr.metrics.formats import BEFORE_THE_PAPER, MetricFormat
 from dsr.metrics.functional import SurfacePair, masked_mean, masked_median
 from dsr.metrics.metric import Metric, depth_mask, target_mask
+from dsr.utils.compute_device import in_own_precision
 
 RATIOS = tuple(np.linspace(1.05, 1.25, 10).tolist())
 """Depth Pro's thresholds, which are their own weights; MoGe's weights are 1 less."""
@@ -275,6 +276,7 @@ def _thinned(ratio: Tensor, threshold: float) -> Tensor:
     return thinned.view_as(above)
 
 
+@in_own_precision
 def _fit_plane(points: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
     """Return the standard deviation of points (B, 3, H, W) about their plane, (B,), and its normal, (B, 3)."""
     weights = mask.to(points).flatten(2)

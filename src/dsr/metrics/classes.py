@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
 
+import numpy as np
 import torch
 import torchmetrics
 from torch import Tensor
@@ -96,10 +97,10 @@ class PerImageMean(torchmetrics.Metric):
     @torch.no_grad()
     def update(
         self,
-        preds: SurfacePair | Tensor,
-        target: Tensor | None = None,
-        camera: Camera | Tensor | None = None,
-        mask: Tensor | None = None,
+        preds: SurfacePair | Tensor | np.ndarray,
+        target: Tensor | np.ndarray | None = None,
+        camera: Camera | Sequence[Camera] | Tensor | np.ndarray | None = None,
+        mask: Tensor | np.ndarray | None = None,
     ) -> None:
         """Add a batch, as for :meth:`dsr.metrics.functional.SurfacePair.of`.
 
@@ -107,7 +108,7 @@ class PerImageMean(torchmetrics.Metric):
             preds: a pair, which is left out if it is of another benchmark than the metric's, or has no expected errors
                 for a metric of these; or predicted depth.
             target: true depth.
-            camera: the camera of these pixels, or their rays.
+            camera: the camera of these pixels, a list of one for each image, or their rays.
             mask: the pixels to compare.
 
         """
@@ -124,6 +125,10 @@ class PerImageMean(torchmetrics.Metric):
         """Return the mean, NaN where no image could be scored."""
         total: Tensor = getattr(self, self._total)
         return total / self.count
+
+    def plot(self, val: Any = None, ax: Any = None) -> Any:
+        """Plot a value, or several in a row; of matplotlib's axes, None for new ones."""
+        return self._plot(val, ax)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], exclude_state: Sequence[str] = "") -> Self:
         """Move the states, and the LPIPS network, which is no submodule, so that checkpoints do not contain it."""

@@ -31,6 +31,7 @@ from dsr.metrics.depth import covered
 from dsr.metrics.formats import BEFORE_THE_PAPER, MetricFormat
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.metric import Metric, target_mask
+from dsr.utils.compute_device import in_own_precision
 
 SCALES = (1, 2, 4, 8)
 RADIUS, SMALLEST_RADIUS = 32, 3
@@ -184,6 +185,7 @@ def _normals(points: Tensor, mask: Tensor) -> Tensor:
     return torch.cat((torch.where(valid, normal / lengths, 0), valid), dim=1).float()
 
 
+@in_own_precision
 def _pair_error(rows: Tensor, first: Tensor, second: Tensor) -> Tensor:
     """Return the mean error of the pairs of one scale, (): NaN if the truth has both normals of none.
 

@@ -16,10 +16,11 @@ gets NaN.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -27,7 +28,7 @@ from dsr.geometry.camera import Camera
 from dsr.geometry.shading import lights, shade
 from dsr.geometry.surface import angle_between, depth_to_normals, length, normal_mask
 from dsr.sample import CENTIMETRES, Unit
-from dsr.utils.compute_device import known_true
+from dsr.utils.compute_device import in_own_precision, known_true, widened
 
 _Derived = TypeVar("_Derived")
 SSIM_WINDOW = 7
@@ -42,7 +43,7 @@ class SurfacePair:
 
     Args:
         prediction, target: (B, 1, H, W) orthogonal depth in metres; NaN is a hole, and so is a depth that is not
-            positive, which no camera sees.
+            positive, which no camera sees. float16 and bfloat16 become float32.
         rays: (B or 1, 3, H, W) rays with z = 1, see :meth:`dsr.geometry.camera.Camera.rays`.
         mask: (B, 1, H, W) bool, the pixels to compare; None for all.
         unit: unit of the metrics that are in the benchmark's own.
@@ -80,12 +81,15 @@ class SurfacePair:
         angle_error: Tensor | None = None,
         image_dtype: torch.dtype | None = None,
     ) -> None:
+        prediction, target, depth_error, angle_error = map(widened, (prediction, target, depth_error, angle_error))
         if prediction.dim() != 4 or prediction.shape[1] != 1 or prediction.shape != target.shape:
             raise ValueError(
                 "prediction, target: expected two depth maps of shape (B, 1, H, W), "
                 f"got {tuple(prediction.shape)} and {tuple(target.shape)}"
             )
-        if rays.dim() != 4 or rays.shape[1] != 3 or rays.shape[-2:] != target.shape[-2:]:
+        if not (prediction.is_floating_point() and target.is_floating_point()):
+            raise ValueError(f"prediction, target: expected metres as floats, got {prediction.dtype}, {target.dtype}")
+        if rays.shape not in ((1, 3, *target.shape[-2:]), (len(target), 3, *target.shape[-2:])):
             raise ValueError(
                 f"rays: expected shape (B or 1, 3, {target.shape[-2]}, {target.shape[-1]}), got {tuple(rays.shape)}"
             )
@@ -115,17 +119,17 @@ class SurfacePair:
     @classmethod
     def of(
         cls,
-        preds: SurfacePair | Tensor,
-        target: Tensor | None = None,
-        camera: Camera | Tensor | None = None,
-        mask: Tensor | None = None,
+        preds: SurfacePair | Tensor | np.ndarray,
+        target: Tensor | np.ndarray | None = None,
+        camera: Camera | Sequence[Camera] | Tensor | np.ndarray | None = None,
+        mask: Tensor | np.ndarray | None = None,
     ) -> SurfacePair:
         """Return a given pair, or make one of a prediction, a target and their camera, as metric classes accept either.
 
         Args:
-            preds: the pair, or (B, 1, H, W) predicted orthogonal depth in metres.
+            preds: the pair, or (B, 1, H, W) predicted orthogonal depth in metres, a tensor or an array.
             target: (B, 1, H, W) true depth.
-            camera: of these pixels, or their rays, (3, H, W) or (B, 3, H, W).
+            camera: of these pixels, one of all images or a list; or their rays, (3, H, W) or (B, 3, H, W).
             mask: (B, 1, H, W) bool, the pixels to compare; None for all.
 
         Raises:
@@ -139,9 +143,16 @@ class SurfacePair:
         if target is None or camera is None:
             lack = "target" if target is None else "camera"
             raise ValueError(f"{lack}: expected preds, target and camera, or a SurfacePair alone; got none")
-        rays = camera.rays(device=target.device) if isinstance(camera, Camera) else camera
-        rays = rays[None] if rays.ndim == 3 else rays
-        return cls(preds, target, rays, mask)
+        first, second = torch.as_tensor(preds), torch.as_tensor(target)
+        if isinstance(camera, Camera | Sequence):
+            cameras = [camera] if isinstance(camera, Camera) else camera
+            if not all(isinstance(each, Camera) for each in cameras):
+                raise ValueError(f"camera: expected dsr.Camera, a list of them, or rays; got {cameras!r:.60}")
+            rays = torch.stack([each.rays(device=second.device) for each in cameras])
+        else:
+            rays = torch.as_tensor(camera)
+            rays = rays[None] if rays.ndim == 3 else rays
+        return cls(first, second, rays, None if mask is None else torch.as_tensor(mask))
 
     def derive(self, make: Callable[[SurfacePair], _Derived]) -> _Derived:
         """Return ``make(self)``, computed once per pair: for quantities that several metrics share."""
@@ -171,7 +182,7 @@ class SurfacePair:
     def shadings(self) -> tuple[Tensor, Tensor]:
         """The two maps of e . n for the four lights, (B, 4, H, W), unclipped; 0 where invalid."""
         directions = lights(dtype=self.image_dtype, device=self.target.device)
-        first, second = (shade(normals, directions) for normals in self.normals)
+        first, second = (in_own_precision(shade)(normals, directions) for normals in self.normals)
         return self._blank(first), self._blank(second)
 
     @cached_property

@@ -9,9 +9,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from dsr.utils.compute_device import in_own_precision
+
 _BINOMIAL = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
 
 
+@in_own_precision
 def l1(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
     """Return the mean absolute difference over valid pixels, (B,), of two (B, 1, H, W) maps; NaN if none is valid.
 
@@ -25,12 +28,14 @@ def l1(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor
     return difference.abs().sum(dim=(-3, -2, -1)) / valid.sum(dim=(-3, -2, -1))
 
 
+@in_own_precision
 def mse(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
     """Return the mean squared difference over valid pixels, (B,); arguments as for :func:`l1`."""
     difference, valid = _difference(prediction, target, mask)
     return difference.square().sum(dim=(-3, -2, -1)) / valid.sum(dim=(-3, -2, -1))
 
 
+@in_own_precision
 def lap1(prediction: Tensor, target: Tensor, mask: Tensor | None = None, *, levels: int = 3) -> Tensor:
     """Return the Laplacian pyramid loss Lap_1, (B,), divided by the number of pixels.
 

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from torch.nn.utils import skip_init
 
 from dsr.metrics.functional import SurfacePair
+from dsr.utils.compute_device import in_own_precision
 from dsr.utils.guards import expect_stored
 
 TRUNK_FILE = "alexnet-owt-7be5be79.pth"
@@ -92,6 +93,7 @@ class LPIPS(nn.Module):
             maps.append(values / (values.square().sum(dim=1, keepdim=True) + 1e-20).sqrt())
         return maps
 
+    @in_own_precision
     def forward(self, first: Tensor, second: Tensor, mask: Tensor | None = None) -> Tensor:
         """Return the distance of two images, (B,).
 

@@ -12,6 +12,7 @@ from dsr.geometry.lights import LIGHT_NAMES
 from dsr.metrics.formats import MetricFormat
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS
+from dsr.utils.compute_device import in_own_precision
 
 WORST, AVERAGE = "max", "avg"
 VARIANTS = (*LIGHT_NAMES, WORST, AVERAGE)
@@ -96,6 +97,7 @@ class Metric:
         worst = values.amin(dim=1) if self.format.higher_is_better else values.amax(dim=1)
         return {**by_light, self.worst: worst, AVERAGE: values.mean(dim=1)}
 
+    @in_own_precision
     def _values(self, pair: SurfacePair) -> Tensor:
         """Return the function's values, of the right shape."""
         values = self.function(pair, network=self.network) if self.perceptual else self.function(pair)

@@ -19,6 +19,7 @@ from dsr.geometry.surface import back_project
 from dsr.metrics.formats import column
 from dsr.metrics.functional import SurfacePair, masked_mean, masked_median
 from dsr.metrics.metric import Metric, depth_mask, target_mask
+from dsr.utils.compute_device import in_own_precision
 
 NEAR = 0.06
 """Metres between a prediction and the plane up to which it is of the plane."""
@@ -150,6 +151,7 @@ def deviation(pair: SurfacePair) -> Tensor:
     return masked_mean((comparison.off - mean).square(), comparison.scored).sqrt().squeeze(1)
 
 
+@in_own_precision
 def angle(pair: SurfacePair) -> Tensor:
     """Return the mean angle between the normals and the plane's in degrees, (B,); 0 to 90, lower is better.
 

@@ -28,6 +28,7 @@ from dsr.geometry.rigid_motion import as_rigid, relative
 from dsr.geometry.surface import angle_between, depth_to_normals, length
 from dsr.geometry.warping import source_pixels, warp_depth
 from dsr.metrics.functional import masked_mean, masked_median
+from dsr.utils.compute_device import in_own_precision
 
 Poses = Tensor | np.ndarray | Sequence[np.ndarray]
 _VISIBLE = 50.0
@@ -36,6 +37,7 @@ _MOVING = 0.05
 """Change of the true depth from frame to frame, as a fraction of the frame's range, from which on it is motion."""
 
 
+@in_own_precision
 def flicker(depths: Tensor, static: Tensor | None = None) -> Tensor:
     """Return the mean over the pixels of the standard deviation over time of depth, relative to its median over time.
 
@@ -55,6 +57,7 @@ def flicker(depths: Tensor, static: Tensor | None = None) -> Tensor:
     return masked_mean(spread, mask).squeeze()
 
 
+@in_own_precision
 def temporal_noise(depths: Tensor, static: Tensor | None = None) -> Tensor:
     """Return the median over the pixels of the deviation over time whose mean is :func:`flicker`.
 
@@ -64,6 +67,7 @@ def temporal_noise(depths: Tensor, static: Tensor | None = None) -> Tensor:
     return masked_median(*_spread(depths, static)).squeeze()
 
 
+@in_own_precision
 def normal_flicker(depths: Tensor, camera: Camera, static: Tensor | None = None) -> Tensor:
     """Return the mean over the pixels of the RMS angle over time between a normal and its mean direction, in degrees.
 
@@ -93,6 +97,7 @@ def covered(depths: Tensor, static: Tensor | None = None) -> Tensor:
     return masked_mean(share, torch.ones_like(share, dtype=torch.bool) if static is None else static).squeeze()
 
 
+@in_own_precision
 def opw(
     depths: Tensor, camera: Camera, poses: Poses, photos: Tensor | None = None, static: Tensor | None = None
 ) -> Tensor:
@@ -148,6 +153,7 @@ def opw(
     return torch.stack(found).mean()
 
 
+@in_own_precision
 def tgm(prediction: Tensor, target: Tensor, static: Tensor | None = None) -> Tensor:
     """Return the mean difference between the changes of predicted and true depth from frame to frame.
 
@@ -243,6 +249,10 @@ class SequenceMean(torchmetrics.Metric):
     def compute(self) -> Tensor:
         """Return the mean over the sequences."""
         return self.total / self.count
+
+    def plot(self, val: Any = None, ax: Any = None) -> Any:
+        """Plot a value, or several in a row; of matplotlib's axes, None for new ones."""
+        return self._plot(val, ax)
 
 
 class Flicker(SequenceMean):

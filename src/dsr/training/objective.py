@@ -19,6 +19,7 @@ from dsr.metrics.functional import SurfacePair, masked_mean, mse_v
 from dsr.metrics.visual_loss import MSE_V, VisualLoss, VisualLossName, make_visual_loss, match_weight
 from dsr.training.degradation import Batch
 from dsr.training.shading import shading_loss
+from dsr.utils.compute_device import in_own_precision
 
 DepthLoss = Literal["lap1", "l1", "mse"]
 _TILT = math.asin(5 / 255)
@@ -157,6 +158,7 @@ class DepthObjective(Objective):
         """Return the loss with a computed weight in place of ``auto``; see :func:`balance_weight`."""
         return replace(self, w=balance_weight(first_patches(_PATCHES_FOR_W), self.visual)) if self.w == "auto" else self
 
+    @in_own_precision
     def __call__(self, answer: Answer, batch: Batch) -> dict[str, Tensor]:
         """Return ``loss`` and its terms; intermediate stages of the network get the depth loss, too."""
         disparity, w = answer.disparity, 1.0 if self.w == "auto" else self.w
@@ -231,6 +233,7 @@ class SurfaceObjective(Objective):
                 f"degradation: expected everything or another one with hints, for {type(net).__name__}, got plain"
             )
 
+    @in_own_precision
     def __call__(self, answer: Answer, batch: Batch) -> dict[str, Tensor]:
         """Return ``loss`` and its terms.
 

@@ -19,6 +19,7 @@ from torch import Tensor
 from dsr.methods.classical.finite_differences import grey
 from dsr.methods.networks.dct import dct2, idct2, laplacian_eigenvalues
 from dsr.metrics.functional import SurfacePair
+from dsr.utils.compute_device import in_own_precision
 
 _RIDGE = 1e-4
 """Weight of the squared coefficients of the light, as in the authors' code; the errors' weight is one per pixel."""
@@ -29,6 +30,7 @@ _GREY_STEP, _COLOUR_STEP = 0.1, 0.05
 """Changes of the logarithm of intensity and of colour per pixel, from which on they are changes of the albedo."""
 
 
+@in_own_precision
 def shading_loss(pair: SurfacePair, rgb: Tensor) -> Tensor:
     """Return the shading loss of each image, (B,); NaN without a valid normal.
 

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import os
+from collections.abc import Callable, Mapping
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
 
 from dsr.utils.configuration import ConfigError
 
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
 _FAST_ON_CPU = ("_is_avx512_bf16_supported", "_is_amx_tile_supported")
 """What a CPU has where convolutions in bfloat16 are faster, also with gradients (``benchmarks/train_speed.py``)."""
 
@@ -21,21 +27,47 @@ def fast_precision(device: torch.device) -> str:
     return "bfloat16" if device.type == "cpu" and any(flag() for flag in flags) else "float32"
 
 
+def widened(value: Any) -> Any:
+    """Return float16 and bfloat16 tensors, also those of a mapping, in float32; anything else as it is."""
+    if isinstance(value, Mapping):
+        return {name: widened(each) for name, each in value.items()}
+    return value.float() if isinstance(value, Tensor) and value.dtype in (torch.float16, torch.bfloat16) else value
+
+
+def in_own_precision(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Let a metric or a loss compute without ``torch.autocast``, and in float32 where its arguments have 16 bits."""
+
+    @functools.wraps(function)
+    def computed(*given: _P.args, **named: _P.kwargs) -> _R:
+        with contextlib.ExitStack() as stack:
+            for kind in ("cpu", "cuda", "mps", "xpu"):
+                if torch.is_autocast_enabled(kind):
+                    stack.enter_context(torch.autocast(kind, enabled=False))
+            return function(*map(widened, given), **widened(named))
+
+    return computed
+
+
 def known_true(flags: Tensor) -> bool:
     """Return whether all flags are set; False for those on a GPU, since reading them would wait for it."""
     return flags.device.type == "cpu" and bool(flags.all())
 
 
-def pick_device(name: str) -> torch.device:
-    """Return the device of that name; ``auto`` is $DSR_DEVICE, else the first GPU where there is one, else the CPU."""
+def pick_device(name: str, fast_on: str = "any") -> torch.device:
+    """Return the device of that name; on a GPU, convolutions in float32 no longer use TF32.
+
+    ``auto`` is $DSR_DEVICE, else the first GPU where there is one and the method is ``fast_on`` any, else the CPU.
+    """
     given_by = "device"
     if name == "auto" and os.environ.get("DSR_DEVICE"):
         given_by, name = "$DSR_DEVICE", os.environ["DSR_DEVICE"]
     if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        name = "cuda" if fast_on == "any" and torch.cuda.is_available() else "cpu"
     try:
         device = torch.device(name)
         torch.zeros(1, device=device).item()
     except (RuntimeError, AssertionError) as error:  # torch asserts that it was built for CUDA
         raise ConfigError(f"{given_by}: expected auto, cpu or a device of this machine, got {name!r}") from error
+    if device.type == "cuda":
+        torch.backends.cudnn.allow_tf32 = False
     return device

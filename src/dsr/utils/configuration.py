@@ -80,7 +80,7 @@ def _make(group: str, node: Mapping[str, Any], given: Mapping[str, Any], name: s
     except (ValueError, OSError) as error:
         raise ConfigError(with_key(str(error), group, inspect.signature(target).parameters)) from error
     except Exception as error:  # Lightning's own, which derives from none of these
-        if type(error).__name__ != "MisconfigurationException":
+        if type(error).__name__ != "MisconfigurationException" and not target.__module__.startswith("lightning."):
             raise
         raise ConfigError(f"{group}: {' '.join(str(error).split())}") from error
 

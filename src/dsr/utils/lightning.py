@@ -33,8 +33,8 @@ _SECONDS_BETWEEN_LOSSES = 0.2
 """Between two losses that are fetched from the device to be shown, each of which waits for it."""
 
 
-_NOT_OF_A_CHECKPOINT = (OSError, FullDiskError, ConfigError, DivergenceError, MemoryError, torch.OutOfMemoryError)
-"""Errors while a checkpoint is restored that it has no part in."""
+NOT_OF_A_CALLBACK = (OSError, FullDiskError, ConfigError, DivergenceError, MemoryError, torch.OutOfMemoryError)
+"""Errors of a training that neither its checkpoint nor its callbacks have a part in."""
 _LOST = ("Connection closed", "Connection reset", "Broken pipe")
 """What gloo says when another process is gone."""
 
@@ -298,7 +298,7 @@ def fit(
             if any(each.requested for each in trainer.callbacks if isinstance(each, Interruption)):  # type: ignore[attr-defined]
                 raise KeyboardInterrupt from error  # the first process has saved the step
             raise LostProcessError(error) from error
-        if resume is None or not resumed.restoring or isinstance(error, _NOT_OF_A_CHECKPOINT):
+        if resume is None or not resumed.restoring or isinstance(error, NOT_OF_A_CALLBACK):
             raise
         raise CheckpointError(resume, error) from error
     finally:

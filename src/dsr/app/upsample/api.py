@@ -30,6 +30,7 @@ from dsr.notes import warn
 from dsr.utils.guards import naming
 from dsr.utils.progress import Steps
 
+_END = object()
 Maps = TypeVar("Maps", np.ndarray, Tensor, list[Any])
 
 
@@ -231,8 +232,8 @@ class Upsampler:
 
         def read_up_to(last: int) -> None:
             while max(kept, default=place - 1) < last:
-                frame = next(source, None)
-                if frame is None:
+                frame = next(source, _END)
+                if frame is _END:
                     return
                 number = max(kept, default=place - 1) + 1
                 kept[number] = _frame(frame, number, unit)

@@ -130,6 +130,8 @@ class JointBilateral(GuidedMethod):
 
     """
 
+    abilities = replace(GuidedMethod.abilities, fast_on="cpu")
+
     def __init__(
         self,
         radius: int = 2,

@@ -85,7 +85,7 @@ class ShapeFromShading(Method):
 
     """
 
-    abilities = Abilities(cost=Cost(1300, 60))
+    abilities = Abilities(fast_on="cpu", cost=Cost(1300, 60))
     range_type: RangeType = "orthogonal"
 
     def __init__(

@@ -21,6 +21,7 @@ from dsr.methods.inpainting import inpaint
 from dsr.methods.networks.normalisation import compute_min_max, normalise
 from dsr.methods.tiling import TILE, UNTILED, AxisTile, blend_tiles, split_axis
 from dsr.sample import DepthSample
+from dsr.utils.compute_device import widened
 from dsr.utils.progress import Steps
 
 Precision = Literal["float32", "bfloat16"]
@@ -46,6 +47,10 @@ class Answer:
     spread: Tensor = _UNKNOWN
     angle: Tensor = _UNKNOWN
     stages: tuple[Tensor, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Take outputs of 16 bits as float32, which losses are computed in."""
+        vars(self).update(widened(vars(self)), stages=tuple(map(widened, self.stages)))
 
 
 @dataclass(frozen=True)
