@@ -6,8 +6,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
+import torch
 
 from dsr.cli import main
+from dsr.degradation.downsampling import Downsampling
+from dsr.geometry.camera import Camera
+from dsr.methods.recipe import Run, read_recipe
+from dsr.sample import DepthSample
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 288.0
 CAMERA = ["--intrinsics", "288", "288", "159.5", "119.5"]
@@ -47,13 +53,16 @@ def millimetres(depth):
 def write(path: Path, picture):
     """Write a depth map, or a photo in RGB, in the format that the name has."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(path), picture[..., ::-1] if picture.ndim == 3 else picture)
+    if path.suffix == ".npy":
+        np.save(path, picture)
+    else:
+        cv2.imwrite(str(path), picture[..., ::-1] if picture.ndim == 3 else picture)
     return path
 
 
-def upsample(out: Path, *options, method="bicubic"):
+def upsample(out: Path, *options, method="bicubic", only="depth"):
     """Run ``dsr upsample`` and return its exit code."""
-    return main(["upsample", *map(str, options), "-o", str(out), "--method", method, "--only", "depth"])
+    return main(["upsample", *map(str, options), "-o", str(out), "--method", method, "--only", only])
 
 
 def mean_error(out: Path, truth):
@@ -62,3 +71,64 @@ def mean_error(out: Path, truth):
     assert depth.shape == truth.shape
     known = np.isfinite(depth) & np.isfinite(truth)
     return 1000 * np.abs(depth - truth)[known].mean(), np.isfinite(depth).mean()
+
+
+def boards(number, by):
+    """Return exact depth (240, 320) of a wall and boards at ``number`` depths, the map that has ``by`` times coarser
+    pixels, and a photo of them."""
+    depth = np.full((240, 320), 3.0)
+    colour = np.full((240, 320, 3), 190.0) + 30 * np.random.default_rng(1).random((240, 320, 1))
+    places = ((0, 240, 140, 180), (60, 120, 30, 90), (150, 200, 200, 300))
+    for (top, bottom, left, right), z in zip(places[: number - 1], (1.5, 2.2, 1.125), strict=False):
+        depth[top:bottom, left:right], colour[top:bottom, left:right] = z, (40, 200 * (z > 2), 100 * z)
+    return depth, depth[by // 2 :: by, by // 2 :: by], colour.astype(np.uint8)
+
+
+def expected_error(folder: Path, photo, depth, name, *options):
+    """Return the median expected error in millimetres."""
+    files = "--rgb", write(folder / "photo.png", photo), "--depth", write(folder / name, depth), *CAMERA, *options
+    assert upsample(folder / "out", *files, method="facets", only="depth,confidence") == 0
+    return 1000 * float(np.nanmedian(np.load(folder / "out/confidence.npz")["depth_error"]))
+
+
+@pytest.mark.parametrize(
+    ("number", "by", "name"), [(2, 4, "d.png"), (3, 8, "d.npy"), (4, 4, "d.npy"), (4, 2, "d.png"), (2, 1, "d.tiff")]
+)
+def test_exact_boards_are_not_rounded(tmp_path, number, by, name):
+    _, depth, photo = boards(number, by)
+    depth = millimetres(depth) if name == "d.png" else depth.astype(np.float32)
+    assert expected_error(tmp_path, photo, depth, name, "--for", "robot") < 6
+    kept = cv2.imread(str(tmp_path / "out/depth_metres.tiff"), cv2.IMREAD_UNCHANGED)
+    assert np.isfinite(kept).mean() > 0.9
+
+
+def test_exact_boards_beside_a_tilted_one_and_in_disparity_are_not_rounded(tmp_path):
+    depth, _, photo = boards(2, 4)
+    depth[40:200, 200:300] = 2 / (1 + 0.2 * (np.arange(200, 300) - 250) / FOCAL)
+    photo[40:200, 200:300] = 30, 160, 60
+    assert expected_error(tmp_path / "tilted", photo, millimetres(depth[2::4, 2::4]), "d.png") < 8
+    disparity = (72 * 0.25 / boards(2, 4)[1]).astype(np.float32)
+    options = "--range-type", "disparity", "--baseline", 0.25
+    assert expected_error(tmp_path / "disparity", boards(2, 4)[2], disparity, "d.tiff", *options) < 6
+
+
+@pytest.mark.parametrize("step", [0.02, 0.1, 0.2])
+def test_rounded_slopes_keep_the_error_of_their_rounding(tmp_path, step):
+    depth, photo = scene()
+    rounded = (step * np.round(depth[2::4, 2::4] / step)).astype(np.float32)
+    assert expected_error(tmp_path, photo, rounded, "d.npy") > 1000 * step / 6
+
+
+@pytest.mark.parametrize(("method", "most"), [("nearest", 0), ("bilinear", 0), ("bicubic", 0), ("guided_filter", 100)])
+def test_both_commands_agree_on_maps_of_the_photos_own_size(tmp_path, method, most):
+    depth, photo = scene()
+    files = "--rgb", write(tmp_path / "p.png", photo), "--depth", write(tmp_path / "d.png", millimetres(depth))
+    assert upsample(tmp_path / "out", *files, *CAMERA, method=method) == 0
+    result = torch.from_numpy(cv2.imread(str(tmp_path / "out/depth_metres.tiff"), cv2.IMREAD_UNCHANGED))
+    given = torch.from_numpy(millimetres(depth) / 1000).float()
+    camera = Camera(WIDTH, HEIGHT, FOCAL, FOCAL, 159.5, 119.5)
+    rgb = torch.from_numpy(photo).permute(2, 0, 1) / 255
+    run = Run(device=torch.device("cpu"), precision="float32", seed=0, downsampling=Downsampling("box"))
+    direct = read_recipe(method).build(1, run)(DepthSample("a", "b", rgb, given[None], camera, camera, 1))[0]
+    assert float((1000 * (result - direct)).abs().max()) < 0.01
+    assert float((1000 * (result - given)).abs().max()) < most + 0.01
