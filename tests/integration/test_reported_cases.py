@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from pathlib import Path
 
 import cv2
@@ -12,6 +14,7 @@ import torch
 from dsr.cli import main
 from dsr.degradation.downsampling import Downsampling
 from dsr.geometry.camera import Camera
+from dsr.inference import plan_for
 from dsr.methods.recipe import Run, read_recipe
 from dsr.sample import DepthSample
 
@@ -132,3 +135,49 @@ def test_both_commands_agree_on_maps_of_the_photos_own_size(tmp_path, method, mo
     direct = read_recipe(method).build(1, run)(DepthSample("a", "b", rgb, given[None], camera, camera, 1))[0]
     assert float((1000 * (result - direct)).abs().max()) < 0.01
     assert float((1000 * (result - given)).abs().max()) < most + 0.01
+
+
+def warnings_of(out: Path):
+    """Return the messages of the warnings of a result, by code."""
+    return {each["code"]: each["message"] for each in json.loads((out / "info.json").read_text())["warnings"]}
+
+
+@pytest.mark.parametrize("by", [2, 4])
+@pytest.mark.parametrize("ratio", [0.7, 0.85, 1.0, 1.3, 1.5])
+def test_another_field_of_view_is_reported(tmp_path, ratio, by):
+    depth, photo = scene()
+    (height, width), cut = (round(each * min(ratio, 1 / ratio) / 4) * 4 for each in (HEIGHT, WIDTH)), max(ratio, 1)
+    inner = slice((HEIGHT - height) // 2, (HEIGHT + height) // 2), slice((WIDTH - width) // 2, (WIDTH + width) // 2)
+    depth, photo = (depth, photo[inner]) if cut > 1 else (depth[inner], photo)
+    small = cv2.resize(millimetres(depth), (WIDTH // by, HEIGHT // by), interpolation=cv2.INTER_NEAREST)
+    photo = cv2.resize(photo, (WIDTH, HEIGHT))
+    files = "--rgb", write(tmp_path / "p.png", photo), "--depth", write(tmp_path / "d.png", small)
+    assert upsample(tmp_path / "out", *files, *CAMERA) == 0
+    found = warnings_of(tmp_path / "out")
+    assert set(found) == ({"field-of-view"} if ratio != 1 else set())
+    if ratio != 1:
+        assert float(re.findall(r"looks ([\d.]+) times", found["field-of-view"])[0]) == pytest.approx(ratio, rel=0.1)
+        assert upsample(tmp_path / "strict", *files, *CAMERA, "--strict") == 2
+
+
+@pytest.mark.parametrize(("sign", "apart"), [(1, 0.1), (-1, 0.1), (1, -0.25), (-1, -0.25)])
+def test_inverse_extrinsics_are_reported(tmp_path, sign, apart):
+    depth, photo = scene(shift=apart)[0][2::4, 2::4], scene()[1]
+    matrix = np.eye(4)
+    matrix[0, 3] = sign * apart
+    np.savetxt(tmp_path / "matrix.txt", matrix)
+    np.savetxt(tmp_path / "depth.txt", [[72, 0, 39.5], [0, 72, 29.5], [0, 0, 1]])
+    files = "--rgb", write(tmp_path / "p.png", photo), "--depth", write(tmp_path / "d.png", millimetres(depth))
+    rig = "--depth-camera", tmp_path / "depth.txt", "--extrinsics", tmp_path / "matrix.txt"
+    assert upsample(tmp_path / "out", *files, *CAMERA, *rig) == 0
+    assert ("extrinsics-inverse" in warnings_of(tmp_path / "out")) == (sign < 0)
+
+
+@pytest.mark.parametrize(
+    ("photo", "depth", "gigabytes"),
+    [((3000, 4000), (192, 256), 2.0), ((6000, 8000), (192, 256), 3.0), ((6000, 8000), (750, 1000), 5.8),
+     ((9000, 12000), (192, 256), 6.1)],
+)  # fmt: skip
+def test_estimated_memory_is_about_what_was_measured(photo, depth, gigabytes):
+    text = plan_for(read_recipe("facets"), photo, depth).text
+    assert float(re.findall(r"about ([\d.]+) GB", text)[0]) == pytest.approx(gigabytes, rel=0.25)
