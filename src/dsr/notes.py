@@ -146,7 +146,7 @@ LIMITS: dict[str, Limit] = {
     "field-of-view": Limit(
         4.0,
         "standard deviations of chance by which edges agree better with another field of view, where edges exist",
-        "none of 440 right pairs exceeds 2.2; of 359 with 0.7 to 1.5 times the width 209 reach it, 34 of 130 small maps",
+        "440 right pairs: at most 2.2; of 359 that are 0.7 to 1.5 times as wide 209 reach it, 34 of 130 small maps",
     ),
     "photo-order": Limit(
         2,

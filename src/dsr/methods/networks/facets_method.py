@@ -75,7 +75,9 @@ class AnyMap(Method):
 
     """
 
-    abilities = Abilities(ratios="any", own_size=True, needs="network", tolerant=True, cost=Cost(100, 2.5, 40, program=5e8))
+    abilities = Abilities(
+        ratios="any", own_size=True, needs="network", tolerant=True, cost=Cost(100, 2.5, 40, program=5e8)
+    )
 
     def __init__(
         self,
