@@ -138,6 +138,16 @@ LIMITS: dict[str, Limit] = {
     ),
     "baseline-short": Limit(0.001, "metres, below which it is", "phones have cameras 10 mm apart"),
     "baseline-long": Limit(5.0, "metres", "KITTI's car has 0.54 m, and rigs of 2 m are rare"),
+    "extrinsics-inverse": Limit(
+        3.0,
+        "standard deviations of chance by which edges agree better with the inverse of `--extrinsics`",
+        "right matrices of 24 rendered pairs: at most -0.2; the inverse of 17 of them reaches it, from 5 cm apart on",
+    ),
+    "field-of-view": Limit(
+        4.0,
+        "standard deviations of chance by which edges agree better with another field of view, where edges exist",
+        "440 right pairs: at most 2.2; of 359 that are 0.7 to 1.5 times as wide 209 reach it, 34 of 130 small maps",
+    ),
     "photo-order": Limit(
         2,
         "pairs, of at most 12 over all, whose depth map fits another one's photo better, by as much as `photo-turned`",

@@ -236,7 +236,7 @@ def test_dubious_pixels_may_be_left_as_holes() -> None:
 
 def test_flat_parts_of_rounded_maps_are_at_best_as_sure_as_the_rounding() -> None:
     rows, columns = 24, 32
-    steps = torch.tensor([0.50, 0.52, 0.56, 0.64]).double()
+    steps = torch.tensor([0.50, 0.52, 0.545, 0.57]).double()
     inverse = steps.repeat_interleave(columns // 4).expand(1, rows, columns)
     sample = _sample((rows, columns), 4)
     sample = replace(sample, depth_lr=inverse.reciprocal())
@@ -244,7 +244,7 @@ def test_flat_parts_of_rounded_maps_are_at_best_as_sure_as_the_rounding() -> Non
     surface = AnyMap(net).surface(sample)  # type: ignore[arg-type]
     assert surface.depth_error is not None
     share = (surface.depth_error / surface.depth)[0, rows * 2]
-    nearest = torch.tensor([0.02, 0.02, 0.04, 0.08]).double()
+    nearest = torch.tensor([0.02, 0.02, 0.025, 0.025]).double()
     middles = share[torch.tensor([16, 48, 80, 112])]
     torch.testing.assert_close(middles, nearest / steps / 4)  # half a step at most, so a quarter on average
     assert surface.angle_error is not None

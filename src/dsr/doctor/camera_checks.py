@@ -44,7 +44,7 @@ def check_registration(scene: Scene) -> list[Finding]:
     if verdict is None:
         return [Finding("registration", "note", "no edges in the depth map or in the photo for this check")]
     if verdict.turned:
-        return [Finding("registration", "problem", str(verdict), "flip or rotate the photo or the depth")]
+        return [Finding("registration", "problem", str(verdict), "flip, rotate or crop the photo or the depth")]
     found = find_displacement(torch.from_numpy(metres(scene))[None], scene.rgb)
     if found is not None and found.certain:
         return [_report(found, math.ceil(max(scene.rgb.shape[1:]) / WORKING_SIZE))]

@@ -14,7 +14,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -26,6 +26,7 @@ from dsr.geometry.edges import JUMP, WORKING_SIZE, Array
 from dsr.notes import LIMITS
 
 Size = tuple[int, int]
+T = TypeVar("T", Array, Tensor)
 _Floats = NDArray[np.float32]
 
 _SIDES = (96, 256)
@@ -56,6 +57,8 @@ _WAYS: dict[str, tuple[bool, tuple[int, ...]]] = {
     "turned by 90 degrees to the left": (True, (0,)),
 }
 """What is done to a photo to compare it: whether rows and columns are exchanged, and what is reversed then."""
+_ZOOMS = (0.68, 0.72, 0.76, 0.8, 0.85, 0.9, 1.1, 1.17, 1.24, 1.31, 1.39, 1.47)
+"""Widths of the depth map's field of view over the photo's, that are compared as well."""
 
 
 class Outlines(NamedTuple):
@@ -118,7 +121,7 @@ class Verdict:
 
     Args:
         as_given: their agreement.
-        way: the mirroring or rotation of one of them with the best agreement.
+        way: the mirroring or rotation of one of them, or the ratio of their fields of view, with the best agreement.
         better: the agreement of that way.
         contours: whether the depth map has enough of them.
         size: height and width of the photo in pixels.
@@ -137,9 +140,14 @@ class Verdict:
         return self.better.significance - max(self.as_given.significance, 0.0)
 
     @property
+    def code(self) -> str:
+        """Of the warning that the other way gets."""
+        return "photo-turned" if self.way in _WAYS else "field-of-view"
+
+    @property
     def turned(self) -> bool:
         """Whether the other way fits clearly better."""
-        return self.margin >= LIMITS["photo-turned"].threshold
+        return self.margin >= LIMITS[self.code].threshold
 
     @property
     def fits(self) -> bool:
@@ -175,6 +183,8 @@ class Verdict:
     @property
     def statement(self) -> str:
         """What was found."""
+        if self.turned and self.way not in _WAYS:
+            return f"the depth map's field of view looks {self.way} times as wide as the photo's"
         if self.turned:
             return f"the depth map fits better with the photo {self.way}"
         if self.apart:
@@ -204,7 +214,7 @@ class Verdict:
 
 
 def judge(depth: Array, rgb: Tensor) -> Verdict | None:
-    """Compare the edges of a depth map with those of a photo: as given, mirrored and rotated.
+    """Compare the edges of a depth map with those of a photo: as given, mirrored, rotated, and of other fields of view.
 
     Args:
         depth: (h, w) in any unit of depth or of its reciprocal, NaN in holes.
@@ -226,9 +236,13 @@ def judge(depth: Array, rgb: Tensor) -> Verdict | None:
         name: compare(fields, transform(_reverse(across if exchanged else seen, axes)))
         for name, (exchanged, axes) in _WAYS.items()
     }
-    best = max(ways, key=lambda name: ways[name].significance)
     found = dict(zip(("side", "length", "coherence"), (max(depth.shape), *outlines.contours()), strict=True))
     enough = all(value >= LIMITS[f"photo-other.{name}"].threshold for name, value in found.items())
+    for zoom in _ZOOMS if enough else ():
+        part, view = _middle(depth, zoom), _middle(rgb, 1 / zoom)
+        edges = photo_outlines(reduce_photo(view, size), max(size) / max(part.shape))
+        ways[f"{zoom:g}"] = compare(transform(depth_outlines(part, size)), transform(edges))
+    best = max(ways, key=lambda name: ways[name].significance)
     return Verdict(compare(fields, transform(seen)), best, ways[best], enough, (rgb.shape[-2], rgb.shape[-1]))
 
 
@@ -354,6 +368,13 @@ def _outlines(strength: _Floats, right: _Floats, down: _Floats) -> Outlines:
     inside[2:-2, 2:-2] = strength[2:-2, 2:-2]
     angle = 2 * np.arctan2(down, right)
     return Outlines(inside, (inside * (np.cos(angle) + 1j * np.sin(angle))).astype(np.complex64))
+
+
+def _middle(values: T, ratio: float) -> T:
+    """Return the middle of a map or photo, (..., H, W), whose sides are smaller by a ratio; all if it is at most 1."""
+    rows, columns = (round(n * min(1 / ratio, 1)) for n in values.shape[-2:])
+    top, left = (values.shape[-2] - rows) // 2, (values.shape[-1] - columns) // 2
+    return values[..., top : top + rows, left : left + columns]
 
 
 def _reverse(outlines: Outlines, axes: tuple[int, ...]) -> Outlines:

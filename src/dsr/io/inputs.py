@@ -13,9 +13,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dsr.geometry.agreement import judge
 from dsr.geometry.camera import ASSUMED_FOV, Camera, RangeType
 from dsr.geometry.lens import Lens, undistort
 from dsr.geometry.plausible import expect_possible
+from dsr.geometry.warping import registered_camera, warp_depth
 from dsr.io.cameras import (
     camera_only,
     find_camera,
@@ -34,7 +36,7 @@ from dsr.io.pairs import Pair, find_camera_file, role_of_words, words_of
 from dsr.io.photos import Size, model_in_exif, read_photo, same_aspect
 from dsr.io.reading import SUNRGBD_BITS, CameraChoice, Reading
 from dsr.io.units import TURNED_BACK, Meaning, expect_narrow, interpret
-from dsr.notes import Assumption
+from dsr.notes import LIMITS, Assumption
 from dsr.sample import FARTHEST, NEAREST
 from dsr.utils.guards import natural_key, pixels_beside
 from dsr.utils.lengths import show_length
@@ -225,7 +227,7 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
         *doubts,
     )
     if rig is not None:
-        depth_lr, warped = _to_photo(pair, reading, depth_lr, rig, camera)
+        depth_lr, warped = _to_photo(pair, reading, depth_lr, rig, camera, rgb)
         all_assumptions, confidence = (*all_assumptions, *warped), None
     device_name = model_in_exif(pair.rgb) if pair.capture is None else pair.capture.app
     time = pair.named_time if pair.own_time is None else pair.own_time
@@ -439,12 +441,22 @@ def _rig(pair: Pair, reading: Reading, geometry: Geometry, size_lr: Size) -> Rig
 
 
 def _to_photo(
-    pair: Pair, reading: Reading, depth_lr: Tensor, rig: Rig, photo: Camera
+    pair: Pair, reading: Reading, depth_lr: Tensor, rig: Rig, photo: Camera, rgb: Tensor
 ) -> tuple[Tensor, list[Assumption]]:
     """Return a depth camera's map in the photo's view, and notes."""
     given = reading.rig is not None
     doubts = doubt_camera(rig.camera, "--depth-camera" if given else "depth camera")
     warped, note = to_photo(depth_lr, rig, photo, "--extrinsics" if given else _camera_source(pair, reading))
+    if given:
+        inverse = torch.from_numpy(np.linalg.inv(rig.transform))[None]
+        other = warp_depth(depth_lr[None], rig.camera, inverse, registered_camera(rig.camera, photo))[0]
+        verdict, better = (judge(each[0].double().numpy(), rgb) for each in (warped, other))
+        if verdict is not None and better is not None and better.contours:
+            gain = better.as_given.significance - max(verdict.as_given.significance, 0)
+            if gain >= LIMITS["extrinsics-inverse"].threshold:
+                text = "--extrinsics: the photo's edges fit better with the inverse matrix"
+                detail = f"{better.figures}; expected the transform from the depth camera's frame to the photo camera's"
+                doubts.append(Assumption(text, detail, "extrinsics-inverse", gain))
     return warped, [*doubts, note]
 
 

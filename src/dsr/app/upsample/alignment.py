@@ -78,8 +78,9 @@ class Order:
 def _doubts(verdict: Verdict) -> list[Assumption]:
     """Return a warning if a pair can hardly belong together."""
     if verdict.turned:
-        detail = f"agreement of edges {verdict.figures}; turn one of the two"
-        return [Assumption(verdict.statement, detail, "photo-turned", verdict.margin)]
+        cure = "turn one of the two" if verdict.code == "photo-turned" else "crop one of the two, or register them"
+        detail = f"agreement of edges {verdict.figures}; {cure}"
+        return [Assumption(verdict.statement, detail, verdict.code, verdict.margin)]
     if verdict.apart:
         detail = f"{verdict.figures}; was one of the two cropped?"
         return [Assumption(verdict.statement, detail, "edges-beside", verdict.pixels)]

@@ -55,7 +55,7 @@ class Interpolation(Method):
 
     """
 
-    abilities = Abilities(ratios="any", cost=Cost(100))
+    abilities = Abilities(ratios="any", own_size=True, cost=Cost(100))
     range_type: RangeType = "perspective"
 
     def __init__(self, order: Order = "bicubic", *, fill_holes: bool = False) -> None:
@@ -117,7 +117,7 @@ class CubicConvolution(Method):
 
     """
 
-    abilities = Abilities(ratios="any")
+    abilities = Abilities(ratios="any", own_size=True)
 
     def __init__(self, range_type: RangeType = "disparity") -> None:
         if range_type not in get_args(RangeType):

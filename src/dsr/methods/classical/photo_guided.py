@@ -84,7 +84,7 @@ class GuidedMethod(Method):
 
     """
 
-    abilities = Abilities(ratios="any", cost=Cost(600, 2))
+    abilities = Abilities(ratios="any", own_size=True, cost=Cost(600, 2))
 
     def __init__(self, *, fill_holes: bool = False, slopes: bool = True) -> None:
         self._fill_holes = fill_holes

@@ -41,7 +41,11 @@ _PER_DEGREE = 0.012
 Middlebury 2014 and ICL-NUIM with holes cut into them it expects 2 % everywhere, and depth is off by 3 % at 0.5 to 1
 degree and by 4 % at 1 to 3 degrees."""
 _ROUNDED = 16
-"""A map with fewer different values than one per so many pixels is taken for a rounded one."""
+"""A map with fewer different values than one per so many pixels may be a rounded one."""
+_STAIR, _EVEN, _STAIRS, _EXCESS = 0.05, 1.3, 2, 2
+"""Share of a level's borders that it has at least with the next nearer and with the next farther level, largest ratio
+of the two steps, and number of such levels from which a map is rounded, otherwise it shows boards at exact depths; and
+relative steps of other levels over the largest of these, at most."""
 
 
 class AnyMap(Method):
@@ -71,7 +75,9 @@ class AnyMap(Method):
 
     """
 
-    abilities = Abilities(ratios="any", own_size=True, needs="network", tolerant=True, cost=Cost(250, 2.5))
+    abilities = Abilities(
+        ratios="any", own_size=True, needs="network", tolerant=True, cost=Cost(100, 2.5, 40, program=5e8)
+    )
 
     def __init__(
         self,
@@ -218,7 +224,7 @@ def _rounding(inverse: Tensor, focal: float) -> tuple[Tensor, Tensor]:
     That of depth is relative: a quarter of the step to the next value, the mean of errors that are equally likely up to
     half a step. That of the normal, in radians, is the tilt of a surface that gains it up to the next other value. Both
     are (B, 1, h, w), and 0 where the values around a pixel differ, from which the truth can be determined more exactly.
-
+    A rounded slope is a staircase; its largest relative step, twice, limits those of single levels.
     """
     known = inverse.isfinite()
     values = inverse[known].unique()
@@ -226,8 +232,19 @@ def _rounding(inverse: Tensor, focal: float) -> tuple[Tensor, Tensor]:
         return torch.zeros_like(inverse), torch.zeros_like(inverse)
     gaps = values.diff()
     step = torch.cat((gaps[:1], torch.minimum(gaps[:-1], gaps[1:]), gaps[-1:]))
-    filled = torch.where(known, inverse, values[0])
-    relative = (step / values)[torch.searchsorted(values, filled).clamp(max=len(values) - 1)] / 4
+    level = torch.searchsorted(values, torch.where(known, inverse, values[0]))
+    above, borders = torch.zeros_like(values), torch.zeros_like(values)  # with the next level, and all, by level
+    for dim in (2, 3):
+        ends = torch.stack([level.narrow(dim, start, level.shape[dim] - 1) for start in (0, 1)])
+        both = known.narrow(dim, 0, ends.shape[dim + 1]) & known.narrow(dim, 1, ends.shape[dim + 1])
+        low, high = ends.amin(0)[both], ends.amax(0)[both]
+        above += torch.bincount(low[high - low == 1], minlength=len(values))
+        borders += torch.bincount(torch.cat((low, high))[(low < high).repeat(2)], minlength=len(values))
+    even = torch.maximum(gaps[1:], gaps[:-1]) <= _EVEN * torch.minimum(gaps[1:], gaps[:-1])
+    stairs = even & (torch.minimum(above[1:-1], above[:-2]) > _STAIR * borders[1:-1])
+    if stairs.sum() < _STAIRS:
+        return torch.zeros_like(inverse), torch.zeros_like(inverse)
+    relative = ((step / values).clamp(max=_EXCESS * (step / values)[1:-1][stairs].max()) / 4)[level]
     low, high = (
         -functional.max_pool2d(-torch.where(known, inverse, torch.inf), 3, stride=1, padding=1),
         functional.max_pool2d(torch.where(known, inverse, -torch.inf), 3, stride=1, padding=1),
