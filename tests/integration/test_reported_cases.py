@@ -34,6 +34,7 @@ from dsr.data import detection
 from dsr.degradation.downsampling import Downsampling
 from dsr.evaluation.run_files import load_results
 from dsr.geometry.camera import Camera
+from dsr.geometry.planes import inverse_votes
 from dsr.inference import plan_for, upsampler
 from dsr.io.cameras import read_any_camera
 from dsr.io.depth_files import read_depth_file
@@ -1136,6 +1137,14 @@ def test_exact_boards_beside_a_tilted_one_and_in_disparity_are_not_rounded(tmp_p
     disparity = (72 * 0.25 / boards(2, 4)[1]).astype(np.float32)
     options = "--range-type", "disparity", "--baseline", 0.25
     assert expected_error(tmp_path / "disparity", boards(2, 4)[2], disparity, "d.tiff", *options) < 6
+
+
+@pytest.mark.parametrize("depths", [(4.0, 1.0), (3.0, 2.0, 1.0), (2.4, 1.8, 1.2, 0.6)])
+def test_boards_before_each_other_are_no_disparities(depths):
+    depth = np.full((60, 80), depths[0])
+    for number, nearer in enumerate(depths[1:]):
+        depth[5 + 2 * number : 50, 10 + 20 * number : 25 + 20 * number] = nearer
+    assert inverse_votes(depth).verdict is inverse_votes(1 / depth).verdict is None
 
 
 @pytest.mark.parametrize("step", [0.02, 0.1, 0.2])

@@ -51,6 +51,8 @@ _LINEAR = 2.0
 """Ratio of the deviations of values and of their reciprocals from a plane above which a window votes."""
 _CURVED = 0.003
 """Least deviation of the worse one of both, as a fraction of the values."""
+_STEEP = 0.25
+"""Largest deviation of the better one of both over the spread of its plane: boards at other depths have no slope."""
 _REDUCED = 320
 """Largest size of the longer side of a map that is judged whole; larger ones are thinned out."""
 
@@ -128,7 +130,7 @@ def inverse_votes(values: Array) -> InverseVotes:
 
     """
     values, camera = thinned(values, Camera.from_fov(ASSUMED_FOV, values.shape[1], values.shape[0]))
-    deviations, inliers = [], []
+    deviations, planar = [], []
     with np.errstate(over="ignore", divide="ignore"):
         reciprocals = 1 / values
     for each in (values, reciprocals):
@@ -138,11 +140,12 @@ def inverse_votes(values: Array) -> InverseVotes:
         columns = np.stack((np.ones_like(windows.u), windows.u, windows.v), axis=-1)
         fit, weight = _robust_fit(columns, windows)
         deviations.append(_spread(windows.inverse - _product(columns, fit), weight))
-        inliers.append(weight.mean(axis=1) > _INLIERS)
+        rise = _spread(_product(columns[..., 1:], fit[:, 1:]), weight)
+        planar.append((weight.mean(axis=1) > _INLIERS) & (deviations[-1] < _STEEP * rise))
     of_reciprocals, of_values = deviations
     curved = np.maximum(of_reciprocals, of_values) > _CURVED
-    falling = curved & inliers[1] & (_LINEAR * of_values < of_reciprocals)
-    rising = curved & inliers[0] & (_LINEAR * of_reciprocals < of_values)
+    falling = curved & planar[1] & (_LINEAR * of_values < of_reciprocals)
+    rising = curved & planar[0] & (_LINEAR * of_reciprocals < of_values)
     return InverseVotes(int(falling.sum()), int(rising.sum()))
 
 
