@@ -46,6 +46,9 @@ from dsr.io.photos import read_photo
 from dsr.io.reading import Reading
 from dsr.io.trajectories import read_poses
 from dsr.methods.networks.network import Answer
+from dsr.inference import plan_for
+from dsr.inference.working_size import left_of, limit_to_noise
+from dsr.methods.base import MapNoise
 from dsr.methods.recipe import Run, read_recipe
 from dsr.metrics import losses
 from dsr.metrics.boundaries import METRICS
@@ -1213,3 +1216,10 @@ def test_inverse_extrinsics_are_reported(tmp_path, sign, apart):
 def test_estimated_memory_is_about_what_was_measured(photo, depth, gigabytes):
     text = plan_for(read_recipe("facets"), photo, depth).text
     assert float(re.findall(r"about ([\d.]+) GB", text)[0]) == pytest.approx(gigabytes, rel=0.25)
+
+
+def test_expected_errors_of_stereo_grow_with_the_square_of_the_distance():
+    inverse = 1 / torch.tensor([1.0, 2.0, 4.0]).double().repeat_interleave(64).expand(1, 64, 192)
+    noise, spread = MapNoise(0.004, 8.0, 2.0), torch.full_like(inverse, 0.05)
+    errors = (limit_to_noise(spread, noise, inverse, inverse) / inverse)[0, 0, 32::64]
+    torch.testing.assert_close(errors, left_of(0.004) * torch.tensor([0.25, 1.0, 4.0]).double())

@@ -256,7 +256,8 @@ class AnyRatio(Method):
             found = found._replace(noise=noise and noise._replace(reduced=factor))
         if noise is None or found.spread is None or (factor == 1 and noise.extent < CORRELATED):
             return found
-        return found._replace(spread=limit_to_noise(found.spread, noise, measured))
+        stereo = found.inverse if sensor is not None and sensor.sensor.kind == "stereo" else None
+        return found._replace(spread=limit_to_noise(found.spread, noise, measured, stereo))
 
     def _choose_size(self, inverse: Tensor, camera: Camera) -> tuple[MapNoise | None, int]:
         """Return the noise of inverse depth, (1, h, w), and by what its size is to be divided."""

@@ -212,7 +212,7 @@ def left_of(deviation: T) -> T:
     return _LEFT * math.sqrt(2 / math.pi) * deviation
 
 
-def limit_to_noise(spread: Tensor, noise: MapNoise, measured: Tensor) -> Tensor:
+def limit_to_noise(spread: Tensor, noise: MapNoise, measured: Tensor, stereo: Tensor | None = None) -> Tensor:
     """Return expected relative errors, (1, H, W), reduced to what the noise of the map leaves, where all is calm.
 
     A network that does not know over how many pixels noise is correlated expects more of it to remain.
@@ -221,9 +221,11 @@ def limit_to_noise(spread: Tensor, noise: MapNoise, measured: Tensor) -> Tensor:
         spread: of the network.
         noise: of the map at its own size.
         measured: (1, h, w) inverse depth of the map in 1/m, NaN in holes, of which more is expected.
+        stereo: (1, H, W) inverse depth of the result, for noise that grows with the square of the distance.
 
     """
-    left = left_of(noise.deviation) * measured.nanmedian().to(spread)
+    at = measured.nanmedian().to(spread) if stereo is None else noise.distance**-2 / stereo.clamp(min=1e-6)
+    left = left_of(noise.deviation) * at
     share, median = _find_calm(spread, measured)
     return spread * torch.lerp(torch.ones_like(spread), (left / median).clamp(max=1).expand_as(spread), share)
 
