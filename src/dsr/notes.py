@@ -138,6 +138,11 @@ LIMITS: dict[str, Limit] = {
     ),
     "baseline-short": Limit(0.001, "metres, below which it is", "phones have cameras 10 mm apart"),
     "baseline-long": Limit(5.0, "metres", "KITTI's car has 0.54 m, and rigs of 2 m are rare"),
+    "other-frame": Limit(
+        1.0,
+        "depth and photos of other frames with cameras that are alike, and no transform between them",
+        "drivers that register depth name the photo's frame; others may have two cameras of one kind",
+    ),
     "extrinsics-inverse": Limit(
         3.0,
         "standard deviations of chance by which edges agree better with the inverse of `--extrinsics`",

@@ -269,7 +269,7 @@ def test_frame_without_a_pose_is_named_and_the_others_are_done(capture, capsys):
     [
         ("", "poses.txt: expected lines of 8 numbers"),
         (text(np.diag([1.0, 1.0, 1.5, 1.0])), "poses.txt: pose 1: expected a rigid transform"),
-        (text(pose(np.nan)), "poses.txt: pose 1: expected finite numbers"),
+        (text(pose(np.nan)), "poses.txt: expected poses of finite numbers"),
         (text(pose(0.0)), "poses.txt: expected a pose for each of the 5 frames"),
     ],
 )

@@ -80,8 +80,8 @@ def test_markdown_has_means_spreads_ranks_missing_values_and_scene_counts():
         ["", "DIP", "3", "<ins>50.0</ins> ± 0.0", "<ins>50</ins> ± 0"],
         ["", "MSG-V", "1", "**40.0**", "**40**"],
         ["mine, average of 2 scenes", "Bicubic", "1", "70.4 (1 of 2)", "70 (1 of 2)"],
-        ["", "DIP", "3", "<ins>36.0</ins> ± 1.0", "<ins>36</ins> ± 1"],
-        ["", "MSG-V", "1", "**31.8**", "**32**"],
+        ["", "DIP", "3", "**22.0** ± 2.0 (1 of 2)", "**22** ± 2 (1 of 2)"],
+        ["", "MSG-V", "1", "<ins>23.6</ins> (1 of 2)", "<ins>24</ins> (1 of 2)"],
     ]
 
 

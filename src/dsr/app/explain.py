@@ -157,7 +157,9 @@ def _explain_key(key: str, name: str, arguments: Sequence[str], directories: Seq
 
 
 def _arguments(prefix: str, node: DictConfig, wanted: str) -> list[str]:
-    """Return the names of the arguments that the target of a node takes, the wanted one of a target that takes any."""
+    """Return what a target outside of dsr, whose keys are all there, takes; the wanted one if it takes any name."""
+    if str(node.get("_target_", "dsr.")).startswith("dsr."):
+        return []
     try:
         taken = inspect.signature(load_target(prefix, dict(node))).parameters
     except (ConfigError, ValueError):  # without a target, or of one without a signature

@@ -102,7 +102,7 @@ def training_trainer(
             raise ConfigError(f"callbacks.{name}: expected a logger to write to, such as logger=csv, got none")
         if isinstance(each, ProgressBar):
             raise ConfigError(f"callbacks.{name}: expected none that shows progress, dsr does it itself; leave it out")
-        if isinstance(each, ModelCheckpoint) and each.state_key in (best.state_key, latest.state_key):
+        if isinstance(each, ModelCheckpoint):  # whose keys would be alike
             each.__class__ = type(type(each).__name__, (type(each),), {"state_key": f"callbacks.{name}"})
     callbacks = [
         OwnFiles(checkpoints, progress.say),

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from torch import Tensor
+from torch import Tensor, from_numpy
 
 from dsr.geometry.edges import JUMP, WORKING_SIZE, Array
 from dsr.notes import LIMITS
@@ -238,12 +238,15 @@ def judge(depth: Array, rgb: Tensor) -> Verdict | None:
     }
     found = dict(zip(("side", "length", "coherence"), (max(depth.shape), *outlines.contours()), strict=True))
     enough = all(value >= LIMITS[f"photo-other.{name}"].threshold for name, value in found.items())
+    given = compare(fields, transform(seen))
+    double = min(2 * size[0], rgb.shape[-2]), min(2 * size[1], rgb.shape[-1])
+    near = from_numpy(reduce_photo(rgb, double)).permute(2, 0, 1)
     for zoom in _ZOOMS if enough else ():
-        part, view = _middle(depth, zoom), _middle(rgb, 1 / zoom)
+        part, view = _middle(depth, zoom), _middle(near, 1 / zoom)
         edges = photo_outlines(reduce_photo(view, size), max(size) / max(part.shape))
         ways[f"{zoom:g}"] = compare(transform(depth_outlines(part, size)), transform(edges))
     best = max(ways, key=lambda name: ways[name].significance)
-    return Verdict(compare(fields, transform(seen)), best, ways[best], enough, (rgb.shape[-2], rgb.shape[-1]))
+    return Verdict(given, best, ways[best], enough, (rgb.shape[-2], rgb.shape[-1]))
 
 
 def significances(depths: Sequence[Outlines], photos: Sequence[Outlines]) -> Array:

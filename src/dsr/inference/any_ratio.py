@@ -52,10 +52,10 @@ class AnyRatio(Method):
     """A method of any factors as one of any ratio, whose maps may have the photo's size, holes and errors.
 
     The method is built once for each factor, so that many maps load its weights once. A low-resolution map is
-    upsampled as :mod:`dsr.inference.plans` describes. Methods that take a map of
-    the photo's size take it as it is, unless a scale is given; for other methods it is first downsampled by ``scale``,
-    by averaging the inverse depth of its valid pixels; if it was enlarged by repeating pixels, the repeated ones are
-    dropped instead. The averages may cross depth steps, as in the networks' training.
+    upsampled as :mod:`dsr.inference.plans` describes. Methods that take a map of the photo's size take it as it is,
+    unless a scale is given; for other methods it is first downsampled by ``scale``, by averaging the inverse depth of
+    its valid pixels; if it was enlarged by repeating pixels, the repeated ones are dropped instead. The averages may
+    cross depth steps, as in the networks' training.
     Patches that are far from everything around them are treated as holes, and the result stays within what is measured
     around each pixel, see :mod:`dsr.inference.plausibility`.
     (With a tenth of the map missing, RMSE_v on Lucy is 0.127, against 0.142 or more with means, medians or planes of

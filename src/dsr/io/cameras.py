@@ -17,7 +17,7 @@ from dsr.geometry.camera import ASSUMED_FOV, Camera, expect_intrinsics
 from dsr.geometry.plausible import may_be_of
 from dsr.geometry.warping import registered_camera, warp_depth
 from dsr.io.frames import Rig
-from dsr.io.images import CameraFile, Pixels, read_camera
+from dsr.io.images import CameraFile, Pixels, pixels_in_header, read_camera
 from dsr.io.photos import Size, focal_in_exif, orientation_of, same_aspect
 from dsr.io.reading import CameraChoice, RigFiles
 from dsr.io.trajectories import intrinsics_camera, read_transform
@@ -25,6 +25,8 @@ from dsr.notes import Assumption
 from dsr.utils.guards import naming, numbers_in, parse_json, read_text, refusing, split_numbers
 from dsr.utils.validation import parse_model
 
+_FOCAL_OF_ONE = 20
+"""Focal length in widths of the picture, which no lens of a photo with depth has."""
 _FILM_DIAGONAL = math.hypot(36, 24)
 """Diagonal of 35 mm film in millimetres, to which equivalent focal lengths refer (CIPA DCG-001)."""
 
@@ -113,7 +115,8 @@ def _fit_to_photo(
     else:
         assumptions = []
     camera, orientation = content.camera, 1
-    if not same_aspect((camera.height, camera.width), size) and same_aspect((camera.width, camera.height), size):
+    across = not same_aspect((camera.height, camera.width), size) and same_aspect((camera.width, camera.height), size)
+    if across and pixels_in_header(photo) != size:
         orientation = orientation_of(photo)
     if orientation >= 5:  # the photo is turned, the camera is that of the sensor
         cx = camera.height - 1 - camera.cy if orientation in (6, 7) else camera.cy
@@ -152,7 +155,7 @@ def scale_to_photo(path: Path, content: CameraFile, size: Size) -> tuple[CameraF
 def _camera_of_matrix(path: Path, matrix: np.ndarray, size: Size, size_lr: Size) -> tuple[CameraFile, list[Assumption]]:
     """Return the camera of a matrix: of the photo's pixels, or else of the depth map's, by its principal point."""
     cx, cy = matrix[0, 2], matrix[1, 2]
-    if max(cx, cy) <= 1:  # of a picture of 1 x 1 whose corner is (0, 0)
+    if min(cx, cy) > 0 and max(cx, cy) < 1 and max(matrix[0, 0], matrix[1, 1]) < _FOCAL_OF_ONE:  # of a 1 x 1 picture
         camera = Camera(1, 1, matrix[0, 0], matrix[1, 1], cx - 0.5, cy - 0.5)
         return camera_only(camera.rescale(size[1], size[0])), []
     for name, (height, width) in (("photo", size), ("depth map", size_lr)):

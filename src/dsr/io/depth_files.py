@@ -148,7 +148,11 @@ def _read_exr(path: Path, most: int | None) -> np.ndarray:
             with quiet_decoders(), quiet, OpenEXR.File(str(path), separate_channels=True, header_only=header) as file:
                 if header:
                     return [_exr_windows(part.header) for part in file.parts]
-                return [(name, channel.pixels) for name, channel in file.channels().items()]
+                return [
+                    (name, (channel.pixels, number))
+                    for number in reversed(range(len(file.parts)))
+                    for name, channel in file.channels(number).items()
+                ]
 
     most = MOST_PIXELS if most is None else most
     parts = read(header=True)
@@ -157,8 +161,8 @@ def _read_exr(path: Path, most: int | None) -> np.ndarray:
             expect_pixels(path, len(rows), len(columns), most)
     expect_bytes(path, sum(size for *_, size in parts), bytes_of_archive(path.stat().st_size))
     channels = dict(read(header=False))
-    values = channels[_depth_channel(path, channels)]
-    (rows, columns), display, _ = parts[0]
+    values, part = channels[_depth_channel(path, channels)]
+    (rows, columns), display, _ = parts[part]
     if (rows, columns) == display or values.shape != (len(rows), len(columns)) or 0 in map(len, display):
         return values
     shown = np.full([len(each) for each in display], np.nan if values.dtype.kind == "f" else 0, values.dtype)

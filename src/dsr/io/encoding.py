@@ -118,7 +118,8 @@ def far_marks(values: np.ndarray, known: np.ndarray) -> list[float]:
         if min(smaller.size, rest.size - smaller.size) < max(_MANY, _SHARE * values.size):
             break
         usual = any(np.isclose(highest * steps, _FAR_MARKS, 1e-6, 0).any() for steps in (1, 10, 100, 1000, 5000))
-        exact = not usual and np.unique(smaller).size < 16  # boards, which may be at any distances
+        boards = np.unique(smaller).size < 16 or 2 * smaller.size < rest.size  # or a wall behind something near
+        exact = not usual and boards
         if highest < float(smaller.max()) * (1.5 if usual else 100 if exact else 10):
             break
         marks.append(highest)
@@ -143,7 +144,7 @@ def _at_sensors_end(values: np.ndarray) -> np.ndarray:
 
 def _mark(values: np.ndarray, found: dict[str, float], hole_value: float | None) -> float:
     """Return the value that most holes have."""
-    if hole_value is not None:
+    if hole_value:
         return hole_value
     if values.dtype.kind in "iu":
         return 0.0

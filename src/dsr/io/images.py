@@ -14,6 +14,7 @@ from pydantic import AliasChoices, BaseModel, BeforeValidator, Field
 
 from dsr.geometry.camera import Camera, RangeType
 from dsr.io.viewing import describe_picture
+from dsr.notes import Assumption
 from dsr.utils.arrays import read_array_header
 from dsr.utils.decoding import decode_pixels
 from dsr.utils.guards import (
@@ -36,6 +37,8 @@ from dsr.utils.validation import Number, Whole, parse_model
 
 MAP_SUFFIXES = (".npy", ".png", ".tiff", ".tif", ".pfm")
 _METRES = {"m": 1.0, "mm": 1e-3}
+_BITS, _DARK = (8, 10, 12, 14, 16), 64
+"""Bits that a photo of 16 may use, and what its values of 8 bits are below if it does not use all."""
 _LONGEST = 40
 """Largest number of bytes of a number and the blank behind it."""
 _TEXT = re.compile(r"[-+.\deEnaifNAIF\s,]*")
@@ -53,8 +56,26 @@ def pixels_in_header(path: Path) -> tuple[int, int] | None:
 
 def read_rgb(path: Path) -> np.ndarray:
     """Return a picture as uint8 RGB, (H, W, 3)."""
-    picture = read_pixels(path, cv2.IMREAD_COLOR)
-    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+    return read_colours(path, cv2.IMREAD_COLOR)[0]
+
+
+def read_colours(path: Path, flags: int) -> tuple[np.ndarray, list[Assumption]]:
+    """Return a picture as uint8 RGB, (H, W, 3), one of 8 to 14 bits in 16 brightened, with a note of that."""
+    pixels = read_pixels(path, flags)
+    deep = read_pixels(path, flags | cv2.IMREAD_ANYDEPTH) if pixels.max() < _DARK else pixels
+    bits, notes = used_bits(deep)
+    if notes:
+        pixels = (deep // 2 ** (bits - 8)).astype(np.uint8)
+    return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), notes
+
+
+def used_bits(pixels: np.ndarray) -> tuple[int, list[Assumption]]:
+    """Return the bits that the values of a photo, uint8 or uint16, use, and a note if they are 8 to 14 of 16."""
+    if pixels.dtype != np.uint16 or not pixels.any():
+        return 8 * pixels.itemsize, []
+    bits = next(bits for bits in _BITS if pixels.max() < 1 << bits)
+    text = f"the photo uses {bits} of its 16 bits and is brightened accordingly"
+    return bits, [Assumption(text, f"up to {pixels.max()}")] if bits < 16 else []
 
 
 def read_map(path: Path, most: int | None = None) -> np.ndarray:
@@ -122,7 +143,7 @@ def read_mask(path: Path, most: int | None = None) -> np.ndarray:
         ValueError: it is missing, damaged or too large.
 
     """
-    return read_pixels(path, cv2.IMREAD_GRAYSCALE, most) > 0
+    return read_pixels(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION, most) > 0
 
 
 def read_numbers(path: Path, count: int) -> np.ndarray:

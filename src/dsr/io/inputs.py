@@ -521,7 +521,8 @@ def _unit(
         turned = reading.unit == "sunrgbd"
         return Meaning(reading.metres, (Assumption(TURNED_BACK),) if turned else (), bits=SUNRGBD_BITS if turned else 0)
     if range_type == "disparity":
-        return Meaning(1.0, (Assumption("disparities are read in pixels of the depth map"),))
+        steps = " (whole numbers may be in steps of a pixel: --depth-unit 1/16)" if stored.dtype.kind in "iu" else ""
+        return Meaning(1.0, (Assumption(f"disparities are read in pixels of the depth map{steps}"),))
     if described.depth_unit is not None:
         unit = described.depth_unit
         return Meaning(unit, (Assumption(f"unit: {show_length(unit)} per value, by the camera file"),))

@@ -171,8 +171,10 @@ def _add_calibration(folder: Path, found: PairingResult) -> PairingResult:
     files = {}
     for pattern in ("calibration.txt", "fov.json", "*.yaml", "*calib*/*.yaml"):
         for path in folder.glob(pattern):
+            named, stems = words_of(path.stem), {pair.rgb.stem for pair in found.pairs}
+            of_photo = path.stem in stems or role_of_words(named) == "rgb" or _CALIBRATIONS & {*named}
             with contextlib.suppress(ValueError, OSError):  # a file of something else
-                if role_of_words(words_of(path.stem)) != "depth" and read_any_camera(path) is not None:
+                if of_photo and role_of_words(named) in (None, "rgb") and read_any_camera(path) is not None:
                     files[path.stem] = path
     only = next(iter(files.values())) if len(files) == 1 else None
     pairs = tuple(replace(pair, camera=files.get(pair.rgb.stem, only)) for pair in found.pairs)

@@ -23,11 +23,14 @@ _DEPTH_ONLY = (".npy", ".npz", ".pfm", ".exr", ".depth")
 _RGB_WORDS = frozenset({"rgb", "color", "colour", "image", "images", "img", "imgs", "photo", "photos", "picture"})
 _DEPTH_WORDS = frozenset({"depth", "depths", "depthmap", "disparity", "disp", "range"})
 _OTHER_WORDS = frozenset(
-    {"mask", "masks", "confidence", "conf", "ir", "infrared", "normal", "normals", "label", "labels"}
+    {"mask", "masks", "confidence", "conf", "ir", "infrared", "normal", "normals", "label", "labels", "vis", "viz"}
 )
 _CONFIDENCE_WORDS = frozenset({"confidence", "conf"})
 _FILLERS = frozenset({"raw", "align", "aligned", "registered", "transformed", "warped", "map", "to", "frame", "in"})
-_REGISTERED = re.compile(r"\b(align|aligned|registered|transformed|warped|depths? (to|in|2) (rgb|colou?r|image))\b")
+_REGISTERED = re.compile(
+    r"(?<!not )\b(align|aligned|registered|transformed|warped|depths? (to|in|2) (rgb|colou?r|image))\b"
+    r"(?!.* (to|in|2) (depth|ir|infra|infrared|left|right)\b)"
+)
 _SECONDS_BY_DIGITS = {10: 1.0, 13: 1e-3, 16: 1e-6, 19: 1e-9}
 """Times since 1970 as whole seconds, milli-, micro- and nanoseconds."""
 _MAX_GAP = 0.02
@@ -106,11 +109,10 @@ def match_names(photos: Iterable[Path], depths: Iterable[Path]) -> list[tuple[Pa
 
     A pair has the same name but for words such as color and depth and for leading zeros; where a name is a time, the
     nearest within 20 ms that no other pair takes. A single photo and a single depth map are a pair whatever they are
-    called. Of two depth maps of one name that which the name calls registered is taken.
+    called. If names call some depth maps registered, only these are taken.
     """
     depths = list(depths)
-    registered = {key_of(path) for path in depths if is_registered(path.stem)}
-    depths = [path for path in depths if is_registered(path.stem) or key_of(path) not in registered]
+    depths = [path for path in depths if is_registered(path.stem)] or depths
     photos, depths = in_order(photos), in_order(depths)
     if len(photos) == len(depths) == 1:
         return [(photos[0], depths[0])]

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from dsr.io.images import read_pixels
+from dsr.io.images import read_colours
 from dsr.notes import Assumption
 from dsr.utils.files import replacing
 from dsr.utils.guards import MOST_FILE, expect_pixels, read_limited, refusing
@@ -27,8 +27,6 @@ from dsr.utils.versions import how_to_install
 
 _MODEL, _ORIENTATION, _EXIF_IFD, _EXIF_FOCAL_35 = 0x0110, 0x0112, 0x8769, 0xA405
 _ASPECT_TOLERANCE = 0.02
-_BITS, _DARK = (8, 10, 12, 14), 64
-"""Bits that a photo of 16 may use, and what its values of 8 bits are below then."""
 HEIC_SUFFIXES = (".heic", ".heif")
 _TURNS: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     2: lambda pixels: pixels[:, ::-1],
@@ -56,14 +54,7 @@ def read_photo(path: Path, size_lr: Size) -> tuple[np.ndarray, list[Assumption]]
         turned = 1 if orientation == 1 else turned_in_heic(path)
         pixels = _TURNS.get(_BACK.get(turned, turned), np.asarray)(read_heic(path))
     else:
-        flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-        pixels = cv2.cvtColor(read_pixels(path, flags), cv2.COLOR_BGR2RGB)
-        deep = read_pixels(path, flags | cv2.IMREAD_ANYDEPTH) if pixels.max() < _DARK else pixels
-        if deep.dtype == np.uint16 and deep.any():
-            bits = next(bits for bits in _BITS if deep.max() < 1 << bits)
-            pixels = (deep[..., ::-1] // 2 ** (bits - 8)).astype(np.uint8)
-            text = f"the photo uses {bits} of its 16 bits and is brightened accordingly"
-            found = [Assumption(text, f"up to {deep.max()}")]
+        pixels, found = read_colours(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if orientation == 1:
         return pixels, found
     size: Size = (pixels.shape[0], pixels.shape[1])

@@ -148,6 +148,9 @@ class SurfacePair:
             cameras = [camera] if isinstance(camera, Camera) else camera
             if not all(isinstance(each, Camera) for each in cameras):
                 raise ValueError(f"camera: expected dsr.Camera, a list of them, or rays; got {cameras!r:.60}")
+            count = 1 if isinstance(camera, Camera) else len(first)
+            if len(cameras) != count or len({(each.height, each.width) for each in cameras}) != 1:
+                raise ValueError(f"camera: expected one for each of {len(first)} maps, of one size, got {len(cameras)}")
             rays = torch.stack([each.rays(device=second.device) for each in cameras])
         else:
             rays = torch.as_tensor(camera)

@@ -13,7 +13,6 @@ from typing import Any
 
 import lightning
 import torch
-from lightning.pytorch.callbacks import GradientAccumulationScheduler
 from torch.utils.data import DataLoader, Dataset, default_collate
 
 from dsr.data.scene_source import SceneSource, content_key
@@ -305,9 +304,6 @@ class _PatchNumbers:
         if trainer is not None:
             self._accumulate, steps = trainer.accumulate_grad_batches, trainer.max_steps
             self._rank, self._devices = trainer.global_rank, trainer.world_size
-            for each in trainer.callbacks:  # type: ignore[attr-defined]
-                if isinstance(each, GradientAccumulationScheduler):  # which sets the trainer's at its first epoch
-                    self._accumulate = each.get_accumulate_grad_batches(0)
         self._length = self._accumulate * (steps if steps > 0 else max(1, _EPOCH // self._accumulate))
 
     def __len__(self) -> int:

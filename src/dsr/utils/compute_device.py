@@ -40,6 +40,9 @@ def in_own_precision(function: Callable[_P, _R]) -> Callable[_P, _R]:
     @functools.wraps(function)
     def computed(*given: _P.args, **named: _P.kwargs) -> _R:
         with contextlib.ExitStack() as stack:
+            if torch.backends.cudnn.allow_tf32 and torch.cuda.is_available():
+                stack.callback(setattr, torch.backends.cudnn, "allow_tf32", True)
+                torch.backends.cudnn.allow_tf32 = False
             for kind in ("cpu", "cuda", "mps", "xpu"):
                 if torch.is_autocast_enabled(kind):
                     stack.enter_context(torch.autocast(kind, enabled=False))

@@ -46,7 +46,7 @@ def decode_pixels(place: str | Path, content: bytes, flags: int, most: int | Non
     )
     no_data = None
     if content[:2] in (b"II", b"MM"):
-        content, no_data = _only_page(place, content, upright=not flags & cv2.IMREAD_IGNORE_ORIENTATION)
+        content, no_data = _only_page(place, content, flags)
     try:
         with _QUIET_STDERR:
             pixels = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
@@ -61,16 +61,16 @@ def decode_pixels(place: str | Path, content: bytes, flags: int, most: int | Non
     return pixels
 
 
-def _only_page(place: str | Path, content: bytes, *, upright: bool) -> tuple[bytes, float | None]:
+def _only_page(place: str | Path, content: bytes, flags: int) -> tuple[bytes, float | None]:
     """Return a TIFF whose first page is the only one that is no thumbnail, and the value of its holes, or None.
 
-    Args:
-        upright: whether its orientation is kept, which OpenCV applies whatever the flags say.
-
+    A photo may have smaller pages behind it. OpenCV applies its orientation whatever the flags say.
     """
     pages = tiff_pages(io.BytesIO(content))
     if any(page.tags.get(262, (0,))[0] in _RAW for page in pages):
         raise ValueError(f"{place}: expected a developed photo, got a raw one (DNG or the like), which is not read")
+    if flags != cv2.IMREAD_UNCHANGED and all(page.tags[256] < pages[0].tags[256] for page in pages[1:]):
+        pages = pages[:1]
     if len(pages) > 1:
         sizes = ", ".join(f"{page.tags[256][0]} x {page.tags[257][0]}" for page in pages)
         raise ValueError(f"{place}: expected a TIFF of one page, got {len(pages)}: {sizes} (width x height)")
@@ -78,7 +78,7 @@ def _only_page(place: str | Path, content: bytes, *, upright: bool) -> tuple[byt
     order, big = "<" if content[:1] == b"I" else ">", b"+" in content[2:4]
     alone = bytearray(content)
     struct.pack_into(order + ("Q" if big else "I"), alone, 8 if big else 4, page.at)
-    if page.orientation_at and not upright:
+    if page.orientation_at and flags & cv2.IMREAD_IGNORE_ORIENTATION:
         alone[page.orientation_at : page.orientation_at + 2] = struct.pack(order + "H", 1)
     try:
         return bytes(alone), float(bytes(page.tags.get(_GDAL_NODATA, ())).strip(b"\0 "))

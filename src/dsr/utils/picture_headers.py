@@ -145,7 +145,7 @@ def tiff_pages(file: IO[bytes]) -> list[TiffPage]:
                 continue
             for place in range(start, start + step * count, step):
                 tag, kind, length = read(place, "HH" + word)
-                if tag not in _TAGS or kind not in _TAG_TYPES:
+                if not length or tag not in _TAGS or kind not in _TAG_TYPES:
                     continue
                 value_at, bytes_each = place + 4 + size, struct.calcsize(order + _TAG_TYPES[kind])
                 if length * bytes_each > size:  # the values lie elsewhere

@@ -18,6 +18,7 @@ from dsr.inference.any_ratio import expect_picture
 from dsr.io.doubts import doubt_camera, doubt_depth
 from dsr.io.encoding import Encoding, decode, far_marks, find_holes, turn_back_bits
 from dsr.io.files import metres_in
+from dsr.io.images import used_bits
 from dsr.io.inputs import Picture
 from dsr.io.reading import SUNRGBD_BITS
 from dsr.notes import Assumption, warn
@@ -132,7 +133,9 @@ def _photo(rgb: Any, camera: Camera) -> Tensor:
     pixels = torch.from_numpy(_as_array(given)) if not isinstance(given, Tensor) else given.detach().cpu()
     photo = pixels.permute(*axes).contiguous()
     if photo.dtype in (torch.uint8, torch.uint16):
-        return photo.float().div_(255 if photo.dtype == torch.uint8 else 65535)
+        bits, notes = used_bits(photo.numpy())
+        warn(notes)
+        return photo.float().div_(2**bits - 1)
     if not photo.is_floating_point():
         raise ValueError(f"rgb: expected values of 8 or 16 bits, or floats from 0 to 1, got {_kind(given)}")
     return photo.float().clone()  # the caller may use its buffer again
@@ -158,14 +161,12 @@ def _metres(stored: np.ndarray, unit: str | float | None, camera: Camera) -> tup
             raise ValueError(
                 f"depth: expected floats in metres, or whole numbers with unit='mm', 'm' or 0.0002, got {kind}"
             )
-        marks = far_marks(stored, np.isfinite(stored))
-        if marks:
-            stored = np.where(np.isin(stored, marks), np.nan, stored)
-            warn([Assumption(f"depth: {marks[-1]:g} m and more, far beyond all other values, counts as holes")])
+        _warn_of_marks(stored, np.isfinite(stored), "NaN")
         return torch.from_numpy(stored.astype(np.float32))[None], _METRES
     bits = SUNRGBD_BITS if factor == "sunrgbd" else 0
     stored = turn_back_bits("depth", stored, bits) if bits else stored
-    holes, mark, _ = find_holes(stored, None)
+    holes, mark, _ = find_holes(stored, None, above=math.inf)
+    _warn_of_marks(stored, ~holes, "0")
     suffix = ".png" if stored.dtype == np.uint16 else ".npy"
     encoding = Encoding(suffix, str(stored.dtype), 1e-3 if factor == "sunrgbd" else factor, mark, "orthogonal")
     return decode(stored, holes, encoding, camera.rescale(stored.shape[1], stored.shape[0])), encoding
@@ -202,3 +203,9 @@ def _kind(given: Any) -> str:
     if shape is None or dtype is None:
         return type(given).__name__
     return f"{'a tensor of ' if isinstance(given, Tensor) else ''}{dtype} of shape {tuple(shape)}"
+
+
+def _warn_of_marks(stored: np.ndarray, known: np.ndarray, hole: str) -> None:
+    """Warn of values that look like marks of holes; an array has others for them."""
+    for value in far_marks(stored, known):
+        warn([Assumption(f"depth: many pixels have {value:g}, far beyond all other values; a hole is {hole}")])

@@ -38,6 +38,7 @@ def add_transforms(folder: Path, found: PairingResult) -> PairingResult | None:
             photo = path_within(file.parent, view["file_path"], file)
             photo = photos.get(photo, photo)
             depth = path_within(file.parent, view["depth_file_path"], file) if view.get("depth_file_path") else None
+            depth = depth if depth and depth.is_file() else None
             pair = pairs.get(photo) or (Pair(photo.stem, photo, depth) if depth and file.parent == folder else None)
             if pair is None:
                 continue
@@ -60,10 +61,11 @@ def _geometry(place: str, view: dict[str, Any], size: tuple[int, int]) -> Geomet
     expected = f"{place}: expected numbers of a camera and a pose of 4 x 4"
     with refusing(expected, ValueError, TypeError, KeyError, ArithmeticError):
         width, height = int(view.get("w", size[1])), int(view.get("h", size[0]))
-        fx = view["fl_x"] if "fl_x" in view else width / 2 / math.tan(view["camera_angle_x"] / 2)
+        fx = view["fl_x"] if "fl_x" in view else width / 2 / math.tan(view.get("camera_angle_x", 0) / 2 or math.nan)
         centre = view.get("cx", width / 2) - 0.5, view.get("cy", height / 2) - 0.5
-        camera = intrinsics_camera(place, (height, width), (fx, view.get("fl_y", fx), *centre))
-        fisheye = "FISHEYE" in str(view.get("camera_model"))
+        intrinsics = (fx, view.get("fl_y", fx), *centre)
+        camera = None if math.isnan(fx) else intrinsics_camera(place, (height, width), intrinsics)
+        fisheye = "FISHEYE" in str(view.get("camera_model")) or bool(view.get("is_fisheye"))
         names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
         lens = Lens("kannala_brandt" if fisheye else "brown_conrady", tuple(float(view.get(name, 0)) for name in names))
         matrix = np.array(view["transform_matrix"], np.float64) if "transform_matrix" in view else None

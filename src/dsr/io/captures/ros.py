@@ -21,7 +21,7 @@ import functools
 import itertools
 import re
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
@@ -46,6 +46,8 @@ _UNITS = {"u": 1e-3, "f": 1.0}
 _COLOUR_NAMES = ("color", "colour", "rgb")
 _ALIKE = 2e-3
 """Difference of focal lengths and centres, over the picture's size, up to which two cameras are the same."""
+_AT_ONE_PLACE = 1e-3
+"""Metres between two cameras, and entries of the rotation, up to which they are at one place."""
 _MOST_TRANSFORMS = 10_000
 """Largest number of messages that are searched for a transform."""
 _EXTRINSICS = re.compile(r"(.*/)extrinsics/(\w+)_to_(\w+)")
@@ -85,8 +87,11 @@ def _read(path: Path, prefix: str = "") -> PairingResult:
         photo_topic, depth_topic = _choose(path, topics)
         photos, depths = (_times(reader, path, each.name) for each in (photo_topic, depth_topic))
         kind = depths[0][0].read().dtype.kind
-        registered, same = _are_registered(photo_topic, depth_topic), _have_same_frame(photo_topic, depth_topic)
-        motion = np.eye(4) if same else None if registered else _transform(reader, photo_topic, depth_topic)
+        same = _have_same_frame(photo_topic, depth_topic)
+        motion = np.eye(4) if same else _transform(reader, photo_topic, depth_topic)
+        registered = _are_registered(photo_topic, depth_topic)
+        if motion is not None and not is_registered(depth_topic.name):
+            registered = registered and np.allclose(motion, np.eye(4), rtol=0, atol=_AT_ONE_PLACE)
     named = {kind: {Path(f"{i:09}"): stamp for i, (_, stamp) in enumerate(each)} for kind, each in
              (("rgb", photos), ("depth", depths))}  # fmt: skip
     partner = match_times(named["rgb"], named["depth"])
@@ -96,6 +101,8 @@ def _read(path: Path, prefix: str = "") -> PairingResult:
     geometry = functools.partial(_camera, path, photo_topic)
     if not registered:
         geometry = functools.partial(_apart, path, photo_topic, depth_topic, motion)
+    elif not same:
+        geometry = functools.partial(_counted, geometry, photo_topic, depth_topic)
     places = Path(f"{path}{photo_topic.name}"), Path(f"{path}{depth_topic.name}")
     pairs = []
     for first, second in sorted(partner.items()):
@@ -105,9 +112,6 @@ def _read(path: Path, prefix: str = "") -> PairingResult:
         pairs.append(Pair(f"{prefix}{int(first.name):06}", *places, unit=_UNITS[kind], capture=frame))
     unit = "millimetres" if kind == "u" else "metres"
     notes = [Assumption(f"a recording of ROS: photos of {photo_topic.name}, depth in {unit} of {depth_topic.name}")]
-    if registered and not same:
-        text = f"depth of the frame {depth_topic.frame!r} counts as registered to photos of {photo_topic.frame!r}"
-        notes.append(Assumption(text))
     others = [each.name for each in topics if each.role and each not in (photo_topic, depth_topic)]
     if others:
         notes.append(Assumption(f"topics that are not read: {', '.join(others)}"))
@@ -269,6 +273,18 @@ def _camera_info(reader: Any, topic: str, role: str) -> _Info | None:
         if role == "depth" or len(place.parts) < 3:
             return None
     return None
+
+
+def _counted(
+    geometry: Callable[[tuple[int, int]], Geometry], photo: _Topic, depth: _Topic, size: tuple[int, int]
+) -> Geometry:
+    """Return the camera of a recording whose depth counts as registered though it has another frame."""
+    found, text = (
+        geometry(size),
+        f"depth of the frame {depth.frame!r} counts as registered to photos of {photo.frame!r}",
+    )
+    code = "" if is_registered(depth.name) else "other-frame"
+    return found._replace(assumptions=(*found.assumptions, Assumption(text, "", code, 1.0 if code else None)))
 
 
 def _apart(path: Path, photo: _Topic, depth: _Topic, motion: Matrix | None, size: tuple[int, int]) -> Geometry:
