@@ -162,7 +162,7 @@ def _arguments(prefix: str, node: DictConfig, wanted: str) -> list[str]:
         return []
     try:
         taken = inspect.signature(load_target(prefix, dict(node))).parameters
-    except (ConfigError, ValueError):  # without a target, or of one without a signature
+    except (ConfigError, ValueError):  # a target that is missing, or has no signature
         return []
     names = [wanted if each.kind is each.VAR_KEYWORD else name for name, each in taken.items()]
     return [name for name in names if prefix != "trainer." or name not in SET_BY_DSR]

@@ -213,12 +213,13 @@ class Verdict:
         return pixels * min(WORKING_SIZE / max(self.size), 1.0)
 
 
-def judge(depth: Array, rgb: Tensor) -> Verdict | None:
+def judge(depth: Array, rgb: Tensor, zooms: Sequence[float] = _ZOOMS) -> Verdict | None:
     """Compare the edges of a depth map with those of a photo: as given, mirrored, rotated, and of other fields of view.
 
     Args:
         depth: (h, w) in any unit of depth or of its reciprocal, NaN in holes.
         rgb: (3, H, W) in [0, 1], of the same field of view.
+        zooms: the other fields of view, as widths of the depth map's over the photo's.
 
     Returns:
         None if the depth map or the photo has no edge.
@@ -238,15 +239,14 @@ def judge(depth: Array, rgb: Tensor) -> Verdict | None:
     }
     found = dict(zip(("side", "length", "coherence"), (max(depth.shape), *outlines.contours()), strict=True))
     enough = all(value >= LIMITS[f"photo-other.{name}"].threshold for name, value in found.items())
-    given = compare(fields, transform(seen))
     double = min(2 * size[0], rgb.shape[-2]), min(2 * size[1], rgb.shape[-1])
-    near = from_numpy(reduce_photo(rgb, double)).permute(2, 0, 1)
-    for zoom in _ZOOMS if enough else ():
-        part, view = _middle(depth, zoom), _middle(near, 1 / zoom)
+    twice = from_numpy(reduce_photo(rgb, double)).permute(2, 0, 1) if enough and zooms else rgb
+    for zoom in zooms if enough else ():
+        part, view = _middle(depth, zoom), _middle(twice, 1 / zoom)
         edges = photo_outlines(reduce_photo(view, size), max(size) / max(part.shape))
         ways[f"{zoom:g}"] = compare(transform(depth_outlines(part, size)), transform(edges))
     best = max(ways, key=lambda name: ways[name].significance)
-    return Verdict(given, best, ways[best], enough, (rgb.shape[-2], rgb.shape[-1]))
+    return Verdict(compare(fields, transform(seen)), best, ways[best], enough, (rgb.shape[-2], rgb.shape[-1]))
 
 
 def significances(depths: Sequence[Outlines], photos: Sequence[Outlines]) -> Array:

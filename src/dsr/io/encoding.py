@@ -118,9 +118,11 @@ def far_marks(values: np.ndarray, known: np.ndarray) -> list[float]:
         if min(smaller.size, rest.size - smaller.size) < max(_MANY, _SHARE * values.size):
             break
         usual = any(np.isclose(highest * steps, _FAR_MARKS, 1e-6, 0).any() for steps in (1, 10, 100, 1000, 5000))
-        boards = np.unique(smaller).size < 16 or 2 * smaller.size < rest.size  # or a wall behind something near
-        exact = not usual and boards
-        if highest < float(smaller.max()) * (1.5 if usual else 100 if exact else 10):
+        second = float(smaller.max())
+        if highest < second * (1.5 if usual else 10):
+            break
+        walls = not usual and highest < second * 100  # behind something near, or a few boards
+        if walls and (2 * smaller.size < rest.size or np.unique(smaller).size < 16):
             break
         marks.append(highest)
         rest = smaller

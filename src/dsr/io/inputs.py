@@ -450,7 +450,7 @@ def _to_photo(
     if given:
         inverse = torch.from_numpy(np.linalg.inv(rig.transform))[None]
         other = warp_depth(depth_lr[None], rig.camera, inverse, registered_camera(rig.camera, photo))[0]
-        verdict, better = (judge(each[0].double().numpy(), rgb) for each in (warped, other))
+        verdict, better = (judge(each[0].double().numpy(), rgb, zooms=()) for each in (warped, other))
         if verdict is not None and better is not None and better.contours:
             gain = better.as_given.significance - max(verdict.as_given.significance, 0)
             if gain >= LIMITS["extrinsics-inverse"].threshold:

@@ -168,13 +168,13 @@ def _add_calibration(folder: Path, found: PairingResult) -> PairingResult:
     listed = add_transforms(folder, found)
     if listed is not None:
         return listed
-    files = {}
+    files, stems = {}, {pair.rgb.stem for pair in found.pairs}
     for pattern in ("calibration.txt", "fov.json", "*.yaml", "*calib*/*.yaml"):
         for path in folder.glob(pattern):
-            named, stems = words_of(path.stem), {pair.rgb.stem for pair in found.pairs}
-            of_photo = path.stem in stems or role_of_words(named) == "rgb" or _CALIBRATIONS & {*named}
-            with contextlib.suppress(ValueError, OSError):  # a file of something else
-                if of_photo and role_of_words(named) in (None, "rgb") and read_any_camera(path) is not None:
+            role, of_photo = role_of_words(words_of(path.stem)), path.stem in stems
+            if role == "rgb" or (role is None and (of_photo or _CALIBRATIONS & {*words_of(path.stem)})):
+                with contextlib.suppress(ValueError, OSError):  # a file of something else
+                    read_any_camera(path)
                     files[path.stem] = path
     only = next(iter(files.values())) if len(files) == 1 else None
     pairs = tuple(replace(pair, camera=files.get(pair.rgb.stem, only)) for pair in found.pairs)

@@ -161,7 +161,7 @@ def _metres(stored: np.ndarray, unit: str | float | None, camera: Camera) -> tup
             raise ValueError(
                 f"depth: expected floats in metres, or whole numbers with unit='mm', 'm' or 0.0002, got {kind}"
             )
-        _warn_of_marks(stored, np.isfinite(stored), "NaN")
+        _warn_of_marks(stored, np.isfinite(stored) & (stored > 0), "NaN")
         return torch.from_numpy(stored.astype(np.float32))[None], _METRES
     bits = SUNRGBD_BITS if factor == "sunrgbd" else 0
     stored = turn_back_bits("depth", stored, bits) if bits else stored
