@@ -1,5 +1,6 @@
 # make run   evaluate on the embedded scenes (ARGS="scale=8 method=..." are handed on to eval.py)
-# make test  lint, types and tests
+# make test  lint, types and tests: what a change must pass
+# make test-all  these and the nightly ones: campaigns, real Slurm, published peers, further ways to interrupt
 # make unit  the unit tests alone, about a minute
 # make fuzz  10,000 damaged, foreign and malicious files for every reader (ARGS="--cases 1000 --seed 1")
 # make chaos commands that are killed, run out of space and run at once (ARGS="--kills 100 --seed 0")
@@ -17,12 +18,15 @@ ARGS ?=
 PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder --maxprocesses 8 \
 	--numprocesses $$(( $$(getconf _NPROCESSORS_ONLN) + 1 ))
 
-.PHONY: run test unit fuzz chaos mistakes lint docs dist benchmark clean
+.PHONY: run test test-all unit fuzz chaos mistakes lint docs dist benchmark clean
 
 run: $(VENV)/installed
 	$(BIN)/python eval.py $(ARGS)
 
 test: lint
+	$(PYTEST) -m "not nightly"
+
+test-all: lint
 	$(PYTEST)
 
 unit: $(VENV)/installed-dev

@@ -30,6 +30,7 @@ from dsr.utils.console import ConsoleProgress, _ConsoleTask
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 UNIT_TESTS = REPOSITORY / "tests" / "unit"
+NIGHTLY = tuple(REPOSITORY / "tests" / name for name in ("chaos", "fuzz", "mistakes"))
 CHROMIUMS = ("chromium", "chromium-browser", "google-chrome")
 CHROMIUM_ARGUMENTS = (
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
@@ -47,7 +48,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Give every test its tiers, and put those that run whole commands first.
 
     ``shared`` tests need the shared material, ``browser`` tests a browser, and ``slow`` tests run whole commands or are
-    marked so. All others are ``unit``.
+    marked so. All others are ``unit``. Campaigns, and what is marked so, are ``nightly``: `make test` leaves them out.
     """
     for item in items:
         fixtures = getattr(item, "fixturenames", ())
@@ -57,6 +58,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker("browser")
         if UNIT_TESTS not in item.path.parents:
             item.add_marker("slow")
+        if any(folder in item.path.parents for folder in NIGHTLY):
+            item.add_marker("nightly")
         if not any(item.get_closest_marker(tier) for tier in ("shared", "browser", "slow")):
             item.add_marker("unit")
     items.sort(key=lambda item: UNIT_TESTS in item.path.parents)  # so that at the end no worker has a long file alone

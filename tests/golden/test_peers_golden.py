@@ -21,6 +21,7 @@ from dsr.metrics.catalogue import catalogue, score_image
 from dsr.metrics.lpips import LPIPS, load_lpips
 from dsr.sample import Scene
 
+pytestmark = pytest.mark.nightly  # only a change in methods/networks/peers can break them
 NAMES = {"pgsr": "PGSR", "dctnet": "DCTNet", "dornet": "DORNet-T", "svlrm": "SVLRM", "fdkn": "FDKN"}
 FEEDS: dict[str, tuple[Downsampling, RangeType]] = {
     "box-disp": (Downsampling("box"), "disparity"),
