@@ -22,7 +22,7 @@ from dsr.metrics.calibration import (
     stated_ratio,
 )
 from dsr.metrics.catalogue import catalogue, score_image
-from dsr.metrics.classes import AUSE, ENCE, OffAUC, StatedRatio, compute_means, visual_metrics
+from dsr.metrics.classes import compute_means, visual_metrics
 from dsr.metrics.functional import SurfacePair
 from dsr.sample import Unit
 
@@ -264,17 +264,6 @@ def test_method_that_states_no_errors_has_no_such_scores() -> None:
     assert not any(name.startswith("Calibration") for name in compute_means(metrics))
     metrics.update(SurfacePair(*maps, depth_error=GIVEN[0][None, None], angle_error=ANGLES[None, None]))
     assert float(compute_means(metrics)["Calibration_AUSE_d"]) == pytest.approx(float(ause(*GIVEN)))
-
-
-def test_classes_are_the_metrics_of_the_protocol() -> None:
-    errors = {"depth_error": GIVEN[0][None, None], "angle_error": ANGLES[None, None]}
-    pair, found = SurfacePair(PREDICTION[None], TRUTH[None], LENS.rays()[None], **errors), _scores()
-    for made, name in ((ENCE(), "ENCE"), (AUSE(), "AUSE_d"), (AUSE(normals=True), "AUSE_v"), (OffAUC(), "AUC_20mm"),
-                       (StatedRatio(), "stated")):  # fmt: skip
-        assert float(made(pair)) == pytest.approx(found[f"Calibration_{name}"], rel=1e-4)
-    assert float(OffAUC(0.05)(pair)) == pytest.approx(float(off_auc(*GIVEN, threshold=0.05)))
-    with pytest.raises(ValueError, match=r"^depth_error: expected shape \(1, 1, 40, 60\), got \(40, 60\)$"):
-        SurfacePair(*pair.given, pair.rays, depth_error=GIVEN[0])
 
 
 def test_alignment_by_a_scale_scales_what_is_stated_and_by_a_shift_drops_it() -> None:

@@ -14,7 +14,6 @@ from depth_steps import CAMERA, UNKNOWN, Array, holed, pair_of, steps
 from dsr.geometry.camera import Camera
 from dsr.metrics import evalmde
 from dsr.metrics.catalogue import catalogue, score_image
-from dsr.metrics.classes import SAWAH, RelNormal
 from dsr.metrics.functional import SurfacePair
 
 METRICS = catalogue(protocols=("evalmde",))
@@ -199,10 +198,3 @@ def test_prediction_of_holes_alone_has_the_largest_errors() -> None:
         "RelNormal": pytest.approx(math.pi),
         "covered": 0,
     }
-
-
-def test_classes_have_the_functions_values() -> None:
-    pair = pair_of(*steps())
-    for made, function in ((RelNormal(), evalmde.rel_normal), (SAWAH(), evalmde.sawa_h)):
-        made.update(pair)
-        assert made.compute().item() == pytest.approx(function(pair).item())

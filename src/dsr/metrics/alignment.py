@@ -29,12 +29,10 @@ ALIGNMENTS = {
     "affine": "by scale and shift of depth, least squares",
     "affine_disparity": "by scale and shift of inverse depth, least squares",
     "robust": "by scale and shift of depth, least absolute relative errors",
-}
-"""What each alignment does, for notes."""
-LEAST = 1e-4
-"""Metres or 1 / metres: smallest value that a shift may leave."""
+}  # what each alignment does, for notes
+LEAST = 1e-4  # metres or 1 / metres: smallest value that a shift may leave
+# of the reweighted least squares: steps, and the relative error from which on weights stay finite
 _ITERATIONS, _SMALLEST_ERROR = 50, 1e-6
-"""Of the reweighted least squares: steps, and the relative error from which on weights stay finite."""
 
 
 def align(prediction: Tensor, target: Tensor, mask: Tensor | None, how: str) -> Tensor:
@@ -48,9 +46,6 @@ def align(prediction: Tensor, target: Tensor, mask: Tensor | None, how: str) -> 
 
     Returns:
         (B, 1, H, W) in the prediction's dtype; its holes are as they were. NaN for an image without a pixel to fit.
-
-    Raises:
-        ValueError: there is no such alignment, or the shapes differ.
 
     """
     if how not in ALIGNMENTS:
@@ -77,17 +72,7 @@ def align(prediction: Tensor, target: Tensor, mask: Tensor | None, how: str) -> 
 
 
 def align_map(depth: Tensor, truth: Tensor | None, how: str) -> Tensor:
-    """Return a prediction, (1, H, W), aligned to its truth, see :func:`align`; as it is where there is none.
-
-    Example:
-        >>> import torch
-        >>> from dsr.metrics.alignment import align_map
-        >>> truth = 1 + torch.rand((1, 24, 32), generator=torch.Generator().manual_seed(0))
-        >>> found = align_map(3 * truth, truth, "scale")
-        >>> bool((found - truth).abs().max() < 1e-5)
-        True
-
-    """
+    """Return a prediction, (1, H, W), aligned to its truth, see :func:`align`; as it is where there is none."""
     return depth if truth is None else align(depth[None], truth[None], None, how)[0]
 
 

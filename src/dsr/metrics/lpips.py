@@ -24,10 +24,9 @@ from dsr.utils.guards import expect_stored
 
 TRUNK_FILE = "alexnet-owt-7be5be79.pth"
 TRUNK_URL = f"https://download.pytorch.org/models/{TRUNK_FILE}"
+# what to do where the trunk is missing, for messages
 GET_TRUNK = f"get {TRUNK_URL} and set metrics.lpips_trunk=FILE or $DSR_LPIPS_TRUNK"
-"""What to do where the trunk is missing, for messages."""
-TRUNK_HASH = "7be5be79"
-"""First digits of the official file's SHA-256, as in its name."""
+TRUNK_HASH = "7be5be79"  # first digits of the official file's SHA-256, as in its name
 _MEAN = (-0.030, -0.088, -0.188)
 _STD = (0.458, 0.448, 0.450)
 _CONVOLUTIONS = {  # index in torchvision's `features`: (in, out, kernel, stride, padding)
@@ -39,8 +38,7 @@ _CONVOLUTIONS = {  # index in torchvision's `features`: (in, out, kernel, stride
 }
 _POOL_BEFORE = (3, 6)
 _DOWNLOAD_TIMEOUT = 15.0
-MIN_SIZE = 31
-"""Smallest height and width in pixels for which the trunk's last level has a feature."""
+MIN_SIZE = 31  # smallest height and width in pixels for which the trunk's last level has a feature
 
 
 class LPIPS(nn.Module):
@@ -48,9 +46,6 @@ class LPIPS(nn.Module):
 
     Args:
         trunk: state dict of torchvision's AlexNet (``features.*``; further keys are ignored).
-
-    Raises:
-        ValueError: a tensor is missing or has another shape.
 
     """
 
@@ -102,9 +97,6 @@ class LPIPS(nn.Module):
             second: (B, 3, H, W) in [-1, 1].
             mask: (B, 1, H, W) bool; each feature is weighted by the fraction of its pixels that is set. None for all.
 
-        Raises:
-            ValueError: the images are smaller than the trunk can take.
-
         """
         if min(first.shape[-2:]) < MIN_SIZE:
             came = tuple(first.shape[-2:])
@@ -149,10 +141,6 @@ def find_trunk(configured: Path | None) -> Path:
     Args:
         configured: a file; None to use the cache.
 
-    Raises:
-        FileNotFoundError: the configured file does not exist.
-        OSError: it is not in the cache and could not be downloaded; no partial file is left.
-
     """
     if configured is not None:
         if not configured.is_file():
@@ -170,13 +158,7 @@ def find_trunk(configured: Path | None) -> Path:
 
 
 def load_lpips(configured: Path | None = None) -> LPIPS:
-    """Return the LPIPS network with the trunk that :func:`find_trunk` finds.
-
-    Raises:
-        ValueError: the file is not a state dict of AlexNet.
-        OSError: no trunk is available.
-
-    """
+    """Return the LPIPS network with the trunk that :func:`find_trunk` finds."""
     path = find_trunk(configured)
     try:
         expect_stored(path)

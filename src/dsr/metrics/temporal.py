@@ -15,12 +15,10 @@ but the last. Holes are left out, and :func:`covered` stands beside them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 import torch
-import torchmetrics
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
@@ -31,10 +29,9 @@ from dsr.metrics.functional import masked_mean, masked_median
 from dsr.utils.compute_device import in_own_precision
 
 Poses = Tensor | np.ndarray | Sequence[np.ndarray]
-_VISIBLE = 50.0
-"""How fast the weight of a pixel falls with the squared difference of its colours."""
+_VISIBLE = 50.0  # how fast the weight of a pixel falls with the squared difference of its colours
+# change of the true depth from frame to frame, as a fraction of the frame's range, from which on it is motion
 _MOVING = 0.05
-"""Change of the true depth from frame to frame, as a fraction of the frame's range, from which on it is motion."""
 
 
 @in_own_precision
@@ -48,9 +45,6 @@ def flicker(depths: Tensor, static: Tensor | None = None) -> Tensor:
 
     Returns:
         () a fraction; NaN if no pixel counts.
-
-    Raises:
-        ValueError: a shape is not as above.
 
     """
     spread, mask = _spread(depths, static)
@@ -119,19 +113,6 @@ def opw(
     Returns:
         () in metres, the mean over the pairs of frames; NaN if one has nothing to compare.
 
-    Raises:
-        ValueError: a shape is not as above, or a pose is not rigid.
-
-    Example:
-        >>> import numpy as np
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.metrics.temporal import opw
-        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
-        >>> depths = torch.full((3, 1, 24, 32), 2.0, dtype=torch.float64)
-        >>> float(opw(depths, camera, [np.eye(4)] * 3))  # nothing moves, nothing flickers
-        0.0
-
     """
     known = _known(depths) if static is None else _known(depths) & static
     frames = [as_rigid(np.asarray(each), f"poses: {number}") for number, each in enumerate(poses)]
@@ -167,9 +148,6 @@ def tgm(prediction: Tensor, target: Tensor, static: Tensor | None = None) -> Ten
 
     Returns:
         () in metres; NaN if no pixel counts.
-
-    Raises:
-        ValueError: a shape is not as above.
 
     """
     if prediction.shape != target.shape:
@@ -215,76 +193,3 @@ def _sample(photo: Tensor, places: tuple[Tensor, Tensor]) -> Tensor:
     grid = torch.stack([2 * place / (size - 1) - 1 for place, size in zip(places, photo.shape[:1:-1], strict=True)], -1)
     grid = grid.nan_to_num(0).to(photo)
     return torch.nn.functional.grid_sample(photo, grid, padding_mode="border", align_corners=True)
-
-
-class SequenceMean(torchmetrics.Metric):
-    """The mean over sequences of a function of this module; ``update`` has its arguments.
-
-    It is NaN if one of the sequences has nothing to compare.
-
-    Args:
-        function: from a sequence to ().
-        **settings: as for every torchmetrics class.
-
-    """
-
-    is_differentiable = False
-    higher_is_better = False
-    full_state_update = False
-    total: Tensor
-    count: Tensor
-
-    def __init__(self, function: Callable[..., Tensor], **settings: Any) -> None:
-        super().__init__(**settings)
-        self._function = function
-        for name in ("total", "count"):
-            self.add_state(name, torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
-
-    @torch.no_grad()
-    def update(self, *sequence: Any, **named: Any) -> None:
-        """Add a sequence."""
-        self.total = self.total + self._function(*sequence, **named).to(self.total)
-        self.count = self.count + 1
-
-    def compute(self) -> Tensor:
-        """Return the mean over the sequences."""
-        return self.total / self.count
-
-    def plot(self, val: Any = None, ax: Any = None) -> Any:
-        """Plot a value, or several in a row; of matplotlib's axes, None for new ones."""
-        return self._plot(val, ax)
-
-
-class Flicker(SequenceMean):
-    """The flicker of depth, a fraction."""
-
-    def __init__(self, **settings: Any) -> None:
-        super().__init__(flicker, **settings)
-
-
-class TemporalNoise(SequenceMean):
-    """The temporal noise of Intel's tool, a fraction."""
-
-    def __init__(self, **settings: Any) -> None:
-        super().__init__(temporal_noise, **settings)
-
-
-class NormalFlicker(SequenceMean):
-    """The flicker of normals in degrees."""
-
-    def __init__(self, **settings: Any) -> None:
-        super().__init__(normal_flicker, **settings)
-
-
-class OPW(SequenceMean):
-    """The warping metric in metres."""
-
-    def __init__(self, **settings: Any) -> None:
-        super().__init__(opw, **settings)
-
-
-class TGM(SequenceMean):
-    """Temporal gradient matching in metres."""
-
-    def __init__(self, **settings: Any) -> None:
-        super().__init__(tgm, **settings)
