@@ -9,14 +9,14 @@ from typing import Literal, NamedTuple
 from dsr.geometry.camera import Camera
 from dsr.notes import LIMITS
 
-_VIEW, _USUAL_VIEW = (LIMITS["view-narrow"].threshold, LIMITS["view-wide"].threshold), (20.0, 120.0)
-"""Horizontal fields of view in degrees that are plausible, and usual."""
-_OFFSET, _SMALL_OFFSET = LIMITS["off-centre"].threshold, LIMITS["other-picture"].threshold
-"""Distance of the principal point from the centre, as a fraction of the size."""
-_RATIO = LIMITS["focal-ratio"].threshold
-"""Largest plausible ratio of fx and fy."""
-_BASELINES = LIMITS["baseline-short"].threshold, LIMITS["baseline-long"].threshold
-"""Plausible range of baselines in metres."""
+# horizontal fields of view in degrees that are plausible, and usual
+_VIEW, _USUAL_VIEW = (LIMITS["view-narrow"], LIMITS["view-wide"]), (20.0, 120.0)
+# distance of the principal point from the centre, as a fraction of the size
+_OFFSET, _SMALL_OFFSET = LIMITS["off-centre"], LIMITS["other-picture"]
+_RATIO = LIMITS["focal-ratio"]  # largest plausible ratio of fx and fy
+# plausible range of baselines in metres
+_BASELINES = LIMITS["baseline-short"], LIMITS["baseline-long"]
+_FITTING = 0.05  # up to which numbers fit another size, or have their principal point in the middle
 _SCALES = (2.0, 3.0, 4.0, 8.0, 1.5, 2.5)
 _NUMBERS = ("fx", "fy", "cx", "cy")
 
@@ -24,14 +24,9 @@ _NUMBERS = ("fx", "fy", "cx", "cy")
 class Remark(NamedTuple):
     """What was found about a camera.
 
-    Attributes:
-        level: ``note`` of what is correct at times; the others mean that it is probably, and certainly, wrong.
-        kind: what it is, in words that are equal for all cameras.
-        message: the numbers, with units.
-        advice: how to correct them.
-        code: of :data:`dsr.notes.LIMITS`; empty for a note.
-        value: what the limit was compared with.
-
+    A ``note`` is correct at times; a ``warning`` is probably, and a ``problem`` certainly, wrong. ``kind`` is equal for
+    all cameras, ``code`` one of :data:`dsr.notes.LIMITS`, empty for a note, and ``value`` what the limit was compared
+    with.
     """
 
     level: Literal["note", "warning", "problem"]
@@ -45,24 +40,16 @@ class Remark(NamedTuple):
 def judge_camera(camera: Camera, size_lr: tuple[int, int] | None = None) -> list[Remark]:
     """Return remarks on implausible values of a camera; none for a usual one.
 
-    Args:
-        camera: the camera.
-        size_lr: (height, width) of a depth map that another camera may have taken; None where there is none.
-
+    ``size_lr`` is the (height, width) of a depth map that another camera may have taken.
     """
     return [*_view(camera), *(_other_picture(camera, size_lr) or [*_centre(camera), *_shape(camera)])]
 
 
 def expect_possible(camera: Camera, name: str) -> None:
-    """Check that a camera could see its picture.
-
-    Raises:
-        ValueError: every ray of the picture is farther from the axis than any lens without distortion shows.
-
-    """
+    """Check that a camera could see its picture."""
     beyond = (max(-0.5 - middle, middle - size + 0.5, 0) / focal for middle, size, focal in _axes(camera))
     angle = math.degrees(math.atan(math.hypot(*beyond)))
-    if angle > LIMITS["beside-axis"].threshold:
+    if angle > LIMITS["beside-axis"]:
         raise ValueError(
             f"{name}: expected a principal point in or near the picture of {camera.width} x {camera.height} pixels "
             f"(width x height), got cx {camera.cx:g} and cy {camera.cy:g} with fx {camera.fx:g} and fy {camera.fy:g}, "
@@ -81,16 +68,10 @@ def plausible_baseline(baseline: float) -> bool:
 
 
 def implausible_distance(low: float, high: float) -> Literal["depth-near", "depth-far"] | None:
-    """Return which limit a depth map is beyond with all that it shows, if any.
-
-    Args:
-        low: near which its depth begins, in metres.
-        high: near which it ends.
-
-    """
-    if high < LIMITS["depth-near"].threshold:
+    """Return which limit a depth map is beyond with all that it shows, from ``low`` to ``high`` metres, if any."""
+    if high < LIMITS["depth-near"]:
         return "depth-near"
-    return "depth-far" if low > LIMITS["depth-far"].threshold else None
+    return "depth-far" if low > LIMITS["depth-far"] else None
 
 
 def view_of(camera: Camera) -> float:
@@ -196,7 +177,7 @@ def _other_picture(camera: Camera, size_lr: tuple[int, int] | None) -> list[Rema
 
 def _is_near(found: float, wanted: float) -> bool:
     """Return whether two ratios are about equal."""
-    return abs(found / wanted - 1) < LIMITS["other-picture.size"].threshold
+    return abs(found / wanted - 1) < _FITTING
 
 
 def _better_order(camera: Camera) -> list[tuple[str, str]] | None:
@@ -208,8 +189,8 @@ def _better_order(camera: Camera) -> list[tuple[str, str]] | None:
         if min(fx, fy) <= 0:
             continue
         other = Camera(camera.width, camera.height, fx, fy, cx, cy)
-        centred = offset_of(other) < LIMITS["other-picture.offset"].threshold
-        square = _ratio(other) < LIMITS["other-picture.ratio"].threshold
+        centred = offset_of(other) < _FITTING
+        square = _ratio(other) < 1.03
         fits = centred and square and _USUAL_VIEW[0] <= view_of(other) <= _USUAL_VIEW[1]
         moved = [(_NUMBERS[place], _NUMBERS[index]) for place, index in enumerate(order) if place != index]
         if fits and (best is None or len(moved) < len(best)):

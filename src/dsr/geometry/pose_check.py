@@ -21,10 +21,10 @@ from dsr.notes import LIMITS, Assumption
 _Reading = Callable[[Matrix], Matrix]
 
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+# axes x right, y down, z forward in the frame x forward, y right, z down, as TartanAir and aircraft have it
 _FORWARD_DOWN = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-"""Axes x right, y down, z forward in the frame x forward, y right, z down, as TartanAir and aircraft have it."""
+# the same in the frame x forward, y left, z up, that of robots (ROS)
 _FORWARD_UP = np.diag([1.0, -1.0, -1.0, 1.0]) @ _FORWARD_DOWN
-"""The same in the frame x forward, y left, z up, that of robots (ROS)."""
 
 
 def _as_given(pose: Matrix) -> Matrix:
@@ -81,21 +81,23 @@ def _readings() -> dict[str, _Reading]:
     return {name: reading for changes in sorted(found) for name, reading in found[changes].items()}
 
 
+# by what the poses then are: what makes poses as :mod:`dsr.geometry.rigid_motion` has them of those; "" as given
 READINGS = _readings()
-"""By what the poses then are: what makes poses as :mod:`dsr.geometry.rigid_motion` has them of those; "" as given."""
 
-_WIDEST = 320
-"""Maps are reduced to at most as many pixels across, by leaving out pixels."""
-_ACROSS = 24
-"""Points across a map that are moved."""
-_GAPS = (0, 1, 3, 10, 30)
-"""Places of the frames of a group that are compared with each other, from its first one."""
-_GROUPS = 4
-"""Groups of frames of a sequence."""
-_TIE = 0.9
-"""Readings whose evidence is at least this much of the best one's cannot be distinguished from it."""
-_MOST_NAMES = 3
-"""Readings that a message names."""
+_WIDEST = 320  # maps are reduced to at most as many pixels across, by leaving out pixels
+_ACROSS = 24  # points across a map that are moved
+_GAPS = (0, 1, 3, 10, 30)  # places of the frames of a group that are compared with each other, from its first one
+_GROUPS = 4  # groups of frames of a sequence
+_TIE = 0.9  # readings whose evidence is at least this much of the best one's cannot be distinguished from it
+_MOST_NAMES = 3  # readings that a message names
+
+
+_TOLERANCE = 0.04  # difference of two depths over the farther one, up to which frames agree in a pixel
+_OVERLAP = 0.3  # share of a frame's points in another one's view, below which the two are not compared
+_EXPLAINED = 0.7  # share of the pixels in which frames have to agree under another reading
+_LEAST = 0.5  # pairs of frames that disagree wholly without motion; fewer distinguish nothing
+_ALIKE = 0.7  # share of the pixels in which frames that look alike agree without any motion
+_STILL = 1.2  # times as many pixels have to disagree under the poses as without any motion
 
 
 class Agreement(NamedTuple):
@@ -121,10 +123,7 @@ def sample(count: int) -> list[tuple[int, ...]]:
 def check(count: int, load: Callable[[int], PosedMap | None]) -> Assumption | None:
     """Compare some frames of a sequence with each other; see :func:`find_fault`.
 
-    Args:
-        count: number of frames.
-        load: returns the frame of a number; None for one that cannot be read, or has no pose.
-
+    ``load`` returns the frame of a number; None for one that cannot be read, or has no pose.
     """
     groups = ([prepare(each) for number in group if (each := load(number)) is not None] for group in sample(count))
     return find_fault(compare(groups))
@@ -177,7 +176,7 @@ def _compare(frame: Reduced, other: Reduced) -> tuple[np.ndarray, np.ndarray]:
     rows, columns = (np.rint(np.where(inside, each, 0)).astype(np.intp) for each in (v, u))
     seen = np.where(inside, frame.depth[rows, columns], np.nan)
     count = np.isfinite(seen).sum(1)
-    agreeing = np.abs(seen - z) <= LIMITS["poses.tolerance"].threshold * np.maximum(seen, z)
+    agreeing = np.abs(seen - z) <= _TOLERANCE * np.maximum(seen, z)
     return count / max(z.shape[1], 1), agreeing.sum(1) / np.maximum(count, 1)
 
 
@@ -186,17 +185,16 @@ def find_fault(agreement: Agreement) -> Assumption | None:
 
     A pair of frames counts as much as they disagree without motion.
     """
-    seen, agreed = agreement.overlap >= LIMITS["poses.overlap"].threshold, agreement.agreed
+    seen, agreed = agreement.overlap >= _OVERLAP, agreement.agreed
     without = agreed[:, -1:]
     given = np.where(seen[:, :1], agreed[:, :1], without)
     weight = seen * (1 - without)  # (pairs, readings + 1)
     total = weight.sum(0)
     means = [(weight * each).sum(0) / np.maximum(total, 1e-9) for each in (agreed, given, without)]
     gain = means[0] - np.maximum(means[1], means[2])
-    explained, least = LIMITS["poses.explained"].threshold, LIMITS["poses.weight"].threshold
-    evidence = np.where((means[0] >= explained) & (total >= least), total * gain, 0)[:-1]
+    evidence = np.where((means[0] >= _EXPLAINED) & (total >= _LEAST), total * gain, 0)[:-1]
     best = int(evidence.argmax())
-    if evidence[best] > 0 and gain[best] >= LIMITS["poses"].threshold:
+    if evidence[best] > 0 and gain[best] >= LIMITS["poses"]:
         names = list(READINGS)
         tied = [names[place] for place in np.flatnonzero(evidence >= _TIE * evidence[best])]
         simplest = [name for name in tied if name.count(",") == min(other.count(",") for other in tied)]
@@ -207,8 +205,8 @@ def find_fault(agreement: Agreement) -> Assumption | None:
             "poses",
             round(float(gain[best]), 3),
         )
-    alike = agreement.moved.size > 0 and float(np.median(without)) >= LIMITS["poses-far.alike"].threshold
-    if alike and agreement.moved.min() >= LIMITS["poses-far"].threshold:
+    alike = agreement.moved.size > 0 and float(np.median(without)) >= _ALIKE
+    if alike and agreement.moved.min() >= LIMITS["poses-far"]:
         nearest = float(agreement.moved.min())
         return Assumption(
             "under the poses the camera is far away in the next frame, which looks similar: are they in millimetres?",
@@ -217,7 +215,7 @@ def find_fault(agreement: Agreement) -> Assumption | None:
             round(nearest, 1),
         )
     wrong, still = (float((seen[:, 0] * (1 - agreed[:, k])).sum() / max(seen[:, 0].sum(), 1)) for k in (0, -1))
-    if wrong < LIMITS["poses-disagree"].threshold or wrong < LIMITS["poses-disagree.still"].threshold * still:
+    if wrong < LIMITS["poses-disagree"] or wrong < _STILL * still:
         return None
     return Assumption(
         "neighbouring frames do not agree under the poses",

@@ -19,18 +19,14 @@ from skimage.measure import marching_cubes
 from dsr.geometry.camera import Camera
 from dsr.geometry.rigid_motion import Matrix, invert
 
+# largest change of the distance within a cell, in units of the truncation; at a surface it is at most 0.43
 _STEEPEST = 0.9
-"""Largest change of the distance within a cell, in units of the truncation; at a surface it is at most 0.43."""
-_SIDE = 8
-"""Voxels along a side of a block."""
-_TRUNCATION = 4.0
-"""Distance from the surface, in voxels, beyond which it does not count."""
-MOST_BLOCKS = 120_000
-"""Blocks that are stored, 8 KiB each."""
+_SIDE = 8  # voxels along a side of a block
+_TRUNCATION = 4.0  # distance from the surface, in voxels, beyond which it does not count
+MOST_BLOCKS = 120_000  # blocks that are stored, 8 KiB each
+# largest extent of the surfaces in blocks of one layer, 2.3 KiB each, whether they are stored or not
 _LARGEST_LAYER = 65_536
-"""Largest extent of the surfaces in blocks of one layer, 2.3 KiB each, whether they are stored or not."""
-_AT_ONCE = 2048
-"""Blocks that are updated at a time."""
+_AT_ONCE = 2048  # blocks that are updated at a time
 
 
 class PosedMap(NamedTuple):
@@ -55,25 +51,9 @@ class FusedMesh(NamedTuple):
 
 
 def fuse_maps(maps: Callable[[], Iterable[PosedMap]], voxel: float) -> FusedMesh:
-    """Return the surface on which depth maps agree.
+    """Return the surface on which depth maps agree, in voxels of an edge length in metres.
 
-    Args:
-        maps: yields the maps; it is called twice, and one map is held at a time.
-        voxel: edge length of a voxel in metres.
-
-    Raises:
-        ValueError: the voxels are too small for the space that the maps see, or no surface is left.
-
-    Example:
-        >>> import numpy as np
-        >>> import dsr
-        >>> from dsr.geometry.tsdf import PosedMap, fuse_maps
-        >>> camera = dsr.Camera.from_fov(60, width=64, height=48)
-        >>> wall = PosedMap(np.full((48, 64), 2.0), camera, np.eye(4))
-        >>> mesh = fuse_maps(lambda: [wall, wall], voxel=0.05)
-        >>> bool(abs(mesh.vertices[:, 2] - 2.0).max() < 1e-3)
-        True
-
+    ``maps`` yields the maps; it is called twice, and one map is held at a time.
     """
     if not 0 < voxel < np.inf:
         raise ValueError(f"voxel: expected a positive number of metres, got {voxel}")
@@ -95,12 +75,7 @@ def fuse_maps(maps: Callable[[], Iterable[PosedMap]], voxel: float) -> FusedMesh
 
 
 def suggest_voxel(maps: Iterable[PosedMap]) -> float:
-    """Return a voxel's edge length: the median width of a pixel on the surfaces, in metres.
-
-    Raises:
-        ValueError: there is no valid pixel.
-
-    """
+    """Return a voxel's edge length: the median width of a pixel on the surfaces, in metres."""
     widths = [float(np.nanmedian(each.depth)) / each.camera.fx for each in maps if np.isfinite(each.depth).any()]
     if not widths:
         raise ValueError("expected depth maps with at least one known pixel, all are holes")

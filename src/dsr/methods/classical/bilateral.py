@@ -41,8 +41,7 @@ from dsr.methods.inpainting import inpaint
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 
-_NO_WEIGHT = 10.0
-"""Standard deviations of depth at which a pixel has no weight: exp(-50)."""
+_NO_WEIGHT = 10.0  # standard deviations of depth at which a pixel has no weight: exp(-50)
 
 
 class Bilateral(GuidedMethod):
@@ -57,22 +56,6 @@ class Bilateral(GuidedMethod):
         sigma_space: standard deviation of the Gaussian of distances, in low-resolution pixels.
         fill_holes: whether holes are inpainted; otherwise a high-resolution pixel whose nearest low-resolution pixel is
             a hole is a hole.
-
-    Raises:
-        ValueError: a value is not positive.
-
-    Example:
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.degradation.downsampling import Downsampling, make_sample
-        >>> from dsr.sample import Scene
-        >>> from dsr.methods.classical.bilateral import Bilateral
-        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
-        >>> depth = torch.full((1, 24, 32), 2.0, dtype=torch.float64)
-        >>> scene = Scene("mine", "wall", torch.rand(3, 24, 32), camera, depth)
-        >>> sample = make_sample(scene, 4, Downsampling("box"), "orthogonal")
-        >>> bool((Bilateral()(sample) - 2).abs().max() < 1e-3)
-        True
 
     """
 
@@ -124,9 +107,6 @@ class JointBilateral(GuidedMethod):
         sigma_colour: standard deviation of the Gaussian of the Euclidean colour difference, colours in [0, 1].
         fill_holes, slopes: see :class:`dsr.methods.classical.photo_guided.GuidedMethod`; a hole is filled by this
             filter within the radius, and inpainted beyond it.
-
-    Raises:
-        ValueError: a value is not positive.
 
     """
 

@@ -51,13 +51,12 @@ from dsr.methods.inpainting import inpaint
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps, part_of
 
-_CHUNK = 4096
-"""Low-resolution pixels that are flooded at once."""
+_CHUNK = 4096  # low-resolution pixels that are flooded at once
+# rows and columns from a pixel to its neighbours, the nearest first
 _BESIDE = ((-1, 0), (0, -1), (0, 1), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
-"""Rows and columns from a pixel to its neighbours, the nearest first."""
 
+# factor by which a result may be farther than the farthest valid low-resolution pixel, or nearer than the nearest
 _BEYOND = 4.0
-"""Factor by which a result may be farther than the farthest valid low-resolution pixel, or nearer than the nearest."""
 
 
 class _Planes(NamedTuple):
@@ -237,9 +236,6 @@ class EdgeGuided(Method):
     Attributes:
         history: of the last call: iterations (over all stages), energy of the labels, largest change of a message.
 
-    Raises:
-        ValueError: a value is out of range.
-
     """
 
     abilities = Abilities(cost=Cost(1500, 12))
@@ -270,12 +266,7 @@ class EdgeGuided(Method):
 
     @torch.inference_mode()
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
-        """Return the high-resolution depth, (1, H, W) in metres in the precision of the low-resolution depth.
-
-        Raises:
-            NoSolutionError: edges do not recur across scales, see the module.
-
-        """
+        """Return the high-resolution depth, (1, H, W) in metres in the precision of the low-resolution depth."""
         disparity_lr = sample.disparity_lr(torch.float64)[0]
         valid = disparity_lr.isfinite()
         lowest, highest = (float(bound) for bound in disparity_lr[valid].aminmax())

@@ -49,16 +49,12 @@ from dsr.methods.classical.photo_guided import estimate_slopes
 from dsr.methods.inpainting import inpaint
 from dsr.utils.progress import Steps
 
-KEPT = 0.2
-"""Fraction of the chosen patches from which a pixel is an edge."""
-_WEAK = 0.4
-"""Canny's lower threshold relative to the upper one."""
-_CELL = 2
-"""Side in pixels of the cells with at most one patch each."""
-_SMALLEST = 4
-"""Minimum number of edge pixels around an edge pixel, itself included."""
+KEPT = 0.2  # fraction of the chosen patches from which a pixel is an edge
+_WEAK = 0.4  # canny's lower threshold relative to the upper one
+_CELL = 2  # side in pixels of the cells with at most one patch each
+_SMALLEST = 4  # minimum number of edge pixels around an edge pixel, itself included
+# rows and columns of the 8 neighbours in a 3 x 3 window, clockwise from the one above
 _AROUND = ((0, 1), (0, 2), (1, 2), (2, 2), (2, 1), (2, 0), (1, 0), (0, 0))
-"""Rows and columns of the 8 neighbours in a 3 x 3 window, clockwise from the one above."""
 
 
 def predict_edge_map(
@@ -81,9 +77,6 @@ def predict_edge_map(
         sharp_weight: weight of the edges relative to that of their distance transform.
         smoothness: weight of the smoothness term.
         iterations: maximum number of iterations of belief propagation.
-
-    Raises:
-        NoSolutionError: the map has edges, but none once it is downsampled.
 
     """
     border = -(-(PATCH // 2 + 1) // scale)

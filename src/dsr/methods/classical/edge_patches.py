@@ -26,17 +26,12 @@ from torch.nn import functional
 
 from dsr.utils.progress import Steps
 
-PATCH = 11
-"""Rows and columns of a patch, in high-resolution pixels."""
-_ENTRIES = 2**24
-"""Maximum number of distances between patches in memory."""
-_BITS = 62
-"""Pixels per 64-bit word, without its sign."""
+PATCH = 11  # rows and columns of a patch, in high-resolution pixels
+_ENTRIES = 2**24  # maximum number of distances between patches in memory
+_BITS = 62  # pixels per 64-bit word, without its sign
 
-_MOVE = 0.5
-"""Damping factor of messages; 1 would be undamped."""
-CHECK_EVERY = 5
-"""Iterations between two evaluations of the labels."""
+_MOVE = 0.5  # damping factor of messages; 1 would be undamped
+CHECK_EVERY = 5  # iterations between two evaluations of the labels
 
 
 class Patches(NamedTuple):

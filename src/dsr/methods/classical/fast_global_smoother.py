@@ -28,10 +28,9 @@ from torch import Tensor
 
 from dsr.methods.classical.photo_guided import Guided, GuidedMethod, expect_positive
 
+# minimum smoothed confidence; below it digits are lost, and the result is the nearest low-resolution value
 _LEAST = 1e-200
-"""Minimum smoothed confidence; below it digits are lost, and the result is the nearest low-resolution value."""
-_HALF = 0.5 + 1e-6
-"""Maximum distance, in high-resolution pixels, of data from the centre of a low-resolution pixel."""
+_HALF = 0.5 + 1e-6  # maximum distance, in high-resolution pixels, of data from the centre of a low-resolution pixel
 
 
 class FastGlobalSmoother(GuidedMethod):
@@ -42,9 +41,6 @@ class FastGlobalSmoother(GuidedMethod):
         sigma_colour: Euclidean colour difference, colours in [0, 1], at which a neighbour's weight is 1 / e.
         iterations: number of pairs of passes.
         fill_holes, slopes: see :class:`dsr.methods.classical.photo_guided.GuidedMethod`.
-
-    Raises:
-        ValueError: a value is not positive.
 
     """
 

@@ -24,10 +24,9 @@ from torch.nn import functional
 
 from dsr.methods.classical.photo_guided import Guided, GuidedMethod, expect_positive, expect_window
 
+# the entries of a symmetric 3 x 3 matrix, in the order of storage
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-"""The entries of a symmetric 3 x 3 matrix, in the order of storage."""
-_ROWS = ([0, 1, 2], [1, 3, 4], [2, 4, 5])
-"""Indices of the matrix's rows among these."""
+_ROWS = ([0, 1, 2], [1, 3, 4], [2, 4, 5])  # indices of the matrix's rows among these
 _TINY = 1e-30
 
 
@@ -38,22 +37,6 @@ class GuidedFilter(GuidedMethod):
         radius: radius of the windows in low-resolution pixels.
         epsilon: regularisation added to the variances of colours in [0, 1]; smaller variances have no effect.
         fill_holes, slopes: see :class:`dsr.methods.classical.photo_guided.GuidedMethod`.
-
-    Raises:
-        ValueError: the radius or epsilon is not positive.
-
-    Example:
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.degradation.downsampling import Downsampling, make_sample
-        >>> from dsr.sample import Scene
-        >>> from dsr.methods.classical.guided_filter import GuidedFilter
-        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
-        >>> depth = torch.full((1, 24, 32), 2.0, dtype=torch.float64)
-        >>> scene = Scene("mine", "wall", torch.rand(3, 24, 32), camera, depth)
-        >>> sample = make_sample(scene, 4, Downsampling("box"), "disparity")
-        >>> bool((GuidedFilter()(sample) - 2).abs().max() < 1e-3)
-        True
 
     """
 

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from dsr.utils.progress import Steps
 
-CHECK_EVERY = 50
-"""Iterations between two checks of how far the map has moved."""
+CHECK_EVERY = 50  # iterations between two checks of how far the map has moved
 
 
 class Solution(NamedTuple):

@@ -25,10 +25,9 @@ from dsr.methods.networks.normalisation import lr_coordinates
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 
-_WIDEST = 1024
-"""Largest radius or width of a filter, in low-resolution pixels."""
+_WIDEST = 1024  # largest radius or width of a filter, in low-resolution pixels
+# factor by which a result may be farther than the farthest valid low-resolution pixel, or nearer than the nearest
 _BEYOND = 4.0
-"""Factor by which a result may be farther than the farthest valid low-resolution pixel, or nearer than the nearest."""
 
 
 @dataclass(frozen=True)

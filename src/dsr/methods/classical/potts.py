@@ -24,14 +24,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-BRIGHTEST = 2.0
-"""Maximum albedo; the minimum is 0."""
-_LEVELS = 5
-"""Number of times that the weight of boundaries grows to reach its value."""
-_GROWTH = 4.0
-"""Factor of its growth."""
-_SHUFFLE = 2654435761
-"""Multiplier of Knuth's hash."""
+BRIGHTEST = 2.0  # maximum albedo; the minimum is 0
+_LEVELS = 5  # number of times that the weight of boundaries grows to reach its value
+_GROWTH = 4.0  # factor of its growth
+_SHUFFLE = 2654435761  # multiplier of Knuth's hash
 _RANGE = 2**32
 
 

@@ -50,12 +50,9 @@ from dsr.utils.decoding import decode_pixels
 from dsr.utils.guards import MOST_FILE, pixels_beside, read_limited
 from dsr.utils.progress import Steps
 
-_RENEW = 10
-"""Iterations between two searches for the regions of the albedo."""
-_NEARER = 4.0
-"""Factor by which a result may be nearer than the nearest valid low-resolution pixel."""
-_WHITE = 127
-"""Value of a mask above which a pixel is white."""
+_RENEW = 10  # iterations between two searches for the regions of the albedo
+_NEARER = 4.0  # factor by which a result may be nearer than the nearest valid low-resolution pixel
+_WHITE = 127  # value of a mask above which a pixel is white
 
 
 class ShapeFromShading(Method):
@@ -79,9 +76,6 @@ class ShapeFromShading(Method):
         history: of the last call, each iteration's ``objective``, its terms ``shading``, ``data``, ``area`` and
             ``boundaries``, the ``residual`` (RMS difference of theta and the slopes) and the movement of z, ``moved``
             (RMS, relative to the median depth).
-
-    Raises:
-        ValueError: a value is out of range, or there is no such folder.
 
     """
 
@@ -118,12 +112,7 @@ class ShapeFromShading(Method):
 
     @torch.inference_mode()
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
-        """Return high-resolution depth without holes, (1, H, W) in metres on the sample's device.
-
-        Raises:
-            ValueError: the sample's mask is missing, or is no image of its size.
-
-        """
+        """Return high-resolution depth without holes, (1, H, W) in metres on the sample's device."""
         self.history = []
         solver, metres = self.prepare(sample)
         for done in range(1, self.iterations + 1):
@@ -182,9 +171,6 @@ def read_foreground(path: Path, size: tuple[int, int]) -> np.ndarray:
 
     Args:
         size: the height and width that it must have.
-
-    Raises:
-        ValueError: it is missing, damaged, of another size, or black.
 
     """
     if not path.is_file():

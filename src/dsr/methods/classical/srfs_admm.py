@@ -38,14 +38,11 @@ from dsr.methods.classical.finite_differences import box_mean, repeat_blocks
 from dsr.methods.classical.iterations import conjugate_gradients
 from dsr.methods.classical.potts import Regions, boundary_length, fit_albedo, fuse
 
-_TINY = 1e-12
-"""Minimum length of m, which avoids division by 0."""
+_TINY = 1e-12  # minimum length of m, which avoids division by 0
 
 _CG_ITERATIONS, _CG_TOLERANCE = 60, 1e-6
-_INNER = 3
-"""Levenberg-Marquardt steps in an update of theta."""
-_LESS, _MORE = 0.2, 5.0
-"""Factors of its damping after a step that lowers the energy, and after one that does not."""
+_INNER = 3  # levenberg-Marquardt steps in an update of theta
+_LESS, _MORE = 0.2, 5.0  # factors of its damping after a step that lowers the energy, and after one that does not
 
 
 class Surface(NamedTuple):
@@ -122,8 +119,7 @@ def fit_lighting(rgb: Tensor, albedo: Tensor, normals: Tensor, inside: Tensor) -
     return (torch.linalg.pinv(gram, hermitian=True, rtol=_RANK) @ right)[..., 0]
 
 
-_RANK = 1e-10
-"""Relative cutoff of singular values, below which a direction of the light is not determined."""
+_RANK = 1e-10  # relative cutoff of singular values, below which a direction of the light is not determined
 
 
 class Weights(NamedTuple):

@@ -51,12 +51,9 @@ from dsr.methods.noise_level import estimate_sensor_noise
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 
-_RELAXATION = 1.9
-"""Over-relaxation factor; the iteration converges below 2."""
-_SLOPE = 0.3
-"""Scale of slopes relative to the map, per pixel, for step sizes."""
-_NOISE_WEIGHT = 0.6
-"""The weight of the data term, times the noise of a normalised map and the scale."""
+_RELAXATION = 1.9  # over-relaxation factor; the iteration converges below 2
+_SLOPE = 0.3  # scale of slopes relative to the map, per pixel, for step sizes
+_NOISE_WEIGHT = 0.6  # the weight of the data term, times the noise of a normalised map and the scale
 _LARGEST_WEIGHT = 1000.0
 
 
@@ -101,22 +98,6 @@ class TotalGeneralisedVariation(Method):
         sharpness: strength of the image's edges, across which the map may jump (beta).
         exponent: exponent of the image's gradient (gamma).
         step_ratio: ratio of dual to primal step sizes; changes the speed of convergence, not the minimum.
-
-    Raises:
-        ValueError: a value is out of range.
-
-    Example:
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.degradation.downsampling import Downsampling, make_sample
-        >>> from dsr.sample import Scene
-        >>> from dsr.methods.classical.tgv import TotalGeneralisedVariation
-        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
-        >>> depth = torch.full((1, 24, 32), 2.0, dtype=torch.float64)
-        >>> scene = Scene("mine", "wall", torch.rand(3, 24, 32), camera, depth)
-        >>> sample = make_sample(scene, 4, Downsampling("box"), "disparity")
-        >>> bool((TotalGeneralisedVariation(iterations=10)(sample) - 2).abs().max() < 1e-3)
-        True
 
     """
 

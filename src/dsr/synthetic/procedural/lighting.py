@@ -22,8 +22,7 @@ from dsr.synthetic.ray_surfaces import Array
 _GRAZING = 0.12  # smallest cosine between ray and normal that a displacement is divided by
 
 Cookie = Callable[[Array], Array]
-SETS = 16
-"""Number of sets into which the samples of a light are divided; neighbouring pixels use different sets."""
+SETS = 16  # number of sets into which the samples of a light are divided; neighbouring pixels use different sets
 _SAMPLES_PER_SET = 3
 
 

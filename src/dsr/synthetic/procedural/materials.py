@@ -15,8 +15,7 @@ from dsr.synthetic.procedural.reliefs import spectrum
 from dsr.synthetic.procedural.shape import Shape, random_rotation
 from dsr.synthetic.ray_surfaces import Array
 
-Image = NDArray[np.uint8]
-"""(S, S, 3); a value stands for the linear light (value / 255)**2."""
+Image = NDArray[np.uint8]  # (S, S, 3); a value stands for the linear light (value / 255)**2
 _SIDE = 384
 _FONTS = (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_TRIPLEX, cv2.FONT_HERSHEY_COMPLEX, cv2.FONT_HERSHEY_DUPLEX)
 _LETTERS = list("abcdefghijklmnoprstuvwyz      ")

@@ -13,8 +13,7 @@ from dsr.synthetic.procedural.materials import MaterialSampler
 from dsr.synthetic.procedural.photo import SceneLayout, View, Viewpoint, develop, radiance
 from dsr.synthetic.rendering import Rendering
 
-PROCEDURAL_VERSION = 1
-"""Version of the scenes; it has to be increased whenever an image changes."""
+PROCEDURAL_VERSION = 1  # version of the scenes; it has to be increased whenever an image changes
 _PREVIEW_SIZE = 64
 _MIN_DEPTH, _MAX_MEDIAN_DEPTH = 0.25, 10.0
 _LAYOUT_TRIES, _CAMERA_TRIES = 6, 10
@@ -54,9 +53,6 @@ def render_random_scene(seed: int, index: int, size: int = 512) -> Rendering:
     Returns:
         The photo and its depth in metres, which is more than 0.2 everywhere and exact for the surfaces that
         :mod:`dsr.synthetic.procedural.lighting` describes.
-
-    Raises:
-        ValueError: a number is negative, or the size is not positive.
 
     """
     for name, value, least in (("seed", seed, 0), ("index", index, 0), ("size", size, 1)):
