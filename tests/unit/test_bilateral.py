@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-import dsr
 from dsr.geometry.camera import Camera
 from dsr.methods.classical.bilateral import Bilateral, filter_bilateral
 from dsr.sample import DepthSample
@@ -95,23 +94,6 @@ def test_hole_of_a_smaller_map_stays_a_hole() -> None:
 def test_parameter_that_is_not_positive_is_refused(name: str) -> None:
     with pytest.raises(ValueError, match=f"^{name}: expected a positive number for the bilateral filter, got 0"):
         Bilateral(**{name: 0})
-
-
-def test_map_of_the_photo_s_size_is_not_averaged_first() -> None:
-    values = _map(12, 16)
-    photo = np.zeros((12, 16, 3))
-    expected = filter_bilateral(torch.from_numpy(values)[None], 19, 0.03, 3.0)[0].numpy()
-    np.testing.assert_allclose(dsr.upsample(photo, values, CAMERA, method="bilateral"), expected, rtol=1e-6)
-    averaged = dsr.upsample(photo, values, CAMERA, 4, method="bilateral")
-    assert not np.allclose(averaged, expected, rtol=1e-3)
-
-
-@pytest.mark.parametrize("size", [(12, 16), (3, 4), (5, 6), (11, 15)])
-def test_upsample_takes_a_map_of_any_size(size: tuple[int, int]) -> None:
-    values = np.full(size, 1.5, np.float32)
-    values[0, 0] = np.nan
-    depth = dsr.upsample(np.zeros((12, 16, 3)), values, CAMERA, method="bilateral")
-    np.testing.assert_allclose(depth, 1.5, rtol=1e-6)
 
 
 @pytest.mark.shared

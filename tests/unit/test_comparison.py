@@ -40,14 +40,6 @@ def test_comparison_shows_photo_input_result_and_truth_and_all_four_lights() -> 
         assert (_panel(picture, 3, light)[0] - 255 * difference).abs().max() <= 1
 
 
-def test_comparison_has_a_label_above_each_panel() -> None:
-    picture = comparison(DEPTH, DEPTH, RAYS, RGB, LOW)
-    labels = [picture[0, row * 160 : row * 160 + 16, column * 160 : (column + 1) * 160] for row in range(4)
-              for column in range(4)]  # fmt: skip
-    assert all(label.max() == 255 for label in labels)
-    assert not any(torch.equal(labels[i], labels[j]) for i in range(16) for j in range(i))
-
-
 def test_comparison_without_truth_shows_the_result_alone_and_holes_black() -> None:
     depth = DEPTH.clone()
     depth[..., 5:9, 5:9] = torch.nan
@@ -56,8 +48,3 @@ def test_comparison_without_truth_shows_the_result_alone_and_holes_black() -> No
     assert int(_panel(picture, 0, 2)[:, 5:9, 5:9].max()) == 0
     assert int(_panel(picture, 0, 3).max()) == 0
     assert int(_panel(picture, 1, 3)[:, 5:8, 5:8].max()) == 0
-
-
-def test_panels_of_small_maps_are_enlarged_so_that_labels_fit() -> None:
-    picture = comparison(DEPTH[..., :32, :40], None, RAYS[..., :32, :40], RGB[..., :32, :40], LOW[..., :8, :10])
-    assert picture.shape == (3, 2 * (128 + 16), 4 * 160)

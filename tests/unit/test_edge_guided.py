@@ -13,7 +13,7 @@ from torch import Tensor
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.methods.base import NoSolutionError
-from dsr.methods.classical.edge_guided import EdgeGuided, bilateral_filter, find_reachable, prime_factors
+from dsr.methods.classical.edge_guided import EdgeGuided, bilateral_filter, find_reachable
 from dsr.methods.classical.interpolation import Interpolation
 from dsr.methods.classical.photo_guided import estimate_slopes
 from dsr.sample import DepthSample, Scene
@@ -133,34 +133,12 @@ def test_holes_are_kept_or_filled_and_their_surroundings_stay_a_plane(fill: bool
     assert float((fine - plane)[~hole].abs().max()) < (0.2 if fill else 1e-9)
 
 
-def test_result_is_deterministic_and_its_progress_reported() -> None:
-    sample = _sample(_step(96, 10.0)[0])
-    method = EdgeGuided(iterations=30)
-    reported: list[tuple[int, int]] = []
-    first = method(sample, lambda done, most: reported.append((done, most)))
-    assert reported[-1] == (60, 60)
-    assert [entry["iteration"] for entry in method.history] == sorted({e["iteration"] for e in method.history})
-    assert torch.equal(first, method(sample))
-
-
-def test_output_precision_is_that_of_the_input() -> None:
-    v, u = _grid(32, 32)
-    sample = _sample((6 + 0.02 * u - 0.03 * v).float())
-    fine = EdgeGuided()(sample)
-    assert fine.dtype == torch.float32
-    torch.testing.assert_close(fine, sample.depth, rtol=1e-5, atol=0)
-
-
 def test_map_too_small_for_patches_has_no_solution() -> None:
     sample = _sample(_step(32, 0.0)[0])
     with pytest.raises(
         NoSolutionError, match="edge-guided upsampling: the edges of a map of 8 x 8 pixels do not recur"
     ):
         EdgeGuided()(sample)
-
-
-def test_scale_is_split_into_prime_factors() -> None:
-    assert [prime_factors(n) for n in (1, 2, 7, 8, 12)] == [[], [2], [7], [2, 2, 2], [2, 2, 3]]
 
 
 @pytest.mark.parametrize("name", ["radius", "step", "sharp_weight", "smoothness", "sigma_space", "mixed"])

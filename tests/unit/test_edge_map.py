@@ -15,7 +15,6 @@ from dsr.methods.classical.edge_map import detect_edges, predict_edge_map, thin
 from dsr.methods.classical.edge_patches import (
     PATCH,
     Patches,
-    average_patches,
     deduplicate,
     edge_distances,
     energy,
@@ -61,19 +60,6 @@ def test_belief_propagation_equals_viterbi_on_a_chain() -> None:
     assert label(unary, pairs, costs, 300, 1e-9).energy == pytest.approx(float(best.min()), abs=1e-9)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_belief_propagation_finds_the_minimum_on_a_small_grid_with_loops(seed: int) -> None:
-    pairs = [(0, 1), (1, 2), (3, 4), (4, 5), (0, 3), (1, 4), (2, 5)]
-    unary, ends, costs = _field(6, pairs, seed=seed)
-    found = label(unary, ends, 0.5 * costs)
-    assert found.energy == pytest.approx(_least(unary, ends, 0.5 * costs), abs=1e-12)
-
-
-def test_nodes_without_pairs_take_their_cheapest_label() -> None:
-    unary, pairs, costs = _field(4, [])
-    assert torch.equal(label(unary, pairs, costs).labels, unary.argmin(dim=1))
-
-
 def test_distances_equal_scipy_and_overlaps_equal_a_loop() -> None:
     masks = _patches(5)
     expected = [ndimage.distance_transform_edt(~each) for each in masks.numpy()]
@@ -99,13 +85,6 @@ def test_distinct_pairs_are_kept_once_and_found_again() -> None:
     assert torch.equal(which[:, 0], torch.arange(6))
     assert float(far[:, 0].max()) < 1e-3
     assert len(deduplicate(Patches(orient(low), orient(high))).low) == 48
-
-
-def test_average_of_one_patch_is_the_patch() -> None:
-    patch = _patches(1)
-    mean = average_patches(patch.flatten(1).float(), torch.tensor([[7, 9]]), (20, 20))
-    assert torch.equal(mean[2:13, 4:15].bool(), patch[0])
-    assert int(mean.count_nonzero()) == int(patch.sum())
 
 
 def test_thinning_reduces_a_bar_to_a_line_and_keeps_a_line() -> None:

@@ -86,19 +86,6 @@ def test_low_and_high_resolution_pixels_are_matched_through_their_cameras(kernel
     np.testing.assert_allclose(fine[inside], perspective.numpy()[inside], rtol=1e-12)
 
 
-def test_bicubic_keeps_a_ramp_away_from_the_border() -> None:
-    perspective = torch.from_numpy(2 + 0.01 * np.mgrid[:32, :48][1]).expand(32, 48)
-    fine = _result(_sample(perspective, scale=2))
-    np.testing.assert_allclose(fine[:, 20:28], perspective.numpy()[:, 20:28], rtol=1e-6)  # the border decays as 0.27^n
-
-
-@pytest.mark.parametrize("order", ORDERS)
-def test_nearest_downsampled_pixels_keep_their_values(order: Order) -> None:
-    perspective = _random()
-    fine = _result(_sample(perspective, "nearest"), order)
-    np.testing.assert_allclose(fine[2::4, 2::4], perspective.numpy()[2::4, 2::4], rtol=1e-9)
-
-
 def _with_holes() -> Tensor:
     perspective = _random()
     perspective[4:12, 8:16] = torch.nan  # 2 x 2 low-resolution pixels
@@ -145,24 +132,6 @@ def test_overshoot_below_zero_becomes_a_hole() -> None:
     fine = _result(_sample(perspective))
     assert 0 < np.isnan(fine).sum() < 32 * 12
     assert (fine[np.isfinite(fine)] > 0).all()
-
-
-def test_result_does_not_depend_on_truth_and_photo() -> None:
-    sample = _sample(_random())
-    blind = DepthSample(
-        "", "", torch.ones_like(sample.rgb), sample.depth_lr, sample.camera, sample.camera_lr, sample.scale
-    )
-    assert torch.equal(Interpolation()(sample), Interpolation()(blind))
-
-
-def test_result_has_the_precision_of_the_low_resolution_depth() -> None:
-    fine = Interpolation()(_sample(_random().float()))
-    assert fine.dtype == torch.float32
-    np.testing.assert_allclose(fine.numpy(), Interpolation()(_sample(_random().float().double())).numpy(), rtol=1e-6)
-
-
-def test_interpolation_works_on_perspective_depth() -> None:
-    assert Interpolation.range_type == "perspective"
 
 
 def test_unknown_order_is_refused() -> None:

@@ -77,11 +77,6 @@ def test_a_factor_of_all_depths_has_errors_in_closed_form() -> None:
     assert found["Normal_mean"] == pytest.approx(0, abs=1e-3)
 
 
-def test_benchmark_in_levels_has_no_errors_in_metres() -> None:
-    levels = Unit("levels", inverse=True, factor=30.0, offset=0.0)
-    assert all(name.startswith("Normal_") for name in _scores(PREDICTION, TRUTH, unit=levels))
-
-
 def test_angles_are_those_of_dsine() -> None:
     # compute_normal_metrics in utils/utils.py of baegwangbin/DSINE (ef0c2af), of numpy's normals of both maps
     found = _scores(1 + 0.05 * PREDICTION, 1 + 0.05 * TRUTH)
@@ -201,22 +196,6 @@ def test_thresholds_are_exceeded_only_beyond_them() -> None:
     assert depth.beyond_ratio(pair, 1.25).item() == 0.5
     pair = SurfacePair(target + torch.tensor([0.03125, -0.03125, 0.0313, -0.0313]), target, pair.rays)
     assert depth.beyond(pair, 0.03125).item() == 0.5
-
-
-def test_errors_in_levels_of_a_batch_are_those_of_its_images() -> None:
-    maps = [_levels(seed) for seed in (0, 1)]
-    rays = FIELD_CAMERA.rays()[None]
-    batch = SurfacePair(*(torch.stack(each) for each in zip(*maps, strict=True)), rays, unit=LEVELS)
-    for function in (depth.unit_rmse, depth.unit_mae):
-        singles = [function(SurfacePair(p[None], t[None], rays, unit=LEVELS)) for p, t in maps]
-        torch.testing.assert_close(function(batch), torch.cat(singles))
-
-
-def test_errors_of_a_pair_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    calls = []
-    monkeypatch.setattr(Unit, "convert", lambda unit, depth: calls.append(unit) or 100 * depth)
-    _field_rows(*_field_maps(), CENTIMETRES)
-    assert len(calls) == 2  # the two maps
 
 
 def test_collection_has_the_metrics_of_the_benchmarks_that_it_saw() -> None:

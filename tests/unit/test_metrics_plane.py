@@ -14,7 +14,6 @@ import torch
 
 from dsr.data.frame_files import read_millimetres
 from dsr.geometry.camera import Camera
-from dsr.metrics.catalogue import catalogue, score_image
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.plane import angle, covered, deviation, fit_plane
 
@@ -81,22 +80,6 @@ def test_other_surfaces_and_holes_do_not_count_and_lower_the_coverage() -> None:
     assert covered(nothing).item() == 0
     assert math.isnan(deviation(nothing).item())
     assert math.isnan(angle(nothing).item())
-
-
-def test_scores_and_classes_are_those_of_the_pairs_pixels() -> None:
-    truth = _plane(0.2, 0.1, 1.5)
-    prediction = truth + 0.01 * np.sin(0.8 * U)
-    maps = (torch.from_numpy(each)[None] for each in (prediction, truth))
-    rows = {row.metric: row.value for row in score_image(*maps, CAMERA.rays(), catalogue(protocols=("plane",)))}
-    pair = _pair(prediction, truth)
-    expected = {"Plane_std": deviation(pair), "Plane_angle": angle(pair), "Plane_covered": covered(pair)}
-    assert rows == pytest.approx({name: value.item() for name, value in expected.items()}, rel=1e-6)
-    left = U < 20
-    both = [_pair(prediction, truth, mask) for mask in (left, ~left)]
-    batch = SurfacePair(*(torch.cat(each) for each in zip(*(each.given for each in both), strict=True)),
-                        CAMERA.rays()[None], torch.cat([each.target_mask for each in both]))  # fmt: skip
-    for function in (deviation, angle, covered):
-        torch.testing.assert_close(function(batch), torch.cat([function(each) for each in both]))
 
 
 def test_frames_before_a_board_have_their_known_scores(shared: Path) -> None:

@@ -113,49 +113,12 @@ def test_single_valid_low_resolution_pixel_is_enough(method: Build) -> None:
 
 
 @every_method
-def test_result_is_complete_at_any_size(method: Build) -> None:
-    for height, width in ((4, 4), (4, 40), (36, 4), (20, 52)):
-        assert bool(_result(method(), _sample(_random(height, width))).isfinite().all())
-
-
-@every_method
-def test_half_turn_of_the_input_turns_the_result(method: Build) -> None:
-    """Rows and columns are solved in order, but their own direction is none."""
-    camera = Camera(48, 32, 60.0, 60.0, 23.5, 15.5)
-    rgb, depth = _photo(32, 48), 1 + _random()[None] / 9
-    sample, turned = (
-        make_sample(Scene("", "", p, camera, d), 4, Downsampling("box"), "disparity")
-        for p, d in ((rgb, depth), (rgb.rot90(2, (1, 2)), depth.rot90(2, (1, 2))))
-    )
-    torch.testing.assert_close(method()(turned).rot90(2, (1, 2)), method()(sample), rtol=1e-9, atol=0)
-
-
-@every_method
 def test_result_is_positive_depth_even_where_far_and_near_meet(method: Build) -> None:
     disparity = torch.where(torch.arange(48) % 16 < 8, 0.01, 40.0).double().expand(32, 48)
     sample = _sample(disparity)
     fine = method()(sample)
     assert bool((fine > 0).all())
     assert float(fine.max()) <= 4 * float(sample.depth_lr.max()) + 1e-9
-
-
-@every_method
-def test_result_is_deterministic_and_independent_of_the_truth(method: Build) -> None:
-    sample = _sample(_random())
-    blind = DepthSample("", "", sample.rgb, sample.depth_lr, sample.camera, sample.camera_lr, sample.scale)
-    assert torch.equal(method()(sample), method()(blind))
-
-
-@every_method
-def test_result_has_the_precision_of_the_low_resolution_depth(method: Build) -> None:
-    single = _sample(_random().float(), rgb=_photo(32, 48).float())
-    assert method()(single).dtype == torch.float32
-    torch.testing.assert_close(method()(single), method()(_sample(_random())).float(), rtol=1e-3, atol=0)
-
-
-@every_method
-def test_guided_methods_work_on_disparity(method: Build) -> None:
-    assert method().range_type == "disparity"
 
 
 def test_slope_is_the_smaller_difference_without_the_pixel_that_mixes_a_step() -> None:

@@ -5,10 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from dsr.geometry.camera import Camera
 from dsr.geometry.lights import LIGHT_NAMES
 from dsr.geometry.shading import lights, render, render_for_viewing, shade
-from dsr.geometry.surface import depth_to_normals
 
 PROTOCOL = -np.array(
     [
@@ -52,31 +50,12 @@ def test_difference_of_three_shadings_is_that_of_the_normal_maps() -> None:
     assert abs(shaded - (first - second).square().mean()) < 1e-14
 
 
-def test_rendering_clips_the_shading_to_zero_and_one() -> None:
-    normals = _normals(3)
-    shaded = shade(normals, lights())
-    assert bool((shaded < 0).any())
-    np.testing.assert_array_equal(render(normals).numpy(), np.clip(shaded.numpy(), 0, 1))
-
-
-def test_frontal_wall_is_brightest_from_the_front_and_equal_from_the_sides() -> None:
-    camera = Camera(5, 4, 10.0, 10.0, 2.0, 1.5)
-    normals = depth_to_normals(torch.full((1, 1, 4, 5), 2.0, dtype=torch.float64), camera.rays()[None])
-    brightness = render(normals).mean(dim=(0, 2, 3)).numpy()
-    np.testing.assert_allclose(brightness, [3**-0.5, 3**-0.5, 3**-0.5, 1], rtol=1e-12)
-
-
 def test_floor_is_lit_from_above_and_a_wall_on_the_right_from_the_left() -> None:
     floor, right_wall = torch.tensor([0.0, -1.0, 0.0]), torch.tensor([-1.0, 0.0, 0.0])
     both = torch.stack((floor, right_wall))[:, :, None, None]
     floor_light, wall_light = render(both)[:, :, 0, 0].tolist()
     np.testing.assert_allclose(floor_light, [np.sqrt(2 / 3), 0, 0, 0], atol=1e-7)
     np.testing.assert_allclose(wall_light, [0, 1 / np.sqrt(2), 0, 0], atol=1e-7)
-
-
-def test_lights_have_the_requested_precision() -> None:
-    assert lights(dtype=torch.float32).dtype == torch.float32
-    assert render(_normals(0).float()).dtype == torch.float32
 
 
 FLOOR, CEILING, WALL, FROM_LEFT, FROM_RIGHT = (0, -1, 0), (0, 1, 0), (0, 0, -1), (1, 0, 0), (-1, 0, 0)
@@ -100,15 +79,3 @@ def test_rendering_for_viewing_shows_a_tilt_of_two_degrees_on_floors_walls_and_c
         tilted = [np.array(normal) + tilt * np.eye(3)[axis] for axis in range(3) if not normal[axis]]
         steps = _brightness(normal, *map(tuple, tilted))
         assert np.abs(steps[1:] - steps[0]).max() > 1.5 / 255
-
-
-def test_rendering_for_viewing_is_the_half_lambert_curve_of_its_light() -> None:
-    normals = _normals(5)
-    light = np.array([-0.4, -0.7, -np.sqrt(0.35)])
-    cosine = (normals.numpy() * light[None, :, None, None]).sum(axis=1, keepdims=True)
-    expected = 0.06 + 0.84 * ((1 + cosine) / 2) ** 1.25
-    np.testing.assert_allclose(render_for_viewing(normals).numpy(), expected, rtol=0, atol=1e-14)
-
-
-def test_rendering_for_viewing_keeps_holes() -> None:
-    assert bool(render_for_viewing(torch.full((1, 3, 2, 2), torch.nan)).isnan().all())

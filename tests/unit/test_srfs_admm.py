@@ -10,7 +10,6 @@ from torch import Tensor
 from dsr.geometry.camera import Camera
 from dsr.geometry.surface import back_project, depth_to_normals
 from dsr.methods.classical.srfs_admm import (
-    chain_to_theta,
     compute_area,
     compute_shading,
     compute_surface,
@@ -59,13 +58,6 @@ def test_rendering_converges_to_that_of_the_geometrys_normals() -> None:
     assert errors[1] == pytest.approx(errors[0] / 2, rel=0.1)  # of differences taken to one side
 
 
-def test_map_without_slopes_has_the_geometrys_normals_exactly() -> None:
-    camera = _camera(8)
-    rays, depth = camera.rays()[None], torch.full((1, 1, 8, 8), 3.0).double()
-    theta = torch.cat((torch.zeros(1, 2, 8, 8).double(), depth), dim=1)
-    torch.testing.assert_close(compute_surface(theta, rays).normals, depth_to_normals(depth, rays))
-
-
 def test_area_is_that_of_the_back_projected_pixels() -> None:
     camera = _camera(256)
     theta, depth = _theta(camera)
@@ -92,14 +84,6 @@ def test_photometry_has_its_stated_derivatives() -> None:
     for channel in range(3):
         (slope,) = torch.autograd.grad(residual(theta)[:, channel].sum(), theta)
         torch.testing.assert_close(seen.slopes[:, channel], slope)
-
-
-def test_derivative_of_the_normal_length_is_the_normal() -> None:
-    theta, rays = _mixed_theta()
-    theta.requires_grad_()
-    surface = compute_surface(theta, rays)
-    (slope,) = torch.autograd.grad(surface.length.sum(), theta)
-    torch.testing.assert_close(chain_to_theta(surface.normals, rays), slope)
 
 
 def test_light_is_recovered_exactly_from_a_photo_without_noise() -> None:
