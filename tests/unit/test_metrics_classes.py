@@ -20,7 +20,6 @@ from torch import Tensor, nn
 
 from dsr.geometry.camera import Camera
 from dsr.metrics import functional
-from dsr.metrics.catalogue import METRICS
 from dsr.metrics.classes import (
     DSSIMv,
     LPIPSv,
@@ -35,7 +34,6 @@ from dsr.metrics.lpips import LPIPS
 from dsr.sample import Unit
 
 CAMERA = Camera(width=40, height=36, fx=40.0, fy=40.0, cx=20.0, cy=18.0)
-NAMES = [metric.name for metric in METRICS]
 
 
 @pytest.fixture(scope="module")

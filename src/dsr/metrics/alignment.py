@@ -36,17 +36,10 @@ _ITERATIONS, _SMALLEST_ERROR = 50, 1e-6
 
 
 def align(prediction: Tensor, target: Tensor, mask: Tensor | None, how: str) -> Tensor:
-    """Return each image's prediction aligned to its truth; no gradients are meant to pass.
+    """Return each image's prediction aligned to its truth, (B, 1, H, W); no gradients are meant to pass.
 
-    Args:
-        prediction, target: (B, 1, H, W) orthogonal depth in metres, the prediction's up to the alignment; NaN is a
-            hole, and so is a depth that is not positive.
-        mask: (B, 1, H, W) bool, the pixels to fit; None for all. Only those with both depths count.
-        how: one of :data:`ALIGNMENTS`.
-
-    Returns:
-        (B, 1, H, W) in the prediction's dtype; its holes are as they were. NaN for an image without a pixel to fit.
-
+    Both are orthogonal depth in metres, the prediction's up to the alignment; NaN is a hole, and so is a depth that is
+    not positive. Only pixels of the mask with both depths count. Holes stay; NaN for an image without a pixel to fit.
     """
     if how not in ALIGNMENTS:
         raise ValueError(f"alignment: expected one of {', '.join(ALIGNMENTS)}, got {how!r}")
@@ -82,12 +75,6 @@ def align_errors(
     """Return the expected errors of depth and normals of an aligned prediction.
 
     A scale multiplies those of depth and leaves those of normals; what a shift makes of them is not known.
-
-    Args:
-        errors: those of ``depth``, of its shape; None without any.
-        depth, aligned: the prediction before and after its alignment.
-        how: the alignment, one of :data:`ALIGNMENTS`.
-
     """
     if errors is None or how == "none":
         return errors

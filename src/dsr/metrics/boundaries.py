@@ -139,14 +139,10 @@ def depth_boundaries(depth: Tensor) -> Tensor:
 def depth_boundary_error(found: Tensor, true: Tensor, quantile: float | None = None) -> tuple[Tensor, Tensor]:
     """Return iBims-1's accuracy and completeness of depth boundaries, (B,) float64 each, in pixels, lower is better.
 
-    The accuracy is the mean distance of found boundaries to true ones, of those less than :data:`DBE_RANGE` away; the
-    completeness that of true boundaries to found ones, without limit. Both are that range where no boundary is found
-    within it, and NaN without true ones. Others' copies limit the completeness, too, or use thresholds of .15 and .3.
-
-    Args:
-        found, true: (B, 1, H, W) bool. iBims-1 has annotated true ones, and ``depth_boundaries(prediction)``.
-        quantile: of the distances, from 0 to 1, in place of their mean; theirs is the mean.
-
+    The accuracy is the mean distance of found boundaries to true ones, (B, 1, H, W) bool, of those less than
+    :data:`DBE_RANGE` away; the completeness that of true boundaries to found ones, without limit. Both are that range
+    where no boundary is found within it, and NaN without true ones. Others' copies limit the completeness, too, or use
+    thresholds of .15 and .3. A ``quantile`` of the distances may take the place of their mean.
     """
     from scipy.ndimage import distance_transform_edt  # noqa: PLC0415 - as above
 

@@ -163,24 +163,18 @@ def score_image(
     regions: Mapping[str, Tensor] | None = None,
     errors: tuple[Tensor, Tensor] | None = None,
 ) -> Iterator[Score]:
-    """Score one predicted depth map.
+    """Score one predicted depth map; NaN where no pixel can be scored.
 
     Rows and columns at the border without any predicted pixel are cut off first (MSG's published networks leave out the
     last of each), except for metrics of the whole image. The valid fractions still refer to the complete map.
 
     Args:
-        prediction: (1, H, W) orthogonal depth in metres, NaN where missing.
-        target: (1, H, W) orthogonal depth in metres, NaN where missing.
+        prediction, target: (1, H, W) orthogonal depth in metres, NaN where missing.
         rays: (3, H, W), see :meth:`dsr.geometry.camera.Camera.rays`.
-        metrics: from :func:`catalogue`; those for other units are left out, and those of regions or stated errors that
-            there are not.
+        metrics: from :func:`catalogue`; those for other units, absent regions or absent errors are left out.
         unit: of the benchmark.
         regions: parts of the image by name, (1, H, W) uint8.
         errors: the method's expected errors, (1, H, W): of depth in metres, of normals in degrees.
-
-    Yields:
-        The scores, NaN where no pixel can be scored.
-
     """
     valid = prediction.isfinite()[0]
     window: list[slice] = []  # rows and columns of the smallest one with all predicted pixels; all if there are none

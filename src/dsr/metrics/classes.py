@@ -93,13 +93,7 @@ class PerImageMean(torchmetrics.Metric):
     ) -> None:
         """Add a batch, as for :meth:`dsr.metrics.functional.SurfacePair.of`.
 
-        Args:
-            preds: a pair, which is left out if it is of another benchmark than the metric's, or has no expected errors
-                for a metric of these; or predicted depth.
-            target: true depth.
-            camera: the camera of these pixels, a list of one for each image, or their rays.
-            mask: the pixels to compare.
-
+        A pair of another benchmark than the metric's, or without the expected errors that it compares, is left out.
         """
         pair = SurfacePair.of(preds, target, camera, mask)
         if not self._metric.applies(pair):

@@ -97,13 +97,7 @@ def describe_directions(formats: Formats) -> str:
 
 
 def complete_formats(names: Iterable[str], *defined: Formats) -> dict[str, MetricFormat]:
-    """Return a format for each metric: the first that is defined, or the raw value under the metric's name.
-
-    Args:
-        names: of metrics, as in ``scores.csv``.
-        *defined: formats to choose from, in order of preference.
-
-    """
+    """Return a format for each metric: the first that is defined, or the raw value under the metric's name."""
     found: dict[str, MetricFormat] = {}
     for name in names:
         formats = (each[name] for each in defined if name in each)

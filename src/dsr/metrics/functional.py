@@ -125,12 +125,7 @@ class SurfacePair:
     ) -> SurfacePair:
         """Return a given pair, or make one of a prediction, a target and their camera, as metric classes accept either.
 
-        Args:
-            preds: the pair, or (B, 1, H, W) predicted orthogonal depth in metres, a tensor or an array.
-            target: (B, 1, H, W) true depth.
-            camera: of these pixels, one of all images or a list; or their rays, (3, H, W) or (B, 3, H, W).
-            mask: (B, 1, H, W) bool, the pixels to compare; None for all.
-
+        Depth and mask are (B, 1, H, W), tensors or arrays; the camera is that of all images, a list, or their rays.
         """
         if isinstance(preds, SurfacePair):
             if not (target is camera is mask is None):

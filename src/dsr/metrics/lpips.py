@@ -42,12 +42,7 @@ MIN_SIZE = 31  # smallest height and width in pixels for which the trunk's last 
 
 
 class LPIPS(nn.Module):
-    """Learned perceptual image patch similarity, version 0.1, AlexNet.
-
-    Args:
-        trunk: state dict of torchvision's AlexNet (``features.*``; further keys are ignored).
-
-    """
+    """Learned perceptual image patch similarity, version 0.1, of the state dict of torchvision's AlexNet."""
 
     mean: Tensor
     std: Tensor
@@ -74,12 +69,7 @@ class LPIPS(nn.Module):
         self.eval()
 
     def features(self, images: Tensor) -> list[Tensor]:
-        """Return the five feature maps, each of unit length along its channels.
-
-        Args:
-            images: (B, 3, H, W) in [-1, 1].
-
-        """
+        """Return the five feature maps of (B, 3, H, W) images in [-1, 1], each of unit length along its channels."""
         maps, values = [], (images - self.mean) / self.std
         for index, layer in self.convolutions.items():
             if int(index) in _POOL_BEFORE:
@@ -90,13 +80,9 @@ class LPIPS(nn.Module):
 
     @in_own_precision
     def forward(self, first: Tensor, second: Tensor, mask: Tensor | None = None) -> Tensor:
-        """Return the distance of two images, (B,).
+        """Return the distance of two images, (B, 3, H, W) in [-1, 1], at least 31 x 31: (B,).
 
-        Args:
-            first: (B, 3, H, W) in [-1, 1], at least 31 x 31.
-            second: (B, 3, H, W) in [-1, 1].
-            mask: (B, 1, H, W) bool; each feature is weighted by the fraction of its pixels that is set. None for all.
-
+        With a mask, (B, 1, H, W) bool, each feature is weighted by the fraction of its pixels that is set.
         """
         if min(first.shape[-2:]) < MIN_SIZE:
             came = tuple(first.shape[-2:])
@@ -118,13 +104,7 @@ class LPIPS(nn.Module):
 
 
 def lpips_v(pair: SurfacePair, network: LPIPS) -> Tensor:
-    """Return LPIPS_v per light, (B, 4): LPIPS of the renderings, repeated to three channels, scaled to [-1, 1].
-
-    Args:
-        pair: the two surfaces.
-        network: it is moved to the pair's device.
-
-    """
+    """Return LPIPS_v per light, (B, 4): LPIPS of the renderings, repeated to three channels, scaled to [-1, 1]."""
     network.to(pair.target.device)
     batch, count, height, width = pair.renderings[0].shape
     as_images = [
@@ -136,12 +116,7 @@ def lpips_v(pair: SurfacePair, network: LPIPS) -> Tensor:
 
 
 def find_trunk(configured: Path | None) -> Path:
-    """Return the file of AlexNet's weights: the configured one, the torch hub cache's, or downloaded into that cache.
-
-    Args:
-        configured: a file; None to use the cache.
-
-    """
+    """Return the file of AlexNet's weights: the configured one, the torch hub cache's, or downloaded into it."""
     if configured is not None:
         if not configured.is_file():
             raise FileNotFoundError(f"expected a file, got {configured} (no such file)")

@@ -48,13 +48,8 @@ FLYING = 0.01  # distance of a flying pixel from every true point, as a fraction
 def nearest(points: Tensor, valid: Tensor, cloud: Tensor, known: Tensor) -> Tensor:
     """Return the distance of each point from the nearest one of another cloud, exactly, by a k-d tree on the CPU.
 
-    Args:
-        points, cloud: (B, 3, H, W); a point's place in its map does not matter.
-        valid, known: (B, 1, H, W) bool, the points that there are.
-
-    Returns:
-        (B, 1, H, W) in the unit of the points; 0 where there is no point, infinite where there is no other one.
-
+    Points and cloud are (B, 3, H, W), ``valid`` and ``known`` (B, 1, H, W) bool the points that there are. The
+    distances, (B, 1, H, W), are 0 where there is no point, and infinite where there is no other one.
     """
     distances = torch.zeros_like(points[:, :1])
     if points.is_meta:  # values are needed, and there are none

@@ -38,14 +38,9 @@ _MOVING = 0.05
 def flicker(depths: Tensor, static: Tensor | None = None) -> Tensor:
     """Return the mean over the pixels of the standard deviation over time of depth, relative to its median over time.
 
-    Args:
-        depths: (T, 1, H, W) orthogonal depth in metres, T at least 2; NaN is a hole, and so is a depth that is not
-            positive. A pixel counts if it has a depth in two frames or more.
-        static: (1, 1, H, W) bool, the pixels where nothing moves; None for all.
-
-    Returns:
-        () a fraction; NaN if no pixel counts.
-
+    Depths are (T, 1, H, W) orthogonal depth in metres, T at least 2; NaN is a hole, and so is a depth that is not
+    positive. A pixel counts if it has a depth in two frames or more. ``static``, (1, 1, H, W) bool, are the pixels
+    where nothing moves. A fraction, (); NaN if no pixel counts.
     """
     spread, mask = _spread(depths, static)
     return masked_mean(spread, mask).squeeze()
@@ -65,10 +60,7 @@ def temporal_noise(depths: Tensor, static: Tensor | None = None) -> Tensor:
 def normal_flicker(depths: Tensor, camera: Camera, static: Tensor | None = None) -> Tensor:
     """Return the mean over the pixels of the RMS angle over time between a normal and its mean direction, in degrees.
 
-    Args:
-        depths, static: as for :func:`flicker`; a pixel counts if it has a normal in two frames or more.
-        camera: that stands still.
-
+    The camera stands still; a pixel counts if it has a normal in two frames or more.
     """
     known = _known(depths)
     normals = depth_to_normals(depths.masked_fill(~known, torch.nan), camera.rays(device=depths.device)[None])
@@ -81,12 +73,7 @@ def normal_flicker(depths: Tensor, camera: Camera, static: Tensor | None = None)
 
 
 def covered(depths: Tensor, static: Tensor | None = None) -> Tensor:
-    """Return the fraction of the pixels of all frames that have a depth, (); higher is better.
-
-    Args:
-        depths, static: as for :func:`flicker`.
-
-    """
+    """Return the fraction of the pixels of all frames that have a depth, (); higher is better."""
     share = _known(depths).to(depths).mean(dim=0, keepdim=True)
     return masked_mean(share, torch.ones_like(share, dtype=torch.bool) if static is None else static).squeeze()
 
@@ -136,19 +123,11 @@ def opw(
 
 @in_own_precision
 def tgm(prediction: Tensor, target: Tensor, static: Tensor | None = None) -> Tensor:
-    """Return the mean difference between the changes of predicted and true depth from frame to frame.
+    """Return the mean difference between the changes of predicted and true depth from frame to frame, () in metres.
 
-    Pixels count whose true depth changes by less than 5 % of the range of the later frame's: it is of one surface. The
-    authors' training takes disparity, fitted to the truth by a scale and a shift, and ten times the value.
-
-    Args:
-        prediction: (T, 1, H, W) orthogonal depth in metres, T at least 2; NaN is a hole.
-        target: true depth, likewise.
-        static: (T, 1, H, W) bool, the pixels to compare; None for all.
-
-    Returns:
-        () in metres; NaN if no pixel counts.
-
+    Depths are (T, 1, H, W) in metres, NaN in holes. Pixels count whose true depth changes by less than 5 % of the range
+    of the later frame's: it is of one surface. The authors' training takes disparity, fitted to the truth by a scale
+    and a shift, and ten times the value.
     """
     if prediction.shape != target.shape:
         raise ValueError(f"target: expected shape {tuple(prediction.shape)}, got {tuple(target.shape)}")

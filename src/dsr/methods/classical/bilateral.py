@@ -83,14 +83,7 @@ class Bilateral(GuidedMethod):
 
 
 def filter_bilateral(depth: Tensor, window: int, sigma_depth: float, sigma_space: float) -> Tensor:
-    """Filter a depth map, (1, h, w) in metres, NaN in holes, which stay holes; see the module.
-
-    Args:
-        window: diameter in pixels.
-        sigma_depth: in metres.
-        sigma_space: in pixels.
-
-    """
+    """Filter a depth map, (1, h, w) in metres, NaN in holes, which stay holes; the window is a diameter in pixels."""
     values = depth[0].cpu().numpy().astype(np.float32)
     valid = np.isfinite(values)
     outside = min(0.0, float(values[valid].min()) - _NO_WEIGHT * sigma_depth)

@@ -79,18 +79,10 @@ def bilateral_filter(
     doubtful: Tensor | None = None,
     sharp: bool = True,
 ) -> Tensor:
-    """Upsample a map, (h, w), by the modified joint bilateral filter to (H, W); holes stay holes.
+    """Upsample a map, (h, w), by the modified joint bilateral filter to (H, W); holes, NaN, stay holes.
 
-    Args:
-        lr: (h, w) map with at least one valid pixel, NaN in holes.
-        barrier: (H, W) bool, the edge map.
-        scale: high-resolution pixels per low-resolution one.
-        radius: radius of the neighbourhood in low-resolution pixels.
-        sigma_space: standard deviation of the distance's Gaussian, in low-resolution pixels.
-        mixed: weight of a low-resolution pixel with an edge through it, relative to others.
-        doubtful: (h, w) bool, further low-resolution pixels that mix two sides; None for none.
-        sharp: whether pixels on edges take a side; otherwise they keep the value that preserves the block means.
-
+    The barrier is the edge map, (H, W) bool. ``doubtful``, (h, w) bool, are further low-resolution pixels that mix two
+    sides. If ``sharp``, pixels on edges take a side; otherwise they keep the value that preserves the block means.
     """
     valid = lr.isfinite()
     doubtful = torch.zeros_like(valid) if doubtful is None else doubtful
@@ -111,18 +103,11 @@ def bilateral_filter(
 def find_reachable(barrier: Tensor, scale: int, radius: int) -> Tensor:
     """Return which low-resolution pixels each high-resolution pixel reaches by a path that crosses no edge.
 
-    A path starts in the middle of the low-resolution pixel, runs over 4-connected high-resolution pixels off the edges,
-    and stays within the low-resolution pixels at most ``radius`` rows and columns away.
+    A path starts in the middle of the low-resolution pixel, runs over 4-connected high-resolution pixels off the edges
+    of the barrier, (H, W) bool, and stays within the low-resolution pixels at most ``radius`` rows and columns away.
 
-    Args:
-        barrier: (H, W) bool, the edge map.
-        scale: high-resolution pixels per low-resolution one.
-        radius: radius of the neighbourhood in low-resolution pixels.
-
-    Returns:
-        (2 radius + 1, 2 radius + 1, H, W) bool: [radius + a, radius + b] is for the low-resolution pixel a rows below
-        and b columns right of the one that contains the high-resolution pixel.
-
+    Returns (2 radius + 1, 2 radius + 1, H, W) bool: [radius + a, radius + b] is for the low-resolution pixel a rows
+    below and b columns right of the one that contains the high-resolution pixel.
     """
     height, width = barrier.shape[0] // scale, barrier.shape[1] // scale
     side, edge = 2 * radius + 1, radius * scale

@@ -67,17 +67,10 @@ def predict_edge_map(
     iterations: int = 100,
     progress: Steps | None = None,
 ) -> tuple[Tensor, Labelling | None]:
-    """Return the high-resolution edge map, (h * scale, w * scale) bool, and its labelling; None without an edge.
+    """Return the edge map of a map (h, w), NaN in holes, (h * scale, w * scale) bool, and its labelling.
 
-    Args:
-        lr: (h, w) map, NaN in holes.
-        scale: high-resolution pixels per low-resolution one, at least 2.
-        step: minimum height of an edge, in the map's unit.
-        candidates: number of candidates for each patch.
-        sharp_weight: weight of the edges relative to that of their distance transform.
-        smoothness: weight of the smoothness term.
-        iterations: maximum number of iterations of belief propagation.
-
+    ``step`` is the minimum height of an edge in the map's unit; the others are as for
+    :class:`dsr.methods.classical.edge_guided.EdgeGuided`. The labelling is None without an edge.
     """
     border = -(-(PATCH // 2 + 1) // scale)
     edges = detect_edges(extend_linearly(lr[None, None], border)[0, 0], scale, step)

@@ -101,12 +101,8 @@ def find_nearest(query: Tensor, examples: Patches, count: int, weight: float) ->
 def find_overlaps(places: Tensor, patches: Tensor) -> tuple[Tensor, Tensor]:
     """Return the pairs of overlapping patches, (E, 2), and the disagreement of their candidates, (E, K, K).
 
-    The disagreement is the sum of squared differences over the pixels that both patches cover.
-
-    Args:
-        places: (N, 2) rows and columns of the patches' centres, all different.
-        patches: (N, K, PATCH^2) float, the candidates of each.
-
+    The disagreement is the sum of squared differences over the pixels that both patches cover. ``places`` are the rows
+    and columns of the patches' centres, (N, 2), all different, and ``patches`` the candidates, (N, K, PATCH^2) float.
     """
     index = places.new_full(tuple((places.amax(dim=0) + PATCH).tolist()), -1)
     index[places[:, 0], places[:, 1]] = torch.arange(len(places), device=places.device)
@@ -148,8 +144,8 @@ def _disagreement(first: Tensor, second: Tensor, down: int, across: int) -> Tens
 class Labelling(NamedTuple):
     """Labels (N,), their energy, whether the messages converged, and the history.
 
-    Each entry of ``history`` has ``iteration``, ``objective`` (the energy of the labels) and ``moved`` (the largest
-    change of a message, relative to the largest cost).
+    Each entry of ``history`` has ``iteration``, ``objective`` (the energy) and ``moved`` (the largest change of a
+    message, relative to the largest cost).
     """
 
     labels: Tensor
@@ -168,12 +164,9 @@ def label(
 ) -> Labelling:
     """Return the labels that min-sum belief propagation finds.
 
-    Args:
-        unary: (N, K) costs of each node's labels, finite.
-        pairs: (E, 2) nodes, each pair once.
-        costs: (E, K, K) of the labels of a pair's first node (rows) and second node (columns), finite.
-        tolerance: largest change of a message, relative to the largest cost, at which it stops.
-
+    The costs of each node's labels are ``unary`` (N, K), and ``costs`` (E, K, K) those of the labels of the first and
+    the second node of each pair (E, 2). It stops if no message changes by more than the tolerance, times the largest
+    cost.
     """
     count, labels = unary.shape
     unit = float(costs.abs().max()) if len(costs) else 0.0

@@ -76,18 +76,9 @@ class FastGlobalSmoother(GuidedMethod):
 
 
 def smooth(guide: Tensor, maps: Tensor, strength: float, sigma_colour: float, iterations: int = 3) -> Tensor:
-    """Smooth maps where the guide is smooth.
+    """Smooth maps, (N, H, W), with the same weights where the guide, (3, H, W), is smooth.
 
-    Args:
-        guide: (3, H, W) colours.
-        maps: (N, H, W), smoothed with the same weights.
-        strength: lambda, in squared pixels.
-        sigma_colour: colour difference of the guide at which a weight is 1 / e.
-        iterations: T.
-
-    Returns:
-        (N, H, W).
-
+    ``strength`` is lambda in squared pixels, ``sigma_colour`` the difference of colours at which a weight is 1 / e.
     """
     along_rows = _weights(guide.mT, sigma_colour)  # (W - 1, H), the axis that is solved along comes first
     along_columns = _weights(guide, sigma_colour)  # (H - 1, W)
@@ -99,17 +90,10 @@ def smooth(guide: Tensor, maps: Tensor, strength: float, sigma_colour: float, it
 
 
 def solve_lines(weights: Tensor, right: Tensor) -> Tensor:
-    """Solve (1 + A) u = f for all lines at once, with the weighted Laplacian A of each line.
+    """Solve (1 + A) u = f for all lines at once, with the weighted Laplacian A of each line, (L, N, M).
 
-    Gaussian elimination for tridiagonal systems (Thomas), stable without pivoting because the diagonal dominates.
-
-    Args:
-        weights: (L - 1, M) lambda w between the neighbours of M lines of L pixels, not negative.
-        right: (L, N, M) f, N right-hand sides per line.
-
-    Returns:
-        (L, N, M).
-
+    Gaussian elimination for tridiagonal systems (Thomas), stable without pivoting because the diagonal dominates. The
+    weights are (L - 1, M), lambda w between the neighbours of M lines, and ``right`` is f, N right-hand sides per line.
     """
     length = right.shape[0]
     solution = right.contiguous().clone()

@@ -56,18 +56,10 @@ class GuidedFilter(GuidedMethod):
 
 
 def guided_filter(guide: Tensor, maps: Tensor, radius: int, epsilon: float, confidence: Tensor | None = None) -> Tensor:
-    """Filter maps with a colour guide.
+    """Filter maps, (N, H, W) finite, with a colour guide, (3, H, W).
 
-    Args:
-        guide: (3, H, W).
-        maps: (N, H, W), finite.
-        radius: radius of the windows of (2 * radius + 1)^2 pixels, truncated at the border.
-        epsilon: regularisation added to the variances of the guide.
-        confidence: (H, W) weights in [0, 1]; None for 1.
-
-    Returns:
-        (N, H, W); a pixel in no window with a positive confidence keeps its value.
-
+    Windows have (2 * radius + 1)^2 pixels, truncated at the border, and ``confidence`` weights pixels in [0, 1], (H,
+    W). A pixel in no window with a positive confidence keeps its value.
     """
     weight = torch.ones_like(guide[0]) if confidence is None else confidence
     mean_weight = _box(weight, radius)

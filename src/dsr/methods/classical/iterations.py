@@ -24,15 +24,10 @@ class Solution(NamedTuple):
 def conjugate_gradients(
     operator: Callable[[Tensor], Tensor], right: Tensor, start: Tensor, *, iterations: int, tolerance: float
 ) -> Solution:
-    """Solve A x = b for each element of a batch.
+    """Solve A x = b for each element of a batch, (B, ...), from a start.
 
-    Args:
-        operator: x -> A x, (B, ...) -> (B, ...), symmetric positive definite for each element of the batch, on the
-            subspace that b - A start lies in; elements do not mix.
-        right: b, (B, ...).
-        start: the first x, (B, ...).
-        tolerance: relative residual |b - A x| / |b|, in all elements, at which it stops.
-
+    The operator x -> A x is symmetric positive definite for each element, on the subspace that b - A start lies in, and
+    does not mix elements. It stops at the relative residual ``tolerance`` in all elements.
     """
     x, residual = start, right - operator(start)
     direction = residual
@@ -60,18 +55,9 @@ def _ratio(above: Tensor, below: Tensor) -> Tensor:
 
 
 class Movement:
-    """The movement of an iterated map between two checks, and whether it is below a tolerance.
+    """The movement of an iterated map, (B, 1, H, W), between two checks, and whether it is below a tolerance.
 
-    Args:
-        start: (B, 1, H, W) the map before the first iteration.
-        iterations: maximum number of iterations.
-        tolerance: RMS movement between two checks, relative to the range, below which the iteration has converged.
-        progress: is called with the iterations done and their maximum.
-        value_range: (B, 1, 1, 1) range of each map; None for maps in [0, 1].
-
-    Attributes:
-        moved: RMS movement at each check, relative to the range; the maximum over the batch.
-
+    ``moved`` is the RMS movement at each check, the maximum over the batch, relative to the range, 1 or (B, 1, 1, 1).
     """
 
     def __init__(

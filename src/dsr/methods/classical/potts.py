@@ -64,17 +64,10 @@ class _Borders(NamedTuple):
 
 
 def fuse(rgb: Tensor, shading: Tensor, weight: float, inside: Tensor | None = None) -> Regions:
-    """Return regions that are a local minimum of E.
+    """Return regions that are a local minimum of E, equal for equal input.
 
-    Args:
-        rgb: (B, C, H, W) float64.
-        shading: likewise.
-        weight: weight of a unit of boundary length.
-        inside: (B, 1, H, W) bool mask of the problem, None for all pixels; each pixel outside is a region of its own.
-
-    Returns:
-        The regions; equal for equal input.
-
+    Image and shading are (B, C, H, W) float64, ``weight`` is that of a unit of boundary length, and ``inside`` the mask
+    (B, 1, H, W) of the problem; each pixel outside is a region of its own.
     """
     batch, channels, height, width = rgb.shape
     count = batch * height * width

@@ -167,12 +167,7 @@ class ShapeFromShading(Method):
 
 
 def read_foreground(path: Path, size: tuple[int, int]) -> np.ndarray:
-    """Return a mask, (H, W) bool, True where the picture is white.
-
-    Args:
-        size: the height and width that it must have.
-
-    """
+    """Return a mask, (H, W) bool of the given size, True where the picture is white."""
     if not path.is_file():
         raise ValueError(f"{path}: expected a mask of the foreground, there is no such file")
     content = read_limited(path, MOST_FILE)

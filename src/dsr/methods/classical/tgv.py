@@ -150,13 +150,9 @@ class TotalGeneralisedVariation(Method):
         return from_range(hr[0], sample.camera, "disparity").to(sample.depth_lr.dtype)
 
     def minimise(self, rgb: Tensor, lr: Tensor, scale: int, progress: Steps | None = None) -> Solution:
-        """Return the minimiser of E for normalised maps.
+        """Return the minimiser of E for normalised maps, (B, 1, h, w) in [0, 1], NaN in holes, of images in [0, 1].
 
-        Args:
-            rgb: (B, 3, H, W) in [0, 1].
-            lr: (B, 1, H / scale, W / scale) of the same type, in [0, 1], NaN in holes.
-            scale: upsampling factor; at 1, only holes are inpainted.
-
+        At a scale of 1, only holes are inpainted.
         """
         start = inpaint(lr)
         if scale > 1 and not bool(lr.isfinite().all()):

@@ -28,26 +28,16 @@ _SAMPLES_PER_SET = 3
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """The points where N rays from the camera meet the surfaces.
+    """The points where N rays from the camera meet the surfaces."""
 
-    Args:
-        depth: (N,) ray parameter, which is the orthogonal depth; inf where nothing is hit.
-        face: (N,) number of the triangle, -1 where nothing is hit.
-        body: (N,) number of the shape.
-        points, normals: (3, N) in the frame of the shapes; normals face the camera.
-        rest, chart: (3, N) the paint's coordinates, as in :class:`dsr.synthetic.procedural.shape.Shape`.
-        bulge: (N,) distance in metres from the triangle to the point along the normal.
-
-    """
-
-    depth: Array
-    face: Index
-    body: Index
-    points: Array
-    normals: Array
-    rest: Array
-    chart: Array
-    bulge: Array
+    depth: Array  # (N,) ray parameter, which is the orthogonal depth; inf where nothing is hit
+    face: Index  # (N,) number of the triangle, -1 where nothing is hit
+    body: Index  # (N,) number of the shape
+    points: Array  # (3, N) in the frame of the shapes
+    normals: Array  # (3, N), facing the camera
+    rest: Array  # (3, N) the paint's coordinates, as in `dsr.synthetic.procedural.shape.Shape`
+    chart: Array  # (3, N)
+    bulge: Array  # (N,) distance in metres from the triangle to the point along the normal
 
 
 class Tracer:
@@ -135,37 +125,19 @@ def _along(bulge: Array, normal: Array, rays: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Lighting:
-    """The light in a scene.
+    """The light in a scene."""
 
-    Args:
-        lamp: (SETS, L, 3) sample points of the lamp in metres.
-        colour: (3,) colour and strength of the lamp.
-        cookie: function from points (3, N) to the fraction (N,) of the lamp's light that arrives there, for example
-            through leaves or a window.
-        ambient: (3,) colour of the light from all directions.
-        sky: (3,) colour of additional light from above.
-        directions: (SETS, A, 3) unit vectors, cosine distributed about z, the normal.
-        occlusion_distance: distance in metres within which surfaces occlude each other's ambient light.
-
-    """
-
-    lamp: Array
-    colour: Array
-    cookie: Cookie
-    ambient: Array
-    sky: Array
-    directions: Array
-    occlusion_distance: float
+    lamp: Array  # (SETS, L, 3) sample points of the lamp in metres
+    colour: Array  # (3,) colour and strength of the lamp
+    cookie: Cookie  # from points (3, N) to the fraction of the lamp's light that arrives there, as through leaves
+    ambient: Array  # (3,) colour of the light from all directions
+    sky: Array  # (3,) colour of additional light from above
+    directions: Array  # (SETS, A, 3) unit vectors, cosine distributed about z, the normal
+    occlusion_distance: float  # metres within which surfaces occlude each other's ambient light
 
 
 def random_lighting(rng: np.random.Generator, tracer: Tracer, seen: Hits, low: Array, high: Array) -> Lighting:
-    """Return random lights for the surfaces of a preview.
-
-    Args:
-        low: (3,) lower corner of the box in which the lamp may hang, in metres.
-        high: (3,) upper corner of the same.
-
-    """
+    """Return random lights for the surfaces of a preview; the lamp may hang in a box from ``low`` to ``high``."""
     middle = np.median(seen.points, axis=1)
     extent = float(np.median(seen.depth))
     points, normals = seen.points, seen.normals

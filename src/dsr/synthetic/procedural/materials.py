@@ -178,12 +178,7 @@ _USUAL_PAINTS: dict[str, tuple[Callable[[np.random.Generator, str, float], Paint
 
 
 class MaterialSampler:
-    """Samples the materials of one scene, whose paints range from plain to patterned; some scenes have a single paint.
-
-    Args:
-        rng: source of random numbers.
-
-    """
+    """Samples the materials of one scene, from plain to patterned; some scenes have a single paint."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng

@@ -20,22 +20,13 @@ Index = NDArray[np.intp]
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """A mesh of V vertices and F triangles.
+    """A mesh of V vertices and F triangles."""
 
-    Args:
-        vertices: (V, 3) in metres.
-        faces: (F, 3) vertex indices, in any orientation.
-        normals: (V, 3) unit normals, to either side.
-        chart: (V, 3) surface coordinates for paint: two in metres and a tone in [0, 1], such as the height of a relief.
-        rest: (V, 3) coordinates of the vertices in the shape's own frame, for solid paint.
-
-    """
-
-    vertices: Array
-    faces: Index
-    normals: Array
-    chart: Array
-    rest: Array
+    vertices: Array  # (V, 3) in metres
+    faces: Index  # (F, 3) vertex indices, in any orientation
+    normals: Array  # (V, 3) unit normals, to either side
+    chart: Array  # (V, 3) for paint: two coordinates in metres and a tone in [0, 1], such as the height of a relief
+    rest: Array  # (V, 3) coordinates of the vertices in the shape's own frame, for solid paint
 
     def translate(self, shift: Sequence[float] | Array) -> Shape:
         """Return the shape translated by ``shift`` (3,) metres."""
@@ -83,13 +74,9 @@ def merge(shapes: Sequence[Shape]) -> Shape:
 
 
 def surface(points: Array, normals: Array | None = None, tone: Array | None = None) -> Shape:
-    """Return the surface through a grid of points.
+    """Return the surface through a grid of points, (R, C, 3); the last column may repeat the first, which closes it.
 
-    Args:
-        points: (R, C, 3); the last column may repeat the first, which makes it closed.
-        normals: (R, C, 3); None to take them from the grid.
-        tone: (R, C) the chart's third coordinate; None for 0.
-
+    Without ``normals`` they are taken from the grid; ``tone`` (R, C) is the chart's third coordinate.
     """
     rows, columns = points.shape[:2]
     if normals is None:
@@ -127,11 +114,9 @@ def _grid_normals(points: Array) -> Array:
 
 
 def lathe(sections: Sequence[Array], segments: int = 80) -> Shape:
-    """Return the surface of revolution of the profile ``sections`` about the z axis.
+    """Return the surface of revolution about the z axis of a profile.
 
-    Args:
-        sections: radius and height along the smooth pieces of the profile, (K, 2) each; edges between pieces are sharp.
-
+    Its sections, (K, 2) each, are radius and height along smooth pieces; edges between pieces are sharp.
     """
     angle = np.linspace(0, 2 * np.pi, segments + 1)
     circle = np.stack((np.cos(angle), np.sin(angle)), axis=1)
@@ -147,13 +132,9 @@ def lathe(sections: Sequence[Array], segments: int = 80) -> Shape:
 
 
 def extrusion(outlines: Sequence[Array], height: float, crease: float = 32.0) -> Shape:
-    """Return a prism from z = 0 to ``height``.
+    """Return a prism from z = 0 to ``height`` over closed polygons (K, 2): the outer one, then holes.
 
-    Args:
-        outlines: (K, 2) closed polygons: the outer one, then holes.
-        height: in metres.
-        crease: angle in degrees below which corners of the outline get smooth normals.
-
+    Corners of the outline below the ``crease`` angle in degrees get smooth normals.
     """
     sides = [_side(outline, height, crease) for outline in outlines]
     flat = np.concatenate(outlines)
