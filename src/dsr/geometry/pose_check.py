@@ -18,70 +18,57 @@ from dsr.geometry.rigid_motion import Matrix, invert, quaternion_of, rotation_of
 from dsr.geometry.tsdf import PosedMap
 from dsr.notes import LIMITS, Assumption
 
-_Reading = Callable[[Matrix], Matrix]
-
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-# axes x right, y down, z forward in the frame x forward, y right, z down, as TartanAir and aircraft have it
-_FORWARD_DOWN = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-# the same in the frame x forward, y left, z up, that of robots (ROS)
-_FORWARD_UP = np.diag([1.0, -1.0, -1.0, 1.0]) @ _FORWARD_DOWN
-
-
-def _as_given(pose: Matrix) -> Matrix:
-    return pose
-
-
-def _transposed(pose: Matrix) -> Matrix:
-    """Return a pose whose rotation was written by columns."""
-    changed = pose.copy()
-    changed[:3, :3] = pose[:3, :3].T
-    return changed
-
-
-def _scalar_first(pose: Matrix) -> Matrix:
-    """Return a pose whose quaternion w x y z was read as x y z w."""
-    w, x, y, z = quaternion_of(pose[:3, :3])
-    changed = pose.copy()
-    changed[:3, :3] = rotation_of_quaternion((x, y, z, w))
-    return changed
-
-
-_DIRECTIONS: dict[str, _Reading] = {"": _as_given, "from world to camera": invert}
+_FORWARD_DOWN = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # as TartanAir has it
+_FORWARD_UP = np.diag([1.0, -1.0, -1.0, 1.0]) @ _FORWARD_DOWN  # x forward, y left, z up, of robots (ROS)
+_DIRECTIONS = ("", "from world to camera")
+_ROTATIONS = ("", "with rotations by columns", "with quaternions w x y z")
 _AXES: dict[str, Matrix] = {
     "": np.eye(4),
     "of cameras with y up and z backward": _OPENGL,
     "of cameras with x forward and z down": _FORWARD_DOWN,
     "of cameras with x forward and z up": _FORWARD_UP,
 }
-_ROTATIONS: dict[str, _Reading] = {
-    "": _as_given,
-    "with rotations by columns": _transposed,
-    "with quaternions w x y z": _scalar_first,
+_LENGTHS = {
+    "": 1.0,
+    "in millimetres": 1e-3,
+    "in centimetres": 1e-2,
+    "10 times too small": 10.0,
+    "100 times too small": 100.0,
+    "1000 times too small": 1000.0,
 }
-_LENGTHS = {"": 1.0, "in millimetres": 1e-3, "in centimetres": 1e-2, "10 times too small": 10.0,
-            "100 times too small": 100.0, "1000 times too small": 1000.0}  # fmt: skip
 
 
-def _readings() -> dict[str, _Reading]:
-    """Return all readings: of direction, axes, rotation and length, those first that change less."""
-    found: dict[int, dict[str, _Reading]] = {}
-    for names in itertools.product(_ROTATIONS, _DIRECTIONS, _AXES, _LENGTHS):
-        turn, direction, axes, length = names
-        if turn and (axes or (direction and turn == "with rotations by columns")):
-            continue
+class Reading(NamedTuple):
+    """What poses may be: what makes poses as :mod:`dsr.geometry.rigid_motion` has them of those."""
 
-        def reading(pose: Matrix, names: tuple[str, ...] = names) -> Matrix:
-            turn, direction, axes, length = names
-            changed = _ROTATIONS[turn](pose)
-            changed = np.block([[changed[:3, :3], _LENGTHS[length] * changed[:3, 3:]], [changed[3:]]])
-            return _DIRECTIONS[direction](changed) @ _AXES[axes]
+    direction: str = ""
+    turn: str = ""
+    axes: str = ""
+    length: str = ""
 
-        said = [name for name in (direction, turn, axes, length) if name]
-        found.setdefault(len(said), {})[", ".join(said)] = reading
-    return {name: reading for changes in sorted(found) for name, reading in found[changes].items()}
+    def __call__(self, pose: Matrix) -> Matrix:
+        """Return the pose that a pose is if it is read so."""
+        rotation = pose[:3, :3]
+        if self.turn == "with rotations by columns":
+            rotation = rotation.T
+        elif self.turn == "with quaternions w x y z":  # it was read as x y z w
+            w, x, y, z = quaternion_of(rotation)
+            rotation = rotation_of_quaternion((x, y, z, w))
+        changed = np.block([[rotation, _LENGTHS[self.length] * pose[:3, 3:]], [pose[3:]]])
+        return (invert(changed) if self.direction else changed) @ _AXES[self.axes]
 
 
-# by what the poses then are: what makes poses as :mod:`dsr.geometry.rigid_motion` has them of those; "" as given
+def _readings() -> dict[str, Reading]:
+    """Return all readings by name, those first that change less; "" is as given."""
+    found = []
+    for turn, direction, axes, length in itertools.product(_ROTATIONS, _DIRECTIONS, _AXES, _LENGTHS):
+        if not turn or not (axes or (direction and turn == "with rotations by columns")):
+            found.append(Reading(direction, turn, axes, length))
+    found.sort(key=lambda reading: sum(map(bool, reading)))
+    return {", ".join(filter(None, reading)): reading for reading in found}
+
+
 READINGS = _readings()
 
 _WIDEST = 320  # maps are reduced to at most as many pixels across, by leaving out pixels

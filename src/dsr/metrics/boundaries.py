@@ -23,6 +23,7 @@ pixels that have a prediction, ``Boundary_covered``, belongs to every score.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -251,16 +252,9 @@ def _planarity(pair: SurfacePair) -> tuple[Tensor, Tensor]:
     return flatness, orientation
 
 
-def _boundary_error(pair: SurfacePair, part: int) -> Tensor:
-    return _boundary_errors(pair)[part]
-
-
-def _directed_error(pair: SurfacePair, part: int) -> Tensor:
-    return directed_depth_error(pair)[:, part]
-
-
-def _planarity_error(pair: SurfacePair, part: int) -> Tensor:
-    return _planarity(pair)[part]
+def _part(pair: SurfacePair, function: Callable[[SurfacePair], Tensor | Sequence[Tensor]], part: int) -> Tensor:
+    found = function(pair)
+    return found[:, part] if isinstance(found, Tensor) else found[part]
 
 
 _whole = partial(Metric, whole=True)
@@ -280,14 +274,18 @@ METRICS: tuple[Metric, ...] = (
     ),
     *(
         _whole(
-            f"DBE_{name}", partial(_boundary_error, part=part), target_mask, column("DBE", f"{name}, px"), min_size=3
+            f"DBE_{name}",
+            partial(_part, function=_boundary_errors, part=part),
+            target_mask,
+            column("DBE", f"{name}, px"),
+            min_size=3,
         )
         for part, name in enumerate(("accuracy", "completeness"))
     ),
     *(
         _whole(
             f"DDE_{name}",
-            partial(_directed_error, part=part),
+            partial(_part, function=directed_depth_error, part=part),
             depth_mask,
             MetricFormat("DDE", f"3 m, {name}, %", 1e2, 1, higher_is_better=part == 0, position=None),
             min_size=1,
@@ -297,7 +295,7 @@ METRICS: tuple[Metric, ...] = (
     *(
         _whole(
             f"PE_{name}",
-            partial(_planarity_error, part=part),
+            partial(_part, function=_planarity, part=part),
             depth_mask,
             column("PE", f"{name}, {unit}", factor),
             min_size=3,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import attrgetter
 
 import torch
 from torch import Tensor
@@ -29,14 +30,6 @@ __all__ = [
 ]
 
 
-def _ssim_mask(pair: SurfacePair) -> Tensor:
-    return pair.ssim_mask
-
-
-def _bumpiness_mask(pair: SurfacePair) -> Tensor:
-    return pair.bumpiness_mask
-
-
 def _bad_pix_d(percent: int, unit: str) -> Metric:
     function = partial(functional.bad_pix_d, threshold=percent / 100, relative=unit == "pct")
     heading = f"{percent} cm, %" if unit == "cm" else f"{percent} % of depth, %"
@@ -58,7 +51,7 @@ METRICS: tuple[Metric, ...] = (
     Metric(
         "DSSIM_v",
         functional.dssim_v,
-        _ssim_mask,
+        attrgetter("ssim_mask"),
         MetricFormat("DSSIM_v", "1/1000", 1e3, 0, position=4),
         per_light=True,
         min_size=functional.SSIM_WINDOW,
@@ -83,7 +76,7 @@ METRICS: tuple[Metric, ...] = (
     Metric(
         "Bumpiness_d",
         functional.bumpiness_d,
-        _bumpiness_mask,
+        attrgetter("bumpiness_mask"),
         MetricFormat("Bump_d", digits=2, position=6),
         min_size=3,
     ),
