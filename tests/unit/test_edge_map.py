@@ -11,17 +11,19 @@ from scipy import ndimage
 from torch import Tensor
 
 from dsr.methods.base import NoSolutionError
-from dsr.methods.classical.edge_map import detect_edges, predict_edge_map, thin
-from dsr.methods.classical.edge_patches import (
+from dsr.methods.classical.edge_map import (
     PATCH,
     Patches,
     deduplicate,
+    detect_edges,
     edge_distances,
     energy,
     find_nearest,
     find_overlaps,
     label,
     orient,
+    predict_edge_map,
+    thin,
 )
 
 

@@ -38,7 +38,7 @@ from dsr.metrics.functional import SurfacePair, masked_mean, masked_median, once
 from dsr.metrics.metric import Metric, depth_mask, target_mask
 from dsr.utils.compute_device import in_own_precision
 
-# depth Pro's thresholds, which are their own weights; MoGe's weights are 1 less
+# Depth Pro's thresholds, which are their own weights; MoGe's weights are 1 less
 RATIOS = tuple(np.linspace(1.05, 1.25, 10).tolist())
 DBE_RANGE = 10.0  # pixels; predicted boundaries further from a true one are no boundaries of it
 DDE_PLANE = 3.0  # metres from the camera to the plane that the directed depth error is about

@@ -15,6 +15,7 @@ fractions ``covered`` stand beside them.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import torch
@@ -147,7 +148,7 @@ def normals_covered(pair: SurfacePair) -> Tensor:
     return masked_mean(pair.normal_mask, true_normal_mask(pair)).squeeze(1)
 
 
-_ERRORS = {  # function, heading, unit, factor, digits
+_ERRORS: dict[str, tuple[Callable[[SurfacePair], Tensor], str, str, float, int]] = {  # heading, unit, factor, digits
     "AbsRel": (abs_rel, "AbsRel", "%", 1e2, 2),
     "SqRel": (sq_rel, "SqRel", "m", 1, 4),
     "RMSE": (rmse, "RMSE", "m", 1, 4),
@@ -167,8 +168,8 @@ _DELTAS = {
 }
 DEPTH = (
     *(
-        Metric(f"Depth_{name}", function, depth_mask, column(*form), min_size=1, unit="cm")
-        for name, (function, *form) in _ERRORS.items()
+        Metric(f"Depth_{name}", function, depth_mask, column(heading, unit, factor, digits), min_size=1, unit="cm")
+        for name, (function, heading, unit, factor, digits) in _ERRORS.items()
     ),
     *(
         Metric(

@@ -1,4 +1,4 @@
-"""Iterative solvers: conjugate gradients, and when an iteration has converged."""
+"""Conjugate gradients for batches."""
 
 from __future__ import annotations
 
@@ -7,10 +7,6 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-
-from dsr.utils.progress import Steps
-
-CHECK_EVERY = 50  # iterations between two checks of how far the map has moved
 
 
 class Solution(NamedTuple):
@@ -52,44 +48,3 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
 def _ratio(above: Tensor, below: Tensor) -> Tensor:
     """Return above / below, 0 where ``below`` is 0, so that a solved element stays unchanged."""
     return torch.where(below > 0, above / torch.where(below > 0, below, 1), 0)
-
-
-class Movement:
-    """The movement of an iterated map, (B, 1, H, W), between two checks, and whether it is below a tolerance.
-
-    ``moved`` is the RMS movement at each check, the maximum over the batch, relative to the range, 1 or (B, 1, 1, 1).
-    """
-
-    def __init__(
-        self,
-        start: Tensor,
-        iterations: int,
-        tolerance: float,
-        progress: Steps | None,
-        value_range: Tensor | None = None,
-    ) -> None:
-        self._previous, self._range = start.clone(), torch.ones_like(start[:1, :1, :1, :1])
-        if value_range is not None:
-            self._range = value_range
-        self._iterations, self._tolerance, self._progress = iterations, tolerance, progress
-        self.moved: list[float] = []
-
-    def converged(self, values: Tensor) -> bool:
-        """Record a check of the map, (B, 1, H, W), and return whether it has stopped moving."""
-        self.moved.append(float(((values - self._previous) / self._range).square().mean(dim=(-2, -1)).max().sqrt()))
-        self._previous.copy_(values)
-        self._report(CHECK_EVERY * len(self.moved))
-        return self.moved[-1] < self._tolerance
-
-    def finish(self) -> None:
-        """Report that the iteration is over, at whatever iteration it has stopped."""
-        self._report(self._iterations)
-
-    def _report(self, done: int) -> None:
-        if self._progress is not None:
-            self._progress(done, self._iterations)
-
-
-def history_of(moved: list[float]) -> list[dict[str, float]]:
-    """Return the history of an iteration, one entry for each check, from :attr:`Movement.moved`."""
-    return [{"iteration": float(CHECK_EVERY * (check + 1)), "moved": value} for check, value in enumerate(moved)]

@@ -41,7 +41,7 @@ from dsr.methods.classical.potts import Regions, boundary_length, fit_albedo, fu
 _TINY = 1e-12  # minimum length of m, which avoids division by 0
 
 _CG_ITERATIONS, _CG_TOLERANCE = 60, 1e-6
-_INNER = 3  # levenberg-Marquardt steps in an update of theta
+_INNER = 3  # Levenberg-Marquardt steps in an update of theta
 _LESS, _MORE = 0.2, 5.0  # factors of its damping after a step that lowers the energy, and after one that does not
 
 

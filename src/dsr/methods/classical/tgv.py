@@ -44,13 +44,13 @@ from dsr.methods.classical.finite_differences import (
     sum_adjacent,
     upsample_linear_border,
 )
-from dsr.methods.classical.iterations import CHECK_EVERY, Movement, history_of
 from dsr.methods.inpainting import inpaint
 from dsr.methods.networks.normalisation import normalise
 from dsr.methods.noise_level import estimate_sensor_noise
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 
+_CHECK_EVERY = 50  # iterations between two checks of how far the map has moved
 _RELAXATION = 1.9  # over-relaxation factor; the iteration converges below 2
 _SLOPE = 0.3  # scale of slopes relative to the map, per pixel, for step sizes
 _NOISE_WEIGHT = 0.6  # the weight of the data term, times the noise of a normalised map and the scale
@@ -145,7 +145,8 @@ class TotalGeneralisedVariation(Method):
         valid = lr.isfinite()
         values = torch.where(valid, scaled.values, torch.nan)
         found = self.minimise(sample.rgb[None].double(), values, whole_scale(sample), progress)
-        self.history = history_of(found.moved)
+        moved = enumerate(found.moved, start=1)
+        self.history = [{"iteration": float(_CHECK_EVERY * check), "moved": value} for check, value in moved]
         hr = found.values * scaled.value_range + scaled.minimum
         return from_range(hr[0], sample.camera, "disparity").to(sample.depth_lr.dtype)
 
@@ -202,7 +203,7 @@ class TotalGeneralisedVariation(Method):
         v = slopes(u)
         p, q = torch.zeros_like(v)[:, :, None], torch.zeros_like(gradient(v))
         mean_u, mean_v = torch.zeros_like(u), torch.zeros_like(v)
-        movement, done = Movement(u, self.iterations, self.tolerance, progress), 0
+        previous, moved, done = u, [], 0
         for done in range(1, self.iterations + 1):
             gp = _zero_border(g.times(p))
             prox_u = data.prox(u + steps.u * divergence(gp))
@@ -212,15 +213,20 @@ class TotalGeneralisedVariation(Method):
                 p + steps.p * g.times(_zero_border(gradient(ahead_u) - ahead_v[:, :, None])), self.alpha1
             )
             prox_q = _project_ball(q + steps.q * gradient(ahead_v), self.alpha0)
-            u, v, p, q = (
-                old.lerp(near, _RELAXATION) for old, near in ((u, prox_u), (v, prox_v), (p, prox_p), (q, prox_q))
-            )
-            since = (done - 1) % CHECK_EVERY + 1
+            u, v = u.lerp(prox_u, _RELAXATION), v.lerp(prox_v, _RELAXATION)
+            p, q = p.lerp(prox_p, _RELAXATION), q.lerp(prox_q, _RELAXATION)
+            since = (done - 1) % _CHECK_EVERY + 1
             mean_u, mean_v = mean_u.lerp(prox_u, 1 / since), mean_v.lerp(prox_v, 1 / since)
-            if since == CHECK_EVERY and movement.converged(mean_u):
-                break
-        movement.finish()
-        return Solution(mean_u, mean_v, done, movement.moved)
+            if since == _CHECK_EVERY:
+                moved.append(float((mean_u - previous).square().mean(dim=(-2, -1)).max().sqrt()))
+                previous = mean_u
+                if progress is not None:
+                    progress(done, self.iterations)
+                if moved[-1] < self.tolerance:
+                    break
+        if progress is not None:
+            progress(self.iterations, self.iterations)
+        return Solution(mean_u, mean_v, done, moved)
 
 
 class _Steps(NamedTuple):
