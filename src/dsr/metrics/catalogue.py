@@ -174,8 +174,11 @@ def score_image(
     for axis in (1, 0):
         hits = valid.any(dim=axis).nonzero()
         window.append(slice(int(hits[0]), int(hits[-1]) + 1) if len(hits) else slice(0, valid.shape[1 - axis]))
+    windows = [[slice(None), slice(None)]]
+    if valid[*window].shape != valid.shape:
+        windows.append(window)
     pairs = []
-    for rows, columns in ((slice(None), slice(None)), window):
+    for rows, columns in windows:
         depth_error, angle_error = (None, None) if errors is None else (e[None, :, rows, columns] for e in errors)
         pairs.append(
             SurfacePair(
@@ -189,8 +192,6 @@ def score_image(
                 image_dtype=torch.float32,
             )
         )
-        if pairs[0].target.shape == prediction[None, :, *window].shape:
-            break
     for metric in metrics:
         pair = pairs[0] if metric.whole else pairs[-1]
         if not metric.applies(pair):

@@ -33,9 +33,6 @@ class PerImageMean(torchmetrics.Metric):
     An image whose target has no valid pixel is left out. If a prediction has no pixel that can be scored, the mean is
     NaN, so that a method that fails never looks better than one that does not.
 
-    Attributes:
-        applied: () bool, whether the metric is for all pairs, or was for one so far.
-
     Args:
         metric: from :func:`dsr.metrics.catalogue.catalogue`, or the name of one, as in ``scores.csv``.
         variant: ``max`` (worst of four lights, the smallest value where higher is better), ``avg`` or one of e1..e4;
@@ -46,7 +43,7 @@ class PerImageMean(torchmetrics.Metric):
 
     is_differentiable = False
     full_state_update = False
-    applied: Tensor
+    applied: Tensor  # whether the metric is for all pairs, or was for one so far
     count: Tensor
 
     def __init__(self, metric: Metric | str, variant: str = WORST, **settings: Any) -> None:
@@ -190,13 +187,13 @@ def visual_metrics(
 
 def compute_means(metrics: torchmetrics.MetricCollection) -> dict[str, Tensor]:
     """Return the means of a collection of :func:`visual_metrics` by name, without metrics of other benchmarks."""
-    return {name: metric.compute() for name, metric in metrics.items() if _applies(metric)}
-
-
-def _applies(metric: Any) -> bool:
-    """Return whether a metric is for the benchmark of a pair of any process."""
-    with metric.sync_context():
-        return bool(getattr(metric, "applied", True))
+    means = {}
+    for name, metric in metrics.items():
+        with metric.sync_context():  # whether a pair of any process is of its benchmark
+            applied = bool(getattr(metric, "applied", True))
+        if applied:
+            means[name] = metric.compute()
+    return means
 
 
 def in_table_units(metrics: torchmetrics.MetricCollection, means: Mapping[str, float]) -> dict[str, float]:
