@@ -1,28 +1,22 @@
 """Metrics of the points that a depth map is back-projected to, against those of the true map: P = z r, in metres.
 
 The predicted cloud has the pixels with both depths, the true one all pixels with a true depth. Distances are Euclidean,
-each to the nearest point of the other cloud, wherever in the image that is; nothing is thinned out.
+each to the nearest point of the other cloud; nothing is thinned out.
 
-- *Chamfer distance*: the mean of two means, over predicted points to the true cloud and over true points to the
-  predicted one. ``chamfer_dist`` in ``unidepth/utils/evaluation_depth.py`` of lpiccinelli-eth/UniDepth (8d8cfe4).
+- *Chamfer distance*: the mean of the mean distances of either cloud to the other. ``chamfer_dist`` in
+  ``unidepth/utils/evaluation_depth.py`` of lpiccinelli-eth/UniDepth (8d8cfe4).
 - *F-score*: the harmonic mean of precision and recall, the fractions of the two clouds that are less than a threshold
   from the other one. Knapitsch et al., *Tanks and Temples*, SIGGRAPH 2017; at 5 cm as for ScanNet, ``eval_mesh`` in
-  ``atlas/evaluation.py`` of magicleap/Atlas (bee3ddb), which thins both clouds out to 2 cm first; and at 1 cm, the
-  smallest threshold of ETH3D (Schoeps et al., CVPR 2017).
-- *Flying pixels*: predicted points in the void between two surfaces (Sabov and Krueger, *Identification and Correction
-  of Flying Pixels in Range Camera Data*, SCCG 2008). Benchmarks of depth maps do not count them; some measure them by
-  the soft edge error, the difference of a depth near an edge from the most similar true depth around (Chen et al., *On
-  the Over-Smoothing Problem of CNN Based Disparity Estimation*, ICCV 2019). Accordingly a point flies if
+  ``atlas/evaluation.py`` of magicleap/Atlas (bee3ddb), which thins both clouds out to 2 cm first; and at 1 cm.
+- *Flying pixels*: predicted points in the void between two surfaces (Sabov and Krueger, SCCG 2008). A point flies if
 
   1. an occlusion edge of the truth is within 16 pixels along rows and columns, as far as one low-resolution pixel
-     reaches at x16: two neighbours whose depths have a ratio of more than 1.05, the smallest that Depth Pro counts as
-     an occluding contour (``src/depth_pro/eval/boundary_metrics.py`` of apple/ml-depth-pro, 9efe5c1);
+     reaches at x16: two neighbours whose depths have a ratio of more than 1.05, as in Depth Pro's contours;
   2. along the ray it lies behind the nearest front and before the farthest back of these edges; and
-  3. along and across the ray it is more than 1 % of its depth away from every true point.
+  3. it is more than 1 % of its depth away from every true point.
 
 A hole of a prediction does not fly and adds nothing to a precision, but the true points there are far from the
-predicted cloud, and ``Points_covered`` stands beside these metrics. Where the truth has holes at its edges, as from a
-stereo camera, it has fewer of them to fly at.
+predicted cloud, and ``Points_covered`` stands beside these metrics.
 """
 
 from __future__ import annotations

@@ -1,27 +1,18 @@
 """Bilateral filters: of a sensor's own depth map without the photo, and joint bilateral upsampling with it.
 
-Without the photo, it is the baseline for noisy maps: Tomasi and Manduchi, *Bilateral Filtering for Gray and Color
-Images*, ICCV 1998. A pixel becomes the mean of the pixels of a round window, weighted by Gaussians of their distance
-and of the difference of their depths: noise is averaged, while a depth step of several ``sigma_depth`` stays. Where the
-photo has more pixels than the map, the filtered map is then interpolated: bilinear means of the planes that its pixels
-stand for, see :mod:`dsr.methods.classical.photo_guided`.
+Tomasi and Manduchi, *Bilateral Filtering for Gray and Color Images*, ICCV 1998: a pixel becomes the mean of a round
+window, weighted by Gaussians of the distance and of the difference of depth. Where the photo has more pixels than the
+map, the filtered map is then interpolated as in :mod:`dsr.methods.classical.photo_guided`. Holes have no weight and
+stay holes; with ``fill_holes`` they are inpainted after filtering. OpenCV filters, in float32.
 
-Holes have no weight and stay holes; with ``fill_holes`` they are inpainted after filtering. OpenCV filters, in float32,
-with weights from a table of 4096 entries over the map's range of depth.
-
-Kopf, Cohen, Lischinski, Uyttendaele, *Joint Bilateral Upsampling*, SIGGRAPH 2007. The high-resolution value at pixel p
-is
+Kopf, Cohen, Lischinski, Uyttendaele, *Joint Bilateral Upsampling*, SIGGRAPH 2007:
 
     S_p = 1 / k_p * sum over low-resolution pixels q of S_q f(|p - q|) g(|I_p - I_q|),
 
 with Gaussians f of the distance in low-resolution pixels and g of the colour difference, and the sum k_p of the
-weights; q runs over the (2 * radius + 1)^2 low-resolution pixels around p.
-
-What differs: I_q is the mean colour over the low-resolution pixel, as low-resolution depth is a mean; the paper takes a
-single pixel of the image. Low-resolution pixels that are holes have no weight. The weights of each pixel are scaled so
-that the largest is 1: a pixel unlike all around it takes the value of its most similar neighbours, without 0 / 0.
-
-Time grows as H * W * (2 * radius + 1)^2; memory peaks at about 20 maps of H * W float64 values, whatever the radius.
+weights. What differs: I_q is the mean colour over the low-resolution pixel, as low-resolution depth is a mean. Weights
+of each pixel are scaled so that the largest is 1: a pixel unlike all around it takes the value of its most similar
+neighbours. Time grows as H * W * (2 * radius + 1)^2; memory peaks at about 20 maps of H * W float64 values.
 """
 
 from __future__ import annotations

@@ -1,37 +1,27 @@
 """Edge-guided upsampling of a depth map alone: a bilateral filter whose means do not cross predicted edges.
 
-Xie, Feris, Sun, *Edge-Guided Single Depth Image Super Resolution*, IEEE TIP 25(1), 2016 (first at ICIP 2014), in its
-self-similar mode. :mod:`dsr.methods.classical.edge_map` predicts the high-resolution edges; the modified joint
-bilateral filter then is
+Xie, Feris, Sun, *Edge-Guided Single Depth Image Super Resolution*, IEEE TIP 25(1), 2016, in its self-similar mode.
+:mod:`dsr.methods.classical.edge_map` predicts the high-resolution edges; the modified joint bilateral filter then is
 
     S_p = 1 / k_p * sum over low-resolution pixels q of S_q f(|p - q|) r(p, q),
 
 with f a Gaussian of the distance in low-resolution pixels, r = 1 if a path from p to q crosses no edge and 0 otherwise,
-and k_p the sum of the weights. The colour image is not used.
+and k_p the sum of the weights. The colour image is not used. What differs from the original, besides the edge map:
 
-What differs from the original, besides the edge map:
-
-- It works on disparity, and each low-resolution pixel stands for a plane, as in
-  :mod:`dsr.methods.classical.photo_guided`: planes are reproduced exactly, where constants would give stairs.
-- A low-resolution pixel is a mean over its block, not a sample. A pixel with an edge through it mixes both sides, so
-  its weight is multiplied by ``mixed``: it counts only if there is no other pixel on the side of p.
-- A path is 4-connected, within the neighbourhood of the low-resolution pixel, and does not touch edges. In the original
-  it is the shortest path with a high cost of edges, one pixel wider.
+- It works on disparity, and each low-resolution pixel stands for a plane, so that planes are reproduced exactly.
+- A low-resolution pixel is a mean over its block. One with an edge through it mixes both sides, so its weight is
+  multiplied by ``mixed``: it counts only if there is no other pixel on the side of p.
+- A path is 4-connected, within the neighbourhood of the low-resolution pixel, and does not touch edges.
 - Pixels on edges get the value that makes the mean of their block equal to the low-resolution value, starting from the
   bicubic map and staying between the two sides: so an edge is placed with subpixel accuracy. Then each takes the
   reachable pixels of its most similar neighbour off the edge. In the original, they reach both sides.
 - Where no pixel is reachable, the result is the bicubic map, not the nearest sample.
-- The scale is split into prime factors, x8 into three stages of x2, each with an edge map of its own, because more
-  patches recur between neighbouring scales; the original has one stage, up to x4. Pixels on edges take sides only in
-  the last stage; after the other stages they count as ``mixed`` and have no slope.
+- The scale is split into prime factors, because more patches recur between neighbouring scales. Pixels on edges take
+  sides only in the last stage; after the other stages they count as ``mixed`` and have no slope.
 
 There is no solution for a map with edges that do not recur at half its size, such as one too small for patches: see
-:class:`dsr.methods.base.NoSolutionError`. A map without edges needs none. Block means are expected; with
-``downsampling=nearest`` the result is half a pixel off.
-
-Depth is computed in float64. Time grows with the number of pixels, and with edge patches times example patches. Memory:
-about 27 float64 maps of the image's size, at most 2^24 distances of 4 bytes, and a part that grows with the edge
-pixels; for a statue before a wall at 512 x 512, 165 maps in total.
+:class:`dsr.methods.base.NoSolutionError`. Memory: about 27 float64 maps of the image's size, at most 2^24 distances of
+4 bytes, and a part that grows with the edge pixels; for a statue before a wall at 512 x 512, 165 maps in total.
 """
 
 from __future__ import annotations

@@ -4,21 +4,12 @@ Min, Choi, Lu, Ham, Sohn, Do, *Fast Global Image Smoothing Based on Weighted Lea
 
     sum over p of (u_p - f_p)^2 + lambda * sum over neighbours p, q of w_pq (u_p - u_q)^2,  w_pq = exp(-|I_p - I_q| / s)
 
-along one row or column solves a tridiagonal system: -lambda w off the diagonal, and 1 + lambda times the sum of the two
-weights on it. The minimiser over the image is approximated by solving all rows, then all columns, T times (the paper's
-T is 3), with
-
-    lambda_t = 3/2 * 4^(T - t) / (4^T - 1) * lambda.
-
-For sparse data, the paper smooths both the data and their index map, and divides: E(c f) / E(c), with the smoothing E
-and c = 1 at data, 0 elsewhere. The same is done here: f is the low-resolution map at the centres of its pixels (the
-four high-resolution pixels around a centre that lies between them), and c is 0 elsewhere and in holes.
-
-What differs: lambda is in units of the squared low-resolution pixel, so that one value fits all scales. It is far
-smaller than the paper's, which blurs renderings. Without ``slopes``, as in the paper, renderings show a tent at each
-low-resolution pixel.
-
-Time grows as iterations * H * W; memory peaks at about 25 maps of H * W float64 values (19 without ``slopes``).
+is approximated by solving the tridiagonal systems of all rows, then of all columns, T times, with
+lambda_t = 3/2 * 4^(T - t) / (4^T - 1) * lambda. Sparse data and their index map are both smoothed and divided, as in
+the paper: the low-resolution map at the centres of its pixels (the four high-resolution pixels around a centre that
+lies between them). What differs: lambda is in units of the squared low-resolution pixel, so that one value fits all
+scales, and far smaller than the paper's, which blurs renderings. Without ``slopes``, as in the paper, renderings show
+a tent at each low-resolution pixel. Memory peaks at about 25 maps of H * W float64 values.
 """
 
 from __future__ import annotations

@@ -1,19 +1,16 @@
 """Guided filter upsampling: in each window, depth is a linear function of the colours.
 
-He, Sun, Tang, *Guided Image Filtering*, TPAMI 2013, with the colour guide of its section on colour images. In every
-window w_k of the high-resolution image, q_i = a_k . I_i + b_k with
+He, Sun, Tang, *Guided Image Filtering*, TPAMI 2013, with its colour guide. In every window w_k of the high-resolution
+image, q_i = a_k . I_i + b_k with
 
     a_k = (S_k + eps U)^-1 (mean(I p) - m_k mean(p)),    b_k = mean(p) - a_k . m_k,
 
-with the mean m_k and the 3 x 3 covariance S_k of the colours I in the window, the input p and the identity U. The
-result is q_i = mean(a_k) . I_i + mean(b_k) over the windows that contain pixel i. For upsampling, p is the bilinear
-interpolation of the low-resolution map, as in the paper's joint upsampling.
+with the mean m_k and the 3 x 3 covariance S_k of the colours I, the input p (the bilinear interpolation of the
+low-resolution map) and the identity U. The result is q_i = mean(a_k) . I_i + mean(b_k) over the windows that contain i.
 
 What differs: means over a window weight pixels by their confidence (see :mod:`dsr.methods.classical.photo_guided`), so
-that holes do not spread, and windows are weighted by the mean confidence of their pixels; without holes this is the
-paper's filter. Windows are truncated at the border. The radius is in low-resolution pixels.
-
-Time grows as H * W * radius * scale; memory peaks at about 50 maps of H * W float64 values, whatever the radius.
+that holes do not spread, and windows by their mean confidence. The radius is in low-resolution pixels. Time grows as
+H * W * radius * scale; memory peaks at about 50 maps of H * W float64 values.
 """
 
 from __future__ import annotations

@@ -2,30 +2,23 @@
 
 Haefner, Quéau, Möllenhoff and Cremers, *Fight Ill-Posedness with Ill-Posedness: Single-shot Variational Depth
 Super-Resolution from Shading*, CVPR 2018: the depth z whose block means are the low-resolution map, the piecewise
-constant albedo and the light that explain the image, with minimal surface area. Their section 3 has the
-rendering equation (:mod:`dsr.methods.classical.srfs_admm`) and the priors: minimal surface for the shape, Potts for
-the albedo (:mod:`dsr.methods.classical.potts`). Their section 4 minimises the energy by alternating directions,
-the penalty growing, over albedo, lighting, theta = (z, grad z), z and the multipliers, in this order
-(:mod:`dsr.methods.classical.srfs_admm`).
-
-The energy per pixel, with intensities in [0, 1] and z in pixels (times the focal length f, by the median depth):
+constant albedo and the light that explain the image, with minimal surface area. It minimises, by alternating
+directions with a growing penalty over albedo, lighting, theta = (z, grad z), z and the multipliers
+(:mod:`dsr.methods.classical.srfs_admm`, :mod:`dsr.methods.classical.potts`), the energy per pixel
 
     1/2 |albedo * shading - rgb|^2 + area_weight * z |m| + boundary_weight * boundaries
-    + data_weight / (2 scale^2) * (mean z - lr)^2.
+    + data_weight / (2 scale^2) * (mean z - lr)^2,
 
-What differs from the original, besides what those modules name:
+with intensities in [0, 1] and z in pixels (times the focal length f, by the median depth). What differs:
 
-- Weights. Its code (mu = 0.1, nu = 1e-4, lambda = 1, doubling the penalty 1e-4 each time) has, in these units at x4
-  with f = 500: data_weight 0.0015, area_weight 1e-7 and boundary_weight 0.5. With so weak a data term the result
-  follows the low-resolution map only over hundreds of pixels, and texture that the albedo does not explain becomes
-  relief. Ours were chosen on procedural scenes and on a bumpy surface under known light. With area_weight = 0.02 such a
-  surface has half the error that 0.2 leaves; with 1 rooms, where depth steps and texture dominate, are a tenth better.
-- Each channel has a light of its own; in the original code they share one. Albedos are between 0 and 2.
+- Weights. Its code has, in these units at x4 with f = 500: data_weight 0.0015, area_weight 1e-7 and boundary_weight
+  0.5. With so weak a data term the result follows the low-resolution map only over hundreds of pixels, and texture that
+  the albedo does not explain becomes relief. Ours were chosen on procedural scenes and on a bumpy surface.
+- Each channel has a light of its own. Albedos are between 0 and 2.
 - The penalty of the copy of z is weighted by 1 / scale^2: with 1 a step spreads over a pixel, and blocks have several.
 - theta by Levenberg and Marquardt's method, its 3 x 3 systems solved in closed form, instead of BFGS; z by plain
   conjugate gradients; it starts from the bicubic map, not smoothed first.
-- Outside the foreground the initial map stays unchanged, including in blocks that cross its border; the original cuts
-  these blocks.
+- Outside the foreground the initial map stays unchanged, including in blocks that cross its border.
 
 The steps of albedo, lighting, theta and z each lower the augmented Lagrangian. The energy itself, logged for z without
 the copy, may rise while the copy still differs. Holes have no data term, and start from inpainted values.
