@@ -115,9 +115,17 @@ def detect_edges(lr: Tensor, scale: int, step: float) -> Tensor:
     excess = [(_central_difference(lr, axis) - estimate_slopes(lr, axis)).square() for axis in (0, 1)]
     most = functional.max_pool2d((excess[0] + excess[1]).sqrt().nan_to_num(nan=0.0)[None, None], 3, stride=1, padding=1)
     most = most.repeat_interleave(scale, 2).repeat_interleave(scale, 3)[0, 0]
-    ridge = torch.minimum(strength, most) * _is_ridge(strength, down, across)
-    strong, weak = ridge > step / 2, ridge > _WEAK * step / 2
-    return _drop_small(_grow(strong, weak))
+    ring = _neighbours(strength)  # the maximum of three pixels along the gradient, to the nearest of 8 neighbours
+    turn = (torch.atan2(across, -down) / (torch.pi / 4)).round().long().remainder(4)[None]
+    ridge = torch.minimum(strength, most) * (
+        (strength > ring.gather(0, turn)[0]) & (strength >= ring.gather(0, turn + 4)[0])
+    )
+    weak = ridge > _WEAK * step / 2
+    grown, new = torch.zeros_like(weak), (ridge > step / 2) & weak
+    while not bool((new == grown).all()):  # the weak pixels that are connected with strong ones
+        grown = new
+        new = weak & (functional.max_pool2d(grown[None, None].float(), 3, stride=1, padding=1)[0, 0] > 0)
+    return _drop_small(grown)
 
 
 def find_recurring(lr: Tensor, scale: int, step: float) -> Patches:
@@ -163,26 +171,6 @@ def _neighbours(x: Tensor) -> Tensor:
 def _central_difference(x: Tensor, axis: int) -> Tensor:
     """Return the central difference along an axis, one-sided at the border, 0 along a single pixel."""
     return torch.gradient(x, dim=axis)[0] if x.shape[axis] > 1 else torch.zeros_like(x)
-
-
-def _is_ridge(strength: Tensor, down: Tensor, across: Tensor) -> Tensor:
-    """Return where the strength is the maximum of three pixels along the gradient, (H, W) bool; of equal ones one.
-
-    The direction of the gradient is rounded to that of the nearest of the 8 neighbours.
-    """
-    ring = _neighbours(strength)
-    turn = (torch.atan2(across, -down) / (torch.pi / 4)).round().long().remainder(4)[None]
-    return (strength > ring.gather(0, turn)[0]) & (strength >= ring.gather(0, turn + 4)[0])
-
-
-def _grow(strong: Tensor, weak: Tensor) -> Tensor:
-    """Return the weak pixels that are connected with strong ones."""
-    grown = strong & weak
-    while True:
-        new = weak & (functional.max_pool2d(grown[None, None].float(), 3, stride=1, padding=1)[0, 0] > 0)
-        if bool((new == grown).all()):
-            return grown
-        grown = new
 
 
 def _drop_small(mask: Tensor) -> Tensor:
@@ -284,7 +272,10 @@ def find_overlaps(places: Tensor, patches: Tensor) -> tuple[Tensor, Tensor]:
             first, second = first[second >= 0], second[second >= 0]
             if len(first):
                 pairs.append(torch.stack((first, second), dim=1))
-                costs.append(_disagreement(images[first], images[second], down, across))
+                left, right = max(across, 0), max(-across, 0)
+                a = images[first][:, :, down:, left : PATCH - right].flatten(2)
+                b = images[second][:, :, : PATCH - down, right : PATCH - left].flatten(2)
+                costs.append(a.square().sum(dim=2)[:, :, None] + b.square().sum(dim=2)[:, None] - 2 * a @ b.mT)
     return torch.cat(pairs), torch.cat(costs)
 
 
@@ -300,14 +291,6 @@ def average_patches(patches: Tensor, places: Tensor, shape: tuple[int, int]) -> 
 
 def _features(low: Tensor, high: Tensor, weight: float) -> Tensor:
     return torch.cat((edge_distances(low).flatten(1), weight * high.flatten(1).float()), dim=1)
-
-
-def _disagreement(first: Tensor, second: Tensor, down: int, across: int) -> Tensor:
-    """Return the squared differences of (E, K, PATCH, PATCH) patches, the second shifted by rows and columns."""
-    left, right = max(across, 0), max(-across, 0)
-    a = first[:, :, down:, left : PATCH - right].flatten(2)
-    b = second[:, :, : PATCH - down, right : PATCH - left].flatten(2)
-    return a.square().sum(dim=2)[:, :, None] + b.square().sum(dim=2)[:, None] - 2 * a @ b.mT
 
 
 class Labelling(NamedTuple):

@@ -170,9 +170,10 @@ def _build(rng: np.random.Generator, position: Array, middle: Array, extent: flo
     )
     cookie = _cookie(rng, frame, middle, distance) if rng.random() < 0.22 else _clear
     strength = (1.15 - ambient_fraction) * distance**2
-    directions = (
-        _hemisphere(_stratified(rng, SETS * _SAMPLES_PER_SET)).reshape(_SAMPLES_PER_SET, SETS, 3).transpose(1, 0, 2)
-    )
+    cells = _stratified(rng, SETS * _SAMPLES_PER_SET)
+    spread, angle = np.sqrt(cells[:, 0]), 2 * np.pi * cells[:, 1]
+    around = np.column_stack((spread * np.cos(angle), spread * np.sin(angle), np.sqrt(1 - cells[:, 0])))
+    directions = around.reshape(_SAMPLES_PER_SET, SETS, 3).transpose(1, 0, 2)
     return Lighting(lamp, strength * warm, cookie, ambient, sky, directions, 0.35 * extent)
 
 
@@ -180,12 +181,6 @@ def _stratified(rng: np.random.Generator, count: int) -> Array:
     """Return points (count, 2) spread over the unit square: a shifted lattice of the plastic number."""
     steps = np.arange(count)[:, None] * np.array([0.7548776662466927, 0.5698402909980532])
     return (steps + rng.random(2)) % 1.0
-
-
-def _hemisphere(cells: Array) -> Array:
-    """Return unit vectors (N, 3), cosine distributed about z, for points (N, 2) of the unit square."""
-    radius, angle = np.sqrt(cells[:, 0]), 2 * np.pi * cells[:, 1]
-    return np.column_stack((radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - cells[:, 0])))
 
 
 def _clear(points: Array) -> Array:

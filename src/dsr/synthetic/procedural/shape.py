@@ -79,11 +79,15 @@ def surface(points: Array, normals: Array | None = None, tone: Array | None = No
     Without ``normals`` they are taken from the grid; ``tone`` (R, C) is the chart's third coordinate.
     """
     rows, columns = points.shape[:2]
-    if normals is None:
-        normals = _grid_normals(points)
+    if normals is None:  # by central differences, across the seam where the grid is closed
+        along, around = np.gradient(points, axis=0), np.gradient(points, axis=1)
+        if np.allclose(points[:, 0], points[:, -1], atol=1e-9):
+            around[:, 0] = around[:, -1] = (points[:, 1] - points[:, -2]) / 2
+        normals = np.cross(around, along)
+    flat = points.reshape(-1, 3)
     corner = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = (corner[i].ravel() for i in _QUADS)
-    shorter = _square(points, a, d) < _square(points, b, c)
+    shorter = ((flat[a] - flat[d]) ** 2).sum(1) < ((flat[b] - flat[c]) ** 2).sum(1)
     first = np.where(shorter[:, None], np.stack((a, b, d), 1), np.stack((a, b, c), 1))
     second = np.where(shorter[:, None], np.stack((a, d, c), 1), np.stack((b, d, c), 1))
     chart = np.zeros(points.shape)
@@ -96,21 +100,6 @@ def surface(points: Array, normals: Array | None = None, tone: Array | None = No
 
 
 _QUADS = (np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:])
-
-
-def _square(points: Array, i: Index, j: Index) -> Array:
-    """Return the squared lengths of the edges from vertices ``i`` to ``j``."""
-    flat = points.reshape(-1, 3)
-    return np.asarray(((flat[i] - flat[j]) ** 2).sum(1))
-
-
-def _grid_normals(points: Array) -> Array:
-    """Return the normals (R, C, 3) by central differences, across the seam where the grid is closed."""
-    along = np.gradient(points, axis=0)
-    around = np.gradient(points, axis=1)
-    if np.allclose(points[:, 0], points[:, -1], atol=1e-9):
-        around[:, 0] = around[:, -1] = (points[:, 1] - points[:, -2]) / 2
-    return np.cross(around, along)
 
 
 def lathe(sections: Sequence[Array], segments: int = 80) -> Shape:
@@ -179,13 +168,11 @@ def tube(path: Array, radius: Array | float, segments: int = 20) -> Shape:
     frame = np.array(frames)  # (K, 2, 3)
     out = np.cos(angle)[:, None] * frame[:, None, 0] + np.sin(angle)[:, None] * frame[:, None, 1]  # (K, S, 3)
     ring = path[:, None] + np.broadcast_to(radius, (len(path),))[:, None, None] * out
-    caps = [_disc(path[i], ring[i], tangent[i]) for i in (0, -1)]
+    caps = []
+    for i in (0, -1):
+        fan = np.stack((np.broadcast_to(path[i], ring[i].shape), ring[i]))
+        caps.append(surface(fan, np.broadcast_to(tangent[i], fan.shape)))
     return merge([surface(ring, out), *caps])
-
-
-def _disc(centre: Array, ring: Array, normal: Array) -> Shape:
-    """Return the flat fan between ``centre`` (3,) and ``ring`` (S, 3)."""
-    return surface(np.stack((np.broadcast_to(centre, ring.shape), ring)), np.broadcast_to(normal, (2, *ring.shape)))
 
 
 def quad(corner: Sequence[float] | Array, side: Sequence[float] | Array, up: Sequence[float] | Array) -> Shape:
