@@ -72,7 +72,12 @@ class _Axis:
         index = centre.floor().long()[:, None] + torch.arange(1 - most, most + 1)
         weight = (1 - (index - centre[:, None]).abs() / radius[:, None]).clamp(min=0)
         weight = torch.where((index >= 0) & (index < old), weight, 0)
-        self.weight = _linear(weight, index - centre[:, None]).to(like)
+        offset = index - centre[:, None]  # of the weighted least-squares line, the value at offset 0
+        total = weight.sum(dim=1, keepdim=True)
+        mean = (weight * offset).sum(dim=1, keepdim=True) / total
+        variance = (weight * (offset - mean).square()).sum(dim=1, keepdim=True) / total
+        slope = torch.where(variance > 1e-9, -mean / variance.clamp(min=1e-9), 0)
+        self.weight = (weight / total * (1 + slope * (offset - mean))).to(like)
         self.index = index.clamp(0, old - 1).to(like.device)
         self.around = (most - 1, most)
 
@@ -83,18 +88,14 @@ class _Axis:
         return axis
 
 
-def _linear(weight: Tensor, offset: Tensor) -> Tensor:
-    """Return the weights, (n, taps), that give the weighted least-squares line's value at offset 0."""
-    total = weight.sum(dim=1, keepdim=True)
-    mean = (weight * offset).sum(dim=1, keepdim=True) / total
-    variance = (weight * (offset - mean).square()).sum(dim=1, keepdim=True) / total
-    slope = torch.where(variance > 1e-9, -mean / variance.clamp(min=1e-9), 0)
-    return weight / total * (1 + slope * (offset - mean))
-
-
 def _resize_strip(x: Tensor, rows: _Axis, columns: _Axis, jump: float) -> Tensor:
     """Resize (1, H, W) to (1, new rows, new columns)."""
-    mean, bend = _along(*_along(x, _bend(x), columns, -1), rows, -2)
+    bend = torch.zeros_like(x)  # the larger of the second differences along the rows and the columns
+    for dim in (-2, -1):
+        if x.shape[dim] > 2:
+            inner = bend.narrow(dim, 1, x.shape[dim] - 2)
+            torch.maximum(inner, x.diff(n=2, dim=dim).abs_(), out=inner)
+    mean, bend = _along(*_along(x, bend, columns, -1), rows, -2)
     best = torch.full_like(mean, torch.inf)
     nearest = mean.clone()
     for i in rows.around:
@@ -104,16 +105,6 @@ def _resize_strip(x: Tensor, rows: _Axis, columns: _Axis, jump: float) -> Tensor
             nearest = torch.where(distance < best, value, nearest)
             best = torch.minimum(best, distance)
     return torch.where(bend > jump * mean.abs(), nearest, mean)
-
-
-def _bend(x: Tensor) -> Tensor:
-    """Return the larger of the second differences along the rows and the columns, (1, H, W)."""
-    bend = torch.zeros_like(x)
-    for dim in (-2, -1):
-        if x.shape[dim] > 2:
-            inner = bend.narrow(dim, 1, x.shape[dim] - 2)
-            torch.maximum(inner, x.diff(n=2, dim=dim).abs_(), out=inner)
-    return bend
 
 
 def _along(x: Tensor, bend: Tensor, axis: _Axis, dim: int) -> tuple[Tensor, Tensor]:

@@ -84,33 +84,25 @@ def suggest_voxel(maps: Iterable[PosedMap]) -> float:
 
 def _touched_blocks(maps: Iterable[PosedMap], voxel: float) -> NDArray[np.int64]:
     """Return the blocks within the truncation distance of a surface, (N, 3) in units of a block, sorted by z."""
-    found = np.empty((0, 3), np.int64)
+    reach, found = _TRUNCATION * voxel, np.empty((0, 3), np.int64)
+    corners = np.stack(np.meshgrid((-1, 1), (-1, 1), (-1, 1)), axis=-1).reshape(-1, 3)
     for each in maps:
-        points = _points(each)
-        reach = _TRUNCATION * voxel
-        own = [np.floor((points + reach * corner) / (voxel * _SIDE)).astype(np.int64) for corner in _CORNERS]
+        points = (each.depth * each.camera.rays().numpy()).reshape(3, -1)
+        points = points[:, np.isfinite(points[2])]
+        points = (each.pose[:3, :3] @ points + each.pose[:3, 3:]).T  # in the world's frame
+        own = [np.floor((points + reach * corner) / (voxel * _SIDE)).astype(np.int64) for corner in corners]
         found = np.unique(np.concatenate((found, *(np.unique(part, axis=0) for part in own))), axis=0)
         if len(found) > 8 * MOST_BLOCKS:
             break  # far too many already
     return found[np.argsort(found[:, 2], kind="stable")]
 
 
-_CORNERS = np.stack(np.meshgrid((-1, 1), (-1, 1), (-1, 1)), axis=-1).reshape(-1, 3)
-
-
-def _points(each: PosedMap) -> np.ndarray:
-    """Return the points of a map in the world's frame, (N, 3)."""
-    rays = each.camera.rays().numpy()
-    points = (each.depth * rays).reshape(3, -1)
-    points = points[:, np.isfinite(points[2])]
-    return (each.pose[:3, :3] @ points + each.pose[:3, 3:]).T
-
-
 def _integrate(
     each: PosedMap, blocks: NDArray[np.int64], voxel: float, distance: np.ndarray, weight: np.ndarray
 ) -> None:
     """Average the distances of voxels to the surface of a map into ``distance``, in units of the truncation."""
-    world = voxel * _voxels(blocks)
+    inner = np.stack(np.meshgrid(*(np.arange(_SIDE),) * 3, indexing="ij")).reshape(3, 1, -1)  # z changes fastest
+    world = voxel * (_SIDE * blocks.T[:, :, None] + inner).reshape(3, -1).astype(np.float64)
     to_camera = invert(each.pose)
     x, y, z = to_camera[:3, :3] @ world + to_camera[:3, 3:]
     camera = each.camera
@@ -128,12 +120,6 @@ def _integrate(
     total = flat_weight[places] + certain
     flat_distance[places] += (certain / total * (gap - flat_distance[places])).astype(np.float32)
     flat_weight[places] = total
-
-
-def _voxels(blocks: NDArray[np.int64]) -> np.ndarray:
-    """Return the voxels of blocks, (3, N * 512), in units of a voxel; z changes fastest within a block."""
-    inner = np.stack(np.meshgrid(*(np.arange(_SIDE),) * 3, indexing="ij")).reshape(3, 1, -1)
-    return (_SIDE * blocks.T[:, :, None] + inner).reshape(3, -1).astype(np.float64)
 
 
 def _extract(blocks: NDArray[np.int64], distance: np.ndarray, weight: np.ndarray, voxel: float) -> FusedMesh:
@@ -159,7 +145,12 @@ def _extract(blocks: NDArray[np.int64], distance: np.ndarray, weight: np.ndarray
             count += len(places)
     if not vertices:
         raise ValueError("expected depth maps that show a surface, got none that voxels of this size can hold")
-    return _merged(np.concatenate(vertices), np.concatenate(normals), np.concatenate(faces), voxel)
+    every, corners = np.concatenate(vertices), np.concatenate(faces)
+    keys = np.rint(every / (1e-4 * voxel)).astype(np.int64)  # vertices at the same place are joined
+    _, first, number = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    corners = number.reshape(-1)[corners]
+    a, b, c = corners.T
+    return FusedMesh(every[first], np.concatenate(normals)[first], corners[(a != b) & (b != c) & (c != a)])
 
 
 def _march(volume: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
@@ -188,12 +179,3 @@ def _march(volume: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray] | No
     renumbered = np.full(len(places), -1)
     renumbered[used] = np.arange(len(used))
     return places[used].astype(np.float64), -normals[used].astype(np.float64), renumbered[faces[:, ::-1]]
-
-
-def _merged(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray, voxel: float) -> FusedMesh:
-    """Return the mesh with vertices at the same place joined, and without triangles that thereby collapse."""
-    keys = np.rint(vertices / (1e-4 * voxel)).astype(np.int64)
-    _, first, number = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    faces = number.reshape(-1)[faces]
-    whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    return FusedMesh(vertices[first], normals[first], faces[whole])

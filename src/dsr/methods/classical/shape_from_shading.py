@@ -108,6 +108,7 @@ class ShapeFromShading(Method):
         """Return high-resolution depth without holes, (1, H, W) in metres on the sample's device."""
         self.history = []
         solver, metres = self.prepare(sample)
+        objective = float("nan")  # of the iteration before
         for done in range(1, self.iterations + 1):
             before = solver.z
             solver.update_albedo(anew=done % _RENEW == 1)
@@ -115,11 +116,14 @@ class ShapeFromShading(Method):
             solver.update_theta()
             solver.update_depth()
             solver.update_missed(self.growth)
-            self.history.append({"iteration": done, **_diagnostics(solver, before)})
+            terms = _diagnostics(solver, before)
+            self.history.append({"iteration": done, **terms})
             if progress is not None:
                 progress(done, self.iterations)
-            if self._converged():
+            change = abs(terms["objective"] - objective)
+            if change < self.tolerance * abs(objective) and terms["residual"] < self.tolerance:
                 break
+            objective = terms["objective"]
         if progress is not None:
             progress(self.iterations, self.iterations)
         nearest = float(sample.depth_lr[sample.mask_lr].min()) / _NEARER
@@ -129,6 +133,10 @@ class ShapeFromShading(Method):
         """Return the solver of a sample before its first step, and its unit of depth in metres."""
         lr = sample.depth_lr[None].double()
         camera = sample.camera
+        inside = torch.ones(1, 1, camera.height, camera.width, dtype=torch.bool, device=lr.device)  # that may change
+        if self.foreground is not None:
+            mask = read_foreground(self.foreground / f"{sample.scene}.png", (camera.height, camera.width))
+            inside = torch.from_numpy(mask)[None, None].to(lr.device)
         unit = (camera.fx * camera.fy) ** 0.5
         metres = float(lr[lr.isfinite()].median()) / unit
         problem = ShadingProblem(
@@ -137,26 +145,10 @@ class ShapeFromShading(Method):
             rays=camera.rays(device=lr.device)[None],
             focal=(camera.fx, camera.fy),
             unit=unit,
-            inside=self._inside(sample),
+            inside=inside,
         )
         first = upsample_linear_border(inpaint(problem.lr), whole_scale(sample))
         return ShadingSolver(problem, self.weights, first, self.penalty), metres
-
-    def _inside(self, sample: DepthSample) -> Tensor:
-        """Return where the map may change, (1, 1, H, W) bool on the sample's device."""
-        size = (sample.camera.height, sample.camera.width)
-        device = sample.depth_lr.device
-        if self.foreground is None:
-            return torch.ones(1, 1, *size, dtype=torch.bool, device=device)
-        mask = read_foreground(self.foreground / f"{sample.scene}.png", size)
-        return torch.from_numpy(mask)[None, None].to(device)
-
-    def _converged(self) -> bool:
-        if len(self.history) < 2:
-            return False
-        before, now = self.history[-2:]
-        change = abs(now["objective"] - before["objective"])
-        return change < self.tolerance * abs(before["objective"]) and now["residual"] < self.tolerance
 
 
 def read_foreground(path: Path, size: tuple[int, int]) -> np.ndarray:
