@@ -145,12 +145,12 @@ def _extract(blocks: NDArray[np.int64], distance: np.ndarray, weight: np.ndarray
             count += len(places)
     if not vertices:
         raise ValueError("expected depth maps that show a surface, got none that voxels of this size can hold")
-    every, corners = np.concatenate(vertices), np.concatenate(faces)
+    every = np.concatenate(vertices)
     keys = np.rint(every / (1e-4 * voxel)).astype(np.int64)  # vertices at the same place are joined
-    _, first, number = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    corners = number.reshape(-1)[corners]
-    a, b, c = corners.T
-    return FusedMesh(every[first], np.concatenate(normals)[first], corners[(a != b) & (b != c) & (c != a)])
+    _, first, place = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    joined = place.reshape(-1)[np.concatenate(faces)]
+    a, b, c = joined.T
+    return FusedMesh(every[first], np.concatenate(normals)[first], joined[(a != b) & (b != c) & (c != a)])
 
 
 def _march(volume: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
