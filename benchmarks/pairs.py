@@ -283,7 +283,7 @@ def lists(pairs: list[Right], *, developed: bool) -> str:
         exchanged = [*drawn[1::-1], *drawn[2:]]
         for kind, order in zip(counts, (drawn, drawn[::-1], drawn[1:] + drawn[:1], exchanged), strict=True):
             found = find_misplaced(agreements[np.ix_(drawn, order)])
-            counts[kind] += len(found) >= LIMITS["photo-order"].threshold
+            counts[kind] += len(found) >= LIMITS["photo-order"]
     return ", ".join(f"{kind} {count}" for kind, count in counts.items())
 
 
@@ -336,7 +336,7 @@ def draw(found: dict[str, list[tuple[float, float, float]]], path: Path) -> None
     for code, points in found.items():
         _, false, detected = np.array(points).T
         axes.plot(100 * false, 100 * detected, ".-", label=code)
-        at = min(points, key=lambda point: abs(point[0] - LIMITS[code].threshold))
+        at = min(points, key=lambda point: abs(point[0] - LIMITS[code]))
         axes.plot(100 * at[1], 100 * at[2], "ko", markersize=8, fillstyle="none")
     axes.set(
         xlim=(-0.1, 6), ylim=(60, 100.5), xlabel="right pairs with a false alarm, %", ylabel="wrong pairs detected, %"

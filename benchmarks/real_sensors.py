@@ -79,7 +79,7 @@ from dsr.metrics import functional
 from dsr.metrics.boundaries import depth_boundaries, depth_boundary_error
 from dsr.metrics.calibration import OFF, off_auc, stated_ratio
 from dsr.metrics.functional import SurfacePair
-from dsr.metrics.plane import PlaneComparison, angle, deviation
+from dsr.metrics.plane import angle, compare, deviation
 from dsr.metrics.sensor import LARGEST_ERROR, SensorComparison
 from dsr.sample import DepthSample, Scene
 
@@ -130,8 +130,8 @@ def score_board(frame: Plane, surface: Surface) -> dict[str, float]:
     board, border = (SurfacePair(*maps, frame.regions[each][None] > 0) for each in ("board", "border"))
     found = {"std": 1e3 * float(deviation(board)), "edge": 1e3 * float(deviation(border)), "angle": float(angle(board))}
     if surface.depth_error is not None:
-        comparison = board.derive(PlaneComparison)
-        off = comparison.off.abs().masked_fill(~comparison.scored, torch.nan)[0]
+        scored, off = compare(board)
+        off = off.abs().masked_fill(~scored, torch.nan)[0]
         found["stated"] = float(stated_ratio(surface.depth_error, off))
     return found
 
@@ -323,7 +323,7 @@ def score_creases(result: Tensor, truth: Tensor, rays: Tensor, *, measured: bool
     """Score normals at creases and elsewhere; for a measured truth as :mod:`dsr.metrics.sensor` compares them."""
     pair = SurfacePair(result[None].double(), truth[None].double(), rays[None])
     if measured:
-        comparison = pair.derive(SensorComparison)
+        comparison = SensorComparison(pair)
         off = functional.angle(comparison.surfaces).masked_fill(~comparison.scored, torch.nan)[0]
     else:
         off = angle_between(*(depth_to_normals(each[None].double(), rays[None]) for each in (result, truth)))[0]

@@ -13,8 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.geometry.edges import find_edges
-from dsr.geometry.registration import find_displacement, undo
+from dsr.geometry.registration import find_displacement, find_edges, undo
 from dsr.io.inputs import read_picture
 from dsr.io.pairs import Pair
 from dsr.io.reading import Reading, parse_unit

@@ -39,10 +39,9 @@ from dsr.degradation.holes import HOLES
 from dsr.degradation.random_degradation import Everything
 from dsr.degradation.random_noise import NOISES
 from dsr.geometry.camera import from_range, to_range
-from dsr.geometry.edges import find_edges
 from dsr.geometry.hole_size import distance_to_known, wide_holes
 from dsr.geometry.mesh import triangulate
-from dsr.geometry.registration import find_displacement, undo
+from dsr.geometry.registration import find_displacement, find_edges, undo
 from dsr.geometry.resampling import pad_inverse_depth, resize_inverse_depth
 from dsr.geometry.shading import render, render_for_viewing
 from dsr.geometry.surface import depth_to_normals

@@ -55,7 +55,6 @@ from dsr.metrics.boundaries import METRICS
 from dsr.metrics.catalogue import score_image
 from dsr.metrics.classes import DSSIMv, LPIPSv, RMSEd, visual_metrics
 from dsr.metrics.functional import SurfacePair, dssim_v
-from dsr.metrics.temporal import Flicker
 from dsr.metrics.visual_loss import VisualLoss
 from dsr.report.leaderboard import standings
 from dsr.report.page.content import problem_data
@@ -1056,12 +1055,9 @@ def test_camera_stays_as_it_is():
 
 def test_metrics_are_plotted():
     pytest.importorskip("matplotlib").use("agg")
-    flicker = Flicker()
-    flicker.update(maps(3)[0])
     for metric in (RMSEd(), LPIPSv(LPIPS)):
         metric.update(*maps(), SMALL)
         assert metric.plot()[1].get_ylabel() == type(metric).__name__
-    assert flicker.plot()[1].get_ylabel() == "Flicker"
 
 
 @pytest.mark.parametrize("pose", [(), (np.eye(4),)])

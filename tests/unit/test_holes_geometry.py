@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 import torch
 
-from dsr.geometry.hole_size import degrees_per_pixel, distance_to_known, wide_holes
+from dsr.geometry.hole_size import distance_to_known, wide_holes
 
 
 def test_distance_is_that_of_the_nearest_known_pixel() -> None:
@@ -48,8 +46,3 @@ def test_holes_of_a_few_pixels_are_never_wide(size: int) -> None:
     known = torch.ones((1, 16, 16), dtype=torch.bool)
     known[:, 5 : 5 + size, 5 : 5 + size] = False
     assert not bool(wide_holes(known, 0.1).any())
-
-
-def test_a_pixel_of_a_camera_of_53_degrees() -> None:
-    assert degrees_per_pixel(1.0) == pytest.approx(45)
-    assert 500 * degrees_per_pixel(500.0) == pytest.approx(math.degrees(1), rel=1e-5)

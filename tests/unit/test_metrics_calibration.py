@@ -17,43 +17,20 @@ from dsr.metrics.calibration import (
     error_ratios,
     measured_errors,
     off_auc,
-    sparsification,
     squared_error_share,
     stated_ratio,
 )
 from dsr.metrics.catalogue import catalogue, score_image
-from dsr.metrics.classes import AUSE, ENCE, OffAUC, StatedRatio, compute_means, visual_metrics
 from dsr.metrics.functional import SurfacePair
 from dsr.sample import Unit
 
 CAMERA = Camera(width=24, height=20, fx=30.0, fy=29.0, cx=11.0, cy=10.5)
 
 
-def _laplace(seed: int, count: int = 400_000) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the scales of Laplace distributions, uniform in (0, 1), and the sizes of one error of each."""
-    random = np.random.default_rng(seed)
-    scales = random.uniform(0, 1, count)
-    return torch.from_numpy(scales), torch.from_numpy(np.abs(random.laplace(0, scales)))
-
-
 def _plane(normal: tuple[float, float, float], distance: float) -> torch.Tensor:
     """Return the depth of the plane n . P = d, (1, 1, H, W)."""
     direction = torch.tensor(normal, dtype=torch.float64)
     return distance / torch.einsum("c,chw->hw", direction, CAMERA.rays())[None, None]
-
-
-@pytest.mark.parametrize("factor", [1.0, 0.5, 3.0])
-def test_ratios_of_laplace_errors_of_known_scale_are_one_over_what_scales_them(factor: float) -> None:
-    scales, errors = _laplace(0)
-    found = error_ratios(factor * scales, errors)
-    np.testing.assert_allclose(found.numpy(), 1 / factor, rtol=0.025)  # 5 standard deviations of 40,000 pixels
-
-
-def test_ratios_of_errors_that_do_not_depend_on_the_expected_ones_fall_as_these_rise() -> None:
-    expected = torch.linspace(0, 1, 100_001, dtype=torch.float64)[1:]
-    measured = torch.full_like(expected, 0.5)
-    middles = np.arange(10) / 10 + 0.05
-    np.testing.assert_allclose(error_ratios(expected, measured).numpy(), 0.5 / middles, rtol=1e-3)
 
 
 @pytest.mark.parametrize("lowest", [0.0, -0.5])
@@ -84,11 +61,6 @@ def test_ratios_and_share_are_those_of_numpy_over_pixels_that_have_both_errors()
     assert float(squared_error_share(*given, kept=0.6)) == pytest.approx(kept)
 
 
-def test_share_of_laplace_errors_of_known_scale_is_that_of_the_integral() -> None:
-    scales, errors = _laplace(2)
-    assert float(squared_error_share(scales, errors)) == pytest.approx(0.8**3, abs=0.01)
-
-
 def test_share_of_uniform_errors_is_the_cube_when_they_are_known_and_the_fraction_when_they_are_not() -> None:
     random = np.random.default_rng(3)
     measured, unrelated = (torch.from_numpy(random.uniform(0, 1, 200_000)) for _ in range(2))
@@ -103,11 +75,6 @@ def test_parts_without_pixels_and_errors_of_zero_have_no_value() -> None:
     assert error_ratios(torch.zeros(4), torch.ones(4), parts=1).tolist() == [math.inf]
     assert math.isnan(squared_error_share(torch.ones(4), torch.zeros(4)))
     assert math.isnan(squared_error_share(torch.empty(0), torch.empty(0)))
-
-
-def test_errors_of_different_pixels_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"same pixels, got shapes \(4,\) and \(1,\)"):
-        error_ratios(torch.ones(4), torch.ones(1))
 
 
 def test_measured_errors_of_planes_are_their_distance_and_the_angle_between_them() -> None:
@@ -144,23 +111,6 @@ def test_sparsification_error_is_that_of_mono_uncertainty(steps: int, expected: 
     assert float(ause(*GIVEN, steps)) * ERRORS.mean() == pytest.approx(expected, rel=1e-12)
 
 
-def test_sparsification_error_is_that_of_numpy_step_by_step() -> None:
-    order = np.argsort(STATED, axis=None)
-    means = [ERRORS.ravel()[order[: 2400 - math.ceil(2399 * step / 10)]].mean() for step in range(10)]
-    np.testing.assert_allclose(sparsification(*GIVEN, 10).numpy(), [*means, 0])
-
-
-def test_area_depends_on_the_steps_and_not_on_units_or_the_order_of_pixels() -> None:
-    measured = torch.from_numpy(np.random.default_rng(4).standard_exponential(20_001) ** 2)
-    unrelated = measured.flip(0)
-    areas = [float(ause(unrelated, measured, steps)) for steps in (20, 100)]
-    assert areas[1] / areas[0] > 1.01
-    assert float(ause(7 * unrelated, 1e3 * measured)) == pytest.approx(areas[1])
-    constant, mixed = torch.ones_like(measured), torch.from_numpy(np.random.default_rng(5).permutation(measured))
-    assert float(ause(constant, measured)) == pytest.approx(float(ause(constant, mixed)), rel=1e-12)
-    assert float(ause(constant, measured)) == pytest.approx(areas[1], rel=0.05)
-
-
 def test_area_of_a_constant_before_uniform_errors_is_a_fourth_and_of_the_truth_itself_nothing() -> None:
     # the mean of the least (1 - x) of them is half of 1 - x: the curves are 1 and 1 - x, relative to the mean 1 / 2
     measured = torch.linspace(0, 1, 100_001, dtype=torch.float64)
@@ -178,15 +128,6 @@ def test_normalised_calibration_error_of_gaussian_and_laplace_errors_is_known() 
     assert float(ence(expected, gaussian)) < 0.01
     assert float(ence(expected, 1.5 * gaussian)) == pytest.approx(0.5, abs=0.01)
     assert float(ence(expected, laplace)) == pytest.approx(2 / np.sqrt(np.pi) - 1, abs=0.015)
-
-
-def test_normalised_calibration_error_is_that_of_numpy_over_parts_of_equal_numbers() -> None:
-    order = np.argsort(STATED, axis=None)
-    parts = [(STATED.ravel()[part], ERRORS.ravel()[part]) for part in np.array_split(order, 7)]
-    rmv = [np.sqrt(np.pi / 2 * np.mean(stated**2)) for stated, _ in parts]
-    rmse = [np.sqrt(np.mean(errors**2)) for _, errors in parts]
-    expected = np.mean([abs(e - v) / v for e, v in zip(rmse, rmv, strict=True)])
-    assert float(ence(*GIVEN, parts=7)) == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.parametrize("decimals", [8, 2])
@@ -254,27 +195,6 @@ def test_scores_count_what_has_no_stated_error_and_need_metres_for_millimetres()
     known = (prediction - TRUTH).abs()
     assert found["Calibration_AUSE_d"] == pytest.approx(float(ause(stated, known)))
     assert "Calibration_AUC_20mm" not in _scores(unit=Unit("levels", inverse=True, factor=30.0, offset=0.0))
-
-
-def test_method_that_states_no_errors_has_no_such_scores() -> None:
-    assert _scores(errors=None) == {}
-    metrics = visual_metrics(protocols=("field", "calibration"))
-    maps = PREDICTION[None], TRUTH[None], LENS.rays()[None]
-    metrics.update(SurfacePair(*maps))
-    assert not any(name.startswith("Calibration") for name in compute_means(metrics))
-    metrics.update(SurfacePair(*maps, depth_error=GIVEN[0][None, None], angle_error=ANGLES[None, None]))
-    assert float(compute_means(metrics)["Calibration_AUSE_d"]) == pytest.approx(float(ause(*GIVEN)))
-
-
-def test_classes_are_the_metrics_of_the_protocol() -> None:
-    errors = {"depth_error": GIVEN[0][None, None], "angle_error": ANGLES[None, None]}
-    pair, found = SurfacePair(PREDICTION[None], TRUTH[None], LENS.rays()[None], **errors), _scores()
-    for made, name in ((ENCE(), "ENCE"), (AUSE(), "AUSE_d"), (AUSE(normals=True), "AUSE_v"), (OffAUC(), "AUC_20mm"),
-                       (StatedRatio(), "stated")):  # fmt: skip
-        assert float(made(pair)) == pytest.approx(found[f"Calibration_{name}"], rel=1e-4)
-    assert float(OffAUC(0.05)(pair)) == pytest.approx(float(off_auc(*GIVEN, threshold=0.05)))
-    with pytest.raises(ValueError, match=r"^depth_error: expected shape \(1, 1, 40, 60\), got \(40, 60\)$"):
-        SurfacePair(*pair.given, pair.rays, depth_error=GIVEN[0])
 
 
 def test_alignment_by_a_scale_scales_what_is_stated_and_by_a_shift_drops_it() -> None:

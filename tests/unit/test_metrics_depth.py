@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.metrics import depth, field, normals
-from dsr.metrics.catalogue import catalogue, score_image
-from dsr.metrics.classes import AbsRel, DeltaAccuracy, NormalAngle, NormalsWithin, SIlog, compute_means, visual_metrics
+from dsr.metrics import depth
+from dsr.metrics.catalogue import PROTOCOLS, Score, catalogue, score_image
+from dsr.metrics.classes import compute_means, visual_metrics
 from dsr.metrics.functional import SurfacePair
-from dsr.sample import Unit
+from dsr.sample import CENTIMETRES, Unit
 
 CAMERA = Camera(width=24, height=20, fx=30.0, fy=30.0, cx=11.5, cy=9.5)
 V, U = np.mgrid[:20, :24].astype(float)
@@ -75,17 +77,6 @@ def test_a_factor_of_all_depths_has_errors_in_closed_form() -> None:
     assert found["Normal_mean"] == pytest.approx(0, abs=1e-3)
 
 
-def test_errors_in_metres_are_the_fields_in_its_unit() -> None:
-    pair = _pair(PREDICTION, TRUTH)
-    assert 100 * depth.rmse(pair).item() == pytest.approx(field.rmse(pair).item())
-    assert 100 * depth.mae(pair).item() == pytest.approx(field.mae(pair).item())
-
-
-def test_benchmark_in_levels_has_no_errors_in_metres() -> None:
-    levels = Unit("levels", inverse=True, factor=30.0, offset=0.0)
-    assert all(name.startswith("Normal_") for name in _scores(PREDICTION, TRUTH, unit=levels))
-
-
 def test_angles_are_those_of_dsine() -> None:
     # compute_normal_metrics in utils/utils.py of baegwangbin/DSINE (ef0c2af), of numpy's normals of both maps
     found = _scores(1 + 0.05 * PREDICTION, 1 + 0.05 * TRUTH)
@@ -132,24 +123,93 @@ def test_batch_has_the_values_of_its_images() -> None:
     pairs = [_pair(PREDICTION, TRUTH), _pair(holed, TRUTH + 0.1)]
     maps = (torch.cat(each) for each in zip(*(pair.given for pair in pairs), strict=True))
     batch = SurfacePair(*maps, CAMERA.rays()[None])
-    for metric in (*depth.METRICS, *normals.METRICS):
+    for metric in (*depth.DEPTH, *depth.NORMALS):
         singles = [metric.function(pair) for pair in pairs]
         torch.testing.assert_close(metric.function(batch), torch.cat(singles), rtol=1e-12, atol=1e-14)
 
 
-def test_classes_are_the_metrics_of_their_protocols() -> None:
-    pair = _pair(PREDICTION, TRUTH)
-    metrics = visual_metrics(protocols=("depth", "normals"))
-    metrics.update(pair)
+FIELD_CAMERA = Camera(width=24, height=20, fx=30.0, fy=30.0, cx=11.5, cy=9.5, baseline=0.5, doffs=40.0)
+LEVELS = Unit("levels", inverse=True, factor=0.5 * 30.0, offset=40.0, limits=(0, 255))
+
+
+def _field_maps(seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Return a prediction with errors around 5 cm and some of factor two, and the truth, both (1, 20, 24)."""
+    random = np.random.default_rng(seed)
+    truth = 1 + random.random((1, 20, 24))
+    off = np.where(random.random(truth.shape) < 0.1, random.choice([0.5, 2.0], truth.shape) * truth - truth, 0)
+    return torch.from_numpy(truth + off + 0.05 * random.standard_normal(truth.shape)), torch.from_numpy(truth)
+
+
+def _levels(seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Return depth maps whose 8-bit levels are 0..255, the prediction's from below 0 to above 255."""
+    random = np.random.default_rng(seed)
+    truth = random.integers(0, 256, (1, 20, 24)).astype(float)
+    levels = np.stack((truth + 20 * random.standard_normal(truth.shape), truth)).clip(-30, 290)
+    prediction, target = torch.from_numpy(15 / (levels + 40))
+    return prediction, target
+
+
+def _field_rows(prediction: Tensor, target: Tensor, unit: Unit) -> dict[str, Score]:
+    metrics = catalogue(protocols=("field",))
+    return {row.metric: row for row in score_image(prediction, target, FIELD_CAMERA.rays(), metrics, unit)}
+
+
+def test_errors_of_depth_are_in_centimetres_over_all_valid_pixels() -> None:
+    prediction, target = _field_maps()
+    prediction[0, 3, :5], target[0, 8:10, 2] = torch.nan, torch.nan
+    p, t = prediction.numpy(), target.numpy()
+    valid = np.isfinite(p) & np.isfinite(t)
+    error, ratio = np.abs(p - t)[valid], np.maximum(p / t, t / p)[valid]
+    rows = _field_rows(prediction, target, CENTIMETRES)
+    assert {name: row.value for name, row in rows.items()} == pytest.approx(
+        {
+            "RMSE_cm": 100 * np.sqrt((error**2).mean()),
+            "MAE_cm": 100 * error.mean(),
+            "Beyond_5cm": (error > 0.05).mean(),
+            "Beyond_delta1": (ratio > 1.25).mean(),
+        },
+        rel=1e-12,
+    )
+    assert [row.valid_share for row in rows.values()] == pytest.approx(4 * [valid.mean()])
+    assert 0.02 < rows["Beyond_delta1"].value < 0.2 < rows["Beyond_5cm"].value < 0.8
+
+
+def test_errors_of_disparity_are_in_levels_and_predictions_are_clamped_to_them() -> None:
+    prediction, target = _levels()
+    levels, truth = (15 / maps.numpy() - 40 for maps in (prediction, target))
+    error = np.abs(levels.clip(0, 255) - truth)
+    assert (levels < -1).any()
+    assert (levels > 256).any()
+    rows = _field_rows(prediction, target, LEVELS)
+    assert {name: row.value for name, row in rows.items()} == pytest.approx(
+        {"RMSE_levels": np.sqrt((error**2).mean()), "MAE_levels": error.mean()}, rel=1e-9
+    )
+    unclamped = _field_rows(prediction, target, replace(LEVELS, limits=None))
+    assert unclamped["MAE_levels"].value == pytest.approx(np.abs(levels - truth).mean(), rel=1e-9)
+    assert unclamped["MAE_levels"].value > 1.01 * rows["MAE_levels"].value
+
+
+def test_thresholds_are_exceeded_only_beyond_them() -> None:
+    target = torch.full((1, 1, 2, 4), 2.0, dtype=torch.float64)
+    prediction = target * torch.tensor([1.25, 1.2501, 0.8, 0.7999], dtype=torch.float64)
+    pair = SurfacePair(prediction, target, FIELD_CAMERA.crop(0, 0, 2, 4).rays()[None])
+    assert depth.beyond_ratio(pair, 1.25).item() == 0.5
+    pair = SurfacePair(target + torch.tensor([0.03125, -0.03125, 0.0313, -0.0313]), target, pair.rays)
+    assert depth.beyond(pair, 0.03125).item() == 0.5
+
+
+def test_collection_has_the_metrics_of_the_benchmarks_that_it_saw() -> None:
+    metrics = visual_metrics(protocols=("field", "paper"))
+    prediction, target = _levels()
+    metrics.update(SurfacePair(prediction[None], target[None], FIELD_CAMERA.rays()[None], unit=LEVELS))
     means = compute_means(metrics)
-    for made, name in (
-        (AbsRel(), "Depth_AbsRel"),
-        (DeltaAccuracy(1.05), "Depth_delta_105"),
-        (DeltaAccuracy(1.25**3), "Depth_delta_125_3"),
-        (SIlog(), "Depth_SIlog"),
-        (NormalAngle(median=True), "Normal_median"),
-        (NormalsWithin(7.5), "Normal_within_7_5"),
-    ):
-        assert made(pair) == means[name]
-    with pytest.raises(ValueError, match=r"^threshold: .*Normal_within_11_25.*got 12$"):
-        NormalsWithin(12)
+    assert {"RMSE_levels", "MAE_levels", "RMSE_v"} < means.keys()
+    assert not {"RMSE_cm", "MAE_cm", "Beyond_5cm", "Beyond_delta1"} & means.keys()
+    assert means["RMSE_levels"].item() == pytest.approx(_field_rows(prediction, target, LEVELS)["RMSE_levels"].value)
+
+
+@pytest.mark.parametrize("protocols", [(), ("papers",), ("field", "none")])
+def test_unknown_protocol_is_refused(protocols: tuple[str, ...]) -> None:
+    came = ", ".join(protocols) or "none"
+    with pytest.raises(ValueError, match=rf"^protocols: expected some of {', '.join(PROTOCOLS)}, got {came}$"):
+        catalogue(protocols=protocols)

@@ -1,4 +1,4 @@
-"""Scores of a sensor before something flat: Intel's Depth Quality Tool, closed forms and a board seen by a camera."""
+"""Scores of a sensor before something flat: closed forms and a board seen by a camera."""
 
 from __future__ import annotations
 
@@ -14,10 +14,8 @@ import torch
 
 from dsr.data.frame_files import read_millimetres
 from dsr.geometry.camera import Camera
-from dsr.metrics.catalogue import catalogue, score_image
-from dsr.metrics.classes import PlaneAngle, PlaneDeviation
 from dsr.metrics.functional import SurfacePair
-from dsr.metrics.plane import PlaneFit, angle, covered, deviation, fit_plane
+from dsr.metrics.plane import angle, covered, deviation, fit_plane
 
 CAMERA = Camera(width=64, height=48, fx=60.0, fy=62.0, cx=31.0, cy=24.5)
 V, U = np.mgrid[:48, :64].astype(float)
@@ -29,50 +27,9 @@ def _plane(x: float, y: float, distance: float) -> np.ndarray:
     return distance * math.sqrt(x * x + y * y + 1) / (x * X + y * Y + 1)
 
 
-def _wall() -> torch.Tensor:
-    """Return a map of a tilted wall in whole millimetres with holes and waves, (1, H, W) in metres."""
-    depth = _plane(0.2, -0.1, 1.2)
-    depth = np.round(1e3 * (depth + 0.004 * np.sin(0.7 * U) + 0.003 * np.cos(1.1 * V + 0.2 * U))) / 1e3
-    return torch.from_numpy(np.where((U * V) % 7 == 3, 0, depth))[None]
-
-
 def _pair(prediction: Any, truth: Any, mask: Any = None) -> SurfacePair:
     maps = (torch.as_tensor(each, dtype=torch.float64)[None, None] for each in (prediction, truth))
     return SurfacePair(*maps, CAMERA.rays()[None], None if mask is None else torch.from_numpy(mask)[None, None])
-
-
-def test_plane_fit_is_that_of_intels_depth_quality_tool() -> None:
-    # tools/depth-quality of IntelRealSense/librealsense (cacc8e7), compiled, of a region of 25 x 19 pixels
-    fit = PlaneFit(_wall(), CAMERA.rays())
-    np.testing.assert_allclose(fit.normal.numpy(), (0.199311227, -0.0972751603, 0.975096166), rtol=1e-5)
-    assert float(fit.distance) == pytest.approx(1.19897699, rel=1e-6)
-    assert 100 * float(fit.fill_rate) == pytest.approx(88)
-    assert 100 * float(fit.rms) == pytest.approx(0.287157565, rel=1e-5)
-    assert 1e3 * float(fit.rms * fit.distance) == pytest.approx(3.44295311, rel=1e-5)
-    assert float(fit.subpixel_rms(baseline=0.05, focal=60.0)) == pytest.approx(0.00655692862, rel=1e-4)
-    millimetre = 100 * 0.001 / 1.18  # how exactly it finds the plane in the middle of the image
-    assert 100 * float(fit.z_accuracy(1.18)) == pytest.approx(3.77960682, abs=millimetre)
-    assert len(fit.errors) == 414
-
-
-def test_exact_plane_has_no_error_and_a_hole_lowers_the_fill_rate_alone() -> None:
-    depth = torch.from_numpy(_plane(-0.3, 0.4, 2.0))[None]
-    region = torch.zeros(1, 48, 64, dtype=torch.bool)
-    region[:, 10:30, 20:60] = True
-    depth[:, 10:15, 20:60] = torch.nan
-    fit = PlaneFit(depth, CAMERA.rays(), region)
-    np.testing.assert_allclose(fit.normal.numpy(), np.array([-0.3, 0.4, 1]) / math.sqrt(1.25), rtol=1e-9)
-    assert float(fit.distance) == pytest.approx(2, rel=1e-12)
-    assert float(fit.fill_rate) == 0.75
-    assert float(fit.rms) < 1e-12
-    assert float(fit.subpixel_rms(0.1, 60.0)) < 1e-9
-
-
-@pytest.mark.parametrize("off", [-0.01, 0.02])
-def test_z_accuracy_of_a_wall_is_how_far_it_seems_from_where_it_is(off: float) -> None:
-    fit = PlaneFit(torch.full((1, 48, 64), 2 * (1 + off)), CAMERA.rays())
-    assert float(fit.z_accuracy(2.0)) == pytest.approx(off, rel=1e-5)
-    assert np.isclose(float(fit.subpixel_rms(0.1, 60.0)), 0)
 
 
 def test_steep_planes_are_fitted_along_the_axis_that_they_face() -> None:
@@ -91,8 +48,6 @@ def test_points_that_span_no_plane_are_refused() -> None:
         fit_plane(torch.eye(3)[:2])
     with pytest.raises(ValueError, match=r"^points: expected at least three .* got 5$"):
         fit_plane(torch.arange(5.0)[:, None] * torch.ones(3))
-    with pytest.raises(ValueError, match=r"^depth, rays, region: expected shapes .*, got \(48, 64\), "):
-        PlaneFit(_wall()[0], CAMERA.rays())
 
 
 def test_waves_about_a_plane_have_the_deviation_of_their_amplitude_whatever_the_offset() -> None:
@@ -125,24 +80,6 @@ def test_other_surfaces_and_holes_do_not_count_and_lower_the_coverage() -> None:
     assert covered(nothing).item() == 0
     assert math.isnan(deviation(nothing).item())
     assert math.isnan(angle(nothing).item())
-
-
-def test_scores_and_classes_are_those_of_the_pairs_pixels() -> None:
-    truth = _plane(0.2, 0.1, 1.5)
-    prediction = truth + 0.01 * np.sin(0.8 * U)
-    maps = (torch.from_numpy(each)[None] for each in (prediction, truth))
-    rows = {row.metric: row.value for row in score_image(*maps, CAMERA.rays(), catalogue(protocols=("plane",)))}
-    pair = _pair(prediction, truth)
-    expected = {"Plane_std": deviation(pair), "Plane_angle": angle(pair), "Plane_covered": covered(pair)}
-    assert rows == pytest.approx({name: value.item() for name, value in expected.items()}, rel=1e-6)
-    assert float(PlaneDeviation()(pair)) == pytest.approx(rows["Plane_std"])
-    assert float(PlaneAngle()(pair)) == pytest.approx(rows["Plane_angle"], rel=1e-6)
-    left = U < 20
-    both = [_pair(prediction, truth, mask) for mask in (left, ~left)]
-    batch = SurfacePair(*(torch.cat(each) for each in zip(*(each.given for each in both), strict=True)),
-                        CAMERA.rays()[None], torch.cat([each.target_mask for each in both]))  # fmt: skip
-    for function in (deviation, angle, covered):
-        torch.testing.assert_close(function(batch), torch.cat([function(each) for each in both]))
 
 
 def test_frames_before_a_board_have_their_known_scores(shared: Path) -> None:

@@ -11,11 +11,6 @@ from scipy.interpolate import LinearNDInterpolator
 
 from dsr.geometry.camera import Camera
 from dsr.metrics.temporal import (
-    OPW,
-    TGM,
-    Flicker,
-    NormalFlicker,
-    TemporalNoise,
     covered,
     flicker,
     normal_flicker,
@@ -155,33 +150,6 @@ def test_temporal_gradients_know_no_offset_and_have_the_size_of_a_jump() -> None
     jumps[1, :10] = np.nan
     assert tgm(_maps(jumps), _maps(true)).item() == pytest.approx(0.02)
     assert math.isnan(tgm(_maps(np.full_like(true, np.nan)), _maps(true)))
-
-
-def test_classes_are_means_over_sequences() -> None:
-    first, second = _maps(_noisy(2, 3)), _maps(_noisy(3, 4))
-    for made, function, more in (
-        (Flicker(), flicker, ()),
-        (TemporalNoise(), temporal_noise, ()),
-        (NormalFlicker(), normal_flicker, (CAMERA,)),
-        (TGM(), tgm, "target"),
-        (OPW(), opw, "poses"),
-    ):
-        found = []
-        for maps in (first, second):
-            if more == "target":
-                given = (_maps(np.tile(STILL, (len(maps), 1, 1))),)
-            elif more == "poses":
-                given = (CAMERA, _poses(*[(0.01 * number, 0, 0) for number in range(len(maps))]))
-            else:
-                given = more
-            made.update(maps, *given)
-            found.append(function(maps, *given).item())
-        assert found[0] != found[1]
-        assert made.compute().item() == pytest.approx(np.mean(found), rel=1e-6)
-    metric = Flicker()
-    metric.update(first)
-    metric.update(torch.full_like(first, torch.nan))
-    assert math.isnan(metric.compute())
 
 
 @pytest.mark.parametrize(

@@ -12,13 +12,10 @@ PAGES = Path(__file__).resolve().parents[2] / "docs"
 
 
 def test_documentation_shows_every_limit() -> None:
-    table = [
-        f"| `{code}` | {limit.threshold:g} | {limit.quantity} | {limit.source} |"
-        for code, limit in sorted(LIMITS.items())
-    ]
     page = (PAGES / "checks_measured.md").read_text(encoding="utf-8")
-    shown = [line for line in page.splitlines() if line.startswith("| `")]
-    assert shown[: len(table)] == table
+    rows = [line.split(" | ") for line in page.splitlines() if line.startswith("| `")]
+    shown = {row[0].strip("| `"): row[1] for row in rows}
+    assert {code: shown.get(code) for code in LIMITS} == {code: f"{limit:g}" for code, limit in LIMITS.items()}
 
 
 def test_documentation_says_what_to_do_about_every_warning() -> None:
@@ -34,7 +31,7 @@ def test_warning_is_reported_and_recorded_with_its_threshold() -> None:
         "message": "edges apart (6 px)",
         "detail": "6 px",
         "value": 6.0,
-        "threshold": LIMITS["edges-beside"].threshold,
+        "threshold": LIMITS["edges-beside"],
     }
 
 

@@ -13,7 +13,7 @@ from dsr.degradation.downsampling import Downsampling, Kernel, make_sample
 from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.methods.classical.bilateral import JointBilateral
 from dsr.methods.classical.fast_global_smoother import FastGlobalSmoother
-from dsr.methods.classical.guided_filter import GuidedFilter
+from dsr.methods.classical.guided_filter import GuidedFilter, guided_filter
 from dsr.methods.classical.photo_guided import GuidedMethod, estimate_slopes
 from dsr.sample import DepthSample, Scene
 from dsr.utils.ratios import SCALES
@@ -113,49 +113,12 @@ def test_single_valid_low_resolution_pixel_is_enough(method: Build) -> None:
 
 
 @every_method
-def test_result_is_complete_at_any_size(method: Build) -> None:
-    for height, width in ((4, 4), (4, 40), (36, 4), (20, 52)):
-        assert bool(_result(method(), _sample(_random(height, width))).isfinite().all())
-
-
-@every_method
-def test_half_turn_of_the_input_turns_the_result(method: Build) -> None:
-    """Rows and columns are solved in order, but their own direction is none."""
-    camera = Camera(48, 32, 60.0, 60.0, 23.5, 15.5)
-    rgb, depth = _photo(32, 48), 1 + _random()[None] / 9
-    sample, turned = (
-        make_sample(Scene("", "", p, camera, d), 4, Downsampling("box"), "disparity")
-        for p, d in ((rgb, depth), (rgb.rot90(2, (1, 2)), depth.rot90(2, (1, 2))))
-    )
-    torch.testing.assert_close(method()(turned).rot90(2, (1, 2)), method()(sample), rtol=1e-9, atol=0)
-
-
-@every_method
 def test_result_is_positive_depth_even_where_far_and_near_meet(method: Build) -> None:
     disparity = torch.where(torch.arange(48) % 16 < 8, 0.01, 40.0).double().expand(32, 48)
     sample = _sample(disparity)
     fine = method()(sample)
     assert bool((fine > 0).all())
     assert float(fine.max()) <= 4 * float(sample.depth_lr.max()) + 1e-9
-
-
-@every_method
-def test_result_is_deterministic_and_independent_of_the_truth(method: Build) -> None:
-    sample = _sample(_random())
-    blind = DepthSample("", "", sample.rgb, sample.depth_lr, sample.camera, sample.camera_lr, sample.scale)
-    assert torch.equal(method()(sample), method()(blind))
-
-
-@every_method
-def test_result_has_the_precision_of_the_low_resolution_depth(method: Build) -> None:
-    single = _sample(_random().float(), rgb=_photo(32, 48).float())
-    assert method()(single).dtype == torch.float32
-    torch.testing.assert_close(method()(single), method()(_sample(_random())).float(), rtol=1e-3, atol=0)
-
-
-@every_method
-def test_guided_methods_work_on_disparity(method: Build) -> None:
-    assert method().range_type == "disparity"
 
 
 def test_slope_is_the_smaller_difference_without_the_pixel_that_mixes_a_step() -> None:
@@ -168,3 +131,65 @@ def test_slope_is_the_smaller_difference_without_the_pixel_that_mixes_a_step() -
 def test_slope_beside_a_hole_is_the_remaining_difference() -> None:
     values = torch.tensor([0.0, 2.0, 4.0, torch.nan, 9.0, 12.0, 15.0]).double()
     torch.testing.assert_close(estimate_slopes(values, 0), torch.tensor([2.0, 2.0, 2.0, 2.0, 3.0, 3.0, 3.0]).double())
+
+
+def _noise(*shape: int, seed: int = 0) -> Tensor:
+    return torch.from_numpy(np.random.default_rng(seed).uniform(size=shape))
+
+
+def _by_loops(guide: Tensor, values: Tensor, radius: int, epsilon: float, weight: Tensor) -> np.ndarray:
+    """Fit each window by weighted ridge regression (numpy's lstsq), then average the fits."""
+    colours, p, w = guide.numpy(), values.numpy(), weight.numpy()
+    height, width = p.shape
+    total, counted = np.zeros((height, width)), np.zeros((height, width))
+    for i in range(height):
+        for j in range(width):
+            rows, columns = slice(max(i - radius, 0), i + radius + 1), slice(max(j - radius, 0), j + radius + 1)
+            share, target = w[rows, columns].ravel(), p[rows, columns].ravel()
+            samples = colours[:, rows, columns].reshape(3, -1).T
+            if share.sum() == 0:
+                continue
+            root = np.sqrt(share)[:, None]
+            ridge = np.sqrt(epsilon * share.sum()) * np.eye(3, 4)
+            design = np.vstack((root * np.column_stack((samples, np.ones(len(share)))), ridge))
+            fit = np.linalg.lstsq(design, np.concatenate((root[:, 0] * target, np.zeros(3))), rcond=None)[0]
+            answer = np.tensordot(fit[:3], colours[:, rows, columns], 1) + fit[3]
+            total[rows, columns] += share.mean() * answer
+            counted[rows, columns] += share.mean()
+    return np.where(counted > 0, total / np.where(counted > 0, counted, 1), p)
+
+
+@pytest.mark.parametrize("radius", [1, 3])
+@pytest.mark.parametrize("holes", [False, True])
+def test_guided_filter_is_the_mean_of_each_windows_ridge_regression(radius: int, holes: bool) -> None:
+    guide, values, weight = _noise(3, 16, 16), _noise(16, 16, seed=1), torch.ones(16, 16).double()
+    if holes:
+        weight = _noise(16, 16, seed=2)
+        weight[3:12, 4:14] = 0
+    result = guided_filter(guide, values[None], radius, 1e-3, weight)[0]
+    np.testing.assert_allclose(result, _by_loops(guide, values, radius, 1e-3, weight), rtol=0, atol=1e-9)
+
+
+def test_guided_filter_under_a_constant_photo_is_the_box_filter_twice() -> None:
+    impulse = torch.zeros(1, 15, 15).double()
+    impulse[0, 7, 7] = 1
+    tent = torch.tensor([1.0, 2.0, 3.0, 2.0, 1.0]).double() / 9
+    result = guided_filter(torch.full((3, 15, 15), 0.4).double(), impulse, 1, 1e-3)[0]
+    torch.testing.assert_close(result[5:10, 5:10], tent[:, None] * tent, rtol=0, atol=1e-15)
+
+
+def test_blurred_step_along_a_photo_edge_becomes_sharp() -> None:
+    """Half of it, as the windows that straddle the edge disagree."""
+    columns = torch.arange(64).double().expand(64, 64)
+    rgb = torch.where(columns < 32, 0.2, 0.8).expand(3, 64, 64).contiguous()
+    blurred = ((columns - 27.5) / 8).clamp(0, 1)
+    sharp = guided_filter(rgb, blurred[None], 8, 1e-4)[0]
+    before, after = ((each[:, 32] - each[:, 31]) for each in (blurred, sharp))
+    torch.testing.assert_close(before, torch.full_like(before, 1 / 8))
+    assert float(after.min()) > 0.5
+
+
+@pytest.mark.parametrize("name", ["radius", "epsilon"])
+def test_parameter_that_is_not_positive_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match=rf"^{name}: expected a positive number for the guided filter, got 0"):
+        GuidedFilter(**{name: 0})

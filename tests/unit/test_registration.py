@@ -98,12 +98,6 @@ def test_map_without_edges_gives_none(scene):
     assert find_displacement(torch.full((1, 96, 96), 2.0), scene[0]) is None
 
 
-def test_only_displacements_that_show_are_visible(scene):
-    photo, inverse = scene
-    assert find_displacement(displaced(inverse, 2.0, -2.0), photo).visible
-    assert not find_displacement(displaced(inverse, 0.5, 0.0), photo).visible
-
-
 def test_undone_shift_of_whole_pixels_is_exact():
     depth = 1 + torch.rand(1, 20, 30, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     depth[:, 4:6, 7] = torch.nan

@@ -7,7 +7,7 @@ import torch
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.lights import LIGHT_NAMES
-from dsr.geometry.shading import lights, render, render_for_viewing, shade
+from dsr.geometry.shading import comparison, lights, render, render_for_viewing, shade
 from dsr.geometry.surface import depth_to_normals
 
 PROTOCOL = -np.array(
@@ -52,31 +52,12 @@ def test_difference_of_three_shadings_is_that_of_the_normal_maps() -> None:
     assert abs(shaded - (first - second).square().mean()) < 1e-14
 
 
-def test_rendering_clips_the_shading_to_zero_and_one() -> None:
-    normals = _normals(3)
-    shaded = shade(normals, lights())
-    assert bool((shaded < 0).any())
-    np.testing.assert_array_equal(render(normals).numpy(), np.clip(shaded.numpy(), 0, 1))
-
-
-def test_frontal_wall_is_brightest_from_the_front_and_equal_from_the_sides() -> None:
-    camera = Camera(5, 4, 10.0, 10.0, 2.0, 1.5)
-    normals = depth_to_normals(torch.full((1, 1, 4, 5), 2.0, dtype=torch.float64), camera.rays()[None])
-    brightness = render(normals).mean(dim=(0, 2, 3)).numpy()
-    np.testing.assert_allclose(brightness, [3**-0.5, 3**-0.5, 3**-0.5, 1], rtol=1e-12)
-
-
 def test_floor_is_lit_from_above_and_a_wall_on_the_right_from_the_left() -> None:
     floor, right_wall = torch.tensor([0.0, -1.0, 0.0]), torch.tensor([-1.0, 0.0, 0.0])
     both = torch.stack((floor, right_wall))[:, :, None, None]
     floor_light, wall_light = render(both)[:, :, 0, 0].tolist()
     np.testing.assert_allclose(floor_light, [np.sqrt(2 / 3), 0, 0, 0], atol=1e-7)
     np.testing.assert_allclose(wall_light, [0, 1 / np.sqrt(2), 0, 0], atol=1e-7)
-
-
-def test_lights_have_the_requested_precision() -> None:
-    assert lights(dtype=torch.float32).dtype == torch.float32
-    assert render(_normals(0).float()).dtype == torch.float32
 
 
 FLOOR, CEILING, WALL, FROM_LEFT, FROM_RIGHT = (0, -1, 0), (0, 1, 0), (0, 0, -1), (1, 0, 0), (-1, 0, 0)
@@ -102,13 +83,43 @@ def test_rendering_for_viewing_shows_a_tilt_of_two_degrees_on_floors_walls_and_c
         assert np.abs(steps[1:] - steps[0]).max() > 1.5 / 255
 
 
-def test_rendering_for_viewing_is_the_half_lambert_curve_of_its_light() -> None:
-    normals = _normals(5)
-    light = np.array([-0.4, -0.7, -np.sqrt(0.35)])
-    cosine = (normals.numpy() * light[None, :, None, None]).sum(axis=1, keepdims=True)
-    expected = 0.06 + 0.84 * ((1 + cosine) / 2) ** 1.25
-    np.testing.assert_allclose(render_for_viewing(normals).numpy(), expected, rtol=0, atol=1e-14)
+CAMERA = Camera(width=160, height=144, fx=200.0, fy=200.0, cx=79.5, cy=71.5)
+RAYS = CAMERA.rays()[None]
+RANDOM = torch.Generator().manual_seed(1)
+DEPTH = 2 + torch.rand(1, 1, 144, 160, dtype=torch.float64, generator=RANDOM)
+RGB = torch.rand(1, 3, 144, 160, generator=RANDOM)
+LOW = DEPTH[..., ::4, ::4]
 
 
-def test_rendering_for_viewing_keeps_holes() -> None:
-    assert bool(render_for_viewing(torch.full((1, 3, 2, 2), torch.nan)).isnan().all())
+def _panel(picture: torch.Tensor, row: int, column: int) -> torch.Tensor:
+    """Return a panel, (3, 144, 160), without the line of 16 pixels above it."""
+    top = row * 160 + 16
+    return picture[:, top : top + 144, column * 160 : (column + 1) * 160].int()
+
+
+def test_comparison_shows_photo_input_result_and_truth_and_all_four_lights() -> None:
+    other = 1.1 * DEPTH
+    other = other + 0.05 * torch.rand(other.shape, generator=RANDOM)
+    picture = comparison(other, DEPTH, RAYS, RGB, LOW)
+    assert (picture.shape, picture.dtype) == ((3, 4 * 160, 4 * 160), torch.uint8)
+    torch.testing.assert_close(_panel(picture, 0, 0), (255 * RGB[0]).round().int())
+    coarse, truth = _panel(picture, 0, 1), _panel(picture, 0, 3)
+    torch.testing.assert_close(coarse[:, 2::4, 2::4], truth[:, ::4, ::4])  # the truth's colours
+    near = (truth[0].float() - (255 * (1 - 0.9 * (DEPTH[0, 0] - DEPTH.min()) / (DEPTH.max() - DEPTH.min())))).abs()
+    assert float(near.max()) <= 1
+    result, lit = (render(depth_to_normals(each, RAYS))[0].float() for each in (other, DEPTH))
+    for light in range(4):
+        assert (_panel(picture, 1, light)[0] - 255 * result[light]).abs().max() <= 1
+        assert (_panel(picture, 2, light)[0] - 255 * lit[light]).abs().max() <= 1
+        difference = (2 * (result[light] - lit[light]).abs()).clamp(max=1)
+        assert (_panel(picture, 3, light)[0] - 255 * difference).abs().max() <= 1
+
+
+def test_comparison_without_truth_shows_the_result_alone_and_holes_black() -> None:
+    depth = DEPTH.clone()
+    depth[..., 5:9, 5:9] = torch.nan
+    picture = comparison(depth, None, RAYS, RGB, LOW)
+    assert picture.shape == (3, 320, 640)
+    assert int(_panel(picture, 0, 2)[:, 5:9, 5:9].max()) == 0
+    assert int(_panel(picture, 0, 3).max()) == 0
+    assert int(_panel(picture, 1, 3)[:, 5:8, 5:8].max()) == 0

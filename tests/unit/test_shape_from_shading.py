@@ -17,7 +17,7 @@ from dsr.geometry.camera import Camera, from_range
 from dsr.geometry.surface import depth_to_normals
 from dsr.methods.classical.interpolation import Interpolation
 from dsr.methods.classical.shape_from_shading import ShapeFromShading
-from dsr.methods.classical.srfs_admm import ShadingProblem, ShadingSolver, Slopes, compute_shading, compute_surface
+from dsr.methods.classical.srfs_admm import ShadingProblem, ShadingSolver, Slopes, compute_shading
 from dsr.sample import DepthSample, Scene
 
 LIGHT = ((0.35, -0.3, -0.55, 0.15), (0.3, -0.25, -0.5, 0.2), (0.25, -0.3, -0.5, 0.2))
@@ -128,14 +128,6 @@ def _adjoint(slopes: Slopes) -> np.ndarray:
     return torch.stack([slopes.adjoint(each).flatten() for each in eye], dim=1).numpy()
 
 
-def test_slopes_give_the_normals_of_geometry_to_first_order() -> None:
-    truth = _sphere(64)
-    solver, metres = ShapeFromShading().prepare(_sample(truth))
-    found = compute_surface(solver.slopes(truth[None, None] / metres), solver.problem.rays).normals
-    expected = depth_to_normals(truth[None, None], solver.problem.rays)
-    assert float((found - expected).abs().mean()) < 5e-3
-
-
 @pytest.mark.parametrize(("holes", "mask"), [(False, False), (True, False), (False, True)])
 def test_depth_step_is_the_least_squares_solution(holes: bool, mask: bool) -> None:
     """Of sqrt(data) (K z - coarse) and sqrt(penalty) (G z - theta + u), as dense matrices by numpy."""
@@ -218,33 +210,6 @@ def test_holes_are_filled_and_have_no_influence() -> None:
     assert fine.shape == (1, 16, 24)
     assert bool(fine.isfinite().all())
     assert float(fine.min()) > 1.0
-
-
-@pytest.mark.parametrize(("scale", "size"), [(2, (10, 6)), (8, (8, 24)), (16, (16, 16)), (2, (2, 2))])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_srfs_takes_any_size_in_single_and_double_precision(
-    scale: int, size: tuple[int, int], dtype: torch.dtype
-) -> None:
-    depth, rgb = _random(*size)
-    fine = ShapeFromShading(iterations=2)(_sample(depth.to(dtype), rgb, scale))
-    assert fine.shape == (1, *size)
-    assert fine.dtype == dtype
-    assert bool(fine.isfinite().all())
-
-
-def test_result_is_independent_of_the_length_unit() -> None:
-    truth = _bumps(32)
-    large, small = (ShapeFromShading(iterations=3)(_sample(k * truth, _lit(truth))) for k in (1.0, 1e-3))
-    torch.testing.assert_close(1e3 * small, large, rtol=1e-6, atol=0)
-
-
-def test_result_is_deterministic_and_independent_of_the_truth() -> None:
-    sample = _sample(*_random(16, 24))
-    method = ShapeFromShading(iterations=4)
-    first = method(sample)
-    assert sample.depth is not None
-    sample.depth.fill_(torch.nan)
-    assert torch.equal(first, method(sample))
 
 
 def test_batch_equals_its_problems_one_at_a_time() -> None:

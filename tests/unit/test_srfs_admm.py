@@ -9,8 +9,8 @@ from torch import Tensor
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.surface import back_project, depth_to_normals
+from dsr.methods.classical.iterations import conjugate_gradients
 from dsr.methods.classical.srfs_admm import (
-    chain_to_theta,
     compute_area,
     compute_shading,
     compute_surface,
@@ -59,13 +59,6 @@ def test_rendering_converges_to_that_of_the_geometrys_normals() -> None:
     assert errors[1] == pytest.approx(errors[0] / 2, rel=0.1)  # of differences taken to one side
 
 
-def test_map_without_slopes_has_the_geometrys_normals_exactly() -> None:
-    camera = _camera(8)
-    rays, depth = camera.rays()[None], torch.full((1, 1, 8, 8), 3.0).double()
-    theta = torch.cat((torch.zeros(1, 2, 8, 8).double(), depth), dim=1)
-    torch.testing.assert_close(compute_surface(theta, rays).normals, depth_to_normals(depth, rays))
-
-
 def test_area_is_that_of_the_back_projected_pixels() -> None:
     camera = _camera(256)
     theta, depth = _theta(camera)
@@ -94,14 +87,6 @@ def test_photometry_has_its_stated_derivatives() -> None:
         torch.testing.assert_close(seen.slopes[:, channel], slope)
 
 
-def test_derivative_of_the_normal_length_is_the_normal() -> None:
-    theta, rays = _mixed_theta()
-    theta.requires_grad_()
-    surface = compute_surface(theta, rays)
-    (slope,) = torch.autograd.grad(surface.length.sum(), theta)
-    torch.testing.assert_close(chain_to_theta(surface.normals, rays), slope)
-
-
 def test_light_is_recovered_exactly_from_a_photo_without_noise() -> None:
     theta, rays = _mixed_theta()
     normals = compute_surface(theta, rays).normals
@@ -119,3 +104,40 @@ def test_light_on_a_flat_wall_is_the_smallest_that_explains_it() -> None:
     albedo = torch.ones(1, 1, 4, 5).double()
     light = fit_lighting(0.6 * albedo, albedo, normals, torch.ones_like(albedo))
     torch.testing.assert_close(light, torch.tensor([[[0.0, 0.0, -0.3, 0.3]]]).double())
+
+
+def _systems(batch: int, size: int) -> tuple[Tensor, Tensor]:
+    rng = np.random.default_rng(0)
+    root = torch.from_numpy(rng.normal(size=(batch, size, size)))
+    return root @ root.mT + torch.eye(size).double(), torch.from_numpy(rng.normal(size=(batch, size)))
+
+
+def _times(matrices: Tensor, x: Tensor) -> Tensor:
+    return (matrices @ x[..., None])[..., 0]
+
+
+def test_conjugate_gradients_equal_a_direct_solver_for_each_element_of_a_batch() -> None:
+    matrices, right = _systems(3, 12)
+    found = conjugate_gradients(
+        lambda x: _times(matrices, x), right, torch.zeros_like(right), iterations=100, tolerance=1e-12
+    )
+    torch.testing.assert_close(found.values, torch.linalg.solve(matrices, right))
+    assert found.residual <= 1e-12
+
+
+def test_conjugate_gradients_need_at_most_one_step_per_distinct_eigenvalue() -> None:
+    diagonal = torch.tensor([1.0, 1, 4, 4, 9, 9]).double()
+    right = torch.arange(1.0, 7.0).double()[None]
+    found = conjugate_gradients(lambda x: diagonal * x, right, torch.zeros_like(right), iterations=100, tolerance=1e-10)
+    assert found.iterations == 3
+    torch.testing.assert_close(found.values, right / diagonal)
+
+
+def test_solved_element_is_unchanged_while_another_goes_on() -> None:
+    matrices, right = _systems(2, 8)
+    right[0] = 0
+    found = conjugate_gradients(
+        lambda x: _times(matrices, x), right, torch.zeros_like(right), iterations=50, tolerance=1e-12
+    )
+    assert torch.equal(found.values[0], torch.zeros(8).double())
+    torch.testing.assert_close(found.values[1], torch.linalg.solve(matrices[1], right[1]))

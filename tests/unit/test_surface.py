@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.surface import back_project, depth_to_normals, length, normal_mask
+from dsr.geometry.surface import back_project, depth_to_normals, normal_mask
 from dsr.metrics.functional import SurfacePair, mse_v
 
 CAMERA = Camera(width=11, height=7, fx=9.0, fy=12.0, cx=4.3, cy=3.9)
@@ -48,14 +48,6 @@ def _sphere_error(camera: Camera) -> float:
     return float((depth_to_normals(depth[None], rays[None])[0] - truth).abs().max())
 
 
-def test_points_lie_on_their_rays_at_their_depth() -> None:
-    depth = _random(CAMERA)
-    points = back_project(depth, CAMERA.rays()[None])
-    v, u = 5, 8
-    z = depth[0, 0, v, u].item()
-    assert points[0, :, v, u].tolist() == pytest.approx([(u - 4.3) / 9.0 * z, (v - 3.9) / 12.0 * z, z], rel=1e-14)
-
-
 @pytest.mark.parametrize("normal", PLANES)
 def test_depth_to_normals_gives_the_plane_normal_at_every_pixel(normal: tuple[float, float, float]) -> None:
     normals = depth_to_normals(_plane(CAMERA, normal), CAMERA.rays()[None])
@@ -79,15 +71,6 @@ def test_depth_to_normals_equals_the_cross_product_of_forward_differences(size: 
     torch.testing.assert_close(depth_to_normals(depth, camera.rays()[None]), expected, rtol=0, atol=1e-10)
 
 
-def test_depth_to_normals_has_unit_length_and_faces_the_camera() -> None:
-    rays = CAMERA.rays()[None]
-    normals = depth_to_normals(_random(CAMERA), rays)
-    torch.testing.assert_close(normals.norm(dim=1), torch.ones(1, 7, 11, dtype=torch.float64), rtol=0, atol=1e-14)
-    assert bool(((normals * rays).sum(dim=1) < 0).all())
-    for plane in PLANES:
-        assert bool((depth_to_normals(_plane(CAMERA, plane), rays)[:, 2] < 0).all())
-
-
 @pytest.mark.parametrize("hole", [(3, 4), (0, 0), (6, 10), (6, 0), (0, 10), (5, 10), (6, 9)])
 def test_normal_is_missing_exactly_where_one_of_its_pixels_is(hole: tuple[int, int]) -> None:
     depth = _random(CAMERA)
@@ -99,15 +82,6 @@ def test_normal_is_missing_exactly_where_one_of_its_pixels_is(hole: tuple[int, i
     assert np.array_equal(normals.isfinite().all(dim=1)[0].numpy(), known)
 
 
-def test_depth_to_normals_does_not_depend_on_the_batch() -> None:
-    depths = torch.cat((_random(CAMERA, 1), _random(CAMERA, 2)))
-    other = Camera(11, 7, 30.0, 31.0, 2.0, 3.0)
-    rays = torch.stack((CAMERA.rays(), other.rays()))
-    together = depth_to_normals(depths, rays)
-    for i in range(2):
-        assert torch.equal(together[i : i + 1], depth_to_normals(depths[i : i + 1], rays[i : i + 1]))
-
-
 def test_float32_normals_keep_the_digits_of_tiny_differences() -> None:
     camera = Camera(11, 7, 1e5, 1e5, 5.0, 3.0)
     depth = 1 + 1e-6 * (_random(camera) - 1)  # float32 depths would differ by 0 or 1.2e-7
@@ -117,25 +91,10 @@ def test_float32_normals_keep_the_digits_of_tiny_differences() -> None:
     torch.testing.assert_close(narrow.double(), exact, rtol=0, atol=5e-7)
 
 
-def test_length_is_the_euclidean_one() -> None:
-    vectors = torch.tensor([2.0, -3.0, 6.0])[:, None, None].expand(3, 2, 2)
-    assert length(vectors).unique().item() == 7.0
-
-
 @pytest.mark.parametrize("size", [(1, 5), (5, 1)])
 def test_map_of_one_row_or_column_is_refused(size: tuple[int, int]) -> None:
     with pytest.raises(ValueError, match=f"at least 2 x 2 pixels, got \\({size[0]}, {size[1]}\\)"):
         depth_to_normals(torch.ones(1, 1, *size), torch.ones(1, 3, *size))
-
-
-@pytest.mark.parametrize("masked", [False, True])
-def test_gradient_of_the_visual_loss_is_that_of_its_value(masked: bool) -> None:
-    camera = Camera(4, 3, 5.0, 6.0, 1.2, 0.9)
-    target, depth = _random(camera, 3), _random(camera, 4).requires_grad_()
-    mask = torch.ones(1, 1, 3, 4, dtype=torch.bool)
-    if masked:
-        mask[0, 0, 1, 2] = False
-    assert torch.autograd.gradcheck(lambda z: mse_v(SurfacePair(z, target, camera.rays()[None], mask)), depth)
 
 
 @pytest.mark.parametrize("where", ["mask", "target", "prediction"])

@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-import torch
 from scipy.spatial.transform import Rotation
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.tsdf import PosedMap, fuse_maps, suggest_voxel
+from dsr.geometry.tsdf import PosedMap, fuse_maps
 
 CAMERA = Camera.centred(96, 80, 110.0)
 CENTRE, RADIUS = np.array([0.1, -0.2, 2.0]), 0.5
@@ -70,21 +69,9 @@ def test_maps_are_weighted_by_their_expected_errors():
     assert middle["both"] == pytest.approx((middle["near"] + middle["far"]) / 2, abs=0.002)
 
 
-def test_suggested_voxel_is_a_pixel_wide():
-    depth = np.full((80, 96), 2.2)
-    assert suggest_voxel([PosedMap(depth, CAMERA, np.eye(4))]) == pytest.approx(0.02)
-
-
 @pytest.mark.parametrize(
     ("voxel", "message"), [(0.0, "positive"), (1e-4, "at least about"), (float("nan"), "positive")]
 )
 def test_impossible_voxels_are_refused(voxel, message):
     with pytest.raises(ValueError, match=f"voxel: .*{message}"):
         fuse_maps(lambda: [seen(0)], voxel)
-
-
-def test_maps_without_a_pixel_are_refused():
-    empty = PosedMap(np.full((80, 96), np.nan), CAMERA, np.eye(4))
-    with pytest.raises(ValueError, match="all are holes"):
-        suggest_voxel([empty])
-    assert torch.isnan(torch.tensor(empty.depth)).all()

@@ -103,26 +103,11 @@ def test_identity_returns_the_map_with_its_steps_and_holes():
     assert torch.allclose(seen, depth, equal_nan=True, rtol=0.021)  # a rim may hide what is 2 % behind it
 
 
-def test_items_of_a_batch_do_not_mix():
-    depth = torch.cat([on_plane(SENSOR, (0.0, 0.1, 1.0), offset) for offset in (1.0, 2.0, 3.0)])
-    moves = torch.stack([torch.from_numpy(transform(shift=(0.02 * i, 0, 0))) for i in range(3)])
-    together = warp_depth(depth, SENSOR, moves, PHOTO)
-    for i in range(3):
-        alone = warp_depth(depth[i : i + 1], SENSOR, moves[i : i + 1], PHOTO)[0]
-        assert torch.equal(together[i].nan_to_num(0), alone.nan_to_num(0))
-
-
 def test_round_trip_keeps_a_plane():
     move, middle = transform(), (..., slice(20, -20), slice(20, -20))
     depth = on_plane(SENSOR, (0.2, 0.1, 1.0), 1.5)
     back = warp(warp(depth, move), invert(move), PHOTO, SENSOR)
     assert float((back - depth)[middle].abs().max()) < 1e-6
-
-
-@pytest.mark.parametrize(("shape", "moves"), [((72, 96), 1), ((1, 1, 72, 95), 1), ((3, 1, 72, 96), 2)])
-def test_wrong_shapes_are_refused(shape, moves):
-    with pytest.raises(ValueError, match="expected shape"):
-        warp_depth(torch.ones(shape), SENSOR, torch.eye(4)[None].repeat(moves, 1, 1), PHOTO)
 
 
 def test_registered_camera_has_the_photos_view_at_the_sensors_resolution():

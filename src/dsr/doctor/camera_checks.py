@@ -9,10 +9,9 @@ import torch
 from dsr.doctor.depth_checks import find_rounding
 from dsr.doctor.finding import Finding, metres
 from dsr.geometry.agreement import judge
-from dsr.geometry.edges import SHIFT, WORKING_SIZE
 from dsr.geometry.planes import range_votes
 from dsr.geometry.plausible import judge_camera, offset_of, view_of
-from dsr.geometry.registration import Displacement, find_displacement
+from dsr.geometry.registration import SHIFT, WORKING_SIZE, Displacement, find_displacement
 from dsr.sample import Scene
 
 _DIVISOR = 8

@@ -84,7 +84,7 @@ def check_units(scene: Scene) -> list[Finding]:
     beyond = implausible_distance(low, high)
     if beyond is not None:
         level, remark = "problem", f": {'nearer' if beyond == 'depth-near' else 'farther'} than any room or table"
-    elif middle < _NEAR or middle > LIMITS["depth-far"].threshold:
+    elif middle < _NEAR or middle > LIMITS["depth-far"]:
         level, remark = "warning", f": {'nearer' if middle < _NEAR else 'farther'} than most rooms and tables"
     elif middle > _FAR:
         level, remark = "note", ": too far for a room, plausible outdoors"
@@ -112,7 +112,7 @@ def _baseline(scene: Scene) -> list[Finding]:
     baseline = scene.camera.baseline
     if baseline is None or plausible_baseline(baseline):
         return []
-    low, high = (show_length(LIMITS[code].threshold) for code in ("baseline-short", "baseline-long"))
+    low, high = (show_length(LIMITS[code]) for code in ("baseline-short", "baseline-long"))
     message = f"baseline {show_length(baseline)}; {low} to {high} are usual"
     advice = 'check "baseline_unit" in camera.json; keep it if depth computed from it is plausible'
     return [Finding("units", "note", message, advice)]

@@ -165,7 +165,7 @@ class Results:
                 len(of_truth),
             )
             for (name, scale), of_truth in apart.items()
-            if len(of_truth) >= LIMITS["truths-differ"].threshold
+            if len(of_truth) >= LIMITS["truths-differ"]
         )
 
     @property

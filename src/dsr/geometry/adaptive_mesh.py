@@ -11,8 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-_LEVELS = 6
-"""The largest triangles have two sides of 2 to this power pixels."""
+_LEVELS = 6  # the largest triangles have two sides of 2 to this power pixels
 
 
 def join(inverse: np.ndarray, whole: np.ndarray, tolerance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -22,13 +21,10 @@ def join(inverse: np.ndarray, whole: np.ndarray, tolerance: np.ndarray) -> tuple
         inverse: (H, W) inverse depth in 1/m, NaN in holes.
         whole: (H - 1, W - 1) bool, which squares of four pixels are one surface; the others keep all their pixels.
         tolerance: (H, W) by how much leaving out a pixel may change the inverse depth there, in 1/m; NaN for not at
-            all. It holds for each halving, not for their sum: in up to 2 % of the pixels of measured surfaces the
-            triangles differ by more, about twice as much at most.
+            all. It holds for each halving: up to 2 % of the pixels differ by more, about twice as much at most.
 
-    Returns:
-        Which squares are left at full density, (H - 1, W - 1) bool, for two triangles each; and all other triangles,
-        (M, 3) indices into the flattened map, counterclockwise as the camera sees them.
-
+    Returns which squares are left at full density, for two triangles each, and all other triangles, (M, 3) indices into
+    the flattened map, counterclockwise as the camera sees them.
     """
     height, width = whole.shape
     side = 1 << _LEVELS

@@ -20,10 +20,10 @@ from torch.utils.data._utils.collate import default_collate_fn_map
 
 from dsr.geometry.range_type import RANGE_TYPES, RangeType
 
+# baseline in metres of the virtual stereo pair of a camera without a second one (Voynov et al. 2019)
 VIRTUAL_BASELINE = 0.2
-"""Baseline in metres of the virtual stereo pair of a camera without a second one (Voynov et al. 2019)."""
+# horizontal field of view in degrees, about that of a phone's main camera and of a depth camera's colour sensor
 ASSUMED_FOV = 60.0
-"""Horizontal field of view in degrees, about that of a phone's main camera and of a depth camera's colour sensor."""
 
 
 @dataclass(unsafe_hash=True)
@@ -97,11 +97,6 @@ class Camera:
         Raises:
             ValueError: the field of view is not between 0 and 180 degrees.
 
-        Example:
-            >>> import dsr
-            >>> round(dsr.Camera.from_fov(60, width=640, height=480).fx)
-            554
-
         """
         if not _is_number(degrees) or not 0 < degrees < 180:
             raise ValueError(f"degrees: expected a horizontal field of view above 0 and below 180, got {degrees!r:.60}")
@@ -140,17 +135,6 @@ class Camera:
 
         Raises:
             ValueError: it is missing, damaged or of another format.
-
-        Example:
-            >>> import json, tempfile
-            >>> from pathlib import Path
-            >>> import dsr
-            >>> intrinsics = {"width": 640, "height": 480, "fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5}
-            >>> with tempfile.TemporaryDirectory() as folder:
-            ...     path = Path(folder) / "camera.json"
-            ...     _ = path.write_text(json.dumps(intrinsics))
-            ...     dsr.Camera.from_json(path).fx
-            525.0
 
         """
         read = importlib.import_module("dsr.io.cameras").read_sized_camera  # files are read on a floor above
@@ -250,18 +234,11 @@ class Camera:
 
 
 default_collate_fn_map[Camera] = lambda batch, **_: list(batch)  # of a DataLoader, for metrics
-_SKEW = 0.01
-"""Largest skew of a matrix of intrinsics, as a share of fx, that is taken for rounding."""
+_SKEW = 0.01  # largest skew of a matrix of intrinsics, as a share of fx, that is taken for rounding
 
 
 def expect_intrinsics(matrix: Any) -> np.ndarray:
-    """Return the intrinsics, (3, 3) float64, that a 3 x 3, 3 x 4 or 4 x 4 matrix begins with.
-
-    Raises:
-        ValueError: it does not begin with (fx 0 cx; 0 fy cy; 0 0 1), with fx and fy above 0. A skew of up to 1 % of fx
-            is left out.
-
-    """
+    """Return the intrinsics, (3, 3) float64, that a 3 x 3, 3 x 4 or 4 x 4 matrix begins with."""
     expected = "expected a matrix (fx 0 cx; 0 fy cy; 0 0 1)"
     try:
         values = np.asarray(matrix.detach().cpu().double() if isinstance(matrix, Tensor) else matrix, np.float64)
@@ -302,14 +279,6 @@ def to_range(depth: Tensor, camera: Camera, range_type: RangeType) -> Tensor:
 
     Returns:
         (..., H, W) in the unit of the type.
-
-    Example:
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.geometry.camera import to_range
-        >>> camera = dsr.Camera(64, 48, 60.0, 60.0, 31.5, 23.5, baseline=0.1)
-        >>> to_range(torch.full((1, 48, 64), 2.0), camera, "disparity")[0, 0, 0]  # 0.1 m * 60 pixels / 2 m
-        tensor(3.)
 
     """
     if range_type == "orthogonal":

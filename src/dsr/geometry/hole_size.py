@@ -9,22 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+# pixels; a hole whose pixels are nearer than that to measured ones is not wide, however coarse the map is
 _NARROW = 2.5
-"""Pixels; a hole whose pixels are nearer than that to measured ones is not wide, however coarse the map is."""
+# share of measured pixels whose four neighbours are measured, below which a map is one of single points
 _TOGETHER = 0.5
-"""Share of measured pixels whose four neighbours are measured, below which a map is one of single points."""
 
 
 def distance_to_known(known: Tensor) -> Tensor:
-    """Return each pixel's distance to the nearest known pixel.
-
-    Args:
-        known: (1, h, w) bool.
-
-    Returns:
-        (1, h, w) float32 in pixels, between centres; 0 at known pixels, infinite if there is none.
-
-    """
+    """Return each pixel's distance to the nearest known one in pixels, (1, h, w); 0 there, infinite without any."""
     if not bool(known.any()):
         return torch.full(known.shape, math.inf, device=known.device)
     return _distance(~known)
@@ -36,19 +28,11 @@ def degrees_per_pixel(focal: float) -> float:
 
 
 def wide_holes(known: Tensor, width: float) -> Tensor:
-    """Return the holes, or parts of holes, that are wider than a limit.
+    """Return the parts of the holes of a map, (1, h, w) bool, that are wider than so many pixels, at least 5.
 
     It is the morphological opening of the holes by a disc: what is left of them where no disc of this width fits. A
     narrow part of a wide hole is not wide. At the border of the map, a hole is wide from half of the width on, since it
     can be filled from one side only.
-
-    Args:
-        known: (1, h, w) bool, false in holes.
-        width: of the widest hole that is not wide, in pixels; it is taken for 5 if it is less.
-
-    Returns:
-        (1, h, w) bool.
-
     """
     radius = max(width / 2, _NARROW)
     core = distance_to_known(known) - 0.5 > radius  # from the known pixel's edge

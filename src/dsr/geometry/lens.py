@@ -27,21 +27,14 @@ _COUNTS = {
     "thin_prism_fisheye": (8,),
 }
 _FISHEYES = ("kannala_brandt", "thin_prism_fisheye")
-_MOST = (1 << 15) - 2
-"""Largest width and height that OpenCV's ``remap`` takes."""
+_MOST = (1 << 15) - 2  # largest width and height that OpenCV's remap takes
 
 
 @dataclass(frozen=True)
 class Lens:
     """A lens: where in the picture the points of a pinhole camera lie.
 
-    Args:
-        model: one of those of the module's text.
-        coefficients: as many as the model has.
-
-    Raises:
-        ValueError: there is no such model, or the coefficients are too few, too many, or not finite.
-
+    ``model`` is one of those of the module's text, and there are as many ``coefficients`` as the model has.
     """
 
     model: str
@@ -66,21 +59,10 @@ class Lens:
 
 
 def undistort(picture: np.ndarray, camera: Camera, lens: Lens, hole: float | None = None) -> np.ndarray:
-    """Return a picture as the pinhole camera sees it.
+    """Return a picture, (h, w) or (h, w, 3), as the pinhole camera of the same intrinsics sees it.
 
-    Args:
-        picture: (h, w) or (h, w, 3) of the camera's size.
-        camera: the intrinsics, with the lens and without.
-        lens: the lens.
-        hole: what pixels of a map have that lie outside of the picture, the others have that of the nearest pixel; None
-            for a photo, which is interpolated and continued at its border.
-
-    Returns:
-        Picture of the same shape and dtype.
-
-    Raises:
-        ValueError: the picture is of another size than the camera, or larger than OpenCV takes.
-
+    A photo is interpolated and continued at its border. With a ``hole``, the picture is a map: its pixels have the
+    value of the nearest one, and those that lie outside of it the hole's.
     """
     if picture.shape[:2] != (camera.height, camera.width) or max(picture.shape[:2]) > _MOST:
         got = f"{picture.shape[1]} x {picture.shape[0]}"
@@ -107,18 +89,18 @@ def _places(camera: Camera, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
     else:
         x = (np.arange(camera.width) - camera.cx) / camera.fx
         y = (np.arange(camera.height)[:, None] - camera.cy) / camera.fy
-        x, y = (_thin_prism_fisheye if lens.model == "thin_prism_fisheye" else _modified_brown_conrady)(
-            x, y, lens.coefficients
-        )
+        move = _thin_prism_fisheye if lens.model == "thin_prism_fisheye" else _modified_brown_conrady
+        x, y = move(x, y, lens.coefficients)
         places = (x * camera.fx + camera.cx, y * camera.fy + camera.cy)
     outside = -2.0 * _MOST
     x, y = (np.clip(np.nan_to_num(each, nan=outside), outside, 2 * _MOST).astype(np.float32) for each in places)
     return x, y
 
 
-def _modified_brown_conrady(
-    x: np.ndarray, y: np.ndarray, coefficients: tuple[float, ...]
-) -> tuple[np.ndarray, np.ndarray]:
+Places = tuple[np.ndarray, np.ndarray]
+
+
+def _modified_brown_conrady(x: np.ndarray, y: np.ndarray, coefficients: tuple[float, ...]) -> Places:
     """Return where the points (x, y, 1) of rays lie at a focal length of 1."""
     k1, k2, p1, p2, k3 = coefficients
     square = x * x + y * y
@@ -127,7 +109,7 @@ def _modified_brown_conrady(
     return x + 2 * p1 * x * y + p2 * (square + 2 * x * x), y + 2 * p2 * x * y + p1 * (square + 2 * y * y)
 
 
-def _thin_prism_fisheye(x: np.ndarray, y: np.ndarray, coefficients: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+def _thin_prism_fisheye(x: np.ndarray, y: np.ndarray, coefficients: tuple[float, ...]) -> Places:
     """Return the same of the other model."""
     k1, k2, p1, p2, k3, k4, sx1, sy1 = coefficients
     angle = np.hypot(x, y)

@@ -22,37 +22,23 @@ from torch import Tensor
 from dsr.geometry.adaptive_mesh import join
 from dsr.geometry.camera import Camera
 
-LARGEST_STEP = 0.02
-"""Maximum relative deviation of a neighbour's depth from the slope of the surface."""
-_HALF_WIDTHS = (1, 2, 3)
-"""Half widths of the windows in pixels."""
-_OWN_FRACTION = 0.25
-"""Fraction of ``largest_step`` by which a pair within a wider window must itself change to be cut."""
-_STRIP = 1 << 21
-"""Pixels whose steps are found, and triangles whose normals are summed, at a time."""
+LARGEST_STEP = 0.02  # maximum relative deviation of a neighbour's depth from the slope of the surface
+_HALF_WIDTHS = (1, 2, 3)  # half widths of the windows in pixels
+_OWN_FRACTION = 0.25  # fraction of largest_step by which a pair within a wider window must itself change to be cut
+_STRIP = 1 << 21  # pixels whose steps are found, and triangles whose normals are summed, at a time
 
 QUADRIC = "quadric decimation"
-FLATNESS = 3e-4
-"""Tolerance of a mesh that looks like the one of all pixels, as a fraction of the depth."""
-ERROR_SHARE = 0.1
-"""The same as a fraction of the depth's expected error, if that is more."""
+FLATNESS = 3e-4  # tolerance of a mesh that looks like the one of all pixels, as a fraction of the depth
+ERROR_SHARE = 0.1  # the same as a fraction of the depth's expected error, if that is more
 
 
 class Mesh(NamedTuple):
-    """Triangles in the camera frame.
+    """Triangles in the camera frame: x right, y down, z forward."""
 
-    Args:
-        vertices: (N, 3) float32 in metres; x right, y down, z forward.
-        faces: (M, 3) int32 indices of vertices, counterclockwise as the camera sees them.
-        pixels: (N,) int64 index of each vertex in the flattened depth map.
-        dense: number of triangles if there were two per square of four pixels.
-
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    pixels: np.ndarray
-    dense: int = 0
+    vertices: np.ndarray  # (N, 3) float32 in metres
+    faces: np.ndarray  # (M, 3) int32 indices of vertices, counterclockwise as the camera sees them
+    pixels: np.ndarray  # (N,) int64 index of each vertex in the flattened depth map
+    dense: int = 0  # number of triangles if there were two per square of four pixels
 
 
 def triangulate(
@@ -78,18 +64,6 @@ def triangulate(
         tolerance: (1, H, W) how far in metres each pixel lies beside the mesh, mostly and by about twice that at
             most, so that flat parts get large triangles, see :func:`dsr.geometry.adaptive_mesh.join`; None for a mesh
             of all pixels.
-
-    Raises:
-        ValueError: ``depth`` is no map of the camera's size, or a number is not positive.
-
-    Example:
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.geometry.mesh import triangulate
-        >>> camera = dsr.Camera.from_fov(60, width=4, height=3)
-        >>> mesh = triangulate(torch.full((1, 3, 4), 2.0), camera)
-        >>> len(mesh.vertices), len(mesh.faces)
-        (12, 12)
 
     """
     if tuple(depth.shape) != (1, camera.height, camera.width):
@@ -156,15 +130,9 @@ def _faces(inverse: np.ndarray, largest_step: float, allowed: np.ndarray | None)
 
 
 def find_connections(inverse: np.ndarray, largest_step: float = LARGEST_STEP) -> tuple[np.ndarray, np.ndarray]:
-    """Return which neighbouring pixels lie on one surface, those that a mesh joins.
+    """Return which neighbouring pixels of inverse depth, (H, W) in 1/m, lie on one surface, those that a mesh joins.
 
-    Args:
-        inverse: (H, W) inverse depth in 1/m, NaN in holes.
-        largest_step: see :func:`triangulate`.
-
-    Returns:
-        Whether each pixel and its right neighbour do, (H, W - 1) bool, and each pixel and the one below, (H - 1, W).
-
+    These are whether each pixel and its right neighbour do, (H, W - 1) bool, and each pixel and the one below.
     """
     return _connected(inverse, largest_step), _connected(inverse.T, largest_step).T
 
@@ -205,16 +173,7 @@ def _shift(values: np.ndarray, by: int) -> np.ndarray:
 def simplify(mesh: Mesh, most: int, camera: Camera) -> Mesh:
     """Return a mesh of at most ``most`` triangles by quadric decimation, or a few more where edges cannot collapse.
 
-    Memory: about 300 bytes per triangle of ``mesh``; time: about a second per million.
-
-    Args:
-        mesh: is returned as it is if it has no more.
-        most: triangles, 1 at least.
-        camera: of the map that the mesh was made of.
-
-    Raises:
-        ImportError: `fast-simplification` is not installed.
-
+    Memory: about 300 bytes per triangle of ``mesh``; time: about a second per million. The camera is that of the map.
     """
     if len(mesh.faces) <= most:
         return mesh
@@ -229,15 +188,7 @@ def simplify(mesh: Mesh, most: int, camera: Camera) -> Mesh:
 
 
 def thin(depth: Tensor, camera: Camera, most: int, largest_step: float) -> tuple[Mesh, int]:
-    """Return a mesh of at most ``most`` triangles, of every second, third, ... row and column, and that stride.
-
-    Args:
-        depth: (1, H, W) orthogonal depth in metres, NaN in holes.
-        camera: of these pixels.
-        most: triangles.
-        largest_step: see :func:`dsr.geometry.mesh.triangulate`.
-
-    """
+    """Return a mesh of at most ``most`` triangles, of every second, third, ... row and column, and that stride."""
     stride = max(2, math.isqrt(2 * int(depth.isfinite().sum()) // most))
     while len((mesh := triangulate(depth, camera, largest_step=largest_step, stride=stride)).faces) > most:
         stride += 1
@@ -248,12 +199,6 @@ def select_points(mesh: Mesh, most: int, camera: Camera) -> np.ndarray:
     """Return the indices of at most ``most`` vertices of an unsimplified mesh, (N,), evenly spread in the image.
 
     They are those in rows and columns at equal distances, which need not be whole numbers of pixels.
-
-    Args:
-        mesh: whose ``pixels`` are read.
-        most: vertices, 1 at least.
-        camera: of the map that the mesh was made of.
-
     """
     count = len(mesh.pixels)
     if count <= most:
@@ -268,12 +213,7 @@ def select_points(mesh: Mesh, most: int, camera: Camera) -> np.ndarray:
 
 
 def project(points: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return the column and row of points in the image, (N, 2) float64, pixel centres at integers, clipped to it.
-
-    Args:
-        points: (N, 3) in the camera frame, in front of it.
-
-    """
+    """Return the columns and rows of points, (N, 3) in front of the camera, in pixels, (N, 2), clipped to the image."""
     x, y, z = points.astype(np.float64).T
     places = np.stack((x / z * camera.fx + camera.cx, y / z * camera.fy + camera.cy), axis=1)
     return places.clip(0, (camera.width - 1, camera.height - 1))

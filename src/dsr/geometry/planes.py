@@ -24,56 +24,34 @@ from dsr.notes import LIMITS
 
 Array = NDArray[np.float64]
 
-_SIZES = (1.0, 2 / 3, 1 / 2, 1 / 3, 1 / 4, 1 / 6)
-"""Sizes of windows, as fractions of the shorter image side."""
-_CELLS = 16
-"""Cells across a window; values are averaged within cells to reduce noise."""
+_SIZES = (1.0, 2 / 3, 1 / 2, 1 / 3, 1 / 4, 1 / 6)  # sizes of windows, as fractions of the shorter image side
+_CELLS = 16  # cells across a window; values are averaged within cells to reduce noise
 _ITERATIONS = 12
-_MIN_VALID, _INLIERS = 0.6, 0.55
-"""Minimum fractions of a window's cells that are valid, and that are on the plane."""
-_NOISE = 0.5
-"""Largest deviation of a planar window from its fit, as a fraction of the curvature that k = 1 causes."""
-_NEAR = 0.3
-"""Largest distance of k from the value that a window votes for."""
-_WHOLE = 0.95
-"""Minimum fraction of valid pixels in a cell."""
-_LARGEST = 1e3
-"""Upper limit of inverse depth, as a multiple of the median's."""
+_MIN_VALID, _INLIERS = 0.6, 0.55  # minimum fractions of a window's cells that are valid, and that are on the plane
+_NOISE = 0.5  # largest deviation of a planar window from its fit, as a fraction of the curvature that k = 1 causes
+_NEAR = 0.3  # largest distance of k from the value that a window votes for
+_WHOLE = 0.95  # minimum fraction of valid pixels in a cell
+_LARGEST = 1e3  # upper limit of inverse depth, as a multiple of the median's
 _EXACT = 1e-12
-_LEAST, _LEAD = 4, 3
-"""Minimum number of votes for orthogonal depth, and their minimum ratio to all others."""
-_LEAST_BENT, _MAJORITY_BENT = (LIMITS[f"along-the-ray{each}"].threshold for each in (".planes", ""))
-"""Minimum number of votes for another type, and their minimum fraction of the planar windows."""
-_LEAST_INVERSE, _LEAD_INVERSE = (LIMITS[f"falls-with-distance{each}"].threshold for each in (".planes", ""))
-"""Minimum number of windows in which values, and not their reciprocals, are linear, and their minimum ratio to those in
-which the reciprocals are."""
-_LINEAR = 2.0
-"""Ratio of the deviations of values and of their reciprocals from a plane above which a window votes."""
-_CURVED = 0.003
-"""Least deviation of the worse one of both, as a fraction of the values."""
+_LEAST, _LEAD = 4, 3  # minimum number of votes for orthogonal depth, and their minimum ratio to all others
+_LEAST_BENT = 6  # votes for another type; none of 28 right maps of sensors and data sets has any
+_LEAST_INVERSE = 10  # windows in which values, not reciprocals, are linear; 28 right maps have at most 4
+_LINEAR = 2.0  # ratio of the deviations of values and of their reciprocals from a plane above which a window votes
+_CURVED = 0.003  # least deviation of the worse one of both, as a fraction of the values
+# largest deviation of the better one of both over the spread of its plane: boards at other depths have no slope
 _STEEP = 0.25
-"""Largest deviation of the better one of both over the spread of its plane: boards at other depths have no slope."""
-_REDUCED = 320
-"""Largest size of the longer side of a map that is judged whole; larger ones are thinned out."""
+_REDUCED = 320  # largest size of the longer side of a map that is judged whole; larger ones are thinned out
 
 
 @dataclass(frozen=True)
 class Windows:
-    """Square windows of a map of inverse depth, averaged within cells.
+    """Square windows of a map of inverse depth, averaged within cells, (N, cells) each."""
 
-    Args:
-        inverse: (N, cells) 1 / s, as a multiple of the window's median; 0 where invalid.
-        valid: (N, cells) bool.
-        u, v: (N, cells) position within the window, about -1 to 1.
-        bend: (N, cells) logarithm of |r|, minus its mean over the window.
-
-    """
-
-    inverse: Array
+    inverse: Array  # 1 / s, as a multiple of the window's median; 0 where invalid
     valid: np.ndarray
-    u: Array
+    u: Array  # position within the window, about -1 to 1
     v: Array
-    bend: Array
+    bend: Array  # logarithm of |r|, minus its mean over the window
 
 
 class RangeVotes(NamedTuple):
@@ -87,9 +65,10 @@ class RangeVotes(NamedTuple):
     @property
     def verdict(self) -> Literal["orthogonal", "ray", "reverse"] | None:
         """What the windows agree on; None if there are too few."""
-        for name, count in (("ray", self.ray), ("reverse", self.reverse)):
-            if count >= _LEAST_BENT and count > _MAJORITY_BENT * self.windows:
-                return "ray" if name == "ray" else "reverse"
+        if self.ray >= _LEAST_BENT and self.ray > LIMITS["along-the-ray"] * self.windows:
+            return "ray"
+        if self.reverse >= _LEAST_BENT and self.reverse > LIMITS["along-the-ray"] * self.windows:
+            return "reverse"
         enough = self.flat >= _LEAST and self.flat > _LEAD * (self.ray + self.reverse)
         return "orthogonal" if enough else None
 
@@ -108,9 +87,9 @@ class InverseVotes(NamedTuple):
     @property
     def verdict(self) -> Literal["falls", "rises"] | None:
         """Whether values fall or rise with distance; None if there are too few planes."""
-        if self.falling >= _LEAST_INVERSE and self.ratio >= _LEAD_INVERSE:
+        if self.falling >= _LEAST_INVERSE and self.ratio >= LIMITS["falls-with-distance"]:
             return "falls"
-        if self.rising >= _LEAST_INVERSE and self.rising >= _LEAD_INVERSE * self.falling:
+        if self.rising >= _LEAST_INVERSE and self.rising >= LIMITS["falls-with-distance"] * self.falling:
             return "rises"
         return None
 
@@ -123,11 +102,9 @@ def range_votes(values: Array, camera: Camera, step: float = 0.0) -> RangeVotes:
 
 
 def inverse_votes(values: Array) -> InverseVotes:
-    """Count in which windows of a map its values are linear, or else their reciprocals.
+    """Count in which windows of a map, (H, W) positive, NaN in holes, its values are linear, or their reciprocals.
 
-    Args:
-        values: (H, W) positive, in any unit, NaN in holes; of a large map, every n-th pixel is read.
-
+    Of a large map, every n-th pixel is read.
     """
     values, camera = thinned(values, Camera.from_fov(ASSUMED_FOV, values.shape[1], values.shape[0]))
     deviations, planar = [], []
@@ -160,11 +137,7 @@ def thinned(values: Array, camera: Camera) -> tuple[Array, Camera]:
 def plane_votes(values: Array, camera: Camera, step: float = 0.0) -> Array:
     """Estimate the exponent k of each planar window: near 0 orthogonal, 1 along the ray, -1 the reverse.
 
-    Args:
-        values: (H, W) positive, in any unit, NaN in holes.
-        camera: camera of these pixels.
-        step: rounding step of the values, as a fraction of them.
-
+    The values are (H, W), positive, in any unit, NaN in holes; ``step`` is their rounding step as a fraction of them.
     """
     windows = _windows(values, camera)
     if not windows.inverse.size:
@@ -240,10 +213,10 @@ def _robust_fit(columns: Array, windows: Windows) -> tuple[Array, Array]:
     for iteration in range(_ITERATIONS):
         size = np.abs(windows.inverse - _product(columns, _solve(columns, weight, windows.inverse)))
         ratio = size / _deviation(size, windows.valid)
-        absolute = iteration < _ITERATIONS // 2
-        weight = valid * (
-            1 / np.maximum(ratio, 0.05) if absolute else np.square((1 - np.square(ratio / 4)).clip(min=0))
-        )
+        if iteration < _ITERATIONS // 2:
+            weight = valid * (1 / np.maximum(ratio, 0.05))
+        else:
+            weight = valid * np.square((1 - np.square(ratio / 4)).clip(min=0))
     fit = _solve(columns, weight, windows.inverse)
     size = np.abs(windows.inverse - _product(columns, fit))
     return fit, valid * (size < 3 * _deviation(size, windows.valid))

@@ -9,14 +9,8 @@ from typing import Literal, NamedTuple
 from dsr.geometry.camera import Camera
 from dsr.notes import LIMITS
 
-_VIEW, _USUAL_VIEW = (LIMITS["view-narrow"].threshold, LIMITS["view-wide"].threshold), (20.0, 120.0)
-"""Horizontal fields of view in degrees that are plausible, and usual."""
-_OFFSET, _SMALL_OFFSET = LIMITS["off-centre"].threshold, LIMITS["other-picture"].threshold
-"""Distance of the principal point from the centre, as a fraction of the size."""
-_RATIO = LIMITS["focal-ratio"].threshold
-"""Largest plausible ratio of fx and fy."""
-_BASELINES = LIMITS["baseline-short"].threshold, LIMITS["baseline-long"].threshold
-"""Plausible range of baselines in metres."""
+_USUAL_VIEW = (20.0, 120.0)  # horizontal fields of view in degrees
+_FITTING = 0.05  # up to which numbers fit another size, or have their principal point in the middle
 _SCALES = (2.0, 3.0, 4.0, 8.0, 1.5, 2.5)
 _NUMBERS = ("fx", "fy", "cx", "cy")
 
@@ -24,14 +18,9 @@ _NUMBERS = ("fx", "fy", "cx", "cy")
 class Remark(NamedTuple):
     """What was found about a camera.
 
-    Attributes:
-        level: ``note`` of what is correct at times; the others mean that it is probably, and certainly, wrong.
-        kind: what it is, in words that are equal for all cameras.
-        message: the numbers, with units.
-        advice: how to correct them.
-        code: of :data:`dsr.notes.LIMITS`; empty for a note.
-        value: what the limit was compared with.
-
+    A ``note`` is correct at times; a ``warning`` is probably, and a ``problem`` certainly, wrong. ``kind`` is equal for
+    all cameras, ``code`` one of :data:`dsr.notes.LIMITS`, empty for a note, and ``value`` what the limit was compared
+    with.
     """
 
     level: Literal["note", "warning", "problem"]
@@ -45,24 +34,18 @@ class Remark(NamedTuple):
 def judge_camera(camera: Camera, size_lr: tuple[int, int] | None = None) -> list[Remark]:
     """Return remarks on implausible values of a camera; none for a usual one.
 
-    Args:
-        camera: the camera.
-        size_lr: (height, width) of a depth map that another camera may have taken; None where there is none.
-
+    ``size_lr`` is the (height, width) of a depth map that another camera may have taken.
     """
-    return [*_view(camera), *(_other_picture(camera, size_lr) or [*_centre(camera), *_shape(camera)])]
+    other = _other_picture(camera, size_lr)
+    return [*_view(camera), *([other] if other else _centre_and_shape(camera))]
 
 
 def expect_possible(camera: Camera, name: str) -> None:
-    """Check that a camera could see its picture.
-
-    Raises:
-        ValueError: every ray of the picture is farther from the axis than any lens without distortion shows.
-
-    """
-    beyond = (max(-0.5 - middle, middle - size + 0.5, 0) / focal for middle, size, focal in _axes(camera))
+    """Check that a camera could see its picture: a lens without distortion shows some of its rays."""
+    axes = (camera.cx, camera.width, camera.fx), (camera.cy, camera.height, camera.fy)
+    beyond = (max(-0.5 - middle, middle - size + 0.5, 0) / focal for middle, size, focal in axes)
     angle = math.degrees(math.atan(math.hypot(*beyond)))
-    if angle > LIMITS["beside-axis"].threshold:
+    if angle > LIMITS["beside-axis"]:
         raise ValueError(
             f"{name}: expected a principal point in or near the picture of {camera.width} x {camera.height} pixels "
             f"(width x height), got cx {camera.cx:g} and cy {camera.cy:g} with fx {camera.fx:g} and fy {camera.fy:g}, "
@@ -70,27 +53,16 @@ def expect_possible(camera: Camera, name: str) -> None:
         )
 
 
-def _axes(camera: Camera) -> tuple[tuple[float, int, float], ...]:
-    """Return the principal point, size and focal length across and down."""
-    return (camera.cx, camera.width, camera.fx), (camera.cy, camera.height, camera.fy)
-
-
 def plausible_baseline(baseline: float) -> bool:
     """Return whether two cameras may be so many metres apart."""
-    return _BASELINES[0] <= baseline <= _BASELINES[1]
+    return LIMITS["baseline-short"] <= baseline <= LIMITS["baseline-long"]
 
 
 def implausible_distance(low: float, high: float) -> Literal["depth-near", "depth-far"] | None:
-    """Return which limit a depth map is beyond with all that it shows, if any.
-
-    Args:
-        low: near which its depth begins, in metres.
-        high: near which it ends.
-
-    """
-    if high < LIMITS["depth-near"].threshold:
+    """Return which limit a depth map is beyond with all that it shows, from ``low`` to ``high`` metres, if any."""
+    if high < LIMITS["depth-near"]:
         return "depth-near"
-    return "depth-far" if low > LIMITS["depth-far"].threshold else None
+    return "depth-far" if low > LIMITS["depth-far"] else None
 
 
 def view_of(camera: Camera) -> float:
@@ -101,17 +73,12 @@ def view_of(camera: Camera) -> float:
 
 def offset_of(camera: Camera) -> float:
     """Return how far the principal point is off the centre, as a fraction of the width or height, the larger one."""
-    return max(map(abs, _offsets(camera)))
+    return max(map(abs, _from_middle(camera.cx, camera.cy, camera.width, camera.height)))
 
 
 def may_be_of(cx: float, cy: float, width: int, height: int) -> bool:
     """Return whether a principal point may be that of a picture of this size."""
-    return max(map(abs, _from_middle(cx, cy, width, height))) <= _OFFSET
-
-
-def _offsets(camera: Camera) -> tuple[float, float]:
-    """Return the offset of the principal point from the centre, as fractions of the width and height."""
-    return _from_middle(camera.cx, camera.cy, camera.width, camera.height)
+    return max(map(abs, _from_middle(cx, cy, width, height))) <= LIMITS["off-centre"]
 
 
 def _from_middle(cx: float, cy: float, width: int, height: int) -> tuple[float, float]:
@@ -126,77 +93,52 @@ def _ratio(camera: Camera) -> float:
 
 def _view(camera: Camera) -> list[Remark]:
     """Judge the field of view."""
-    view = view_of(camera)
-    if _USUAL_VIEW[0] <= view <= _USUAL_VIEW[1]:
+    view, (low, high) = view_of(camera), _USUAL_VIEW
+    if low <= view <= high:
         return []
-    low, high = _USUAL_VIEW
+    kind = "hardly any camera has this field of view"
     message = (
         f"fx {camera.fx:.4g} px gives a horizontal field of view of {view:.3g} degrees; {low:g} to {high:g} are usual"
     )
-    if _VIEW[0] <= view <= _VIEW[1]:
-        return [
-            Remark(
-                "note",
-                "hardly any camera has this field of view",
-                message,
-                "correct for a telephoto or a very wide lens",
-            )
-        ]
+    if LIMITS["view-narrow"] <= view <= LIMITS["view-wide"]:
+        return [Remark("note", kind, message, "correct for a telephoto or a very wide lens")]
     degrees = f"60 degrees correspond to {0.866 * camera.width:.0f} px"
     advice = f"give fx and fy in pixels of this image, not in mm; {degrees}"
-    return [
-        Remark(
-            "warning",
-            "hardly any camera has this field of view",
-            message,
-            advice,
-            "view-narrow" if view < _VIEW[0] else "view-wide",
-            view,
-        )
-    ]
+    return [Remark("warning", kind, message, advice, "view-narrow" if view < low else "view-wide", view)]
 
 
-def _other_picture(camera: Camera, size_lr: tuple[int, int] | None) -> list[Remark]:
+def _other_picture(camera: Camera, size_lr: tuple[int, int] | None) -> Remark | None:
     """Judge whether the numbers fit better in another order, or to an image of another size."""
     offset = offset_of(camera)
-    if offset <= _SMALL_OFFSET and _ratio(camera) <= _RATIO:
-        return []
+    if offset <= LIMITS["other-picture"] and _ratio(camera) <= LIMITS["focal-ratio"]:
+        return None
     text = f"fx {camera.fx:.4g}, fy {camera.fy:.4g}, cx {camera.cx:.4g}, cy {camera.cy:.4g} px"
     order = _better_order(camera)
     if order is not None:
-        correction = ", ".join(f"{name} is the number given as {other}" for name, other in order)
         message = f"{text} fit the {camera.height} x {camera.width} image in another order"
-        return [
-            Remark(
-                "problem",
-                "the intrinsics are in another order",
-                message,
-                f"correct the order: {correction}",
-                "other-picture",
-                offset,
-            )
-        ]
+        advice = f"correct the order: {', '.join(f'{name} is the number given as {other}' for name, other in order)}"
+        return Remark("problem", "the intrinsics are in another order", message, advice, "other-picture", offset)
     across, down = (2 * camera.cx + 1) / camera.width, (2 * camera.cy + 1) / camera.height
+
+    def fits(wide: float, high: float) -> bool:
+        return abs(across / wide - 1) < _FITTING and abs(down / high - 1) < _FITTING
+
+    kind = "the intrinsics fit another picture"
     if size_lr is not None and size_lr != (camera.height, camera.width):
         height, width = size_lr
-        if _is_near(across, width / camera.width) and _is_near(down, height / camera.height):
+        if fits(width / camera.width, height / camera.height):
             message = (
                 f"{text} fit the depth map of {width} x {height}, not the photo of {camera.width} x {camera.height}"
             )
             advice = "give the intrinsics of the photo's camera, in pixels of the photo"
-            return [Remark("problem", "the intrinsics fit another picture", message, advice, "other-picture", offset)]
+            return Remark("problem", kind, message, advice, "other-picture", offset)
     for scale in (*_SCALES, *(1 / scale for scale in _SCALES)):
-        if _is_near(across, scale) and _is_near(down, scale):
+        if fits(scale, scale):
             size = f"{camera.height * scale:.0f} x {camera.width * scale:.0f}"
             message = f"{text} fit an image {scale:.3g} times as large ({size})"
             advice = f"divide them by {scale:.3g}, unless the image was cropped"
-            return [Remark("problem", "the intrinsics fit another picture", message, advice, "other-picture", offset)]
-    return []
-
-
-def _is_near(found: float, wanted: float) -> bool:
-    """Return whether two ratios are about equal."""
-    return abs(found / wanted - 1) < LIMITS["other-picture.size"].threshold
+            return Remark("problem", kind, message, advice, "other-picture", offset)
+    return None
 
 
 def _better_order(camera: Camera) -> list[tuple[str, str]] | None:
@@ -208,8 +150,8 @@ def _better_order(camera: Camera) -> list[tuple[str, str]] | None:
         if min(fx, fy) <= 0:
             continue
         other = Camera(camera.width, camera.height, fx, fy, cx, cy)
-        centred = offset_of(other) < LIMITS["other-picture.offset"].threshold
-        square = _ratio(other) < LIMITS["other-picture.ratio"].threshold
+        centred = offset_of(other) < _FITTING
+        square = _ratio(other) < 1.03
         fits = centred and square and _USUAL_VIEW[0] <= view_of(other) <= _USUAL_VIEW[1]
         moved = [(_NUMBERS[place], _NUMBERS[index]) for place, index in enumerate(order) if place != index]
         if fits and (best is None or len(moved) < len(best)):
@@ -217,28 +159,25 @@ def _better_order(camera: Camera) -> list[tuple[str, str]] | None:
     return best
 
 
-def _centre(camera: Camera) -> list[Remark]:
-    """Judge the principal point."""
-    right, below = _offsets(camera)
-    offset = offset_of(camera)
-    if offset <= _SMALL_OFFSET:
-        return []
-    message = (
-        f"principal point ({camera.cx:.4g}, {camera.cy:.4g}) px is {abs(right):.0%} of the width "
-        f"{'right' if right > 0 else 'left'} of the centre and {abs(below):.0%} of the height "
-        f"{'below' if below > 0 else 'above'} it"
-    )
-    if offset <= _OFFSET:
-        return [Remark("note", "the principal point is far from the middle", message, "correct for a cropped image")]
-    advice = "check cx and cy; if the image was cropped or resized, the camera must be adapted"
-    return [Remark("warning", "the principal point is far from the middle", message, advice, "off-centre", offset)]
-
-
-def _shape(camera: Camera) -> list[Remark]:
-    """Judge the ratio of the focal lengths."""
-    ratio = _ratio(camera)
-    if ratio <= _RATIO:
-        return []
-    message = f"fx {camera.fx:.4g} and fy {camera.fy:.4g} px differ by {ratio - 1:.0%}"
-    advice = "pixels are usually square: check both, and the aspect ratio of the image"
-    return [Remark("warning", "fx and fy differ", message, advice, "focal-ratio", ratio)]
+def _centre_and_shape(camera: Camera) -> list[Remark]:
+    """Judge the principal point, and the ratio of the focal lengths."""
+    found = []
+    right, below = _from_middle(camera.cx, camera.cy, camera.width, camera.height)
+    offset, ratio = offset_of(camera), _ratio(camera)
+    if offset > LIMITS["other-picture"]:
+        kind = "the principal point is far from the middle"
+        message = (
+            f"principal point ({camera.cx:.4g}, {camera.cy:.4g}) px is {abs(right):.0%} of the width "
+            f"{'right' if right > 0 else 'left'} of the centre and {abs(below):.0%} of the height "
+            f"{'below' if below > 0 else 'above'} it"
+        )
+        advice = "check cx and cy; if the image was cropped or resized, the camera must be adapted"
+        if offset <= LIMITS["off-centre"]:
+            found.append(Remark("note", kind, message, "correct for a cropped image"))
+        else:
+            found.append(Remark("warning", kind, message, advice, "off-centre", offset))
+    if ratio > LIMITS["focal-ratio"]:
+        message = f"fx {camera.fx:.4g} and fy {camera.fy:.4g} px differ by {ratio - 1:.0%}"
+        advice = "pixels are usually square: check both, and the aspect ratio of the image"
+        found.append(Remark("warning", "fx and fy differ", message, advice, "focal-ratio", ratio))
+    return found

@@ -18,84 +18,73 @@ from dsr.geometry.rigid_motion import Matrix, invert, quaternion_of, rotation_of
 from dsr.geometry.tsdf import PosedMap
 from dsr.notes import LIMITS, Assumption
 
-_Reading = Callable[[Matrix], Matrix]
-
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-_FORWARD_DOWN = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-"""Axes x right, y down, z forward in the frame x forward, y right, z down, as TartanAir and aircraft have it."""
-_FORWARD_UP = np.diag([1.0, -1.0, -1.0, 1.0]) @ _FORWARD_DOWN
-"""The same in the frame x forward, y left, z up, that of robots (ROS)."""
-
-
-def _as_given(pose: Matrix) -> Matrix:
-    return pose
-
-
-def _transposed(pose: Matrix) -> Matrix:
-    """Return a pose whose rotation was written by columns."""
-    changed = pose.copy()
-    changed[:3, :3] = pose[:3, :3].T
-    return changed
-
-
-def _scalar_first(pose: Matrix) -> Matrix:
-    """Return a pose whose quaternion w x y z was read as x y z w."""
-    w, x, y, z = quaternion_of(pose[:3, :3])
-    changed = pose.copy()
-    changed[:3, :3] = rotation_of_quaternion((x, y, z, w))
-    return changed
-
-
-_DIRECTIONS: dict[str, _Reading] = {"": _as_given, "from world to camera": invert}
+_FORWARD_DOWN = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # as TartanAir has it
+_FORWARD_UP = np.diag([1.0, -1.0, -1.0, 1.0]) @ _FORWARD_DOWN  # x forward, y left, z up, of robots (ROS)
+_DIRECTIONS = ("", "from world to camera")
+_ROTATIONS = ("", "with rotations by columns", "with quaternions w x y z")
 _AXES: dict[str, Matrix] = {
     "": np.eye(4),
     "of cameras with y up and z backward": _OPENGL,
     "of cameras with x forward and z down": _FORWARD_DOWN,
     "of cameras with x forward and z up": _FORWARD_UP,
 }
-_ROTATIONS: dict[str, _Reading] = {
-    "": _as_given,
-    "with rotations by columns": _transposed,
-    "with quaternions w x y z": _scalar_first,
+_LENGTHS = {
+    "": 1.0,
+    "in millimetres": 1e-3,
+    "in centimetres": 1e-2,
+    "10 times too small": 10.0,
+    "100 times too small": 100.0,
+    "1000 times too small": 1000.0,
 }
-_LENGTHS = {"": 1.0, "in millimetres": 1e-3, "in centimetres": 1e-2, "10 times too small": 10.0,
-            "100 times too small": 100.0, "1000 times too small": 1000.0}  # fmt: skip
 
 
-def _readings() -> dict[str, _Reading]:
-    """Return all readings: of direction, axes, rotation and length, those first that change less."""
-    found: dict[int, dict[str, _Reading]] = {}
-    for names in itertools.product(_ROTATIONS, _DIRECTIONS, _AXES, _LENGTHS):
-        turn, direction, axes, length = names
-        if turn and (axes or (direction and turn == "with rotations by columns")):
-            continue
+class Reading(NamedTuple):
+    """What poses may be: what makes poses as :mod:`dsr.geometry.rigid_motion` has them of those."""
 
-        def reading(pose: Matrix, names: tuple[str, ...] = names) -> Matrix:
-            turn, direction, axes, length = names
-            changed = _ROTATIONS[turn](pose)
-            changed = np.block([[changed[:3, :3], _LENGTHS[length] * changed[:3, 3:]], [changed[3:]]])
-            return _DIRECTIONS[direction](changed) @ _AXES[axes]
+    direction: str = ""
+    turn: str = ""
+    axes: str = ""
+    length: str = ""
 
-        said = [name for name in (direction, turn, axes, length) if name]
-        found.setdefault(len(said), {})[", ".join(said)] = reading
-    return {name: reading for changes in sorted(found) for name, reading in found[changes].items()}
+    def __call__(self, pose: Matrix) -> Matrix:
+        """Return the pose that a pose is if it is read so."""
+        rotation = pose[:3, :3]
+        if self.turn == "with rotations by columns":
+            rotation = rotation.T
+        elif self.turn == "with quaternions w x y z":  # it was read as x y z w
+            w, x, y, z = quaternion_of(rotation)
+            rotation = rotation_of_quaternion((x, y, z, w))
+        changed = np.block([[rotation, _LENGTHS[self.length] * pose[:3, 3:]], [pose[3:]]])
+        return (invert(changed) if self.direction else changed) @ _AXES[self.axes]
+
+
+def _readings() -> dict[str, Reading]:
+    """Return all readings by name, those first that change less; "" is as given."""
+    found = []
+    for turn, direction, axes, length in itertools.product(_ROTATIONS, _DIRECTIONS, _AXES, _LENGTHS):
+        if not turn or not (axes or (direction and turn == "with rotations by columns")):
+            found.append(Reading(direction, turn, axes, length))
+    found.sort(key=lambda reading: sum(map(bool, reading)))
+    return {", ".join(filter(None, reading)): reading for reading in found}
 
 
 READINGS = _readings()
-"""By what the poses then are: what makes poses as :mod:`dsr.geometry.rigid_motion` has them of those; "" as given."""
 
-_WIDEST = 320
-"""Maps are reduced to at most as many pixels across, by leaving out pixels."""
-_ACROSS = 24
-"""Points across a map that are moved."""
-_GAPS = (0, 1, 3, 10, 30)
-"""Places of the frames of a group that are compared with each other, from its first one."""
-_GROUPS = 4
-"""Groups of frames of a sequence."""
-_TIE = 0.9
-"""Readings whose evidence is at least this much of the best one's cannot be distinguished from it."""
-_MOST_NAMES = 3
-"""Readings that a message names."""
+_WIDEST = 320  # maps are reduced to at most as many pixels across, by leaving out pixels
+_ACROSS = 24  # points across a map that are moved
+_GAPS = (0, 1, 3, 10, 30)  # places of the frames of a group that are compared with each other, from its first one
+_GROUPS = 4  # groups of frames of a sequence
+_TIE = 0.9  # readings whose evidence is at least this much of the best one's cannot be distinguished from it
+_MOST_NAMES = 3  # readings that a message names
+
+
+_TOLERANCE = 0.04  # difference of two depths over the farther one, up to which frames agree in a pixel
+_OVERLAP = 0.3  # share of a frame's points in another one's view, below which the two are not compared
+_EXPLAINED = 0.7  # share of the pixels in which frames have to agree under another reading
+_LEAST = 0.5  # pairs of frames that disagree wholly without motion; fewer distinguish nothing
+_ALIKE = 0.7  # share of the pixels in which frames that look alike agree without any motion
+_STILL = 1.2  # times as many pixels have to disagree under the poses as without any motion
 
 
 class Agreement(NamedTuple):
@@ -121,10 +110,7 @@ def sample(count: int) -> list[tuple[int, ...]]:
 def check(count: int, load: Callable[[int], PosedMap | None]) -> Assumption | None:
     """Compare some frames of a sequence with each other; see :func:`find_fault`.
 
-    Args:
-        count: number of frames.
-        load: returns the frame of a number; None for one that cannot be read, or has no pose.
-
+    ``load`` returns the frame of a number; None for one that cannot be read, or has no pose.
     """
     groups = ([prepare(each) for number in group if (each := load(number)) is not None] for group in sample(count))
     return find_fault(compare(groups))
@@ -177,7 +163,7 @@ def _compare(frame: Reduced, other: Reduced) -> tuple[np.ndarray, np.ndarray]:
     rows, columns = (np.rint(np.where(inside, each, 0)).astype(np.intp) for each in (v, u))
     seen = np.where(inside, frame.depth[rows, columns], np.nan)
     count = np.isfinite(seen).sum(1)
-    agreeing = np.abs(seen - z) <= LIMITS["poses.tolerance"].threshold * np.maximum(seen, z)
+    agreeing = np.abs(seen - z) <= _TOLERANCE * np.maximum(seen, z)
     return count / max(z.shape[1], 1), agreeing.sum(1) / np.maximum(count, 1)
 
 
@@ -186,17 +172,16 @@ def find_fault(agreement: Agreement) -> Assumption | None:
 
     A pair of frames counts as much as they disagree without motion.
     """
-    seen, agreed = agreement.overlap >= LIMITS["poses.overlap"].threshold, agreement.agreed
+    seen, agreed = agreement.overlap >= _OVERLAP, agreement.agreed
     without = agreed[:, -1:]
     given = np.where(seen[:, :1], agreed[:, :1], without)
     weight = seen * (1 - without)  # (pairs, readings + 1)
     total = weight.sum(0)
     means = [(weight * each).sum(0) / np.maximum(total, 1e-9) for each in (agreed, given, without)]
     gain = means[0] - np.maximum(means[1], means[2])
-    explained, least = LIMITS["poses.explained"].threshold, LIMITS["poses.weight"].threshold
-    evidence = np.where((means[0] >= explained) & (total >= least), total * gain, 0)[:-1]
+    evidence = np.where((means[0] >= _EXPLAINED) & (total >= _LEAST), total * gain, 0)[:-1]
     best = int(evidence.argmax())
-    if evidence[best] > 0 and gain[best] >= LIMITS["poses"].threshold:
+    if evidence[best] > 0 and gain[best] >= LIMITS["poses"]:
         names = list(READINGS)
         tied = [names[place] for place in np.flatnonzero(evidence >= _TIE * evidence[best])]
         simplest = [name for name in tied if name.count(",") == min(other.count(",") for other in tied)]
@@ -207,8 +192,8 @@ def find_fault(agreement: Agreement) -> Assumption | None:
             "poses",
             round(float(gain[best]), 3),
         )
-    alike = agreement.moved.size > 0 and float(np.median(without)) >= LIMITS["poses-far.alike"].threshold
-    if alike and agreement.moved.min() >= LIMITS["poses-far"].threshold:
+    alike = agreement.moved.size > 0 and float(np.median(without)) >= _ALIKE
+    if alike and agreement.moved.min() >= LIMITS["poses-far"]:
         nearest = float(agreement.moved.min())
         return Assumption(
             "under the poses the camera is far away in the next frame, which looks similar: are they in millimetres?",
@@ -217,7 +202,7 @@ def find_fault(agreement: Agreement) -> Assumption | None:
             round(nearest, 1),
         )
     wrong, still = (float((seen[:, 0] * (1 - agreed[:, k])).sum() / max(seen[:, 0].sum(), 1)) for k in (0, -1))
-    if wrong < LIMITS["poses-disagree"].threshold or wrong < LIMITS["poses-disagree.still"].threshold * still:
+    if wrong < LIMITS["poses-disagree"] or wrong < _STILL * still:
         return None
     return Assumption(
         "neighbouring frames do not agree under the poses",

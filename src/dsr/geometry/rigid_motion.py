@@ -13,20 +13,14 @@ from numpy.typing import NDArray
 
 Matrix = NDArray[np.float64]
 
+# largest deviation of the product of a rotation with its transpose from the identity: matrices of few decimals
 _TOLERANCE = 5e-3
-"""Largest deviation of the product of a rotation with its transpose from the identity: matrices of few decimals."""
 
 
 def as_rigid(values: Sequence[Sequence[float]] | np.ndarray, name: str) -> Matrix:
-    """Return a rigid transform as a 4 x 4 matrix whose rotation is orthonormal to rounding.
+    """Return a 3 x 4 or 4 x 4 transform as a 4 x 4 matrix whose rotation is orthonormal to rounding.
 
-    Args:
-        values: 3 x 4 or 4 x 4 numbers, the translation in the last column.
-        name: what the message begins with, such as the file that the numbers are from.
-
-    Raises:
-        ValueError: the numbers have another shape, are not finite, or are no rotation and translation.
-
+    Errors begin with ``name``, such as the file that the numbers are from.
     """
     try:
         if not isinstance(values, np.ndarray) and any(isinstance(each, bool | str) for row in values for each in row):
@@ -44,7 +38,18 @@ def as_rigid(values: Sequence[Sequence[float]] | np.ndarray, name: str) -> Matri
         columns = np.allclose(matrix[:, 3], (0, 0, 0, 1), atol=1e-6)
         hint = "; are rows and columns exchanged?" if columns else ""
         raise ValueError(f"{name}: expected 0 0 0 1 as the last row, got {_text(matrix[3])}{hint}")
-    return _with_rotation(matrix, name)
+    turn = matrix[:3, :3]
+    if not orthonormal_error(turn) <= _TOLERANCE:  # NaN is none either
+        lengths = [math.hypot(*row) for row in turn]
+        raise ValueError(
+            f"{name}: expected a rigid transform, got rows of length {_text(lengths)} that do not form one"
+        )
+    if np.linalg.det(turn) < 0:
+        raise ValueError(f"{name}: expected a rigid transform, got one that mirrors")
+    left, _, right = np.linalg.svd(turn)
+    rigid = np.eye(4)
+    rigid[:3, :3], rigid[:3, 3] = left @ right, matrix[:3, 3]
+    return rigid
 
 
 def orthonormal_error(turn: np.ndarray) -> float:
@@ -61,29 +66,8 @@ def is_rotation(turn: np.ndarray, tolerance: float) -> bool:
     return orthonormal_error(turn) <= tolerance and float(np.linalg.det(turn)) > 0
 
 
-def _with_rotation(matrix: Matrix, name: str) -> Matrix:
-    """Return the transform with the nearest rotation, after checking that it has one."""
-    turn = matrix[:3, :3]
-    if not orthonormal_error(turn) <= _TOLERANCE:  # NaN is none either
-        lengths = [math.hypot(*row) for row in turn]
-        raise ValueError(
-            f"{name}: expected a rigid transform, got rows of length {_text(lengths)} that do not form one"
-        )
-    if np.linalg.det(turn) < 0:
-        raise ValueError(f"{name}: expected a rigid transform, got one that mirrors")
-    left, _, right = np.linalg.svd(turn)
-    rigid = np.eye(4)
-    rigid[:3, :3], rigid[:3, 3] = left @ right, matrix[:3, 3]
-    return rigid
-
-
 def from_quaternion(translation: Sequence[float], quaternion: Sequence[float], name: str) -> Matrix:
-    """Return the transform of a translation in metres and a unit quaternion (x, y, z, w).
-
-    Raises:
-        ValueError: a number is not finite, or the quaternion's length is not 1 to within 1 %.
-
-    """
+    """Return the transform of a translation in metres and a unit quaternion (x, y, z, w)."""
     length = math.hypot(*quaternion)
     if not abs(length - 1) <= 0.01:
         raise ValueError(f"{name}: expected a quaternion of length 1, got {length:g}")
@@ -124,17 +108,7 @@ def invert(transform: Matrix) -> Matrix:
 
 
 def relative(pose: Matrix, to: Matrix) -> Matrix:
-    """Return the transform from the frame of the camera at ``pose`` to that of the camera at ``to``.
-
-    Example:
-        >>> import numpy as np
-        >>> from dsr.geometry.rigid_motion import relative
-        >>> aside = np.eye(4)
-        >>> aside[0, 3] = 0.5
-        >>> relative(np.eye(4), aside)[:3, 3]  # half a metre to its left
-        array([-0.5,  0. ,  0. ])
-
-    """
+    """Return the transform from the frame of the camera at ``pose`` to that of the camera at ``to``."""
     return invert(to) @ pose
 
 

@@ -12,74 +12,38 @@ from torch.nn import functional
 from dsr.geometry.lights import LIGHT_NAMES, LIGHTS, VIEWING_LIGHT
 from dsr.geometry.surface import depth_to_normals
 
-_SHORTEST, _LONGEST = 128, 256
-"""The longer side of a panel is at least and at most so long, pixels."""
-_LABEL = 16
-"""Height of the line above a panel, pixels."""
+_SHORTEST, _LONGEST = 128, 256  # the longer side of a panel is at least and at most so long, pixels
+_LABEL = 16  # height of the line above a panel, pixels
 
 
 def lights(*, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Tensor:
     """Return the paper's lights e1..e4 in the camera frame, (4, 3) unit vectors that point from surface to light.
 
     e1, e2, e3 are orthonormal, so renderings under them are the normal map in another basis; e4 is frontal.
-
-    Example:
-        >>> from dsr.geometry.shading import lights
-        >>> (lights() @ lights().T).round(decimals=2)[:3, :3]  # e1 to e3 are orthonormal
-        tensor([[1., 0., 0.],
-                [0., 1., 0.],
-                [0., 0., 1.]], dtype=torch.float64)
-
     """
     return torch.tensor([light.direction for light in LIGHTS.values()], dtype=dtype, device=device)
 
 
 def shade(normals: Tensor, directions: Tensor) -> Tensor:
-    """Return the unclipped Lambertian shading e . n.
-
-    Args:
-        normals: (B, 3, H, W) unit vectors.
-        directions: (L, 3) unit vectors towards the lights.
-
-    Returns:
-        (B, L, H, W) in [-1, 1].
-
-    """
+    """Return the unclipped Lambertian shading e . n in [-1, 1], (B, L, H, W), for (L, 3) unit vectors to lights."""
     return torch.einsum("lc,bchw->blhw", directions, normals)
 
 
 def render(normals: Tensor) -> Tensor:
-    """Return the renderings clip(e . n, 0, 1) under the four lights, (B, 4, H, W) in [0, 1].
-
-    Example:
-        >>> import torch
-        >>> from dsr.geometry.shading import render
-        >>> facing = torch.tensor([0.0, 0.0, -1.0]).view(1, 3, 1, 1)
-        >>> render(facing).flatten().round(decimals=2)
-        tensor([0.5800, 0.5800, 0.5800, 1.0000])
-
-    """
+    """Return the renderings clip(e . n, 0, 1) under the four lights, (B, 4, H, W) in [0, 1]."""
     return shade(normals, lights(dtype=normals.dtype, device=normals.device)).clamp(0, 1)
 
 
+# brightness of a surface that faces away from the light and of one that faces it, and the exponent between them
 VIEWING_TONES = (0.06, 0.9, 1.25)
-"""Brightness of a surface that faces away from the light and of one that faces it, and the exponent between them."""
 
 
 def render_for_viewing(normals: Tensor) -> Tensor:
-    """Return a rendering in which no direction of the surface is clipped: floors, walls and ceilings all keep tone.
+    """Return a rendering, (B, 1, H, W) in (0, 1), in which no direction is clipped: floors and ceilings keep tone.
 
-    Clipped Lambertian shading is white or black over whole floors, side walls and ceilings, so that their relief cannot
-    be seen. Here the cosine to the light is mapped to a brightness over its whole range from -1 to 1, as in the "half
-    Lambert" shading of Mitchell et al., "Shading in Valve's Source Engine", SIGGRAPH 2006 course. It is for pictures
-    alone; metrics and the renderings e1 to e4 use :func:`render`.
-
-    Args:
-        normals: (B, 3, H, W) unit vectors.
-
-    Returns:
-        (B, 1, H, W) in (0, 1), NaN where the normal is.
-
+    The cosine to the light is mapped to a brightness over its whole range from -1 to 1, as in the "half Lambert"
+    shading of Mitchell et al., "Shading in Valve's Source Engine", SIGGRAPH 2006 course. It is for pictures alone;
+    metrics and the renderings e1 to e4 use :func:`render`.
     """
     low, high, exponent = VIEWING_TONES
     cosine = shade(normals, torch.tensor([VIEWING_LIGHT], dtype=normals.dtype, device=normals.device))
@@ -87,22 +51,12 @@ def render_for_viewing(normals: Tensor) -> Tensor:
 
 
 def comparison(depth: Tensor, truth: Tensor | None, rays: Tensor, rgb: Tensor, depth_lr: Tensor) -> Tensor:
-    """Return labelled panels of a result, its input and the true depth; holes are black.
+    """Return labelled panels of a result, its input and the true depth, (3, H', W') uint8; holes are black.
 
     The first row has the photo, the input, the result and the truth, in the grey levels of the truth's range of depth
     (near is bright); below it are the renderings under the four lights e1 .. e4, a column each: those of the result, of
-    the truth, and twice their difference.
-
-    Args:
-        depth: (1, 1, H, W) in metres.
-        truth: true depth, (1, 1, H, W) in metres, or None: there are only the photo, the input and the result.
-        rays: (1, 3, H, W), see :meth:`dsr.geometry.camera.Camera.rays`.
-        rgb: the photo, (1, 3, H, W) in [0, 1].
-        depth_lr: the input, (1, 1, h, w) in metres.
-
-    Returns:
-        (3, rows x panel height, 4 x panel width) uint8; the longer side of a panel has 128 to 256 pixels.
-
+    the truth, and twice their difference. Without a truth there are only the photo, the input and the result. Depth is
+    (1, 1, h, w) in metres, the photo (1, 3, H, W) in [0, 1].
     """
     size = depth.shape[-2:]
     shown = depth if truth is None else truth

@@ -7,58 +7,24 @@ from torch import Tensor
 
 
 def back_project(depth: Tensor, rays: Tensor) -> Tensor:
-    """Back-project depth: P = z r.
-
-    Args:
-        depth: (B, 1, H, W) orthogonal depth in metres.
-        rays: (B or 1, 3, H, W) rays with z = 1, see :meth:`dsr.geometry.camera.Camera.rays`.
-
-    Returns:
-        (B, 3, H, W) points in metres; x right, y down, z forward.
-
-    Example:
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.geometry.surface import back_project
-        >>> camera = dsr.Camera.from_fov(60, width=64, height=48)
-        >>> back_project(torch.full((1, 1, 48, 64), 2.0), camera.rays()[None]).shape
-        torch.Size([1, 3, 48, 64])
-
-    """
+    """Back-project depth, (B, 1, H, W) metres, along rays with z = 1: the points P = z r, (B, 3, H, W)."""
     return depth * rays
 
 
 def depth_to_normals(depth: Tensor, rays: Tensor, dtype: torch.dtype | None = None) -> Tensor:
-    """Return the unit normals of the surface, facing the camera (n . r < 0).
+    """Return the unit normals of the surface, (B, 3, H, W), facing the camera (n . r < 0).
 
-    First-order forward differences along u and v, the last column's and row's differences repeated:
-    n = dP/dv x dP/du, normalised (Voynov et al. 2019, section 3, with the border as its authors evaluate it).
+    First-order forward differences along u and v, the last column's and row's differences repeated: n = dP/dv x dP/du,
+    normalised (Voynov et al. 2019, section 3, with the border as its authors evaluate it).
 
-    For a pinhole camera the product is known in closed form. With z' and z'' the depths of the neighbours along u and
-    v it is, up to a positive factor, n = (fx (z' - z) z'', fy (z'' - z) z', -z' z'' - x n_x - y n_y), as
-    n . r = -z' z''. Unlike differences of points, this cancels digits only in z' - z.
+    For a pinhole camera the product is known in closed form. With z' and z'' the depths of the neighbours along u and v
+    it is, up to a positive factor, n = (fx (z' - z) z'', fy (z'' - z) z', -z' z'' - x n_x - y n_y), as n . r = -z' z''.
+    Unlike differences of points, this cancels digits only in z' - z.
 
     Args:
-        depth: (B, 1, H, W) orthogonal depth in metres, H and W at least 2. Where it is NaN
-            so are the normals that need it.
+        depth: (B, 1, H, W) orthogonal depth in metres, at least 2 x 2. Normals that need a NaN are NaN.
         rays: (B or 1, 3, H, W) rays of a pinhole camera with z = 1.
         dtype: of the result, None for the depth's. Differences, where digits cancel, are taken in the depth's dtype.
-
-    Returns:
-        (B, 3, H, W) unit vectors in the camera frame.
-
-    Raises:
-        ValueError: the map is less than 2 pixels high or wide.
-
-    Example:
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.geometry.surface import depth_to_normals
-        >>> camera = dsr.Camera.from_fov(60, width=64, height=48)
-        >>> normals = depth_to_normals(torch.full((1, 1, 48, 64), 2.0), camera.rays(dtype=torch.float32)[None])
-        >>> normals[0, :, 24, 32] + 0  # a wall faces the camera
-        tensor([ 0.,  0., -1.])
-
     """
     if min(depth.shape[-2:]) < 2:
         raise ValueError(f"normals: expected a map of at least 2 x 2 pixels, got {tuple(depth.shape[-2:])}")
@@ -96,15 +62,7 @@ def angle_between(first: Tensor, second: Tensor) -> Tensor:
 
 
 def normal_mask(mask: Tensor) -> Tensor:
-    """Return the valid mask of normals: a normal needs its pixel and the two that its differences use.
-
-    Args:
-        mask: (B, 1, H, W) bool, the valid mask of depth.
-
-    Returns:
-        (B, 1, H, W) bool.
-
-    """
+    """Return the mask of normals of a mask of depth, (B, 1, H, W): each needs its pixel and two neighbours."""
     along_u = _repeat_last(mask[..., :, 1:] & mask[..., :, :-1], dim=-1)
     along_v = _repeat_last(mask[..., 1:, :] & mask[..., :-1, :], dim=-2)
     return along_u & along_v

@@ -19,18 +19,14 @@ from skimage.measure import marching_cubes
 from dsr.geometry.camera import Camera
 from dsr.geometry.rigid_motion import Matrix, invert
 
+# largest change of the distance within a cell, in units of the truncation; at a surface it is at most 0.43
 _STEEPEST = 0.9
-"""Largest change of the distance within a cell, in units of the truncation; at a surface it is at most 0.43."""
-_SIDE = 8
-"""Voxels along a side of a block."""
-_TRUNCATION = 4.0
-"""Distance from the surface, in voxels, beyond which it does not count."""
-MOST_BLOCKS = 120_000
-"""Blocks that are stored, 8 KiB each."""
+_SIDE = 8  # voxels along a side of a block
+_TRUNCATION = 4.0  # distance from the surface, in voxels, beyond which it does not count
+MOST_BLOCKS = 120_000  # blocks that are stored, 8 KiB each
+# largest extent of the surfaces in blocks of one layer, 2.3 KiB each, whether they are stored or not
 _LARGEST_LAYER = 65_536
-"""Largest extent of the surfaces in blocks of one layer, 2.3 KiB each, whether they are stored or not."""
-_AT_ONCE = 2048
-"""Blocks that are updated at a time."""
+_AT_ONCE = 2048  # blocks that are updated at a time
 
 
 class PosedMap(NamedTuple):
@@ -55,25 +51,9 @@ class FusedMesh(NamedTuple):
 
 
 def fuse_maps(maps: Callable[[], Iterable[PosedMap]], voxel: float) -> FusedMesh:
-    """Return the surface on which depth maps agree.
+    """Return the surface on which depth maps agree, in voxels of an edge length in metres.
 
-    Args:
-        maps: yields the maps; it is called twice, and one map is held at a time.
-        voxel: edge length of a voxel in metres.
-
-    Raises:
-        ValueError: the voxels are too small for the space that the maps see, or no surface is left.
-
-    Example:
-        >>> import numpy as np
-        >>> import dsr
-        >>> from dsr.geometry.tsdf import PosedMap, fuse_maps
-        >>> camera = dsr.Camera.from_fov(60, width=64, height=48)
-        >>> wall = PosedMap(np.full((48, 64), 2.0), camera, np.eye(4))
-        >>> mesh = fuse_maps(lambda: [wall, wall], voxel=0.05)
-        >>> bool(abs(mesh.vertices[:, 2] - 2.0).max() < 1e-3)
-        True
-
+    ``maps`` yields the maps; it is called twice, and one map is held at a time.
     """
     if not 0 < voxel < np.inf:
         raise ValueError(f"voxel: expected a positive number of metres, got {voxel}")
@@ -95,12 +75,7 @@ def fuse_maps(maps: Callable[[], Iterable[PosedMap]], voxel: float) -> FusedMesh
 
 
 def suggest_voxel(maps: Iterable[PosedMap]) -> float:
-    """Return a voxel's edge length: the median width of a pixel on the surfaces, in metres.
-
-    Raises:
-        ValueError: there is no valid pixel.
-
-    """
+    """Return a voxel's edge length: the median width of a pixel on the surfaces, in metres."""
     widths = [float(np.nanmedian(each.depth)) / each.camera.fx for each in maps if np.isfinite(each.depth).any()]
     if not widths:
         raise ValueError("expected depth maps with at least one known pixel, all are holes")
@@ -109,33 +84,25 @@ def suggest_voxel(maps: Iterable[PosedMap]) -> float:
 
 def _touched_blocks(maps: Iterable[PosedMap], voxel: float) -> NDArray[np.int64]:
     """Return the blocks within the truncation distance of a surface, (N, 3) in units of a block, sorted by z."""
-    found = np.empty((0, 3), np.int64)
+    reach, found = _TRUNCATION * voxel, np.empty((0, 3), np.int64)
+    corners = np.stack(np.meshgrid((-1, 1), (-1, 1), (-1, 1)), axis=-1).reshape(-1, 3)
     for each in maps:
-        points = _points(each)
-        reach = _TRUNCATION * voxel
-        own = [np.floor((points + reach * corner) / (voxel * _SIDE)).astype(np.int64) for corner in _CORNERS]
+        points = (each.depth * each.camera.rays().numpy()).reshape(3, -1)
+        points = points[:, np.isfinite(points[2])]
+        points = (each.pose[:3, :3] @ points + each.pose[:3, 3:]).T  # in the world's frame
+        own = [np.floor((points + reach * corner) / (voxel * _SIDE)).astype(np.int64) for corner in corners]
         found = np.unique(np.concatenate((found, *(np.unique(part, axis=0) for part in own))), axis=0)
         if len(found) > 8 * MOST_BLOCKS:
             break  # far too many already
     return found[np.argsort(found[:, 2], kind="stable")]
 
 
-_CORNERS = np.stack(np.meshgrid((-1, 1), (-1, 1), (-1, 1)), axis=-1).reshape(-1, 3)
-
-
-def _points(each: PosedMap) -> np.ndarray:
-    """Return the points of a map in the world's frame, (N, 3)."""
-    rays = each.camera.rays().numpy()
-    points = (each.depth * rays).reshape(3, -1)
-    points = points[:, np.isfinite(points[2])]
-    return (each.pose[:3, :3] @ points + each.pose[:3, 3:]).T
-
-
 def _integrate(
     each: PosedMap, blocks: NDArray[np.int64], voxel: float, distance: np.ndarray, weight: np.ndarray
 ) -> None:
     """Average the distances of voxels to the surface of a map into ``distance``, in units of the truncation."""
-    world = voxel * _voxels(blocks)
+    inner = np.stack(np.meshgrid(*(np.arange(_SIDE),) * 3, indexing="ij")).reshape(3, 1, -1)  # z changes fastest
+    world = voxel * (_SIDE * blocks.T[:, :, None] + inner).reshape(3, -1).astype(np.float64)
     to_camera = invert(each.pose)
     x, y, z = to_camera[:3, :3] @ world + to_camera[:3, 3:]
     camera = each.camera
@@ -153,12 +120,6 @@ def _integrate(
     total = flat_weight[places] + certain
     flat_distance[places] += (certain / total * (gap - flat_distance[places])).astype(np.float32)
     flat_weight[places] = total
-
-
-def _voxels(blocks: NDArray[np.int64]) -> np.ndarray:
-    """Return the voxels of blocks, (3, N * 512), in units of a voxel; z changes fastest within a block."""
-    inner = np.stack(np.meshgrid(*(np.arange(_SIDE),) * 3, indexing="ij")).reshape(3, 1, -1)
-    return (_SIDE * blocks.T[:, :, None] + inner).reshape(3, -1).astype(np.float64)
 
 
 def _extract(blocks: NDArray[np.int64], distance: np.ndarray, weight: np.ndarray, voxel: float) -> FusedMesh:
@@ -184,7 +145,12 @@ def _extract(blocks: NDArray[np.int64], distance: np.ndarray, weight: np.ndarray
             count += len(places)
     if not vertices:
         raise ValueError("expected depth maps that show a surface, got none that voxels of this size can hold")
-    return _merged(np.concatenate(vertices), np.concatenate(normals), np.concatenate(faces), voxel)
+    every = np.concatenate(vertices)
+    keys = np.rint(every / (1e-4 * voxel)).astype(np.int64)  # vertices at the same place are joined
+    _, first, place = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    joined = place.reshape(-1)[np.concatenate(faces)]
+    a, b, c = joined.T
+    return FusedMesh(every[first], np.concatenate(normals)[first], joined[(a != b) & (b != c) & (c != a)])
 
 
 def _march(volume: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
@@ -213,12 +179,3 @@ def _march(volume: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray] | No
     renumbered = np.full(len(places), -1)
     renumbered[used] = np.arange(len(used))
     return places[used].astype(np.float64), -normals[used].astype(np.float64), renumbered[faces[:, ::-1]]
-
-
-def _merged(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray, voxel: float) -> FusedMesh:
-    """Return the mesh with vertices at the same place joined, and without triangles that thereby collapse."""
-    keys = np.rint(vertices / (1e-4 * voxel)).astype(np.int64)
-    _, first, number = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    faces = number.reshape(-1)[faces]
-    whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    return FusedMesh(vertices[first], normals[first], faces[whole])

@@ -16,16 +16,12 @@ from torch import Tensor
 
 from dsr.geometry.camera import Camera
 
+# change of inverse depth between neighbours, beyond the slopes on both sides, that is a step; relative to it
 STEP = 0.03
-"""Change of inverse depth between neighbours, beyond the slopes on both sides, that is a step; relative to it."""
-_NEAREST = 1e-3
-"""Nearest depth in metres that the other camera sees."""
-_RIM = 0.02
-"""Relative difference of depth from which a pixel's square may hide a triangle."""
-_INSIDE = -1e-6
-"""Smallest barycentric coordinate inside a triangle: neighbouring triangles leave no gap."""
-_FRAGMENTS = 1 << 21
-"""Pairs of triangle and pixel that are rasterised at a time."""
+_NEAREST = 1e-3  # nearest depth in metres that the other camera sees
+_RIM = 0.02  # relative difference of depth from which a pixel's square may hide a triangle
+_INSIDE = -1e-6  # smallest barycentric coordinate inside a triangle: neighbouring triangles leave no gap
+_FRAGMENTS = 1 << 21  # pairs of triangle and pixel that are rasterised at a time
 
 
 class _Corners(NamedTuple):
@@ -41,31 +37,10 @@ class _Corners(NamedTuple):
 
 
 def warp_depth(depth: Tensor, camera: Camera, transforms: Tensor, target: Camera) -> Tensor:
-    """Return depth maps as another camera sees their surfaces.
+    """Return depth maps, (B, 1, h, w) metres, NaN in holes, as another camera sees their surfaces, (B, 1, H, W).
 
-    Args:
-        depth: (B, 1, h, w) orthogonal depth in metres, NaN in holes.
-        camera: camera of these maps.
-        transforms: (B or 1, 4, 4) rigid transforms from the frame of ``camera`` to that of ``target``, metres.
-        target: the other camera.
-
-    Returns:
-        (B, 1, H, W) orthogonal depth of the nearest surface at each pixel centre of ``target``, in the dtype of
-        ``depth``; NaN where the maps have no surface.
-
-    Raises:
-        ValueError: a shape is not as above.
-
-    Example:
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.geometry.warping import warp_depth
-        >>> camera = dsr.Camera.from_fov(60, width=64, height=48)
-        >>> back = torch.eye(4, dtype=torch.float64)[None]
-        >>> back[:, 2, 3] = 1.0  # what is at 2 m is at 3 m for a camera 1 m behind
-        >>> float(warp_depth(torch.full((1, 1, 48, 64), 2.0), camera, back, camera).nanmedian())
-        3.0
-
+    The transforms, (B or 1, 4, 4) in metres, are rigid, from the frame of ``camera`` to that of ``target``. The result
+    is the nearest surface at each pixel centre, NaN without one, in the dtype of ``depth``.
     """
     batch, size = depth.shape[0], (camera.height, camera.width)
     if min(size) < 2:
@@ -87,17 +62,9 @@ def warp_depth(depth: Tensor, camera: Camera, transforms: Tensor, target: Camera
 
 
 def source_pixels(depth: Tensor, camera: Camera, transforms: Tensor, target: Camera) -> tuple[Tensor, Tensor]:
-    """Return where the pixels of a warped map come from.
+    """Return where the pixels of a map of :func:`warp_depth` come from.
 
-    Args:
-        depth: (B, 1, H, W) of :func:`warp_depth`.
-        camera: camera of the maps that were warped.
-        transforms: (B or 1, 4, 4) transforms from the frame of ``camera`` to that of ``target``, metres.
-        target: camera of ``depth``.
-
-    Returns:
-        Columns and rows in pixels of ``camera``, (B, H, W) float64, NaN in holes.
-
+    They are columns and rows in pixels of ``camera``, (B, H, W) float64 each, NaN in holes.
     """
     inverse = torch.linalg.inv(transforms.double())
     points = depth.double() * target.rays(device=depth.device)  # (B, 3, H, W)
@@ -111,14 +78,7 @@ def source_pixels(depth: Tensor, camera: Camera, transforms: Tensor, target: Cam
 def registered_camera(camera: Camera, photo: Camera) -> Camera:
     """Return the camera of a low-resolution map in a photo's view that keeps what another camera's map shows.
 
-    Args:
-        camera: camera of the map to be warped.
-        photo: camera of the photo.
-
-    Returns:
-        Camera with the photo's field of view whose pixels are as fine as those of ``camera``, or as the photo's where
-        these are coarser.
-
+    It has the photo's field of view, and pixels as fine as those of ``camera``, or as the photo's if these are coarser.
     """
     scale = min(max(camera.fx / photo.fx, camera.fy / photo.fy), 1.0)
     return photo.rescale(max(round(scale * photo.width), 2), max(round(scale * photo.height), 2))

@@ -10,13 +10,7 @@ from torch.nn import functional
 
 
 def window_maxima(values: Tensor, reach: int) -> Tensor:
-    """Return the largest values within some rows and columns of each pixel, (1, h, w).
-
-    Args:
-        values: (1, h, w), without NaN.
-        reach: rows and columns to each side.
-
-    """
+    """Return the largest values within ``reach`` rows and columns of each pixel, (1, h, w), without NaN."""
     result = functional.pad(values, (reach,) * 4, value=-math.inf)
     for dim in (-2, -1):
         size = 1

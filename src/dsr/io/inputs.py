@@ -453,7 +453,7 @@ def _to_photo(
         verdict, better = (judge(each[0].double().numpy(), rgb, zooms=()) for each in (warped, other))
         if verdict is not None and better is not None and better.contours:
             gain = better.as_given.significance - max(verdict.as_given.significance, 0)
-            if gain >= LIMITS["extrinsics-inverse"].threshold:
+            if gain >= LIMITS["extrinsics-inverse"]:
                 text = "--extrinsics: the photo's edges fit better with the inverse matrix"
                 detail = f"{better.figures}; expected the transform from the depth camera's frame to the photo camera's"
                 doubts.append(Assumption(text, detail, "extrinsics-inverse", gain))

@@ -22,7 +22,7 @@ from dsr.utils.lengths import show_length
 
 TURNED_BACK = f"bits are turned back by {SUNRGBD_BITS}, as SUN RGB-D turns them: millimetres, also in the result"
 _OVERRIDE = "--depth-unit overrides it"
-_MIN_MEDIAN, _MAX_MEDIAN = (LIMITS[f"far-millimetres.{end}"].threshold for end in ("least", "most"))
+_MIN_MEDIAN, _MAX_MEDIAN = (LIMITS[f"far-millimetres.{end}"] for end in ("least", "most"))
 """Range of plausible medians in metres; a unit that gives another median is not assumed."""
 _OTHER_UNITS = ((1e-4, "0.1 mm"), (1e-6, "micrometres"), (1e-2, "centimetres"))
 """Units of whole numbers that cannot be millimetres, the most likely first."""
@@ -225,8 +225,8 @@ def _by_steps(clues: _Clues) -> Meaning | None:
     for step, name, unit in ((5, "1/5000", 1 / 5000), (10, "0.0001", 1e-4)):
         if not clues.multiples(step):
             continue
-        nearest = LIMITS[f"far-millimetres.{step}"].threshold
-        fine, coarse = nearest <= clues.middle * unit, clues.middle * 1e-3 <= LIMITS["far-millimetres"].threshold
+        nearest = LIMITS[f"far-millimetres.{step}"]
+        fine, coarse = nearest <= clues.middle * unit, clues.middle * 1e-3 <= LIMITS["far-millimetres"]
         why = f"values are multiples of {step}, as of millimetres stored in {name} m"
         if fine and not coarse:
             return Meaning(unit, (_whole(clues, f"{name} m", unit, why),))
@@ -245,14 +245,14 @@ def _by_median(clues: _Clues) -> Meaning:
     middle = clues.middle
     if _MIN_MEDIAN <= middle * 1e-3 <= _MAX_MEDIAN:
         others = "TUM RGB-D and ICL-NUIM store 1/5000 m"
-        if clues.conclusive and middle * 1e-3 > LIMITS["far-millimetres"].threshold:
+        if clues.conclusive and middle * 1e-3 > LIMITS["far-millimetres"]:
             why = f"as millimetres that is far for a depth camera; {others}"
             clues.ask(why, ("mm", 1e-3), ("1/5000", 1 / 5000))
         found = [Assumption("whole numbers are read as millimetres", f"median {clues.metres(1e-3)}")]
-        if middle * 1e-3 > LIMITS["far-metres"].threshold:
+        if middle * 1e-3 > LIMITS["far-metres"]:
             found.append(Assumption(f"that is far for a sensor: {others} (--depth-unit), SUN RGB-D sunrgbd"))
         near = float(np.percentile(clues.known, 99)) * 1e-3
-        if clues.conclusive and near < LIMITS["near-millimetres"].threshold:
+        if clues.conclusive and near < LIMITS["near-millimetres"]:
             text = "everything is near if whole numbers are millimetres: are they centimetres? --depth-unit mm or cm"
             found.append(Assumption(text, f"99 % within {show_length(near, 2)}", "near-millimetres", near))
         if clues.sparse and not clues.compact:
@@ -279,7 +279,7 @@ def _interpret_floats(clues: _Clues) -> Meaning:
         _expect_one_reading(clues)
     whole = clues.conclusive and bool((clues.known == np.round(clues.known)).all())
     sure = "float-millimetres.whole" if whole or not clues.conclusive else "float-millimetres"
-    if middle > LIMITS[sure].threshold:
+    if middle > LIMITS[sure]:
         return Meaning(1e-3, (Assumption("floats this large are read as millimetres", f"median {middle:.4g}"),))
     found = [Assumption("floats are read as metres", f"median {clues.metres(1.0)}")]
     if middle < _MIN_MEDIAN:
@@ -320,15 +320,15 @@ def _expect_one_reading(clues: _Clues) -> None:
     middle = clues.middle
     whole = bool((clues.known == np.round(clues.known)).all())
     likely_pixels = clues.may_fall and clues.votes.verdict != "rises" and not clues.scattered
-    if LIMITS["far-metres"].threshold < middle <= LIMITS["far-floats"].threshold and likely_pixels:
+    if LIMITS["far-metres"] < middle <= LIMITS["far-floats"] and likely_pixels:
         raise ValueError(
             f"{clues.name}: expected --depth-unit m (median {clues.metres(1.0)}), or --range-type disparity with "
             "--baseline METRES: floats of this size are as often pixels as metres, and there are too few planes to tell"
         )
-    least = LIMITS["float-millimetres.whole"].threshold
-    if LIMITS["far-floats"].threshold < middle <= least and not clues.scattered:
+    least = LIMITS["float-millimetres.whole"]
+    if LIMITS["far-floats"] < middle <= least and not clues.scattered:
         clues.ask("floats of this size are as often centimetres as metres", ("cm", 1e-2), ("m", 1.0))
-    if least < middle <= LIMITS["float-millimetres"].threshold and not whole:
+    if least < middle <= LIMITS["float-millimetres"] and not whole:
         clues.ask("floats of this size are as often centimetres as millimetres", ("cm", 1e-2), ("mm", 1e-3))
 
 

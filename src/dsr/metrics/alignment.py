@@ -29,29 +29,17 @@ ALIGNMENTS = {
     "affine": "by scale and shift of depth, least squares",
     "affine_disparity": "by scale and shift of inverse depth, least squares",
     "robust": "by scale and shift of depth, least absolute relative errors",
-}
-"""What each alignment does, for notes."""
-LEAST = 1e-4
-"""Metres or 1 / metres: smallest value that a shift may leave."""
+}  # what each alignment does, for notes
+LEAST = 1e-4  # metres or 1 / metres: smallest value that a shift may leave
+# of the reweighted least squares: steps, and the relative error from which on weights stay finite
 _ITERATIONS, _SMALLEST_ERROR = 50, 1e-6
-"""Of the reweighted least squares: steps, and the relative error from which on weights stay finite."""
 
 
 def align(prediction: Tensor, target: Tensor, mask: Tensor | None, how: str) -> Tensor:
-    """Return each image's prediction aligned to its truth; no gradients are meant to pass.
+    """Return each image's prediction aligned to its truth, (B, 1, H, W); no gradients are meant to pass.
 
-    Args:
-        prediction, target: (B, 1, H, W) orthogonal depth in metres, the prediction's up to the alignment; NaN is a
-            hole, and so is a depth that is not positive.
-        mask: (B, 1, H, W) bool, the pixels to fit; None for all. Only those with both depths count.
-        how: one of :data:`ALIGNMENTS`.
-
-    Returns:
-        (B, 1, H, W) in the prediction's dtype; its holes are as they were. NaN for an image without a pixel to fit.
-
-    Raises:
-        ValueError: there is no such alignment, or the shapes differ.
-
+    Both are orthogonal depth in metres, the prediction's up to the alignment; NaN is a hole, and so is a depth that is
+    not positive. Only pixels of the mask with both depths count. Holes stay; NaN for an image without a pixel to fit.
     """
     if how not in ALIGNMENTS:
         raise ValueError(f"alignment: expected one of {', '.join(ALIGNMENTS)}, got {how!r}")
@@ -77,17 +65,7 @@ def align(prediction: Tensor, target: Tensor, mask: Tensor | None, how: str) -> 
 
 
 def align_map(depth: Tensor, truth: Tensor | None, how: str) -> Tensor:
-    """Return a prediction, (1, H, W), aligned to its truth, see :func:`align`; as it is where there is none.
-
-    Example:
-        >>> import torch
-        >>> from dsr.metrics.alignment import align_map
-        >>> truth = 1 + torch.rand((1, 24, 32), generator=torch.Generator().manual_seed(0))
-        >>> found = align_map(3 * truth, truth, "scale")
-        >>> bool((found - truth).abs().max() < 1e-5)
-        True
-
-    """
+    """Return a prediction, (1, H, W), aligned to its truth, see :func:`align`; as it is where there is none."""
     return depth if truth is None else align(depth[None], truth[None], None, how)[0]
 
 
@@ -97,12 +75,6 @@ def align_errors(
     """Return the expected errors of depth and normals of an aligned prediction.
 
     A scale multiplies those of depth and leaves those of normals; what a shift makes of them is not known.
-
-    Args:
-        errors: those of ``depth``, of its shape; None without any.
-        depth, aligned: the prediction before and after its alignment.
-        how: the alignment, one of :data:`ALIGNMENTS`.
-
     """
     if errors is None or how == "none":
         return errors

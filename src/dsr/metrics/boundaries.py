@@ -6,7 +6,7 @@ of the same two pixels is above the same threshold. This is scale-invariant and 
 - Depth Pro (Bochkovskii et al., *Depth Pro: Sharp Monocular Metric Depth in Less Than a Second*, ICLR 2025; apple/
   ml-depth-pro 9efe5c1, ``src/depth_pro/eval/boundary_metrics.py``): neighbours in a row or column, thresholds 1.05 to
   1.25; precision and recall are means over four directions, and a direction without edges counts 0. So a truth may have
-  less than 1 against itself, which is the ceiling beside it. Its recall for mattes thins the predicted edges.
+  less than 1 against itself, which is the ceiling beside it.
 - MoGe (Wang et al., *MoGe-2*, 2025; microsoft/MoGe 0744441, ``moge/test/metrics.py``): pixels up to a radius
   apart in any direction, counted together, a border of the radius left out. Its code has the names of precision and
   recall the wrong way round, which F1 does not see, and weights thresholds by 0.05 to 0.25 where Depth Pro has 1.05 to
@@ -23,6 +23,8 @@ pixels that have a prediction, ``Boundary_covered``, belongs to every score.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -31,28 +33,22 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from dsr.metrics.depth import covered
-from dsr.metrics.formats import BEFORE_THE_PAPER, MetricFormat
-from dsr.metrics.functional import SurfacePair, masked_mean, masked_median
+from dsr.metrics.formats import BEFORE_THE_PAPER, MetricFormat, column
+from dsr.metrics.functional import SurfacePair, masked_mean, masked_median, once_per_pair
 from dsr.metrics.metric import Metric, depth_mask, target_mask
 from dsr.utils.compute_device import in_own_precision
 
+# Depth Pro's thresholds, which are their own weights; MoGe's weights are 1 less
 RATIOS = tuple(np.linspace(1.05, 1.25, 10).tolist())
-"""Depth Pro's thresholds, which are their own weights; MoGe's weights are 1 less."""
-MOGE_RADII = (1, 2, 3)
-DBE_RANGE = 10.0
-"""Pixels; predicted boundaries further from a true one are no boundaries of it."""
-DDE_PLANE = 3.0
-"""Metres from the camera to the plane that the directed depth error is about."""
-EDGES = "edges"
-"""The region with annotated depth boundaries, see :class:`dsr.sample.Scene`; a band about outlines is none."""
-_BAND = 5
-"""Width and height in pixels of squares that a band has and lines have not."""
-PLANES = "planes"
-"""The region with numbered planes, see :class:`dsr.sample.Scene`."""
-PLANE_SHARE = 0.05
-"""Smaller planes, as a fraction of the image, have no planarity error."""
+DBE_RANGE = 10.0  # pixels; predicted boundaries further from a true one are no boundaries of it
+DDE_PLANE = 3.0  # metres from the camera to the plane that the directed depth error is about
+EDGES = "edges"  # the region with annotated depth boundaries, see `dsr.sample.Scene`; a band about outlines is none
+_BAND = 5  # width and height in pixels of squares that a band has and lines have not
+PLANES = "planes"  # the region with numbered planes, see `dsr.sample.Scene`
+PLANE_SHARE = 0.05  # smaller planes, as a fraction of the image, have no planarity error
 
 
+@once_per_pair
 def known_maps(pair: SurfacePair) -> tuple[Tensor, Tensor]:
     """Return the prediction and the truth with NaN where the truth is unknown, and in holes, (B, 1, H, W) each."""
     prediction, target = pair.given
@@ -60,14 +56,9 @@ def known_maps(pair: SurfacePair) -> tuple[Tensor, Tensor]:
 
 
 def count_edges(first: Tensor, second: Tensor) -> Tensor:
-    """Return how many ratios are above each of :data:`RATIOS`.
+    """Return how many ratios are above each of :data:`RATIOS`, (B, 3, T): in the first map, in the second, in both.
 
-    Args:
-        first, second: (B, ...) ratios of the same pairs of pixels in two maps; NaN is below.
-
-    Returns:
-        (B, 3, T) int64: in the first map, in the second, in both.
-
+    The two (B, ...) are ratios of the same pairs of pixels in two maps; NaN is below.
     """
     images, steps = len(first), len(RATIOS) + 1
     first, second = first.flatten(1), second.flatten(1)
@@ -79,18 +70,24 @@ def count_edges(first: Tensor, second: Tensor) -> Tensor:
     return torch.stack(counts, dim=1).flip(2).cumsum(2).flip(2)[..., 1:]
 
 
+@once_per_pair
 def boundary_counts(pair: SurfacePair) -> Tensor:
     """Return the counts of Depth Pro's edges, (B, 4, 3, T): for each direction as :func:`count_edges` has them."""
-    maps = pair.derive(known_maps)
-    along_u = [(each[..., 1:], each[..., :-1]) for each in maps]
-    along_v = [(each[..., 1:, :], each[..., :-1, :]) for each in maps]
-    ways = [way for axis in (along_u, along_v) for way in (axis, [(near, far) for far, near in axis])]
-    return torch.stack([count_edges(*(far / near for far, near in way)) for way in ways], dim=1)
+    prediction, target = known_maps(pair)
+    counts = []
+    for here, beside in (
+        ((..., slice(1, None)), (..., slice(-1))),
+        ((..., slice(-1)), (..., slice(1, None))),
+        ((..., slice(1, None), slice(None)), (..., slice(-1), slice(None))),
+        ((..., slice(-1), slice(None)), (..., slice(1, None), slice(None))),
+    ):
+        counts.append(count_edges(prediction[here] / prediction[beside], target[here] / target[beside]))
+    return torch.stack(counts, dim=1)
 
 
 def boundary_f1(pair: SurfacePair) -> Tensor:
     """Return Depth Pro's scale-invariant boundary F1, (B,), a fraction, higher is better."""
-    predicted, true, both = pair.derive(boundary_counts).double().unbind(2)
+    predicted, true, both = boundary_counts(pair).double().unbind(2)
     recall, precision = ((both / each.clamp(min=1)).mean(dim=1) for each in (true, predicted))
     f1 = 2 * recall * precision / (recall + precision).clamp(min=torch.finfo(torch.float64).tiny)
     return _over_thresholds(f1, 0, pair)
@@ -98,23 +95,21 @@ def boundary_f1(pair: SurfacePair) -> Tensor:
 
 def boundary_ceiling(pair: SurfacePair) -> Tensor:
     """Return :func:`boundary_f1` of the truth against itself, (B,): the fraction of directions that have edges."""
-    true = pair.derive(boundary_counts)[:, :, 1]
+    true = boundary_counts(pair)[:, :, 1]
     return _over_thresholds((true > 0).double().mean(dim=1), 0, pair)
 
 
 def moge_f1(pair: SurfacePair, radius: int = 1) -> Tensor:
     """Return MoGe's boundary F1, (B,), a fraction, higher is better; without any true edge it is 0, as theirs is.
 
-    Args:
-        pair: the two maps, larger than 2 ``radius`` in height and width. MoGe fits the prediction to the truth first
-            by a factor, which changes nothing, or by a factor and an offset, which is up to the caller.
-        radius: largest distance of the two pixels, 1, 2 or 3 in their tables.
-
+    Two pixels are at most ``radius`` apart, 1, 2 or 3 in their tables; the maps are larger than twice that. MoGe fits
+    the prediction to the truth first by a factor, which changes nothing, or by a factor and an offset, which is up to
+    the caller.
     """
     height, width = (size - 2 * radius for size in pair.target.shape[-2:])
     span = range(2 * radius + 1)
     near = [(v, u) for v in span for u in span if 0 < math.hypot(v - radius, u - radius) <= radius]
-    maps = pair.derive(known_maps)
+    maps = known_maps(pair)
     inner = [each[..., radius : radius + height, radius : radius + width] for each in maps]
     counts = []
     for v, u in near:
@@ -122,34 +117,6 @@ def moge_f1(pair: SurfacePair, radius: int = 1) -> Tensor:
         counts.append(count_edges(*ratios))
     predicted, true, both = torch.stack(counts).sum(dim=0).double().unbind(1)
     return _over_thresholds(2 * both / (predicted + true).clamp(min=1), 1, pair)
-
-
-def matte_recall(depth: Tensor, matte: Tensor, opaque: float = 0.1) -> Tensor:
-    """Return Depth Pro's boundary recall for a matte, (B,), a fraction, higher is better.
-
-    The outline of the foreground is found where the prediction is nearer inside than outside. Of the neighbouring
-    predicted edges in a row (a column) only the one with the largest ratio counts.
-
-    Args:
-        depth: (B, 1, H, W) predicted depth of any unit; NaN and what is not positive has no edges.
-        matte: (B, 1, H, W) fraction of each pixel that the foreground covers.
-        opaque: a pixel with more is foreground.
-
-    Raises:
-        ValueError: the shapes differ.
-
-    """
-    if depth.shape != matte.shape or depth.dim() != 4:
-        raise ValueError(f"depth, matte: expected two (B, 1, H, W), got {tuple(depth.shape)}, {tuple(matte.shape)}")
-    depth, inside = torch.where(depth > 0, depth, torch.nan), matte > opaque
-    recalls = []
-    for z, mask in ((depth[:, 0], inside[:, 0]), (depth[:, 0].mT, inside[:, 0].mT)):
-        for near, far in ((slice(1, None), slice(-1)), (slice(-1), slice(1, None))):
-            true, ratio = mask[..., near] & ~mask[..., far], z[..., far] / z[..., near]
-            found = torch.stack([(_thinned(ratio, t) & true).sum(dim=(1, 2)) for t in RATIOS], dim=1)
-            recalls.append(found / true.sum(dim=(1, 2)).clamp(min=1)[:, None])
-    weights = torch.tensor(RATIOS, dtype=torch.float64, device=depth.device)
-    return torch.stack(recalls).mean(dim=0).double() @ (weights / weights.sum())
 
 
 def depth_boundaries(depth: Tensor) -> Tensor:
@@ -173,14 +140,10 @@ def depth_boundaries(depth: Tensor) -> Tensor:
 def depth_boundary_error(found: Tensor, true: Tensor, quantile: float | None = None) -> tuple[Tensor, Tensor]:
     """Return iBims-1's accuracy and completeness of depth boundaries, (B,) float64 each, in pixels, lower is better.
 
-    The accuracy is the mean distance of found boundaries to true ones, of those less than :data:`DBE_RANGE` away; the
-    completeness that of true boundaries to found ones, without limit. Both are that range where no boundary is found
-    within it, and NaN without true ones. Others' copies limit the completeness, too, or use thresholds of .15 and .3.
-
-    Args:
-        found, true: (B, 1, H, W) bool. iBims-1 has annotated true ones, and ``depth_boundaries(prediction)``.
-        quantile: of the distances, from 0 to 1, in place of their mean; theirs is the mean.
-
+    The accuracy is the mean distance of found boundaries to true ones, (B, 1, H, W) bool, of those less than
+    :data:`DBE_RANGE` away; the completeness that of true boundaries to found ones, without limit. Both are that range
+    where no boundary is found within it, and NaN without true ones. Others' copies limit the completeness, too, or use
+    thresholds of .15 and .3. A ``quantile`` of the distances may take the place of their mean.
     """
     from scipy.ndimage import distance_transform_edt  # noqa: PLC0415 - as above
 
@@ -197,17 +160,11 @@ def depth_boundary_error(found: Tensor, true: Tensor, quantile: float | None = N
 
 
 def directed_depth_error(pair: SurfacePair, plane: float = DDE_PLANE) -> Tensor:
-    """Return iBims-1's directed depth error, (B, 3): the fractions of pixels that are on the right side of a plane,
-    in front of it though the truth is not, and beyond it though the truth is not.
+    """Return iBims-1's directed depth error about a plane at a depth in metres, (B, 3) fractions of pixels.
 
-    Their code overwrites depths by 0 and 1 before it has compared all of them, so that planes nearer than 1 m came out
-    wrong; here they are right.
-
-    Args:
-        pair: the two maps.
-        plane: its orthogonal depth in metres.
-
-    """  # noqa: D205
+    They are on the right side, in front of it though the truth is not, and beyond it though the truth is not. Their
+    code overwrites depths by 0 and 1 before it has compared all of them, so that planes nearer than 1 m came out wrong.
+    """
     before, truly = pair.prediction <= plane, pair.target <= plane
     parts = (before == truly, before & ~truly, ~before & truly)
     return torch.cat([masked_mean(part, pair.depth_mask) for part in parts], dim=1)
@@ -226,16 +183,10 @@ def planarity(
         planes: (B, P, H, W) bool, the pixels of each plane.
         normals: (B, P, 3) true normals, x right, y down, z forward, of either sign; None for those of the truth's
             points, fitted alike. iBims-1's are x right, y forward, z up: theirs of (x, y, z) is (x, -z, y) here.
-        smallest: planes with a lower fraction of the image's pixels, whatever of them is predicted, get NaN; so does a
-            larger one without a prediction.
+        smallest: planes with a lower fraction of the image's pixels get NaN, and so does one without a prediction.
 
-    Returns:
-        The flatness, the standard deviation of the points about their plane in metres, and the orientation, the angle
-        between its normal and the true one in degrees.
-
-    Raises:
-        ValueError: shapes or types do not fit together.
-
+    Returns the flatness, the standard deviation of the points about their plane in metres, and the orientation, the
+    angle between its normal and the true one in degrees.
     """
     images, _, height, width = pair.target.shape
     if planes.dim() != 4 or planes.dtype != torch.bool or planes[:, :1].shape != pair.target.shape:
@@ -262,20 +213,6 @@ def _over_thresholds(scores: Tensor, less: float, pair: SurfacePair) -> Tensor:
     return torch.where(pair.target_mask.flatten(1).any(dim=1), scores @ (weights / weights.sum()), torch.nan)
 
 
-def _thinned(ratio: Tensor, threshold: float) -> Tensor:
-    """Return where a ratio, (B, H, W), is the first largest of a run above the threshold along its row."""
-    above = ratio > threshold
-    starts = above.clone()
-    starts[..., 1:] &= ~above[..., :-1]
-    place = above.flatten().nonzero()[:, 0]
-    run, values = starts.flatten()[place].cumsum(0) - 1, ratio.flatten()[place]
-    largest = values == values.new_zeros(len(place)).scatter_reduce(0, run, values, "amax")[run]
-    run, place = run[largest], place[largest]
-    thinned = torch.zeros_like(above).flatten()
-    thinned[place[run.diff(prepend=run.new_tensor([-1])) != 0]] = True
-    return thinned.view_as(above)
-
-
 @in_own_precision
 def _fit_plane(points: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
     """Return the standard deviation of points (B, 3, H, W) about their plane, (B,), and its normal, (B, 3)."""
@@ -287,9 +224,10 @@ def _fit_plane(points: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
     return values[:, 0].clamp(min=0).sqrt(), vectors[..., 0]
 
 
+@once_per_pair
 def _boundary_errors(pair: SurfacePair) -> tuple[Tensor, Tensor]:
     """Return the errors to the annotated boundaries, without a mask, as iBims-1; else to the truth's own."""
-    prediction, target = pair.derive(known_maps)
+    prediction, target = known_maps(pair)
     edges = pair.regions.get(EDGES, torch.zeros_like(target)) > 0
     band = avg_pool2d(edges.float(), _BAND, stride=1, padding=_BAND // 2) > 1 - 1e-3
     annotated = (edges.flatten(1).any(dim=1) & ~band.flatten(1).any(dim=1)).view(-1, 1, 1, 1)
@@ -298,14 +236,7 @@ def _boundary_errors(pair: SurfacePair) -> tuple[Tensor, Tensor]:
     return depth_boundary_error(found, torch.where(annotated, edges, depth_boundaries(target)))
 
 
-def _boundary_error(pair: SurfacePair, part: int) -> Tensor:
-    return pair.derive(_boundary_errors)[part]
-
-
-def _directed_error(pair: SurfacePair, part: int) -> Tensor:
-    return pair.derive(directed_depth_error)[:, part]
-
-
+@once_per_pair
 def _planarity(pair: SurfacePair) -> tuple[Tensor, Tensor]:
     """Return the planarity errors, means over the large planes of the region ``planes``, (B,) each.
 
@@ -321,48 +252,57 @@ def _planarity(pair: SurfacePair) -> tuple[Tensor, Tensor]:
     return flatness, orientation
 
 
-def _planarity_error(pair: SurfacePair, part: int) -> Tensor:
-    return pair.derive(_planarity)[part]
+def _part(pair: SurfacePair, function: Callable[[SurfacePair], Tensor | Sequence[Tensor]], part: int) -> Tensor:
+    found = function(pair)
+    return found[:, part] if isinstance(found, Tensor) else found[part]
 
 
-def _shown(heading: str, unit: str, factor: float = 1e2, *, higher: bool = True, column: bool = True) -> MetricFormat:
-    return MetricFormat(heading, unit, factor, 1, higher, BEFORE_THE_PAPER if column else None)
-
-
-def _moge(radius: int) -> Metric:
-    shown = _shown("F1", f"MoGe, {radius} px, %", column=radius == 1)
-    return Metric(f"MoGe_F1_{radius}", partial(moge_f1, radius=radius), target_mask, shown, min_size=7, whole=True)
-
-
-def _boundary(part: int, name: str) -> Metric:
-    shown = _shown("DBE", f"{name}, px", 1, higher=False)
-    return Metric(f"DBE_{name}", partial(_boundary_error, part=part), target_mask, shown, min_size=3, whole=True)
-
-
-def _directed(part: int, name: str) -> Metric:
-    shown = _shown("DDE", f"3 m, {name}, %", higher=part == 0, column=False)
-    return Metric(f"DDE_{name}", partial(_directed_error, part=part), depth_mask, shown, min_size=1, whole=True)
-
-
-def _plane(part: int, name: str, unit: str, factor: float) -> Metric:
-    shown = _shown("PE", f"{name}, {unit}", factor, higher=False)
-    return Metric(
-        f"PE_{name}", partial(_planarity_error, part=part), depth_mask, shown, min_size=3, region=PLANES, whole=True
-    )
-
-
+_whole = partial(Metric, whole=True)
+_shown = partial(column, higher_is_better=True)
 METRICS: tuple[Metric, ...] = (
-    Metric("DepthPro_F1", boundary_f1, target_mask, _shown("F1", "Depth Pro, %"), whole=True),
-    Metric("DepthPro_ceiling", boundary_ceiling, target_mask, _shown("F1", "of the truth, %"), whole=True),
-    *map(_moge, MOGE_RADII),
-    _boundary(0, "accuracy"),
-    _boundary(1, "completeness"),
-    _directed(0, "right"),
-    _directed(1, "before"),
-    _directed(2, "beyond"),
-    _plane(0, "flatness", "mm", 1e3),
-    _plane(1, "orientation", "deg", 1),
-    Metric("PE_covered", covered, target_mask, _shown("PE", "covered, %"), min_size=1, region=PLANES, whole=True),
-    Metric("Boundary_covered", covered, target_mask, _shown("Covered", "%"), min_size=1, whole=True),
+    _whole("DepthPro_F1", boundary_f1, target_mask, _shown("F1", "Depth Pro, %", 1e2)),
+    _whole("DepthPro_ceiling", boundary_ceiling, target_mask, _shown("F1", "of the truth, %", 1e2)),
+    *(
+        _whole(
+            f"MoGe_F1_{radius}",
+            partial(moge_f1, radius=radius),
+            target_mask,
+            replace(_shown("F1", f"MoGe, {radius} px, %", 1e2), position=BEFORE_THE_PAPER if radius == 1 else None),
+            min_size=7,
+        )
+        for radius in (1, 2, 3)
+    ),
+    *(
+        _whole(
+            f"DBE_{name}",
+            partial(_part, function=_boundary_errors, part=part),
+            target_mask,
+            column("DBE", f"{name}, px"),
+            min_size=3,
+        )
+        for part, name in enumerate(("accuracy", "completeness"))
+    ),
+    *(
+        _whole(
+            f"DDE_{name}",
+            partial(_part, function=directed_depth_error, part=part),
+            depth_mask,
+            MetricFormat("DDE", f"3 m, {name}, %", 1e2, 1, higher_is_better=part == 0, position=None),
+            min_size=1,
+        )
+        for part, name in enumerate(("right", "before", "beyond"))
+    ),
+    *(
+        _whole(
+            f"PE_{name}",
+            partial(_part, function=_planarity, part=part),
+            depth_mask,
+            column("PE", f"{name}, {unit}", factor),
+            min_size=3,
+            region=PLANES,
+        )
+        for part, (name, unit, factor) in enumerate((("flatness", "mm", 1e3), ("orientation", "deg", 1)))
+    ),
+    _whole("PE_covered", covered, target_mask, _shown("PE", "covered, %", 1e2), min_size=1, region=PLANES),
+    _whole("Boundary_covered", covered, target_mask, _shown("Covered", "%", 1e2), min_size=1),
 )
-"""The metrics of ``metrics=boundaries``."""

@@ -2,8 +2,9 @@
 
 Expected errors are calibrated if they are right on average both where they are small and where they are large, see
 :func:`error_ratios` and :func:`ence`. They are informative if they are largest where the result is worst, see
-:func:`squared_error_share`, :func:`ause` and :func:`off_auc`. These functions take the pixels of one image or of many;
-pixels without either error are left out, and ``Calibration_covered`` says how many have both.
+:func:`squared_error_share`, :func:`ause` and :func:`off_auc`. These functions take expected and measured
+absolute errors of the same pixels, of any shape, and return float64. Pixels without either error, NaN, are left out,
+and ``Calibration_covered`` says how many have both; without any pixel the result is NaN.
 
 ENCE is that of Levi et al., *Evaluating and Calibrating Uncertainty Prediction in Regression Tasks*, Sensors 2022
 (arXiv 1905.11659), with parts of equal numbers of pixels, while ``ENCE.py`` of EFS-OpenSource/calibration-framework
@@ -23,56 +24,29 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.surface import angle_between, depth_to_normals
-from dsr.metrics.formats import BEFORE_THE_PAPER, MetricFormat
+from dsr.metrics.formats import MetricFormat, column
 from dsr.metrics.functional import SurfacePair, angle, masked_mean
 from dsr.metrics.metric import Metric, depth_mask, normal_mask, target_mask
 
-DEVIATION = math.sqrt(math.pi / 2)
-"""Standard deviation of a Gaussian over its mean absolute value."""
-STEPS = 100
-"""Steps of a sparsification curve."""
-OFF = 0.02
-"""Metres from which on a pixel is off."""
+DEVIATION = math.sqrt(math.pi / 2)  # standard deviation of a Gaussian over its mean absolute value
+STEPS = 100  # steps of a sparsification curve
+OFF = 0.02  # metres from which on a pixel is off
 
 
 def measured_errors(prediction: Tensor, target: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the absolute errors of depth and normals.
+    """Return the absolute errors of depth in metres and of normals in degrees, (B, 1, H, W) each, NaN where undefined.
 
-    Args:
-        prediction: (B, 1, H, W) orthogonal depth in metres, NaN in holes; H and W at least 2.
-        target: true depth, likewise.
-        rays: (B or 1, 3, H, W) rays with z = 1, see :meth:`dsr.geometry.camera.Camera.rays`.
-
-    Returns:
-        Two maps (B, 1, H, W): the absolute difference of the depths in metres, NaN where one is missing, and the angle
-        between the normals in degrees, NaN where one is undefined.
-
-    Raises:
-        ValueError: the maps are less than 2 pixels high or wide.
-
+    Prediction and target are (B, 1, H, W) orthogonal depth in metres, NaN in holes, the rays (B or 1, 3, H, W).
     """
     first, second = (depth_to_normals(depth, rays) for depth in (prediction, target))
     return (prediction - target).abs(), angle_between(first, second)
 
 
 def error_ratios(expected: Tensor, measured: Tensor, parts: int = 10) -> Tensor:
-    """Return the mean measured error over the mean expected error for equal parts of the pixels.
+    """Return the mean measured error over the mean expected error for equal parts of the pixels, (parts,).
 
-    The pixels are sorted by expected error, those of equal expected error as they come.
-
-    Args:
-        expected: expected absolute errors, of any shape and unit; NaN where there is none.
-        measured: measured absolute errors of the same pixels in the same unit; NaN where there is none.
-        parts: number of parts, 10 for deciles; their sizes differ by one pixel at most.
-
-    Returns:
-        (parts,) float64, from the pixels with the smallest expected errors to those with the largest. 1 is as expected,
-        more means larger errors than expected. NaN for a part without pixels, infinite for one whose expected errors
-        are all 0 and the measured ones are not.
-
-    Raises:
-        ValueError: the shapes differ.
-
+    The pixels are sorted by expected error, those of equal expected error as they come. 1 is as expected, more means
+    larger errors than expected. NaN for a part without pixels, infinite for one whose expected errors are all 0.
     """
     expected, measured = _ordered(expected, measured)
     pairs = zip(expected.tensor_split(parts), measured.tensor_split(parts), strict=True)
@@ -80,21 +54,10 @@ def error_ratios(expected: Tensor, measured: Tensor, parts: int = 10) -> Tensor:
 
 
 def squared_error_share(expected: Tensor, measured: Tensor, kept: float = 0.8) -> Tensor:
-    """Return the fraction of the sum of squared errors that lies in the pixels with the smallest expected errors.
+    """Return the fraction of the sum of squared errors that lies in the pixels with the smallest expected errors, ().
 
-    Args:
-        expected: expected absolute errors, of any shape and unit; NaN where there is none.
-        measured: measured absolute errors of the same pixels in any unit; NaN where there is none.
-        kept: the fraction of pixels.
-
-    Returns:
-        () float64. Expected errors that have nothing to do with the measured ones give ``kept`` on average; the least
-        possible value is that of ``squared_error_share(measured, measured)``. NaN if all errors are 0, or without
-        pixels.
-
-    Raises:
-        ValueError: the shapes differ.
-
+    Expected errors that have nothing to do with the measured ones give ``kept``, the fraction of pixels, on average;
+    the least possible value is that of ``squared_error_share(measured, measured)``.
     """
     _, measured = _ordered(expected, measured)
     squares = measured.square()
@@ -107,43 +70,19 @@ def ence(expected: Tensor, measured: Tensor, parts: int = 10) -> Tensor:
     The parts are those of :func:`error_ratios`. RMSE is the root of a part's mean squared error, RMV that of its mean
     variance, for which an expected absolute error counts as that of a Gaussian: its standard deviation is sqrt(pi / 2)
     of it. Errors with heavier tails than a Gaussian's have a larger RMSE, even where they are expected rightly.
-
-    Args:
-        expected: expected absolute errors, of any shape and unit; NaN where there is none.
-        measured: measured errors of the same pixels in the same unit; NaN where there is none.
-        parts: number of parts; those without pixels are left out.
-
-    Returns:
-        () float64, 0 or more; lower is better. NaN without pixels, infinite if a part's expected errors are all 0.
-
-    Raises:
-        ValueError: the shapes differ.
-
     """
     expected, measured = _ordered(expected, measured)
     variances, squares = (DEVIATION * expected).square().tensor_split(parts), measured.square().tensor_split(parts)
-    rmv, rmse = (torch.stack([part.mean() for part in each if len(part)] or [each[0].mean()]).sqrt()
-                 for each in (variances, squares))  # fmt: skip
+    rmv = torch.stack([part.mean() for part in variances if len(part)] or [variances[0].mean()]).sqrt()
+    rmse = torch.stack([part.mean() for part in squares if len(part)] or [squares[0].mean()]).sqrt()
     return ((rmse - rmv).abs() / rmv).mean()
 
 
 def sparsification(expected: Tensor, measured: Tensor, steps: int = STEPS) -> Tensor:
-    """Return the mean error of the pixels that are left when those with the largest expected errors are removed.
+    """Return the mean error of the pixels left when those with the largest expected errors are removed, (steps + 1,).
 
     Step t removes t / steps of the pixels. Of pixels of equal expected error, each part that is left has their mean
     error.
-
-    Args:
-        expected: expected absolute errors, of any shape and unit; NaN where there is none.
-        measured: measured absolute errors of the same pixels in any unit; NaN where there is none.
-        steps: number of steps.
-
-    Returns:
-        (steps + 1,) float64, from the mean of all pixels to 0 for none. NaN without pixels.
-
-    Raises:
-        ValueError: the shapes differ.
-
     """
     expected, measured = _ordered(expected, measured)
     count = len(measured)
@@ -160,24 +99,6 @@ def ause(expected: Tensor, measured: Tensor, steps: int = STEPS) -> Tensor:
 
     The sparsification error is the curve of :func:`sparsification` less that of an oracle, which expects the measured
     errors; the area is by trapezoids. It depends on the number of steps: by a sixth from 20 to 100.
-
-    Args:
-        expected, measured, steps: as for :func:`sparsification`.
-
-    Returns:
-        () float64, 0 or more, lower is better. Expected errors that have nothing to do with the measured ones give that
-        of a constant. NaN without pixels, or if all are without error.
-
-    Raises:
-        ValueError: the shapes differ.
-
-    Example:
-        >>> import torch
-        >>> from dsr.metrics.calibration import ause
-        >>> measured = torch.rand(1000, generator=torch.Generator().manual_seed(0))
-        >>> float(ause(measured, measured))  # expected errors in the order of the measured ones
-        0.0
-
     """
     measured = measured.masked_fill(~expected.isfinite(), torch.nan)
     curve, oracle = (sparsification(each, measured, steps) for each in (expected, measured))
@@ -189,18 +110,6 @@ def off_auc(expected: Tensor, measured: Tensor, threshold: float = OFF) -> Tenso
 
     It is the probability that a pixel whose measured error exceeds the threshold has a larger expected error than one
     whose measured error does not; equal expected errors count half.
-
-    Args:
-        expected: expected absolute errors, of any shape and unit; NaN where there is none.
-        measured: measured absolute errors of the same pixels; NaN where there is none.
-        threshold: in the unit of ``measured``.
-
-    Returns:
-        () float64, higher is better, 0.5 is chance. NaN if no pixel is off, or all are.
-
-    Raises:
-        ValueError: the shapes differ.
-
     """
     expected, measured = _ordered(expected, measured)
     of, sizes = expected.unique_consecutive(return_inverse=True, return_counts=True)[1:]
@@ -210,21 +119,9 @@ def off_auc(expected: Tensor, measured: Tensor, threshold: float = OFF) -> Tenso
 
 
 def stated_ratio(expected: Tensor, measured: Tensor) -> Tensor:
-    """Return the median expected error over the median measured one.
-
-    Args:
-        expected: expected absolute errors, of any shape and unit; NaN where there is none.
-        measured: measured absolute errors of the same pixels in the same unit; NaN where there is none.
-
-    Returns:
-        () float64. 1 is as expected, less means larger errors than expected. NaN without pixels.
-
-    Raises:
-        ValueError: the shapes differ.
-
-    """
-    first, second = map(_median, _ordered(expected, measured))
-    return first / second
+    """Return the median expected error over the median measured one."""
+    first, second = _ordered(expected, measured)
+    return _median(first) / _median(second)
 
 
 def _median(values: Tensor) -> Tensor:
@@ -294,40 +191,27 @@ def _of_depth(name: str, compare: _Comparison, shown: MetricFormat, unit: str | 
     return Metric(f"Calibration_{name}", function, depth_mask, shown, min_size=1, unit=unit, stated="depth_error")
 
 
-def auc_metric(threshold: float = OFF) -> Metric:
-    """Return the metric of :func:`off_auc` of depth for a threshold in metres."""
-    millimetres = f"{1e3 * threshold:g}"
-    shown = MetricFormat("AUC", f"off by {millimetres} mm", 1, 3, higher_is_better=True, position=BEFORE_THE_PAPER)
-    compare = partial(off_auc, threshold=threshold)
-    return _of_depth(f"AUC_{millimetres}mm".replace(".", "_"), compare, shown, unit="cm")
-
-
-def _shown(heading: str, unit: str, factor: float = 1, digits: int = 3) -> MetricFormat:
-    return MetricFormat(heading, unit, factor, digits, position=BEFORE_THE_PAPER)
-
-
 METRICS: tuple[Metric, ...] = (
-    _of_depth("ENCE", ence, _shown("ENCE", "depth, %", 1e2, 1)),
-    _of_depth("AUSE_d", ause, _shown("AUSE", f"depth, {STEPS} steps")),
+    _of_depth("ENCE", ence, column("ENCE", "depth, %", 1e2, 1)),
+    _of_depth("AUSE_d", ause, column("AUSE", f"depth, {STEPS} steps", 1, 3)),
     Metric(
         "Calibration_AUSE_v",
         partial(of_normals, compare=ause),
         normal_mask,
-        _shown("AUSE", f"normals, {STEPS} steps"),
+        column("AUSE", f"normals, {STEPS} steps", 1, 3),
         stated="angle_error",
     ),
-    auc_metric(),
+    _of_depth("AUC_20mm", off_auc, column("AUC", "off by 20 mm", 1, 3, higher_is_better=True), unit="cm"),
     _of_depth("stated", stated_ratio, MetricFormat("Stated", "of true error", position=None)),
-    _of_depth("factor", factor_off, _shown("Stated off", "factor", digits=2)),
+    _of_depth("factor", factor_off, column("Stated off", "factor", 1, 2)),
     Metric(
         "Calibration_covered",
         covered,
         target_mask,
-        MetricFormat("Covered", "stated, %", 1e2, 1, higher_is_better=True, position=BEFORE_THE_PAPER),
+        column("Covered", "stated, %", 1e2, 1, higher_is_better=True),
         min_size=1,
         stated="depth_error",
         regional=True,
         whole=True,
     ),
 )
-"""The metrics of ``metrics=calibration``, of methods that state their errors."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from operator import attrgetter
 
 import torch
 from torch import Tensor
 
-from dsr.metrics import boundaries, calibration, depth, evalmde, field, functional, normals, plane, points, sensor
+from dsr.metrics import boundaries, calibration, depth, evalmde, functional, plane, points, sensor
 from dsr.metrics.formats import MetricFormat
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS, MIN_SIZE, lpips_v
@@ -30,45 +30,28 @@ __all__ = [
 ]
 
 
-def _ssim_mask(pair: SurfacePair) -> Tensor:
-    return pair.ssim_mask
+def _bad_pix_d(percent: int, unit: str) -> Metric:
+    function = partial(functional.bad_pix_d, threshold=percent / 100, relative=unit == "pct")
+    heading = f"{percent} cm, %" if unit == "cm" else f"{percent} % of depth, %"
+    shown = MetricFormat("BadPix_d", heading, 1e2, 2, position=2 if (percent, unit) == (5, "cm") else None)
+    return Metric(f"BadPix_d_{percent}{unit}", function, depth_mask, shown, min_size=1)
 
 
-def _bumpiness_mask(pair: SurfacePair) -> Tensor:
-    return pair.bumpiness_mask
-
-
-def _bad_pix_d(percent: int, position: int | None = None) -> Metric:
-    function = partial(functional.bad_pix_d, threshold=percent / 100)
-    shown = MetricFormat("BadPix_d", f"{percent} cm, %", 1e2, 2, position=position)
-    return Metric(f"BadPix_d_{percent}cm", function, depth_mask, shown, min_size=1)
-
-
-def _bad_pix_d_relative(percent: int) -> Metric:
-    function = partial(functional.bad_pix_d, threshold=percent / 100, relative=True)
-    shown = MetricFormat("BadPix_d", f"{percent} % of depth, %", 1e2, 2, position=None)
-    return Metric(f"BadPix_d_{percent}pct", function, depth_mask, shown, min_size=1)
-
-
-def _bad_pix_v(level: int, position: int | None = None) -> Metric:
+def _bad_pix_v(level: int) -> Metric:
+    shown = MetricFormat("BadPix_v", f"{level}, %", 1e2, 1, position=3 if level == 5 else None)
     function = partial(functional.bad_pix_v, threshold=level)
-    shown = MetricFormat("BadPix_v", f"{level}, %", 1e2, 1, position=position)
     return Metric(f"BadPix_v_{level}", function, normal_mask, shown, per_light=True)
 
 
+# the paper's metrics in the order of scores.csv; those with a position are the columns of its tables
 METRICS: tuple[Metric, ...] = (
     Metric("RMSE_d", functional.rmse_d, depth_mask, MetricFormat("RMSE_d", "mm", 1e3, 1, position=1), min_size=1),
-    _bad_pix_d(1),
-    _bad_pix_d(5, position=2),
-    _bad_pix_d(10),
-    *map(_bad_pix_d_relative, (1, 5, 10)),
-    _bad_pix_v(1),
-    _bad_pix_v(5, position=3),
-    _bad_pix_v(10),
+    *(_bad_pix_d(percent, unit) for unit in ("cm", "pct") for percent in (1, 5, 10)),
+    *map(_bad_pix_v, (1, 5, 10)),
     Metric(
         "DSSIM_v",
         functional.dssim_v,
-        _ssim_mask,
+        attrgetter("ssim_mask"),
         MetricFormat("DSSIM_v", "1/1000", 1e3, 0, position=4),
         per_light=True,
         min_size=functional.SSIM_WINDOW,
@@ -93,21 +76,22 @@ METRICS: tuple[Metric, ...] = (
     Metric(
         "Bumpiness_d",
         functional.bumpiness_d,
-        _bumpiness_mask,
+        attrgetter("bumpiness_mask"),
         MetricFormat("Bump_d", digits=2, position=6),
         min_size=3,
     ),
 )
-"""The metrics of the paper, in the order of ``scores.csv``; those with a position are the columns of its tables."""
+# sets of metrics by name: the paper's, those that the field prints, those for real sensors, of depth estimation, of
+# EvalMDE, of boundaries, of stated errors and of planes
 PROTOCOLS: Mapping[str, tuple[Metric, ...]] = {
     "paper": METRICS,
-    "field": field.METRICS,
+    "field": depth.FIELD,
     "sensor": sensor.METRICS,
     **{
         name: tuple(replace(metric, format=replace(metric.format, family=name)) for metric in metrics)
         for name, metrics in {
-            "depth": depth.METRICS,
-            "normals": normals.METRICS,
+            "depth": depth.DEPTH,
+            "normals": depth.NORMALS,
             "points": points.METRICS,
             "evalmde": evalmde.METRICS,
             "boundaries": boundaries.METRICS,
@@ -116,8 +100,6 @@ PROTOCOLS: Mapping[str, tuple[Metric, ...]] = {
         }.items()
     },
 }
-"""Sets of metrics by name: the paper's, those that the field prints, those for real sensors, of depth estimation, of
-EvalMDE, of boundaries, of stated errors and of planes."""
 KNOWN_FORMATS = {metric.name: metric.format for metric in METRICS}
 
 
@@ -127,21 +109,13 @@ def catalogue(
     protocols: Sequence[str] = ("paper",),
     regions: Sequence[str] = (),
 ) -> tuple[Metric, ...]:
-    """Return the metrics that can be computed: those of some protocols, then others.
+    """Return the metrics that can be computed: those of some protocols, then ``extra``.
 
     Args:
         network: for perceptual metrics; None leaves them out.
         extra: metrics beside those of the protocols.
         protocols: names of protocols, in the order of the metrics.
         regions: parts of the scenes, for which the columns of tables that are means over pixels follow once more.
-
-    Raises:
-        ValueError: there is no such protocol, or two metrics have one name.
-
-    Example:
-        >>> from dsr.metrics.catalogue import catalogue
-        >>> [metric.name for metric in catalogue()][:3]
-        ['RMSE_d', 'BadPix_d_1cm', 'BadPix_d_5cm']
 
     """
     if not protocols or not set(protocols) <= set(PROTOCOLS):
@@ -155,7 +129,10 @@ def catalogue(
             raise ValueError(f"{name}: expected metrics of different names, got two of this one")
     if network is None:
         return tuple(metric for metric in metrics if not metric.perceptual)
-    return tuple(replace(metric, network=network) if metric.perceptual else metric for metric in metrics)
+    return tuple(
+        replace(metric, function=partial(metric.function, network=network)) if metric.perceptual else metric
+        for metric in metrics
+    )
 
 
 @dataclass(frozen=True)
@@ -179,51 +156,46 @@ def score_image(
     regions: Mapping[str, Tensor] | None = None,
     errors: tuple[Tensor, Tensor] | None = None,
 ) -> Iterator[Score]:
-    """Score one predicted depth map.
+    """Score one predicted depth map; NaN where no pixel can be scored.
 
     Rows and columns at the border without any predicted pixel are cut off first (MSG's published networks leave out the
     last of each), except for metrics of the whole image. The valid fractions still refer to the complete map.
 
     Args:
-        prediction: (1, H, W) orthogonal depth in metres, NaN where missing.
-        target: (1, H, W) orthogonal depth in metres, NaN where missing.
+        prediction, target: (1, H, W) orthogonal depth in metres, NaN where missing.
         rays: (3, H, W), see :meth:`dsr.geometry.camera.Camera.rays`.
-        metrics: from :func:`catalogue`; those for other units are left out, and those of regions or stated errors that
-            there are not.
+        metrics: from :func:`catalogue`; those for other units, absent regions or absent errors are left out.
         unit: of the benchmark.
         regions: parts of the image by name, (1, H, W) uint8.
         errors: the method's expected errors, (1, H, W): of depth in metres, of normals in degrees.
-
-    Yields:
-        The scores, NaN where no pixel can be scored.
-
     """
-
-    def pair_of(window: tuple[Any, ...]) -> SurfacePair:
-        maps = (values[window][None] for values in (prediction, target, rays))
-        parts = {name: region[window][None] for name, region in (regions or {}).items()}
-        named = zip(("depth_error", "angle_error"), errors or (), strict=False)
-        stated = {name: each[window][None] for name, each in named}
-        return SurfacePair(*maps, unit=unit, regions=parts, image_dtype=torch.float32, **stated)
-
-    window = (..., *_covered(prediction))
-    whole = covered = pair_of((...,))
-    if prediction[window].shape != prediction.shape:
-        covered = pair_of(window)
-    for metric in metrics:
-        pair = whole if metric.whole else covered
-        if not metric.applies(pair):
-            continue
-        valid = metric.valid_fraction(pair).item() * (pair.target.numel() / target.numel())
-        for variant, value in metric.variants(pair).items():
-            yield Score(metric.name, variant, value.item(), valid)
-
-
-def _covered(prediction: Tensor) -> tuple[slice, slice]:
-    """Return the rows and columns of the smallest window with all predicted pixels; all of them if there are none."""
     valid = prediction.isfinite()[0]
-    ranges = []
+    window: list[slice] = []  # rows and columns of the smallest one with all predicted pixels; all if there are none
     for axis in (1, 0):
         hits = valid.any(dim=axis).nonzero()
-        ranges.append(slice(int(hits[0]), int(hits[-1]) + 1) if len(hits) else slice(0, valid.shape[1 - axis]))
-    return ranges[0], ranges[1]
+        window.append(slice(int(hits[0]), int(hits[-1]) + 1) if len(hits) else slice(0, valid.shape[1 - axis]))
+    windows = [[slice(None), slice(None)]]
+    if valid[*window].shape != valid.shape:
+        windows.append(window)
+    pairs = []
+    for rows, columns in windows:
+        depth_error, angle_error = (None, None) if errors is None else (e[None, :, rows, columns] for e in errors)
+        pairs.append(
+            SurfacePair(
+                prediction[None, :, rows, columns],
+                target[None, :, rows, columns],
+                rays[None, :, rows, columns],
+                unit=unit,
+                regions={name: region[None, :, rows, columns] for name, region in (regions or {}).items()},
+                depth_error=depth_error,
+                angle_error=angle_error,
+                image_dtype=torch.float32,
+            )
+        )
+    for metric in metrics:
+        pair = pairs[0] if metric.whole else pairs[-1]
+        if not metric.applies(pair):
+            continue
+        share = metric.valid_fraction(pair).item() * (pair.target.numel() / target.numel())
+        for variant, value in metric.variants(pair).items():
+            yield Score(metric.name, variant, value.item(), share)

@@ -18,8 +18,7 @@ prediction, belongs to every score.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -28,26 +27,23 @@ from torch import Tensor
 from dsr.geometry.surface import length
 from dsr.metrics.boundaries import boundary_f1
 from dsr.metrics.depth import covered
-from dsr.metrics.formats import BEFORE_THE_PAPER, MetricFormat
-from dsr.metrics.functional import SurfacePair
+from dsr.metrics.formats import column
+from dsr.metrics.functional import SurfacePair, once_per_pair
 from dsr.metrics.metric import Metric, target_mask
 from dsr.utils.compute_device import in_own_precision
 
 SCALES = (1, 2, 4, 8)
+# pixels: the largest distance of two normals along each axis at scale 1, and the smallest such limit at any scale
 RADIUS, SMALLEST_RADIUS = 32, 3
-"""Pixels: the largest distance of two normals along each axis at scale 1, and the smallest such limit at any scale."""
 PAIRS = 10**6
-CHUNK = 1 << 15
-"""How many points or pairs are worked on at a time."""
-STEEPEST = 1e-5
-"""Sine of the angle between the two edges of a triangle below which it has no normal."""
+CHUNK = 1 << 15  # how many points or pairs are worked on at a time
+STEEPEST = 1e-5  # sine of the angle between the two edges of a triangle below which it has no normal
 RATIO = 1.25**0.125
-NEAREST = 1e-4
-"""Lower limit of aligned depth in metres and of aligned disparity in 1/m."""
-MIN_SIZE = 2 * SCALES[-1] + 1
-"""Of a map with a normal at the coarsest scale."""
+NEAREST = 1e-4  # lower limit of aligned depth in metres and of aligned disparity in 1/m
+MIN_SIZE = 2 * SCALES[-1] + 1  # of a map with a normal at the coarsest scale
 
 
+@once_per_pair
 def rel_normal(pair: SurfacePair) -> Tensor:
     """Return RelNormal, (B,) in radians, the mean error of the angle between two normals; lower is better.
 
@@ -71,13 +67,8 @@ def rel_normal(pair: SurfacePair) -> Tensor:
 def nearest_to_centres(mask: Tensor, scale: int) -> Tensor:
     """Return which pixel stands for each block: the set one nearest to its centre, the first of equally near ones.
 
-    Args:
-        mask: (B, 1, H, W) bool.
-        scale: size of a block in pixels; blocks at the lower and right border may be smaller.
-
-    Returns:
-        (B, ceil(H / scale), ceil(W / scale)) int64, indices into the flattened map; of any pixel where none is set.
-
+    The mask is (B, 1, H, W) bool; blocks of ``scale`` pixels at the lower and right border may be smaller. Returns
+    indices into the flattened map, (B, ceil(H / scale), ceil(W / scale)) int64; of any pixel where none is set.
     """
     (height, width), device = mask.shape[-2:], mask.device
     padded = torch.nn.functional.pad(mask, (0, -width % scale, 0, -height % scale))
@@ -119,6 +110,7 @@ def sobol_pairs(height: int, width: int, device: torch.device) -> list[Tensor]:
     return found
 
 
+@once_per_pair
 def wkdr(pair: SurfacePair) -> Tensor:
     """Return the fraction of pairs of pixels that the prediction has in another order, (B,), lower is better.
 
@@ -141,6 +133,7 @@ def wkdr(pair: SurfacePair) -> Tensor:
     return torch.tensor(errors, dtype=torch.float64, device=pair.target.device)
 
 
+@once_per_pair
 def beyond_disparity(pair: SurfacePair) -> Tensor:
     """Return the fraction of pixels with a ratio to the true depth of 1.25^.125 or more, (B,), lower is better.
 
@@ -150,6 +143,7 @@ def beyond_disparity(pair: SurfacePair) -> Tensor:
     return _beyond(pair, 1 / aligned)
 
 
+@once_per_pair
 def beyond_depth(pair: SurfacePair) -> Tensor:
     """Return the same as :func:`beyond_disparity` with depth itself fitted to the true depth, (B,), lower is better."""
     return _beyond(pair, _aligned(pair, pair.prediction, pair.target))
@@ -157,7 +151,7 @@ def beyond_depth(pair: SurfacePair) -> Tensor:
 
 def boundary_error(pair: SurfacePair) -> Tensor:
     """Return 1 less the boundary F1 of Depth Pro, (B,), see :func:`dsr.metrics.boundaries.boundary_f1`."""
-    return 1 - pair.derive(boundary_f1)
+    return 1 - boundary_f1(pair)
 
 
 WEIGHTS = {wkdr: 3.65, beyond_disparity: 0.18, beyond_depth: 0.01, boundary_error: 0.20, rel_normal: 1.94}
@@ -165,7 +159,7 @@ WEIGHTS = {wkdr: 3.65, beyond_disparity: 0.18, beyond_depth: 0.01, boundary_erro
 
 def sawa_h(pair: SurfacePair) -> Tensor:
     """Return SAWA-H, (B,), without unit, lower is better: the sum of the parts by :data:`WEIGHTS`."""
-    return torch.stack([weight * pair.derive(part).double() for part, weight in WEIGHTS.items()]).sum(dim=0)
+    return torch.stack([weight * part(pair).double() for part, weight in WEIGHTS.items()]).sum(dim=0)
 
 
 def _taken(values: Tensor, source: Tensor) -> Tensor:
@@ -187,13 +181,7 @@ def _normals(points: Tensor, mask: Tensor) -> Tensor:
 
 @in_own_precision
 def _pair_error(rows: Tensor, first: Tensor, second: Tensor) -> Tensor:
-    """Return the mean error of the pairs of one scale, (): NaN if the truth has both normals of none.
-
-    Args:
-        rows: (N, 8) true normals and whether there are any, then the predicted ones.
-        first, second: (P,) indices of rows.
-
-    """
+    """Return the mean error of the pairs of one scale, (): NaN if the truth has both normals of none."""
     sums = rows.new_zeros(8, 2)  # of squares: a matrix product, as sums over three columns are slow
     sums[:3, 0] = sums[4:7, 1] = 1
     total, count = rows.new_zeros((), dtype=torch.float64), rows.new_zeros((), dtype=torch.float64)
@@ -231,26 +219,15 @@ def _beyond(pair: SurfacePair, aligned: Tensor) -> Tensor:
     return 1 - within.double() / pair.target_mask.sum(dim=(1, 2, 3))
 
 
-def _metric(name: str, part: Callable[[SurfacePair], Tensor], shown: MetricFormat) -> Metric:
-    function = partial(SurfacePair.derive, make=part)  # SAWA-H has the parts of the same pair
-    return Metric(f"EvalMDE_{name}", function, target_mask, shown, min_size=MIN_SIZE, whole=True)
-
-
-METRICS: tuple[Metric, ...] = (
-    _metric("SAWA_H", sawa_h, MetricFormat("SAWA-H", position=BEFORE_THE_PAPER)),
-    _metric("RelNormal", rel_normal, MetricFormat("RelNormal", "rad", position=BEFORE_THE_PAPER)),
-    _metric("WKDR", wkdr, MetricFormat("WKDR", "%", 1e2, 2, position=BEFORE_THE_PAPER)),
-    _metric(
-        "beyond_disparity",
-        beyond_disparity,
-        MetricFormat("Beyond", "1.028 x, disparity fitted, %", 1e2, 1, position=BEFORE_THE_PAPER),
-    ),
-    _metric(
-        "beyond_depth",
-        beyond_depth,
-        MetricFormat("Beyond", "1.028 x, depth fitted, %", 1e2, 1, position=BEFORE_THE_PAPER),
-    ),
-    _metric("boundary", boundary_error, MetricFormat("1 - F1", "Depth Pro, %", 1e2, 1, position=BEFORE_THE_PAPER)),
-    _metric("covered", covered, MetricFormat("Covered", "%", 1e2, 1, higher_is_better=True, position=BEFORE_THE_PAPER)),
+METRICS: tuple[Metric, ...] = tuple(
+    Metric(f"EvalMDE_{name}", function, target_mask, shown, min_size=MIN_SIZE, whole=True)
+    for name, function, shown in (
+        ("SAWA_H", sawa_h, column("SAWA-H", "", 1, 3)),
+        ("RelNormal", rel_normal, column("RelNormal", "rad", 1, 3)),
+        ("WKDR", wkdr, column("WKDR", "%", 1e2, 2)),
+        ("beyond_disparity", beyond_disparity, column("Beyond", "1.028 x, disparity fitted, %", 1e2, 1)),
+        ("beyond_depth", beyond_depth, column("Beyond", "1.028 x, depth fitted, %", 1e2, 1)),
+        ("boundary", boundary_error, column("1 - F1", "Depth Pro, %", 1e2, 1)),
+        ("covered", covered, column("Covered", "%", 1e2, 1, higher_is_better=True)),
+    )
 )
-"""The metrics of ``metrics=evalmde``."""

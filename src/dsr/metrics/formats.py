@@ -6,20 +6,17 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-BEFORE_THE_PAPER = 0
-"""The position of metrics that stand before those of the paper's tables."""
-AFTER_THE_PAPER = 100
-"""The position of metrics that the paper's tables do not have."""
-PAPER = "paper"
-"""The family of the paper's metrics, and of those that stand beside them."""
+BEFORE_THE_PAPER = 0  # the position of metrics that stand before those of the paper's tables
+AFTER_THE_PAPER = 100  # the position of metrics that the paper's tables do not have
+PAPER = "paper"  # the family of the paper's metrics, and of those that stand beside them
 _MOST_DIGITS = 20
+# the metrics of how a surface looks, by which results are compared first: RMSE_v, without lights, and three for the
+# worst of four lights
 LOOKS = ("RMSE_v", "RMSE_v1", "DSSIM_v", "LPIPS_v")
-"""The metrics of how a surface looks, by which results are compared first: RMSE_v, without lights, and three for the
-worst of four lights."""
 LIGHTS_NOTE = "RMSE_v has no lights, the other metrics of renderings are of the worst of four"
+# variants of the value that stands for an image: without lights, or the worst of four lights (the smallest value where
+# higher is better)
 HEADLINES = ("", "max", "min")
-"""Variants of the value that stands for an image: without lights, or the worst of four lights (the smallest value where
-higher is better)."""
 
 
 @dataclass(frozen=True)
@@ -34,9 +31,6 @@ class MetricFormat:
         higher_is_better: direction of the ranking.
         family: metrics of one family share a table; those of other families and of regions have one of their own.
         position: place among the columns of a table, from the left; None for a metric that is only in ``scores.csv``.
-
-    Raises:
-        ValueError: ``factor`` is not positive and finite, or ``digits`` is out of range.
 
     """
 
@@ -76,8 +70,7 @@ def column(
     return MetricFormat(heading, unit, factor, digits, higher_is_better, BEFORE_THE_PAPER)
 
 
-Formats = Mapping[str, MetricFormat]
-"""Formats of metrics by their names in ``scores.csv``."""
+Formats = Mapping[str, MetricFormat]  # formats of metrics by their names in scores.csv
 
 
 def in_tables(formats: Formats) -> dict[str, MetricFormat]:
@@ -104,13 +97,7 @@ def describe_directions(formats: Formats) -> str:
 
 
 def complete_formats(names: Iterable[str], *defined: Formats) -> dict[str, MetricFormat]:
-    """Return a format for each metric: the first that is defined, or the raw value under the metric's name.
-
-    Args:
-        names: of metrics, as in ``scores.csv``.
-        *defined: formats to choose from, in order of preference.
-
-    """
+    """Return a format for each metric: the first that is defined, or the raw value under the metric's name."""
     found: dict[str, MetricFormat] = {}
     for name in names:
         formats = (each[name] for each in defined if name in each)

@@ -34,8 +34,20 @@ _Derived = TypeVar("_Derived")
 SSIM_WINDOW = 7
 SSIM_DATA_RANGE = 2.0
 BUMPINESS_CLIP = 0.05
-BUMPINESS_DISPARITY = 20.48
-"""k in px m: baseline 14 mm x focal length 100 mm x 512 px / 35 mm (4D light field benchmark, scene "origami")."""
+BUMPINESS_DISPARITY = 20.48  # k in px m: 14 mm baseline x 100 mm focal length x 512 px / 35 mm (scene "origami")
+
+
+def once_per_pair(function: Callable[[SurfacePair], _Derived]) -> Callable[[SurfacePair], _Derived]:
+    """Let a function of a pair be computed once per pair, for quantities that several metrics share."""
+
+    @functools.wraps(function)
+    def kept(pair: SurfacePair) -> _Derived:
+        if function not in pair.derived:
+            pair.derived[function] = function(pair)
+        found: _Derived = pair.derived[function]
+        return found
+
+    return kept
 
 
 class SurfacePair:
@@ -52,19 +64,6 @@ class SurfacePair:
             normals in degrees, NaN where there is none; None from a method that states none.
         image_dtype: of normals and renderings, None for the depth's. float32 halves their computing time and changes
             scores by about 1e-7; depths and their differences keep their own dtype.
-
-    Raises:
-        ValueError: shapes or types do not fit together.
-
-    Example:
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.metrics.functional import SurfacePair
-        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
-        >>> truth = torch.full((1, 1, 24, 32), 2.0)
-        >>> pair = SurfacePair(truth + 0.01, truth, camera.rays()[None])
-        >>> pair.prediction.shape
-        torch.Size([1, 1, 24, 32])
 
     """
 
@@ -110,7 +109,7 @@ class SurfacePair:
         self.mask, self.regions = mask, dict(regions or {})
         self.image_dtype = image_dtype or target.dtype
         self.given = prediction, target
-        self._derived: dict[Callable[[SurfacePair], Any], Any] = {}
+        self.derived: dict[Any, Any] = {}  # what once_per_pair and within keep
         self.prediction, self.target = prediction, target
         if not self.complete:  # a finite stand-in keeps NaN out of sums and gradients
             self.prediction = torch.where(self.depth_mask, prediction, 1.0)
@@ -126,15 +125,7 @@ class SurfacePair:
     ) -> SurfacePair:
         """Return a given pair, or make one of a prediction, a target and their camera, as metric classes accept either.
 
-        Args:
-            preds: the pair, or (B, 1, H, W) predicted orthogonal depth in metres, a tensor or an array.
-            target: (B, 1, H, W) true depth.
-            camera: of these pixels, one of all images or a list; or their rays, (3, H, W) or (B, 3, H, W).
-            mask: (B, 1, H, W) bool, the pixels to compare; None for all.
-
-        Raises:
-            ValueError: the target or the camera is missing, or shapes do not fit together.
-
+        Depth and mask are (B, 1, H, W), tensors or arrays; the camera is that of all images, a list, or their rays.
         """
         if isinstance(preds, SurfacePair):
             if not (target is camera is mask is None):
@@ -157,16 +148,22 @@ class SurfacePair:
             rays = rays[None] if rays.ndim == 3 else rays
         return cls(first, second, rays, None if mask is None else torch.as_tensor(mask))
 
-    def derive(self, make: Callable[[SurfacePair], _Derived]) -> _Derived:
-        """Return ``make(self)``, computed once per pair: for quantities that several metrics share."""
-        if make not in self._derived:
-            self._derived[make] = make(self)
-        derived: _Derived = self._derived[make]
-        return derived
-
     def within(self, region: str) -> SurfacePair:
         """Return the pair in a region alone."""
-        return self.derive(_in_region(region))
+        if region not in self.derived:
+            mask = self.regions[region] > 0
+            self.derived[region] = SurfacePair(
+                *self.given,
+                self.rays,
+                mask if self.mask is None else mask & self.mask,
+                unit=self.unit,
+                regions={region: self.regions[region]},
+                depth_error=self.depth_error,
+                angle_error=self.angle_error,
+                image_dtype=self.image_dtype,
+            )
+        found: SurfacePair = self.derived[region]
+        return found
 
     @cached_property
     def normals(self) -> tuple[Tensor, Tensor]:
@@ -229,63 +226,15 @@ class SurfacePair:
         return values if self.complete else values * self.normal_mask
 
 
-@functools.cache
-def _in_region(name: str) -> Callable[[SurfacePair], SurfacePair]:
-    """Return a function that restricts a pair to a region, the same for each name."""
-
-    def restrict(pair: SurfacePair) -> SurfacePair:
-        mask = pair.regions[name] > 0
-        mask = mask if pair.mask is None else mask & pair.mask
-        regions, kind = {name: pair.regions[name]}, pair.image_dtype
-        return SurfacePair(
-            *pair.given,
-            pair.rays,
-            mask,
-            unit=pair.unit,
-            regions=regions,
-            depth_error=pair.depth_error,
-            angle_error=pair.angle_error,
-            image_dtype=kind,
-        )
-
-    return restrict
-
-
 def rmse_d(pair: SurfacePair) -> Tensor:
-    """Return the RMS difference of the perspective depths in metres, (B,).
-
-    Example:
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.metrics.functional import SurfacePair
-        >>> from dsr.metrics.functional import rmse_d
-        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
-        >>> truth = torch.full((1, 1, 24, 32), 2.0)
-        >>> rmse_d(SurfacePair(truth + 0.01, truth, camera.rays()[None])).round(decimals=3)  # along the rays
-        tensor([0.0110])
-
-    """
+    """Return the RMS difference of the perspective depths in metres, (B,)."""
     return masked_mean(pair.perspective_error.square(), pair.depth_mask).sqrt().squeeze(1)
 
 
 def bad_pix_d(pair: SurfacePair, threshold: float, *, relative: bool = False) -> Tensor:
     """Return the fraction of pixels whose perspective depths differ by more than a threshold, (B,).
 
-    Args:
-        pair: the two surfaces.
-        threshold: in metres, or as a fraction of the target where ``relative``.
-        relative: see ``threshold``.
-
-    Example:
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.metrics.functional import SurfacePair
-        >>> from dsr.metrics.functional import bad_pix_d
-        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
-        >>> truth = torch.full((1, 1, 24, 32), 2.0)
-        >>> bad_pix_d(SurfacePair(1.02 * truth, truth, camera.rays()[None]), 0.01, relative=True)
-        tensor([1.], dtype=torch.float64)
-
+    The threshold is in metres, or a fraction of the target if ``relative``.
     """
     limit = pair.target * pair.ray_lengths * threshold if relative else threshold
     return masked_mean(pair.perspective_error > limit, pair.depth_mask).squeeze(1)
@@ -301,19 +250,7 @@ def mse_v(pair: SurfacePair) -> Tensor:
 
 
 def rmse_v(pair: SurfacePair) -> Tensor:
-    """Return RMSE_v = sqrt(MSE_v), (B,).
-
-    Example:
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.metrics.functional import SurfacePair
-        >>> from dsr.metrics.functional import rmse_v
-        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
-        >>> truth = torch.full((1, 1, 24, 32), 2.0)
-        >>> rmse_v(SurfacePair(truth + 0.01, truth, camera.rays()[None]))  # a wall nearer by shows the same
-        tensor([0.])
-
-    """
+    """Return RMSE_v = sqrt(MSE_v), (B,)."""
     return mse_v(pair).sqrt()
 
 
@@ -333,21 +270,6 @@ def dssim_v(pair: SurfacePair) -> Tensor:
 
     SSIM (Wang et al. 2004) with a 7 x 7 uniform window, sample covariance and a data range of 2; windows that
     would extend beyond the border are left out.
-
-    Raises:
-        ValueError: the map is smaller than a window.
-
-    Example:
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.metrics.functional import SurfacePair
-        >>> from dsr.metrics.functional import dssim_v
-        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
-        >>> truth = torch.full((1, 1, 24, 32), 2.0)
-        >>> noise = 0.01 * torch.rand(truth.shape, generator=torch.Generator().manual_seed(0))
-        >>> dssim_v(SurfacePair(truth + noise, truth, camera.rays()[None])).shape  # for each light
-        torch.Size([1, 4])
-
     """
     first, second = pair.renderings
     if min(first.shape[-2:]) < SSIM_WINDOW:
@@ -361,17 +283,6 @@ def bumpiness_d(pair: SurfacePair) -> Tensor:
 
     Metric of the 4D light field benchmark (Honauer et al. 2016), with k in px m as if its camera had seen the scene.
     Derivatives are Scharr filters, 0 on the map's outermost pixel after each.
-
-    Example:
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.metrics.functional import SurfacePair
-        >>> from dsr.metrics.functional import bumpiness_d
-        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
-        >>> truth = torch.full((1, 1, 24, 32), 2.0)
-        >>> bumpiness_d(SurfacePair(truth, truth, camera.rays()[None]))
-        tensor([0.])
-
     """
     difference = (BUMPINESS_DISPARITY * (1 / pair.prediction - 1 / pair.target)).to(pair.image_dtype)
     if not pair.complete:
@@ -382,12 +293,9 @@ def bumpiness_d(pair: SurfacePair) -> Tensor:
     return 100 * masked_mean(squares.sqrt().clamp(max=BUMPINESS_CLIP), pair.bumpiness_mask).squeeze(1)
 
 
+@once_per_pair
 def angle(pair: SurfacePair) -> Tensor:
     """Return the angle between the two normals in degrees, (B, 1, H, W); meaningful where ``normal_mask`` is set."""
-    return pair.derive(_angle)
-
-
-def _angle(pair: SurfacePair) -> Tensor:
     return angle_between(*pair.normals)
 
 
@@ -400,13 +308,7 @@ def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
 
 
 def masked_median(values: Tensor, mask: Tensor) -> Tensor:
-    """Return the median over the pixels that are set, (B, 1, 1, 1); of an even number the mean of the middle two.
-
-    Args:
-        values: (B, 1, H, W).
-        mask: (B, 1, H, W) bool; NaN for an image without a set pixel.
-
-    """
+    """Return the median of (B, 1, H, W) where the mask is set, (B, 1, 1, 1); of an even number of the middle two."""
     ordered = values.masked_fill(~mask, torch.inf).flatten(1).sort(dim=1).values
     count = mask.flatten(1).sum(dim=1, keepdim=True)
     middle = torch.cat(((count - 1).clamp(min=0) // 2, count // 2), dim=1)

@@ -24,10 +24,9 @@ from dsr.utils.guards import expect_stored
 
 TRUNK_FILE = "alexnet-owt-7be5be79.pth"
 TRUNK_URL = f"https://download.pytorch.org/models/{TRUNK_FILE}"
+# what to do where the trunk is missing, for messages
 GET_TRUNK = f"get {TRUNK_URL} and set metrics.lpips_trunk=FILE or $DSR_LPIPS_TRUNK"
-"""What to do where the trunk is missing, for messages."""
-TRUNK_HASH = "7be5be79"
-"""First digits of the official file's SHA-256, as in its name."""
+TRUNK_HASH = "7be5be79"  # first digits of the official file's SHA-256, as in its name
 _MEAN = (-0.030, -0.088, -0.188)
 _STD = (0.458, 0.448, 0.450)
 _CONVOLUTIONS = {  # index in torchvision's `features`: (in, out, kernel, stride, padding)
@@ -39,20 +38,11 @@ _CONVOLUTIONS = {  # index in torchvision's `features`: (in, out, kernel, stride
 }
 _POOL_BEFORE = (3, 6)
 _DOWNLOAD_TIMEOUT = 15.0
-MIN_SIZE = 31
-"""Smallest height and width in pixels for which the trunk's last level has a feature."""
+MIN_SIZE = 31  # smallest height and width in pixels for which the trunk's last level has a feature
 
 
 class LPIPS(nn.Module):
-    """Learned perceptual image patch similarity, version 0.1, AlexNet.
-
-    Args:
-        trunk: state dict of torchvision's AlexNet (``features.*``; further keys are ignored).
-
-    Raises:
-        ValueError: a tensor is missing or has another shape.
-
-    """
+    """Learned perceptual image patch similarity, version 0.1, of the state dict of torchvision's AlexNet."""
 
     mean: Tensor
     std: Tensor
@@ -79,12 +69,7 @@ class LPIPS(nn.Module):
         self.eval()
 
     def features(self, images: Tensor) -> list[Tensor]:
-        """Return the five feature maps, each of unit length along its channels.
-
-        Args:
-            images: (B, 3, H, W) in [-1, 1].
-
-        """
+        """Return the five feature maps of (B, 3, H, W) images in [-1, 1], each of unit length along its channels."""
         maps, values = [], (images - self.mean) / self.std
         for index, layer in self.convolutions.items():
             if int(index) in _POOL_BEFORE:
@@ -95,16 +80,9 @@ class LPIPS(nn.Module):
 
     @in_own_precision
     def forward(self, first: Tensor, second: Tensor, mask: Tensor | None = None) -> Tensor:
-        """Return the distance of two images, (B,).
+        """Return the distance of two images, (B, 3, H, W) in [-1, 1], at least 31 x 31: (B,).
 
-        Args:
-            first: (B, 3, H, W) in [-1, 1], at least 31 x 31.
-            second: (B, 3, H, W) in [-1, 1].
-            mask: (B, 1, H, W) bool; each feature is weighted by the fraction of its pixels that is set. None for all.
-
-        Raises:
-            ValueError: the images are smaller than the trunk can take.
-
+        With a mask, (B, 1, H, W) bool, each feature is weighted by the fraction of its pixels that is set.
         """
         if min(first.shape[-2:]) < MIN_SIZE:
             came = tuple(first.shape[-2:])
@@ -126,13 +104,7 @@ class LPIPS(nn.Module):
 
 
 def lpips_v(pair: SurfacePair, network: LPIPS) -> Tensor:
-    """Return LPIPS_v per light, (B, 4): LPIPS of the renderings, repeated to three channels, scaled to [-1, 1].
-
-    Args:
-        pair: the two surfaces.
-        network: it is moved to the pair's device.
-
-    """
+    """Return LPIPS_v per light, (B, 4): LPIPS of the renderings, repeated to three channels, scaled to [-1, 1]."""
     network.to(pair.target.device)
     batch, count, height, width = pair.renderings[0].shape
     as_images = [
@@ -144,16 +116,7 @@ def lpips_v(pair: SurfacePair, network: LPIPS) -> Tensor:
 
 
 def find_trunk(configured: Path | None) -> Path:
-    """Return the file of AlexNet's weights: the configured one, the torch hub cache's, or downloaded into that cache.
-
-    Args:
-        configured: a file; None to use the cache.
-
-    Raises:
-        FileNotFoundError: the configured file does not exist.
-        OSError: it is not in the cache and could not be downloaded; no partial file is left.
-
-    """
+    """Return the file of AlexNet's weights: the configured one, the torch hub cache's, or downloaded into it."""
     if configured is not None:
         if not configured.is_file():
             raise FileNotFoundError(f"expected a file, got {configured} (no such file)")
@@ -170,13 +133,7 @@ def find_trunk(configured: Path | None) -> Path:
 
 
 def load_lpips(configured: Path | None = None) -> LPIPS:
-    """Return the LPIPS network with the trunk that :func:`find_trunk` finds.
-
-    Raises:
-        ValueError: the file is not a state dict of AlexNet.
-        OSError: no trunk is available.
-
-    """
+    """Return the LPIPS network with the trunk that :func:`find_trunk` finds."""
     path = find_trunk(configured)
     try:
         expect_stored(path)

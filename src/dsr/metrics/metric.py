@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from dsr.geometry.lights import LIGHT_NAMES
+from dsr.geometry.shading import LIGHT_NAMES
 from dsr.metrics.formats import MetricFormat
 from dsr.metrics.functional import SurfacePair
-from dsr.metrics.lpips import LPIPS
 from dsr.utils.compute_device import in_own_precision
 
 WORST, AVERAGE = "max", "avg"
@@ -24,21 +23,17 @@ class Metric:
 
     Args:
         name: as in ``scores.csv``.
-        function: from a pair to (B,), or to (B, 4) where ``per_light``.
+        function: from a pair to (B,), or to (B, 4) if ``per_light``.
         mask: from a pair to the (B, 1, H', W') pixels that the metric uses.
         format: how tables and figures show it.
         per_light: whether there is a value for each of the lights e1..e4.
         min_size: smallest height and width in pixels that it is defined for.
-        perceptual: whether the function takes an LPIPS network, ``network``.
-        network: that of a perceptual metric; :func:`dsr.metrics.catalogue.catalogue` sets it.
-        unit: name of the unit of the benchmarks that it is for, see :class:`dsr.sample.Unit`; None for all of them.
-        region: the part of the image that it is of, see :class:`dsr.sample.Scene`; None for all of it. It is left out
-            where a scene has no such region.
-        regional: whether tables of regions have it; None for metrics that are means over the pixels with a depth, or
-            a normal, in both maps.
+        perceptual: whether the function takes an LPIPS ``network``; :func:`dsr.metrics.catalogue.catalogue` binds it.
+        unit: name of the benchmarks' unit that it is for, see :class:`dsr.sample.Unit`; None for all of them.
+        region: the part of the image that it is of, see :class:`dsr.sample.Scene`. Scenes without it are skipped.
+        regional: whether tables of regions have it; None for means over the pixels with both depths or both normals.
         whole: whether it is computed of the whole image even where a method left out rows or columns at the border.
-        stated: the expected errors of the method that it compares, ``depth_error`` or ``angle_error``; it is left out
-            for methods that state none. None if it needs none.
+        stated: the expected errors that it compares, ``depth_error`` or ``angle_error``; methods without are skipped.
 
     """
 
@@ -49,7 +44,6 @@ class Metric:
     per_light: bool = False
     min_size: int = 2
     perceptual: bool = False
-    network: LPIPS | None = field(default=None, repr=False, compare=False)
     unit: str | None = None
     region: str | None = None
     regional: bool | None = None
@@ -57,7 +51,7 @@ class Metric:
     stated: str | None = None
 
     def applies(self, pair: SurfacePair) -> bool:
-        """Return whether the metric is for the pair's benchmark, and there are the region and errors that it needs."""
+        """Return whether the metric is for the pair's benchmark, and the pair has its region and expected errors."""
         known = self.stated is None or getattr(pair, self.stated) is not None
         return known and self.unit in (None, pair.unit.name) and (self.region is None or self.region in pair.regions)
 
@@ -77,34 +71,28 @@ class Metric:
 
     @property
     def worst(self) -> str:
-        """The variant that is the worst of four lights: the largest value, the smallest where higher is better."""
+        """The variant that is the worst of four lights: the largest value, the smallest if higher is better."""
         return "min" if self.format.higher_is_better else WORST
 
+    @in_own_precision
     def variants(self, pair: SurfacePair) -> dict[str, Tensor]:
         """Return the value per image, (B,), by variant: e1..e4, the worst of them and their average, or just "".
 
         NaN for images below the metric's smallest size.
         """
         pair = pair if self.region is None else pair.within(self.region)
-        count, size = len(pair.target), min(pair.target.shape[-2:])
-        if size < self.min_size:
-            values = pair.target.new_full((count, len(LIGHT_NAMES)) if self.per_light else (count,), torch.nan)
+        shape = (len(pair.target), len(LIGHT_NAMES)) if self.per_light else (len(pair.target),)
+        if min(pair.target.shape[-2:]) < self.min_size:
+            values = pair.target.new_full(shape, torch.nan)
         else:
-            values = self._values(pair)
+            values = self.function(pair)
+        if tuple(values.shape) != shape:
+            raise ValueError(f"{self.name}: expected values of shape {shape}, got {tuple(values.shape)}")
         if not self.per_light:
             return {"": values}
         by_light = dict(zip(LIGHT_NAMES, values.unbind(1), strict=True))
         worst = values.amin(dim=1) if self.format.higher_is_better else values.amax(dim=1)
         return {**by_light, self.worst: worst, AVERAGE: values.mean(dim=1)}
-
-    @in_own_precision
-    def _values(self, pair: SurfacePair) -> Tensor:
-        """Return the function's values, of the right shape."""
-        values = self.function(pair, network=self.network) if self.perceptual else self.function(pair)
-        expected = (len(pair.target), len(LIGHT_NAMES)) if self.per_light else (len(pair.target),)
-        if tuple(values.shape) != expected:
-            raise ValueError(f"{self.name}: expected values of shape {expected}, got {tuple(values.shape)}")
-        return values
 
     def valid_fraction(self, pair: SurfacePair) -> Tensor:
         """Return the valid fraction of the pixels that the metric would use in a complete map, (B,)."""

@@ -1,28 +1,22 @@
 """Metrics of the points that a depth map is back-projected to, against those of the true map: P = z r, in metres.
 
 The predicted cloud has the pixels with both depths, the true one all pixels with a true depth. Distances are Euclidean,
-each to the nearest point of the other cloud, wherever in the image that is; nothing is thinned out.
+each to the nearest point of the other cloud; nothing is thinned out.
 
-- *Chamfer distance*: the mean of two means, over predicted points to the true cloud and over true points to the
-  predicted one. ``chamfer_dist`` in ``unidepth/utils/evaluation_depth.py`` of lpiccinelli-eth/UniDepth (8d8cfe4).
+- *Chamfer distance*: the mean of the mean distances of either cloud to the other. ``chamfer_dist`` in
+  ``unidepth/utils/evaluation_depth.py`` of lpiccinelli-eth/UniDepth (8d8cfe4).
 - *F-score*: the harmonic mean of precision and recall, the fractions of the two clouds that are less than a threshold
   from the other one. Knapitsch et al., *Tanks and Temples*, SIGGRAPH 2017; at 5 cm as for ScanNet, ``eval_mesh`` in
-  ``atlas/evaluation.py`` of magicleap/Atlas (bee3ddb), which thins both clouds out to 2 cm first; and at 1 cm, the
-  smallest threshold of ETH3D (Schoeps et al., CVPR 2017).
-- *Flying pixels*: predicted points in the void between two surfaces (Sabov and Krueger, *Identification and Correction
-  of Flying Pixels in Range Camera Data*, SCCG 2008). Benchmarks of depth maps do not count them; some measure them by
-  the soft edge error, the difference of a depth near an edge from the most similar true depth around (Chen et al., *On
-  the Over-Smoothing Problem of CNN Based Disparity Estimation*, ICCV 2019). Accordingly a point flies if
+  ``atlas/evaluation.py`` of magicleap/Atlas (bee3ddb), which thins both clouds out to 2 cm first; and at 1 cm.
+- *Flying pixels*: predicted points in the void between two surfaces (Sabov and Krueger, SCCG 2008). A point flies if
 
   1. an occlusion edge of the truth is within 16 pixels along rows and columns, as far as one low-resolution pixel
-     reaches at x16: two neighbours whose depths have a ratio of more than 1.05, the smallest that Depth Pro counts as
-     an occluding contour (``src/depth_pro/eval/boundary_metrics.py`` of apple/ml-depth-pro, 9efe5c1);
+     reaches at x16: two neighbours whose depths have a ratio of more than 1.05, as in Depth Pro's contours;
   2. along the ray it lies behind the nearest front and before the farthest back of these edges; and
-  3. along and across the ray it is more than 1 % of its depth away from every true point.
+  3. it is more than 1 % of its depth away from every true point.
 
 A hole of a prediction does not fly and adds nothing to a precision, but the true points there are far from the
-predicted cloud, and ``Points_covered`` stands beside these metrics. Where the truth has holes at its edges, as from a
-stereo camera, it has fewer of them to fly at.
+predicted cloud, and ``Points_covered`` stands beside these metrics.
 """
 
 from __future__ import annotations
@@ -32,31 +26,24 @@ from functools import partial
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from dsr.geometry.surface import back_project
-from dsr.metrics import depth
+from dsr.metrics.depth import covered
 from dsr.metrics.formats import column
-from dsr.metrics.functional import SurfacePair, masked_mean
+from dsr.metrics.functional import SurfacePair, masked_mean, once_per_pair
 from dsr.metrics.metric import Metric, depth_mask, target_mask
 
 EDGE_RATIO = 1.05
 EDGE_RADIUS = 16
-FLYING = 0.01
-"""Distance of a flying pixel from every true point, as a fraction of its depth."""
+FLYING = 0.01  # distance of a flying pixel from every true point, as a fraction of its depth
 
 
 def nearest(points: Tensor, valid: Tensor, cloud: Tensor, known: Tensor) -> Tensor:
-    """Return the distance of each point from the nearest one of another cloud, exactly.
+    """Return the distance of each point from the nearest one of another cloud, exactly, by a k-d tree on the CPU.
 
-    It is computed by a k-d tree on the CPU and not differentiable.
-
-    Args:
-        points, cloud: (B, 3, H, W); a point's place in its map does not matter.
-        valid, known: (B, 1, H, W) bool, the points that there are.
-
-    Returns:
-        (B, 1, H, W) in the unit of the points; 0 where there is no point, infinite where there is no other one.
-
+    Points and cloud are (B, 3, H, W), ``valid`` and ``known`` (B, 1, H, W) bool the points that there are. The
+    distances, (B, 1, H, W), are 0 where there is no point, and infinite where there is no other one.
     """
     distances = torch.zeros_like(points[:, :1])
     if points.is_meta:  # values are needed, and there are none
@@ -69,46 +56,22 @@ def nearest(points: Tensor, valid: Tensor, cloud: Tensor, known: Tensor) -> Tens
     return distances
 
 
+@once_per_pair
 def to_truth(pair: SurfacePair) -> Tensor:
     """Return the distances of the predicted points from the true cloud in metres, (B, 1, H, W); 0 without a point."""
-    return pair.derive(_to_truth)
-
-
-def to_prediction(pair: SurfacePair) -> Tensor:
-    """Return the distances of the true points from the predicted cloud in metres, (B, 1, H, W); 0 without a point."""
-    return pair.derive(_to_prediction)
-
-
-def _to_truth(pair: SurfacePair) -> Tensor:
-    predicted, true = pair.derive(_clouds)
+    predicted, true = back_project(pair.prediction, pair.rays), back_project(pair.given[1], pair.rays)
     return nearest(predicted, pair.depth_mask, true, pair.target_mask)
 
 
-def _to_prediction(pair: SurfacePair) -> Tensor:
-    predicted, true = pair.derive(_clouds)
+@once_per_pair
+def to_prediction(pair: SurfacePair) -> Tensor:
+    """Return the distances of the true points from the predicted cloud in metres, (B, 1, H, W); 0 without a point."""
+    predicted, true = back_project(pair.prediction, pair.rays), back_project(pair.given[1], pair.rays)
     return nearest(true, pair.target_mask, predicted, pair.depth_mask)
 
 
-def _clouds(pair: SurfacePair) -> tuple[Tensor, Tensor]:
-    """Return the predicted and the true points, (B, 3, H, W) each."""
-    predicted, true = (back_project(depth, pair.rays) for depth in (pair.prediction, pair.given[1]))
-    return predicted, true
-
-
 def chamfer(pair: SurfacePair) -> Tensor:
-    """Return the Chamfer distance in metres, (B,); lower is better. NaN without a predicted point.
-
-    Example:
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.metrics.functional import SurfacePair
-        >>> from dsr.metrics.points import chamfer
-        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
-        >>> truth = torch.full((1, 1, 24, 32), 2.0)
-        >>> chamfer(SurfacePair(truth + 0.01, truth, camera.rays()[None])).round(decimals=3)
-        tensor([0.0110])
-
-    """
+    """Return the Chamfer distance in metres, (B,); lower is better. NaN without a predicted point."""
     both = masked_mean(to_truth(pair), pair.depth_mask) + masked_mean(to_prediction(pair), pair.target_mask)
     return both.squeeze(1) / 2
 
@@ -123,15 +86,8 @@ def f_score(pair: SurfacePair, threshold: float) -> Tensor:
 
 def flying(pair: SurfacePair) -> Tensor:
     """Return the fraction of the predicted points that fly between two surfaces, (B,); lower is better."""
-    front, back = _edges(pair)
-    between = (front < pair.prediction) & (pair.prediction < back)
-    return masked_mean(between & (to_truth(pair) > FLYING * pair.prediction), pair.depth_mask).squeeze(1)
-
-
-def _edges(pair: SurfacePair) -> tuple[Tensor, Tensor]:
-    """Return the nearest front and the farthest back of the true edges around each pixel; inf and 0 without any."""
     truth = torch.where(pair.target_mask, pair.given[1], torch.nan)
-    front, back = torch.full_like(truth, torch.inf), torch.zeros_like(truth)
+    front, back = torch.full_like(truth, torch.inf), torch.zeros_like(truth)  # of the true edges at a pixel
     for dim in (-1, -2):
         size = truth.shape[dim] - 1
         sides = truth.narrow(dim, 0, size), truth.narrow(dim, 1, size)
@@ -142,21 +98,16 @@ def _edges(pair: SurfacePair) -> tuple[Tensor, Tensor]:
             part.copy_(torch.where(edge, torch.minimum(part, near), part))
             part = back.narrow(dim, start, size)
             part.copy_(torch.where(edge, torch.maximum(part, far), part))
-    return -_largest_around(-front), _largest_around(back)
+    front, back = -largest_around(-front, EDGE_RADIUS), largest_around(back, EDGE_RADIUS)
+    between = (front < pair.prediction) & (pair.prediction < back)
+    return masked_mean(between & (to_truth(pair) > FLYING * pair.prediction), pair.depth_mask).squeeze(1)
 
 
-def _largest_around(values: Tensor) -> Tensor:
-    """Return the largest value within the radius of the edges along rows and columns."""
-    for size in ((1, 2 * EDGE_RADIUS + 1), (2 * EDGE_RADIUS + 1, 1)):
-        pad = size[0] // 2, size[1] // 2
-        values = torch.nn.functional.max_pool2d(values, size, stride=1, padding=pad)
+def largest_around(values: Tensor, radius: int) -> Tensor:
+    """Return the largest value up to ``radius`` pixels away along rows and columns, (B, 1, H, W)."""
+    for size in ((1, 2 * radius + 1), (2 * radius + 1, 1)):
+        values = max_pool2d(values, size, stride=1, padding=(size[0] // 2, size[1] // 2))
     return values
-
-
-def _f_score(centimetres: int) -> Metric:
-    function = partial(f_score, threshold=centimetres / 100)
-    form = column(f"F at {centimetres} cm", "%", 1e2, 2, higher_is_better=True)
-    return Metric(f"Points_F_{centimetres}cm", function, target_mask, form, min_size=1, unit="cm", whole=True)
 
 
 METRICS: tuple[Metric, ...] = (
@@ -170,17 +121,13 @@ METRICS: tuple[Metric, ...] = (
         regional=False,  # the outlines of a region's objects are edges of what lies outside
         whole=True,
     ),
-    Metric("Points_chamfer", chamfer, target_mask, column("Chamfer", "mm", 1e3, 2), min_size=1, unit="cm", whole=True),
-    _f_score(1),
-    _f_score(5),
-    Metric(
-        "Points_covered",
-        depth.covered,
-        target_mask,
-        column("Covered", "points, %", 1e2, 1, higher_is_better=True),
-        min_size=1,
-        unit="cm",
-        whole=True,
+    *(
+        Metric(f"Points_{name}", function, target_mask, shown, min_size=1, unit="cm", whole=True)
+        for name, function, shown in (
+            ("chamfer", chamfer, column("Chamfer", "mm", 1e3, 2)),
+            ("F_1cm", partial(f_score, threshold=0.01), column("F at 1 cm", "%", 1e2, 2, higher_is_better=True)),
+            ("F_5cm", partial(f_score, threshold=0.05), column("F at 5 cm", "%", 1e2, 2, higher_is_better=True)),
+            ("covered", covered, column("Covered", "points, %", 1e2, 1, higher_is_better=True)),
+        )
     ),
 )
-"""The metrics of ``metrics=points``."""

@@ -14,27 +14,20 @@ import torch
 from torch import Tensor
 
 from dsr.metrics.formats import column
-from dsr.metrics.functional import SSIM_WINDOW, SurfacePair, angle, masked_mean, masked_median, ssim_map
+from dsr.metrics.functional import SSIM_WINDOW, SurfacePair, angle, masked_mean, masked_median, once_per_pair, ssim_map
 from dsr.metrics.metric import Metric
 
 TRUTH_EROSION = 3
 PREDICTION_EROSION = 1
-LARGEST_ERROR = 0.1
-"""Metres; a prediction further off is another surface, not a shape of this one."""
+LARGEST_ERROR = 0.1  # metres; a prediction further off is another surface, not a shape of this one
 
 
 class SensorComparison:
-    """What the metrics derive from a pair.
+    """What the metrics derive from a pair of the refined map and the truth.
 
-    Args:
-        pair: the refined map and the truth.
-
-    Attributes:
-        inner: (B, 1, H, W) bool, the pixels that a prediction should cover.
-        scored: (B, 1, H, W) bool, those that it covers.
-        offset: (B, 1, 1, 1) median of prediction - truth over the scored pixels, in metres.
-        surfaces: the prediction less the offset, and the truth, without unknown pixels.
-
+    ``inner`` are the pixels that a prediction should cover and ``scored`` those that it covers, (B, 1, H, W) bool;
+    ``offset`` is the median of prediction - truth over the scored pixels in metres, (B, 1, 1, 1); ``surfaces`` are the
+    prediction less the offset, and the truth, without unknown pixels.
     """
 
     def __init__(self, pair: SurfacePair) -> None:
@@ -53,13 +46,16 @@ class SensorComparison:
         )
 
 
+@once_per_pair
+def compare(pair: SurfacePair) -> SensorComparison:
+    """Return the comparison of a pair."""
+    return SensorComparison(pair)
+
+
 def erode(mask: Tensor, steps: int) -> Tensor:
-    """Return a mask without the pixels within ``steps`` of an unset one, counted along rows and columns.
+    """Return a mask (B, 1, H, W) without the pixels within ``steps`` of an unset one along rows and columns.
 
-    Args:
-        mask: (B, 1, H, W) bool; pixels outside count as unset.
-        steps: distance in pixels.
-
+    Pixels outside count as unset.
     """
     for _ in range(steps):
         padded = torch.nn.functional.pad(mask, (1, 1, 1, 1))
@@ -70,25 +66,25 @@ def erode(mask: Tensor, steps: int) -> Tensor:
 
 def covered(pair: SurfacePair) -> Tensor:
     """Return the fraction of the inner pixels that are scored, (B,)."""
-    comparison = pair.derive(SensorComparison)
+    comparison = compare(pair)
     return masked_mean(comparison.scored, comparison.inner).squeeze(1)
 
 
 def offset_d(pair: SurfacePair) -> Tensor:
     """Return the absolute value of the offset in metres, (B,)."""
-    return pair.derive(SensorComparison).offset.abs().flatten()
+    return compare(pair).offset.abs().flatten()
 
 
 def rmse_d(pair: SurfacePair) -> Tensor:
     """Return the RMS difference of orthogonal depth in metres after the offset's removal, (B,)."""
-    comparison = pair.derive(SensorComparison)
+    comparison = compare(pair)
     difference = comparison.surfaces.prediction - comparison.surfaces.target
     return masked_mean(difference.square(), comparison.scored).sqrt().squeeze(1)
 
 
 def rmse_v(pair: SurfacePair) -> Tensor:
     """Return RMSE_v over the scored pixels, (B,), see :func:`dsr.metrics.functional.rmse_v`."""
-    comparison = pair.derive(SensorComparison)
+    comparison = compare(pair)
     first, second = comparison.surfaces.normals
     squares = (first - second).square().mean(dim=1, keepdim=True)
     return masked_mean(squares, comparison.scored).sqrt().squeeze(1)
@@ -96,7 +92,7 @@ def rmse_v(pair: SurfacePair) -> Tensor:
 
 def dssim_v(pair: SurfacePair) -> Tensor:
     """Return DSSIM_v over the scored pixels per light, (B, 4), see :func:`dsr.metrics.functional.dssim_v`."""
-    comparison = pair.derive(SensorComparison)
+    comparison = compare(pair)
     border = SSIM_WINDOW // 2  # no scored pixel is so close to it
     scored = comparison.scored[..., border:-border, border:-border]
     lights = zip(*(maps.unbind(1) for maps in comparison.surfaces.renderings), strict=True)
@@ -105,22 +101,22 @@ def dssim_v(pair: SurfacePair) -> Tensor:
 
 def angle_mean(pair: SurfacePair) -> Tensor:
     """Return the mean angle between the normals over the scored pixels, (B,) in degrees."""
-    comparison = pair.derive(SensorComparison)
+    comparison = compare(pair)
     return masked_mean(angle(comparison.surfaces), comparison.scored).squeeze(1)
 
 
 def angle_median(pair: SurfacePair) -> Tensor:
     """Return the median angle between the normals over the scored pixels, (B,) in degrees."""
-    comparison = pair.derive(SensorComparison)
+    comparison = compare(pair)
     return masked_median(angle(comparison.surfaces), comparison.scored).flatten()
 
 
 def _inner(pair: SurfacePair) -> Tensor:
-    return pair.derive(SensorComparison).inner
+    return compare(pair).inner
 
 
 def _scored(pair: SurfacePair) -> Tensor:
-    return pair.derive(SensorComparison).scored
+    return compare(pair).scored
 
 
 METRICS: tuple[Metric, ...] = (
@@ -139,5 +135,4 @@ METRICS: tuple[Metric, ...] = (
     Metric("Sensor_covered", covered, _inner, column("Covered", "%", 1e2, 1, higher_is_better=True), whole=True),
     Metric("Sensor_offset", offset_d, _scored, column("Offset", "mm", 1e3, 2), whole=True),
     Metric("Sensor_RMSE_d", rmse_d, _scored, column("RMSE_d", "sensor, mm", 1e3, 2), whole=True),
-)
-"""The metrics of ``metrics=sensor``."""
+)  # the metrics of metrics=sensor

@@ -15,12 +15,10 @@ but the last. Holes are left out, and :func:`covered` stands beside them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 import torch
-import torchmetrics
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
@@ -31,27 +29,18 @@ from dsr.metrics.functional import masked_mean, masked_median
 from dsr.utils.compute_device import in_own_precision
 
 Poses = Tensor | np.ndarray | Sequence[np.ndarray]
-_VISIBLE = 50.0
-"""How fast the weight of a pixel falls with the squared difference of its colours."""
+_VISIBLE = 50.0  # how fast the weight of a pixel falls with the squared difference of its colours
+# change of the true depth from frame to frame, as a fraction of the frame's range, from which on it is motion
 _MOVING = 0.05
-"""Change of the true depth from frame to frame, as a fraction of the frame's range, from which on it is motion."""
 
 
 @in_own_precision
 def flicker(depths: Tensor, static: Tensor | None = None) -> Tensor:
     """Return the mean over the pixels of the standard deviation over time of depth, relative to its median over time.
 
-    Args:
-        depths: (T, 1, H, W) orthogonal depth in metres, T at least 2; NaN is a hole, and so is a depth that is not
-            positive. A pixel counts if it has a depth in two frames or more.
-        static: (1, 1, H, W) bool, the pixels where nothing moves; None for all.
-
-    Returns:
-        () a fraction; NaN if no pixel counts.
-
-    Raises:
-        ValueError: a shape is not as above.
-
+    Depths are (T, 1, H, W) orthogonal depth in metres, T at least 2; NaN is a hole, and so is a depth that is not
+    positive. A pixel counts if it has a depth in two frames or more. ``static``, (1, 1, H, W) bool, are the pixels
+    where nothing moves. A fraction, (); NaN if no pixel counts.
     """
     spread, mask = _spread(depths, static)
     return masked_mean(spread, mask).squeeze()
@@ -71,10 +60,7 @@ def temporal_noise(depths: Tensor, static: Tensor | None = None) -> Tensor:
 def normal_flicker(depths: Tensor, camera: Camera, static: Tensor | None = None) -> Tensor:
     """Return the mean over the pixels of the RMS angle over time between a normal and its mean direction, in degrees.
 
-    Args:
-        depths, static: as for :func:`flicker`; a pixel counts if it has a normal in two frames or more.
-        camera: that stands still.
-
+    The camera stands still; a pixel counts if it has a normal in two frames or more.
     """
     known = _known(depths)
     normals = depth_to_normals(depths.masked_fill(~known, torch.nan), camera.rays(device=depths.device)[None])
@@ -87,12 +73,7 @@ def normal_flicker(depths: Tensor, camera: Camera, static: Tensor | None = None)
 
 
 def covered(depths: Tensor, static: Tensor | None = None) -> Tensor:
-    """Return the fraction of the pixels of all frames that have a depth, (); higher is better.
-
-    Args:
-        depths, static: as for :func:`flicker`.
-
-    """
+    """Return the fraction of the pixels of all frames that have a depth, (); higher is better."""
     share = _known(depths).to(depths).mean(dim=0, keepdim=True)
     return masked_mean(share, torch.ones_like(share, dtype=torch.bool) if static is None else static).squeeze()
 
@@ -119,19 +100,6 @@ def opw(
     Returns:
         () in metres, the mean over the pairs of frames; NaN if one has nothing to compare.
 
-    Raises:
-        ValueError: a shape is not as above, or a pose is not rigid.
-
-    Example:
-        >>> import numpy as np
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.metrics.temporal import opw
-        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
-        >>> depths = torch.full((3, 1, 24, 32), 2.0, dtype=torch.float64)
-        >>> float(opw(depths, camera, [np.eye(4)] * 3))  # nothing moves, nothing flickers
-        0.0
-
     """
     known = _known(depths) if static is None else _known(depths) & static
     frames = [as_rigid(np.asarray(each), f"poses: {number}") for number, each in enumerate(poses)]
@@ -155,22 +123,11 @@ def opw(
 
 @in_own_precision
 def tgm(prediction: Tensor, target: Tensor, static: Tensor | None = None) -> Tensor:
-    """Return the mean difference between the changes of predicted and true depth from frame to frame.
+    """Return the mean difference between the changes of predicted and true depth from frame to frame, () in metres.
 
-    Pixels count whose true depth changes by less than 5 % of the range of the later frame's: it is of one surface. The
-    authors' training takes disparity, fitted to the truth by a scale and a shift, and ten times the value.
-
-    Args:
-        prediction: (T, 1, H, W) orthogonal depth in metres, T at least 2; NaN is a hole.
-        target: true depth, likewise.
-        static: (T, 1, H, W) bool, the pixels to compare; None for all.
-
-    Returns:
-        () in metres; NaN if no pixel counts.
-
-    Raises:
-        ValueError: a shape is not as above.
-
+    Depths are (T, 1, H, W) in metres, NaN in holes. Pixels count whose true depth changes by less than 5 % of the range
+    of the later frame's: it is of one surface. The authors' training takes disparity, fitted to the truth by a scale
+    and a shift, and ten times the value.
     """
     if prediction.shape != target.shape:
         raise ValueError(f"target: expected shape {tuple(prediction.shape)}, got {tuple(target.shape)}")
@@ -215,76 +172,3 @@ def _sample(photo: Tensor, places: tuple[Tensor, Tensor]) -> Tensor:
     grid = torch.stack([2 * place / (size - 1) - 1 for place, size in zip(places, photo.shape[:1:-1], strict=True)], -1)
     grid = grid.nan_to_num(0).to(photo)
     return torch.nn.functional.grid_sample(photo, grid, padding_mode="border", align_corners=True)
-
-
-class SequenceMean(torchmetrics.Metric):
-    """The mean over sequences of a function of this module; ``update`` has its arguments.
-
-    It is NaN if one of the sequences has nothing to compare.
-
-    Args:
-        function: from a sequence to ().
-        **settings: as for every torchmetrics class.
-
-    """
-
-    is_differentiable = False
-    higher_is_better = False
-    full_state_update = False
-    total: Tensor
-    count: Tensor
-
-    def __init__(self, function: Callable[..., Tensor], **settings: Any) -> None:
-        super().__init__(**settings)
-        self._function = function
-        for name in ("total", "count"):
-            self.add_state(name, torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
-
-    @torch.no_grad()
-    def update(self, *sequence: Any, **named: Any) -> None:
-        """Add a sequence."""
-        self.total = self.total + self._function(*sequence, **named).to(self.total)
-        self.count = self.count + 1
-
-    def compute(self) -> Tensor:
-        """Return the mean over the sequences."""
-        return self.total / self.count
-
-    def plot(self, val: Any = None, ax: Any = None) -> Any:
-        """Plot a value, or several in a row; of matplotlib's axes, None for new ones."""
-        return self._plot(val, ax)
-
-
-class Flicker(SequenceMean):
-    """The flicker of depth, a fraction."""
-
-    def __init__(self, **settings: Any) -> None:
-        super().__init__(flicker, **settings)
-
-
-class TemporalNoise(SequenceMean):
-    """The temporal noise of Intel's tool, a fraction."""
-
-    def __init__(self, **settings: Any) -> None:
-        super().__init__(temporal_noise, **settings)
-
-
-class NormalFlicker(SequenceMean):
-    """The flicker of normals in degrees."""
-
-    def __init__(self, **settings: Any) -> None:
-        super().__init__(normal_flicker, **settings)
-
-
-class OPW(SequenceMean):
-    """The warping metric in metres."""
-
-    def __init__(self, **settings: Any) -> None:
-        super().__init__(opw, **settings)
-
-
-class TGM(SequenceMean):
-    """Temporal gradient matching in metres."""
-
-    def __init__(self, **settings: Any) -> None:
-        super().__init__(tgm, **settings)

@@ -68,7 +68,7 @@ class Order:
     def warnings(self) -> list[Assumption]:
         """Return a warning if too many fit another photo better."""
         found = find_misplaced(significances(self._depths, self._photos)) if len(self._pairs) > 1 else []
-        if len(found) < LIMITS["photo-order"].threshold:
+        if len(found) < LIMITS["photo-order"]:
             return []
         text = f"of {len(self._pairs)} pairs {len(found)} fit another photo better: are the lists in the same order?"
         own, other = (self._pairs[number] for number in found[0])

@@ -77,7 +77,7 @@ class FrameSequence:
         if picture.pose is None and self._count:
             where = "this capture has none; give --poses" if self._file is None else f"{self._file} has none"
             raise ValueError(f"--neighbours: expected a pose for each frame, {where}")
-        if picture.pose is None and self._file is not None and self._without >= LIMITS["poses-missing"].threshold:
+        if picture.pose is None and self._file is not None and self._without >= LIMITS["poses-missing"]:
             detail = f"{self._without} of {len(self._places)} frames have none"
             notes.append(
                 Assumption(f"{self._file.name} has no pose of this frame", detail, "poses-missing", self._without)
@@ -167,7 +167,7 @@ def vote(picture: Picture, views: Sequence[View], count: int, failed: int = 0) -
     text, code = f"{who} on the depth", "neighbours-disagree"
     share = agreeing / seeing if seeing else 0.0
     note = Assumption(text, detail)
-    if count and share < LIMITS[code].threshold:
+    if count and share < LIMITS[code]:
         note = Assumption(f"{text}, and hardly any agree with it: are the poses right?", detail, code, round(share, 3))
     return replace(picture, depth_lr=fused.depth, assumptions=(*picture.assumptions, note))
 

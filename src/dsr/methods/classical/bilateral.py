@@ -1,27 +1,18 @@
 """Bilateral filters: of a sensor's own depth map without the photo, and joint bilateral upsampling with it.
 
-Without the photo, it is the baseline for noisy maps: Tomasi and Manduchi, *Bilateral Filtering for Gray and Color
-Images*, ICCV 1998. A pixel becomes the mean of the pixels of a round window, weighted by Gaussians of their distance
-and of the difference of their depths: noise is averaged, while a depth step of several ``sigma_depth`` stays. Where the
-photo has more pixels than the map, the filtered map is then interpolated: bilinear means of the planes that its pixels
-stand for, see :mod:`dsr.methods.classical.photo_guided`.
+Tomasi and Manduchi, *Bilateral Filtering for Gray and Color Images*, ICCV 1998: a pixel becomes the mean of a round
+window, weighted by Gaussians of the distance and of the difference of depth. Where the photo has more pixels than the
+map, the filtered map is then interpolated as in :mod:`dsr.methods.classical.photo_guided`. Holes have no weight and
+stay holes; with ``fill_holes`` they are inpainted after filtering. OpenCV filters, in float32.
 
-Holes have no weight and stay holes; with ``fill_holes`` they are inpainted after filtering. OpenCV filters, in float32,
-with weights from a table of 4096 entries over the map's range of depth.
-
-Kopf, Cohen, Lischinski, Uyttendaele, *Joint Bilateral Upsampling*, SIGGRAPH 2007. The high-resolution value at pixel p
-is
+Kopf, Cohen, Lischinski, Uyttendaele, *Joint Bilateral Upsampling*, SIGGRAPH 2007:
 
     S_p = 1 / k_p * sum over low-resolution pixels q of S_q f(|p - q|) g(|I_p - I_q|),
 
 with Gaussians f of the distance in low-resolution pixels and g of the colour difference, and the sum k_p of the
-weights; q runs over the (2 * radius + 1)^2 low-resolution pixels around p.
-
-What differs: I_q is the mean colour over the low-resolution pixel, as low-resolution depth is a mean; the paper takes a
-single pixel of the image. Low-resolution pixels that are holes have no weight. The weights of each pixel are scaled so
-that the largest is 1: a pixel unlike all around it takes the value of its most similar neighbours, without 0 / 0.
-
-Time grows as H * W * (2 * radius + 1)^2; memory peaks at about 20 maps of H * W float64 values, whatever the radius.
+weights. What differs: I_q is the mean colour over the low-resolution pixel, as low-resolution depth is a mean. Weights
+of each pixel are scaled so that the largest is 1: a pixel unlike all around it takes the value of its most similar
+neighbours. Time grows as H * W * (2 * radius + 1)^2; memory peaks at about 20 maps of H * W float64 values.
 """
 
 from __future__ import annotations
@@ -41,8 +32,7 @@ from dsr.methods.inpainting import inpaint
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 
-_NO_WEIGHT = 10.0
-"""Standard deviations of depth at which a pixel has no weight: exp(-50)."""
+_NO_WEIGHT = 10.0  # standard deviations of depth at which a pixel has no weight: exp(-50)
 
 
 class Bilateral(GuidedMethod):
@@ -57,22 +47,6 @@ class Bilateral(GuidedMethod):
         sigma_space: standard deviation of the Gaussian of distances, in low-resolution pixels.
         fill_holes: whether holes are inpainted; otherwise a high-resolution pixel whose nearest low-resolution pixel is
             a hole is a hole.
-
-    Raises:
-        ValueError: a value is not positive.
-
-    Example:
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.degradation.downsampling import Downsampling, make_sample
-        >>> from dsr.sample import Scene
-        >>> from dsr.methods.classical.bilateral import Bilateral
-        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
-        >>> depth = torch.full((1, 24, 32), 2.0, dtype=torch.float64)
-        >>> scene = Scene("mine", "wall", torch.rand(3, 24, 32), camera, depth)
-        >>> sample = make_sample(scene, 4, Downsampling("box"), "orthogonal")
-        >>> bool((Bilateral()(sample) - 2).abs().max() < 1e-3)
-        True
 
     """
 
@@ -100,14 +74,7 @@ class Bilateral(GuidedMethod):
 
 
 def filter_bilateral(depth: Tensor, window: int, sigma_depth: float, sigma_space: float) -> Tensor:
-    """Filter a depth map, (1, h, w) in metres, NaN in holes, which stay holes; see the module.
-
-    Args:
-        window: diameter in pixels.
-        sigma_depth: in metres.
-        sigma_space: in pixels.
-
-    """
+    """Filter a depth map, (1, h, w) in metres, NaN in holes, which stay holes; the window is a diameter in pixels."""
     values = depth[0].cpu().numpy().astype(np.float32)
     valid = np.isfinite(values)
     outside = min(0.0, float(values[valid].min()) - _NO_WEIGHT * sigma_depth)
@@ -124,9 +91,6 @@ class JointBilateral(GuidedMethod):
         sigma_colour: standard deviation of the Gaussian of the Euclidean colour difference, colours in [0, 1].
         fill_holes, slopes: see :class:`dsr.methods.classical.photo_guided.GuidedMethod`; a hole is filled by this
             filter within the radius, and inpainted beyond it.
-
-    Raises:
-        ValueError: a value is not positive.
 
     """
 

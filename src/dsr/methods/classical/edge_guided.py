@@ -1,37 +1,27 @@
 """Edge-guided upsampling of a depth map alone: a bilateral filter whose means do not cross predicted edges.
 
-Xie, Feris, Sun, *Edge-Guided Single Depth Image Super Resolution*, IEEE TIP 25(1), 2016 (first at ICIP 2014), in its
-self-similar mode. :mod:`dsr.methods.classical.edge_map` predicts the high-resolution edges; the modified joint
-bilateral filter then is
+Xie, Feris, Sun, *Edge-Guided Single Depth Image Super Resolution*, IEEE TIP 25(1), 2016, in its self-similar mode.
+:mod:`dsr.methods.classical.edge_map` predicts the high-resolution edges; the modified joint bilateral filter then is
 
     S_p = 1 / k_p * sum over low-resolution pixels q of S_q f(|p - q|) r(p, q),
 
 with f a Gaussian of the distance in low-resolution pixels, r = 1 if a path from p to q crosses no edge and 0 otherwise,
-and k_p the sum of the weights. The colour image is not used.
+and k_p the sum of the weights. The colour image is not used. What differs from the original, besides the edge map:
 
-What differs from the original, besides the edge map:
-
-- It works on disparity, and each low-resolution pixel stands for a plane, as in
-  :mod:`dsr.methods.classical.photo_guided`: planes are reproduced exactly, where constants would give stairs.
-- A low-resolution pixel is a mean over its block, not a sample. A pixel with an edge through it mixes both sides, so
-  its weight is multiplied by ``mixed``: it counts only if there is no other pixel on the side of p.
-- A path is 4-connected, within the neighbourhood of the low-resolution pixel, and does not touch edges. In the original
-  it is the shortest path with a high cost of edges, one pixel wider.
+- It works on disparity, and each low-resolution pixel stands for a plane, so that planes are reproduced exactly.
+- A low-resolution pixel is a mean over its block. One with an edge through it mixes both sides, so its weight is
+  multiplied by ``mixed``: it counts only if there is no other pixel on the side of p.
+- A path is 4-connected, within the neighbourhood of the low-resolution pixel, and does not touch edges.
 - Pixels on edges get the value that makes the mean of their block equal to the low-resolution value, starting from the
   bicubic map and staying between the two sides: so an edge is placed with subpixel accuracy. Then each takes the
   reachable pixels of its most similar neighbour off the edge. In the original, they reach both sides.
 - Where no pixel is reachable, the result is the bicubic map, not the nearest sample.
-- The scale is split into prime factors, x8 into three stages of x2, each with an edge map of its own, because more
-  patches recur between neighbouring scales; the original has one stage, up to x4. Pixels on edges take sides only in
-  the last stage; after the other stages they count as ``mixed`` and have no slope.
+- The scale is split into prime factors, because more patches recur between neighbouring scales. Pixels on edges take
+  sides only in the last stage; after the other stages they count as ``mixed`` and have no slope.
 
 There is no solution for a map with edges that do not recur at half its size, such as one too small for patches: see
-:class:`dsr.methods.base.NoSolutionError`. A map without edges needs none. Block means are expected; with
-``downsampling=nearest`` the result is half a pixel off.
-
-Depth is computed in float64. Time grows with the number of pixels, and with edge patches times example patches. Memory:
-about 27 float64 maps of the image's size, at most 2^24 distances of 4 bytes, and a part that grows with the edge
-pixels; for a statue before a wall at 512 x 512, 165 maps in total.
+:class:`dsr.methods.base.NoSolutionError`. Memory: about 27 float64 maps of the image's size, at most 2^24 distances of
+4 bytes, and a part that grows with the edge pixels; for a statue before a wall at 512 x 512, 165 maps in total.
 """
 
 from __future__ import annotations
@@ -51,13 +41,12 @@ from dsr.methods.inpainting import inpaint
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps, part_of
 
-_CHUNK = 4096
-"""Low-resolution pixels that are flooded at once."""
+_CHUNK = 4096  # low-resolution pixels that are flooded at once
+# rows and columns from a pixel to its neighbours, the nearest first
 _BESIDE = ((-1, 0), (0, -1), (0, 1), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
-"""Rows and columns from a pixel to its neighbours, the nearest first."""
 
+# factor by which a result may be farther than the farthest valid low-resolution pixel, or nearer than the nearest
 _BEYOND = 4.0
-"""Factor by which a result may be farther than the farthest valid low-resolution pixel, or nearer than the nearest."""
 
 
 class _Planes(NamedTuple):
@@ -80,18 +69,10 @@ def bilateral_filter(
     doubtful: Tensor | None = None,
     sharp: bool = True,
 ) -> Tensor:
-    """Upsample a map, (h, w), by the modified joint bilateral filter to (H, W); holes stay holes.
+    """Upsample a map, (h, w), by the modified joint bilateral filter to (H, W); holes, NaN, stay holes.
 
-    Args:
-        lr: (h, w) map with at least one valid pixel, NaN in holes.
-        barrier: (H, W) bool, the edge map.
-        scale: high-resolution pixels per low-resolution one.
-        radius: radius of the neighbourhood in low-resolution pixels.
-        sigma_space: standard deviation of the distance's Gaussian, in low-resolution pixels.
-        mixed: weight of a low-resolution pixel with an edge through it, relative to others.
-        doubtful: (h, w) bool, further low-resolution pixels that mix two sides; None for none.
-        sharp: whether pixels on edges take a side; otherwise they keep the value that preserves the block means.
-
+    The barrier is the edge map, (H, W) bool. ``doubtful``, (h, w) bool, are further low-resolution pixels that mix two
+    sides. If ``sharp``, pixels on edges take a side; otherwise they keep the value that preserves the block means.
     """
     valid = lr.isfinite()
     doubtful = torch.zeros_like(valid) if doubtful is None else doubtful
@@ -112,18 +93,11 @@ def bilateral_filter(
 def find_reachable(barrier: Tensor, scale: int, radius: int) -> Tensor:
     """Return which low-resolution pixels each high-resolution pixel reaches by a path that crosses no edge.
 
-    A path starts in the middle of the low-resolution pixel, runs over 4-connected high-resolution pixels off the edges,
-    and stays within the low-resolution pixels at most ``radius`` rows and columns away.
+    A path starts in the middle of the low-resolution pixel, runs over 4-connected high-resolution pixels off the edges
+    of the barrier, (H, W) bool, and stays within the low-resolution pixels at most ``radius`` rows and columns away.
 
-    Args:
-        barrier: (H, W) bool, the edge map.
-        scale: high-resolution pixels per low-resolution one.
-        radius: radius of the neighbourhood in low-resolution pixels.
-
-    Returns:
-        (2 radius + 1, 2 radius + 1, H, W) bool: [radius + a, radius + b] is for the low-resolution pixel a rows below
-        and b columns right of the one that contains the high-resolution pixel.
-
+    Returns (2 radius + 1, 2 radius + 1, H, W) bool: [radius + a, radius + b] is for the low-resolution pixel a rows
+    below and b columns right of the one that contains the high-resolution pixel.
     """
     height, width = barrier.shape[0] // scale, barrier.shape[1] // scale
     side, edge = 2 * radius + 1, radius * scale
@@ -237,9 +211,6 @@ class EdgeGuided(Method):
     Attributes:
         history: of the last call: iterations (over all stages), energy of the labels, largest change of a message.
 
-    Raises:
-        ValueError: a value is out of range.
-
     """
 
     abilities = Abilities(cost=Cost(1500, 12))
@@ -270,12 +241,7 @@ class EdgeGuided(Method):
 
     @torch.inference_mode()
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
-        """Return the high-resolution depth, (1, H, W) in metres in the precision of the low-resolution depth.
-
-        Raises:
-            NoSolutionError: edges do not recur across scales, see the module.
-
-        """
+        """Return the high-resolution depth, (1, H, W) in metres in the precision of the low-resolution depth."""
         disparity_lr = sample.disparity_lr(torch.float64)[0]
         valid = disparity_lr.isfinite()
         lowest, highest = (float(bound) for bound in disparity_lr[valid].aminmax())

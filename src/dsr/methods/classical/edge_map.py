@@ -6,8 +6,7 @@ the true ones. The candidates of each patch of edges in the upsampled map are th
 random field selects one of them: its data term is the squared distance of the patches' distance
 transforms plus ``sharp_weight``^2 times that of the sharp edges, by the number of pixels, and its smoothness term the
 squared difference of the true patches where two patches overlap. Loopy belief propagation finds the labels
-(:mod:`dsr.methods.classical.edge_patches`). The mean of the chosen patches, where it is above ``KEPT``, is the
-edge map.
+(:func:`label`). The mean of the chosen patches, where it is above ``KEPT``, is the edge map.
 
 As in the original: patches of 11 x 11 pixels in the self-similar mode, 5 candidates, weight 3, 100 iterations, a mean
 above 0.2, edges of less than 4 pixels dropped, pairs only if both have enough edge pixels and similar numbers of them.
@@ -22,43 +21,46 @@ What differs:
 - Pairs are used in the 8 exact orientations of the grid, not rotated by multiples of 18 degrees.
 - Each cell of 2 x 2 pixels has at most one patch; the original scans, and skips the neighbours of each patch.
 - The edge map is thinned to lines one pixel wide. The map is extrapolated linearly, so that edges reach the border.
+
+The labels: Pearl, *Probabilistic Reasoning in Intelligent Systems*, 1988; min-sum is max-product in negative
+logarithms, as used by Freeman, Pasztor, Carmichael, *Learning Low-Level Vision*, IJCV 2000. The energy of labels x is
+
+    E(x) = sum over nodes i of unary_i(x_i) + sum over pairs (i, j) of cost_ij(x_i, x_j),
+
+the message from i to j is m_ij(x_j) = min over x_i of unary_i(x_i) + cost_ij(x_i, x_j) + the messages to i from nodes
+other than j, less its minimum. A node's label minimises unary_i plus all messages to it. On trees this is the minimum;
+on other graphs it is an approximation, and the best labels so far are kept. Messages are damped by one half, because
+they may oscillate on loops.
+
+Sums run in the order of the pairs, on any device: equal input gives equal labels. Memory: for each pair, 4 messages of
+K values and K x K costs, with K labels.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from dsr.methods.base import NoSolutionError
-from dsr.methods.classical.edge_patches import (
-    PATCH,
-    Labelling,
-    Patches,
-    average_patches,
-    deduplicate,
-    extract_patches,
-    find_nearest,
-    find_overlaps,
-    label,
-    no_patches,
-    orient,
-)
 from dsr.methods.classical.finite_differences import box_mean, extend_linearly, upsample_linear_border
 from dsr.methods.classical.photo_guided import estimate_slopes
 from dsr.methods.inpainting import inpaint
 from dsr.utils.progress import Steps
 
-KEPT = 0.2
-"""Fraction of the chosen patches from which a pixel is an edge."""
-_WEAK = 0.4
-"""Canny's lower threshold relative to the upper one."""
-_CELL = 2
-"""Side in pixels of the cells with at most one patch each."""
-_SMALLEST = 4
-"""Minimum number of edge pixels around an edge pixel, itself included."""
+PATCH = 11  # rows and columns of a patch, in high-resolution pixels
+_ENTRIES = 2**24  # maximum number of distances between patches in memory
+_BITS = 62  # pixels per 64-bit word, without its sign
+_MOVE = 0.5  # damping factor of messages; 1 would be undamped
+CHECK_EVERY = 5  # iterations between two evaluations of the labels
+KEPT = 0.2  # fraction of the chosen patches from which a pixel is an edge
+_WEAK = 0.4  # Canny's lower threshold relative to the upper one
+_CELL = 2  # side in pixels of the cells with at most one patch each
+_SMALLEST = 4  # minimum number of edge pixels around an edge pixel, itself included
+# rows and columns of the 8 neighbours in a 3 x 3 window, clockwise from the one above
 _AROUND = ((0, 1), (0, 2), (1, 2), (2, 2), (2, 1), (2, 0), (1, 0), (0, 0))
-"""Rows and columns of the 8 neighbours in a 3 x 3 window, clockwise from the one above."""
 
 
 def predict_edge_map(
@@ -71,20 +73,10 @@ def predict_edge_map(
     iterations: int = 100,
     progress: Steps | None = None,
 ) -> tuple[Tensor, Labelling | None]:
-    """Return the high-resolution edge map, (h * scale, w * scale) bool, and its labelling; None without an edge.
+    """Return the edge map of a map (h, w), NaN in holes, (h * scale, w * scale) bool, and its labelling.
 
-    Args:
-        lr: (h, w) map, NaN in holes.
-        scale: high-resolution pixels per low-resolution one, at least 2.
-        step: minimum height of an edge, in the map's unit.
-        candidates: number of candidates for each patch.
-        sharp_weight: weight of the edges relative to that of their distance transform.
-        smoothness: weight of the smoothness term.
-        iterations: maximum number of iterations of belief propagation.
-
-    Raises:
-        NoSolutionError: the map has edges, but none once it is downsampled.
-
+    ``step`` is the minimum height of an edge in the map's unit; the others are as for
+    :class:`dsr.methods.classical.edge_guided.EdgeGuided`. The labelling is None without an edge.
     """
     border = -(-(PATCH // 2 + 1) // scale)
     edges = detect_edges(extend_linearly(lr[None, None], border)[0, 0], scale, step)
@@ -123,9 +115,17 @@ def detect_edges(lr: Tensor, scale: int, step: float) -> Tensor:
     excess = [(_central_difference(lr, axis) - estimate_slopes(lr, axis)).square() for axis in (0, 1)]
     most = functional.max_pool2d((excess[0] + excess[1]).sqrt().nan_to_num(nan=0.0)[None, None], 3, stride=1, padding=1)
     most = most.repeat_interleave(scale, 2).repeat_interleave(scale, 3)[0, 0]
-    ridge = torch.minimum(strength, most) * _is_ridge(strength, down, across)
-    strong, weak = ridge > step / 2, ridge > _WEAK * step / 2
-    return _drop_small(_grow(strong, weak))
+    ring = _neighbours(strength)  # the maximum of three pixels along the gradient, to the nearest of 8 neighbours
+    turn = (torch.atan2(across, -down) / (torch.pi / 4)).round().long().remainder(4)[None]
+    ridge = torch.minimum(strength, most) * (
+        (strength > ring.gather(0, turn)[0]) & (strength >= ring.gather(0, turn + 4)[0])
+    )
+    weak = ridge > _WEAK * step / 2
+    grown, new = torch.zeros_like(weak), (ridge > step / 2) & weak
+    while not bool((new == grown).all()):  # the weak pixels that are connected with strong ones
+        grown = new
+        new = weak & (functional.max_pool2d(grown[None, None].float(), 3, stride=1, padding=1)[0, 0] > 0)
+    return _drop_small(grown)
 
 
 def find_recurring(lr: Tensor, scale: int, step: float) -> Patches:
@@ -173,26 +173,6 @@ def _central_difference(x: Tensor, axis: int) -> Tensor:
     return torch.gradient(x, dim=axis)[0] if x.shape[axis] > 1 else torch.zeros_like(x)
 
 
-def _is_ridge(strength: Tensor, down: Tensor, across: Tensor) -> Tensor:
-    """Return where the strength is the maximum of three pixels along the gradient, (H, W) bool; of equal ones one.
-
-    The direction of the gradient is rounded to that of the nearest of the 8 neighbours.
-    """
-    ring = _neighbours(strength)
-    turn = (torch.atan2(across, -down) / (torch.pi / 4)).round().long().remainder(4)[None]
-    return (strength > ring.gather(0, turn)[0]) & (strength >= ring.gather(0, turn + 4)[0])
-
-
-def _grow(strong: Tensor, weak: Tensor) -> Tensor:
-    """Return the weak pixels that are connected with strong ones."""
-    grown = strong & weak
-    while True:
-        new = weak & (functional.max_pool2d(grown[None, None].float(), 3, stride=1, padding=1)[0, 0] > 0)
-        if bool((new == grown).all()):
-            return grown
-        grown = new
-
-
 def _drop_small(mask: Tensor) -> Tensor:
     """Return a mask without pixels that have less than ``_SMALLEST`` pixels in the window around them."""
     size = 2 * _SMALLEST - 1
@@ -209,3 +189,182 @@ def _patch_centres(edges: Tensor) -> Tensor:
     first = torch.ones_like(number, dtype=torch.bool)
     first[1:] = number[order].diff() != 0
     return places[order[first].sort().values]
+
+
+class Patches(NamedTuple):
+    """Edges of an upsampled map, and the true edges at the same positions."""
+
+    low: Tensor
+    high: Tensor
+
+
+def no_patches(device: torch.device) -> Patches:
+    """Return an empty set of patches."""
+    none = torch.zeros(0, PATCH, PATCH, dtype=torch.bool, device=device)
+    return Patches(none, none)
+
+
+def extract_patches(mask: Tensor, places: Tensor) -> Tensor:
+    """Return the patches of a mask, (H, W), around positions (N, 2), rows and columns, whose patches lie inside."""
+    offsets = torch.arange(PATCH, device=mask.device) - PATCH // 2
+    return mask[places[:, 0, None, None] + offsets[:, None], places[:, 1, None, None] + offsets]
+
+
+def orient(patches: Tensor) -> Tensor:
+    """Return patches under the 8 dihedral transforms, (8 N, PATCH, PATCH)."""
+    quarters = [patches.rot90(k, (1, 2)) for k in range(4)]
+    return torch.cat(quarters + [each.mT for each in quarters])
+
+
+def deduplicate(patches: Patches) -> Patches:
+    """Return the pairs without repetitions, sorted."""
+    pixels = 2 * PATCH**2
+    bits = torch.cat((patches.low.flatten(1), patches.high.flatten(1)), dim=1).long()
+    place = torch.arange(_BITS, device=bits.device)
+    words = (functional.pad(bits, (0, -pixels % _BITS)).unflatten(1, (-1, _BITS)) << place).sum(dim=2)
+    words = torch.unique(words, dim=0)
+    bits = ((words[:, :, None] >> place) & 1).flatten(1)[:, :pixels]
+    return Patches(*bits.bool().unflatten(1, (2, PATCH, PATCH)).unbind(1))
+
+
+def edge_distances(patches: Tensor) -> Tensor:
+    """Return each pixel's Euclidean distance from the edges of its patch, (N, PATCH, PATCH) float32.
+
+    Infinite in a patch without an edge.
+    """
+    place = torch.arange(PATCH, device=patches.device)
+    square = (place[:, None] - place).square().float()
+    along = torch.where(patches[:, :, None], square, torch.inf).amin(dim=3)  # (N, row, column), within the row
+    return (along[:, None] + square[:, :, None]).amin(dim=2).sqrt()
+
+
+def find_nearest(query: Tensor, examples: Patches, count: int, weight: float) -> tuple[Tensor, Tensor]:
+    """Return the examples most similar to patches: squared distances and indices, (N, count) each, the best first.
+
+    |D(query) - D(low)|^2 + weight^2 |query - high|^2, D being :func:`edge_distances`.
+    """
+    features = _features(examples.low, examples.high, weight)
+    length = features.square().sum(dim=1)
+    distances, indices = [], []
+    for chunk in query.split(max(_ENTRIES // len(features), 1)):
+        query_features = _features(chunk, chunk, weight)
+        square = query_features.square().sum(dim=1, keepdim=True) + length - 2 * query_features @ features.T
+        least = square.clamp_(min=0).topk(min(count, len(features)), dim=1, largest=False)
+        distances.append(least.values)
+        indices.append(least.indices)
+    return torch.cat(distances), torch.cat(indices)
+
+
+def find_overlaps(places: Tensor, patches: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the pairs of overlapping patches, (E, 2), and the disagreement of their candidates, (E, K, K).
+
+    The disagreement is the sum of squared differences over the pixels that both patches cover. ``places`` are the rows
+    and columns of the patches' centres, (N, 2), all different, and ``patches`` the candidates, (N, K, PATCH^2) float.
+    """
+    index = places.new_full(tuple((places.amax(dim=0) + PATCH).tolist()), -1)
+    index[places[:, 0], places[:, 1]] = torch.arange(len(places), device=places.device)
+    images = patches.unflatten(2, (PATCH, PATCH))
+    pairs, costs = [places.new_zeros(0, 2)], [patches.new_zeros(0, patches.shape[1], patches.shape[1])]
+    for down in range(PATCH):
+        for across in range(-PATCH + 1 if down else 1, PATCH):
+            first = (places[:, 1] + across >= 0).nonzero()[:, 0]
+            second = index[places[first, 0] + down, places[first, 1] + across]
+            first, second = first[second >= 0], second[second >= 0]
+            if len(first):
+                pairs.append(torch.stack((first, second), dim=1))
+                left, right = max(across, 0), max(-across, 0)
+                a = images[first][:, :, down:, left : PATCH - right].flatten(2)
+                b = images[second][:, :, : PATCH - down, right : PATCH - left].flatten(2)
+                costs.append(a.square().sum(dim=2)[:, :, None] + b.square().sum(dim=2)[:, None] - 2 * a @ b.mT)
+    return torch.cat(pairs), torch.cat(costs)
+
+
+def average_patches(patches: Tensor, places: Tensor, shape: tuple[int, int]) -> Tensor:
+    """Return the mean of the patches, (N, PATCH^2), that cover each pixel, (H, W); 0 where there is none."""
+    total, number = patches.new_zeros(shape), patches.new_zeros(shape)
+    for k in range(PATCH**2):  # for one k, all patches touch different pixels
+        rows, columns = places[:, 0] + k // PATCH - PATCH // 2, places[:, 1] + k % PATCH - PATCH // 2
+        total[rows, columns] += patches[:, k]
+        number[rows, columns] += 1
+    return total / number.clamp(min=1)
+
+
+def _features(low: Tensor, high: Tensor, weight: float) -> Tensor:
+    return torch.cat((edge_distances(low).flatten(1), weight * high.flatten(1).float()), dim=1)
+
+
+class Labelling(NamedTuple):
+    """Labels (N,), their energy, whether the messages converged, and the history.
+
+    Each entry of ``history`` has ``iteration``, ``objective`` (the energy) and ``moved`` (the largest change of a
+    message, relative to the largest cost).
+    """
+
+    labels: Tensor
+    energy: float
+    converged: bool
+    history: list[dict[str, float]]
+
+
+def label(
+    unary: Tensor,
+    pairs: Tensor,
+    costs: Tensor,
+    iterations: int = 100,
+    tolerance: float = 1e-3,
+    progress: Steps | None = None,
+) -> Labelling:
+    """Return the labels that min-sum belief propagation finds.
+
+    The costs of each node's labels are ``unary`` (N, K), and ``costs`` (E, K, K) those of the labels of the first and
+    the second node of each pair (E, 2). It stops if no message changes by more than the tolerance, times the largest
+    cost.
+    """
+    count, labels = unary.shape
+    unit = float(costs.abs().max()) if len(costs) else 0.0
+    unit = unit if unit > 0 else 1.0
+    sources = torch.cat((pairs[:, 0], pairs[:, 1]))
+    both = torch.cat((costs, costs.mT))  # (2E, K, K): the source's labels, the target's
+    heard = _incoming(torch.cat((pairs[:, 1], pairs[:, 0])), count)
+    silence = unary.new_zeros(1, labels)
+    messages = unary.new_zeros(2 * len(pairs), labels)
+    best, least, history = unary.argmin(dim=1), torch.inf, []
+    moved = 0.0
+    for done in range(1, iterations + 1):
+        beliefs = unary + torch.cat((messages, silence))[heard].sum(dim=1)
+        others = beliefs[sources] - messages.roll(len(pairs), 0)  # less the target's message
+        new = (others[:, :, None] + both).amin(dim=1)
+        step = (new - new.amin(dim=1, keepdim=True) - messages) * _MOVE
+        messages = messages + step
+        moved = float(step.abs().max()) / unit if len(step) else 0.0
+        settled = moved <= tolerance
+        if settled or done % CHECK_EVERY == 0 or done == iterations:
+            found = (unary + torch.cat((messages, silence))[heard].sum(dim=1)).argmin(dim=1)
+            now = energy(found, unary, pairs, costs)
+            history.append({"iteration": float(done), "objective": now, "moved": moved})
+            if now < least:
+                best, least = found, now
+            if progress is not None:
+                progress(iterations if settled else done, iterations)
+        if settled:
+            break
+    return Labelling(best, least, moved <= tolerance, history)
+
+
+def energy(labels: Tensor, unary: Tensor, pairs: Tensor, costs: Tensor) -> float:
+    """Return E of labels (N,)."""
+    alone = unary.gather(1, labels[:, None]).sum()
+    first, second = labels[pairs[:, 0]], labels[pairs[:, 1]]
+    return float(alone + costs[torch.arange(len(pairs), device=pairs.device), first, second].sum())
+
+
+def _incoming(targets: Tensor, count: int) -> Tensor:
+    """Return the indices of the messages to each node, (count, most), padded with the index past the last."""
+    order = targets.argsort(stable=True)
+    numbers = torch.bincount(targets, minlength=count)
+    starts = numbers.cumsum(0) - numbers
+    most = int(numbers.max()) if count else 0
+    table = targets.new_full((count, most), len(targets))
+    place = torch.arange(len(targets), device=targets.device) - starts[targets[order]]
+    table[targets[order], place] = order
+    return table

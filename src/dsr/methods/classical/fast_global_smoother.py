@@ -4,21 +4,12 @@ Min, Choi, Lu, Ham, Sohn, Do, *Fast Global Image Smoothing Based on Weighted Lea
 
     sum over p of (u_p - f_p)^2 + lambda * sum over neighbours p, q of w_pq (u_p - u_q)^2,  w_pq = exp(-|I_p - I_q| / s)
 
-along one row or column solves a tridiagonal system: -lambda w off the diagonal, and 1 + lambda times the sum of the two
-weights on it. The minimiser over the image is approximated by solving all rows, then all columns, T times (the paper's
-T is 3), with
-
-    lambda_t = 3/2 * 4^(T - t) / (4^T - 1) * lambda.
-
-For sparse data, the paper smooths both the data and their index map, and divides: E(c f) / E(c), with the smoothing E
-and c = 1 at data, 0 elsewhere. The same is done here: f is the low-resolution map at the centres of its pixels (the
-four high-resolution pixels around a centre that lies between them), and c is 0 elsewhere and in holes.
-
-What differs: lambda is in units of the squared low-resolution pixel, so that one value fits all scales. It is far
-smaller than the paper's, which blurs renderings. Without ``slopes``, as in the paper, renderings show a tent at each
-low-resolution pixel.
-
-Time grows as iterations * H * W; memory peaks at about 25 maps of H * W float64 values (19 without ``slopes``).
+is approximated by solving the tridiagonal systems of all rows, then of all columns, T times, with
+lambda_t = 3/2 * 4^(T - t) / (4^T - 1) * lambda. Sparse data and their index map are both smoothed and divided, as in
+the paper: the low-resolution map at the centres of its pixels (the four high-resolution pixels around a centre that
+lies between them). What differs: lambda is in units of the squared low-resolution pixel, so that one value fits all
+scales, and far smaller than the paper's, which blurs renderings. Without ``slopes``, as in the paper, renderings show
+a tent at each low-resolution pixel. Memory peaks at about 25 maps of H * W float64 values.
 """
 
 from __future__ import annotations
@@ -28,10 +19,9 @@ from torch import Tensor
 
 from dsr.methods.classical.photo_guided import Guided, GuidedMethod, expect_positive
 
+# minimum smoothed confidence; below it digits are lost, and the result is the nearest low-resolution value
 _LEAST = 1e-200
-"""Minimum smoothed confidence; below it digits are lost, and the result is the nearest low-resolution value."""
-_HALF = 0.5 + 1e-6
-"""Maximum distance, in high-resolution pixels, of data from the centre of a low-resolution pixel."""
+_HALF = 0.5 + 1e-6  # maximum distance, in high-resolution pixels, of data from the centre of a low-resolution pixel
 
 
 class FastGlobalSmoother(GuidedMethod):
@@ -42,9 +32,6 @@ class FastGlobalSmoother(GuidedMethod):
         sigma_colour: Euclidean colour difference, colours in [0, 1], at which a neighbour's weight is 1 / e.
         iterations: number of pairs of passes.
         fill_holes, slopes: see :class:`dsr.methods.classical.photo_guided.GuidedMethod`.
-
-    Raises:
-        ValueError: a value is not positive.
 
     """
 
@@ -80,18 +67,9 @@ class FastGlobalSmoother(GuidedMethod):
 
 
 def smooth(guide: Tensor, maps: Tensor, strength: float, sigma_colour: float, iterations: int = 3) -> Tensor:
-    """Smooth maps where the guide is smooth.
+    """Smooth maps, (N, H, W), with the same weights where the guide, (3, H, W), is smooth.
 
-    Args:
-        guide: (3, H, W) colours.
-        maps: (N, H, W), smoothed with the same weights.
-        strength: lambda, in squared pixels.
-        sigma_colour: colour difference of the guide at which a weight is 1 / e.
-        iterations: T.
-
-    Returns:
-        (N, H, W).
-
+    ``strength`` is lambda in squared pixels, ``sigma_colour`` the difference of colours at which a weight is 1 / e.
     """
     along_rows = _weights(guide.mT, sigma_colour)  # (W - 1, H), the axis that is solved along comes first
     along_columns = _weights(guide, sigma_colour)  # (H - 1, W)
@@ -103,17 +81,10 @@ def smooth(guide: Tensor, maps: Tensor, strength: float, sigma_colour: float, it
 
 
 def solve_lines(weights: Tensor, right: Tensor) -> Tensor:
-    """Solve (1 + A) u = f for all lines at once, with the weighted Laplacian A of each line.
+    """Solve (1 + A) u = f for all lines at once, with the weighted Laplacian A of each line, (L, N, M).
 
-    Gaussian elimination for tridiagonal systems (Thomas), stable without pivoting because the diagonal dominates.
-
-    Args:
-        weights: (L - 1, M) lambda w between the neighbours of M lines of L pixels, not negative.
-        right: (L, N, M) f, N right-hand sides per line.
-
-    Returns:
-        (L, N, M).
-
+    Gaussian elimination for tridiagonal systems (Thomas), stable without pivoting because the diagonal dominates. The
+    weights are (L - 1, M), lambda w between the neighbours of M lines, and ``right`` is f, N right-hand sides per line.
     """
     length = right.shape[0]
     solution = right.contiguous().clone()

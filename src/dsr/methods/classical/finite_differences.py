@@ -10,10 +10,8 @@ from torch.nn import functional
 
 from dsr.methods.networks.normalisation import upsample_bicubic
 
-LUMA = (0.299, 0.587, 0.114)
-"""Weights of red, green and blue in the luma (ITU-R BT.601)."""
-_REACH = 2
-"""Half width of Keys' kernel in low-resolution pixels."""
+LUMA = (0.299, 0.587, 0.114)  # weights of red, green and blue in the luma (ITU-R BT.601)
+_REACH = 2  # half width of Keys' kernel in low-resolution pixels
 
 
 def gradient(x: Tensor) -> Tensor:

@@ -1,19 +1,16 @@
 """Guided filter upsampling: in each window, depth is a linear function of the colours.
 
-He, Sun, Tang, *Guided Image Filtering*, TPAMI 2013, with the colour guide of its section on colour images. In every
-window w_k of the high-resolution image, q_i = a_k . I_i + b_k with
+He, Sun, Tang, *Guided Image Filtering*, TPAMI 2013, with its colour guide. In every window w_k of the high-resolution
+image, q_i = a_k . I_i + b_k with
 
     a_k = (S_k + eps U)^-1 (mean(I p) - m_k mean(p)),    b_k = mean(p) - a_k . m_k,
 
-with the mean m_k and the 3 x 3 covariance S_k of the colours I in the window, the input p and the identity U. The
-result is q_i = mean(a_k) . I_i + mean(b_k) over the windows that contain pixel i. For upsampling, p is the bilinear
-interpolation of the low-resolution map, as in the paper's joint upsampling.
+with the mean m_k and the 3 x 3 covariance S_k of the colours I, the input p (the bilinear interpolation of the
+low-resolution map) and the identity U. The result is q_i = mean(a_k) . I_i + mean(b_k) over the windows that contain i.
 
 What differs: means over a window weight pixels by their confidence (see :mod:`dsr.methods.classical.photo_guided`), so
-that holes do not spread, and windows are weighted by the mean confidence of their pixels; without holes this is the
-paper's filter. Windows are truncated at the border. The radius is in low-resolution pixels.
-
-Time grows as H * W * radius * scale; memory peaks at about 50 maps of H * W float64 values, whatever the radius.
+that holes do not spread, and windows by their mean confidence. The radius is in low-resolution pixels. Time grows as
+H * W * radius * scale; memory peaks at about 50 maps of H * W float64 values.
 """
 
 from __future__ import annotations
@@ -24,10 +21,9 @@ from torch.nn import functional
 
 from dsr.methods.classical.photo_guided import Guided, GuidedMethod, expect_positive, expect_window
 
+# the entries of a symmetric 3 x 3 matrix, in the order of storage
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-"""The entries of a symmetric 3 x 3 matrix, in the order of storage."""
-_ROWS = ([0, 1, 2], [1, 3, 4], [2, 4, 5])
-"""Indices of the matrix's rows among these."""
+_ROWS = ([0, 1, 2], [1, 3, 4], [2, 4, 5])  # indices of the matrix's rows among these
 _TINY = 1e-30
 
 
@@ -38,22 +34,6 @@ class GuidedFilter(GuidedMethod):
         radius: radius of the windows in low-resolution pixels.
         epsilon: regularisation added to the variances of colours in [0, 1]; smaller variances have no effect.
         fill_holes, slopes: see :class:`dsr.methods.classical.photo_guided.GuidedMethod`.
-
-    Raises:
-        ValueError: the radius or epsilon is not positive.
-
-    Example:
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.degradation.downsampling import Downsampling, make_sample
-        >>> from dsr.sample import Scene
-        >>> from dsr.methods.classical.guided_filter import GuidedFilter
-        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
-        >>> depth = torch.full((1, 24, 32), 2.0, dtype=torch.float64)
-        >>> scene = Scene("mine", "wall", torch.rand(3, 24, 32), camera, depth)
-        >>> sample = make_sample(scene, 4, Downsampling("box"), "disparity")
-        >>> bool((GuidedFilter()(sample) - 2).abs().max() < 1e-3)
-        True
 
     """
 
@@ -73,18 +53,10 @@ class GuidedFilter(GuidedMethod):
 
 
 def guided_filter(guide: Tensor, maps: Tensor, radius: int, epsilon: float, confidence: Tensor | None = None) -> Tensor:
-    """Filter maps with a colour guide.
+    """Filter maps, (N, H, W) finite, with a colour guide, (3, H, W).
 
-    Args:
-        guide: (3, H, W).
-        maps: (N, H, W), finite.
-        radius: radius of the windows of (2 * radius + 1)^2 pixels, truncated at the border.
-        epsilon: regularisation added to the variances of the guide.
-        confidence: (H, W) weights in [0, 1]; None for 1.
-
-    Returns:
-        (N, H, W); a pixel in no window with a positive confidence keeps its value.
-
+    Windows have (2 * radius + 1)^2 pixels, truncated at the border, and ``confidence`` weights pixels in [0, 1], (H,
+    W). A pixel in no window with a positive confidence keeps its value.
     """
     weight = torch.ones_like(guide[0]) if confidence is None else confidence
     mean_weight = _box(weight, radius)

@@ -37,22 +37,6 @@ class Interpolation(Method):
         fill_holes: whether holes of the low-resolution map take the value of the nearest valid pixel; otherwise a
             high-resolution pixel whose nearest low-resolution pixel is a hole is a hole.
 
-    Raises:
-        ValueError: an unknown order.
-
-    Example:
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.degradation.downsampling import Downsampling, make_sample
-        >>> from dsr.sample import Scene
-        >>> from dsr.methods.classical.interpolation import Interpolation
-        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
-        >>> depth = torch.full((1, 24, 32), 2.0, dtype=torch.float64)
-        >>> scene = Scene("mine", "wall", torch.rand(3, 24, 32), camera, depth)
-        >>> sample = make_sample(scene, 4, Downsampling("box"), "orthogonal")
-        >>> Interpolation("bicubic")(sample).shape
-        torch.Size([1, 24, 32])
-
     """
 
     abilities = Abilities(ratios="any", own_size=True, cost=Cost(100))
@@ -111,9 +95,6 @@ class CubicConvolution(Method):
 
     Args:
         range_type: range type that is interpolated.
-
-    Raises:
-        ValueError: an unknown range type.
 
     """
 

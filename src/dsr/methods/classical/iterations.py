@@ -1,4 +1,4 @@
-"""Iterative solvers: conjugate gradients, and when an iteration has converged."""
+"""Conjugate gradients for batches."""
 
 from __future__ import annotations
 
@@ -7,11 +7,6 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-
-from dsr.utils.progress import Steps
-
-CHECK_EVERY = 50
-"""Iterations between two checks of how far the map has moved."""
 
 
 class Solution(NamedTuple):
@@ -25,15 +20,10 @@ class Solution(NamedTuple):
 def conjugate_gradients(
     operator: Callable[[Tensor], Tensor], right: Tensor, start: Tensor, *, iterations: int, tolerance: float
 ) -> Solution:
-    """Solve A x = b for each element of a batch.
+    """Solve A x = b for each element of a batch, (B, ...), from a start.
 
-    Args:
-        operator: x -> A x, (B, ...) -> (B, ...), symmetric positive definite for each element of the batch, on the
-            subspace that b - A start lies in; elements do not mix.
-        right: b, (B, ...).
-        start: the first x, (B, ...).
-        tolerance: relative residual |b - A x| / |b|, in all elements, at which it stops.
-
+    The operator x -> A x is symmetric positive definite for each element, on the subspace that b - A start lies in, and
+    does not mix elements. It stops at the relative residual ``tolerance`` in all elements.
     """
     x, residual = start, right - operator(start)
     direction = residual
@@ -58,53 +48,3 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
 def _ratio(above: Tensor, below: Tensor) -> Tensor:
     """Return above / below, 0 where ``below`` is 0, so that a solved element stays unchanged."""
     return torch.where(below > 0, above / torch.where(below > 0, below, 1), 0)
-
-
-class Movement:
-    """The movement of an iterated map between two checks, and whether it is below a tolerance.
-
-    Args:
-        start: (B, 1, H, W) the map before the first iteration.
-        iterations: maximum number of iterations.
-        tolerance: RMS movement between two checks, relative to the range, below which the iteration has converged.
-        progress: is called with the iterations done and their maximum.
-        value_range: (B, 1, 1, 1) range of each map; None for maps in [0, 1].
-
-    Attributes:
-        moved: RMS movement at each check, relative to the range; the maximum over the batch.
-
-    """
-
-    def __init__(
-        self,
-        start: Tensor,
-        iterations: int,
-        tolerance: float,
-        progress: Steps | None,
-        value_range: Tensor | None = None,
-    ) -> None:
-        self._previous, self._range = start.clone(), torch.ones_like(start[:1, :1, :1, :1])
-        if value_range is not None:
-            self._range = value_range
-        self._iterations, self._tolerance, self._progress = iterations, tolerance, progress
-        self.moved: list[float] = []
-
-    def converged(self, values: Tensor) -> bool:
-        """Record a check of the map, (B, 1, H, W), and return whether it has stopped moving."""
-        self.moved.append(float(((values - self._previous) / self._range).square().mean(dim=(-2, -1)).max().sqrt()))
-        self._previous.copy_(values)
-        self._report(CHECK_EVERY * len(self.moved))
-        return self.moved[-1] < self._tolerance
-
-    def finish(self) -> None:
-        """Report that the iteration is over, at whatever iteration it has stopped."""
-        self._report(self._iterations)
-
-    def _report(self, done: int) -> None:
-        if self._progress is not None:
-            self._progress(done, self._iterations)
-
-
-def history_of(moved: list[float]) -> list[dict[str, float]]:
-    """Return the history of an iteration, one entry for each check, from :attr:`Movement.moved`."""
-    return [{"iteration": float(CHECK_EVERY * (check + 1)), "moved": value} for check, value in enumerate(moved)]

@@ -25,29 +25,20 @@ from dsr.methods.networks.normalisation import lr_coordinates
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 
-_WIDEST = 1024
-"""Largest radius or width of a filter, in low-resolution pixels."""
+_WIDEST = 1024  # largest radius or width of a filter, in low-resolution pixels
+# factor by which a result may be farther than the farthest valid low-resolution pixel, or nearer than the nearest
 _BEYOND = 4.0
-"""Factor by which a result may be farther than the farthest valid low-resolution pixel, or nearer than the nearest."""
 
 
 @dataclass(frozen=True)
 class Guided:
-    """Low-resolution maps and the image that guides their upsampling.
+    """Low-resolution maps and the image that guides their upsampling, all float64."""
 
-    Args:
-        rgb: (3, H, W) float64 in [0, 1].
-        maps: (N, h, w) float64, to be upsampled with the same weights; holes are inpainted.
-        valid: (h, w) float64, 1 where the maps are valid and 0 in holes.
-        rows, columns: (H,), (W,) float64, position of each high-resolution pixel in low-resolution pixels.
-
-    """
-
-    rgb: Tensor
-    maps: Tensor
-    valid: Tensor
-    rows: Tensor
-    columns: Tensor
+    rgb: Tensor  # (3, H, W) in [0, 1]
+    maps: Tensor  # (N, h, w), to be upsampled with the same weights; holes are inpainted
+    valid: Tensor  # (h, w), 1 where the maps are valid and 0 in holes
+    rows: Tensor  # (H,) position of each high-resolution pixel in low-resolution pixels
+    columns: Tensor  # (W,)
 
     @property
     def scale(self) -> float:

@@ -24,14 +24,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-BRIGHTEST = 2.0
-"""Maximum albedo; the minimum is 0."""
-_LEVELS = 5
-"""Number of times that the weight of boundaries grows to reach its value."""
-_GROWTH = 4.0
-"""Factor of its growth."""
-_SHUFFLE = 2654435761
-"""Multiplier of Knuth's hash."""
+BRIGHTEST = 2.0  # maximum albedo; the minimum is 0
+_LEVELS = 5  # number of times that the weight of boundaries grows to reach its value
+_GROWTH = 4.0  # factor of its growth
+_SHUFFLE = 2654435761  # multiplier of Knuth's hash
 _RANGE = 2**32
 
 
@@ -68,17 +64,10 @@ class _Borders(NamedTuple):
 
 
 def fuse(rgb: Tensor, shading: Tensor, weight: float, inside: Tensor | None = None) -> Regions:
-    """Return regions that are a local minimum of E.
+    """Return regions that are a local minimum of E, equal for equal input.
 
-    Args:
-        rgb: (B, C, H, W) float64.
-        shading: likewise.
-        weight: weight of a unit of boundary length.
-        inside: (B, 1, H, W) bool mask of the problem, None for all pixels; each pixel outside is a region of its own.
-
-    Returns:
-        The regions; equal for equal input.
-
+    Image and shading are (B, C, H, W) float64, ``weight`` is that of a unit of boundary length, and ``inside`` the mask
+    (B, 1, H, W) of the problem; each pixel outside is a region of its own.
     """
     batch, channels, height, width = rgb.shape
     count = batch * height * width

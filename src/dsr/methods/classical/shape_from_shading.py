@@ -2,30 +2,23 @@
 
 Haefner, Quéau, Möllenhoff and Cremers, *Fight Ill-Posedness with Ill-Posedness: Single-shot Variational Depth
 Super-Resolution from Shading*, CVPR 2018: the depth z whose block means are the low-resolution map, the piecewise
-constant albedo and the light that explain the image, with minimal surface area. Their section 3 has the
-rendering equation (:mod:`dsr.methods.classical.srfs_admm`) and the priors: minimal surface for the shape, Potts for
-the albedo (:mod:`dsr.methods.classical.potts`). Their section 4 minimises the energy by alternating directions,
-the penalty growing, over albedo, lighting, theta = (z, grad z), z and the multipliers, in this order
-(:mod:`dsr.methods.classical.srfs_admm`).
-
-The energy per pixel, with intensities in [0, 1] and z in pixels (times the focal length f, by the median depth):
+constant albedo and the light that explain the image, with minimal surface area. It minimises, by alternating
+directions with a growing penalty over albedo, lighting, theta = (z, grad z), z and the multipliers
+(:mod:`dsr.methods.classical.srfs_admm`, :mod:`dsr.methods.classical.potts`), the energy per pixel
 
     1/2 |albedo * shading - rgb|^2 + area_weight * z |m| + boundary_weight * boundaries
-    + data_weight / (2 scale^2) * (mean z - lr)^2.
+    + data_weight / (2 scale^2) * (mean z - lr)^2,
 
-What differs from the original, besides what those modules name:
+with intensities in [0, 1] and z in pixels (times the focal length f, by the median depth). What differs:
 
-- Weights. Its code (mu = 0.1, nu = 1e-4, lambda = 1, doubling the penalty 1e-4 each time) has, in these units at x4
-  with f = 500: data_weight 0.0015, area_weight 1e-7 and boundary_weight 0.5. With so weak a data term the result
-  follows the low-resolution map only over hundreds of pixels, and texture that the albedo does not explain becomes
-  relief. Ours were chosen on procedural scenes and on a bumpy surface under known light. With area_weight = 0.02 such a
-  surface has half the error that 0.2 leaves; with 1 rooms, where depth steps and texture dominate, are a tenth better.
-- Each channel has a light of its own; in the original code they share one. Albedos are between 0 and 2.
+- Weights. Its code has, in these units at x4 with f = 500: data_weight 0.0015, area_weight 1e-7 and boundary_weight
+  0.5. With so weak a data term the result follows the low-resolution map only over hundreds of pixels, and texture that
+  the albedo does not explain becomes relief. Ours were chosen on procedural scenes and on a bumpy surface.
+- Each channel has a light of its own. Albedos are between 0 and 2.
 - The penalty of the copy of z is weighted by 1 / scale^2: with 1 a step spreads over a pixel, and blocks have several.
 - theta by Levenberg and Marquardt's method, its 3 x 3 systems solved in closed form, instead of BFGS; z by plain
   conjugate gradients; it starts from the bicubic map, not smoothed first.
-- Outside the foreground the initial map stays unchanged, including in blocks that cross its border; the original cuts
-  these blocks.
+- Outside the foreground the initial map stays unchanged, including in blocks that cross its border.
 
 The steps of albedo, lighting, theta and z each lower the augmented Lagrangian. The energy itself, logged for z without
 the copy, may rise while the copy still differs. Holes have no data term, and start from inpainted values.
@@ -50,12 +43,9 @@ from dsr.utils.decoding import decode_pixels
 from dsr.utils.guards import MOST_FILE, pixels_beside, read_limited
 from dsr.utils.progress import Steps
 
-_RENEW = 10
-"""Iterations between two searches for the regions of the albedo."""
-_NEARER = 4.0
-"""Factor by which a result may be nearer than the nearest valid low-resolution pixel."""
-_WHITE = 127
-"""Value of a mask above which a pixel is white."""
+_RENEW = 10  # iterations between two searches for the regions of the albedo
+_NEARER = 4.0  # factor by which a result may be nearer than the nearest valid low-resolution pixel
+_WHITE = 127  # value of a mask above which a pixel is white
 
 
 class ShapeFromShading(Method):
@@ -79,9 +69,6 @@ class ShapeFromShading(Method):
         history: of the last call, each iteration's ``objective``, its terms ``shading``, ``data``, ``area`` and
             ``boundaries``, the ``residual`` (RMS difference of theta and the slopes) and the movement of z, ``moved``
             (RMS, relative to the median depth).
-
-    Raises:
-        ValueError: a value is out of range, or there is no such folder.
 
     """
 
@@ -118,14 +105,10 @@ class ShapeFromShading(Method):
 
     @torch.inference_mode()
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
-        """Return high-resolution depth without holes, (1, H, W) in metres on the sample's device.
-
-        Raises:
-            ValueError: the sample's mask is missing, or is no image of its size.
-
-        """
+        """Return high-resolution depth without holes, (1, H, W) in metres on the sample's device."""
         self.history = []
         solver, metres = self.prepare(sample)
+        objective = float("nan")  # of the iteration before
         for done in range(1, self.iterations + 1):
             before = solver.z
             solver.update_albedo(anew=done % _RENEW == 1)
@@ -133,11 +116,14 @@ class ShapeFromShading(Method):
             solver.update_theta()
             solver.update_depth()
             solver.update_missed(self.growth)
-            self.history.append({"iteration": done, **_diagnostics(solver, before)})
+            terms = _diagnostics(solver, before)
+            self.history.append({"iteration": done, **terms})
             if progress is not None:
                 progress(done, self.iterations)
-            if self._converged():
+            change = abs(terms["objective"] - objective)
+            if change < self.tolerance * abs(objective) and terms["residual"] < self.tolerance:
                 break
+            objective = terms["objective"]
         if progress is not None:
             progress(self.iterations, self.iterations)
         nearest = float(sample.depth_lr[sample.mask_lr].min()) / _NEARER
@@ -147,6 +133,10 @@ class ShapeFromShading(Method):
         """Return the solver of a sample before its first step, and its unit of depth in metres."""
         lr = sample.depth_lr[None].double()
         camera = sample.camera
+        inside = torch.ones(1, 1, camera.height, camera.width, dtype=torch.bool, device=lr.device)  # that may change
+        if self.foreground is not None:
+            mask = read_foreground(self.foreground / f"{sample.scene}.png", (camera.height, camera.width))
+            inside = torch.from_numpy(mask)[None, None].to(lr.device)
         unit = (camera.fx * camera.fy) ** 0.5
         metres = float(lr[lr.isfinite()].median()) / unit
         problem = ShadingProblem(
@@ -155,38 +145,14 @@ class ShapeFromShading(Method):
             rays=camera.rays(device=lr.device)[None],
             focal=(camera.fx, camera.fy),
             unit=unit,
-            inside=self._inside(sample),
+            inside=inside,
         )
         first = upsample_linear_border(inpaint(problem.lr), whole_scale(sample))
         return ShadingSolver(problem, self.weights, first, self.penalty), metres
 
-    def _inside(self, sample: DepthSample) -> Tensor:
-        """Return where the map may change, (1, 1, H, W) bool on the sample's device."""
-        size = (sample.camera.height, sample.camera.width)
-        device = sample.depth_lr.device
-        if self.foreground is None:
-            return torch.ones(1, 1, *size, dtype=torch.bool, device=device)
-        mask = read_foreground(self.foreground / f"{sample.scene}.png", size)
-        return torch.from_numpy(mask)[None, None].to(device)
-
-    def _converged(self) -> bool:
-        if len(self.history) < 2:
-            return False
-        before, now = self.history[-2:]
-        change = abs(now["objective"] - before["objective"])
-        return change < self.tolerance * abs(before["objective"]) and now["residual"] < self.tolerance
-
 
 def read_foreground(path: Path, size: tuple[int, int]) -> np.ndarray:
-    """Return a mask, (H, W) bool, True where the picture is white.
-
-    Args:
-        size: the height and width that it must have.
-
-    Raises:
-        ValueError: it is missing, damaged, of another size, or black.
-
-    """
+    """Return a mask, (H, W) bool of the given size, True where the picture is white."""
     if not path.is_file():
         raise ValueError(f"{path}: expected a mask of the foreground, there is no such file")
     content = read_limited(path, MOST_FILE)

@@ -38,14 +38,11 @@ from dsr.methods.classical.finite_differences import box_mean, repeat_blocks
 from dsr.methods.classical.iterations import conjugate_gradients
 from dsr.methods.classical.potts import Regions, boundary_length, fit_albedo, fuse
 
-_TINY = 1e-12
-"""Minimum length of m, which avoids division by 0."""
+_TINY = 1e-12  # minimum length of m, which avoids division by 0
 
 _CG_ITERATIONS, _CG_TOLERANCE = 60, 1e-6
-_INNER = 3
-"""Levenberg-Marquardt steps in an update of theta."""
-_LESS, _MORE = 0.2, 5.0
-"""Factors of its damping after a step that lowers the energy, and after one that does not."""
+_INNER = 3  # Levenberg-Marquardt steps in an update of theta
+_LESS, _MORE = 0.2, 5.0  # factors of its damping after a step that lowers the energy, and after one that does not
 
 
 class Surface(NamedTuple):
@@ -63,13 +60,7 @@ class Photometry(NamedTuple):
 
 
 def compute_surface(theta: Tensor, rays: Tensor) -> Surface:
-    """Return the normals, and the lengths of m.
-
-    Args:
-        theta: (B, 3, H, W), slopes along u and v and depth.
-        rays: (1, 3, H, W), see :meth:`dsr.geometry.camera.Camera.rays`.
-
-    """
+    """Return the normals, and the lengths of m, of theta (B, 3, H, W) and rays (1, 3, H, W)."""
     p, q, z = theta.split(1, dim=1)
     m = torch.cat((p, q, -z - rays[:, :1] * p - rays[:, 1:2] * q), dim=1)
     size = length(m).clamp(min=_TINY)
@@ -105,14 +96,7 @@ def compute_area(theta: Tensor, surface: Surface) -> Tensor:
 def fit_lighting(rgb: Tensor, albedo: Tensor, normals: Tensor, inside: Tensor) -> Tensor:
     """Return the lighting with the least squared error in each channel, (B, C, 4) float64.
 
-    If the normals do not determine it, as on a plane, it is the one of minimum norm.
-
-    Args:
-        rgb: (B, C, H, W).
-        albedo: (B, C, H, W).
-        normals: (B, 3, H, W).
-        inside: (B, 1, H, W) weight of each pixel.
-
+    If the normals do not determine it, as on a plane, it is the one of minimum norm. ``inside`` weights the pixels.
     """
     ones = torch.ones_like(normals[:, :1])
     design = (torch.cat((normals, ones), dim=1) * inside)[:, None] * albedo[:, :, None]  # (B, C, 4, H, W)
@@ -122,8 +106,7 @@ def fit_lighting(rgb: Tensor, albedo: Tensor, normals: Tensor, inside: Tensor) -
     return (torch.linalg.pinv(gram, hermitian=True, rtol=_RANK) @ right)[..., 0]
 
 
-_RANK = 1e-10
-"""Relative cutoff of singular values, below which a direction of the light is not determined."""
+_RANK = 1e-10  # relative cutoff of singular values, below which a direction of the light is not determined
 
 
 class Weights(NamedTuple):
@@ -200,15 +183,7 @@ class Slopes:
 class ShadingSolver:
     """The variables of a problem, and their updates.
 
-    Args:
-        problem: the constants.
-        weights: weights of the terms of E.
-        first: (B, 1, H, W) initial z, which stays unchanged outside the mask.
-        penalty: initial penalty.
-
-    Attributes:
-        z, theta, missed, albedo, lighting, regions: the variables; ``missed`` is u.
-
+    ``first`` is the initial z, (B, 1, H, W), which stays unchanged outside the mask; ``missed`` is u.
     """
 
     def __init__(self, problem: ShadingProblem, weights: Weights, first: Tensor, penalty: float) -> None:

@@ -44,19 +44,16 @@ from dsr.methods.classical.finite_differences import (
     sum_adjacent,
     upsample_linear_border,
 )
-from dsr.methods.classical.iterations import CHECK_EVERY, Movement, history_of
 from dsr.methods.inpainting import inpaint
 from dsr.methods.networks.normalisation import normalise
 from dsr.methods.noise_level import estimate_sensor_noise
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 
-_RELAXATION = 1.9
-"""Over-relaxation factor; the iteration converges below 2."""
-_SLOPE = 0.3
-"""Scale of slopes relative to the map, per pixel, for step sizes."""
-_NOISE_WEIGHT = 0.6
-"""The weight of the data term, times the noise of a normalised map and the scale."""
+_CHECK_EVERY = 50  # iterations between two checks of how far the map has moved
+_RELAXATION = 1.9  # over-relaxation factor; the iteration converges below 2
+_SLOPE = 0.3  # scale of slopes relative to the map, per pixel, for step sizes
+_NOISE_WEIGHT = 0.6  # the weight of the data term, times the noise of a normalised map and the scale
 _LARGEST_WEIGHT = 1000.0
 
 
@@ -101,22 +98,6 @@ class TotalGeneralisedVariation(Method):
         sharpness: strength of the image's edges, across which the map may jump (beta).
         exponent: exponent of the image's gradient (gamma).
         step_ratio: ratio of dual to primal step sizes; changes the speed of convergence, not the minimum.
-
-    Raises:
-        ValueError: a value is out of range.
-
-    Example:
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.degradation.downsampling import Downsampling, make_sample
-        >>> from dsr.sample import Scene
-        >>> from dsr.methods.classical.tgv import TotalGeneralisedVariation
-        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
-        >>> depth = torch.full((1, 24, 32), 2.0, dtype=torch.float64)
-        >>> scene = Scene("mine", "wall", torch.rand(3, 24, 32), camera, depth)
-        >>> sample = make_sample(scene, 4, Downsampling("box"), "disparity")
-        >>> bool((TotalGeneralisedVariation(iterations=10)(sample) - 2).abs().max() < 1e-3)
-        True
 
     """
 
@@ -164,18 +145,15 @@ class TotalGeneralisedVariation(Method):
         valid = lr.isfinite()
         values = torch.where(valid, scaled.values, torch.nan)
         found = self.minimise(sample.rgb[None].double(), values, whole_scale(sample), progress)
-        self.history = history_of(found.moved)
+        moved = enumerate(found.moved, start=1)
+        self.history = [{"iteration": float(_CHECK_EVERY * check), "moved": value} for check, value in moved]
         hr = found.values * scaled.value_range + scaled.minimum
         return from_range(hr[0], sample.camera, "disparity").to(sample.depth_lr.dtype)
 
     def minimise(self, rgb: Tensor, lr: Tensor, scale: int, progress: Steps | None = None) -> Solution:
-        """Return the minimiser of E for normalised maps.
+        """Return the minimiser of E for normalised maps, (B, 1, h, w) in [0, 1], NaN in holes, of images in [0, 1].
 
-        Args:
-            rgb: (B, 3, H, W) in [0, 1].
-            lr: (B, 1, H / scale, W / scale) of the same type, in [0, 1], NaN in holes.
-            scale: upsampling factor; at 1, only holes are inpainted.
-
+        At a scale of 1, only holes are inpainted.
         """
         start = inpaint(lr)
         if scale > 1 and not bool(lr.isfinite().all()):
@@ -225,7 +203,7 @@ class TotalGeneralisedVariation(Method):
         v = slopes(u)
         p, q = torch.zeros_like(v)[:, :, None], torch.zeros_like(gradient(v))
         mean_u, mean_v = torch.zeros_like(u), torch.zeros_like(v)
-        movement, done = Movement(u, self.iterations, self.tolerance, progress), 0
+        previous, moved, done = u, [], 0
         for done in range(1, self.iterations + 1):
             gp = _zero_border(g.times(p))
             prox_u = data.prox(u + steps.u * divergence(gp))
@@ -235,15 +213,20 @@ class TotalGeneralisedVariation(Method):
                 p + steps.p * g.times(_zero_border(gradient(ahead_u) - ahead_v[:, :, None])), self.alpha1
             )
             prox_q = _project_ball(q + steps.q * gradient(ahead_v), self.alpha0)
-            u, v, p, q = (
-                old.lerp(near, _RELAXATION) for old, near in ((u, prox_u), (v, prox_v), (p, prox_p), (q, prox_q))
-            )
-            since = (done - 1) % CHECK_EVERY + 1
+            u, v = u.lerp(prox_u, _RELAXATION), v.lerp(prox_v, _RELAXATION)
+            p, q = p.lerp(prox_p, _RELAXATION), q.lerp(prox_q, _RELAXATION)
+            since = (done - 1) % _CHECK_EVERY + 1
             mean_u, mean_v = mean_u.lerp(prox_u, 1 / since), mean_v.lerp(prox_v, 1 / since)
-            if since == CHECK_EVERY and movement.converged(mean_u):
-                break
-        movement.finish()
-        return Solution(mean_u, mean_v, done, movement.moved)
+            if since == _CHECK_EVERY:
+                moved.append(float((mean_u - previous).square().mean(dim=(-2, -1)).max().sqrt()))
+                previous = mean_u
+                if progress is not None:
+                    progress(done, self.iterations)
+                if moved[-1] < self.tolerance:
+                    break
+        if progress is not None:
+            progress(self.iterations, self.iterations)
+        return Solution(mean_u, mean_v, done, moved)
 
 
 class _Steps(NamedTuple):

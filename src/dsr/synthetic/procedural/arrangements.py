@@ -285,5 +285,4 @@ LAYOUTS: dict[str, tuple[Layout, float]] = {
     "portico": (portico, 0.06),
     "shapes": (shapes, 0.07),
     "shelves": (shelves, 0.06),
-}
-"""Layouts and their relative frequencies, by name."""
+}  # layouts and their relative frequencies, by name

@@ -22,33 +22,22 @@ from dsr.synthetic.ray_surfaces import Array
 _GRAZING = 0.12  # smallest cosine between ray and normal that a displacement is divided by
 
 Cookie = Callable[[Array], Array]
-SETS = 16
-"""Number of sets into which the samples of a light are divided; neighbouring pixels use different sets."""
+SETS = 16  # number of sets into which the samples of a light are divided; neighbouring pixels use different sets
 _SAMPLES_PER_SET = 3
 
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """The points where N rays from the camera meet the surfaces.
+    """The points where N rays from the camera meet the surfaces."""
 
-    Args:
-        depth: (N,) ray parameter, which is the orthogonal depth; inf where nothing is hit.
-        face: (N,) number of the triangle, -1 where nothing is hit.
-        body: (N,) number of the shape.
-        points, normals: (3, N) in the frame of the shapes; normals face the camera.
-        rest, chart: (3, N) the paint's coordinates, as in :class:`dsr.synthetic.procedural.shape.Shape`.
-        bulge: (N,) distance in metres from the triangle to the point along the normal.
-
-    """
-
-    depth: Array
-    face: Index
-    body: Index
-    points: Array
-    normals: Array
-    rest: Array
-    chart: Array
-    bulge: Array
+    depth: Array  # (N,) ray parameter, which is the orthogonal depth; inf where nothing is hit
+    face: Index  # (N,) number of the triangle, -1 where nothing is hit
+    body: Index  # (N,) number of the shape
+    points: Array  # (3, N) in the frame of the shapes
+    normals: Array  # (3, N), facing the camera
+    rest: Array  # (3, N) the paint's coordinates, as in `dsr.synthetic.procedural.shape.Shape`
+    chart: Array  # (3, N)
+    bulge: Array  # (N,) distance in metres from the triangle to the point along the normal
 
 
 class Tracer:
@@ -136,37 +125,19 @@ def _along(bulge: Array, normal: Array, rays: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Lighting:
-    """The light in a scene.
+    """The light in a scene."""
 
-    Args:
-        lamp: (SETS, L, 3) sample points of the lamp in metres.
-        colour: (3,) colour and strength of the lamp.
-        cookie: function from points (3, N) to the fraction (N,) of the lamp's light that arrives there, for example
-            through leaves or a window.
-        ambient: (3,) colour of the light from all directions.
-        sky: (3,) colour of additional light from above.
-        directions: (SETS, A, 3) unit vectors, cosine distributed about z, the normal.
-        occlusion_distance: distance in metres within which surfaces occlude each other's ambient light.
-
-    """
-
-    lamp: Array
-    colour: Array
-    cookie: Cookie
-    ambient: Array
-    sky: Array
-    directions: Array
-    occlusion_distance: float
+    lamp: Array  # (SETS, L, 3) sample points of the lamp in metres
+    colour: Array  # (3,) colour and strength of the lamp
+    cookie: Cookie  # from points (3, N) to the fraction of the lamp's light that arrives there, as through leaves
+    ambient: Array  # (3,) colour of the light from all directions
+    sky: Array  # (3,) colour of additional light from above
+    directions: Array  # (SETS, A, 3) unit vectors, cosine distributed about z, the normal
+    occlusion_distance: float  # metres within which surfaces occlude each other's ambient light
 
 
 def random_lighting(rng: np.random.Generator, tracer: Tracer, seen: Hits, low: Array, high: Array) -> Lighting:
-    """Return random lights for the surfaces of a preview.
-
-    Args:
-        low: (3,) lower corner of the box in which the lamp may hang, in metres.
-        high: (3,) upper corner of the same.
-
-    """
+    """Return random lights for the surfaces of a preview; the lamp may hang in a box from ``low`` to ``high``."""
     middle = np.median(seen.points, axis=1)
     extent = float(np.median(seen.depth))
     points, normals = seen.points, seen.normals
@@ -199,9 +170,10 @@ def _build(rng: np.random.Generator, position: Array, middle: Array, extent: flo
     )
     cookie = _cookie(rng, frame, middle, distance) if rng.random() < 0.22 else _clear
     strength = (1.15 - ambient_fraction) * distance**2
-    directions = (
-        _hemisphere(_stratified(rng, SETS * _SAMPLES_PER_SET)).reshape(_SAMPLES_PER_SET, SETS, 3).transpose(1, 0, 2)
-    )
+    cells = _stratified(rng, SETS * _SAMPLES_PER_SET)
+    spread, angle = np.sqrt(cells[:, 0]), 2 * np.pi * cells[:, 1]
+    around = np.column_stack((spread * np.cos(angle), spread * np.sin(angle), np.sqrt(1 - cells[:, 0])))
+    directions = around.reshape(_SAMPLES_PER_SET, SETS, 3).transpose(1, 0, 2)
     return Lighting(lamp, strength * warm, cookie, ambient, sky, directions, 0.35 * extent)
 
 
@@ -209,12 +181,6 @@ def _stratified(rng: np.random.Generator, count: int) -> Array:
     """Return points (count, 2) spread over the unit square: a shifted lattice of the plastic number."""
     steps = np.arange(count)[:, None] * np.array([0.7548776662466927, 0.5698402909980532])
     return (steps + rng.random(2)) % 1.0
-
-
-def _hemisphere(cells: Array) -> Array:
-    """Return unit vectors (N, 3), cosine distributed about z, for points (N, 2) of the unit square."""
-    radius, angle = np.sqrt(cells[:, 0]), 2 * np.pi * cells[:, 1]
-    return np.column_stack((radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - cells[:, 0])))
 
 
 def _clear(points: Array) -> Array:

@@ -15,8 +15,7 @@ from dsr.synthetic.procedural.reliefs import spectrum
 from dsr.synthetic.procedural.shape import Shape, random_rotation
 from dsr.synthetic.ray_surfaces import Array
 
-Image = NDArray[np.uint8]
-"""(S, S, 3); a value stands for the linear light (value / 255)**2."""
+Image = NDArray[np.uint8]  # (S, S, 3); a value stands for the linear light (value / 255)**2
 _SIDE = 384
 _FONTS = (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_TRIPLEX, cv2.FONT_HERSHEY_COMPLEX, cv2.FONT_HERSHEY_DUPLEX)
 _LETTERS = list("abcdefghijklmnoprstuvwyz      ")
@@ -179,12 +178,7 @@ _USUAL_PAINTS: dict[str, tuple[Callable[[np.random.Generator, str, float], Paint
 
 
 class MaterialSampler:
-    """Samples the materials of one scene, whose paints range from plain to patterned; some scenes have a single paint.
-
-    Args:
-        rng: source of random numbers.
-
-    """
+    """Samples the materials of one scene, from plain to patterned; some scenes have a single paint."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
@@ -204,7 +198,10 @@ class MaterialSampler:
         gloss = float(rng.choice([0.0, 0.0, 0.1, 0.5])) * (2.5 if family == "metal" else 1.0)
         shine = float(np.exp(rng.uniform(2, 5)))
         if self._shared is not None and not (family == "print" and rng.random() < 0.5):
-            return Body(self._with_scene_coordinates(shape), self._shared, gloss, shine)
+            place = shape.vertices @ self._turn.T  # the coordinates of the scene are those of the paint
+            chart = np.column_stack((place[:, :2], shape.chart[:, 2]))
+            whole = Shape(shape.vertices, shape.faces, shape.normals, chart, place)
+            return Body(whole, self._shared, gloss, shine)
         return Body(shape, self.paint(family, scale), gloss, shine)
 
     def paint(self, family: str, scale: float) -> Paint:
@@ -221,9 +218,3 @@ class MaterialSampler:
         if rng.random() < 0.2:
             return picture_paint(rng, "any", scale)
         return PAINTS[rng.integers(len(PAINTS))](rng, colours, scale)
-
-    def _with_scene_coordinates(self, shape: Shape) -> Shape:
-        """Return the shape with the coordinates of the scene as its paint coordinates."""
-        place = shape.vertices @ self._turn.T
-        chart = np.column_stack((place[:, :2], shape.chart[:, 2]))
-        return Shape(shape.vertices, shape.faces, shape.normals, chart, place)

@@ -14,23 +14,15 @@ from dsr.synthetic.ray_surfaces import Array
 
 @dataclass(frozen=True, eq=False)
 class Blobs:
-    """A field, the sum of B Gaussian blobs - 0.5 + ripples, positive inside, with a gradient in closed form.
+    """A field, the sum of B Gaussian blobs - 0.5 + ripples, positive inside, with a gradient in closed form."""
 
-    Args:
-        centres, radii: (B, 3) of the blobs along the coordinate axes.
-        weights: (B,) 1 for a blob, below 0 for a hollow.
-        waves: (K, 3) wave vectors of the ripples; phases, heights: (K,).
-        ridged: whether ripples are folds with sharp valleys instead of hills.
-
-    """
-
-    centres: Array
-    radii: Array
-    weights: Array
-    waves: Array
-    phases: Array
-    heights: Array
-    ridged: bool
+    centres: Array  # (B, 3)
+    radii: Array  # (B, 3) along the coordinate axes
+    weights: Array  # (B,) 1 for a blob, below 0 for a hollow
+    waves: Array  # (K, 3) wave vectors of the ripples
+    phases: Array  # (K,)
+    heights: Array  # (K,)
+    ridged: bool  # whether ripples are folds with sharp valleys instead of hills
 
     def lattice(self, axes: list[Array]) -> Array:
         """Return the field on the lattice of the three coordinate ``axes``."""

@@ -31,19 +31,12 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """The rays of a camera.
+    """The rays of a camera."""
 
-    Args:
-        eye: (3,) origin of the rays in metres.
-        rays: (3, H, W) directions of length 1 along the optical axis.
-        right, down: (3,) steps of the directions from pixel to pixel.
-
-    """
-
-    eye: Array
-    rays: Array
-    right: Array
-    down: Array
+    eye: Array  # (3,) origin of the rays in metres
+    rays: Array  # (3, H, W) directions of length 1 along the optical axis
+    right: Array  # (3,) step of the directions from pixel to pixel
+    down: Array  # (3,)
 
 
 def radiance(tracer: Tracer, bodies: Sequence[Body], view: View, lighting: Lighting) -> tuple[Array, Array]:
@@ -51,7 +44,8 @@ def radiance(tracer: Tracer, bodies: Sequence[Body], view: View, lighting: Light
     shape = view.rays.shape[1:]
     rays = view.rays.reshape(3, -1)
     parts = [tracer.trace(view.eye, rays[:, i : i + _CHUNK]) for i in range(0, rays.shape[1], _CHUNK)]
-    hits = _join_hits(parts)
+    names = Hits.__dataclass_fields__
+    hits = Hits(**{name: np.concatenate([getattr(part, name) for part in parts], axis=-1) for name in names})
     extent = float(np.median(hits.depth))
     which = _pattern(shape)
     pieces = [
@@ -68,12 +62,6 @@ def radiance(tracer: Tracer, bodies: Sequence[Body], view: View, lighting: Light
         pixels = rough[start : start + _CHUNK]
         colour[:, pixels] = _supersample(tracer, bodies, view, lighting, hits, seen, pixels)
     return colour.reshape(3, *shape), hits.depth.reshape(shape)
-
-
-def _join_hits(parts: Sequence[Hits]) -> Hits:
-    """Return the hits of several parts as one."""
-    names = Hits.__dataclass_fields__
-    return Hits(**{name: np.concatenate([getattr(part, name) for part in parts], axis=-1) for name in names})
 
 
 def _pattern(shape: tuple[int, ...]) -> NDArray[np.intp]:
@@ -185,22 +173,13 @@ def develop(linear: Array, rng: np.random.Generator) -> NDArray[np.uint8]:
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """The pose and the intrinsics of a camera in a layout.
+    """The pose and the intrinsics of a camera in a layout."""
 
-    Args:
-        eye: (3,) position of the camera in metres, z up.
-        target: (3,) point in the middle of the picture in metres.
-        focal: focal length in image widths.
-        roll: rotation about the viewing direction in degrees.
-        centre: (2,) principal point in image widths from the left and upper edge.
-
-    """
-
-    eye: Array
-    target: Array
-    focal: float
-    roll: float
-    centre: Array
+    eye: Array  # (3,) position of the camera in metres, z up
+    target: Array  # (3,) point in the middle of the picture in metres
+    focal: float  # focal length in image widths
+    roll: float  # rotation about the viewing direction in degrees
+    centre: Array  # (2,) principal point in image widths from the left and upper edge
 
     def axes(self) -> Array:
         """Return the camera's right, down and forward axes as rows (3, 3)."""
@@ -220,16 +199,9 @@ def aim_camera(rng: np.random.Generator, eye: Array, target: Array, low: float =
 
 @dataclass(frozen=True, eq=False)
 class SceneLayout:
-    """The bodies of a scene, and where its cameras and lamps may be.
-
-    Args:
-        bodies: bodies that fill the view of every camera.
-        views: function that makes a random camera.
-        low, high: (3,) corners of the box in which lamps may hang, in metres.
-
-    """
+    """The bodies of a scene, which fill the view of every camera, and where its cameras and lamps may be."""
 
     bodies: Sequence[Body]
     views: Callable[[np.random.Generator], Viewpoint]
-    low: Array
+    low: Array  # (3,) corners of the box in which lamps may hang, in metres
     high: Array

@@ -13,8 +13,7 @@ from dsr.synthetic.procedural.materials import MaterialSampler
 from dsr.synthetic.procedural.photo import SceneLayout, View, Viewpoint, develop, radiance
 from dsr.synthetic.rendering import Rendering
 
-PROCEDURAL_VERSION = 1
-"""Version of the scenes; it has to be increased whenever an image changes."""
+PROCEDURAL_VERSION = 1  # version of the scenes; it has to be increased whenever an image changes
 _PREVIEW_SIZE = 64
 _MIN_DEPTH, _MAX_MEDIAN_DEPTH = 0.25, 10.0
 _LAYOUT_TRIES, _CAMERA_TRIES = 6, 10
@@ -22,42 +21,22 @@ _LAYOUT_TRIES, _CAMERA_TRIES = 6, 10
 
 @dataclass(frozen=True, eq=False)
 class RandomScene:
-    """A scene that can be rendered at any size.
+    """A scene that can be rendered at any size."""
 
-    Args:
-        layout_name: key of its layout in :data:`LAYOUTS`.
-        layout: bodies of the scene.
-        tracer: ray tracer of these bodies.
-        viewpoint: camera.
-        lighting: lights.
-        metres: metres per unit of length of the layout.
-        seed: seed of the camera's noise.
-
-    """
-
-    layout_name: str
+    layout_name: str  # key of its layout in LAYOUTS
     layout: SceneLayout
     tracer: Tracer
     viewpoint: Viewpoint
     lighting: Lighting
-    metres: float
-    seed: int
+    metres: float  # metres per unit of length of the layout
+    seed: int  # of the camera's noise
 
 
 def render_random_scene(seed: int, index: int, size: int = 512) -> Rendering:
-    """Return the scene number ``index`` of the endless series ``seed``; the view is the same at any size.
+    """Return the scene number ``index`` of the endless series ``seed``; the view is the same at any size in pixels.
 
-    Args:
-        index: number of the scene in it, from 0. The scene is a function of these two numbers alone.
-        size: height and width in pixels.
-
-    Returns:
-        The photo and its depth in metres, which is more than 0.2 everywhere and exact for the surfaces that
-        :mod:`dsr.synthetic.procedural.lighting` describes.
-
-    Raises:
-        ValueError: a number is negative, or the size is not positive.
-
+    The scene is a function of these two numbers alone. Its depth in metres is more than 0.2 everywhere and exact for
+    the surfaces that :mod:`dsr.synthetic.procedural.lighting` describes.
     """
     for name, value, least in (("seed", seed, 0), ("index", index, 0), ("size", size, 1)):
         if value < least:

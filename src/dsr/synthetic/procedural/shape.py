@@ -20,22 +20,13 @@ Index = NDArray[np.intp]
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """A mesh of V vertices and F triangles.
+    """A mesh of V vertices and F triangles."""
 
-    Args:
-        vertices: (V, 3) in metres.
-        faces: (F, 3) vertex indices, in any orientation.
-        normals: (V, 3) unit normals, to either side.
-        chart: (V, 3) surface coordinates for paint: two in metres and a tone in [0, 1], such as the height of a relief.
-        rest: (V, 3) coordinates of the vertices in the shape's own frame, for solid paint.
-
-    """
-
-    vertices: Array
-    faces: Index
-    normals: Array
-    chart: Array
-    rest: Array
+    vertices: Array  # (V, 3) in metres
+    faces: Index  # (F, 3) vertex indices, in any orientation
+    normals: Array  # (V, 3) unit normals, to either side
+    chart: Array  # (V, 3) for paint: two coordinates in metres and a tone in [0, 1], such as the height of a relief
+    rest: Array  # (V, 3) coordinates of the vertices in the shape's own frame, for solid paint
 
     def translate(self, shift: Sequence[float] | Array) -> Shape:
         """Return the shape translated by ``shift`` (3,) metres."""
@@ -83,20 +74,20 @@ def merge(shapes: Sequence[Shape]) -> Shape:
 
 
 def surface(points: Array, normals: Array | None = None, tone: Array | None = None) -> Shape:
-    """Return the surface through a grid of points.
+    """Return the surface through a grid of points, (R, C, 3); the last column may repeat the first, which closes it.
 
-    Args:
-        points: (R, C, 3); the last column may repeat the first, which makes it closed.
-        normals: (R, C, 3); None to take them from the grid.
-        tone: (R, C) the chart's third coordinate; None for 0.
-
+    Without ``normals`` they are taken from the grid; ``tone`` (R, C) is the chart's third coordinate.
     """
     rows, columns = points.shape[:2]
-    if normals is None:
-        normals = _grid_normals(points)
+    if normals is None:  # by central differences, across the seam where the grid is closed
+        along, around = np.gradient(points, axis=0), np.gradient(points, axis=1)
+        if np.allclose(points[:, 0], points[:, -1], atol=1e-9):
+            around[:, 0] = around[:, -1] = (points[:, 1] - points[:, -2]) / 2
+        normals = np.cross(around, along)
+    flat = points.reshape(-1, 3)
     corner = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = (corner[i].ravel() for i in _QUADS)
-    shorter = _square(points, a, d) < _square(points, b, c)
+    shorter = ((flat[a] - flat[d]) ** 2).sum(1) < ((flat[b] - flat[c]) ** 2).sum(1)
     first = np.where(shorter[:, None], np.stack((a, b, d), 1), np.stack((a, b, c), 1))
     second = np.where(shorter[:, None], np.stack((a, d, c), 1), np.stack((b, d, c), 1))
     chart = np.zeros(points.shape)
@@ -111,27 +102,10 @@ def surface(points: Array, normals: Array | None = None, tone: Array | None = No
 _QUADS = (np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:])
 
 
-def _square(points: Array, i: Index, j: Index) -> Array:
-    """Return the squared lengths of the edges from vertices ``i`` to ``j``."""
-    flat = points.reshape(-1, 3)
-    return np.asarray(((flat[i] - flat[j]) ** 2).sum(1))
-
-
-def _grid_normals(points: Array) -> Array:
-    """Return the normals (R, C, 3) by central differences, across the seam where the grid is closed."""
-    along = np.gradient(points, axis=0)
-    around = np.gradient(points, axis=1)
-    if np.allclose(points[:, 0], points[:, -1], atol=1e-9):
-        around[:, 0] = around[:, -1] = (points[:, 1] - points[:, -2]) / 2
-    return np.cross(around, along)
-
-
 def lathe(sections: Sequence[Array], segments: int = 80) -> Shape:
-    """Return the surface of revolution of the profile ``sections`` about the z axis.
+    """Return the surface of revolution about the z axis of a profile.
 
-    Args:
-        sections: radius and height along the smooth pieces of the profile, (K, 2) each; edges between pieces are sharp.
-
+    Its sections, (K, 2) each, are radius and height along smooth pieces; edges between pieces are sharp.
     """
     angle = np.linspace(0, 2 * np.pi, segments + 1)
     circle = np.stack((np.cos(angle), np.sin(angle)), axis=1)
@@ -147,13 +121,9 @@ def lathe(sections: Sequence[Array], segments: int = 80) -> Shape:
 
 
 def extrusion(outlines: Sequence[Array], height: float, crease: float = 32.0) -> Shape:
-    """Return a prism from z = 0 to ``height``.
+    """Return a prism from z = 0 to ``height`` over closed polygons (K, 2): the outer one, then holes.
 
-    Args:
-        outlines: (K, 2) closed polygons: the outer one, then holes.
-        height: in metres.
-        crease: angle in degrees below which corners of the outline get smooth normals.
-
+    Corners of the outline below the ``crease`` angle in degrees get smooth normals.
     """
     sides = [_side(outline, height, crease) for outline in outlines]
     flat = np.concatenate(outlines)
@@ -198,13 +168,11 @@ def tube(path: Array, radius: Array | float, segments: int = 20) -> Shape:
     frame = np.array(frames)  # (K, 2, 3)
     out = np.cos(angle)[:, None] * frame[:, None, 0] + np.sin(angle)[:, None] * frame[:, None, 1]  # (K, S, 3)
     ring = path[:, None] + np.broadcast_to(radius, (len(path),))[:, None, None] * out
-    caps = [_disc(path[i], ring[i], tangent[i]) for i in (0, -1)]
+    caps = []
+    for i in (0, -1):
+        fan = np.stack((np.broadcast_to(path[i], ring[i].shape), ring[i]))
+        caps.append(surface(fan, np.broadcast_to(tangent[i], fan.shape)))
     return merge([surface(ring, out), *caps])
-
-
-def _disc(centre: Array, ring: Array, normal: Array) -> Shape:
-    """Return the flat fan between ``centre`` (3,) and ``ring`` (S, 3)."""
-    return surface(np.stack((np.broadcast_to(centre, ring.shape), ring)), np.broadcast_to(normal, (2, *ring.shape)))
 
 
 def quad(corner: Sequence[float] | Array, side: Sequence[float] | Array, up: Sequence[float] | Array) -> Shape:
