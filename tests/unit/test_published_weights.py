@@ -14,7 +14,8 @@ from bombs import Trap
 from torch import Tensor
 
 from dsr.methods.networks.msg_net import MSGNet
-from dsr.methods.networks.trained import TrainedNetwork, load_msg_weights
+from dsr.methods.networks.published import load_msg_weights
+from dsr.methods.networks.trained import TrainedNetwork
 
 Layer = tuple[str, str, list[Tensor]]
 
@@ -192,21 +193,11 @@ def test_caffe_blob_of_the_wrong_size_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "problem"),
-    [
-        (b"\x80\x80", "a number is cut off"),
-        (b"\xff" * 11, "a number is longer than 64 bits"),
-        (b"\xa2\x06\xff\xff\xff\xff\x0f\x00", "field 100 is cut off"),
-        (b"\x0b", "field 1 has the unknown wire type 3"),
-        (b"\x02\x00", "a field has number 0"),
-        (b"\xa0\x06\x01", "field 100 is a number instead of bytes"),
-        (_field(1, b"name"), "6 bytes without a Caffe layer"),
-    ],
+    "content",
+    [b"\xff" * 11, b"\xa2\x06\xff\xff\xff\xff\x0f\x00", b"\x0b", b"\xa0\x06\x01", _field(1, b"name")],
 )
-def test_protobuf_error_is_described(tmp_path: Path, content: bytes, problem: str) -> None:
-    if content[0] == 0x80:  # a torch file's first byte, too
-        content = _field(1, b"name") + content
-    assert problem in _refusal(_write(tmp_path / "net.caffemodel", content))
+def test_what_is_no_protobuf_or_no_network_is_refused(tmp_path: Path, content: bytes) -> None:
+    assert "expected a torch or Caffe model" in _refusal(_write(tmp_path / "net.caffemodel", content))
 
 
 def test_torch_file_of_another_network_is_refused(tmp_path: Path) -> None:
