@@ -183,9 +183,9 @@ def test_windows_equal_the_whole_image() -> None:
     net = _net(2, iterations=2)
     rgb, coarse = _photo(80, 84), _map(40, 42)
     whole = net.upsample(rgb, coarse)
-    context = net.global_context(rgb, coarse)
+    context = net.context(rgb, coarse)
     radius, start, stop = net.receptive_field_radius, 12, 40
-    part = context.upsample_window(rgb[..., 2 * start : 2 * stop, 20:], context.disparity[..., start:stop, 10:])
+    part = net.upsample(rgb[..., 2 * start : 2 * stop, 20:], coarse[..., start:stop, 10:], *context)
     top, left = 2 * (start + radius), 20 + 2 * radius
     kept = part[..., 2 * radius :, 2 * radius :]
     torch.testing.assert_close(kept, whole[..., top:, left:], rtol=1e-6, atol=0)

@@ -61,12 +61,11 @@ from dsr.degradation.downsampling import check_scale
 from dsr.methods.classical.finite_differences import extend_linearly, upsample_linear_border
 from dsr.methods.exportable import apply
 from dsr.methods.networks.facets_planes import stencil
-from dsr.methods.networks.network import NormalisedNetwork, expect_rgb_size
+from dsr.methods.networks.network import NormalisedNetwork
 
 Offset = tuple[int, int]
 
-_FAINT = 1e-3
-"""A difference of normalised disparity that becomes about 1 in the network's input."""
+_FAINT = 1e-3  # a difference of normalised disparity that becomes about 1 in the network's input
 _INPUTS = 9
 _TINY = 1e-12
 
@@ -231,9 +230,6 @@ class UnrolledHuber(nn.Module):
         data: initial weight of the distance from f.
         huber: initial epsilon.
 
-    Raises:
-        ValueError: a value is out of range.
-
     """
 
     def __init__(self, window: int = 5, iterations: int = 10, data: float = 10.0, huber: float = 1.0) -> None:
@@ -246,11 +242,6 @@ class UnrolledHuber(nn.Module):
         self.log_huber = nn.Parameter(torch.tensor(math.log(huber)))
         first = torch.tensor(safe_step(data, huber, window)).log()
         self.log_steps = nn.Parameter(first.repeat(iterations, 1))  # (iterations, 3): sigma, tau, theta
-
-    @property
-    def receptive_field_radius(self) -> int:
-        """Receptive-field radius in pixels."""
-        return self.iterations * (self.window // 2)
 
     def steps(self, dtype: torch.dtype = torch.float32) -> list[Step]:
         """Return the sizes of each step."""
@@ -289,9 +280,6 @@ class PrimalDualNetwork(NormalisedNetwork):
         window: size in pixels of the window that a pixel is compared within, odd.
         iterations: number of unrolled iterations.
 
-    Raises:
-        ValueError: a value is out of range.
-
     """
 
     def __init__(self, scale: int, width: int = 64, layers: int = 10, window: int = 5, iterations: int = 10) -> None:
@@ -314,20 +302,11 @@ class PrimalDualNetwork(NormalisedNetwork):
         self.head.weight.data[:1].zero_()  # no residual at first
         self.head.bias.data.zero_()  # type: ignore[union-attr]
         self.log_strength = nn.Parameter(torch.zeros(()))
-
-    @property
-    def receptive_field_radius(self) -> int:
-        """Receptive-field radius in low-resolution pixels.
-
-        One high-resolution pixel for each convolution, half a window for each iteration, and four low-resolution pixels
-        for the upsampling and the differences of the low-resolution input.
-        """
-        radius_hr = self.layers + self.stage.receptive_field_radius
-        return -(-radius_hr // self.scale) + 4
+        # of convolutions and iterations in high-resolution pixels; 4 of the upsampling and the differences
+        self.receptive_field_radius = -(-(layers + iterations * (window // 2)) // scale) + 4
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
         """Return normalised disparity (B, 1, H, W) for (B, 3, H, W) and (B, 1, h, w); see the base class."""
-        expect_rgb_size(rgb, values, self.scale)
         hr = upsample_linear_border(values, self.scale)
         inputs, bend = self._inputs(rgb, values, hr)
         output = self.head(self.trunk(inputs.to(self.head.weight.dtype)))
