@@ -90,7 +90,7 @@ class Facets(NormalisedNetwork):
         planes = self._propose_planes(self.planes(x), around)
         for up, join, features in zip(self.up, self.join, reversed(pyramid[:-1]), strict=True):
             x = functional.relu(enlarge_and_join(up, join, x, features), inplace=True)
-        return mix_planes(planes, self.choice(x), self.scale)
+        return mix_planes(planes, self.choice(x), self.scale)[0]
 
     def _propose_planes(self, output: Tensor, around: Stencil) -> Tensor:
         """Return the planes of each low-resolution pixel, (B, facets, 3, h, w): value at its centre and slopes."""
