@@ -181,7 +181,6 @@ def test_bfloat16_changes_the_result_a_little() -> None:
         ({"range_type": "depth"}, "range_type: expected one of orthogonal, perspective, disparity, got 'depth'"),
         ({"value_range": "full"}, "range: expected one of measured, truth, got 'full'"),
         ({"precision": "float16"}, "precision: expected one of float32, bfloat16, got 'float16'"),
-        ({"tile": 3}, "tile: expected at least 4 pixels, got 3"),
     ],
 )
 def test_unsupported_value_is_refused(arguments: dict[str, str], message: str) -> None:
