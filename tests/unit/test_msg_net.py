@@ -67,13 +67,6 @@ def test_guidance_of_another_size_is_refused() -> None:
         _net(4)(torch.zeros(1, 1, 31, 32), torch.zeros(1, 1, 8, 8))
 
 
-def test_unknown_scale_or_variant_is_refused() -> None:
-    with pytest.raises(ValueError, match="scale: expected one of"):
-        MSGNet(3)
-    with pytest.raises(ValueError, match="variant: expected one of hui, voynov, dsr, got 'caffe'"):
-        MSGNet(4, "caffe")  # type: ignore[arg-type]
-
-
 def test_3x3_mean_equals_scipy_with_mirrored_borders() -> None:
     x = torch.rand(2, 1, 5, 7, dtype=torch.float64)
     expected = [ndimage.convolve(image, np.full((3, 3), 1 / 9), mode="reflect") for image in x[:, 0].numpy()]
@@ -246,13 +239,6 @@ def test_disparity_that_is_not_positive_becomes_a_hole() -> None:
     assert bool(NetworkUpsampler(net)(_sample(4, 8, 8)).isnan().all())
 
 
-def test_network_of_the_caller_is_unchanged() -> None:
-    net = MSGNet(4).train()
-    NetworkUpsampler(net, "bfloat16")
-    assert net.training
-    assert all(value.dtype == torch.float32 and value.requires_grad for value in net.parameters())
-
-
 def test_other_scale_and_unknown_precision_are_refused() -> None:
     with pytest.raises(ValueError, match="scene: expected scale 4, the network's, got 2"):
         NetworkUpsampler(_net(4))(_sample(2, 8, 8))
@@ -283,22 +269,3 @@ def test_untrained_variant_of_ours_is_nearly_the_interpolation_without_a_checker
         fine = MSGNet(scale, "dsr").upsample(rgb, disparity)
     base = upsample_bicubic(mean3x3(disparity), scale)
     assert float((fine - base).abs().max()) < 0.02
-
-
-def test_given_min_max_replaces_the_maps_own_range() -> None:
-    net, rgb, disparity = MSGNet(4, "dsr"), torch.rand(1, 3, 32, 32), 5 + torch.rand(1, 1, 8, 8)
-    own = torch.stack((disparity.min(), disparity.max())).view(1, 2, 1, 1)
-    with torch.no_grad():
-        torch.testing.assert_close(net.upsample(rgb, disparity, own), net.upsample(rgb, disparity))
-        wide = net.upsample(rgb, disparity, torch.tensor([0.0, 20.0]).view(1, 2, 1, 1))
-    assert not torch.allclose(wide, net.upsample(rgb, disparity).detach(), atol=1e-6)
-
-
-def test_our_variant_fills_holes_from_their_surroundings() -> None:
-    net, rgb = MSGNet(4, "dsr"), torch.rand(1, 3, 64, 64)
-    disparity = torch.full((1, 1, 16, 16), 7.0)
-    disparity[..., :3] = 9.0
-    pierced = disparity.clone()
-    pierced[..., 8, 9] = torch.nan
-    with torch.no_grad():
-        torch.testing.assert_close(net.upsample(rgb, pierced), net.upsample(rgb, disparity))

@@ -17,7 +17,6 @@ from dsr.sample import DepthSample
 
 NETS: dict[str, Callable[[], DisparityNetwork]] = {
     "facets": lambda: Facets(4, width=8, blocks=2),
-    "facets x8": lambda: Facets(8, width=8, blocks=1),
     "dsr": lambda: MSGNet(4, "dsr"),
     "voynov": lambda: MSGNet(4, "voynov"),
     "hui": lambda: MSGNet(2, "hui"),

@@ -12,7 +12,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, cast
 
 import torch
 import yaml
@@ -139,7 +139,7 @@ class Recipe:
         """Return the method with a file of weights, or a directory with published ones; None for its own."""
         if path is None or self.abilities.needs is None:
             return self
-        return replace(self, node=OmegaConf.merge(self.node, {"weights": {"path": str(path)}}))
+        return replace(self, node=_merge(self.node, {"weights": {"path": str(path)}}))
 
     def weights(self, factor: float) -> Path | None:
         """Return the file of weights for a factor; None for a method that needs none.
@@ -250,7 +250,7 @@ def read_recipe(name: str, settings: Mapping[str, Any] | None = None, directorie
         node, given = content.get("method", {}), dict(settings or {})
         if isinstance(given.get("weights"), str) and isinstance(node.get("weights"), DictConfig):
             given["weights"] = {"path": given["weights"]}
-        node = OmegaConf.merge(node, given)
+        node = _merge(node, given)
     except OmegaConfBaseException as error:
         raise ConfigError(f"method={name}: {str(error).splitlines()[0]}") from error
     label = str(content.get("label") or name)
@@ -269,10 +269,14 @@ def _read_file(group: str, name: str, places: Sequence[Path], above: tuple[str, 
     except (OSError, yaml.YAMLError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: expected a readable YAML file, got {type(error).__name__}") from error
     listed = own.pop("defaults", None) or [] if isinstance(own, DictConfig) else None
-    if not isinstance(listed, list | ListConfig):
+    if not isinstance(own, DictConfig) or not isinstance(listed, list | ListConfig):
         raise ConfigError(f"{path}: expected keys and values, with a list of names as defaults")
     if group == "method" and not isinstance(own.get(group), DictConfig):  # without "@package _global_"
         own = OmegaConf.create({group: own})
     names = list(listed) if "_self_" in listed else [*listed, "_self_"]
     parts = [own if each == "_self_" else _read_file(group, str(each), places, (*above, name)) for each in names]
-    return OmegaConf.merge(*parts)  # type: ignore[return-value]  # all have keys
+    return _merge(*parts)
+
+
+def _merge(*nodes: Mapping[str, Any]) -> DictConfig:
+    return cast(DictConfig, OmegaConf.merge(*nodes))  # all have keys

@@ -81,7 +81,7 @@ class MixedResidual(nn.Module):
         ``gains`` (B, C), and ``shifts`` (B, C) are added. On a GPU, which is slow at convolutions of many groups, the
         results of both sets are mixed instead of the weights.
         """
-        first, second = self.ways
+        first, second = cast(list[Residual], self.ways)
         if x.is_cuda and len(x) > 1:
             share, gain, shift = (each[..., None, None] for each in (shares[:, None], 1 + gains, shifts))
             hidden = torch.lerp(one := first.first(x), second.first(x), share.to(one))

@@ -374,13 +374,12 @@ def _project(result: Tensor, values: Tensor, known: Tensor, gate: Tensor, kernel
     scale = result.shape[-1] // values.shape[-1]
     for kernel in dict.fromkeys(filter(None, kernels)):
         places = [i for i, each in enumerate(kernels) if each == kernel]
-        whole = len(places) == len(kernels)
-        index = None if whole else constant(tuple(places), torch.int64, result.device)
-        x, given, valid, factor = (each if whole else each[index] for each in (result, values, known, gate))
+        index = None if len(places) == len(kernels) else constant(tuple(places), torch.int64, result.device)
+        x, given, valid, factor = (each if index is None else each[index] for each in (result, values, known, gate))
         for _ in range(_PROJECTIONS):
             residual = torch.where(valid, given - Downsampling(kernel)(x, scale), 0)  # type: ignore[arg-type]
             x = x + factor.to(x.dtype) * upsample_bicubic(residual, scale)
-        result = x if whole else result.index_copy(0, index, x)
+        result = x if index is None else result.index_copy(0, index, x)
     return result
 
 
@@ -393,9 +392,9 @@ def _roughness(bend: Tensor, weight: Tensor) -> Tensor:
         found = [quantiles_in_graph(level.float().flatten(1), known, fractions) for level in bend]
         quantiles = torch.cat(found, dim=1)
     else:
-        step = max(1, math.isqrt(weight.shape[-2] * weight.shape[-1] // _SAMPLES))
-        known = weight[..., ::step, ::step].flatten(1) > 0.5
-        bends = bend[..., ::step, ::step].flatten(2).float().masked_fill(~known, torch.nan)
+        every_nth = max(1, math.isqrt(weight.shape[-2] * weight.shape[-1] // _SAMPLES))
+        known = weight[..., ::every_nth, ::every_nth].flatten(1) > 0.5
+        bends = bend[..., ::every_nth, ::every_nth].flatten(2).float().masked_fill(~known, torch.nan)
         quantiles = torch.nanquantile(bends, fractions, dim=2).permute(2, 1, 0).flatten(1)  # (B, levels * quantiles)
     return (torch.log10(quantiles.nan_to_num(0) + 1e-6) + 4) / 2
 

@@ -288,7 +288,7 @@ class NetworkUpsampler(Method):
             results = []
             for index, context in enumerate(contexts):
                 turned = [apply_dihedral(each, index) for each in (window, given[..., row, column])]
-                results.append(undo_dihedral(net.upsample(*turned, *context), index))  # type: ignore[arg-type]
+                results.append(undo_dihedral(net.upsample(*turned, *context), index))
                 if progress is not None:
                     progress(next(done), count * self.ensemble)
             return sum(results[1:], results[0]) / self.ensemble

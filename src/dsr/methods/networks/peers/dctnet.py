@@ -76,8 +76,8 @@ class CoupledConv(nn.Module):
         """Map two tensors of (B, 64, H, W) to two of the same shape."""
         results = []
         for x, own in ((depth, self.depth), (rgb, self.rgb)):
-            weight, bias = torch.cat([self.shared.weight, own.weight]), torch.cat([self.shared.bias, own.bias])
-            weight = weight.contiguous(memory_format=torch.channels_last)
+            weight = torch.cat([self.shared.weight, own.weight]).contiguous(memory_format=torch.channels_last)
+            bias = torch.cat([conv.get_parameter("bias") for conv in (self.shared, own)])
             results.append(functional.conv2d(x, weight, bias, padding=1))
         return results[0], results[1]
 
