@@ -19,9 +19,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dsr.methods.networks.msg_net import MSGNet, upsample_disparity
+from dsr.methods.networks.msg_net import MSGNet
 from dsr.methods.networks.network import NetworkUpsampler
-from dsr.methods.networks.trained import load_msg_weights
+from dsr.methods.networks.published import load_msg_weights
 
 SCALE = 4
 TARGETS = {"float32": 3.0, "bfloat16": 8.0}
@@ -44,16 +44,15 @@ def ways(net: MSGNet, size: int, device: torch.device) -> dict[str, Callable[[],
     float32, bfloat16 = (NetworkUpsampler(net, each, device).net for each in ("float32", "bfloat16"))
     plain = copy.deepcopy(net).eval().to(device)
 
-    def run(net: MSGNet, *, crop: bool, inference: bool) -> Callable[[], Tensor]:
+    def run(net: MSGNet, *, inference: bool) -> Callable[[], Tensor]:
         mode = torch.inference_mode if inference else torch.no_grad
-        return mode()(lambda: upsample_disparity(net, rgb, disparity, crop_drift=crop))
+        return mode()(lambda: net.upsample(rgb, disparity))
 
     return {
-        "plain": run(plain, crop=False, inference=False),
-        "+ drift from a crop": run(plain, crop=True, inference=False),
-        "+ channels last": run(float32, crop=True, inference=False),
-        "+ activation in place (float32)": run(float32, crop=True, inference=True),
-        "+ bfloat16": run(bfloat16, crop=True, inference=True),
+        "plain": run(plain, inference=False),
+        "+ channels last": run(float32, inference=False),
+        "+ activation in place (float32)": run(float32, inference=True),
+        "+ bfloat16": run(bfloat16, inference=True),
     }
 
 

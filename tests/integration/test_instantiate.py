@@ -12,7 +12,7 @@ import torch
 from hydra.utils import instantiate
 from lightning.pytorch.callbacks import Callback, EarlyStopping
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
-from methods_at_hand import AT_HAND, PEERS
+from methods_at_hand import AT_HAND
 
 import dsr
 from dsr.app.schema import TrainConfig, plain_config
@@ -30,20 +30,11 @@ def choices(group: str) -> list[str]:
     return list_choices(group, config_directories())
 
 
-@pytest.mark.parametrize("name", AT_HAND)
-def test_method_is_instantiated_with_its_weights(name: str) -> None:
-    scale = 8 if 8 in read_recipe(name).factors else 4
-    made = instantiate(dsr.compose("eval", [f"method={name}", f"scale={scale}"]).method)
+@pytest.mark.parametrize("name", [name for name in AT_HAND if read_recipe(name).abilities.needs is None])
+def test_method_without_weights_is_instantiated(name: str) -> None:
+    made = instantiate(dsr.compose("eval", [f"method={name}"]).method)
     assert isinstance(made, Method)
     assert type(made) is read_recipe(name).kind
-    assert getattr(made, "scale", scale) == scale
-
-
-@pytest.mark.parametrize("name", PEERS)
-def test_method_with_its_authors_weights_is_instantiated(name: str, shared: Path) -> None:
-    path = f"method.weights.path={shared / 'weights' / 'peers'}"
-    scale = read_recipe(name).with_weights(shared / "weights" / "peers").factors[0]
-    assert isinstance(instantiate(dsr.compose("eval", [f"method={name}", f"scale={scale}", path]).method), Method)
 
 
 @pytest.mark.parametrize(

@@ -87,12 +87,6 @@ def test_facets_without_slopes_stay_within_the_surrounding_values() -> None:
     assert 1 - 1e-12 < float(hr.max()) <= 1 + 1e-12
 
 
-@pytest.mark.parametrize("arguments", [{"scale": 3}, {"scale": 4, "width": 0}, {"scale": 4, "facets": 0}])
-def test_arguments_out_of_range_are_refused(arguments: dict[str, int]) -> None:
-    with pytest.raises(ValueError, match=r"(scale|model): expected"):
-        Facets(**arguments)
-
-
 def test_holes_are_filled_from_the_outside_in_with_means_of_valid_neighbours() -> None:
     x = torch.arange(49.0, dtype=torch.float64).view(1, 1, 7, 7)
     pierced = x.clone()

@@ -19,7 +19,6 @@ from dsr.methods.networks.facets_planes import (
     NEIGHBOURS,
     average_planes,
     mix_planes,
-    mix_planes_apart,
     spline_logits,
 )
 from dsr.methods.networks.facets_unet import FacetsUNet
@@ -223,13 +222,9 @@ def test_gradients_of_mixed_planes_are_those_of_differences(monkeypatch: pytest.
     monkeypatch.setattr(facets_planes, "_CHUNK", 5 * 9 * 4)  # several parts, the last one smaller
     generator = torch.Generator().manual_seed(0)
     planes = torch.randn((1, 1, 3, 3, 4), generator=generator, dtype=torch.float64, requires_grad=True)
-    choice = torch.randn((1, NEIGHBOURS, 6, 8), generator=generator, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda *given: mix_planes(*given, 2), (planes, choice), fast_mode=True)
     found = torch.randn((1, NEIGHBOURS + 2, 6, 8), generator=generator, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda *given: mix_planes_apart(*given, 2), (planes, found), fast_mode=True)
-    mixed, others = mix_planes_apart(planes, found, 2)
-    torch.testing.assert_close(mixed, mix_planes(planes, found[:, :NEIGHBOURS], 2))
-    torch.testing.assert_close(others, found[:, NEIGHBOURS:])
+    assert torch.autograd.gradcheck(lambda *given: mix_planes(*given, 2), (planes, found), fast_mode=True)
+    torch.testing.assert_close(mix_planes(planes, found, 2)[1], found[:, NEIGHBOURS:])
 
 
 @pytest.mark.parametrize("width", [0, 5])
@@ -274,7 +269,7 @@ def test_mixing_in_single_precision_keeps_planes_and_logits(width: int) -> None:
     planes[:, :, 0] = 7 + 0.5 * torch.arange(3, dtype=torch.float64)[:, None]
     found = torch.randn((1, 2 * NEIGHBOURS, 6, 2 * width), generator=generator)
     before = found.clone()
-    mixed = mix_planes(planes, found, 2)
+    mixed, _ = mix_planes(planes, found, 2)
     expected = 7 + 0.5 * (torch.arange(6, dtype=torch.float64) / 2 - 0.25)[:, None].expand(6, 2 * width)
     torch.testing.assert_close(mixed[0, 0], expected, rtol=0, atol=1e-14)
     assert torch.equal(found, before)
@@ -284,7 +279,7 @@ def test_mixed_planes_are_planes_at_each_pixel_weighted_by_a_softmax() -> None:
     generator = torch.Generator().manual_seed(1)
     planes = torch.randn((1, 2, 3, 3, 4), generator=generator, dtype=torch.float64)
     choice = torch.randn((1, 2 * NEIGHBOURS, 6, 8), generator=generator, dtype=torch.float64)
-    found = mix_planes(planes, choice, 2)
+    found, _ = mix_planes(planes, choice, 2)
     offsets = torch.tensor([-0.25, 0.25], dtype=torch.float64)
     weights = (choice.view(NEIGHBOURS, 2, 6, 8) + spline_logits(offsets).repeat(1, 3, 4)[:, None]).flatten(0, 1)
     weights = weights.softmax(dim=0).view(NEIGHBOURS, 2, 6, 8)

@@ -12,12 +12,12 @@ from small_scenes import maps, photos
 from dsr.methods.networks.ddrnet import DDRNet
 from dsr.methods.networks.dynamic_guidance import DynamicGuidance
 from dsr.methods.networks.facets import Facets
-from dsr.methods.networks.network import DisparityNetwork, NetworkUpsampler, WindowedNetwork
+from dsr.methods.networks.network import DisparityNetwork, NetworkUpsampler
 from dsr.methods.networks.normalisation import compute_min_max
 from dsr.methods.networks.pdn import PrimalDualNetwork
 from dsr.methods.networks.sparse_to_dense import SparseToDense
 
-WINDOWED: MappingProxyType[str, Callable[[int], WindowedNetwork]] = MappingProxyType(
+WINDOWED: MappingProxyType[str, Callable[[int], DisparityNetwork]] = MappingProxyType(
     {
         "facets": lambda scale: Facets(scale, width=8, blocks=1),
         "pdn": lambda scale: PrimalDualNetwork(scale, width=6, layers=2, window=3, iterations=1),
@@ -46,10 +46,10 @@ def net(request: pytest.FixtureRequest) -> DisparityNetwork:
 
 
 @pytest.fixture(params=WINDOWED)
-def build_windowed(request: pytest.FixtureRequest) -> Callable[..., WindowedNetwork]:
+def build_windowed(request: pytest.FixtureRequest) -> Callable[..., DisparityNetwork]:
     """Return what builds a small network that processes windows."""
 
-    def built(scale: int = 4) -> WindowedNetwork:
+    def built(scale: int = 4) -> DisparityNetwork:
         net = WINDOWED[request.param](scale)
         _disturb(net)
         return net
@@ -98,7 +98,7 @@ def test_maps_of_any_size_keep_their_dtype(net: DisparityNetwork) -> None:
             assert bool(result.isfinite().all())
 
 
-def test_hole_is_filled_locally_within_the_receptive_field(build_windowed: Callable[..., WindowedNetwork]) -> None:
+def test_hole_is_filled_locally_within_the_receptive_field(build_windowed: Callable[..., DisparityNetwork]) -> None:
     net = build_windowed()
     columns = 2 * net.receptive_field_radius + 6
     rgb, coarse = photos(32, 4 * columns), maps(8, columns)
@@ -117,7 +117,7 @@ def test_image_without_a_valid_pixel_becomes_nan(net: DisparityNetwork) -> None:
 
 
 @pytest.mark.parametrize("scale", [2, 4])
-def test_tiles_equal_the_whole_image(build_windowed: Callable[..., WindowedNetwork], scale: int) -> None:
+def test_tiles_equal_the_whole_image(build_windowed: Callable[..., DisparityNetwork], scale: int) -> None:
     net = build_windowed(scale)
     rows, columns = net.receptive_field_radius + 9, 2 * net.receptive_field_radius + 10
     rgb, coarse = photos(scale * rows, scale * columns).double(), maps(rows, columns).double()
@@ -139,9 +139,7 @@ def test_patches_get_the_answer_of_the_upsampling_prepared_or_not(net: Disparity
 
 
 def test_photo_of_another_size_is_refused(net: DisparityNetwork) -> None:
-    with pytest.raises(
-        ValueError, match=r"^rgb: expected \(24, 28\) pixels for a low-resolution map of \(6, 7\) at scale 4"
-    ):
+    with pytest.raises(ValueError, match=r"^rgb: expected \(24, 28\) pixels for a map of \(6, 7\) at scale 4"):
         net.upsample(photos(24, 24), maps(6, 7))
 
 

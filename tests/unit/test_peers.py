@@ -21,7 +21,7 @@ from dsr.methods.networks.normalisation import resize_bicubic
 from dsr.methods.networks.peers.local_filters import SVLRM
 from dsr.methods.networks.peers.peer import PEERS, Peer
 from dsr.methods.networks.peers.peer_network import PeerNetwork, PeerUpsampler, fold_batch_norm, load_peer
-from dsr.methods.networks.weight_choice import WeightChoice, nearest_scale
+from dsr.methods.networks.weight_choice import has_weights, nearest_scale
 from dsr.methods.recipe import read_recipe
 from dsr.sample import DepthSample
 from dsr.utils.configuration import ConfigError
@@ -181,7 +181,6 @@ def test_bfloat16_changes_the_result_a_little() -> None:
         ({"range_type": "depth"}, "range_type: expected one of orthogonal, perspective, disparity, got 'depth'"),
         ({"value_range": "full"}, "range: expected one of measured, truth, got 'full'"),
         ({"precision": "float16"}, "precision: expected one of float32, bfloat16, got 'float16'"),
-        ({"tile": 3}, "tile: expected at least 4 pixels, got 3"),
     ],
 )
 def test_unsupported_value_is_refused(arguments: dict[str, str], message: str) -> None:
@@ -314,7 +313,7 @@ def test_missing_file_and_unknown_network_are_refused(tmp_path: Path) -> None:
 def test_directory_is_searched_for_the_authors_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DSR_WEIGHTS", raising=False)
     recipe = read_recipe("svlrm")
-    assert not WeightChoice.of(recipe.at(8)["weights"], 8).exists()
+    assert not has_weights(recipe.at(8)["weights"], 8)
     message = (
         r"weights: method=svlrm: scale 8 needs weights=FILE, or a directory with SVLRM_X8.pth "
         r"\(from github.com/sunny2109/SVLRM, weights/\); its authors publish them, dsr does not come with them"

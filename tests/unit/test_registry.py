@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
-from hydra.utils import instantiate
 
 from dsr.app.schema import plain_config, register
 from dsr.methods.classical.tgv import TotalGeneralisedVariation
@@ -51,9 +50,9 @@ def test_unknown_method_is_refused_with_those_that_there_are(tmp_path: Path) -> 
     [
         ("a: [1, 2", r"bad.yaml: expected a readable YAML file, got ParserError"),
         ("- 1", r"bad.yaml: expected keys and values"),
-        ("defaults: [nowhere]", "expected a file nowhere.yaml that bad.yaml begins with"),
-        ("defaults: [bad]", "expected a file bad.yaml that bad.yaml begins with"),
-        ("defaults: 5", "defaults: expected a list of names, got 5"),
+        ("defaults: [nowhere]", "expected a readable file nowhere.yaml"),
+        ("defaults: [bad]", "expected a readable file bad.yaml"),
+        ("defaults: 5", "bad.yaml: expected keys and values, with a list of names as defaults"),
         ("name: ${nowhere}", "method=bad: Interpolation key 'nowhere' not found"),
     ],
 )
@@ -79,4 +78,3 @@ def test_weights_are_those_given_or_named_or_packaged(tmp_path: Path) -> None:
         recipe.with_weights(tmp_path / "nowhere").weights(4)
     with pytest.raises(ConfigError, match=r"weights\.pack: unknown key; expected file, files, packaged"):
         read_recipe("msg_v", {"weights": {"pack": "x"}}).weights(4)
-    assert instantiate(recipe.at(4)["weights"]) == recipe.weights(4)

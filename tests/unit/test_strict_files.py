@@ -27,7 +27,7 @@ from dsr.io.captures.record3d import find_record3d
 from dsr.io.images import read_camera
 from dsr.io.trajectories import read_transform
 from dsr.methods.networks.peers.peer_network import read_tensors
-from dsr.methods.networks.trained import read_msg_weights
+from dsr.methods.networks.published import load_msg_weights
 from dsr.report.study.answers import read_all
 from dsr.report.study.key import Candidate, Key, Trial, read_key, write_key
 from dsr.sample import FARTHEST, NEAREST, DepthSample, Scene
@@ -352,9 +352,12 @@ def test_record_of_exports_that_is_none_is_refused(tmp_path, text):
 @pytest.mark.parametrize("tensor", [torch.ones(2, 3, device="meta"), torch.eye(3).to_sparse()])
 def test_weights_without_plain_values_are_refused(tmp_path, tensor):
     path = tmp_path / "net.pth"
-    for content, read in (({"a": tensor}, read_tensors), ({"model_state_dict": {"a": tensor}}, read_msg_weights)):
+    for content, read in (
+        ({"a": tensor}, [read_tensors]),
+        ({"model_state_dict": {"a": tensor}}, [load_msg_weights, 4]),
+    ):
         torch.save(content, path)
-        assert "expected a torch file of plain tensors, got one" in refusal(path, read, path)
+        assert "expected a torch file of plain tensors, got one" in refusal(path, read[0], path, *read[1:])
 
 
 RUN = {

@@ -17,7 +17,6 @@ from dsr.sample import DepthSample
 
 NETS: dict[str, Callable[[], DisparityNetwork]] = {
     "facets": lambda: Facets(4, width=8, blocks=2),
-    "facets x8": lambda: Facets(8, width=8, blocks=1),
     "dsr": lambda: MSGNet(4, "dsr"),
     "voynov": lambda: MSGNet(4, "voynov"),
     "hui": lambda: MSGNet(2, "hui"),
@@ -106,8 +105,8 @@ def test_pixels_beyond_the_receptive_field_do_not_matter(name: str) -> None:
     other, photo = coarse.clone(), rgb.clone()
     other[..., at, at], photo[..., net.scale * at + 1, net.scale * at + 1] = 23.0, 0.6
     with torch.inference_mode():
-        context = net.global_context(rgb, coarse)
-        change = (context.upsample_window(photo, other) - context.upsample_window(rgb, coarse)).abs()[0, 0]
+        context = net.context(rgb, coarse)
+        change = (net.upsample(photo, other, *context) - net.upsample(rgb, coarse, *context)).abs()[0, 0]
     rows, columns = (change > 1e-6).nonzero().T
     for index in (rows, columns):
         distance = (index // net.scale - at).abs()
@@ -127,10 +126,3 @@ def test_large_photo_is_tiled_automatically(monkeypatch: pytest.MonkeyPatch) -> 
     tiled = method(sample, lambda done, total: parts.append(total))
     assert parts == [1, *[4] * 4]
     torch.testing.assert_close(tiled, whole, rtol=1e-5, atol=0)
-
-
-def test_tile_below_a_low_resolution_pixel_is_refused() -> None:
-    with pytest.raises(ValueError, match="tile: expected at least 4 pixels, the scale, got 3"):
-        _method("facets", tile=3)
-    with pytest.raises(ValueError, match="tiles: expected a positive size and tile"):
-        split_axis(10, 0, 1, 2)

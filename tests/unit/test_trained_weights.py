@@ -16,8 +16,8 @@ from dsr.methods.networks.msg_net import MSGNet
 from dsr.methods.networks.network import DisparityNetwork
 from dsr.methods.networks.sparse_to_dense import SparseToDense
 from dsr.methods.networks.trained import NETWORKS, TrainedNetwork
-from dsr.methods.networks.weight_choice import packaged_names, packaged_weights
 from dsr.methods.networks.weight_files import is_dsr_weights, load_network, read_header, save_network
+from dsr.methods.weights import packaged_names, packaged_weights
 
 NETS = {
     "msg": lambda: MSGNet(2, "dsr"),

@@ -23,7 +23,7 @@ from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera
 from dsr.methods.networks.facets_method import AnyMap
 from dsr.methods.networks.facets_unet import FacetsUNet
-from dsr.methods.networks.msg_net import MSGNet, upsample_disparity
+from dsr.methods.networks.msg_net import MSGNet
 from dsr.methods.networks.network import Answer
 from dsr.methods.networks.sparse_to_dense import SparseToDense
 from dsr.methods.recipe import read_recipe
@@ -316,7 +316,7 @@ def test_training_loss_is_the_objective_of_the_networks_output_in_full_precision
     losses, module = _Losses(), _module()
     [batch] = _one_batch()
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=mixed):
-        disparity = upsample_disparity(module.net, batch["rgb"], batch["disparity_lr"], batch["min_max"])
+        disparity = module.net.upsample(batch["rgb"], batch["disparity_lr"], batch["min_max"])
     expected = float(module.objective(Answer(disparity), batch)["loss"])
     precision = "bf16-mixed" if mixed else "32-true"
     _trainer(tmp_path, max_steps=1, callbacks=[losses], precision=precision).fit(module, _one_batch())
@@ -458,7 +458,7 @@ def test_validation_logs_the_mean_over_the_scenes_in_the_units_of_tables(tmp_pat
     for i in range(3):
         batch = collate_scene([scenes[i]])
         with torch.no_grad():
-            disparity = upsample_disparity(module.average, batch["rgb"], batch["disparity_lr"])
+            disparity = module.average.upsample(batch["rgb"], batch["disparity_lr"])
         assert bool((disparity > 0).all())
         pair = SurfacePair(40 * 0.2 / disparity, batch["depth"], CAMERA.rays()[None])
         values["RMSE_d"].append(float(scores.rmse_d(pair)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from dsr.inference.any_ratio import AnyRatio, finds_noise
 from dsr.inference.defaults import Fill
 from dsr.inference.plans import steps_of
 from dsr.methods.base import Method
-from dsr.methods.networks.weight_choice import WeightChoice
+from dsr.methods.networks.weight_choice import has_weights
 from dsr.methods.recipe import Recipe, Run
 from dsr.utils.configuration import ConfigError
 
@@ -77,9 +78,9 @@ def select(recipe: Recipe, scale: float, weights: Path | None = None, *, measure
             downsampling, the error says that it needs weights.
 
     """
-    node = recipe.at()  # with the scale as the run names it
-    choice = WeightChoice.of(node.get("weights"), scale)
-    lacking = weights is None and choice.packaged is not None and not choice.exists()
+    node = recipe.at().get("weights")  # with the scale as the run names it
+    packaged = node.get("packaged") if isinstance(node, Mapping) else None
+    lacking = weights is None and packaged is not None and not has_weights(node, scale)
     as_upsample = measured and (lacking or finds_noise(recipe))
     direct = recipe.abilities.takes(scale) and not as_upsample
     return Selection(recipe.with_weights(weights), scale, direct)

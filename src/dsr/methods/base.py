@@ -18,8 +18,7 @@ from dsr.utils.configuration import Node
 from dsr.utils.progress import Steps
 from dsr.utils.ratios import SCALES, round_ratio
 
-_HALF = float(np.finfo(np.float16).max)
-"""Largest number of half precision."""
+_HALF = float(np.finfo(np.float16).max)  # largest number of half precision
 
 
 class NoSolutionError(ValueError):
@@ -277,11 +276,8 @@ class Method(abc.ABC):
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
         """Return the HR orthogonal depth, (1, H, W) in metres on the sample's device, NaN where missing.
 
-        A method never reads ``sample.depth``.
-
-        Args:
-            sample: the guide image, the low-resolution depth and the cameras.
-            progress: is called with the steps done and their total, by methods that take more than one.
+        A method never reads ``sample.depth``. One that takes several steps calls ``progress`` with the steps done and
+        their total.
 
         Raises:
             NoSolutionError: the method has no solution for this image.
@@ -317,32 +313,17 @@ class Method(abc.ABC):
         return float("nan")
 
 
-WORKSPACE = "optimisation"
-"""Folder in which a method that optimises keeps what it needs to go on after an interruption."""
+WORKSPACE = "optimisation"  # folder in which a method that optimises keeps what it needs after an interruption
 
 
 def expect_some_depth(depth: Tensor, name: str) -> None:
-    """Check that a result has a depth; values that are not finite and positive are holes, as metrics and files have it.
-
-    Args:
-        depth: (1, H, W) in metres.
-        name: of the method, for the message.
-
-    Raises:
-        ValueError: every pixel is a hole.
-
-    """
+    """Raise a ValueError that names the method if no pixel of its result, (1, H, W), is finite and positive."""
     if not bool((depth.isfinite() & (depth > 0)).any()):
         raise ValueError(f"{name} gave no finite positive depth in any of the {depth.numel()} pixels")
 
 
 def whole_scale(sample: DepthSample) -> int:
-    """Return the scale of a sample for a method that needs a whole one.
-
-    Raises:
-        ValueError: it is not whole.
-
-    """
+    """Return the scale of a sample for a method that needs a whole one, else raise a ValueError."""
     if not isinstance(sample.scale, int):
         raise ValueError(f"{sample.scene}: expected a whole scale for this method, got {round_ratio(sample.scale)}")
     return sample.scale

@@ -30,22 +30,16 @@ from dsr.utils.ratios import round_ratio
 from dsr.utils.versions import hash_once
 
 INVERSE = "inverse"
-QUANTITIES = (*RANGE_TYPES, INVERSE)
-"""What the values measure: a range type, or inverse depth in 1/m, or in any unit where it is fitted."""
+QUANTITIES = (*RANGE_TYPES, INVERSE)  # what values measure; inverse depth in 1/m, or in any unit if it is fitted
 Resize = Literal["nearest", "bilinear"]
 Fit = Literal["scale", "affine"]
 _FIELD = re.compile(r"\{(\w*)\}")
 _FIELDS = ("scene", "dataset", "scale")
-_NAMED = 5
-"""Largest number of files that a message names."""
-_STEPS = 50
-"""Largest number of iterations of a robust fit."""
-_CONTRAST = 0.05
-"""Relative deviation of a scene's inverse depth from which on agreement with it is looked at."""
-_LEAST_AGREEMENT = 0.2
-"""Correlation with the low-resolution map below which a map is of something else."""
-_MOST_OFF = 3.0
-"""Factor between the medians from which on the unit is another one."""
+_NAMED = 5  # largest number of files that a message names
+_STEPS = 50  # largest number of iterations of a robust fit
+_CONTRAST = 0.05  # relative deviation of a scene's inverse depth from which on agreement with it is looked at
+_LEAST_AGREEMENT = 0.2  # correlation with the low-resolution map below which a map is of something else
+_MOST_OFF = 3.0  # factor between the medians from which on the unit is another one
 
 
 class External(Method):
@@ -66,9 +60,6 @@ class External(Method):
         check: whether maps are refused that cannot be of the scene, or in the unit: of another median, or unlike the
             low-resolution map.
         alignment: of the predictions to the truths, see :mod:`dsr.metrics.alignment`; with one, any median is taken.
-
-    Raises:
-        ValueError: a value is not one of these, or there is no such directory.
 
     """
 
@@ -111,13 +102,14 @@ class External(Method):
         self._resize, self._check, self._metric = resize, check, alignment == "none"
 
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
-        """Return the map of the sample's scene, (1, H, W) orthogonal depth in metres, NaN in holes.
-
-        Raises:
-            ValueError: the file is missing or damaged, of another size, has no known pixel, or is not of the scene.
-
-        """
-        path = self._find(sample)
+        """Return the map of the sample's scene, (1, H, W) orthogonal depth in metres, NaN in holes."""
+        name = self._name(sample.dataset, sample.scene, sample.scale)
+        found = self._found(name)
+        if not found:
+            raise ValueError(f"{self.folder / name}: expected a map as {', '.join(DEPTH_SUFFIXES)}, there is none")
+        if len(found) > 1:
+            raise ValueError(f"{self.folder}: expected one map of {name}, got {', '.join(path.name for path in found)}")
+        path = found[0]
         values = self._read(path, sample.camera)
         if self._fit is not None:
             values = fit_to_map(values, sample, self._quantity, self._fit, path)
@@ -130,7 +122,7 @@ class External(Method):
 
     def describe(self, sample: DepthSample) -> str:
         """Return a note on the scene's map if its format costs precision, or if it was changed."""
-        found = self._found(self._stem(sample))
+        found = self._found(self._name(sample.dataset, sample.scene, sample.scale))
         stored = ""
         if len(found) == 1:
             kind = read_depth_file(found[0], pixels_beside(sample.camera.height, sample.camera.width)).dtype
@@ -152,9 +144,6 @@ class External(Method):
         """Return the SHA-256 of a scene's file; None without one."""
         return ", ".join(map(hash_once, self._found(self._name(dataset, scene, scale)))) or None
 
-    def _stem(self, sample: DepthSample) -> str:
-        return self._name(sample.dataset, sample.scene, sample.scale)
-
     def _name(self, dataset: str, scene: str, scale: float) -> str:
         """Return the file's name of a scene."""
         values = {"dataset": dataset, "scene": scene, "scale": str(round_ratio(scale))}
@@ -164,16 +153,6 @@ class External(Method):
         """Return the files of a name."""
         suffixes = ("",) if name.lower().endswith(DEPTH_SUFFIXES) else DEPTH_SUFFIXES
         return [path for suffix in suffixes if (path := self.folder / f"{name}{suffix}").is_file()]
-
-    def _find(self, sample: DepthSample) -> Path:
-        """Return the file of a sample's scene."""
-        name = self._stem(sample)
-        found = self._found(name)
-        if not found:
-            raise ValueError(f"{self.folder / name}: expected a map as {', '.join(DEPTH_SUFFIXES)}, there is none")
-        if len(found) > 1:
-            raise ValueError(f"{self.folder}: expected one map of {name}, got {', '.join(path.name for path in found)}")
-        return found[0]
 
     def _read(self, path: Path, camera: Camera) -> Tensor:
         """Return the values of a file, (1, H, W) float64 in their quantity's unit, NaN in holes."""
@@ -208,18 +187,9 @@ def describe_fit(fit: str | None) -> str:
 
 
 def fit_to_map(values: Tensor, sample: DepthSample, quantity: str, fit: Fit, place: Path) -> Tensor:
-    """Return values of a quantity, fitted to the low-resolution map.
+    """Return values of a quantity, (1, H, W) on the CPU in any unit, NaN in holes, fitted to the low-resolution map.
 
-    Args:
-        values: (1, H, W) on the CPU, in any unit, NaN in holes.
-        sample: the problem, whose truth is not looked at.
-        quantity: what they measure, of :data:`QUANTITIES`.
-        fit: ``scale``, or ``affine``.
-        place: the file that they are of, for messages.
-
-    Raises:
-        ValueError: the map knows none of their pixels, or falls where they rise.
-
+    The sample's truth is not looked at; ``place`` is the file that the values are of, for messages.
     """
     target = from_depth(sample.depth_lr.to("cpu", torch.float64), sample, quantity)
     values = values.to(torch.float64)
@@ -235,15 +205,9 @@ def fit_to_map(values: Tensor, sample: DepthSample, quantity: str, fit: Fit, pla
 
 
 def fit_line(values: Tensor, target: Tensor, *, shift: bool = True) -> tuple[float, float]:
-    """Return the gain and shift of the line with the least sum of absolute errors.
+    """Return the gain and shift, or 0 for it, of ``gain * values + shift`` with the least sum of absolute errors.
 
     Reweighted least squares, which begin at the line of least squares; outliers, as at depth steps, hardly count.
-
-    Args:
-        values: (N,) numbers.
-        target: (N,) those that ``gain * values + shift`` is to be near to.
-        shift: whether there is one; else it is 0.
-
     """
     weight, line = torch.ones_like(values), torch.zeros(2, dtype=values.dtype)
     floor = 1e-6 * float(target.abs().median()) + torch.finfo(values.dtype).tiny

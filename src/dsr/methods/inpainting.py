@@ -8,22 +8,17 @@ from torch.nn import functional
 
 from dsr.methods.exportable import exporting, fill_by_colour_in_graph, fill_in_graph, neighbours_of
 
-_CONTRAST = 0.02
-"""Standard deviation of the difference of the colours of a surface's neighbouring pixels, on the scale of [0, 1]."""
-_ALIKE = 0.3
-"""Affinity from which two pixels count as of one surface."""
-_LEAST = 1e-4
-"""Affinity of pixels of different surfaces."""
+_CONTRAST = 0.02  # standard deviation of the difference of the colours of a surface's neighbouring pixels in [0, 1]
+_ALIKE = 0.3  # affinity from which two pixels count as of one surface
+_LEAST = 1e-4  # affinity of pixels of different surfaces
 
 
 def inpaint(x: Tensor, photo: Tensor | None = None) -> Tensor:
     """Replace the non-finite values of (B, 1, h, w) by means of the valid ones in 3 x 3 pixels, from outside in.
 
     With a photo, the means are weighted by how alike the colours are, and pixels of the colour of a valid neighbour are
-    filled before others, so that values stop at the photo's edges. An image without a valid value stays unchanged.
-
-    Args:
-        photo: (B, 3, H, W) in [0, 1], of any size.
+    filled before others, so that values stop at the photo's edges. An image without a valid value stays unchanged. The
+    photo is (B, 3, H, W) in [0, 1], of any size.
 
     Example:
         >>> import torch

@@ -10,12 +10,9 @@ from torch.nn import functional
 
 from dsr.geometry.camera import Camera
 
-_FRACTION, _QUANTILE = 0.1, 0.12566
-"""A tenth of a normal variable's absolute values are below this many standard deviations."""
-_QUARTER, _QUARTILE = 0.25, 0.31864
-"""A quarter of them are below this many."""
-_STRIDES = (1, 2)
-"""Distances of the pixels that are compared: noise that neighbours share shows at a distance of two pixels."""
+_FRACTION, _QUANTILE = 0.1, 0.12566  # a tenth of a normal variable's absolute values are below so many deviations
+_QUARTER, _QUARTILE = 0.25, 0.31864  # a quarter of them are below so many
+_STRIDES = (1, 2)  # distances of compared pixels: noise that neighbours share shows at a distance of two pixels
 
 
 def estimate_noise(depth_lr: Tensor) -> float:

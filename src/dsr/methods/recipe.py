@@ -2,18 +2,17 @@
 
 A method is a file of ``conf/method``, in the project's configuration or in a directory of the user's: its ``method`` is
 a node whose ``_target_`` is the class that makes it, and whose other keys are the arguments; ``label`` is its name in
-tables. ``eval.py`` composes that file with Hydra; everything else reads it with :func:`read_recipe`.
+tables. ``eval.py`` composes that file with Hydra, :func:`read_recipe` without, which is faster.
 """
 
 from __future__ import annotations
 
 import functools
 import os
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, cast
 
 import torch
 import yaml
@@ -23,28 +22,20 @@ from omegaconf.errors import OmegaConfBaseException
 from dsr.degradation.downsampling import Downsampling
 from dsr.methods.base import Abilities, Method
 from dsr.methods.networks.network import DisparityNetwork
-from dsr.methods.networks.trained import NETWORKS, load_msg_weights
-from dsr.methods.networks.weight_choice import WeightChoice
+from dsr.methods.networks.published import load_msg_weights
+from dsr.methods.networks.trained import NETWORKS
+from dsr.methods.networks.weight_choice import find_weights, has_weights
 from dsr.methods.networks.weight_files import is_dsr_weights, load_network, network_name, read_header
 from dsr.utils.configuration import ConfigError, Node, build, config_directories, list_choices, load_target
 from dsr.utils.ratios import SCALES
 
-_NETWORK = "network"
-"""Key of a method's node: the dotted path of the network's class, for a method whose weights come from a training."""
-_OPEN = (None, "auto")
-"""Values of a method's keys that leave them to what is known of the maps."""
-OF_RUN = ("weights", "scale", "downsampling")
-"""Keys of a method's node that a run gives in another way; the node names them for ``hydra.utils.instantiate``."""
-_ALONE: Mapping[str, Any] = {"scale": 4, "seed": 0, "downsampling": None}
-"""What a method's file may refer to where there is no run."""
+_NETWORK = "network"  # key of a method's node: the dotted path of the network's class, for weights of a training
+OF_RUN = ("weights", "scale", "downsampling")  # keys of a method's node that a run gives in another way
+_ALONE: Mapping[str, Any] = {"scale": 4, "seed": 0, "downsampling": None}  # what a node may refer to without a run
 
 
 class Known(NamedTuple):
-    """Known properties of low-resolution maps; None for unknown ones.
-
-    ``kernel``: of their downsampling; ``edges``: whether the scenes' depth steps are sharp or soft; ``clean``: whether
-    they have no noise.
-    """
+    """Known properties of low-resolution maps: their kernel, their scenes' depth steps, no noise; None for unknown."""
 
     kernel: str | None = None
     edges: Literal["sharp", "soft"] | None = None
@@ -55,15 +46,9 @@ class Known(NamedTuple):
 class Run:
     """Settings of a run for its method, which gets those that the signature of its class names.
 
-    Args:
-        device: where to compute.
-        precision: dtype of the convolutions.
-        seed: of random numbers.
-        downsampling: the assumed model.
-        known: what is known of the maps, for arguments that the method's node leaves open, by null or ``auto``.
-        alignment: of the predictions to the truths that scores are computed after.
-        metrics, workspace, display, about, lpips_trunk: see :class:`~dsr.methods.dip.upsampler.DeepImagePrior`.
-
+    ``known`` is for arguments that the method's node leaves open, by null or ``auto``. ``alignment`` is that of the
+    predictions to the ground truth before scores. The last five are those of
+    :class:`~dsr.methods.dip.upsampler.DeepImagePrior`.
     """
 
     device: torch.device | str = "cpu"
@@ -102,12 +87,7 @@ class Recipe:
     _resolved: dict[float | None, dict[str, Any]] = field(default_factory=dict, init=False, repr=False)
 
     def at(self, factor: float | None = None) -> Node:
-        """Return the node for a factor, as plain values; None for the run's scale as it is named.
-
-        Raises:
-            ConfigError: it refers to a value that there is not.
-
-        """
+        """Return the node for a factor, as plain values; None for the run's scale as it is named."""
         if factor not in self._resolved:
             scale = {} if factor is None else {"scale": factor}
             try:
@@ -120,17 +100,11 @@ class Recipe:
 
     @functools.cached_property
     def kind(self) -> type[Method]:
-        """The method's class.
-
-        Raises:
-            ConfigError: the node names none.
-
-        """
-        key, node = "method", self.at()
-        target = load_target(key, node)
+        """The method's class."""
+        target = load_target("method", self.at())
         if not (isinstance(target, type) and issubclass(target, Method)):
-            expected = f"{Method.__module__}.{Method.__name__}"
-            raise ConfigError(f"{key}._target_: expected a class that derives from {expected}, got {node['_target_']}")
+            expected, came = f"{Method.__module__}.{Method.__name__}", self.at()["_target_"]
+            raise ConfigError(f"method._target_: expected a class that derives from {expected}, got {came}")
         return target
 
     @functools.cached_property
@@ -140,40 +114,32 @@ class Recipe:
 
     @functools.cached_property
     def factors(self) -> tuple[int, ...]:
-        """The factors that it is made for.
-
-        Raises:
-            ValueError: it has no weights for any.
-
-        """
+        """The factors that it is made for; a ValueError if it has no weights for any."""
         if self.abilities.needs is None:
             return SCALES
-        factors = tuple(scale for scale in SCALES if self._choice(scale).exists())
+        factors = tuple(scale for scale in SCALES if has_weights(self.at(scale).get("weights"), scale))
         if not factors:
-            self.weights(4)  # its error says where to get them
-            raise ValueError(
-                f"method={self.name}: expected weights that it names, or that come with dsr; there are none"
-            )
+            found = self.weights(4)  # raises an error that says where to get them, unless there are others
+            raise ValueError(f"method={self.name}: expected weights for one of the factors {SCALES}, got {found}")
         return factors
 
     @functools.cached_property
     def of_run(self) -> tuple[str, ...]:
         """Keys of the node that a run gives in another way, of weights only to a method that needs a file."""
-        return OF_RUN if self.abilities.needs else tuple(key for key in OF_RUN if key != "weights")
+        return OF_RUN if self.abilities.needs else OF_RUN[1:]
 
     @property
     def computed_at(self) -> tuple[float, ...]:
         """Factors at which a method computes that takes a map of any size, if there are only some."""
-        packaged = self._choice(4).packaged
+        weights = self.at(4).get("weights")
+        packaged = weights.get("packaged") if isinstance(weights, Mapping) else None
         return tuple(packaged.values()) if self.abilities.own_size and isinstance(packaged, Mapping) else ()
 
     def with_weights(self, path: Path | None) -> Recipe:
         """Return the method with a file of weights, or a directory with published ones; None for its own."""
         if path is None or self.abilities.needs is None:
             return self
-        node = OmegaConf.merge(self.node, {"weights": {"path": str(path)}})
-        assert isinstance(node, DictConfig)  # noqa: S101 - for the type checker
-        return replace(self, node=node)
+        return replace(self, node=_merge(self.node, {"weights": {"path": str(path)}}))
 
     def weights(self, factor: float) -> Path | None:
         """Return the file of weights for a factor; None for a method that needs none.
@@ -182,18 +148,8 @@ class Recipe:
             ConfigError: there is none; it says where to get it.
 
         """
-        return None if self.abilities.needs is None else self._found(factor)
-
-    def _found(self, factor: float) -> Path:
-        """Return the file of weights for a factor."""
-        try:
-            return self._choice(factor).find()
-        except ConfigError as error:
-            raise ConfigError(re.sub(r"^weights: ", f"weights: method={self.name}: ", str(error))) from error
-
-    def _choice(self, factor: float) -> WeightChoice:
-        """Return where the weights for a factor are."""
-        return WeightChoice.of(self.at(factor).get("weights"), factor)
+        needs = self.abilities.needs is not None
+        return find_weights(self.at(factor).get("weights"), factor, self.name) if needs else None
 
     def build(self, factor: float, run: Run | None = None, **decided: Any) -> Method:
         """Build the method for a factor.
@@ -207,17 +163,16 @@ class Recipe:
                 weights.
 
         """
-        run = run or Run()
+        given = {**vars(run or Run()), "scale": factor}
         node = {key: value for key, value in self.at(factor).items() if key not in decided or key in self.settings}
-        asked = {
-            key: value for key, value in run.known._asdict().items() if value is not None and node.get(key) in _OPEN
-        }
-        given = {key: value for key, value in vars(run).items() if key != "known"}
-        given = {**given, **asked, **decided, "scale": factor}
+        for key, value in given.pop("known")._asdict().items():
+            if value is not None and node.get(key) in (None, "auto"):
+                node.pop(key, None)
+                given[key] = value
         if self.abilities.needs is not None:
             given |= {"weights": self.weights(factor), "networks": self._networks}
-        own = {key: value for key, value in node.items() if key not in (*self.of_run, _NETWORK, *asked)}
-        method: Method = build("method", own, given, self.name)
+        node = {key: value for key, value in node.items() if key not in (*self.of_run, _NETWORK)}
+        method: Method = build("method", node, {**given, **decided}, self.name)
         return method
 
     def network(self, factor: int) -> DisparityNetwork:
@@ -225,7 +180,6 @@ class Recipe:
 
         Raises:
             ConfigError: it has no network of dsr, or there are no weights.
-            FileNotFoundError: the weights share layers with a file that is missing.
             ValueError: the weights are damaged or of another model or scale.
 
         """
@@ -234,7 +188,7 @@ class Recipe:
             known = [name for name in names if read_recipe(name, None, self.directories).abilities.needs == "network"]
             raise ConfigError(f"method: expected one with a network of dsr, {', '.join(known)}; got {self.name!r}")
         node = self.at(factor)
-        path, variant = self._found(factor), node.get("variant")
+        path, variant = find_weights(node.get("weights"), factor, self.name), node.get("variant")
         if variant is not None and not is_dsr_weights(path):
             return load_msg_weights(path, factor, variant)
         header = read_header(path)
@@ -266,28 +220,17 @@ class Recipe:
         model = node.get("model")
         if model is None or model not in list_choices("model", places):
             return None
-        target = OmegaConf.select(_read_file("model", str(model), places, ()), "net._target_")
+        target = OmegaConf.select(_read_file("model", str(model), places), "net._target_")
         return None if target is None else str(target)
 
 
 def list_methods(directories: Sequence[Path] = ()) -> list[str]:
-    """Return the names of all methods.
-
-    Example:
-        >>> from dsr.methods.recipe import list_methods
-        >>> {"bicubic", "facets", "tgv"} <= set(list_methods())
-        True
-
-    """
+    """Return the names of all methods."""
     return list_choices("method", config_directories(directories))
 
 
 def read_recipe(name: str, settings: Mapping[str, Any] | None = None, directories: Sequence[Path] = ()) -> Recipe:
-    """Read the file of a method.
-
-    Args:
-        name: the method's name.
-        settings: arguments to change, by name.
+    """Read the file of a method; ``settings`` are arguments to change, by name.
 
     Raises:
         ConfigError: there is no such method, or its file cannot be read.
@@ -303,46 +246,37 @@ def read_recipe(name: str, settings: Mapping[str, Any] | None = None, directorie
     if name not in names:
         raise ConfigError(f"method: expected one of {', '.join(names)}, got {name!r}")
     try:
-        content = _read_file("method", name, places, ())
+        content = _read_file("method", name, places)
         node, given = content.get("method", {}), dict(settings or {})
         if isinstance(given.get("weights"), str) and isinstance(node.get("weights"), DictConfig):
             given["weights"] = {"path": given["weights"]}
-        node = OmegaConf.merge(node, given)
+        node = _merge(node, given)
     except OmegaConfBaseException as error:
         raise ConfigError(f"method={name}: {str(error).splitlines()[0]}") from error
-    assert isinstance(node, DictConfig)  # noqa: S101 - for the type checker
     label = str(content.get("label") or name)
     recipe = Recipe(name, node, tuple(directories), settings=frozenset(settings or {}), label=label)
     recipe.at()  # its error says what cannot be resolved
     return recipe
 
 
-def _read_file(group: str, name: str, places: Sequence[Path], above: tuple[str, ...]) -> DictConfig:
+def _read_file(group: str, name: str, places: Sequence[Path], above: tuple[str, ...] = ()) -> DictConfig:
     """Return the content of a group's file, merged with the files of its ``defaults``."""
-    path = next(
-        (place / group / f"{name}.yaml" for place in places if (place / group / f"{name}.yaml").is_file()), None
-    )
+    path = next((path for place in places if (path := place / group / f"{name}.yaml").is_file()), None)
     if path is None or name in above:
-        wanted = f"a file {name}.yaml that {above[-1]}.yaml begins with" if above else f"a readable file {name}.yaml"
-        raise ConfigError(f"{group}: expected {wanted}")
+        raise ConfigError(f"{group}: expected a readable file {name}.yaml, which {above[-1:] or group} begins with")
     try:
         own = OmegaConf.load(path)
     except (OSError, yaml.YAMLError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: expected a readable YAML file, got {type(error).__name__}") from error
-    if not isinstance(own, DictConfig):
-        raise ConfigError(f"{path}: expected keys and values")
-    listed = own.pop("defaults", None)
-    listed = ListConfig([]) if listed is None else listed
-    if not isinstance(listed, ListConfig):
-        raise ConfigError(f"{path}: defaults: expected a list of names, got {listed!r:.60}")
+    listed = own.pop("defaults", None) or [] if isinstance(own, DictConfig) else None
+    if not isinstance(own, DictConfig) or not isinstance(listed, list | ListConfig):
+        raise ConfigError(f"{path}: expected keys and values, with a list of names as defaults")
     if group == "method" and not isinstance(own.get(group), DictConfig):  # without "@package _global_"
         own = OmegaConf.create({group: own})
-    defaults = [str(each) for each in listed]
-    parts = [
-        own if each == "_self_" else _read_file(group, each, places, (*above, name))
-        for each in (defaults if "_self_" in defaults else [*defaults, "_self_"])
-    ]
-    merged = OmegaConf.merge(*parts)
-    if not isinstance(merged, DictConfig):
-        raise ConfigError(f"{path}: expected keys and values")
-    return merged
+    names = list(listed) if "_self_" in listed else [*listed, "_self_"]
+    parts = [own if each == "_self_" else _read_file(group, str(each), places, (*above, name)) for each in names]
+    return _merge(*parts)
+
+
+def _merge(*nodes: Mapping[str, Any]) -> DictConfig:
+    return cast(DictConfig, OmegaConf.merge(*nodes))  # all have keys

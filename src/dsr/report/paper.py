@@ -18,7 +18,7 @@ from dsr.evaluation.results import Run
 
 PAPER_METHODS = {"bicubic": "Bicubic", "dip": "DIP", "dip_v": "DIP-V", "msg": "MSG", "msg_v": "MSG-V"}
 """Method names of the paper by name in ``scores.csv``, where the label may differ from them."""
-OF_FILES = ("external", "monocular", "onnx", "torchscript")
+OF_FILES = ("external", "monocular", "onnx")
 """Methods whose maps or networks are files of a user's."""
 REIMPLEMENTED = ("SRfS", "EG", "PDN", "DG")
 """Methods that the paper ran with other programs or weights than dsr's."""

@@ -88,6 +88,5 @@ def _extend(x: Tensor, border: int, dim: int) -> Tensor:
     first, last = x.narrow(dim, 0, 1), x.narrow(dim, count - 1, 1)
     before = first - x.narrow(dim, min(1, count - 1), 1)  # 0 where there is a single pixel
     after = last - x.narrow(dim, max(count - 2, 0), 1)
-    steps = range(border, 0, -1)
-    pieces = [first + k * before for k in steps] + [x] + [last + k * after for k in reversed(steps)]
-    return torch.cat(pieces, dim=dim)
+    steps = torch.arange(1, border + 1, dtype=x.dtype, device=x.device).view(-1, *[1] * (-1 - dim))
+    return torch.cat((first + steps.flip(0) * before, x, last + steps * after), dim=dim)

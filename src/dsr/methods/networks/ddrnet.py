@@ -24,16 +24,14 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.methods.classical.finite_differences import grey, upsample_linear_border
-from dsr.methods.networks.network import NormalisedNetwork, expect_rgb_size
+from dsr.methods.networks.network import NormalisedNetwork
 from dsr.utils.ratios import check_scale
 
 _HALVINGS = 2
 _BLOCKS = 2
 _SLOPE = 0.2
-_GAIN = 0.05
-"""Factor of the last layers' outputs: a step of the optimiser changes maps that are nearly right by less."""
-_UPSAMPLING = 4
-"""Receptive-field radius of the upsampling in low-resolution pixels."""
+_GAIN = 0.05  # of the last layers' outputs: a step of the optimiser changes maps that are nearly right by less
+_UPSAMPLING = 4  # receptive-field radius of the upsampling in low-resolution pixels
 
 
 class DDRNet(NormalisedNetwork):
@@ -45,9 +43,6 @@ class DDRNet(NormalisedNetwork):
         scale: upsampling factor, 2, 4, 8 or 16.
         denoising: channels of the first layer of the denoising network.
         refinement: channels of the first layers of the refinement network, even.
-
-    Raises:
-        ValueError: a value is out of range.
 
     """
 
@@ -63,20 +58,15 @@ class DDRNet(NormalisedNetwork):
         self.halvings = min(_HALVINGS, scale.bit_length() - 1)
         self.denoise = Denoising(denoising, self.halvings)
         self.refine = Refinement(refinement, self.halvings)
-
-    @property
-    def receptive_field_radius(self) -> int:
-        """Receptive-field radius in low-resolution pixels."""
         radius_hr = self.denoise.receptive_field_radius + self.refine.receptive_field_radius
-        return -(-radius_hr // self.scale) + _UPSAMPLING
+        self.receptive_field_radius = -(-radius_hr // scale) + _UPSAMPLING
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
-        """Return normalised disparity (B, 1, H, W) for (B, 3, H, W) and (B, 1, h, w); see the base class."""
+        """Return the refined map, (B, 1, H, W), normalised to 0..1."""
         return self.compute_stages(rgb, values)[-1]
 
-    def compute_stages(self, rgb: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+    def compute_stages(self, rgb: Tensor, values: Tensor, *context: Tensor | None) -> tuple[Tensor, Tensor]:
         """Return the denoised and the refined map, (B, 1, H, W) each, normalised to 0..1."""
-        expect_rgb_size(rgb, values, self.scale)
         weight = self.denoise.last.weight
         enlarged = 2 * upsample_linear_border(values, self.scale) - 1
         denoised = enlarged + self.denoise(enlarged.to(weight.dtype)).to(values.dtype)

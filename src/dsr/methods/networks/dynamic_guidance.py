@@ -52,15 +52,13 @@ from torch.nn import functional
 
 from dsr.degradation.downsampling import check_scale
 from dsr.methods.classical.finite_differences import box_mean, upsample_linear_border
-from dsr.methods.networks.network import NormalisedNetwork, expect_rgb_size
+from dsr.methods.networks.network import NormalisedNetwork
 
-WIDTHS = tuple(1e-3 * 4**j for j in range(6))
-"""tau_j, in the unit of the map: from 1/1000 to about 1."""
+WIDTHS = tuple(1e-3 * 4**j for j in range(6))  # tau_j, in the unit of the map: from 1/1000 to about 1
 
+# initial height of penalties; scale of the b_m; c_lm for m other than l; size of the data step
 _HEIGHT, _CONTRAST, _SHARED, _FIDELITY = 0.05, 2.0, 0.02, 0.5
-"""Initial height of penalties; scale of the b_m; c_lm for m other than l; size of the data step."""
-_BICUBIC = 2
-"""Half width of the bicubic kernel in low-resolution pixels."""
+_BICUBIC = 2  # half width of the bicubic kernel in low-resolution pixels
 
 
 def plane_free_basis(size: int) -> Tensor:
@@ -78,16 +76,7 @@ def zero_mean_basis(size: int) -> Tensor:
 
 
 def influence(z: Tensor, heights: Tensor) -> Tensor:
-    """Return rho'(z).
-
-    Args:
-        z: (B, L, H, W) responses of L filters.
-        heights: (L, 6) coefficients a_j of each filter's penalty.
-
-    Returns:
-        (B, L, H, W).
-
-    """
+    """Return rho'(z) of the responses of L filters, (B, L, H, W), for the a_j of their penalties, (L, 6)."""
     return z * _Mixture.apply(z, heights)
 
 
@@ -136,13 +125,7 @@ def _products(size: int) -> Tensor:
 
 
 class Stage(nn.Module):
-    """One step from a map to a better one.
-
-    Args:
-        filters: number of filters k_l, and of b_m.
-        size: of a filter, pixels.
-
-    """
+    """One step from a map to a better one, with as many filters k_l as b_m, of ``size`` pixels."""
 
     def __init__(self, filters: int, size: int) -> None:
         super().__init__()
@@ -166,27 +149,14 @@ class Stage(nn.Module):
         return torch.exp(-functional.conv2d(squares, self.mixing.to(rgb).abs()[..., None, None]))
 
     def energy(self, x: Tensor, rgb: Tensor) -> Tensor:
-        """Return E of maps (B, 1, H, W), (B,); a map smaller than a filter has none.
-
-        Args:
-            x: the maps, normalised.
-            rgb: (B, 3, H, W) the photos.
-
-        """
+        """Return E of normalised maps (B, 1, H, W) and photos (B, 3, H, W), (B,); 0 of a map smaller than a filter."""
         if min(x.shape[-2:]) < self.size:
             return x.new_zeros(len(x))
         responses = functional.conv2d(x, self.filters(x))
         return (self.weights(rgb) * penalty(responses, self._heights(x))).sum(dim=(1, 2, 3))
 
     def forward(self, x: Tensor, lr: Tensor, rgb: Tensor) -> Tensor:
-        """Return the next map, (B, 1, H, W): a step towards the low-resolution map, then one down the gradient of E.
-
-        Args:
-            x: (B, 1, H, W) the map.
-            lr: (B, 1, h, w) target of its block means.
-            rgb: (B, 3, H, W) the photos.
-
-        """
+        """Return the next map, (B, 1, H, W): a step towards the block means ``lr``, then one down the gradient of E."""
         scale = x.shape[-1] // lr.shape[-1]
         x = x - self.fidelity.to(x) * upsample_linear_border(box_mean(x, scale) - lr, scale)
         if min(x.shape[-2:]) < self.size:
@@ -212,9 +182,6 @@ class DynamicGuidance(NormalisedNetwork):
         filters: number of filters of each step, at most size^2 - 3.
         size: size of a filter in pixels, at least 3.
 
-    Raises:
-        ValueError: a value is out of range.
-
     """
 
     def __init__(self, scale: int, stages: int = 5, filters: int = 24, size: int = 7) -> None:
@@ -226,23 +193,15 @@ class DynamicGuidance(NormalisedNetwork):
             raise ValueError(f"filters: expected 1 to {size**2 - 3} of size {size}, got {filters}")
         self.scale, self.filters, self.size = scale, filters, size
         self.stages = nn.ModuleList(Stage(filters, size) for _ in range(stages))
+        # of the initial upsampling and, for each stage, of an upsampling, a filter and its adjoint
+        self.receptive_field_radius = _BICUBIC + stages * (_BICUBIC + math.ceil((size - 1) / scale))
 
     def arguments(self) -> dict[str, Any]:
         """Return the constructor's arguments."""
         return {"scale": self.scale, "stages": len(self.stages), "filters": self.filters, "size": self.size}
 
-    @property
-    def receptive_field_radius(self) -> int:
-        """Receptive-field radius in low-resolution pixels.
-
-        The sum of the radii of the initial bicubic upsampling and, for each stage, of a bicubic upsampling, a filter
-        and its adjoint.
-        """
-        return _BICUBIC + len(self.stages) * (_BICUBIC + math.ceil((self.size - 1) / self.scale))
-
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
         """Return normalised disparity (B, 1, H, W) for (B, 3, H, W) and (B, 1, h, w); see the base class."""
-        expect_rgb_size(rgb, values, self.scale)
         weight = next(self.parameters())
         with torch.autocast(rgb.device.type, enabled=False):
             guide, lr = (x.to(torch.promote_types(weight.dtype, torch.float32)) for x in (rgb, values))

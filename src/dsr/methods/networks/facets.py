@@ -33,7 +33,7 @@ from dsr.methods.networks.facets_layers import (
     silence,
 )
 from dsr.methods.networks.facets_planes import NEIGHBOURS, Stencil, mix_planes, stencil
-from dsr.methods.networks.network import DisparityNetwork, NormalisedNetwork, expect_rgb_size
+from dsr.methods.networks.network import DisparityNetwork, NormalisedNetwork
 
 _FAINT, _STRONG = 1e-3, 0.25
 """Differences of normalised disparity that become about 1 in the network's compressed and linear inputs."""
@@ -55,9 +55,6 @@ class Facets(NormalisedNetwork):
         slopes: whether planes have slopes; if not, each is a constant, and the network predicts an interpolation kernel
             for each pixel (an ablation).
 
-    Raises:
-        ValueError: a value is out of range.
-
     """
 
     def __init__(self, scale: int, width: int = 96, blocks: int = 6, facets: int = 2, *, slopes: bool = True) -> None:
@@ -68,6 +65,8 @@ class Facets(NormalisedNetwork):
                 f"model: expected width and facets of at least 1, blocks of at least 0; got {width}, {facets}, {blocks}"
             )
         self.scale, self.width, self.blocks, self.facets, self.slopes = scale, width, blocks, facets, slopes
+        # of each residual block 2; 1 of the neighbours' planes, 3 convolutions, 2 of the differences
+        self.receptive_field_radius = 2 * blocks + 6
         levels = scale.bit_length() - 1
         self.photo, self.down, up, join = make_pyramid(levels, width)
         self.coarse = nn.Conv2d(10, width, 3, padding=1)
@@ -76,23 +75,12 @@ class Facets(NormalisedNetwork):
         self.up, self.join = up, join
         self.choice = scale_down(nn.Conv2d(HEAD, NEIGHBOURS * facets, 3, padding=1))
 
-    @property
-    def receptive_field_radius(self) -> int:
-        """Receptive-field radius in low-resolution pixels.
-
-        The sum of one pixel for the neighbours' planes and the layers after the trunk, two for each residual block, one
-        for each convolution of the planes and of the low-resolution map, and two for the differences. The image's
-        features have a smaller receptive field.
-        """
-        return 2 * self.blocks + 6
-
-    def context(self, rgb: Tensor) -> tuple[Tensor, ...]:
-        """Return the mean colour of the image, (B, 3, 1, 1)."""
-        return (mean_colour(rgb),)
+    def context(self, rgb: Tensor, disparity: Tensor) -> tuple[Tensor | None, ...]:
+        """Return the range and the mean colour of the image, (B, 3, 1, 1)."""
+        return (*super().context(rgb, disparity), mean_colour(rgb))
 
     def forward(self, rgb: Tensor, values: Tensor, mean: Tensor | None = None) -> Tensor:
         """Return normalised disparity; ``mean`` is the mean colour of the image that ``rgb`` is a window of."""
-        expect_rgb_size(rgb, values, self.scale)
         around = stencil(values)
         dtype = self.photo.weight.dtype
         pyramid = [functional.relu(self.photo(photo_input(rgb, mean).to(dtype)), inplace=True)]
@@ -102,7 +90,7 @@ class Facets(NormalisedNetwork):
         planes = self._propose_planes(self.planes(x), around)
         for up, join, features in zip(self.up, self.join, reversed(pyramid[:-1]), strict=True):
             x = functional.relu(enlarge_and_join(up, join, x, features), inplace=True)
-        return mix_planes(planes, self.choice(x), self.scale)
+        return mix_planes(planes, self.choice(x), self.scale)[0]
 
     def _propose_planes(self, output: Tensor, around: Stencil) -> Tensor:
         """Return the planes of each low-resolution pixel, (B, facets, 3, h, w): value at its centre and slopes."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Sequence
 from typing import Any, NamedTuple, cast
@@ -13,10 +14,15 @@ from torch.nn import functional
 
 from dsr.methods.exportable import exporting, pad_to_multiple
 
-FULL, HALF = 16, 32
-"""Channels of the photo's features at the full and at half the resolution."""
-HEAD = 24
-"""Channels of the layers that choose the planes, at the full resolution."""
+FULL, HALF = 16, 32  # channels of the photo's features at the full and at half the resolution
+HEAD = 24  # channels of the layers that choose the planes, at the full resolution
+
+
+@functools.lru_cache(64)
+def constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Return numbers as a tensor, (n,), which is made once, so that no step waits for its copy to a GPU."""
+    with torch.inference_mode(mode=False):  # it may later be used with gradients
+        return torch.tensor(values, dtype=dtype, device=device)
 
 
 class Pyramid(NamedTuple):
@@ -31,11 +37,7 @@ class Pyramid(NamedTuple):
 def make_pyramid(levels: int, width: int, inputs: int = 4) -> Pyramid:
     """Return the layers between the photo's resolution and the map's.
 
-    Args:
-        levels: how many times the resolution is halved.
-        width: channels at the map's resolution.
-        inputs: channels of the photo.
-
+    The resolution is halved ``levels`` times, down to ``width`` channels.
     """
     channels = [*[FULL, HALF, width, width][:levels], width]
     outputs = [HEAD, *channels[1:-1]]
@@ -75,32 +77,29 @@ class MixedResidual(nn.Module):
     def forward(self, x: Tensor, shares: Tensor, gains: Tensor, shifts: Tensor) -> Tensor:
         """Map (B, C, h, w) to the same shape.
 
-        Args:
-            x: (B, C, h, w).
-            shares: (B,) share of the second set.
-            gains: (B, C) by which the features after the first convolution are multiplied, minus 1.
-            shifts: (B, C) what is added to them.
-
+        ``shares`` (B,) are those of the second set; the features after the first convolution are multiplied by 1 +
+        ``gains`` (B, C), and ``shifts`` (B, C) are added. On a GPU, which is slow at convolutions of many groups, the
+        results of both sets are mixed instead of the weights.
         """
-        if exporting():  # a graph is for one image, and has to know the shapes of its weights
-            width = self.width
-            return self._map(x, shares.reshape(1), 1 + gains.reshape(width), shifts.reshape(width))
-        each = zip(x.split(1), shares.float(), 1 + gains.float(), shifts.float(), strict=True)
-        return concatenate([self._map(*parts) for parts in each])
-
-    def _map(self, x: Tensor, share: Tensor, gain: Tensor, shift: Tensor) -> Tensor:
-        """Map one image; gain and shift become part of the convolution."""
-        mixed = [
-            torch.lerp(one.float(), other.float(), share) for one, other in zip(*self._parameters_of(), strict=True)
-        ]
-        weights = [mixed[0] * gain.view(-1, 1, 1, 1), torch.addcmul(shift, mixed[1], gain), *mixed[2:]]
-        first, first_bias, second, second_bias = (each.to(x.dtype) for each in weights)
-        hidden = functional.relu(functional.conv2d(x, first, first_bias, padding=1), inplace=True)
-        return functional.conv2d(hidden, second, second_bias, padding=1).add_(x)
-
-    def _parameters_of(self) -> list[list[Tensor]]:
-        """Return the weights and biases of both convolutions, for both sets."""
-        return [list(way.parameters()) for way in self.ways]
+        first, second = cast(list[Residual], self.ways)
+        if x.is_cuda and len(x) > 1:
+            share, gain, shift = (each[..., None, None] for each in (shares[:, None], 1 + gains, shifts))
+            hidden = torch.lerp(one := first.first(x), second.first(x), share.to(one))
+            hidden = functional.relu(torch.addcmul(shift.to(one), hidden, gain.to(one)), inplace=True)
+            return torch.lerp(one := first.second(hidden), second.second(hidden), share.to(one)).add_(x)
+        batch = 1 if exporting() else len(x)  # a graph has to know the shapes of its weights
+        share, shift = shares.reshape(batch).float(), shifts.reshape(batch, self.width).float()
+        gain = (1 + gains.float()).reshape(batch, self.width)
+        weight, bias, last, last_bias = (
+            torch.lerp(one.float()[None], other.float()[None], share.view(-1, *[1] * one.dim()))
+            for one, other in zip(first.parameters(), second.parameters(), strict=True)
+        )
+        weights = (weight * gain[..., None, None, None], torch.addcmul(shift, bias, gain), last, last_bias)
+        weight, bias, last, last_bias = (each.to(x.dtype).flatten(0, 1) for each in weights)
+        images = x.reshape(1, -1, *x.shape[-2:]) if batch > 1 else x  # each image is a group of channels
+        hidden = functional.relu(functional.conv2d(images, weight, bias, padding=1, groups=batch), inplace=True)
+        found = functional.conv2d(hidden, last, last_bias, padding=1, groups=batch)
+        return (found.view(x.shape) if batch > 1 else found).add_(x)
 
 
 class Context(nn.Module):
@@ -145,14 +144,8 @@ def convolve_together(convs: Sequence[nn.Conv2d], x: Tensor) -> Tensor:
 def enlarge(conv: nn.Module, x: Tensor, *features: Tensor) -> Tensor:
     """Return the sub-pixel shuffle of a 1 x 1 convolution's results, with the features behind them.
 
-    Args:
-        conv: a 1 x 1 convolution with a bias, to 4 C channels.
-        x: (B, channels, h, w).
-        features: (B, n, 2 h, 2 w), or none.
-
-    Returns:
-        (B, C + n, 2 h, 2 w), the channels of a pixel side by side in memory.
-
+    The 1 x 1 convolution has a bias and maps (B, channels, h, w) to 4 C channels; with features (B, n, 2 h, 2 w) the
+    result is (B, C + n, 2 h, 2 w), the channels of a pixel side by side in memory.
     """
     if exporting():
         return torch.cat((functional.pixel_shuffle(conv(x), 2), *features), dim=1)
@@ -168,16 +161,6 @@ def enlarge_and_join(up: nn.Module, join: nn.Module, x: Tensor, features: Tensor
     without the arrays between them. The bias of the first becomes the weight of a channel of ones, which, like all
     others, has no effect beyond the border. In lower precisions, whose matrix products prefer even numbers of channels,
     that would be slower and less exact.
-
-    Args:
-        up: a 1 x 1 convolution with a bias, to 4 C channels.
-        join: a 3 x 3 convolution with a bias, from C + n channels to D.
-        x: (B, channels, h, w).
-        features: (B, n, 2 h, 2 w).
-
-    Returns:
-        (B, D, 2 h, 2 w).
-
     """
     if exporting() or x.dtype.itemsize < torch.float32.itemsize:  # a graph has to know the weights of a convolution
         return cast(Tensor, join(enlarge(up, x, features)))
@@ -196,17 +179,15 @@ class _BySubPixel(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, weight: Tensor) -> Tensor:
-        """Return (4 C, ...)."""
         ctx.save_for_backward(weight)
         return weight.unflatten(0, (-1, 4)).transpose(0, 1).flatten(0, 1)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> Tensor:
-        """Return the gradient in the layout of the weight, as several devices expect it."""
         (weight,) = ctx.saved_tensors
         ordered = gradient.unflatten(0, (4, -1)).transpose(0, 1).flatten(0, 1)
-        return torch.empty_like(weight).copy_(ordered)
+        return torch.empty_like(weight).copy_(ordered)  # in the layout of the weight, as several devices expect it
 
 
 class _Interleave(torch.autograd.Function):
@@ -214,7 +195,6 @@ class _Interleave(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, *features: Tensor) -> Tensor:
-        """Return (B, C + n, 2 h, 2 w)."""
         batch, channels, height, width = x.shape
         ctx.counts = [channels // 4, *(each.shape[1] for each in features)]
         size = (batch, sum(ctx.counts), 2 * height, 2 * width)
@@ -228,7 +208,6 @@ class _Interleave(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, ...]:
-        """Return the gradients of all."""
         own, *others = gradient.split(ctx.counts, dim=1)
         batch, count, height, width = own.shape
         of_x = own.new_empty(batch, height // 2, width // 2, 4 * count).permute(0, 3, 1, 2)

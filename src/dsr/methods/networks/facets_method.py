@@ -28,24 +28,21 @@ from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 
 Edges = Literal["auto", "sharp", "soft"]
-_TOLERANCE = 0.02
-"""A map is taken for one of the photo's own size up to this relative difference."""
-CAUTION = 1.1
-"""Measured errors over expected ones on rendered scenes that are not trained on, see ``benchmarks/confidence.py``."""
+_TOLERANCE = 0.02  # a map is taken for one of the photo's own size up to this relative difference
+CAUTION = 1.1  # measured errors over expected ones on held-out rendered scenes, see ``benchmarks/confidence.py``
+# of maps without noise, by kernel and depth steps: which further weights there may be, and ``CAUTION`` for them
 SPECIAL: Mapping[tuple[Kernel | None, Edges], tuple[Literal["clean", "soft"], float]] = MappingProxyType(
     {("box", "sharp"): ("clean", 0.85), ("bicubic", "soft"): ("soft", CAUTION)}
 )
-"""Of maps without noise, by kernel and depth steps: which further weights there may be, and ``CAUTION`` for them."""
+# Relative error of depth in holes that the network does not expect, per degree from the nearest measured pixel. On
+# Middlebury 2014 and ICL-NUIM with holes cut into them it expects 2 % everywhere, and depth is off by 3 % at 0.5 to 1
+# degree and by 4 % at 1 to 3 degrees.
 _PER_DEGREE = 0.012
-"""Relative error of depth in holes that the network does not expect, per degree from the nearest measured pixel. On
-Middlebury 2014 and ICL-NUIM with holes cut into them it expects 2 % everywhere, and depth is off by 3 % at 0.5 to 1
-degree and by 4 % at 1 to 3 degrees."""
-_ROUNDED = 16
-"""A map with fewer different values than one per so many pixels may be a rounded one."""
+_ROUNDED = 16  # a map with fewer different values than one per so many pixels may be a rounded one
+# Share of a level's borders that it has at least with the next nearer and with the next farther level, largest ratio of
+# the two steps, and number of such levels from which a map is rounded, otherwise it shows boards at exact depths; and
+# relative steps of other levels over the largest of these, at most.
 _STAIR, _EVEN, _STAIRS, _EXCESS = 0.05, 1.3, 2, 2
-"""Share of a level's borders that it has at least with the next nearer and with the next farther level, largest ratio
-of the two steps, and number of such levels from which a map is rounded, otherwise it shows boards at exact depths; and
-relative steps of other levels over the largest of these, at most."""
 
 
 class AnyMap(Method):
@@ -64,14 +61,7 @@ class AnyMap(Method):
         kernel: of the downsampling that made the map, if it is known.
         clean: whether the map is known to have no noise, unless ``noise`` or ``smooth`` say otherwise.
         max_error: share of the depth; pixels that are expected to be further off are left as holes; None for no limit.
-        device: device of the computations.
         model: name of the model that the file must contain.
-        precision: dtype of the convolutions, for a file.
-        networks: network classes by their names in weights files.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is damaged or of another model, or a value is out of range.
 
     """
 
@@ -114,7 +104,7 @@ class AnyMap(Method):
             kind, caution = SPECIAL.get((kernel, edges), (None, CAUTION)) if cleanly else (None, CAUTION)
             if kind is not None and (special := special_weights(Path(weights), kind)) is not None:
                 weights, self._caution = special, caution
-            weights = _load(Path(weights), model, precision, networks)
+            weights = _load(Path(weights), model, networks).to(DTYPES[precision])
         self._max_error = max_error
         self._net = weights.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs
         self._device, self._smooth = torch.device(device), smooth
@@ -139,7 +129,8 @@ class AnyMap(Method):
         """Return the result for a map of this noise; None for one that is not known."""
         inverse = sample.depth_lr.to(self._device).reciprocal()[None]
         size = sample.rgb.shape[-2:]
-        factor = self._factor(sample.scale)
+        own_size = self._net.serves(self._net.scale, 1) and sample.scale <= 1 + _TOLERANCE
+        factor = 1 if own_size else self._net.scale
         rows, columns = inverse.shape[-2:]
         rgb = _resize(sample.rgb.to(self._device).float()[None], (factor * rows, factor * columns)).clamp(0, 1)
         padded = inverse
@@ -169,10 +160,6 @@ class AnyMap(Method):
             depth = depth.masked_fill(spread > self._max_error, torch.nan)
         return Surface(depth, depth_error, torch.rad2deg(angle), found)
 
-    def _factor(self, ratio: float) -> int:
-        """Return the factor at which the network is run for a ratio of the sizes."""
-        return 1 if self._net.serves(self._net.scale, 1) and ratio <= 1 + _TOLERANCE else self._net.scale
-
     def _answer(self, rgb: Tensor, inverse: Tensor, noise: Tensor | None, progress: Steps | None) -> Answer:
         """Return the network's answer, with the noise if it is given."""
         facts = self._facts.to(self._device).clone()
@@ -180,15 +167,11 @@ class AnyMap(Method):
         return self._net.answer(rgb, inverse, None if noise is None else noise.float(), facts, progress)
 
 
-def _load(path: Path, model: str, precision: Precision, networks: Mapping[str, type[DisparityNetwork]]) -> FacetsUNet:
-    """Return the network of a file."""
+def _load(path: Path, model: str, networks: Mapping[str, type[DisparityNetwork]]) -> FacetsUNet:
     net = load_network(path, networks, None, model)
     if not isinstance(net, FacetsUNet):
-        raise ValueError(
-            f"{path}: expected weights of {FacetsUNet.__name__}, got those of {type(net).__name__}, which "
-            "method=facets_box takes"
-        )
-    return net.eval().requires_grad_(False).to(DTYPES[precision])
+        raise ValueError(f"{path}: expected weights of {FacetsUNet.__name__}, got those of {type(net).__name__}")
+    return net.eval().requires_grad_(False)
 
 
 def _half(progress: Steps | None, before: int) -> Steps | None:

@@ -6,6 +6,7 @@ axis but two: (B, facets, 3, h, w). Everything here reproduces planes exactly.
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any, NamedTuple
 
@@ -17,10 +18,8 @@ from torch.nn import functional
 from dsr.methods.classical.finite_differences import extend_linearly
 from dsr.methods.exportable import exporting
 
-NEIGHBOURS = 9
-"""Low-resolution pixels whose planes are mixed or averaged: 3 x 3."""
-_CHUNK = 2**17
-"""Values that a processor's cache holds several of."""
+NEIGHBOURS = 9  # low-resolution pixels whose planes are mixed or averaged: 3 x 3
+_CHUNK = 2**17  # values that a processor's cache holds several of
 
 
 class Stencil(NamedTuple):
@@ -53,66 +52,36 @@ def stencil(values: Tensor) -> Stencil:
     return Stencil(here, slopes, bend, turns, functional.avg_pool2d(padded, 3, stride=1))
 
 
-def smooth(values: Tensor, weight: Tensor, levels: int) -> list[Stencil]:
-    """Return the stencils of a map that is smoothed more and more: binomial kernels a trous, 1, 2, 4, ... pixels apart.
+def smooth(values: Tensor, weight: Tensor, levels: int) -> list[Tensor]:
+    """Return copies of a map, (B, 1, h, w), smoothed more and more: binomial kernels 1, 2, 4, ... pixels apart.
 
-    Planes stay planes where nothing was filled in. Values that were filled in count a tenth.
-
-    Args:
-        values: (B, 1, h, w).
-        weight: (B, 1, h, w), 1 where the map is known and 0 where it was filled in.
-        levels: number of smoothed maps.
-
+    Planes stay planes where nothing was filled in: ``weight`` (B, 1, h, w) is 1 where the map is known and 0 where it
+    was filled in, which counts a tenth.
     """
     weight = 0.1 + 0.9 * weight
     found = []
     for level in range(levels):
         step = 2**level
-        padded, padded_weight = extend_linearly(values, step), functional.pad(weight, (step,) * 4, mode="replicate")
-        total = _binomial(padded_weight, step)
-        values = _binomial(padded * padded_weight, step) / total
-        weight = total
-        found.append(stencil(values))
+        padded_weight = functional.pad(weight, (step,) * 4, mode="replicate")
+        both = torch.stack((extend_linearly(values, step) * padded_weight, padded_weight))
+        for dim in (-2, -1):  # weights 1, 2, 1 along both axes
+            size = both.shape[dim] - 2 * step
+            before, here, after = (both.narrow(dim, i * step, size) for i in range(3))
+            both = (before + after) / 4 + here / 2
+        values, weight = both[0] / both[1], both[1]
+        found.append(values)
     return found
-
-
-def _binomial(values: Tensor, step: int) -> Tensor:
-    """Return means of (B, 1, h + 2 step, w + 2 step) with weights 1, 2, 1 along both axes, ``step`` pixels apart."""
-    for dim in (-2, -1):
-        size = values.shape[dim] - 2 * step
-        before, here, after = (values.narrow(dim, i * step, size) for i in range(3))
-        values = (before + after) / 4 + here / 2
-    return values
 
 
 def average_planes(planes: Tensor, weights: Tensor, reach: int) -> Tensor:
     """Return averages of planes, extended to each pixel, ``reach`` pixels apart or less at the border.
 
-    Args:
-        planes: (B, facets, 3, h, w).
-        weights: (B, facets, 9, h, w), row by row.
-        reach: low-resolution pixels.
-
+    ``planes`` are (B, facets, 3, h, w), ``weights`` (B, facets, 9, h, w), row by row.
     """
     if exporting():
-        return _average_planes(planes, weights, reach)
+        return (weights.unflatten(2, (3, 3))[:, :, None] * _extend_to_centre(planes, reach)).sum(dim=(3, 4))
     average: Tensor = _AveragePlanes.apply(planes, weights, reach)
     return average
-
-
-def _average_planes(planes: Tensor, weights: Tensor, reach: int) -> Tensor:
-    """Return what :func:`average_planes` does, in operations that a graph may have."""
-    height, width = planes.shape[-2:]
-    padded = _pad(planes, reach)
-    down, across = _offsets(height, reach, planes), _offsets(width, reach, planes)
-    total = torch.zeros_like(planes)
-    for k in range(NEIGHBOURS):
-        i, j = divmod(k, 3)
-        near = padded[..., i * reach : i * reach + height, j * reach : j * reach + width]
-        value = near[:, :, 0] - across[j] * near[:, :, 1] - down[i][:, None] * near[:, :, 2]
-        extended = torch.cat((value[:, :, None], near[:, :, 1:]), dim=2)
-        total = total + weights[:, :, k : k + 1] * extended
-    return total
 
 
 class _AveragePlanes(torch.autograd.Function):
@@ -120,105 +89,80 @@ class _AveragePlanes(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, planes: Tensor, weights: Tensor, reach: int) -> Tensor:
-        """Return (B, facets, 3, h, w)."""
-        height, width = planes.shape[-2:]
-        padded = _pad(planes, reach)
-        down, across = _offsets(height, reach, planes), _offsets(width, reach, planes)
+        padded = functional.pad(planes.flatten(1, 2), (reach,) * 4, mode="replicate").unflatten(1, planes.shape[1:3])
+        near = _windows(padded, planes.shape, reach)
+        down, across = _offsets(planes, reach)
         total = torch.zeros_like(planes, memory_format=torch.contiguous_format)
-        for k in range(NEIGHBOURS):
-            i, j = divmod(k, 3)
-            near = padded[..., i * reach : i * reach + height, j * reach : j * reach + width]
-            value = near[:, :, 0] - across[j] * near[:, :, 1] - down[i][:, None] * near[:, :, 2]
-            total[:, :, 0].addcmul_(weights[:, :, k], value)
-            total[:, :, 1:].addcmul_(weights[:, :, k, None], near[:, :, 1:])
-        ctx.save_for_backward(padded, weights, *down, *across)
+        for i in range(3):
+            value = near[:, :, 0, i] - across * near[:, :, 1, i] - down[i] * near[:, :, 2, i]  # (B, facets, 3, h, w)
+            for j in range(3):
+                total[:, :, 0].addcmul_(weights[:, :, 3 * i + j], value[:, :, j])
+                total[:, :, 1:].addcmul_(weights[:, :, 3 * i + j, None], near[:, :, 1:, i, j])
+        ctx.save_for_backward(padded, weights)
         ctx.reach = reach
         return total
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None]:
-        """Return the gradients of the planes and of the weights."""
-        padded, weights, *offsets = ctx.saved_tensors
-        down, across = offsets[:3], offsets[3:]
-        reach, (height, width) = ctx.reach, gradient.shape[-2:]
-        of_padded, of_weights = torch.zeros_like(padded), torch.empty_like(weights)
-        of_value, of_u, of_v = gradient.unbind(dim=2)
+        padded, weights = ctx.saved_tensors
+        near, (down, across) = _windows(padded, gradient.shape, ctx.reach), _offsets(gradient, ctx.reach)
+        of_value = gradient[:, :, :1, None, None]  # (B, facets, 1, 1, 1, h, w)
+        of_u = gradient[:, :, 1:2, None, None] - across * of_value
+        of_v = gradient[:, :, 2:, None, None] - down * of_value
+        of_weights = of_value * near[:, :, :1]  # (B, facets, 1, 3, 3, h, w)
+        of_weights.addcmul_(of_u, near[:, :, 1:2]).addcmul_(of_v, near[:, :, 2:])
+        parts = torch.cat([each.expand_as(of_weights) for each in (of_value, of_u, of_v)], dim=2)
+        of_padded = torch.zeros_like(padded)
+        sums = _windows(of_padded, gradient.shape, ctx.reach)
         for k in range(NEIGHBOURS):
             i, j = divmod(k, 3)
-            window = (..., slice(i * reach, i * reach + height), slice(j * reach, j * reach + width))
-            near, sums = padded[window], of_padded[window]
-            parts = (of_value, of_u - across[j] * of_value, of_v - down[i][:, None] * of_value)
-            torch.mul(parts[0], near[:, :, 0], out=of_weights[:, :, k])
-            for channel, part in enumerate(parts):
-                sums[:, :, channel].addcmul_(weights[:, :, k], part)
-                if channel:
-                    of_weights[:, :, k].addcmul_(part, near[:, :, channel])
+            sums[:, :, :, i, j].addcmul_(weights[:, :, k, None], parts[:, :, :, i, j])
         for dim in (-2, -1):  # what lies beyond the border is the border's
-            size = of_padded.shape[dim] - 2 * reach
-            before, inner, after = of_padded.split((reach, size, reach), dim)
+            size = of_padded.shape[dim] - 2 * ctx.reach
+            before, inner, after = of_padded.split((ctx.reach, size, ctx.reach), dim)
             inner.narrow(dim, 0, 1).add_(before.sum(dim, keepdim=True))
             inner.narrow(dim, size - 1, 1).add_(after.sum(dim, keepdim=True))
             of_padded = inner
-        return of_padded, of_weights, None
+        return of_padded, of_weights.flatten(2, 4), None
 
 
-def _pad(planes: Tensor, reach: int) -> Tensor:
-    """Return planes, (B, facets, 3, h, w), with the border's repeated ``reach`` times."""
-    return functional.pad(planes.flatten(1, 2), (reach,) * 4, mode="replicate").unflatten(1, planes.shape[1:3])
+def _windows(padded: Tensor, size: torch.Size, reach: int) -> Tensor:
+    """Return the 3 x 3 neighbours of pixels, (..., h + 2 reach, w + 2 reach) to (..., 3, 3, h, w): a view."""
+    height, width = size[-2:]
+    if exporting():
+        rows = torch.stack([padded[..., i * reach : i * reach + height, :] for i in range(3)], dim=-3)
+        return torch.stack([rows[..., j * reach : j * reach + width] for j in range(3)], dim=-3)
+    return padded.unfold(-2, height, reach).unfold(-2, width, reach)
 
 
-def _offsets(size: int, reach: int, like: Tensor) -> list[Tensor]:
-    """Return how far the pixels ``reach`` before, at and after each pixel are, (size,) each, if they are inside."""
-    places = torch.arange(size, dtype=like.dtype, device=like.device)
-    return [(places + step).clamp(0, size - 1) - places for step in (-reach, 0, reach)]
+@functools.lru_cache(64)
+def _offsets_along(size: int, reach: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    with torch.inference_mode(mode=False):  # a cached tensor may later be used with gradients
+        places = torch.arange(size, dtype=dtype, device=device)
+        return torch.stack([(places + step).clamp(0, size - 1) - places for step in (-reach, 0, reach)])
 
 
-def gather_neighbours(planes: Tensor) -> Tensor:
-    """Return the planes of the 3 x 3 low-resolution pixels around each, extended to its centre.
+def _offsets(planes: Tensor, reach: int) -> tuple[Tensor, Tensor]:
+    """Return how far the rows, (3, 1, h, 1), and columns, (3, 1, w), before, at and after each are, if inside."""
+    height, width = planes.shape[-2:]
+    along = _offsets_along.__wrapped__ if exporting() else _offsets_along  # sizes of a graph are no constants
+    down, across = along(height, reach, planes.dtype, planes.device), along(width, reach, planes.dtype, planes.device)
+    return down[:, None, :, None], across[:, None]
 
-    Args:
-        planes: (B, facets, 3, h, w).
 
-    Returns:
-        (B, 9, facets, 3, h, w), row by row; a pixel's own planes in place of those beyond the border.
+def _extend_to_centre(planes: Tensor, reach: int) -> Tensor:
+    """Return the planes of the 3 x 3 pixels around each, extended to its centre, (B, facets, 3, 3, 3, h, w).
 
+    Planes are (B, facets, 3, h, w). In place of those beyond the border are the border's.
     """
-    value, slope_u, slope_v = planes.unbind(dim=2)  # (B, facets, h, w)
-    height, width = value.shape[-2:]
-    padded = [functional.pad(each, (1, 1, 1, 1), mode="replicate") for each in (value, slope_u, slope_v)]
-    around = []
-    for i in range(3):
-        for j in range(3):
-            v, u_slope, v_slope = (each[..., i : i + height, j : j + width] for each in padded)
-            # how far this pixel's centre is from the neighbour's; 0 where the neighbour is the pixel itself, repeated
-            rows = _steps(height, i - 1, value)[:, None]
-            columns = _steps(width, j - 1, value)
-            around.append(torch.stack((v - columns * u_slope - rows * v_slope, u_slope, v_slope), dim=2))
-    return torch.stack(around, dim=1)
+    padded = functional.pad(planes.flatten(1, 2), (reach,) * 4, mode="replicate").unflatten(1, planes.shape[1:3])
+    near, (down, across) = _windows(padded, planes.shape, reach), _offsets(planes, reach)
+    value = near[:, :, :1] - across * near[:, :, 1:2] - down * near[:, :, 2:]
+    return torch.cat((value, near[:, :, 1:]), dim=2)
 
 
-def _steps(size: int, step: int, like: Tensor) -> Tensor:
-    """Return ``step`` for every index whose neighbour lies inside, else 0, (size,)."""
-    steps = torch.full((size,), float(step), dtype=like.dtype, device=like.device)
-    if step:
-        steps[0 if step < 0 else -1] = 0
-    return steps
-
-
-def mix_planes(planes: Tensor, choice: Tensor, scale: int) -> Tensor:
-    """Return the mixture of the planes around each high-resolution pixel, (B, 1, H, W).
-
-    Args:
-        planes: (B, facets, 3, h, w).
-        choice: (B, 9 * facets, H, W) logits, to which those of a quadratic B-spline are added.
-        scale: H / h.
-
-    """
-    return mix_planes_apart(planes, choice, scale)[0]
-
-
-def mix_planes_apart(planes: Tensor, found: Tensor, scale: int) -> tuple[Tensor, Tensor]:
+def mix_planes(planes: Tensor, found: Tensor, scale: int) -> tuple[Tensor, Tensor]:
     """Return the mixture of the planes around each high-resolution pixel, (B, 1, H, W), and the other channels.
 
     What is mixed are the differences to the first plane of the pixel's own low-resolution pixel, in the type of
@@ -226,8 +170,8 @@ def mix_planes_apart(planes: Tensor, found: Tensor, scale: int) -> tuple[Tensor,
 
     Args:
         planes: (B, facets, 3, h, w).
-        found: (B, 9 * facets + n, H, W): logits as for :func:`mix_planes`, and n more channels, which are returned in
-            at least float32.
+        found: (B, 9 * facets + n, H, W): logits, to which those of a quadratic B-spline are added, and n more channels,
+            which are returned in at least float32.
         scale: H / h.
 
     """
@@ -239,17 +183,14 @@ def mix_planes_apart(planes: Tensor, found: Tensor, scale: int) -> tuple[Tensor,
         blocks = values.view(batch, s, s, height, width).permute(0, 3, 1, 4, 2)
         return blocks.reshape(batch, 1, height * s, width * s)
 
-    # of the high-resolution pixels from the centre of their low-resolution pixel, in low-resolution pixels
-    offsets = (torch.arange(s, dtype=planes.dtype, device=planes.device) + 0.5) / s - 0.5
-    ones = torch.ones(s, s, dtype=offsets.dtype, device=offsets.device)
-    basis = torch.stack((ones, ones * offsets, ones * offsets[:, None]), dim=-1).view(s * s, 3)
     dtype = torch.promote_types(found.dtype, torch.float32)
+    basis, prior = _mixing_constants(s, facets, planes.dtype, planes.device)
     with torch.autocast(planes.device.type, enabled=False):
         first = planes[:, 0]
-        prior = spline_logits(offsets).repeat_interleave(facets, dim=0).view(count, s * s, 1).to(dtype)
-        near = (gather_neighbours(planes) - first[:, None, None]).reshape(batch, count, 3, height, width).to(dtype)
+        near = _extend_to_centre(planes, 1).permute(0, 3, 4, 1, 2, 5, 6) - first[:, None, None, None]
+        near = near.reshape(batch, count, 3, height, width).to(dtype)
         base = side_by_side(basis @ first.flatten(2))
-        basis = basis.to(dtype)
+        basis, prior = basis.to(dtype), prior.to(dtype)
         if not exporting():
             mixed, others = _MixPlanes.apply(near, found, prior, basis)
             return base + mixed, others
@@ -261,12 +202,23 @@ def mix_planes_apart(planes: Tensor, found: Tensor, scale: int) -> tuple[Tensor,
         return base + side_by_side(mixed), found[:, count:].to(dtype)
 
 
+@functools.lru_cache(64)
+def _mixing_constants(scale: int, facets: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return value and slopes' factors of high-resolution pixels, (s s, 3), and logits of a B-spline, (9 f, s s, 1)."""
+    with torch.inference_mode(mode=False):  # cached tensors may later be used with gradients
+        # from the centre of the low-resolution pixel, in low-resolution pixels
+        offsets = (torch.arange(scale, dtype=dtype, device=device) + 0.5) / scale - 0.5
+        ones = torch.ones(scale, scale, dtype=dtype, device=device)
+        basis = torch.stack((ones, ones * offsets, ones * offsets[:, None]), dim=-1).view(scale * scale, 3)
+        logits = spline_logits(offsets).repeat_interleave(facets, dim=0)
+        return basis, logits.view(NEIGHBOURS * facets, scale * scale, 1)
+
+
 class _MixPlanes(torch.autograd.Function):
     """A softmax over proposals times their planes at each pixel, some pixels at a time: no array of all of them."""
 
     @staticmethod
     def forward(ctx: Any, near: Tensor, found: Tensor, prior: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what :func:`mix_planes_apart` does."""
         count, (height, width), s = near.shape[1], near.shape[-2:], math.isqrt(len(basis))
         mixed = near.new_empty(found.shape[0], 1, *found.shape[-2:])
         logits, target, kept = _blocks(found[:, :count], s), _blocks(mixed, s), []
@@ -285,7 +237,6 @@ class _MixPlanes(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor, of_others: Tensor) -> tuple[Tensor, Tensor, None, None]:
-        """Return the gradients of the planes and of the logits with the other channels."""
         near, found, mixed, basis, *kept = ctx.saved_tensors
         count, (height, width), s = near.shape[1], near.shape[-2:], math.isqrt(len(basis))
         of_near, of_found = torch.empty_like(near), torch.empty_like(found)

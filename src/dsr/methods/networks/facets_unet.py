@@ -46,6 +46,7 @@ from dsr.methods.networks.facets_layers import (
     Context,
     MixedResidual,
     concatenate,
+    constant,
     convolve_together,
     enlarge_and_join,
     make_pyramid,
@@ -53,39 +54,30 @@ from dsr.methods.networks.facets_layers import (
     scale_down,
     silence,
 )
-from dsr.methods.networks.facets_planes import NEIGHBOURS, Stencil, average_planes, mix_planes_apart, smooth, stencil
+from dsr.methods.networks.facets_planes import NEIGHBOURS, Stencil, average_planes, mix_planes, smooth, stencil
 from dsr.methods.networks.network import Answer, DisparityNetwork, expect_rgb_size
 from dsr.methods.networks.normalisation import upsample_bicubic
 from dsr.utils.progress import Steps
 
+# layers at the low resolution
 _SHARED = ("coarse", "hints", "modulation", "shares", "trunk", "wide", "planes", "blend")
-"""Layers at the low resolution."""
-_LEVELS = 3
-"""Smoothed copies of the map."""
+_LEVELS = 3  # smoothed copies of the map
 _LR_CHANNELS = 10 + 4 * _LEVELS + 3
-_REACHES = (1, 2, 4, 8, 16)
-"""Low-resolution pixels between the planes that are averaged, step by step."""
-_OWN = 8.0
-"""What is added to the logit of a pixel's own plane."""
+_REACHES = (1, 2, 4, 8, 16)  # low-resolution pixels between the planes that are averaged, step by step
+_OWN = 8.0  # what is added to the logit of a pixel's own plane
 _PROJECTIONS = 2
-_CLOSED = -3.0
-"""Logit of the factor of the residual, at first."""
-_BEFORE = 3
-"""Residual blocks before the U-net."""
+_CLOSED = -3.0  # logit of the factor of the residual, at first
+_BEFORE = 3  # residual blocks before the U-net
+# relative differences of disparity that become about 1 in the compressed and in the linear inputs
 _FAINT, _STRONG = 5e-4, 0.125
-"""Relative differences of disparity that become about 1 in the compressed and in the linear inputs."""
-_KINDS = 32
-"""Features of what is known of the whole map."""
+_KINDS = 32  # features of what is known of the whole map
+# at first the share of a block's second weights is logistic in the roughness, and a half where it is the second
 _SLOPE, _ROUGH = 6.0, 0.5
-"""At first the share of a block's second weights is logistic in the roughness, and a half where it is the second."""
 _QUANTILES = (0.1, 0.5)
 _ROUGHNESS = len(_QUANTILES) * (1 + _LEVELS)
-_SAMPLES = 2**16
-"""About how many low-resolution pixels the roughness of a map is measured at."""
-_BAND = 2**20
-"""Pixels of the photo that are processed at a time, beside the trunk, which sees the whole map."""
-_MARGIN = 4
-"""Low-resolution rows beyond a band that its result depends on."""
+_SAMPLES = 2**16  # about how many low-resolution pixels the roughness of a map is measured at
+_BAND = 2**20  # pixels of the photo that are processed at a time, beside the trunk, which sees the whole map
+_MARGIN = 4  # low-resolution rows beyond a band that its result depends on
 
 
 class _Band(NamedTuple):
@@ -93,12 +85,6 @@ class _Band(NamedTuple):
 
     rows: slice
     inner: slice
-
-    @classmethod
-    def of(cls, first: int, end: int, height: int) -> _Band:
-        """Return the band of the rows ``first`` to ``end`` of ``height``."""
-        above = max(0, first - _MARGIN)
-        return cls(slice(above, min(end + _MARGIN, height)), slice(first - above, end - above))
 
 
 class FacetsUNet(DisparityNetwork):
@@ -110,14 +96,6 @@ class FacetsUNet(DisparityNetwork):
         deep: channels of its coarser levels.
         blocks: residual blocks at the low resolution, of two sets of weights each.
         facets: number of planes that each low-resolution pixel proposes.
-
-    Raises:
-        ValueError: a value is out of range.
-
-    Example:
-        >>> from dsr.methods.networks.facets_unet import FacetsUNet
-        >>> sum(values.numel() for values in FacetsUNet(4).parameters()) // 1000  # thousands
-        3587
 
     """
 
@@ -163,12 +141,7 @@ class FacetsUNet(DisparityNetwork):
     def start_from(self, first: DisparityNetwork) -> None:
         """Take over the weights of a trained network for the same or another factor, or of Facets.
 
-        From Facets for the same factor, the results for clean maps are nearly the same. Where the factors differ, so do
-        the photo's layers.
-
-        Raises:
-            ValueError: it is another kind of network, or of another size.
-
+        From Facets for the same factor, the results for clean maps are nearly the same.
         """
         sizes = {key: self.arguments()[key] for key in ("width", "blocks", "facets")}
         theirs = {key: first.arguments().get(key) for key in sizes}
@@ -184,12 +157,7 @@ class FacetsUNet(DisparityNetwork):
 
     @torch.no_grad()
     def share(self, first: DisparityNetwork) -> None:
-        """Take over the layers at the low resolution from a network for another factor, and do not train them.
-
-        Raises:
-            ValueError: it is another kind of network, or of another size.
-
-        """
+        """Take over the layers at the low resolution from a network for another factor, and do not train them."""
         own = {**self.arguments(), "scale": None}
         if not isinstance(first, FacetsUNet) or {**first.arguments(), "scale": None} != own:
             raise ValueError(
@@ -245,9 +213,6 @@ class FacetsUNet(DisparityNetwork):
             filled: the disparity without holes; None to inpaint it.
             kernels: those that the hints give; None to read them.
 
-        Raises:
-            ValueError: the photo's size is not a multiple of the map's by a factor of the network.
-
         """
         expect_rgb_size(rgb, disparity, 1 if self.scale < 4 and rgb.shape[-1] == disparity.shape[-1] else self.scale)
         known = disparity.isfinite()
@@ -276,15 +241,8 @@ class FacetsUNet(DisparityNetwork):
     ) -> tuple[Tensor, Tensor]:
         """Return high-resolution values, (B, 1, H, W), and the logarithms of both expected errors, (B, 2, H, W).
 
-        Args:
-            rgb: (B, 3, H, W).
-            values: (B, 1, h, w) disparity over its median, without holes.
-            known: (B, 1, h, w) bool, false where a value was filled in.
-            noise: (B, 1, h, w) standard deviation of the logarithm of the values, where that is known.
-            hints: (B, ``FACTS``).
-            kernels: those that the hints give.
-            progress: called after each band of rows.
-
+        ``values`` (B, 1, h, w) are disparity over its median, without holes, ``known`` (B, 1, h, w) false where one was
+        filled in, ``noise`` the standard deviation of their logarithm where that is known.
         """
         scale, given = rgb.shape[-1] // values.shape[-1], values
         dtype = self.photo.weight.dtype
@@ -297,9 +255,10 @@ class FacetsUNet(DisparityNetwork):
                 parts.append(fine)
             elif scale == 2:
                 parts.append(torch.zeros_like(rgb[:, :3]))
-            around, smoothed = stencil(values), smooth(values, weight, _LEVELS)
-            lr_input = _lr_input(around, smoothed, weight, noise, hints)
-            cues = torch.cat((hints.float(), _roughness([around, *smoothed], weight)), dim=1)
+            levels = torch.cat((values, *smooth(values, weight, _LEVELS)))
+            around = Stencil(*(torch.stack(each.chunk(1 + _LEVELS)) for each in stencil(levels)))  # (levels, B, ...)
+            lr_input = _lr_input(around, weight, noise, hints)
+            cues = torch.cat((hints.float(), _roughness(around.bend, weight)), dim=1)
         photo, bands = torch.cat(parts, dim=1), self._split(values.shape[-2], rgb.shape)
         kept = [self._see(photo, scale, bands[0])] if len(bands) == 1 else None
         seen = kept or (self._see(photo, scale, band) for band in bands)
@@ -310,7 +269,7 @@ class FacetsUNet(DisparityNetwork):
             if number == _BEFORE:
                 x = x + self.wide(x)
             x = block(x, shares[:, number], *modulate(kind).chunk(2, dim=1))
-        planes = self._blend_planes(self._propose_planes(self.planes(x), around, smoothed), self.blend(x))
+        planes = self._blend_planes(self._propose_planes(self.planes(x), around), self.blend(x))
         bits = []
         for number, band in enumerate(bands, 1):
             pyramid = kept[0] if kept else self._see(photo, scale, band)
@@ -327,10 +286,13 @@ class FacetsUNet(DisparityNetwork):
 
     def _split(self, height: int, shape: torch.Size) -> list[_Band]:
         """Return the bands of low-resolution rows that are processed one after another; all rows in a training."""
-        if exporting():
+        if exporting() or self.training:
             return [_Band(slice(0, height), slice(0, height))]
-        rows = height if self.training else max(1, height * _BAND // (shape[0] * shape[-2] * shape[-1]))
-        return [_Band.of(first, min(first + rows, height), height) for first in range(0, height, rows)]
+        rows, bands = max(1, height * _BAND // (shape[0] * shape[-2] * shape[-1])), []
+        for first in range(0, height, rows):
+            above, end = max(0, first - _MARGIN), min(first + rows, height)
+            bands.append(_Band(slice(above, min(end + _MARGIN, height)), slice(first - above, end - above)))
+        return bands
 
     def _see(self, photo: Tensor, scale: int, band: _Band) -> list[Tensor]:
         """Return the photo's features in a band with its margins, from the full to the low resolution."""
@@ -345,21 +307,21 @@ class FacetsUNet(DisparityNetwork):
         for up, join, features in zip(self.up, self.join, reversed(pyramid[:-1]), strict=True):
             x = functional.relu(enlarge_and_join(up, join, x, features), inplace=True)
         found = convolve_together((self.choice, self.errors, self.gate), x)
-        mixed, others = mix_planes_apart(planes, found, scale)
+        mixed, others = mix_planes(planes, found, scale)
         errors, gate = others.float().split((2, 1), dim=1)
         return mixed, errors - 5, torch.sigmoid(gate + _CLOSED)
 
-    def _propose_planes(self, output: Tensor, around: Stencil, smoothed: list[Stencil]) -> Tensor:
+    def _propose_planes(self, output: Tensor, around: Stencil) -> Tensor:
         """Return the planes of each low-resolution pixel, (B, facets, 3, h, w): value at its centre and slopes."""
         output = output.to(torch.promote_types(around.value.dtype, torch.float32))
         output = output.unflatten(1, (self.facets, -1))
         values, slopes, moves = output.split((1 + _LEVELS, 2 * (3 + _LEVELS), 3), dim=2)
         values = _favour(values, 0).softmax(dim=2)
-        value = (values * torch.stack([around.value, *(each.value for each in smoothed)], dim=2)).sum(dim=2)
+        value = (values * around.value.permute(1, 2, 0, 3, 4)).sum(dim=2)
         slopes = _favour(slopes.unflatten(2, (2, -1)), 1).softmax(dim=3)  # (B, facets, 2, 3 + levels, h, w)
-        offered = torch.cat((around.slopes, torch.stack([each.slopes[:, :, 1] for each in smoothed], dim=2)), dim=2)
-        slope = (slopes * offered[:, None]).sum(dim=3)
-        return torch.cat((value[:, :, None], slope), dim=2) + moves * around.bend[:, None]
+        central = around.slopes[1:, :, :, 1].permute(1, 2, 0, 3, 4)
+        slope = (slopes * torch.cat((around.slopes[0], central), dim=2)[:, None]).sum(dim=3)
+        return torch.cat((value[:, :, None], slope), dim=2) + moves * around.bend[0][:, None]
 
     def _blend_planes(self, planes: Tensor, logits: Tensor) -> Tensor:
         """Return planes averaged with those around them, (B, facets, 3, h, w)."""
@@ -373,9 +335,8 @@ class FacetsUNet(DisparityNetwork):
 
 def _favour(logits: Tensor, index: int) -> Tensor:
     """Return logits of (B, facets, ..., n, h, w) with 2 added to one of the n."""
-    first = logits.new_zeros(logits.shape[-3])
-    first[index] = 2
-    return logits + first[:, None, None]
+    added = tuple(2.0 * (i == index) for i in range(logits.shape[-3]))
+    return logits + constant(added, logits.dtype, logits.device)[:, None, None]
 
 
 def _pair_up(values: Tensor, weight: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -388,15 +349,12 @@ def _pair_up(values: Tensor, weight: Tensor, noise: Tensor) -> tuple[Tensor, Ten
     return mean, fine, share, functional.avg_pool2d(noise, 2)
 
 
-def _lr_input(around: Stencil, smoothed: list[Stencil], weight: Tensor, noise: Tensor, hints: Tensor) -> Tensor:
-    """Return the trunk's input, (B, channels, h, w) in float32."""
-    central = around.slopes[:, :, 1]
-    differences = torch.cat((around.value - around.mean, central, around.bend), dim=1).float()
-    tiny = torch.finfo(torch.float32).tiny
-    turns = around.turns.float() / around.bend.float().clamp(min=tiny)
-    wide = torch.cat(
-        [torch.cat((around.value - each.value, each.slopes[:, :, 1], each.bend), dim=1) for each in smoothed], dim=1
-    ).float()
+def _lr_input(around: Stencil, weight: Tensor, noise: Tensor, hints: Tensor) -> Tensor:
+    """Return the trunk's input, (B, channels, h, w) in float32, of differences of (levels, B, ...) and hints."""
+    value, central, bend = around.value, around.slopes[:, :, :, 1], around.bend
+    differences = torch.cat((value[0] - around.mean[0], central[0], bend[0]), dim=1).float()
+    turns = around.turns[0].float() / bend[0].float().clamp(min=torch.finfo(torch.float32).tiny)
+    wide = torch.cat((value[0] - value[1:], central[1:], bend[1:]), dim=2).transpose(0, 1).flatten(1, 2).float()
     noise_known = hints[:, -1:, None, None].float().expand_as(weight)
     level = torch.where(noise_known > 0, torch.log10(noise.float().clamp(min=1e-5) / 1e-3), 0)
     parts = (
@@ -413,44 +371,32 @@ def _lr_input(around: Stencil, smoothed: list[Stencil], weight: Tensor, noise: T
 
 def _project(result: Tensor, values: Tensor, known: Tensor, gate: Tensor, kernels: Sequence[str | None]) -> Tensor:
     """Return results closer to what was measured, where the kernel is known."""
-    if not any(kernels):
-        return result
-    scale, parts = result.shape[-1] // values.shape[-1], []
-    for i, kernel in enumerate(kernels):
-        part = slice(i, i + 1)
-        x = result[part]
-        for _ in range(_PROJECTIONS if kernel else 0):
-            coarse = Downsampling(kernel)(x, scale)  # type: ignore[arg-type]  # one of them
-            residual = torch.where(known[part], values[part] - coarse, 0)
-            x = x + gate[part].to(x.dtype) * upsample_bicubic(residual, scale)
-        parts.append(x)
-    return torch.cat(parts)
+    scale = result.shape[-1] // values.shape[-1]
+    for kernel in dict.fromkeys(filter(None, kernels)):
+        places = [i for i, each in enumerate(kernels) if each == kernel]
+        index = None if len(places) == len(kernels) else constant(tuple(places), torch.int64, result.device)
+        x, given, valid, factor = (each if index is None else each[index] for each in (result, values, known, gate))
+        for _ in range(_PROJECTIONS):
+            residual = torch.where(valid, given - Downsampling(kernel)(x, scale), 0)  # type: ignore[arg-type]
+            x = x + factor.to(x.dtype) * upsample_bicubic(residual, scale)
+        result = x if index is None else result.index_copy(0, index, x)
+    return result
 
 
-def _roughness(levels: list[Stencil], weight: Tensor) -> Tensor:
-    """Return how rough maps are, (B, channels): logarithms of quantiles of the bend where the map is known."""
+def _roughness(bend: Tensor, weight: Tensor) -> Tensor:
+    """Return how rough maps are, (B, channels): logarithms of quantiles of the bend, (levels, B, 1, h, w), if known."""
+    fractions = constant(_QUANTILES, torch.float32, bend.device)
     if exporting():
-        return _scale_roughness([_quantiles_in_graph(level.bend.float(), weight) for level in levels])
-    step = max(1, math.isqrt(weight.shape[-2] * weight.shape[-1] // _SAMPLES))
-    known = weight[..., ::step, ::step].flatten(1) > 0.5
-    quantiles = weight.new_tensor(_QUANTILES).float()
-    found = []
-    for level in levels:
-        bends = level.bend[..., ::step, ::step].flatten(1).float().masked_fill(~known, torch.nan)
-        found.append(torch.nanquantile(bends, quantiles, dim=1).T)
-    return _scale_roughness(found)
-
-
-def _quantiles_in_graph(bend: Tensor, weight: Tensor) -> Tensor:
-    """Return the quantiles of :func:`_roughness` of one map, (B, quantiles)."""
-    step = (torch.ones_like(weight[0, 0]).sum() / _SAMPLES).sqrt().floor().clamp(min=1)
-    known = (weight > 0.5) & every(step, weight)
-    return quantiles_in_graph(bend.flatten(1), known.flatten(1), bend.new_tensor(_QUANTILES))
-
-
-def _scale_roughness(quantiles: list[Tensor]) -> Tensor:
-    """Return quantiles of the bend, (B, n) each and NaN where nothing is known, as inputs of the network."""
-    return (torch.log10(torch.cat([each.nan_to_num(0) for each in quantiles], dim=1) + 1e-6) + 4) / 2
+        step = (torch.ones_like(weight[0, 0]).sum() / _SAMPLES).sqrt().floor().clamp(min=1)
+        known = ((weight > 0.5) & every(step, weight)).flatten(1)
+        found = [quantiles_in_graph(level.float().flatten(1), known, fractions) for level in bend]
+        quantiles = torch.cat(found, dim=1)
+    else:
+        every_nth = max(1, math.isqrt(weight.shape[-2] * weight.shape[-1] // _SAMPLES))
+        known = weight[..., ::every_nth, ::every_nth].flatten(1) > 0.5
+        bends = bend[..., ::every_nth, ::every_nth].flatten(2).float().masked_fill(~known, torch.nan)
+        quantiles = torch.nanquantile(bends, fractions, dim=2).permute(2, 1, 0).flatten(1)  # (B, levels * quantiles)
+    return (torch.log10(quantiles.nan_to_num(0) + 1e-6) + 4) / 2
 
 
 def _median(values: Tensor, known: Tensor) -> Tensor:

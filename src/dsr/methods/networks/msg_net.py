@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -24,7 +24,7 @@ from dsr.degradation.downsampling import check_scale
 from dsr.methods.classical.finite_differences import LUMA
 from dsr.methods.exportable import exporting
 from dsr.methods.inpainting import inpaint
-from dsr.methods.networks.network import GlobalContext, WindowedNetwork
+from dsr.methods.networks.network import DisparityNetwork
 from dsr.methods.networks.normalisation import compute_min_max, mean3x3, normalise, upsample_bicubic
 
 VariantName = Literal["hui", "voynov", "dsr"]
@@ -131,31 +131,20 @@ VARIANTS = MappingProxyType(
 )
 
 
-class Traits(NamedTuple):
-    """The global values of an image that MSG-Net uses, besides the range of the disparity.
-
-    ``intensity`` and ``detail`` (B, 2, 1, 1): minimum and maximum of the intensity and of its difference to its 3 x 3
-    mean, None for plain guidance; ``drift`` (B, 1, 1, 1): see :func:`dsr.methods.networks.msg_net.output_drift`, None
-    without drift compensation.
-    """
-
-    intensity: Tensor | None
-    detail: Tensor | None
-    drift: Tensor | None
-
-
-def guidance_map(rgb: Tensor, variant: MSGVariant, traits: Traits | None = None) -> Tensor:
+def guidance_map(
+    rgb: Tensor, variant: MSGVariant, intensity_range: Tensor | None = None, detail_range: Tensor | None = None
+) -> Tensor:
     """Return the guidance map (B, 1, H, W) of an image (B, 3, H, W) in 0..1.
 
     The intensity (see :class:`MSGVariant`) is normalised, its 3 x 3 mean is subtracted, and the result is normalised
-    again to 0..1. With plain guidance, the map is the intensity in -1..1. ``traits`` are those of the whole image if
-    ``rgb`` is a window.
+    again to 0..1. With plain guidance, the map is the intensity in -1..1. The ranges, (B, 2, 1, 1), are those of the
+    whole image if ``rgb`` is a window.
     """
     intensity = intensity_of(rgb, variant)
     if variant.plain_guidance:
         return intensity / 127.5 - 1
-    intensity = normalise(intensity, traits and traits.intensity).values
-    return normalise(intensity - mean3x3(intensity), traits and traits.detail).values
+    intensity = normalise(intensity, intensity_range).values
+    return normalise(intensity - mean3x3(intensity), detail_range).values
 
 
 def intensity_of(rgb: Tensor, variant: MSGVariant) -> Tensor:
@@ -164,7 +153,7 @@ def intensity_of(rgb: Tensor, variant: MSGVariant) -> Tensor:
     return ((255 * rgb * weights).sum(-3, keepdim=True) + variant.rgb_offset).clip(0, 255)
 
 
-class MSGNet(WindowedNetwork):
+class MSGNet(DisparityNetwork):
     """The network of all variants; modules are registered in the order in which data passes them.
 
     Args:
@@ -199,27 +188,26 @@ class MSGNet(WindowedNetwork):
         )
         self.smooth = self._conv(FEATURES, FEATURES)
         self.reconstruct = self._conv(FEATURES, 1, active=self.variant.activate_output)
+        self.receptive_field_radius = self.rows_seen(0) + 2  # two are for the uneven padding of ``hui``
         if variant == "dsr":
             self._start_smooth()
 
     def forward(self, guidance: Tensor, depth: Tensor) -> Tensor:
-        """Map normalised inputs to the high-resolution residual.
+        """Map normalised inputs to the high-resolution residual, (B, 1, H, W), in units of the disparity's range.
 
-        Args:
-            guidance: (B, 1, H, W) from :func:`guidance_map`, of the size given by :meth:`output_size`.
-            depth: (B, 1, h, w) normalised disparity minus its mean, see :func:`normalise`.
-
-        Returns:
-            (B, 1, H, W) residual, in units of the disparity's range.
-
+        ``guidance`` (B, 1, H, W) is that of :func:`guidance_map` in the size of :meth:`output_size`, ``depth``
+        (B, 1, h, w) normalised disparity minus its mean.
         """
         if guidance.shape[-2:] != self.output_size(depth):
             raise ValueError(
                 f"guidance: expected {tuple(self.output_size(depth))} for depth of {tuple(depth.shape[-2:])} at scale "
                 f"{self.scale} ({self.variant.name}), got {tuple(guidance.shape[-2:])}"
             )
+        pyramid = [self.guidance[1](self.guidance[0](guidance))]  # (B, 32, H, W), (B, 32, H / 2, W / 2), ...
+        for layer in self.guidance[2:]:
+            pyramid.append(self.pool(layer(pyramid[-1])))
         x = self.stem(depth)
-        for level, guide in zip(self.levels, reversed(self._pyramid(guidance)), strict=True):
+        for level, guide in zip(self.levels, reversed(pyramid), strict=True):
             x = level(x, guide)  # (B, 32, 2 h, 2 w), (B, 32, 4 h, 4 w), ...
         return self.reconstruct(self.smooth(x))
 
@@ -227,21 +215,51 @@ class MSGNet(WindowedNetwork):
         """Return the constructor's arguments."""
         return {"scale": self.scale, "variant": self.variant.name}
 
-    def upsample(self, rgb: Tensor, disparity: Tensor, min_max: Tensor | None = None) -> Tensor:
-        """Return high-resolution disparity; see :func:`upsample_disparity`."""
-        return upsample_disparity(self, rgb, disparity, min_max)
+    def upsample(
+        self,
+        rgb: Tensor,
+        disparity: Tensor,
+        min_max: Tensor | None = None,
+        intensity_range: Tensor | None = None,
+        detail_range: Tensor | None = None,
+        drift: Tensor | None = None,
+    ) -> Tensor:
+        """Return high-resolution disparity; see :meth:`~dsr.methods.networks.network.DisparityNetwork.upsample`.
 
-    @property
-    def receptive_field_radius(self) -> int:
-        """Receptive-field radius in low-resolution pixels; two of them are for the uneven padding of ``hui``."""
-        return self.rows_seen(0) + 2
+        It is (B, 1, H - 1, W - 1) for the ``hui`` variant, and can be negative.
+        """
+        values, minimum, value_range = normalise(disparity, min_max)
+        if self.variant.fill_holes:
+            values = inpaint(torch.where(disparity.isfinite(), values, torch.nan))
+        low_pass = mean3x3(values)
+        height, width = self.output_size(values)
+        guidance = guidance_map(rgb, self.variant, intensity_range, detail_range)[..., :height, :width]
+        output = self.residual(guidance, values - low_pass)
+        if self.variant.drift_compensation:
+            output = output - (output_drift(self, guidance, values) if drift is None else drift)
+        output = output + upsample_bicubic(low_pass, self.scale)[..., :height, :width]
+        return output * value_range + minimum
 
-    def global_context(self, rgb: Tensor, disparity: Tensor) -> GlobalContext:
-        """Return a context with the ranges, the drift and the inpainted disparity of the whole image."""
-        min_max = compute_min_max(disparity)
-        traits = compute_traits(self, rgb, disparity)
-        disparity = inpaint(disparity) if self.variant.fill_holes else disparity
-        return GlobalContext(disparity, lambda rgb, window: upsample_disparity(self, rgb, window, min_max, traits))
+    def context(self, rgb: Tensor, disparity: Tensor) -> tuple[Tensor | None, ...]:
+        """Return the ranges of disparity, intensity and detail, and the drift; None for what the variant lacks."""
+        intensity = detail = drift = None
+        if not self.variant.plain_guidance:
+            grey = intensity_of(rgb, self.variant)
+            intensity, grey = compute_min_max(grey), normalise(grey).values
+            detail = compute_min_max(grey - mean3x3(grey))
+        if self.variant.drift_compensation:
+            drift = output_drift(self, guidance_map(rgb, self.variant), normalise(disparity).values)
+        return compute_min_max(disparity), intensity, detail, drift
+
+    def fill(self, disparity: Tensor) -> Tensor:
+        """Return disparity without holes, for a variant that inpaints them."""
+        return inpaint(disparity) if self.variant.fill_holes else disparity
+
+    def residual(self, guidance: Tensor, depth: Tensor) -> Tensor:
+        """Run the network in the precision of its weights; the output has the dtype of ``depth``, at least float32."""
+        dtype = self.stem.conv.weight.dtype
+        output = self(guidance.to(dtype), (self.variant.depth_gain * depth).to(dtype))
+        return self.variant.residual_gain * output.to(torch.promote_types(depth.dtype, torch.float32))
 
     def output_size(self, depth: Tensor) -> torch.Size:
         """Return the output's size (H, W) for depth of (..., h, w)."""
@@ -259,13 +277,6 @@ class MSGNet(WindowedNetwork):
         for _ in self.levels:
             seen = (seen + 4 + 1) // 2 + 1  # refinement and fusion, then the transposed convolution
         return seen + 2
-
-    def _pyramid(self, guidance: Tensor) -> list[Tensor]:
-        """Return the guidance features, full resolution first: (B, 32, H, W), (B, 32, H / 2, W / 2), ..."""
-        pyramid = [self.guidance[1](self.guidance[0](guidance))]
-        for layer in self.guidance[2:]:
-            pyramid.append(self.pool(layer(pyramid[-1])))
-        return pyramid
 
     @torch.no_grad()
     def _start_smooth(self) -> None:
@@ -287,47 +298,27 @@ class MSGNet(WindowedNetwork):
                 nn.init.zeros_(layer.bias)
         self.reconstruct.conv.weight.mul_(0.05)
 
-    def _slopes(self, channels: int) -> int:
-        return 1 if self.variant.shared_slopes else channels
+    def _layer(self, conv: nn.Conv2d | nn.ConvTranspose2d, *, active: bool = True) -> ConvLayer:
+        slopes = 1 if self.variant.shared_slopes else conv.out_channels
+        return ConvLayer(conv, slopes if active else 0)
 
     def _conv(self, before: int, after: int, *, kernel: int = 5, active: bool = True) -> ConvLayer:
-        conv = nn.Conv2d(before, after, kernel, padding=kernel // 2)
-        return ConvLayer(conv, self._slopes(after) if active else 0)
+        return self._layer(nn.Conv2d(before, after, kernel, padding=kernel // 2), active=active)
 
     def _up(self, *, first: bool) -> ConvLayer:
-        padding = 2 if first or self.variant.same_size else 1
-        extra = 1 if self.variant.same_size else 0
+        same_size = self.variant.same_size
+        padding, extra = 2 if first or same_size else 1, 1 if same_size else 0
         before = 2 * FEATURES if first else FEATURES
-        conv = nn.ConvTranspose2d(before, FEATURES, 5, stride=2, padding=padding, output_padding=extra)
-        return ConvLayer(conv, self._slopes(FEATURES))
-
-
-def compute_traits(net: MSGNet, rgb: Tensor, disparity: Tensor) -> Traits:
-    """Compute the traits of an image; see :func:`upsample_disparity`."""
-    variant = net.variant
-    intensity = detail = drift = None
-    if not variant.plain_guidance:
-        grey = intensity_of(rgb, variant)
-        intensity, grey = compute_min_max(grey), normalise(grey).values
-        detail = compute_min_max(grey - mean3x3(grey))
-    if variant.drift_compensation:
-        drift = output_drift(net, guidance_map(rgb, variant), normalise(disparity).values)
-    return Traits(intensity, detail, drift)
+        return self._layer(nn.ConvTranspose2d(before, FEATURES, 5, 2, padding, extra))
 
 
 def output_drift(net: MSGNet, guidance: Tensor, disparity: Tensor, *, crop: bool = True) -> Tensor:
-    """Return the constant offset of the network's output, (B, 1, 1, 1).
+    """Return the constant offset of the output of a ``voynov`` network, (B, 1, 1, 1).
 
-    The first quarter of rows and columns of the normalised disparity is set to 0.5. The network's output is averaged
-    over rows h // 16 .. h // 4 - h // 16 and the corresponding columns, where h, w is the low-resolution size and the
-    indices count high-resolution pixels, as in the released code. The offset is 0 where that region is empty.
-
-    Args:
-        net: the network, of the ``voynov`` variant.
-        guidance: (B, 1, H, W) from :func:`guidance_map`.
-        disparity: (B, 1, h, w) from :func:`normalise`.
-        crop: whether to run the network only on the inputs that those pixels depend on: the same value in less time.
-
+    The first quarter of rows and columns of the normalised disparity, (B, 1, h, w), is set to 0.5. The network's output
+    is averaged over rows h // 16 .. h // 4 - h // 16 and the corresponding columns, where the indices count
+    high-resolution pixels, as in the released code. The offset is 0 where that region is empty. With ``crop`` the
+    network runs only on the inputs that those pixels depend on: the same value in less time.
     """
     height, width = disparity.shape[-2:]
     rows, columns = (slice(n // 16, n // 4 - n // 16) for n in (height, width))
@@ -339,50 +330,5 @@ def output_drift(net: MSGNet, guidance: Tensor, disparity: Tensor, *, crop: bool
     if crop:
         height, width = (min(n, net.rows_seen(s.stop)) for n, s in ((height, rows), (width, columns)))
     guidance = guidance[..., : net.scale * height, : net.scale * width]
-    output = residual(net, guidance, probe[..., :height, :width])
+    output = net.residual(guidance, probe[..., :height, :width])
     return output[..., rows, columns].mean((-2, -1), keepdim=True)
-
-
-def residual(net: MSGNet, guidance: Tensor, depth: Tensor) -> Tensor:
-    """Run the network in the precision of its weights; the output has the dtype of ``depth``, at least float32."""
-    dtype = net.stem.conv.weight.dtype
-    output = net(guidance.to(dtype), (net.variant.depth_gain * depth).to(dtype))
-    return net.variant.residual_gain * output.to(torch.promote_types(depth.dtype, torch.float32))
-
-
-def upsample_disparity(
-    net: MSGNet,
-    rgb: Tensor,
-    disparity: Tensor,
-    min_max: Tensor | None = None,
-    traits: Traits | None = None,
-    *,
-    crop_drift: bool = True,
-) -> Tensor:
-    """Upsample disparity with a photo's guidance.
-
-    Args:
-        rgb: (B, 3, H, W) in 0..1, with H = scale * h and W = scale * w.
-        disparity: (B, 1, h, w); non-finite values are holes.
-        min_max: see :meth:`dsr.methods.networks.network.DisparityNetwork.upsample`.
-        traits: traits of the image that this is a window of; None for those of ``rgb`` and ``disparity``.
-        crop_drift: see :func:`output_drift`.
-
-    Returns:
-        (B, 1, H, W) in the unit of the input, (B, 1, H - 1, W - 1) for the ``hui`` variant. It can be negative, and
-        is NaN for a sample without a finite value.
-
-    """
-    values, minimum, value_range = normalise(disparity, min_max)
-    if net.variant.fill_holes:
-        values = inpaint(torch.where(disparity.isfinite(), values, torch.nan))
-    low_pass = mean3x3(values)
-    height, width = net.output_size(values)
-    guidance = guidance_map(rgb, net.variant, traits)[..., :height, :width]
-    output = residual(net, guidance, values - low_pass)
-    if traits is not None and traits.drift is not None:
-        output = output - traits.drift
-    elif net.variant.drift_compensation:
-        output = output - output_drift(net, guidance, values, crop=crop_drift)
-    output = output + upsample_bicubic(low_pass, net.scale)[..., :height, :width]
-    return output * value_range + minimum

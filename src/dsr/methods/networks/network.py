@@ -1,12 +1,13 @@
-"""Base classes of the networks, which map low-resolution disparity and an RGB image to high-resolution disparity."""
+"""The networks, which map low-resolution disparity and an RGB image to high-resolution disparity, and their method."""
 
 from __future__ import annotations
 
 import abc
 import copy
 import inspect
+import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal
@@ -18,7 +19,7 @@ from torch.nn import functional
 from dsr.geometry.camera import from_range, to_range
 from dsr.methods.base import Abilities, Cost, InverseSample, InverseSurface, Method
 from dsr.methods.inpainting import inpaint
-from dsr.methods.networks.normalisation import compute_min_max, normalise
+from dsr.methods.networks.normalisation import compute_min_max
 from dsr.methods.tiling import TILE, UNTILED, AxisTile, blend_tiles, split_axis
 from dsr.sample import DepthSample
 from dsr.utils.compute_device import widened
@@ -33,7 +34,7 @@ _UNKNOWN = torch.tensor(math.nan)
 
 @dataclass(frozen=True)
 class Answer:
-    """The outputs of a network for a batch of images, all (B, 1, H, W).
+    """The outputs of a network for a batch of images, all (B, 1, H, W); those of 16 bits become float32.
 
     Args:
         disparity: in the unit of the input.
@@ -49,24 +50,7 @@ class Answer:
     stages: tuple[Tensor, ...] = ()
 
     def __post_init__(self) -> None:
-        """Take outputs of 16 bits as float32, which losses are computed in."""
         vars(self).update(widened(vars(self)), stages=tuple(map(widened, self.stages)))
-
-
-@dataclass(frozen=True)
-class GlobalContext:
-    """The values of a whole image that a network needs to process windows of it as it processes the image.
-
-    Args:
-        disparity: (B, 1, h, w) low-resolution disparity, inpainted if the network inpaints holes.
-        upsample_window: function from a window of the RGB image, (B, 3, scale * n, scale * m), and one of
-            ``disparity``, (B, 1, n, m), to high-resolution disparity. The result is valid except within the network's
-            receptive-field radius of a window border inside the image.
-
-    """
-
-    disparity: Tensor
-    upsample_window: Callable[[Tensor, Tensor], Tensor]
 
 
 class DisparityNetwork(nn.Module, abc.ABC):
@@ -74,6 +58,8 @@ class DisparityNetwork(nn.Module, abc.ABC):
 
     Attributes:
         scale: upsampling factor.
+        receptive_field_radius: in low-resolution pixels, of a network whose outputs depend on a neighbourhood and a few
+            global values only; large images are then processed in tiles. None for any other network.
         of_inverse_depth: whether it takes inverse depth in place of disparity, which may have an offset.
         states_errors: whether its answers have expected errors, and it is given what is known of the maps.
         covers: whether the output covers the whole image; some published networks leave out a row and a column.
@@ -82,6 +68,7 @@ class DisparityNetwork(nn.Module, abc.ABC):
     """
 
     scale: int
+    receptive_field_radius: int | None = None
     covers: bool = True
     of_inverse_depth: bool = False
     states_errors: bool = False
@@ -95,12 +82,7 @@ class DisparityNetwork(nn.Module, abc.ABC):
         return trained == scale
 
     def start_from(self, first: DisparityNetwork) -> None:
-        """Take over the weights of a trained network, perhaps for another factor.
-
-        Raises:
-            ValueError: it is another kind of network, of another size, or for a factor with other parameters.
-
-        """
+        """Take over the weights of a trained network, perhaps for another factor; a ValueError if they do not fit."""
         if type(first) is not type(self) or {**first.arguments(), "scale": self.scale} != self.arguments():
             raise ValueError(
                 f"expected weights of {type(self).__name__} {self.arguments()}, got those of {type(first).__name__} "
@@ -115,12 +97,7 @@ class DisparityNetwork(nn.Module, abc.ABC):
         self.load_state_dict(first.state_dict())
 
     def share(self, first: DisparityNetwork) -> None:
-        """Take over layers that do not depend on the factor from a trained network, and do not train them.
-
-        Raises:
-            ValueError: there are no such layers, or ``first`` has others.
-
-        """
+        """Take over layers that do not depend on the factor from a trained network, and do not train them."""
         raise ValueError(f"{type(self).__name__} has no layers that do not depend on the factor")
 
     def arguments(self) -> dict[str, Any]:
@@ -135,12 +112,21 @@ class DisparityNetwork(nn.Module, abc.ABC):
             rgb: (B, 3, H, W) in [0, 1], H = scale * h and W = scale * w.
             disparity: (B, 1, h, w) in pixels of the high-resolution camera; non-finite values are holes.
             min_max: (B, 2, 1, 1) minimum and maximum low-resolution disparity of the image that this is a window of,
-                for the normalisation; None for those of ``disparity``.
+                for the normalisation; None for those of ``disparity``. With a receptive-field radius, a network takes
+                all of its :meth:`context` as further arguments.
 
         Returns:
             (B, 1, H, W) in the dtype of ``disparity``; NaN for an image without a valid pixel.
 
         """
+
+    def context(self, rgb: Tensor, disparity: Tensor) -> tuple[Tensor | None, ...]:
+        """Return what windows need to know of the whole image, the range of disparity first."""
+        return (compute_min_max(disparity),)
+
+    def fill(self, disparity: Tensor) -> Tensor:
+        """Return disparity as windows get it: without holes."""
+        return inpaint(disparity)
 
     @staticmethod
     def prepare(batch: Mapping[str, Any]) -> dict[str, Any]:
@@ -148,51 +134,31 @@ class DisparityNetwork(nn.Module, abc.ABC):
         return dict(batch)
 
     def answer_patches(self, batch: Mapping[str, Any]) -> Answer:
-        """Return the outputs that a training compares with the truth, in float32.
+        """Return what a training compares with the truth, in float32, for perhaps prepared patches.
 
-        Args:
-            batch: patches as of :func:`dsr.training.degradation.to_tensors`, with a batch axis, perhaps prepared.
-
+        The patches are as of :func:`dsr.training.degradation.to_tensors`, with a batch axis.
         """
         return Answer(self.upsample(batch["rgb"], batch["disparity_lr"], batch["min_max"]).float())
 
     def answer_scene(self, batch: Mapping[str, Tensor]) -> Tensor:
-        """Return high-resolution disparity to be scored by a validation, (B, 1, H, W).
-
-        Args:
-            batch: a scene as of :class:`dsr.training.data_module.WholeScenes`, with a batch axis.
-
-        """
+        """Return high-resolution disparity, (B, 1, H, W), of a scene with a batch axis that a validation scores."""
         return self.upsample(batch["rgb"], batch["disparity_lr"])
 
 
-class WindowedNetwork(DisparityNetwork):
-    """A network whose outputs depend on a neighbourhood and a few global values only.
-
-    Large images can therefore be processed in tiles; other networks process them without tiles.
-    """
-
-    @property
-    @abc.abstractmethod
-    def receptive_field_radius(self) -> int:
-        """Receptive-field radius in low-resolution pixels."""
-
-    @abc.abstractmethod
-    def global_context(self, rgb: Tensor, disparity: Tensor) -> GlobalContext:
-        """Return the context of an image, to upsample windows of it; see :meth:`upsample` for the arguments."""
-
-
-class RangeNetwork(DisparityNetwork):
+class NormalisedNetwork(DisparityNetwork):
     """A network whose input is an RGB image and inpainted low-resolution disparity, normalised to 0..1.
 
     The output is rescaled to the range of the input, so the network commutes with affine maps of the disparity, and a
-    constant map stays constant. The module maps (B, 3, H, W) and (B, 1, h, w) to (B, 1, H, W).
+    constant map stays constant. The module maps (B, 3, H, W) and (B, 1, h, w) to (B, 1, H, W); for a window it gets
+    what :meth:`context` returns beside the range as further arguments.
     """
 
-    def upsample(self, rgb: Tensor, disparity: Tensor, min_max: Tensor | None = None) -> Tensor:
+    def upsample(
+        self, rgb: Tensor, disparity: Tensor, min_max: Tensor | None = None, *context: Tensor | None
+    ) -> Tensor:
         """Return high-resolution disparity; see :meth:`DisparityNetwork.upsample`."""
         min_max = compute_min_max(disparity) if min_max is None else min_max
-        return self.in_range(inpaint(disparity), min_max, lambda values: (self(rgb, values),))[0]
+        return self._in_range(rgb, inpaint(disparity), min_max, *context)[-1]
 
     @staticmethod
     def prepare(batch: Mapping[str, Any]) -> dict[str, Any]:
@@ -200,59 +166,33 @@ class RangeNetwork(DisparityNetwork):
         return dict(batch) if "filled" in batch else {**batch, "filled": inpaint(batch["disparity_lr"])}
 
     def answer_patches(self, batch: Mapping[str, Any]) -> Answer:
-        """Return the outputs that a training compares with the truth, in float32."""
-        filled = self.prepare(batch)["filled"]
-        stages = self.in_range(filled, batch["min_max"], lambda values: self.compute_stages(batch["rgb"], values))
-        return Answer(stages[-1].float(), stages=tuple(each.float() for each in stages[:-1]))
+        """Return the maps of all stages; see :meth:`DisparityNetwork.answer_patches`."""
+        maps = self._in_range(batch["rgb"], self.prepare(batch)["filled"], batch["min_max"])
+        *stages, disparity = (each.float() for each in maps)
+        return Answer(disparity, stages=tuple(stages))
 
-    def compute_stages(self, rgb: Tensor, values: Tensor) -> tuple[Tensor, ...]:
-        """Return the maps of the network's stages, which a training compares with the truth; the result last."""
-        return (self(rgb, values),)
+    def compute_stages(self, rgb: Tensor, values: Tensor, *context: Tensor | None) -> tuple[Tensor, ...]:
+        """Return the normalised maps of the network's stages, which a training compares with the truth; result last."""
+        return (self(rgb, values, *context),)
 
-    @staticmethod
-    def in_range(
-        filled: Tensor, min_max: Tensor, compute: Callable[[Tensor], tuple[Tensor, ...]]
-    ) -> tuple[Tensor, ...]:
-        """Return the maps that ``compute`` makes of normalised disparity without holes, in the disparity's unit."""
-        _, minimum, value_range = normalise(filled, min_max)
-        varies = value_range > 0
-        value_range = torch.where(varies, value_range, 1)
-        values = (filled - minimum) / value_range
-        return tuple(torch.where(varies, values * value_range, 0) + minimum for values in compute(values))
-
-
-class NormalisedNetwork(RangeNetwork, WindowedNetwork):
-    """A :class:`RangeNetwork` whose outputs depend on a neighbourhood and a few global values only.
-
-    For a window, the :meth:`context` of the whole image is passed to the module as further arguments.
-    """
-
-    def global_context(self, rgb: Tensor, disparity: Tensor) -> GlobalContext:
-        """Return a context with the disparity's range and the :meth:`context` of the whole image."""
-        min_max, context = compute_min_max(disparity), self.context(rgb)
-        return GlobalContext(
-            inpaint(disparity),
-            lambda rgb, window: self.in_range(window, min_max, lambda values: (self(rgb, values, *context),))[0],
-        )
-
-    def context(self, rgb: Tensor) -> tuple[Tensor, ...]:
-        """Return the global values that the network computes from the whole image, (B, 3, H, W)."""
-        return ()
+    def _in_range(self, rgb: Tensor, filled: Tensor, min_max: Tensor, *context: Tensor | None) -> tuple[Tensor, ...]:
+        """Return the maps of the stages in the unit of disparity without holes."""
+        expect_rgb_size(rgb, filled, self.scale)
+        low, high = min_max.to(filled).split(1, dim=1)
+        extent = high - low  # -inf where nothing is finite
+        low = torch.where(extent >= 0, low, torch.nan)
+        varies = extent > 0
+        extent = torch.where(varies, extent, 1)
+        maps = self.compute_stages(rgb, (filled - low) / extent, *context)
+        return tuple(torch.where(varies, each * extent, 0) + low for each in maps)
 
 
 def expect_rgb_size(rgb: Tensor, values_lr: Tensor, scale: int) -> None:
-    """Check that an RGB image, (..., H, W), is ``scale`` times the size of a low-resolution map, (..., h, w).
-
-    Raises:
-        ValueError: it is not.
-
-    """
-    expected, came = tuple(scale * n for n in values_lr.shape[-2:]), tuple(rgb.shape[-2:])
+    """Check that an RGB image, (..., H, W), is ``scale`` times the size of a low-resolution map, (..., h, w)."""
+    size, came = tuple(values_lr.shape[-2:]), tuple(rgb.shape[-2:])
+    expected = tuple(scale * n for n in size)
     if came != expected:
-        size = tuple(values_lr.shape[-2:])
-        raise ValueError(
-            f"rgb: expected {expected} pixels for a low-resolution map of {size} at scale {scale}, got {came}"
-        )
+        raise ValueError(f"rgb: expected {expected} pixels for a map of {size} at scale {scale}, got {came}")
 
 
 class NetworkUpsampler(Method):
@@ -275,8 +215,7 @@ class NetworkUpsampler(Method):
         tile: side of a tile in high-resolution pixels; None for ``TILE``, and no tiles up to ``UNTILED`` pixels.
 
     Raises:
-        ValueError: the precision or the ensemble is not supported, the ensemble is larger than 1 for a network that
-            leaves out pixels, or a tile is smaller than a low-resolution pixel.
+        ValueError: the precision or the ensemble is not supported, or not for a network that leaves out pixels.
 
     """
 
@@ -296,11 +235,7 @@ class NetworkUpsampler(Method):
             raise ValueError(f"ensemble: expected one of {', '.join(map(str, ENSEMBLES))}, got {ensemble!r}")
         if ensemble > 1 and not net.covers:
             raise ValueError(f"ensemble: expected 1 for a network that leaves out pixels, got {ensemble}")
-        if tile is not None and tile < net.scale:
-            raise ValueError(f"tile: expected at least {net.scale} pixels, the scale, got {tile}")
-        self.ensemble = ensemble
-        self.tile = tile
-        self.device = torch.device(device)
+        self.ensemble, self.tile, self.device = ensemble, tile, torch.device(device)
         net = copy.deepcopy(net).eval().requires_grad_(False).to(self.device, DTYPES[precision])
         self.net = net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs lack it
 
@@ -334,67 +269,45 @@ class NetworkUpsampler(Method):
         Args:
             rgb: (B, 3, H, W) in [0, 1].
             disparity_lr: (B, 1, h, w) in pixels of the high-resolution camera; non-finite values are holes.
-            progress: called after each augmentation, or each augmentation of each tile.
+            progress: called after each augmentation of the image or of each tile.
 
         """
-        net = self._tiled_network(rgb.shape[-2], rgb.shape[-1])
-        if net is None:
-            return self._average_transforms(
-                lambda index: self.net.upsample(apply_dihedral(rgb, index), apply_dihedral(disparity_lr, index)),
-                progress,
-            )
-        rows, columns = (self._split_axis(n, net) for n in disparity_lr.shape[-2:])
-        contexts = [
-            net.global_context(apply_dihedral(rgb, index), apply_dihedral(disparity_lr, index))
-            for index in range(self.ensemble)
-        ]
-        total, done, scale = len(rows) * len(columns) * self.ensemble, 0, self.net.scale
-
-        def count(part: int, parts: int) -> None:
-            nonlocal done
-            done += 1
-            if progress is not None:
-                progress(done, total)
+        net, scale = self.net, self.net.scale
+        rows, columns = self._tiles(*rgb.shape[-2:])
+        count = len(rows) * len(columns)
+        contexts: list[tuple[Tensor | None, ...]] = [()] * self.ensemble
+        given = disparity_lr
+        if count > 1:
+            images = ([apply_dihedral(each, index) for each in (rgb, disparity_lr)] for index in range(self.ensemble))
+            contexts = [net.context(*image) for image in images]
+            given = net.fill(disparity_lr)
+        done = itertools.count(1)
 
         def compute(row: slice, column: slice) -> Tensor:
             window = rgb[..., scale * row.start : scale * row.stop, scale * column.start : scale * column.stop]
-            window_lr = contexts[0].disparity[..., row, column]
-            return self._average_transforms(
-                lambda index: contexts[index].upsample_window(
-                    apply_dihedral(window, index), apply_dihedral(window_lr, index)
-                ),
-                count,
-            )
+            results = []
+            for index, context in enumerate(contexts):
+                turned = [apply_dihedral(each, index) for each in (window, given[..., row, column])]
+                results.append(undo_dihedral(net.upsample(*turned, *context), index))
+                if progress is not None:
+                    progress(next(done), count * self.ensemble)
+            return sum(results[1:], results[0]) / self.ensemble
 
         return blend_tiles(compute, rows, columns, scale)
 
     def count_steps(self, height: int, width: int) -> int:
         """Return the total that ``progress`` receives for an image of height x width pixels."""
-        net = self._tiled_network(height, width)
-        if net is None:
-            return self.ensemble
-        tiles = [len(self._split_axis(n // net.scale, net)) for n in (height, width)]
-        return tiles[0] * tiles[1] * self.ensemble
+        rows, columns = self._tiles(height, width)
+        return len(rows) * len(columns) * self.ensemble
 
-    def _tiled_network(self, height: int, width: int) -> WindowedNetwork | None:
-        """Return the network if it processes images of height x width pixels in tiles, else None."""
-        large = self.tile is not None or height * width > UNTILED
-        return self.net if large and isinstance(self.net, WindowedNetwork) else None
-
-    def _split_axis(self, size: int, net: WindowedNetwork) -> list[AxisTile]:
-        """Return the tiles along an axis of ``size`` low-resolution pixels."""
-        return split_axis(size, (self.tile or TILE) // net.scale, net.receptive_field_radius, _OVERLAP)
-
-    def _average_transforms(self, compute: Callable[[int], Tensor], progress: Steps | None) -> Tensor:
-        """Return the mean of ``compute`` over the dihedral transforms, each result transformed back."""
-        total = compute(0)
-        for index in range(1, self.ensemble):
-            if progress is not None:
-                progress(index, self.ensemble)
-            total += undo_dihedral(compute(index), index)
-        if progress is not None:
-            progress(self.ensemble, self.ensemble)
-        return total / self.ensemble
+    def _tiles(self, height: int, width: int) -> tuple[list[AxisTile], list[AxisTile]]:
+        """Return the tiles along both axes of an image, of which there may be one alone."""
+        scale, radius = self.net.scale, self.net.receptive_field_radius
+        sizes = height // scale, width // scale
+        whole = radius is None or (self.tile is None and height * width <= UNTILED)
+        tile = max(sizes) if whole else (self.tile or TILE) // scale
+        rows, columns = (split_axis(size, tile, radius or 0, _OVERLAP) for size in sizes)
+        return rows, columns
 
 
 def apply_dihedral(x: Tensor, index: int) -> Tensor:

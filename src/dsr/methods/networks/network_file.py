@@ -1,4 +1,4 @@
-"""A network as an ONNX or TorchScript file, whose inputs and result are declared, as a method.
+"""A network as an ONNX file, whose inputs and result are declared, as a method.
 
 What a network's authors did to its inputs is no part of its file: which quantity its depth is, what became 0..1, and
 how the map was enlarged. The configuration declares it.
@@ -44,22 +44,18 @@ _IMAGES: Mapping[str, Callable[[Tensor], Tensor]] = {
 }
 _MAPS = ("lr", "up", "valid")
 CONTENTS = (*_IMAGES, *_MAPS)
-"""What an input may get: the photo in 0..1, in 0..255, normalised as for ImageNet, or its luma; the low-resolution map,
-that map enlarged by Keys' cubic kernel to the photo's size, and where the low-resolution map is known (bool)."""
 SAME, RESIDUAL, MEASURED = "same", "residual", "measured"
 OUTPUTS = (SAME, RESIDUAL, *QUANTITIES)
-TORCHSCRIPT = (".pt", ".pth", ".ts", ".torchscript")
-_Run = Callable[[dict[str, Tensor]], Tensor]
 
 
 class NetworkFile(Method):
     """A method that is a network's file.
 
     Args:
-        path: ``.onnx``, which needs ``pip install -e '.[onnx]'``, or TorchScript, one of ``TORCHSCRIPT``. TorchScript
-            is a program: only load one that you trust.
-        inputs: one of ``CONTENTS`` for each input, by name; of TorchScript in the order of its arguments. Pictures are
-            (1, C, H, W) float32.
+        path: ``.onnx``, which needs ``pip install -e '.[onnx]'``.
+        inputs: what each input gets, by its name, (1, C, H, W) float32: ``image``, the photo in 0..1; ``image255``;
+            ``imagenet``, normalised as for ImageNet; ``grey``, its luma; ``lr``, the low-resolution map; ``up``, that
+            map enlarged by Keys' cubic kernel to the photo's size; ``valid``, where the map is known (bool).
         range_type: what the depth inputs measure, and the type that the low-resolution map is averaged in:
             ``orthogonal``, ``perspective``, ``disparity`` in pixels of the photo's camera, or ``inverse`` in 1/m, which
             is averaged as disparity.
@@ -69,11 +65,10 @@ class NetworkFile(Method):
             to be added to the enlarged map; or a quantity as it is, of :data:`dsr.methods.external.QUANTITIES`.
         fit: of the result to the low-resolution map, in the quantity that it measures: ``scale``, ``affine``, or None
             for a network that is metric. See :func:`dsr.methods.external.fit_to_map`.
-        result: name of the output of an ONNX file; None for its first.
+        result: name of the output; None for the first.
         size: height and width that photos are resized to by Keys' cubic kernel, and the result bilinearly back, for a
             network that sees the photo alone; None for the photo's.
         multiple: the number that has to divide the height and width; the photo is continued at the right and bottom.
-        device: where to compute.
 
     Raises:
         ValueError: the file is missing, damaged or of another kind, or a declaration does not fit it.
@@ -96,23 +91,21 @@ class NetworkFile(Method):
         device: torch.device | str = "cpu",
     ) -> None:
         self._path = Path(path).expanduser()
-        if self._path.suffix.lower() not in (".onnx", *TORCHSCRIPT):
-            raise ValueError(f"path: expected a file {', '.join(('.onnx', *TORCHSCRIPT))}, got {path}")
-        if not self._path.is_file():
-            raise ValueError(f"path: expected a network's file, got {path} (no such file)")
+        if self._path.suffix.lower() != ".onnx" or not self._path.is_file():
+            raise ValueError(f"path: expected an existing file *.onnx, got {path}")
         for key, value, known in (
             ("range_type", range_type, QUANTITIES),
             ("output", output, OUTPUTS),
             ("fit", fit, (None, *get_args(Fit))),
+            *((f"inputs.{name}", content, CONTENTS) for name, content in inputs.items()),
         ):
             expect_one_of(key, value, known)
         self._inputs = dict(inputs)
-        for name, content in self._inputs.items():
-            if content not in CONTENTS:
-                raise ValueError(f"inputs.{name}: expected one of {', '.join(CONTENTS)}, got {content!r}")
-        if not self._inputs:
-            raise ValueError(f"inputs: expected one of {', '.join(CONTENTS)} for each input, got none")
-        self._limits = None if range in (None, MEASURED) else _limits(range)
+        self._limits = None
+        if range not in (None, MEASURED):
+            if isinstance(range, str) or len(range) != 2 or not range[0] < range[1]:
+                raise ValueError(f"range: expected {MEASURED}, null or two numbers that rise, got {range!r}")
+            self._limits = torch.tensor([float(each) for each in range], dtype=torch.float64).view(1, 2, 1, 1)
         if multiple < 1:
             raise ValueError(f"multiple: expected 1 or more, got {multiple}")
         sees_map = set(self._inputs.values()) & set(_MAPS) or output == RESIDUAL
@@ -124,9 +117,9 @@ class NetworkFile(Method):
         self._quantity, self._scaled, self._output = range_type, range is not None, output
         self._fit: Fit | None = fit  # type: ignore[assignment]  # it has been checked
         self._result, self._multiple, self.device = result, multiple, torch.device(device)
-        self._weights = self._files_of_weights() if self._path.suffix.lower() == ".onnx" else []
-        self._runs: dict[int, _Run] = {}
-        self._load(threads=1)  # its errors, before anything is computed
+        self._weights = self._files_of_weights()
+        self._sessions: dict[int, Any] = {}  # by process: a worker has one of its own
+        self._session(threads=1)  # its errors, before anything is computed
 
     @torch.inference_mode()
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
@@ -152,12 +145,13 @@ class NetworkFile(Method):
             name: self._padded(_IMAGES[content](rgb) if content in _IMAGES else pictures[content], size)
             for name, content in self._inputs.items()
         }
-        if os.getpid() not in self._runs:  # a worker has a program of its own
-            self._runs[os.getpid()] = self._load(torch.get_num_threads())
+        if os.getpid() not in self._sessions:
+            self._sessions[os.getpid()] = self._session(torch.get_num_threads())
         with refusing(f"{self._path}: expected a network for {size[0]} x {size[1]} pixels, it failed", Exception):
-            found = self._runs[os.getpid()](given)
+            session, inputs = self._sessions[os.getpid()], {name: each.cpu().numpy() for name, each in given.items()}
+            found = torch.from_numpy(session.run([self._result or session.get_outputs()[0].name], inputs)[0])
         found = found.reshape(1, 1, *found.shape[-2:]) if found.numel() == found.shape[-2:].numel() else found
-        if found.dim() != 4 or found.shape[:2] != (1, 1) or any(map(int.__lt__, found.shape[-2:], size)):
+        if found.dim() != 4 or found.shape[:2] != (1, 1) or found.shape[-2] < size[0] or found.shape[-1] < size[1]:
             raise ValueError(f"{self._path}: expected a map of {size[0]} x {size[1]}, got {tuple(found.shape)}")
         values = found[..., : size[0], : size[1]].to(values_lr)
         if self._output in (SAME, RESIDUAL):
@@ -205,12 +199,8 @@ class NetworkFile(Method):
         padding = (0, int(steps[1]), 0, int(steps[0]))
         return functional.pad(picture.float(), padding, mode="replicate").to(picture.dtype)
 
-    def _load(self, threads: int) -> _Run:
-        """Return a function that runs the network."""
-        return self._load_onnx(threads) if self._path.suffix.lower() == ".onnx" else self._load_torchscript()
-
-    def _load_onnx(self, threads: int) -> _Run:
-        """Return a function that runs an ONNX file, in a session that begins with it."""
+    def _session(self, threads: int) -> Any:
+        """Return a session of onnxruntime, whose inputs and outputs are those that are declared."""
         runtime = import_library("onnxruntime", f"method.path={self._path}")
         options = runtime.SessionOptions()
         options.intra_op_num_threads, options.log_severity_level = threads, 3
@@ -223,34 +213,4 @@ class NetworkFile(Method):
         results = [each.name for each in session.get_outputs()]
         if self._result is not None and self._result not in results:
             raise ValueError(f"result: expected one of {', '.join(results)}, got {self._result!r}")
-        result = self._result or results[0]
-
-        def run(given: dict[str, Tensor]) -> Tensor:
-            (found,) = session.run([result], {name: each.cpu().numpy() for name, each in given.items()})
-            return torch.from_numpy(found)
-
-        return run
-
-    def _load_torchscript(self) -> _Run:
-        """Return a function that runs a TorchScript file."""
-        if self._result is not None:
-            raise ValueError(
-                f"result: expected null for TorchScript, whose first result is taken, got {self._result!r}"
-            )
-        with refusing(f"{self._path}: expected a TorchScript file, got a damaged or foreign one", Exception):
-            module = torch.jit.load(str(self._path), map_location=self.device).eval()
-
-        def run(given: dict[str, Tensor]) -> Tensor:
-            found: Any = module(*given.values())
-            while not isinstance(found, Tensor):
-                found = next(iter(found.values() if isinstance(found, Mapping) else found))
-            return found
-
-        return run
-
-
-def _limits(given: Any) -> Tensor:
-    """Return the values that become 0 and 1, (1, 2, 1, 1)."""
-    if isinstance(given, str) or len(given) != 2 or not given[0] < given[1]:
-        raise ValueError(f"range: expected {MEASURED}, null or two numbers that rise, got {given!r}")
-    return torch.tensor([float(each) for each in given], dtype=torch.float64).view(1, 2, 1, 1)
+        return session

@@ -27,10 +27,7 @@ def normalise(x: Tensor, min_max: Tensor | None = None) -> Normalised:
 
     A constant map becomes 0 with a range of 0. Without a finite value, the minimum is NaN.
 
-    Args:
-        x: (B, 1, H, W) map.
-        min_max: (B, 2, 1, 1) minimum and maximum to use; None for those of the map.
-
+    ``min_max`` (B, 2, 1, 1) are the minimum and maximum to use; None for those of the map.
     """
     valid = x.isfinite()
     min_max = compute_min_max(x) if min_max is None else min_max.to(x)

@@ -32,25 +32,13 @@ from dsr.utils.versions import how_to_install
 INPUTS = ("photo", "inverse_depth", "valid")
 RESULT = "inverse_depth_hr"
 ERRORS = ("relative_error", "angle_error")
-_OPSET = 18
-"""The first one whose Resize knows the border of Keys' kernel."""
-_TRACED, _CHECKED = (24, 40), (19, 33)
-"""Low-resolution sizes, height and width, of the maps that the graph is traced and checked with."""
-_TOLERANCE = 1e-4
-"""Largest difference between the graph's and the network's result, over the range of the result."""
+_OPSET = 18  # the first one whose Resize knows the border of Keys' kernel
+_TRACED, _CHECKED = (24, 40), (19, 33)  # low-resolution heights and widths that the graph is traced and checked with
+_TOLERANCE = 1e-4  # largest difference between the graph's and the network's result, over the range of the result
 
 
 class OnnxGraph(nn.Module):
-    """What an ONNX file computes, as a module.
-
-    Args:
-        net: the network, which is changed to evaluate.
-        scale: upsampling factor: the network's, or 1 for a network that serves it.
-
-    Raises:
-        ValueError: the network is not for this factor.
-
-    """
+    """What an ONNX file computes, as a module: the network at its own scale, or at 1 if it serves that, too."""
 
     def __init__(self, net: DisparityNetwork, scale: int) -> None:
         super().__init__()
@@ -88,17 +76,10 @@ class OnnxGraph(nn.Module):
 
 
 def write_onnx(path: Path, graph: OnnxGraph, facts: Mapping[str, Any]) -> float:
-    """Write a network as an ONNX file, atomically, after checking that its results are the network's.
+    """Write a network as an ONNX file with facts as metadata, atomically, after comparing its results.
 
-    Args:
-        facts: plain values that become the file's metadata.
-
-    Returns:
-        The largest difference in the check, over the range of the result.
-
-    Raises:
-        ValueError: `onnx` or `onnxruntime` is not installed, or the results differ.
-
+    Return the largest difference, over the range of the result; a ValueError if they differ, or if `onnx` or
+    `onnxruntime` is not installed.
     """
     onnx, runtime = import_library("onnx", "--onnx"), import_library("onnxruntime", "--onnx")
     with replacing(path) as temporary:

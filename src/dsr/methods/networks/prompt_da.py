@@ -33,10 +33,10 @@ from dsr.utils.guards import expect_bytes, parse_json, read_limited, refusing
 from dsr.utils.progress import Steps
 from dsr.utils.versions import hash_once
 
-SIZE = 756
-"""Side in pixels to which the authors' processor brings photos, that which has to be changed less."""
+SIZE = 756  # side in pixels to which the authors' processor brings photos, that which has to be changed less
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 _HUB_NAME = re.compile(r"[\w.-]+/[\w.-]+")
+# what is read of a configuration; the rest can name code and files that are to be fetched
 _NETWORK = (
     "patch_size", "reassemble_hidden_size", "reassemble_factors", "neck_hidden_sizes", "fusion_hidden_size",
     "head_in_index", "head_hidden_size", "depth_estimation_type", "max_depth",
@@ -46,9 +46,7 @@ _BACKBONE = (
     "image_size", "patch_size", "num_channels", "qkv_bias", "layerscale_value", "use_swiglu_ffn", "out_indices",
     "out_features", "apply_layernorm", "reshape_hidden_states", "use_mask_token",
 )  # fmt: skip
-"""What is read of a configuration; the rest can name code and files that are to be fetched."""
-_LARGEST = 4096
-"""Largest whole number in a configuration."""
+_LARGEST = 4096  # largest whole number in a configuration
 
 
 class PromptDA(Method):
@@ -63,11 +61,6 @@ class PromptDA(Method):
             its cache, or else fetched. Nothing but these two files is read, and no code in them is executed.
         size: to which that side of the photo is brought, at its aspect, that has to be changed less; both sides are
             rounded to multiples of the backbone's patches.
-        device: where to compute.
-
-    Raises:
-        ValueError: ``transformers`` is missing, there are no such files, they are damaged or of another network, or
-            ``size`` is less than a patch.
 
     """
 
@@ -93,13 +86,7 @@ class PromptDA(Method):
         return within_limits(depth).to(sample.depth_lr)
 
     def predict(self, rgb: Tensor, prompt: Tensor) -> Tensor:
-        """Return depth in metres, (B, 1, H, W) on the network's device.
-
-        Args:
-            rgb: (B, 3, H, W) photos in 0..1.
-            prompt: (B, 1, h, w) low-resolution depth in metres, without holes.
-
-        """
+        """Return depth in metres, (B, 1, H, W), of photos (B, 3, H, W) in 0..1 and depth (B, 1, h, w) without holes."""
         size = (rgb.shape[-2], rgb.shape[-1])
         photo = resize_bicubic(rgb.to(torch.float64), self._size_within(size)).clamp(0, 1)  # as exact as Pillow's
         flat = prompt.amax(dim=(-2, -1), keepdim=True) == prompt.amin(dim=(-2, -1), keepdim=True)

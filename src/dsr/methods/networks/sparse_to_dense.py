@@ -28,15 +28,14 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.methods.exportable import pad_to_multiple
-from dsr.methods.networks.network import RangeNetwork, expect_rgb_size
+from dsr.methods.networks.network import NormalisedNetwork
 from dsr.utils.ratios import check_scale
 
-_STRIDE = 32
-"""The photo's pixels, along an axis, for each pixel of the encoder's result."""
+_STRIDE = 32  # the photo's pixels, along an axis, for each pixel of the encoder's result
 _STAGES = 4
 
 
-class SparseToDense(RangeNetwork):
+class SparseToDense(NormalisedNetwork):
     """The network.
 
     An image is processed as a whole, because the receptive field is wider than most images, in about 150 bytes for each
@@ -45,9 +44,6 @@ class SparseToDense(RangeNetwork):
     Args:
         scale: upsampling factor, 2, 4, 8 or 16.
         width: channels of the first residual blocks, a multiple of 4; the original has 64.
-
-    Raises:
-        ValueError: a value is out of range.
 
     """
 
@@ -73,7 +69,6 @@ class SparseToDense(RangeNetwork):
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
         """Return normalised disparity (B, 1, H, W) for (B, 3, H, W) and (B, 1, h, w); see the base class."""
-        expect_rgb_size(rgb, values, self.scale)
         height, width = rgb.shape[-2:]
         factor = max(_STRIDE // self.scale, 1)
         samples = place_samples(pad_to_multiple(values, factor) + 1, self.scale)
@@ -88,13 +83,7 @@ class SparseToDense(RangeNetwork):
 
 
 class ResidualBlock(nn.Module):
-    """Two 3 x 3 convolutions and a shortcut; a block that changes the number of channels halves the size.
-
-    Args:
-        before: channels of the input.
-        after: channels of the output.
-
-    """
+    """Two 3 x 3 convolutions and a shortcut; a block that changes the number of channels halves the size."""
 
     def __init__(self, before: int, after: int) -> None:
         super().__init__()
@@ -116,12 +105,7 @@ class ResidualBlock(nn.Module):
 
 
 class UpProjection(nn.Module):
-    """An up-projection, which doubles the size and halves the channels.
-
-    Args:
-        before: channels of the input.
-
-    """
+    """An up-projection, which doubles the size and halves the channels."""
 
     def __init__(self, before: int) -> None:
         super().__init__()
@@ -141,12 +125,7 @@ class UpProjection(nn.Module):
 
 
 class BatchNorm(nn.Module):
-    """Batch normalisation without the library's counter of batches, so that its state consists of real numbers alone.
-
-    Args:
-        channels: channels of the input.
-
-    """
+    """Batch normalisation without the library's counter of batches, so that its state is real numbers alone."""
 
     running_mean: Tensor
     running_var: Tensor

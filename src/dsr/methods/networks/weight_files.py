@@ -14,21 +14,19 @@ import torch
 from torch import Tensor, nn
 
 from dsr.methods.networks.network import DisparityNetwork
-from dsr.utils.guards import expect_bytes, opened, parse_json
+from dsr.utils.guards import expect_bytes, opened, parse_json, refusing
 
 FORMAT = "dsr-network-1"
-_KEY = "dsr"
-_LARGEST_ARGUMENT = 4096
-"""Largest whole number among the arguments of a network in a file of weights."""
-_SHARED = "shared"
+_KEY, _SHARED = "dsr", "shared"
+_DAMAGED = "expected a safetensors file, got a damaged one"
+_LARGEST_ARGUMENT = 4096  # largest whole number among the arguments of a network in a file of weights
 LINKS: Mapping[str, str] = MappingProxyType(
     {
         _SHARED: "whose layers it shares",
         "clean": "for box means without noise",
         "soft": "for bicubic maps without noise, with soft depth steps",
     }
-)
-"""Keys of the files beside a file that it names, and what they are for."""
+)  # keys of the files beside a file that it names, and what they are for
 
 
 def save_network(
@@ -57,19 +55,16 @@ def save_network(
         "arguments": net.arguments(),
         "model": model,
         "facts": dict(facts or {}),
+        **{key: other.name for key, other in links.items()},
     }
     tensors = {
         name: value.detach().to("cpu", torch.float16 if half and value.dim() > 1 else value.dtype).contiguous()
         for name, value in net.state_dict().items()
     }
-    header |= {key: other.name for key, other in links.items()}
-    if _SHARED in links:
-        there = _read_tensors(links[_SHARED])
-        tensors = {
-            name: value
-            for name, value in tensors.items()
-            if name not in there or there[name].dtype != value.dtype or not torch.equal(there[name], value)
-        }
+    there = _read_tensors(links[_SHARED]) if _SHARED in links else {}
+    for name, value in there.items():
+        if name in tensors and tensors[name].dtype == value.dtype and torch.equal(tensors[name], value):
+            del tensors[name]
     safetensors.torch.save_file(tensors, path, {_KEY: json.dumps(header, sort_keys=True)})
 
 
@@ -95,11 +90,8 @@ def read_header(path: Path) -> dict[str, Any]:
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such weights file")
-    try:
-        with safetensors.safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-    except Exception as error:  # the library names no set of errors for damaged files
-        raise ValueError(f"{path}: expected a safetensors file, got a damaged one ({type(error).__name__})") from error
+    with refusing(f"{path}: {_DAMAGED}", Exception), safetensors.safe_open(path, framework="pt") as file:
+        metadata = file.metadata() or {}
     try:
         header = dict(parse_json(metadata[_KEY]))
         if header["format"] == FORMAT and header.keys() >= {"network", "arguments", "model"}:
@@ -128,11 +120,12 @@ def load_network(
     header = read_header(path)
     if model is not None and header["model"] != model:
         raise ValueError(f"{path}: expected weights of model {model}, got those of {header['model']}")
+    shared = _beside(path, header, _SHARED)
     try:
         kind, arguments = networks[header["network"]], dict(header["arguments"])
         if scale is not None and kind.serves(arguments["scale"], scale):
             arguments["scale"] = scale
-        net = make_network(path, kind, arguments, _beside(path, header, _SHARED))
+        net = make_network(path, kind, arguments, shared)
     except (KeyError, TypeError, ValueError) as error:
         names = ", ".join(networks)
         raise ValueError(
@@ -141,32 +134,20 @@ def load_network(
     if scale is not None and net.scale != scale:
         raise ValueError(f"{path}: weights are for scale {net.scale}, the run is at scale {scale}")
     tensors = _read_tensors(path)
-    if (other := _beside(path, header, _SHARED)) is not None:
+    if shared is not None:
         needed = net.state_dict().keys()
-        tensors = {name: value for name, value in _read_tensors(other).items() if name in needed} | tensors
+        tensors = {name: value for name, value in _read_tensors(shared).items() if name in needed} | tensors
     load_parameters(net, tensors, path, f"{header['network']} at scale {net.scale}")
     return net
 
 
 def special_weights(path: Path, kind: Literal["clean", "soft"]) -> Path | None:
-    """Return the file of weights for maps of a kind, see ``LINKS``, if the file names one beside it.
-
-    Raises:
-        FileNotFoundError: there is no such file, or the other one is missing.
-        ValueError: the file is damaged or not a dsr weights file.
-
-    """
+    """Return the file of weights for maps of a kind, see ``LINKS``, if the file names one beside it."""
     return _beside(path, read_header(path), kind)
 
 
 def files_of_weights(path: Path) -> list[Path]:
-    """Return a file of weights and those beside it that it needs; one that is not dsr's is alone.
-
-    Raises:
-        FileNotFoundError: one is missing.
-        ValueError: one is damaged.
-
-    """
+    """Return a file of weights and those beside it that it needs; one that is not dsr's is alone."""
     if not is_dsr_weights(path):
         return [path]
     header, found = read_header(path), {path: None}
@@ -192,9 +173,7 @@ def make_network(
 ) -> DisparityNetwork:
     """Return a network without values, or one of the user's with random ones, which may need them as it is made.
 
-    Raises:
-        ValueError: it would be larger than the file that names its arguments, with the one that it shares layers of.
-
+    A ValueError if it would be larger than the file that names its arguments, with the one that it shares layers of.
     """
     if any(isinstance(value, int) and abs(value) > _LARGEST_ARGUMENT for value in arguments.values()):
         raise ValueError(f"{path}: expected sizes of a network of at most {_LARGEST_ARGUMENT}")
@@ -209,35 +188,17 @@ def make_network(
 
 
 def _read_tensors(path: Path) -> dict[str, Tensor]:
-    """Return the tensors of a safetensors file by name."""
-    try:
+    with refusing(f"{path}: {_DAMAGED}", Exception):
         return dict(safetensors.torch.load(path.read_bytes()))
-    except Exception as error:  # the library names no set of errors for damaged files
-        raise ValueError(f"{path}: expected a safetensors file, got a damaged one ({type(error).__name__})") from error
 
 
 def load_parameters(net: nn.Module, tensors: Mapping[str, Tensor], path: Path, expected: str) -> None:
     """Check the tensors of a file and load them into a network.
 
-    Args:
-        tensors: tensors by parameter name.
-        path: path of the file, for the message.
-        expected: description of the expected network, for the message.
-
-    Raises:
-        ValueError: a tensor is missing, unexpected, of another shape or dtype, or not finite.
-
+    A ValueError names one that is missing, unexpected, of another shape or dtype, or not finite; ``expected`` describes
+    the network.
     """
     shapes = {name: tuple(value.shape) for name, value in net.state_dict().items()}
-    problems = _find_mismatches(tensors, shapes)
-    if problems:
-        found = problems[0] if len(problems) == 1 else f"{problems[0]}, and {len(problems) - 1} more do not fit"
-        raise ValueError(f"{path}: expected the tensors of {expected}, but {found}")
-    net.load_state_dict({name: value.float().contiguous() for name, value in tensors.items()}, assign=True)
-
-
-def _find_mismatches(tensors: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...]]) -> list[str]:
-    """Describe the tensors that are missing, unexpected, of another shape or dtype, or not finite."""
     problems = [f"{name} is missing" for name in shapes if name not in tensors]
     problems += [f"{name!r} is unexpected" for name in tensors if name not in shapes]
     for name, value in ((name, tensors[name]) for name in shapes if name in tensors):
@@ -245,4 +206,7 @@ def _find_mismatches(tensors: Mapping[str, Tensor], shapes: Mapping[str, tuple[i
             problems.append(f"{name} has shape {tuple(value.shape)} instead of {shapes[name]}")
         elif not value.is_floating_point() or not bool(value.isfinite().all()):
             problems.append(f"{name} holds values other than finite real numbers")
-    return problems
+    if problems:
+        found = problems[0] if len(problems) == 1 else f"{problems[0]}, and {len(problems) - 1} more do not fit"
+        raise ValueError(f"{path}: expected the tensors of {expected}, but {found}")
+    net.load_state_dict({name: value.float().contiguous() for name, value in tensors.items()}, assign=True)

@@ -20,13 +20,12 @@ from torch.nn import functional
 
 from dsr.methods.base import Cost
 from dsr.methods.networks.dct import dct2, idct2, laplacian_eigenvalues
-from dsr.methods.networks.normalisation import normalise_imagenet, resize_bicubic
+from dsr.methods.networks.normalisation import normalise_imagenet
 from dsr.methods.networks.peers.peer_network import PeerNetwork, rename
 
 FEATURES = 64
 _LAYERS = 4
-_CHUNK = 2**20
-"""Number of values that the transforms process at once, so that they stay in the processor's cache."""
+_CHUNK = 2**20  # values that the transforms process at once, so that they stay in the processor's cache
 _UNUSED = "WPNet.conv_dilation."
 _RENAMED = {
     r"^WPNet\.": "attention.",
@@ -44,7 +43,6 @@ class EdgeAttention(nn.Module):
     """Weights in 0..1 of the photo's edges, from the photo's features and from a coarse map of them."""
 
     def __init__(self) -> None:
-        """Make the layers."""
         super().__init__()
         inner = FEATURES // 4
         self.conv1 = nn.Conv2d(FEATURES, inner, 1)
@@ -70,28 +68,24 @@ class CoupledConv(nn.Module):
     """A convolution of the depth's features and one of the photo's, which share half of their kernels."""
 
     def __init__(self) -> None:
-        """Make the kernels of both, the depth's and the photo's."""
         super().__init__()
         half = FEATURES // 2
         self.shared, self.depth, self.rgb = (nn.Conv2d(FEATURES, half, 3, padding=1) for _ in range(3))
 
     def forward(self, depth: Tensor, rgb: Tensor) -> tuple[Tensor, Tensor]:
         """Map two tensors of (B, 64, H, W) to two of the same shape."""
-        return self._convolve(depth, self.depth), self._convolve(rgb, self.rgb)
-
-    def _convolve(self, x: Tensor, own: nn.Conv2d) -> Tensor:
-        """Apply the shared kernels and others, (B, 64, H, W)."""
-        weight, bias = (
-            torch.cat([conv.get_parameter(name) for conv in (self.shared, own)]) for name in ("weight", "bias")
-        )
-        return functional.conv2d(x, weight.contiguous(memory_format=torch.channels_last), bias, padding=1)
+        results = []
+        for x, own in ((depth, self.depth), (rgb, self.rgb)):
+            weight = torch.cat([self.shared.weight, own.weight]).contiguous(memory_format=torch.channels_last)
+            bias = torch.cat([conv.get_parameter("bias") for conv in (self.shared, own)])
+            results.append(functional.conv2d(x, weight, bias, padding=1))
+        return results[0], results[1]
 
 
 class CoupledLayer(nn.Module):
     """A residual block of two coupled convolutions."""
 
     def __init__(self) -> None:
-        """Make the convolutions."""
         super().__init__()
         self.conv1, self.conv2 = CoupledConv(), CoupledConv()
 
@@ -116,7 +110,6 @@ class DCTNet(PeerNetwork):
     cost: ClassVar[Cost] = Cost(memory=1600, seconds=8)
 
     def __init__(self, scale: float) -> None:
-        """Make the layers."""
         super().__init__(scale)
         self.lambd = nn.Parameter(torch.zeros(1, FEATURES, 1, 1))
         self.depth_head = nn.Conv2d(1, FEATURES, 3, padding=1)
@@ -137,12 +130,8 @@ class DCTNet(PeerNetwork):
         """Return the parameters by their names here, without the one layer that the authors do not use."""
         return rename({name: value for name, value in tensors.items() if not name.startswith(_UNUSED)}, _RENAMED)
 
-    def enlarge(self, values_lr: Tensor, size: tuple[int, int]) -> Tensor:
-        """Enlarge as Pillow's bicubic filter does."""
-        return resize_bicubic(values_lr, size)
-
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
-        """Refine an enlarged map; see :meth:`PeerNetwork.forward`. The result is not negative."""
+        """Refine an enlarged map; see :meth:`PeerNetwork.forward`."""
         depth = self.depth_head(values).relu_()
         guide = self.rgb_head(normalise_imagenet(rgb)).relu_()
         for layer in self.layers:
@@ -153,15 +142,7 @@ class DCTNet(PeerNetwork):
 def transfer_edges(depth: Tensor, guide: Tensor, weight: Tensor, strength: Tensor) -> Tensor:
     """Return x with (1 + strength L^2) x = depth + strength L (weight L guide), L the Laplacian.
 
-    Args:
-        depth: (B, C, H, W).
-        guide: (B, C, H, W).
-        weight: (B, C, H, W) weights of the guide's edges.
-        strength: (1, C, 1, 1).
-
-    Returns:
-        (B, C, H, W) in float32 or float64.
-
+    The first three are (B, C, H, W), ``strength`` (1, C, 1, 1), and x in float32 or float64.
     """
     dtype = torch.promote_types(strength.dtype, torch.float32)
     height, width = depth.shape[-2:]
@@ -176,12 +157,7 @@ def transfer_edges(depth: Tensor, guide: Tensor, weight: Tensor, strength: Tenso
 
 
 def laplacian(x: Tensor) -> Tensor:
-    """Return the sum of the 3 x 3 neighbours of each pixel minus 9 times the pixel, divided by 16; mirrored border.
-
-    Args:
-        x: (B, C, H, W) with at least two rows and columns.
-
-    """
+    """Return the sum of the 3 x 3 neighbours of each pixel minus 9 times the pixel, divided by 16; mirrored border."""
     padded = functional.pad(x, (1, 1, 1, 1), mode="reflect")
     rows = padded[..., :-2, :] + padded[..., 1:-1, :] + padded[..., 2:, :]
     return (rows[..., :-2] + rows[..., 1:-1] + rows[..., 2:] - 9 * x) / 16

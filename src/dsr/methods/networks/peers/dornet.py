@@ -21,18 +21,14 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.methods.base import Cost
-from dsr.methods.networks.normalisation import resize_bicubic
 from dsr.methods.networks.peers.peer_network import PeerNetwork, fold_batch_norm, rename
 
-_CHUNK = 2**20
-"""Number of values that are read at once, so that they stay in the processor's cache."""
+_CHUNK = 2**20  # values that are read at once, so that they stay in the processor's cache
 
 FEATURES = 24
-_INNER = 6
-"""Number of features in the bottlenecks."""
+_INNER = 6  # features in the bottlenecks
 _STAGES = 5
-_SENSOR_RATIO = 8 / 3
-"""Ratio of RGB-D-D's photos to the maps of its phone."""
+_SENSOR_RATIO = 8 / 3  # of RGB-D-D's photos to the maps of its phone
 _UNUSED = "Dab."
 _BLOCK = (("backbone", 0), ("backbone", 3), ("shortcut", 0))
 _NORMALISED = {
@@ -76,15 +72,8 @@ _RENAMED = {
 def deformable_conv3x3(x: Tensor, offsets: Tensor, mask: Tensor, weight: Tensor) -> Tensor:
     """Convolve features with 3 x 3 kernels whose taps are displaced; features outside the image are 0.
 
-    Args:
-        x: (B, C, H, W) features.
-        offsets: (B, 18, H, W) displacements in pixels, (dy, dx) for each tap, row by row.
-        mask: (B, 9, H, W) factors of the taps.
-        weight: (B, D, C, 3, 3) kernels of each image.
-
-    Returns:
-        (B, D, H, W).
-
+    Features ``x`` (B, C, H, W) become (B, D, H, W). ``offsets`` (B, 18, H, W) are in pixels, (dy, dx) for each tap, row
+    by row, ``mask`` (B, 9, H, W) factors of the taps, ``weight`` (B, D, C, 3, 3) the kernels of each image.
     """
     batch, channels, height, width = x.shape
     kernels = weight.flatten(2)  # (B, D, C * 9)
@@ -116,7 +105,6 @@ class ChannelAttention(nn.Module):
     """A residual block whose features are weighted by factors of the whole image (Zhang et al., *RCAN*, ECCV 2018)."""
 
     def __init__(self, slope: float) -> None:
-        """Make the convolutions; ``slope`` is the activation's for negative values."""
         super().__init__()
         self.slope = slope
         self.conv1, self.conv2 = _conv(FEATURES, FEATURES), _conv(FEATURES, FEATURES)
@@ -133,7 +121,6 @@ class ResidualGroup(nn.Module):
     """Two blocks with channel attention, a convolution, and a connection around all."""
 
     def __init__(self) -> None:
-        """Make the layers."""
         super().__init__()
         self.blocks = nn.Sequential(ChannelAttention(0.2), ChannelAttention(0.2))
         self.conv = _conv(FEATURES, FEATURES)
@@ -147,7 +134,6 @@ class EncoderBlock(nn.Module):
     """A residual block; batch normalisation is part of the convolutions."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
-        """Make the convolutions."""
         super().__init__()
         self.conv1, self.conv2 = _conv(inputs, outputs), _conv(outputs, outputs)
         self.shortcut = nn.Conv2d(inputs, outputs, 1)
@@ -162,7 +148,6 @@ class DegradationEncoder(nn.Module):
     """Features that describe how the enlarged map was degraded."""
 
     def __init__(self) -> None:
-        """Make the layers."""
         super().__init__()
         sizes = ((1, FEATURES // 2), (FEATURES // 2, FEATURES), (FEATURES, FEATURES))
         self.blocks = nn.Sequential(*(EncoderBlock(*size) for size in sizes))
@@ -180,7 +165,6 @@ class Transfer(nn.Module):
     """The step that aligns the photo's features by the degradation and adds them to the depth's."""
 
     def __init__(self) -> None:
-        """Make the layers."""
         super().__init__()
         self.block = ChannelAttention(0)
         self.deformable = _conv(FEATURES, FEATURES, bias=False)
@@ -193,28 +177,17 @@ class Transfer(nn.Module):
         self.fuse = _conv(2 * FEATURES, FEATURES)
 
     def forward(self, depth: Tensor, rgb: Tensor, local: Tensor, vector: Tensor) -> Tensor:
-        """Return the depth's features, (B, 24, H, W).
-
-        Args:
-            depth: (B, 24, H, W) features.
-            rgb: (B, 24, H, W) features of the photo.
-            local: (B, 24, H, W) features of the degradation.
-            vector: (B, 96, 1, 1) features of the degradation.
-
-        """
-        rgb = self._align(self.block(rgb), local, vector)
-        gate = self.fusion1(local).sigmoid_()
-        rgb = rgb + self.fusion3(self.fusion2(rgb) * gate)
-        return self.fuse(torch.cat((rgb, depth), dim=1)).add_(depth)
-
-    def _align(self, rgb: Tensor, local: Tensor, vector: Tensor) -> Tensor:
-        """Return the photo's features after the deformable convolution, whose kernels depend on the image."""
+        """Return the depth's features, (B, 24, H, W), of those of photo and degradation; ``vector`` (B, 96, 1, 1)."""
+        rgb = self.block(rgb)
         steering = self.offsets(local)
         scale = self.scale(vector)[:, None]  # (B, 1, 24, 1, 1): a factor of each input feature
         # the 1 x 1 convolution after the deformable one is part of the kernels
         mixed = torch.einsum("ed,dcij->ecij", self.mix.weight[..., 0, 0], self.deformable.weight)
         aligned = deformable_conv3x3(rgb, steering[:, :18], steering[:, 18:].sigmoid(), mixed * scale)
-        return self.conv(aligned + rgb)
+        rgb = self.conv(aligned + rgb)
+        gate = self.fusion1(local).sigmoid_()
+        rgb = rgb + self.fusion3(self.fusion2(rgb) * gate)
+        return self.fuse(torch.cat((rgb, depth), dim=1)).add_(depth)
 
 
 class DORNet(PeerNetwork):
@@ -230,8 +203,8 @@ class DORNet(PeerNetwork):
     cost: ClassVar[Cost] = Cost(memory=2000, seconds=10)
 
     def __init__(self, scale: float) -> None:
-        """Make the layers."""
         super().__init__(scale)
+        self.depth_range = (0.0, 5.0) if scale == _SENSOR_RATIO else None  # of weights trained on RGB-D-D's phone
         self.encoder = DegradationEncoder()
         self.depth_head, self.rgb_head = _conv(1, FEATURES), _conv(3, FEATURES)
         self.rgb_convs = nn.ModuleDict({str(i + 1): _conv(FEATURES, FEATURES) for i in range(_STAGES - 1)})
@@ -239,11 +212,6 @@ class DORNet(PeerNetwork):
         self.refinements = nn.ModuleDict({str(i + 1): ResidualGroup() for i in range(_STAGES)})
         self.merge = nn.Conv2d(_STAGES * FEATURES, FEATURES, 1)
         self.tail = _conv(FEATURES, 1)
-
-    @property
-    def depth_range(self) -> tuple[float, float] | None:
-        """Return 0 to 5 m for the weights that were trained on RGB-D-D's phone."""
-        return (0.0, 5.0) if self.scale == _SENSOR_RATIO else None
 
     @classmethod
     def convert(cls, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -255,10 +223,6 @@ class DORNet(PeerNetwork):
                 tensors.setdefault(f"{conv}.bias", weight.new_zeros(weight.shape[:1]))
             fold_batch_norm(tensors, conv, norm)
         return rename(tensors, _RENAMED)
-
-    def enlarge(self, values_lr: Tensor, size: tuple[int, int]) -> Tensor:
-        """Enlarge as Pillow's bicubic filter does."""
-        return resize_bicubic(values_lr, size)
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
         """Refine an enlarged map; see :meth:`PeerNetwork.forward`."""

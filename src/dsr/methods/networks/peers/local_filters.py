@@ -24,12 +24,10 @@ from torch.nn import functional
 from dsr.degradation.downsampling import cubic_kernel
 from dsr.methods.base import Cost
 from dsr.methods.classical.finite_differences import grey
-from dsr.methods.networks.normalisation import resize_bicubic
 from dsr.methods.networks.peers.peer_network import SWAPPED_LUMA, PeerNetwork, fold_batch_norm, rename
 
 _WIDTH, _DEPTH, _SLOPE = 64, 10, 0.1
-_CUBIC = -0.75
-"""Parameter of the cubic kernel."""
+_CUBIC = -0.75  # parameter of the cubic kernel
 
 _FACTOR, _TAPS, _RADIUS = 4, 3, 7
 _WIDTHS = (16, 32, 32, 64, 64, 128, 128)
@@ -112,10 +110,6 @@ class FDKN(PeerNetwork):
             for index in (1, 3, 5):
                 fold_batch_norm(tensors, f"{branch}.conv{index}", f"{branch}.conv{index}_bn")
         return rename(tensors, _NAMES)
-
-    def enlarge(self, values_lr: Tensor, size: tuple[int, int]) -> Tensor:
-        """Enlarge as Pillow's bicubic filter does."""
-        return resize_bicubic(values_lr, size)
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
         """Refine an enlarged map; see :meth:`PeerNetwork.forward`."""

@@ -39,12 +39,6 @@ class Peer(PeerUpsampler):
         weights_files: the trained factors of the authors' files by their names.
         range_type: see :class:`~dsr.methods.networks.peers.peer_network.PeerUpsampler`.
         range: its ``value_range``.
-        precision: dtype of the convolutions.
-        device: device of the computations.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is damaged or of another network or scale, or a value is not supported.
 
     """
 
@@ -70,16 +64,9 @@ class Peer(PeerUpsampler):
         network, weights = PEERS[peer], Path(weights)
         if not weights.is_file():
             raise FileNotFoundError(f"{weights}: no such weights file")
-        trained = _trained_scale(weights, network, weights_files)
+        named = (factor for name, factor in weights_files.items() if weights.as_posix().endswith(f"/{name}"))
+        trained = network.checksums.get(file_hash(weights)[:16]) or next(named, None)
         if trained is not None and scale != trained and scale in weights_files.values() and float(scale).is_integer():
             raise ValueError(f"{weights}: weights are for scale {trained:g}, the run is at scale {scale:g}")
         net = load_peer(weights, network, trained or nearest_scale(weights_files.values(), scale))
         super().__init__(net, range_type, range, precision, device)
-
-
-def _trained_scale(weights: Path, network: type[PeerNetwork], files: Mapping[str, float]) -> float | None:
-    """Return the factor that a file's weights were trained for: by its content, else its name; None if unknown."""
-    known = network.checksums.get(file_hash(weights)[:16])
-    if known is not None:
-        return known
-    return next((factor for name, factor in files.items() if weights.as_posix().endswith(f"/{name}")), None)

@@ -25,31 +25,22 @@ from dsr.methods.base import Abilities, Cost, Method
 from dsr.methods.classical.finite_differences import LUMA
 from dsr.methods.inpainting import inpaint
 from dsr.methods.networks.network import DTYPES, Precision
-from dsr.methods.networks.normalisation import compute_min_max, normalise
+from dsr.methods.networks.normalisation import compute_min_max, normalise, resize_bicubic
 from dsr.methods.networks.weight_files import load_parameters
-from dsr.methods.tiling import TILE, UNTILED, AxisTile, blend_tiles, split_axis
+from dsr.methods.tiling import TILE, UNTILED, blend_tiles, split_axis
 from dsr.sample import DepthSample
 from dsr.utils.guards import expect_one_of
 from dsr.utils.progress import Steps
 from dsr.utils.torch_files import read_torch_file
 
-_PARALLEL = "module."
-"""Prefix of the names in files of networks that were trained on several GPUs."""
-_NORM_PARTS = ("weight", "bias", "running_mean", "running_var")
-
 Range = Literal["measured", "truth"]
-SWAPPED_LUMA = LUMA[::-1]
-"""Weights of red, green and blue: those of the luma in reverse, as some authors' code applies them to RGB."""
-_OVERLAP = 16
-"""Overlap of neighbouring tiles in pixels."""
+SWAPPED_LUMA = LUMA[::-1]  # weights of red, green and blue, as some authors' code applies the luma's to RGB
+_NORM_PARTS = ("weight", "bias", "running_mean", "running_var")
+_OVERLAP = 16  # of neighbouring tiles in pixels
 
 
 def load_peer(path: Path, network: type[PeerNetwork], scale: float) -> PeerNetwork:
-    """Load a network of its authors' file, in float32 on the CPU.
-
-    Args:
-        network: the network's class.
-        scale: the factor that the weights were trained for.
+    """Load a network, whose weights were trained for a factor, of its authors' file, in float32 on the CPU.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -64,28 +55,16 @@ def load_peer(path: Path, network: type[PeerNetwork], scale: float) -> PeerNetwo
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
-    """Read the tensors of an authors' file by name, without the prefix of networks trained on several GPUs.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is damaged or holds other Python objects than tensors.
-
-    """
+    """Read the tensors of an authors' file by name, without the prefix of networks trained on several GPUs."""
     content = read_torch_file(path)
     if not isinstance(content, dict) or not all(isinstance(value, Tensor) for value in content.values()):
         keys = ", ".join(map(str, list(content)[:4])) if isinstance(content, dict) else type(content).__name__
         raise ValueError(f"{path}: expected a network's tensors by name, got {keys}")
-    return {str(name).removeprefix(_PARALLEL): value for name, value in content.items()}
+    return {str(name).removeprefix("module."): value for name, value in content.items()}
 
 
 def rename(tensors: Mapping[str, Tensor], names: Mapping[str, str]) -> dict[str, Tensor]:
-    """Return tensors by new names.
-
-    Args:
-        tensors: tensors by name.
-        names: replacements of regular expressions, applied one after the other to every name.
-
-    """
+    """Return tensors by new names: replacements of regular expressions, one after the other, for every name."""
     renamed = {}
     for name, value in tensors.items():
         for pattern, replacement in names.items():
@@ -95,15 +74,9 @@ def rename(tensors: Mapping[str, Tensor], names: Mapping[str, str]) -> dict[str,
 
 
 def fold_batch_norm(tensors: dict[str, Tensor], conv: str, norm: str, eps: float = 1e-5) -> None:
-    """Merge a batch normalisation, as evaluation runs it, into the convolution before it.
+    """Merge a batch normalisation, as evaluation runs it, into the convolution with a bias before it, in place.
 
-    Args:
-        tensors: content of a file; the convolution's are replaced and the normalisation's removed, unless one is
-            missing or of another shape.
-        conv: name of the convolution, which has a bias.
-        norm: name of the batch normalisation.
-        eps: constant that the normalisation adds to the variance.
-
+    Nothing happens if a tensor is missing or of another shape.
     """
     weight, bias = (tensors.get(f"{conv}.{part}") for part in ("weight", "bias"))
     parts = [tensors.get(f"{norm}.{part}") for part in _NORM_PARTS]
@@ -121,10 +94,7 @@ def fold_batch_norm(tensors: dict[str, Tensor], conv: str, norm: str, eps: float
 
 
 class PeerNetwork(nn.Module, abc.ABC):
-    """A published network that refines an enlarged depth map, guided by a photo.
-
-    Args:
-        scale: the factor that its weights were trained for.
+    """A published network that refines an enlarged depth map, guided by a photo; ``scale`` is that of its weights.
 
     Attributes:
         title: the name in messages.
@@ -132,6 +102,7 @@ class PeerNetwork(nn.Module, abc.ABC):
         multiple: the number that divides the sizes of its images.
         receptive_field_radius: in pixels of the photo; None where an output depends on the whole image. Large images
             are processed in tiles if there is one.
+        depth_range: orthogonal depth in metres that became 0 and 1 in the training; None if each map's own range did.
         cost: the rough cost.
 
     """
@@ -140,51 +111,26 @@ class PeerNetwork(nn.Module, abc.ABC):
     checksums: ClassVar[Mapping[str, float]]
     multiple: ClassVar[int] = 1
     receptive_field_radius: ClassVar[int | None] = None
+    depth_range: tuple[float, float] | None = None
     cost: ClassVar[Cost]
 
     def __init__(self, scale: float) -> None:
         super().__init__()
         self.scale = scale
 
-    @property
-    def depth_range(self) -> tuple[float, float] | None:
-        """Orthogonal depth in metres that became 0 and 1 in the training; None if each map's own range did."""
-        return None
-
-    @abc.abstractmethod
     def enlarge(self, values_lr: Tensor, size: tuple[int, int]) -> Tensor:
-        """Enlarge a low-resolution map as the authors do.
-
-        Args:
-            values_lr: (B, 1, h, w) map without holes.
-            size: height and width of the photo.
-
-        Returns:
-            (B, 1, *size).
-
-        """
+        """Enlarge a map without holes, (B, 1, h, w), to (B, 1, *size) as the authors do: by Pillow's bicubic filter."""
+        return resize_bicubic(values_lr, size)
 
     @abc.abstractmethod
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
-        """Refine an enlarged map.
-
-        Args:
-            rgb: (B, 3, H, W) photo in 0..1; ``multiple`` divides H and W.
-            values: (B, 1, H, W) enlarged map, of which 0..1 is the range.
-
-        Returns:
-            (B, 1, H, W) in the same range.
-
-        """
+        """Refine an enlarged map, (B, 1, H, W), of which 0..1 is the range, with a photo (B, 3, H, W) in 0..1."""
 
     @classmethod
     def convert(cls, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return the network's parameters by their names here.
+        """Return the network's parameters by their names here, of those of any file by the authors' names.
 
-        Args:
-            tensors: content of any file, by the authors' names without ``module.``. Names that the authors' files do
-                not have are kept, so that another network's file is recognised.
-
+        Names that the authors' files do not have are kept, so that another network's file is recognised.
         """
         return tensors
 
@@ -206,9 +152,6 @@ class PeerUpsampler(Method):
         device: device of the computations.
         tile: side of a tile in pixels; None for ``TILE``, and no tiles up to ``UNTILED`` pixels.
 
-    Raises:
-        ValueError: a value is not supported.
-
     """
 
     abilities = Abilities(ratios="any", needs="weights")
@@ -225,18 +168,14 @@ class PeerUpsampler(Method):
         expect_one_of("range_type", range_type, RANGE_TYPES)
         expect_one_of("range", value_range, get_args(Range))
         expect_one_of("precision", precision, tuple(DTYPES))
-        if tile is not None and tile < net.multiple:
-            raise ValueError(f"tile: expected at least {net.multiple} pixels, got {tile}")
         if net.depth_range is not None and value_range == "truth":
             low, high = net.depth_range
             raise ValueError(
                 f"range: expected measured for weights trained on depth of {low:g} to {high:g} m, got truth"
             )
         self.range_type = range_type if net.depth_range is None else "orthogonal"
-        self.device = torch.device(device)
+        self.device, self._dtype, self._tile = torch.device(device), DTYPES[precision], tile
         self._uses_truth = value_range == "truth"
-        self._dtype = DTYPES[precision]
-        self._tile = tile
         net = copy.deepcopy(net).eval().requires_grad_(False).to(self.device)
         self.net: PeerNetwork = net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs
 
@@ -254,77 +193,41 @@ class PeerUpsampler(Method):
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
         """Return the high-resolution orthogonal depth, (1, H, W) in metres on the sample's device.
 
-        It is NaN where the disparity corresponds to a depth at or beyond infinity.
-
-        Raises:
-            ValueError: the truth's range is needed, and there is no truth.
-
+        It is NaN where the disparity corresponds to a depth at or beyond infinity. A ValueError if the truth's range is
+        needed, and there is no truth.
         """
-        values_lr = self._convert(sample).to(self.device)[None]
-        values = self.refine(sample.rgb.to(self.device)[None], values_lr, self._min_max(sample), progress)[0]
-        return from_range(values, sample.camera, self.range_type).to(sample.depth_lr.device)
+        if self.range_type == "disparity":
+            values_lr = sample.disparity_lr()
+        else:
+            values_lr = to_range(sample.depth_lr, sample.camera_lr, self.range_type)
+        min_max = None  # the low-resolution map's own
+        if self.net.depth_range is not None:
+            min_max = torch.tensor(self.net.depth_range).view(1, 2, 1, 1)
+        elif self._uses_truth:
+            if sample.depth is None:
+                raise ValueError(f"{sample.scene}: range=truth expects a scene with a true depth map, there is none")
+            min_max = compute_min_max(to_range(sample.depth, sample.camera, self.range_type)[None])
+        values_lr, rgb = values_lr.to(self.device)[None], sample.rgb.to(self.device)[None]
+        values, minimum, value_range = normalise(inpaint(values_lr), min_max)
+        refined = self._refine(rgb, values, progress).to(values_lr.dtype) * value_range + minimum
+        return from_range(refined[0], sample.camera, self.range_type).to(sample.depth_lr.device)
 
-    def refine(
-        self, rgb: Tensor, values_lr: Tensor, min_max: Tensor | None = None, progress: Steps | None = None
-    ) -> Tensor:
-        """Return the high-resolution map.
-
-        Args:
-            rgb: (B, 3, H, W) in 0..1.
-            values_lr: (B, 1, h, w) low-resolution map; non-finite values are holes.
-            min_max: (B, 2, 1, 1) values that map to 0 and 1; None for the map's minimum and maximum.
-
-        Returns:
-            (B, 1, H, W) in the dtype of ``values_lr``.
-
-        """
-        height, width = rgb.shape[-2:]
-        normalised = normalise(inpaint(values_lr), min_max)
-        values = self.net.enlarge(normalised.values.float(), (height, width))
-        padding = (0, -width % self.net.multiple, 0, -height % self.net.multiple)
-        rgb, values = (functional.pad(each.float(), padding, mode="replicate") for each in (rgb, values))
-        refined = self._run(rgb, values, progress)[..., :height, :width].to(values_lr.dtype)
-        return refined * normalised.value_range + normalised.minimum
-
-    def _run(self, rgb: Tensor, values: Tensor, progress: Steps | None) -> Tensor:
-        """Apply the network to maps whose sizes are multiples of its own, in tiles if they are large."""
+    def _refine(self, rgb: Tensor, values_lr: Tensor, progress: Steps | None) -> Tensor:
+        """Return a map in 0..1, (B, 1, h, w), enlarged to the photo's size and refined, in tiles if that is large."""
         multiple, radius = self.net.multiple, self.net.receptive_field_radius
         height, width = rgb.shape[-2:]
-        if radius is None or (self._tile is None and height * width <= UNTILED):
-            refined = self._apply(rgb, values)
-            if progress is not None:
-                progress(1, 1)
-            return refined
+        padding = (0, -width % multiple, 0, -height % multiple)
+        enlarged = self.net.enlarge(values_lr.float(), (height, width))
+        rgb, enlarged = (functional.pad(each.float(), padding, mode="replicate") for each in (rgb, enlarged))
+        sizes = [n // multiple for n in rgb.shape[-2:]]
+        whole = radius is None or (self._tile is None and rgb.shape[-2] * rgb.shape[-1] <= UNTILED)
+        tile = max(sizes) if whole else (self._tile or TILE) // multiple
+        margin, overlap = -(-(radius or 0) // multiple), max(_OVERLAP // multiple, 2)
+        rows, columns = (split_axis(n, tile, margin, overlap) for n in sizes)
 
         def compute(row: slice, column: slice) -> Tensor:
             down, across = (slice(multiple * each.start, multiple * each.stop) for each in (row, column))
-            return self._apply(rgb[..., down, across], values[..., down, across])
+            with torch.autocast(self.device.type, self._dtype, enabled=self._dtype != torch.float32):
+                return self.net(rgb[..., down, across], enlarged[..., down, across]).float()
 
-        rows, columns = (self._split_axis(n // multiple, radius) for n in (height, width))
-        return blend_tiles(compute, rows, columns, multiple, progress)
-
-    def _split_axis(self, size: int, radius: int) -> list[AxisTile]:
-        """Return the tiles along an axis, in multiples of the network's."""
-        multiple = self.net.multiple
-        return split_axis(size, (self._tile or TILE) // multiple, -(-radius // multiple), max(_OVERLAP // multiple, 2))
-
-    def _apply(self, rgb: Tensor, values: Tensor) -> Tensor:
-        """Apply the network, its convolutions in the precision."""
-        with torch.autocast(self.device.type, self._dtype, enabled=self._dtype != torch.float32):
-            return self.net(rgb, values).float()
-
-    def _convert(self, sample: DepthSample) -> Tensor:
-        """Return the low-resolution map in the range type, (1, h, w)."""
-        if self.range_type == "disparity":
-            return sample.disparity_lr()
-        return to_range(sample.depth_lr, sample.camera_lr, self.range_type)
-
-    def _min_max(self, sample: DepthSample) -> Tensor | None:
-        """Return the values that map to 0 and 1, (1, 2, 1, 1); None for the low-resolution map's own."""
-        if self.net.depth_range is not None:
-            return torch.tensor(self.net.depth_range).view(1, 2, 1, 1)
-        if not self._uses_truth:
-            return None
-        if sample.depth is None:
-            raise ValueError(f"{sample.scene}: range=truth expects a scene with a true depth map, there is none")
-        return compute_min_max(to_range(sample.depth, sample.camera, self.range_type)[None])
+        return blend_tiles(compute, rows, columns, multiple, progress)[..., :height, :width]

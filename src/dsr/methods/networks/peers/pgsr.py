@@ -28,10 +28,8 @@ _ROUNDS, _GROUPS, _BLOCKS, _SQUEEZED = 3, 2, 2, 2
 _SLOPE, _BLOCK_SLOPE = 0.1, 0.01
 _LARGEST_OFFSET, _STEPS = 0.1, 3
 _TINY = 1e-6
-_STRIP = 2**18
-"""Number of the photo's pixels that the last layers compute at a time."""
-_HALO = 2
-"""Rows, at a quarter of the resolution, that a row of the last layers depends on at either side."""
+_STRIP = 2**18  # pixels of the photo that the last layers compute at a time
+_HALO = 2  # rows, at a quarter of the resolution, that a row of the last layers depends on at either side
 _NAMES = {
     r"\.body\.(\d)\.body\.0\.0\.": r".blocks.\1.first.",
     r"\.body\.(\d)\.body\.2\.0\.": r".blocks.\1.second.",
@@ -107,20 +105,15 @@ class PGSR(PeerNetwork):
         """Refine an enlarged map; see :meth:`PeerNetwork.forward`."""
         luma = grey(normalise_imagenet(rgb), SWAPPED_LUMA)
         depth, photo = (functional.pixel_unshuffle(each, _FACTOR) for each in (values, luma))
-        of_depth, of_photo = self._extract("shared", torch.cat((depth, photo))).chunk(2)
-        depth = _apply(self.merges["depth"], self._extract("depth", depth), of_depth)
-        photo = _apply(self.merges["rgb"], self._extract("rgb", photo), of_photo)
+        of_depth, of_photo = self.features["shared"](_apply(self.stems["shared"], torch.cat((depth, photo)))).chunk(2)
+        depth = _apply(self.merges["depth"], self.features["depth"](_apply(self.stems["depth"], depth)), of_depth)
+        photo = _apply(self.merges["rgb"], self.features["rgb"](_apply(self.stems["rgb"], photo)), of_photo)
         fused = of_depth
         for interaction in self.interactions.values():
             fused = interaction(depth, photo)
             depth, photo = _apply(self.updates["depth"], fused, depth), _apply(self.updates["rgb"], fused, photo)
         result: Tensor = self.reconstruction(depth, photo, fused)
         return result
-
-    def _extract(self, name: str, x: Tensor) -> Tensor:
-        """Return the features of one branch."""
-        features: Tensor = self.features[name](_apply(self.stems[name], x))
-        return features
 
 
 class _Block(nn.Module):
