@@ -13,8 +13,8 @@ At the border, kernels are truncated and normalised.
 
 from __future__ import annotations
 
+import functools
 import hashlib
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -80,20 +80,16 @@ class Downsampling:
             return camera.decimate(scale, scale // 2)
         return camera.downscale(scale)
 
-    def __call__(self, values: Tensor, scale: int) -> Tensor:
-        """Downsample maps.
+    def __call__(self, values: Tensor, scale: int, *, complete: bool | None = None) -> Tensor:
+        """Downsample (..., H, W) maps with NaN in holes to (..., H / scale, W / scale).
 
         A low-resolution pixel whose block has no valid pixel is a hole. If less than half of a kernel's weight falls on
         valid pixels, the result is the mean of the block's valid pixels.
 
         Args:
-            values: (..., H, W), NaN where unknown; H and W divisible by ``scale``.
-
-        Returns:
-            (..., H / scale, W / scale).
-
-        Raises:
-            ValueError: the scale does not divide the size.
+            values: H and W divisible by ``scale``.
+            scale: factor.
+            complete: whether there are no holes; None if not known.
 
         """
         height, width = values.shape[-2:]
@@ -101,13 +97,15 @@ class Downsampling:
             raise ValueError(f"downsampling: expected a size divisible by {scale}, got {height} x {width}")
         if self.kernel == "nearest":
             return values[..., scale // 2 :: scale, scale // 2 :: scale]
-        valid = values.isfinite()
-        if known_true(valid):
+        if complete:
             return self._apply(values, scale)
-        complete, weight = torch.where(valid, values, 0), valid.to(values.dtype)
-        mean, fraction = self._apply(complete, scale), self._apply(weight, scale)
+        valid = values.isfinite()
+        if complete is None and known_true(valid):
+            return self._apply(values, scale)
+        filled, weight = torch.where(valid, values, 0), valid.to(values.dtype)
+        mean, fraction = self._apply(filled, scale), self._apply(weight, scale)
         box = Downsampling("box")
-        block_mean, block_fraction = box._apply(complete, scale), box._apply(weight, scale)
+        block_mean, block_fraction = box._apply(filled, scale), box._apply(weight, scale)
         tiny = torch.finfo(values.dtype).tiny
         smooth = mean / fraction.clamp(min=_LEAST_WEIGHT)
         depth_lr = torch.where(fraction >= _LEAST_WEIGHT, smooth, block_mean / block_fraction.clamp(min=tiny))
@@ -115,24 +113,27 @@ class Downsampling:
 
     def _apply(self, values: Tensor, scale: int) -> Tensor:
         """Return the weighted averages of maps without holes."""
-        rows = self._matrix(values.shape[-2], scale).to(values)
-        columns = self._matrix(values.shape[-1], scale).to(values)
+        rows, columns = (
+            _matrix(self.kernel, self.sigma, size, scale, values.dtype, values.device) for size in values.shape[-2:]
+        )
         return rows @ values @ columns.T
 
-    def _matrix(self, size: int, scale: int) -> Tensor:
-        """Return the kernel's weights, (size / scale, size); every row sums to 1."""
-        centres = (torch.arange(size // scale, dtype=torch.float64) + 0.5) * scale - 0.5
-        distance = (torch.arange(size, dtype=torch.float64) - centres[:, None]) / scale
-        weights = _PROFILES[self.kernel](distance.abs(), self.sigma)
-        return weights / weights.sum(dim=1, keepdim=True)
 
-
-def _box(x: Tensor, _: float) -> Tensor:
-    return (x < 0.5).double()
-
-
-def _bilinear(x: Tensor, _: float) -> Tensor:
-    return (1 - x).clamp(min=0)
+@functools.lru_cache(maxsize=16)
+@torch.inference_mode(mode=False)  # so that gradients can be computed with it
+def _matrix(kernel: Kernel, sigma: float, size: int, scale: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Return a kernel's weights, (size / scale, size); every row sums to 1."""
+    centres = (torch.arange(size // scale, dtype=torch.float64) + 0.5) * scale - 0.5
+    x = ((torch.arange(size, dtype=torch.float64) - centres[:, None]) / scale).abs()
+    if kernel == "box":
+        weights = (x < 0.5).double()
+    elif kernel == "bilinear":
+        weights = (1 - x).clamp(min=0)
+    elif kernel == "bicubic":
+        weights = cubic_kernel(x)
+    else:
+        weights = torch.exp(-0.5 * (x / sigma).square()) * (x <= 3 * sigma)
+    return (weights / weights.sum(dim=1, keepdim=True)).to(device, dtype)
 
 
 def cubic_kernel(x: Tensor, a: float = -0.5) -> Tensor:
@@ -140,22 +141,6 @@ def cubic_kernel(x: Tensor, a: float = -0.5) -> Tensor:
     near = ((a + 2) * x - (a + 3)) * x * x + 1
     far = ((x - 5) * x + 8) * x * a - 4 * a
     return torch.where(x < 1, near, torch.where(x < 2, far, 0))
-
-
-def _bicubic(x: Tensor, _: float) -> Tensor:
-    return cubic_kernel(x)
-
-
-def _gaussian(x: Tensor, sigma: float) -> Tensor:
-    return torch.exp(-0.5 * (x / sigma).square()) * (x <= 3 * sigma)
-
-
-_PROFILES: dict[str, Callable[[Tensor, float], Tensor]] = {
-    "box": _box,
-    "bilinear": _bilinear,
-    "bicubic": _bicubic,
-    "gaussian": _gaussian,
-}
 
 
 @dataclass(frozen=True)
@@ -285,6 +270,8 @@ def downsample_depth(
     downsampling: Downsampling,
     range_type: RangeType,
     noise: tuple[Noise, torch.Generator] | None = None,
+    *,
+    complete: bool | None = None,
 ) -> tuple[Tensor, Camera]:
     """Return the low-resolution depth that a model and noise make of high-resolution depth, and its camera.
 
@@ -297,6 +284,7 @@ def downsample_depth(
         downsampling: downsampling model.
         range_type: range type that is averaged, unless the model sets one.
         noise: noise of the averages and its generator, in the same range type, unless the noise sets one.
+        complete: whether neither map can have holes or values out of range; None if not known.
 
     """
     range_type = downsampling.range_type or range_type
@@ -304,7 +292,7 @@ def downsample_depth(
     values_hr = to_range(depth, camera, range_type)
     if range_type == "disparity":  # in the low-resolution camera's pixels
         values_hr = values_hr / scale
-    values = downsampling(values_hr, scale)
+    values = downsampling(values_hr, scale, complete=complete)
     if noise is not None:
         kind, generator = noise
         if kind.range_type is not None:
@@ -312,5 +300,7 @@ def downsample_depth(
             range_type, values = kind.range_type, to_range(averages, camera_lr, kind.range_type)
         values = kind(values, generator)
     depth_lr = from_range(values, camera_lr, range_type)
+    if complete:
+        return depth_lr, camera_lr
     held = (depth_lr >= NEAREST) & (depth_lr <= FARTHEST)  # bicubic may undershoot beside a depth step
     return torch.where(held, depth_lr, torch.nan), camera_lr
