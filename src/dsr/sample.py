@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Self
@@ -22,6 +22,7 @@ from dsr.utils.arrays import read_arrays
 from dsr.utils.files import replacing
 from dsr.utils.guards import TooLargeError, parse_json
 from dsr.utils.ratios import as_ratio, fits_ratio, round_ratio
+from dsr.utils.records import derived
 
 NEAREST, FARTHEST = 1e-6, 1e9
 """Limits of depth in metres: a micrometre, nearer than any lens focuses, and beyond the Moon. Within them, the inverse
@@ -142,9 +143,11 @@ class Scene:
                 (first_row, end_row), (first_column, end_column) = map(int, rows), map(int, columns)
                 measured[ratio] = depth_lr[:, first_row:end_row, first_column:end_column]
         depth = None if self.depth is None else self.depth[window]
+        if depth is None and not measured:
+            raise ValueError(f"{self.name}: expected a window with a depth map, high-resolution or measured, got none")
         camera = self.camera.crop(top, left, height, width)
         regions = {name: region[window] for name, region in self.regions.items()}
-        return replace(self, rgb=self.rgb[window], depth=depth, camera=camera, measured=measured, regions=regions)
+        return derived(self, rgb=self.rgb[window], depth=depth, camera=camera, measured=measured, regions=regions)
 
     def _steps(self, ratio: float) -> tuple[Fraction, Fraction]:
         """Return the height and the width of a pixel of a measured map in the photo's pixels."""

@@ -24,10 +24,11 @@ from torch import Tensor
 from dsr.degradation.holes import Holes
 from dsr.degradation.noise import Noise
 from dsr.geometry.camera import Camera, RangeType, from_range, to_range
-from dsr.sample import FARTHEST, NEAREST, DepthSample, Scene
+from dsr.sample import FARTHEST, NEAREST, AllHolesError, DepthSample, Scene
 from dsr.utils.compute_device import known_true
 from dsr.utils.guards import naming
 from dsr.utils.ratios import check_scale, match_ratio
+from dsr.utils.records import unchecked
 
 Kernel = Literal["box", "nearest", "bilinear", "bicubic", "gaussian"]
 _LEAST_WEIGHT = 0.5
@@ -229,9 +230,11 @@ def make_sample(
         )
     if holes is not None:
         depth_lr = depth_lr.masked_fill(holes(depth_lr, camera_lr, of_holes), torch.nan)
-    return DepthSample(
-        scene.dataset, scene.name, scene.rgb, depth_lr, scene.camera, camera_lr, ratio, scene.depth, notes, scene.unit,
-        scene.regions,
+    if not bool(depth_lr.isfinite().any()):
+        raise AllHolesError(f"{scene.name}: depth_lr: expected at least one known pixel, all are holes")
+    return unchecked(
+        DepthSample, dataset=scene.dataset, scene=scene.name, rgb=scene.rgb, depth_lr=depth_lr, camera=scene.camera,
+        camera_lr=camera_lr, scale=ratio, depth=scene.depth, notes=notes, unit=scene.unit, regions=scene.regions,
     )  # fmt: skip
 
 

@@ -41,7 +41,8 @@ from dsr.degradation.random_fields import (
 )
 from dsr.degradation.random_noise import NOISES
 from dsr.geometry.camera import Camera
-from dsr.sample import AllHolesError, DepthSample, Scene
+from dsr.sample import CENTIMETRES, AllHolesError, DepthSample, Scene
+from dsr.utils.records import unchecked
 
 SENSOR_NOISES = ("waves", "structured", "flight", "lidar", "stereo")
 """Kinds of noise that stand for a sensor, which does not see glass; the others stand for maps made of a surface."""
@@ -175,9 +176,11 @@ class Everything:
         if not bool(noisy.isfinite().any()):
             raise AllHolesError(scene.name)
         rgb = self._change_photo(scene.rgb.float(), self.photo / (1 + (kind == "none")), generator)
-        sample = DepthSample(
-            scene.dataset, scene.name, rgb, noisy.reciprocal(), scene.camera, camera_lr, scale, scene.depth
-        )
+        sample = unchecked(
+            DepthSample, dataset=scene.dataset, scene=scene.name, rgb=rgb, depth_lr=noisy.reciprocal(),
+            camera=scene.camera, camera_lr=camera_lr, scale=scale, depth=scene.depth, notes=(), unit=CENTIMETRES,
+            regions={},
+        )  # fmt: skip
         return sample, self._hints(clean, noisy, kernel, generator, soft=soft)
 
     def _change_surfaces(self, scene: Scene, scale: int, generator: torch.Generator) -> Scene:
