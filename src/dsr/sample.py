@@ -44,9 +44,6 @@ class Unit:
         offset: see ``inverse``.
         limits: smallest and largest value that a prediction may have; the benchmark clamps to them. None for any value.
 
-    Raises:
-        ValueError: ``factor`` is not positive, or ``offset`` is not 0 for depth.
-
     """
 
     name: str
@@ -87,19 +84,6 @@ class Scene:
         unit: the unit in which the data set's benchmark prints errors.
         regions: parts of the scene that tables show on their own, by name: (1, H, W) uint8, 0 outside; a region of
             several objects, such as planes, numbers them from 1.
-
-    Raises:
-        ValueError: a shape, range or unit is not as above.
-
-    Example:
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.sample import Scene
-        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
-        >>> depth = torch.full((1, 24, 32), 2.0, dtype=torch.float64)
-        >>> scene = Scene("mine", "wall", torch.rand(3, 24, 32), camera, depth)
-        >>> scene.camera.width
-        32
 
     """
 
@@ -174,21 +158,6 @@ class DepthSample:
         unit: the unit in which the data set's benchmark prints errors.
         regions: as of a :class:`Scene`.
 
-    Raises:
-        ValueError: a shape, range or unit is not as above.
-
-    Example:
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.degradation.downsampling import Downsampling, make_sample
-        >>> from dsr.sample import Scene
-        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
-        >>> depth = torch.full((1, 24, 32), 2.0, dtype=torch.float64)
-        >>> scene = Scene("mine", "wall", torch.rand(3, 24, 32), camera, depth)
-        >>> sample = make_sample(scene, 4, Downsampling("box"), "disparity")
-        >>> sample.depth_lr.shape, sample.camera_lr.width
-        (torch.Size([1, 6, 8]), 8)
-
     """
 
     dataset: str
@@ -246,12 +215,7 @@ class DepthSample:
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Return the sample that :meth:`save` wrote.
-
-        Raises:
-            ValueError: the file is missing, damaged or something else.
-
-        """
+        """Return the sample that :meth:`save` wrote."""
         try:
             arrays = read_arrays(path)
             about: dict[str, Any] = parse_json(str(arrays["about"]))
@@ -313,10 +277,8 @@ def _read_unit(entries: Mapping[str, Any]) -> Unit:
     return Unit(**{**entries, "limits": None if limits is None else tuple(limits)})
 
 
-_REGION = "region_"
-"""Beginning of the names of arrays that are regions."""
-_BITS = {"uint8": 255, "uint16": 65535}
-"""The largest values of the integers that photos are stored as."""
+_REGION = "region_"  # beginning of the names of arrays that are regions
+_BITS = {"uint8": 255, "uint16": 65535}  # the largest values of the integers that photos are stored as
 
 
 def _pack(rgb: np.ndarray) -> np.ndarray:
@@ -366,9 +328,6 @@ def expect_distances(place: str, depth: Tensor) -> None:
     Args:
         place: the file, or the scene and the map, for the message.
         depth: metres, of any shape; NaN in holes.
-
-    Raises:
-        ValueError: a value is nearer or farther.
 
     """
     beyond = depth[(depth < NEAREST) | (depth > FARTHEST)]

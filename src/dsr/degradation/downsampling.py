@@ -46,16 +46,6 @@ class Downsampling:
         range_type: range type that is averaged; None for the one that the method works on, as in the paper.
         assumed: kernel of the forward model that methods assume (DIP); None for the true one.
 
-    Raises:
-        ValueError: the kernel is unknown, or sigma is below 0.1.
-
-    Example:
-        >>> import torch
-        >>> from dsr.degradation.downsampling import Downsampling
-        >>> Downsampling("box")(torch.arange(16.0).view(1, 4, 4), 2)
-        tensor([[[ 2.5000,  4.5000],
-                 [10.5000, 12.5000]]])
-
     """
 
     kernel: Kernel
@@ -188,23 +178,6 @@ def make_sample(
         noise: noise of the low-resolution map, unless it is measured.
         generator: random generator of noise and holes, or a seed, from which each scene gets generators of its own.
         holes: holes of the low-resolution map.
-
-    Raises:
-        ValueError: the scene has no depth or no measured map at this scale, or a value is out of range.
-
-    Example:
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.degradation.downsampling import Downsampling, make_sample
-        >>> from dsr.sample import Scene
-        >>> from dsr.degradation.noise import GaussianMultiplicative
-        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
-        >>> depth = torch.full((1, 24, 32), 2.0, dtype=torch.float64)
-        >>> scene = Scene("mine", "wall", torch.rand(3, 24, 32), camera, depth)
-        >>> noise = GaussianMultiplicative(0.01)
-        >>> sample = make_sample(scene, 4, Downsampling("box"), "disparity", noise, generator=1)
-        >>> sample.depth_lr.shape, bool((sample.depth_lr - 2).abs().max() < 0.1)
-        (torch.Size([1, 6, 8]), True)
 
     """
     if isinstance(downsampling, Measured):

@@ -73,20 +73,6 @@ class Everything:
             steps are soft, as their edges are not.
         told: fraction of the maps whose kernel is stated by a hint; likewise, independently, for noise and steps.
 
-    Raises:
-        ValueError: there is no such kind, or a frequency or a fraction is out of range.
-
-    Example:
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.degradation.random_degradation import Everything
-        >>> from dsr.sample import Scene
-        >>> camera = dsr.Camera.from_fov(60, width=64, height=64)
-        >>> scene = Scene("mine", "wall", torch.rand(3, 64, 64), camera, torch.full((1, 64, 64), 2.0))
-        >>> sample, hints = Everything()(scene, 4, torch.Generator().manual_seed(0))
-        >>> sample.depth_lr.shape
-        torch.Size([1, 16, 16])
-
     """
 
     scales: Mapping[Any, float] | None = None
@@ -147,9 +133,6 @@ class Everything:
             scene: a scene or a patch with a true depth.
             scale: the factor, which divides its size.
             soft: whether its depth steps are soft, for the hint.
-
-        Raises:
-            AllHolesError: no pixel is left.
 
         """
         scene = self._change_surfaces(scene, scale, generator)

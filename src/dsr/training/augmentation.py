@@ -19,23 +19,7 @@ _BLUR, _NOISE = 1.0, 0.03
 
 
 def augment(scene: Scene, settings: PatchSettings, random: np.random.Generator) -> tuple[Scene, float]:
-    """Return a scene changed at random, rgb, depth and camera alike, and the factor that multiplied its depth.
-
-    Example:
-        >>> import numpy as np
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.sample import Scene
-        >>> from dsr.training.augmentation import augment
-        >>> from dsr.training.settings import PatchSettings
-        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
-        >>> depth = torch.full((1, 24, 32), 2.0, dtype=torch.float64)
-        >>> scene = Scene("mine", "wall", torch.rand(3, 24, 32), camera, depth)
-        >>> changed, factor = augment(scene, PatchSettings(), np.random.default_rng(0))
-        >>> bool((changed.depth - 2 * factor).abs().max() < 1e-6)
-        True
-
-    """
+    """Return a scene changed at random, rgb, depth and camera alike, and the factor that multiplied its depth."""
     rgb = scene.rgb
     if settings.colour:
         gain = torch.from_numpy(1 + settings.colour * random.standard_normal((3, 1, 1))).float()

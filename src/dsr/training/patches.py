@@ -47,9 +47,6 @@ class Patches(Dataset[Batch]):
             have one factor.
         per_step: number of patches of a step; None for those of a batch.
 
-    Raises:
-        ValueError: a scene is too small or has no true depth, or there is no scene.
-
     """
 
     def __init__(
@@ -180,12 +177,7 @@ class Patches(Dataset[Batch]):
 
 
 def check_patches(scenes: Sequence[Scene], settings: PatchSettings, scale: int) -> None:
-    """Check that patches of these settings can be cropped.
-
-    Raises:
-        ValueError: the scale does not divide the patches, or a scene is smaller than a patch or has no true depth.
-
-    """
+    """Check that patches of these settings can be cropped."""
     if settings.patch % scale:
         raise ValueError(f"patch: expected a size that scale={scale} divides, got {settings.patch}")
     for scene in scenes:
