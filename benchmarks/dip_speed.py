@@ -2,8 +2,8 @@
 
     python benchmarks/dip_speed.py [--size 256] [--steps 5] [--threads N] [--quality-steps 0] [--device cpu]
 
-The plain way is that of the original's code: float32, PyTorch's default memory layout, reflected borders, the library's
-bilinear upsampling, 128 channels in each level. ``same network`` is ours with these channels, ``default`` with ours.
+The plain way is that of the original's code: float32, PyTorch's default memory layout, the library's bilinear
+upsampling, 128 channels in each level. ``same network`` is ours with these channels, ``default`` with ours.
 All take turns within the run; ratios are those of the medians. ``--quality-steps N`` optimises the statue for N steps
 in the plain way and in ours with the same network, and prints both scores.
 
@@ -25,8 +25,7 @@ from torch.nn import functional
 from dsr.data.rendered import SimGeo
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.methods.dip import skip_net
-from dsr.methods.dip.optimisation import PriorOptimisation
-from dsr.methods.dip.upsampler import DeepImagePrior
+from dsr.methods.dip.upsampler import DeepImagePrior, PriorOptimisation
 from dsr.metrics.classes import visual_metrics
 from dsr.metrics.functional import SurfacePair
 from dsr.sample import DepthSample
@@ -48,24 +47,24 @@ def module_of(
     given: dict[str, object] = {} if widths is None else {"widths": widths}
     precision = "float32" if plain else fast_precision(device)
     if plain:
-        given |= {"padding": "reflect", "border": 0}
+        given |= {"border": 0}
     prior = DeepImagePrior(scale=4, downsampling=BOX, precision=precision, device=device, **given)  # type: ignore[arg-type]
-    module, _ = prior.module(sample)
+    module = PriorOptimisation(prior, sample, visual=True)
     if plain:
         module.net.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
-        module.answer = lambda: in_plain_layout(module)  # type: ignore[method-assign]
+        module.forward = lambda: in_plain_layout(module)  # type: ignore[method-assign]
     return module
 
 
 def in_plain_layout(module: PriorOptimisation) -> tuple[Tensor, Tensor]:
-    """Return the answer as :meth:`PriorOptimisation.answer` does, without a memory layout of its own."""
+    """Return what :meth:`PriorOptimisation.forward` does, without a memory layout of its own."""
     draws = torch.randn(module.start.shape, generator=module.generator, device=module.start.device)
     before, skip_net.upsample_2x = skip_net.upsample_2x, library
     try:
         y = module.net(torch.addcmul(module.start, draws, module.spread).contiguous())
     finally:
         skip_net.upsample_2x = before
-    return module._depth(y[:, :1]), y[:, 1:].sigmoid()
+    return module.near + (module.far - module.near) * y[:, :1].sigmoid(), y[:, 1:].sigmoid()
 
 
 def stepper(module: PriorOptimisation) -> Callable[[], Tensor]:
@@ -73,8 +72,8 @@ def stepper(module: PriorOptimisation) -> Callable[[], Tensor]:
     optimiser = module.configure_optimizers()
 
     def step() -> Tensor:
-        depth, intensity = module.answer()
-        loss = module.objective(depth, intensity, module.problem)["loss"]
+        depth, intensity = module()
+        loss = module.loss_terms(depth, intensity)["loss"]
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()

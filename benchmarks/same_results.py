@@ -27,7 +27,7 @@ import torch
 from safetensors.numpy import load_file
 
 ROOT = Path.cwd()
-SLOW = {"dip": ["method.steps=20"], "dip_v": ["method.steps=20"], "dip_v_warm": ["method.steps=10"]}
+SLOW = {"dip": ["method.steps=20"], "dip_v": ["method.steps=20"]}
 UNTIMED = ("seconds", "versions")
 
 

@@ -75,7 +75,7 @@ SIZES = {"1": 64, "1.07": 60, "1.23": 52, "1.4": 46, "2": 32, "2.06": 31, "2.67"
 """Sizes of the low-resolution map by the ratio of the sizes."""
 _NOISY = ("1.4", "2.67", "8")
 _EVERYWHERE = ("facets", "msg_v", "bicubic", "bilateral", "guided_filter", "tgv")
-_NETWORKS = ("msg", "pdn", "dg", "ddrnet", "sparse_to_dense", "facets_box", "dip", "dip_v", "dip_v_warm", "eg", "srfs")
+_NETWORKS = ("msg", "pdn", "dg", "ddrnet", "sparse_to_dense", "facets_box", "dip", "dip_v", "eg", "srfs")
 """Methods that are run at all ratios, and at those of networks alone, the last ones because they are slow."""
 _BLOCKS = 6
 Job = Callable[[], Any]
@@ -90,7 +90,7 @@ def upsampling() -> Iterator[tuple[str, Job]]:
         some = SIZES if method in _EVERYWHERE else ("2.67", "4") if method in _NETWORKS else ("1.4", "2.67", "8")
         for ratio in ("2", "4") if method == "msg_v_noisy" else some:
             yield f"{method} {ratio}", _upsampled(ratio, method, errors=errors, **settings)
-    for method in ("dip", "dip_v", "dip_v_warm"):
+    for method in ("dip", "dip_v"):
         yield f"one step of {method}", _upsampled("4", method, steps=1)
     for ratio in ("1", "2", "4", "8"):
         for method in ("facets", "msg_v", "guided_filter"):

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Self
@@ -22,6 +22,7 @@ from dsr.utils.arrays import read_arrays
 from dsr.utils.files import replacing
 from dsr.utils.guards import TooLargeError, parse_json
 from dsr.utils.ratios import as_ratio, fits_ratio, round_ratio
+from dsr.utils.records import derived
 
 NEAREST, FARTHEST = 1e-6, 1e9
 """Limits of depth in metres: a micrometre, nearer than any lens focuses, and beyond the Moon. Within them, the inverse
@@ -42,9 +43,6 @@ class Unit:
         factor: see ``inverse``; depth in metres.
         offset: see ``inverse``.
         limits: smallest and largest value that a prediction may have; the benchmark clamps to them. None for any value.
-
-    Raises:
-        ValueError: ``factor`` is not positive, or ``offset`` is not 0 for depth.
 
     """
 
@@ -86,19 +84,6 @@ class Scene:
         unit: the unit in which the data set's benchmark prints errors.
         regions: parts of the scene that tables show on their own, by name: (1, H, W) uint8, 0 outside; a region of
             several objects, such as planes, numbers them from 1.
-
-    Raises:
-        ValueError: a shape, range or unit is not as above.
-
-    Example:
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.sample import Scene
-        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
-        >>> depth = torch.full((1, 24, 32), 2.0, dtype=torch.float64)
-        >>> scene = Scene("mine", "wall", torch.rand(3, 24, 32), camera, depth)
-        >>> scene.camera.width
-        32
 
     """
 
@@ -142,9 +127,11 @@ class Scene:
                 (first_row, end_row), (first_column, end_column) = map(int, rows), map(int, columns)
                 measured[ratio] = depth_lr[:, first_row:end_row, first_column:end_column]
         depth = None if self.depth is None else self.depth[window]
+        if depth is None and not measured:
+            raise ValueError(f"{self.name}: expected a window with a depth map, high-resolution or measured, got none")
         camera = self.camera.crop(top, left, height, width)
         regions = {name: region[window] for name, region in self.regions.items()}
-        return replace(self, rgb=self.rgb[window], depth=depth, camera=camera, measured=measured, regions=regions)
+        return derived(self, rgb=self.rgb[window], depth=depth, camera=camera, measured=measured, regions=regions)
 
     def _steps(self, ratio: float) -> tuple[Fraction, Fraction]:
         """Return the height and the width of a pixel of a measured map in the photo's pixels."""
@@ -170,21 +157,6 @@ class DepthSample:
         notes: what somebody who reads the scores should know, such as "cropped from 513 x 512".
         unit: the unit in which the data set's benchmark prints errors.
         regions: as of a :class:`Scene`.
-
-    Raises:
-        ValueError: a shape, range or unit is not as above.
-
-    Example:
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.degradation.downsampling import Downsampling, make_sample
-        >>> from dsr.sample import Scene
-        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
-        >>> depth = torch.full((1, 24, 32), 2.0, dtype=torch.float64)
-        >>> scene = Scene("mine", "wall", torch.rand(3, 24, 32), camera, depth)
-        >>> sample = make_sample(scene, 4, Downsampling("box"), "disparity")
-        >>> sample.depth_lr.shape, sample.camera_lr.width
-        (torch.Size([1, 6, 8]), 8)
 
     """
 
@@ -243,12 +215,7 @@ class DepthSample:
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Return the sample that :meth:`save` wrote.
-
-        Raises:
-            ValueError: the file is missing, damaged or something else.
-
-        """
+        """Return the sample that :meth:`save` wrote."""
         try:
             arrays = read_arrays(path)
             about: dict[str, Any] = parse_json(str(arrays["about"]))
@@ -310,10 +277,8 @@ def _read_unit(entries: Mapping[str, Any]) -> Unit:
     return Unit(**{**entries, "limits": None if limits is None else tuple(limits)})
 
 
-_REGION = "region_"
-"""Beginning of the names of arrays that are regions."""
-_BITS = {"uint8": 255, "uint16": 65535}
-"""The largest values of the integers that photos are stored as."""
+_REGION = "region_"  # beginning of the names of arrays that are regions
+_BITS = {"uint8": 255, "uint16": 65535}  # the largest values of the integers that photos are stored as
 
 
 def _pack(rgb: np.ndarray) -> np.ndarray:
@@ -363,9 +328,6 @@ def expect_distances(place: str, depth: Tensor) -> None:
     Args:
         place: the file, or the scene and the map, for the message.
         depth: metres, of any shape; NaN in holes.
-
-    Raises:
-        ValueError: a value is nearer or farther.
 
     """
     beyond = depth[(depth < NEAREST) | (depth > FARTHEST)]

@@ -276,11 +276,9 @@ def _resume(place: Place) -> None:
 
 
 def _checkpoint(place: Place) -> None:
-    from dsr.methods.dip.optimisation import checkpoint_of  # noqa: PLC0415
     from dsr.training.module import SuperResolution  # noqa: PLC0415
 
     path = place.input / "run" / "checkpoints" / "best.ckpt"
-    checkpoint_of(path, "0")
     SuperResolution.load_from_checkpoint(path)
 
 

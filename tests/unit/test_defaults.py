@@ -8,8 +8,6 @@ import pytest
 from omegaconf import OmegaConf
 
 from dsr.app.schema import EvalConfig, MetricsConfig, TrainConfig
-from dsr.methods.dip.optimisation import PriorSettings
-from dsr.methods.dip.problem import PriorObjective
 from dsr.methods.dip.upsampler import DeepImagePrior
 from dsr.methods.recipe import read_recipe
 from dsr.training.module import SuperResolution
@@ -19,7 +17,7 @@ from dsr.utils.configuration import load_target
 CONF = Path(__file__).resolve().parents[2] / "conf"
 GROUPS = ("method", "model", "noise", "holes", "downsampling", "dataset")
 DIFFERENT = {
-    "method/dip": {"data_loss", "data_weight", "w"},  # the class's are those of dip_v, which shares it
+    "method/dip": {"data_loss", "w"},  # the class's are those of dip_v, which shares it
     "method/bilinear": {"order"},  # one function, three orders; its default is bicubic
     "method/nearest": {"order"},
     "method/monocular": {"fit", "multiple", "output"},  # one class, of any network's file
@@ -82,11 +80,6 @@ def test_every_setting_of_deep_image_priors_is_in_conf():
         "scale",
         "downsampling",
     }
-
-
-@pytest.mark.parametrize(("part", "resolved"), [(PriorSettings, set()), (PriorObjective, {"w", "visual"})])
-def test_deep_image_prior_has_the_defaults_of_its_parts_but_for_what_it_resolves(part, resolved):
-    assert differences(defaults_of(part), defaults_of(DeepImagePrior)) == resolved
 
 
 def test_patches_in_conf_have_the_defaults_of_their_class():

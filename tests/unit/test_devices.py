@@ -46,10 +46,10 @@ from dsr.utils.compute_device import fast_precision, pick_device
 from dsr.utils.configuration import ConfigError
 
 SHORT: dict[str, dict[str, Any]] = {
-    "dip": {"steps": 2}, "dip_v": {"steps": 2}, "dip_v_warm": {"steps": 2}, "tgv": {"iterations": 20},
+    "dip": {"steps": 2}, "dip_v": {"steps": 2}, "tgv": {"iterations": 20},
     "srfs": {"iterations": 1},
 }  # fmt: skip
-SLOW = {"eg", "srfs", "dip", "dip_v", "dip_v_warm"}
+SLOW = {"eg", "srfs", "dip", "dip_v"}
 METHODS = [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in AT_HAND]
 CPU = torch.device("cpu")
 

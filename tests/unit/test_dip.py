@@ -1,29 +1,27 @@
-"""Deep image priors as a method: one network for one image."""
+"""Deep image priors: the method, its loss and its network."""
 
 from __future__ import annotations
 
-import contextlib
 import functools
-import os
 import re
-import signal
-from collections.abc import Iterator
-from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.degradation.holes import Blobs
 from dsr.geometry.camera import Camera
-from dsr.methods.dip.optimisation import cost_of_step
-from dsr.methods.dip.upsampler import DeepImagePrior, WarmStarted
-from dsr.methods.networks.weight_choice import packaged_weights
+from dsr.methods.dip.skip_net import SkipNet, levels_for, upsample_2x
+from dsr.methods.dip.upsampler import DeepImagePrior, PriorOptimisation
+from dsr.methods.networks.normalisation import mean3x3
 from dsr.metrics.classes import visual_metrics
-from dsr.metrics.functional import SurfacePair, rmse_v
+from dsr.metrics.functional import SurfacePair, dssim_v, mse_v, rmse_v
+from dsr.metrics.losses import lap1
 from dsr.sample import DepthSample, Scene
-from dsr.utils.progress import Progress, Task, Unit
+from dsr.utils.progress import Progress
 
 BOX = Downsampling("box")
 ENOUGH = {"steps": 120, "widths": (16, 32), "skips": (4, 4), "average": 0.9, "learning_rate": 0.02}
@@ -39,28 +37,21 @@ def _sample(name: str = "step", holes: Blobs | None = None, scale: int = 2) -> D
     return make_sample(Scene("set", name, rgb, CAMERA, depth), scale, BOX, "orthogonal", holes=holes)
 
 
-def _prior(**settings: object) -> DeepImagePrior:
+def _prior(**settings: Any) -> DeepImagePrior:
     quick = {"steps": 12, "widths": (4, 6), "skips": (2, 2), "validate_every": 0, "average": 0.5}
-    return DeepImagePrior(scale=2, downsampling=BOX, **{**quick, **settings})  # type: ignore[arg-type]
+    return DeepImagePrior(**{"scale": 2, "downsampling": BOX, **quick, **settings})
 
 
-class Stopper(Progress):
-    """Keeps the lines, and has the process terminated at a step."""
+def _module(sample: DepthSample, **settings: Any) -> PriorOptimisation:
+    return PriorOptimisation(_prior(**settings), sample, visual=True)
 
-    def __init__(self, at: int) -> None:
-        self.lines: list[str] = []
-        self._at = at
 
-    def say(self, line: str) -> None:
-        self.lines.append(line)
+def _depth(seed: int = 3) -> Tensor:
+    return 2 + torch.rand(1, 1, 32, 48, generator=torch.Generator().manual_seed(seed))
 
-    @contextlib.contextmanager
-    def task(self, name: str, total: int | None = None, *, done: int = 0, unit: Unit = "items") -> Iterator[Task]:
-        def update(done: int, total: int | None = None, remark: str | None = None) -> None:
-            if name == "steps" and done == self._at:
-                os.kill(os.getpid(), signal.SIGTERM)
 
-        yield update
+def _changed(sample: DepthSample, **values: Any) -> DepthSample:
+    return DepthSample(**{**vars(sample), **values})
 
 
 def _error(depth: Tensor, sample: DepthSample, where: Tensor | None = None) -> float:
@@ -69,46 +60,46 @@ def _error(depth: Tensor, sample: DepthSample, where: Tensor | None = None) -> f
     return float((difference if where is None else difference[where]).mean().sqrt())
 
 
-def test_same_seed_gives_the_same_bits_and_another_seed_others() -> None:
-    sample = _sample()
-    first, again, other = (_prior(seed=seed)(sample) for seed in (0, 0, 1))
-    assert torch.equal(first, again)
-    assert not torch.equal(first, other)
-    assert first.shape == (1, 32, 48)
-    assert first.dtype == sample.depth_lr.dtype
-
-
-def test_result_does_not_depend_on_earlier_optimisations_or_global_random_state() -> None:
+def test_result_is_a_function_of_seed_and_scene_alone() -> None:
     a, b = _sample("a"), _sample("b")
-    prior = _prior()
-    alone = _prior()(b)
+    alone, other = _prior()(b), _prior(seed=1)(b)
     torch.manual_seed(99)
+    expected = torch.rand(3)
+    torch.manual_seed(99)
+    prior = _prior()
     both = {name: prior(sample) for name, sample in (("a", a), ("b", b))}
+    assert torch.equal(torch.rand(3), expected)  # the global generator's state is unchanged
     assert torch.equal(both["b"], alone)
     assert not torch.equal(both["a"], both["b"])  # the same maps, but another scene
-
-
-def test_global_random_state_is_unchanged() -> None:
-    torch.manual_seed(5)
-    expected = torch.rand(3)
-    torch.manual_seed(5)
-    _prior(steps=2)(_sample())
-    assert torch.equal(torch.rand(3), expected)
+    assert not torch.equal(alone, other)
+    assert alone.shape == (1, 32, 48)
+    assert alone.dtype == b.depth_lr.dtype
 
 
 def test_result_does_not_depend_on_the_truth() -> None:
     sample = _sample()
-    blind = DepthSample(**{**vars(sample), "depth": None})
     settings = {"validate_every": 4, "metrics": visual_metrics}
-    assert torch.equal(_prior(**settings)(sample), _prior(**settings)(blind))
+    assert torch.equal(_prior(**settings)(sample), _prior(**settings)(_changed(sample, depth=None)))
+
+
+def test_oracle_is_the_best_validation_and_flagged() -> None:
+    sample = _sample()
+    assert sample.depth is not None
+    prior = _prior(oracle=True, steps=5, validate_every=1, learning_rate=0.5)
+    scores = [
+        float(rmse_v(SurfacePair(depth[None], sample.depth[None], CAMERA.rays()[None])))
+        for depth in (_prior(steps=n, learning_rate=0.5)(sample) for n in range(1, 6))
+    ]
+    best = prior(sample)
+    assert torch.equal(best, _prior(steps=1 + scores.index(min(scores)), learning_rate=0.5)(sample))
+    assert (prior.flag, _prior().flag) == ("oracle", "")
 
 
 @functools.cache
 def _fitted(*, visual: bool) -> tuple[Tensor, DepthSample]:
     """Return a result after enough steps, and its sample."""
     sample = _sample()
-    loss = {} if visual else {"data_loss": "mse", "data_weight": 10.0, "w": 0.0}
-    return _prior(**ENOUGH, **loss)(sample), sample
+    return _prior(**ENOUGH, **({} if visual else {"data_loss": "mse", "w": 0.0}))(sample), sample
 
 
 @pytest.mark.slow
@@ -139,179 +130,167 @@ def test_holes_are_filled_better_than_with_the_nearest_values() -> None:
     assert _error(depth, sample, holes) < 0.3 * _error(flat, sample, holes)
 
 
-def test_diverging_optimisation_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "dsr.methods.dip.optimisation.PriorOptimisation.result", lambda _: torch.full((1, 1, 32, 48), torch.nan)
-    )
-    with pytest.raises(ValueError, match=r"step: the optimisation diverged; a lower method.learning_rate"):
-        _prior(steps=1)(_sample())
-
-
-def test_optimisation_stops_at_the_first_loss_that_is_not_finite_and_keeps_no_checkpoint(tmp_path: Path) -> None:
-    what = r"step: the optimisation diverged at step \d+: the loss is nan, at a learning rate of 1e\+30; a lower method"
-    with pytest.raises(ValueError, match=what):
-        _prior(steps=50, learning_rate=1e30, workspace=tmp_path)(_sample())
-    assert not list(tmp_path.rglob("*.ckpt"))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("stopping", ["fixed", "variance", "oracle"])
-def test_interrupted_optimisation_gives_bit_identical_results(tmp_path: Path, stopping: str) -> None:
-    sample = _sample()
-    settings = {"steps": 50, "stopping": stopping, "patience": 15, "validate_every": 20, "metrics": visual_metrics}
-    whole = _prior(workspace=tmp_path / "whole", **settings)(sample)
-    stopper = Stopper(33)
-    with pytest.raises(
-        KeyboardInterrupt, match="interrupted at step 33 of step; the same command continues from there"
-    ):
-        _prior(workspace=tmp_path / "parts", display=stopper, **settings)(sample)
-    last = tmp_path / "parts" / "optimisation" / "step" / "last.ckpt"
-    assert last.is_file()
-    resumed = Stopper(-1)
-    assert torch.equal(_prior(workspace=tmp_path / "parts", display=resumed, **settings)(sample), whole)
-    assert "resumed" in resumed.lines[0]
-    assert not last.exists()
-    tables = [(tmp_path / name / "optimisation" / "step" / "validation.csv").read_text() for name in ("whole", "parts")]
-    assert tables[0] == tables[1]
-    assert "40,val,RMSE_v," in tables[0]
-
-
-def test_signals_act_as_before_after_an_optimisation_that_ended_early(tmp_path: Path) -> None:
-    before = signal.getsignal(signal.SIGTERM)
-    with pytest.raises(KeyboardInterrupt):
-        _prior(workspace=tmp_path, display=Stopper(2))(_sample())
-    assert signal.getsignal(signal.SIGTERM) is before
-    with pytest.raises(ValueError, match="diverged"):
-        _prior(workspace=tmp_path, learning_rate=1e30, steps=50)(_sample())
-    assert signal.getsignal(signal.SIGTERM) is before
-
-
-@pytest.mark.slow
-def test_killed_optimisation_resumes_from_the_last_minute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    sample, settings = _sample(), {"steps": 30}
-    whole = _prior(**settings)(sample)
-    monkeypatch.setattr("dsr.methods.dip.upsampler._SECONDS_BETWEEN_CHECKPOINTS", -1.0)  # each step is a minute
-
-    def kill(*_: object) -> None:
-        raise RuntimeError("killed")
-
-    with monkeypatch.context() as patch:
-        patch.setattr("dsr.methods.dip.optimisation.PriorOptimisation.validation_step", kill)
-        with pytest.raises(RuntimeError, match="killed"):
-            _prior(workspace=tmp_path, **{**settings, "validate_every": 17})(sample)
-    display = Stopper(-1)
-    assert torch.equal(_prior(workspace=tmp_path, display=display, **settings)(sample), whole)
-    assert "resumed" in display.lines[0]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("spoil", ["settings", "input", "bytes"])
-def test_checkpoint_of_another_optimisation_is_not_resumed(tmp_path: Path, spoil: str) -> None:
-    sample = _sample()
-    with pytest.raises(KeyboardInterrupt):
-        _prior(workspace=tmp_path, display=Stopper(5))(sample)
-    settings = {"learning_rate": 0.02} if spoil == "settings" else {}
-    if spoil == "input":
-        sample = DepthSample(**{**vars(sample), "depth_lr": sample.depth_lr * 1.01})
-    if spoil == "bytes":
-        last = tmp_path / "optimisation" / "step" / "last.ckpt"
-        last.write_bytes(last.read_bytes()[:2000])
-    display = Stopper(-1)
-    assert torch.equal(_prior(workspace=tmp_path, display=display, **settings)(sample), _prior(**settings)(sample))
-    assert "resumed" not in display.lines[0]
-
-
-def test_expected_duration_is_announced_at_the_start() -> None:
-    display = Stopper(-1)
-    _prior(display=display)(_sample())
-    pattern = (
-        r"step: 12 steps at 32 x 48 in float32; about \d+ s \([\d.e-]+ s a step as measured now\), "
-        r"about 0\.\d GiB of memory of its own"
-    )
-    assert re.fullmatch(pattern, display.lines[0])
-
-
-@pytest.mark.slow
-def test_stopping_rule_reports_its_step() -> None:
-    display = Stopper(-1)
-    noisy = _sample()
-    _prior(display=display, steps=400, stopping="variance", patience=20, learning_rate=0.05)(noisy)
-    assert re.fullmatch(r"step: stopped at step \d+ \(variance\)", display.lines[-1])
-    assert "up to 400 steps" in display.lines[0]
-
-
-def test_memory_of_a_step_grows_with_the_network() -> None:
-    bytes_kept = [
-        cost_of_step(_prior(widths=widths, border=0).module(_sample())[0])[1] for widths in ((4, 6), (32, 48))
-    ]
-    pixels = 32 * 48
-    assert 4 * 4 * pixels < bytes_kept[0]
-    assert 4 * 32 * pixels * 4 < bytes_kept[1] < 4 * 32 * pixels * 40
-
-
-def test_measuring_a_step_changes_nothing() -> None:
-    first, second = (_prior().module(_sample())[0] for _ in range(2))
-    cost_of_step(first)
-    for one, other in zip(first.answer(), second.answer(), strict=True):
-        assert torch.equal(one, other)
+@pytest.mark.parametrize("steps", [3, 150])
+def test_diverging_optimisation_ends_with_advice(steps: int) -> None:
+    with pytest.raises(ValueError, match=rf"step: .* diverged by step {min(steps, 100)}; a lower method.learning_rate"):
+        _prior(steps=steps, learning_rate=1e30)(_sample())
 
 
 def test_network_sees_a_mirrored_border_that_the_result_lacks() -> None:
     sample = _sample()
-    module, _ = _prior(border=5).module(sample)
+    module = _module(sample, border=5)
     assert module.start.shape == (1, 35, 42, 58)
     photo = module.start[0, 32:]
     torch.testing.assert_close(photo[:, 5:-5, 5:-5], sample.rgb)
     torch.testing.assert_close(photo[:, 4], photo[:, 6])
-    depth, intensity = module.answer()
+    depth, intensity = module()
     assert depth.shape == intensity.shape == (1, 1, 32, 48)
-    plain, _ = _prior(border=0).module(sample)
-    assert plain.start.shape == (1, 35, 32, 48)
-    wide, _ = _prior(border=100).module(sample)  # as far as there is something to mirror
+    wide = _module(sample, border=100)  # as far as there is something to mirror
     assert wide.start.shape == (1, 35, 32 + 62, 48 + 62)
 
 
 def test_normals_of_noise_are_ignored() -> None:
-    clean = _sample()
+    clean, lines = _sample(), list[str]()
     draws = torch.randn(clean.depth_lr.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    noisy = DepthSample(**{**vars(clean), "depth_lr": clean.depth_lr * (1 + 0.02 * draws)})
-    weights = [_prior(w=0.7).module(sample)[0].objective.w for sample in (clean, noisy)]
-    assert weights == [0.7, 0.0]
-    assert _prior(w=0.7, largest_tilt=None).module(noisy)[0].objective.w == 0.7
-    display = Stopper(-1)
-    _prior(steps=1, display=display)(noisy)
-    noise = r"noise of \d\.\d+% tilts the input's normals by \d+ degrees"
-    assert re.fullmatch(rf"step: without MSE_v; {noise}, more than largest_tilt", display.lines[1])
-
-
-def test_oracle_is_flagged() -> None:
-    assert _prior(stopping="oracle", validate_every=5).flag == "oracle"
-    assert _prior(stopping="variance").flag == ""
-
-
-@pytest.mark.slow
-def test_warm_start_begins_at_the_result_of_the_trained_network() -> None:
-    weights = packaged_weights("msg_v_x4")
-    assert weights is not None
-    settings = {"scale": 4, "downsampling": BOX, "weights": weights, "model": "msg_v", "widths": (16,), "skips": (4,)}
-    sample = _sample(scale=4)
-    warm = WarmStarted(**settings, steps=1, validate_every=0)  # type: ignore[arg-type]
-    base = warm.base(sample)
-    torch.testing.assert_close(warm(sample), base, rtol=0, atol=1e-6)
-    module, _ = WarmStarted(**settings, steps=60, validate_every=0).module(sample)  # type: ignore[arg-type]
-    before = float(module.problem.residual(base[None].float()))
-    after = WarmStarted(**settings, steps=60, average=0.9, learning_rate=0.02, validate_every=0)(sample)  # type: ignore[arg-type]
-    assert float(module.problem.residual(after[None].float())) < 0.8 * before
+    noisy = _changed(clean, depth_lr=clean.depth_lr * (1 + 0.02 * draws))
+    display = Progress()
+    display.say = lines.append  # type: ignore[method-assign]
+    depth = _prior(steps=3, display=display)(noisy)
+    assert torch.equal(depth, _prior(steps=3, w=0.0)(noisy))
+    assert re.fullmatch(r"step: without MSE_v; noise of \d\.\d+% tilts the input's normals by \d+ degrees.*", lines[0])
+    assert not torch.equal(_prior(steps=3)(clean), _prior(steps=3, w=0.0)(clean))
 
 
 @pytest.mark.parametrize(
     "settings",
     [
-        {"steps": 0}, {"learning_rate": 0.0}, {"average": 1.0}, {"widths": (4, 0)}, {"skips": (2,)}, {"patience": 0},
-        {"validate_every": -1}, {"validate_every": 0, "stopping": "oracle"}, {"input_noise": 0.0, "guide": False},
-        {"margin": -0.1}, {"border": -1}, {"stopping": "never"}, {"largest_tilt": -1.0},
+        {"steps": 0}, {"learning_rate": 0.0}, {"average": 1.0}, {"widths": (4, 0)}, {"widths": (2,)}, {"border": -1},
+        {"validate_every": -1}, {"validate_every": 0, "oracle": True}, {"input_noise": -1.0}, {"data_loss": "l2"},
+        {"w": -1.0}, {"w_intensity": -0.1}, {"visual": "dssim", "w": 0.0}, {"visual": "ssim"}, {"precision": "int8"},
     ],
 )  # fmt: skip
-def test_settings_out_of_range_are_refused(settings: dict[str, object]) -> None:
+def test_options_out_of_range_are_refused(settings: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=f"^{next(iter(settings))}: expected"):
         _prior(**settings)
+
+
+def test_map_too_small_for_the_visual_loss_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"^visual: dssim expects maps of at least 7 x 7 pixels, got 4 x 6$"):
+        _module(_sample(scale=8), visual="dssim", scale=8)
+
+
+def test_loss_is_the_sum_of_its_terms_on_low_resolution_maps() -> None:
+    module = _module(_sample(), w=0.7, w_intensity=0.3)
+    depth, intensity = _depth(), torch.rand(1, 1, 32, 48)
+    blocks = depth.view(1, 1, 16, 2, 24, 2).mean(dim=(3, 5))
+    depth_lr = module.depth_lr
+    depth_range = float(depth_lr.max() - depth_lr.min())
+    terms = module.loss_terms(depth, intensity)
+    data = lap1(blocks / depth_range, depth_lr / depth_range)
+    visual = rmse_v(SurfacePair(blocks, depth_lr, CAMERA.downscale(2).rays(dtype=torch.float32)[None])).square()
+    photo = lap1(intensity, module.grey)
+    torch.testing.assert_close(terms["data_lap1"], data[0])
+    torch.testing.assert_close(terms["mse_v"], visual[0])
+    torch.testing.assert_close(terms["loss"], data[0] + 0.7 * visual[0] + 0.3 * photo[0])
+    plain = _module(_sample(), data_loss="mse", w=0.0, w_intensity=0.0).loss_terms(depth, intensity)
+    torch.testing.assert_close(plain["loss"], 10 * ((blocks - depth_lr) / depth_range).square().mean())
+    assert plain.keys() == {"loss", "data_mse"}
+
+
+def test_automatic_weight_makes_a_loss_as_large_as_mse_v_for_a_smoothed_input() -> None:
+    sample = _sample()
+    depth_lr = sample.depth_lr[None].float()
+    pair = SurfacePair(mean3x3(depth_lr), depth_lr, sample.camera_lr.rays(dtype=torch.float32)[None])
+    w = _module(sample, visual="dssim").w
+    assert w * dssim_v(pair).mean().item() == pytest.approx(mse_v(pair).item(), rel=1e-5)
+    assert _module(sample).w == 1
+    assert _module(sample, visual="dssim", w=0.25).w == 0.25
+
+
+@pytest.mark.parametrize("loss", [{"data_loss": "mse", "w": 0.0}, {"data_loss": "lap1"}])
+def test_depth_under_a_hole_does_not_matter(loss: dict[str, Any]) -> None:
+    sample = _sample()
+    depth_lr = sample.depth_lr.clone()
+    depth_lr[:, 4:9, 6:14] = torch.nan
+    depth = _depth().requires_grad_()
+    module = _module(_changed(sample, depth_lr=depth_lr), w_intensity=0.0, **loss)
+    module.loss_terms(depth, torch.rand(1, 1, 32, 48))["loss"].backward()
+    gradient = depth.grad
+    assert gradient is not None
+    assert bool(gradient.isfinite().all())
+    assert float(gradient[..., 8:18, 12:28].abs().max()) == 0
+    assert float(gradient[..., 20:, :].abs().min()) > 0
+
+
+def test_loss_is_finite_where_no_two_neighbours_are_valid() -> None:
+    depth_lr = torch.full((1, 16, 24), torch.nan, dtype=torch.float64)
+    depth_lr[:, ::3, ::3] = 2.5
+    depth = _depth().requires_grad_()
+    terms = _module(_changed(_sample(), depth_lr=depth_lr)).loss_terms(depth, torch.rand(1, 1, 32, 48))
+    terms["loss"].backward()
+    assert bool(terms["loss"].isfinite())
+    assert bool(depth.grad.isfinite().all())  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("shape", [(1, 3, 1, 1), (2, 3, 4, 5), (1, 1, 7, 1)])
+@pytest.mark.parametrize("layout", [torch.contiguous_format, torch.channels_last])
+def test_doubling_is_bilinear_interpolation(shape: tuple[int, ...], layout: torch.memory_format) -> None:
+    x = torch.rand(shape, dtype=torch.float64).to(memory_format=layout)
+    expected = functional.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
+    torch.testing.assert_close(upsample_2x(x), expected)
+
+
+@pytest.mark.parametrize("size", [(3, 4), (1, 2)])
+def test_gradient_of_doubling_agrees_with_finite_differences(size: tuple[int, int]) -> None:
+    x = torch.rand(1, 2, *size, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(upsample_2x, x)
+
+
+@pytest.mark.parametrize(("height", "width"), [(32, 48), (37, 50)])
+def test_output_has_the_size_of_the_input(height: int, width: int) -> None:
+    net = SkipNet(5, 2, (4, 6, 8), (2, 2, 2))
+    assert net(torch.rand(1, 5, height, width)).shape == (1, 2, height, width)
+
+
+def test_network_is_the_hourglass_of_ulyanov_et_al() -> None:
+    """Against a plain construction from their supplementary material: two levels, written out."""
+    torch.manual_seed(0)
+    net = SkipNet(3, 2, (4, 6), (1, 2)).double()
+    x = torch.rand(1, 3, 8, 12, dtype=torch.float64)
+
+    def block(y: Tensor, layer: torch.nn.Module) -> Tensor:
+        convolution, norm, _ = layer
+        weight, bias, stride = convolution.weight, convolution.bias, convolution.stride
+        y = functional.conv2d(y, weight, bias, stride, convolution.kernel_size[0] // 2)
+        return functional.leaky_relu(normal(y, norm), 0.2)
+
+    def normal(y: Tensor, norm: torch.nn.Module) -> Tensor:
+        mean, variance = y.mean((0, 2, 3), keepdim=True), y.var((0, 2, 3), unbiased=False, keepdim=True)
+        scaled = (y - mean) / (variance + 1e-5).sqrt()
+        return scaled * norm.weight.view(1, -1, 1, 1) + norm.bias.view(1, -1, 1, 1)
+
+    first = block(block(x, net.down[0][0]), net.down[0][1])
+    y = block(block(first, net.down[1][0]), net.down[1][1])
+    for level, source in ((1, first), (0, x)):
+        y = functional.interpolate(y, scale_factor=2, mode="bilinear")
+        y = normal(torch.cat((block(source, net.skip[level]), y), 1), net.norm[level])
+        y = block(block(y, net.up[level][0]), net.up[level][1])
+    torch.testing.assert_close(net(x), functional.conv2d(y, net.last.weight, net.last.bias))
+
+
+def test_output_is_finer_than_bfloat16_even_if_the_convolutions_are_not() -> None:
+    torch.manual_seed(0)
+    net, x = SkipNet(4, 1, (8, 8), (2, 2)), torch.rand(1, 4, 64, 64)
+    with torch.autocast("cpu", torch.bfloat16):
+        y = net(x)
+    assert y.dtype == torch.float32
+    assert len(y.unique()) > 3000
+    torch.testing.assert_close(y, net(x), rtol=0, atol=0.1 * float(y.detach().std()))
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "most", "levels"),
+    [(512, 512, 5, 5), (32, 512, 5, 4), (4, 4, 5, 1), (2, 2, 5, 1), (64, 64, 2, 2)],
+)
+def test_small_image_has_fewer_levels(height: int, width: int, most: int, levels: int) -> None:
+    assert levels_for(height, width, most) == levels

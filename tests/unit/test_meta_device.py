@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from dataclasses import fields, replace
 from typing import Any
 from unittest import mock
 
@@ -22,9 +21,7 @@ from torch.utils.data import default_collate
 
 from dsr.degradation.downsampling import Downsampling
 from dsr.degradation.hints import encode_facts
-from dsr.methods.dip.problem import PriorObjective
-from dsr.methods.dip.stopping import Variance
-from dsr.methods.dip.upsampler import DeepImagePrior
+from dsr.methods.dip.upsampler import DeepImagePrior, PriorOptimisation
 from dsr.methods.networks.network import Answer
 from dsr.methods.networks.peers.peer import PEERS
 from dsr.methods.networks.trained import NETWORKS
@@ -128,13 +125,14 @@ def test_peers_read_no_value(name: str) -> None:
     net(torch.empty(1, 3, 64, 64, device=META), torch.empty(1, 1, 64, 64, device=META)).sum().backward()
 
 
-@pytest.mark.parametrize("objective", [PriorObjective(), PriorObjective("mse", w=0.0)])
-def test_step_of_a_deep_image_prior_reads_no_value(objective: PriorObjective) -> None:
-    module, _ = DeepImagePrior(scale=4, downsampling=Downsampling("box")).module(sample_of(*step(64)))
-    tensors = {each.name: getattr(module.problem, each.name) for each in fields(module.problem)}
-    module.problem = replace(module.problem, **_on_meta({k: v for k, v in tensors.items() if isinstance(v, Tensor)}))
+@pytest.mark.parametrize("loss", [{}, {"data_loss": "mse", "w": 0.0}])
+def test_step_of_a_deep_image_prior_reads_no_value(loss: dict[str, Any]) -> None:
+    prior = DeepImagePrior(scale=4, downsampling=Downsampling("box"), **loss)
+    module = PriorOptimisation(prior, sample_of(*step(64)), visual=True)
+    for name, value in vars(module).items():
+        if isinstance(value, Tensor):
+            setattr(module, name, value.to(META))
     module.to(META)
-    module.objective, module.stopping = objective, Variance(module.average, patience=20)
     with mock.patch("torch.randn", lambda shape, **_: torch.empty(shape, device=META)):  # the generator is the CPU's
-        module.training_step(None, 0).backward()
+        module.loss_terms(*module())["loss"].backward()
     assert all(each.grad is not None for each in module.net.parameters())

@@ -172,7 +172,7 @@ def test_crop_keeps_a_map_at_any_ratio_where_the_window_has_whole_pixels_of_it()
     scene = _scene(rgb=torch.rand(3, 16, 24), camera=camera, depth=None, measured={24 / 9: depth_lr})
     window = scene.crop(8, 0, 8, 16)
     assert torch.equal(window.measured[24 / 9], depth_lr[:, 3:, :6])
-    with pytest.raises(ValueError, match="expected a depth map, high-resolution or measured, got none"):
+    with pytest.raises(ValueError, match="expected a window with a depth map"):
         scene.crop(0, 0, 12, 24)
 
 

@@ -37,7 +37,7 @@ def _sample(width: int, height: int, hole: bool = False) -> DepthSample:
     [
         ("bicubic", (1, 1.5, 2, 3)), ("guided_filter", (1, 1.5, 2, 3)), ("joint_bilateral", (1, 1.5, 2, 3)),
         ("fast_global_smoother", (1, 1.5, 2, 3)), ("bilateral", (1, 1.5, 2, 3)), ("dornet", (1, 1.5, 2, 3)),
-        ("tgv", (1, 2, 3)), ("dip", (1, 2, 3)), ("dip_v_warm", (2,)),
+        ("tgv", (1, 2, 3)), ("dip", (1, 2, 3)), ("dip_v", (1, 2, 3)),
         ("facets_box", (2,)), ("srfs", (2,)), ("eg", (2,)),
     ],
 )  # fmt: skip

@@ -12,10 +12,7 @@ from torch import Tensor
 
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera
-from dsr.methods.dip.problem import ImageProblem, PriorObjective
-from dsr.methods.dip.upsampler import DeepImagePrior
 from dsr.methods.networks.network import Answer
-from dsr.methods.networks.normalisation import mean3x3
 from dsr.metrics.functional import SurfacePair, dssim_v, mse_v
 from dsr.metrics.lpips import LPIPS, lpips_v
 from dsr.metrics.visual_loss import MSE_V, VisualLoss, VisualLossName, make_visual_loss, match_weight
@@ -108,12 +105,6 @@ def test_objectives_have_the_visual_loss_as_a_term(name: VisualLossName, network
     assert terms["loss"].item() == pytest.approx((terms["l1"] + 0.3 * terms[name]).item(), rel=1e-6)
     expected = loss(SurfacePair(batch["bf"] / disparity, batch["depth"], batch["rays"]))
     assert terms[name].item() == pytest.approx(expected.item(), rel=1e-6)
-    problem = ImageProblem.of(sample, Downsampling("box"), "orthogonal", torch.device("cpu"))
-    depth, photo = _surface(0, 64).float(), torch.rand(1, 1, 64, 64)
-    terms = PriorObjective("mse", 1.0, 0.3, 0.0, loss)(depth, photo, problem)
-    assert terms["loss"].item() == pytest.approx((terms["data_mse"] + 0.3 * terms[name]).item(), rel=1e-6)
-    expected = loss(SurfacePair(problem.downsample(depth), problem.depth_lr, problem.rays_lr))
-    assert terms[name].item() == pytest.approx(expected.item(), rel=1e-6)
 
 
 def test_automatic_weight_makes_a_loss_as_large_as_mse_v_for_interpolation() -> None:
@@ -131,38 +122,10 @@ def test_automatic_weight_makes_a_loss_as_large_as_mse_v_for_interpolation() -> 
     assert balance_weight(patches, MSE_V) == w
 
 
-def test_automatic_weight_of_a_prior_makes_a_loss_as_large_as_mse_v_for_a_smoothed_input() -> None:
-    sample = _sample(64)
-    prior = DeepImagePrior(scale=2, downsampling=Downsampling("box"), steps=1, visual="dssim", largest_tilt=None)
-    objective = prior.module(sample)[0].objective
-    depth_lr = sample.depth_lr[None].float()
-    pair = SurfacePair(mean3x3(depth_lr), depth_lr, sample.camera_lr.rays(dtype=torch.float32)[None])
-    assert objective.w * dssim_v(pair).mean().item() == pytest.approx(mse_v(pair).item(), rel=1e-5)
-    for visual, w, expected in (("mse_v", "auto", 1.0), ("dssim", 0.25, 0.25)):
-        settings = {"visual": visual, "w": w, "largest_tilt": None}
-        prior = DeepImagePrior(scale=2, downsampling=Downsampling("box"), steps=1, **settings)  # type: ignore[arg-type]
-        assert prior.module(sample)[0].objective.w == expected
-
-
 def test_weight_without_a_typical_error_is_one() -> None:
     pair = SurfacePair(_surface(0), _surface(0), CAMERA.rays()[None])
     assert match_weight(VisualLoss("dssim"), [pair]) == 1
     assert match_weight(VisualLoss("dssim"), []) == 1
-
-
-def test_prior_refuses_a_visual_loss_that_it_cannot_use(tmp_path: Path) -> None:
-    def prior(**settings: object) -> DeepImagePrior:
-        return DeepImagePrior(scale=2, downsampling=Downsampling("box"), steps=1, **settings)  # type: ignore[arg-type]
-
-    with pytest.raises(ValueError, match=r"^visual: expected mse_v where w is 0, as for DIP, got dssim$"):
-        prior(visual="dssim", w=0.0)
-    with pytest.raises(ValueError, match=r"^visual: expected one of mse_v, dssim, lpips, got 'ssim'$"):
-        prior(visual="ssim")
-    absent = tmp_path / "none.pth"
-    with pytest.raises(ValueError, match=rf"^visual: lpips needs AlexNet's weights: expected a file, got {absent} "):
-        prior(visual="lpips", lpips_trunk=absent)
-    with pytest.raises(ValueError, match=r"^visual: dssim expects maps of at least 7 x 7 pixels, got 5 x 5$"):
-        prior(visual="dssim").module(_sample(10))
 
 
 def test_lpips_without_its_weights_is_one_line_that_says_what_to_do(tmp_path: Path) -> None:
@@ -173,5 +136,7 @@ def test_lpips_without_its_weights_is_one_line_that_says_what_to_do(tmp_path: Pa
     damaged.write_bytes(b"not weights")
     with pytest.raises(ValueError, match=r"^visual: lpips needs AlexNet's weights: .*damaged\.pth"):
         make_visual_loss("lpips", damaged)
+    with pytest.raises(ValueError, match=r"^visual: expected one of mse_v, dssim, lpips, got 'ssim'$"):
+        make_visual_loss("ssim")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"^visual: expected a network for lpips, got none$"):
         VisualLoss("lpips")

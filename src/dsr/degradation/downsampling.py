@@ -13,8 +13,8 @@ At the border, kernels are truncated and normalised.
 
 from __future__ import annotations
 
+import functools
 import hashlib
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -24,10 +24,11 @@ from torch import Tensor
 from dsr.degradation.holes import Holes
 from dsr.degradation.noise import Noise
 from dsr.geometry.camera import Camera, RangeType, from_range, to_range
-from dsr.sample import FARTHEST, NEAREST, DepthSample, Scene
+from dsr.sample import FARTHEST, NEAREST, AllHolesError, DepthSample, Scene
 from dsr.utils.compute_device import known_true
 from dsr.utils.guards import naming
 from dsr.utils.ratios import check_scale, match_ratio
+from dsr.utils.records import unchecked
 
 Kernel = Literal["box", "nearest", "bilinear", "bicubic", "gaussian"]
 _LEAST_WEIGHT = 0.5
@@ -44,16 +45,6 @@ class Downsampling:
         sigma: standard deviation of the gaussian as a fraction of the scale factor.
         range_type: range type that is averaged; None for the one that the method works on, as in the paper.
         assumed: kernel of the forward model that methods assume (DIP); None for the true one.
-
-    Raises:
-        ValueError: the kernel is unknown, or sigma is below 0.1.
-
-    Example:
-        >>> import torch
-        >>> from dsr.degradation.downsampling import Downsampling
-        >>> Downsampling("box")(torch.arange(16.0).view(1, 4, 4), 2)
-        tensor([[[ 2.5000,  4.5000],
-                 [10.5000, 12.5000]]])
 
     """
 
@@ -80,20 +71,16 @@ class Downsampling:
             return camera.decimate(scale, scale // 2)
         return camera.downscale(scale)
 
-    def __call__(self, values: Tensor, scale: int) -> Tensor:
-        """Downsample maps.
+    def __call__(self, values: Tensor, scale: int, *, complete: bool | None = None) -> Tensor:
+        """Downsample (..., H, W) maps with NaN in holes to (..., H / scale, W / scale).
 
         A low-resolution pixel whose block has no valid pixel is a hole. If less than half of a kernel's weight falls on
         valid pixels, the result is the mean of the block's valid pixels.
 
         Args:
-            values: (..., H, W), NaN where unknown; H and W divisible by ``scale``.
-
-        Returns:
-            (..., H / scale, W / scale).
-
-        Raises:
-            ValueError: the scale does not divide the size.
+            values: H and W divisible by ``scale``.
+            scale: factor.
+            complete: whether there are no holes; None if not known.
 
         """
         height, width = values.shape[-2:]
@@ -101,13 +88,15 @@ class Downsampling:
             raise ValueError(f"downsampling: expected a size divisible by {scale}, got {height} x {width}")
         if self.kernel == "nearest":
             return values[..., scale // 2 :: scale, scale // 2 :: scale]
-        valid = values.isfinite()
-        if known_true(valid):
+        if complete:
             return self._apply(values, scale)
-        complete, weight = torch.where(valid, values, 0), valid.to(values.dtype)
-        mean, fraction = self._apply(complete, scale), self._apply(weight, scale)
+        valid = values.isfinite()
+        if complete is None and known_true(valid):
+            return self._apply(values, scale)
+        filled, weight = torch.where(valid, values, 0), valid.to(values.dtype)
+        mean, fraction = self._apply(filled, scale), self._apply(weight, scale)
         box = Downsampling("box")
-        block_mean, block_fraction = box._apply(complete, scale), box._apply(weight, scale)
+        block_mean, block_fraction = box._apply(filled, scale), box._apply(weight, scale)
         tiny = torch.finfo(values.dtype).tiny
         smooth = mean / fraction.clamp(min=_LEAST_WEIGHT)
         depth_lr = torch.where(fraction >= _LEAST_WEIGHT, smooth, block_mean / block_fraction.clamp(min=tiny))
@@ -115,24 +104,27 @@ class Downsampling:
 
     def _apply(self, values: Tensor, scale: int) -> Tensor:
         """Return the weighted averages of maps without holes."""
-        rows = self._matrix(values.shape[-2], scale).to(values)
-        columns = self._matrix(values.shape[-1], scale).to(values)
+        rows, columns = (
+            _matrix(self.kernel, self.sigma, size, scale, values.dtype, values.device) for size in values.shape[-2:]
+        )
         return rows @ values @ columns.T
 
-    def _matrix(self, size: int, scale: int) -> Tensor:
-        """Return the kernel's weights, (size / scale, size); every row sums to 1."""
-        centres = (torch.arange(size // scale, dtype=torch.float64) + 0.5) * scale - 0.5
-        distance = (torch.arange(size, dtype=torch.float64) - centres[:, None]) / scale
-        weights = _PROFILES[self.kernel](distance.abs(), self.sigma)
-        return weights / weights.sum(dim=1, keepdim=True)
 
-
-def _box(x: Tensor, _: float) -> Tensor:
-    return (x < 0.5).double()
-
-
-def _bilinear(x: Tensor, _: float) -> Tensor:
-    return (1 - x).clamp(min=0)
+@functools.lru_cache(maxsize=16)
+@torch.inference_mode(mode=False)  # so that gradients can be computed with it
+def _matrix(kernel: Kernel, sigma: float, size: int, scale: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Return a kernel's weights, (size / scale, size); every row sums to 1."""
+    centres = (torch.arange(size // scale, dtype=torch.float64) + 0.5) * scale - 0.5
+    x = ((torch.arange(size, dtype=torch.float64) - centres[:, None]) / scale).abs()
+    if kernel == "box":
+        weights = (x < 0.5).double()
+    elif kernel == "bilinear":
+        weights = (1 - x).clamp(min=0)
+    elif kernel == "bicubic":
+        weights = cubic_kernel(x)
+    else:
+        weights = torch.exp(-0.5 * (x / sigma).square()) * (x <= 3 * sigma)
+    return (weights / weights.sum(dim=1, keepdim=True)).to(device, dtype)
 
 
 def cubic_kernel(x: Tensor, a: float = -0.5) -> Tensor:
@@ -140,22 +132,6 @@ def cubic_kernel(x: Tensor, a: float = -0.5) -> Tensor:
     near = ((a + 2) * x - (a + 3)) * x * x + 1
     far = ((x - 5) * x + 8) * x * a - 4 * a
     return torch.where(x < 1, near, torch.where(x < 2, far, 0))
-
-
-def _bicubic(x: Tensor, _: float) -> Tensor:
-    return cubic_kernel(x)
-
-
-def _gaussian(x: Tensor, sigma: float) -> Tensor:
-    return torch.exp(-0.5 * (x / sigma).square()) * (x <= 3 * sigma)
-
-
-_PROFILES: dict[str, Callable[[Tensor, float], Tensor]] = {
-    "box": _box,
-    "bilinear": _bilinear,
-    "bicubic": _bicubic,
-    "gaussian": _gaussian,
-}
 
 
 @dataclass(frozen=True)
@@ -203,23 +179,6 @@ def make_sample(
         generator: random generator of noise and holes, or a seed, from which each scene gets generators of its own.
         holes: holes of the low-resolution map.
 
-    Raises:
-        ValueError: the scene has no depth or no measured map at this scale, or a value is out of range.
-
-    Example:
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.degradation.downsampling import Downsampling, make_sample
-        >>> from dsr.sample import Scene
-        >>> from dsr.degradation.noise import GaussianMultiplicative
-        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
-        >>> depth = torch.full((1, 24, 32), 2.0, dtype=torch.float64)
-        >>> scene = Scene("mine", "wall", torch.rand(3, 24, 32), camera, depth)
-        >>> noise = GaussianMultiplicative(0.01)
-        >>> sample = make_sample(scene, 4, Downsampling("box"), "disparity", noise, generator=1)
-        >>> sample.depth_lr.shape, bool((sample.depth_lr - 2).abs().max() < 0.1)
-        (torch.Size([1, 6, 8]), True)
-
     """
     if isinstance(downsampling, Measured):
         ratio = _match_measured(scene, scale)
@@ -244,9 +203,11 @@ def make_sample(
         )
     if holes is not None:
         depth_lr = depth_lr.masked_fill(holes(depth_lr, camera_lr, of_holes), torch.nan)
-    return DepthSample(
-        scene.dataset, scene.name, scene.rgb, depth_lr, scene.camera, camera_lr, ratio, scene.depth, notes, scene.unit,
-        scene.regions,
+    if not bool(depth_lr.isfinite().any()):
+        raise AllHolesError(f"{scene.name}: depth_lr: expected at least one known pixel, all are holes")
+    return unchecked(
+        DepthSample, dataset=scene.dataset, scene=scene.name, rgb=scene.rgb, depth_lr=depth_lr, camera=scene.camera,
+        camera_lr=camera_lr, scale=ratio, depth=scene.depth, notes=notes, unit=scene.unit, regions=scene.regions,
     )  # fmt: skip
 
 
@@ -285,6 +246,8 @@ def downsample_depth(
     downsampling: Downsampling,
     range_type: RangeType,
     noise: tuple[Noise, torch.Generator] | None = None,
+    *,
+    complete: bool | None = None,
 ) -> tuple[Tensor, Camera]:
     """Return the low-resolution depth that a model and noise make of high-resolution depth, and its camera.
 
@@ -297,6 +260,7 @@ def downsample_depth(
         downsampling: downsampling model.
         range_type: range type that is averaged, unless the model sets one.
         noise: noise of the averages and its generator, in the same range type, unless the noise sets one.
+        complete: whether neither map can have holes or values out of range; None if not known.
 
     """
     range_type = downsampling.range_type or range_type
@@ -304,7 +268,7 @@ def downsample_depth(
     values_hr = to_range(depth, camera, range_type)
     if range_type == "disparity":  # in the low-resolution camera's pixels
         values_hr = values_hr / scale
-    values = downsampling(values_hr, scale)
+    values = downsampling(values_hr, scale, complete=complete)
     if noise is not None:
         kind, generator = noise
         if kind.range_type is not None:
@@ -312,5 +276,7 @@ def downsample_depth(
             range_type, values = kind.range_type, to_range(averages, camera_lr, kind.range_type)
         values = kind(values, generator)
     depth_lr = from_range(values, camera_lr, range_type)
+    if complete:
+        return depth_lr, camera_lr
     held = (depth_lr >= NEAREST) & (depth_lr <= FARTHEST)  # bicubic may undershoot beside a depth step
     return torch.where(held, depth_lr, torch.nan), camera_lr

@@ -10,12 +10,9 @@ from torch.nn import functional
 
 KERNELS = ("box", "nearest", "bilinear", "bicubic", "gaussian")
 """Kernels in the order of their facts; a sensor's point spread counts as gaussian."""
-FACTS = len(KERNELS) + 3
-"""Number of the facts of a map."""
-LARGEST = 0.1
-"""Relative errors beyond this are outliers, and do not count as noise."""
-_WINDOW = 9
-"""Low-resolution pixels of the window in which the noise is measured."""
+FACTS = len(KERNELS) + 3  # number of the facts of a map
+LARGEST = 0.1  # relative errors beyond this are outliers, and do not count as noise
+_WINDOW = 9  # low-resolution pixels of the window in which the noise is measured
 
 
 class Hints(NamedTuple):
@@ -36,9 +33,6 @@ def encode_facts(kernel: str | None = None, soft: bool | None = None, *, noise: 
         kernel: the kernel that made it, one of ``KERNELS``, as the first five.
         soft: whether its depth steps are soft, as the next two: sharp, soft.
         noise: whether its noise is given, as the last.
-
-    Raises:
-        ValueError: there is no such kernel.
 
     """
     facts = torch.zeros(FACTS)

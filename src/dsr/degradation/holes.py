@@ -28,18 +28,6 @@ class Blobs:
         share: fraction of the pixels.
         size: typical diameter in low-resolution pixels.
 
-    Raises:
-        ValueError: the fraction is not between 0 and 1, or the size is below 1.
-
-    Example:
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.degradation.holes import Blobs
-        >>> camera, depth = dsr.Camera.from_fov(60, width=80, height=60), torch.full((1, 60, 80), 2.0)
-        >>> holes = Blobs(share=0.1)(depth, camera, torch.Generator().manual_seed(0))
-        >>> round(float(holes.float().mean()), 2)
-        0.1
-
     """
 
     share: float = 0.1
@@ -69,20 +57,6 @@ class Shadows:
 
     Args:
         baseline: in metres; positive if the second is to the right, so that holes lie to the left of near objects.
-
-    Raises:
-        ValueError: the baseline is 0 or not finite.
-
-    Example:
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.degradation.holes import Shadows
-        >>> camera, depth = dsr.Camera.from_fov(60, width=80, height=60), torch.full((1, 60, 80), 3.0)
-        >>> bool(Shadows()(depth, camera, torch.Generator()).any())  # a wall hides nothing
-        False
-        >>> depth[:, 20:40, 30:50] = 1.0
-        >>> bool(Shadows()(depth, camera, torch.Generator()).any())  # a box before it does
-        True
 
     """
 

@@ -41,7 +41,8 @@ from dsr.degradation.random_fields import (
 )
 from dsr.degradation.random_noise import NOISES
 from dsr.geometry.camera import Camera
-from dsr.sample import AllHolesError, DepthSample, Scene
+from dsr.sample import CENTIMETRES, AllHolesError, DepthSample, Scene
+from dsr.utils.records import unchecked
 
 SENSOR_NOISES = ("waves", "structured", "flight", "lidar", "stereo")
 """Kinds of noise that stand for a sensor, which does not see glass; the others stand for maps made of a surface."""
@@ -71,20 +72,6 @@ class Everything:
             mirroring or glossy objects stand. The truth is their surface, the map what a sensor sees. None if depth
             steps are soft, as their edges are not.
         told: fraction of the maps whose kernel is stated by a hint; likewise, independently, for noise and steps.
-
-    Raises:
-        ValueError: there is no such kind, or a frequency or a fraction is out of range.
-
-    Example:
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.degradation.random_degradation import Everything
-        >>> from dsr.sample import Scene
-        >>> camera = dsr.Camera.from_fov(60, width=64, height=64)
-        >>> scene = Scene("mine", "wall", torch.rand(3, 64, 64), camera, torch.full((1, 64, 64), 2.0))
-        >>> sample, hints = Everything()(scene, 4, torch.Generator().manual_seed(0))
-        >>> sample.depth_lr.shape
-        torch.Size([1, 16, 16])
 
     """
 
@@ -147,9 +134,6 @@ class Everything:
             scale: the factor, which divides its size.
             soft: whether its depth steps are soft, for the hint.
 
-        Raises:
-            AllHolesError: no pixel is left.
-
         """
         scene = self._change_surfaces(scene, scale, generator)
         kernel, kind = self._draw_kinds(scale, generator)
@@ -175,9 +159,11 @@ class Everything:
         if not bool(noisy.isfinite().any()):
             raise AllHolesError(scene.name)
         rgb = self._change_photo(scene.rgb.float(), self.photo / (1 + (kind == "none")), generator)
-        sample = DepthSample(
-            scene.dataset, scene.name, rgb, noisy.reciprocal(), scene.camera, camera_lr, scale, scene.depth
-        )
+        sample = unchecked(
+            DepthSample, dataset=scene.dataset, scene=scene.name, rgb=rgb, depth_lr=noisy.reciprocal(),
+            camera=scene.camera, camera_lr=camera_lr, scale=scale, depth=scene.depth, notes=(), unit=CENTIMETRES,
+            regions={},
+        )  # fmt: skip
         return sample, self._hints(clean, noisy, kernel, generator, soft=soft)
 
     def _change_surfaces(self, scene: Scene, scale: int, generator: torch.Generator) -> Scene:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -15,6 +14,7 @@ from torch.nn import functional
 
 from dsr.geometry.windows import window_maxima
 from dsr.sample import Scene
+from dsr.utils.records import derived
 
 
 def draw(shares: Mapping[str, float], generator: torch.Generator) -> str:
@@ -127,9 +127,9 @@ def add_relief(scene: Scene, generator: torch.Generator) -> Scene:
     assert scene.depth is not None  # noqa: S101 - for the type checker
     values = scene.depth.reciprocal()
     if chance(0.3, generator):
-        return replace(scene, depth=round_values(values, generator).reciprocal())
+        return derived(scene, depth=round_values(values, generator).reciprocal())
     grain = field_of(values.float(), uniform(0, 1.5, generator) if chance(0.6, generator) else 0, generator)
-    return replace(scene, depth=(values * (1 + power(-4.6, -3, generator) * grain)).reciprocal())
+    return derived(scene, depth=(values * (1 + power(-4.6, -3, generator) * grain)).reciprocal())
 
 
 def add_folds(scene: Scene, generator: torch.Generator) -> Scene:
@@ -147,7 +147,7 @@ def add_folds(scene: Scene, generator: torch.Generator) -> Scene:
     down, across = (functional.pad(height.diff(dim=dim), pad) for dim, pad in ((-2, (0, 0, 0, 1)), (-1, (0, 1, 0, 0))))
     light = 1 + strength * scene.camera.fx * (math.cos(angle) * across + math.sin(angle) * down)
     rgb = (scene.rgb * light.clamp(0.2, 1.8).to(scene.rgb)).clamp(0, 1)
-    return replace(scene, rgb=rgb, depth=scene.depth * (1 + height.clamp(-0.2, 0.2)).to(scene.depth))
+    return derived(scene, rgb=rgb, depth=scene.depth * (1 + height.clamp(-0.2, 0.2)).to(scene.depth))
 
 
 def displace(values: Tensor, scale: int, generator: torch.Generator) -> Tensor:

@@ -272,18 +272,7 @@ def recognise(device_name: str) -> Sensor | None:
 
 
 def sensor_named(name: str) -> Sensor:
-    """Return the sensor of one of the names of ``SENSORS``, without regard to case, or of a device's name.
-
-    Raises:
-        ValueError: there is none, or none of its figures is known.
-
-    Example:
-        >>> from dsr.degradation.sensors import sensor_named
-        >>> sensor = sensor_named("Intel RealSense D435")
-        >>> sensor.kind, sensor.width
-        ('stereo', 1280)
-
-    """
+    """Return the sensor of one of the names of ``SENSORS``, without regard to case, or of a device's name."""
     found = next((each for each in SENSORS if each.name.casefold() == name.casefold()), None) or recognise(name)
     if found is None or not _has_figures(found):
         known = ", ".join(each.name for each in SENSORS if _has_figures(each))
@@ -328,9 +317,6 @@ def identify(depth: Tensor, name: str = "auto", device_name: str = "") -> Identi
         depth: (1, h, w) in metres, NaN in holes, as it was read.
         name: of one of ``SENSORS`` or of a device; ``auto``, or ``none`` for none.
         device_name: of the device, as its files state it; empty where they do not.
-
-    Raises:
-        ValueError: there is no such sensor, or the map's values keep to steps that it does not have.
 
     """
     if name == "none":
@@ -411,31 +397,22 @@ def _interpolate(depth: Tensor, points: tuple[tuple[float, float], ...]) -> Tens
 
 _CONSTANTS = (16.0, 4096.0)
 """Range of constants that are looked for, in metres: 16 pixel metres in whole pixels to 128 in steps of 1/32."""
-_ROUNDINGS = (1e-3, 1.25e-4, 1e-4)
-"""Metres to which cameras' files are rounded."""
-_SEEN = 2.0
-"""A step of depth shows if it is so many times what values are rounded to."""
-_COMMON = 4
-"""Pixels that a value must have; rarer ones come from resampling."""
-_BAND = 1.2
-"""Ratio of the constants that are looked for in the same values, those far enough to show them."""
-_FEWEST, _CYCLES = 12, 8
-"""Distinct values, and steps between the smallest and the largest, that are needed."""
+_ROUNDINGS = (1e-3, 1.25e-4, 1e-4)  # metres to which cameras' files are rounded
+_SEEN = 2.0  # A step of depth shows if it is so many times what values are rounded to
+_COMMON = 4  # pixels that a value must have; rarer ones come from resampling
+_BAND = 1.2  # ratio of the constants that are looked for in the same values, those far enough to show them
+_FEWEST, _CYCLES = 12, 8  # distinct values, and steps between the smallest and the largest, that are needed
 _CONFIDENT, _SIGNIFICANT = 0.6, 25.0
 """Least confidence; and least N confidence^2 for N values, minus the logarithm of the chance that random ones have."""
-_NEAREST = 0.1
-"""Metres; nearer values are left out."""
-_PIXELS = 2**20
-"""About how many pixels are looked at; of larger maps some rows."""
-_MOST = 400
-"""Values that are looked at, drawn at random."""
+_NEAREST = 0.1  # metres; nearer values are left out
+_PIXELS = 2**20  # about how many pixels are looked at; of larger maps some rows
+_MOST = 400  # values that are looked at, drawn at random
 _DENSE = 1.2
 """Distinct values over the number of steps between the smallest and the largest, from which they keep to no steps."""
 _HARMONIC = 0.8
 """Values that are multiples of a step are also multiples of its parts: the largest step is taken whose confidence is
 at least this share of the best."""
-_FINE = 4
-"""Samples of the spectrum for each cycle that fits into the range of inverse depth."""
+_FINE = 4  # samples of the spectrum for each cycle that fits into the range of inverse depth
 
 
 def recognise_values(depth: Tensor) -> ValueSteps | None:

@@ -19,6 +19,7 @@ from torch import Tensor
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from dsr.geometry.range_type import RANGE_TYPES, RangeType
+from dsr.utils.records import derived
 
 # baseline in metres of the virtual stereo pair of a camera without a second one (Voynov et al. 2019)
 VIRTUAL_BASELINE = 0.2
@@ -148,7 +149,7 @@ class Camera:
                 f"crop: expected a window within {self.height} x {self.width}, "
                 f"got {height} x {width} at row {top}, column {left}"
             )
-        return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top, doffs=self.doffs)
+        return derived(self, width=int(width), height=int(height), cx=float(self.cx - left), cy=float(self.cy - top))
 
     def rescale(self, width: int, height: int) -> Camera:
         """Return the camera of the same view, resampled to ``width x height`` pixels that cover the same area.
@@ -210,7 +211,7 @@ class Camera:
         """
         camera = self
         for _ in range(turns % 4):
-            camera = replace(
+            camera = derived(
                 camera,
                 width=camera.height,
                 height=camera.width,

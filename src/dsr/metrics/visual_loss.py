@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -26,36 +26,15 @@ _MIN_SIZES = {"mse_v": 2, "dssim": SSIM_WINDOW, "lpips": MIN_SIZE}
 
 @dataclass(frozen=True)
 class VisualLoss:
-    """A loss on renderings.
-
-    Args:
-        name: ``mse_v``, ``dssim`` or ``lpips``.
-        network: of ``lpips``; see :func:`make_visual_loss`.
-
-    Raises:
-        ValueError: there is no such loss, or no network for it.
-
-    Example:
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.metrics.functional import SurfacePair
-        >>> from dsr.metrics.visual_loss import VisualLoss
-        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
-        >>> truth = torch.full((1, 1, 24, 32), 2.0)
-        >>> prediction = truth.clone().requires_grad_()
-        >>> loss = VisualLoss("mse_v")(SurfacePair(prediction, truth, camera.rays()[None]))
-        >>> loss.shape, loss.requires_grad
-        (torch.Size([1]), True)
-
-    """
+    """A loss on renderings; :func:`make_visual_loss` loads the network of ``lpips``."""
 
     name: VisualLossName = "mse_v"
     network: LPIPS | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         """Check the values."""
-        if self.name not in get_args(VisualLossName):
-            raise ValueError(f"visual: expected one of {', '.join(get_args(VisualLossName))}, got {self.name!r}")
+        if self.name not in _TITLES:
+            raise ValueError(f"visual: expected one of {', '.join(_TITLES)}, got {self.name!r}")
         if self.name == "lpips" and self.network is None:
             raise ValueError("visual: expected a network for lpips, got none")
 
@@ -63,9 +42,8 @@ class VisualLoss:
         """Return the loss, (B,); NaN for an image without a valid normal."""
         if self.name == "mse_v":
             return mse_v(pair)
-        if self.network is None:
-            return dssim_v(pair).mean(dim=1)
-        return lpips_v(pair, self.network).mean(dim=1)
+        values = dssim_v(pair) if self.network is None else lpips_v(pair, self.network)
+        return values.mean(dim=1)
 
     @property
     def title(self) -> str:
@@ -88,11 +66,8 @@ def make_visual_loss(name: VisualLossName, trunk: str | Path | None = None) -> V
     """Return a loss, with the network that ``lpips`` needs.
 
     Args:
-        name: see :class:`VisualLoss`.
+        name: ``mse_v``, ``dssim`` or ``lpips``.
         trunk: file of AlexNet's weights; None to use torch's hub cache.
-
-    Raises:
-        ValueError: there is no such loss, or the weights are not there.
 
     """
     if name != "lpips":
@@ -105,13 +80,7 @@ def make_visual_loss(name: VisualLossName, trunk: str | Path | None = None) -> V
 
 @torch.no_grad()
 def match_weight(visual: VisualLoss, pairs: Iterable[SurfacePair]) -> float:
-    """Return the weight for which a loss is as large as MSE_v: the median of their ratio over typical pairs.
-
-    Args:
-        visual: the loss.
-        pairs: typical errors, one image each. Pairs without an error do not count; if none does, the weight is 1.
-
-    """
+    """Return the weight that makes a loss as large as MSE_v: the median of their ratios, 1 if no pair has an error."""
     ratios = torch.cat([torch.ones(0), *(mse_v(pair).cpu() / visual(pair).cpu() for pair in pairs)])
     ratios = ratios[ratios.isfinite() & (ratios > 0)]
     return float(ratios.median()) if len(ratios) else 1.0

@@ -22,8 +22,7 @@ from dsr.utils.files import replacing
 from dsr.utils.guards import parse_json
 from dsr.utils.memory import expect_memory
 
-_BYTES = 150
-"""Least memory that a pixel takes while a scene is made; random ones take four times as much."""
+_BYTES = 150  # least memory that a pixel takes while a scene is made; random ones take four times as much
 
 
 @dataclass(frozen=True)
@@ -34,9 +33,6 @@ class Rendering:
         rgb: (H, W, 3) uint8.
         depth: (H, W) float64 orthogonal depth in metres.
         camera: camera of both.
-
-    Raises:
-        ValueError: the arrays are of other types or sizes.
 
     """
 
@@ -78,12 +74,7 @@ def load_or_render(path: Path, make: Callable[[], Rendering]) -> Rendering:
 
 
 def expect_size(size: int) -> None:
-    """Refuse a height and width of scenes that this machine has too little memory to make.
-
-    Raises:
-        OutOfMemoryError: it has; the message begins with ``size``.
-
-    """
+    """Refuse a height and width of scenes that this machine has too little memory to make."""
     expect_memory("size", size, _BYTES * size**2)
 
 

@@ -47,13 +47,10 @@ SCENES: tuple[str, ...] = (
     "sphere_cylinder_no_texture",
     "statue",
 )
-SCENES_VERSION = 1
-"""Version of the scenes; it has to be increased whenever an image changes."""
-FOCAL = 618.0386 / 512
-"""Focal length in image widths."""
+SCENES_VERSION = 1  # version of the scenes; it has to be increased whenever an image changes
+FOCAL = 618.0386 / 512  # focal length in image widths
 WALL_Z = 3.95
-STATUE_BASE = (0.0, 1.09, 3.02)
-"""Point of the floor on which the statue stands, in camera coordinates in metres."""
+STATUE_BASE = (0.0, 1.09, 3.02)  # point of the floor on which the statue stands, in camera coordinates in metres
 
 
 def statue_distance(p: Array) -> Array:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -14,33 +13,20 @@ from torch.nn import functional
 from dsr.degradation.downsampling import Downsampling
 from dsr.sample import Scene
 from dsr.training.settings import PatchSettings
+from dsr.utils.records import derived
 
 _BLUR, _NOISE = 1.0, 0.03
 
 
 def augment(scene: Scene, settings: PatchSettings, random: np.random.Generator) -> tuple[Scene, float]:
-    """Return a scene changed at random, rgb, depth and camera alike, and the factor that multiplied its depth.
-
-    Example:
-        >>> import numpy as np
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.sample import Scene
-        >>> from dsr.training.augmentation import augment
-        >>> from dsr.training.settings import PatchSettings
-        >>> camera = dsr.Camera.from_fov(60, width=32, height=24)
-        >>> depth = torch.full((1, 24, 32), 2.0, dtype=torch.float64)
-        >>> scene = Scene("mine", "wall", torch.rand(3, 24, 32), camera, depth)
-        >>> changed, factor = augment(scene, PatchSettings(), np.random.default_rng(0))
-        >>> bool((changed.depth - 2 * factor).abs().max() < 1e-6)
-        True
-
-    """
+    """Return a scene changed at random, rgb, depth and camera alike, and the factor that multiplied its depth."""
+    rgb = scene.rgb
     if settings.colour:
         gain = torch.from_numpy(1 + settings.colour * random.standard_normal((3, 1, 1))).float()
-        scene = replace(scene, rgb=(scene.rgb * gain).clamp(0, 1))
+        rgb = (rgb * gain).clamp(0, 1)
     if random.random() < settings.photo:
-        scene = replace(scene, rgb=simulate_camera(scene.rgb, random))
+        rgb = simulate_camera(rgb, random)
+    scene = derived(scene, rgb=rgb)
     if settings.flip:
         for vertical in (False, True):
             if random.random() < 0.5:
@@ -48,8 +34,7 @@ def augment(scene: Scene, settings: PatchSettings, random: np.random.Generator) 
     if settings.rotate:
         scene = rotate90(scene, int(random.integers(4)))
     factor = math.exp(random.uniform(-settings.depth_scale, settings.depth_scale)) if settings.depth_scale else 1.0
-    depth = None if scene.depth is None else scene.depth * factor
-    return replace(scene, depth=depth), factor
+    return derived(scene, depth=_depth_of(scene) * factor), factor
 
 
 def simulate_camera(rgb: Tensor, random: np.random.Generator) -> Tensor:
@@ -74,8 +59,7 @@ def soften(scene: Scene, sigma: float = 0.0, *, halve: bool = True) -> Scene:
         halve: whether the result is half as large, of means of 2 x 2 pixels of the photo and of blurred inverse depth.
 
     """
-    assert scene.depth is not None  # noqa: S101 - for the type checker
-    inverse = scene.depth.reciprocal()
+    inverse = _depth_of(scene).reciprocal()
     if sigma:
         valid, width = inverse.isfinite(), sigma * (1 + halve)
         sums, weights = (
@@ -84,28 +68,32 @@ def soften(scene: Scene, sigma: float = 0.0, *, halve: bool = True) -> Scene:
         )
         inverse = torch.where(valid, torch.from_numpy(sums) / torch.from_numpy(weights), torch.nan)
     if not halve:
-        return replace(scene, depth=inverse.reciprocal())
+        return derived(scene, depth=inverse.reciprocal())
     inverse = Downsampling("box")(inverse, 2)
     camera = scene.camera.downscale(2)
-    return replace(scene, rgb=functional.avg_pool2d(scene.rgb[None], 2)[0], depth=inverse.reciprocal(), camera=camera)
+    return derived(scene, rgb=functional.avg_pool2d(scene.rgb[None], 2)[0], depth=inverse.reciprocal(), camera=camera)
 
 
 def mirror(scene: Scene, *, vertical: bool = False) -> Scene:
     """Return the mirror image of a scene and its camera, left to right or, with ``vertical``, top to bottom."""
     camera = scene.camera
     if vertical:
-        camera = replace(camera, cy=camera.height - 1 - camera.cy)
+        camera = derived(camera, cy=camera.height - 1 - camera.cy)
     else:
-        camera = replace(camera, cx=camera.width - 1 - camera.cx)
+        camera = derived(camera, cx=camera.width - 1 - camera.cx)
     axis = -2 if vertical else -1
-    depth = None if scene.depth is None else scene.depth.flip(axis)
-    return replace(scene, rgb=scene.rgb.flip(axis), depth=depth, camera=camera, measured={})
+    return derived(scene, rgb=scene.rgb.flip(axis), depth=_depth_of(scene).flip(axis), camera=camera, measured={})
 
 
 def rotate90(scene: Scene, turns: int) -> Scene:
     """Return the scene rotated counterclockwise by ``turns`` quarter turns, the camera included."""
     if turns % 4 == 0:
         return scene
-    depth = None if scene.depth is None else scene.depth.rot90(turns, (-2, -1))
-    rgb = scene.rgb.rot90(turns, (-2, -1))
-    return replace(scene, rgb=rgb, depth=depth, camera=scene.camera.rotate90(turns), measured={})
+    rgb, depth = scene.rgb.rot90(turns, (-2, -1)), _depth_of(scene).rot90(turns, (-2, -1))
+    return derived(scene, rgb=rgb, depth=depth, camera=scene.camera.rotate90(turns), measured={})
+
+
+def _depth_of(scene: Scene) -> Tensor:
+    """Return the true depth, which scenes to train with have."""
+    assert scene.depth is not None  # noqa: S101 - for the type checker
+    return scene.depth

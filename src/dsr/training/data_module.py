@@ -25,8 +25,7 @@ from dsr.training.patches import Patches, check_patches
 from dsr.training.settings import PatchSettings
 from dsr.utils import interruption
 
-_EPOCH = 1000
-"""About how many batches an epoch has where the trainer has no number of steps."""
+_EPOCH = 1000  # about how many batches an epoch has where the trainer has no number of steps
 
 
 @dataclass(frozen=True)
@@ -36,9 +35,6 @@ class Part:
     Args:
         source: the data set.
         share: how often patches come from it, relative to the other parts.
-
-    Raises:
-        ValueError: the share is negative or no number.
 
     """
 
@@ -108,21 +104,6 @@ class PatchData(lightning.LightningDataModule):
         everything: the distribution of degradations to train on in place of ``degradation``.
         patches_per_step: of all devices and batches of a step; None for those of one batch.
 
-    Raises:
-        ValueError: a data set is one to evaluate on or has too few scenes, a scene is to be trained on and validated
-            with, or the scale does not divide a patch.
-
-    Example:
-        >>> from dsr.data.rendered import Procedural
-        >>> from dsr.degradation.downsampling import Downsampling
-        >>> from dsr.training.data_module import Part, PatchData
-        >>> from dsr.training.degradation import Degradation
-        >>> from dsr.training.settings import PatchSettings
-        >>> parts = [Part(Procedural(count=6, size=64))]
-        >>> data = PatchData(parts, PatchSettings(patch=32, batch=2), Degradation(4, Downsampling("box")))
-        >>> type(data).__mro__[1].__name__  # for lightning.Trainer().fit(model, data)
-        'LightningDataModule'
-
     """
 
     def __init__(
@@ -173,12 +154,7 @@ class PatchData(lightning.LightningDataModule):
         return dict(self._held_out)
 
     def setup(self, stage: str = "fit") -> None:
-        """Load the scenes; Lightning's ``stage`` makes no difference.
-
-        Raises:
-            ValueError: a scene is smaller than a patch, or lacks a true depth.
-
-        """
+        """Load the scenes; Lightning's ``stage`` makes no difference."""
         if self._cut is not None:
             return
         groups = [

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.degradation.noise import Noise
@@ -14,10 +13,7 @@ from dsr.geometry.camera import baseline_times_focal
 from dsr.methods.networks.normalisation import compute_min_max
 from dsr.sample import DepthSample, Scene
 
-Batch = dict[str, Any]
-"""Tensors by name; whole scenes also have ``unit``, the benchmark's as plain values."""
-_MIN_RELATIVE_RANGE = 1e-3
-"""Smallest range of a map as a fraction of its disparity."""
+Batch = dict[str, Any]  # tensors by name; whole scenes also have ``unit``, the benchmark's as plain values
 
 
 @dataclass(frozen=True)
@@ -26,13 +22,6 @@ class Degradation:
 
     Args:
         scale, downsampling, noise: as for :func:`dsr.degradation.downsampling.make_sample`.
-
-    Example:
-        >>> from dsr.degradation.downsampling import Downsampling
-        >>> from dsr.degradation.noise import GaussianMultiplicative
-        >>> from dsr.training.degradation import Degradation
-        >>> Degradation(4, Downsampling("box"), GaussianMultiplicative(0.01)).scale
-        4
 
     """
 
@@ -47,25 +36,17 @@ class Degradation:
 
 
 def to_tensors(sample: DepthSample, dtype: torch.dtype = torch.float32) -> Batch:
-    """Return a sample as the tensors on which a network of disparities is trained.
+    """Return a sample with a true depth as the tensors on which a network of disparities is trained.
 
-    Args:
-        sample: a sample with a true depth.
-        dtype: type of all tensors but ``rgb`` and ``min_max``.
-
-    Returns:
-        ``rgb`` (3, H, W) and ``min_max`` (2, 1, 1), the lowest and highest low-resolution disparity, in float32; in
-        ``dtype`` ``disparity_lr`` (1, h, w) in pixels of the high-resolution camera, ``depth`` (1, H, W) in metres,
-        ``rays`` (3, H, W), ``bf`` (1, 1, 1), the baseline times the focal length, and ``doffs`` (1, 1, 1).
-
-    Raises:
-        ValueError: the sample has no true depth.
-
+    ``rgb`` (3, H, W) and ``min_max`` (2, 1, 1), the lowest and highest low-resolution disparity, in float32; in
+    ``dtype`` ``disparity_lr`` (1, h, w) in pixels of the high-resolution camera, ``depth`` (1, H, W) in metres,
+    ``rays`` (3, H, W), ``bf`` (1, 1, 1), the baseline times the focal length, and ``doffs`` (1, 1, 1).
     """
     if sample.depth is None:
         raise ValueError(f"{sample.scene}: expected a true depth to train with, there is none")
-    camera = sample.camera
-    disparity = sample.disparity_lr()
+    camera, disparity = sample.camera, sample.disparity_lr()
+    low, high = compute_min_max(disparity[None]).flatten()
+    min_range = 1e-3 * high.abs().clamp(min=1e-3)  # of a map without relief
     return {
         "rgb": sample.rgb.float(),
         "disparity_lr": disparity.to(dtype),
@@ -73,12 +54,5 @@ def to_tensors(sample: DepthSample, dtype: torch.dtype = torch.float32) -> Batch
         "rays": camera.rays(dtype=dtype),
         "bf": torch.full((1, 1, 1), baseline_times_focal(camera), dtype=dtype),
         "doffs": torch.full((1, 1, 1), camera.doffs, dtype=dtype),
-        "min_max": _min_max(disparity).float(),
+        "min_max": torch.stack((low, torch.maximum(high, low + min_range))).view(2, 1, 1).float(),
     }
-
-
-def _min_max(disparity: Tensor) -> Tensor:
-    """Return the lowest and the highest valid value, (2, 1, 1), which differ by a thousandth at least."""
-    low, high = compute_min_max(disparity[None]).flatten()
-    min_range = _MIN_RELATIVE_RANGE * high.abs().clamp(min=_MIN_RELATIVE_RANGE)
-    return torch.stack((low, torch.maximum(high, low + min_range))).view(2, 1, 1)

@@ -33,8 +33,7 @@ from dsr.training.parts import node_of, partial_node_of, read_node
 from dsr.utils.guards import refusing
 from dsr.utils.torch_files import read_torch_file
 
-_RENDERED_SCENES = 4
-"""Number of scenes of each validation set that are rendered for TensorBoard."""
+_RENDERED_SCENES = 4  # number of scenes of each validation set that are rendered for TensorBoard
 
 
 _PARTS: dict[str, tuple[type, Callable[..., Any]]] = {
@@ -54,9 +53,6 @@ class WarmupCosine(LambdaLR):
         optimizer: whose rate is the highest one.
         steps: number of steps of the whole training.
         warmup: number of steps until the highest rate.
-
-    Raises:
-        ValueError: the warm-up is negative.
 
     """
 
@@ -90,17 +86,6 @@ class SuperResolution(lightning.LightningModule):
             smaller in the first steps.
         metrics: function that makes the metrics of a validation set.
         validation_sets: names of the validation sets, in the order of the loaders.
-
-    Raises:
-        ValueError: the network does not cover the whole image, or the decay is out of range.
-
-    Example:
-        >>> from dsr.methods.networks.msg_net import MSGNet
-        >>> from dsr.training.module import SuperResolution
-        >>> from dsr.training.objective import DepthObjective
-        >>> training = SuperResolution(MSGNet(4), DepthObjective(w=0.7))
-        >>> type(training.configure_optimizers()).__name__
-        'AdamW'
 
     """
 
@@ -312,9 +297,6 @@ class SuperResolution(lightning.LightningModule):
             map_location: as for :func:`torch.load`.
             **parts: arguments of the constructor in place of those that the checkpoint names, such as a ``net`` that is
                 not dsr's own. The ``metrics`` are not in it.
-
-        Raises:
-            ValueError: it is no such checkpoint, or a part has to be given.
 
         """
         stored = read_torch_file(Path(checkpoint_path)).get("hyper_parameters")

@@ -22,9 +22,7 @@ from dsr.training.shading import shading_loss
 from dsr.utils.compute_device import in_own_precision
 
 DepthLoss = Literal["lap1", "l1", "mse"]
-_TILT = math.asin(5 / 255)
-"""1.1 degrees: it changes the rendering of a surface lit from the side by 5 of 255, the threshold of BadPix_v(5)."""
-_TINY, _FAINT = 1e-5, 1e-7
+_TILT = math.asin(5 / 255)  # 1.1 degrees: changes a rendering under grazing light by 5 of 255, as for BadPix_v(5)
 _DEPTH_LOSSES = {"lap1": losses.lap1, "l1": losses.l1, "mse": losses.mse}
 _PATCHES_FOR_W = 64
 
@@ -42,9 +40,9 @@ class Objective(abc.ABC):
     def facts(self) -> dict[str, str | float]:
         """Entries of the loss in the header of weights files."""
 
-    @abc.abstractmethod
     def arguments(self) -> dict[str, Any]:
         """Return plain values from which :meth:`of` makes the loss again."""
+        return dict(vars(self))
 
     @classmethod
     def of(cls, **arguments: Any) -> Self:
@@ -63,25 +61,17 @@ class Objective(abc.ABC):
 
     @abc.abstractmethod
     def check(self, net: DisparityNetwork, patch: int, *, hinted: bool) -> None:
-        """Check that a network can be trained with this loss.
+        """Raise a ValueError if a network cannot be trained with this loss, on patches of this size.
 
         Args:
             net: the network.
             patch: height and width of the patches in pixels.
             hinted: whether there are hints on the maps.
 
-        Raises:
-            ValueError: it cannot.
-
         """
 
     def balanced(self, first_patches: Callable[[int], Sequence[Batch]]) -> Self:
-        """Return the loss with weights that are computed from patches, if there are any such; else itself.
-
-        Args:
-            first_patches: returns as many of the training's patches, without a batch axis.
-
-        """
+        """Return the loss with weights that are computed from as many patches as it asks for; itself without such."""
         return self
 
 
@@ -97,15 +87,6 @@ class DepthObjective(Objective):
         w: weight of the visual loss; 0 for none; ``auto`` is computed by :meth:`balanced`, and 1 before.
         visual: the visual loss.
         shading: weight of :func:`dsr.training.shading.shading_loss`; 0 for none.
-
-    Raises:
-        ValueError: there is no such depth loss, or the weight of the shading loss is negative.
-
-    Example:
-        >>> from dsr.metrics.visual_loss import VisualLoss
-        >>> from dsr.training.objective import DepthObjective
-        >>> DepthObjective("lap1", w=0.7, visual=VisualLoss("mse_v")).w
-        0.7
 
     """
 
@@ -161,20 +142,16 @@ class DepthObjective(Objective):
     @in_own_precision
     def __call__(self, answer: Answer, batch: Batch) -> dict[str, Tensor]:
         """Return ``loss`` and its terms; intermediate stages of the network get the depth loss, too."""
-        disparity, w = answer.disparity, 1.0 if self.w == "auto" else self.w
-        target = batch["bf"] / batch["depth"] - batch["doffs"]
-        extent = _range(batch["disparity_lr"])
-
-        def compare(disparity: Tensor) -> Tensor:
-            return _DEPTH_LOSSES[self.depth_loss](disparity / extent, target / extent).nanmean()
-
-        loss = compare(disparity)
-        terms: dict[str, Tensor] = {self.depth_loss: loss}
-        for number, each in enumerate(answer.stages, 1):
-            terms[f"{self.depth_loss}_stage{number}"] = compare(each)
-            loss = loss + terms[f"{self.depth_loss}_stage{number}"]
+        name, w = self.depth_loss, 1.0 if self.w == "auto" else self.w
+        compare, extent = _DEPTH_LOSSES[name], _range(batch["disparity_lr"])
+        target = (batch["bf"] / batch["depth"] - batch["doffs"]) / extent
+        loss = compare(answer.disparity / extent, target).nanmean()
+        terms: dict[str, Tensor] = {name: loss}
+        for number, stage in enumerate(answer.stages, 1):
+            terms[f"{name}_stage{number}"] = compare(stage / extent, target).nanmean()
+            loss = loss + terms[f"{name}_stage{number}"]
         if w or self.shading:
-            pair = SurfacePair(to_depth(disparity, batch), batch["depth"], batch["rays"])
+            pair = SurfacePair(to_depth(answer.disparity, batch), batch["depth"], batch["rays"])
         if w:
             terms[self.visual.name] = self.visual(pair).nanmean()
             loss = loss + w * terms[self.visual.name]
@@ -215,23 +192,15 @@ class SurfaceObjective(Objective):
     @property
     def facts(self) -> dict[str, str | float]:
         """Entries of the loss in the header of weights files."""
-        return {"loss": "surface", "depth": self.depth, "soft": self.soft, "sharp": self.sharp, "errors": self.errors}
-
-    def arguments(self) -> dict[str, Any]:
-        """Return the constructor's arguments."""
-        return dict(vars(self))
+        return {"loss": "surface", **vars(self)}
 
     def check(self, net: DisparityNetwork, patch: int, *, hinted: bool) -> None:
         """Refuse a network that does not state its errors, and maps without hints."""
+        name, choices = type(net).__name__, ", ".join(_DEPTH_LOSSES)
         if not net.states_errors:
-            choices = ", ".join(_DEPTH_LOSSES)
-            raise ValueError(
-                f"depth_loss: expected one of {choices} for {type(net).__name__}, which states no errors, got surface"
-            )
+            raise ValueError(f"depth_loss: expected one of {choices} for {name}, which states no errors, got surface")
         if not hinted:
-            raise ValueError(
-                f"degradation: expected everything or another one with hints, for {type(net).__name__}, got plain"
-            )
+            raise ValueError(f"degradation: expected everything or another one with hints, for {name}, got plain")
 
     @in_own_precision
     def __call__(self, answer: Answer, batch: Batch) -> dict[str, Tensor]:
@@ -244,22 +213,21 @@ class SurfaceObjective(Objective):
                 steps are soft.
 
         """
-        target = batch["bf"] / batch["depth"]
+        disparity, target = answer.disparity, batch["bf"] / batch["depth"]
         unit = target.flatten(1).nanmedian(dim=1).values.view(-1, 1, 1, 1)
-        positive = answer.disparity > 0
-        depth = torch.where(positive, batch["bf"] / torch.where(positive, answer.disparity, 1), torch.nan)
+        positive = disparity > 0
+        depth = torch.where(positive, batch["bf"] / torch.where(positive, disparity, 1), torch.nan)
         pair = SurfacePair(depth, batch["depth"], batch["rays"])
+        squares = ((disparity - target) / unit).nan_to_num(0).square()
+        rmse = (masked_mean(squares, target.isfinite())[:, 0] + 1e-7).sqrt()
         terms = {
-            "lap1": losses.lap1(answer.disparity / unit, target / unit).nanmean(),
-            "rmse_v": (mse_v(pair) + _TINY).sqrt().nanmean(),
+            "lap1": losses.lap1(disparity / unit, target / unit).nanmean(),
+            "rmse_v": (mse_v(pair) + 1e-5).sqrt().nanmean(),
+            "rmse_soft": (batch["soft"] * rmse).nanmean(),
+            "rmse_sharp": ((1 - batch["soft"]) * rmse).nanmean(),
         }
-        missed = (answer.disparity - target) / unit
-        missed = masked_mean(missed.nan_to_num(0).square(), target.isfinite())
-        missed = (missed[:, 0] + _FAINT).sqrt()
-        terms["rmse_soft"] = (batch["soft"] * missed).nanmean()
-        terms["rmse_sharp"] = ((1 - batch["soft"]) * missed).nanmean()
         with torch.no_grad():
-            off = (answer.disparity.clamp(min=1e-6) / target).log().abs()
+            off = (disparity.clamp(min=1e-6) / target).log().abs()
             angle = torch.deg2rad(angle_between(*pair.normals))
         for name, expected, error, valid in (
             ("spread", answer.spread, off, off.isfinite()),
@@ -280,40 +248,31 @@ def to_depth(disparity: Tensor, batch: Batch) -> Tensor:
 
 
 def balance_weight(patches: Sequence[Batch], visual: VisualLoss = MSE_V) -> float:
-    """Return the weight w for which one depth error gives both terms of the loss the same size.
+    """Return the weight w with which a small tilt of the surface costs the same in both terms of the loss.
 
-    A depth error of tan(a) z / f metres between two neighbouring pixels, z / f metres apart, tilts the normal by a. The
-    depth term of this error is bf tan(a) / (f z range), where bf is the baseline times the focal length and range that
-    of the low-resolution disparities; MSE_v is (2 - 2 cos a) / 3. w is the median over the patches of their ratio for a
-    tilt of 1.1 degrees, which changes a rendering by 5 of 255. For another visual loss, w makes it as large as w MSE_v
-    would be for bicubic interpolation, where a training begins.
-
-    Args:
-        patches: single training patches, without a batch axis, as from :func:`dsr.training.degradation.to_tensors`.
-        visual: the visual loss.
-
-    Raises:
-        ValueError: there is no patch.
-
+    A depth error of tan(a) z / f from one pixel to the next tilts the normal by a. The depth term of this error is
+    bf tan(a) / (f z range), where bf is the baseline times the focal length and range that of the low-resolution
+    disparities; MSE_v is (2 - 2 cos a) / 3. w is the median of their ratio over the patches, which have no batch axis.
+    For another visual loss, w makes it as large as w MSE_v would be for bicubic interpolation, where a training begins.
     """
-    ratios = []
+    if not patches:
+        raise ValueError("patches: expected one or more to compute w from, got none")
+    ratios, pairs = [], []
     for patch in patches:
         x = patch["rays"][0, 0].double()
         focal = (x.numel() - 1) / float(x[-1] - x[0])
         depth = float(patch["depth"][patch["depth"].isfinite()].median())
         extent = float(_range(patch["disparity_lr"][None]))
         ratios.append(float(patch["bf"]) * math.tan(_TILT) / (focal * depth * extent))
-    if not ratios:
-        raise ValueError("patches: expected one or more to compute w from, got none")
     w = float(torch.tensor(ratios, dtype=torch.float64).median()) / ((2 - 2 * math.cos(_TILT)) / 3)
-    return w if visual.name == "mse_v" else w * match_weight(visual, map(_interpolate, patches))
-
-
-def _interpolate(patch: Batch) -> SurfacePair:
-    """Return the bicubic interpolation of a patch's low-resolution disparity, and the patch."""
-    batch = {name: value[None] for name, value in patch.items()}
-    scale = batch["depth"].shape[-1] // batch["disparity_lr"].shape[-1]
-    return SurfacePair(to_depth(upsample_bicubic(batch["disparity_lr"], scale), batch), batch["depth"], batch["rays"])
+    if visual.name == "mse_v":
+        return w
+    for patch in patches:
+        batch = {name: value[None] for name, value in patch.items()}
+        scale = batch["depth"].shape[-1] // batch["disparity_lr"].shape[-1]
+        depth_map = to_depth(upsample_bicubic(batch["disparity_lr"], scale), batch)
+        pairs.append(SurfacePair(depth_map, batch["depth"], batch["rays"]))
+    return w * match_weight(visual, pairs)
 
 
 def _range(disparity: Tensor) -> Tensor:

@@ -8,9 +8,9 @@ same on one device and on several.
 from __future__ import annotations
 
 import contextlib
+import copy
 import itertools
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -24,6 +24,7 @@ from dsr.sample import AllHolesError, DepthSample, Scene
 from dsr.training.augmentation import augment, soften
 from dsr.training.degradation import Batch, Degradation, to_tensors
 from dsr.training.settings import PatchSettings
+from dsr.utils.records import derived
 
 _WINDOW_TRIES, _SCENE_TRIES = 10, 100
 _MIN_VALID_FRACTION = 0.5
@@ -45,9 +46,6 @@ class Patches(Dataset[Batch]):
         everything: the distribution of degradations to draw from in place of ``degradation``; all patches of a step
             have one factor.
         per_step: number of patches of a step; None for those of a batch.
-
-    Raises:
-        ValueError: a scene is too small or has no true depth, or there is no scene.
 
     """
 
@@ -85,8 +83,8 @@ class Patches(Dataset[Batch]):
 
     def select(self, first: int, count: int) -> Patches:
         """Return the patches ``first`` .. ``first + count - 1`` of the same run."""
-        other = Patches.__new__(Patches)
-        other.__dict__ = {**self.__dict__, "_first": first, "_count": count}
+        other = copy.copy(self)
+        other._first, other._count = first, count
         return other
 
     def __getitem__(self, index: int) -> Batch:
@@ -98,62 +96,51 @@ class Patches(Dataset[Batch]):
         random = np.random.default_rng([self._seed, number])
         for _ in range(_SCENE_TRIES):
             with contextlib.suppress(AllHolesError):
-                return (
-                    self._patch(random) if self._everything is None else self._degrade(self._everything, number, random)
-                )
+                return self._patch(number, random)
         raise ValueError(
             "patches: expected low-resolution maps with a known pixel or more; noise makes all of them holes"
         )
 
-    def _patch(self, random: np.random.Generator) -> Batch:
-        """Return a random patch."""
+    def _patch(self, number: int, random: np.random.Generator) -> Batch:
+        """Return a random patch; with a distribution of degradations, ``noise`` and ``facts`` are hints."""
+        everything, size = self._everything, self._settings.patch
         group = min(int(np.searchsorted(self._limits, random.random(), "right")), len(self._groups) - 1)
-        number, top, left = self._window(group, random)
-        source = self._groups[group][number]
-        size = self._settings.patch
-        cropped = source.crop(top, left, size, size)
-        depth = None if cropped.depth is None else cropped.depth.double()
-        scene, factor = augment(replace(cropped, depth=depth, measured={}), self._settings, random)
+        soft = everything is not None and random.random() < everything.soft
+        halved = soft and min(min(scene.rgb.shape[-2:]) for scene in self._groups[group]) >= 2 * size
+        window = 2 * size if halved else size
+        index, top, left = self._window(group, random, window)
+        scene = derived(self._groups[group][index].crop(top, left, window, window), measured={})
+        if soft:
+            scene = soften(scene, random.uniform(0 if halved else _SOFT, _SOFTEST), halve=halved)
+        if everything is None and scene.depth is not None:
+            scene = derived(scene, depth=scene.depth.double())
+        scene, factor = augment(scene, self._settings, random)
         generator = torch.Generator().manual_seed(int(random.integers(2**63)))
-        sample = self._degradation.sample(scene, generator)
-        patch = to_tensors(sample)
-        patch["min_max"] = self._blend_min_max(
-            patch["min_max"], self._depth_range(group, number), sample, factor, random
-        )
-        return patch
-
-    def _degrade(self, everything: Everything, number: int, random: np.random.Generator) -> Batch:
-        """Return a random patch with a degradation from a distribution; ``noise`` and ``facts`` are hints."""
+        if everything is None:
+            sample = self._degradation.sample(scene, generator)
+            patch = to_tensors(sample)
+            whole = self._depth_range(group, index)
+            patch["min_max"] = self._blend_min_max(patch["min_max"], whole, sample, factor, random)
+            return patch
         of_step = np.random.default_rng([self._seed, number // self._per_step, 1])
         drawing = torch.Generator().manual_seed(int(of_step.integers(2**62)))
         scale = everything.draw_scale(self._degradation.scale, drawing)
-        size = self._settings.patch
-        group = min(int(np.searchsorted(self._limits, random.random(), "right")), len(self._groups) - 1)
-        soft = random.random() < everything.soft
-        halved = soft and min(min(scene.rgb.shape[-2:]) for scene in self._groups[group]) >= 2 * size
-        window = 2 * size if halved else size
-        number, top, left = self._window(group, random, window)
-        cropped = replace(self._groups[group][number].crop(top, left, window, window), measured={})
-        if soft:
-            cropped = soften(cropped, random.uniform(0 if halved else _SOFT, _SOFTEST), halve=halved)
-        scene, _ = augment(cropped, self._settings, random)
-        generator = torch.Generator().manual_seed(int(random.integers(2**63)))
         sample, hints = everything(scene, scale, generator, soft=soft)
-        known = {"noise": hints.noise, "facts": hints.facts, "soft": torch.tensor(float(soft))}
-        return {**to_tensors(sample), **known}
+        return {**to_tensors(sample), **hints._asdict(), "soft": torch.tensor(float(soft))}
 
-    def _window(self, group: int, random: np.random.Generator, size: int | None = None) -> tuple[int, int, int]:
+    def _window(self, group: int, random: np.random.Generator, size: int) -> tuple[int, int, int]:
         """Return a random window of a group: the number of the scene, the top and the left.
 
         The first window of a random scene with enough valid depth is taken, else the best of ten. Another scene is
         taken only where all ten have no valid depth, so that scenes with many holes are not trained on less often.
         """
-        size, scenes = size or self._settings.patch, self._groups[group]
+        scenes = self._groups[group]
         for _ in range(_SCENE_TRIES):
             number, best, highest = int(random.integers(len(scenes))), None, 0.0
             for _ in range(_WINDOW_TRIES):
                 top, left = (int(random.integers(length - size + 1)) for length in scenes[number].rgb.shape[-2:])
-                fraction = _valid_fraction(scenes[number], top, left, size)
+                window = scenes[number].depth[:, top : top + size, left : left + size]  # type: ignore[index]  # checked
+                fraction = float(window.isfinite().float().mean())
                 if fraction > highest:
                     best, highest = (number, top, left), fraction
                 if highest >= _MIN_VALID_FRACTION:
@@ -190,12 +177,7 @@ class Patches(Dataset[Batch]):
 
 
 def check_patches(scenes: Sequence[Scene], settings: PatchSettings, scale: int) -> None:
-    """Check that patches of these settings can be cropped.
-
-    Raises:
-        ValueError: the scale does not divide the patches, or a scene is smaller than a patch or has no true depth.
-
-    """
+    """Check that patches of these settings can be cropped."""
     if settings.patch % scale:
         raise ValueError(f"patch: expected a size that scale={scale} divides, got {settings.patch}")
     for scene in scenes:
@@ -204,10 +186,3 @@ def check_patches(scenes: Sequence[Scene], settings: PatchSettings, scale: int) 
         height, width = scene.rgb.shape[-2:]
         if min(height, width) < settings.patch:
             raise ValueError(f"patch: expected at most {scene.name}'s {height} x {width}, got {settings.patch}")
-
-
-def _valid_fraction(scene: Scene, top: int, left: int, size: int) -> float:
-    """Return the fraction of a window's pixels whose depth is valid."""
-    if scene.depth is None:
-        return 0.0
-    return float(scene.depth[:, top : top + size, left : left + size].isfinite().float().mean())

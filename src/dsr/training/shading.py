@@ -23,8 +23,7 @@ from dsr.utils.compute_device import in_own_precision
 
 _RIDGE = 1e-4
 """Weight of the squared coefficients of the light, as in the authors' code; the errors' weight is one per pixel."""
-_LARGEST_ALBEDO = 2.0
-"""Albedos have a mean of 1 and are clipped to this, as in the authors' code."""
+_LARGEST_ALBEDO = 2.0  # albedos have a mean of 1 and are clipped to this, as in the authors' code
 _DARKEST = 1 / 255
 _GREY_STEP, _COLOUR_STEP = 0.1, 0.05
 """Changes of the logarithm of intensity and of colour per pixel, from which on they are changes of the albedo."""

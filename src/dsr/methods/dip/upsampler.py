@@ -1,18 +1,22 @@
 """DIP and DIP-V: depth super-resolution by an untrained network that is optimised for each image.
 
 Ulyanov, Vedaldi, Lempitsky, *Deep Image Prior*, CVPR 2018, guided by the photo and with the visual loss of Voynov et
-al., *Perceptual Deep Depth Super-Resolution*, ICCV 2019, section 4.2. The network outputs a depth map, whose
-low-resolution version is compared with the input, and the photo's intensity. Holes of the input have no data term and
-are inpainted by the network.
+al., *Perceptual Deep Depth Super-Resolution*, ICCV 2019, section 4.2. The network predicts a depth map d, whose
+low-resolution version D d is compared with the input d_LR, and the intensity of the photo:
+
+    c data(D d / r, d_LR / r) + w visual(D d, d_LR) + w_I Lap_1(intensity, photo)
+
+with the range r of the input, and c = 10 for MSE, 1 for Lap_1. Holes of the input have no data term; the network fills
+them. The result is a moving average of the depth maps of all steps.
 """
 
 from __future__ import annotations
 
-import hashlib
+import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import lightning
 import torch
@@ -20,31 +24,38 @@ import torchmetrics
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
+from torch.nn import functional
 from torch.utils.data import DataLoader
 
-from dsr.degradation.downsampling import Downsampling, scene_generator
-from dsr.methods.base import WORKSPACE, Abilities, Cost, Method
-from dsr.methods.dip.optimisation import PriorOptimisation, PriorSettings, Provenance, checkpoint_of, cost_of_step
-from dsr.methods.dip.problem import DataLoss, ImageProblem, PriorObjective
-from dsr.methods.dip.skip_net import Padding
-from dsr.methods.dip.stopping import Fixed, Oracle, Residual, Stopping, StoppingName, Variance
+from dsr.degradation.downsampling import Downsampling, downsample_depth, scene_generator
+from dsr.geometry.shading import comparison
+from dsr.geometry.surface import depth_to_normals
+from dsr.methods.base import WORKSPACE, Abilities, Cost, Method, whole_scale
+from dsr.methods.classical.finite_differences import grey
+from dsr.methods.dip.skip_net import SkipNet, levels_for
 from dsr.methods.networks.network import DTYPES, Precision
-from dsr.methods.networks.trained import TrainedNetwork
+from dsr.methods.networks.normalisation import compute_min_max, mean3x3
 from dsr.methods.noise_level import estimate_noise, normal_noise_deg
-from dsr.metrics.visual_loss import VisualLossName, make_visual_loss
+from dsr.metrics.classes import compute_means, in_table_units
+from dsr.metrics.functional import SurfacePair, rmse_v
+from dsr.metrics.losses import lap1, mse
+from dsr.metrics.visual_loss import VisualLossName, make_visual_loss, match_weight
 from dsr.sample import DepthSample
-from dsr.utils.checkpoints import Divergence, DivergenceError, Interruption
 from dsr.utils.lightning import ListedScores, StepProgress, ValidationTable, fit, make_trainer
-from dsr.utils.progress import Progress, Steps, StepsProgress, duration
+from dsr.utils.progress import Progress, Steps, StepsProgress
 from dsr.utils.runs_table import list_run
 
-_SECONDS_BETWEEN_CHECKPOINTS = 60.0
-_ADVICE = "a lower method.learning_rate may help"
+DATA_WEIGHTS = {"mse": 10.0, "lap1": 1.0}
+_NOISE_CHANNELS = 32
+_PHOTO_PERTURBATION = 0.05  # standard deviation of the noise added to the photo in each step
+_MARGIN = 0.1  # extension of the depth range beyond the input's, as a fraction of it
+_LARGEST_TILT = 10.0  # degrees by which the input's noise may tilt its normals for a visual loss
+_STEPS_BETWEEN_CHECKS = 100  # of the loss, which is fetched from the device for it
 
 
 @dataclass(kw_only=True)
 class DeepImagePrior(Method):
-    """A method that optimises a network for each image.
+    """A method that optimises a network for each image; the options are described in ``conf/method/dip.yaml``.
 
     Each image has its own network and its own random numbers, which depend on the seed, the data set, the scene and the
     scale only, not on other images.
@@ -52,30 +63,14 @@ class DeepImagePrior(Method):
     Args:
         scale: upsampling factor.
         downsampling: assumed downsampling model of the low-resolution map.
-        steps, learning_rate, widths, skips, padding, border: see :class:`~dsr.methods.dip.optimisation.PriorSettings`.
-        guide, input_noise, perturbation, guide_perturbation, average, margin: the same.
-        data_loss, data_weight, w_intensity: see :class:`~dsr.methods.dip.problem.PriorObjective`.
-        w: weight of the visual loss; ``auto`` is 1 for MSE_v, and makes another loss as large as MSE_v for a smoothed
-            low-resolution map.
-        visual: the visual loss, see :class:`~dsr.metrics.visual_loss.VisualLoss`.
-        largest_tilt: limit in degrees; the visual loss is omitted if the estimated noise of the low-resolution map
-            tilts its normals by more. None for no limit.
-        stopping: ``fixed``: after ``steps``; ``variance``: at the minimum of the iterates' variance; ``residual``: when
-            the residual reaches the estimated noise of the low-resolution map; ``oracle``: at the validation pass with
-            the lowest RMSE_v, which uses the true depth.
-        patience: steps without a new minimum until ``variance`` stops.
-        validate_every: steps between validation passes, which log scores and renderings; 0 for none.
         precision: dtype of the convolutions.
         seed: seed of all random numbers.
         device: device of the computations.
         metrics: function that returns the metrics of a validation pass; None for none.
-        workspace: directory for logs and checkpoints; None for neither.
+        workspace: directory for logs; None for no logs.
         display: display of the progress.
         about: what TensorBoard's table of runs says of an image: ``method`` and ``degradation``; None for not known.
         lpips_trunk: file of AlexNet's weights for ``visual=lpips``; None to use torch's hub cache.
-
-    Raises:
-        ValueError: a value is out of range, or ``visual`` needs weights that are not there.
 
     """
 
@@ -84,26 +79,19 @@ class DeepImagePrior(Method):
 
     scale: int
     downsampling: Downsampling
-    steps: int = PriorSettings.steps
-    learning_rate: float = PriorSettings.learning_rate
-    widths: Sequence[int] = PriorSettings.widths
-    skips: Sequence[int] = PriorSettings.skips
-    padding: Padding = PriorSettings.padding
-    border: int = PriorSettings.border
-    guide: bool = PriorSettings.guide
-    input_noise: float = PriorSettings.input_noise
-    perturbation: float = PriorSettings.perturbation
-    guide_perturbation: float = PriorSettings.guide_perturbation
-    average: float = PriorSettings.average
-    margin: float = PriorSettings.margin
-    data_loss: DataLoss = PriorObjective.data_loss
-    data_weight: float = PriorObjective.data_weight
-    w: float | Literal["auto"] = "auto"
-    w_intensity: float = PriorObjective.w_intensity
+    steps: int = 600
+    learning_rate: float = 0.01
+    widths: Sequence[int] = (32, 64, 128, 128, 128)
+    skips: Sequence[int] = (4, 4, 4, 4, 4)
+    border: int = 8
+    input_noise: float = 0.1
+    perturbation: float = 0.1
+    average: float = 0.99
+    data_loss: Literal["lap1", "mse"] = "lap1"
     visual: VisualLossName = "mse_v"
-    largest_tilt: float | None = 10.0
-    stopping: StoppingName = "fixed"
-    patience: int = 200
+    w: float | Literal["auto"] = "auto"
+    w_intensity: float = 0.01
+    oracle: bool = False
     validate_every: int = 100
     precision: Precision = "float32"
     seed: int = 0
@@ -115,205 +103,209 @@ class DeepImagePrior(Method):
     lpips_trunk: str | Path | None = None
 
     def __post_init__(self) -> None:
-        """Check the values."""
+        """Check the options, and load the network of LPIPS."""
         self.device = torch.device(self.device)
-        if self.precision not in DTYPES:
-            raise ValueError(f"precision: expected one of {', '.join(DTYPES)}, got {self.precision!r}")
-        for name, least in (("patience", 1), ("validate_every", 0), ("largest_tilt", 0)):
-            if (getattr(self, name) or 0) < least:
-                raise ValueError(f"{name}: expected {least} or more, got {getattr(self, name)}")
-        if self.stopping not in get_args(StoppingName):
-            raise ValueError(f"stopping: expected one of {', '.join(get_args(StoppingName))}, got {self.stopping!r}")
-        if self.stopping == "oracle" and not self.validate_every:
-            raise ValueError("validate_every: expected a positive number, as stopping=oracle needs it")
-        given = {each.name: getattr(self, each.name) for each in fields(PriorSettings) if each.name != "mixed"}
-        given |= {"widths": tuple(self.widths), "skips": tuple(self.skips)}
-        self._settings = PriorSettings(**given, mixed=self.precision == "bfloat16")
-        if self.visual != "mse_v" and self.w == 0:
-            raise ValueError(f"visual: expected mse_v where w is 0, as for DIP, got {self.visual}")
-        visual = make_visual_loss(self.visual, self.lpips_trunk)
         w = 1.0 if self.w == "auto" else self.w
-        self._objective = PriorObjective(self.data_loss, self.data_weight, w, self.w_intensity, visual)
+        layers = len(self.widths) == len(self.skips) > 0
+        for name, expected, right in (
+            ("steps", "a positive number", self.steps > 0),
+            ("learning_rate", "a positive number", 0 < self.learning_rate < float("inf")),
+            ("widths", "a positive number for each level", layers and min(self.widths) > 0),
+            ("skips", "a positive number for each level", layers and min(self.skips) > 0),
+            ("border", "0 or a positive number", self.border >= 0),
+            ("input_noise", "0 or a positive number", 0 <= self.input_noise < float("inf")),
+            ("perturbation", "0 or a positive number", 0 <= self.perturbation < float("inf")),
+            ("average", "0 or more and less than 1", 0 <= self.average < 1),
+            ("data_loss", "lap1 or mse", self.data_loss in DATA_WEIGHTS),
+            ("visual", "mse_v where w is 0, as for DIP", bool(w) or self.visual == "mse_v"),
+            ("w", "0 or a positive number", 0 <= w < float("inf")),
+            ("w_intensity", "0 or a positive number", 0 <= self.w_intensity < float("inf")),
+            ("validate_every", "0 or a positive number", self.validate_every >= 0),
+            ("validate_every", "a positive number for oracle=true", self.validate_every > 0 or not self.oracle),
+            ("precision", f"one of {', '.join(DTYPES)}", self.precision in DTYPES),
+        ):  # fmt: skip
+            if not right:
+                raise ValueError(f"{name}: expected {expected}, got {getattr(self, name)}")
+        self.visual_loss = make_visual_loss(self.visual, self.lpips_trunk)
 
     @property
     def flag(self) -> str:
         """Mark for scores: ``oracle`` if the true depth was used, else empty."""
-        return "oracle" if self.stopping == "oracle" else ""
-
-    def base(self, sample: DepthSample) -> Tensor | None:
-        """Return the initial depth of the optimisation, (1, H, W) in metres; None for none."""
-        return None
+        return "oracle" if self.oracle else ""
 
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
         """Return the high-resolution orthogonal depth, (1, H, W) in metres on the sample's device; valid everywhere.
 
         Args:
+            sample: the low-resolution map and the photo.
             progress: called with the number of steps done and their total, unless there is a display.
 
         Raises:
             ValueError: the optimisation diverged.
-            KeyboardInterrupt: the user interrupted it; with a workspace, the next call resumes.
 
         """
+        display = self.display or StepsProgress(progress)
         with torch.inference_mode(mode=False), torch.enable_grad():
-            module, origin = self.module(sample)
-            display = self.display or StepsProgress(progress)
-            folder = None if self.workspace is None else self.workspace / WORKSPACE / sample.scene
-            resume = None if folder is None else checkpoint_of(folder / "last.ckpt", origin)
-            if folder is not None and resume is None:
-                (folder / "last.ckpt").unlink(missing_ok=True)
-            display.say(self._announcement(module, sample.scene, resume is not None))
-            if not module.objective.w and self._objective.w:
-                title = module.objective.visual.title
-                display.say(f"{sample.scene}: without {title}; {_noise_of(sample)}, more than largest_tilt")
-            trainer = self._trainer(module, folder, origin, display, sample)
-            try:
-                fit(trainer, module, _numbers(self.steps), resume, val_dataloaders=_numbers(1))
-            except DivergenceError as error:
-                raise ValueError(f"{sample.scene}: the optimisation {error}; {_ADVICE}") from error
-            except KeyboardInterrupt:
-                where = f"interrupted at step {trainer.global_step} of {sample.scene}"
-                on = "; the same command continues from there" if folder is not None else ""
-                raise KeyboardInterrupt(where + on) from None
-            depth = module.result()
-        if not bool(depth.isfinite().all()):
-            raise ValueError(f"{sample.scene}: the optimisation diverged; {_ADVICE}")
-        if folder is not None:
-            (folder / "last.ckpt").unlink(missing_ok=True)
-        if trainer.global_step < self.steps:
-            display.say(f"{sample.scene}: stopped at step {trainer.global_step} ({self.stopping})")
-        return depth[0].detach().to(sample.depth_lr)
-
-    def seconds(self, sample: DepthSample) -> float:
-        """Return how long an image takes, in seconds, by a step that is measured now."""
-        with torch.inference_mode(mode=False), torch.enable_grad():
-            return self.steps * cost_of_step(self.module(sample)[0])[0]
-
-    def module(self, sample: DepthSample) -> tuple[PriorOptimisation, str]:
-        """Return an image's LightningModule, and a digest of its problem and settings."""
-        device = torch.device(self.device)
-        problem = ImageProblem.of(sample, self.downsampling, self.range_type, device)
-        base = self.base(sample)
-        truth = None if sample.depth is None else sample.depth[None].to(device, torch.float32)
-        seed = scene_generator(self.seed, sample.dataset, sample.scene, sample.scale, "prior").initial_seed()
-        objective = replace(self._objective, w=self._weight(problem, sample))
-        facts = (self._settings, objective, self.downsampling, self.stopping, self.patience, seed)
-        digest = hashlib.sha256(repr((facts, sample.camera, sample.camera_lr)).encode())
-        for values in (sample.rgb, sample.depth_lr, base):
-            if values is not None:
-                digest.update(values.detach().cpu().contiguous().numpy().tobytes())
-        module = PriorOptimisation(
-            problem,
-            objective,
-            self._settings,
-            self._rule(problem),
-            seed,
-            None if self.metrics is None or truth is None else self.metrics().to(device),
-            truth,
-            None if base is None else base[None].to(device, torch.float32),
-        )
-        return module, digest.hexdigest()
-
-    def _weight(self, problem: ImageProblem, sample: DepthSample) -> float:
-        """Return the weight of the visual loss; 0 if the noise of the low-resolution map is too large for normals."""
-        visual = self._objective.visual
-        if self._objective.w:
-            visual.check_size(sample.camera_lr.height, sample.camera_lr.width)
-        if not self._normals_count(sample):
-            return 0.0
-        return problem.balance_weight(visual) if self.w == "auto" else self._objective.w
-
-    def _normals_count(self, sample: DepthSample) -> bool:
-        """Return whether noise tilts the low-resolution map's normals by at most ``largest_tilt``."""
-        tilt = normal_noise_deg(estimate_noise(sample.depth_lr[None]), sample.camera_lr)
-        return self.largest_tilt is None or tilt <= self.largest_tilt
-
-    def _rule(self, problem: ImageProblem) -> Stopping:
-        """Return the stopping rule."""
-        if self.stopping == "variance":
-            return Variance(problem.grey, self.patience)
-        if self.stopping == "residual":
-            return Residual(problem.depth_lr, problem.residual)
-        return Oracle() if self.stopping == "oracle" else Fixed()
-
-    def _announcement(self, module: PriorOptimisation, scene: str, resumed: bool) -> str:
-        """Return a line with the number of steps, the expected time and memory."""
-        seconds, memory = cost_of_step(module)
-        most = "" if self.stopping in ("fixed", "oracle") else "up to "
-        height, width = module.problem.grey.shape[-2:]
-        return (
-            f"{scene}: {most}{self.steps} steps at {height} x {width} in {self.precision}"
-            f"{', resumed' if resumed else ''}; {most}about {duration(seconds * self.steps)} "
-            f"({seconds:.2g} s a step as measured now), about {memory / 2**30:.1f} GiB of memory of its own"
-        )
-
-    def _trainer(
-        self, module: PriorOptimisation, folder: Path | None, origin: str, display: Progress, sample: DepthSample
-    ) -> lightning.Trainer:
-        """Return Lightning's trainer for one image."""
-        scene = sample.scene
-        callbacks: list[Callback] = [Divergence(patience=1), StepProgress(display, "steps", scene)]
-        logger: Any = False
-        if folder is not None:
-            callbacks += [
-                Provenance(origin),
-                Interruption(folder / "last.ckpt", _SECONDS_BETWEEN_CHECKPOINTS),
-            ]
-            if module.metrics is not None and self.validate_every:
-                callbacks += [ValidationTable(folder / "validation.csv"), ListedScores()]
-            logger = TensorBoardLogger(folder.parent, name="", version=scene, default_hp_metric=False)
-            settings = {"scene": scene, "scale": self.scale, "stopping": self.stopping, "w": module.objective.w,
-                        "visual": self.visual, "data_loss": self.data_loss, "steps": self.steps, "seed": self.seed,
-                        "dataset": sample.dataset, **(self.about or {})}  # fmt: skip
-            logger.log_hyperparams(settings)
-            list_run(logger.experiment, "optimisation", settings, {})
-        return make_trainer(
-            torch.device(self.device),
-            self.steps,
-            min(self.validate_every or self.steps, self.steps),
-            callbacks=callbacks,
-            logger=logger,
-            limit_val_batches=1 if self.validate_every else 0,
-            enable_checkpointing=folder is not None,  # the callback above
-        )
+            noise = estimate_noise(sample.depth_lr[None])
+            tilt = normal_noise_deg(noise, sample.camera_lr)
+            module = PriorOptimisation(self, sample, visual=tilt <= _LARGEST_TILT)
+            if self.w and not module.w:
+                display.say(
+                    f"{sample.scene}: without {self.visual_loss.title}; noise of {noise:.2%} tilts the input's normals "
+                    f"by {tilt:.0f} degrees, more than {_LARGEST_TILT:.0f}"
+                )
+            callbacks: list[Callback] = [StepProgress(display, "steps", sample.scene)]
+            logger: TensorBoardLogger | Literal[False] = False
+            if self.workspace is not None:
+                folder = self.workspace / WORKSPACE / sample.scene
+                shutil.rmtree(folder, ignore_errors=True)  # of an interrupted run
+                if module.metrics is not None and self.validate_every:
+                    callbacks += [ValidationTable(folder / "validation.csv"), ListedScores()]
+                logger = TensorBoardLogger(folder.parent, name="", version=sample.scene, default_hp_metric=False)
+                settings = {"scene": sample.scene, "dataset": sample.dataset, "scale": self.scale, "w": module.w,
+                            "visual": self.visual, "data_loss": self.data_loss, "steps": self.steps,
+                            "seed": self.seed, **(self.about or {})}  # fmt: skip
+                logger.log_hyperparams(settings)
+                list_run(logger.experiment, "optimisation", settings, {})
+            trainer = make_trainer(
+                torch.device(self.device),
+                self.steps,
+                min(self.validate_every or self.steps, self.steps),
+                callbacks=callbacks,
+                logger=logger,
+                limit_val_batches=1 if self.validate_every else 0,
+                enable_checkpointing=False,
+            )
+            fit(trainer, module, _numbers(self.steps), val_dataloaders=_numbers(1))
+        return (module.average if module.best is None else module.best)[0].to(sample.depth_lr)
 
 
-@dataclass(kw_only=True)
-class WarmStarted(DeepImagePrior):
-    """A deep image prior that starts from the result of a trained network.
+class PriorOptimisation(lightning.LightningModule):
+    """The optimisation of one network for one image, with a visual loss if ``visual``."""
 
-    Args:
-        weights: weights file of the network.
-        model: name of the network's model.
-        **settings: as for :class:`DeepImagePrior`; ``margin`` is the depth that an output of 1 adds, as a fraction of
-            the low-resolution map's range.
+    def __init__(self, options: DeepImagePrior, sample: DepthSample, *, visual: bool) -> None:
+        super().__init__()
+        self.options, self.sample, device = options, sample, torch.device(options.device)
+        self.rgb = sample.rgb[None].to(device, torch.float32)  # (1, 3, H, W)
+        self.grey = grey(self.rgb)
+        self.depth_lr = sample.depth_lr[None].to(device, torch.float32)  # (1, 1, h, w)
+        self.truth = None if sample.depth is None else sample.depth[None].to(device, torch.float32)
+        self.rays = sample.camera.rays(dtype=torch.float32, device=device)[None]
+        self.rays_lr = sample.camera_lr.rays(dtype=torch.float32, device=device)[None]
+        self.complete = bool(sample.depth_lr.isfinite().all())
+        low, high = compute_min_max(sample.depth_lr[None]).flatten().tolist()
+        self.range = max(high - low, 1e-3 * high)
+        margin = _MARGIN * self.range
+        self.target = self.depth_lr / self.range
+        self.near, self.far = max(low - margin, 0.5 * low), low + self.range + margin
 
-    Raises:
-        ValueError: a value is out of range, or the weights are of another network.
+        height, width = self.grey.shape[-2:]
+        self.border = min(options.border, min(height, width) - 1)  # reflection needs as many pixels
+        seed = scene_generator(options.seed, sample.dataset, sample.scene, sample.scale, "prior").initial_seed()
+        self.generator = torch.Generator(device).manual_seed(seed)
+        photo = functional.pad(self.rgb, (self.border,) * 4, mode="reflect")
+        levels = levels_for(height, width, len(options.widths))
+        with torch.random.fork_rng([]):
+            torch.manual_seed(seed)
+            net = SkipNet(_NOISE_CHANNELS + 3, 2, options.widths[:levels], options.skips[:levels])
+            noise = options.input_noise * torch.rand(1, _NOISE_CHANNELS, *photo.shape[-2:])
+        self.net = net.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.start = torch.cat([noise.to(device), photo], dim=1)
+        self.spread = torch.full((_NOISE_CHANNELS + 3, 1, 1), options.perturbation, device=device)
+        self.spread[_NOISE_CHANNELS:] = _PHOTO_PERTURBATION
 
-    """
+        self.w = (1.0 if options.w == "auto" else options.w) if visual else 0.0
+        self.normals_lr = depth_to_normals(self.depth_lr, self.rays_lr) if self.w and self.complete else None
+        if self.w:
+            options.visual_loss.check_size(*self.depth_lr.shape[-2:])
+            if options.w == "auto" and options.visual != "mse_v":
+                smoothed = SurfacePair(mean3x3(self.depth_lr), self.depth_lr, self.rays_lr)
+                self.w = match_weight(options.visual_loss, [smoothed])
+        self.average = torch.zeros_like(self.grey)
+        self.best: Tensor | None = None
+        self.lowest = float("inf")
+        self.metrics = None if options.metrics is None or self.truth is None else options.metrics().to(device)
+        self.validation_scores: dict[str, dict[str, float]] = {}
+        self.shown_scores: dict[str, dict[str, float]] = {}
 
-    abilities = replace(DeepImagePrior.abilities, ratios="factors", needs="weights")
+    def forward(self) -> tuple[Tensor, Tensor]:
+        """Return depth in metres and intensity in [0, 1], both (1, 1, H, W), for a newly perturbed input."""
+        draws = torch.randn(self.start.shape, generator=self.generator, device=self.start.device)
+        x = torch.addcmul(self.start, draws, self.spread).contiguous(memory_format=torch.channels_last)
+        with torch.autocast(x.device.type, torch.bfloat16, enabled=self.options.precision == "bfloat16"):
+            y = self.net(x)
+        (height, width), border = self.grey.shape[-2:], self.border
+        depth, intensity = y[..., border : border + height, border : border + width].float().split(1, dim=1)
+        return self.near + (self.far - self.near) * depth.sigmoid(), intensity.sigmoid()
 
-    weights: Path
-    model: str
-    steps: int = 100
+    def loss_terms(self, depth: Tensor, intensity: Tensor) -> dict[str, Tensor]:
+        """Return ``loss`` and its terms, scalars, of (1, 1, H, W) depth in metres and intensity in [0, 1]."""
+        options, scale, model = self.options, whole_scale(self.sample), self.options.downsampling
+        complete = None if model.kernel == "bicubic" else True  # bicubic may undershoot
+        depth_lr = downsample_depth(depth, self.sample.camera, scale, model, options.range_type, complete=complete)[0]
+        complete = complete if self.complete else False
+        if options.data_loss == "mse":
+            data = mse(depth_lr / self.range, self.target, complete=complete).squeeze()
+        else:
+            levels = _count_levels(depth_lr)
+            data = lap1(depth_lr / self.range, self.target, levels=levels, complete=complete).squeeze()
+        terms = {f"data_{options.data_loss}": data}
+        loss = DATA_WEIGHTS[options.data_loss] * data
+        if self.w:
+            surfaces = SurfacePair(depth_lr, self.depth_lr, self.rays_lr)
+            if surfaces.complete and self.normals_lr is not None:
+                surfaces.normals = depth_to_normals(depth_lr, self.rays_lr), self.normals_lr
+            visual = options.visual_loss(surfaces).squeeze()
+            terms[options.visual] = visual if surfaces.complete else visual.nansum()  # there may be none between holes
+            loss = loss + self.w * terms[options.visual]
+        if options.w_intensity:
+            terms["intensity"] = lap1(intensity, self.grey, levels=_count_levels(intensity), complete=True).squeeze()
+            loss = loss + options.w_intensity * terms["intensity"]
+        return {"loss": loss, **terms}
 
-    def __post_init__(self) -> None:
-        """Load the network."""
-        super().__post_init__()
-        self._trained = TrainedNetwork(Path(self.weights), self.scale, self.model, device=self.device)
+    def training_step(self, _: Any, __: int) -> Tensor:
+        """Return the loss of this step's depth map, and update the average."""
+        depth, intensity = self()
+        terms, step = self.loss_terms(depth, intensity), self.global_step + 1
+        if step in (1, self.options.steps) or step % self.trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
+            named = {f"train/{name}": value.detach() for name, value in terms.items()}
+            self.log_dict({"step": float(step), **named}, batch_size=1)  # else Lightning counts from 0
+        if (step == self.options.steps or step % _STEPS_BETWEEN_CHECKS == 0) and not terms["loss"].isfinite():
+            raise ValueError(
+                f"{self.sample.scene}: the optimisation diverged by step {step}; a lower method.learning_rate may help"
+            )
+        with torch.no_grad():
+            self.average.lerp_(depth, 1 - min(self.options.average, (step - 1) / (step + 9)))
+        return terms["loss"]
 
-    def base(self, sample: DepthSample) -> Tensor:
-        """Return the trained network's depth; holes are filled with the low-resolution map's mean."""
-        depth = self._trained(sample).clone()
-        return torch.where(depth.isfinite(), depth, sample.depth_lr.nanmean())
+    def validation_step(self, _: Any, __: int) -> None:
+        """Score the average if there is a true depth, and log renderings."""
+        if self.truth is not None:
+            pair = SurfacePair(self.average, self.truth, self.rays, unit=self.sample.unit)
+            score = float(rmse_v(pair).nanmean()) if self.options.oracle else float("inf")
+            if score < self.lowest:
+                self.lowest, self.best = score, self.average.clone()
+            if self.metrics is not None:
+                self.metrics.reset()
+                self.metrics.update(pair)
+                scores = {name: float(value) for name, value in compute_means(self.metrics).items()}
+                self.validation_scores = {"val": scores}
+                self.shown_scores = {"val": in_table_units(self.metrics, scores)}
+                named = {f"val/{name}": value for name, value in self.shown_scores["val"].items()}
+                self.log_dict({"step": float(self.global_step), **named}, batch_size=1)
+        if isinstance(self.logger, TensorBoardLogger):
+            picture = comparison(self.average, self.truth, self.rays, self.rgb, self.depth_lr)
+            self.logger.experiment.add_image("renderings", picture, self.global_step)
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        """Return Adam."""
+        return torch.optim.Adam(self.net.parameters(), self.options.learning_rate, fused=True)
 
 
-def _noise_of(sample: DepthSample) -> str:
-    """Describe the estimated noise of a low-resolution map."""
-    noise = estimate_noise(sample.depth_lr[None])
-    return f"noise of {noise:.2%} tilts the input's normals by {normal_noise_deg(noise, sample.camera_lr):.0f} degrees"
+def _count_levels(x: Tensor) -> int:
+    """Return the number of levels of a Laplacian pyramid, up to 3, that a map has room for."""
+    side = min(x.shape[-2:])
+    return 1 + (side >= 6) + (side >= 12)
 
 
 def _numbers(count: int) -> Any:
