@@ -134,9 +134,8 @@ def test_every_scene_has_lines_with_named_times_off_a_terminal(default_run):
     lines = default_run[2].stdout.splitlines()
     times = r"elapsed \d:\d\d:\d\d, remaining \d:\d\d:\d\d"
     for number, scene in enumerate(SIMGEO, 1):
-        for work in ("predict", "score"):
-            [line] = [line for line in lines if line.startswith(f"{work} {scene}: ")]
-            assert re.fullmatch(rf"{work} {scene}: {number} of 6, \d+\.\d s, {times}", line)
+        [line] = [line for line in lines if line.startswith(f"evaluate {scene}: ")]
+        assert re.fullmatch(rf"evaluate {scene}: {number} of 6, \d+\.\d s, {times}", line)
 
 
 @pytest.mark.usefixtures("line_per_report")
@@ -145,7 +144,7 @@ def test_network_reports_its_steps_within_a_scene(within):
     assert (code, errors) == (0, [])
     time = r"\d:\d\d:\d\d"
     steps = (
-        rf"predict statue \(0 of 1(?:, remaining {time})?\): steps: (\d+) of (\d+), elapsed {time}, remaining {time}"
+        rf"evaluate statue \(0 of 1(?:, remaining {time})?\): steps: (\d+) of (\d+), elapsed {time}, remaining {time}"
     )
     found = re.findall(f"^{steps}$", output, re.MULTILINE)
     assert found

@@ -52,6 +52,7 @@ class Run:
         unsolved: reason by scene why the method has no solution.
         formats: formats of its metrics that the run stores.
         notes: remarks on the scores of a scene, by its name.
+        truths: identifies its ground truths, by scene.
         truth: identifies its ground truth where other runs have a different one for the same scenes, as in
             ``dataset``; empty otherwise.
 
@@ -72,6 +73,7 @@ class Run:
     unsolved: Mapping[str, str] = field(default_factory=dict)
     formats: Mapping[str, MetricFormat] = field(default_factory=dict)
     notes: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    truths: Mapping[str, str] = field(default_factory=dict)
     truth: str = ""
 
     @property

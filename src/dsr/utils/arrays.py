@@ -65,22 +65,6 @@ def array_headers(path: Path) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
     return headers
 
 
-def array_checksums(path: Path) -> dict[str, int]:
-    """Return the CRC-32 of the arrays of an ``.npz`` file, header and values, as the archive states it.
-
-    Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: the file is damaged or no archive.
-
-    """
-    with (
-        opened(path) as file,
-        refusing(f"{path}: expected an archive of arrays, got a damaged or foreign file", Exception),
-        zipfile.ZipFile(file) as archive,
-    ):
-        return {member.filename.removesuffix(".npy"): member.CRC for member in archive.infolist()}
-
-
 def read_array_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
     """Return shape and type in the header of an ``.npy`` file, and stay behind it.
 
