@@ -27,7 +27,9 @@ from dsr.app.metrics import check_metrics, chosen_metrics, metric_collection
 from dsr.app.multirun import Plan, runs_here
 from dsr.app.schema import Config, EvalConfig, Identity, given_keys, plain_config, raw_group, user_directories
 from dsr.data.scene_source import SceneSource, prepare_scenes, regions_of
-from dsr.degradation.downsampling import Downsampling
+from dsr.degradation.downsampling import Downsampling, Measured
+from dsr.degradation.holes import Holes
+from dsr.degradation.noise import Noise
 from dsr.evaluation.results import Run as StoredRun
 from dsr.evaluation.run_files import read_run
 from dsr.evaluation.scenes import (
@@ -124,6 +126,9 @@ class _Prepared:
     plain: Config
     selected: Selection
     source: SceneSource
+    downsampling: Downsampling | Measured
+    noise: Noise
+    holes: Holes
     device: torch.device
     identity: Identity
     folder: Path
@@ -165,7 +170,8 @@ def _prepare(
         weights_hash = hashlib.sha256("".join(hashes).encode()).hexdigest()
     identity = rundir.identity_of(plain, weights_hash, device, recipe.targets())
     folder = rundir.folder_of(settings.output_dir or rundir.default_directory("eval", plain, identity))
-    prepared = _Prepared(settings, plain, selected, source, device, identity, folder)
+    degradation = [settings.build(group) for group in ("downsampling", "noise", "holes")]
+    prepared = _Prepared(settings, plain, selected, source, *degradation, device, identity, folder)
     progress = ConsoleProgress(open_console())
     method = _method(prepared, progress)
     check_metrics(settings.metrics)
@@ -187,7 +193,7 @@ def _scale(settings: EvalConfig, source: SceneSource) -> float:
 
 def _method(prepared: _Prepared, progress: Progress) -> Method:
     """Build the method of a run."""
-    settings, downsampling, known = prepared.settings, prepared.settings.build("downsampling"), Known()
+    settings, downsampling, known = prepared.settings, prepared.downsampling, Known()
     if isinstance(downsampling, Downsampling):  # nothing is known of the maps of a sensor
         edges: Literal["soft", "sharp"] = "soft" if getattr(prepared.source, "soft_edges", False) else "sharp"
         known = Known(downsampling.assumed_model().kernel, edges, clean=settings.names["noise"] == "none")
@@ -246,7 +252,7 @@ def _study(prepared: _Prepared, method: Method) -> Evaluation:
     return Evaluation(
         folder,
         prepared.source,
-        settings.build("downsampling"),
+        prepared.downsampling,
         _degradation(prepared),
         settings.scale,
         method,
@@ -255,8 +261,8 @@ def _study(prepared: _Prepared, method: Method) -> Evaluation:
         prepared.identity,
         metrics,
         prepared.device,
-        noise=settings.build("noise"),
-        holes=settings.build("holes"),
+        noise=prepared.noise,
+        holes=prepared.holes,
         alignment=settings.metrics.alignment,
         label=label,
         illustrate=functools.partial(_illustrate, folder, label, formats),
