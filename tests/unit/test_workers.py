@@ -19,12 +19,12 @@ SPAWN = multiprocessing.get_context("spawn")
 
 
 def answer(kill, item):
-    """Return an item in capitals with the process and its threads; the worker is killed at "k" as often as told."""
+    """Return an item in capitals, the process, its threads and signals; it is killed at "k" as often as told."""
     folder, times = kill
     if item == "k" and len(list(folder.iterdir())) < times:
         (folder / str(os.getpid())).touch()
         os.kill(os.getpid(), signal.SIGKILL)
-    return item.upper(), os.getpid(), torch.get_num_threads()
+    return item.upper(), os.getpid(), torch.get_num_threads(), signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
 
 def draw(results, number):
@@ -36,7 +36,7 @@ def test_items_of_a_killed_worker_are_done_by_others_and_threads_are_those_asked
     with Pool(2, threads=1, say=lines.append) as pool:
         found = dict(pool.results(functools.partial(answer, (tmp_path, 1)), list("ijklm")))
     assert {item: value[0] for item, value in found.items()} == {item: item.upper() for item in "ijklm"}
-    assert {value[2] for value in found.values()} == {1}
+    assert {value[2:] for value in found.values()} == {(1, True)}  # Ctrl-C is left to the parent
     assert len(lines) == 1
     for process in {value[1] for value in found.values()}:
         with pytest.raises(ProcessLookupError):
