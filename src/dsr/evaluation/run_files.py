@@ -38,10 +38,6 @@ def load_results(paths: Sequence[Path]) -> Results:
     """Read all runs in and below some directories.
 
     Damaged runs are omitted, and so is the older of two predictions of a scene by the same method. The notes list them.
-
-    Raises:
-        ValueError: a path is not a directory, there is no readable run, or a run names files outside of it.
-
     """
     runs: list[Run] = []
     notes: list[str] = []
@@ -114,12 +110,7 @@ def _folders(paths: Sequence[Path]) -> Iterator[Path]:
 
 
 def read_run(folder: Path) -> Run:
-    """Return one run, with the label that it has by itself.
-
-    Raises:
-        ValueError: a file of the directory is missing or damaged, or names a scene whose files lie elsewhere.
-
-    """
+    """Return one run, with the label that it has by itself."""
     summary, versions = _read(_Summary, folder / _SUMMARY), _read(_Versions, folder / _VERSIONS)
     settings = versions.identity.model_dump(exclude_unset=True)
     scores = _read_scores(folder / _SCORES)

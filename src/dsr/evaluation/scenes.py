@@ -118,9 +118,6 @@ def evaluate_scene(study: Evaluation, scene: str, since: float = -math.inf, prog
         since: time from which on a stored prediction is reused, to overwrite older ones.
         progress: display of the method's steps.
 
-    Raises:
-        StalePredictionError: the stored prediction has another configuration.
-
     """
     result = SceneResult()
     path = prediction_path(study.folder, scene)

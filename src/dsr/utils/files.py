@@ -60,11 +60,6 @@ def expect_targets(folder: Path, names: Iterable[str]) -> None:
     """Check files that are to be written into a folder, or below it, before the work that they are made of.
 
     The folder may be a link to one; what is in it may not lead out of it.
-
-    Raises:
-        TargetError: something else is in the place of one.
-        OutsideError: one would be outside of the folder.
-
     """
     expect_target(folder, folder=True)
     for name in names:
@@ -138,10 +133,6 @@ def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside ``path`` that replaces it when the block ends without error.
 
     The directory is created if it does not exist. After an error or an interruption the temporary file is deleted.
-
-    Raises:
-        TargetError: ``path`` is a device, a pipe, a socket, a link or a folder.
-
     """
     expect_target(path)
     temporary = path.with_name(f".{path.stem}-{secrets.token_hex(4)}{path.suffix}")
@@ -161,10 +152,6 @@ def replacing_folder(path: Path) -> Iterator[Path]:
     """Yield a temporary directory beside ``path`` that replaces it when the block ends without error.
 
     Where ``path`` is a link to a directory, that one is replaced, and the link stays.
-
-    Raises:
-        TargetError: ``path`` is a file, a device, a pipe, a socket or a link to nothing.
-
     """
     expect_target(path, folder=True)
     path = path.resolve()

@@ -35,10 +35,6 @@ def work_through(request: UpsampleRequest, frames: Frames, reporter: Reporter, p
     """Upsample pictures, ``frames.workers`` at a time, each with its share of the cores; yield each once it is done.
 
     Notes are shown in the order of the pictures, or as they come from several workers.
-
-    Raises:
-        ValueError: the file of poses is damaged, or does not fit the pictures.
-
     """
     jobs = [(pair, frames.target(request.results.output, pair)) for pair in frames.found.pairs]
     workers = min(request.frames.workers, len(jobs))
