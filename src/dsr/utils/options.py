@@ -191,7 +191,7 @@ class _Stated(NamedTuple):
 
 
 @functools.cache
-def _stated(record: type) -> tuple[_Stated, ...]:
+def _stated(record: Any) -> tuple[_Stated, ...]:
     """Return the options and groups of a record, in order."""
     hints, found = get_type_hints(record), []
     for each in fields(record):

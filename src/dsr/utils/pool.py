@@ -19,7 +19,7 @@ from typing import Any, Self, TypeVar
 _Item = TypeVar("_Item")
 _Value = TypeVar("_Value")
 _SECONDS_TO_END = 2.0  # in which a worker may remove its temporary files
-LOST = "worker processes were killed before it was done, perhaps for want of memory; fewer workers need less"
+LOST = "worker processes were killed twice, perhaps for want of memory; fewer workers need less"
 
 
 class Pool:
@@ -49,7 +49,7 @@ class Pool:
     def __enter__(self) -> Self:
         """Return itself."""
         self._others = set(multiprocessing.active_children())
-        self._replace()
+        self._executors.append(self._executor())
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
@@ -91,26 +91,33 @@ class Pool:
                 for future in list(left) if ordered else as_completed(left):
                     value = future.result()
                     yield left.pop(future), value
-            except BrokenProcessPool as error:
-                if executor is self._executors[-1]:
-                    if len(self._executors) > 1:
-                        raise ChildProcessError(LOST) from error
-                    self._say("a worker process was killed; others begin again what it left")
-                    self._replace()
+            except BrokenProcessPool:
+                self._replace(executor)
                 items = list(left.values())
                 futures, executor = self._submit(function, items)
                 left = dict(zip(futures, items, strict=True))
 
-    def _replace(self) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._executors.append(ProcessPoolExecutor(self._count, context, _begin, self._plan))
-
     def _submit(
         self, function: Callable[[_Item], _Value], items: Sequence[_Item]
     ) -> tuple[list[Future[_Value]], ProcessPoolExecutor]:
-        executor = self._executors[-1]
-        with _without_interrupts():
-            return [executor.submit(_call, function, item) for item in items], executor
+        while True:
+            executor = self._executors[-1]
+            try:
+                with _without_interrupts():
+                    return [executor.submit(_call, function, item) for item in items], executor
+            except BrokenProcessPool:
+                self._replace(executor)
+
+    def _replace(self, broken: ProcessPoolExecutor) -> None:
+        """Replace a broken executor, unless that is done; the second one that breaks is an error."""
+        if broken is self._executors[-1]:
+            if len(self._executors) > 1:
+                raise ChildProcessError(LOST)
+            self._say("a worker process was killed; others begin again what it left")
+            self._executors.append(self._executor())
+
+    def _executor(self) -> ProcessPoolExecutor:
+        return ProcessPoolExecutor(self._count, multiprocessing.get_context("spawn"), _begin, self._plan)
 
 
 @contextlib.contextmanager
@@ -138,7 +145,7 @@ def _begin(plan: bytes, threads: int | None) -> None:
     threading.Thread(target=end_with_parent, daemon=True).start()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     warnings.filterwarnings("ignore", category=RuntimeWarning, module=r"(dsr|numpy)\b")
-    set_threads(threads)
+    _set_threads(threads)
     prepare, arguments = pickle.loads(plan)  # noqa: S301 - of the parent
     if prepare is not None:
         prepare(*arguments)
@@ -160,7 +167,7 @@ def computing_threads(count: int | None) -> Iterator[None]:
     import torch  # noqa: PLC0415
 
     before = torch.get_num_threads(), cv2.getNumThreads()
-    set_threads(count)
+    _set_threads(count)
     try:
         yield
     finally:
@@ -169,7 +176,7 @@ def computing_threads(count: int | None) -> Iterator[None]:
             cv2.setNumThreads(before[1])
 
 
-def set_threads(count: int | None) -> None:
+def _set_threads(count: int | None) -> None:
     """Set the number of threads that torch and OpenCV compute with; None leaves it."""
     import cv2  # noqa: PLC0415 - workers import them, and not before they have taken in what they get
     import torch  # noqa: PLC0415
