@@ -61,6 +61,7 @@ from dsr.utils.versions import hash_once
 
 _OBJECTIVE = "RMSE_v"
 _MEMORY = 1 << 30  # bytes of free memory that the automatic number of workers leaves to each
+_BETWEEN_ROUNDS = 0.3  # seconds, where other commands work on all scenes that are left
 _WORTH_WORKERS = 30.0  # seconds of work from which workers are started, which take some to begin
 
 
@@ -323,6 +324,7 @@ def _evaluate_scenes(prepared: _Prepared, study: Evaluation, progress: Progress)
 def _rounds(pool: Pool, left: list[str]) -> Iterator[tuple[str, SceneResult]]:
     """Yield the scenes with their results; those that another command works on are tried again."""
     while left:
+        before = len(left)
         try:
             for scene, result in pool.results(_in_worker, tuple(left)):
                 if result is not None:
@@ -331,6 +333,8 @@ def _rounds(pool: Pool, left: list[str]) -> Iterator[tuple[str, SceneResult]]:
         except ChildProcessError:
             yield from ((scene, SceneResult(failure=f"{scene}: {LOST}")) for scene in left)
             return
+        if len(left) == before:
+            time.sleep(_BETWEEN_ROUNDS)
 
 
 _worker: tuple[Evaluation, float] | None = None  # of this process, if it is a worker
