@@ -171,8 +171,8 @@ def _prepare(
         weights_hash = hashlib.sha256("".join(hashes).encode()).hexdigest()
     identity = rundir.identity_of(plain, weights_hash, device, recipe.targets())
     folder = rundir.folder_of(settings.output_dir or rundir.default_directory("eval", plain, identity))
-    degradation = [settings.build(group) for group in ("downsampling", "noise", "holes")]
-    prepared = _Prepared(settings, plain, selected, source, *degradation, device, identity, folder)
+    downsampling, noise, holes = (settings.build(group) for group in ("downsampling", "noise", "holes"))
+    prepared = _Prepared(settings, plain, selected, source, downsampling, noise, holes, device, identity, folder)
     progress = ConsoleProgress(open_console())
     method = _method(prepared, progress)
     check_metrics(settings.metrics)

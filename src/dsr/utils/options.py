@@ -22,7 +22,6 @@ Example:
 
 from __future__ import annotations
 
-import functools
 import math
 from argparse import SUPPRESS, ArgumentParser, Namespace
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -190,8 +189,7 @@ class _Stated(NamedTuple):
         return (long or self.flags)[0].lstrip("-").replace("-", "_")
 
 
-@functools.cache
-def _stated(record: Any) -> tuple[_Stated, ...]:
+def _stated(record: type) -> tuple[_Stated, ...]:
     """Return the options and groups of a record, in order."""
     hints, found = get_type_hints(record), []
     for each in fields(record):
