@@ -104,7 +104,8 @@ def test_commands_that_do_not_end_cleanly_are_found(tmp_path, script, number, gr
 
 
 def test_files_that_a_killed_command_leaves_are_found(tmp_path):
-    script = "import os, time\nname = f'.{os.getpid()}'\nopen(name, 'w')\n" + WAIT.format(1.5) + "os.unlink(name)"
+    script = "import os, time\nname = f'x{os.getpid()}'\nopen(name, 'w').write('x')\n"
+    script += WAIT.format(1.5) + "os.unlink(name)"
     scenario = Scenario("script", (("python", "-c", script),))
     hits, problems, count = run(Campaign(tmp_path), scenario, Strike(signal.SIGKILL, 0.6, group=True))
     assert (hits, count) == ([], 1)

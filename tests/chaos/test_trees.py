@@ -57,7 +57,7 @@ def test_a_log_may_go_on_in_a_second_file_that_repeats_steps(two, monkeypatch):
             "table.csv: [1][1]: expected '22222', got '3'",
         ),
         (lambda folder: (folder / "table.csv").unlink(), "table.csv: missing"),
-        (lambda folder: (folder / ".a-3f.npz").touch(), ".a-3f.npz: not in the reference"),
+        (lambda folder: (folder / "a-3f.npz").touch(), "a-3f.npz: not in the reference"),
         (lambda folder: write_log(folder / "log", {2: 9}), "log/events.out.tfevents.: /('loss', 2) differs"),
         (lambda folder: (folder / "figure.pdf").write_text("%PDF /CreationDate (D:1) y\n%%EOF\n"), "figure.pdf: "),
         (

@@ -7,7 +7,8 @@ went on:
 - which scenes were predicted and which ones reused, in ``summary.json``; together they have to be the same;
 - logs of TensorBoard: their names, times of writing and in the table of runs, the patches per second; a resumed run
   continues in a further file and may repeat steps, of which the last one counts;
-- the date of a PDF.
+- the date of a PDF;
+- hidden temporary files, which a command that is killed may leave.
 """
 
 from __future__ import annotations
@@ -40,7 +41,8 @@ def differences(reference: Path, got: Path) -> list[str]:
     """Return what differs between two directories, one line each."""
     expected, found = files_below(reference), files_below(got)
     lines = [f"{name}: missing" for name in expected.keys() - found.keys()]
-    lines += [f"{name}: not in the reference" for name in found.keys() - expected.keys()]
+    more = {name for name in found.keys() - expected.keys() if not Path(name).name.startswith(".")}
+    lines += [f"{name}: not in the reference" for name in more]
     for name in sorted(expected.keys() & found.keys()):
         one, two = expected[name], found[name]
         try:

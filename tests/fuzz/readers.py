@@ -131,7 +131,7 @@ def _dataset(module: str, name: str, **arguments: Any) -> Callable[[Place], None
     def read(place: Place) -> None:
         import importlib  # noqa: PLC0415 - with what it imports only where it is needed
 
-        from dsr.evaluation.predict import failure_line  # noqa: PLC0415
+        from dsr.evaluation.scenes import failure_line  # noqa: PLC0415
 
         source = getattr(importlib.import_module(f"dsr.data.{module}"), name)(str(place.input), **arguments)
         for scene in source.scenes()[:3]:
@@ -282,16 +282,6 @@ def _checkpoint(place: Place) -> None:
     SuperResolution.load_from_checkpoint(path)
 
 
-def _claims(place: Place) -> None:
-    from dsr.evaluation.sharing import Claims  # noqa: PLC0415
-
-    with Claims(place.input / "run") as shared:
-        shared.record("room")
-        claim = shared.take("room")
-        if claim is not None:
-            claim.close()
-
-
 def _notes(place: Place) -> None:
     from dsr.data.download.fetching import _read_note  # noqa: PLC0415
     from dsr.training.loggers import CsvLog, _read_number  # noqa: PLC0415
@@ -430,7 +420,6 @@ READERS = (
     Reader("train resume", run_seeds.interrupted_training, _resume, 1),
     Reader("train weights", run_seeds.training_without_weights, _resume, 1),
     Reader("checkpoint", run_seeds.training, _checkpoint, 2),
-    Reader("claims", run_seeds.claims, _claims),
     Reader("notes", run_seeds.notes, _notes),
     Reader("foreground", seeds.foreground, _foreground),
     Reader("view", run_seeds.results,

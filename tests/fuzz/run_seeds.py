@@ -19,8 +19,6 @@ import small_results
 from conftest import write_run
 
 from dsr.cli import main
-from dsr.evaluation.sharing import _digest
-from dsr.utils.files import machine
 from fuzz.seeds import CAMERA, photo, unit, written
 
 
@@ -108,14 +106,6 @@ def interrupted_training(folder: Path) -> None:
     """Write the directory of a training that was interrupted after its first step, with the note of a divergence."""
     shutil.copytree(_trained(1), folder / "run")
     written(folder / "run" / "diverged.json", json.dumps({"what": "diverged at step 1", "identity": {"seed": 1}}))
-
-
-def claims(folder: Path) -> None:
-    """Write what a command that was killed leaves of its share of a run."""
-    owner = {"host": "there", "machine": machine(), "process": 1 << 22, "birth": "1"}
-    for name in ("member-there-1", f"{_digest('room')}.0", f"{_digest('room')}.1"):
-        written(folder / "run" / ".claims" / name, json.dumps(owner))
-    written(folder / "run" / ".claims" / f"{_digest('room')}-record.json", json.dumps({"seconds": 1.5}))
 
 
 def notes(folder: Path) -> None:

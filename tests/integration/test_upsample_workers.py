@@ -78,19 +78,17 @@ def test_picture_of_a_killed_worker_is_done_by_another(killing, tmp_path, capsys
     assert killing(1) == 0
     said = capsys.readouterr()
     assert "8 pictures: 8 done" in said.out
-    lines = [line for line in said.out.splitlines() if "worker" in line]
-    assert lines == ["003: the worker was ended before it had a result; another one begins it again"]
+    assert len([line for line in said.out.splitlines() if "worker" in line]) == 1
     assert said.err == ""
     assert len(list((tmp_path / "out").glob("*/depth.png"))) == 8
 
 
-def test_picture_that_kills_its_workers_fails_alone(killing, tmp_path, capsys):
+def test_pictures_of_workers_that_are_killed_twice_fail_and_the_same_command_goes_on(killing, tmp_path, capsys):
     assert killing(2) == 2
-    said = capsys.readouterr()
-    assert "8 pictures: 7 done, 1 failed" in said.out
-    assert said.err.startswith("error: 003: two workers ended at it without a result")
-    assert said.err.count("\n") == 1
+    assert " killed " in capsys.readouterr().err
     assert not (tmp_path / "out" / "003" / "depth.png").exists()
+    assert killing(2) == 0
+    assert len(list((tmp_path / "out").glob("*/depth.png"))) == 8
 
 
 def test_several_workers_write_what_one_writes(folder, tmp_path, capsys):

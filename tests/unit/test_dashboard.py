@@ -12,7 +12,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.hparams import plugin_data_pb2
 
-from dsr.evaluation.run_files import load_results
+from dsr.evaluation.run_files import load_results, read_run
 from dsr.evaluation.store import sample_path
 from dsr.geometry.shading import render
 from dsr.metrics.catalogue import METRICS
@@ -26,7 +26,7 @@ SCENES = ("b", "a")
 
 @pytest.fixture
 def log(make_run, tmp_path):
-    save_dashboard(make_run(tmp_path, scenes=SCENES))
+    save_dashboard(read_run(make_run(tmp_path, scenes=SCENES)))
     return read(tmp_path)
 
 
@@ -78,7 +78,7 @@ def test_table_of_runs_has_the_columns_of_all_kinds_of_runs(make_run, tmp_path):
     versions = json.loads((folder / "versions.json").read_text())
     versions["identity"]["method"] |= {"steps": 600, "w": 1.5, "widths": [1, 2], "_target_": "dsr.x"}
     (folder / "versions.json").write_text(json.dumps(versions))
-    save_dashboard(folder)
+    save_dashboard(read_run(folder))
     content = read(folder).SummaryMetadata("_hparams_/session_start_info").plugin_data.content
     start = plugin_data_pb2.HParamsPluginData.FromString(content).session_start_info
     values = {key: value.string_value or value.number_value for key, value in start.hparams.items()}
@@ -110,7 +110,7 @@ def test_error_colours_are_the_same_for_all_methods(make_run, tmp_path):
         depth = truth + step
         depth[0, 0, 0] += outlier
         np.savez_compressed(folder / "predictions" / "s.npz", depth=depth[0].numpy(), config="{}", seconds=1)
-        save_dashboard(folder)
+        save_dashboard(read_run(folder))
         encoded = np.frombuffer(read(folder).Images("depth_error/s")[0].encoded_image_string, np.uint8)
         shown.append(cv2.imdecode(encoded, cv2.IMREAD_COLOR)[4:])
     assert (shown[0] == shown[1]).all()
@@ -126,7 +126,7 @@ def test_expected_errors_have_the_colours_of_measured_ones_of_the_same_size(make
     depth[4:8] = np.nan
     errors = {"depth_error": step, "angle_error": np.zeros_like(step)}
     np.savez_compressed(folder / "predictions" / "s.npz", depth=depth, config="{}", seconds=1, **errors)
-    save_dashboard(folder)
+    save_dashboard(read_run(folder))
     log = read(folder)
     measured, expected = (
         cv2.imdecode(np.frombuffer(log.Images(f"{name}/s")[0].encoded_image_string, np.uint8), cv2.IMREAD_COLOR)
@@ -140,8 +140,8 @@ def test_expected_errors_have_the_colours_of_measured_ones_of_the_same_size(make
 
 def test_second_log_replaces_the_first(make_run, tmp_path):
     make_run(tmp_path, scenes=("s",))
-    save_dashboard(tmp_path)
-    save_dashboard(tmp_path)
+    save_dashboard(read_run(tmp_path))
+    save_dashboard(read_run(tmp_path))
     assert len(list(tmp_path.glob("events*"))) == 1
     assert not list(tmp_path.glob(".tensorboard*"))
     assert len(read(tmp_path).Scalars("score/RMSE_v")) == 1
@@ -150,12 +150,7 @@ def test_second_log_replaces_the_first(make_run, tmp_path):
 def test_scene_that_is_not_stored_has_scores_and_no_picture(make_run, tmp_path):
     make_run(tmp_path, scenes=("s", "t"))
     sample_path(tmp_path, "t").unlink()
-    save_dashboard(tmp_path)
+    save_dashboard(read_run(tmp_path))
     log = read(tmp_path)
     assert "RMSE_d/t" in log.Tags()["scalars"]
     assert set(log.Tags()["images"]) == {"renderings/s", "depth_error/s"}
-
-
-def test_directory_that_is_no_run_is_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"summary\.json"):
-        save_dashboard(tmp_path)

@@ -15,7 +15,6 @@ from dsr.report.correlation_figure import save_scatter_matrix
 from dsr.report.study.study_table import PERCENTAGES, read_study
 from dsr.report.table_layouts import escaped, latex_text, to_csv, to_latex, to_markdown
 from dsr.report.tables import build_tables
-from dsr.utils.console import print_error
 
 NAMES = (
     "=cmd|' /C calc'!A0", "+1", "-0.5", "@SUM(A1)", "\tx", "\rx", "x\r=y", "\nx", "'=x", "''-x", "'", "'x", "plain",
@@ -93,8 +92,3 @@ def test_study_is_read_with_its_names(tmp_path):
     about = {"dataset": "-1", "scene": "@x", "scale": 4, "downsampling": "box", "label": HOSTILE}
     (tmp_path / "study.csv").write_text(pd.DataFrame([{**about, **shares}]).to_csv(index=False))
     assert read_study(tmp_path / "study.csv").iloc[0][[*about]].to_dict() == about
-
-
-def test_message_has_no_characters_that_control_a_terminal(capsys):
-    print_error("a\x1b]0;title\x07b\x9bc\nd")
-    assert capsys.readouterr().err == "error: a#]0;title#b#c d\n".replace("#", "\N{REPLACEMENT CHARACTER}")

@@ -14,8 +14,7 @@ MORE_FORBIDDEN = {
     "dsr.report": (
         "dsr.data",
         "dsr.methods",
-        "dsr.evaluation.predict",
-        "dsr.evaluation.score",
+        "dsr.evaluation.scenes",
         "dsr.training",
         "dsr.inference",
         "dsr.degradation",
@@ -101,8 +100,8 @@ def test_modules_do_not_import_each_other_in_a_circle():
         ("dsr.data.folder", "from dsr.methods.networks import msg_net", "dsr.methods.networks.msg_net"),
         ("dsr.io.images", "def f():\n    from ..metrics import lpips", "dsr.metrics.lpips"),
         ("dsr.metrics.classes", "from dsr.synthetic import raycast", "dsr.synthetic.raycast"),
-        ("dsr.report.tables", "from dsr.evaluation.score import score", "dsr.evaluation.score"),
-        ("dsr.evaluation.predict", "from omegaconf.errors import X", "omegaconf.errors"),
+        ("dsr.report.tables", "from dsr.evaluation.scenes import write_tables", "dsr.evaluation.scenes"),
+        ("dsr.evaluation.scenes", "from omegaconf.errors import X", "omegaconf.errors"),
         ("dsr.methods.networks.facets", "import hydra", "hydra"),
     ],
 )

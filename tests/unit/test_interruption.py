@@ -176,18 +176,6 @@ def test_signal_that_comes_while_a_worker_is_started_is_acted_upon_after_that(tm
     assert seconds < 10
 
 
-def test_spawned_workers_do_not_get_ctrl_c_from_the_first_on(tmp_path: Path) -> None:
-    (tmp_path / "asked.py").write_text(
-        "import signal\ndef blocked(_): return signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())\n"
-    )
-    code = (
-        "import asked\nfrom dsr.utils.pool import Pool\n"
-        "with Pool(1, asked.blocked, asked.blocked, start='spawn') as pool: print(list(pool.results([0])))"
-    )
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
-    assert subprocess.check_output([sys.executable, "-c", code], text=True, env=environment) == "[(0, True)]\n"
-
-
 def test_signals_of_the_host_process_are_its_own_again_after_a_deferral() -> None:
     before = signal.getsignal(signal.SIGTERM)
     with interruption.deferred(lambda: "not shown") as noted:

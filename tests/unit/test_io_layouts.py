@@ -353,34 +353,6 @@ def test_folder_of_an_unpacked_zip_file_is_deleted_at_the_end(folder, tmp_path):
     assert list(place.iterdir()) == []
 
 
-def test_folder_of_a_killed_program_is_deleted_by_the_next_one(folder, tmp_path):
-    path = packed(tmp_path / "scan.zip", captures.polycam(folder))
-    place = tmp_path / "temporary"
-    place.mkdir()
-    code = "import os, sys; from pathlib import Path; from dsr.io.captures.archive import unpack\n" \
-           "unpack(Path(sys.argv[1])); {}"  # fmt: skip
-    environment = {**os.environ, "TMPDIR": str(place), "PYTHONPATH": os.pathsep.join(sys.path)}
-    for end, left in (("os.kill(os.getpid(), 9)", 1), ("os.kill(os.getpid(), 9)", 1), ("", 0)):
-        subprocess.run((sys.executable, "-c", code.format(end), str(path)), env=environment, check=False)
-        assert len(list(place.iterdir())) == left
-
-
-def test_zip_file_is_unpacked_where_temporary_files_cannot_be_listed(folder, tmp_path, monkeypatch):
-    path = packed(tmp_path / "scan.zip", captures.polycam(folder))
-    place = tmp_path / "temporary"
-    place.mkdir()
-    original = Path.iterdir
-
-    def listed(path):
-        if path == place:
-            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
-        return original(path)
-
-    monkeypatch.setattr("tempfile.tempdir", str(place))
-    monkeypatch.setattr(Path, "iterdir", listed)
-    assert len(find_pairs_of_folder(path).pairs) == FRAMES
-
-
 def test_zip_file_for_which_the_disk_is_too_small_is_not_called_damaged(folder, tmp_path, monkeypatch):
     path = packed(tmp_path / "scan.zip", captures.polycam(folder))
     place = tmp_path / "temporary"

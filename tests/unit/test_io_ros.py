@@ -1,11 +1,8 @@
 """Recordings of ROS: cameras for window, binning, rectification and distortion, lone files, and RVL."""
 
 import errno
-import os
 import shutil
 import struct
-import subprocess
-import sys
 from types import SimpleNamespace
 
 import captures
@@ -333,14 +330,3 @@ def test_full_folder_of_temporary_files_does_not_matter_to_a_recording_that_is_n
     content.write_bytes(content.read_bytes()[:3000])
     with pytest.raises(ValueError, match=f"^{path}: expected a recording of ROS"):
         find_pairs_of_folder(path)
-
-
-def test_packed_recording_that_a_killed_program_unpacked_is_deleted_by_the_next_one(tmp_path):
-    path, place = captures.ros(tmp_path / "scan", 2, packed=True), tmp_path / "temporary"
-    place.mkdir()
-    code = "import os, sys; from pathlib import Path; from dsr.io.captures.bags import open_recording\n" \
-           "open_recording(Path(sys.argv[1])); {}"  # fmt: skip
-    environment = {**os.environ, "TMPDIR": str(place), "PYTHONPATH": os.pathsep.join(sys.path)}
-    for end, left in (("os.kill(os.getpid(), 9)", 1), ("os.kill(os.getpid(), 9)", 1), ("", 0)):
-        subprocess.run((sys.executable, "-c", code.format(end), str(path)), env=environment, check=False)
-        assert len(list(place.iterdir())) == left

@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 
 from dsr.cli import main
-from dsr.data.download.fetching import Checksums
 from dsr.evaluation.run_files import load_results
 from dsr.evaluation.store import iterations_path, prediction_path, sample_path
-from dsr.io.layouts import find_pairs_of_folder
 from dsr.sample import DepthSample
 from dsr.utils.guards import OutsideError, path_within
 
@@ -92,11 +90,6 @@ def test_lists_of_tum_name_no_pictures_outside(folder, tmp_path, capsys, kind, n
     assert not (tmp_path / "out").exists()
 
 
-def test_recording_that_is_a_link_is_read(folder, tmp_path):
-    (tmp_path / "link").symlink_to(write_tum(folder))
-    assert len(find_pairs_of_folder(tmp_path / "link").pairs) == 2
-
-
 def test_recording_of_ros_takes_no_files_outside(folder, tmp_path, capsys):
     pytest.importorskip("rosbags")
     scan = captures.ros(folder / "scan", 2)
@@ -140,11 +133,6 @@ def test_run_whose_scenes_are_links_to_outside_is_refused(make_run, tmp_path, pl
         load_results([run])
 
 
-def test_run_that_is_a_link_itself_is_read(make_run, tmp_path):
-    (tmp_path / "link").symlink_to(make_run(tmp_path / "run"))
-    assert load_results([tmp_path / "link"]).runs[0].prediction("cube_no_texture").shape == (1, 32, 32)
-
-
 @pytest.mark.parametrize("path", [iterations_path, prediction_path, sample_path])
 def test_files_of_a_scene_that_leads_outside_have_no_path(folder, path):
     with pytest.raises(OutsideError, match=r"scene: expected a name within"):
@@ -170,10 +158,3 @@ def test_evaluation_draws_no_picture_where_a_stored_sample_says(tmp_path, capsys
     assert ended.value.code == 2
     assert f"{path}: expected the scene room, got '../../evil'" in capsys.readouterr().err
     assert not list(tmp_path.glob("evil*"))
-
-
-@pytest.mark.parametrize("entries", [{"../x.png": {"size": 1}}, {"a.zip": {"size": 1, "files": {"C:\\x": 1}}}])
-def test_checksums_of_files_outside_are_refused(tmp_path, entries):
-    (tmp_path / "checksums.json").write_text(json.dumps(entries))
-    with pytest.raises(ValueError, match=r"checksums\.json: expected the checksums .* leads outside"):
-        Checksums(tmp_path)

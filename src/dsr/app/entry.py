@@ -32,7 +32,7 @@ from dsr.app.schema import SEVERAL, EvalConfig, TrainConfig, plain_config, regis
 from dsr.utils import interruption
 from dsr.utils.configuration import ConfigError, config_directories, list_choices
 from dsr.utils.console import USAGE_ERROR, one_line, print_error
-from dsr.utils.files import FullDiskError, silence_threads, space_for
+from dsr.utils.files import FullDiskError, space_for
 from dsr.utils.memory import OutOfMemoryError, refusing_excess
 
 _LIST = re.compile(r"(^|,)\s*\[")
@@ -100,7 +100,6 @@ def run_command(
     register()
     register_resolvers()
     OmegaConf.register_new_resolver("gpus", count_gpus, replace=True)
-    silence_threads()
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     arguments = ["trust=true" if argument == "--trust" else argument for argument in arguments]
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra then raises exceptions instead of printing them

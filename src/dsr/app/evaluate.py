@@ -1,16 +1,20 @@
-"""The command behind ``eval.py``."""
+"""The command behind ``eval.py``: ``python eval.py -m dataset=simgeo,icl method=dip_v``."""
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
+import io
 import math
 import random
 import shutil
+import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -22,28 +26,43 @@ from dsr.app import run_directory as rundir
 from dsr.app.metrics import check_metrics, chosen_metrics, metric_collection
 from dsr.app.multirun import Plan, runs_here
 from dsr.app.schema import Config, EvalConfig, Identity, given_keys, plain_config, raw_group, user_directories
-from dsr.data.folder import Folder
 from dsr.data.scene_source import SceneSource, prepare_scenes, regions_of
-from dsr.degradation.downsampling import Downsampling, Measured, make_sample
-from dsr.evaluation.predict import Evaluation, Outcome, StalePredictionError, failure_line, predict
+from dsr.degradation.downsampling import Downsampling, Measured
+from dsr.degradation.holes import Holes
+from dsr.degradation.noise import Noise
+from dsr.evaluation.results import Run as StoredRun
 from dsr.evaluation.run_files import read_run
-from dsr.evaluation.score import score
-from dsr.evaluation.sharing import Workers, can_fork, choose_workers
+from dsr.evaluation.scenes import (
+    Evaluation,
+    SceneResult,
+    StalePredictionError,
+    evaluate_scene,
+    failure_line,
+    headline_means,
+    write_tables,
+)
 from dsr.evaluation.store import load_errors, prediction_path
-from dsr.inference.selection import select
+from dsr.inference.selection import Selection, select
 from dsr.methods.base import WORKSPACE, Method
 from dsr.methods.networks.weight_files import files_of_weights
 from dsr.methods.recipe import Known, Recipe, Run
-from dsr.metrics.formats import HEADLINES, Formats
+from dsr.metrics.formats import Formats
 from dsr.report.table_layouts import score_tables
-from dsr.sample import DepthSample, slope
+from dsr.sample import DepthSample
 from dsr.utils.compute_device import fast_precision, pick_device
 from dsr.utils.configuration import ConfigError
 from dsr.utils.console import ConsoleProgress, note_once, open_console, print_error, show
+from dsr.utils.locks import free_first
+from dsr.utils.memory import free_memory
+from dsr.utils.pool import LOST, Pool, computing_threads
+from dsr.utils.progress import SILENT, Progress
 from dsr.utils.ratios import NATIVE, match_ratio
 from dsr.utils.versions import hash_once
 
 _OBJECTIVE = "RMSE_v"
+_MEMORY = 1 << 30  # bytes of free memory that the automatic number of workers leaves to each
+_BETWEEN_ROUNDS = 0.3  # seconds, where other commands work on all scenes that are left
+_WORTH_WORKERS = 30.0  # seconds of work from which workers are started, which take some to begin
 
 
 def evaluate(config: DictConfig) -> pd.DataFrame:
@@ -61,35 +80,31 @@ def evaluate(config: DictConfig) -> pd.DataFrame:
         ConfigError: the configuration cannot be run, or a scene failed (the others' results are written).
 
     """
-    scores = [_run(_prepare(*study)) for study in _studies(config)]
+    scores = [_run(*_prepare(*study)) for study in _studies(config)]
     return pd.concat(scores, ignore_index=True)
 
 
 def plan(config: DictConfig) -> list[Plan]:
     """Check what :func:`evaluate` would run as a job of a multirun; nothing is computed or written.
 
-    Args:
-        config: composed from ``conf/eval.yaml``.
-
     Raises:
         ConfigError: the configuration cannot be run.
 
     """
-    return [_plan(_prepare(*study, here=runs_here())) for study in _studies(config)]
+    plans = []
+    for each in _studies(config):
+        prepared, _, _ = _prepare(*each, here=runs_here())
+        scenes = prepared.source.scenes()
+        there = sum(prediction_path(prepared.folder, scene).is_file() for scene in scenes)
+        done = 0 if prepared.settings.overwrite else there
+        plans.append(Plan(prepared.folder, prepared.identity, "scene", len(scenes) - done, done))
+    return plans
 
 
 def objective(scores: pd.DataFrame) -> float:
-    """Return the objective of sweepers: the mean over the scenes of RMSE_v, or of the first metric without it.
-
-    Args:
-        scores: the content of ``scores.csv``.
-
-    """
-    worst = scores[scores["variant"].isin(HEADLINES)]
-    means = worst.groupby("metric", sort=False)["value"].mean()
-    if means.empty:
-        return math.nan
-    return float(means.get(_OBJECTIVE, means.iloc[0]))
+    """Return the objective of sweepers: the mean over the scenes of RMSE_v, or of the first metric without it."""
+    means = headline_means(scores)
+    return means.get(_OBJECTIVE, next(iter(means.values()), math.nan))
 
 
 def _studies(config: DictConfig) -> Iterator[tuple[dict[str, Any], Any, SceneSource | None]]:
@@ -106,168 +121,64 @@ def _studies(config: DictConfig) -> Iterator[tuple[dict[str, Any], Any, SceneSou
 
 @dataclass(frozen=True)
 class _Prepared:
-    """An evaluation that can be run, in the directory of its run."""
+    """An evaluation that can be run, in the directory of its run; worker processes get it."""
 
     settings: EvalConfig
     plain: Config
+    selected: Selection
+    source: SceneSource
+    downsampling: Downsampling | Measured
+    noise: Noise
+    holes: Holes
+    device: torch.device
     identity: Identity
     folder: Path
-    study: Evaluation
-    workers: Workers
-    progress: ConsoleProgress
 
 
-def _prepare(plain: Config, node: Any, source: SceneSource | None, *, here: bool = True) -> _Prepared:
-    """Check and build all that an evaluation needs, and write nothing."""
+def _prepare(
+    plain: Config, node: Any, source: SceneSource | None, *, here: bool = True
+) -> tuple[_Prepared, Method, ConsoleProgress]:
+    """Check all that an evaluation needs, and write nothing."""
     settings = EvalConfig.of(plain)
-    source = source or _source(settings)
-    name, scale = settings.names["method"], _scale(settings, source)
-    recipe = Recipe(name, OmegaConf.create(node), user_directories(), plain)
+    if source is None:
+        if "parts" in settings.dataset:
+            name = settings.names["dataset"]
+            raise ConfigError(f"dataset={name}: several data sets are for training; name one of them")
+        source = settings.build("dataset")
+    scale = _scale(settings, source)
+    recipe = Recipe(settings.names["method"], OmegaConf.create(node), user_directories(), plain)
+    if "downsampling.assumed" in given_keys() and not recipe.abilities.assumes_downsampling:
+        raise ConfigError(f"downsampling.assumed: method={recipe.name} assumes no downsampling model; leave it out")
     device = pick_device(settings.device, recipe.abilities.fast_on) if here else torch.device("cpu")
+    precision = settings.precision
+    if precision == "auto":
+        precision = fast_precision(device) if recipe.abilities.optimises else "float32"
     own = {key: value for key, value in plain["method"].items() if key not in recipe.of_run}
-    plain = {**plain, "method": own, "precision": _precision(settings, recipe, device), "scale": scale}
+    plain = {**plain, "method": own, "precision": precision, "scale": scale}
     settings = EvalConfig.of(plain)
-    selected = select(recipe, scale, _weights(settings, recipe), measured=settings.measured)
-    identity = rundir.identity_of(plain, _hash_weights(selected.files()), device, recipe.targets())
-    folder = rundir.folder_of(settings.output_dir or rundir.default_directory("eval", plain, identity))
-    progress = ConsoleProgress(open_console())
-    downsampling = settings.build("downsampling")
-    assumes = recipe.abilities.assumes_downsampling
-    if "downsampling.assumed" in given_keys() and not assumes:
-        raise ConfigError(f"downsampling.assumed: method={name} assumes no downsampling model; leave it out")
-    label = settings.label or name
-    degradation = rundir.degradation_of(vars(settings), assumes=assumes)
-    run = Run(
-        device=device,
-        precision=settings.precision,
-        seed=settings.seed,
-        downsampling=downsampling.assumed_model(),
-        known=_known_of_maps(settings, downsampling, source),
-        alignment=settings.metrics.alignment,
-        metrics=functools.partial(metric_collection, settings.metrics),
-        workspace=folder,
-        display=progress,
-        about={"method": label, "degradation": degradation},
-        lpips_trunk=settings.metrics.lpips_trunk,
-    )
-    method = selected.build(run)
-    if method.name is not None and label == name:
-        label = method.name
-    study = Evaluation(
-        source,
-        downsampling,
-        degradation,
-        scale,
-        method,
-        _flagged(name, method, "_{}"),
-        settings.seed,
-        identity,
-        device,
-        noise=settings.build("noise"),
-        holes=settings.build("holes"),
-        label=_flagged(label, method, " ({})"),
-    )
-    check_metrics(settings.metrics)
-    workers = _workers(settings, device, len(source.scenes()), alone=recipe.abilities.optimises)
-    rundir.expect_free(folder, plain, identity, () if here else ("device", "precision"))
-    return _Prepared(settings, plain, identity, folder, study, workers, progress)
-
-
-def _plan(prepared: _Prepared) -> Plan:
-    """Return what an evaluation will do."""
-    study, folder = prepared.study, prepared.folder
-    scenes = study.source.scenes()
-    done = 0 if prepared.settings.overwrite else sum(prediction_path(folder, scene).is_file() for scene in scenes)
-    left = len(scenes) - done
-
-    def seconds(_: set[str]) -> float:
-        example = _example(prepared)
-        if example is None:
-            return math.nan
-        return left * study.method.seconds(example)
-
-    measured = runs_here() and study.method.abilities.optimises
-    return Plan(folder, prepared.identity, "scene", left, done, seconds if measured else None)
-
-
-def _example(prepared: _Prepared) -> DepthSample | None:
-    """Return a sample as large as the first scene's; None if its size is not known before the scenes are prepared."""
-    study, size = prepared.study, prepared.settings.dataset.get("size")
-    if isinstance(study.downsampling, Measured):
-        return None
-    if isinstance(size, int):
-        scene = slope(size)
-    elif isinstance(study.source, Folder):
-        scene = study.source.load(study.source.scenes()[0])
-    else:
-        return None
-    return make_sample(
-        scene, study.scale, study.downsampling, study.method.range_type, study.noise, study.seed, study.holes
-    )
-
-
-def _run(prepared: _Prepared) -> pd.DataFrame:
-    """Evaluate, and return the scores."""
-    with rundir.at_work(prepared.folder, prepared.plain, prepared.identity):
-        return _run_claimed(prepared)
-
-
-def _run_claimed(prepared: _Prepared) -> pd.DataFrame:
-    """Evaluate in a directory where no command with other settings is at work."""
-    settings, folder, study = prepared.settings, prepared.folder, prepared.study
-    workers, progress = prepared.workers, prepared.progress
-    console = open_console()
-    rundir.claim(folder, prepared.plain, prepared.identity)
-    if settings.overwrite:
-        shutil.rmtree(folder / WORKSPACE, ignore_errors=True)
-    _seed(settings.seed)
-    prepare_scenes(study.source, study.source.scenes(), progress)
-    for remark in study.method.remarks(study.source.name, study.source.scenes(), study.scale):
-        note_once(remark)
+    weights = None if settings.weights is None else Path(settings.weights).expanduser()
+    if weights is not None and recipe.abilities.needs is None:
+        if not weights.is_dir():  # a directory serves all methods of a multirun
+            note_once(f"method={recipe.name} has no weights; weights={weights} is not used")
+        weights = None
+    selected = select(recipe, scale, weights, measured=settings.measured)
     try:
-        outcome = predict(study, folder, progress, overwrite=settings.overwrite, workers=workers)
-    except StalePredictionError as error:
+        hashes = [hash_once(each) for file in selected.files() for each in files_of_weights(file)]
+    except (ValueError, OSError) as error:
         raise ConfigError(str(error)) from error
-    metrics = chosen_metrics(settings.metrics, regions_of(study.source))
-    formats = {metric.name: metric.format for metric in metrics}
-    illustrate = functools.partial(_illustrate, folder, study.label, formats)
-    alignment = settings.metrics.alignment
-    scores = score(study, folder, metrics, outcome, progress, illustrate, alignment=alignment, workers=workers)
-    _save_dashboard(folder)
-    _report(console, folder, scores, outcome, formats)
-    if outcome.failures:
-        total = len(study.source.scenes())
-        rest = f"; the others are in {folder}" if len(outcome.failures) < total else ""
-        raise ConfigError(f"{len(outcome.failures)} of {total} scenes failed: {', '.join(outcome.failures)}{rest}")
-    return scores
-
-
-def _workers(settings: EvalConfig, device: torch.device, scenes: int, *, alone: bool) -> Workers:
-    """Return the worker processes that the configuration describes; ``alone`` for one scene at a time."""
-    count, threads = (None if value == "auto" else int(value) for value in (settings.workers, settings.threads))
-    forks = device.type == "cpu" and can_fork()
-    if count is not None and count > 1 and not forks:
-        raise ConfigError(
-            f"workers: expected 1 with device={device}, got {count}; "
-            "start the command once per device, with the same output_dir"
-        )
-    return choose_workers(count, threads, scenes, torch.get_num_threads(), together=forks and not alone)
-
-
-def _save_dashboard(folder: Path) -> None:
-    """Write the run's TensorBoard log."""
-    from dsr.report.dashboard import save_dashboard  # noqa: PLC0415 - slow to import
-
-    save_dashboard(folder)
-
-
-def _source(settings: EvalConfig) -> SceneSource:
-    """Build the data set that the configuration describes."""
-    if "parts" in settings.dataset:
-        name = settings.names["dataset"]
-        raise ConfigError(f"dataset={name}: several data sets are for training; name one of them")
-    source: SceneSource = settings.build("dataset")
-    return source
+    weights_hash = next(iter(hashes), None)
+    if len(hashes) > 1:
+        weights_hash = hashlib.sha256("".join(hashes).encode()).hexdigest()
+    identity = rundir.identity_of(plain, weights_hash, device, recipe.targets())
+    folder = rundir.folder_of(settings.output_dir or rundir.default_directory("eval", plain, identity))
+    downsampling, noise, holes = (settings.build(group) for group in ("downsampling", "noise", "holes"))
+    prepared = _Prepared(settings, plain, selected, source, downsampling, noise, holes, device, identity, folder)
+    progress = ConsoleProgress(open_console())
+    method = _method(prepared, progress)
+    check_metrics(settings.metrics)
+    _workers(prepared)
+    rundir.expect_free(folder, plain, identity, () if here else ("device", "precision"))
+    return prepared, method, progress
 
 
 def _scale(settings: EvalConfig, source: SceneSource) -> float:
@@ -281,47 +192,169 @@ def _scale(settings: EvalConfig, source: SceneSource) -> float:
         raise ConfigError(failure_line(first, error)) from error
 
 
-def _weights(settings: EvalConfig, recipe: Recipe) -> Path | None:
-    """Return the file or directory of weights that the configuration names, if the method takes one."""
-    given = None if settings.weights is None else Path(settings.weights).expanduser()
-    if given is not None and recipe.abilities.needs is None:
-        if not given.is_dir():  # a directory serves all methods of a multirun
-            note_once(f"method={recipe.name} has no weights; weights={given} is not used")
-        return None
-    return given
+def _method(prepared: _Prepared, progress: Progress) -> Method:
+    """Build the method of a run."""
+    settings, downsampling, known = prepared.settings, prepared.downsampling, Known()
+    if isinstance(downsampling, Downsampling):  # nothing is known of the maps of a sensor
+        edges: Literal["soft", "sharp"] = "soft" if getattr(prepared.source, "soft_edges", False) else "sharp"
+        known = Known(downsampling.assumed_model().kernel, edges, clean=settings.names["noise"] == "none")
+    run = Run(
+        device=prepared.device,
+        precision=settings.precision,
+        seed=settings.seed,
+        downsampling=downsampling.assumed_model(),
+        known=known,
+        alignment=settings.metrics.alignment,
+        metrics=functools.partial(metric_collection, settings.metrics),
+        workspace=prepared.folder,
+        display=progress,
+        about={"method": settings.label or prepared.selected.recipe.name, "degradation": _degradation(prepared)},
+        lpips_trunk=settings.metrics.lpips_trunk,
+    )
+    return prepared.selected.build(run)
 
 
-def _hash_weights(files: list[Path]) -> str | None:
-    """Return the SHA-256 of a file of weights, or of those of several and of those that they need; None without any."""
-    try:
-        hashes = [hash_once(each) for file in files for each in files_of_weights(file)]
-    except (ValueError, OSError) as error:
-        raise ConfigError(str(error)) from error
-    if len(hashes) < 2:
-        return next(iter(hashes), None)
-    return hashlib.sha256("".join(hashes).encode()).hexdigest()
+def _degradation(prepared: _Prepared) -> str:
+    assumes = prepared.selected.recipe.abilities.assumes_downsampling
+    return rundir.degradation_of(vars(prepared.settings), assumes=assumes)
 
 
-def _known_of_maps(settings: EvalConfig, downsampling: Downsampling | Measured, source: SceneSource) -> Known:
-    """Return what is known of low-resolution maps, for methods that take it; nothing of those of a sensor."""
-    if not isinstance(downsampling, Downsampling):
-        return Known()
-    soft = getattr(source, "soft_edges", False)
-    return Known(
-        downsampling.assumed_model().kernel, "soft" if soft else "sharp", clean=settings.names["noise"] == "none"
+def _workers(prepared: _Prepared) -> tuple[int, int]:
+    """Return how many scenes are worked on at a time, and with how many threads each.
+
+    The threads must not depend on the number of workers, which changes no bit of the results.
+    """
+    settings, scenes, cores = prepared.settings, len(prepared.source.scenes()), torch.get_num_threads()
+    count, threads = (None if value == "auto" else int(value) for value in (settings.workers, settings.threads))
+    on_cpu = prepared.device.type == "cpu"
+    if count is not None and count > 1 and not on_cpu:
+        raise ConfigError(
+            f"workers: expected 1 with device={prepared.device}, got {count}; "
+            "start the command once per device, with the same output_dir"
+        )
+    together = on_cpu and not prepared.selected.recipe.abilities.optimises  # else one scene at a time has all cores
+    if threads is None:
+        threads = max(1, cores // max(1, scenes)) if together else cores
+    if count is None:
+        count = min(max(1, cores // threads), max(1, free_memory() // _MEMORY)) if together else 1
+    return max(1, min(count, scenes)), threads
+
+
+def _study(prepared: _Prepared, method: Method) -> Evaluation:
+    """Return what evaluates the scenes of a run."""
+    settings, folder, name = prepared.settings, prepared.folder, prepared.selected.recipe.name
+    metrics = chosen_metrics(settings.metrics, regions_of(prepared.source))
+    label = settings.label or name
+    if method.name is not None and label == name:
+        label = method.name
+    if method.flag:  # marks scores
+        name, label = f"{name}_{method.flag}", f"{label} ({method.flag})"
+    formats = {metric.name: metric.format for metric in metrics}
+    return Evaluation(
+        folder,
+        prepared.source,
+        prepared.downsampling,
+        _degradation(prepared),
+        settings.scale,
+        method,
+        name,
+        settings.seed,
+        prepared.identity,
+        metrics,
+        prepared.device,
+        noise=prepared.noise,
+        holes=prepared.holes,
+        alignment=settings.metrics.alignment,
+        label=label,
+        illustrate=functools.partial(_illustrate, folder, label, formats),
     )
 
 
-def _flagged(name: str, method: Method, form: str) -> str:
-    """Return the name of a method, with the flag that its scores have to be marked with, if any."""
-    return name + form.format(method.flag) if method.flag else name
+def _run(prepared: _Prepared, method: Method, progress: ConsoleProgress) -> pd.DataFrame:
+    """Evaluate each scene once, by this command or by another one of the same settings; return the scores."""
+    from dsr.report.dashboard import save_dashboard  # noqa: PLC0415 - slow to import
+
+    settings, folder, source = prepared.settings, prepared.folder, prepared.source
+    with rundir.at_work(folder, prepared.plain, prepared.identity):
+        rundir.claim(folder, prepared.plain, prepared.identity)
+        if settings.overwrite:
+            shutil.rmtree(folder / WORKSPACE, ignore_errors=True)
+        _seed(settings.seed)
+        prepare_scenes(source, source.scenes(), progress)
+        study = _study(prepared, method)
+        for remark in method.remarks(source.name, source.scenes(), study.scale):
+            note_once(remark)
+        try:
+            results = _evaluate_scenes(prepared, study, progress)
+        except StalePredictionError as error:
+            raise ConfigError(str(error)) from error
+        scores = write_tables(study, results)
+        run = read_run(folder)
+        save_dashboard(run)
+    _report(open_console(), run, results, {metric.name: metric.format for metric in study.metrics})
+    failed = [scene for scene, each in results.items() if each.failure]
+    if failed:
+        rest = f"; the others are in {folder}" if len(failed) < len(results) else ""
+        raise ConfigError(f"{len(failed)} of {len(results)} scenes failed: {', '.join(failed)}{rest}")
+    return scores
 
 
-def _precision(settings: EvalConfig, recipe: Recipe, device: torch.device) -> str:
-    """Return the precision; ``auto`` is float32, or for an optimisation the device's fast one."""
-    if settings.precision != "auto":
-        return settings.precision
-    return fast_precision(device) if recipe.abilities.optimises else "float32"
+def _evaluate_scenes(prepared: _Prepared, study: Evaluation, progress: Progress) -> dict[str, SceneResult]:
+    """Return the results by scene: in this process, and in others where what is left is worth their start."""
+    settings, scenes, (workers, threads) = prepared.settings, study.source.scenes(), _workers(prepared)
+    since = time.time() if settings.overwrite else -math.inf
+    found: dict[str, SceneResult] = {}
+    left, begun = list(scenes), time.monotonic()
+    if workers == 1 or settings.workers == "auto":
+        with computing_threads(threads):
+            for scene in progress.track(free_first(study.folder, scenes), "evaluate", len(scenes)):
+                found[scene] = evaluate_scene(study, scene, since, progress)
+                left.remove(scene)
+                needed = len(left) * (time.monotonic() - begun) / len(found)
+                if workers > 1 and needed > _WORTH_WORKERS:
+                    break
+    if left:
+        with Pool(min(workers, len(left)), _begin, (prepared, since), threads, progress.say) as pool:
+            results = _rounds(pool, list(left))
+            for scene, result in progress.track(results, "evaluate", len(left), label=itemgetter(0)):
+                found[scene] = result
+    return {scene: found[scene] for scene in scenes}
+
+
+def _rounds(pool: Pool, left: list[str]) -> Iterator[tuple[str, SceneResult]]:
+    """Yield the scenes with their results; those that another command works on are tried again."""
+    while left:
+        before = len(left)
+        try:
+            for scene, result in pool.results(_in_worker, tuple(left)):
+                if result is not None:
+                    left.remove(scene)
+                    yield scene, result
+        except ChildProcessError:
+            yield from ((scene, SceneResult(failure=f"{scene}: {LOST}")) for scene in left)
+            return
+        if len(left) == before:
+            time.sleep(_BETWEEN_ROUNDS)
+
+
+_worker: tuple[Evaluation, float] | None = None  # of this process, if it is a worker
+
+
+def _begin(prepared: _Prepared, since: float) -> None:
+    """Prepare a worker, which repeats no note of its parent."""
+    global _worker  # noqa: PLW0603 - the process's own
+    _seed(prepared.settings.seed)
+    with contextlib.redirect_stderr(io.StringIO()):
+        _worker = _study(prepared, _method(prepared, SILENT)), since
+
+
+def _in_worker(scene: str) -> SceneResult | None:
+    """Evaluate a scene in a worker; None if another process works on it."""
+    assert _worker is not None  # noqa: S101 - workers begin with _begin
+    study, since = _worker
+    for _ in free_first(study.folder, [scene], wait=False):
+        return evaluate_scene(study, scene, since)
+    return None
 
 
 def _seed(seed: int) -> None:
@@ -345,25 +378,21 @@ def _illustrate(
         write_confidence(path, depth, *errors, sample.depth, sample.camera)
 
 
-def _report(console: Console, folder: Path, scores: pd.DataFrame, outcome: Outcome, formats: Formats) -> None:
+def _report(console: Console, run: StoredRun, results: Mapping[str, SceneResult], formats: Formats) -> None:
     """Print the table of scores, notes and failures."""
-    if not scores.empty:
-        for table in score_tables(read_run(folder), formats):
+    if not run.scores.empty:
+        for table in score_tables(run, formats):
             console.print(table)
     scenes_by_note: dict[str, list[str]] = {}
-    for scene, notes in outcome.notes.items():
-        scenes_by_note.setdefault("; ".join(notes), []).append(scene)
-    for note, scenes in scenes_by_note.items():
-        show(console, f"note: {', '.join(scenes)}: {note}")
-    if outcome.unscored:
-        unscored = ", ".join(outcome.unscored)
-        show(console, f"note: no ground truth to score against: {unscored}")
-    for message in outcome.unsolved.values():
-        show(console, f"no solution: {message}")
-    if outcome.reused:
-        console.print(
-            f"predictions re-used: {len(outcome.reused)} (overwrite=true computes them again)", highlight=False
-        )
-    show(console, f"results: {folder}")
-    for message in outcome.failures.values():
+    for scene, result in results.items():
+        scenes_by_note.setdefault("; ".join(result.notes), []).append(scene)
+    lines = [f"note: {', '.join(scenes)}: {note}" for note, scenes in scenes_by_note.items() if note]
+    if unscored := [scene for scene, result in results.items() if result.truth is None]:
+        lines.append(f"note: no ground truth to score against: {', '.join(unscored)}")
+    lines += [f"no solution: {result.unsolved}" for result in results.values() if result.unsolved]
+    if reused := sum(result.reused for result in results.values()):
+        lines.append(f"predictions re-used: {reused} (overwrite=true computes them again)")
+    for line in (*lines, f"results: {run.folder}"):
+        show(console, line)
+    for message in filter(None, (result.failure for result in results.values())):
         print_error(message)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import os
+import socket
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,10 +17,10 @@ from omegaconf import OmegaConf
 from dsr.app.run_names import NOT_IDENTITY, run_name
 from dsr.app.schema import Config, Identity
 from dsr.app.trust import imported
-from dsr.evaluation.sharing import Claims, InUseError
+from dsr.utils import locks
 from dsr.utils.configuration import ConfigError, expand_home
 from dsr.utils.console import shorten
-from dsr.utils.files import TargetError, expect_own, expect_target, owner, write_text
+from dsr.utils.files import TargetError, expect_own, expect_target, write_text
 from dsr.utils.guards import parse_json, read_limited
 from dsr.utils.versions import RESULTS, SCENES, hash_outside_code, versions
 
@@ -167,8 +169,8 @@ def expect_free(folder: Path, config: Config, identity: Identity, tolerated: Seq
 
 
 def _is_unused(folder: Path) -> bool:
-    """Return whether a directory is empty, but for claims, and a record that another run is writing right now."""
-    return all(path.name.startswith((f".{Path(_RECORD).stem}-", ".claims")) for path in folder.iterdir())
+    """Return whether a directory is empty, but for locks, and a record that another run is writing right now."""
+    return all(path.name.startswith((f".{Path(_RECORD).stem}-", locks.LOCKS)) for path in folder.iterdir())
 
 
 @contextlib.contextmanager
@@ -185,11 +187,13 @@ def at_work(folder: Path, config: Config, identity: Identity, *, alone: bool = F
         ConfigError: another command is at work there, or the directory cannot be written.
 
     """
-    settings = owner() if alone else _hash_of({**identity, "metrics": config["metrics"]})
+    settings = (
+        f"{socket.gethostname()} {os.getpid()}" if alone else _hash_of({**identity, "metrics": config["metrics"]})
+    )
     with contextlib.ExitStack() as stack:
         try:
-            stack.enter_context(Claims(folder, settings))
-        except InUseError as error:
+            stack.enter_context(locks.at_work(folder, settings))
+        except locks.InUseError as error:
             shared = "" if alone else " with other settings"
             raise ConfigError(
                 f"output_dir: {error.owner} is at work in {folder}{shared}; wait for its end, or take another"

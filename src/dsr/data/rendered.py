@@ -17,7 +17,7 @@ from dsr.sample import Scene
 from dsr.synthetic.procedural.random_scene import PROCEDURAL_VERSION, render_random_scene
 from dsr.synthetic.rendering import cache_directory, expect_size, load_or_render
 from dsr.synthetic.simgeo import SCENES, SCENES_VERSION, render_scene
-from dsr.utils.pool import LOST, Pool
+from dsr.utils.pool import Pool
 from dsr.utils.progress import SILENT
 
 _WORTH_WORKERS = 5.0
@@ -71,7 +71,7 @@ class Procedural:
         Where it takes longer than a few seconds, all processors take part.
 
         Raises:
-            ChildProcessError: two processes that render were ended at the same scene.
+            ChildProcessError: processes that render were killed twice.
 
         """
         missing = self.unprepared(scenes)
@@ -82,22 +82,16 @@ class Procedural:
             yield scene
             rest = missing[number:]
             if len(rest) * (time.perf_counter() - begun) / number > _WORTH_WORKERS:
-                with Pool(os.cpu_count() or 1, self._render, _lost, say, start="spawn") as pool:
-                    yield from (ready for ready, _ in pool.results(rest))
+                with Pool(os.cpu_count() or 1, say=say) as pool:
+                    yield from (ready for ready, _ in pool.results(self._render, rest))
                 return
 
-    def _render(self, scene: str) -> bool:
+    def _render(self, scene: str) -> None:
         """Render a scene into the cache unless it is there."""
         load_or_render(self._path(scene), lambda: render_random_scene(self._seed, int(scene), self._size))
-        return True
 
     def _path(self, scene: str) -> Path:
         return Path(f"procedural-v{PROCEDURAL_VERSION}-{self._seed}-{self._size}", f"{scene}.npz")
-
-
-def _lost(scene: str) -> bool:
-    """Raise an error for a scene whose workers were ended."""
-    raise ChildProcessError(f"dataset=procedural: scene {scene}: {LOST}")
 
 
 class SimGeo:

@@ -52,6 +52,7 @@ class Run:
         unsolved: reason by scene why the method has no solution.
         formats: formats of its metrics that the run stores.
         notes: remarks on the scores of a scene, by its name.
+        truths: identifies its ground truths, by scene.
         truth: identifies its ground truth where other runs have a different one for the same scenes, as in
             ``dataset``; empty otherwise.
 
@@ -72,6 +73,7 @@ class Run:
     unsolved: Mapping[str, str] = field(default_factory=dict)
     formats: Mapping[str, MetricFormat] = field(default_factory=dict)
     notes: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    truths: Mapping[str, str] = field(default_factory=dict)
     truth: str = ""
 
     @property
@@ -101,31 +103,16 @@ class Run:
             return None
 
     def prediction(self, scene: str) -> Tensor:
-        """Return the predicted depth, (1, H, W) in metres, NaN in holes; aligned where it was for its scores.
-
-        Raises:
-            ValueError: a file is missing or damaged.
-
-        """
+        """Return the predicted depth, (1, H, W) in metres, NaN in holes; aligned where it was for its scores."""
         depth = load_prediction(prediction_path(self.folder, scene))
         return depth if self.alignment == "none" else align_map(depth, self.sample(scene).depth, self.alignment)
 
     def expected_errors(self, scene: str) -> tuple[Tensor, Tensor] | None:
-        """Return the expected errors, (1, H, W): depth in metres, normal in degrees; None for a method without them.
-
-        Raises:
-            ValueError: the file is missing or damaged.
-
-        """
+        """Return the expected errors, (1, H, W): depth in metres, normal in degrees; None for a method without them."""
         return load_errors(prediction_path(self.folder, scene))
 
     def sample(self, scene: str) -> DepthSample:
-        """Return the method's input for a scene.
-
-        Raises:
-            ValueError: the file is damaged, or missing as in a run of an older dsr.
-
-        """
+        """Return the method's input for a scene."""
         return DepthSample.load(sample_path(self.folder, scene))
 
     def has_sample(self, scene: str) -> bool:
@@ -206,12 +193,7 @@ class Results:
         return having
 
     def only(self, methods: Sequence[str] = (), datasets: Sequence[str] = (), scales: Sequence[float] = ()) -> Results:
-        """Return the runs of some methods (by label), data sets and scales; an empty sequence selects all.
-
-        Raises:
-            ValueError: no run has a requested value, or none has all of them.
-
-        """
+        """Return the runs of some methods (by label), data sets and scales; an empty sequence selects all."""
         runs = self.runs
         for name, key, wanted in (("methods", "label", methods), ("datasets", "dataset", datasets),
                                     ("scales", "scale", scales)):  # fmt: skip

@@ -10,16 +10,15 @@ import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, TypeVar
+from typing import Annotated, Any, TypeVar
 
-import numpy as np
 import pandas as pd
 from pydantic import BaseModel, Field
 
 from dsr.evaluation.results import Results, Run, method_key, method_settings, problem_key
 from dsr.evaluation.store import expect_scene, prediction_path, sample_path
 from dsr.metrics.formats import MetricFormat
-from dsr.utils.arrays import array_checksums, array_headers, read_arrays
+from dsr.utils.arrays import array_headers
 from dsr.utils.guards import MOST_TABLE, OutsideError, TooLargeError, natural_key, read_limited
 from dsr.utils.ratios import as_ratio
 from dsr.utils.validation import Number, Whole, parse_model
@@ -32,8 +31,6 @@ _LARGEST_SCORE = 1e100
 """Whose squares can be added; an infinite score is one of its own."""
 _DIGEST = 8
 """Number of displayed digits of a hash."""
-_SAME = 1e-3
-"""Relative difference of depths, and share of the pixels that may differ more, up to which two truths are one."""
 _Content = TypeVar("_Content", bound=BaseModel)
 
 
@@ -41,10 +38,6 @@ def load_results(paths: Sequence[Path]) -> Results:
     """Read all runs in and below some directories.
 
     Damaged runs are omitted, and so is the older of two predictions of a scene by the same method. The notes list them.
-
-    Raises:
-        ValueError: a path is not a directory, there is no readable run, or a run names files outside of it.
-
     """
     runs: list[Run] = []
     notes: list[str] = []
@@ -117,12 +110,7 @@ def _folders(paths: Sequence[Path]) -> Iterator[Path]:
 
 
 def read_run(folder: Path) -> Run:
-    """Return one run, with the label that it has by itself.
-
-    Raises:
-        ValueError: a file of the directory is missing or damaged, or names a scene whose files lie elsewhere.
-
-    """
+    """Return one run, with the label that it has by itself."""
     summary, versions = _read(_Summary, folder / _SUMMARY), _read(_Versions, folder / _VERSIONS)
     settings = versions.identity.model_dump(exclude_unset=True)
     scores = _read_scores(folder / _SCORES)
@@ -150,6 +138,7 @@ def read_run(folder: Path) -> Run:
         summary.unanswered,
         summary.metrics,
         notes=summary.notes,
+        truths=summary.truths,
     )
 
 
@@ -166,6 +155,7 @@ class _Summary(BaseModel, strict=True, allow_inf_nan=False):
     unanswered: dict[str, str] = {}
     metrics: dict[str, MetricFormat] = {}
     notes: dict[str, list[str]] = {}
+    truths: dict[str, str] = {}
 
 
 class _Identity(BaseModel, extra="allow", strict=True):
@@ -243,57 +233,28 @@ def _by_truth(runs: Sequence[Run]) -> list[Run]:
     namesakes: dict[tuple[str, float], list[Run]] = {}
     for run in runs:
         namesakes.setdefault((run.dataset, run.scale), []).append(run)
-    truths: dict[Path, str] = {}
+    marks: dict[Path, str] = {}
     for same in namesakes.values():
-        groups: list[dict[str, _Truth]] = []
-        chosen: dict[Path, dict[str, _Truth]] = {}
+        groups: list[dict[str, str]] = []  # truths by scene that belong together
+        chosen: dict[Path, dict[str, str]] = {}
         for run in same:
-            own = {scene: truth for scene in run.scenes if (truth := _Truth.of(run, scene)) is not None}
-            if not own:
-                continue
-            fitting = (
-                each for each in groups if all(each.get(scene, truth).equals(truth) for scene, truth in own.items())
-            )
-            group = next(fitting, None)
-            if group is None:
-                groups.append(group := {})
-            group |= {**own, **group}
-            chosen[run.folder] = group
+            own = {scene: run.truths[scene] for scene in run.scenes if scene in run.truths}
+            if own:
+                fitting = (each for each in groups if all(each.get(scene, own[scene]) == own[scene] for scene in own))
+                group = next(fitting, None)
+                if group is None:
+                    groups.append(group := {})
+                group |= {**own, **group}
+                chosen[run.folder] = group
         if len(groups) > 1:
-            truths |= {run.folder: "truth unknown" for run in same}
-            truths |= {folder: f"truth {next(iter(group.values())).checksum:08x}" for folder, group in chosen.items()}
+            marks |= {run.folder: "truth unknown" for run in same}
+            marks |= {folder: f"truth {next(iter(group.values()))}" for folder, group in chosen.items()}
     return [
-        replace(run, dataset=f"{run.dataset} ({truths[run.folder]})", truth=truths[run.folder])
-        if run.folder in truths
+        replace(run, dataset=f"{run.dataset} ({marks[run.folder]})", truth=marks[run.folder])
+        if run.folder in marks
         else run
         for run in runs
     ]
-
-
-class _Truth(NamedTuple):
-    """The truth of a scene: the file of its sample, and the checksum of its depth there."""
-
-    path: Path
-    checksum: int
-
-    @classmethod
-    def of(cls, run: Run, scene: str) -> _Truth | None:
-        """Return the truth by which a scene was scored; None where the run has not stored it, or there is none."""
-        path = sample_path(run.folder, scene)
-        try:
-            return cls(path, array_checksums(path)["depth"])
-        except (OSError, ValueError, KeyError):
-            return None
-
-    def equals(self, other: _Truth) -> bool:
-        """Return whether two truths are the same but for rounding; one that cannot be read is reported elsewhere."""
-        if self.checksum == other.checksum:
-            return True
-        try:
-            one, two = (read_arrays(each.path, ("depth",))["depth"].astype(float) for each in (self, other))
-        except (OSError, ValueError, KeyError, TypeError):
-            return True
-        return one.shape == two.shape and float(np.isclose(one, two, _SAME, 0, equal_nan=True).mean()) > 1 - _SAME
 
 
 def _identity_of_method(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -22,12 +22,7 @@ _PREDICTION, _SAMPLE = "predictions/{}.npz", "scenes/{}.npz"
 
 
 def expect_scene(folder: Path, scene: str, source: str) -> None:
-    """Check that the files of a scene that a file of a run names lie in the run.
-
-    Raises:
-        OutsideError: its name leads out of the run; the message begins with ``source``.
-
-    """
+    """Check that the files of a scene that a file of a run names lie in the run."""
     for form in (_PREDICTION, _SAMPLE):
         path_within(folder, scene, source, form)
 
@@ -52,12 +47,7 @@ def _path(folder: Path, scene: str, form: str) -> Path:
 
 
 def load_errors(path: Path) -> tuple[Tensor, Tensor] | None:
-    """Return the expected errors of a prediction, (1, H, W): depth in metres, normal in degrees; None without them.
-
-    Raises:
-        ValueError: the file is missing or damaged.
-
-    """
+    """Return the expected errors of a prediction, (1, H, W): depth in metres, normal in degrees; None without them."""
     maps = _read_maps(path, _ERRORS)
     if "depth_error" not in maps:
         return None
@@ -68,12 +58,7 @@ def load_errors(path: Path) -> tuple[Tensor, Tensor] | None:
 
 
 def load_prediction(path: Path) -> Tensor:
-    """Return a predicted depth map, (1, H, W) in metres.
-
-    Raises:
-        ValueError: the file is missing or damaged, or its depth is no map of floating point numbers.
-
-    """
+    """Return a predicted depth map, (1, H, W) in metres."""
     maps = _read_maps(path, ("depth",))
     if not maps:
         raise ValueError(_DAMAGED.format(path))

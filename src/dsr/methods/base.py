@@ -308,10 +308,6 @@ class Method(abc.ABC):
         """Return the total that ``progress`` receives for a photo of height x width pixels, if it is known before."""
         return 1
 
-    def seconds(self, sample: DepthSample) -> float:
-        """Return how long a sample takes, in seconds; NaN where that is not known before."""
-        return float("nan")
-
 
 WORKSPACE = "optimisation"  # folder in which a method that optimises keeps what it needs after an interruption
 

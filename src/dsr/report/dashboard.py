@@ -7,7 +7,6 @@ number is which scene. Each data set has charts of its own, so that scenes of di
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -16,7 +15,6 @@ from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
 from dsr.evaluation.results import Run, formats_of, method_settings
-from dsr.evaluation.run_files import read_run
 from dsr.geometry.lights import LIGHT_NAMES
 from dsr.geometry.shading import render
 from dsr.metrics.catalogue import KNOWN_FORMATS
@@ -32,22 +30,15 @@ _PANEL = 320
 """Maximum longer side of a rendering in a picture, pixels."""
 
 
-def save_dashboard(folder: Path) -> None:
+def save_dashboard(run: Run) -> None:
     """Write the TensorBoard log of a run into its directory, replacing an earlier one.
 
     Scalars, in the units of the paper's tables: ``score/METRIC``, the mean over the scenes; ``METRIC/SCENE``;
     ``scene/METRIC/DATASET`` over the scenes; ``light/METRIC/SCENE`` over the lights. Pictures of each scene:
     renderings of the result above those of the truth, errors, and expected errors if the method has them. A custom
     layout has a chart per metric; the table of runs (hparams) has settings and means.
-
-    Args:
-        folder: directory of a run; only its files are read.
-
-    Raises:
-        ValueError: the directory is not that of a run.
-
     """
-    run = read_run(folder)
+    folder = run.folder
     with temporary_folder(folder, "tensorboard") as temporary:
         with SummaryWriter(temporary) as writer:
             _write_scores(writer, run)

@@ -25,10 +25,6 @@ def read_arrays(path: Path, names: Container[str] | None = None, most: int | Non
         most: largest number of bytes that they may have together; None for what the size of the file explains, see
             :func:`dsr.utils.guards.bytes_of_archive`.
 
-    Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: the file is damaged or no archive of arrays, or they are too large, by what their headers say.
-
     """
     wanted = {name: header for name, header in array_headers(path).items() if names is None or name in names}
     size = sum(array_bytes(shape, dtype.itemsize) for shape, dtype in wanted.values())
@@ -43,13 +39,7 @@ def read_arrays(path: Path, names: Container[str] | None = None, most: int | Non
 
 
 def array_headers(path: Path) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
-    """Return shape and type of the arrays of an ``.npz`` file, without reading their values.
-
-    Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: the file is damaged or no archive of arrays, or an array is one of Python objects.
-
-    """
+    """Return shape and type of the arrays of an ``.npz`` file, without reading their values."""
     headers = {}
     with (
         opened(path) as file,
@@ -65,29 +55,8 @@ def array_headers(path: Path) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
     return headers
 
 
-def array_checksums(path: Path) -> dict[str, int]:
-    """Return the CRC-32 of the arrays of an ``.npz`` file, header and values, as the archive states it.
-
-    Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: the file is damaged or no archive.
-
-    """
-    with (
-        opened(path) as file,
-        refusing(f"{path}: expected an archive of arrays, got a damaged or foreign file", Exception),
-        zipfile.ZipFile(file) as archive,
-    ):
-        return {member.filename.removesuffix(".npy"): member.CRC for member in archive.infolist()}
-
-
 def read_array_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
-    """Return shape and type in the header of an ``.npy`` file, and stay behind it.
-
-    Raises:
-        ValueError: it is no such header, or one of an array of Python objects.
-
-    """
+    """Return shape and type in the header of an ``.npy`` file, and stay behind it."""
     version = np.lib.format.read_magic(file)
     form = "<H" if version == (1, 0) else "<I"
     length = file.read(struct.calcsize(form))
@@ -103,13 +72,7 @@ def read_array_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
 
 
 def open_array(path: Path) -> np.ndarray:
-    """Return the array of an ``.npy`` file, mapped: its header and its size are checked, and values read when used.
-
-    Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: the file is damaged, or no array of numbers.
-
-    """
+    """Return the array of an ``.npy`` file, mapped: its header and its size are checked, and values read when used."""
     try:
         with opened(path), np.errstate(over="ignore"):  # of sizes that no file has, which are refused
             array: np.ndarray = np.lib.format.open_memmap(path, mode="r")

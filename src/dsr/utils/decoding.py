@@ -32,9 +32,6 @@ def decode_pixels(place: str | Path, content: bytes, flags: int, most: int | Non
         content: a PNG, JPEG, TIFF, BMP, WebP or portable map.
         most: largest number of pixels; None for what its length explains.
 
-    Raises:
-        ValueError: its header declares more.
-
     """
     header = picture_size(io.BytesIO(content))
     if header is None:

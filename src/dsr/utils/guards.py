@@ -54,23 +54,13 @@ class TooLargeError(ValueError):
 
 
 def expect_pixels(place: str | Path, height: int, width: int, most: int = MOST_PIXELS) -> None:
-    """Check the size of a picture or map that its header declares.
-
-    Raises:
-        TooLargeError: it has more than ``most`` pixels; the message begins with ``place``.
-
-    """
+    """Raise TooLargeError if a picture or map declares more than ``most`` pixels."""
     if height * width > most:
         raise TooLargeError(f"{place}: expected at most {most} pixels, got {width} x {height} (width x height)")
 
 
 def expect_bytes(place: str | Path, size: int, most: int) -> None:
-    """Check how many bytes something takes in memory, by what its header declares.
-
-    Raises:
-        TooLargeError: they are more than ``most``; the message begins with ``place``.
-
-    """
+    """Raise TooLargeError if something declares that it takes more than ``most`` bytes in memory."""
     if size > most:
         raise TooLargeError(f"{place}: expected at most {most} bytes, got {size}")
 
@@ -99,13 +89,7 @@ def array_bytes(shape: tuple[int, ...], itemsize: int) -> int:
 
 
 def read_limited(path: Path, most: int = MOST_TEXT) -> bytes:
-    """Return the content of a file of moderate size.
-
-    Raises:
-        OSError: there is no such file, or it is none (a folder, a pipe, a device), or it cannot be read.
-        TooLargeError: it is larger than ``most`` bytes.
-
-    """
+    """Return the content of a file of at most ``most`` bytes."""
     with opened(path) as file:
         expect_bytes(path, path.stat().st_size, most)
         return file.read(most)
@@ -125,13 +109,7 @@ def decode_text(content: bytes) -> str:
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[BufferedReader]:
-    """Return a context with a file that is open for reading.
-
-    Raises:
-        OSError: there is no such file, or it is none (a folder, a pipe that nobody writes to, a device), or it cannot
-            be read; it has the file's name.
-
-    """
+    """Open a plain file for reading; a pipe or device is an OSError, and each OSError has the file's name."""
     if not path.is_file():
         code = errno.EISDIR if path.is_dir() else errno.EINVAL if path.exists() else errno.ENOENT
         raise OSError(code, os.strerror(code), str(path))
@@ -145,13 +123,7 @@ def opened(path: Path) -> Iterator[BufferedReader]:
 
 
 def expect_stored(path: Path) -> None:
-    """Check that no member of a torch file, if it is there, is compressed or shared; torch writes none so.
-
-    Raises:
-        OSError: it is no file, such as a device without an end.
-        ValueError: one is.
-
-    """
+    """Check that no member of a torch file, if it is there, is compressed or shared; torch writes none so."""
     if not path.exists():
         return
     with opened(path) as file:
@@ -165,12 +137,7 @@ def expect_stored(path: Path) -> None:
 
 
 def files_in(packed: zipfile.ZipFile, archive: object) -> list[zipfile.ZipInfo]:
-    """Return the files of an archive that may be unpacked.
-
-    Raises:
-        ValueError: one is a link or a device, has no name or leads outside the folder; it begins with ``archive``.
-
-    """
+    """Return the files of an archive; a ValueError if one is no file, has no name or leads outside."""
     entries = [each for each in packed.infolist() if not each.filename.endswith("/")]
     for each in entries:
         if not each.filename:
@@ -187,10 +154,6 @@ def read_member(packed: zipfile.ZipFile, name: str) -> bytes:
 
     The caller checks that size. A member that unpacks to more, which :meth:`zipfile.ZipFile.read` unpacks whole before
     it cuts it off, is damaged.
-
-    Raises:
-        zipfile.BadZipFile: it unpacks to less or more than declared, or to something else.
-
     """
     declared = packed.getinfo(name).file_size
     parts, length = [], 0
@@ -265,9 +228,6 @@ def parse_json(text: str | bytes, *, finite: bool = True) -> Any:
     Args:
         finite: whether NaN and infinity, which Python writes and JSON does not have, are refused.
 
-    Raises:
-        ValueError: it is no JSON, is nested too deeply, or has a number that no float can hold.
-
     """
     only: Any = {"parse_constant": _refuse, "parse_float": _parse_float} if finite else {}
     with refusing("nested too deeply", RecursionError):
@@ -302,16 +262,13 @@ def leads_outside(name: str) -> bool:
 
 
 def path_within(folder: Path, name: str, source: object, form: str = "{}") -> Path:
-    """Return the path of a file that another file names, which has to lie in a folder or below it.
+    """Return the path of a file that another file names; OutsideError if it is not in a folder or below it.
 
     The folder may be a link; links that the name leads through may not lead out of it.
 
     Args:
         source: what gives the name, such as ``FILE: line 3``, for the message.
         form: the path that the name is a part of, from the folder on, with ``{}`` for the name.
-
-    Raises:
-        OutsideError: the name leads out of the folder; the message begins with ``source``.
 
     """
     expected = f"{source}: expected a name within {folder}, got {name[:_LONGEST]!r}"

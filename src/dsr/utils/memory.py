@@ -27,15 +27,12 @@ def free_memory() -> int:
 
 
 def expect_memory(name: str, value: object, needed: float) -> None:
-    """Refuse a value for which this machine, whatever else runs on it, has too little memory.
+    """Raise OutOfMemoryError for a value for which this machine, whatever else runs on it, has too little memory.
 
     Args:
         name: of the value.
         value: what came.
         needed: bytes that it needs at least.
-
-    Raises:
-        OutOfMemoryError: it has less; the message begins with ``name``.
 
     """
     there, needed = _meminfo("MemTotal:"), min(needed, _MOST)

@@ -48,7 +48,6 @@ class OptionError(ValueError):
 
 
 def _shown(value: Any) -> str:
-    """Return a value as an error line shows it."""
     if isinstance(value, tuple):
         return " ".join(map(_shown, value))
     return f"{value:g}" if isinstance(value, float) else str(value)
@@ -59,8 +58,7 @@ class Rule(NamedTuple):
 
     Args:
         expected: in words, which follow "expected".
-        holds: whether a value is as expected.
-        each: whether that is said of each value of a tuple.
+        each: whether it is expected of each value of a tuple.
         shown: how an error line shows a value.
         known: names of which one is expected, if any are; an error line says which may be meant.
 
@@ -73,23 +71,15 @@ class Rule(NamedTuple):
     known: Collection[str] = ()
 
     def expect(self, name: str, value: Any) -> None:
-        """Check the value of an option.
-
-        Raises:
-            OptionError: it is not as expected.
-
-        """
+        """Raise OptionError if the value of an option is not as expected."""
         for one in value if self.each else (value,):
-            if not self._allows(one):
+            try:
+                fits = self.holds(one)
+            except TypeError:  # of another type, which only Python gives
+                fits = False
+            if not fits:
                 meant = did_you_mean(one, self.known)
                 raise OptionError(name, f"expected {self.expected}, got {self.shown(one)}{meant}")
-
-    def _allows(self, value: Any) -> bool:
-        """Return whether a value is as expected; one of another type, which only Python gives, is not."""
-        try:
-            return self.holds(value)
-        except TypeError:
-            return False
 
 
 def at_least(least: int) -> Rule:
@@ -113,7 +103,7 @@ def some_of(choices: Collection[str], shown: Callable[[Any], str] = repr) -> Rul
 
 
 class _Option(NamedTuple):
-    """What :func:`option` says of a field."""
+    """See :func:`option`."""
 
     help: str
     metavar: str | tuple[str, ...] | None
@@ -145,7 +135,6 @@ def option(
 
     Args:
         default: the value where it is not given; ``...`` if it has to be given.
-        metavar: what stands for the value there.
         flags: its flags, such as ``"-o --output"``, of which errors name the first; or a name without dashes for an
             argument by its place. By default the name of the field.
         rule: what is expected of the value; of a ``Literal`` by default that it is one of its values.
@@ -176,7 +165,7 @@ def group(record: Callable[[], Any] | None = None, title: str = "") -> Any:
 
 
 class _Stated(NamedTuple):
-    """A field: its type without None, whether that is allowed, and what was said of it as an option or as a group."""
+    """A field: its type without None, whether that is allowed, and what was stated of it as an option or a group."""
 
     name: str
     hint: Any
@@ -185,12 +174,8 @@ class _Stated(NamedTuple):
     default: Any
     option: _Option | None
     title: str
-
-    @property
-    def flags(self) -> list[str]:
-        """Its flags, the one that errors name first."""
-        said = self.option.flags.split() if self.option is not None else []
-        return said or [f"--{self.name.replace('_', '-')}"]
+    flags: list[str]  # the one that errors name first
+    rule: Rule | None
 
     @property
     def by_place(self) -> bool:
@@ -203,13 +188,6 @@ class _Stated(NamedTuple):
         long = [flag for flag in self.flags if flag.startswith("--")]
         return (long or self.flags)[0].lstrip("-").replace("-", "_")
 
-    @property
-    def rule(self) -> Rule | None:
-        """What is expected of its value."""
-        if self.option is not None and self.option.rule is None and get_origin(self.hint) is Literal:
-            return one_of(get_args(self.hint))
-        return None if self.option is None else self.option.rule
-
 
 def _stated(record: type) -> tuple[_Stated, ...]:
     """Return the options and groups of a record, in order."""
@@ -217,20 +195,17 @@ def _stated(record: type) -> tuple[_Stated, ...]:
     for each in fields(record):
         if _KEY not in each.metadata:
             continue
-        kinds = [kind for kind in get_args(hints[each.name]) if kind is not NoneType]
-        optional = NoneType in get_args(hints[each.name])
-        said = each.metadata[_KEY]
-        found.append(
-            _Stated(
-                each.name,
-                kinds[0] if optional else hints[each.name],
-                optional,
-                each.default is MISSING and each.default_factory is MISSING,
-                each.default,
-                said if isinstance(said, _Option) else None,
-                "" if isinstance(said, _Option) else said,
-            )
-        )
+        stated, hint = each.metadata[_KEY], hints[each.name]
+        optional = NoneType in get_args(hint)
+        if optional:
+            hint = next(kind for kind in get_args(hint) if kind is not NoneType)
+        option, title = (stated, "") if isinstance(stated, _Option) else (None, stated)
+        flags = ([] if option is None else option.flags.split()) or [f"--{each.name.replace('_', '-')}"]
+        rule = None if option is None else option.rule
+        if option is not None and rule is None and get_origin(hint) is Literal:
+            rule = one_of(get_args(hint))
+        required = each.default is MISSING and each.default_factory is MISSING
+        found.append(_Stated(each.name, hint, optional, required, each.default, option, title, flags, rule))
     return tuple(found)
 
 
@@ -239,22 +214,17 @@ class Options:
     """A record of options, which checks its values; dataclasses of options derive from it."""
 
     def __post_init__(self) -> None:
-        """Check each value by its rule.
-
-        Raises:
-            OptionError: a value is not as expected.
-
-        """
+        """Raise OptionError for a value that is not as expected."""
         for each in _stated(type(self)):
-            value, rule = getattr(self, each.name), each.rule
+            value = getattr(self, each.name)
             if value is None:
                 continue
             if each.option is not None and each.option.writes:
                 found = obstacle(Path(value).expanduser(), folder=each.option.writes == "folder")
                 if found is not None:
                     raise OptionError(each.name, f"expected a {each.option.writes} to write, got {found}: {value}")
-            if rule is not None:
-                rule.expect(each.name, value)
+            if each.rule is not None:
+                each.rule.expect(each.name, value)
 
 
 Record = TypeVar("Record", bound=Options)
@@ -262,19 +232,20 @@ Record = TypeVar("Record", bound=Options)
 
 def add_options(parser: ArgumentParser, record: type[Options]) -> None:
     """Add the options of a record to a command's parser; :func:`build` reads them."""
-    _add(parser, record, {}, needed=True)
+    _add(parser, record, needed=True)
 
 
-def _add(place: Any, record: type[Options], alone: dict[tuple[int, str], Any], *, needed: bool) -> None:
-    """Add the options of a record to a parser or a group of it; ``alone`` has the groups of those that exclude."""
+def _add(place: Any, record: type[Options], *, needed: bool) -> None:
+    """Add the options of a record, which are required only if it is ``needed``, to a parser or a group of it."""
+    excluding: dict[str, Any] = {}
     for each in _stated(record):
         if each.option is None:
             inner = place.add_argument_group(each.title) if each.title else place
-            _add(inner, each.hint, alone, needed=needed and not each.optional)
+            _add(inner, each.hint, needed=needed and not each.optional)
             continue
-        where, key = place, (id(place), each.option.alone)
-        if each.option.alone:
-            where = alone[key] = alone.get(key) or place.add_mutually_exclusive_group()
+        where, alone = place, each.option.alone
+        if alone:
+            where = excluding[alone] = excluding.get(alone) or place.add_mutually_exclusive_group()
         where.add_argument(*each.flags, **_keywords(each, each.option, needed=needed))
 
 
@@ -320,17 +291,13 @@ def build(record: type[Record], given: Namespace) -> Record:
             values[each.name] = build(each.hint, given)
     try:
         return record(**values)
-    except OptionError as error:
-        raise ValueError(f"{_flag_of(record, error.name)}: {error.message}") from error
+    except OptionError as error:  # of the record itself or of a group in it
+        flag = next((each.flags[0] for each in _walk(record) if each.name == error.name), error.name)
+        raise ValueError(f"{flag}: {error.message}") from error
 
 
 def _with_presets(record: type[Options], given: Namespace) -> Namespace:
-    """Return what was given with what presets among it stand for.
-
-    Raises:
-        ValueError: something else was given for it.
-
-    """
+    """Return what was given with what presets among it stand for; a ValueError if something else was given for it."""
     found = Namespace(**vars(given))
     walked = list(_walk(record))
     flags = {each.key: each.flags[0] for each in walked}
@@ -367,18 +334,13 @@ def _is_absent(record: type[Options], given: Namespace) -> bool:
     return not there
 
 
-def _flag_of(record: type[Options], name: str) -> str:
-    """Return the flag of an option, which is of the record itself or of a group in it."""
-    found = [each.flags[0] for each in _walk(record) if each.name == name]
-    return found[0] if found else name
-
-
 def _walk(record: type[Options]) -> Iterator[_Stated]:
     """Yield the options of a record, then those of its groups."""
-    inner = [each for each in _stated(record) if each.option is None]
-    yield from (each for each in _stated(record) if each.option is not None)
-    for each in inner:
-        yield from _walk(each.hint)
+    stated = _stated(record)
+    yield from (each for each in stated if each.option is not None)
+    for each in stated:
+        if each.option is None:
+            yield from _walk(each.hint)
 
 
 def recorded(record: Options) -> dict[str, Any]:

@@ -40,9 +40,6 @@ def match_ratio(scale: float | str, measured: Collection[float]) -> float:
     Args:
         scale: the ratio, to within 1 %, or ``native`` for the only one.
 
-    Raises:
-        ValueError: there is no such map, or there are several.
-
     """
     have = ", ".join(f"x{round_ratio(ratio)}" for ratio in sorted(measured)) or "none"
     if isinstance(scale, str):

@@ -32,9 +32,6 @@ def parse_model(model: type[Content], content: str | bytes, place: object, expec
         place: where it is from, for the message.
         expected: what the message says after that, such as ``expected a camera; ``.
 
-    Raises:
-        ValueError: it is no JSON or does not fit the model; the message begins with ``place``.
-
     """
     try:
         return model.model_validate_json(decode_text(content) if isinstance(content, bytes) else content)

@@ -20,7 +20,6 @@ from typing import Any, Literal
 
 from dsr.app.browser.work import SHOWN, What
 from dsr.utils.console import one_line
-from dsr.utils.files import owner, remove_abandoned
 from dsr.utils.memory import free_memory
 from dsr.utils.progress import megabytes
 
@@ -146,9 +145,8 @@ class Desk:
     def __init__(
         self, most_bytes: int, most_seconds: float, most_memory: int | None = None, kept: float = _KEPT
     ) -> None:
-        remove_abandoned(Path(tempfile.gettempdir()))
         self.most_bytes, self.most_seconds, self.most_memory, self.kept = most_bytes, most_seconds, most_memory, kept
-        self.folder = Path(tempfile.mkdtemp(prefix=f".dsr-{owner()}-"))
+        self.folder = Path(tempfile.mkdtemp(prefix=".dsr-"))
         self.uploads: dict[str, Upload] = {}
         self._queue: deque[Job] = deque()
         self._running: Job | None = None

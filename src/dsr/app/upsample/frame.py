@@ -31,7 +31,6 @@ from dsr.app.upsample.reporting import Messages
 from dsr.app.upsample.request import UpsampleRequest, Upsampling, files_of, inputs_with_neighbours
 from dsr.app.upsample.sequence import FrameSequence
 from dsr.degradation.sensors import Identified
-from dsr.evaluation.sharing import Claims
 from dsr.inference import AnyRatio, Plan, enlarged_by, find_filled, find_sensor
 from dsr.io.exports import FLAT
 from dsr.io.inputs import Picture, read_picture
@@ -41,6 +40,7 @@ from dsr.methods.glass import NOTED
 from dsr.notes import CHECKS, Assumption, expect_no_warning
 from dsr.utils.guards import readable
 from dsr.utils.lengths import show_length
+from dsr.utils.locks import scene_lock
 from dsr.utils.memory import refusing_excess
 from dsr.utils.progress import Progress, megabytes
 from dsr.utils.versions import package_versions
@@ -76,7 +76,6 @@ class FrameWork:
 
     def __init__(self, request: UpsampleRequest, frames: Frames) -> None:
         self._request, self._frames = request, frames
-        self._claims = Claims(request.results.output)
         self.seconds: float | None = None
         self.bytes = 0.0
         self._read_last: tuple[str, Picture] | None = None
@@ -103,12 +102,11 @@ class FrameWork:
 
     def __call__(self, pair: Pair, target: Path, reporter: Messages, progress: Progress) -> str:
         """Upsample one picture, and return the outcome; commands that have it in common do so one after the other."""
-        job = self._job(pair, target)
-        with contextlib.ExitStack() as stack:
-            if not (self._request.results.dry_run or job.is_done()):
-                stack.enter_context(self._claims.wait(f"frame {target.relative_to(self._request.results.output)}"))
-                job = replace(job, earlier=read_previous_run(target))
+        job, output = self._job(pair, target), self._request.results.output
+        if self._request.results.dry_run or job.is_done():
             return self._work(job, reporter, progress)
+        with scene_lock(output, str(target.relative_to(output))):
+            return self._work(replace(job, earlier=read_previous_run(target)), reporter, progress)
 
     def is_to_do(self, pair: Pair, target: Path) -> bool:
         """Return whether a picture is not complete; one that cannot be read is reported when its turn comes."""

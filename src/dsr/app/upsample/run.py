@@ -19,7 +19,6 @@ from dsr.app.upsample.request import UpsampleRequest
 from dsr.app.upsample.scene import EXPORTS, write_scene
 from dsr.app.upsample.stored import read_info
 from dsr.app.upsample.workers import work_through
-from dsr.evaluation.sharing import Claims
 from dsr.io.images import pixels_in_header
 from dsr.io.inputs import read_geometry
 from dsr.io.pairs import Pair
@@ -28,6 +27,7 @@ from dsr.io.scene_files import expect_poses
 from dsr.io.trajectories import USUAL_SIZE, read_poses
 from dsr.utils.console import ConsoleProgress, show
 from dsr.utils.files import expect_targets, write_text
+from dsr.utils.locks import at_work
 from dsr.utils.progress import clock, megabytes
 
 _UNPOSED = {
@@ -63,9 +63,8 @@ def run(request: UpsampleRequest, console: Console) -> list[str]:
                 show(console, f"--with {part.name}: the frame has no pose{_UNPOSED.get(part.name, '')}")
     with contextlib.ExitStack() as stack:
         if not request.results.dry_run:
-            claims = Claims(request.results.output, json.dumps(request.settings, sort_keys=True))
             try:
-                stack.enter_context(claims)
+                stack.enter_context(at_work(request.results.output, json.dumps(request.settings, sort_keys=True)))
             except OSError as error:
                 if error.errno not in _READ_ONLY:  # where all may be complete; what is written says so itself
                     raise

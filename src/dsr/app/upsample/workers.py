@@ -17,10 +17,8 @@ from dsr.utils.memory import refusing_excess
 from dsr.utils.pool import LOST, Pool
 from dsr.utils.progress import Progress
 
-_Job = tuple[Pair, Path]
-"""A picture and the folder of its results."""
-_work: FrameWork | None = None
-"""The work of this process, if it is a worker."""
+_Job = tuple[Pair, Path]  # a picture and the folder of its results
+_work: FrameWork | None = None  # of this process, if it is a worker
 
 
 class Done(NamedTuple):
@@ -34,20 +32,9 @@ class Done(NamedTuple):
 
 
 def work_through(request: UpsampleRequest, frames: Frames, reporter: Reporter, progress: Progress) -> Iterator[Done]:
-    """Upsample pictures.
+    """Upsample pictures, ``frames.workers`` at a time, each with its share of the cores; yield each once it is done.
 
-    Args:
-        request: the request; ``frames.workers`` work at a time, each with its share of the cores and its own memory.
-        frames: the pictures.
-        reporter: where notes are shown: in the order of the pictures, or as they come from several workers.
-        progress: where the progress is shown.
-
-    Yields:
-        Each picture once it is done.
-
-    Raises:
-        ValueError: the file of poses is damaged, or does not fit the pictures.
-
+    Notes are shown in the order of the pictures, or as they come from several workers.
     """
     jobs = [(pair, frames.target(request.results.output, pair)) for pair in frames.found.pairs]
     workers = min(request.frames.workers, len(jobs))
@@ -57,21 +44,18 @@ def work_through(request: UpsampleRequest, frames: Frames, reporter: Reporter, p
         for pair, target in progress.track(jobs, "upsample", label=lambda job: job[0].name, lines=False, shares=STAGES):
             yield attempt(work, pair, target, reporter, progress)
         return
-    with Pool(
-        workers,
-        _remote,
-        _lost,
-        progress.say,
-        start="spawn",
-        prepare=_begin,
-        arguments=(request, frames),
-        label=_name_of,
-        threads=max(1, (os.cpu_count() or 1) // workers),
-    ) as pool:
-        results = progress.track(pool.results(jobs), "upsample", len(jobs), label=lambda each: _name_of(each[0]))
-        for _, (done, record) in results:
-            record.replay(reporter)
-            yield done
+    left, threads = list(jobs), max(1, (os.cpu_count() or 1) // workers)
+    with Pool(workers, _begin, (request, frames), threads, progress.say) as pool:
+        results = pool.results(_remote, jobs)
+        try:
+            for job, (done, record) in progress.track(
+                results, "upsample", len(jobs), label=lambda each: each[0][0].name
+            ):
+                left.remove(job)
+                record.replay(reporter)
+                yield done
+        except ChildProcessError:
+            yield from (Done(*job, "", LOST) for job in left)
 
 
 def _begin(request: UpsampleRequest, frames: Frames) -> None:
@@ -85,16 +69,6 @@ def _remote(job: _Job) -> tuple[Done, Record]:
     assert _work is not None  # noqa: S101 - workers begin with _begin
     record = Record()
     return attempt(_work, *job, record, Progress()), record
-
-
-def _lost(job: _Job) -> tuple[Done, Record]:
-    """Return the result of a picture whose workers were ended."""
-    return Done(*job, "", LOST), Record()
-
-
-def _name_of(job: _Job) -> str:
-    """Return the name of a picture."""
-    return job[0].name
 
 
 def attempt(work: FrameWork, pair: Pair, target: Path, reporter: Messages, progress: Progress) -> Done:

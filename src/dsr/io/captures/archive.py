@@ -25,7 +25,7 @@ import numpy as np
 
 from dsr.io.frames import Record, file_state
 from dsr.utils.decoding import decode_pixels
-from dsr.utils.files import expect_space, owner, remove_abandoned, space_for
+from dsr.utils.files import expect_space, space_for
 from dsr.utils.guards import (
     bytes_of_archive,
     expect_bytes,
@@ -288,8 +288,7 @@ def _unpack(path: Path, _: tuple[int, int]) -> Path:
             )
         expect_bytes(f"{path}: the members declare", total, bytes_of_archive(path.stat().st_size))
         with contextlib.ExitStack() as stack:
-            remove_abandoned(Path(tempfile.gettempdir()))
-            work = tempfile.mkdtemp(prefix=f".dsr-{owner()}-")
+            work = tempfile.mkdtemp(prefix=".dsr-")
             stack.callback(shutil.rmtree, work, ignore_errors=True)
             target = Path(work) / path.name
             target.mkdir()

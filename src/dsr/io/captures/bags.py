@@ -20,7 +20,7 @@ import numpy as np
 
 from dsr.io.captures.ros_images import decode_message
 from dsr.io.frames import Record
-from dsr.utils.files import FullDiskError, expect_space, owner, remove_abandoned, space_for
+from dsr.utils.files import FullDiskError, expect_space, space_for
 from dsr.utils.guards import MOST_TEXT, bytes_of_archive, expect_bytes, opened, path_within, refusing
 from dsr.utils.versions import how_to_install
 
@@ -225,13 +225,6 @@ def _limit_chunks() -> None:
     of_messages: Any = importlib.import_module("rosbags.rosbag2.reader")
     allowance = _Allowance(zstd)
     of_messages.zstd = SimpleNamespace(decompress=functools.partial(bounded, kinds["zstd"]), open=allowance.opened)
-    of_messages.TemporaryDirectory = _temporary
-
-
-def _temporary() -> tempfile.TemporaryDirectory[str]:
-    """Make a temporary folder that names this process; those of processes that are gone are deleted."""
-    remove_abandoned(Path(tempfile.gettempdir()))
-    return tempfile.TemporaryDirectory(prefix=f".dsr-{owner()}-")
 
 
 class _Allowance:

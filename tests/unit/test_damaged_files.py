@@ -1,0 +1,639 @@
+"""Damaged, wrong and hostile files end with one line that names the file: a table of readers and damages."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+import re
+import struct
+import tracemalloc
+import zipfile
+from pathlib import Path
+from unittest.mock import Mock
+
+import bombs
+import captures
+import cv2
+import h5py
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+from omegaconf import OmegaConf
+from small_results import write_result
+
+from dsr.app.entry import run_command
+from dsr.app.training_runs import read_config
+from dsr.app.trust import read_plain_yaml
+from dsr.app.upsample.outputs import kept_surface, read_previous_run
+from dsr.app.upsample.scene import _read_record
+from dsr.app.upsample.stored import read_result
+from dsr.data.download.fetching import Checksums, unpack
+from dsr.data.folder import Folder, load_scene
+from dsr.data.matlab import read_variables
+from dsr.evaluation.run_files import load_results, read_run
+from dsr.evaluation.store import load_errors, load_prediction, prediction_path, sample_path
+from dsr.geometry.camera import Camera
+from dsr.io.cameras import read_any_camera
+from dsr.io.captures.arkit import find_arkitscenes, find_polycam
+from dsr.io.captures.record3d import find_record3d
+from dsr.io.captures.stray import find_stray
+from dsr.io.depth_files import read_depth_file
+from dsr.io.exports import read_input, write_input
+from dsr.io.images import pixels_in_header, read_camera, read_mask
+from dsr.io.inputs import read_picture
+from dsr.io.pairs import Pair
+from dsr.io.photos import read_photo
+from dsr.io.reading import Reading
+from dsr.io.trajectories import read_transform
+from dsr.methods.networks.peers.peer_network import read_tensors
+from dsr.methods.networks.trained import NETWORKS, read_msg_weights
+from dsr.methods.networks.weight_choice import packaged_weights
+from dsr.methods.networks.weight_files import is_dsr_weights, load_network
+from dsr.report.study.answers import files_of, read_all
+from dsr.report.study.key import Candidate, Key, Trial, read_key, write_key
+from dsr.report.study.study_table import read_study
+from dsr.report.surface_page import is_view
+from dsr.sample import DepthSample
+from dsr.utils.arrays import open_array
+from dsr.utils.configuration import ConfigError
+from dsr.utils.console import one_line, print_error
+from dsr.utils.guards import TooLargeError, is_number, parse_json, read_limited, read_member
+from dsr.utils.torch_files import read_torch_file
+
+HUGE = "1" + "0" * 400
+NO_NUMBERS = ("true", "Infinity", HUGE, '"4"', "[]")  # as JSON; a float holds none of them
+DEEP = "[" * 100_000
+MOST = 450 << 20  # growth of memory in bytes while a file is refused; MATLAB's old files take the most
+CANDIDATES = {name: Candidate(name, name, "runs") for name in ("a", "b")}
+KEY = Key("0123", "e4", 1, 0, {"s1": Trial("simgeo", "cube", 4, "box", CANDIDATES)})
+
+
+def refusal(path, read, *arguments):
+    """Return why a file is refused, in one line without its name."""
+    with pytest.raises(ValueError) as caught:  # noqa: PT011 - the callers look at the message
+        read(*arguments)
+    message = str(caught.value)
+    assert str(path) in message
+    assert "\n" not in message
+    assert len(message) < 600 + len(str(path))
+    return message.replace(str(path), "")
+
+
+# Files that declare or unpack to gigabytes
+
+
+def memory(key):
+    """Return an entry of this process's memory in bytes."""
+    line = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith(key))
+    return 1024 * int(line.split()[1])
+
+
+@pytest.fixture
+def watched():
+    """Check that memory does not grow within the test beyond ``MOST``."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew
+        before = memory("VmRSS")
+    except OSError:
+        pytest.skip("needs the peak of memory in Linux's /proc")
+    yield
+    assert memory("VmHWM") - before < MOST
+
+
+def photo(path):
+    return read_photo(path, (8, 8))
+
+
+def capture(path):
+    return [pair.capture.photo.read() for pair in find_record3d(path).pairs]
+
+
+BOMBS = [
+    (bombs.npz, "x.npz", read_depth_file),
+    (bombs.npz, "x.npz", load_prediction),
+    (bombs.npz, "x.npz", DepthSample.load),
+    (bombs.npz, "x.npz", read_input),
+    (bombs.npz_long_header, "x.npz", read_depth_file),
+    (bombs.npy, "x.npy", read_depth_file),
+    (bombs.npy_sparse, "x.npy", read_depth_file),
+    (bombs.png, "x.png", read_depth_file),
+    (bombs.png, "x.png", read_mask),
+    (bombs.png_huge_header, "x.png", photo),
+    (bombs.jpeg, "x.jpg", photo),
+    (bombs.bmp, "x.bmp", photo),
+    (bombs.webp, "x.webp", photo),
+    (bombs.ppm, "x.ppm", photo),
+    (bombs.tiff, "x.tiff", read_depth_file),
+    (bombs.tiff_tiles, "x.tiff", read_depth_file),
+    (bombs.tiff_big, "x.tiff", read_depth_file),
+    (bombs.pfm, "x.pfm", read_depth_file),
+    (bombs.exr, "x.exr", read_depth_file),
+    (bombs.mat5, "x.mat", read_variables),
+    (bombs.mat73, "x.mat", read_variables),
+    (bombs.mat73_block, "x.mat", read_variables),
+    (bombs.r3d, "x.r3d", capture),
+]
+
+
+@pytest.mark.parametrize(("write", "name", "read"), BOMBS)
+def test_bomb_is_refused_in_one_line_and_little_memory(tmp_path, watched, write, name, read):
+    write(tmp_path / name)
+    assert "expected" in refusal(tmp_path / name, read, tmp_path / name)
+
+
+def test_depth_map_may_not_be_much_larger_than_its_photo(tmp_path, watched):
+    cv2.imwrite(str(tmp_path / "rgb.png"), np.zeros((64, 64, 3), np.uint8))
+    for name, write in (("d.png", bombs.png_of_16_megapixels), ("d.npz", bombs.npz), ("d.exr", bombs.exr)):
+        write(tmp_path / name)
+        with pytest.raises(TooLargeError, match=rf"{name}: expected at most"):
+            read_picture(Pair("x", tmp_path / "rgb.png", tmp_path / name), Reading())
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tiff", ".bmp", ".webp", ".ppm", ".pgm"])
+def test_header_states_the_size_that_the_decoder_finds_and_one_that_is_cut_off_none(tmp_path, suffix):
+    path = tmp_path / f"x{suffix}"
+    shape = (33, 57) if suffix == ".pgm" else (33, 57, 3)
+    assert cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 255, shape).astype(np.uint8))
+    assert pixels_in_header(path) == (33, 57)
+    path.write_bytes(path.read_bytes()[:6])
+    assert pixels_in_header(path) is None
+
+
+def test_member_that_unpacks_to_more_than_the_archive_declares_is_damaged(tmp_path, watched):
+    bombs.r3d(tmp_path / "x.r3d")
+    with zipfile.ZipFile(tmp_path / "x.r3d") as packed, pytest.raises(zipfile.BadZipFile):
+        read_member(packed, "rgbd/0.jpg")
+
+
+@pytest.mark.parametrize("arguments", [{"scale": 4, "width": 4000}, {"scale": 4, "blocks": 10**9}])
+def test_weights_that_ask_for_more_than_their_file_holds_are_refused(tmp_path, watched, arguments):
+    header = {"format": 1, "network": "FacetsUNet", "arguments": arguments, "model": "facets", "facts": {}}
+    with safetensors.safe_open(packaged_weights("facets_x4"), framework="pt") as file:
+        [key] = file.metadata()
+        header["format"] = json.loads(file.metadata()[key])["format"]
+    path = tmp_path / "w.safetensors"
+    safetensors.torch.save_file({"a": torch.zeros(4)}, path, {key: json.dumps(header)})
+    assert ": expected" in refusal(path, load_network, path, NETWORKS)
+
+
+def test_large_texts_of_a_run_are_refused_unread(tmp_path):
+    (tmp_path / "versions.json").write_text("{}")
+    with (tmp_path / "summary.json").open("wb") as file:
+        file.truncate(1 << 40)
+    with pytest.raises(ValueError, match=r"summary\.json: expected at most 16777216 bytes, got 1099511627776"):
+        read_run(tmp_path)
+
+
+@pytest.mark.parametrize("read", [read_limited, open_array, read_study, is_dsr_weights, is_view])
+def test_pipe_that_nobody_writes_to_is_not_waited_for(tmp_path, read):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises((ValueError, OSError), match="pipe"):
+        read(tmp_path / "pipe")
+
+
+def test_heic_file_of_gigabytes_is_not_read_for_its_exif_data(tmp_path):
+    with (tmp_path / "photo.heic").open("wb") as file:
+        file.truncate(3 << 30)
+    tracemalloc.start()
+    assert refusal(tmp_path / "photo.heic", photo, tmp_path / "photo.heic")
+    assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    tracemalloc.stop()
+
+
+# JSON whose values are none
+
+
+def replaced(text, key, value):
+    """Return a JSON text with another value of a key, as text."""
+    changed = re.sub(rf'"{key}": ("[^"]*"|\[[^\]]*\]|[-\d.e]+)', lambda _: f'"{key}": {value}', text, count=1)
+    assert changed != text
+    return changed
+
+
+def camera(folder, key, value):
+    entries = {"width": 64, "height": 48, "fx": 60, "fy": 60, "cx": 31.5, "cy": 23.5, "baseline": 0.1}
+    path = folder / "camera.json"
+    path.write_text(replaced(json.dumps(entries), key, value))
+    return path, lambda: read_camera(path)
+
+
+def camera_of_open3d(folder, key, value):
+    path = folder / "camera.json"
+    entries = {"width": 64, "height": 48, "intrinsic_matrix": [60, 0, 0, 0, 60, 0, 31.5, 23.5, 1]}
+    value = value if key == "width" else f"[{value}, 0, 0, 0, 60, 0, 31.5, 23.5, 1]"
+    path.write_text(replaced(json.dumps(entries), key, value))
+    return path, lambda: read_any_camera(path)
+
+
+def transform(folder, _, value):
+    path = folder / "ir_to_rgb.json"
+    path.write_text(f"[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, {value}, 0]]")
+    return path, lambda: read_transform(path)
+
+
+def camera_of_polycam(folder, key, value):
+    captures.polycam(folder)
+    pair = find_polycam(folder).pairs[0]
+    path = pair.capture.description
+    path.write_text(replaced(json.dumps(json.loads(path.read_text())), key, value))
+    return path, lambda: pair.capture.geometry((8, 8))
+
+
+def result(folder, key, value):
+    path = write_result(folder / "a") / "info.json"
+    path.write_text(replaced(path.read_text(), key, value))
+    return path, lambda: read_result(path.parent, "a")
+
+
+def study(folder, key, value):
+    path = folder / "key.json"
+    write_key(path, KEY)
+    assert read_key(path) == KEY
+    path.write_text(replaced(path.read_text(), key, value))
+    return path, lambda: read_key(path)
+
+
+JSON = [
+    *((camera, key) for key in ("width", "fx", "cy", "baseline")),
+    *((camera_of_open3d, key) for key in ("width", "intrinsic_matrix")),
+    *((camera_of_polycam, key) for key in ("width", "fx", "t_12")),
+    *((study, key) for key in ("repeat", "scale", "scenes_per_person", "page")),
+    (transform, ""),
+    (result, "fx"),
+]
+
+
+@pytest.mark.parametrize("value", NO_NUMBERS)
+@pytest.mark.parametrize(("write", "key"), JSON)
+def test_value_that_is_no_number_is_refused_by_file_and_key(tmp_path, write, key, value):
+    path, read = write(tmp_path, key, value)
+    assert "expected" in refusal(path, read)
+
+
+@pytest.mark.parametrize(("key", "value"), [("w", True), ("K", [True] * 9), ("poses", [["60"] * 7])])
+def test_metadata_of_record3d_with_a_value_that_is_no_number_are_refused(tmp_path, key, value):
+    captures.record3d(tmp_path / "scan.r3d", **{key: value})
+    assert key in refusal(tmp_path / "scan.r3d", find_record3d, tmp_path)
+
+
+@pytest.mark.parametrize("entry", [
+    *({"sha256": "0" * 64, "size": size} for size in (False, -1, 1.5, "1", None)),
+    *({"sha256": digest, "size": 1} for digest in ("x" * 64, "0" * 63, 5)),
+    {"sha256": "0" * 64, "size": 1, "files": {"C:\\x": 1}}, {"sha256": "0" * 64, "size": 1, "files": {"a": True}},
+])  # fmt: skip
+def test_checksums_with_values_that_are_none_are_refused(tmp_path, entry):
+    (tmp_path / "checksums.json").write_text(json.dumps({"set/a.zip": entry}))
+    assert "expected the checksums" in refusal(tmp_path / "checksums.json", Checksums, tmp_path)
+
+
+@pytest.mark.parametrize("value", ["true", HUGE, "-1", DEEP])
+def test_answers_with_a_time_that_is_none_are_left_out_and_the_others_count(tmp_path, value):
+    trial = {"scene": "s1", "again": False, "order": ["a", "b"], "first": "a", "second": "b", "ms": 5000}
+    about = {"study": KEY.study, "page": 1, "finished": "2024-05-01T12:00:00Z", "trials": [trial]}
+    files = [tmp_path / f"{person}.json" for person in ("x", "y")]
+    for file in files:
+        file.write_text(json.dumps({**about, "participant": file.stem}))
+    files[0].write_text(files[0].read_text().replace("5000", value))
+    accepted, [rejected] = read_all(files, KEY)
+    assert [each.participant for each in accepted] == ["y"]
+    assert str(files[0]) in rejected
+
+
+@pytest.mark.parametrize("text", [
+    "[]", "5", "{", DEEP, HUGE, '{"complete": true, "settings": 5}', '{"complete": true, "files": [1.5]}',
+    '{"complete": true, "inputs": {"rgb": 3}}',
+])  # fmt: skip
+def test_record_of_an_earlier_result_that_is_none_is_refused(tmp_path, text):
+    (tmp_path / "info.json").write_text(text)
+    refusal(tmp_path / "info.json", read_previous_run, tmp_path)
+
+
+@pytest.mark.parametrize("text", ["[]", '{"exports": 5}', '{"exports": {"a": "b"}}', '{"exports": {"a": [5]}}'])
+def test_record_of_exports_that_is_none_is_refused(tmp_path, text):
+    (tmp_path / "exports.json").write_text(text)
+    refusal(tmp_path / "exports.json", _read_record, tmp_path)
+
+
+@pytest.mark.parametrize("text", ["NaN", "-Infinity", "[1e999]", "9" * 5000, DEEP, "{", ""])
+def test_json_with_what_is_no_json_is_refused(text):
+    with pytest.raises(ValueError):  # noqa: PT011 - of many kinds
+        parse_json(text)
+    assert math.isnan(parse_json("NaN", finite=False))
+
+
+@pytest.mark.parametrize("value", [True, np.bool_(True), 10**400, math.inf, math.nan, "1", None])
+def test_number_is_finite_and_no_boolean(value):
+    assert not is_number(value)
+    assert is_number(np.float32(2))
+    assert is_number(np.int64(2))
+
+
+# The files of a run
+
+
+def with_identity(**entries):
+    def change(text):
+        stored = json.loads(text)
+        return json.dumps({**stored, "identity": {**stored["identity"], **entries}})
+
+    return change
+
+
+def with_text(old, new):
+    return lambda text: re.sub(old, lambda _: new, text)
+
+
+def with_column(name, value):
+    def change(text):
+        head, *rows = (line.split(",") for line in text.splitlines())
+        rows = [[value if column == name else cell for column, cell in zip(head, row, strict=True)] for row in rows]
+        return "\n".join(",".join(row) for row in (head, *rows)) + "\n"
+
+    return change
+
+
+DAMAGED_RUNS = [
+    *(("summary.json", with_text(r'"scale": \d+', f'"scale": {value}')) for value in (*NO_NUMBERS, "0", "0.5")),
+    *(("summary.json", with_text(r'"seed": \d+', f'"seed": {value}')) for value in (*NO_NUMBERS, "-1", "0.5")),
+    *(("summary.json", with_text(r"0\.25", value)) for value in (*NO_NUMBERS, "-1")),
+    ("summary.json", with_text(r'"label": "\w+"', '"label": 0.5')),
+    ("summary.json", with_text(r"^{", '{"metrics": {"RMSE_d": {"heading": "a", "factor": Infinity}}, ')),
+    *(("versions.json", with_identity(dataset=value)) for value in (5, ["a"], None)),
+    ("versions.json", with_identity(method="x")),
+    ("versions.json", lambda _: '{"identity": ' + DEEP),
+    *(("scores.csv", with_column("scale", value)) for value in ("inf", "true", "-4", "x")),
+    *(("scores.csv", with_column("seed", value)) for value in ("1e30", "true", "-1", "")),
+    *(("scores.csv", with_column("value", value)) for value in ("true", "x", "1e308")),
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def two_runs(make_run, tmp_path_factory):
+    """Return the contents of the files of two runs, ``fine`` and ``damaged``, neither of which is damaged yet."""
+    folder = tmp_path_factory.mktemp("runs")
+    for name, label in (("fine", "Bicubic"), ("damaged", "MSG")):
+        make_run(folder / name, label=label, scenes=("s",))
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture
+def runs(two_runs, tmp_path):
+    for path, content in two_runs.items():
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / path).write_bytes(content)
+    return tmp_path
+
+
+@pytest.mark.parametrize(("name", "change"), DAMAGED_RUNS)
+def test_damaged_run_is_left_out_with_a_line_and_the_others_are_read(runs, name, change):
+    path = runs / "damaged" / name
+    before = path.read_text()
+    path.write_text(change(before))
+    assert path.read_text() != before
+    results = load_results([runs])
+    assert results.methods() == ["Bicubic"]
+    assert [str(path) in note for note in results.notes] == [True]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [lambda depth: depth[:-3], lambda depth: depth > 2, lambda depth: depth.astype(int), lambda depth: depth[None]],
+)
+def test_prediction_of_another_size_or_type_is_left_out_with_its_scores(runs, change):
+    path = prediction_path(runs / "damaged", "s")
+    depth = load_prediction(path)[0].numpy()
+    np.savez(path, depth=change(depth), config="{}", seconds=1.0)
+    results = load_results([runs])
+    assert set(results.scores["label"]) == {"Bicubic"}
+    (note,) = results.notes
+    assert note.startswith(f"left out: {path}: expected")
+
+
+@pytest.mark.parametrize("values", [np.ones((4, 4), bool), np.ones((1, 4, 4)), np.array([{}, None])])
+def test_arrays_that_are_no_maps_of_floats_are_no_prediction(tmp_path, values):
+    path = tmp_path / "a.npz"
+    np.savez(path, depth=values, depth_error=values, angle_error=values)
+    refusal(path, load_prediction, path)
+    refusal(path, load_errors, path)
+
+
+@pytest.mark.parametrize("value", [*(each for each in NO_NUMBERS if each != '"4"'), '"four"', "0", "0.5"])
+def test_stored_scene_with_a_scale_that_is_none_is_refused(runs, value):
+    path = sample_path(runs / "fine", "s")
+    with np.load(path) as stored:
+        arrays = dict(stored)
+    np.savez(path, **{**arrays, "about": replaced(str(arrays["about"]), "scale", value)})
+    refusal(path, DepthSample.load, path)
+
+
+RUN = {
+    "names": {"model": "msg_v", "dataset": "simgeo", "downsampling": "box", "noise": "none"},
+    "model": {"net": {"_target_": "dsr.methods.networks.msg_net.MSGNet"}},
+    "dataset": {"_target_": "dsr.data.rendered.SimGeo"},
+    "downsampling": {"_target_": "dsr.degradation.downsampling.Downsampling", "kernel": "box"},
+    "noise": {"_target_": "dsr.degradation.noise.no_noise"},
+    "scale": 4,
+    "seed": 0,
+    "trainer": {"max_steps": 2, "val_check_interval": 1},
+}
+
+
+@pytest.mark.parametrize(("key", "value"), [
+    ("seed", "abc"), ("scale", None), ("trainer", 5), ("model", "msg_v"), ("start", {"weights": 5}),
+    ("names", {"model": "msg_v"}),
+])  # fmt: skip
+def test_configuration_of_a_run_with_a_value_of_another_type_is_refused(tmp_path, key, value):
+    path = tmp_path / "config.yaml"
+    OmegaConf.save(OmegaConf.create(RUN), path)
+    assert read_config(tmp_path)["seed"] == 0
+    path.write_text(OmegaConf.to_yaml(OmegaConf.create({**RUN, key: value})))
+    assert refusal(path, read_config, tmp_path).startswith(f": {key}")
+
+
+def test_configuration_of_10000_nested_lists_is_refused_at_once(tmp_path):
+    path = tmp_path / "config.yaml"
+    path.write_text("model: " + "[" * 10_000 + "]" * 10_000)
+    with pytest.raises(ConfigError, match=r"config\.yaml: line 1: expected"):
+        read_plain_yaml(path)
+
+
+@pytest.mark.parametrize("content", ["3.5", "name: tgv\nsharpness: !!set {a, b}\n"])
+def test_unusable_file_of_a_method_is_named_by_the_commands(tmp_path, capfd, content):
+    (tmp_path / "method").mkdir()
+    (tmp_path / "method" / "mine.yaml").write_text(content)
+    with pytest.raises(SystemExit) as ended:
+        run_command("eval", Mock(), ["--config-dir", str(tmp_path), "method=mine"])
+    assert ended.value.code == 2
+    assert f"{tmp_path}/method/mine.yaml: expected" in capfd.readouterr().err
+
+
+# Maps, weights, archives and captures
+
+
+@pytest.fixture
+def scene_folder(tmp_path):
+    """Return a scene's folder; its depth is still to be written."""
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    cv2.imwrite(str(folder / "rgb.png"), np.zeros((8, 8, 3), np.uint8))
+    entries = {"width": 8, "height": 8, "fx": 9, "fy": 9, "cx": 3.5, "cy": 3.5, "baseline": 0.1}
+    (folder / "camera.json").write_text(json.dumps(entries))
+    return folder
+
+
+@pytest.mark.parametrize(("name", "value"), [("depth", 1e19), ("depth", 1e-9), ("disparity", 1e-12)])
+def test_depth_that_is_no_distance_is_refused_where_a_scene_enters(scene_folder, name, value):
+    path = scene_folder / f"{name}.npy"
+    np.save(path, np.where(np.eye(8) == 1, value, 2.0))
+    said = refusal(path, load_scene, scene_folder, "folder")
+    assert said.startswith(": expected depths of 1e-06 to 1e+09 m, got ")
+    assert " in 12.50% of the pixels" in said
+
+
+@pytest.mark.parametrize("depth", [0.0, 4e-41, 1e12])
+def test_stored_input_with_a_depth_out_of_range_is_refused(tmp_path, depth):
+    depth_lr = torch.full((1, 4, 4), 2.0)
+    depth_lr[0, 1, 2] = depth
+    path = tmp_path / "input.npz"
+    write_input(path, torch.rand(3, 16, 16), depth_lr)
+    assert ": expected depths" in refusal(path, read_input, path)
+
+
+@pytest.mark.parametrize("content", [
+    {"other": np.ones((4, 4))}, {"depth_lr": np.ones((4, 4)), "photo": np.ones(9, np.uint8)},
+    {"depth_lr": np.ones((4, 4), np.float32), "photo": np.frombuffer(b"\xff\xd8 no picture", np.uint8)},
+])  # fmt: skip
+def test_something_else_than_the_input_beside_a_result_is_refused(tmp_path, content):
+    path = tmp_path / "input.npz"
+    np.savez(path, **content)
+    assert ": expected" in refusal(path, read_input, path)
+
+
+@pytest.mark.parametrize("damage", [lambda data: data[:40], lambda data: data[:-200], lambda _: b""])
+def test_damaged_depth_of_an_earlier_result_is_made_again_and_refused_where_it_is_read(tmp_path, damage):
+    folder = write_result(tmp_path / "a")
+    path = folder / "depth_metres.tiff"
+    path.write_bytes(damage(path.read_bytes()))
+    assert kept_surface(folder, Camera(64, 64, 80.0, 80.0, 31.0, 32.5), errors=False) is None
+    assert ": expected" in refusal(path, read_result, folder, "a")
+
+
+@pytest.mark.parametrize("tensor", [torch.ones(2, 3, device="meta"), torch.eye(3).to_sparse()])
+def test_weights_without_plain_values_are_refused(tmp_path, tensor):
+    path = tmp_path / "net.pth"
+    for content, read in (({"a": tensor}, read_tensors), ({"model_state_dict": {"a": tensor}}, read_msg_weights)):
+        torch.save(content, path)
+        assert "expected a torch file" in refusal(path, read, path)
+
+
+def test_torch_file_with_compressed_members_is_refused(tmp_path):
+    torch.save({"a": torch.zeros(1 << 10)}, tmp_path / "stored.pth")
+    assert read_torch_file(tmp_path / "stored.pth")["a"].shape == (1 << 10,)
+    with zipfile.ZipFile(tmp_path / "stored.pth") as before, zipfile.ZipFile(tmp_path / "x.pth", "w", 8) as packed:
+        for name in before.namelist():
+            packed.writestr(name, before.read(name))
+    assert ": expected" in refusal(tmp_path / "x.pth", read_torch_file, tmp_path / "x.pth")
+
+
+@pytest.mark.parametrize("shape", ["(9223372036854775807, 2)", "(-5, 4)", "(4294967296, 4294967296)", "(1e3,)", "(("])
+def test_array_of_a_shape_that_no_file_has_is_refused(tmp_path, shape):
+    header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    path = tmp_path / "depth.npy"
+    path.write_bytes(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + b"\0" * 64)
+    assert ": expected an array" in refusal(path, open_array, path)
+
+
+def external(file, secret):
+    file.create_dataset("depth", (4, 4), "f8", external=[(str(secret), 0, 128)])
+
+
+def linked(file, secret):
+    file["depth"] = h5py.ExternalLink(str(secret), "/secret")
+
+
+@pytest.mark.parametrize("fill", [external, linked])
+def test_matrix_of_another_file_is_not_read(tmp_path, fill):
+    (tmp_path / "secret").write_bytes(np.ones(16).tobytes())
+    with h5py.File(tmp_path / "x.mat", "w") as file:
+        fill(file, tmp_path / "secret")
+    assert refusal(tmp_path / "x.mat", read_variables, tmp_path / "x.mat")
+
+
+def nameless(content):
+    """Take the name `abc` off the central directory's only entry of an archive."""
+    entry, end = content.index(b"PK\x01\x02"), content.index(b"PK\x05\x06")
+    directory, tail = bytearray(content[entry : entry + 46] + content[entry + 49 : end]), bytearray(content[end:])
+    struct.pack_into("<H", directory, 28, 0)
+    struct.pack_into("<I", tail, 12, len(directory))
+    return content[:entry] + bytes(directory) + bytes(tail)
+
+
+def displaced(content):
+    """Let the member of an archive lie before its start."""
+    changed = bytearray(content)
+    place = len(changed) - 22 + 16
+    struct.pack_into("<L", changed, place, struct.unpack_from("<L", changed, place)[0] + 50)
+    return changed
+
+
+@pytest.mark.parametrize("damage", [nameless, displaced, lambda content: content[:-30]])
+def test_damaged_archive_is_refused_and_nothing_unpacked(tmp_path, damage):
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as file:
+        file.writestr("abc", b"x" * 100)
+    path = tmp_path / "data.zip"
+    path.write_bytes(damage(packed.getvalue()))
+    refusal(path, unpack, path, tmp_path / "out", Mock())
+    assert not (tmp_path / "out").exists()
+
+
+def test_trajectory_at_a_time_that_is_no_number_is_refused(tmp_path):
+    captures.arkitscenes(tmp_path)
+    path = tmp_path / "lowres_wide.traj"
+    path.write_text(re.sub(r"^\S+", "nan", path.read_text()))
+    assert ": line 1: expected" in refusal(path, find_arkitscenes, tmp_path)
+
+
+def test_odometry_with_a_field_longer_than_a_table_may_have_is_refused(tmp_path):
+    captures.stray(tmp_path)
+    path = tmp_path / "odometry.csv"
+    path.write_text(path.read_text() + "x" * 200_000 + "\n")
+    assert ": expected a table" in refusal(path, find_stray, tmp_path)
+
+
+@pytest.mark.filterwarnings("error")
+def test_translation_of_1e308_metres_is_refused_without_a_warning_of_overflow(tmp_path):
+    shift = np.eye(4)
+    shift[0, 3] = -1e308
+    np.savetxt(tmp_path / "extrinsics.txt", shift)
+    path = tmp_path / "extrinsics.txt"
+    assert ": expected a translation" in refusal(path, read_transform, path)
+
+
+def test_name_that_is_not_utf8_is_refused_unless_other_scenes_are_named(tmp_path):
+    for name in (b"bad\xff", b"good"):
+        (tmp_path / name.decode(errors="surrogateescape")).mkdir()
+    with pytest.raises(ValueError, match=r"^scenes: expected names in UTF-8, got 'bad\\udcff'"):
+        Folder(str(tmp_path))
+    assert Folder(str(tmp_path), ["good"]).scenes() == ["good"]
+
+
+def test_loop_of_links_among_answers_is_one_file_and_no_error(tmp_path):
+    (tmp_path / "a.json").symlink_to(tmp_path / "b.json")
+    (tmp_path / "b.json").symlink_to(tmp_path / "a.json")
+    (tmp_path / "c.json").write_text("{}")
+    assert tmp_path / "c.json" in files_of([tmp_path])
+
+
+def test_long_message_keeps_the_name_at_its_beginning_and_its_end(capsys):
+    print_error(f"/data/camera.json: expected a number, got {'9' * 10_000} at the end")
+    line = capsys.readouterr().err
+    assert len(line) <= len("\n") + 1000
+    assert line.startswith("error: /data/camera.json: expected a number, got 999")
+    assert line.endswith("9 at the end\n")
+    assert one_line(ValueError("short\nmessage")) == "short message"
+    print_error("a\x1b]0;title\x07b\x9bc\nd")
+    assert capsys.readouterr().err == "error: a#]0;title#b#c d\n".replace("#", "\N{REPLACEMENT CHARACTER}")

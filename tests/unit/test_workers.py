@@ -1,0 +1,114 @@
+"""Worker processes and locks: each item once, also where a worker is killed; settings keep a folder for themselves."""
+
+import functools
+import multiprocessing
+import os
+import signal
+import threading
+import time
+
+import pytest
+import torch
+
+from dsr.report.worker_pool import WorkerPool
+from dsr.utils.files import replacing
+from dsr.utils.locks import LOCKS, InUseError, at_work, free_first, scene_lock
+from dsr.utils.pool import Pool
+
+SPAWN = multiprocessing.get_context("spawn")
+
+
+def answer(kill, item):
+    """Return an item in capitals, the process, its threads and signals; it is killed at "k" as often as told."""
+    folder, times = kill
+    if item == "k" and len(list(folder.iterdir())) < times:
+        (folder / str(os.getpid())).touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    return item.upper(), os.getpid(), torch.get_num_threads(), signal.SIGINT in blocked
+
+
+def draw(results, number):
+    return None if number is None else results[number]
+
+
+def test_items_of_a_killed_worker_are_done_by_others_and_threads_are_those_asked_for(tmp_path):
+    lines = []
+    with Pool(2, threads=1, say=lines.append) as pool:
+        found = dict(pool.results(functools.partial(answer, (tmp_path, 1)), list("ijklm")))
+    assert {item: value[0] for item, value in found.items()} == {item: item.upper() for item in "ijklm"}
+    assert {value[2:] for value in found.values()} == {(1, True)}  # Ctrl-C is left to the parent
+    assert len(lines) == 1
+    for process in {value[1] for value in found.values()}:
+        with pytest.raises(ProcessLookupError):
+            os.kill(process, 0)
+
+
+def test_workers_that_are_killed_twice_are_an_error(tmp_path):
+    with Pool(1) as pool, pytest.raises(ChildProcessError, match="killed"):
+        list(pool.results(functools.partial(answer, (tmp_path, 2)), ["k", "l"]))
+
+
+def test_parts_of_a_report_come_in_their_order():
+    with WorkerPool([7, 8, 9], 2) as work:
+        values, others = work.map(draw, [None, 0, 1, 2]), work.map(draw, [2, 1])
+        assert list(others) == [9, 8]
+        assert list(values) == [None, 7, 8, 9]
+
+
+def write_half(folder, name):
+    with replacing(folder / name) as temporary:
+        temporary.write_bytes(b"half")
+        time.sleep(60)
+
+
+def test_workers_that_are_ended_while_they_write_leave_no_temporary_file(tmp_path):
+    def interrupt():
+        while not list(tmp_path.iterdir()):
+            time.sleep(0.05)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt).start()
+    with pytest.raises(KeyboardInterrupt), Pool(1) as pool:
+        list(pool.results(functools.partial(write_half, tmp_path), ["file.png"]))
+    assert list(tmp_path.iterdir()) == []
+
+
+def hold(folder, settings, scene, started):
+    with at_work(folder, settings), scene_lock(folder, scene):
+        started.set()
+        time.sleep(60)
+
+
+@pytest.fixture
+def holder(tmp_path):
+    """Return another process with the settings "its" that has the lock of "a" in a folder, and the folder."""
+    started = SPAWN.Event()
+    process = SPAWN.Process(target=hold, args=(tmp_path / "run", "its", "a", started))
+    process.start()
+    assert started.wait(60)
+    yield process, tmp_path / "run"
+    process.kill()
+    process.join()
+
+
+def test_other_settings_are_refused_until_the_process_ends_however_it_does(holder):
+    process, folder = holder
+    with pytest.raises(InUseError, match=f"process {process.pid} of "), at_work(folder, "others"):
+        pass
+    with at_work(folder, "its"):
+        assert next(free_first(folder, ["a", "b"])) == "b"
+        assert list(free_first(folder, ["a", "b"], wait=False)) == ["b"]
+        process.kill()
+        process.join()
+        assert list(free_first(folder, ["a", "b"])) == ["a", "b"]
+    with at_work(folder, "others"):
+        assert folder.is_dir()
+    assert list(folder.iterdir()) == []
+
+
+def test_folder_that_holds_something_is_kept_without_the_locks(tmp_path):
+    with at_work(tmp_path / "new" / "run", "its"):
+        assert (tmp_path / "new" / "run" / LOCKS).is_dir()
+        (tmp_path / "new" / "run" / "file").touch()
+    assert [path.name for path in (tmp_path / "new" / "run").iterdir()] == ["file"]
