@@ -201,7 +201,7 @@ def test_worker_that_stops_at_a_signal_ends_without_a_word_and_another_begins_ag
     def work(item):
         if not (tmp_path / item).exists():
             (tmp_path / item).touch()
-            with interruption.deferred(str) as noted:
+            with interruption.deferred() as noted:
                 os.kill(os.getpid(), signal.SIGTERM)  # as of a scheduler, to all processes
                 assert noted.requested
             raise KeyboardInterrupt("saved")

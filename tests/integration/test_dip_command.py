@@ -21,7 +21,6 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from dsr.app.entry import run_command
 from dsr.app.evaluate import evaluate
-from dsr.utils import interruption
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 QUICK = (
@@ -160,63 +159,6 @@ def test_interrupted_run_resumes_within_the_image(tmp_path: Path, run: Run) -> N
     assert run(tmp_path, *arguments, "output_dir=whole")[0] == 0
     assert np.array_equal(_depth(tmp_path / "out", "statue"), _depth(tmp_path / "whole", "statue"))
     assert not (tmp_path / "out" / "optimisation" / "statue" / "last.ckpt").exists()
-
-
-SLOW = """
-import os, pathlib, signal, sys, time
-sys.path.insert(0, {source!r})
-from dsr.methods.dip.optimisation import PriorOptimisation
-from dsr.utils import interruption
-
-interruption._GRACE = 1.5
-step = PriorOptimisation.training_step
-
-def slow(self, *batch):
-    loss = step(self, *batch)
-    if self.global_step == 2 and not pathlib.Path("sent").exists():  # by one worker
-        pathlib.Path("sent").touch()
-        for number in {numbers}:
-            os.kill({process}(), number)
-            time.sleep(0.1)
-        time.sleep(4)
-    return loss
-
-PriorOptimisation.training_step = slow
-if __name__ == "__main__":
-    interruption.start("dsr.app.entry", "run_eval")
-"""
-
-
-@pytest.mark.parametrize(
-    ("numbers", "workers", "end"),
-    [
-        ((signal.SIGINT,), 1, "interrupted at step 3 of statue; the same command continues from there"),
-        ((signal.SIGINT,), 2, interruption.MESSAGE),
-        ((signal.SIGINT, signal.SIGINT), 1, "interrupted before the first checkpoint; the same command begins this "),
-        ((signal.SIGTERM,), 1, "interrupted before the first checkpoint; the same command begins this again, "),
-    ],
-)
-def test_step_longer_than_the_grace_is_saved_at_ctrl_c_and_no_checkpoint_named_that_is_not_there(
-    tmp_path: Path, numbers: tuple[int, ...], workers: int, end: str
-) -> None:
-    (tmp_path / "slow.py").write_text(
-        SLOW.format(
-            source=str(REPOSITORY / "src"), numbers=tuple(map(int, numbers)),
-            process="os.getpid" if workers == 1 else "os.getppid",
-        )
-    )  # fmt: skip
-    scenes = "dataset.scenes=[statue]" if workers == 1 else "dataset.scenes=[statue,cube_no_texture]"
-    arguments = ("method=dip_v", scenes, f"workers={workers}", "output_dir=out")
-    done = run_python(str(tmp_path / "slow.py"), *QUICK, *arguments, cwd=tmp_path)
-    assert done.returncode == 128 + numbers[0], done.stderr
-    *reported, line = done.stderr.splitlines()
-    assert line.startswith(end)
-    saved = [torch.load(path, weights_only=True)["global_step"] for path in (tmp_path / "out").rglob("last.ckpt")]
-    if numbers == (signal.SIGINT,):
-        assert reported == ["stopping after this step (Ctrl-C again stops at once)"]
-        assert 3 in saved
-    else:
-        assert (reported, saved) == ([], [])
 
 
 def test_oracle_is_named_in_scores_and_table(tmp_path: Path, run: Run) -> None:

@@ -21,7 +21,6 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from dsr.utils import interruption
 from dsr.utils.guards import path_within
 from dsr.utils.progress import megabytes
 
@@ -274,18 +273,17 @@ def replacing(path: Path) -> Iterator[Path]:
 
     """
     expect_target(path)
-    with interruption.leaving():
+    with space_for(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        remove_abandoned(path.parent)
+        temporary = _new(path.with_name(f".{path.stem}-{owner()}-"), path.suffix, _create)
+    try:
         with space_for(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            remove_abandoned(path.parent)
-            temporary = _new(path.with_name(f".{path.stem}-{owner()}-"), path.suffix, _create)
-        try:
-            with space_for(path):
-                yield temporary
-                expect_target(path)  # what has come there meanwhile
-                temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
+            yield temporary
+            expect_target(path)  # what has come there meanwhile
+            temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager

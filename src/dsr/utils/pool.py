@@ -92,7 +92,6 @@ class Pool(Generic[_T, _R]):
 
     def __enter__(self) -> Self:
         """Return itself."""
-        self._stack.enter_context(interruption.with_workers())
         if self._forks:  # they inherit it: to set it in them can wait for ever for a thread that only this process has
             self._stack.enter_context(computing_threads(self._threads))
         return self
@@ -101,14 +100,12 @@ class Pool(Generic[_T, _R]):
         """Terminate the workers, whatever they are doing."""
         for process in self._processes.values():
             process.terminate()
-        waits, deadline = interruption.is_ctrl_c(), time.monotonic() + _SECONDS_TO_END
-        with interruption.deferred(lambda: interruption.MESSAGE) if waits else contextlib.nullcontext():
-            for connection, process in self._processes.items():
-                # for the step that it is at, or for the end of what it is writing
-                process.join(None if waits else max(0.0, deadline - time.monotonic()))
-                process.kill()  # whatever kept it from ending
-                process.join()
-                connection.close()
+        deadline = time.monotonic() + _SECONDS_TO_END
+        for connection, process in self._processes.items():
+            process.join(max(0.0, deadline - time.monotonic()))  # for the end of what it is writing
+            process.kill()  # whatever kept it from ending
+            process.join()
+            connection.close()
         self._processes, self._busy = {}, {}
         self._stack.close()
 
@@ -226,7 +223,7 @@ class Pool(Generic[_T, _R]):
 
 def _serve(connection: Connection, parent: int, plan: tuple[Any, ...] | None) -> None:
     """Work on items in a worker, until it is terminated."""
-    interruption.end_with(parent, terminated=True)
+    interruption.end_with(parent)
     surroundings.close_to_settings()
     with contextlib.suppress(EOFError, KeyboardInterrupt):  # the parent was interrupted, or has ended this process
         work, prepare, arguments, threads = connection.recv() if plan is None else plan

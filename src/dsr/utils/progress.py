@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from typing import Literal, Protocol, TypeVar
 
 Steps = Callable[[int, int], object]
@@ -44,7 +44,7 @@ class Progress:
             unit: what the amounts count.
 
         """
-        return contextlib.nullcontext(_ignore)
+        return contextlib.nullcontext(ignore)
 
     def track(
         self,
@@ -54,7 +54,6 @@ class Progress:
         *,
         label: Callable[[Item], str] = str,
         lines: bool = True,
-        shares: Mapping[str, float] | None = None,
     ) -> Iterator[Item]:
         """Yield items, and show how many are done.
 
@@ -62,20 +61,12 @@ class Progress:
             total: number of items; None where ``items`` can be counted.
             label: returns the name of an item.
             lines: whether each item gets a line if the output is not a terminal; False if the caller prints one.
-            shares: of the time of an item, by the stages that it goes through, in their order; see :meth:`stage`. They
-                are what is expected until an item is done.
 
         """
         yield from items
 
-    def stage(self, name: str, seconds: float | None = None) -> None:
-        """Say that the item that is being worked on begins a stage.
-
-        Args:
-            name: one of the stages in ``shares`` of :meth:`track`.
-            seconds: about how long it takes, where that is known.
-
-        """
+    def stage(self, name: str) -> None:
+        """Say that the item that is being worked on begins a stage."""
 
 
 SILENT = Progress()
@@ -97,7 +88,7 @@ class StepsProgress(Progress):
         """Return a context in which the steps of a task are reported, unless it is part of another."""
         steps, all_steps = self._steps, total or 0
         if steps is None or self._busy:
-            yield _ignore
+            yield ignore
             return
 
         def report(done: int, total: int | None = None, remark: str | None = None) -> None:
@@ -116,7 +107,7 @@ def part_of(progress: Steps | None, before: int, total: int) -> Steps | None:
     return None if progress is None else lambda done, _: progress(before + done, total)
 
 
-def _ignore(done: int, total: int | None = None, remark: str | None = None) -> None:
+def ignore(done: int, total: int | None = None, remark: str | None = None) -> None:
     """Report nothing."""
 
 
