@@ -68,11 +68,7 @@ def train(config: DictConfig) -> float:
         config: composed from ``conf/train.yaml``.
 
     Returns:
-        The score of the validation of the weights that are kept, their mean RMSE_v, as a fraction like those in files.
-
-    Raises:
-        ConfigError: the configuration cannot be run, or its training is already complete or has diverged.
-        KeyboardInterrupt: the training was interrupted; the message says how to resume it.
+        The mean RMSE_v of the validation of the weights that are kept, as a fraction like those in files.
 
     """
     plain, settings, device = _read(config)
@@ -87,17 +83,7 @@ def train(config: DictConfig) -> float:
 
 
 def plan(config: DictConfig) -> list[Plan]:
-    """Check what :func:`train` would do as a job of a multirun; nothing is computed or written.
-
-    A training that is complete is no work, and keeps no other one from its own.
-
-    Args:
-        config: composed from ``conf/train.yaml``.
-
-    Raises:
-        ConfigError: the configuration cannot be run.
-
-    """
+    """Check what :func:`train` would do as a job of a multirun; nothing is computed or written."""
     here = runs_here()
     plain, settings, device = _read(config, here=here)
     prepared = _prepare(plain, settings, device, find_processes(device, settings.trainer["devices"] if here else 1))

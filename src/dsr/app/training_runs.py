@@ -24,14 +24,11 @@ _NOT_WITH_RUN = ("method", "scale", "weights")
 
 
 def read_config(folder: Path, trust: Any = None) -> dict[str, Any]:
-    """Read the configuration of a training.
+    """Read the configuration of a training, which may come from somebody else, from its run's directory.
 
     Args:
-        folder: the run's directory, which may come from somebody else.
-        trust: the command line's value of the key; see :meth:`dsr.app.trust.Trust.of`.
-
-    Raises:
-        ConfigError: the directory is not that of a training, or a target is neither dsr's nor trusted.
+        folder: the run's directory.
+        trust: the command line's value of the key.
 
     """
     path = folder / "config.yaml"
@@ -63,9 +60,6 @@ def studies_of_run(plain: Config, given: Sequence[str]) -> Iterator[tuple[dict[s
     Args:
         plain: the composed configuration of ``eval.py``.
         given: the keys that the command line sets.
-
-    Raises:
-        ConfigError: the directory holds no finished training, or a key contradicts it.
 
     """
     folder = Path(plain["run"]).expanduser()

@@ -24,27 +24,14 @@ def expect_installed(name: str) -> None:
 
 
 def log_config(logger: Logger | None, text: str) -> None:
-    """Log the complete configuration for readers, so that TensorBoard shows the run before it has values.
-
-    Args:
-        logger: of the training; others than TensorBoard's are left out.
-        text: in Markdown.
-
-    """
+    """Log the configuration as Markdown, so that TensorBoard shows the run before it has values."""
     if isinstance(logger, TensorBoardLogger):
         logger.experiment.add_text("config", text)
         logger.experiment.flush()
 
 
 def log_settings(logger: Logger | None, table: Mapping[str, Any], config: Mapping[str, Any]) -> None:
-    """Log the settings of a training.
-
-    Args:
-        logger: of the training.
-        table: the main settings, among them the columns of TensorBoard's table of runs.
-        config: the complete configuration, for other loggers.
-
-    """
+    """Log the main settings to TensorBoard and its table of runs, the complete configuration to other loggers."""
     if isinstance(logger, TensorBoardLogger):
         logger.log_hyperparams(dict(table))
         list_run(logger.experiment, "training", table, {})
@@ -55,14 +42,8 @@ def log_settings(logger: Logger | None, table: Mapping[str, Any], config: Mappin
 def log_layout(logger: Logger | None, metrics: Mapping[str, str], losses: Sequence[str] = _CURVES) -> None:
     """Lay out TensorBoard's *Custom scalars*: metrics of renderings first, then those of depth, then losses.
 
-    A chart has a metric's mean over all validation sets and, if there are several, that of each, of the network and of
-    bicubic interpolation.
-
-    Args:
-        logger: of the training; others than TensorBoard's have no layout.
-        metrics: titles of the validation's metrics, by name.
-        losses: names of values of the training.
-
+    A chart has a metric's mean over all validation sets and, if there are several, the means of each, of the network
+    and of bicubic interpolation. ``metrics`` are the titles of the validation's metrics by name.
     """
     if not isinstance(logger, TensorBoardLogger):
         return
@@ -78,15 +59,7 @@ def log_layout(logger: Logger | None, metrics: Mapping[str, str], losses: Sequen
 
 
 def log_picture(logger: Any, tag: str, picture: Tensor, step: int) -> None:
-    """Log a picture where pictures are shown.
-
-    Args:
-        logger: of the training.
-        tag: the picture's name.
-        picture: (3, H, W) uint8.
-        step: of the training.
-
-    """
+    """Log a picture, (3, H, W) uint8, where pictures are shown."""
     array = picture.permute(1, 2, 0).numpy()
     if isinstance(logger, TensorBoardLogger):
         logger.experiment.add_image(tag, picture, step)

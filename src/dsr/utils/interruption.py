@@ -18,7 +18,7 @@ import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from dsr.utils import surroundings
 
@@ -92,11 +92,11 @@ def deferred() -> Iterator[Deferred]:
         if number == signal.SIGINT:
             os.write(2, b"stopping after this step (Ctrl-C again stops at once)\n")
 
-    preemption = getattr(signal, "SIGUSR2", None)
+    preemption: Any = getattr(signal, "SIGUSR2", None)  # Windows has none
     requeues = preemption is not None and callable(signal.getsignal(preemption))
-    handlers = {signal.SIGINT: note, signal.SIGTERM: signal.SIG_IGN if requeues else note}
+    handlers: dict[Any, Any] = {signal.SIGINT: note, signal.SIGTERM: signal.SIG_IGN if requeues else note}
     handlers |= {preemption: note} if requeues else {}
-    before = {}
+    before: dict[Any, Any] = {}
     if threading.current_thread() is threading.main_thread():
         before = {number: signal.signal(number, handler) for number, handler in handlers.items()
                   if signal.getsignal(number) != signal.SIG_IGN}  # fmt: skip

@@ -175,30 +175,22 @@ def make_trainer(
     devices: int = 1,
     accumulate: int = 1,
     environment: ClusterEnvironment | None = None,
-    make: Callable[..., lightning.Trainer] | None = None,
+    make: Callable[..., lightning.Trainer] = lightning.Trainer,
     **named: Any,
 ) -> lightning.Trainer:
     """Return a trainer for a number of steps, with a validation after every few and after the last one.
 
     Args:
-        device: to train on.
-        steps: of the training.
         interval: steps between two validations.
-        callbacks: of Lightning.
-        devices: how many devices of that kind to train on.
         accumulate: batches of a step.
         environment: what Lightning learns of the processes of several devices from; None where it starts them itself,
             whatever Slurm or MPI say.
-        make: function that makes the trainer; None for :class:`lightning.Trainer`.
+        make: makes the trainer of its arguments.
         **named: its other arguments.
 
     """
     with without_chatter():
-        defaults = {
-            "log_every_n_steps": min(LOG_EVERY, interval), "enable_progress_bar": False, "enable_model_summary": False,
-            "num_sanity_val_steps": 0,
-        }  # fmt: skip
-        return (make or lightning.Trainer)(
+        return make(
             accelerator="gpu" if device.type == "cuda" else device.type,
             devices=devices if device.index is None or devices > 1 else [device.index],
             max_steps=steps,
@@ -208,7 +200,11 @@ def make_trainer(
             callbacks=[LastValidation(interval), *callbacks],
             plugins=[AtomicCheckpoints(), environment or LightningEnvironment()],
             use_distributed_sampler=False,
-            **{**defaults, **named},
+            log_every_n_steps=min(LOG_EVERY, interval),
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            num_sanity_val_steps=0,
+            **named,
         )
 
 
@@ -219,14 +215,7 @@ def fit(
     resume: Path | None = None,
     **named: Any,
 ) -> None:
-    """Train.
-
-    Raises:
-        KeyboardInterrupt: the training was interrupted.
-        FullDiskError: there is no space for its log or a checkpoint.
-        ConfigError: the checkpoint to go on from is damaged, or one of another training.
-
-    """
+    """Train; KeyboardInterrupt if it is interrupted, ConfigError if the checkpoint to go on from is none of it."""
     callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
     before = signal.getsignal(signal.SIGINT)
     try:

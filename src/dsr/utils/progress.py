@@ -6,8 +6,7 @@ import contextlib
 from collections.abc import Callable, Iterable, Iterator
 from typing import Literal, Protocol, TypeVar
 
-Steps = Callable[[int, int], object]
-"""Is called with the number of steps done and their total."""
+Steps = Callable[[int, int], object]  # is called with the number of steps done and their total
 Unit = Literal["items", "bytes"]
 Item = TypeVar("Item")
 
@@ -16,14 +15,7 @@ class Task(Protocol):
     """A piece of work under way; it is cheap to call in a loop."""
 
     def __call__(self, done: int, total: int | None = None, remark: str | None = None) -> None:
-        """Report how much is done.
-
-        Args:
-            done: amount of work done; less than before if the work starts again.
-            total: amount of all work; None if unchanged or unknown.
-            remark: short text shown beside the numbers; None if unchanged.
-
-        """
+        """Report how much is done, of how much, and a short text shown beside the numbers; None if unchanged."""
         ...
 
 
@@ -36,14 +28,7 @@ class Progress:
     def task(
         self, name: str, total: int | None = None, *, done: int = 0, unit: Unit = "items"
     ) -> contextlib.AbstractContextManager[Task]:
-        """Return a context in which a piece of work is shown, below the one that is already under way.
-
-        Args:
-            name: what is done, such as ``train``.
-            done: amount of work done before.
-            unit: what the amounts count.
-
-        """
+        """Return a context in which a piece of work is shown, ``done`` units of which were done before."""
         return contextlib.nullcontext(ignore)
 
     def track(
@@ -59,7 +44,6 @@ class Progress:
 
         Args:
             total: number of items; None where ``items`` can be counted.
-            label: returns the name of an item.
             lines: whether each item gets a line if the output is not a terminal; False if the caller prints one.
 
         """
