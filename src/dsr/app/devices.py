@@ -73,7 +73,8 @@ def find_processes(device: torch.device, devices: int | Literal["auto"]) -> Proc
         ConfigError: there are fewer devices, or Slurm or ``torchrun`` have started another number of processes.
 
     """
-    there = torch.cuda.device_count() if device.type == "cuda" and device.index is None else 1
+    index: int | None = device.index  # torch's stubs say int
+    there = torch.cuda.device_count() if device.type == "cuda" and index is None else 1
     count = there if devices == "auto" else devices
     if device.type != "cpu" and count > there:
         raise ConfigError(f"trainer.devices: expected at most {there} for device={device}, got {count}")

@@ -172,6 +172,7 @@ def _prepare(plain: Config, settings: TrainConfig, device: torch.device, process
         with without_chatter():
             loggers.append(build(f"logger.{name}", {"save_dir": str(folder), **node}))
     node = settings.more_of_trainer
+    unused = "_find_unused_parameters_true" if settings.degradation.get("scales") else ""  # layers of one factor
     check("trainer", node)
     trainer = make_trainer(
         device,
@@ -182,8 +183,7 @@ def _prepare(plain: Config, settings: TrainConfig, device: torch.device, process
         devices=processes.count,
         accumulate=settings.accumulate,
         environment=processes.environment,
-        # layers may have no part in a step, such as those of another factor
-        strategy="ddp_find_unused_parameters_true" if processes.count > 1 else "auto",
+        strategy=f"ddp{unused}" if processes.count > 1 else "auto",
         precision="bf16-mixed" if settings.precision == "bfloat16" else "32-true",
         default_root_dir=folder,
         make=lambda **given: build("trainer", node, {key: value for key, value in given.items() if key not in node}),

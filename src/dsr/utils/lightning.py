@@ -189,10 +189,11 @@ def make_trainer(
         **named: its other arguments.
 
     """
+    index: int | None = device.index  # torch's stubs say int
     with without_chatter():
         return make(
             accelerator="gpu" if device.type == "cuda" else device.type,
-            devices=devices if device.index is None or devices > 1 else [device.index],
+            devices=devices if index is None or devices > 1 else [index],
             max_steps=steps,
             accumulate_grad_batches=accumulate,
             val_check_interval=interval * accumulate,
