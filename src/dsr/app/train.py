@@ -44,7 +44,7 @@ from dsr.training.module import SuperResolution
 from dsr.utils import interruption
 from dsr.utils.checkpoints import BestCheckpoint, DivergenceError, Interruption
 from dsr.utils.compute_device import fast_precision, pick_device
-from dsr.utils.configuration import ConfigError, build, check
+from dsr.utils.configuration import ConfigError, build
 from dsr.utils.console import USAGE_ERROR, ConsoleProgress, one_line, without_credentials
 from dsr.utils.files import replacing
 from dsr.utils.guards import expect_stored
@@ -173,7 +173,6 @@ def _prepare(plain: Config, settings: TrainConfig, device: torch.device, process
             loggers.append(build(f"logger.{name}", {"save_dir": str(folder), **node}))
     node = settings.more_of_trainer
     unused = "_find_unused_parameters_true" if settings.degradation.get("scales") else ""  # layers of one factor
-    check("trainer", node)
     trainer = make_trainer(
         device,
         settings.steps,
