@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import copy
-import functools
 import statistics
 import tempfile
 import time
@@ -29,11 +28,8 @@ from lightning.pytorch.callbacks import Callback
 from torch import nn
 
 from dsr.app.devices import find_processes
-from dsr.app.metrics import metric_collection
 from dsr.app.schema import TrainConfig, plain_config, register
-from dsr.app.train import _module, _network
-from dsr.app.trainer import FirstValidation, training_trainer
-from dsr.app.training_runs import training_data
+from dsr.app.train import _prepare
 from dsr.data.rendered import SimGeo
 from dsr.degradation.downsampling import Downsampling
 from dsr.methods.networks.msg_net import MSGNet
@@ -42,8 +38,8 @@ from dsr.training.degradation import Batch, Degradation
 from dsr.training.objective import DepthObjective, Objective
 from dsr.training.patches import Patches
 from dsr.training.settings import PatchSettings
+from dsr.utils.checkpoints import BestCheckpoint
 from dsr.utils.lightning import fit
-from dsr.utils.progress import SILENT
 
 SCALE = 4
 
@@ -139,16 +135,15 @@ def profile(steps: int, device: torch.device, overrides: Sequence[str]) -> None:
             f"trainer.max_steps={steps}",
             f"trainer.val_check_interval={steps}",
         ]
-        settings = TrainConfig.of(plain_config(hydra.compose("train", [*small, *overrides])))
-    settings.precision = "float32" if settings.precision == "auto" else settings.precision
+        plain = plain_config(hydra.compose("train", [*small, *overrides]))
+    plain["precision"] = "float32" if plain["precision"] == "auto" else plain["precision"]
     times = StepTimes(device)
-    data = training_data(settings)
-    module = _module(settings, _network(settings), data, functools.partial(metric_collection, settings.metrics))
-    data.setup()
-    processes = find_processes(device, 1, "auto")
     with tempfile.TemporaryDirectory() as folder:
-        trainer, _ = training_trainer(settings, Path(folder), device, SILENT, processes)
-        without = [each for each in trainer.callbacks if not isinstance(each, FirstValidation)]  # type: ignore[attr-defined]
+        plain["output_dir"] = folder
+        prepared = _prepare(plain, TrainConfig.of(plain), device, find_processes(device, 1))
+        trainer, module, data = prepared.trainer, prepared.module, prepared.data
+        data.setup()
+        without = [each for each in trainer.callbacks if not isinstance(each, BestCheckpoint)]  # type: ignore[attr-defined]
         trainer.callbacks = [*without, LastCallback(times)]  # type: ignore[attr-defined]
         trainer.limit_val_batches = 0
         network = "network and losses"

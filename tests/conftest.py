@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import gc
 import json
 import os
@@ -26,7 +25,6 @@ from dsr.geometry.camera import Camera
 from dsr.metrics.catalogue import catalogue, score_image
 from dsr.sample import Scene
 from dsr.utils.compute_device import pick_device
-from dsr.utils.console import ConsoleProgress, _ConsoleTask
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 UNIT_TESTS = REPOSITORY / "tests" / "unit"
@@ -177,21 +175,6 @@ def webgl_browser(browser: Any) -> Iterator[Any]:
 @pytest.fixture
 def line_per_report(monkeypatch: pytest.MonkeyPatch) -> None:
     """Make commands print a line for each report of progress, as if seconds lay between them."""
-    make_task, report = ConsoleProgress.task, _ConsoleTask.__call__
-    shown_by: dict[int, ConsoleProgress] = {}
-
-    @contextlib.contextmanager
-    def task(self: ConsoleProgress, *arguments: Any, **named: Any) -> Iterator[_ConsoleTask]:
-        with make_task(self, *arguments, **named) as made:
-            shown_by[id(made)] = self
-            yield made
-
-    def report_and_print(self: _ConsoleTask, *arguments: Any, **named: Any) -> None:
-        report(self, *arguments, **named)
-        shown_by[id(self)].tick()
-
-    monkeypatch.setattr(ConsoleProgress, "task", task)
-    monkeypatch.setattr(_ConsoleTask, "__call__", report_and_print)
     monkeypatch.setattr("dsr.utils.console._FIRST_LINE", 0.0)
     monkeypatch.setattr("dsr.utils.console._NEXT_LINE", 0.0)
 

@@ -284,11 +284,8 @@ def _checkpoint(place: Place) -> None:
 
 def _notes(place: Place) -> None:
     from dsr.data.download.fetching import _read_note  # noqa: PLC0415
-    from dsr.training.loggers import CsvLog, _read_number  # noqa: PLC0415
 
     _read_note(place.input / "a.png.part", "https://localhost/a.png")
-    _read_number(place.input, "wandb")
-    CsvLog(place.input)
 
 
 def _foreground(place: Place) -> None:

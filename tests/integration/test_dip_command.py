@@ -154,6 +154,7 @@ def test_interrupted_run_begins_the_image_again(tmp_path: Path, run: Run) -> Non
     assert np.array_equal(_depth(tmp_path / "out", "statue"), _depth(tmp_path / "whole", "statue"))
     tables = [(tmp_path / name / "optimisation" / "statue" / "validation.csv").read_text() for name in ("out", "whole")]
     assert tables[0] == tables[1]
+    assert not (tmp_path / "out" / "optimisation" / "statue" / "last.ckpt").exists()
 
 
 def test_oracle_is_named_in_scores_and_table(tmp_path: Path, run: Run) -> None:

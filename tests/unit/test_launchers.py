@@ -2,7 +2,6 @@
 
 import importlib.util
 import os
-import signal
 import stat
 from types import SimpleNamespace
 
@@ -11,7 +10,6 @@ import pytest
 from dsr.app import gpus, slurm
 from dsr.app.multirun import LAUNCHERS, expect_launcher
 from dsr.app.slurm import SlurmSettings
-from dsr.utils import interruption
 from dsr.utils.configuration import ConfigError
 
 SLURM = {
@@ -103,50 +101,6 @@ def test_reason_that_jobs_are_pending_is_reported_once(squeue, monkeypatch, capl
     assert caplog.messages == [
         "Jobs pending in Slurm: 2 (Resources)", "Jobs pending in Slurm: 1 (PartitionConfig)"
     ]  # fmt: skip
-
-
-@pytest.fixture
-def requeues():
-    """Return the list of signals at which the job was requeued, as submitit's handler does."""
-    seen = []
-    before = signal.signal(signal.SIGUSR2, lambda number, _: seen.append(number))
-    yield seen
-    signal.signal(signal.SIGUSR2, before)
-
-
-def test_job_that_has_to_leave_is_interrupted_and_then_requeued(requeues):
-    def job():
-        with interruption.requeued():
-            try:
-                os.kill(os.getpid(), signal.SIGUSR2)
-            finally:
-                assert requeues == []
-
-    with pytest.raises(KeyboardInterrupt):
-        job()
-    assert requeues == [signal.SIGUSR2]
-
-
-def test_job_that_has_to_leave_first_saves_what_it_defers(requeues):
-    def job():
-        with interruption.requeued(), interruption.deferred(str) as noted:
-            os.kill(os.getpid(), signal.SIGTERM)
-            assert not noted.requested
-            os.kill(os.getpid(), signal.SIGUSR2)
-            assert noted.requested
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        job()
-    assert requeues == [signal.SIGUSR2]
-    os.kill(os.getpid(), signal.SIGUSR2)  # again that of submitit
-    assert len(requeues) == 2
-
-
-def test_job_that_is_interrupted_otherwise_is_not_requeued(requeues):
-    with pytest.raises(KeyboardInterrupt), interruption.requeued():
-        raise KeyboardInterrupt
-    assert requeues == []
 
 
 def test_visible_gpus_are_those_of_the_environment(monkeypatch):

@@ -138,43 +138,6 @@ def test_history_of_an_optimiser_goes_on_as_saved(tmp_path, steps):
     assert torch.equal(train_history(tmp_path, 6, tmp_path / "last.ckpt")[1], train_history(tmp_path, 6)[1])
 
 
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("old_dirs", [torch.zeros(9)] * 3), ("old_stps", []), ("ro", ["x"] * 3), ("old_dirs", 7), ("d", torch.zeros(9)),
-        ("n_iter", "x"), ("prev_flat_grad", None), ("al", [None]),
-    ],
-)  # fmt: skip
-def test_history_of_another_optimiser_is_refused(tmp_path, key, value):
-    train_history(tmp_path, 4)[0].save_checkpoint(tmp_path / "last.ckpt", weights_only=False)
-    checkpoint = torch.load(tmp_path / "last.ckpt", weights_only=True)
-    checkpoint["optimizer_states"][0]["state"][0][key] = value
-    torch.save(checkpoint, tmp_path / "last.ckpt")
-    with pytest.raises(ValueError, match=r"last\.ckpt: expected a checkpoint of this training.*optimizer_states"):
-        train_history(tmp_path, 6, tmp_path / "last.ckpt")
-
-
-class _Interrupted:
-    """A loader that is interrupted as it starts, after Lightning has tried whether it can."""
-
-    tried = False
-
-    def __iter__(self):
-        if self.tried:
-            raise KeyboardInterrupt
-        self.tried = True
-        return iter([torch.ones(1)])
-
-
-def test_interruption_of_a_trainings_start_is_no_other_error(tmp_path):
-    trainer = make_trainer(torch.device("cpu"), 1, 1, callbacks=[], logger=False, default_root_dir=tmp_path)
-    with pytest.raises(KeyboardInterrupt) as interrupted:
-        fit(trainer, OneWeight(), _Interrupted())
-    assert isinstance(
-        interrupted.value.__cause__, RuntimeError
-    )  # that of Lightning's teardown, which must not be printed
-
-
 @pytest.mark.parametrize("rows", [[[1e308, 1e308, 0], [1e308, -1e308, 0], [0, 0, 1]], [[1e200, 0, 0]] * 3])
 def test_rotation_whose_squares_are_beyond_floats_is_refused_without_a_warning(rows):
     assert not is_rotation(np.array(rows), 0.1)

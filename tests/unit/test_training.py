@@ -18,7 +18,6 @@ from small_lpips import random_lpips
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from dsr.app.trainer import has_idle_layers, seconds_per_step
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera
 from dsr.methods.networks.facets_method import AnyMap
@@ -345,8 +344,6 @@ def test_weight_average_follows_the_weights_with_its_decay(tmp_path: Path) -> No
 def test_average_has_the_statistics_of_batch_normalisation(tmp_path: Path) -> None:
     torch.manual_seed(0)
     module = SuperResolution(SparseToDense(2, width=8), DepthObjective("l1"))  # with 4, torch crashes where AVX2 is all
-    seconds_per_step(module, next(iter(_one_batch())))
-    assert not any(bool(mean.any()) for name, mean in module.net.named_buffers() if name.endswith("mean"))
     _trainer(tmp_path, max_epochs=2).fit(module, _one_batch())
     assert all(map(torch.equal, module.net.buffers(), module.average.buffers()))
     assert all(bool(mean.any()) for name, mean in module.average.named_buffers() if name.endswith("mean"))
@@ -356,17 +353,6 @@ def test_weights_are_stored_themselves_without_an_average(tmp_path: Path) -> Non
     module = _module(average=0.0)
     _trainer(tmp_path, max_epochs=2).fit(module, _one_batch())
     assert all(map(torch.equal, module.net.parameters(), module.average.parameters()))
-
-
-def test_layers_without_a_part_in_a_step_are_found_and_the_module_stays_as_it_was() -> None:
-    batch = next(iter(_one_batch()))
-    plain = _module()
-    idle = SuperResolution(FacetsUNet(2, 8, 8, 3), plain.objective)
-    for module, expected in ((plain, False), (idle, True)):  # the wide layers come after the third block
-        before = copy.deepcopy(module.state_dict())
-        assert has_idle_layers(module, batch) is expected
-        assert all(torch.equal(value, before[name]) for name, value in module.state_dict().items())
-        assert all(parameter.grad is None for parameter in module.parameters())
 
 
 def test_gradients_add_up_over_accumulated_batches(tmp_path: Path) -> None:

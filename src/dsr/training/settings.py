@@ -9,8 +9,7 @@ from dsr.utils.memory import expect_memory
 
 _MAX_DEPTH_SCALE = 3.0  # depth changes by a factor of exp(3) = 20 at most
 _MIN_SIZE = 16
-_BYTES, _BYTES_OF_WORKER = 256, 1 << 26
-"""Least memory of a pixel, as of a photo, a map and one layer of a network, and of a process that crops patches."""
+_BYTES, _BYTES_OF_WORKER = 256, 1 << 26  # least memory of a pixel with a layer of a network, and of a worker
 
 
 @dataclass(frozen=True)

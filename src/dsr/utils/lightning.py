@@ -1,15 +1,17 @@
-"""Lightning for trainings and per-image optimisations: the trainer, progress, interruption, logs."""
+"""Lightning for trainings and per-image optimisations: the trainer, its progress and its table of validations."""
 
 from __future__ import annotations
 
 import contextlib
 import csv
 import logging
+import signal
+import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import lightning
 import torch
@@ -17,58 +19,22 @@ from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.plugins.environments import ClusterEnvironment, LightningEnvironment
 
-from dsr.utils import interruption
-from dsr.utils.checkpoints import AtomicCheckpoints, CheckpointError, DivergenceError, Interruption, Resumed
+from dsr.utils.checkpoints import AtomicCheckpoints, Interruption
 from dsr.utils.configuration import ConfigError
+from dsr.utils.console import one_line
 from dsr.utils.files import FullDiskError, replacing, space_for
-from dsr.utils.guards import MOST_TABLE, read_limited
 from dsr.utils.progress import Progress, Task
 from dsr.utils.runs_table import SCORES, list_scores
 
-_COLUMNS = 4
-"""Columns of a table of validations."""
-LOG_EVERY = 10
-"""Steps between two values of a training in its log."""
-_SECONDS_BETWEEN_LOSSES = 0.2
-"""Between two losses that are fetched from the device to be shown, each of which waits for it."""
-
-
-NOT_OF_A_CALLBACK = (OSError, FullDiskError, ConfigError, DivergenceError, MemoryError, torch.OutOfMemoryError)
-"""Errors of a training that neither its checkpoint nor its callbacks have a part in."""
-_LOST = ("Connection closed", "Connection reset", "Broken pipe")
-"""What gloo says when another process is gone."""
-
-
-class LostProcessError(ConfigError):
-    """Another process of a training on several devices has ended.
-
-    Args:
-        error: what a communication with it raised.
-
-    """
-
-    def __init__(self, error: Exception) -> None:
-        text = str(error).partition("]")[2] or str(error)
-        reason = text.strip().partition("\n")[0].partition(". ")[0]
-        super().__init__(
-            f"another process of the training ended ({reason}); the same command continues from the latest checkpoint"
-        )
-
-
-class Scored(Protocol):
-    """A module that keeps the scores of its last validation, and those that it is compared with: by set, by metric.
-
-    ``validation_scores`` are in metres and fractions, ``shown_scores``, which are logged, in the units of tables.
-    """
-
-    validation_scores: dict[str, dict[str, float]]
-    shown_scores: dict[str, dict[str, float]]
+LOG_EVERY = 10  # steps between two values of a training in its log
+_SECONDS_BETWEEN_LOSSES = 0.2  # between two losses that are shown, each of which waits for the device
 
 
 class ValidationTable(Callback):
-    """Keeps the raw scores of all validations of a :class:`Scored` module in a file, to the last digit.
+    """Keeps the raw scores of all validations in a file, to the last digit: step, set, metric and value.
 
-    Its columns are step, set, metric and value.
+    The module's ``validation_scores`` are in metres and fractions, ``shown_scores``, which are logged, in the units of
+    tables; both by set and by metric.
 
     Args:
         path: the file's path.
@@ -83,28 +49,14 @@ class ValidationTable(Callback):
         if trainer.sanity_checking or not trainer.is_global_zero:
             return
         scored: Any = pl_module
-        step, before = trainer.global_step, self._read()
+        step, kept = trainer.global_step, []
+        if self._path.is_file():
+            with self._path.open(newline="", encoding="utf-8") as before:
+                kept = [row for row in list(csv.reader(before))[1:] if int(row[0]) < step]
         rows = [[str(step), kind, name, repr(value)]
                 for kind, each in scored.validation_scores.items() for name, value in each.items()]  # fmt: skip
         with replacing(self._path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-            kept = (row for row in before if int(row[0]) < step)
             csv.writer(file, lineterminator="\n").writerows([("step", "set", "metric", "value"), *kept, *rows])
-
-    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Check the rows from before an interruption."""
-        self._read()
-
-    def _read(self) -> list[list[str]]:
-        """Return the rows without their names; ConfigError where they are none."""
-        if not self._path.is_file():
-            return []
-        try:
-            rows = list(csv.reader(read_limited(self._path, MOST_TABLE).decode().splitlines()))[1:]
-            if all(len(row) == _COLUMNS and int(row[0]) >= 0 for row in rows):
-                return rows
-        except (ValueError, OSError, csv.Error):
-            pass
-        raise ConfigError(f"{self._path}: expected the scores of a training's validations, got a damaged file")
 
 
 class ListedScores(Callback):
@@ -132,23 +84,6 @@ class ListedScores(Callback):
                 list_scores(logger.experiment, scores, trainer.global_step)
 
 
-class LastValidation(Callback):
-    """Validates after the last step if the interval does not divide the number of steps.
-
-    Args:
-        interval: between validations, in steps.
-
-    """
-
-    def __init__(self, interval: int) -> None:
-        self._interval = interval
-
-    def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
-        """Let Lightning stop, which runs a validation."""
-        if trainer.global_step == trainer.max_steps and trainer.global_step % self._interval:
-            trainer.should_stop = True
-
-
 class StepProgress(Callback):
     """Shows the steps of a training with the latest loss, the scenes of a validation, and its scores.
 
@@ -160,11 +95,10 @@ class StepProgress(Callback):
     """
 
     def __init__(self, progress: Progress, name: str, subject: str = "") -> None:
-        self._progress, self._name, self._subject = progress, name, subject
-        self._stack = contextlib.ExitStack()
-        self._validation = contextlib.ExitStack()
-        self._steps: Task | None = None
-        self._scenes: Task | None = None
+        self._progress, self._name, self._subject = progress, name, f"{subject}: " if subject else ""
+        self._stack, self._validation = contextlib.ExitStack(), contextlib.ExitStack()
+        self._steps: Task = lambda *_, **__: None
+        self._scenes: Task = lambda *_, **__: None
         self._fetched, self._validated = 0.0, 0
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
@@ -174,8 +108,6 @@ class StepProgress(Callback):
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
         """Show a step; the loss is fetched from the device a few times a second."""
-        if self._steps is None:
-            return
         now, remark = time.monotonic(), None
         if now - self._fetched > _SECONDS_BETWEEN_LOSSES:
             self._fetched, remark = now, _loss_text(trainer)
@@ -183,41 +115,55 @@ class StepProgress(Callback):
 
     def on_validation_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Begin to show the scenes of a validation."""
-        total = sum(int(count) for count in trainer.num_val_batches)
-        self._validated = 0
+        self._validated, total = 0, sum(int(count) for count in trainer.num_val_batches)
         self._scenes = self._validation.enter_context(self._progress.task("validate", total))
 
     def on_validation_batch_end(self, *_: Any) -> None:
         """Show a scene."""
         self._validated += 1
-        if self._scenes is not None:
-            self._scenes(self._validated)
+        self._scenes(self._validated)
 
     def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Print the scores of the validation."""
+        """Print the scores of the validation, and first those of bicubic interpolation."""
         self._validation.close()
         scored: Any = pl_module
-        scores = scores_line(scored.shown_scores.get("val", {}))
+        scores, bicubic = (scores_line(scored.shown_scores.get(kind, {})) for kind in ("val", "bicubic"))
         if scores:
-            subject = f"{self._subject}: " if self._subject else ""
-            parts = (f"{subject}step {trainer.global_step:>6}", _loss_text(trainer), f"validation: {scores}")
+            parts = (f"{self._subject}step {trainer.global_step:>6}", _loss_text(trainer), f"validation: {scores}")
             self._progress.say("  ".join(filter(None, parts)))
-        bicubic = scores_line(scored.shown_scores.get("bicubic", {}))
         if bicubic and not trainer.global_step:
             self._progress.say(f"             bicubic:    {bicubic}")
 
-    def on_train_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Stop showing steps."""
-        self._close()
-
-    def on_exception(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, _: BaseException) -> None:
-        """Stop showing progress."""
-        self._close()
-
-    def _close(self) -> None:
+    def on_train_end(self, *_: Any) -> None:
         """Stop showing anything."""
         self._validation.close()
         self._stack.close()
+
+    def on_exception(self, *_: Any) -> None:
+        """Stop showing anything."""
+        self.on_train_end()
+
+
+class LastValidation(Callback):
+    """Validates after the last step if the interval does not divide the number of steps; the first callback.
+
+    Args:
+        interval: between validations, in steps.
+
+    """
+
+    def __init__(self, interval: int) -> None:
+        self._interval = interval
+        self.started = False  # and so what was to be restored is restored
+
+    def on_train_start(self, *_: Any) -> None:
+        """Note that the training starts."""
+        self.started = True
+
+    def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
+        """Let Lightning stop, which runs a validation."""
+        if trainer.global_step == trainer.max_steps and trainer.global_step % self._interval:
+            trainer.should_stop = True
 
 
 def make_trainer(
@@ -229,32 +175,25 @@ def make_trainer(
     devices: int = 1,
     accumulate: int = 1,
     environment: ClusterEnvironment | None = None,
-    make: Callable[..., lightning.Trainer] | None = None,
+    make: Callable[..., lightning.Trainer] = lightning.Trainer,
     **named: Any,
 ) -> lightning.Trainer:
     """Return a trainer for a number of steps, with a validation after every few and after the last one.
 
     Args:
-        device: to train on.
-        steps: of the training.
         interval: steps between two validations.
-        callbacks: of Lightning.
-        devices: how many devices of that kind to train on.
         accumulate: batches of a step.
         environment: what Lightning learns of the processes of several devices from; None where it starts them itself,
             whatever Slurm or MPI say.
-        make: function that makes the trainer; None for :class:`lightning.Trainer`.
+        make: makes the trainer of its arguments.
         **named: its other arguments.
 
     """
+    index: int | None = device.index  # torch's stubs say int
     with without_chatter():
-        defaults = {
-            "log_every_n_steps": min(LOG_EVERY, interval), "enable_progress_bar": False, "enable_model_summary": False,
-            "num_sanity_val_steps": 0,
-        }  # fmt: skip
-        return (make or lightning.Trainer)(
+        return make(
             accelerator="gpu" if device.type == "cuda" else device.type,
-            devices=_lightning_devices(device, devices),
+            devices=devices if index is None or devices > 1 else [index],
             max_steps=steps,
             accumulate_grad_batches=accumulate,
             val_check_interval=interval * accumulate,
@@ -262,7 +201,11 @@ def make_trainer(
             callbacks=[LastValidation(interval), *callbacks],
             plugins=[AtomicCheckpoints(), environment or LightningEnvironment()],
             use_distributed_sampler=False,
-            **{**defaults, **named},
+            log_every_n_steps=min(LOG_EVERY, interval),
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            num_sanity_val_steps=0,
+            **named,
         )
 
 
@@ -273,60 +216,33 @@ def fit(
     resume: Path | None = None,
     **named: Any,
 ) -> None:
-    """Train.
-
-    Raises:
-        KeyboardInterrupt: the training was interrupted.
-        FullDiskError: there is no space for its log or a checkpoint.
-        CheckpointError: the checkpoint to go on from is damaged, or one of another training.
-        LostProcessError: another process of it has ended, and this one has not been interrupted.
-
-    """
-    resumed = Resumed()
-    if resume is not None:
-        trainer.callbacks.append(resumed)  # type: ignore[attr-defined]
+    """Train; KeyboardInterrupt if it is interrupted, ConfigError if the checkpoint to go on from is none of it."""
+    callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
+    before = signal.getsignal(signal.SIGINT)
     try:
         with without_chatter(), space_for(Path(trainer.log_dir or trainer.default_root_dir)):
             trainer.fit(module, data, ckpt_path=resume, weights_only=True, **named)
     except SystemExit:  # Lightning turns an interruption into an exit with code 1
         if not trainer.interrupted:
             raise
+    except (OSError, FullDiskError, MemoryError, torch.OutOfMemoryError):
+        raise
     except Exception as error:
-        if _follows_interruption(error):  # Lightning's teardown fails if the interruption met its setup
-            raise KeyboardInterrupt from error
-        if _is_lost(error):
-            if any(each.requested for each in trainer.callbacks if isinstance(each, Interruption)):  # type: ignore[attr-defined]
-                raise KeyboardInterrupt from error  # the first process has saved the step
-            raise LostProcessError(error) from error
-        if resume is None or not resumed.restoring or isinstance(error, NOT_OF_A_CALLBACK):
+        if resume is None or any(isinstance(each, LastValidation) and each.started for each in callbacks):
             raise
-        raise CheckpointError(resume, error) from error
+        what = one_line(error).removeprefix(f"{resume}: ")
+        raise ConfigError(
+            f"{resume}: expected a checkpoint of this training, got a damaged or foreign one ({what:.200}); "
+            "overwrite=true starts again"
+        ) from error
     finally:
-        interruption.reinstall()  # Lightning ignores SIGINT after an interruption
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, before)  # which Lightning ignores after an interruption
     if trainer.interrupted:
+        for each in callbacks:
+            if isinstance(each, Interruption) and callable(signal.getsignal(each.signal.number or signal.SIGINT)):
+                signal.raise_signal(each.signal.number or signal.SIGINT)  # to who else waits for it, such as submitit
         raise KeyboardInterrupt
-
-
-def _follows_interruption(error: BaseException | None) -> bool:
-    """Return whether an error arose while an interruption was handled."""
-    while error is not None and not isinstance(error, KeyboardInterrupt):
-        error = error.__context__
-    return error is not None
-
-
-def _is_lost(error: Exception) -> bool:
-    """Return whether an error says that another process of the training is gone."""
-    if not torch.distributed.is_available():
-        return False
-    gone = isinstance(error, RuntimeError) and "gloo" in str(error) and any(text in str(error) for text in _LOST)
-    return gone or isinstance(error, torch.distributed.DistError)
-
-
-def _lightning_devices(device: torch.device, count: int) -> Any:
-    """Return the devices for Lightning: their number, or a list of one."""
-    if device.type != "cpu" and count == 1 and device.index is not None:
-        return [device.index]
-    return count
 
 
 def _loss_text(trainer: lightning.Trainer) -> str:
@@ -350,16 +266,8 @@ def without_chatter() -> Iterator[None]:
         logger.setLevel(logging.ERROR)
     try:
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", ".*does not have many workers.*")
-            warnings.filterwarnings("ignore", ".*smaller than the logging interval.*")
-            warnings.filterwarnings("ignore", ".*sync_dist=True.*")  # metrics are the same on every device
-            warnings.filterwarnings("ignore", ".*was called before the ``update``.*")  # devices may have no scene
-            for resumed in ("exists and is not empty", "that ended before the epoch ended", "dirpath has changed"):
-                warnings.filterwarnings("ignore", f".*{resumed}.*")
-            warnings.filterwarnings("ignore", ".*`srun` command is available.*")  # a sweep's or a login node's Slurm
-            warnings.filterwarnings("ignore", ".*callbacks used to create the checkpoint.*")  # shows a stranger's names
-            warnings.filterwarnings("ignore", ".*LeafSpec.*", FutureWarning)
-            warnings.filterwarnings("ignore", ".*LeafSpec.*", DeprecationWarning)
+            warnings.filterwarnings("ignore", module=r"(lightning|torchmetrics)\.")
+            warnings.filterwarnings("ignore", ".*LeafSpec.*")
             yield
     finally:
         for logger, level in zip(loggers, levels, strict=True):

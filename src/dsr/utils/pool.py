@@ -9,12 +9,12 @@ import os
 import pickle
 import signal
 import sys
-import threading
-import warnings
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, Self, TypeVar
+
+from dsr.utils import interruption
 
 _Item = TypeVar("_Item")
 _Value = TypeVar("_Value")
@@ -103,7 +103,7 @@ class Pool:
         while True:
             executor = self._executors[-1]
             try:
-                with _without_interrupts():
+                with interruption.starting_workers():
                     return [executor.submit(_call, function, item) for item in items], executor
             except BrokenProcessPool:
                 self._replace(executor)
@@ -120,31 +120,10 @@ class Pool:
         return ProcessPoolExecutor(self._count, multiprocessing.get_context("spawn"), _begin, self._plan)
 
 
-@contextlib.contextmanager
-def _without_interrupts() -> Iterator[None]:
-    """Start processes that ignore Ctrl-C, which reaches all processes of a terminal; it is left to this one."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
 def _begin(plan: bytes, threads: int | None) -> None:
     """Prepare a worker, which ends with its parent."""
-
-    def end_with_parent() -> None:
-        parent = multiprocessing.parent_process()
-        if parent is not None:
-            parent.join()
-        os._exit(1)
-
-    threading.Thread(target=end_with_parent, daemon=True).start()
+    interruption.end_with(os.getppid())
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
-    warnings.filterwarnings("ignore", category=RuntimeWarning, module=r"(dsr|numpy)\b")
     _set_threads(threads)
     prepare, arguments = pickle.loads(plan)  # noqa: S301 - of the parent
     if prepare is not None:

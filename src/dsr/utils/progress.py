@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from typing import Literal, Protocol, TypeVar
 
-Steps = Callable[[int, int], object]
-"""Is called with the number of steps done and their total."""
+Steps = Callable[[int, int], object]  # is called with the number of steps done and their total
 Unit = Literal["items", "bytes"]
 Item = TypeVar("Item")
 
@@ -16,14 +15,7 @@ class Task(Protocol):
     """A piece of work under way; it is cheap to call in a loop."""
 
     def __call__(self, done: int, total: int | None = None, remark: str | None = None) -> None:
-        """Report how much is done.
-
-        Args:
-            done: amount of work done; less than before if the work starts again.
-            total: amount of all work; None if unchanged or unknown.
-            remark: short text shown beside the numbers; None if unchanged.
-
-        """
+        """Report how much is done, of how much, and a short text shown beside the numbers; None if unchanged."""
         ...
 
 
@@ -36,15 +28,8 @@ class Progress:
     def task(
         self, name: str, total: int | None = None, *, done: int = 0, unit: Unit = "items"
     ) -> contextlib.AbstractContextManager[Task]:
-        """Return a context in which a piece of work is shown, below the one that is already under way.
-
-        Args:
-            name: what is done, such as ``train``.
-            done: amount of work done before.
-            unit: what the amounts count.
-
-        """
-        return contextlib.nullcontext(_ignore)
+        """Return a context in which a piece of work is shown, ``done`` units of which were done before."""
+        return contextlib.nullcontext(ignore)
 
     def track(
         self,
@@ -54,28 +39,18 @@ class Progress:
         *,
         label: Callable[[Item], str] = str,
         lines: bool = True,
-        shares: Mapping[str, float] | None = None,
     ) -> Iterator[Item]:
         """Yield items, and show how many are done.
 
         Args:
             total: number of items; None where ``items`` can be counted.
-            label: returns the name of an item.
             lines: whether each item gets a line if the output is not a terminal; False if the caller prints one.
-            shares: of the time of an item, by the stages that it goes through, in their order; see :meth:`stage`. They
-                are what is expected until an item is done.
 
         """
         yield from items
 
-    def stage(self, name: str, seconds: float | None = None) -> None:
-        """Say that the item that is being worked on begins a stage.
-
-        Args:
-            name: one of the stages in ``shares`` of :meth:`track`.
-            seconds: about how long it takes, where that is known.
-
-        """
+    def stage(self, name: str) -> None:
+        """Say that the item that is being worked on begins a stage."""
 
 
 SILENT = Progress()
@@ -97,7 +72,7 @@ class StepsProgress(Progress):
         """Return a context in which the steps of a task are reported, unless it is part of another."""
         steps, all_steps = self._steps, total or 0
         if steps is None or self._busy:
-            yield _ignore
+            yield ignore
             return
 
         def report(done: int, total: int | None = None, remark: str | None = None) -> None:
@@ -116,7 +91,7 @@ def part_of(progress: Steps | None, before: int, total: int) -> Steps | None:
     return None if progress is None else lambda done, _: progress(before + done, total)
 
 
-def _ignore(done: int, total: int | None = None, remark: str | None = None) -> None:
+def ignore(done: int, total: int | None = None, remark: str | None = None) -> None:
     """Report nothing."""
 
 

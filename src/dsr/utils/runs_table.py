@@ -16,10 +16,10 @@ from torch.utils.tensorboard.summary import hparams
 from torch.utils.tensorboard.writer import SummaryWriter
 
 Kind = Literal["training", "evaluation", "optimisation"]
+# TensorBoard sorts settings that differ, and then the others, by name, and shows five until more are chosen.
 COLUMNS = ("dataset", "degradation", "method", "scale", "w", "kind", "seed", "steps")
-"""Settings; TensorBoard sorts those that differ, and then the others, by name, and shows five until more are chosen."""
-_COMPARED = ("dataset", "degradation", "method", "scale", "w")
-"""The ones that runs are compared by."""
+_COMPARED = COLUMNS[:5]
+_NUMBERS = ("scale", "seed")  # that every run has; the others are text, as the type must not differ between runs
 SCORES = {
     "RMSE_v": "RMSE_v (1/1000)",
     "RMSE_v1": "RMSE_v1 (1/1000), worst light",
@@ -28,25 +28,24 @@ SCORES = {
     "RMSE_d": "RMSE_d (mm)",
     "BadPix_v_5": "BadPix_v (5, %), worst light",
     "Bumpiness_d": "Bump_d",
-}
-"""Metrics, with the headings of their columns, in the units of tables."""
-_NUMBERS = ("scale", "seed")
-"""Columns that every run has a number for; the others are text, as the type must not differ between runs."""
-_ABSENT = "-"
+}  # with the headings of their columns, in the units of tables
 
 
 def list_run(writer: SummaryWriter, kind: Kind, settings: Mapping[str, Any], scores: Mapping[str, float]) -> None:
-    """Put a run into the table of runs.
-
-    Args:
-        settings: values by column; others are left out, and absent ones are a dash.
-        scores: see :func:`list_scores`; empty if there are none yet.
-
-    """
+    """Put a run into the table of runs; settings of other names are left out, and absent ones are a dash."""
     given = {**settings, "kind": kind}
     values = {name: given[name] if name in _NUMBERS else _text(given.get(name)) for name in COLUMNS}
+    types = {name: DataType.DATA_TYPE_FLOAT64 if name in _NUMBERS else DataType.DATA_TYPE_STRING for name in COLUMNS}
+    experiment = Experiment(
+        hparam_infos=[HParamInfo(name=name, type=type_, differs=name in _COMPARED) for name, type_ in types.items()],
+        metric_infos=[
+            MetricInfo(name=MetricName(tag=f"score/{name}"), display_name=title) for name, title in SCORES.items()
+        ],
+    )
+    about = metadata.create_summary_metadata(HParamsPluginData(experiment=experiment))
+    columns = Summary(value=[Summary.Value(tag=metadata.EXPERIMENT_TAG, metadata=about)])
     _, start, end = hparams(values, {})
-    for part in (_columns(), start, end):
+    for part in (columns, start, end):
         writer.file_writer.add_summary(part)  # type: ignore[attr-defined]  # torch's stubs say None
     list_scores(writer, scores)
 
@@ -57,21 +56,8 @@ def list_scores(writer: SummaryWriter, scores: Mapping[str, float], step: int = 
         writer.add_scalar(f"score/{name}", value, step)
 
 
-def _columns() -> Summary:
-    """Return the summary that says which columns there are."""
-    types = {name: DataType.DATA_TYPE_FLOAT64 if name in _NUMBERS else DataType.DATA_TYPE_STRING for name in COLUMNS}
-    experiment = Experiment(
-        hparam_infos=[HParamInfo(name=name, type=kind, differs=name in _COMPARED) for name, kind in types.items()],
-        metric_infos=[
-            MetricInfo(name=MetricName(tag=f"score/{name}"), display_name=title) for name, title in SCORES.items()
-        ],
-    )
-    about = metadata.create_summary_metadata(HParamsPluginData(experiment=experiment))
-    return Summary(value=[Summary.Value(tag=metadata.EXPERIMENT_TAG, metadata=about)])
-
-
 def _text(value: Any) -> str:
     """Return a value as text, a dash for an absent one."""
     if value is None:
-        return _ABSENT
+        return "-"
     return f"{value:.3g}" if isinstance(value, float) else str(value)

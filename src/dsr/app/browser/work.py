@@ -92,7 +92,7 @@ class _Steps(Progress):
         yield report
         send(done=0, total=0)
 
-    def stage(self, name: str, seconds: float | None = None) -> None:
+    def stage(self, name: str) -> None:
         """Send which stage of the frame begins."""
         send(stage=name)
 

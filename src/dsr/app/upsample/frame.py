@@ -7,7 +7,7 @@ import functools
 import math
 import platform
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -47,12 +47,8 @@ from dsr.utils.versions import package_versions
 
 TO_DO, COMPLETE = "to do", "complete already"
 """Outcomes of a picture that is not computed."""
-STAGES = {"reading": 0.03, "upsampling": 0.57, "writing": 0.4}
-"""Shares of the time of a phone's frame, by the names that they have in ``info.json``."""
 _WHITE = 1.5
 """Noise that is alike over fewer pixels counts as white."""
-_MEASURABLE = 0.02
-"""Least seconds of a core from which the load of the machine is estimated."""
 _GLASS = 0.005
 """Share of the pixels that look like glass from which it is said."""
 _PACKAGES = ("dsr", "torch", "numpy", "opencv-python-headless")
@@ -137,8 +133,7 @@ class FrameWork:
         picture = self._read(pair)
         picture = replace(picture, assumptions=(*picture.assumptions, *self._frames.warnings.get(pair.name, ())))
         picture, identified = prepare(picture, how.sensor, functools.partial(sequence.fuse, pair))
-        with times.computing():
-            picture = align(picture, register=request.reading.register)
+        picture = align(picture, register=request.reading.register)
         size_lr = (picture.depth_lr.shape[-2], picture.depth_lr.shape[-1])
         size = (picture.camera.height, picture.camera.width)
         planned = self._upsampler.plan(size, size_lr)
@@ -153,7 +148,7 @@ class FrameWork:
         expect_free(target, inputs, ours=wanted.overwrite or job.earlier is not None)
         errors = any(part.errors for part in wanted.of_frame)
         surface = kept_surface(target, picture.camera, errors=errors) if job.reusable else None
-        times.begin("upsampling", planned.seconds if surface is None else 0.0)
+        times.begin("upsampling")
         if surface is not None and job.earlier is not None:
             times.keep(job.earlier.seconds)
             surface = surface._replace(filled=find_filled(surface.depth, picture.depth_lr))
@@ -199,27 +194,17 @@ class FrameWork:
 
 
 class Times:
-    """Measures the seconds of each stage of a picture and shows its progress; some may be known beforehand."""
+    """Measures the seconds of each stage of a picture and shows which one begins; some may be known beforehand."""
 
     def __init__(self, progress: Progress, **seconds: float) -> None:
         self._progress, self._seconds = progress, {stage: round(each, 3) for stage, each in seconds.items()}
         self._stage, self._since, self._kept = "", 0.0, {}  # type: str, float, Mapping[str, float]
-        self._slower = 1.0
 
-    def begin(self, stage: str, seconds: float | None = None) -> None:
-        """Begin one of :data:`STAGES`; ``seconds`` is its estimated duration on idle cores, if known."""
+    def begin(self, stage: str) -> None:
+        """Begin reading, upsampling or writing."""
         self.read()
         self._stage, self._since = stage, time.perf_counter()
-        self._progress.stage(stage, None if seconds is None else seconds * self._slower)
-
-    @contextlib.contextmanager
-    def computing(self) -> Iterator[None]:
-        """Observe by a computation of one thread how much longer it takes beside other work than on an idle core."""
-        started, used = time.perf_counter(), time.thread_time()
-        yield
-        passed, used = time.perf_counter() - started, time.thread_time() - used
-        if used >= _MEASURABLE:
-            self._slower = max(passed / used, 1.0)
+        self._progress.stage(stage)
 
     def read(self) -> dict[str, float]:
         """Return the seconds of each stage so far, to milliseconds, and their sum as ``total``."""

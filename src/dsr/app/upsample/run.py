@@ -101,7 +101,7 @@ def _run(request: UpsampleRequest, frames: Frames, console: Console) -> list[str
     expect_targets(wanted.output, of_all if shard is None else [_summary_of(shard)])
     _show_found(console, request, frames)
     found, single = frames.found, frames.single
-    reporter, progress = Reporter(console), ConsoleProgress(console, since=started)
+    reporter, progress = Reporter(console), ConsoleProgress(console)
     problems: dict[str, list[str]] = {}
     outcomes: Counter[str] = Counter()
     targets: dict[str, Path] = {}

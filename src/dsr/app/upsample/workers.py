@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from dsr.app.upsample.frame import STAGES, FrameWork
+from dsr.app.upsample.frame import FrameWork
 from dsr.app.upsample.frames import Frames
 from dsr.app.upsample.reporting import Messages, Record, Reporter
 from dsr.app.upsample.request import UpsampleRequest
@@ -41,7 +41,7 @@ def work_through(request: UpsampleRequest, frames: Frames, reporter: Reporter, p
     work = FrameWork(request, frames)  # raises for poses that do not fit
     frames = work.check_together(jobs)
     if workers <= 1:
-        for pair, target in progress.track(jobs, "upsample", label=lambda job: job[0].name, lines=False, shares=STAGES):
+        for pair, target in progress.track(jobs, "upsample", label=lambda job: job[0].name, lines=False):
             yield attempt(work, pair, target, reporter, progress)
         return
     left, threads = list(jobs), max(1, (os.cpu_count() or 1) // workers)
