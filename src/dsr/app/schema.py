@@ -348,11 +348,16 @@ class TrainConfig(RunConfig):
         return min(math.ceil(self.trainer["val_check_interval"] / self.accumulate), self.steps)
 
 
-def given_keys() -> list[str]:
-    """Return the keys that the command line sets, without + or ~; none outside of a Hydra command."""
+def given_overrides() -> list[str]:
+    """Return the overrides of the command line or of the job of a multirun; none outside of a Hydra command."""
     if not HydraConfig.initialized():
         return []
-    return [override.partition("=")[0].lstrip("+~") for override in HydraConfig.get().overrides.task]
+    return list(OmegaConf.to_container(HydraConfig.get().overrides.task, resolve=False))  # type: ignore[arg-type]
+
+
+def given_keys() -> list[str]:
+    """Return the keys that the command line sets, without + or ~; none outside of a Hydra command."""
+    return [override.partition("=")[0].lstrip("+~") for override in given_overrides()]
 
 
 def user_directories() -> tuple[Path, ...]:
@@ -380,7 +385,11 @@ def plain_config(config: DictConfig) -> dict[str, Any]:
     nodes = {group: node for group, node in plain.items() if group in NAMED and isinstance(node, Mapping)}
     named = {group: str(node["_target_"]).rpartition(".")[2] for group, node in nodes.items() if "_target_" in node}
     if HydraConfig.initialized():
-        named |= {group: name for group, name in HydraConfig.get().runtime.choices.items() if group in NAMED}
+        choices = HydraConfig.get().runtime.choices
+        if lists := named.keys() - choices.keys():
+            group = lists.pop()
+            raise ConfigError(f"{group}: expected one choice, got a list; -m {group}=A,B runs each of several")
+        named |= {group: name for group, name in choices.items() if group in NAMED}
     plain["names"] = named | {
         group: str(name) for group, name in (plain.get("names") or {}).items() if name is not None
     }
