@@ -180,7 +180,7 @@ def test_pipe_that_nobody_writes_to_is_not_waited_for(tmp_path, read):
 def test_configuration_of_10000_nested_lists_is_refused_at_once(tmp_path):
     path = tmp_path / "config.yaml"
     path.write_text("model: " + "[" * 10_000 + "]" * 10_000)
-    with pytest.raises(ConfigError, match=r"config\.yaml: line 1: expected plain values, got nested ones"):
+    with pytest.raises(ConfigError, match=r"config\.yaml: line 1: expected plain values"):
         read_plain_yaml(path)
 
 

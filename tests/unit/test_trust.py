@@ -18,6 +18,7 @@ CONFIG = {
     "dataset": {"_target_": "dsr.data.rendered.Procedural", "count": 6, "size": 64},
     "downsampling": {"_target_": "dsr.degradation.downsampling.Downsampling", "kernel": "box"},
     "noise": {"_target_": "dsr.degradation.noise.no_noise"},
+    "trainer": {"max_steps": 1},
     "scale": 4,
     "seed": 0,
 }

@@ -11,18 +11,28 @@ import re
 import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor
+from pathlib import Path
 from typing import Any, NoReturn
 
 import hydra
+from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from dsr.app.experiments import register_resolvers
-from dsr.app.schema import EvalConfig, TrainConfig, given_overrides, plain_config, register, user_directories
+from dsr.app.schema import (
+    EvalConfig,
+    TrainConfig,
+    explain_value,
+    given_overrides,
+    plain_config,
+    register,
+    user_directories,
+)
 from dsr.utils import interruption
 from dsr.utils.configuration import ConfigError, config_directories
 from dsr.utils.console import USAGE_ERROR, one_line, print_error
@@ -79,13 +89,11 @@ def run_command(name: str, command: Callable[[DictConfig], Any], arguments: Sequ
     except KeyboardInterrupt as interrupted:
         sys.exit(interruption.stop(str(interrupted)))
     except (HydraException, OmegaConfBaseException) as error:
-        fail(explain(error))
-    except (ConfigError, OSError, FullDiskError, YAMLError, BrokenExecutor) as error:
-        fail(one_line(error))
-    except ValueError as error:
-        if begun:
-            raise
-        fail(one_line(error))  # of Hydra's, as for method=null
+        fail(_damaged_file() or explain(error))
+    except (OSError, FullDiskError, ValueError, YAMLError, RecursionError, BrokenExecutor) as error:
+        if begun and isinstance(error, ValueError | RecursionError) and not isinstance(error, ConfigError):
+            raise  # a defect of the command's
+        fail(_damaged_file() or one_line(error))
     finally:
         sys.argv = process
 
@@ -124,6 +132,17 @@ def fail(message: str) -> NoReturn:
     sys.exit(USAGE_ERROR)
 
 
+def _damaged_file() -> str:
+    """Return which of the user's configuration files cannot be read, one line; empty if all can."""
+    folder = get_args_parser().parse_known_args(sys.argv[1:])[0].config_dir
+    for path in sorted(Path(folder or "nowhere").glob("*/*.yaml")):
+        try:
+            OmegaConf.load(path)
+        except Exception as error:  # damaged YAML raises many types
+            return f"{path}: expected a readable YAML file, got {type(error).__name__}"
+    return ""
+
+
 def explain(error: Exception) -> str:
     """Return the first sentence of an error of Hydra's or OmegaConf's, with the keys or choices that there are."""
     if isinstance(error, MissingConfigException) and error.options:
@@ -137,11 +156,6 @@ def explain(error: Exception) -> str:
     key = override[1] if override else str(getattr(cause, "full_key", None) or "")
     if str(error).startswith("Ambiguous value"):
         return f"{key}: expected one value, got several; -m runs each of them, {key}=[...] is a list"
-    if " not in " in str(cause) and getattr(cause, "parent_node", None) is not None:
-        keys = [str(each) for each in cause.parent_node if not str(each).startswith("_")]
-        meant = did_you_mean(key.rpartition(".")[2], keys)
-        return f"{key}: unknown key; expected one of {', '.join(keys)}{meant}; +{key}=... adds one"
     if "No match in the defaults list" in str(error):
         return f"{key}: expected a choice that the command has; +{key}=... adds one"
-    first = str(cause).partition("\n")[0]
-    return f"{key}: {first}" if key else first
+    return explain_value(cause, key) if isinstance(cause, OmegaConfBaseException) else one_line(error)

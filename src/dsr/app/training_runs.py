@@ -6,16 +6,16 @@ import contextlib
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any
 
-from dsr.app.schema import Config, RunConfig, TrainConfig, user_directories
+from dsr.app.schema import Config, TrainConfig, user_directories
 from dsr.app.trust import Trust, expect_trusted, read_plain_yaml
 from dsr.data.scene_source import SceneSource, SceneSubset
 from dsr.degradation.downsampling import Downsampling
 from dsr.training.data_module import Part, PatchData
 from dsr.training.degradation import Degradation
 from dsr.training.settings import PatchSettings
-from dsr.utils.configuration import ConfigError, build, check_types, load_target, with_key
+from dsr.utils.configuration import ConfigError, build, load_target, with_key
 from dsr.utils.guards import is_number
 
 WEIGHTS = "weights.safetensors"
@@ -40,36 +40,15 @@ def read_config(folder: Path, trust: Any = None) -> dict[str, Any]:
     config = read_plain_yaml(path)
     if "model" not in config:
         raise ConfigError(f"{folder}: expected the directory of a training, its config.yaml names no model")
-    _check_types(path, config)
+    try:
+        TrainConfig.of(config)
+        for key in ("model", "dataset", "downsampling", "noise"):
+            if not isinstance(config["names"].get(key), str):
+                raise ConfigError(f"names.{key}: expected text, got {config['names'].get(key)!r:.60}")
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
     expect_trusted(path, config, Trust.of(trust, user_directories()))
     return config
-
-
-def _check_types(file: Path, config: Mapping[Any, Any]) -> None:
-    """Check that the values of a run's configuration have the types of the schema."""
-    kinds = get_type_hints(TrainConfig)
-    try:
-        for key in (*_FROM_RUN, "model"):
-            if key not in config:
-                raise ConfigError(f"{key}: missing")
-        check_types(TrainConfig, {key: value for key, value in config.items() if key in kinds})
-        for key in ("start", "loss", "metrics"):
-            part = config.get(key, {})
-            if not isinstance(part, Mapping):
-                raise ConfigError(f"{key}: expected keys, got {part!r:.60}")
-            names = {entry.name for entry in dataclasses.fields(kinds[key])}
-            check_types(kinds[key], {name: value for name, value in part.items() if name in names}, f"{key}.")
-        named = config.get("names")
-        for key in ("model", "dataset", "downsampling", "noise"):
-            name = named.get(key) if isinstance(named, Mapping) else None
-            if not isinstance(name, str):
-                raise ConfigError(f"names.{key}: expected text, got {name!r:.60}")
-        net = config["model"].get("net")
-        if not isinstance(net, Mapping) or "_target_" not in net:
-            raise ConfigError("model.net._target_: missing")
-        RunConfig.check(RunConfig(precision=config.get("precision", "auto"), seed=config["seed"]))
-    except ConfigError as error:
-        raise ConfigError(f"{file}: {error}") from error
 
 
 def studies_of_run(plain: Config, given: Sequence[str]) -> Iterator[tuple[dict[str, Any], SceneSource | None]]:

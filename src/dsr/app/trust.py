@@ -24,6 +24,7 @@ from dsr.utils.configuration import ConfigError, config_directories
 from dsr.utils.guards import read_limited
 
 _LARGEST = 1 << 18  # bytes of a run's configuration
+_DEEPEST = 30  # nested keys and lists
 _TARGETS = ("_target_", "network")  # keys whose value is imported
 
 
@@ -46,16 +47,21 @@ class Trust:
 
 def read_plain_yaml(path: Path) -> dict[str, Any]:
     """Return the keys of a YAML file; aliases, which a bomb is made of, and interpolations are refused."""
+    depth = 0
     try:
         text = read_limited(path, _LARGEST).decode()
-        if "${" in text or any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
-            raise ConfigError("got an alias or an interpolation")
+        for event in yaml.parse(text, Loader=yaml.SafeLoader):
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if isinstance(event, yaml.AliasEvent) or depth > _DEEPEST or "${" in getattr(event, "value", ""):
+                line = event.start_mark.line + 1
+                raise ConfigError(f"{path}: line {line}: expected plain values, got an alias, ${{...}} or nested ones")
         content = OmegaConf.to_container(OmegaConf.create(text))
-        if not isinstance(content, dict):
-            raise ConfigError("got none")
-    except (OSError, ValueError, RecursionError, yaml.YAMLError, OmegaConfBaseException) as error:
-        reason = str(error) if isinstance(error, ConfigError) else f"got {type(error).__name__}"
-        raise ConfigError(f"{path}: expected YAML of keys and plain values, {reason}") from error
+    except ConfigError:
+        raise
+    except (OSError, ValueError, yaml.YAMLError, OmegaConfBaseException) as error:
+        raise ConfigError(f"{path}: expected YAML of keys and plain values, got {type(error).__name__}") from error
+    if not isinstance(content, dict):
+        raise ConfigError(f"{path}: expected keys and values")
     return {str(key): value for key, value in content.items()}
 
 
