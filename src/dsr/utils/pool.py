@@ -22,7 +22,7 @@ from typing import Any, Generic, Literal, Self, TypeVar, cast
 import cv2
 import torch
 
-from dsr.utils import interruption, surroundings
+from dsr.utils import interruption
 
 _T = TypeVar("_T")
 _R = TypeVar("_R")
@@ -227,7 +227,6 @@ class Pool(Generic[_T, _R]):
 def _serve(connection: Connection, parent: int, plan: tuple[Any, ...] | None) -> None:
     """Work on items in a worker, until it is terminated."""
     interruption.end_with(parent, terminated=True)
-    surroundings.close_to_settings()
     with contextlib.suppress(EOFError, KeyboardInterrupt):  # the parent was interrupted, or has ended this process
         work, prepare, arguments, threads = connection.recv() if plan is None else plan
         if plan is None:
