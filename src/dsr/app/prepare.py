@@ -28,9 +28,6 @@ def prepare_dataset(name: str, overrides: Sequence[str], console: Console, confi
         console: where progress is shown.
         config_dirs: the user's own directories of configuration files.
 
-    Raises:
-        ConfigError: the data set is unknown, its files are missing, or a scene cannot be read (the others are drawn).
-
     """
     source = _source(name, overrides, config_dirs)
     progress = ConsoleProgress(console)
