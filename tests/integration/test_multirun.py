@@ -64,7 +64,7 @@ def test_every_job_that_cannot_be_run_is_named(multirun, tmp_path):
 def test_jobs_that_would_share_a_directory_are_refused(multirun, tmp_path):
     code, output, errors = multirun("eval", *SMALL, "method=bicubic,nearest,bilinear", "output_dir=out")
     assert (code, output) == (2, [])
-    assert sum("output_dir: expected one for each job" in line for line in errors) == 2
+    assert sum("output_dir: expected a directory for each job" in line for line in errors) == 2
     assert list(tmp_path.iterdir()) == []
 
 

@@ -371,7 +371,7 @@ USAGE_ERRORS = {
         ["+model.optimizer.momentum=0.9"],
         "model.optimizer.momentum: unknown key; ",
     ),
-    "a misspelt argument of the trainer": (["+trainer.max_step=3"], "trainer.max_step: unknown key; expected"),
+    "a misspelt argument of the trainer": (["+trainer.max_step=3"], "trainer.max_step: unknown key; "),
     "an argument of the trainer that dsr sets": (
         ["+trainer.num_nodes=2"],
         "trainer.num_nodes: unknown key; dsr sets it",
@@ -389,7 +389,7 @@ USAGE_ERRORS = {
     "a weight of a model without": (["model=msg", "loss.w=1"], "loss.w: model=msg has "),
     "a mistyped visual loss": (["loss.visual=ssim"], "loss.visual: "),
     "a visual loss without its network": (["loss.visual=lpips", "metrics.lpips_trunk=none.pth"], "loss.visual: lpips "),
-    "a mistyped key": (["trainer.step=3"], "trainer.step: unknown key; expected trainer.max_steps=3"),
+    "a mistyped key": (["trainer.step=3"], "trainer.step: unknown key; expected one of "),
     "too few scenes": (["dataset.count=1"], "patches.validation_scenes: "),
     "a measured map": (["downsampling=measured"], "downsampling: "),
     "a scale": (["scale=3"], "scale: "),

@@ -106,12 +106,12 @@ def test_missing_key_is_refused_with_how_to_set_it():
 @pytest.mark.parametrize(
     ("key", "value", "expected"),
     [
-        ("root", 3, "str, got 3"), ("root", None, "str, got None"), ("root", "", ""),
+        ("root", 3, "text, got 3"), ("root", None, "text, got None"), ("root", "", ""),
         ("names", "a", ".*, got 'a'"), ("names", [1], ".*, got \\[1\\]"),
-        ("share", "x", "float, got 'x'"), ("share", True, "float, got True"),
-        ("count", 1.5, "int, got 1.5"), ("count", True, "int, got True"),
-        ("order", "mid", ".*, got 'mid'"), ("flag", "yes", "bool, got 'yes'"),
-        ("flag", 1, "bool, got 1"), ("file", 1, ".*, got 1"),
+        ("share", "x", "a number, got 'x'"), ("share", True, "a number, got True"),
+        ("count", 1.5, "a whole number, got 1.5"), ("count", True, "a whole number, got True"),
+        ("order", "mid", ".*, got 'mid'"), ("flag", "yes", "true or false, got 'yes'"),
+        ("flag", 1, "true or false, got 1"), ("file", 1, ".*, got 1"),
     ],
 )  # fmt: skip
 def test_value_of_the_wrong_type_is_refused_with_the_expected_type(key, value, expected):
@@ -173,7 +173,7 @@ def settings(**changes):
     [
         ({"scale": 3}, "scale: expected one of 2, 4, 8, 16"), ({"precision": "float16"}, "precision: expected one of "),
         ({"seed": -1}, "seed: "), ({"seed": True}, "seed: "),
-        ({"dataset": 5}, "dataset: "), ({"method": "???"}, "method: expected"), ({"dataset": None}, "dataset: "),
+        ({"dataset": 5}, "dataset: "), ({"method": "???"}, "method: missing"), ({"dataset": None}, "dataset: "),
         ({"scal": 4}, r"scal: unknown key; .*did you mean scale\?"),
         ({"metrics": {"lpips": False, "lpip": 1}}, "metrics.lpip: unknown key; "),
         ({"workers": 0}, "workers: expected auto or "),

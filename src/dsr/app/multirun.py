@@ -24,16 +24,7 @@ from dsr.utils.console import USAGE_ERROR, one_line, open_console, print_error, 
 
 @dataclass(frozen=True)
 class Plan:
-    """The outline of a job, as far as it is known beforehand.
-
-    Args:
-        folder: the directory of its run.
-        identity: what its results depend on, see :func:`dsr.app.run_directory.identity_of`.
-        unit: what its work is counted in: scenes or steps.
-        left: how many of them are left to do.
-        done: how many are complete.
-
-    """
+    """The outline of a job: its directory and identity, and how many units (scenes or steps) are left and done."""
 
     folder: Path
     identity: Identity

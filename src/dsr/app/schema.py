@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any, Self
 
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import MISSING, DictConfig, OmegaConf
-from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+from omegaconf.errors import OmegaConfBaseException
 
 from dsr.utils.configuration import ConfigError, build
 from dsr.utils.guards import is_number
@@ -85,9 +85,16 @@ class RunConfig:
     def of(cls, plain: Config) -> Self:
         """Return the settings of a composed configuration; OmegaConf checks names and types, :meth:`check` values."""
         try:
-            settings: Self = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(cls), dict(plain)))  # type: ignore[assignment]
+            merged = OmegaConf.merge(OmegaConf.structured(cls), dict(plain))
+            values: dict[str, Any] = OmegaConf.to_container(merged, resolve=True)  # type: ignore[assignment]
         except OmegaConfBaseException as error:
             raise ConfigError(explain_value(error, error.full_key or "")) from error
+        for key, value in values.items():
+            if value == MISSING:  # within a node it may be missing: a part of a mixture need not be used
+                raise ConfigError(f"{key}: missing; give it as {key}=...")
+        parts: dict[str, Any] = {each.name: each.default_factory for each in fields(cls)}
+        settings = cls(**{key: parts[key](**value) if is_dataclass(parts[key]) else value
+                          for key, value in values.items()})  # fmt: skip
         settings.check()
         return settings
 
@@ -223,8 +230,6 @@ class TrainConfig(RunConfig):
 def explain_value(error: OmegaConfBaseException, key: str) -> str:
     """Return what OmegaConf says of a key: its first sentence, or the keys that there are beside an unknown one."""
     first = str(error).partition("\n")[0]
-    if isinstance(error, MissingMandatoryValue):
-        return f"{key}: expected a value, {key}=..."
     if " not in " in first and error.parent_node is not None:
         keys = [str(each) for each in error.parent_node if not str(each).startswith("_")]
         meant = did_you_mean(key.rpartition(".")[2], keys)
@@ -266,9 +271,9 @@ def plain_config(config: DictConfig) -> dict[str, Any]:
     named = {group: str(node["_target_"]).rpartition(".")[2] for group, node in nodes.items() if "_target_" in node}
     if HydraConfig.initialized():
         choices = HydraConfig.get().runtime.choices
-        if lists := named.keys() - choices.keys():
-            group = lists.pop()
-            raise ConfigError(f"{group}: expected one choice, got a list; -m {group}=A,B runs each of several")
+        for group in named.keys() - choices.keys():
+            if any(each.startswith(f"{group}=[") for each in given_overrides()):
+                raise ConfigError(f"{group}: expected one choice, got a list; -m {group}=A,B runs each of several")
         named |= {group: name for group, name in choices.items() if group in NAMED}
     plain["names"] = named | {
         group: str(name) for group, name in (plain.get("names") or {}).items() if name is not None

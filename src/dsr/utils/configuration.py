@@ -101,9 +101,7 @@ def _checked(group: str, node: Node, given: Mapping[str, Any], name: str | None)
         if value == "":  # which as a path would be the current directory
             raise ConfigError(f"{group}.{key}: expected a text of one character or more, or null for none")
         if key in hints and not _is_node(value) and not _fits(value, hints[key]):
-            hint = parameters[key].annotation
-            hint = getattr(hint, "__name__", str(hint)).removeprefix("typing.")
-            raise ConfigError(f"{group}.{key}: expected {hint}, got {value!r:.60}")
+            raise ConfigError(f"{group}.{key}: expected {_describe(hints[key])}, got {value!r:.60}")
     return target, {**arguments, **given}
 
 
@@ -166,6 +164,26 @@ def _fits(value: Any, hint: Any) -> bool:
     if origin is not None or not isinstance(accepted, type | tuple):
         return origin is not Callable  # which no plain value is; another kind is its target's to check
     return isinstance(value, accepted) and (hint in (bool, Any) or not isinstance(value, bool))
+
+
+def _describe(hint: Any) -> str:
+    """Return a type for a reader."""
+    origin = get_origin(hint)
+    if origin in (Union, types.UnionType):
+        *others, last = (_describe(choice) for choice in get_args(hint))
+        return f"{', '.join(others)} or {last}"
+    if origin is Literal:
+        names = [str(choice) for choice in get_args(hint)]
+        return names[0] if len(names) == 1 else f"one of {', '.join(names)}"
+    if origin is not None and issubclass(origin, Sequence):
+        return f"a list of {_describe(get_args(hint)[0])}"
+    if origin is not None and issubclass(origin, Mapping):
+        return f"keys, each with {_describe(get_args(hint)[1])}"
+    if origin is Callable:
+        return "a node with _target_"
+    types_of = {float: "a number", int: "a whole number", str: "text", bool: "true or false", Any: "a value",
+                type(None): "null"}  # fmt: skip
+    return types_of.get(hint, getattr(hint, "__name__", str(hint)))
 
 
 def config_directories(more: Sequence[Path] = ()) -> tuple[Path, ...]:
