@@ -158,8 +158,6 @@ def configuration_reference(conf: Path) -> str:
     commands = [f"## {name}.py\n\n{_file_text(conf / f'{name}.yaml')}" for name in ("eval", "train")]
     folders = [folder for folder in sorted(conf.iterdir()) if folder.is_dir() and folder.name != "hydra"]
     groups = [_group_section(folder, folder.name) for folder in folders]
-    launchers = conf / "hydra" / "launcher"
-    groups += [_group_section(launchers, "hydra/launcher")] if launchers.is_dir() else []
     return "\n".join([_HEAD_CONFIGURATION, *commands, *groups])
 
 

@@ -92,7 +92,7 @@ def test_prepare_draws_a_contact_sheet_and_errors_are_one_line(tmp_path, monkeyp
     wrong = {
         ("icl",): "dataset=icl: expected its files in nowhere/icl_nuim, got no such directory; get it with",
         ("icll",): "dataset=icll: unknown; expected one of arkitscenes, cleargrasp, ",
-        ("icl", "dataset.sizes=3"): "dataset.sizes: unknown key; expected dataset.size=3",
+        ("icl", "dataset.sizes=3"): "dataset.sizes: unknown key; expected one of ",
         ("paper_train",): "dataset=paper_train: expected one data set, it has the parts middlebury_train, sintel, pro",
     }
     for arguments, message in wrong.items():

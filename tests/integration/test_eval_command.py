@@ -302,7 +302,7 @@ def test_errors_that_a_method_states_are_scored_and_scaled_with_the_prediction(t
 
 
 USAGE_ERRORS = {
-    "an added key": (["+scal=8"], "scal: unknown key; expected names, dataset, "),
+    "an added key": (["+scal=8"], "scal: unknown key; expected one of names, "),
     "an added key of a group": (["+method.sharp=1"], "method.sharp: unknown key; method=bicubic takes order, "),
     "a group taken away": (["~method"], "method: missing"),
     "a scale that is none": (["scale=3"], "scale: "),

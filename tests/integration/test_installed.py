@@ -59,11 +59,6 @@ def test_the_wheel_holds_every_configuration_file(installed):
     assert files(installed / "dsr" / "conf") == files(REPOSITORY / "conf")
 
 
-def test_the_wheel_holds_the_launchers_where_hydra_looks_for_them(installed):
-    assert (installed / "hydra_plugins" / "dsr_launchers.py").is_file()
-    assert not (installed / "hydra_plugins" / "__init__.py").exists()  # it would hide those of other packages
-
-
 def test_installed_eval_writes_scores(dsr, tmp_path):
     dsr("eval", "dataset.size=64", "dataset.scenes=[statue]", "method=facets", "output_dir=out", *SMALL)
     assert (tmp_path / "out" / "scores.csv").is_file()

@@ -1,7 +1,10 @@
 """A multirun is refused before anything is computed if one of its jobs cannot be run, and says what it will do."""
 
 import os
-import re
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -9,36 +12,38 @@ from commands import run_python
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 SMALL = ("dataset.size=64", "metrics.lpips=false", "device=cpu")
-TRAINING = ("trainer=smoke", "dataset.count=6", *SMALL)
-RECORDS = "hydra.sweep.dir=records"
 
 
 @pytest.fixture
-def multirun(tmp_path, dsr_cache):
+def multirun(tmp_path, dsr_cache, monkeypatch):
     """Return a runner of a multirun: the exit code, the lines of its output and those of its errors."""
-    folders = {"DSR_CACHE": str(dsr_cache), "DSR_DATA": "data"}
+    for name, value in (("DSR_CACHE", str(dsr_cache)), ("DSR_DATA", "data"), ("OMP_NUM_THREADS", "1")):
+        monkeypatch.setenv(name, value)
 
     def call(command, *arguments):
-        environment = {**os.environ, **folders, "OMP_NUM_THREADS": "1"}
-        done = run_python(str(REPOSITORY / f"{command}.py"), "-m", *arguments, cwd=tmp_path, env=environment)
+        done = run_python(str(REPOSITORY / f"{command}.py"), "-m", *arguments, cwd=tmp_path, env=dict(os.environ))
         return done.returncode, done.stdout.splitlines(), done.stderr.splitlines()
 
     return call
 
 
-@pytest.mark.parametrize("launcher", ["basic", "joblib"])
-def test_data_set_that_is_absent_refuses_the_multirun_before_anything_is_computed(multirun, tmp_path, launcher):
-    if launcher == "joblib":
-        pytest.importorskip("joblib")
-    code, output, errors = multirun(
-        "eval", "dataset=simgeo,icl", "method=bicubic", "metrics.lpips=false", f"hydra/launcher={launcher}"
-    )
+@pytest.mark.parametrize(
+    ("command", "arguments"),
+    [
+        ("eval", ("dataset=simgeo,icl", "method=dip_v")),
+        ("eval", ("dataset=simgeo,icl", "method=bicubic", "hydra/launcher=joblib")),
+        ("train", ("dataset=procedural,icl", "trainer=smoke", "metrics.lpips=false")),
+    ],
+)
+def test_data_set_that_is_absent_refuses_the_multirun_before_anything_is_computed(
+    multirun, tmp_path, command, arguments
+):
+    begin = time.monotonic()
+    code, output, errors = multirun(command, *arguments)
     assert (code, output) == (2, [])
-    assert errors == [
-        "error: 1 of 2 jobs cannot be run, so none is begun",
-        "error: dataset=icl: expected its files in data/icl_nuim, got no such directory; get it with: dsr data get "
-        "icl; or say where it is: dataset.root=DIR",
-    ]
+    assert time.monotonic() - begin < 60
+    assert errors[0] == "error: 1 of the jobs cannot be run, so none is begun"
+    assert ": dataset=icl: expected its files in data/icl_nuim" in errors[1]
     assert list(tmp_path.iterdir()) == []
 
 
@@ -49,57 +54,81 @@ def test_every_job_that_cannot_be_run_is_named(multirun, tmp_path):
         "eval", *SMALL, "method=bicubic,msg_v", "seed=1,2", "output_dir=out/${seed}", "weights=nowhere"
     )
     assert (code, output) == (2, [])
-    foreign = "output_dir: out/2 holds files of something else; another output_dir keeps them"
-    unfound = "weights: method=msg_v: expected a file of weights, got nowhere (no such file)"
-    assert [line for line in errors if line.startswith("error")] == [
-        "error: 3 of 4 jobs cannot be run, so none is begun", f"error: method=bicubic seed=2: {foreign}",
-        f"error: method=msg_v seed=1: {unfound}", f"error: method=msg_v seed=2: {unfound}",
-    ]  # fmt: skip
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    named = [line for line in errors if line.startswith("error: dataset.size=64")]
+    assert ["method=bicubic seed=2" in named[0], "output_dir: out/2" in named[0]] == [True, True]
+    assert all("weights: method=msg_v: expected a file of weights, got nowhere" in line for line in named[1:])
+    assert len(named) == 3
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["2"]
 
 
 def test_jobs_that_would_share_a_directory_are_refused(multirun, tmp_path):
     code, output, errors = multirun("eval", *SMALL, "method=bicubic,nearest,bilinear", "output_dir=out")
     assert (code, output) == (2, [])
-    assert [line.partition(" got ")[0] for line in errors] == [
-        "error: 2 of 3 jobs cannot be run, so none is begun",
-        "error: method=nearest: output_dir: expected a directory for each job,",
-        "error: method=bilinear: output_dir: expected a directory for each job,",
-    ]
+    assert sum("output_dir: expected a directory for each job" in line for line in errors) == 2
     assert list(tmp_path.iterdir()) == []
 
 
-def test_scenes_of_all_jobs_are_counted_and_complete_ones_are_no_work(multirun, tmp_path):
-    arguments = (*SMALL, "method=dip,dip_v", "++method.steps=1", "dataset.scenes=[statue,cube_no_texture]", RECORDS)
+@pytest.mark.parametrize("launcher", ["basic", "joblib"])
+def test_jobs_are_run_and_complete_scenes_are_no_work(multirun, tmp_path, launcher):
+    arguments = (*SMALL, "method=bicubic,nearest", "dataset.scenes=[statue]", f"hydra/launcher={launcher}")
     code, output, errors = multirun("eval", *arguments)
-    assert (code, errors) == (0, [])
-    assert output[0] == "2 jobs, 4 scenes"
-    first, _ = (tmp_path / "outputs" / "eval").iterdir()
-    (first / "predictions" / "statue.npz").unlink()
-    code, output, errors = multirun("eval", *arguments)
-    assert (code, errors) == (0, [])
-    assert output[0] == "2 jobs, 1 scene (3 more are complete)"
-    assert sum("predictions re-used" in line for line in output) == 2
-    assert multirun("eval", *arguments)[1][0] == "2 jobs, 0 scenes (4 more are complete)"
-
-
-def test_training_that_cannot_be_run_refuses_the_others(multirun, tmp_path):
-    code, output, errors = multirun("train", "trainer=smoke", "dataset=procedural,icl", *SMALL)
-    assert (code, output) == (2, [])
-    assert errors[0] == "error: 1 of 2 jobs cannot be run, so none is begun"
-    assert errors[-1].startswith("error: dataset=icl: expected its files in ")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_time_of_all_trainings_is_said_once_and_a_complete_one_is_no_work(multirun):
-    code, output, errors = multirun("train", *TRAINING, "seed=0", RECORDS)
-    assert (code, errors) == (0, [])
-    assert re.fullmatch(r"1 job, 2 steps: about \d+ s", output[0])
-    code, output, errors = multirun("train", *TRAINING, "seed=0,1", RECORDS)
-    assert code == 2
-    assert re.fullmatch(r"2 jobs, 2 steps \(2 more are complete\): about \d+ s", output[0])
-    assert [line.partition("; ")[0].partition(" outputs")[0] for line in errors][1:] == [
-        "error: 1 of 2 jobs failed", "error: seed=0: output_dir:"
+    assert (code, errors, output[0]) == (0, [], "2 runs, scenes to do: 2")
+    assert sorted(path.name for path in (tmp_path / "outputs" / "eval").iterdir()) == [
+        "bicubic_x4_simgeo_scenes-statue_size64_seed0", "nearest_x4_simgeo_scenes-statue_size64_seed0"
     ]  # fmt: skip
-    assert sum(line.startswith("weights: ") for line in output) == 1
+    assert multirun("eval", *arguments)[1][0] == "2 runs, scenes to do: 0 (2 more are complete)"
+
+
+SWEEP = """
+import os, sys, time
+from pathlib import Path
+from dsr.app.entry import run_command
+from dsr.utils.configuration import ConfigError
+
+def job(config):
+    import torch
+    Path(f"job-{config.seed}").write_text(f"{os.getpid()} {torch.get_num_threads()}")
+    if config.seed == 1:
+        raise ConfigError("seed: not this one")
+    if config.seed == 3:
+        time.sleep(60)
+
+if __name__ == "__main__":
+    run_command("eval", job, sys.argv[1:])
+"""
+
+
+@pytest.fixture
+def sweep(tmp_path, monkeypatch):
+    """Start a sweep of two jobs at once over seeds; a job fails with 1, and waits with 3."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.setenv("PYTHONPATH", str(REPOSITORY / "src"))
+    (tmp_path / "sweep.py").write_text(SWEEP)
+    joblib = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
+
+    def begin(seeds):
+        command = [sys.executable, "sweep.py", "-m", f"seed={seeds}", "method=bicubic", *joblib]
+        return subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+
+    return begin
+
+
+def test_jobs_in_processes_of_joblib_share_the_cores_and_a_failing_one_is_named(sweep, tmp_path):
+    _, error = (process := sweep("0,1,2")).communicate(timeout=120)
+    assert process.returncode == 2
+    assert error.splitlines()[-1] == "error: a job failed, seed=1 method=bicubic: seed: not this one"
+    threads = [int((tmp_path / f"job-{seed}").read_text().split()[1]) for seed in range(3)]
+    assert max(threads) <= max(1, len(os.sched_getaffinity(0)) // 2)
+
+
+def test_interrupted_sweep_stops_its_jobs(sweep, tmp_path):
+    process, pid = sweep("3"), tmp_path / "job-3"
+    deadline = time.monotonic() + 60
+    while not (pid.is_file() and pid.read_text()) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=30)
+    assert process.returncode == 130
+    time.sleep(2)
+    assert not Path("/proc", pid.read_text().split()[0]).exists()

@@ -180,7 +180,7 @@ def test_network_from_outside_is_trained_evaluated_and_used(home):
         assert done.returncode == 0, done.stderr
     done = run(home, program, "run=training", "output_dir=runs/refused")
     assert done.returncode == 2
-    assert "training/config.yaml: model.net._target_: expected a target of dsr's own model group" in done.stderr
+    assert "training/config.yaml: model.net._target_: expected a target of dsr's own" in done.stderr
     assert "if you trust it, trust=outside.Shifted allows it" in done.stderr
     done = upsample(home, "--method", "shifted", "-o", "by_network")
     assert done.returncode == 0, done.stderr

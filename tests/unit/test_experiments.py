@@ -8,7 +8,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from dsr.app.composition import compose
-from dsr.app.experiments import register_resolvers, with_keys_of_swept_groups, without_overridden_sweeps
+from dsr.app.experiments import register_resolvers
 from dsr.app.schema import EvalConfig, TrainConfig, plain_config
 from dsr.app.training_runs import training_data
 from dsr.methods.base import Method
@@ -92,30 +92,3 @@ def test_paper_tables_runs_the_data_sets_that_are_here(tmp_path, monkeypatch, ca
     assert "left out" in (note := capsys.readouterr().err)
     assert note.count("\n") == 1
     assert "icl" in note
-
-
-def test_a_value_on_the_command_line_replaces_the_sweep_over_it():
-    arguments = ["+experiment=noise", "method=facets", "scale=8"]
-    assert without_overridden_sweeps(arguments, DIRECTORIES) == [*arguments, "~hydra.sweeper.params.method"]
-
-
-def test_keys_of_swept_groups_may_be_added():
-    keys = ["method.range=truth", "dataset.root=DIR", "seed=1"]
-    for sweep in (["-m", "method=pgsr,svlrm"], ["--multirun", "+experiment=published_networks"]):
-        found = with_keys_of_swept_groups([*sweep, *keys], DIRECTORIES)
-        assert found[:3] == [*sweep, "++method.range=truth"]
-        assert found[4:] == ["seed=1"]
-    assert with_keys_of_swept_groups(["-m", "scale=4,8", *keys], DIRECTORIES) == ["-m", "scale=4,8", *keys]
-    assert with_keys_of_swept_groups(["method=pgsr", *keys], DIRECTORIES) == ["method=pgsr", *keys]
-
-
-def test_own_experiments_are_narrowed_too(tmp_path):
-    (tmp_path / "experiment").mkdir()
-    (tmp_path / "experiment" / "mine.yaml").write_text("hydra: {sweeper: {params: {seed: '0,1'}}}\n")
-    found = without_overridden_sweeps(["+experiment=mine", "seed=2"], (*DIRECTORIES, tmp_path))
-    assert found[-1] == "~hydra.sweeper.params.seed"
-
-
-def test_an_experiment_without_a_sweep_is_left_as_it_is():
-    arguments = ["+experiment=facets_box_x4", "scale=8"]
-    assert without_overridden_sweeps(arguments, DIRECTORIES) == arguments

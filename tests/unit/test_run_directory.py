@@ -15,7 +15,6 @@ from dsr.app.run_directory import (
     claim,
     default_directory,
     expect_free,
-    folder_of,
     identity_of,
 )
 from dsr.app.schema import plain_config
@@ -258,17 +257,3 @@ def test_versions_outside_of_a_checkout_have_no_commit(monkeypatch, tmp_path):
 def test_missing_package_is_recorded_as_such():
     found = package_versions(["dsr", "no-such-package-here"])
     assert found == {"dsr": dsr.__version__, "no-such-package-here": "not installed"}
-
-
-@pytest.mark.parametrize(("name", "reason"), [
-    ("x" * 300, "got xxx.*xxx \\(File name too long\\)$"),
-    ("~nobody-of-this-name/x", "got '~nobody-of-this-name/x'"),
-])  # fmt: skip
-def test_directory_that_cannot_be_named_so_is_refused_in_one_short_line(name, reason):
-    with pytest.raises(ConfigError, match=f"^output_dir: expected a (directory|path), {reason}") as caught:
-        folder_of(name)
-    assert len(str(caught.value)) < 150
-
-
-def test_directory_of_a_run_need_not_exist(tmp_path):
-    assert folder_of(tmp_path / "a" / "b") == tmp_path / "a" / "b"

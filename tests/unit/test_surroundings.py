@@ -1,4 +1,4 @@
-"""Files of the directory that a command is run in have no say in it: no code of theirs runs, no setting counts."""
+"""Files of the directory that a command is run in have no say in it: no code of theirs runs."""
 
 import os
 import subprocess
@@ -12,12 +12,11 @@ SCRIPT = "from dsr.__main__ import main\nif __name__ == '__main__':\n    main()\
 MODULES = ("cv2", "json", "matplotlib", "multiprocessing", "numpy", "pickle", "pydantic", "rich", "sitecustomize",
            "torch", "usercustomize", "yaml", "zlib")  # fmt: skip
 LIBRARIES = ("libc.so.6", "libz.so.1", "libm.so.6", "libpcre2-8.so.0")
-SETTINGS = ("text.usetex: true\n", "axes.facecolor: blue\nno such line\n", b"\xff\xfe\x00")
 
 
 @pytest.fixture
 def hostile(tmp_path: Path) -> Path:
-    """A directory full of files that leave a mark when they are run, and of settings."""
+    """A directory full of files that leave a mark when they are run."""
     folder = tmp_path / "work"
     folder.mkdir()
     mark = f"open({str(tmp_path / 'mark')!r}, 'a').write(__name__)\n"
@@ -29,11 +28,6 @@ def hostile(tmp_path: Path) -> Path:
     (folder / "hydra_plugins" / "mine.py").write_text(mark)
     (folder / "conf" / "method").mkdir(parents=True)
     (folder / "conf" / "method" / "nearest.yaml").write_text("_target_: os.getcwd\n")
-    (folder / "matplotlibrc").write_text(SETTINGS[0])
-    (tmp_path / "bin").mkdir()
-    latex = tmp_path / "bin" / "latex"
-    latex.write_text(f"#!/bin/sh\necho latex >> {tmp_path / 'mark'}\nexit 1\n")
-    latex.chmod(0o755)
     (tmp_path / "dsr.script").write_text(SCRIPT)
     for number in range(2):
         captures.save(tmp_path / "in" / "rgb" / f"{number}.png", captures.photo(number))
@@ -46,7 +40,6 @@ def run(folder: Path, *arguments: object, by: str = "script") -> subprocess.Comp
     start = [str(folder.parent / "dsr.script")] if by == "script" else ["-m", "dsr"]
     modules = [path for path in sys.path if path and Path(path).resolve() != folder]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(modules), "OMP_NUM_THREADS": "1"}
-    environment["PATH"] = f"{folder.parent / 'bin'}{os.pathsep}{environment['PATH']}"
     environment.pop("LD_LIBRARY_PATH", None)
     return subprocess.run(
         [sys.executable, *start, *map(str, arguments)],
@@ -60,7 +53,7 @@ def upsampling(folder: Path) -> tuple[object, ...]:
             "nearest", "--workers", "2")  # fmt: skip
 
 
-def test_no_code_or_setting_of_the_working_directory_counts_for_a_command_and_its_workers(hostile, tmp_path):
+def test_no_code_of_the_working_directory_counts_for_a_command_and_its_workers(hostile, tmp_path):
     done = run(hostile, *upsampling(hostile))
     assert (done.returncode, done.stderr) == (0, "")
     assert not (tmp_path / "mark").exists()
@@ -80,36 +73,3 @@ def test_of_the_working_directory_a_module_imports_no_more_than_python_itself_be
     done = run(hostile, *upsampling(hostile), by="module")
     assert (done.returncode, done.stderr) == (0, "")
     assert not (tmp_path / "mark").exists()
-
-
-@pytest.mark.parametrize("content", SETTINGS)
-def test_figures_are_the_same_whatever_settings_lie_in_the_working_directory(tmp_path, content):
-    draw = (
-        "from dsr.utils import surroundings; surroundings.close()\n"
-        "import matplotlib as mpl; print(sorted((k, str(v)) for k, v in mpl.rcParams.items()))"
-    )
-    (tmp_path / "draw.py").write_text(draw)
-    found = []
-    for name in ("with", "without"):
-        (tmp_path / name).mkdir()
-        if name == "with":
-            path = tmp_path / name / "matplotlibrc"
-            path.write_bytes(content) if isinstance(content, bytes) else path.write_text(content)
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-        done = subprocess.run([sys.executable, tmp_path / "draw.py"], check=True, cwd=tmp_path / name, env=environment,
-                              capture_output=True, text=True)  # fmt: skip
-        found.append((done.stdout, done.stderr))
-    assert found[0] == found[1]
-
-
-def test_settings_that_the_user_names_still_count(tmp_path):
-    (tmp_path / "own").write_text("axes.facecolor: blue\n")
-    code = (
-        "from dsr.utils import surroundings; surroundings.close()\n"
-        "import matplotlib as mpl; print(mpl.rcParams['axes.facecolor'])"
-    )
-    (tmp_path / "draw.py").write_text(code)
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "MATPLOTLIBRC": str(tmp_path / "own")}
-    done = subprocess.run([sys.executable, tmp_path / "draw.py"], check=True, cwd=tmp_path, env=environment,
-                          capture_output=True, text=True)  # fmt: skip
-    assert done.stdout == "blue\n"

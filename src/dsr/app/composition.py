@@ -14,16 +14,13 @@ from dsr.app.schema import NAMED, register
 from dsr.utils.configuration import config_directories
 
 
-def compose(
-    name: str, overrides: Sequence[str] = (), directories: Sequence[Path] = (), *, with_hydra: bool = False
-) -> DictConfig:
+def compose(name: str, overrides: Sequence[str] = (), directories: Sequence[Path] = ()) -> DictConfig:
     """Compose the configuration of a command, as in ``compose("train", ["model=msg_v", "scale=8"])``.
 
     Args:
         name: ``train`` or ``eval``.
         overrides: as on the command line.
         directories: of configuration files of your own.
-        with_hydra: whether Hydra's own settings are there, too.
 
     Example:
         >>> import dsr
@@ -42,13 +39,12 @@ def compose(
     try:
         with hydra.initialize_config_dir(str(project), version_base="1.3"):
             config = hydra.compose(name, [*overrides, *more], return_hydra_config=True)
-            with open_dict(config):
-                choices = config.hydra.runtime.choices
-                given = {group: name for group, name in config.names.items() if name is not None}
-                config.names = {each: choices[each] for each in NAMED if each in choices} | given
-                if not with_hydra:
-                    del config["hydra"]
-            return config
     finally:
         if running is not None:
             GlobalHydra.instance().initialize(running)
+    with open_dict(config):
+        choices = config.hydra.runtime.choices
+        given = {group: name for group, name in config.names.items() if name is not None}
+        config.names = {each: choices[each] for each in NAMED if each in choices} | given
+        del config["hydra"]
+    return config

@@ -9,8 +9,7 @@ from dsr.data.download.collections import CATALOGUE, Collection, Item
 from dsr.methods import weights
 from dsr.utils.versions import DISTRIBUTION
 
-_URL = "Weights"
-"""The label under which ``project.urls`` of pyproject.toml has the address of the release's files."""
+_URL = "Weights"  # the label of the release's files in ``project.urls`` of pyproject.toml
 
 
 def downloads() -> Mapping[str, Collection]:

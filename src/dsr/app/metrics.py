@@ -21,12 +21,7 @@ if TYPE_CHECKING:
 
 
 def chosen_metrics(settings: MetricsConfig, regions: Sequence[str] = ()) -> tuple[Metric, ...]:
-    """Return the metrics to compute, those of some regions of the scenes, too.
-
-    Raises:
-        ConfigError: a metric or the network's file is not valid.
-
-    """
+    """Return the metrics to compute, those of some regions of the scenes, too."""
     extra = extra_metrics(settings)
     return catalogue(_network(settings, extra), extra, settings.protocols, regions)
 
@@ -41,12 +36,7 @@ def metric_collection(settings: MetricsConfig) -> torchmetrics.MetricCollection:
 
 
 def check_metrics(settings: MetricsConfig) -> None:
-    """Check a configuration's metrics, before anything is written.
-
-    Raises:
-        ConfigError: a metric, the alignment or the network's file is not valid.
-
-    """
+    """Check a configuration's metrics, their alignment and the file of LPIPS's network, before anything is written."""
     extra_metrics(settings)
     if settings.alignment not in ALIGNMENTS:
         raise ConfigError(f"metrics.alignment: expected one of {', '.join(ALIGNMENTS)}, got {settings.alignment!r}")
@@ -55,15 +45,9 @@ def check_metrics(settings: MetricsConfig) -> None:
 
 
 def extra_metrics(settings: MetricsConfig) -> tuple[Metric, ...]:
-    """Return the metrics beside those of the protocols.
-
-    Raises:
-        ConfigError: there is no such metric or protocol, or two metrics have one name.
-
-    """
-    paths = settings.extra
-    metrics = tuple(load_object("metrics.extra", path, "a dsr.metrics.catalogue.Metric") for path in paths)
-    for path, metric in zip(paths, metrics, strict=True):
+    """Return the metrics beside those of the protocols, whose names have to be unique."""
+    metrics = tuple(load_object("metrics.extra", path, "a dsr.metrics.catalogue.Metric") for path in settings.extra)
+    for path, metric in zip(settings.extra, metrics, strict=True):
         if not isinstance(metric, Metric):
             raise ConfigError(f"metrics.extra: expected a dsr.metrics.catalogue.Metric, {path!r} is none")
     try:
@@ -86,13 +70,8 @@ def perceptual_network(trunk: str | None) -> LPIPS | None:
     """Return the LPIPS network; without weights of its trunk, print one line of advice, and return None."""
     try:
         return load_lpips(None if trunk is None else Path(trunk).expanduser())
-    except OSError as error:
-        if trunk is not None:
+    except (OSError, ValueError) as error:
+        if trunk is not None or isinstance(error, ValueError):
             raise ConfigError(f"metrics.lpips_trunk: {error}") from error
-        print(  # noqa: T201
-            f"LPIPS_v is left out: AlexNet's weights {one_line(error)}; {GET_TRUNK}",
-            file=sys.stderr,
-        )
+        print(f"LPIPS_v is left out: AlexNet's weights {one_line(error)}; {GET_TRUNK}", file=sys.stderr)  # noqa: T201
         return None
-    except ValueError as error:
-        raise ConfigError(f"metrics.lpips_trunk: {error}") from error

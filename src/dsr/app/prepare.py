@@ -10,12 +10,12 @@ from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
 from dsr.app.composition import compose
-from dsr.app.explain import explain
+from dsr.app.entry import explain
 from dsr.app.schema import EvalConfig, plain_config
 from dsr.data.scene_source import SceneSource, prepare_scenes
 from dsr.pictures.sheets import save_contact_sheet
 from dsr.sample import Scene
-from dsr.utils.configuration import ConfigError, config_directories
+from dsr.utils.configuration import ConfigError
 from dsr.utils.console import ConsoleProgress, one_line, show
 
 
@@ -27,9 +27,6 @@ def prepare_dataset(name: str, overrides: Sequence[str], console: Console, confi
         overrides: overrides as on the command line of ``eval.py``, such as ``dataset.size=256``.
         console: where progress is shown.
         config_dirs: the user's own directories of configuration files.
-
-    Raises:
-        ConfigError: the data set is unknown, its files are missing, or a scene cannot be read (the others are drawn).
 
     """
     source = _source(name, overrides, config_dirs)
@@ -51,12 +48,10 @@ def prepare_dataset(name: str, overrides: Sequence[str], console: Console, confi
 
 def _source(name: str, overrides: Sequence[str], config_dirs: Sequence[Path]) -> SceneSource:
     """Build the data set that a configuration describes."""
-    directories = config_directories(config_dirs)
-    arguments = [f"dataset={name}", *overrides]
     try:
-        plain = plain_config(compose("eval", arguments, config_dirs))
+        plain = plain_config(compose("eval", [f"dataset={name}", *overrides], config_dirs))
     except (HydraException, OmegaConfBaseException) as error:
-        raise ConfigError(explain(error, "eval", arguments, directories)) from error
+        raise ConfigError(explain(error)) from error
     if "parts" in plain["dataset"]:
         parts = ", ".join(plain["dataset"]["parts"])
         raise ConfigError(f"dataset={name}: expected one data set, it has the parts {parts}")

@@ -18,8 +18,7 @@ from dsr.app.run_names import NOT_IDENTITY, run_name
 from dsr.app.schema import Config, Identity
 from dsr.app.trust import imported
 from dsr.utils import locks
-from dsr.utils.configuration import ConfigError, expand_home
-from dsr.utils.console import shorten
+from dsr.utils.configuration import ConfigError
 from dsr.utils.files import TargetError, expect_own, expect_target, write_text
 from dsr.utils.guards import parse_json, read_limited
 from dsr.utils.versions import RESULTS, SCENES, hash_outside_code, versions
@@ -32,19 +31,10 @@ _NO_BITS = ("log_every_n_steps", "profiler", "detect_anomaly", "enable_progress_
 def identity_of(
     config: Config, weights_hash: str | None, device: torch.device, targets: Iterable[str] = ()
 ) -> dict[str, Any]:
-    """Return everything that a run's results depend on, as plain values: settings, weights, kind of device.
+    """Return everything that a run's results depend on, as plain values: settings, weights, kind of device, code.
 
-    Of the metrics it has how predictions are aligned before they are scored, where they are; the rest may change.
-
-    The code counts by its numbers in :mod:`dsr.utils.versions`, that of the user's own classes by its hash.
-
-    Args:
-        config: the run's configuration.
-        weights_hash: the hash of the file of weights; None for none.
-        device: the device that computes the predictions.
-        targets: dotted paths of classes and functions in addition to those that the groups of ``config`` name; the
-            code of those outside dsr is part of the identity.
-
+    Of the metrics it has how predictions are aligned before they are scored, where they are; the rest may change. The
+    code counts by its numbers in :mod:`dsr.utils.versions`, the user's own classes, ``targets`` among them, by a hash.
     """
     kept = {key: value for key, value in config.items() if key not in NOT_IDENTITY}
     if isinstance(kept.get("trainer"), Mapping):
@@ -66,7 +56,7 @@ def default_directory(kind: str, config: Config, identity: Identity) -> Path:
     name, complete = run_name(kind, config, identity)
     plain = Path("outputs") / kind / name
     marked = plain.with_name(f"{name}-{_hash_of(identity)[:8]}")
-    return plain if complete and not marked.is_dir() and _may_hold(plain, identity) else marked
+    return plain if complete and not marked.is_dir() and _changes_in(plain, identity) == [] else marked
 
 
 def _hash_of(identity: Identity) -> str:
@@ -74,19 +64,15 @@ def _hash_of(identity: Identity) -> str:
     return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
 
 
-def _identity_in(folder: Path) -> dict[str, Any]:
-    """Return the identity of the run in a directory; an OSError, ValueError, KeyError or TypeError if there is none."""
-    return dict(parse_json(read_limited(folder / _RECORD), finite=False)["identity"])
-
-
-def _may_hold(folder: Path, identity: Identity) -> bool:
-    """Return whether a directory does not exist yet, or is empty, or is that of a run of this identity."""
+def _changes_in(folder: Path, identity: Identity) -> list[str] | None:
+    """Return the keys in which the run in a directory differs; None if the directory holds something else."""
+    if not folder.is_dir() or _is_unused(folder):
+        return [] if folder.is_dir() or not folder.exists() else None
     try:
-        if not folder.is_dir() or _is_unused(folder):
-            return not folder.exists() or folder.is_dir()
-        return not _changes(_identity_in(folder), json.loads(json.dumps(identity)))
+        before = dict(parse_json(read_limited(folder / _RECORD), finite=False)["identity"])
     except (OSError, ValueError, KeyError, TypeError):
-        return False
+        return None
+    return _changes(before, json.loads(json.dumps(identity)))
 
 
 def degradation_of(config: Config, *, assumes: bool = False) -> str:
@@ -110,39 +96,15 @@ def degradation_of(config: Config, *, assumes: bool = False) -> str:
 
 
 def folder_of(output_dir: str | Path) -> Path:
-    """Return the directory of a run, which need not exist.
-
-    Raises:
-        ConfigError: no directory can have such a name.
-
-    """
-    folder = expand_home("output_dir", str(output_dir))
-    try:
-        folder.lstat()
-    except (FileNotFoundError, NotADirectoryError, PermissionError):
-        pass
-    except OSError as error:
-        raise ConfigError(
-            f"output_dir: expected a directory, got {shorten(str(folder), 60)} ({error.strerror})"
-        ) from error
-    return folder
+    """Return the directory of a run, which need not exist."""
+    return Path(output_dir).expanduser()
 
 
 def expect_free(folder: Path, config: Config, identity: Identity, tolerated: Sequence[str] = ()) -> list[str]:
-    """Check that ``folder`` can become the directory of this run; nothing is written.
+    """Check that ``folder`` can become the directory of this run, and return the ``tolerated`` keys that differ.
 
-    Args:
-        folder: the directory.
-        config: the run's configuration.
-        identity: see :func:`identity_of`.
-        tolerated: keys of the identity that may differ from those of the run that is there already.
-
-    Returns:
-        The tolerated keys that differ.
-
-    Raises:
-        ConfigError: something else is there already and ``overwrite`` is not set, or a link leads out of the directory.
-
+    Nothing is written. Something else that is there already is refused without ``overwrite``, as is a link that leads
+    out of the directory.
     """
     try:
         expect_target(folder, folder=True)
@@ -150,15 +112,11 @@ def expect_free(folder: Path, config: Config, identity: Identity, tolerated: Seq
             expect_own(folder)
     except TargetError as error:
         raise ConfigError(f"output_dir: {error}") from error
-    if not folder.is_dir() or _is_unused(folder) or config["overwrite"]:
+    if config["overwrite"]:
         return []
-    try:
-        before = _identity_in(folder)
-    except (OSError, ValueError, KeyError, TypeError):
-        raise ConfigError(
-            f"output_dir: {folder} holds files of something else; another output_dir keeps them"
-        ) from None
-    different = _changes(before, json.loads(json.dumps(identity)))
+    different = _changes_in(folder, identity)
+    if different is None:
+        raise ConfigError(f"output_dir: {folder} holds files of something else; another output_dir keeps them")
     changed = [key for key in different if key not in tolerated]
     if changed:
         raise ConfigError(
@@ -175,18 +133,7 @@ def _is_unused(folder: Path) -> bool:
 
 @contextlib.contextmanager
 def at_work(folder: Path, config: Config, identity: Identity, *, alone: bool = False) -> Iterator[None]:
-    """Within this context ``folder`` is that of commands with the settings of this one, and of no others.
-
-    Args:
-        folder: the directory of the run, which is made if it does not exist.
-        config: the run's configuration.
-        identity: see :func:`identity_of`.
-        alone: whether it is even that of this process alone.
-
-    Raises:
-        ConfigError: another command is at work there, or the directory cannot be written.
-
-    """
+    """Within this context ``folder`` is that of commands with these settings; if ``alone``, of this command only."""
     settings = (
         f"{socket.gethostname()} {os.getpid()}" if alone else _hash_of({**identity, "metrics": config["metrics"]})
     )
@@ -209,21 +156,7 @@ def _unwritable(folder: Path, error: OSError) -> ConfigError:
 
 
 def claim(folder: Path, config: Config, identity: Identity, tolerated: Sequence[str] = ()) -> list[str]:
-    """Make ``folder`` the directory of this run, with its ``config.yaml`` and ``versions.json``.
-
-    Args:
-        folder: the directory.
-        config: the run's configuration.
-        identity: see :func:`identity_of`.
-        tolerated: keys of the identity that may differ from those of the run that is there already.
-
-    Returns:
-        The tolerated keys that differ.
-
-    Raises:
-        ConfigError: something else is there already and ``overwrite`` is not set, or the directory cannot be written.
-
-    """
+    """Write ``config.yaml`` and ``versions.json`` of this run into ``folder``, checked by :func:`expect_free`."""
     different = expect_free(folder, config, identity, tolerated)
     record = {**versions(), "hash": _hash_of(identity), "identity": dict(identity)}
     try:

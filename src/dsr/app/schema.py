@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -13,73 +13,24 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from dsr.utils.configuration import ConfigError, build, check_types
+from dsr.utils.configuration import ConfigError, build
 from dsr.utils.guards import is_number
-from dsr.utils.ratios import NATIVE, check_scale
+from dsr.utils.ratios import NATIVE, SCALES
 from dsr.utils.spelling import did_you_mean
 
-Config = Mapping[str, Any]
-"""A composed configuration as plain values."""
-Identity = Mapping[str, Any]
-"""What the results of a run depend on: settings, weights, versions, the kind of device."""
-_LONGEST_NAME = 100
-_MOST = 1024
-"""Workers and threads, more of which no system starts."""
-STRATEGIES = ("auto", "ddp")
-KEPT = ("best", "last")
-VISUAL = ("mse_v", "dssim", "lpips")
-PRECISIONS = ("float32", "bfloat16", "auto")
-_TRAINER = {"max_steps": 12000, "val_check_interval": 1000, "accumulate_grad_batches": 1, "devices": 1,
-            "strategy": "auto", "gradient_clip_val": None}  # fmt: skip
-"""What dsr itself reads of the trainer's arguments, and their defaults."""
-MOVED = {
-    **{f"trainer.{key}": f"trainer.{new}" for key, new in (
-        ("steps", "max_steps"), ("validate_every", "val_check_interval"), ("accumulate", "accumulate_grad_batches"),
-        ("clip", "gradient_clip_val"), ("max_step", "max_steps"), ("step", "max_steps"),
-    )},
-    **{f"trainer.{key}": f"patches.{key}" for key in (
-        "patch", "batch", "validation_scenes", "scenes", "flip", "rotate", "depth_scale", "colour", "photo", "workers"
-    )},
-    "trainer.init": "start.weights",
-    **{f"trainer.{key}": f"start.{key}" for key in ("shared", "frozen")},
-    **{f"trainer.{key}": f"model.{new}" for key, new in (
-        ("learning_rate", "optimizer.lr"), ("lr", "optimizer.lr"), ("weight_decay", "optimizer.weight_decay"),
-        ("warmup", "scheduler.warmup"), ("average", "average"),
-    )},
-    "trainer.keep": "keep",
-    "trainer.precision": "precision",
-    "trainer.accelerator": "device",
-    "trainer.logger": "logger",
-    "trainer.callbacks": "callbacks",
-    "model.depth_loss": "model.objective.depth_loss",
-    "model.shading": "model.objective.shading",
-    "model.visual": "model.objective.w",
-}  # fmt: skip
-"""Keys by other names: what Lightning and torch have names for, and arguments of the trainer that have their own."""
-SET_BY_DSR = ("plugins", "use_distributed_sampler", "num_nodes", "default_root_dir", "enable_checkpointing",
-               "barebones", "inference_mode", "max_epochs", "min_epochs", "max_time")  # fmt: skip
-"""Arguments of the trainer that dsr's trainings have values of their own for."""
-_GROUPS = (
-    "dataset",
-    "downsampling",
-    "noise",
-    "holes",
-    "degradation",
-    "method",
-    "metrics",
-    "model",
-    "trainer",
-    "loss",
-    "logger",
-    "callbacks",
-)
-
-
+Config = Mapping[str, Any]  # a composed configuration as plain values
+Identity = Mapping[str, Any]  # what a run's results depend on: settings, weights, versions, the kind of device
 NAMED = ("dataset", "downsampling", "noise", "holes", "degradation", "method", "model", "optimizer", "scheduler",
          "trainer")  # fmt: skip
 """Groups whose choice is in ``names``."""
-SEVERAL = ("logger", "callbacks", "experiment")
-"""Groups of which several choices go together, as a list."""
+_LONGEST_NAME = 100
+_MOST = 1024  # workers and threads, more of which no system starts
+_TRAINER = {"max_steps": 12000, "val_check_interval": 1000, "accumulate_grad_batches": 1, "devices": 1,
+            "strategy": "auto", "gradient_clip_val": None}  # fmt: skip
+"""What dsr itself reads of the trainer's arguments, and their defaults."""
+SET_BY_DSR = ("plugins", "use_distributed_sampler", "num_nodes", "default_root_dir", "enable_checkpointing",
+               "barebones", "inference_mode", "max_epochs", "min_epochs", "max_time")  # fmt: skip
+"""Arguments of the trainer that dsr's trainings have values of their own for."""
 
 
 @dataclass
@@ -93,71 +44,24 @@ class MetricsConfig:
     extra: list[str] = field(default_factory=list)
 
 
-class Checked:
-    """A dataclass of settings that is checked when it is made from a configuration."""
-
-    @classmethod
-    def of(cls, plain: Config) -> Self:
-        """Return the checked settings of a composed configuration.
-
-        Raises:
-            ConfigError: a key is unknown or missing, or a value is not one of its choices.
-
-        """
-        parts: dict[str, Any] = {entry.name: entry.default_factory for entry in fields(cls)}  # type: ignore[arg-type]
-        _refuse_unknown(plain, parts)
-        for key, value in plain.items():
-            if value == MISSING or (value is None and key in _GROUPS):
-                raise ConfigError(f"{key}: missing; give it as {key}=...")
-            if is_dataclass(parts[key]):
-                _refuse_unknown(value, [entry.name for entry in fields(parts[key])], f"{key}.")
-                check_types(parts[key], value, f"{key}.")
-        check_types(cls, plain)
-        settings = cls(**{k: parts[k](**v) if is_dataclass(parts[k]) else v for k, v in plain.items()})
-        settings.check()
-        return settings
-
-    def check(self) -> None:
-        """Check values beyond their types.
-
-        Raises:
-            ConfigError: a value is not one of its choices.
-
-        """
-
-
 def expect_name(key: str, name: str) -> None:
-    """Refuse a name, which becomes that of files and folders, that would lead elsewhere.
-
-    Raises:
-        ConfigError: the name is such a one.
-
-    """
+    """Refuse a name, which becomes that of files and folders, that would lead elsewhere."""
     leads = name in ("", ".", "..") or {*"/\\"} & {*name} or not name.isprintable()
     if leads or len(name) > _LONGEST_NAME:
         raise ConfigError(f"{key}: expected a name without folders, got {name[:60]!r}")
 
 
-def _expect_factor(scale: Any, hint: str = "") -> None:
-    """Raise ConfigError, with a hint, for a scale that downsampling models do not have."""
-    try:
-        check_scale(scale)
-    except ValueError as error:
-        raise ConfigError(f"{error}{hint}") from error
+def _expect_one_of(key: str, value: object, choices: tuple[Any, ...], hint: str = "") -> None:
+    if value not in choices:
+        raise ConfigError(f"{key}: expected one of {', '.join(map(str, choices))}, got {value!r:.60}{hint}")
 
 
-def _refuse_unknown(plain: Any, names: Collection[str], place: str = "") -> None:
-    """Raise ConfigError for the first key that is not in ``names``, and for a value that has no keys."""
-    if not isinstance(plain, Mapping):
-        raise ConfigError(f"{place.rstrip('.')}: expected the keys {', '.join(names)}, got {plain!r}")
-    for key in plain:
-        if key not in names:
-            meant = did_you_mean(key, names if place else [*names, "experiment"])
-            raise ConfigError(f"{place}{key}: unknown key; expected {', '.join(names)}{meant}")
+def _is_count(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value > 0
 
 
 @dataclass
-class RunConfig(Checked):
+class RunConfig:
     """The configuration that all commands have.
 
     The groups (dataset, downsampling, noise, method, model) are nodes for ``hydra.utils.instantiate``, which
@@ -177,27 +81,33 @@ class RunConfig(Checked):
     output_dir: str | None = None
     overwrite: bool = False
 
+    @classmethod
+    def of(cls, plain: Config) -> Self:
+        """Return the settings of a composed configuration; OmegaConf checks names and types, :meth:`check` values."""
+        try:
+            merged = OmegaConf.merge(OmegaConf.structured(cls), dict(plain))
+            values: dict[str, Any] = OmegaConf.to_container(merged, resolve=True)  # type: ignore[assignment]
+        except OmegaConfBaseException as error:
+            raise ConfigError(explain_value(error, error.full_key or "")) from error
+        for key, value in values.items():
+            if value == MISSING:  # within a node it may be missing: a part of a mixture need not be used
+                raise ConfigError(f"{key}: missing; give it as {key}=...")
+        parts: dict[str, Any] = {each.name: each.default_factory for each in fields(cls)}
+        settings = cls(**{key: parts[key](**value) if is_dataclass(parts[key]) else value
+                          for key, value in values.items()})  # fmt: skip
+        settings.check()
+        return settings
+
     def build(self, group: str) -> Any:
-        """Build what a group's node describes.
-
-        Raises:
-            ConfigError: a key is unknown, missing or of another type, or a value is refused.
-
-        """
+        """Build what a group's node describes."""
         name = self.names.get(group)
         return build(group, getattr(self, group), {} if name is None else {"name": name}, name)
 
     def check(self) -> None:
-        """Check values beyond their types.
-
-        Raises:
-            ConfigError: a value is not one of its choices.
-
-        """
+        """Check values beyond their types."""
         for group, name in self.names.items():
             expect_name(f"names.{group}", str(name))
-        if self.precision not in PRECISIONS:
-            raise ConfigError(f"precision: expected one of {', '.join(PRECISIONS)}, got {self.precision}")
+        _expect_one_of("precision", self.precision, ("float32", "bfloat16", "auto"))
         if self.seed < 0:
             raise ConfigError(f"seed: expected 0 or a positive number, got {self.seed}")
 
@@ -222,23 +132,17 @@ class EvalConfig(RunConfig):
         return str(self.downsampling.get("_target_")).endswith(".Measured")
 
     def check(self) -> None:
-        """Check values beyond their types.
-
-        Raises:
-            ConfigError: a value is not one of its choices.
-
-        """
+        """Check values beyond their types."""
         super().check()
         for name in ("workers", "threads"):
             value = getattr(self, name)
-            if value != "auto" and (isinstance(value, bool) or not isinstance(value, int) or not 0 < value <= _MOST):
+            if value != "auto" and not (_is_count(value) and value <= _MOST):
                 raise ConfigError(f"{name}: expected auto or a whole number from 1 to {_MOST}, got {value!r}")
         if not self.measured:
-            _expect_factor(self.scale, "; downsampling=measured takes a sensor's map of any ratio")
-        if not (is_number(self.scale) and self.scale >= 1) and self.scale != NATIVE:
-            raise ConfigError(
-                f"scale: expected {NATIVE} or the ratio of the measured maps, 1 or more, got {self.scale!r}"
-            )
+            _expect_one_of("scale", self.scale, SCALES, "; downsampling=measured takes a sensor's map of any ratio")
+        elif self.scale != NATIVE and not (is_number(self.scale) and self.scale >= 1):
+            expected = f"{NATIVE} or the ratio of the measured maps, 1 or more"
+            raise ConfigError(f"scale: expected {expected}, got {self.scale!r}")
 
 
 @dataclass
@@ -278,54 +182,29 @@ class TrainConfig(RunConfig):
     trust: Any = None
 
     def check(self) -> None:
-        """Check values beyond their types.
-
-        Raises:
-            ConfigError: a value is not one of its choices.
-
-        """
+        """Check values beyond their types, of the trainer without Lightning, which takes seconds to import."""
         super().check()
-        _expect_factor(self.scale)
+        _expect_one_of("scale", self.scale, SCALES)
         if "net" not in self.model:
             raise ConfigError("model: missing; give it as model=...")
-        if self.loss.visual not in VISUAL:
-            raise ConfigError(f"loss.visual: expected one of {', '.join(VISUAL)}, got {self.loss.visual!r}")
+        _expect_one_of("loss.visual", self.loss.visual, ("mse_v", "dssim", "lpips"))
+        _expect_one_of("keep", self.keep, ("best", "last"))
         w = self.loss.w
         if w != "auto" and (not is_number(w) or w < 0):
             raise ConfigError(f"loss.w: expected auto or a number, 0 or more, got {w!r}")
-        if self.keep not in KEPT:
-            raise ConfigError(f"keep: expected one of {', '.join(KEPT)}, got {self.keep}")
-        for key in (*(f"trainer.{each}" for each in self.trainer), *(f"model.{each}" for each in self.model)):
-            if key in MOVED:
-                raise ConfigError(f"{key}: unknown key; expected {MOVED[key]}")
         for key in self.trainer:
             if key in SET_BY_DSR:
                 raise ConfigError(f"trainer.{key}: unknown key; dsr sets it itself, a training has trainer.max_steps")
         if isinstance(self.trainer.get("profiler"), str):
-            raise ConfigError(
-                "trainer.profiler: expected a node with _target_, dirpath and filename, which writes a file"
-            )
-        self._check_trainer()
-
-    def _check_trainer(self) -> None:
-        """Check what dsr itself reads of the trainer's arguments, without Lightning, which takes seconds to import."""
-        self.trainer = {**_TRAINER, **self.trainer}
-
-        def is_count(value: Any) -> bool:
-            return isinstance(value, int) and not isinstance(value, bool) and value > 0
-
-        for name, fits, expected in (
-            ("max_steps", is_count, "a whole number, 1 or more"),
-            ("val_check_interval", is_count, "a whole number of batches, 1 or more"),
-            ("accumulate_grad_batches", is_count, "a whole number, 1 or more"),
-            ("devices", lambda value: value == "auto" or is_count(value), "auto or a whole number, 1 or more"),
-            ("strategy", lambda value: value in STRATEGIES, f"one of {', '.join(STRATEGIES)}"),
-            ("gradient_clip_val", lambda value: value is None or (is_number(value) and 0 < value < math.inf),
-             "a positive number or null"),
-        ):  # fmt: skip
-            value = self.trainer[name]
-            if not fits(value):
-                raise ConfigError(f"trainer.{name}: expected {expected}, got {value!r:.60}")
+            raise ConfigError("trainer.profiler: expected a node with _target_, dirpath and filename")
+        trainer = self.trainer = {**_TRAINER, **self.trainer}
+        _expect_one_of("trainer.strategy", trainer["strategy"], ("auto", "ddp"))
+        for name in ("max_steps", "val_check_interval", "accumulate_grad_batches", "devices"):
+            if not _is_count(trainer[name]) and (name, trainer[name]) != ("devices", "auto"):
+                raise ConfigError(f"trainer.{name}: expected a whole number, 1 or more, got {trainer[name]!r:.60}")
+        clip = trainer["gradient_clip_val"]
+        if clip is not None and not (is_number(clip) and clip > 0):
+            raise ConfigError(f"trainer.gradient_clip_val: expected a positive number or null, got {clip!r:.60}")
 
     @property
     def more_of_trainer(self) -> dict[str, Any]:
@@ -348,11 +227,26 @@ class TrainConfig(RunConfig):
         return min(math.ceil(self.trainer["val_check_interval"] / self.accumulate), self.steps)
 
 
-def given_keys() -> list[str]:
-    """Return the keys that the command line sets, without + or ~; none outside of a Hydra command."""
+def explain_value(error: OmegaConfBaseException, key: str) -> str:
+    """Return what OmegaConf says of a key: its first sentence, or the keys that there are beside an unknown one."""
+    first = str(error).partition("\n")[0]
+    if " not in " in first and error.parent_node is not None:
+        keys = [str(each) for each in error.parent_node if not str(each).startswith("_")]
+        meant = did_you_mean(key.rpartition(".")[2], keys)
+        return f"{key}: unknown key; expected one of {', '.join(keys)}{meant}; +{key}=... adds one"
+    return f"{key}: {first}" if key else first
+
+
+def given_overrides() -> list[str]:
+    """Return the overrides of the command line or of the job of a multirun; none outside of a Hydra command."""
     if not HydraConfig.initialized():
         return []
-    return [override.partition("=")[0].lstrip("+~") for override in HydraConfig.get().overrides.task]
+    return list(OmegaConf.to_container(HydraConfig.get().overrides.task, resolve=False))  # type: ignore[arg-type]
+
+
+def given_keys() -> list[str]:
+    """Return the keys that the command line sets, without + or ~; none outside of a Hydra command."""
+    return [override.partition("=")[0].lstrip("+~") for override in given_overrides()]
 
 
 def user_directories() -> tuple[Path, ...]:
@@ -367,10 +261,6 @@ def plain_config(config: DictConfig) -> dict[str, Any]:
     """Return a composed configuration as plain Python, interpolations resolved; missing values are "???".
 
     ``names`` gets the choices of the groups: those of the Hydra command, else the names of their classes.
-
-    Raises:
-        ConfigError: an interpolation cannot be resolved.
-
     """
     try:
         plain: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
@@ -380,7 +270,11 @@ def plain_config(config: DictConfig) -> dict[str, Any]:
     nodes = {group: node for group, node in plain.items() if group in NAMED and isinstance(node, Mapping)}
     named = {group: str(node["_target_"]).rpartition(".")[2] for group, node in nodes.items() if "_target_" in node}
     if HydraConfig.initialized():
-        named |= {group: name for group, name in HydraConfig.get().runtime.choices.items() if group in NAMED}
+        choices = HydraConfig.get().runtime.choices
+        for group in named.keys() - choices.keys():
+            if any(each.startswith(f"{group}=[") for each in given_overrides()):
+                raise ConfigError(f"{group}: expected one choice, got a list; -m {group}=A,B runs each of several")
+        named |= {group: name for group, name in choices.items() if group in NAMED}
     plain["names"] = named | {
         group: str(name) for group, name in (plain.get("names") or {}).items() if name is not None
     }

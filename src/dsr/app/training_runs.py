@@ -37,16 +37,12 @@ def read_config(folder: Path, trust: Any = None) -> dict[str, Any]:
     config = read_plain_yaml(path)
     if "model" not in config:
         raise ConfigError(f"{folder}: expected the directory of a training, its config.yaml names no model")
-    known = {entry.name for entry in dataclasses.fields(TrainConfig)}
     try:
-        for key in _FROM_RUN:
-            if key not in config:
-                raise ConfigError(f"{key}: missing")
-        settings = TrainConfig.of({"trainer": {}, **{key: value for key, value in config.items() if key in known}})
+        TrainConfig.of(config)
         for key in ("model", "dataset", "downsampling", "noise"):
-            if not isinstance(settings.names.get(key), str):
-                raise ConfigError(f"names.{key}: expected text, got {settings.names.get(key)!r:.60}")
-        if "_target_" not in (settings.model.get("net") or ()):
+            if not isinstance(config["names"].get(key), str):
+                raise ConfigError(f"names.{key}: expected text, got {config['names'].get(key)!r:.60}")
+        if "_target_" not in (config["model"].get("net") or ()):
             raise ConfigError("model.net._target_: missing")
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error

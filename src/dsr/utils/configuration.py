@@ -9,36 +9,23 @@ shown with the key that sets it (``method.sharpness: expected ...``).
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import importlib
 import importlib.util
 import inspect
 import types
 from collections.abc import Callable, Collection, Mapping, Sequence
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
-import yaml
-
-from dsr.utils.guards import TooLargeError, read_limited
+from dsr.utils.spelling import did_you_mean
 from dsr.utils.versions import how_to_install
 
-Node = Mapping[str, Any]
-"""A node of the configuration: ``_target_``, perhaps ``_partial_``, and arguments of the target."""
+Node = Mapping[str, Any]  # ``_target_``, perhaps ``_partial_``, and arguments of the target
 _MISSING = "???"
 _TARGET, _PARTIAL = "_target_", "_partial_"
-_MANY = 20
-"""Of more arguments than these, a message names those like the mistyped one."""
-
 _PACKAGE = Path(__file__).resolve().parents[1]
-_LARGEST = 2**20
-"""Bytes of a file of the user's."""
-_MOST_VALUES = 100_000
-"""Values of a file of the user's, where each alias counts as what it stands for."""
-_PLACES = (_PACKAGE / "conf", _PACKAGE.parents[1] / "conf")
-"""Where the project's own files are: in an installed package, and in a checkout."""
+_PLACES = (_PACKAGE / "conf", _PACKAGE.parents[1] / "conf")  # of an installed package, and of a checkout
 
 
 class ConfigError(ValueError):
@@ -52,7 +39,7 @@ def expect_library(key: str, module: str, extra: str) -> None:
         raise ConfigError(f"{key}: expected {library}, which is not installed; {how_to_install(extra)}")
 
 
-def build(group: str, node: Mapping[str, Any], given: Mapping[str, Any] | None = None, name: str | None = None) -> Any:
+def build(group: str, node: Node, given: Mapping[str, Any] | None = None, name: str | None = None) -> Any:
     """Build the object that a node describes.
 
     Args:
@@ -61,37 +48,13 @@ def build(group: str, node: Mapping[str, Any], given: Mapping[str, Any] | None =
         given: values of the whole run (scale, weights, device, ...); the target gets those that its signature names.
         name: of the group's choice, for messages.
 
-    Raises:
-        ConfigError: a key is unknown, missing or of another type, or the target rejects a value.
-
     """
     _expect_whole(group, node)
     return _make(group, node, given or {}, name)
 
 
-def _make(group: str, node: Mapping[str, Any], given: Mapping[str, Any], name: str | None = None) -> Any:
-    """Build the object, or the partial, that a node describes."""
-    target, arguments = _checked(group, node, given, name)
-    arguments = {key: _built(f"{group}.{key}", value) for key, value in arguments.items()}
-    if node.get(_PARTIAL):
-        return functools.partial(target, **arguments)
-    try:
-        return target(**arguments)
-    except (ValueError, OSError) as error:
-        raise ConfigError(with_key(str(error), group, inspect.signature(target).parameters)) from error
-    except Exception as error:  # Lightning's own, which derives from none of these
-        if type(error).__name__ != "MisconfigurationException" and not target.__module__.startswith("lightning."):
-            raise
-        raise ConfigError(f"{group}: {' '.join(str(error).split())}") from error
-
-
-def check(group: str, node: Mapping[str, Any], given: Mapping[str, Any] | None = None) -> None:
-    """Check what can be checked before :func:`build`: that a node has the keys of its target, of the right types.
-
-    Raises:
-        ConfigError: it has not.
-
-    """
+def check(group: str, node: Node, given: Mapping[str, Any] | None = None) -> None:
+    """Check what can be checked before :func:`build`: that a node has the keys of its target, of the right types."""
     _expect_whole(group, node)
     _checked(group, node, given or {}, None)
 
@@ -102,9 +65,24 @@ def _expect_whole(group: str, node: Any) -> None:
         raise ConfigError(f"{group}.{_PARTIAL}: expected an object, which a partial is not; leave it out")
 
 
-def _checked(
-    group: str, node: Mapping[str, Any], given: Mapping[str, Any], name: str | None
-) -> tuple[Any, dict[str, Any]]:
+def _make(group: str, node: Node, given: Mapping[str, Any], name: str | None = None) -> Any:
+    """Build the object, or the partial, that a node describes."""
+    target, arguments = _checked(group, node, given, name)
+    arguments = {key: _built(f"{group}.{key}", value) for key, value in arguments.items()}
+    if node.get(_PARTIAL):
+        return functools.partial(target, **arguments)
+    try:
+        return target(**arguments)
+    except Exception as error:  # Lightning's own errors derive from Exception alone
+        if not isinstance(error, ValueError | OSError) and not target.__module__.startswith("lightning."):
+            raise
+        message = " ".join(str(error).split())
+        keyed = with_key(message, group, inspect.signature(target).parameters)
+        foreign = keyed == message and not target.__module__.startswith("dsr.")
+        raise ConfigError(f"{group}: {message}" if foreign else keyed) from error
+
+
+def _checked(group: str, node: Node, given: Mapping[str, Any], name: str | None) -> tuple[Any, dict[str, Any]]:
     """Return what a node names, and its arguments, those that are given included."""
     target = load_target(group, node)
     parameters = inspect.signature(target).parameters
@@ -116,12 +94,12 @@ def _checked(
     arguments = {key: value for key, value in node.items() if key not in (_TARGET, _PARTIAL)}
     for key, value in arguments.items():
         if key not in own and not takes_any:
-            near = get_close_matches(key, own) if len(own) > _MANY else []
-            accepted = ", ".join(near or own) or "none"
-            raise ConfigError(f"{group}.{key}: unknown key; {choice} takes {accepted}")
-        expect_usable(f"{group}.{key}", value)
+            accepted = ", ".join(own) or "none"
+            raise ConfigError(f"{group}.{key}: unknown key; {choice} takes {accepted}{did_you_mean(key, own)}")
         if value == _MISSING:
             raise ConfigError(f"{group}.{key}: {choice} needs it: {group}.{key}=...")
+        if value == "":  # which as a path would be the current directory
+            raise ConfigError(f"{group}.{key}: expected a text of one character or more, or null for none")
         if key in hints and not _is_node(value) and not _fits(value, hints[key]):
             raise ConfigError(f"{group}.{key}: expected {_describe(hints[key])}, got {value!r:.60}")
     return target, {**arguments, **given}
@@ -142,43 +120,6 @@ def _built(key: str, value: Any) -> Any:
     if _TARGET in value:
         return _make(key, value, {})
     return {name: _built(f"{key}.{name}", each) for name, each in value.items()}
-
-
-def check_types(kind: type, values: Mapping[str, Any], place: str = "") -> None:
-    """Check values for the fields of a dataclass that have a plain type.
-
-    Args:
-        place: what stands before the names in messages, such as ``trainer.``.
-
-    Raises:
-        ConfigError: a value is of another type than its field, or an empty text.
-
-    """
-    hints = get_type_hints(kind)
-    for name, value in values.items():
-        if dataclasses.is_dataclass(hints[name]) or value == _MISSING:
-            continue
-        expect_usable(f"{place}{name}", value)
-        if not _fits(value, hints[name]):
-            raise ConfigError(f"{place}{name}: expected {_describe(hints[name])}, got {value!r:.60}")
-
-
-def expect_usable(key: str, value: Any) -> None:
-    """Refuse a text without characters, which as a path would be the current directory, and a number beyond 64 bits."""
-    if isinstance(value, str) and (not value.strip() or "\0" in value):
-        raise ConfigError(f"{key}: expected a text of one character or more, or null for none; got {value!r:.60}")
-    if isinstance(value, str) and value.startswith("~"):
-        expand_home(key, value)
-    if isinstance(value, int) and not -(2**63) <= value < 2**63:
-        raise ConfigError(f"{key}: expected a number that 64 bits hold, got {value!r:.60}")
-
-
-def expand_home(key: str, path: str) -> Path:
-    """Return a path with ~ replaced by the user's directory."""
-    try:
-        return Path(path).expanduser()
-    except RuntimeError as error:
-        raise ConfigError(f"{key}: expected a path, got {path!r:.60} ({error})") from error
 
 
 def with_key(message: str, group: str, parameters: Collection[str]) -> str:
@@ -246,31 +187,13 @@ def _describe(hint: Any) -> str:
 
 
 def config_directories(more: Sequence[Path] = ()) -> tuple[Path, ...]:
-    """Return the directories of configuration files in the order in which they are searched.
-
-    Returns:
-        The project's directory first, so that no file of the user's replaces one of the project's.
-
-    """
+    """Return the directories of configuration files: the project's first, whose files no other replaces."""
     own = next((place for place in _PLACES if (place / "eval.yaml").is_file()), None)
     if own is None:
-        raise ValueError(f"{_PLACES[0]}: expected the configuration files of dsr; the installation is incomplete")
+        raise ConfigError(f"{_PLACES[0]}: expected the configuration files of dsr; the installation is incomplete")
     for directory in more:
-        try:
-            there = directory.is_dir()
-        except OSError:  # such as a name that is too long
-            there = False
-        if not there:
-            raise ValueError(f"--config-dir: expected a directory, got {directory}")
-        for path in directory.glob("*/*.yaml"):
-            if path.exists() and not path.is_file():  # a pipe would be waited for
-                raise ValueError(f"{path}: expected a file, got something else")
-            try:
-                _expect_moderate(path)
-            except FileNotFoundError:  # a link to nowhere
-                continue
-            except OSError as error:  # whose own message does not always name the file
-                raise ValueError(f"{path}: expected a readable file, got {error.strerror}") from error
+        if not directory.is_dir():
+            raise ConfigError(f"--config-dir: expected a directory, got {directory}")
     return (own, *more)
 
 
@@ -283,29 +206,3 @@ def list_groups(directories: Sequence[Path]) -> list[str]:
     """Return the sorted names of the groups in all directories, without those of Hydra's own settings."""
     names = {path.name for directory in directories for path in directory.iterdir() if path.is_dir()}
     return sorted(names - {"hydra"})
-
-
-def _expect_moderate(path: Path) -> None:
-    """Refuse a file that is huge, or a short one whose aliases stand for something huge."""
-    try:
-        content = read_limited(path, _LARGEST)
-        if b"*" not in content:
-            return
-        values = _count(yaml.compose(content, Loader=yaml.SafeLoader), {})
-    except TooLargeError as error:
-        raise ValueError(str(error)) from error
-    except (ValueError, RecursionError, yaml.YAMLError):  # reported where it is composed
-        return
-    if values > _MOST_VALUES:
-        raise ValueError(f"{path}: expected at most {_MOST_VALUES} values, got more by its aliases")
-
-
-def _count(node: yaml.Node | None, counted: dict[int, int]) -> int:
-    """Return the number of values of a node, each node counted once but added wherever it stands."""
-    if not isinstance(node, yaml.CollectionNode):
-        return 1
-    if id(node) not in counted:
-        counted[id(node)] = 1
-        parts = [part for pair in node.value for part in (pair if isinstance(pair, tuple) else (pair,))]
-        counted[id(node)] += sum(_count(part, counted) for part in parts)
-    return counted[id(node)]
