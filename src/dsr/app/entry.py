@@ -114,7 +114,7 @@ def _job(command: Callable[[DictConfig], Any], argv: list[str], begun: list[Dict
             own = [f"--config-dir={place}" for place in user_directories()]
             sys.argv = [argv[0], *(each for each in argv[1:2] if each in ("train", "eval")), *own, *overrides]
         try:
-            with interruption.requeued(), interruption.working(), refusing_excess():
+            with refusing_excess():
                 return command(config)
         except (ConfigError, OSError, FullDiskError, OutOfMemoryError) as error:
             problem = one_line(error)

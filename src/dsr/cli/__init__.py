@@ -69,7 +69,7 @@ def main(arguments: Sequence[str] | None = None, catalogue: Mapping[str, Collect
     options = make_parser().parse_args(arguments)
     console = open_console()
     try:
-        with interruption.working(), refusing_excess():
+        with refusing_excess():
             problems = options.run(options, console, downloads() if catalogue is None else catalogue)
     except KeyboardInterrupt as interrupted:
         return interruption.stop(str(interrupted))

@@ -26,7 +26,6 @@ MESSAGE = "interrupted; what is finished is kept, the same command continues fro
 _BETWEEN_LOOKS = 0.5  # seconds between two looks of a worker after its parent
 _came: list[int] = []  # the signals that this process was interrupted by
 
-working = requeued = contextlib.nullcontext  # a command at work needs no preparation
 
 
 def start(module: str, function: str) -> NoReturn:
