@@ -51,7 +51,7 @@ def module_of(
     prior = DeepImagePrior(scale=4, downsampling=BOX, precision=precision, device=device, **given)  # type: ignore[arg-type]
     module = PriorOptimisation(prior, sample, visual=True)
     if plain:
-        module.net.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
+        module.net.to(memory_format=torch.contiguous_format)
         module.forward = lambda: in_plain_layout(module)  # type: ignore[method-assign]
     return module
 

@@ -154,7 +154,7 @@ def test_normals_of_noise_are_ignored() -> None:
     draws = torch.randn(clean.depth_lr.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     noisy = _changed(clean, depth_lr=clean.depth_lr * (1 + 0.02 * draws))
     display = Progress()
-    display.say = lines.append  # type: ignore[method-assign]
+    display.say = lines.append  # type: ignore[method-assign, assignment]
     depth = _prior(steps=3, display=display)(noisy)
     assert torch.equal(depth, _prior(steps=3, w=0.0)(noisy))
     assert re.fullmatch(r"step: without MSE_v; noise of \d\.\d+% tilts the input's normals by \d+ degrees.*", lines[0])
@@ -255,16 +255,16 @@ def test_output_has_the_size_of_the_input(height: int, width: int) -> None:
 def test_network_is_the_hourglass_of_ulyanov_et_al() -> None:
     """Against a plain construction from their supplementary material: two levels, written out."""
     torch.manual_seed(0)
-    net = SkipNet(3, 2, (4, 6), (1, 2)).double()
+    net: Any = SkipNet(3, 2, (4, 6), (1, 2)).double()
     x = torch.rand(1, 3, 8, 12, dtype=torch.float64)
 
-    def block(y: Tensor, layer: torch.nn.Module) -> Tensor:
+    def block(y: Tensor, layer: Any) -> Tensor:
         convolution, norm, _ = layer
         weight, bias, stride = convolution.weight, convolution.bias, convolution.stride
         y = functional.conv2d(y, weight, bias, stride, convolution.kernel_size[0] // 2)
         return functional.leaky_relu(normal(y, norm), 0.2)
 
-    def normal(y: Tensor, norm: torch.nn.Module) -> Tensor:
+    def normal(y: Tensor, norm: Any) -> Tensor:
         mean, variance = y.mean((0, 2, 3), keepdim=True), y.var((0, 2, 3), unbiased=False, keepdim=True)
         scaled = (y - mean) / (variance + 1e-5).sqrt()
         return scaled * norm.weight.view(1, -1, 1, 1) + norm.bias.view(1, -1, 1, 1)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.methods.noise_level import estimate_noise, estimate_sensor_noise
+from dsr.geometry.camera import Camera
+from dsr.geometry.surface import depth_to_normals
+from dsr.methods.noise_level import estimate_noise, estimate_sensor_noise, normal_noise_deg
 
 
 def _ramp() -> Tensor:
@@ -44,3 +48,25 @@ def test_clean_and_tiny_maps_have_no_noise() -> None:
     assert estimate_sensor_noise(_ramp()) < 1e-9
     assert estimate_sensor_noise(_ramp()[..., :2, :2]) == 0
     assert estimate_sensor_noise(torch.full((1, 1, 8, 8), torch.nan)) == 0
+
+
+@pytest.mark.parametrize("std", [0.001, 0.01])
+def test_noise_level_is_estimated_from_the_depth_map_alone(std: float) -> None:
+    v, u = torch.meshgrid(torch.linspace(0, 1, 90), torch.linspace(0, 1, 120), indexing="ij")
+    depth = (2 + u + 0.5 * v + 1.5 * (u > 0.4))[None, None].double()
+    noisy = depth * (
+        1 + std * torch.randn(depth.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    )
+    noisy[..., 20:40, 30:60] = torch.nan
+    assert estimate_noise(noisy) == pytest.approx(std, rel=0.1)
+    assert estimate_noise(depth) < 1e-5
+    assert estimate_noise(depth[..., :2, :2]) == 0
+
+
+def test_normal_noise_deg_is_the_tilt_of_a_frontal_surface() -> None:
+    camera = Camera(width=200, height=150, fx=80.0, fy=80.0, cx=99.5, cy=74.5)
+    draws = torch.randn(1, 1, 150, 200, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    normals = depth_to_normals(3 * (1 + 0.001 * draws), camera.rays()[None])
+    slopes = (normals[:, 0] / normals[:, 2])[..., 60:90, 80:120]
+    assert math.degrees(math.atan(float(slopes.std()))) == pytest.approx(normal_noise_deg(0.001, camera), rel=0.1)
+    assert normal_noise_deg(0.0, camera) == 0
