@@ -93,7 +93,7 @@ def _jobs(config: DictConfig) -> list[tuple[list[str], DictConfig]]:
     """Return the overrides and the configuration of each job, all of which are composed before the first is planned."""
     loader: Any = GlobalHydra.instance().config_loader()
     given = [f"{key}={value}" for key, value in (config.hydra.sweeper.params or {}).items()]
-    given += OmegaConf.to_container(config.hydra.overrides.task)  # type: ignore[arg-type, operator]
+    given += OmegaConf.to_container(config.hydra.overrides.task)  # type: ignore[arg-type]
     overrides = OverridesParser.create(loader).parse_overrides(given)
     jobs = BasicSweeper.split_arguments(overrides, None)[0]
     return [(job, loader.load_sweep_config(config, job)) for job in jobs]
