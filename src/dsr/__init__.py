@@ -14,8 +14,6 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-import dsr.utils.threads  # noqa: F401 - for forks
-
 if TYPE_CHECKING:
     from dsr.app.composition import compose
     from dsr.app.upsample.api import Upsampler, upsample

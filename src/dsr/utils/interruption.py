@@ -27,7 +27,6 @@ _BETWEEN_LOOKS = 0.5  # seconds between two looks of a worker after its parent
 _came: list[int] = []  # the signals that this process was interrupted by
 
 
-
 def start(module: str, function: str) -> NoReturn:
     """Import a function, call it, and exit with the code that it returns, or with that of an interruption."""
     for number in (signal.SIGINT, signal.SIGTERM):
