@@ -84,7 +84,7 @@ def test_scores_of_each_validation_are_printed_and_the_run_ends_in_a_table(
     for scene in ("statue", "cube_no_texture"):
         scores = r"RMSE_d \d+\.\d mm  RMSE_v \d+\.\d  DSSIM_v \d+\.\d"
         assert re.search(rf"^{scene}: step +40  loss \d\.\d+  validation: {scores}$", done.stdout, re.M)
-        assert re.search(rf"^predict {scene}: \d of 2, \d+\.\d s, elapsed 0:\d\d:\d\d, remaining", done.stdout, re.M)
+        assert re.search(rf"^evaluate {scene}: \d of 2, ", done.stdout, re.M)
     assert "DIP-V on simgeo, x4, box downsampling" in done.stdout
     assert {row["method"] for row in _rows(home)} == {"dip_v"}
 
@@ -96,7 +96,7 @@ def test_steps_have_lines_with_named_times_off_a_terminal(tmp_path: Path, run: R
     )
     assert (code, errors) == (0, "")
     times = r"elapsed \d:\d\d:\d\d, remaining \d:\d\d:\d\d"
-    outer = r"predict statue \(0 of 1(?:, remaining \d:\d\d:\d\d)?\)"
+    outer = r"evaluate statue \(0 of 1(?:, remaining \d:\d\d:\d\d)?\)"
     steps = rf"^{outer}: steps: (\d) of 4, {times}(?:, loss \d+\.\d{{4}})?$"
     assert list(dict.fromkeys(re.findall(steps, output, re.MULTILINE))) == ["1", "2", "3"]
 

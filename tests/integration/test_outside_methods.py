@@ -163,7 +163,7 @@ def test_upsample_runs_a_method_from_outside_with_settings(home):
     np.testing.assert_allclose(read_depth_file(home / "picture" / "depth_metres.tiff"), 1.501, rtol=1e-6)
     done = upsample(home, "--method", "constant", "--set", "ofset=0.001", "-o", "other")
     assert done.returncode == 2
-    assert done.stderr == "error: --set ofset: unknown key; method=constant takes offset\n"
+    assert done.stderr.startswith("error: --set ofset: unknown key; method=constant takes offset")
     assert not (home / "other").exists()
 
 

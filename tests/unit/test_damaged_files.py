@@ -10,6 +10,7 @@ import re
 import struct
 import tracemalloc
 import zipfile
+from functools import partial
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -49,7 +50,8 @@ from dsr.io.photos import read_photo
 from dsr.io.reading import Reading
 from dsr.io.trajectories import read_transform
 from dsr.methods.networks.peers.peer_network import read_tensors
-from dsr.methods.networks.trained import NETWORKS, read_msg_weights
+from dsr.methods.networks.published import load_msg_weights
+from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_choice import packaged_weights
 from dsr.methods.networks.weight_files import is_dsr_weights, load_network
 from dsr.report.study.answers import files_of, read_all
@@ -442,7 +444,7 @@ RUN = {
 
 
 @pytest.mark.parametrize(("key", "value"), [
-    ("seed", "abc"), ("scale", None), ("trainer", 5), ("model", "msg_v"), ("start", {"weights": 5}),
+    ("seed", "abc"), ("scale", None), ("trainer", 5), ("model", "msg_v"), ("start", 5),
     ("names", {"model": "msg_v"}),
 ])  # fmt: skip
 def test_configuration_of_a_run_with_a_value_of_another_type_is_refused(tmp_path, key, value):
@@ -524,7 +526,10 @@ def test_damaged_depth_of_an_earlier_result_is_made_again_and_refused_where_it_i
 @pytest.mark.parametrize("tensor", [torch.ones(2, 3, device="meta"), torch.eye(3).to_sparse()])
 def test_weights_without_plain_values_are_refused(tmp_path, tensor):
     path = tmp_path / "net.pth"
-    for content, read in (({"a": tensor}, read_tensors), ({"model_state_dict": {"a": tensor}}, read_msg_weights)):
+    for content, read in (
+        ({"a": tensor}, read_tensors),
+        ({"model_state_dict": {"a": tensor}}, partial(load_msg_weights, scale=4)),
+    ):
         torch.save(content, path)
         assert "expected a torch file" in refusal(path, read, path)
 

@@ -134,7 +134,8 @@ def _limit(memory: int) -> None:
 
 def _end_with_parent() -> None:
     """End this process when the server closes its standard input, or ends."""
-    sys.stdin.buffer.read()
+    while os.read(0, 4096):  # not by sys.stdin, whose lock Python would want at its end
+        pass
     os._exit(1)
 
 
