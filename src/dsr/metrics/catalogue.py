@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from operator import attrgetter
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -30,24 +31,30 @@ __all__ = [
 ]
 
 
-def _bad_pix_d(percent: int, unit: str) -> Metric:
-    function = partial(functional.bad_pix_d, threshold=percent / 100, relative=unit == "pct")
-    heading = f"{percent} cm, %" if unit == "cm" else f"{percent} % of depth, %"
-    shown = MetricFormat("BadPix_d", heading, 1e2, 2, position=2 if (percent, unit) == (5, "cm") else None)
-    return Metric(f"BadPix_d_{percent}{unit}", function, depth_mask, shown, min_size=1)
-
-
-def _bad_pix_v(level: int) -> Metric:
-    shown = MetricFormat("BadPix_v", f"{level}, %", 1e2, 1, position=3 if level == 5 else None)
-    function = partial(functional.bad_pix_v, threshold=level)
-    return Metric(f"BadPix_v_{level}", function, normal_mask, shown, per_light=True)
-
-
 # the paper's metrics in the order of scores.csv; those with a position are the columns of its tables
 METRICS: tuple[Metric, ...] = (
     Metric("RMSE_d", functional.rmse_d, depth_mask, MetricFormat("RMSE_d", "mm", 1e3, 1, position=1), min_size=1),
-    *(_bad_pix_d(percent, unit) for unit in ("cm", "pct") for percent in (1, 5, 10)),
-    *map(_bad_pix_v, (1, 5, 10)),
+    *(
+        Metric(
+            f"BadPix_d_{percent}{unit}",
+            partial(functional.bad_pix_d, threshold=percent / 100, relative=unit == "pct"),
+            depth_mask,
+            MetricFormat("BadPix_d", f"{percent} {of}, %", 1e2, 2, position=2 if percent == second else None),
+            min_size=1,
+        )
+        for unit, of, second in (("cm", "cm", 5), ("pct", "% of depth", None))
+        for percent in (1, 5, 10)
+    ),
+    *(
+        Metric(
+            f"BadPix_v_{level}",
+            partial(functional.bad_pix_v, threshold=level),
+            normal_mask,
+            MetricFormat("BadPix_v", f"{level}, %", 1e2, 1, position=3 if level == 5 else None),
+            per_light=True,
+        )
+        for level in (1, 5, 10)
+    ),
     Metric(
         "DSSIM_v",
         functional.dssim_v,
@@ -135,8 +142,7 @@ def catalogue(
     )
 
 
-@dataclass(frozen=True)
-class Score:
+class Score(NamedTuple):
     """One row of ``scores.csv``: a metric's value for one image, and the valid fraction of the pixels that it uses."""
 
     metric: str
