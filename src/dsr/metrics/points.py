@@ -28,7 +28,6 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from dsr.geometry.surface import back_project
 from dsr.metrics.depth import covered
 from dsr.metrics.formats import column
 from dsr.metrics.functional import SurfacePair, masked_mean, once_per_pair
@@ -62,7 +61,7 @@ def distances(pair: SurfacePair) -> tuple[Tensor, Tensor]:
 
     They are (B, 1, H, W) in metres, 0 without a point.
     """
-    predicted, true = back_project(pair.prediction, pair.rays), back_project(pair.given[1], pair.rays)
+    predicted, true = pair.prediction * pair.rays, pair.given[1] * pair.rays
     return (
         nearest(predicted, pair.depth_mask, true, pair.target_mask),
         nearest(true, pair.target_mask, predicted, pair.depth_mask),
