@@ -9,11 +9,11 @@ from torch import Tensor
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.surface import depth_to_normals
-from dsr.methods.classical.iterations import conjugate_gradients
 from dsr.methods.classical.srfs_admm import (
     compute_area,
     compute_shading,
     compute_surface,
+    conjugate_gradients,
     fit_lighting,
     linearise_photometry,
 )
