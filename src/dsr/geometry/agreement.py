@@ -177,12 +177,8 @@ class Verdict:
 def judge(depth: Array, rgb: Tensor, zooms: Sequence[float] = _ZOOMS) -> Verdict | None:
     """Compare the edges of a depth map with those of a photo: as given, mirrored, rotated, and of other fields of view.
 
-    Args:
-        depth: (h, w) in any unit of depth or of its reciprocal, NaN in holes.
-        rgb: (3, H, W) in [0, 1], of the same field of view.
-        zooms: the other fields of view, as widths of the depth map's over the photo's.
-
-    Returns None if the depth map or the photo has no edge.
+    Depth is (h, w) in any unit of depth or of its reciprocal, NaN in holes; the photo is (3, H, W) in [0, 1]. Zooms are
+    widths of the depth map's field of view over the photo's. Returns None if the depth map or the photo has no edge.
     """
     size = working_size(depth, rgb)
     pixel = max(size) / max(depth.shape)

@@ -55,16 +55,10 @@ def triangulate(
     The diagonal of a square is the one with the smaller change of depth. A square with one missing pixel gives one
     triangle. Memory: about 110 bytes per pixel, and 80 bytes for :func:`vertex_normals`.
 
-    Args:
-        depth: (1, H, W) orthogonal depth in metres, NaN in holes.
-        camera: of these pixels.
-        largest_step: relative change of depth, beyond what the slopes on both sides predict, from which a pair is cut.
-        stride: every which row and column becomes vertices.
-        isolated: whether vertices without a triangle are kept.
-        tolerance: (1, H, W) how far in metres each pixel lies beside the mesh, mostly and by about twice that at
-            most, so that flat parts get large triangles, see :func:`dsr.geometry.adaptive_mesh.join`; None for a mesh
-            of all pixels.
-
+    Depth is (1, H, W) in metres, NaN in holes. A pair is cut from the relative change ``largest_step`` on, beyond what
+    the slopes on both sides predict. ``isolated`` keeps vertices without a triangle. ``tolerance``, (1, H, W), is how
+    far in metres pixels lie beside the mesh, mostly and by about twice that at most, so that flat parts get large
+    triangles, see :func:`dsr.geometry.adaptive_mesh.join`; None for a mesh of all pixels.
     """
     if tuple(depth.shape) != (1, camera.height, camera.width):
         raise ValueError(f"depth: expected shape {(1, camera.height, camera.width)}, got {tuple(depth.shape)}")

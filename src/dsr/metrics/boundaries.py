@@ -177,12 +177,9 @@ def planarity(
     The prediction is scaled by the ratio of the two median depths in the plane, and a plane is fitted to its points.
     An image's error is the mean over its planes (``nanmean``).
 
-    Args:
-        pair: the two maps.
-        planes: (B, P, H, W) bool, the pixels of each plane.
-        normals: (B, P, 3) true normals, x right, y down, z forward, of either sign; None for those of the truth's
-            points, fitted alike. iBims-1's are x right, y forward, z up: theirs of (x, y, z) is (x, -z, y) here.
-        smallest: planes with a lower fraction of the image's pixels get NaN, and so does one without a prediction.
+    Planes are (B, P, H, W) bool; true normals, (B, P, 3) of either sign, x right, y down, z forward, or None for those
+    of the truth's points, fitted alike. iBims-1's are x right, y forward, z up: (x, y, z) is (x, -z, y) here. Planes
+    with less than the fraction ``smallest`` of the image's pixels get NaN, and so does one without a prediction.
 
     Returns the flatness, the standard deviation of the points about their plane in metres, and the orientation, the
     angle between its normal and the true one in degrees.

@@ -118,12 +118,7 @@ def catalogue(
 ) -> tuple[Metric, ...]:
     """Return the metrics that can be computed: those of some protocols, then ``extra``.
 
-    Args:
-        network: for perceptual metrics; None leaves them out.
-        extra: metrics beside those of the protocols.
-        protocols: names of protocols, in the order of the metrics.
-        regions: parts of the scenes, for which the columns of tables that are means over pixels follow once more.
-
+    Perceptual metrics need the network. For each region, the columns of tables that are means over pixels follow again.
     """
     if not protocols or not set(protocols) <= set(PROTOCOLS):
         raise ValueError(f"protocols: expected some of {', '.join(PROTOCOLS)}, got {', '.join(protocols) or 'none'}")
@@ -167,13 +162,9 @@ def score_image(
     Rows and columns at the border without any predicted pixel are cut off first (MSG's published networks leave out the
     last of each), except for metrics of the whole image. The valid fractions still refer to the complete map.
 
-    Args:
-        prediction, target: (1, H, W) orthogonal depth in metres, NaN where missing.
-        rays: (3, H, W), see :meth:`dsr.geometry.camera.Camera.rays`.
-        metrics: from :func:`catalogue`; those for other units, absent regions or absent errors are left out.
-        unit: of the benchmark.
-        regions: parts of the image by name, (1, H, W) uint8.
-        errors: the method's expected errors, (1, H, W): of depth in metres, of normals in degrees.
+    Both maps are (1, H, W) orthogonal depth in metres, NaN where missing, the rays (3, H, W), regions (1, H, W) uint8,
+    and ``errors`` the method's expected errors, (1, H, W): of depth in metres, of normals in degrees. Metrics for other
+    units, absent regions or absent errors are left out.
     """
     valid = prediction.isfinite()[0]
     window: list[slice] = []  # rows and columns of the smallest one with all predicted pixels; all if there are none
