@@ -97,9 +97,9 @@ def flying(pair: SurfacePair) -> Tensor:
             part.copy_(torch.where(edge, torch.minimum(part, near), part))
             part = back.narrow(dim, start, size)
             part.copy_(torch.where(edge, torch.maximum(part, far), part))
-    for size, padding in (((1, 2 * EDGE_RADIUS + 1), (0, EDGE_RADIUS)), ((2 * EDGE_RADIUS + 1, 1), (EDGE_RADIUS, 0))):
-        front = -max_pool2d(-front, size, stride=1, padding=padding)
-        back = max_pool2d(back, size, stride=1, padding=padding)
+    for window, padding in (((1, 2 * EDGE_RADIUS + 1), (0, EDGE_RADIUS)), ((2 * EDGE_RADIUS + 1, 1), (EDGE_RADIUS, 0))):
+        front = -max_pool2d(-front, window, stride=1, padding=padding)
+        back = max_pool2d(back, window, stride=1, padding=padding)
     between = (front < pair.prediction) & (pair.prediction < back)
     return masked_mean(between & (distances(pair)[0] > FLYING * pair.prediction), pair.depth_mask).squeeze(1)
 

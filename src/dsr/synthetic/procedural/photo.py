@@ -78,20 +78,14 @@ def _smooth_visibility(seen: Array, hits: Hits, shape: tuple[int, ...]) -> Array
     total, weight = np.zeros_like(values), np.zeros((height, width), np.float32)
     for dv in range(-2, 2):
         for du in range(-2, 2):
-            a, b = _overlap(height, dv), _overlap(width, du)
-            here, there = (a[0], b[0]), (a[1], b[1])
+            v, u = slice(max(0, -dv), height - max(0, dv)), slice(max(0, -du), width - max(0, du))
+            here, there = (v, u), (slice(v.start + dv, v.stop + dv), slice(u.start + du, u.stop + du))
             alike = np.einsum("ihw,ihw->hw", normals[:, *here], normals[:, *there]) > 0.9
             near = np.abs(inverse[here] - inverse[there]) < (abs(du) + abs(dv) + 0.5) * slack[here]
             w = (alike & near).astype(np.float32)
             total[:, *here] += w * values[:, *there]
             weight[here] += w
     return np.asarray(total / weight, dtype=np.float64).reshape(2, -1)
-
-
-def _overlap(count: int, step: int) -> tuple[slice, slice]:
-    """Return the slice of the indices that have a neighbour ``step`` further, and the slice of the neighbours."""
-    here = slice(max(0, -step), count - max(0, step))
-    return here, slice(here.start + step, here.stop + step)
 
 
 def shade(bodies: Sequence[Body], hits: Hits, lighting: Lighting, eye: Array, seen: Array) -> Array:
