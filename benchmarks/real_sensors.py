@@ -68,8 +68,8 @@ from dsr.degradation.glass import add_glass
 from dsr.degradation.noise import Kinect
 from dsr.degradation.random_degradation import Everything
 from dsr.degradation.random_fields import field_of, near_steps
+from dsr.geometry.hole_size import window_maxima
 from dsr.geometry.surface import angle_between, depth_to_normals
-from dsr.geometry.windows import window_maxima
 from dsr.inference import upsample_surface
 from dsr.inference.defaults import Fill
 from dsr.inference.sequences import View, fuse_views

@@ -58,20 +58,12 @@ LIMITS: dict[str, float] = {
 
 
 class Assumption(NamedTuple):
-    """Something that was assumed about the files, or found in them; with a code, a warning that it can hardly be right.
+    """Something assumed about the files, or found in them; with a code, a warning that it can hardly be right."""
 
-    Attributes:
-        text: statement, equal for all pictures to which it applies.
-        detail: figures of a single picture.
-        code: that of a warning, one of :data:`LIMITS`; empty where there is nothing to warn of.
-        value: what a warning's limit was compared with.
-
-    """
-
-    text: str
-    detail: str = ""
-    code: str = ""
-    value: float | None = None
+    text: str  # statement, equal for all pictures to which it applies
+    detail: str = ""  # figures of a single picture
+    code: str = ""  # of a warning, one of LIMITS; empty where there is nothing to warn of
+    value: float | None = None  # what a warning's limit was compared with
 
     def __str__(self) -> str:
         return f"warning: {self.message}" if self.code else self.message
@@ -119,14 +111,7 @@ def read_warning(entry: Mapping[str, Any]) -> Assumption:
 
 
 def expect_no_warning(where: str, notes: Iterable[Assumption], *, brief: bool = False) -> None:
-    """Take warnings for an error, as ``--strict`` asks.
-
-    Args:
-        where: what they are about, at the beginning of the message.
-        notes: among which there may be warnings.
-        brief: whether the message is without figures, equal for all pictures.
-
-    """
+    """Take warnings for an error, as ``--strict`` asks; a brief message is without figures, equal for all pictures."""
     messages = [each.text if brief else each.message for each in notes if each.code]
     if messages:
         more = f", and {len(messages) - 1} more" if len(messages) > 1 else ""

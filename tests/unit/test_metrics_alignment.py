@@ -110,7 +110,7 @@ def test_constant_prediction_becomes_a_constant(how: str) -> None:
 @pytest.mark.parametrize("how", WAYS)
 def test_image_without_a_pixel_to_fit_has_no_score(how: str) -> None:
     pair = SurfacePair(_batch(PREDICTION + 2), torch.full((1, 1, 20, 24), torch.nan, dtype=torch.float64), RAYS)
-    assert depth.abs_rel(align_pair(pair, how)).isnan().all()
+    assert depth.depth_errors(align_pair(pair, how))["AbsRel"].isnan().all()
 
 
 def test_collection_aligns_each_pair_and_gradients_of_none_are_kept() -> None:

@@ -62,7 +62,7 @@ def test_accuracies_are_fractions_below_a_ratio() -> None:
         assert found[f"Depth_delta_{name}"] == pytest.approx((ratio < limit).mean())
     assert 0 < found["Depth_delta_105"] < found["Depth_delta_110"] < found["Depth_delta_125"] < 1
     exactly = np.where(U < 12, 1.25, np.where(U < 18, 1.2, 0.8))
-    assert depth.within_ratio(_pair(exactly, np.ones_like(U)), 1.25).item() == 0.25
+    assert depth.depth_errors(_pair(exactly, np.ones_like(U)))["delta_125"].item() == 0.25
 
 
 def test_a_factor_of_all_depths_has_errors_in_closed_form() -> None:
@@ -193,9 +193,9 @@ def test_thresholds_are_exceeded_only_beyond_them() -> None:
     target = torch.full((1, 1, 2, 4), 2.0, dtype=torch.float64)
     prediction = target * torch.tensor([1.25, 1.2501, 0.8, 0.7999], dtype=torch.float64)
     pair = SurfacePair(prediction, target, FIELD_CAMERA.crop(0, 0, 2, 4).rays()[None])
-    assert depth.beyond_ratio(pair, 1.25).item() == 0.5
-    pair = SurfacePair(target + torch.tensor([0.03125, -0.03125, 0.0313, -0.0313]), target, pair.rays)
-    assert depth.beyond(pair, 0.03125).item() == 0.5
+    assert depth.field_errors(pair)["delta1"].item() == 0.5
+    pair = SurfacePair(target + torch.tensor([0.0499, -0.0499, 0.0501, -0.0501]), target, pair.rays)
+    assert depth.field_errors(pair)["5cm"].item() == 0.5
 
 
 def test_collection_has_the_metrics_of_the_benchmarks_that_it_saw() -> None:

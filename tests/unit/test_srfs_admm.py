@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.surface import back_project, depth_to_normals
-from dsr.methods.classical.iterations import conjugate_gradients
+from dsr.geometry.surface import depth_to_normals
 from dsr.methods.classical.srfs_admm import (
     compute_area,
     compute_shading,
     compute_surface,
+    conjugate_gradients,
     fit_lighting,
     linearise_photometry,
 )
@@ -63,7 +63,7 @@ def test_area_is_that_of_the_back_projected_pixels() -> None:
     camera = _camera(256)
     theta, depth = _theta(camera)
     rays = camera.rays()[None]
-    points = back_project(depth, rays)[0]
+    points = (depth * rays)[0]
     along_u, along_v = points.diff(dim=2)[:, :-1], points.diff(dim=1)[:, :, :-1]
     expected = torch.linalg.cross(along_u, along_v, dim=0).norm(dim=0)
     ours = compute_area(theta, compute_surface(theta, rays))[0, 0, :-1, :-1] / (camera.fx * camera.fy)

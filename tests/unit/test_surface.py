@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.surface import back_project, depth_to_normals, normal_mask
+from dsr.geometry.surface import depth_to_normals, normal_mask
 from dsr.metrics.functional import SurfacePair, mse_v
 
 CAMERA = Camera(width=11, height=7, fx=9.0, fy=12.0, cx=4.3, cy=3.9)
@@ -44,7 +44,7 @@ def _sphere_error(camera: Camera) -> float:
     rays = camera.rays()
     a, b, c = (rays * rays).sum(0), (rays * centre).sum(0), (centre * centre).sum() - radius**2
     depth = ((b - (b * b - a * c).sqrt()) / a)[None]
-    truth = (back_project(depth[None], rays[None])[0] - centre) / radius
+    truth = (depth * rays - centre) / radius
     return float((depth_to_normals(depth[None], rays[None])[0] - truth).abs().max())
 
 

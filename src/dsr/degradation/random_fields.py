@@ -12,7 +12,7 @@ from scipy import ndimage
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.geometry.windows import window_maxima
+from dsr.geometry.hole_size import window_maxima
 from dsr.sample import Scene
 from dsr.utils.records import derived
 

@@ -19,7 +19,7 @@ from dsr.degradation.random_fields import (
     waves_of,
     window_means,
 )
-from dsr.geometry.windows import window_maxima
+from dsr.geometry.hole_size import window_maxima
 
 
 def _white(values: Tensor, _: Tensor, generator: torch.Generator) -> Tensor:

@@ -177,12 +177,8 @@ class Verdict:
 def judge(depth: Array, rgb: Tensor, zooms: Sequence[float] = _ZOOMS) -> Verdict | None:
     """Compare the edges of a depth map with those of a photo: as given, mirrored, rotated, and of other fields of view.
 
-    Args:
-        depth: (h, w) in any unit of depth or of its reciprocal, NaN in holes.
-        rgb: (3, H, W) in [0, 1], of the same field of view.
-        zooms: the other fields of view, as widths of the depth map's over the photo's.
-
-    Returns None if the depth map or the photo has no edge.
+    Depth is (h, w) in any unit of depth or of its reciprocal, NaN in holes; the photo is (3, H, W) in [0, 1]. Zooms are
+    widths of the depth map's field of view over the photo's. Returns None if the depth map or the photo has no edge.
     """
     size = working_size(depth, rgb)
     pixel = max(size) / max(depth.shape)
@@ -192,10 +188,12 @@ def judge(depth: Array, rgb: Tensor, zooms: Sequence[float] = _ZOOMS) -> Verdict
         return None
     fields = transform(outlines)
     across = photo_outlines(np.asarray(cv2.resize(photo.transpose(1, 0, 2), size[::-1]), np.float32), pixel)
-    ways = {
-        name: compare(fields, transform(_reverse(across if exchanged else seen, axes)))
-        for name, (exchanged, axes) in _WAYS.items()
-    }
+    ways = {}
+    for name, (exchanged, axes) in _WAYS.items():
+        given = across if exchanged else seen
+        strength, direction = np.flip(given.strength, axes), np.flip(given.direction, axes)
+        reversed_ = Outlines(strength, direction if len(axes) == 2 else direction.conj())
+        ways[name] = compare(fields, transform(reversed_))
     length, coherence = outlines.contours()
     enough = max(depth.shape) >= _SIDE and length >= _LENGTH and coherence >= _COHERENCE
     double = min(2 * size[0], rgb.shape[-2]), min(2 * size[1], rgb.shape[-1])
@@ -325,12 +323,6 @@ def _middle(values: T, ratio: float) -> T:
     rows, columns = (round(n * min(1 / ratio, 1)) for n in values.shape[-2:])
     top, left = (values.shape[-2] - rows) // 2, (values.shape[-1] - columns) // 2
     return values[..., top : top + rows, left : left + columns]
-
-
-def _reverse(outlines: Outlines, axes: tuple[int, ...]) -> Outlines:
-    """Return the outlines of a photo that is reversed along axes."""
-    strength, direction = np.flip(outlines.strength, axes), np.flip(outlines.direction, axes)
-    return Outlines(strength, direction if len(axes) == 2 else direction.conj())
 
 
 def _bridge(depth: Array, gap: int) -> Array:

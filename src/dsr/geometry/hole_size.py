@@ -1,4 +1,4 @@
-"""Holes of depth maps: how far their pixels are from measured ones, and which holes are wide."""
+"""Pixels and those around them: distances to measured ones, wide holes, largest values of windows."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 # pixels; a hole whose pixels are nearer than that to measured ones is not wide, however coarse the map is
 _NARROW = 2.5
@@ -46,6 +47,19 @@ def is_scattered(known: Tensor) -> bool:
     inner = known[:, 1:-1, 1:-1]
     beside = known[:, :-2, 1:-1] & known[:, 2:, 1:-1] & known[:, 1:-1, :-2] & known[:, 1:-1, 2:]
     return bool((inner & beside).sum() < _TOGETHER * inner.sum())
+
+
+def window_maxima(values: Tensor, reach: int) -> Tensor:
+    """Return the largest values within ``reach`` rows and columns of each pixel, (1, h, w), without NaN."""
+    result = functional.pad(values, (reach,) * 4, value=-math.inf)
+    for dim in (-2, -1):
+        size = 1
+        while size < 2 * reach + 1:  # of windows twice as large, until they are large enough
+            shift = min(size, 2 * reach + 1 - size)
+            rest = result.shape[dim] - shift
+            result = torch.maximum(result.narrow(dim, 0, rest), result.narrow(dim, shift, rest))
+            size += shift
+    return result
 
 
 def _distance(mask: Tensor) -> Tensor:

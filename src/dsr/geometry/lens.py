@@ -89,34 +89,24 @@ def _places(camera: Camera, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
     else:
         x = (np.arange(camera.width) - camera.cx) / camera.fx
         y = (np.arange(camera.height)[:, None] - camera.cy) / camera.fy
-        move = _thin_prism_fisheye if lens.model == "thin_prism_fisheye" else _modified_brown_conrady
-        x, y = move(x, y, lens.coefficients)
+        k1, k2, p1, p2, k3, *others = lens.coefficients
+        if lens.model == "modified_brown_conrady":
+            square = x * x + y * y
+            radial = 1 + square * (k1 + square * (k2 + square * k3))
+            x, y = x * radial, y * radial
+            dx, dy = p2 * (square + 2 * x * x), p1 * (square + 2 * y * y)
+            x, y = x + 2 * p1 * x * y + dx, y + 2 * p2 * x * y + dy
+        else:
+            k4, sx1, sy1 = others
+            angle = np.hypot(x, y)
+            shrinks = np.divide(np.arctan(angle), angle, out=np.ones_like(angle), where=angle > 0)
+            x, y = x * shrinks, y * shrinks
+            square = x * x + y * y
+            radial = 1 + square * (k1 + square * (k2 + square * (k3 + square * k4)))
+            dx = 2 * p1 * x * y + p2 * (square + 2 * x * x) + sx1 * square
+            dy = 2 * p2 * x * y + p1 * (square + 2 * y * y) + sy1 * square
+            x, y = x * radial + dx, y * radial + dy
         places = (x * camera.fx + camera.cx, y * camera.fy + camera.cy)
     outside = -2.0 * _MOST
     x, y = (np.clip(np.nan_to_num(each, nan=outside), outside, 2 * _MOST).astype(np.float32) for each in places)
     return x, y
-
-
-Places = tuple[np.ndarray, np.ndarray]
-
-
-def _modified_brown_conrady(x: np.ndarray, y: np.ndarray, coefficients: tuple[float, ...]) -> Places:
-    """Return where the points (x, y, 1) of rays lie at a focal length of 1."""
-    k1, k2, p1, p2, k3 = coefficients
-    square = x * x + y * y
-    radial = 1 + square * (k1 + square * (k2 + square * k3))
-    x, y = x * radial, y * radial
-    return x + 2 * p1 * x * y + p2 * (square + 2 * x * x), y + 2 * p2 * x * y + p1 * (square + 2 * y * y)
-
-
-def _thin_prism_fisheye(x: np.ndarray, y: np.ndarray, coefficients: tuple[float, ...]) -> Places:
-    """Return the same of the other model."""
-    k1, k2, p1, p2, k3, k4, sx1, sy1 = coefficients
-    angle = np.hypot(x, y)
-    shrinks = np.divide(np.arctan(angle), angle, out=np.ones_like(angle), where=angle > 0)
-    x, y = x * shrinks, y * shrinks
-    square = x * x + y * y
-    radial = 1 + square * (k1 + square * (k2 + square * (k3 + square * k4)))
-    dx = 2 * p1 * x * y + p2 * (square + 2 * x * x) + sx1 * square
-    dy = 2 * p2 * x * y + p1 * (square + 2 * y * y) + sy1 * square
-    return x * radial + dx, y * radial + dy

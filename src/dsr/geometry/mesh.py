@@ -55,16 +55,10 @@ def triangulate(
     The diagonal of a square is the one with the smaller change of depth. A square with one missing pixel gives one
     triangle. Memory: about 110 bytes per pixel, and 80 bytes for :func:`vertex_normals`.
 
-    Args:
-        depth: (1, H, W) orthogonal depth in metres, NaN in holes.
-        camera: of these pixels.
-        largest_step: relative change of depth, beyond what the slopes on both sides predict, from which a pair is cut.
-        stride: every which row and column becomes vertices.
-        isolated: whether vertices without a triangle are kept.
-        tolerance: (1, H, W) how far in metres each pixel lies beside the mesh, mostly and by about twice that at
-            most, so that flat parts get large triangles, see :func:`dsr.geometry.adaptive_mesh.join`; None for a mesh
-            of all pixels.
-
+    Depth is (1, H, W) in metres, NaN in holes. A pair is cut from the relative change ``largest_step`` on, beyond what
+    the slopes on both sides predict. ``isolated`` keeps vertices without a triangle. ``tolerance``, (1, H, W), is how
+    far in metres pixels lie beside the mesh, mostly and by about twice that at most, so that flat parts get large
+    triangles, see :func:`dsr.geometry.adaptive_mesh.join`; None for a mesh of all pixels.
     """
     if tuple(depth.shape) != (1, camera.height, camera.width):
         raise ValueError(f"depth: expected shape {(1, camera.height, camera.width)}, got {tuple(depth.shape)}")
@@ -139,26 +133,23 @@ def find_connections(inverse: np.ndarray, largest_step: float = LARGEST_STEP) ->
 
 def _connected(inverse: np.ndarray, largest_step: float) -> np.ndarray:
     """Return whether each pixel and its right neighbour lie on one surface, (H, W - 1) bool; False beside holes."""
-    rows = max(1, _STRIP // inverse.shape[1])
-    strips = [inverse[start : start + rows] for start in range(0, len(inverse), rows)]
-    return np.concatenate([_connected_strip(strip, largest_step) for strip in strips])
-
-
-def _connected_strip(inverse: np.ndarray, largest_step: float) -> np.ndarray:
-    """Return :func:`_connected` of a few rows."""
-    change = np.diff(inverse, axis=1)  # (H, W - 1)
-    scale = largest_step * np.minimum(inverse[:, :-1], inverse[:, 1:])
-    step = np.zeros(change.shape, dtype=bool)
-    for half_width in _HALF_WIDTHS:
-        far, near = _shift(inverse, half_width)[:, :-1], _shift(inverse, 1 - half_width)[:, :-1]
-        beyond, before = _shift(inverse, 2 * half_width)[:, :-1], _shift(inverse, 1 - 2 * half_width)[:, :-1]
-        total, pairs = far - near, 2 * half_width - 1
-        excess, own = np.abs(total), np.abs(change)
-        for slope in ((beyond - far) / half_width, (near - before) / half_width):
-            excess = np.fmin(excess, np.abs(total - pairs * slope))
-            own = np.fmin(own, np.abs(change - slope))
-        step |= (excess > scale) & (own > (1.0 if half_width == 1 else _OWN_FRACTION) * scale)
-    return np.isfinite(change) & ~step
+    rows, found = max(1, _STRIP // inverse.shape[1]), []
+    for start in range(0, len(inverse), rows):
+        strip = inverse[start : start + rows]
+        change = np.diff(strip, axis=1)
+        scale = largest_step * np.minimum(strip[:, :-1], strip[:, 1:])
+        step = np.zeros(change.shape, dtype=bool)
+        for half_width in _HALF_WIDTHS:
+            far, near = _shift(strip, half_width)[:, :-1], _shift(strip, 1 - half_width)[:, :-1]
+            beyond, before = _shift(strip, 2 * half_width)[:, :-1], _shift(strip, 1 - 2 * half_width)[:, :-1]
+            total, pairs = far - near, 2 * half_width - 1
+            excess, own = np.abs(total), np.abs(change)
+            for slope in ((beyond - far) / half_width, (near - before) / half_width):
+                excess = np.fmin(excess, np.abs(total - pairs * slope))
+                own = np.fmin(own, np.abs(change - slope))
+            step |= (excess > scale) & (own > (1.0 if half_width == 1 else _OWN_FRACTION) * scale)
+        found.append(np.isfinite(change) & ~step)
+    return np.concatenate(found)
 
 
 def _shift(values: np.ndarray, by: int) -> np.ndarray:

@@ -33,6 +33,7 @@ _NEAR = 0.3  # largest distance of k from the value that a window votes for
 _WHOLE = 0.95  # minimum fraction of valid pixels in a cell
 _LARGEST = 1e3  # upper limit of inverse depth, as a multiple of the median's
 _EXACT = 1e-12
+_SIGMA = 1.4826  # standard deviation over the median absolute residual
 _LEAST, _LEAD = 4, 3  # minimum number of votes for orthogonal depth, and their minimum ratio to all others
 _LEAST_BENT = 6  # votes for another type; none of 28 right maps of sensors and data sets has any
 _LEAST_INVERSE = 10  # windows in which values, not reciprocals, are linear; 28 right maps have at most 4
@@ -212,19 +213,14 @@ def _robust_fit(columns: Array, windows: Windows) -> tuple[Array, Array]:
     weight = valid
     for iteration in range(_ITERATIONS):
         size = np.abs(windows.inverse - _product(columns, _solve(columns, weight, windows.inverse)))
-        ratio = size / _deviation(size, windows.valid)
+        ratio = size / (_SIGMA * _medians(size, windows.valid) + _EXACT)
         if iteration < _ITERATIONS // 2:
             weight = valid * (1 / np.maximum(ratio, 0.05))
         else:
             weight = valid * np.square((1 - np.square(ratio / 4)).clip(min=0))
     fit = _solve(columns, weight, windows.inverse)
     size = np.abs(windows.inverse - _product(columns, fit))
-    return fit, valid * (size < 3 * _deviation(size, windows.valid))
-
-
-def _deviation(size: Array, valid: np.ndarray) -> Array:
-    """Estimate the standard deviation from the median absolute residual, (N, 1)."""
-    return 1.4826 * _medians(size, valid) + _EXACT
+    return fit, valid * (size < 3 * (_SIGMA * _medians(size, windows.valid) + _EXACT))
 
 
 def _medians(values: Array, valid: np.ndarray) -> Array:

@@ -59,18 +59,18 @@ class Reading(NamedTuple):
         return (invert(changed) if self.direction else changed) @ _AXES[self.axes]
 
 
-def _readings() -> dict[str, Reading]:
-    """Return all readings by name, those first that change less; "" is as given."""
-    found = []
-    for turn, direction, axes, length in itertools.product(_ROTATIONS, _DIRECTIONS, _AXES, _LENGTHS):
-        if not turn or not (axes or (direction and turn == "with rotations by columns")):
-            found.append(Reading(direction, turn, axes, length))
-    found.sort(key=lambda reading: sum(map(bool, reading)))
-    return {", ".join(filter(None, reading)): reading for reading in found}
-
-
-READINGS = _readings()
-
+# all readings by name, those first that change less; "" is as given
+READINGS = {
+    ", ".join(filter(None, reading)): reading
+    for reading in sorted(
+        (
+            Reading(direction, turn, axes, length)
+            for turn, direction, axes, length in itertools.product(_ROTATIONS, _DIRECTIONS, _AXES, _LENGTHS)
+            if not turn or not (axes or (direction and turn == "with rotations by columns"))
+        ),
+        key=lambda reading: sum(map(bool, reading)),
+    )
+}
 _WIDEST = 320  # maps are reduced to at most as many pixels across, by leaving out pixels
 _ACROSS = 24  # points across a map that are moved
 _GAPS = (0, 1, 3, 10, 30)  # places of the frames of a group that are compared with each other, from its first one

@@ -49,23 +49,14 @@ _CONTRAST, _BY_CHANCE, _BY_OTHERS, _BY_NONE = 1.2, 2.8, 2.0, 3.0
 
 @dataclass(frozen=True)
 class Displacement:
-    """Where the photo shows a point of the depth map, in pixels of the map: p -> c + scale (p - c) + (right, down).
+    """Where the photo shows a point of the depth map, in pixels of the map: p -> c + scale (p - c) + (right, down)."""
 
-    Args:
-        right, down: shift from depth edges to the photo's edges, in pixels of the depth map.
-        scale: about the middle c of the map.
-        certain: whether photo and depth agree significantly better there than elsewhere, and than with no displacement.
-        visible: whether it is at least a pixel of the depth map and one that the eye sees in the photo.
-        moved: how far it moves a corner, in pixels of the photo, at most ``WORKING_SIZE`` on its longer side.
-
-    """
-
-    right: float
+    right: float  # shift from depth edges to the photo's edges, in pixels of the depth map
     down: float
-    scale: float = 1.0
-    certain: bool = False
-    visible: bool = False
-    moved: float = 0.0
+    scale: float = 1.0  # about the middle c of the map
+    certain: bool = False  # agreement is significantly better there than elsewhere, and than with no displacement
+    visible: bool = False  # at least a pixel of the depth map, and one that the eye sees in the photo
+    moved: float = 0.0  # of a corner, in pixels of the photo, at most ``WORKING_SIZE`` on its longer side
 
     def __str__(self) -> str:
         """Return the displacement of depth that is undone, for people."""
@@ -213,12 +204,9 @@ def undo(depth_lr: Tensor, displacement: Displacement) -> Tensor:
 def find_edges(depth: Array, margin: int, gap: int | None = None) -> Edges:
     """Return the jumps of depth, (H, W) with NaN in holes, away from the border; a subset if there are very many.
 
-    Args:
-        depth: in metres.
-        margin: smallest distance from the border in pixels.
-        gap: widest hole in pixels across which a jump counts, as a sensor's shadow beside an edge: the edge is then
-            where the nearer surface ends. None to leave out jumps within two pixels of a hole.
-
+    ``margin`` is the smallest distance from the border in pixels, ``gap`` the widest hole in pixels across which a jump
+    counts, as a sensor's shadow beside an edge: the edge is then where the nearer surface ends. None leaves out jumps
+    within two pixels of a hole.
     """
     safe = np.ones(depth.shape, bool) if gap is not None else ~ndimage.binary_dilation(np.isnan(depth), iterations=2)
     safe[:margin] = safe[-margin:] = safe[:, :margin] = safe[:, -margin:] = False

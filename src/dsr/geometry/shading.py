@@ -80,25 +80,18 @@ def comparison(depth: Tensor, truth: Tensor | None, rays: Tensor, rgb: Tensor, d
 
 
 def _row(panels: dict[str, Tensor]) -> Tensor:
-    """Return up to four panels beside each other with their labels, (3, H, W) uint8."""
-    columns = [torch.cat([_label(name, panel.shape[-1]), panel], dim=-2)
-               for name, panel in ((name, _panel(values)) for name, values in panels.items())]  # fmt: skip
+    """Return up to four images, (C, H, W) in [0, 1] with NaN in holes, beside each other with labels, (3, H', W')."""
+    columns = []
+    for name, values in panels.items():
+        longest = max(values.shape[-2:])
+        factor, repeats = math.ceil(longest / _LONGEST), math.ceil(_SHORTEST / longest)
+        opaque = values.detach().float().cpu().nan_to_num(0)[None]
+        reduced = functional.avg_pool2d(opaque, factor, ceil_mode=True, count_include_pad=False)[0]
+        enlarged = reduced.repeat_interleave(repeats, dim=-2).repeat_interleave(repeats, dim=-1)
+        panel = (255 * enlarged).round().to(torch.uint8).expand(3, -1, -1)
+        line = Image.new("L", (panel.shape[-1], _LABEL))  # what does not fit is cut off
+        ImageDraw.Draw(line).text((2, 1), name, fill=255, font=ImageFont.load_default(11))
+        label = torch.frombuffer(bytearray(line.tobytes()), dtype=torch.uint8).view(1, _LABEL, -1).expand(3, -1, -1)
+        columns.append(torch.cat([label, panel], dim=-2))
     columns += [torch.zeros_like(columns[0])] * (len(LIGHT_NAMES) - len(columns))
     return torch.cat(columns, dim=-1)
-
-
-def _panel(values: Tensor) -> Tensor:
-    """Return an image, (C, H, W) in [0, 1] with NaN in holes, as (3, h, w) uint8 of the size of panels."""
-    longest = max(values.shape[-2:])
-    factor, repeats = math.ceil(longest / _LONGEST), math.ceil(_SHORTEST / longest)
-    values = values.detach().float().cpu().nan_to_num(0)[None]
-    reduced = functional.avg_pool2d(values, factor, ceil_mode=True, count_include_pad=False)[0]
-    enlarged = reduced.repeat_interleave(repeats, dim=-2).repeat_interleave(repeats, dim=-1)
-    return (255 * enlarged).round().to(torch.uint8).expand(3, -1, -1)
-
-
-def _label(text: str, width: int) -> Tensor:
-    """Return a line of white text on black, (3, 16, width) uint8; what does not fit is cut off."""
-    line = Image.new("L", (width, _LABEL))
-    ImageDraw.Draw(line).text((2, 1), text, fill=255, font=ImageFont.load_default(11))
-    return torch.frombuffer(bytearray(line.tobytes()), dtype=torch.uint8).view(1, _LABEL, width).expand(3, -1, -1)

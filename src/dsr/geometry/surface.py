@@ -1,14 +1,9 @@
-"""Points and normals of a depth map."""
+"""Normals of a depth map."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
-
-
-def back_project(depth: Tensor, rays: Tensor) -> Tensor:
-    """Back-project depth, (B, 1, H, W) metres, along rays with z = 1: the points P = z r, (B, 3, H, W)."""
-    return depth * rays
 
 
 def depth_to_normals(depth: Tensor, rays: Tensor, dtype: torch.dtype | None = None) -> Tensor:
@@ -31,7 +26,9 @@ def depth_to_normals(depth: Tensor, rays: Tensor, dtype: torch.dtype | None = No
     dtype = dtype or depth.dtype
     step_u = _repeat_last(depth.diff(dim=-1).to(dtype), dim=-1)
     step_v = _repeat_last(depth.diff(dim=-2).to(dtype), dim=-2)
-    along_u, along_v = (_next_pixel(depth.to(dtype), dim) for dim in (-1, -2))
+    values = depth.to(dtype)  # of the next pixel; the last pixel's is the one before it
+    along_u = torch.cat((values[..., 1:], values[..., -2:-1]), dim=-1)
+    along_v = torch.cat((values[..., 1:, :], values[..., -2:-1, :]), dim=-2)
     x, y, _ = rays.split(1, dim=-3)
     height, width = depth.shape[-2:]
     fx = ((width - 1) / (x[..., :1, -1:] - x[..., :1, :1])).to(dtype)
@@ -71,9 +68,3 @@ def normal_mask(mask: Tensor) -> Tensor:
 def _repeat_last(values: Tensor, dim: int) -> Tensor:
     """Append a copy of the last slice along ``dim``."""
     return torch.cat((values, values.narrow(dim, -1, 1)), dim)
-
-
-def _next_pixel(values: Tensor, dim: int) -> Tensor:
-    """Return each pixel's next one along ``dim``; the last pixel's is the one before it."""
-    size = values.shape[dim]
-    return torch.cat((values.narrow(dim, 1, size - 1), values.narrow(dim, size - 2, 1)), dim)

@@ -18,9 +18,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.hole_size import degrees_per_pixel, distance_to_known
+from dsr.geometry.hole_size import degrees_per_pixel, distance_to_known, window_maxima
 from dsr.geometry.surface import angle_between, depth_to_normals
-from dsr.geometry.windows import window_maxima
 from dsr.inference.resizing import resize_nearest, size_of
 from dsr.methods.base import Outliers
 

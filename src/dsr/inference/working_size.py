@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.degradation.sensors import Identified, identify
-from dsr.geometry.windows import window_maxima
+from dsr.geometry.hole_size import window_maxima
 from dsr.inference.defaults import SIZES
 from dsr.inference.resizing import resize_nearest, size_of
 from dsr.methods.base import InverseSurface, MapNoise, NoiseLaw

@@ -18,8 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dsr.geometry.hole_size import is_scattered, wide_holes
-from dsr.geometry.windows import window_maxima
+from dsr.geometry.hole_size import is_scattered, wide_holes, window_maxima
 
 _WEIGHTS = Path(__file__).with_suffix(".safetensors")
 GRID = 320

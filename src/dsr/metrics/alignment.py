@@ -60,7 +60,12 @@ def align(prediction: Tensor, target: Tensor, mask: Tensor | None, how: str) -> 
     elif how == "affine_disparity":
         aligned = 1 / _least_squares(1 / z, 1 / truth, valid.double()).clamp(min=LEAST)
     else:
-        aligned = _least_deviations(z, truth, valid / truth).clamp(min=LEAST)
+        weights = valid / truth
+        aligned = _least_squares(z, truth, weights)
+        for _ in range(_ITERATIONS):  # of the least absolute deviations
+            apart = torch.maximum((aligned - truth).abs(), _SMALLEST_ERROR * truth)
+            aligned = _least_squares(z, truth, weights / apart)
+        aligned = aligned.clamp(min=LEAST)
     return torch.where(known, aligned.to(prediction.dtype), prediction)
 
 
@@ -105,11 +110,3 @@ def _least_squares(x: Tensor, y: Tensor, weights: Tensor) -> Tensor:
     x, middle = x - mean(x), mean(y)
     variance = mean(x.square())
     return torch.where(variance > 0, mean(x * (y - middle)) / variance, 0) * x + middle
-
-
-def _least_deviations(x: Tensor, y: Tensor, weights: Tensor) -> Tensor:
-    """Return a x + b with the least weighted sum of absolute differences from y."""
-    fitted = _least_squares(x, y, weights)
-    for _ in range(_ITERATIONS):
-        fitted = _least_squares(x, y, weights / torch.maximum((fitted - y).abs(), _SMALLEST_ERROR * y))
-    return fitted

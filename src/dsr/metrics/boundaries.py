@@ -23,7 +23,6 @@ pixels that have a prediction, ``Boundary_covered``, belongs to every score.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -35,7 +34,7 @@ from torch.nn.functional import avg_pool2d
 from dsr.metrics.depth import covered
 from dsr.metrics.formats import BEFORE_THE_PAPER, MetricFormat, column
 from dsr.metrics.functional import SurfacePair, masked_mean, masked_median, once_per_pair
-from dsr.metrics.metric import Metric, depth_mask, target_mask
+from dsr.metrics.metric import Metric, depth_mask, part_of, target_mask
 from dsr.utils.compute_device import in_own_precision
 
 # Depth Pro's thresholds, which are their own weights; MoGe's weights are 1 less
@@ -159,15 +158,15 @@ def depth_boundary_error(found: Tensor, true: Tensor, quantile: float | None = N
     return accuracy, completeness
 
 
-def directed_depth_error(pair: SurfacePair, plane: float = DDE_PLANE) -> Tensor:
-    """Return iBims-1's directed depth error about a plane at a depth in metres, (B, 3) fractions of pixels.
+def directed_depth_error(pair: SurfacePair, plane: float = DDE_PLANE) -> tuple[Tensor, ...]:
+    """Return iBims-1's directed depth error about a plane at a depth in metres, three fractions of pixels, (B,) each.
 
     They are on the right side, in front of it though the truth is not, and beyond it though the truth is not. Their
     code overwrites depths by 0 and 1 before it has compared all of them, so that planes nearer than 1 m came out wrong.
     """
     before, truly = pair.prediction <= plane, pair.target <= plane
     parts = (before == truly, before & ~truly, ~before & truly)
-    return torch.cat([masked_mean(part, pair.depth_mask) for part in parts], dim=1)
+    return tuple(masked_mean(part, pair.depth_mask).squeeze(1) for part in parts)
 
 
 def planarity(
@@ -178,12 +177,9 @@ def planarity(
     The prediction is scaled by the ratio of the two median depths in the plane, and a plane is fitted to its points.
     An image's error is the mean over its planes (``nanmean``).
 
-    Args:
-        pair: the two maps.
-        planes: (B, P, H, W) bool, the pixels of each plane.
-        normals: (B, P, 3) true normals, x right, y down, z forward, of either sign; None for those of the truth's
-            points, fitted alike. iBims-1's are x right, y forward, z up: theirs of (x, y, z) is (x, -z, y) here.
-        smallest: planes with a lower fraction of the image's pixels get NaN, and so does one without a prediction.
+    Planes are (B, P, H, W) bool; true normals, (B, P, 3) of either sign, x right, y down, z forward, or None for those
+    of the truth's points, fitted alike. iBims-1's are x right, y forward, z up: (x, y, z) is (x, -z, y) here. Planes
+    with less than the fraction ``smallest`` of the image's pixels get NaN, and so does one without a prediction.
 
     Returns the flatness, the standard deviation of the points about their plane in metres, and the orientation, the
     angle between its normal and the true one in degrees.
@@ -252,11 +248,6 @@ def _planarity(pair: SurfacePair) -> tuple[Tensor, Tensor]:
     return flatness, orientation
 
 
-def _part(pair: SurfacePair, function: Callable[[SurfacePair], Tensor | Sequence[Tensor]], part: int) -> Tensor:
-    found = function(pair)
-    return found[:, part] if isinstance(found, Tensor) else found[part]
-
-
 _whole = partial(Metric, whole=True)
 _shown = partial(column, higher_is_better=True)
 METRICS: tuple[Metric, ...] = (
@@ -275,7 +266,7 @@ METRICS: tuple[Metric, ...] = (
     *(
         _whole(
             f"DBE_{name}",
-            partial(_part, function=_boundary_errors, part=part),
+            partial(part_of, function=_boundary_errors, part=part),
             target_mask,
             column("DBE", f"{name}, px"),
             min_size=3,
@@ -285,7 +276,7 @@ METRICS: tuple[Metric, ...] = (
     *(
         _whole(
             f"DDE_{name}",
-            partial(_part, function=directed_depth_error, part=part),
+            partial(part_of, function=directed_depth_error, part=part),
             depth_mask,
             MetricFormat("DDE", f"3 m, {name}, %", 1e2, 1, higher_is_better=part == 0, position=None),
             min_size=1,
@@ -295,7 +286,7 @@ METRICS: tuple[Metric, ...] = (
     *(
         _whole(
             f"PE_{name}",
-            partial(_part, function=_planarity, part=part),
+            partial(part_of, function=_planarity, part=part),
             depth_mask,
             column("PE", f"{name}, {unit}", factor),
             min_size=3,

@@ -120,14 +120,12 @@ def off_auc(expected: Tensor, measured: Tensor, threshold: float = OFF) -> Tenso
 
 def stated_ratio(expected: Tensor, measured: Tensor) -> Tensor:
     """Return the median expected error over the median measured one."""
-    first, second = _ordered(expected, measured)
-    return _median(first) / _median(second)
-
-
-def _median(values: Tensor) -> Tensor:
-    """Return the median of (N,) values; of an even number the mean of the middle two."""
-    count = len(values)
-    return values.sort().values[[(count - 1) // 2, count // 2]].mean() if count else values.mean()
+    expected, measured = _ordered(expected, measured)
+    count = len(expected)
+    if not count:
+        return expected.new_tensor(torch.nan)
+    middle = [(count - 1) // 2, count // 2]  # of an even number the mean of the middle two
+    return expected[middle].mean() / measured.sort().values[middle].mean()
 
 
 def _ordered(expected: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
@@ -136,22 +134,15 @@ def _ordered(expected: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
         came = f"{tuple(expected.shape)} and {tuple(measured.shape)}"
         raise ValueError(f"expected, measured: expected errors of the same pixels, got shapes {came}")
     valid = expected.isfinite() & measured.isfinite()
-    expected = expected[valid].double()
-    order = _stable_order(expected)
-    return expected[order], measured[valid].double()[order]
-
-
-def _stable_order(values: Tensor) -> Tensor:
-    """Return the indices that sort (N,) values; equal ones keep their order.
-
-    Non-negative values of half precision, as expected errors are stored in, are sorted by radix, which takes a tenth
-    of the time.
-    """
-    halves = values.half()
-    if values.device.type == "cpu" and torch.equal(halves.double(), values) and bool((values >= 0).all()):
+    expected, measured = expected[valid].double(), measured[valid].double()
+    halves = expected.half()
+    if expected.device.type == "cpu" and torch.equal(halves.double(), expected) and bool((expected >= 0).all()):
+        # expected errors are stored in half precision: sorted by radix, they take a tenth of the time
         bits = halves.abs().view(torch.int16)  # ordered as the numbers are
-        return torch.from_numpy(np.argsort(bits.numpy(), kind="stable"))
-    return values.argsort(stable=True)
+        order = torch.from_numpy(np.argsort(bits.numpy(), kind="stable"))
+    else:
+        order = expected.argsort(stable=True)
+    return expected[order], measured[order]
 
 
 _Comparison = Callable[[Tensor, Tensor], Tensor]

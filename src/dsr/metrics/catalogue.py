@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from operator import attrgetter
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -30,24 +31,30 @@ __all__ = [
 ]
 
 
-def _bad_pix_d(percent: int, unit: str) -> Metric:
-    function = partial(functional.bad_pix_d, threshold=percent / 100, relative=unit == "pct")
-    heading = f"{percent} cm, %" if unit == "cm" else f"{percent} % of depth, %"
-    shown = MetricFormat("BadPix_d", heading, 1e2, 2, position=2 if (percent, unit) == (5, "cm") else None)
-    return Metric(f"BadPix_d_{percent}{unit}", function, depth_mask, shown, min_size=1)
-
-
-def _bad_pix_v(level: int) -> Metric:
-    shown = MetricFormat("BadPix_v", f"{level}, %", 1e2, 1, position=3 if level == 5 else None)
-    function = partial(functional.bad_pix_v, threshold=level)
-    return Metric(f"BadPix_v_{level}", function, normal_mask, shown, per_light=True)
-
-
 # the paper's metrics in the order of scores.csv; those with a position are the columns of its tables
 METRICS: tuple[Metric, ...] = (
     Metric("RMSE_d", functional.rmse_d, depth_mask, MetricFormat("RMSE_d", "mm", 1e3, 1, position=1), min_size=1),
-    *(_bad_pix_d(percent, unit) for unit in ("cm", "pct") for percent in (1, 5, 10)),
-    *map(_bad_pix_v, (1, 5, 10)),
+    *(
+        Metric(
+            f"BadPix_d_{percent}{unit}",
+            partial(functional.bad_pix_d, threshold=percent / 100, relative=unit == "pct"),
+            depth_mask,
+            MetricFormat("BadPix_d", f"{percent} {of}, %", 1e2, 2, position=2 if percent == second else None),
+            min_size=1,
+        )
+        for unit, of, second in (("cm", "cm", 5), ("pct", "% of depth", None))
+        for percent in (1, 5, 10)
+    ),
+    *(
+        Metric(
+            f"BadPix_v_{level}",
+            partial(functional.bad_pix_v, threshold=level),
+            normal_mask,
+            MetricFormat("BadPix_v", f"{level}, %", 1e2, 1, position=3 if level == 5 else None),
+            per_light=True,
+        )
+        for level in (1, 5, 10)
+    ),
     Metric(
         "DSSIM_v",
         functional.dssim_v,
@@ -111,12 +118,7 @@ def catalogue(
 ) -> tuple[Metric, ...]:
     """Return the metrics that can be computed: those of some protocols, then ``extra``.
 
-    Args:
-        network: for perceptual metrics; None leaves them out.
-        extra: metrics beside those of the protocols.
-        protocols: names of protocols, in the order of the metrics.
-        regions: parts of the scenes, for which the columns of tables that are means over pixels follow once more.
-
+    Perceptual metrics need the network. For each region, the columns of tables that are means over pixels follow again.
     """
     if not protocols or not set(protocols) <= set(PROTOCOLS):
         raise ValueError(f"protocols: expected some of {', '.join(PROTOCOLS)}, got {', '.join(protocols) or 'none'}")
@@ -135,8 +137,7 @@ def catalogue(
     )
 
 
-@dataclass(frozen=True)
-class Score:
+class Score(NamedTuple):
     """One row of ``scores.csv``: a metric's value for one image, and the valid fraction of the pixels that it uses."""
 
     metric: str
@@ -161,13 +162,9 @@ def score_image(
     Rows and columns at the border without any predicted pixel are cut off first (MSG's published networks leave out the
     last of each), except for metrics of the whole image. The valid fractions still refer to the complete map.
 
-    Args:
-        prediction, target: (1, H, W) orthogonal depth in metres, NaN where missing.
-        rays: (3, H, W), see :meth:`dsr.geometry.camera.Camera.rays`.
-        metrics: from :func:`catalogue`; those for other units, absent regions or absent errors are left out.
-        unit: of the benchmark.
-        regions: parts of the image by name, (1, H, W) uint8.
-        errors: the method's expected errors, (1, H, W): of depth in metres, of normals in degrees.
+    Both maps are (1, H, W) orthogonal depth in metres, NaN where missing, the rays (3, H, W), regions (1, H, W) uint8,
+    and ``errors`` the method's expected errors, (1, H, W): of depth in metres, of normals in degrees. Metrics for other
+    units, absent regions or absent errors are left out.
     """
     valid = prediction.isfinite()[0]
     window: list[slice] = []  # rows and columns of the smallest one with all predicted pixels; all if there are none

@@ -37,7 +37,6 @@ class PerImageMean(torchmetrics.Metric):
         metric: from :func:`dsr.metrics.catalogue.catalogue`, or the name of one, as in ``scores.csv``.
         variant: ``max`` (worst of four lights, the smallest value where higher is better), ``avg`` or one of e1..e4;
             has no effect on metrics without lights.
-        **settings: as for every torchmetrics class.
 
     """
 
@@ -143,11 +142,7 @@ class LPIPSv(PerImageMean):
 class SurfaceMetrics(torchmetrics.MetricCollection):
     """A collection that makes one :class:`~dsr.metrics.functional.SurfacePair` of a batch for all of its metrics.
 
-    Args:
-        *metrics: as for every torchmetrics collection.
-        alignment: one of :data:`dsr.metrics.alignment.ALIGNMENTS`, of each prediction to its truth.
-        **settings: as for every torchmetrics collection.
-
+    ``alignment`` is one of :data:`dsr.metrics.alignment.ALIGNMENTS`, of each prediction to its truth.
     """
 
     def __init__(self, *metrics: Any, alignment: str = "none", **settings: Any) -> None:
@@ -172,13 +167,7 @@ def visual_metrics(
 ) -> SurfaceMetrics:
     """Return all metrics of some protocols, each of the worst of four lights, as one collection.
 
-    Args:
-        network: for perceptual metrics; None leaves them out.
-        extra: metrics beside those of the protocols.
-        protocols: names of :data:`dsr.metrics.catalogue.PROTOCOLS`.
-        alignment: see :class:`SurfaceMetrics`.
-        **settings: as for every torchmetrics class.
-
+    Perceptual metrics need the network; ``alignment`` is that of :class:`SurfaceMetrics`.
     """
     chosen = catalogue(network, extra, protocols)
     metrics: dict[str, Any] = {metric.name: PerImageMean(metric, **settings) for metric in chosen}

@@ -123,7 +123,10 @@ def wkdr(pair: SurfacePair) -> Tensor:
     for prediction, target, known, true in zip(*pair.given, pair.depth_mask, pair.target_mask, strict=True):
         x, y = (each[known].detach().float().cpu() for each in (prediction, target))  # in 32 bits, as theirs
         keys = [each.view(torch.int32) for each in (x, y)]
-        ties = [_tied(each) for each in (*keys, (keys[0].long() << 32) | keys[1])]
+        ties = []  # how many pairs of numbers are equal
+        for each in (*keys, (keys[0].long() << 32) | keys[1]):
+            counts = torch.unique_consecutive(each.sort().values, return_counts=True)[1]
+            ties.append(int((counts * (counts - 1) // 2).sum()))
         count = len(x) * (len(x) - 1) // 2
         tau = kendalltau(x.numpy(), y.numpy()).statistic if count > max(ties) else 0
         balance = round(tau * math.sqrt((count - ties[0]) * (count - ties[1])))  # concordant pairs less discordant ones
@@ -139,8 +142,7 @@ def beyond_disparity(pair: SurfacePair) -> Tensor:
 
     The prediction's inverse depth is first fitted to the true one by a factor and an offset, by least squares.
     """
-    aligned = _aligned(pair, 1 / pair.prediction, 1 / pair.target)
-    return _beyond(pair, 1 / aligned)
+    return _beyond(pair, 1 / _aligned(pair, 1 / pair.prediction, 1 / pair.target))
 
 
 @once_per_pair
@@ -193,12 +195,6 @@ def _pair_error(rows: Tensor, first: Tensor, second: Tensor) -> Tensor:
         error = torch.where(valid[:, 1] > 0, (angles[:, 0] - angles[:, 1]).abs(), torch.pi)
         total, count = total + (error * valid[:, 0]).sum(), count + valid[:, 0].sum()
     return total / count
-
-
-def _tied(keys: Tensor) -> int:
-    """Return how many pairs of numbers are equal."""
-    counts = torch.unique_consecutive(keys.sort().values, return_counts=True)[1]
-    return int((counts * (counts - 1) // 2).sum())
 
 
 def _aligned(pair: SurfacePair, values: Tensor, target: Tensor) -> Tensor:

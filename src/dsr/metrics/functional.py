@@ -183,7 +183,7 @@ class SurfacePair:
         """The two maps of e . n for the four lights, (B, 4, H, W), unclipped; 0 where invalid."""
         directions = lights(dtype=self.image_dtype, device=self.target.device)
         first, second = (in_own_precision(shade)(normals, directions) for normals in self.normals)
-        return self._blank(first), self._blank(second)
+        return (first, second) if self.complete else (first * self.normal_mask, second * self.normal_mask)
 
     @cached_property
     def renderings(self) -> tuple[Tensor, Tensor]:
@@ -220,10 +220,6 @@ class SurfacePair:
             return self.depth_mask
         missing = (~self.depth_mask).to(self.target.dtype)
         return torch.nn.functional.max_pool2d(missing, 5, stride=1, padding=2) == 0
-
-    def _blank(self, values: Tensor) -> Tensor:
-        """Return ``values`` with 0 where a normal is invalid."""
-        return values if self.complete else values * self.normal_mask
 
 
 def rmse_d(pair: SurfacePair) -> Tensor:
@@ -347,16 +343,12 @@ def _scharr(values: Tensor) -> tuple[Tensor, Tensor]:
 
     The response to a ramp of slope 1 per pixel is 2 (edge weights 1, 0, -1; smoothing 3/16, 10/16, 3/16).
     """
-    along_v = values[..., 2:, :] - values[..., :-2, :]
-    along_u = values[..., :, 2:] - values[..., :, :-2]
-    along_v = _smooth(along_v, dim=-1)
-    along_u = _smooth(along_u, dim=-2)
-    pad = torch.nn.functional.pad
-    return pad(along_v, (1, 1, 1, 1)), pad(along_u, (1, 1, 1, 1))
-
-
-def _smooth(values: Tensor, dim: int) -> Tensor:
-    """Return the (3, 10, 3) / 16 average along ``dim``, two pixels shorter."""
-    size = values.shape[dim] - 2
-    outer = values.narrow(dim, 0, size) + values.narrow(dim, 2, size)
-    return outer * (3 / 16) + values.narrow(dim, 1, size) * (10 / 16)
+    found = []
+    for along, across in ((-2, -1), (-1, -2)):
+        size = values.shape[along] - 2
+        steps = values.narrow(along, 2, size) - values.narrow(along, 0, size)
+        size = values.shape[across] - 2
+        outer = steps.narrow(across, 0, size) + steps.narrow(across, 2, size)
+        smooth = outer * (3 / 16) + steps.narrow(across, 1, size) * (10 / 16)
+        found.append(torch.nn.functional.pad(smooth, (1, 1, 1, 1)))
+    return found[0], found[1]

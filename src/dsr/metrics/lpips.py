@@ -96,9 +96,7 @@ class LPIPS(nn.Module):
                 total = total + distance.mean(dim=(-2, -1))
             else:
                 weight = nn.functional.adaptive_avg_pool2d(mask.to(a.dtype), (a.shape[-2], a.shape[-1])).squeeze(1)
-                weighted = torch.where(
-                    weight > 0, distance * weight, 0
-                )  # no 0 * NaN in gradients without a valid pixel
+                weighted = torch.where(weight > 0, distance * weight, 0)  # no 0 * NaN in gradients
                 total = total + weighted.sum(dim=(-2, -1)) / weight.sum(dim=(-2, -1))
         return total
 

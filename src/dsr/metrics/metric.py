@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from operator import attrgetter
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -102,16 +104,12 @@ class Metric:
         return self.mask(pair).double().mean(dim=(-3, -2, -1))
 
 
-def depth_mask(pair: SurfacePair) -> Tensor:
-    """Return the pixels with a depth in both maps."""
-    return pair.depth_mask
+depth_mask = attrgetter("depth_mask")  # the pixels with a depth in both maps
+target_mask = attrgetter("target_mask")  # the pixels with a true depth, which a prediction should cover
+normal_mask = attrgetter("normal_mask")  # the pixels with a normal in both maps
 
 
-def target_mask(pair: SurfacePair) -> Tensor:
-    """Return the pixels with a true depth, which a prediction should cover."""
-    return pair.target_mask
-
-
-def normal_mask(pair: SurfacePair) -> Tensor:
-    """Return the pixels with a normal in both maps."""
-    return pair.normal_mask
+def part_of(pair: SurfacePair, function: Callable[[SurfacePair], Any], part: Any) -> Tensor:
+    """Return one of the values of a function that computes several together."""
+    value: Tensor = function(pair)[part]
+    return value

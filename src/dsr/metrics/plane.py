@@ -10,7 +10,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dsr.geometry.surface import back_project
 from dsr.metrics.formats import column
 from dsr.metrics.functional import SurfacePair, masked_mean, masked_median, once_per_pair
 from dsr.metrics.metric import Metric, depth_mask, target_mask
@@ -62,7 +61,7 @@ def angle(pair: SurfacePair) -> Tensor:
     The normals are by differences over two pixels, whose neighbours may be beyond the outline; the plane's is that of a
     fit to the truth, whose values may be rounded.
     """
-    points = back_project(pair.given[0], pair.rays)
+    points = pair.given[0] * pair.rays
     along_u, along_v = torch.full_like(points, torch.nan), torch.full_like(points, torch.nan)
     along_u[..., 1:-1] = points[..., 2:] - points[..., :-2]
     along_v[..., 1:-1, :] = points[..., 2:, :] - points[..., :-2, :]

@@ -28,7 +28,6 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from dsr.geometry.surface import back_project
 from dsr.metrics.depth import covered
 from dsr.metrics.formats import column
 from dsr.metrics.functional import SurfacePair, masked_mean, once_per_pair
@@ -57,29 +56,29 @@ def nearest(points: Tensor, valid: Tensor, cloud: Tensor, known: Tensor) -> Tens
 
 
 @once_per_pair
-def to_truth(pair: SurfacePair) -> Tensor:
-    """Return the distances of the predicted points from the true cloud in metres, (B, 1, H, W); 0 without a point."""
-    predicted, true = back_project(pair.prediction, pair.rays), back_project(pair.given[1], pair.rays)
-    return nearest(predicted, pair.depth_mask, true, pair.target_mask)
+def distances(pair: SurfacePair) -> tuple[Tensor, Tensor]:
+    """Return the distances of the predicted points from the true cloud, and of the true ones from the predicted cloud.
 
-
-@once_per_pair
-def to_prediction(pair: SurfacePair) -> Tensor:
-    """Return the distances of the true points from the predicted cloud in metres, (B, 1, H, W); 0 without a point."""
-    predicted, true = back_project(pair.prediction, pair.rays), back_project(pair.given[1], pair.rays)
-    return nearest(true, pair.target_mask, predicted, pair.depth_mask)
+    They are (B, 1, H, W) in metres, 0 without a point.
+    """
+    predicted, true = pair.prediction * pair.rays, pair.given[1] * pair.rays
+    return (
+        nearest(predicted, pair.depth_mask, true, pair.target_mask),
+        nearest(true, pair.target_mask, predicted, pair.depth_mask),
+    )
 
 
 def chamfer(pair: SurfacePair) -> Tensor:
     """Return the Chamfer distance in metres, (B,); lower is better. NaN without a predicted point."""
-    both = masked_mean(to_truth(pair), pair.depth_mask) + masked_mean(to_prediction(pair), pair.target_mask)
-    return both.squeeze(1) / 2
+    to_truth, to_prediction = distances(pair)
+    return (masked_mean(to_truth, pair.depth_mask) + masked_mean(to_prediction, pair.target_mask)).squeeze(1) / 2
 
 
 def f_score(pair: SurfacePair, threshold: float) -> Tensor:
     """Return the F-score at a threshold in metres, (B,), 0 to 1; higher is better. NaN without a predicted point."""
-    precision = masked_mean(to_truth(pair) < threshold, pair.depth_mask)
-    recall = masked_mean(to_prediction(pair) < threshold, pair.target_mask)
+    to_truth, to_prediction = distances(pair)
+    precision = masked_mean(to_truth < threshold, pair.depth_mask)
+    recall = masked_mean(to_prediction < threshold, pair.target_mask)
     score = 2 * precision * recall / (precision + recall)
     return torch.where(precision + recall == 0, 0, score).squeeze(1)
 
@@ -98,16 +97,11 @@ def flying(pair: SurfacePair) -> Tensor:
             part.copy_(torch.where(edge, torch.minimum(part, near), part))
             part = back.narrow(dim, start, size)
             part.copy_(torch.where(edge, torch.maximum(part, far), part))
-    front, back = -largest_around(-front, EDGE_RADIUS), largest_around(back, EDGE_RADIUS)
+    for window, padding in (((1, 2 * EDGE_RADIUS + 1), (0, EDGE_RADIUS)), ((2 * EDGE_RADIUS + 1, 1), (EDGE_RADIUS, 0))):
+        front = -max_pool2d(-front, window, stride=1, padding=padding)
+        back = max_pool2d(back, window, stride=1, padding=padding)
     between = (front < pair.prediction) & (pair.prediction < back)
-    return masked_mean(between & (to_truth(pair) > FLYING * pair.prediction), pair.depth_mask).squeeze(1)
-
-
-def largest_around(values: Tensor, radius: int) -> Tensor:
-    """Return the largest value up to ``radius`` pixels away along rows and columns, (B, 1, H, W)."""
-    for size in ((1, 2 * radius + 1), (2 * radius + 1, 1)):
-        values = max_pool2d(values, size, stride=1, padding=(size[0] // 2, size[1] // 2))
-    return values
+    return masked_mean(between & (distances(pair)[0] > FLYING * pair.prediction), pair.depth_mask).squeeze(1)
 
 
 METRICS: tuple[Metric, ...] = (

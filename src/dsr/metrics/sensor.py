@@ -10,12 +10,15 @@ leaving out what is difficult, so the fraction of scored pixels, ``Sensor_covere
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import torch
 from torch import Tensor
 
-from dsr.metrics.formats import column
+from dsr.metrics.formats import MetricFormat, column
 from dsr.metrics.functional import SSIM_WINDOW, SurfacePair, angle, masked_mean, masked_median, once_per_pair, ssim_map
-from dsr.metrics.metric import Metric
+from dsr.metrics.metric import Metric, part_of
 
 TRUTH_EROSION = 3
 PREDICTION_EROSION = 1
@@ -53,10 +56,7 @@ def compare(pair: SurfacePair) -> SensorComparison:
 
 
 def erode(mask: Tensor, steps: int) -> Tensor:
-    """Return a mask (B, 1, H, W) without the pixels within ``steps`` of an unset one along rows and columns.
-
-    Pixels outside count as unset.
-    """
+    """Return a mask (B, 1, H, W) without the pixels within ``steps`` of an unset one, or of the border."""
     for _ in range(steps):
         padded = torch.nn.functional.pad(mask, (1, 1, 1, 1))
         along_u = padded[..., 1:-1, 2:] & padded[..., 1:-1, :-2]
@@ -64,30 +64,22 @@ def erode(mask: Tensor, steps: int) -> Tensor:
     return mask
 
 
-def covered(pair: SurfacePair) -> Tensor:
-    """Return the fraction of the inner pixels that are scored, (B,)."""
+@once_per_pair
+def sensor_errors(pair: SurfacePair) -> dict[str, Tensor]:
+    """Return the scores without lights by name, (B,) each, over the scored pixels: metres and degrees."""
     comparison = compare(pair)
-    return masked_mean(comparison.scored, comparison.inner).squeeze(1)
-
-
-def offset_d(pair: SurfacePair) -> Tensor:
-    """Return the absolute value of the offset in metres, (B,)."""
-    return compare(pair).offset.abs().flatten()
-
-
-def rmse_d(pair: SurfacePair) -> Tensor:
-    """Return the RMS difference of orthogonal depth in metres after the offset's removal, (B,)."""
-    comparison = compare(pair)
-    difference = comparison.surfaces.prediction - comparison.surfaces.target
-    return masked_mean(difference.square(), comparison.scored).sqrt().squeeze(1)
-
-
-def rmse_v(pair: SurfacePair) -> Tensor:
-    """Return RMSE_v over the scored pixels, (B,), see :func:`dsr.metrics.functional.rmse_v`."""
-    comparison = compare(pair)
-    first, second = comparison.surfaces.normals
-    squares = (first - second).square().mean(dim=1, keepdim=True)
-    return masked_mean(squares, comparison.scored).sqrt().squeeze(1)
+    surfaces, scored = comparison.surfaces, comparison.scored
+    first, second = surfaces.normals
+    angles = angle(surfaces)
+    found = {
+        "RMSE_v": masked_mean((first - second).square().mean(dim=1, keepdim=True), scored).sqrt(),
+        "angle_mean": masked_mean(angles, scored),
+        "angle_median": masked_median(angles, scored),
+        "covered": masked_mean(scored, comparison.inner),
+        "offset": comparison.offset.abs(),
+        "RMSE_d": masked_mean((surfaces.prediction - surfaces.target).square(), scored).sqrt(),
+    }
+    return {name: value.flatten() for name, value in found.items()}
 
 
 def dssim_v(pair: SurfacePair) -> Tensor:
@@ -99,18 +91,6 @@ def dssim_v(pair: SurfacePair) -> Tensor:
     return torch.cat([1 - masked_mean(ssim_map(x, y)[:, None], scored) for x, y in lights], dim=1)
 
 
-def angle_mean(pair: SurfacePair) -> Tensor:
-    """Return the mean angle between the normals over the scored pixels, (B,) in degrees."""
-    comparison = compare(pair)
-    return masked_mean(angle(comparison.surfaces), comparison.scored).squeeze(1)
-
-
-def angle_median(pair: SurfacePair) -> Tensor:
-    """Return the median angle between the normals over the scored pixels, (B,) in degrees."""
-    comparison = compare(pair)
-    return masked_median(angle(comparison.surfaces), comparison.scored).flatten()
-
-
 def _inner(pair: SurfacePair) -> Tensor:
     return compare(pair).inner
 
@@ -119,8 +99,12 @@ def _scored(pair: SurfacePair) -> Tensor:
     return compare(pair).scored
 
 
+def _error(name: str, shown: MetricFormat, mask: Callable[[SurfacePair], Tensor] = _scored) -> Metric:
+    return Metric(f"Sensor_{name}", partial(part_of, function=sensor_errors, part=name), mask, shown, whole=True)
+
+
 METRICS: tuple[Metric, ...] = (
-    Metric("Sensor_RMSE_v", rmse_v, _scored, column("RMSE_v", "sensor, 1/1000", 1e3, 0), whole=True),
+    _error("RMSE_v", column("RMSE_v", "sensor, 1/1000", 1e3, 0)),
     Metric(
         "Sensor_DSSIM_v",
         dssim_v,
@@ -130,9 +114,9 @@ METRICS: tuple[Metric, ...] = (
         min_size=SSIM_WINDOW,
         whole=True,
     ),
-    Metric("Sensor_angle_mean", angle_mean, _scored, column("Angle", "mean, deg", 1, 1), whole=True),
-    Metric("Sensor_angle_median", angle_median, _scored, column("Angle", "median, deg", 1, 1), whole=True),
-    Metric("Sensor_covered", covered, _inner, column("Covered", "%", 1e2, 1, higher_is_better=True), whole=True),
-    Metric("Sensor_offset", offset_d, _scored, column("Offset", "mm", 1e3, 2), whole=True),
-    Metric("Sensor_RMSE_d", rmse_d, _scored, column("RMSE_d", "sensor, mm", 1e3, 2), whole=True),
+    _error("angle_mean", column("Angle", "mean, deg", 1, 1)),
+    _error("angle_median", column("Angle", "median, deg", 1, 1)),
+    _error("covered", column("Covered", "%", 1e2, 1, higher_is_better=True), _inner),
+    _error("offset", column("Offset", "mm", 1e3, 2)),
+    _error("RMSE_d", column("RMSE_d", "sensor, mm", 1e3, 2)),
 )  # the metrics of metrics=sensor

@@ -113,7 +113,9 @@ def opw(
         mask = known[now][None] & warped.isfinite()
         weight = mask.to(depths)
         if photos is not None:
-            seen = _sample(photos[before:now], source_pixels(warped, camera, move, camera))
+            places = zip(source_pixels(warped, camera, move, camera), photos.shape[:1:-1], strict=True)
+            grid = torch.stack([2 * place / (size - 1) - 1 for place, size in places], -1).nan_to_num(0).to(photos)
+            seen = torch.nn.functional.grid_sample(photos[before:now], grid, padding_mode="border", align_corners=True)
             apart = (seen - photos[now]).square().sum(dim=1, keepdim=True)
             weight = torch.where(mask, torch.exp(-_VISIBLE * apart), 0)
         error = torch.where(mask, (depths[now] - warped).abs(), 0)
@@ -165,10 +167,3 @@ def _spread(depths: Tensor, static: Tensor | None) -> tuple[Tensor, Tensor]:
     median = masked_median(*of_pixels).view_as(mean)
     counted = _counted(count, static)
     return torch.where(counted, variance.sqrt() / median, 0), counted
-
-
-def _sample(photo: Tensor, places: tuple[Tensor, Tensor]) -> Tensor:
-    """Return a photo, (1, 3, H, W), at columns and rows, (1, H, W) each, by linear interpolation."""
-    grid = torch.stack([2 * place / (size - 1) - 1 for place, size in zip(places, photo.shape[:1:-1], strict=True)], -1)
-    grid = grid.nan_to_num(0).to(photo)
-    return torch.nn.functional.grid_sample(photo, grid, padding_mode="border", align_corners=True)

@@ -252,7 +252,21 @@ class EdgeGuided(Method):
         for number, scale in enumerate(stages):
             report = part_of(progress, number * self._iterations, len(stages) * self._iterations)
             doubtful = barrier
-            barrier = self._predict_edges(disparity, scale, self._step * (highest - lowest), report)
+            barrier, answer = predict_edge_map(
+                disparity,
+                scale,
+                self._step * (highest - lowest),
+                self._candidates,
+                self._sharp_weight,
+                self._smoothness,
+                self._iterations,
+                report,
+            )
+            if report is not None:
+                report(self._iterations, self._iterations)
+            done = self.history[-1]["iteration"] if self.history else 0.0
+            if answer is not None:
+                self.history += [{**entry, "iteration": entry["iteration"] + done} for entry in answer.history]
             disparity = bilateral_filter(
                 disparity,
                 barrier,
@@ -268,18 +282,6 @@ class EdgeGuided(Method):
         if self._fill_holes:
             disparity = inpaint(disparity[None, None])[0, 0]
         return from_range(disparity[None], sample.camera, "disparity").to(sample.depth_lr)
-
-    def _predict_edges(self, disparity_lr: Tensor, scale: int, step: float, report: Steps | None) -> Tensor:
-        """Return the high-resolution edge map of a map (h, w), and append its labelling to the history."""
-        barrier, answer = predict_edge_map(
-            disparity_lr, scale, step, self._candidates, self._sharp_weight, self._smoothness, self._iterations, report
-        )
-        if report is not None:
-            report(self._iterations, self._iterations)
-        done = self.history[-1]["iteration"] if self.history else 0.0
-        if answer is not None:
-            self.history += [{**entry, "iteration": entry["iteration"] + done} for entry in answer.history]
-        return barrier
 
 
 def prime_factors(scale: int) -> list[int]:

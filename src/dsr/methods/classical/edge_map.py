@@ -95,8 +95,12 @@ def predict_edge_map(
     pairs, costs = find_overlaps(places, patches)
     answer = label(distances / PATCH**2, pairs, smoothness * costs, iterations, progress=progress)
     chosen = patches[torch.arange(len(patches), device=patches.device), answer.labels]
-    mean = average_patches(chosen, places, (edges.shape[0], edges.shape[1]))
-    return _drop_small(thin(mean > KEPT))[within], answer
+    total, number = chosen.new_zeros(edges.shape), chosen.new_zeros(edges.shape)  # of the patches that cover a pixel
+    for k in range(PATCH**2):  # for one k, all patches touch different pixels
+        rows, columns = places[:, 0] + k // PATCH - PATCH // 2, places[:, 1] + k % PATCH - PATCH // 2
+        total[rows, columns] += chosen[:, k]
+        number[rows, columns] += 1
+    return _drop_small(thin(total / number.clamp(min=1) > KEPT))[within], answer
 
 
 def detect_edges(lr: Tensor, scale: int, step: float) -> Tensor:
@@ -132,7 +136,8 @@ def find_recurring(lr: Tensor, scale: int, step: float) -> Patches:
     """Return the pairs of patches of a map, (h, w), downsampled by ``scale``; none if it is too small."""
     height, width = (n - n % scale for n in lr.shape)
     if min(height, width) < max(PATCH, 2 * scale):
-        return no_patches(lr.device)
+        none = torch.zeros(0, PATCH, PATCH, dtype=torch.bool, device=lr.device)
+        return Patches(none, none)
     truth = lr[:height, :width]
     low, high = detect_edges(box_mean(truth[None, None], scale)[0, 0], scale, step), detect_edges(truth, 1, step)
     half = PATCH // 2
@@ -196,12 +201,6 @@ class Patches(NamedTuple):
 
     low: Tensor
     high: Tensor
-
-
-def no_patches(device: torch.device) -> Patches:
-    """Return an empty set of patches."""
-    none = torch.zeros(0, PATCH, PATCH, dtype=torch.bool, device=device)
-    return Patches(none, none)
 
 
 def extract_patches(mask: Tensor, places: Tensor) -> Tensor:
@@ -277,16 +276,6 @@ def find_overlaps(places: Tensor, patches: Tensor) -> tuple[Tensor, Tensor]:
                 b = images[second][:, :, : PATCH - down, right : PATCH - left].flatten(2)
                 costs.append(a.square().sum(dim=2)[:, :, None] + b.square().sum(dim=2)[:, None] - 2 * a @ b.mT)
     return torch.cat(pairs), torch.cat(costs)
-
-
-def average_patches(patches: Tensor, places: Tensor, shape: tuple[int, int]) -> Tensor:
-    """Return the mean of the patches, (N, PATCH^2), that cover each pixel, (H, W); 0 where there is none."""
-    total, number = patches.new_zeros(shape), patches.new_zeros(shape)
-    for k in range(PATCH**2):  # for one k, all patches touch different pixels
-        rows, columns = places[:, 0] + k // PATCH - PATCH // 2, places[:, 1] + k % PATCH - PATCH // 2
-        total[rows, columns] += patches[:, k]
-        number[rows, columns] += 1
-    return total / number.clamp(min=1)
 
 
 def _features(low: Tensor, high: Tensor, weight: float) -> Tensor:

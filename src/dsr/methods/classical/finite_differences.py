@@ -16,7 +16,8 @@ _REACH = 2  # half width of Keys' kernel in low-resolution pixels
 
 def gradient(x: Tensor) -> Tensor:
     """Return forward differences along u and v, (B, C, H, W) -> (B, 2, C, H, W); 0 in the last column and row."""
-    return torch.stack((_forward(x, -1), _forward(x, -2)), dim=1)
+    along_u, along_v = functional.pad(x.diff(dim=-1), (0, 1)), functional.pad(x.diff(dim=-2), (0, 0, 0, 1))
+    return torch.stack((along_u, along_v), dim=1)
 
 
 def divergence(p: Tensor) -> Tensor:
@@ -67,7 +68,14 @@ def grey(rgb: Tensor, weights: Sequence[float] = LUMA) -> Tensor:
 
 def extend_linearly(x: Tensor, border: int) -> Tensor:
     """Extrapolate (B, C, h, w) linearly by ``border`` pixels on each side; planes are continued exactly."""
-    return _extend(_extend(x, border, -1), border, -2)
+    for dim in (-1, -2):
+        count = x.shape[dim]
+        first, last = x.narrow(dim, 0, 1), x.narrow(dim, count - 1, 1)
+        before = first - x.narrow(dim, min(1, count - 1), 1)  # 0 where there is a single pixel
+        after = last - x.narrow(dim, max(count - 2, 0), 1)
+        steps = torch.arange(1, border + 1, dtype=x.dtype, device=x.device).view(-1, *[1] * (-1 - dim))
+        x = torch.cat((first + steps.flip(0) * before, x, last + steps * after), dim=dim)
+    return x
 
 
 def upsample_linear_border(lr: Tensor, scale: int) -> Tensor:
@@ -76,17 +84,3 @@ def upsample_linear_border(lr: Tensor, scale: int) -> Tensor:
         return lr.clone()
     edge = _REACH * scale
     return upsample_bicubic(extend_linearly(lr, _REACH), scale)[..., edge:-edge, edge:-edge].contiguous()
-
-
-def _forward(x: Tensor, dim: int) -> Tensor:
-    ends = (0, 1) if dim == -1 else (0, 0, 0, 1)
-    return functional.pad(x.diff(dim=dim), ends)
-
-
-def _extend(x: Tensor, border: int, dim: int) -> Tensor:
-    count = x.shape[dim]
-    first, last = x.narrow(dim, 0, 1), x.narrow(dim, count - 1, 1)
-    before = first - x.narrow(dim, min(1, count - 1), 1)  # 0 where there is a single pixel
-    after = last - x.narrow(dim, max(count - 2, 0), 1)
-    steps = torch.arange(1, border + 1, dtype=x.dtype, device=x.device).view(-1, *[1] * (-1 - dim))
-    return torch.cat((first + steps.flip(0) * before, x, last + steps * after), dim=dim)

@@ -71,15 +71,16 @@ def guided_filter(guide: Tensor, maps: Tensor, radius: int, epsilon: float, conf
     mean_confidence = mean_weight / _box(torch.ones_like(weight), radius)
     total = _box(mean_confidence, radius)
 
-    def filter_one(values: Tensor) -> Tensor:
+    filtered = []
+    for values in maps:
         mean_value = _box(weight * values, radius) / divisor
         cross = _box(weight * guide * values, radius) / divisor - mean * mean_value
         slopes = torch.stack([(inverse[row] * cross).sum(dim=0) for row in _ROWS])
         constant = mean_value - (slopes * mean).sum(dim=0)
         slopes, constant = _box(mean_confidence * slopes, radius), _box(mean_confidence * constant, radius)
-        return torch.where(total > 0, ((slopes * guide).sum(dim=0) + constant) / total.clamp(min=_TINY), values)
-
-    return torch.stack([filter_one(values) for values in maps])
+        smooth = ((slopes * guide).sum(dim=0) + constant) / total.clamp(min=_TINY)
+        filtered.append(torch.where(total > 0, smooth, values))
+    return torch.stack(filtered)
 
 
 def _box(x: Tensor, radius: int) -> Tensor:

@@ -48,7 +48,8 @@ class Guided:
     def nearest(self) -> tuple[Tensor, Tensor]:
         """Return the row (H,) and the column (W,) of the low-resolution pixel nearest to each high-resolution pixel."""
         height, width = self.valid.shape
-        return _nearest_index(self.rows, height), _nearest_index(self.columns, width)
+        rows, columns = (self.rows + 0.5).floor().long(), (self.columns + 0.5).floor().long()
+        return rows.clamp(0, height - 1), columns.clamp(0, width - 1)
 
     def interpolate(self) -> tuple[Tensor, Tensor]:
         """Return the maps, (N, H, W), and their confidence, (H, W), at the high-resolution pixels.
@@ -149,10 +150,6 @@ def _fit_planes(disparity_lr: Tensor) -> Tensor:
         - across * torch.arange(width).to(disparity_lr)
     )
     return torch.stack((constant, down, across)).masked_fill(disparity_lr.isnan(), torch.nan)
-
-
-def _nearest_index(where: Tensor, size: int) -> Tensor:
-    return (where + 0.5).floor().long().clamp(0, size - 1)
 
 
 def _linear_weights(where: Tensor, size: int) -> Tensor:

@@ -136,8 +136,10 @@ def _choose_fusions(fits: _Fits, borders: _Borders, price: float, turn: int) -> 
     length, cost = length[cheap].repeat(2), cost[cheap].repeat(2)
     count = len(worth)
     takes = (_hash(torch.arange(count, device=one.device) + turn * count) & 1).bool()
-    leaf, centre, length, cost = _select(~takes[ends[0]] & takes[ends[1]], ends[0], ends[1], length, cost)
-    leaf, centre, length, cost = _select(_is_cheapest(leaf, cost, count), leaf, centre, length, cost)
+    kept = ~takes[ends[0]] & takes[ends[1]]
+    leaf, centre, length, cost = ends[0][kept], ends[1][kept], length[kept], cost[kept]
+    kept = _is_cheapest(leaf, cost, count)
+    leaf, centre, length, cost = leaf[kept], centre[kept], length[kept], cost[kept]
     union = _Fits(*(each.index_add(0, centre, each[leaf]) for each in fits))
     lost = worth.index_add(0, centre, worth[leaf]) - union.worth()
     saved = torch.zeros_like(worth).index_add_(0, centre, price * length.to(worth))
@@ -154,10 +156,6 @@ def _is_cheapest(owner: Tensor, cost: Tensor, count: int) -> Tensor:
     number = _hash(torch.arange(len(owner), device=owner.device))
     number = torch.where(cost == least[owner], number, _RANGE)
     return number == torch.full((count,), _RANGE, device=owner.device).scatter_reduce_(0, owner, number, "amin")[owner]
-
-
-def _select(which: Tensor, *values: Tensor) -> tuple[Tensor, ...]:
-    return tuple(each[which] for each in values)
 
 
 def _hash(number: Tensor) -> Tensor:

@@ -116,14 +116,19 @@ class ShapeFromShading(Method):
             solver.update_theta()
             solver.update_depth()
             solver.update_missed(self.growth)
-            terms = _diagnostics(solver, before)
-            self.history.append({"iteration": done, **terms})
+            terms = solver.terms()
+            objective_now = sum(terms.values())
+            missed = (solver.slopes(solver.z) - solver.theta)[:, :2]
+            residual = float(missed.square().mean().sqrt())
+            moved = float((solver.z - before).square().mean().sqrt()) / solver.problem.unit
+            entry = {"iteration": done, "objective": objective_now, **terms, "residual": residual, "moved": moved}
+            self.history.append(entry)
             if progress is not None:
                 progress(done, self.iterations)
-            change = abs(terms["objective"] - objective)
-            if change < self.tolerance * abs(objective) and terms["residual"] < self.tolerance:
+            change = abs(objective_now - objective)
+            if change < self.tolerance * abs(objective) and residual < self.tolerance:
                 break
-            objective = terms["objective"]
+            objective = objective_now
         if progress is not None:
             progress(self.iterations, self.iterations)
         nearest = float(sample.depth_lr[sample.mask_lr].min()) / _NEARER
@@ -166,11 +171,3 @@ def read_foreground(path: Path, size: tuple[int, int]) -> np.ndarray:
     if not (levels > _WHITE).any():
         raise ValueError(f"{path}: expected a foreground in white, got a black mask")
     return levels > _WHITE
-
-
-def _diagnostics(solver: ShadingSolver, before: Tensor) -> dict[str, float]:
-    """Return the terms of the energy, the residual of the splitting and the movement of z."""
-    terms = solver.terms()
-    missed = (solver.slopes(solver.z) - solver.theta)[:, :2]
-    moved = float((solver.z - before).square().mean().sqrt()) / solver.problem.unit
-    return {"objective": sum(terms.values()), **terms, "residual": float(missed.square().mean().sqrt()), "moved": moved}

@@ -28,6 +28,7 @@ albedos; (B, C, 4) for lighting.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -35,7 +36,6 @@ from torch import Tensor
 
 from dsr.geometry.surface import length
 from dsr.methods.classical.finite_differences import box_mean, repeat_blocks
-from dsr.methods.classical.iterations import conjugate_gradients
 from dsr.methods.classical.potts import Regions, boundary_length, fit_albedo, fuse
 
 _TINY = 1e-12  # minimum length of m, which avoids division by 0
@@ -345,3 +345,41 @@ def _solve(gradient: Tensor, hessian: Tensor, damping: Tensor) -> Tensor:
     y = (y - low * z) / middle
     x = (x - b * y - c * z) / a
     return torch.stack((x, y, z), dim=1)
+
+
+class Solution(NamedTuple):
+    """The solution ``values`` (B, ...), the number of steps, and the largest |b - A x| / |b| in the batch."""
+
+    values: Tensor
+    iterations: int
+    residual: float
+
+
+def conjugate_gradients(
+    operator: Callable[[Tensor], Tensor], right: Tensor, start: Tensor, *, iterations: int, tolerance: float
+) -> Solution:
+    """Solve A x = b for each element of a batch, (B, ...), from a start.
+
+    The operator x -> A x is symmetric positive definite for each element, on the subspace that b - A start lies in, and
+    does not mix elements. It stops at the relative residual ``tolerance`` in all elements.
+    """
+
+    def dot(a: Tensor, b: Tensor) -> Tensor:  # (B, 1, ...)
+        return (a * b).sum(dim=tuple(range(1, a.ndim)), keepdim=True)
+
+    def ratio(above: Tensor, below: Tensor) -> Tensor:  # 0 where ``below`` is: a solved element stays
+        return torch.where(below > 0, above / torch.where(below > 0, below, 1), 0)
+
+    x, residual = start, right - operator(start)
+    direction = residual
+    size, goal = dot(residual, residual), tolerance**2 * dot(right, right)
+    done = 0
+    while done < iterations and bool((size > goal).any()):
+        image = operator(direction)
+        step = ratio(size, dot(direction, image))
+        x = x + step * direction
+        residual = residual - step * image
+        before, size = size, dot(residual, residual)
+        direction = residual + ratio(size, before) * direction
+        done += 1
+    return Solution(x, done, float(ratio(size, dot(right, right)).max().sqrt()))

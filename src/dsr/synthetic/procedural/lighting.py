@@ -54,26 +54,29 @@ class Tracer:
         self._scene = EmbreeScene(robust=True)
         TriangleMesh(self._scene, mesh.vertices.astype(np.float32), self._faces.astype(np.int32))
 
-    def first_triangle(self, eye: Array, rays: Array) -> Index:
-        """Return the triangle (N,) that each ray (3, N) from ``eye`` (3,) meets first, -1 for none."""
-        ahead = np.ascontiguousarray(rays.T, dtype=np.float32)
-        start = np.ascontiguousarray(np.broadcast_to(eye, ahead.shape), dtype=np.float32)
-        return np.asarray(self._scene.run(start, ahead), dtype=np.intp)
-
     def triangles(self, face: Index) -> Array:
         """Return the corners (3 of the triangle, 3 coordinates, N) of the triangles ``face`` (N,)."""
         return np.stack([self._table[self._faces[face, i], :3].T for i in range(3)])
 
     def trace(self, eye: Array, rays: Array) -> Hits:
         """Return the first hits of rays (3, N) from ``eye`` (3,)."""
-        face = self.first_triangle(eye, rays)
+        ahead = np.ascontiguousarray(rays.T, dtype=np.float32)
+        start = np.ascontiguousarray(np.broadcast_to(eye, ahead.shape), dtype=np.float32)
+        face = np.asarray(self._scene.run(start, ahead), dtype=np.intp)
         known = np.maximum(face, 0)
         rows = [self._table[self._faces[known, i]].T for i in range(3)]  # 3 x (12, N)
         corners = [row[:3] - eye[:, None] for row in rows]
         t, weights = _intersect(corners, rays)
-        bulge, normal = _bulge(corners, [row[3:6] for row in rows], weights)
-        depth = np.where(face < 0, np.inf, t + _along(bulge, normal, rays))
-        facing = -np.sign((normal * rays).sum(0))
+        flat = sum(w * p for w, p in zip(weights, corners, strict=True))
+        normal = np.asarray(sum(w * row[3:6] for w, row in zip(weights, rows, strict=True)))
+        normal = normal / np.maximum(np.sqrt((normal**2).sum(0)), 1e-300)
+        bulge = np.zeros(weights.shape[1])  # the signed height of the curved patch above its triangle
+        for w, p, row in zip(weights, corners, rows, strict=True):
+            bulge += 0.5 * w * ((p - flat) * row[3:6]).sum(0) * (row[3:6] * normal).sum(0)
+        slope, least = (normal * rays).sum(0), _GRAZING * np.sqrt((rays**2).sum(0))
+        along = bulge / np.where(np.abs(slope) > least, slope, np.copysign(least, slope))  # in units of the ray
+        depth = np.where(face < 0, np.inf, t + along)
+        facing = -np.sign(slope)
         paint = sum(w * row[6:] for w, row in zip(weights, rows, strict=True))
         points = eye[:, None] + np.where(face < 0, 0.0, depth) * rays
         return Hits(depth, face, self._body[known], points, normal * facing, paint[:3], paint[3:], bulge * facing)
@@ -103,24 +106,6 @@ def _intersect(corners: Sequence[Array], rays: Array) -> tuple[Array, Array]:
 def _cross(a: Array, b: Array) -> Array:
     """Return the cross product of (3, N) vectors."""
     return np.stack((a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]))
-
-
-def _bulge(corners: Sequence[Array], normals: Sequence[Array], weights: Array) -> tuple[Array, Array]:
-    """Return the signed height (N,) of the curved patch above its triangle and the unit normal (3, N)."""
-    flat = sum(w * p for w, p in zip(weights, corners, strict=True))
-    normal = np.asarray(sum(w * n for w, n in zip(weights, normals, strict=True)))
-    normal = normal / np.maximum(np.sqrt((normal**2).sum(0)), 1e-300)
-    height = np.zeros(weights.shape[1])
-    for w, p, n in zip(weights, corners, normals, strict=True):
-        height += 0.5 * w * ((p - flat) * n).sum(0) * (n * normal).sum(0)
-    return height, normal
-
-
-def _along(bulge: Array, normal: Array, rays: Array) -> Array:
-    """Return how far along the rays the displacement ``bulge`` moves the hit, in units of the ray."""
-    slope = (normal * rays).sum(0)
-    least = _GRAZING * np.sqrt((rays**2).sum(0))
-    return bulge / np.where(np.abs(slope) > least, slope, np.copysign(least, slope))
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +153,7 @@ def _build(rng: np.random.Generator, position: Array, middle: Array, extent: flo
         ambient_fraction * 0.7 * (2 - warm),
         ambient_fraction * rng.uniform(0.0, 0.6) * np.array([0.9, 1.0, 1.15]),
     )
-    cookie = _cookie(rng, frame, middle, distance) if rng.random() < 0.22 else _clear
+    cookie = _cookie(rng, frame, middle, distance) if rng.random() < 0.22 else lambda points: np.ones(points.shape[1])
     strength = (1.15 - ambient_fraction) * distance**2
     cells = _stratified(rng, SETS * _SAMPLES_PER_SET)
     spread, angle = np.sqrt(cells[:, 0]), 2 * np.pi * cells[:, 1]
@@ -181,10 +166,6 @@ def _stratified(rng: np.random.Generator, count: int) -> Array:
     """Return points (count, 2) spread over the unit square: a shifted lattice of the plastic number."""
     steps = np.arange(count)[:, None] * np.array([0.7548776662466927, 0.5698402909980532])
     return (steps + rng.random(2)) % 1.0
-
-
-def _clear(points: Array) -> Array:
-    return np.ones(points.shape[1])
 
 
 def _cookie(rng: np.random.Generator, frame: Array, middle: Array, distance: float) -> Cookie:

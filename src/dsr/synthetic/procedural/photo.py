@@ -47,7 +47,8 @@ def radiance(tracer: Tracer, bodies: Sequence[Body], view: View, lighting: Light
     names = Hits.__dataclass_fields__
     hits = Hits(**{name: np.concatenate([getattr(part, name) for part in parts], axis=-1) for name in names})
     extent = float(np.median(hits.depth))
-    which = _pattern(shape)
+    v, u = np.indices(shape)
+    which = ((u % 4 + 4 * (v % 4)) * 7 % SETS).ravel()  # of light samples; each 4 x 4 window has every set once
     pieces = [
         visibility(tracer, lighting, part, which[i * _CHUNK :][: len(part.depth)], extent)
         for i, part in enumerate(parts)
@@ -55,19 +56,15 @@ def radiance(tracer: Tracer, bodies: Sequence[Body], view: View, lighting: Light
     seen = _smooth_visibility(np.stack([np.concatenate(p) for p in zip(*pieces, strict=True)]), hits, shape)
     colour = shade(bodies, hits, lighting, view.eye, seen)
     display = np.clip(colour / (2.5 * np.median(colour) + 1e-9), 0, 1) ** (1 / 2.2)
-    contrast = _contrast(display.reshape(3, *shape))
+    grey = display.reshape(3, *shape).astype(np.float32)  # differences within 3 x 3 pixels, of the channels the largest
+    difference = maximum_filter(grey, (1, 3, 3), mode="nearest") - minimum_filter(grey, (1, 3, 3), mode="nearest")
+    contrast = difference.max(0).ravel().astype(np.float64)
     limit = max(0.04, float(np.quantile(contrast, 1 - _MAX_SUPERSAMPLED)))
     rough = np.flatnonzero(contrast > limit)
     for start in range(0, rough.size, _CHUNK):
         pixels = rough[start : start + _CHUNK]
         colour[:, pixels] = _supersample(tracer, bodies, view, lighting, hits, seen, pixels)
     return colour.reshape(3, *shape), hits.depth.reshape(shape)
-
-
-def _pattern(shape: tuple[int, ...]) -> NDArray[np.intp]:
-    """Return the set of light samples (H * W,) of each pixel; each 4 x 4 window has every set once."""
-    v, u = np.indices(shape)
-    return np.asarray((u % 4 + 4 * (v % 4)) * 7 % SETS).ravel()
 
 
 def _smooth_visibility(seen: Array, hits: Hits, shape: tuple[int, ...]) -> Array:
@@ -81,20 +78,14 @@ def _smooth_visibility(seen: Array, hits: Hits, shape: tuple[int, ...]) -> Array
     total, weight = np.zeros_like(values), np.zeros((height, width), np.float32)
     for dv in range(-2, 2):
         for du in range(-2, 2):
-            a, b = _overlap(height, dv), _overlap(width, du)
-            here, there = (a[0], b[0]), (a[1], b[1])
+            v, u = slice(max(0, -dv), height - max(0, dv)), slice(max(0, -du), width - max(0, du))
+            here, there = (v, u), (slice(v.start + dv, v.stop + dv), slice(u.start + du, u.stop + du))
             alike = np.einsum("ihw,ihw->hw", normals[:, *here], normals[:, *there]) > 0.9
             near = np.abs(inverse[here] - inverse[there]) < (abs(du) + abs(dv) + 0.5) * slack[here]
             w = (alike & near).astype(np.float32)
             total[:, *here] += w * values[:, *there]
             weight[here] += w
     return np.asarray(total / weight, dtype=np.float64).reshape(2, -1)
-
-
-def _overlap(count: int, step: int) -> tuple[slice, slice]:
-    """Return the slice of the indices that have a neighbour ``step`` further, and the slice of the neighbours."""
-    here = slice(max(0, -step), count - max(0, step))
-    return here, slice(here.start + step, here.stop + step)
 
 
 def shade(bodies: Sequence[Body], hits: Hits, lighting: Lighting, eye: Array, seen: Array) -> Array:
@@ -144,14 +135,6 @@ def _supersample(
             best, nearest = np.where(away < nearest, other, best), np.minimum(away, nearest)
         total += shade(bodies, fine, lighting, view.eye, seen[:, best])
     return total / len(_SUBPIXELS)
-
-
-def _contrast(image: Array) -> Array:
-    """Return the largest difference within 3 x 3 pixels over the channels of (3, H, W), shape (H * W,)."""
-    size = (1, 3, 3)
-    grey = image.astype(np.float32)
-    difference = maximum_filter(grey, size, mode="nearest") - minimum_filter(grey, size, mode="nearest")
-    return np.asarray(difference.max(0).ravel(), dtype=np.float64)
 
 
 def develop(linear: Array, rng: np.random.Generator) -> NDArray[np.uint8]:

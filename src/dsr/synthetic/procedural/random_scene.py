@@ -58,7 +58,8 @@ def random_scene(rng: np.random.Generator, layout_name: str | None = None) -> Ra
             seen = tracer.trace(view.eye, view.rays.reshape(3, -1))
             if _is_usable(seen):
                 lighting = random_lighting(rng, tracer, seen, layout.low, layout.high)
-                metres = _random_scale(rng, seen)
+                scale = min(np.exp(rng.normal(0, 0.3)), _MAX_MEDIAN_DEPTH / float(np.median(seen.depth)))
+                metres = float(max(scale, 1.5 * _MIN_DEPTH / float(seen.depth.min())))  # per unit, within the limits
                 return RandomScene(name, layout, tracer, viewpoint, lighting, metres, int(rng.integers(1 << 31)))
     raise RuntimeError("no view of the scene was usable")  # pragma: no cover
 
@@ -71,13 +72,6 @@ def _is_usable(seen: Hits) -> bool:
     fractions = np.bincount(seen.body) / seen.body.size
     near = seen.depth.min() > 0.17 * middle
     return bool(near and high < 6.2 * low and fractions.max() < 0.985 and np.sum(fractions > 0.004) >= 2)
-
-
-def _random_scale(rng: np.random.Generator, seen: Hits) -> float:
-    """Return a random scale, metres per unit, that keeps the depth within its limits."""
-    scale = np.exp(rng.normal(0, 0.3))
-    scale = min(scale, _MAX_MEDIAN_DEPTH / float(np.median(seen.depth)))
-    return float(max(scale, 1.5 * _MIN_DEPTH / float(seen.depth.min())))
 
 
 def make_camera(viewpoint: Viewpoint, size: int) -> Camera:

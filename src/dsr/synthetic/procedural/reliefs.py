@@ -171,9 +171,7 @@ RELIEFS: tuple[Maker, ...] = (masonry, cobbles, ornament, panels, folds, crumple
 def relief(rng: np.random.Generator, maker: Maker, side: float, count: int = 300, bend: float = 0.0) -> Shape:
     """Return a square relief of ``side`` metres: (x, y) in the middle of the origin, heights along z.
 
-    Args:
-        bend: height of the middle above the edges along x as a fraction of the side.
-
+    ``bend`` is the height of the middle above the edges along x as a fraction of the side.
     """
     height, tone, amplitude = maker(rng, count)
     u, v = _grid(count)

@@ -90,11 +90,9 @@ def cylinder(rng: np.random.Generator) -> Shape:
     radius, height = rng.uniform(0.15, 0.45), rng.uniform(0.3, 1.0)
     top = radius * (1.0 if rng.random() < 0.6 else rng.uniform(0.02, 0.9))
     shape = frustum(radius, top, height)
-    return (
-        shape
-        if rng.random() < 0.7
-        else place_on_ground(shape.rotate(rotation_about(2, rng.uniform(0, 360)) @ rotation_about(0, 90)))
-    )
+    if rng.random() < 0.7:
+        return shape
+    return place_on_ground(shape.rotate(rotation_about(2, rng.uniform(0, 360)) @ rotation_about(0, 90)))
 
 
 def frustum(radius: float, top: float, height: float) -> Shape:
@@ -152,49 +150,36 @@ def hollow(radii: Array, height: float, wall: float, *, smooth: bool = True) -> 
 
 
 def prism(rng: np.random.Generator) -> Shape:
-    """Return an extruded polygon, star, gear or smooth outline, standing or lying."""
-    maker = (_polygon, _gear, _lobes, _frame)[rng.integers(4)]
-    shape = extrusion(maker(rng), rng.uniform(0.08, 0.7))
-    return (
-        shape
-        if rng.random() < 0.5
-        else place_on_ground(shape.rotate(rotation_about(2, rng.uniform(0, 360)) @ rotation_about(0, 90)))
-    )
+    """Return an extruded polygon, star, gear, smooth outline or frame, standing or lying."""
+    kind = rng.integers(4)
+    if kind == 0:  # a regular polygon or a star
+        count = int(rng.integers(3, 9))
+        if rng.random() < 0.5:
+            outlines = [_ring(0.45, count, rng.uniform(0, 6))]
+        else:
+            outlines = [_ring(np.where(np.arange(2 * count) % 2, rng.uniform(0.15, 0.35), 0.48), 2 * count)]
+    elif kind == 1:  # a toothed wheel with a round hole
+        teeth, deep = int(rng.integers(8, 22)), rng.uniform(0.03, 0.08)
+        radii = np.tile([0.46, 0.46, 0.46 - deep, 0.46 - deep], teeth)
+        outlines = [_ring(radii, 4 * teeth), _ring(rng.uniform(0.06, 0.3), 48)[::-1]]
+    elif kind == 2:  # a smooth closed curve
+        angle = np.arange(120) * 2 * np.pi / 120
+        waves = sum(rng.uniform(-0.09, 0.09) * np.cos(k * angle + rng.uniform(0, 6)) for k in range(2, 6))
+        outlines = [_ring(0.36 + waves, 120)]
+    else:  # a rectangular frame
+        half = rng.uniform(0.2, 0.48, 2)
+        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half
+        outlines = [corners, (corners * (1 - rng.uniform(0.05, 0.2) * half.min() * 4))[::-1]]
+    shape = extrusion(outlines, rng.uniform(0.08, 0.7))
+    if rng.random() < 0.5:
+        return shape
+    return place_on_ground(shape.rotate(rotation_about(2, rng.uniform(0, 360)) @ rotation_about(0, 90)))
 
 
 def _ring(radius: Array | float, count: int, phase: float = 0.0) -> Array:
     """Return ``count`` points at ``radius`` around the origin, (count, 2)."""
     angle = phase + np.arange(count) * 2 * np.pi / count
     return np.stack((np.cos(angle), np.sin(angle)), axis=1) * np.broadcast_to(radius, (count,))[:, None]
-
-
-def _polygon(rng: np.random.Generator) -> list[Array]:
-    """Return a regular polygon or a star."""
-    count = int(rng.integers(3, 9))
-    if rng.random() < 0.5:
-        return [_ring(0.45, count, rng.uniform(0, 6))]
-    return [_ring(np.where(np.arange(2 * count) % 2, rng.uniform(0.15, 0.35), 0.48), 2 * count)]
-
-
-def _gear(rng: np.random.Generator) -> list[Array]:
-    """Return a toothed wheel with a round hole."""
-    teeth, deep = int(rng.integers(8, 22)), rng.uniform(0.03, 0.08)
-    radii = np.tile([0.46, 0.46, 0.46 - deep, 0.46 - deep], teeth)
-    return [_ring(radii, 4 * teeth), _ring(rng.uniform(0.06, 0.3), 48)[::-1]]
-
-
-def _lobes(rng: np.random.Generator) -> list[Array]:
-    """Return a smooth closed curve."""
-    angle = np.arange(120) * 2 * np.pi / 120
-    waves = sum(rng.uniform(-0.09, 0.09) * np.cos(k * angle + rng.uniform(0, 6)) for k in range(2, 6))
-    return [_ring(0.36 + waves, 120)]
-
-
-def _frame(rng: np.random.Generator) -> list[Array]:
-    """Return a rectangular frame."""
-    half = rng.uniform(0.2, 0.48, 2)
-    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half
-    return [corners, (corners * (1 - rng.uniform(0.05, 0.2) * half.min() * 4))[::-1]]
 
 
 def letter(rng: np.random.Generator) -> Shape:
