@@ -223,6 +223,7 @@ def test_wrong_and_large_files_are_refused_before_they_are_sent_and_work_can_be_
     assert page.is_enabled(".compute")
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("photo", "depth", "size"),
     [
