@@ -3,7 +3,7 @@
 # make test-all  these and the nightly ones: campaigns, real Slurm, published peers, further ways to interrupt
 # make unit  the unit tests alone, about a minute
 # make fuzz  10,000 damaged, foreign and malicious files for every reader (ARGS="--cases 1000 --seed 1")
-# make chaos commands that are killed, run out of space and run at once (ARGS="--kills 100 --seed 0")
+# make chaos commands that are killed and run at once (ARGS="--kills 100 --seed 0")
 # make mistakes  inputs that can be computed with and are wrong: which are told (ARGS="--cases 500 --seed 0")
 # make dist  what a release consists of, built and checked, in dist
 # make docs  the documentation as a site in outputs/site

@@ -1,4 +1,4 @@
-"""Strike commands, let them run out of space and run them at once, and compare with undisturbed results.
+"""Strike commands and run them at once, and compare with undisturbed results.
 
 ``make chaos ARGS="--kills 100 --seed 0"``, on Linux. Files and output of cases that are not clean are kept.
 """
@@ -16,12 +16,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from chaos import disks, kills, together
+from chaos import kills, together
 from chaos.campaign import Campaign
 from chaos.scenarios import ALL
 
-PARTS = ("kills", "disks", "pairs")
-_COLUMNS = ("SIGKILL", "SIGTERM", "SIGINT", "twice", "before the first output", "at work", "disk", "pair", "unclean")
+PARTS = ("kills", "pairs")
+_COLUMNS = ("SIGKILL", "SIGTERM", "SIGINT", "twice", "before the first output", "at work", "pair", "unclean")
 
 
 @dataclass
@@ -53,8 +53,7 @@ class Tally:
             rows.append(f"{name:<28}{counts['kills']:>6}{cells}")
         rows.append(f"signals are caught after {self.ready:.2f} s of computing at most")
         rows.append(
-            f"{total['kills']} kills, {total['disk']} full disks, {total['pair']} pairs in {seconds / 60:.1f} minutes: "
-            f"{len(self.unclean)} unclean"
+            f"{total['kills']} kills, {total['pair']} pairs in {seconds / 60:.1f} minutes: {len(self.unclean)} unclean"
         )
         return "\n".join(rows)
 
@@ -83,13 +82,6 @@ class Session:
         reported = "; ".join(f"{hit.strike} {hit.place}" for hit in hits) or "no strike met it"
         self._conclude(case.name, case.scenario.name, reported, problems)
 
-    def fill(self, case: disks.DiskCase) -> None:
-        """Run a case of a full disk."""
-        problems = disks.run_case(self.campaign, case)
-        self.tally.counts[case.scenario.name].update(["disk"])
-        reported = "> /dev/full" if case.fraction is None else f"{case.fraction:.0%} of the space"
-        self._conclude(case.name, case.scenario.name, reported, problems)
-
     def pair(self, case: together.PairCase) -> None:
         """Run two commands at once."""
         problems = together.run_case(self.campaign, case)
@@ -108,21 +100,19 @@ class Session:
         if problems:
             self.tally.counts[scenario]["unclean"] += 1
             self.tally.unclean[name] = problems
-            if not name.startswith("disk"):
-                self.campaign.keep(name, problems)
+            self.campaign.keep(name, problems)
 
 
 def main() -> int:
     """Run the campaign, and return the exit code."""
     options = _parser().parse_args()
     signal.signal(signal.SIGINT, signal.default_int_handler)  # children of a background job would ignore it
-    mounts = disks.enter_namespace()
     root = (options.folder or Path(tempfile.mkdtemp(prefix="dsr-chaos-"))).resolve()
     session = Session(Campaign(root, options.grace), options)
     if options.case:
         _repeat(session, options.case, options.seed)
     else:
-        _run_all(session, options, mounts)
+        _run_all(session, options)
     print(session.tally.summary(session.seconds))
     if session.tally.unclean:
         print(f"unclean: {' '.join(session.tally.unclean)}; their files are in {root / 'unclean'}")
@@ -132,19 +122,13 @@ def main() -> int:
     return 0
 
 
-def _run_all(session: Session, options: argparse.Namespace, mounts: bool) -> None:
+def _run_all(session: Session, options: argparse.Namespace) -> None:
     """Run the chosen parts of the campaign."""
     chosen = tuple(options.only or ALL)
     if "kills" in options.parts:
         cases = kills.kill_cases(options.seed, chosen)
         while session.tally.kills < options.kills:
             session.kill(next(cases))
-    if "disks" in options.parts:
-        if not mounts:
-            print("no file system can be mounted here: full disks are /dev/full alone")
-        for disk in disks.disk_cases():
-            if disk.scenario.name in chosen and (mounts or disk.fraction is None):
-                session.fill(disk)
     if "pairs" in options.parts:
         for pair in together.pair_cases(options.seed):
             if pair.scenario.name in chosen:
@@ -156,10 +140,9 @@ def _repeat(session: Session, name: str, seed: int) -> None:
     kind, _, number = name.partition("-")
     cases: dict[str, Iterator] = {
         "kill": kills.kill_cases(seed),
-        "disk": iter(disks.disk_cases()),
         "pair": iter(together.pair_cases(seed)),
     }
-    run = {"kill": session.kill, "disk": session.fill, "pair": session.pair}[kind]
+    run = {"kill": session.kill, "pair": session.pair}[kind]
     run(next(case for _, case in zip(range(int(number) + 1), cases[kind], strict=False) if case.name == name))
 
 
@@ -172,7 +155,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of scenarios, signals and moments; 0")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help="these alone")
     parser.add_argument("--only", nargs="+", choices=sorted(ALL), metavar="NAME", help=f"of {', '.join(sorted(ALL))}")
-    parser.add_argument("--case", metavar="NAME", help="one case again, such as kill-17, disk-3 or pair-0; same seed")
+    parser.add_argument("--case", metavar="NAME", help="one case again, such as kill-17 or pair-0; same seed")
     parser.add_argument("--grace", type=float, default=5.0, metavar="S", help="seconds for the end after a signal; 5")
     parser.add_argument("--folder", type=Path, metavar="DIR", help="where to work; a temporary folder by default")
     return parser

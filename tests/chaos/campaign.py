@@ -23,13 +23,11 @@ class Undisturbed:
     Args:
         folder: its files.
         computed: seconds of computing of each command.
-        size: bytes of its inputs and of all its files, in whole pages.
 
     """
 
     folder: Path
     computed: tuple[float, ...]
-    size: tuple[int, int]
 
 
 @dataclass
@@ -71,10 +69,10 @@ class Campaign:
             else:
                 shutil.copytree(self.root / "undisturbed" / origin[0] / origin[1], path)
 
-    def start(self, scenario: Scenario, number: int = 0, out: str | None = None) -> Command:
+    def start(self, scenario: Scenario, number: int = 0) -> Command:
         """Start a command of a scenario."""
         logs = self.root / f"log-{len(list(self.root.glob('log-*'))) + 1}"
-        return Command(scenario.arguments(number), self.work, self.environment, logs, out)
+        return Command(scenario.arguments(number), self.work, self.environment, logs)
 
     def finish(self, scenario: Scenario) -> tuple[list[str], list[Ended]]:
         """Run all commands of a scenario one after the other; return what is wrong, and how they ended."""
@@ -96,14 +94,13 @@ class Campaign:
                 if not callable(origin):
                     self.undisturbed(ALL[origin[0]])
             self.begin(scenario)
-            before = pages(self.work)
             problems, ends = self.finish(scenario)
             if problems:
                 raise RuntimeError(f"{scenario.name}: undisturbed: {'; '.join(problems)}")
             folder = self.root / "undisturbed" / scenario.name
             shutil.copytree(self.work, folder)
             computed = tuple(end.computed for end in ends)
-            self._known[scenario.name] = Undisturbed(folder, computed, (before, pages(folder)))
+            self._known[scenario.name] = Undisturbed(folder, computed)
         return self._known[scenario.name]
 
     def compare(self, scenario: Scenario) -> list[str]:
@@ -128,9 +125,3 @@ def undisturbed_problems(scenario: Scenario, end: Ended) -> list[str]:
     problems = [] if end.code == 0 else [f"exit code {end.code} undisturbed"]
     problems += [f"undisturbed, on stderr: {line}" for line in end.err.splitlines()[-3:]]
     return problems + ([f"undisturbed, left {len(end.left)} processes"] if end.left else [])
-
-
-def pages(folder: Path) -> int:
-    """Return the bytes that a folder's files take on a file system of memory, in whole pages."""
-    page = os.sysconf("SC_PAGE_SIZE")
-    return sum(-(-path.stat().st_size // page) * page for path in folder.rglob("*") if path.is_file())

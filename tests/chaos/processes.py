@@ -46,18 +46,14 @@ class Command:
         folder: its working directory.
         environment: its environment variables.
         logs: folder of the files ``out`` and ``err``.
-        out: where its output goes instead, such as ``/dev/full``.
 
     """
 
-    def __init__(
-        self, arguments: Sequence[str], folder: Path, environment: Mapping[str, str], logs: Path, out: str | None = None
-    ) -> None:
+    def __init__(self, arguments: Sequence[str], folder: Path, environment: Mapping[str, str], logs: Path) -> None:
         self._logs, self._folder, self._computed = logs, folder, 0.0
         self._started, self._clock = time.monotonic(), time.time()
         logs.mkdir(parents=True, exist_ok=True)
-        (logs / "out").write_bytes(b"")
-        with Path(out or logs / "out").open("wb") as output, (logs / "err").open("wb") as errors:
+        with (logs / "out").open("wb") as output, (logs / "err").open("wb") as errors:
             self._process = subprocess.Popen(
                 arguments, cwd=folder, env=dict(environment), stdin=subprocess.DEVNULL, stdout=output, stderr=errors,
                 start_new_session=True,

@@ -133,7 +133,7 @@ STRUCK = {
         Scenario("prepare", (("dsr", "data", "prepare", "procedural", "dataset.count=5", "dataset.size=48"),)),
     )
 }  # fmt: skip
-"""What is struck by signals and runs out of space."""
+"""What is struck by signals."""
 
 PREPARING = {each.name: each for each in (Scenario("eval_bicubic", (_BICUBIC,)),)}
 """What others start from."""

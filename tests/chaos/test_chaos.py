@@ -6,10 +6,9 @@ import sys
 
 import pytest
 
-from chaos import disks, kills, together
+from chaos import kills, together
 from chaos.campaign import Campaign
-from chaos.disks import DiskCase
-from chaos.kills import KillCase, Strike, kill_cases
+from chaos.kills import KillCase, Strike
 from chaos.scenarios import STRUCK, Scenario, make_answers
 from chaos.together import PairCase
 
@@ -57,19 +56,8 @@ def test_sigterm_while_torch_is_imported_ends_an_evaluation_in_one_line(campaign
     assert list(campaign.work.iterdir()) == []
 
 
-def test_output_to_a_full_device_is_one_line_and_nothing_is_lost(campaign):
-    assert disks.run_case(campaign, DiskCase("disk", COLLECT, None)) == []
-
-
 def test_two_commands_at_once_do_not_disturb_each_other(campaign):
     assert together.run_case(campaign, PairCase("pair", COLLECT, 0.0)) == []
-
-
-def test_rivals_that_both_have_their_way_are_found(tmp_path):
-    scripts = [Scenario(name, (("python", "-c", f"open('out', 'w').write('{name}')"),)) for name in ("one", "two")]
-    rivals = Scenario("rivals", tuple(each.commands[0] for each in scripts), rivals=tuple(scripts))
-    [line] = together.run_case(Campaign(tmp_path), PairCase("pair", rivals, 0.0))
-    assert line == "exit codes [0, 0], expected that one is refused"
 
 
 STUBBORN = "import signal, time\nfor n in (2, 15): signal.signal(n, lambda *_: None)\n"
@@ -101,21 +89,3 @@ def test_commands_that_do_not_end_cleanly_are_found(tmp_path, script, number, gr
     end = kills.carry_out(command, strike, campaign.grace)
     problems = kills.end_problems(strike, end, end.computed - before) + kills.damaged(campaign.work)
     assert any(problem in line for line in problems), problems
-
-
-def test_files_that_a_killed_command_leaves_are_found(tmp_path):
-    script = "import os, time\nname = f'x{os.getpid()}'\nopen(name, 'w').write('x')\n"
-    script += WAIT.format(1.5) + "os.unlink(name)"
-    scenario = Scenario("script", (("python", "-c", script),))
-    hits, problems, count = run(Campaign(tmp_path), scenario, Strike(signal.SIGKILL, 0.6, group=True))
-    assert (hits, count) == ([], 1)
-    [line] = problems
-    assert line.endswith("not in the reference")
-
-
-def test_cases_follow_from_the_seed_alone():
-    one, two, other = (kill_cases(seed) for seed in (0, 0, 1))
-    first = [next(one) for _ in range(30)]
-    assert first == [next(two) for _ in range(30)]
-    assert first != [next(other) for _ in range(30)]
-    assert {case.scenario.name for case in first} == set(STRUCK)

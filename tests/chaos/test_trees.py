@@ -38,16 +38,6 @@ def test_times_may_differ(two):
     assert damaged(two[0]) == []
 
 
-def test_a_log_may_go_on_in_a_second_file_that_repeats_steps(two, monkeypatch):
-    for path in (two[1] / "log").iterdir():
-        path.unlink()
-    monkeypatch.setattr("time.time", lambda: 1000.0)
-    write_log(two[1] / "log", {0: 0, 1: 1, 2: 7})
-    monkeypatch.setattr("time.time", lambda: 2000.0)
-    write_log(two[1] / "log", {2: 2, 3: 3})
-    assert differences(*two) == []
-
-
 @pytest.mark.parametrize(
     ("change", "line"),
     [

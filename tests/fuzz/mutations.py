@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import io
 import os
 import shutil
 import struct
 from collections.abc import Callable
 from pathlib import Path
 from random import Random
-
-import h5py
-import numpy as np
 
 from fuzz import containers, texts, values
 from fuzz.place import Place
@@ -77,8 +73,6 @@ def _change_content(random: Random, path: Path, canary: Path) -> str:
     if path.suffix in _PICKLED and random.random() < 0.06:
         path.write_bytes(values.pickled(random, canary, inside=random.random() < 0.5))
         return f"{path.name}: a pickle"
-    if path.suffix in (".mat",) and content[512:516] == b"\x89HDF" and random.random() < 0.4:
-        return _change_hdf5(random, path)
     kind, changed = change(random, path.suffix, content, canary)
     path.write_bytes(changed)
     return f"{path.name}: {kind}"
@@ -104,14 +98,8 @@ def _change_binary(random: Random, suffix: str, content: bytes, canary: Path) ->
         unpacked = {"blocks": (10,)} if suffix == ".zip" else {}  # what is unpacked to the disk may be large
         member = functools.partial(_member, random, canary)
         return "archive", containers.mutate_zip(random, content, canary, member, **unpacked)
-    if content[:8] == b"\x89PNG\r\n\x1a\n":
-        return "chunks", containers.mutate_png(random, content)
     if content[:2] == b"\x1f\x8b" or content[257:262] == b"ustar":
         return "archive", containers.mutate_tar(random, content, canary)
-    if suffix == ".safetensors":
-        inner: Callable[[bytes], bytes] = lambda header: texts.mutate_json(random, header.decode(), canary)  # noqa: E731
-        with contextlib.suppress(ValueError, struct.error):
-            return "header", containers.mutate_safetensors(random, content, inner)
     return _change_bytes(random, content)
 
 
@@ -198,33 +186,3 @@ _PLACES = (
     "missing", "missing", "directory", "directory", "loop", "fifo", "fifo", "link", "link", "empty", "name", "name",
     "sparse",
 )  # fmt: skip
-
-
-def _change_hdf5(random: Random, path: Path) -> str:
-    """Replace a data set of an HDF5 file by one of another shape or type, by a link, or by nothing."""
-    content = path.read_bytes()
-    file = io.BytesIO(content)
-    with contextlib.suppress(OSError, KeyError, RuntimeError, ValueError), h5py.File(file, "r+") as opened:
-        names = [name for name in opened if isinstance(opened[name], h5py.Dataset)]
-        name = random.choice(names)
-        shape, dtype = opened[name].shape, opened[name].dtype
-        del opened[name]
-        kind = random.randrange(8)
-        if kind == 0:
-            opened.create_dataset(name, shape=(60000, 60000), dtype=dtype, chunks=(1000, 1000), compression="gzip")
-        elif kind == 1:
-            opened.create_dataset(name, shape=(max(shape[0], 1), 20000, 20000), dtype="f8", chunks=(1, 1000, 1000))
-        elif kind == 2:
-            opened[name] = h5py.ExternalLink("/etc/passwd", "/x")
-        elif kind == 3:
-            opened[name] = h5py.SoftLink("/" + name)
-        elif kind == 4:
-            opened[name] = np.array([b"text"] * 3, dtype=h5py.string_dtype())
-        elif kind == 5 and dtype.kind in "fiu":  # it may be text of an earlier change
-            shape = tuple(min(each, 2000) for each in shape)  # it may be that of a data set of gigabytes from above
-            opened.create_dataset(name, data=np.full(shape, random.choice((0, 1e19, -1, 250))).astype(dtype))
-        elif kind == 6:
-            opened.create_group(name)
-        file.flush()
-    path.write_bytes(file.getvalue())
-    return f"{path.name}: another data set"

@@ -2,24 +2,15 @@
 
 import contextlib
 import io
-import json
-import math
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from dsr.app.entry import run_command
 from dsr.cli import main
-from dsr.geometry.camera import Camera
-from dsr.io.cameras import read_any_camera
-from dsr.io.images import CameraFile, read_camera
-from dsr.io.reading import parse_unit
-from dsr.io.trajectories import read_poses, read_transform
-from dsr.utils.console import one_line
 from fuzz.values import NUMBERS
 
 checked = settings(
@@ -28,83 +19,6 @@ checked = settings(
 few = settings(checked, max_examples=10)
 LINES = st.text(st.characters(codec="utf-8"), max_size=40)
 NUMBER_TEXTS = st.one_of(st.sampled_from(NUMBERS), st.floats().map(str), st.integers().map(str), LINES)
-JSON = st.recursive(
-    st.none() | st.booleans() | st.floats() | st.integers() | LINES,
-    lambda inner: st.lists(inner, max_size=5) | st.dictionaries(LINES, inner, max_size=5),
-    max_leaves=12,
-)
-CAMERA = {"width": 64, "height": 48, "fx": 50.0, "fy": 51.0, "cx": 31.0, "cy": 24.0}
-KEYS = (*CAMERA, "range_type", "baseline", "baseline_unit", "doffs", "depth_unit", "hole_value", "intrinsic_matrix")
-
-
-@pytest.fixture(scope="module")
-def file(tmp_path_factory):
-    return tmp_path_factory.mktemp("texts") / "stranger.txt"
-
-
-def expect_one_line(error, named):
-    message = one_line(error)  # as commands print it
-    assert named in message
-    assert "\n" not in message
-    assert len(message) <= 1000
-
-
-@checked
-@given(NUMBER_TEXTS)
-@example("1/0")
-@example("9" * 400)
-@example("1e-320/1e308")
-def test_unit_is_a_positive_number_or_refused(text):
-    try:
-        unit = parse_unit(text)
-    except ValueError as error:
-        expect_one_line(error, "expected m, cm")
-    else:
-        assert 0 < unit < math.inf
-
-
-@checked
-@given(st.dictionaries(st.sampled_from(KEYS), JSON, max_size=3), st.sets(st.sampled_from(list(CAMERA)), max_size=1))
-def test_camera_of_json_is_finite_or_refused(file, changes, without):
-    path = file.with_suffix(".json")
-    path.write_text(json.dumps({key: value for key, value in {**CAMERA, **changes}.items() if key not in without}))
-    for read in (read_camera, read_any_camera):
-        try:
-            found = read(path)
-        except ValueError as error:
-            expect_one_line(error, path.name)
-        else:
-            assert isinstance(found, CameraFile)
-            assert isinstance(found.camera, Camera)
-            assert math.isfinite(found.camera.fx)
-            assert found.camera.width > 0
-
-
-@checked
-@given(st.lists(st.lists(NUMBER_TEXTS, min_size=3, max_size=4), min_size=3, max_size=4))
-def test_matrix_of_text_is_a_camera_and_a_rigid_motion_or_refused(file, rows):
-    file.write_text("\n".join(" ".join(row) for row in rows), encoding="utf-8", errors="replace")
-    with contextlib.suppress(ValueError):
-        assert np.isfinite(read_any_camera(file)).all()
-    try:
-        matrix = read_transform(file)
-    except ValueError as error:
-        expect_one_line(error, file.name)
-    else:
-        assert np.linalg.det(matrix[:3, :3]) == pytest.approx(1, abs=1e-3)
-
-
-@checked
-@given(st.lists(st.lists(NUMBER_TEXTS, min_size=8, max_size=8) | st.lists(NUMBER_TEXTS, max_size=16), max_size=4))
-@example([["1", "0", "0", "0", "0", "0", "0", "1"]])
-def test_poses_of_text_are_rigid_or_refused(file, rows):
-    file.write_text("\n".join(" ".join(row) for row in rows), encoding="utf-8", errors="replace")
-    try:
-        found = read_poses(file)
-    except ValueError as error:
-        expect_one_line(error, file.name)
-    else:
-        assert all(np.isfinite(pose).all() for pose in found.poses)
 
 
 OPTIONS = {

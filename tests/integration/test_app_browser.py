@@ -1,6 +1,5 @@
 """The page of `dsr app` in a browser: files to surfaces and back to files, by the mouse and by keys alone."""
 
-import contextlib
 import io
 import zipfile
 
@@ -224,108 +223,7 @@ def test_wrong_and_large_files_are_refused_before_they_are_sent_and_work_can_be_
     assert page.is_enabled(".compute")
 
 
-def test_work_goes_on_after_a_cancelled_look_and_after_the_files_were_deleted(webgl_browser, client, tmp_path):
-    context = webgl_browser.new_context(viewport=DESKTOP)
-    page = context.new_page()
-    page.goto(client.page)
-    page.set_input_files("#capture", captures.record3d(tmp_path / "scan.r3d"))
-    page.click(".cancel")
-    assert finished(page)[0] == "Cancelled."
-    page.select_option("#method", "bicubic")
-    page.click(".compute")
-    assert "3 frames" in finished(page)[0]
-    page.fill("#frame", "2")
-    for name in list(client.desk.uploads):
-        client.desk.drop(name)
-    computed(page)
-    assert f"focal length {captures.INTRINSICS[0] + 1:.0f} pixels" in page.inner_text(".facts")
-    context.close()
-
-
-def test_page_that_is_left_while_it_sends_leaves_no_files(webgl_browser, client, pair):
-    context = webgl_browser.new_context(viewport=DESKTOP)
-    page = context.new_page()
-    page.goto(client.page)
-    held = []
-    page.route("**/depth?*", lambda route: held.append(route))  # noqa: PLW0108 - Playwright reads its signature
-    drop(page, *pair)
-    before = set(client.desk.uploads)
-    with page.expect_request("**/depth?*"):
-        page.click(".compute")
-    (name,) = set(client.desk.uploads) - before
-    page.goto("about:blank")
-    page.wait_for_timeout(500)
-    assert client.desk.find(name) is None
-    for route in held:  # one that is never answered is reported when it is collected, amid another test
-        with contextlib.suppress(Exception):
-            route.abort()
-    context.close()
-
-
-def test_page_hides_its_token_and_loads_again_in_its_tab_alone(webgl_browser, client):
-    context = webgl_browser.new_context(viewport=DESKTOP)
-    page, own = context.new_page(), f"http://127.0.0.1:{client.port}/"
-    page.goto(client.page)
-    assert page.url == own
-    page.reload()
-    page.wait_for_selector(".compute")
-    assert page.url == own
-    other = context.new_page()
-    assert other.goto(own).status == 403
-    assert "dsr app" in other.inner_text("body")
-    context.close()
-
-
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("width", [360, 1280, 1920])
-def test_page_fits_the_window_and_its_texts_stand_out(webgl_browser, client, width, scheme):
-    context = webgl_browser.new_context(viewport={"width": width, "height": 800}, color_scheme=scheme)
-    page = context.new_page()
-    page.goto(client.page)
-    page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
-    page.evaluate(REVEAL)
-    assert page.evaluate("document.documentElement.scrollWidth") <= width
-    assert page.evaluate(FAINT) == []
-    context.close()
-
-
-REVEAL = """() => {
-  const find = (selector) => document.querySelector(selector);
-  for (const part of [".refused", ".read", ".downloads", ".frames"]) find(part).hidden = false;
-  find(".refused").textContent = "x";
-  for (const className of ["warning", ""]) {
-    find(".job-notes").append(Object.assign(document.createElement("li"), { className, textContent: "x" }));
-  }
-}"""
-FAINT = """() => {
-  const paint = document.createElement("canvas").getContext("2d", { willReadFrequently: true });
-  const rgba = (colour) => {
-    paint.clearRect(0, 0, 1, 1);
-    paint.fillStyle = colour;
-    paint.fillRect(0, 0, 1, 1);
-    return [...paint.getImageData(0, 0, 1, 1).data];
-  };
-  const linear = (c) => (c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4);
-  const light = ([r, g, b]) => 0.2126 * linear(r / 255) + 0.7152 * linear(g / 255) + 0.0722 * linear(b / 255);
-  const behind = (element) => {
-    for (let each = element; each; each = each.parentElement) {
-      const colour = rgba(getComputedStyle(each).backgroundColor);
-      if (colour[3] === 255) return colour;
-    }
-    return rgba("Canvas");
-  };
-  const faint = [];
-  for (const element of document.querySelectorAll("body *")) {
-    if (!element.checkVisibility() || element.closest(":disabled, .setting:has(:disabled), .skip")) continue;
-    if (![...element.childNodes].some((node) => node.nodeType === 3 && node.textContent.trim())) continue;
-    const [a, b] = [light(rgba(getComputedStyle(element).color)), light(behind(element))];
-    const contrast = (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05);
-    if (contrast < 4.5) faint.push(`${element.tagName}.${element.className}: ${contrast.toFixed(2)}`);
-  }
-  return faint;
-}"""
-
-
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("photo", "depth", "size"),
     [

@@ -20,6 +20,8 @@ SMALL = {
 }
 """Arguments, and how many ratios are printed."""
 
+pytestmark = pytest.mark.nightly
+
 
 @pytest.mark.parametrize("name", SMALL)
 def test_benchmark_prints_ratios(name: str) -> None:
@@ -73,17 +75,6 @@ def test_crops_have_one_panel_for_each_method(wall: Path, tmp_path: Path) -> Non
     panels = [picture[100:200, 10 + column * 392 :][:, 100:284].std() for column in range(4)]
     assert panels[0] < 1 < panels[2] < panels[1] / 2, "the photo is grey, the input has noise, the result less of it"
     assert panels[3] == 0, "there is no fourth panel"
-
-
-def test_flatness_of_a_wall(wall: Path) -> None:
-    printed = run_benchmark(
-        "flatness.py", "--shared", str(wall), "--floors", "depth_camera_0", "--methods", "bilateral"
-    )
-    rows = [line.strip("| ").split(" | ") for line in printed.splitlines()[2:]]
-    assert [row[0] for row in rows] == ["input", "bilateral filter of OpenCV", "Bilateral"]
-    floors = [float(row[1]) for row in rows]
-    assert floors[0] > 2 * floors[1] > 0
-    assert all(row[2:] == ["0.0", "0", "100"] for row in rows)
 
 
 def test_flatness_is_the_published_one(shared: Path) -> None:

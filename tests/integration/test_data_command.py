@@ -8,14 +8,12 @@ import subprocess
 import sys
 import threading
 import time
-import types
 from http.server import BaseHTTPRequestHandler
 
 import pytest
 
 from dsr import cli
 from dsr.data.download import fetching
-from dsr.data.download.collections import Collection, Item
 
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(range(256)) * 1000
 NAMES = [f"middlebury2003/{scene}/{name}" for scene in ("cones", "teddy") for name in ("im2.png", "disp2.png")]
@@ -83,10 +81,6 @@ def in_process(capsys, *arguments, catalogue=None):
     code = cli.main(arguments, catalogue)
     said = capsys.readouterr()
     return code, said.out.splitlines(), said.err.splitlines()
-
-
-def mine(*items, **fields):
-    return {"mine": Collection("mine", "Mine", "https://page", "Free.", "Me, 2020.", ("set",), 3e6, items, **fields)}
 
 
 def test_dataset_is_fetched_listed_verified_and_not_fetched_twice(mirror, root):
@@ -181,69 +175,6 @@ def drain(terminal):
         pass
 
 
-def test_file_found_nowhere_is_one_line_and_the_others_come(mirror, root, capsys):
-    items = [Item(f"set/{number}.png", (f"{mirror.url}/{name}",)) for number, name in enumerate(("gone", NAMES[0]))]
-    code, _, errors = in_process(capsys, "data", "get", "mine", catalogue=mine(*items))
-    assert (code, errors) == (2, [f"error: set/0.png: {mirror.url}/gone: HTTP 404 Not Found"])
-    assert (root / "set/1.png").exists()
-    code, lines, _ = in_process(capsys, "data", "list", catalogue=mine(*items))
-    assert code == 0
-    assert lines[-1].split() == ["mine", "Mine", "3.0", "MB", "partial", "1", "of", "2", "1", "unknown,", "1", "noted"]
-
-
-def test_damaged_file_is_found_and_fetched_again(mirror, root, capsys):
-    get = ("data", "get", "middlebury2003", "--mirror", mirror.url)
-    assert in_process(capsys, *get)[0] == 0
-    path = root / NAMES[1]
-    path.write_bytes(PNG[:-1] + b"?" + NAMES[1].encode())
-    code, lines, errors = in_process(capsys, "data", "verify", "middlebury2003")
-    assert (code, len(errors)) == (2, 1)
-    assert errors[0].startswith(f"error: {path}: expected sha256 ")
-    assert lines == ["middlebury2003: `dsr data get middlebury2003` fetches what is missing or damaged"]
-    code, lines, _ = in_process(capsys, *get)
-    assert code == 0
-    assert any(line.endswith(": fetching it again") for line in lines)
-    assert path.read_bytes() == PNG + NAMES[1].encode()
-
-
-def test_changed_file_is_refused_until_it_is_accepted(mirror, root, capsys):
-    catalogue = mine(Item("set/a.png", (f"{mirror.url}/{NAMES[0]}",)))
-    assert in_process(capsys, "data", "get", "mine", catalogue=catalogue)[0] == 0
-    (root / "set/a.png").unlink()
-    mirror.files[f"/{NAMES[0]}"] = PNG
-    code, _, errors = in_process(capsys, "data", "get", "mine", catalogue=catalogue)
-    assert (code, len(errors)) == (2, 1)
-    assert "--accept-changed" in errors[0]
-    assert in_process(capsys, "data", "get", "mine", "--accept-changed", catalogue=catalogue)[0] == 0
-    assert in_process(capsys, "data", "verify", "mine", catalogue=catalogue)[0] == 0
-
-
-def test_manual_route_names_the_files_places_and_checks_them(root, capsys):
-    for task in ("get", "verify"):
-        code, lines, errors = in_process(capsys, "data", task, "tofmark")
-        assert (code, len(errors)) == (2, 1)
-        assert f"put benchmarking_dataset_*.mat into {root / 'tofmark'}, then `dsr data verify tofmark`" in errors[0]
-    (root / "tofmark").mkdir(parents=True)
-    (root / "tofmark/benchmarking_dataset_books.mat").write_bytes(b"MATLAB 5.0 MAT-file")
-    code, lines, errors = in_process(capsys, "data", "verify", "tofmark")
-    assert (code, errors, lines[-1]) == (0, [], "tofmark: complete, as recorded")
-    assert "recorded as found: tofmark/benchmarking_dataset_books.mat" in lines[0]
-    assert in_process(capsys, "data", "get", "tofmark")[0] == 0
-    (root / "tofmark/benchmarking_dataset_books.mat").write_bytes(b"MATLAB 5.0 another")
-    assert in_process(capsys, "data", "verify", "tofmark")[0] == 2
-
-
-def test_manual_route_takes_photos_in_any_folder(root, capsys):
-    for name, content in (("20200509112638_RGB.jpg", b"\xff\xd8\xff\xe0"), ("20200509112638_HR_gt.png", PNG)):
-        path = root / "rgbdd/portraits/portraits_test/20200509112638" / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content)
-    code, lines, errors = in_process(capsys, "data", "verify", "rgbdd")
-    assert (code, errors, lines[-1]) == (0, [], "rgbdd: complete, as recorded")
-    path.with_name("20200509112638_RGB.jpg").write_bytes(b"GIF89a")
-    assert "expected a .jpg file" in in_process(capsys, "data", "verify", "rgbdd")[2][0]
-
-
 def test_locations_of_the_datasets_are_printed(root, capsys):
     code, lines, _ = in_process(capsys, "data", "where")
     assert (code, lines[0]) == (0, str(root))
@@ -257,30 +188,3 @@ def test_unknown_name_is_one_line_with_the_known_ones(root, capsys, task):
     assert (code, lines, len(errors)) == (2, [], 1)
     assert errors[0].startswith("error: middelbury: unknown data set; expected some of middlebury, middlebury_train, ")
     assert not root.exists()
-
-
-def test_invalid_mirror_address_is_one_line(root, capsys):
-    code, _, errors = in_process(capsys, "data", "get", "nyu", "--mirror", "/mnt/data")
-    assert (code, errors) == (
-        2,
-        ["error: --mirror: expected an address that begins with http:// or https://, got '/mnt/data'"],
-    )
-
-
-@pytest.mark.parametrize("arguments", [("--help",), ("data", "--help"), ("data", "get", "--help")])
-def test_help_has_examples(arguments, capsys):
-    with pytest.raises(SystemExit) as caught:
-        cli.main(arguments)
-    assert caught.value.code == 0
-    said = capsys.readouterr().out
-    assert "dsr data get" in said
-    assert all(len(line) <= 120 for line in said.splitlines())
-
-
-def test_doctor_exit_code_is_that_of_the_command(tmp_path, monkeypatch):
-    doctor = types.ModuleType("dsr.doctor.examine")
-    seen = []
-    doctor.examine_directory = lambda *given: seen.append(given) or 3
-    monkeypatch.setitem(sys.modules, "dsr.doctor.examine", doctor)
-    assert cli.main(["doctor", str(tmp_path)]) == 3
-    assert seen == [(tmp_path, None)]

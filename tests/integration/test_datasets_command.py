@@ -1,7 +1,6 @@
 """``python eval.py`` and ``python train.py`` on data sets in their owners' formats."""
 
 import os
-import shutil
 import sys
 from pathlib import Path
 
@@ -101,18 +100,3 @@ def test_prepare_draws_a_contact_sheet_and_errors_are_one_line(tmp_path, monkeyp
         assert len(errors) == 1
         assert errors[0].startswith(f"error: {message}")
     assert [path.name for path in tmp_path.iterdir()] == ["outputs"]
-
-
-def test_unreadable_scene_is_named_and_the_others_are_drawn(tmp_path, monkeypatch, capsys, shared, dsr_cache):
-    (tmp_path / "icl_nuim").mkdir()
-    for name in ("good", "bad"):
-        shutil.copytree(shared / "real" / "icl_nuim" / "living", tmp_path / "icl_nuim" / name)
-    (tmp_path / "icl_nuim" / "bad" / "depth.png").write_bytes(b"no picture")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("DSR_DATA", str(tmp_path))
-    assert main(["data", "prepare", "icl", "dataset.scenes=found", "dataset.size=64"]) == 2
-    captured = capsys.readouterr()
-    assert "contact sheet: outputs/data/icl/sheet.png" in captured.out
-    assert captured.err.startswith(
-        f"error: 1 of 2 scenes cannot be read: {tmp_path}/icl_nuim/bad/depth.png: expected a "
-    )

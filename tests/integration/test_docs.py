@@ -21,7 +21,6 @@ from dsr.app.schema import EvalConfig, TrainConfig, plain_config, register
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
-CARD = DOCS / "weights.md"
 PAGES = (ROOT / "README.md", ROOT / "src/dsr/methods/weights/README.md", *sorted(DOCS.glob("*.md")))
 EXTENDING = DOCS / "extend.md"
 """Its commands use the modules that it contains; a test runs them."""
@@ -62,10 +61,6 @@ def parametrize(name: str) -> Any:
     return pytest.mark.parametrize("arguments", found.values(), ids=found.keys())
 
 
-def test_readme_has_at_most_8_kb() -> None:
-    assert (ROOT / "README.md").stat().st_size <= 8192
-
-
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_relative_links_of_a_page_lead_somewhere(page: Path, generated: dict[str, str]) -> None:
     text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
@@ -73,11 +68,6 @@ def test_relative_links_of_a_page_lead_somewhere(page: Path, generated: dict[str
     local = {target for target in targets if target and "://" not in target}
     missing = {target for target in local if not (page.parent / target).exists()}
     assert missing <= (set(generated) if page.parent == DOCS else set())
-
-
-def test_documentation_pictures_are_all_used() -> None:
-    text = "".join(page.read_text() for page in PAGES)
-    assert [path.name for path in sorted((DOCS / "pictures").iterdir()) if path.name not in text] == []
 
 
 @parametrize("dsr")
@@ -173,18 +163,6 @@ def test_command_reference_has_every_command_and_option(hook: ModuleType, genera
             assert [name for name in action.option_strings if name not in section] == []
 
 
-def test_option_reference_has_a_table_for_each_group_with_every_option(
-    hook: ModuleType, generated: dict[str, str]
-) -> None:
-    page = generated["reference/upsample.md"]
-    parser = next(each for each in hook.all_parsers(hook.command_parser()) if each.prog == "dsr upsample")
-    rows = dict(re.findall(r"^\| `([^`]+)` \| (.*) \|$", page, re.MULTILINE))
-    flags = {flag for shown in rows for flag in re.findall(r"(?<![\w-])--?[a-z-]+", shown)}
-    assert {flag for action in parser._actions for flag in action.option_strings} == {*flags, "-h", "--help"}
-    assert all(rows.values())
-    assert re.findall(r"^## (.*)$", page, re.MULTILINE)[0] == "What to work on"
-
-
 def leaves(node: Any, above: str = "") -> Iterator[tuple[str, Any]]:
     """Yield the dotted keys of nested mappings, with their values where these are no mappings."""
     for key, value in node.items():
@@ -214,24 +192,6 @@ def test_configuration_reference_has_every_key_and_default(path: Path, generated
     assert list(rows) == list(expected)
     scalars = {key: value for key, value in expected.items() if key != "defaults" and value not in (None, {}, "")}
     assert {key: yaml.safe_load(rows[key]) for key in scalars} == scalars
-
-
-def test_model_card_describes_the_weights_that_are_here() -> None:
-    from dsr.methods import weights  # noqa: PLC0415
-
-    card = CARD.read_text()
-    files = card.partition("### Files")[2].partition("\n### ")[0]
-    assert f"weights `{weights.version()}`" in card
-    assert set(re.findall(r"^\| `(\w+)` \|", files, re.MULTILINE)) == set(weights.known())
-
-
-def test_citation_has_what_the_format_requires() -> None:
-    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
-    assert {"cff-version", "message", "title", "authors", "version", "license"} <= set(citation)
-    paper = citation["preferred-citation"]
-    assert {"type", "title", "authors", "year"} <= set(paper)
-    assert paper["title"] == "Perceptual Deep Depth Super-Resolution"
-    assert [author["family-names"] for author in paper["authors"]][::6] == ["Voynov", "Zorin"]
 
 
 def test_citation_names_the_version_of_the_package() -> None:

@@ -1,14 +1,12 @@
 """Exports of ``dsr upsample``: what is asked for is written, numbers are said, and refusals write nothing."""
 
 import json
-import sys
 
 import numpy as np
 import pytest
 import trimesh
 from PIL import Image
-
-from dsr.cli import main
+from upsampling import upsample
 
 FRAMES = ("000", "001")
 
@@ -25,10 +23,6 @@ def capture(tmp_path):
         depth = (1500 + 10 * rows + 5 * columns + 100 * number).astype(np.uint16)
         Image.fromarray(depth).save(tmp_path / "capture" / "depth" / f"{name}.png")
     return tmp_path / "capture"
-
-
-def upsample(*arguments):
-    return main(["upsample", *map(str, arguments), "--method", "bicubic"])
 
 
 def names_in(folder):
@@ -79,26 +73,6 @@ def test_frames_without_poses_are_refused_before_anything_is_computed(
     assert not (tmp_path / "out").exists()
 
 
-def test_single_frame_without_a_pose_is_reported_to_give_no_scene(capture, tmp_path, capsys):
-    files = ("--rgb", capture / "rgb" / f"{FRAMES[0]}.png", "--depth", capture / "depth" / f"{FRAMES[0]}.png")
-    assert upsample(*files, "--only", "gaussian", "--dry-run", "-o", tmp_path / "o") == 0
-    said = capsys.readouterr().out.splitlines()
-    assert said[0].startswith("--with gaussian: the frame has no pose: images, depths")
-
-
-def test_result_that_a_link_leads_elsewhere_is_reported_and_not_read_as_one_without_a_pose(capture, tmp_path, capsys):
-    out, other = tmp_path / "out", tmp_path / "other"
-    assert upsample(capture, "--only", "depth,rgbd", "-o", out) == 0
-    set_poses(out)
-    (out / "001").rename(other)
-    (out / "001").symlink_to(other)
-    capsys.readouterr()
-    assert upsample(capture, "--only", "nerfstudio", "-o", out) == 2
-    [error] = capsys.readouterr().err.splitlines()
-    assert f"a link to {other}" in error
-    assert names_in(other) == names_in(out / "000")
-
-
 def test_poses_of_a_file_are_those_of_the_exports(capture, tmp_path):
     (tmp_path / "poses.txt").write_text("".join(f"{number} {number} 2 3 0 0 0 1\n" for number in range(2)))
     out = tmp_path / "out"
@@ -115,19 +89,6 @@ def test_foreign_file_in_place_of_an_export_is_left_alone(capture, tmp_path, cap
     assert upsample(capture, "--only", "open3d", "-o", out) == 2
     assert "open3d: is there already and not of an earlier run" in capsys.readouterr().err
     assert (out / "open3d").read_text() == "mine"
-
-
-def test_pose_that_is_not_rigid_is_one_line(capture, tmp_path, capsys):
-    out = tmp_path / "out"
-    assert upsample(capture, "--only", "depth,rgbd", "-o", out) == 0
-    set_poses(out)
-    path = out / "001" / "info.json"
-    path.write_text(path.read_text().replace('"pose": [[1, 0', '"pose": [[3, 0'))
-    capsys.readouterr()
-    assert upsample(capture, "--only", "nerfstudio", "-o", out) == 2
-    error = capsys.readouterr().err
-    assert "info.json: pose: expected a rigid transform of 4 x 4 numbers" in error
-    assert error.count("\n") == 1
 
 
 def test_mesh_and_cloud_beyond_limits_are_said_and_recorded(capture, tmp_path, capsys):
@@ -159,11 +120,4 @@ def test_mesh_and_cloud_beyond_limits_are_said_and_recorded(capture, tmp_path, c
 def test_refusals_write_nothing(arguments, text, capture, tmp_path, capsys):
     assert upsample(capture, *arguments, "-o", tmp_path / "out") == 2
     assert text in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
-
-
-def test_missing_rerun_is_one_line_before_anything_is_computed(capture, tmp_path, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    assert upsample(capture, "--with", "rerun", "-o", tmp_path / "out") == 2
-    assert "rerun-sdk; pip install -e '.[rerun]' in a checkout" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -1,6 +1,5 @@
 """Other lights are one change in one place: metrics, files, pictures, pages and choices follow."""
 
-import base64
 import json
 import os
 import re
@@ -11,12 +10,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import torch
 
-from dsr.evaluation.run_files import load_results
 from dsr.geometry import lights
-from dsr.geometry.shading import shade
-from dsr.pictures.depth_views import normals_seen_by
 
 OTHER = {
     "left": (-0.8, 0.0, -0.6),
@@ -87,13 +82,6 @@ def found(made):
     return json.loads((made / "found.json").read_text())
 
 
-def brightness(folder, light):
-    """Return the truth of the scene under one of the lights, (H, W) in [0, 1]."""
-    sample = load_results([folder / "runs"]).runs[0].sample("statue")
-    direction = torch.tensor([OTHER[light]], dtype=torch.float64)
-    return shade(normals_seen_by(sample.camera, sample.depth), direction)[0, 0].clamp(0, 1).numpy()
-
-
 def test_metrics_have_a_value_for_each_of_the_other_lights(found):
     n = -np.array([[0.3, 0, 1] / np.hypot(0.3, 1), [0, 0, 1]])  # of the slope and the wall
     expected = {name: abs((n[0] - n[1]) @ direction) for name, direction in OTHER.items()}
@@ -108,35 +96,3 @@ def test_files_and_panels_are_named_and_lit_by_the_other_lights(made, found):
         grey = cv2.imread(str(made / "files" / f"{name}.png"), cv2.IMREAD_UNCHANGED)
         assert abs(int(grey[3, 4].ravel()[0]) + 255 * direction[2]) <= 0.51
         assert {f"ours under {name}", f"truth under {name}"} <= set(found["panels"])
-
-
-def test_command_line_takes_the_other_lights_alone(made, found):
-    assert {name: found[name] for name in ("report below", "report e1", "study below", "study e1")} == {
-        "report below": 0, "report e1": 2, "study below": 0, "study e1": 2,
-    }  # fmt: skip
-    assert json.loads((made / "study" / "below" / "key.json").read_text())["light"] == "below"
-    text = (made / "study" / "below" / "index.html").read_text(encoding="utf-8")
-    picture = base64.b64decode(re.search(r'"truth":"([^"]+)"', text).group(1))
-    image = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_UNCHANGED)
-    grey, shown = (image if image.ndim == 2 else image[..., 0]), brightness(made, "below")
-    known = np.isfinite(shown)
-    assert np.abs(grey[known].astype(float) - 1 - 254 * shown[known]).max() <= 0.51
-
-
-def test_page_of_a_report_offers_and_shows_the_other_lights(made, browser):
-    page = browser.new_page()
-    wrong = []
-    page.on("console", lambda message: wrong.append(message.text))
-    page.on("pageerror", lambda error: wrong.append(str(error)))
-    page.goto((made / "report" / "below" / "index.html").as_uri())
-    page.wait_for_selector(".stage[data-shown]")
-    assert page.locator("[data-light]").all_inner_texts() == [*OTHER, "free"]
-    page.locator("#scenes select.right").select_option(label="truth")
-    for number, name in enumerate(OTHER, start=1):
-        page.keyboard.press(str(number))
-        page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
-        url = page.evaluate("document.querySelector('.pane-right canvas').toDataURL()")
-        drawn = cv2.imdecode(np.frombuffer(base64.b64decode(url.split(",")[1]), np.uint8), cv2.IMREAD_COLOR)[..., 0]
-        assert np.abs(drawn - 255 * brightness(made, name)).max() <= 2.3
-    assert wrong == []
-    page.close()

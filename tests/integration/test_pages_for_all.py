@@ -99,15 +99,6 @@ def test_page_is_as_wide_as_the_window_and_labels_are_whole(visit, name, size):
     assert page.evaluate(CUT) == []
 
 
-def test_tables_scroll_inside_their_box_and_keep_their_names(visit):
-    page = visit("report", NARROW)
-    box = page.locator("#tables .box").first
-    assert box.evaluate("(box) => box.scrollWidth > box.clientWidth")
-    box.evaluate("(box) => { box.scrollLeft = 9999 }")
-    name, around = box.locator("tbody td").first.bounding_box(), box.bounding_box()
-    assert abs(name["x"] - around["x"]) <= 2
-
-
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("name", PAGES)
 def test_keys_reach_everything_and_show_where_they_are(visit, name, scheme):
@@ -126,15 +117,3 @@ def test_keys_reach_everything_and_show_where_they_are(visit, name, scheme):
 @pytest.mark.parametrize("name", PAGES)
 def test_text_stands_out_from_what_is_behind_it(visit, name, scheme):
     assert visit(name, WIDE, color_scheme=scheme).evaluate(CONTRASTS) == []
-
-
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("name", PAGES)
-def test_on_paper_controls_are_gone_and_all_is_dark_on_white(visit, name, scheme):
-    page = visit(name, {"width": 794, "height": 1123}, color_scheme=scheme)
-    page.emulate_media(media="print", color_scheme=scheme)
-    assert page.evaluate("document.documentElement.scrollWidth") <= 794
-    for hidden in (".controls", ".zoom", ".strip", ".divider", "footer", ".actions"):
-        assert not any(each.is_visible() for each in page.locator(hidden).all()), hidden
-    assert page.evaluate("getComputedStyle(document.body).color") == "rgb(0, 0, 0)"
-    assert page.evaluate(CONTRASTS.replace("matchMedia('(prefers-color-scheme: dark)').matches", "false")) == []

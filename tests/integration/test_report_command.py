@@ -71,16 +71,6 @@ def test_workers_make_the_same_files_and_notes_as_the_command_alone(runs: Path, 
     assert any("no figures of statue" in note for note in notes[0])
 
 
-def test_report_replaces_an_earlier_one_whole(runs: Path, tmp_path: Path) -> None:
-    output = tmp_path / "report"
-    arguments = ["report", str(runs), "-o", str(output), "--only", "tables"]
-    assert main(arguments) == 0
-    assert "Bicubic" in (output / "tables" / "all.md").read_text(encoding="utf-8")
-    assert main([*arguments, "--methods", "MSG-V"]) == 0
-    assert "Bicubic |" not in (output / "tables" / "all.md").read_text(encoding="utf-8")
-    assert not (output / "index.html").exists()
-
-
 def test_interrupted_report_leaves_the_earlier_one_as_it_was(
     runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -153,10 +143,6 @@ def test_invalid_choice_is_one_line_and_nothing_is_written(
     assert not (tmp_path / "report").exists()
 
 
-def test_directory_without_runs_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "expected runs of eval.py" in refused(capsys, "report", tmp_path, "-o", tmp_path / "report")
-
-
 # truths of the same scenes that differ
 
 
@@ -199,13 +185,6 @@ def test_different_truths_are_reported_and_have_tables_of_their_own(
     assert "the runs have different ground truths" in (report / "index.html").read_text(encoding="utf-8")
 
 
-def test_run_that_does_not_say_its_truths_is_compared_with_neither(apart: Path, tmp_path: Path) -> None:
-    set_truths(apart / "one" / "MSG-V", {})
-    assert main(["report", str(apart), "-o", str(tmp_path / "report"), "--only", "tables"]) == 0
-    tables = [pd.read_csv(path) for path in (tmp_path / "report" / "tables").glob("simgeo*.csv")]
-    assert sorted(sorted(set(each["method"])) for each in tables) == [["Bicubic"], ["Bicubic", "MSG-V"], ["MSG-V"]]
-
-
 def test_strict_refuses_different_truths_unless_one_alone_is_chosen(
     apart: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -215,18 +194,6 @@ def test_strict_refuses_different_truths_unless_one_alone_is_chosen(
     assert not (tmp_path / "report").exists()
     name = re.findall(r"simgeo \(truth [0-9a-f]{8}\)", line)[0]
     assert main([*map(str, command), "--datasets", name]) == 0
-
-
-def test_study_asks_about_each_truth_and_strict_refuses(
-    apart: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["study", "build", str(apart), "-o", str(tmp_path / "study")]) == 0
-    assert "warning: simgeo x4: the runs have different ground truths" in " ".join(capsys.readouterr().out.split())
-    trials = json.loads((tmp_path / "study" / "key.json").read_text())["trials"].values()
-    assert len(trials) == 4
-    assert len({trial["dataset"] for trial in trials}) == 2
-    assert "different ground truths" in refused(capsys, "study", "build", apart, "-o", tmp_path / "other", "--strict")
-    assert not (tmp_path / "other").exists()
 
 
 def test_leaderboard_is_a_page_that_ranks_the_methods_and_their_tables(

@@ -1,10 +1,8 @@
 """The page of a report in a browser: it sorts, lights, compares and reads out what it should, and asks nobody."""
 
 import base64
-import dataclasses
 import functools
 import json
-import re
 
 import cv2
 import matplotlib as mpl
@@ -12,13 +10,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from dsr.evaluation.results import Results
 from dsr.evaluation.run_files import load_results
 from dsr.geometry.shading import lights, render, shade
 from dsr.pictures.depth_views import normals_seen_by
-from dsr.report.page import content, save_page
+from dsr.report.page import save_page
 from dsr.report.table_layouts import write_tables
-from dsr.report.tables import FACTS, Fact
 
 SPITEFUL = "<img src=x onerror=alert(1)>\"'&</script><script>alert(2)</script>"
 SIZE = 64
@@ -50,15 +46,6 @@ def results(make_run, folder):
 @pytest.fixture
 def address(make_run, folder):
     return made(make_run, folder)[1]
-
-
-@pytest.fixture(scope="module")
-def papers(make_run, tmp_path_factory):
-    """The address of a page about a scene of the paper."""
-    folder = tmp_path_factory.mktemp("papers")
-    make_run(folder / "run", scenes=("lucy",), size=512)
-    save_page(folder / "index.html", load_results([folder]), title="A report")
-    return (folder / "index.html").as_uri()
 
 
 @pytest.fixture(scope="module")
@@ -110,12 +97,6 @@ def pixels(page, selector):
     return cv2.imdecode(content, cv2.IMREAD_COLOR)[..., ::-1]
 
 
-def seen(page, selector=".stage"):
-    """Return an element as it is on the screen, (h, w, 3)."""
-    content = page.locator(selector).screenshot()
-    return cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int)
-
-
 def run_of(results, label):
     return next(run for run in results.runs if run.label == label and run.scale == 4)
 
@@ -148,21 +129,6 @@ def column(page, table, number):
     )
 
 
-def test_labels_of_bars_are_whole(make_run, tmp_path, opened):
-    labels = ["DIP-V (steps=300, widths=[8, 16])", "DIP-V (steps=600, widths=[8, 16])"]
-    for number, label in enumerate(labels):
-        make_run(tmp_path / str(number), method="dip_v", label=label, scenes=SCENES[:1], size=SIZE)
-    save_page(tmp_path / "index.html", load_results([tmp_path]), title="A report")
-    page = opened((tmp_path / "index.html").as_uri(), pictures=False)
-    for size in (DESKTOP, {"width": 390, "height": 800}):
-        page.set_viewport_size(size)
-        shown = page.evaluate(
-            "[...document.querySelectorAll('.chart')[0].querySelectorAll('.label')]"
-            ".map((label) => [label.innerText, label.scrollWidth <= label.clientWidth])"
-        )
-        assert shown == [[label, True] for label in labels]
-
-
 def test_both_sides_show_the_renderings_of_the_protocol_under_every_light(opened, results):
     page = opened()
     choose(page, "left", "MSG-V")
@@ -175,39 +141,6 @@ def test_both_sides_show_the_renderings_of_the_protocol_under_every_light(opened
             assert drawn.shape == (SIZE, SIZE, 3)
             assert np.abs(drawn[..., 0] - rendering(results, label, light)).max() <= (1.51 if light < 3 else 2.3)
             assert (drawn == drawn[..., :1]).all()
-
-
-def test_another_fact_of_a_row_is_a_column_of_the_tables(make_run, tmp_path, opened, monkeypatch):
-    fact = Fact("size", lambda row: row.runs[0].size(row.about.places[0].scene)[0], lambda _: True, number=True)
-    monkeypatch.setattr(content, "FACTS", (*FACTS, fact))
-    make_run(tmp_path / "run", scenes=SCENES, size=SIZE)
-    save_page(tmp_path / "index.html", load_results([tmp_path]))
-    page = opened((tmp_path / "index.html").as_uri())
-    heads = "[...document.querySelectorAll('#tables table')].map((table) => table.rows[0].innerText.split(/\\s+/))"
-    means, scenes = page.evaluate(heads)
-    assert means[:2] == ["Method", "Size"]
-    assert scenes[:3] == ["Scene", "Method", "Size"]
-    assert column(page, 1, 2) == [str(SIZE)] * 2
-
-
-def test_divider_separates_the_two_pictures_on_the_screen(opened, results):
-    page = opened()
-    choose(page, "left", "Bicubic")
-    for share in (0.25, 0.75):
-        box = page.locator(".stage").bounding_box()
-        page.mouse.click(box["x"] + share * box["width"], box["y"] + 0.3 * box["height"])
-        page.mouse.move(5, 5)
-        image = seen(page)
-        height, width = image.shape[:2]
-        rows, columns = np.mgrid[8 : SIZE - 20, 2 : SIZE - 2]
-        far = np.abs((columns + 0.5) / SIZE - share) > 0.06
-        rows, columns = rows[far], columns[far]
-        found = image[((rows + 0.5) * height / SIZE).astype(int), ((columns + 0.5) * width / SIZE).astype(int), 0]
-        left, right = rendering(results, "Bicubic", 0), rendering(results, "truth", 0)
-        expected = np.where((columns + 0.5) / SIZE < share, left[rows, columns], right[rows, columns])
-        assert np.abs(found - expected).max() <= 2
-        assert np.abs(left - right).max() > 50
-        assert page.get_attribute(".divider", "aria-valuenow") == str(round(100 * share))
 
 
 def test_divider_moves_by_keys_mouse_and_touch(opened):
@@ -235,29 +168,6 @@ def test_divider_moves_by_keys_mouse_and_touch(opened):
         points = [] if share is None else [{"x": x + share * box["width"], "y": y}]
         session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
     assert now() == 60
-
-
-def test_both_pictures_zoom_and_move_together(opened):
-    page = opened()
-
-    def transforms():
-        return page.eval_on_selector_all(".stage .pane canvas", "all => all.map(each => each.style.transform)")
-
-    page.click(".zoom-in")
-    left, right = transforms()
-    assert left == right
-    assert "scale(1.5)" in left
-    box = page.locator(".stage").bounding_box()
-    middle = box["x"] + box["width"] * 0.3, box["y"] + box["height"] * 0.3
-    page.mouse.move(*middle)
-    page.mouse.down()
-    page.mouse.move(middle[0] - 40, middle[1] - 30)
-    page.mouse.up()
-    moved, other = transforms()
-    assert moved == other != left
-    assert page.get_attribute(".divider", "aria-valuenow") == "50"
-    page.click(".zoom-reset")
-    assert transforms()[0] == "translate(0px, 0px) scale(1)"
 
 
 def test_free_light_follows_the_pointer_and_shades_like_a_light_of_that_direction(opened, results):
@@ -339,89 +249,6 @@ def test_expected_errors_have_the_colours_and_limits_of_the_measured_ones(opened
     assert page.inner_text(".stage-scale").split("≥")[1].replace("+", "") == end
 
 
-def test_expected_errors_are_read_out_under_the_pointer(opened, sure):
-    results, address = sure
-    page = opened(address)
-    choose(page, "left", "Sure")
-    depth, angle = (each[0].numpy() for each in run_of(results, "Sure").expected_errors(SCENES[0]))
-    box = page.locator(".stage").bounding_box()
-    for row, across in ((20, 33), (50, 10)):
-        page.mouse.move(box["x"] + (across + 0.5) * box["width"] / SIZE, box["y"] + (row + 0.5) * box["height"] / SIZE)
-        settle(page)
-        found = re.search(
-            r"Sure .*expected errors: depth (\S+) (cm|mm), normal (\S+)°", page.inner_text(".readout >> nth=0")
-        )
-        metres = float(found[1]) / {"cm": 100, "mm": 1000}[found[2]]
-        assert metres == pytest.approx(depth[row, across], abs=0.0007)
-        assert float(found[3]) == pytest.approx(angle[row, across], abs=0.2)
-
-
-def test_method_without_expected_errors_is_said_to_have_none(opened, sure):
-    page = opened(sure[1])
-    choose(page, "left", "Sure")
-    choose(page, "right", "Bicubic")
-    page.click("[data-view=expectedError]")
-    settle(page)
-    assert page.locator(".pane .silent").all_inner_texts() == ["", "says nothing of its errors"]
-    assert page.locator(".strip button:has-text('Bicubic') .silent").inner_text() == "says nothing of its errors"
-    box = page.locator(".stage").bounding_box()
-    page.mouse.move(box["x"] + 9, box["y"] + 99)
-    assert re.search("Bicubic .*says nothing of its errors", page.inner_text(".readout >> nth=0"))
-    image = seen(page)
-    empty = image[image.shape[0] // 4, 5 * image.shape[1] // 8 :]
-    assert (empty == empty[0]).all()  # the left picture does not shine through
-    page.click("[data-view=depth]")
-    settle(page)
-    assert set(page.locator(".silent").all_inner_texts()) == {""}
-
-
-def test_expected_errors_are_shown_without_a_truth_and_their_holes_are_pink(opened, sure, tmp_path):
-    run = dataclasses.replace(run_of(sure[0], "Sure"))
-    stored, depth = dataclasses.replace(run.sample(SCENES[0]), depth=None), run.prediction(SCENES[0]).clone()
-    depth[0, 10:20, 10:20] = np.nan
-    object.__setattr__(run, "sample", lambda _: stored)
-    object.__setattr__(run, "prediction", lambda _: depth)
-    save_page(tmp_path / "index.html", Results((run,)))
-    page = opened((tmp_path / "index.html").as_uri())
-    choose(page, "left", "Sure")
-    assert page.locator("[data-view=error]").is_hidden()
-    assert page.locator("#calibration").is_hidden()
-    for view, first in (("expectedError", 10), ("expectedAngle", 9)):
-        page.click(f"[data-view={view}]")
-        settle(page)
-        hole = (pixels(page, ".pane-left canvas") == [214, 132, 180]).all(axis=-1)
-        assert hole[first:20, 10:20].all()
-        assert not hole[:first].any()
-        assert not hole[20:].any()
-
-
-def test_calibration_is_a_table_where_a_method_has_expected_errors(opened, sure, address):
-    page = opened(address)
-    assert page.locator("[data-view=expectedError]").is_hidden()
-    assert page.locator("#calibration").is_hidden()
-    assert page.locator("nav [href='#calibration']").is_hidden()
-    page = opened(sure[1])
-    rows = page.locator("#calibration tbody tr")
-    assert [row.split("\t")[:2] for row in rows.all_inner_texts()] == [["Sure", "depth"], ["Sure", "normal"]]
-    assert all(float(each) > 0 for row in rows.all_inner_texts() for each in row.split("\t")[2:12])
-    assert page.locator("nav [href='#calibration']").is_visible()
-    page.set_viewport_size({"width": 360, "height": 780})
-    assert page.evaluate("document.documentElement.scrollWidth") == 360
-
-
-def test_depth_has_the_colours_of_the_other_pictures_and_the_photo_is_unchanged(opened, results):
-    page = opened()
-    choose(page, "left", "photo")
-    photo = run_of(results, "Bicubic").sample(SCENES[0]).rgb.permute(1, 2, 0).numpy() * 255
-    assert np.abs(pixels(page, ".pane-left canvas") - photo).max() <= 1
-    page.click("[data-view=depth]")
-    settle(page)
-    depth = depth_of(results, "truth")[0].numpy()
-    drawn = pixels(page, ".pane-right canvas")
-    assert drawn[np.unravel_index(depth.argmin(), depth.shape)].tolist() == [68, 1, 84]  # both ends of viridis
-    assert drawn[np.unravel_index(depth.argmax(), depth.shape)].tolist() == [253, 231, 36]
-
-
 def test_headings_sort_by_click_and_by_key_and_say_so(opened):
     page = opened()
     headers = page.locator("#tables table").first.locator("th")
@@ -439,24 +266,6 @@ def test_headings_sort_by_click_and_by_key_and_say_so(opened):
     assert headers.nth(1).get_attribute("aria-sort") == "none"
 
 
-def test_rows_are_filtered_by_scene_and_method(opened):
-    page = opened()
-    page.fill(".filter-scene", "STAT")
-    page.fill(".filter-method", "msg")
-    assert (column(page, 1, 0), column(page, 1, 1)) == (["statue"], ["MSG-V"])
-
-
-def test_published_values_are_shown_on_demand_where_there_are_any(opened, papers):
-    page = opened()
-    assert not page.is_visible(".show-published")
-    page = opened(papers)
-    assert "355" not in page.inner_text("#tables .tables")  # the paper's DSSIM_v of this scene
-    page.check(".show-published")
-    assert "355" in page.inner_text("#tables .tables")
-    page.uncheck(".show-published")
-    assert "355" not in page.inner_text("#tables .tables")
-
-
 def test_scene_of_a_table_opens_in_the_viewer_and_the_address_keeps_it(opened):
     page = opened()
     page.evaluate("document.querySelectorAll('#tables details').forEach((each) => { each.open = true; })")
@@ -467,37 +276,6 @@ def test_scene_of_a_table_opens_in_the_viewer_and_the_address_keeps_it(opened):
     again = opened(page.url)
     again.wait_for_selector(".stage[data-shown=s1]")
     assert again.inner_text(".name-left") == "MSG-V"
-
-
-def test_other_setting_has_its_own_methods_and_the_same_scene(opened):
-    page = opened()
-    page.locator("#scenes select.problem").select_option(index=1)
-    page.wait_for_selector(".stage[data-shown=s2]")
-    assert page.eval_on_selector_all("#scenes select.left option", "all => all.map(each => each.text)") == [
-        "photo", "input", "Bicubic", "truth",
-    ]  # fmt: skip
-
-
-@pytest.mark.parametrize(("width", "scheme"), [(360, "light"), (390, "dark")])
-def test_layout_fits_a_phone(opened, papers, width, scheme):
-    page = opened(papers)
-    page.set_viewport_size({"width": width, "height": 780})
-    page.emulate_media(color_scheme=scheme)
-    page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
-    page.check(".show-published")
-    assert page.evaluate("document.documentElement.scrollWidth") == width
-    assert page.locator(".stage").bounding_box()["width"] <= width
-
-
-def test_names_that_are_code_are_shown_and_not_run(opened, results, tmp_path):
-    runs = [dataclasses.replace(run, label=SPITEFUL, dataset=SPITEFUL) for run in results.runs[:1]]
-    path = tmp_path / "index.html"
-    save_page(path, Results(tuple(runs), (SPITEFUL,)), title=SPITEFUL)
-    page = opened(path.as_uri())
-    assert page.title() == SPITEFUL
-    assert page.inner_text("h1") == SPITEFUL
-    assert page.inner_text(".name-left") == SPITEFUL
-    assert page.locator("img").count() == 0
 
 
 def test_names_in_the_files_of_a_run_are_shown_and_not_run(opened, make_run, tmp_path):
@@ -519,16 +297,6 @@ def test_names_in_the_files_of_a_run_are_shown_and_not_run(opened, make_run, tmp
     assert SPITEFUL in page.inner_text("#tables")
     assert name in page.inner_text("body")
     assert page.locator("img").count() == 0
-
-
-def test_page_without_pictures_has_its_tables(opened, make_run, tmp_path):
-    run = make_run(tmp_path / "run")
-    (run / "scenes" / "cube_no_texture.npz").unlink()
-    save_page(tmp_path / "index.html", load_results([run]))
-    page = opened((tmp_path / "index.html").as_uri(), pictures=False)
-    assert page.locator("#tables td").count() > 0
-    assert page.locator("#scenes").is_hidden()
-    assert "no pictures" in page.inner_text(".notes")
 
 
 def test_method_of_the_leaderboard_is_shown_at_a_click(make_run, tmp_path, opened):

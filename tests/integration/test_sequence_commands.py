@@ -12,10 +12,10 @@ import trimesh
 from PIL import Image
 from scipy.spatial.transform import Rotation
 from small_frames import in_text, room, walk, write_recording
+from upsampling import info, refused_line, upsample
 
 from dsr.cli import main
 from dsr.geometry.camera import Camera
-from dsr.geometry.warping import warp_depth
 from dsr.io.depth_files import read_depth_file
 from dsr.metrics.temporal import opw
 
@@ -63,22 +63,6 @@ def capture(tmp_path):
     return folder
 
 
-def upsample(*arguments):
-    return main(["upsample", *map(str, arguments)])
-
-
-def info(folder):
-    return json.loads((folder / "info.json").read_text())
-
-
-def error_of(capsys, code):
-    """Return the only line on stderr of a command that failed."""
-    assert code == 2
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1, lines
-    return lines[0]
-
-
 # a depth camera elsewhere
 
 
@@ -110,13 +94,6 @@ def test_rig_gives_depth_in_the_photos_view(rig, capsys):
     assert {"depth_camera", "extrinsics"} <= info(rig / "out")["inputs"].keys()
 
 
-def test_rig_that_changed_is_another_result(rig, capsys):
-    assert with_rig(rig) == 0
-    (rig / "move.txt").write_text(text(pose(-0.05)))
-    capsys.readouterr()
-    assert "holds a result of other inputs" in error_of(capsys, with_rig(rig))
-
-
 @pytest.mark.parametrize(
     ("matrix", "message"),
     [
@@ -129,18 +106,8 @@ def test_rig_that_changed_is_another_result(rig, capsys):
 )
 def test_bad_extrinsics_end_in_one_line(rig, capsys, matrix, message):
     (rig / "move.txt").write_text(text(matrix))
-    assert message in error_of(capsys, with_rig(rig))
+    assert message in refused_line(capsys, with_rig(rig))
     assert not (rig / "out").exists()
-
-
-def test_depth_camera_of_another_aspect_is_refused(rig, capsys):
-    (rig / "ir.json").write_text(camera_json(CAMERA))
-    assert "ir.json: the camera is of 96 x 72 pixels" in error_of(capsys, with_rig(rig))
-
-
-def test_depth_camera_needs_extrinsics(rig, capsys):
-    files = ("--rgb", rig / "photo.png", "--depth", rig / "depth.npy", "--depth-camera", rig / "ir.json")
-    assert "--depth-camera: expected --extrinsics with it" in error_of(capsys, upsample(*files, "-o", rig / "out"))
 
 
 # registration
@@ -243,25 +210,13 @@ def test_broken_neighbour_does_not_stop_the_others(capture, capsys):
     code = upsample(
         capture, "--poses", capture.parent / "poses.txt", "--neighbours", "2", *DEPTH_ONLY, "-o", capture.parent / "out"
     )
-    assert "003" in error_of(capsys, code)
+    assert "003" in refused_line(capsys, code)
     assert sorted(path.parent.name for path in (capture.parent / "out").glob("*/depth.png")) == [
         "000",
         "001",
         "002",
         "004",
     ]
-
-
-def test_frame_without_a_pose_is_named_and_the_others_are_done(capture, capsys):
-    lines = [f"{number} {0.04 * number} 0 0 0 0 0 1" for number in (0, 1, 3, 4)]
-    (capture.parent / "poses.txt").write_text("\n".join(lines))
-    code = upsample(
-        capture, "--poses", capture.parent / "poses.txt", "--neighbours", "2", *DEPTH_ONLY, "-o", capture.parent / "out"
-    )
-    message = error_of(capsys, code)
-    assert "002" in message
-    assert "expected a pose for each frame" in message
-    assert len(list((capture.parent / "out").glob("*/depth.png"))) == 4
 
 
 @pytest.mark.parametrize(
@@ -276,15 +231,15 @@ def test_frame_without_a_pose_is_named_and_the_others_are_done(capture, capsys):
 def test_bad_poses_end_in_one_line(capture, capsys, poses, message):
     (capture.parent / "poses.txt").write_text(poses)
     code = upsample(capture, "--poses", capture.parent / "poses.txt", "--neighbours", "2", "-o", capture.parent / "out")
-    assert message in error_of(capsys, code)
+    assert message in refused_line(capsys, code)
     assert not (capture.parent / "out").exists()
 
 
 def test_neighbours_without_poses_are_refused(capture, capsys):
     code = upsample(capture, "--neighbours", "2", *DEPTH_ONLY, "-o", capture.parent / "out")
-    assert "expected a pose for each frame, this capture has none; give --poses" in error_of(capsys, code)
+    assert "expected a pose for each frame, this capture has none; give --poses" in refused_line(capsys, code)
     code = upsample(capture, "--neighbours", "-1", "-o", capture.parent / "out")
-    assert "--neighbours: expected 0 or a positive number of frames, got -1" in error_of(capsys, code)
+    assert "--neighbours: expected 0 or a positive number of frames, got -1" in refused_line(capsys, code)
 
 
 # fuse
@@ -311,7 +266,7 @@ def test_results_with_poses_become_one_mesh(capture, capsys):
     assert abs(np.ptp(box[:, 0]) - 0.6) < 0.12  # the frames' boxes coincide
 
 
-@pytest.mark.parametrize(("part", "up"), [("input", "y"), ("rgbd", ""), ("depth", "")])
+@pytest.mark.parametrize(("part", "up"), [("input", "y"), ("depth", "")])
 def test_fused_mesh_says_its_frame_and_has_the_photos_colours(capture, part, up):
     out, path = capture.parent / "out", capture.parent / "mesh.ply"
     options = ("--method", "bicubic", "--only", f"depth,{part}")
@@ -337,7 +292,7 @@ def test_results_without_poses_and_damaged_ones_are_refused(capture, capsys):
     out, mesh = capture.parent / "out", capture.parent / "mesh.ply"
     assert upsample(capture, *DEPTH_ONLY, "-o", out) == 0
     capsys.readouterr()
-    assert "expected a pose; run" in error_of(capsys, main(["fuse", str(out), "-o", str(mesh)]))
+    assert "expected a pose; run" in refused_line(capsys, main(["fuse", str(out), "-o", str(mesh)]))
     for number, change in enumerate(({"pose": np.ones((4, 4)).tolist()}, {"camera": 3}, {"complete": False})):
         path = out / f"{number:03}" / "info.json"
         path.write_text(json.dumps({**json.loads(path.read_text()), "pose": pose(0.0).tolist(), **change}))
@@ -350,16 +305,8 @@ def test_results_without_poses_and_damaged_ones_are_refused(capture, capsys):
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 4
     assert mesh.is_file()
-    assert ".ply" in error_of(capsys, main(["fuse", str(out), "-o", str(capture.parent / "mesh.obj")]))
-    assert "found no info.json" in error_of(capsys, main(["fuse", str(capture), "-o", str(mesh)]))
-
-
-def test_warped_depth_agrees_with_the_library(rig):
-    assert with_rig(rig, "--fill", "none") == 0
-    depth = torch.from_numpy(np.load(rig / "depth.npy"))[None, None]
-    sensor = Camera(80, 64, 70.0, 70.0, 40.0, 31.0)
-    seen = warp_depth(depth, sensor, torch.from_numpy(pose(-0.1))[None], CAMERA.rescale(75, 56))
-    assert info(rig / "out")["input_holes"] == pytest.approx(float(seen.isnan().double().mean()), abs=1e-6)
+    assert ".ply" in refused_line(capsys, main(["fuse", str(out), "-o", str(capture.parent / "mesh.obj")]))
+    assert "found no info.json" in refused_line(capsys, main(["fuse", str(capture), "-o", str(mesh)]))
 
 
 # poses that cannot be right
@@ -402,28 +349,11 @@ def test_poses_that_are_read_wrongly_are_reported_once_and_in_every_info(walked,
         assert warning["value"] > warning["threshold"]
 
 
-def test_right_poses_are_not_warned_of_and_strict_takes_them(walked, capsys):
-    command = (walked, *poses_of(walked, np.array), "--neighbours", "2", *DEPTH_ONLY, "--strict")
-    assert upsample(*command, "-o", walked.parent / "out") == 0
-    assert "warning" not in capsys.readouterr().out
-
-
 def test_strict_refuses_wrong_poses_and_writes_no_result(walked, capsys):
     out = walked.parent / "out"
     assert upsample(walked, *poses_of(walked, np.linalg.inv), *DEPTH_ONLY, "--strict", "-o", out) == 2
     assert "the poses are probably from world to camera" in capsys.readouterr().err
     assert not list(out.rglob("info.json"))
-
-
-def test_shards_and_workers_warn_alike(walked):
-    command = (walked, *poses_of(walked, np.linalg.inv), *DEPTH_ONLY)
-    out = walked.parent / "out"
-    assert upsample(*command, "-o", out / "whole") == 0
-    assert upsample(*command, "--shard", "3/3", "-o", out / "shard") == 0
-    assert upsample(*command, "--workers", "2", "-o", out / "workers") == 0
-    expected = info(out / "whole" / "005")["warnings"]
-    assert [each["code"] for each in expected] == ["poses"]
-    assert info(out / "shard" / "005")["warnings"] == info(out / "workers" / "005")["warnings"] == expected
 
 
 @pytest.mark.parametrize(("change", "codes"), [(np.array, []), (np.linalg.inv, ["poses"])])
@@ -438,17 +368,6 @@ def test_poses_of_a_capture_are_compared_with_its_depth(tmp_path, monkeypatch, c
     about = [info(path.parent) for path in sorted((tmp_path / "out").rglob("info.json"))]
     assert len(about) == len(poses)
     assert all([each["code"] for each in one["warnings"] if each["code"].startswith("poses")] == codes for one in about)
-
-
-def test_neighbours_that_agree_are_counted_without_the_frame_itself(walked, capsys):
-    command = (walked, "--neighbours", "2", *DEPTH_ONLY)
-    assert upsample(*command, *poses_of(walked, np.array), "-o", walked.parent / "right") == 0
-    right = re.search(r"of (\d\.\d) that see a pixel (\d\.\d) agree", " ".join(capsys.readouterr().out.split()))
-    assert 1 < float(right[2]) <= float(right[1]) <= 2
-    assert upsample(*command, *poses_of(walked, in_millimetres), "-o", walked.parent / "wrong") == 0
-    assert "hardly any agree with it: are the poses right?" in " ".join(capsys.readouterr().out.split())
-    warning = info(walked.parent / "wrong" / "002")["warnings"][-1]
-    assert (warning["code"], warning["value"]) == ("neighbours-disagree", 0.0)
 
 
 def test_frames_without_a_pose_are_reported_and_strict_refuses_them(walked, capsys):
@@ -474,22 +393,9 @@ def test_frames_without_a_pose_are_reported_and_strict_refuses_them(walked, caps
     assert "8 poses for 6 frames" in " ".join(reported.split())
     assert "warning" not in reported
     write(100, 101)
-    assert "expected a pose for each of the 6 frames" in error_of(capsys, upsample(*command, "-o", walked.parent / "x"))
-
-
-def test_poses_of_another_time_are_refused(walked, capsys):
-    for kind in ("rgb", "depth"):
-        for path in (walked / kind).iterdir():
-            path.rename(path.with_name(f"1305031102.{path.name}"))
-    (walked.parent / "poses.txt").write_text("".join(f"{time} 0 0 0 0 0 0 1\n" for time in range(6)))
-    command = (walked, "--poses", walked.parent / "poses.txt", *DEPTH_ONLY, "-o", walked.parent / "out")
-    assert "expected times as in the names of the frames" in error_of(capsys, upsample(*command))
-    assert not (walked.parent / "out").exists()
-
-
-def test_columns_in_place_of_rows_are_named(walked, capsys):
-    command = (walked, *poses_of(walked, np.transpose), *DEPTH_ONLY, "-o", walked.parent / "out")
-    assert "are rows and columns exchanged?" in error_of(capsys, upsample(*command))
+    assert "expected a pose for each of the 6 frames" in refused_line(
+        capsys, upsample(*command, "-o", walked.parent / "x")
+    )
 
 
 def test_fuse_reports_wrong_poses_and_strict_refuses_them(walked, capsys):
@@ -503,7 +409,7 @@ def test_fuse_reports_wrong_poses_and_strict_refuses_them(walked, capsys):
     for path in out.rglob("info.json"):
         content = json.loads(path.read_text())
         path.write_text(json.dumps({**content, "pose": np.linalg.inv(content["pose"]).tolist()}))
-    assert "the poses are probably from world to camera" in error_of(capsys, main([*fuse, "--strict"]))
+    assert "the poses are probably from world to camera" in refused_line(capsys, main([*fuse, "--strict"]))
     assert not mesh.exists()
     assert main(fuse) == 0
     assert capsys.readouterr().out.count("warning: the poses are probably from world to camera") == 1

@@ -7,27 +7,12 @@ import numpy as np
 import pytest
 from captures import FRAMES, INTRINSICS, SIZE, SIZE_LR
 from PIL import Image
+from upsampling import info, refused_line, upsample
 
-from dsr.cli import main
 from dsr.io.depth_files import read_depth_file
 from dsr.io.inputs import read_picture
 
 DEPTH_ONLY = ("--method", "bicubic", "--only", "depth")
-
-
-def upsample(*arguments):
-    return main(["upsample", *map(str, arguments)])
-
-
-def info(folder):
-    return json.loads((folder / "info.json").read_text())
-
-
-def refused(capsys, code):
-    """Return the one line on stderr of a command that ended with 2."""
-    error = capsys.readouterr().err
-    assert (code, error.count("\n"), error[:7]) == (2, 1, "error: ")
-    return error[7:-1]
 
 
 def test_capture_of_a_phone_has_nothing_left_to_assume(tmp_path, capsys):
@@ -108,23 +93,23 @@ def test_confidence_maps_may_be_levels_bytes_or_fractions(lists, kind):
 def test_confidence_that_does_not_fit_is_refused_in_one_line(lists, capsys):
     given = ("--rgb", lists / "rgb", "--depth", lists / "depth", "-o", lists / "out", *DEPTH_ONLY)
     sure = ("--confidence", lists / "sure")
-    assert "--confidence: expected --min-confidence with it" in refused(capsys, upsample(*given, *sure))
-    assert "--min-confidence: expected a fraction from 0 to 1, got 2" in refused(
+    assert "--confidence: expected --min-confidence with it" in refused_line(capsys, upsample(*given, *sure))
+    assert "--min-confidence: expected a fraction from 0 to 1, got 2" in refused_line(
         capsys, upsample(*given, *sure, "--min-confidence", 2)
     )
-    assert "expected a confidence map for --min-confidence, there is none" in refused(
+    assert "expected a confidence map for --min-confidence, there is none" in refused_line(
         capsys, upsample("--rgb", lists / "rgb" / "0.png", "--depth", lists / "depth" / "0.png", "-o", lists / "out",
                          *DEPTH_ONLY, "--min-confidence", 0.5)
     )  # fmt: skip
     captures.save(lists / "sure" / "confidence_000.png", np.ones((5, 7), np.uint8))
-    message = refused(capsys, upsample(*given, *sure, "--min-confidence", 0.5))
+    message = refused_line(capsys, upsample(*given, *sure, "--min-confidence", 0.5))
     assert (
         "confidence_000.png: expected confidence of the depth map's 16 x 12 pixels (width x height), got 7 x 5"
         in message
     )
     assert (lists / "out" / "1" / "depth.png").is_file()
     (lists / "sure" / "confidence_001.png").unlink()
-    message = refused(capsys, upsample(*given, *sure, "--min-confidence", 0.5))
+    message = refused_line(capsys, upsample(*given, *sure, "--min-confidence", 0.5))
     assert "expected a map for each of the 2 depth maps, there is none for 1, such as 1" in message
 
 
@@ -154,49 +139,6 @@ def test_resumed_folder_of_millimetre_floats_keeps_its_unit(tmp_path, monkeypatc
             np.testing.assert_allclose(read_depth_file(place / str(number) / "depth_metres.tiff"), metres, rtol=0.03)
         reported = [{**info(place / str(number)), "seconds": None} for place in (tmp_path / "whole", out)]
         assert reported[0] == reported[1]
-
-
-def test_sun_rgbd_has_its_intrinsics_one_folder_up_and_turned_bits(tmp_path, capsys):
-    scene, out = tmp_path / "scene", tmp_path / "out"
-    millimetres = 4 * captures.millimetres(2)
-    assert millimetres.max() > 8192
-    captures.save(scene / "image" / "a.jpg", captures.photo())
-    captures.save(scene / "depth" / "b.png", (millimetres << 3) | (millimetres >> 13))
-    (scene / "intrinsics.txt").write_text("50 0 31 0 51 24 0 0 1\n")
-    files = ("--rgb", scene / "image" / "a.jpg", "--depth", scene / "depth" / "b.png")
-    assert upsample(*files, "-o", out, *DEPTH_ONLY, "--depth-unit", "sunrgbd", "--fill", "none") == 0
-    assert "bits are turned back by 3, as SUN RGB-D turns them" in capsys.readouterr().out
-    reported = info(out)
-    assert (reported["camera"]["fx"], reported["camera"]["cx"], reported["settings"]["depth_unit"]) == (
-        50,
-        31,
-        "sunrgbd",
-    )
-    assert abs(read_depth_file(out / "depth_metres.tiff").mean() - millimetres.mean() / 1000) < 0.02
-    np.save(scene / "depth.npy", captures.depth())
-    assert "expected 16-bit values for --depth-unit sunrgbd, got float64" in refused(
-        capsys, upsample(*files[:3], scene / "depth.npy", "-o", tmp_path / "x", *DEPTH_ONLY, "--depth-unit", "sunrgbd")
-    )
-
-
-def test_depth_text_of_icl_nuim_is_read_beside_a_bmp(tmp_path, capsys):
-    y, x = np.mgrid[0:480, 0:640]
-    Image.fromarray(np.stack((x % 256, y % 256, x % 99), -1).astype(np.uint8)).save(tmp_path / "scene_00_0000.bmp")
-    rays = np.sqrt(((x - 319.5) / 481.2) ** 2 + ((y - 239.5) / 480.0) ** 2 + 1)
-    (tmp_path / "scene_00_0000.depth").write_text(" ".join(f"{value:.3f}" for value in (250 * rays).ravel()))
-    out = tmp_path / "out"
-    assert upsample(tmp_path, "-o", out, "--method", "bilateral", "--only", "depth") == 0
-    said = capsys.readouterr().out
-    assert "camera: that of ICL-NUIM" in said
-    assert "distances along the rays in centimetres" in said
-    reported = info(out / "scene_00_0000")
-    assert reported["input_depth"]["range_type"] == "perspective"
-    np.testing.assert_allclose(read_depth_file(out / "scene_00_0000" / "depth_metres.tiff"), 2.5, rtol=1e-3)
-    np.testing.assert_allclose(np.load(out / "scene_00_0000" / "depth.npy"), 250 * rays, rtol=1e-3)
-    (tmp_path / "scene_00_0000.depth").write_text("1 2 3")
-    assert "scene_00_0000.depth: expected 307200 numbers, got 3" in refused(
-        capsys, upsample(tmp_path, "-o", tmp_path / "other", "--method", "bilateral", "--only", "depth")
-    )
 
 
 def test_broken_frame_of_a_capture_does_not_stop_the_others(tmp_path, capsys):

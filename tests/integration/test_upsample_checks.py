@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from small_scenes import room
+from upsampling import refused_line
 
 from dsr.cli import main
 from dsr.geometry.camera import Camera
@@ -39,13 +40,6 @@ def upsample(*arguments):
     return main(["upsample", *map(str, arguments), "--method", "bicubic", "--only", "depth"])
 
 
-def refused(capsys, code):
-    """Return the one line on stderr of a command that ended with 2."""
-    error = capsys.readouterr().err
-    assert (code, error.count("\n"), error[:7]) == (2, 1, "error: ")
-    return error[7:-1]
-
-
 def warned(tmp_path, capsys, files, *options):
     """Return the codes in info.json, and what was printed, after checking that --strict refuses what is warned of."""
     assert upsample(*files, *options, "-o", tmp_path / "out") == 0
@@ -56,7 +50,7 @@ def warned(tmp_path, capsys, files, *options):
     code = upsample(*files, *options, "-o", tmp_path / "strict", "--strict")
     assert not (tmp_path / "strict" / "info.json").exists() or not warnings
     if warnings:
-        assert warnings[0]["message"] in refused(capsys, code)
+        assert warnings[0]["message"] in refused_line(capsys, code)
     else:
         assert code == 0
     return [each["code"] for each in warnings], printed
@@ -85,17 +79,6 @@ def test_what_values_show_is_read_so_with_its_reason(tmp_path, capsys, values, s
     assert codes == []
     assert said in printed
     assert np.median(metres(tmp_path / "out")) == pytest.approx(np.median(DEPTH), rel=0.01)
-
-
-def test_inferred_units_are_overridden_by_the_option_that_the_line_names(tmp_path, capsys):
-    for number, values in enumerate((MILLIMETRES * np.uint16(5), (MILLIMETRES << 3) | (MILLIMETRES >> 13))):
-        folder = tmp_path / str(number)
-        folder.mkdir()
-        _, printed = warned(folder, capsys, write(folder, values))
-        assert "--depth-unit overrides it" in printed
-        assert upsample(*write(folder, values), "--depth-unit", "mm", "-o", folder / "mm") == 0
-        assert np.median(metres(folder / "mm")) == pytest.approx(np.median(values) / 1000, rel=0.01)
-        capsys.readouterr()
 
 
 def test_sizes_and_cameras_of_known_data_sets_give_the_unit(tmp_path, capsys):
@@ -132,7 +115,7 @@ def test_sizes_and_cameras_of_known_data_sets_give_the_unit(tmp_path, capsys):
     ],
 )  # fmt: skip
 def test_what_has_two_likely_readings_or_no_unit_is_asked_for_in_one_line(tmp_path, capsys, values, expected):
-    line = refused(capsys, upsample(*write(tmp_path, values), "-o", tmp_path / "out"))
+    line = refused_line(capsys, upsample(*write(tmp_path, values), "-o", tmp_path / "out"))
     assert line.startswith(str(tmp_path / "depth"))
     for text in expected:
         assert text in line
@@ -149,7 +132,7 @@ def test_what_has_two_likely_readings_or_no_unit_is_asked_for_in_one_line(tmp_pa
     ],
 )
 def test_pictures_for_viewing_are_named_by_their_kind(tmp_path, capsys, picture, expected):
-    assert expected in refused(capsys, upsample(*write(tmp_path, picture), "-o", tmp_path / "out"))
+    assert expected in refused_line(capsys, upsample(*write(tmp_path, picture), "-o", tmp_path / "out"))
 
 
 def test_an_option_answers_what_was_asked(tmp_path, capsys):
@@ -161,13 +144,6 @@ def test_an_option_answers_what_was_asked(tmp_path, capsys):
         folder.mkdir()
         assert warned(folder, capsys, write(folder, values), *options)[0] == []
         assert np.median(metres(folder / "out")) == pytest.approx(np.median(DEPTH), rel=0.02)
-
-
-def test_values_that_fall_with_distance_are_disparities_where_the_baseline_is_known(tmp_path, capsys):
-    codes, printed = warned(tmp_path, capsys, write(tmp_path, DISPARITY), "--baseline", BASELINE)
-    assert codes == []
-    assert "values are read as disparities in pixels of the depth map: values fall with distance" in printed
-    assert np.median(metres(tmp_path / "out")) == pytest.approx(np.median(DEPTH), rel=0.02)
 
 
 def test_whole_centimetres_of_a_room_are_not_taken_for_a_near_thing_in_silence(tmp_path, capsys):
@@ -191,12 +167,6 @@ def test_planes_warn_of_distances_along_the_ray_and_of_disparities_given_as_dept
     codes, printed = warned(tmp_path, capsys, files, "--baseline", BASELINE, "--overwrite")
     assert codes == ["falls-with-distance"]
     assert "disparities rise with distance" in printed
-
-
-def test_distances_of_a_wrong_unit_are_warned_of(tmp_path, capsys):
-    files = write(tmp_path, MILLIMETRES)
-    assert warned(tmp_path, capsys, files, "--depth-unit", "m")[0] == ["depth-far"]
-    assert warned(tmp_path, capsys, files, "--depth-unit", "0.000001", "--overwrite")[0] == ["depth-near"]
 
 
 # cameras
@@ -224,11 +194,11 @@ def test_cameras_that_can_hardly_be_right_are_warned_of(tmp_path, capsys, intrin
 
 def test_a_camera_that_cannot_see_its_picture_is_refused(tmp_path, capsys):
     files = write(tmp_path, MILLIMETRES)
-    line = refused(capsys, upsample(*files, "--intrinsics", 220, 220, 1e9, 95.5, "-o", tmp_path / "out"))
+    line = refused_line(capsys, upsample(*files, "--intrinsics", 220, 220, 1e9, 95.5, "-o", tmp_path / "out"))
     assert line.startswith("--intrinsics: expected a principal point in or near the picture of 256 x 192 pixels")
     content = {"width": 256, "height": 192, "fx": 220, "fy": 220, "cx": 127.5, "cy": -1e9}
     (tmp_path / "camera.json").write_text(json.dumps(content))
-    line = refused(capsys, upsample(*files, "-o", tmp_path / "out"))
+    line = refused_line(capsys, upsample(*files, "-o", tmp_path / "out"))
     assert line.startswith(f"{tmp_path / 'camera.json'}: expected a principal point")
 
 
@@ -240,16 +210,6 @@ def test_a_baseline_in_another_unit_is_warned_of(tmp_path, capsys, baseline, cod
     assert "--baseline is in metres" in printed
     codes, _ = warned(tmp_path, capsys, write(tmp_path, MILLIMETRES), "--baseline", baseline, "--overwrite")
     assert codes == [code]
-
-
-def test_a_depth_cameras_own_intrinsics_are_checked(tmp_path, capsys):
-    (tmp_path / "depth.txt").write_text("110 0 110 0 110 47.5 0 0 1")
-    (tmp_path / "move.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1")
-    rig = ("--depth-camera", tmp_path / "depth.txt", "--extrinsics", tmp_path / "move.txt")
-    codes, printed = warned(tmp_path, capsys, write(tmp_path, MILLIMETRES), *rig)
-    assert "off-centre" in codes
-    assert "--depth-camera: " in printed
-    assert "principal point (110, 47.5) px" in printed
 
 
 def folder_of(place, maps, cameras=()):
@@ -278,24 +238,6 @@ def test_near_frame_of_a_folder_makes_no_other_doubtful(tmp_path):
     mixed = folder_of(tmp_path / "mixed", [near, MILLIMETRES, MILLIMETRES])
     assert upsample(mixed, "--strict", "-o", tmp_path / "out") == 0
     assert upsample(folder_of(tmp_path / "near", [near, near]), "--strict", "-o", tmp_path / "out_near") == 2
-
-
-def test_warning_of_cameras_of_frames_is_one_line(tmp_path, capsys):
-    folders = folder_of(tmp_path / "in", [MILLIMETRES] * 3, [4000.0, 4001.0, 4002.0])
-    assert upsample(*sorted(folders.iterdir()), "-o", tmp_path / "out") == 0
-    assert capsys.readouterr().out.count("warning: ") == 1
-    assert upsample(*sorted(folders.iterdir()), "-o", tmp_path / "strict", "--strict") == 2
-
-
-def test_result_of_other_checks_is_checked_again_where_no_warning_is_allowed(tmp_path, capsys):
-    files = (*write(tmp_path, MILLIMETRES), "--fov", "4", "-o", tmp_path / "out")
-    assert upsample(*files) == 0
-    path = tmp_path / "out" / "info.json"
-    info = json.loads(path.read_text())
-    path.write_text(json.dumps({**info, "warnings": [], "checks": None}))
-    assert upsample(*files) == 0
-    assert "complete already" in capsys.readouterr().out
-    assert "field of view" in refused(capsys, upsample(*files, "--strict"))
 
 
 def test_what_most_of_the_maps_of_a_folder_show_applies_to_all_of_them(tmp_path, capsys):

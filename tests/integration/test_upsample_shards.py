@@ -8,14 +8,9 @@ from pathlib import Path
 import pytest
 from commands import run_python
 from small_frames import FRAMES, results, write_frames
-
-from dsr.cli import main
+from upsampling import upsample
 
 FAST = ("--method", "bicubic", "--only", "depth,normals,input", "--fov", "60")
-
-
-def upsample(*arguments):
-    return main(["upsample", *map(str, arguments)])
 
 
 @pytest.fixture
@@ -61,21 +56,6 @@ def test_shard_alone_works_on_its_block_and_says_how_it_went(folder, tmp_path, c
     assert (summary["shard"], summary["outcomes"]) == ("2/3", {"done": 1})
     assert [each["frames"] for each in summary["failed"]] == [["003"]]
     assert "003.png" in summary["failed"][0]["problem"]
-
-
-def test_exports_of_all_frames_are_left_to_the_command_without_shard(folder, tmp_path, capsys):
-    options = ("--method", "bicubic", "--only", "nerfstudio", "--poses", poses(tmp_path / "poses.txt"), "--fov", "60")
-    for kind in ("rgb", "depth"):  # those that are holes alone fail
-        for name in ("000.png", "001.png"):
-            (folder / kind / name).unlink()
-    poses(tmp_path / "poses.txt", FRAMES - 2)
-    for number in (1, 2):
-        assert upsample(folder, "--shard", f"{number}/2", "-o", tmp_path / "out", *options) == 0
-    assert "nerfstudio: of all frames, by the same command without --shard" in capsys.readouterr().out
-    assert not (tmp_path / "out" / "transforms.json").exists()
-    assert upsample(folder, "-o", tmp_path / "out", *options) == 0
-    assert "5 complete already" in capsys.readouterr().out
-    assert len(json.loads((tmp_path / "out" / "transforms.json").read_text())["frames"]) == FRAMES - 2
 
 
 BOTH = """

@@ -175,70 +175,6 @@ def test_keys_choose_undo_and_go_on_and_back(visit):
     assert somebody.ranks() == [None, "2"]
 
 
-def test_tab_key_reaches_pictures_and_enter_chooses_them(visit):
-    somebody = visit().begin()
-    for number in (1, 2):
-        somebody.press("Tab", "Enter")
-        assert somebody.tile(number).get_attribute("aria-pressed") == "true"
-    assert somebody.tile(1).get_attribute("aria-label") == "Picture 1, chosen as most similar"
-    somebody.press("Enter")
-    assert somebody.text("#where") == f"Scene 2 of {QUESTIONS}"
-
-
-def test_clicking_a_choice_again_undoes_it(visit):
-    somebody = visit().begin()
-    somebody.tile(1).click()
-    somebody.tile(2).click()
-    somebody.tile(2).click()
-    assert somebody.ranks() == ["1", None]
-    somebody.tile(1).click()
-    assert somebody.ranks() == [None, None]
-    assert somebody.page.locator("#undo").is_disabled()
-
-
-def test_space_bar_held_shows_the_original_everywhere_and_a_long_press_in_one_place(visit):
-    somebody = visit().begin()
-    original, *others = somebody.pictures()
-    assert original not in others
-    somebody.page.keyboard.down("Space")
-    assert somebody.pictures() == [original] * 4
-    somebody.page.keyboard.up("Space")
-    assert somebody.pictures() == [original, *others]
-    somebody.tile(2).hover()
-    somebody.page.mouse.down()
-    somebody.page.locator(".tile.flip").wait_for()
-    assert somebody.pictures() == [original, others[0], original, others[2]]
-    somebody.page.mouse.up()
-    assert somebody.pictures() == [original, *others]
-    assert somebody.ranks() == [None, None]
-
-
-def test_pictures_have_one_size_and_zoom_and_move_together(visit):
-    somebody = visit().begin()
-    script = """() => [...document.querySelectorAll('#grid .view')].map(view => {
-        const [box, image] = [view, view.firstElementChild].map(each => each.getBoundingClientRect());
-        return [box.width, box.height, image.width, image.x - box.x, image.y - box.y].map(Math.round);
-    })"""
-    boxes = somebody.page.evaluate(script)
-    assert boxes == [boxes[0]] * 4
-    assert boxes[0][0] == boxes[0][1] == boxes[0][2] > 300
-    somebody.tile(1).hover()
-    somebody.page.mouse.wheel(0, -400)
-    somebody.page.locator("#grid.zoomed").wait_for()
-    zoomed = somebody.page.evaluate(script)
-    assert zoomed == [zoomed[0]] * 4
-    assert zoomed[0][2] > 1.5 * boxes[0][0]
-    somebody.page.mouse.down()
-    somebody.page.mouse.move(0, 0, steps=4)
-    somebody.page.mouse.up()
-    moved = somebody.page.evaluate(script)
-    assert moved == [moved[0]] * 4
-    assert moved[0][3:] == [boxes[0][0] - moved[0][2]] * 2
-    assert somebody.ranks() == [None, None]
-    somebody.press("0")
-    assert somebody.page.evaluate(script) == boxes
-
-
 @pytest.mark.parametrize("options", [PHONE, LANDSCAPE], ids=["phone", "landscape"])
 def test_layout_fits_the_window_without_overlaps(visit, options):
     somebody = visit(**options)
@@ -249,18 +185,6 @@ def test_layout_fits_the_window_without_overlaps(visit, options):
         for one, other in itertools.combinations(boxes, 2):
             beside = one["x"] + one["width"] <= other["x"] or other["x"] + other["width"] <= one["x"]
             assert beside or one["y"] + one["height"] <= other["y"]
-
-
-def test_window_without_storage_is_reported_once_and_works(visit, tmp_path):
-    somebody = visit()
-    script = "Object.defineProperty(window, 'localStorage', {get() { throw new DOMException('no'); }})"
-    somebody.context.add_init_script(script)
-    somebody.page.reload()
-    assert "keeps nothing" in somebody.text("#notice")
-    somebody.page.locator("#dismiss").click()
-    somebody.begin().answer_rest()
-    assert not somebody.page.locator("#notice").is_visible()
-    assert len(somebody.save(tmp_path / "answers.json")["trials"]) == QUESTIONS
 
 
 DAMAGES = ("'{'", "'null'", *(f"JSON.stringify({{...person, started: 'x', {part}}})" for part in (
@@ -290,18 +214,6 @@ def test_next_person_starts_anew_and_answers_are_not_dropped_unasked(visit, tmp_
     second = somebody.save(tmp_path / "second.json")
     assert first["participant"] != second["participant"]
     assert first["study"] == second["study"]
-
-
-def test_changed_choice_after_the_last_scene_is_in_the_file(visit, tmp_path):
-    somebody = visit().begin()
-    somebody.answer_rest()
-    before = somebody.save(tmp_path / "before.json")
-    somebody.page.locator("#revise").click()
-    somebody.press("Backspace", "Backspace", "3", "1", "Enter")
-    after = somebody.save(tmp_path / "after.json")
-    assert after["finished"] > before["finished"]
-    assert after["trials"][-1]["first"] == after["trials"][-1]["order"][2]
-    assert after["trials"][:-1] == before["trials"][:-1]
 
 
 def test_order_is_fixed_for_a_person_and_uniform_over_many(visit):

@@ -234,43 +234,6 @@ def at_row(picture):
     return picture[picture.shape[0] // 3]
 
 
-def test_back_of_the_surface_is_distinguished_from_its_front(shown):
-    shown.press("3", "p")
-    shown.page.locator("#stage").focus()
-    back = shown.press(*["ArrowRight"] * 36).seen()  # by 180 degrees
-    middle = back[back.shape[0] // 3, back.shape[1] // 2 + 40]
-    assert middle[2] > middle[0]
-    assert 20 < middle.mean() < 140
-
-
-def test_fingers_turn_pinch_and_move(window, page_of_one):
-    phone = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
-    shown = window(**phone).open(page_of_one)
-    first = shown.press("3").seen()
-    send = shown.context.new_cdp_session(shown.page).send
-    box = shown.page.locator("#stage").bounding_box()
-
-    def touch(kind, *places):
-        corner, size = np.array([box["x"], box["y"]]), np.array([box["width"], box["height"]])
-        points = [dict(zip("xy", (corner + size * place).tolist(), strict=True)) for place in places]
-        points = [{**point, "id": k} for k, point in enumerate(points)]
-        send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
-
-    touch("touchStart", (0.4, 0.5))
-    touch("touchMove", (0.5, 0.5))
-    touch("touchEnd")
-    assert re.search(r"turned \d+\u00b0 to the right", shown.label())
-    shown.press("0")
-    touch("touchStart", (0.45, 0.5))
-    touch("touchStart", (0.45, 0.5), (0.55, 0.5))
-    touch("touchMove", (0.2, 0.5), (0.8, 0.5))
-    touch("touchEnd")
-    zoomed = shown.seen()
-    assert "from where the photo was taken" in shown.label()
-    assert np.abs(zoomed - first).mean() > 3
-    assert shown.page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-
-
 def test_results_are_chosen_by_list_strip_and_keys_and_names_are_text(window, page_of_two):
     shown = window().open(page_of_two)
     page = shown.page
@@ -292,30 +255,6 @@ def test_results_are_chosen_by_list_strip_and_keys_and_names_are_text(window, pa
     page.wait_for_selector(".stage[data-shown='1']")
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_page_follows_light_and_dark_mode(window, page_of_one, scheme):
-    shown = window(color_scheme=scheme).open(page_of_one)
-    ground = shown.page.evaluate("getComputedStyle(document.documentElement).backgroundColor")
-    assert (min(map(int, re.findall(r"\d+", ground))) > 200) == (scheme == "light")
-
-
-def test_every_control_can_be_reached_and_named(shown):
-    named = shown.page.evaluate(
-        "[...document.querySelectorAll('button, select, input, [role=slider], [role=img], img')]"
-        ".filter((e) => e.checkVisibility())"
-        ".map((e) => e.getAttribute('aria-label') || e.innerText || e.alt || e.labels?.[0]?.innerText || '')"
-    )
-    assert len(named) >= 14
-    assert all(named)
-    reached = set()
-    for _ in range(30):
-        shown.press("Tab")
-        reached.add(
-            shown.page.evaluate("(({className, dataset}) => className || dataset.side)(document.activeElement)")
-        )
-    assert {"before", "ball", "stage", "divider", "zoom-reset"} <= reached
-
-
 def test_browser_without_webgl_shows_pictures_and_says_why(browser, page_of_two):
     shown = Window(browser)
     shown.page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
@@ -332,11 +271,3 @@ def test_browser_without_webgl_shows_pictures_and_says_why(browser, page_of_two)
     assert shown.page.locator("#stills h2").all_inner_texts() == [SPITEFUL, "b"]
     shown.context.close()
     assert shown.wrong == []
-
-
-def test_browser_without_scripts_shows_pictures_and_says_why(browser, page_of_one):
-    shown = Window(browser, java_script_enabled=False)
-    shown.page.goto(page_of_one)
-    assert shown.page.locator("noscript .problem").is_visible()
-    assert shown.page.locator("#stills img").count() == 2
-    shown.context.close()

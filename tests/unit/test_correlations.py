@@ -9,10 +9,8 @@ import pytest
 from scipy import stats
 
 from dsr.evaluation.results import Results, Run
-from dsr.metrics.catalogue import KNOWN_FORMATS
-from dsr.metrics.formats import in_tables
 from dsr.report import correlation_figure
-from dsr.report.correlation_figure import FIXED, density_of, method_colours, save_scatter_matrix, scatter_matrix
+from dsr.report.correlation_figure import density_of, save_scatter_matrix
 from dsr.report.correlations import correlate, metric_matrix, pairs, with_reference, write_correlations
 from dsr.report.paper import published
 
@@ -91,11 +89,6 @@ def test_correlation_of_too_few_points_or_a_constant_is_unknown(kind, other):
     assert math.isnan(table.loc["x", "y"])
 
 
-def test_unknown_kind_of_correlation_is_refused():
-    with pytest.raises(ValueError, match="kind: expected pearson or spearman, got kendall"):
-        correlate(pd.DataFrame({"x": [1.0]}), "kendall")
-
-
 def test_metrics_are_ordered_by_rank_correlation_with_lpips_without_its_own_variants():
     ranking = with_reference(metric_matrix(RESULTS))
     assert list(ranking["spearman"]) == sorted(ranking["spearman"], reverse=True)
@@ -137,38 +130,6 @@ def test_missing_lpips_leaves_the_rest_and_one_line_says_so(tmp_path, monkeypatc
     assert "no LPIPS_v in these results" in drawn["scatter_matrix.pdf"].texts[0].get_text()
 
 
-def test_scatter_matrix_has_points_coefficients_and_densities():
-    matrix = metric_matrix(RESULTS)
-    figure = scatter_matrix(matrix, ["Bicubic", "MSG", "Mine"], in_tables(KNOWN_FORMATS))
-    axes = np.array(figure.axes).reshape(3, 3)
-    drawn = axes[2, 0].collections[0].get_offsets()
-    assert sorted(drawn[:, 0]) == pytest.approx(sorted(1000 * matrix["RMSE_d"]))
-    expected = stats.spearmanr(matrix["RMSE_d"], matrix["LPIPS_v"]).statistic
-    assert f"{expected:.2f}" in axes[0, 2].texts[1].get_text()
-    curves = [line for line in axes[1, 1].lines if len(line.get_xdata()) == 200]
-    assert [line.get_color() for line in curves] == [
-        FIXED["Bicubic"],
-        FIXED["MSG"],
-    ]  # of two results there is no density
-    assert all(max(line.get_ydata()) == pytest.approx(1) for line in curves)
-    assert axes[2, 2].get_xlabel() == "LPIPS_v (1/1000)"
-
-
-def test_points_have_the_colours_of_their_methods():
-    matrix = metric_matrix(RESULTS)
-    figure = scatter_matrix(matrix, ["Bicubic", "MSG", "Mine"], in_tables(KNOWN_FORMATS))
-    points = figure.axes[3].collections[0]
-    colours = method_colours(["Bicubic", "MSG", "Mine"])
-    by_place = {
-        tuple(place): tuple(colour[:3])
-        for place, colour in zip(points.get_offsets(), points.get_facecolors(), strict=True)
-    }
-    for label, colour in colours.items():
-        rows = matrix.xs(label, level="label")
-        for x, y in zip(1000 * rows["RMSE_d"], 1000 * rows["DSSIM_v"], strict=True):
-            assert by_place[x, y] == pytest.approx(tuple(int(colour[at : at + 2], 16) / 255 for at in (1, 3, 5)))
-
-
 def test_densities_equal_scipy_and_integrate_to_one():
     values = np.random.default_rng(2).normal(3, 1, 50)
     grid = np.linspace(-5, 11, 4001)
@@ -177,31 +138,3 @@ def test_densities_equal_scipy_and_integrate_to_one():
     width = values.std(ddof=1) * 50 ** (-1 / 5)  # Scott's rule in one dimension
     at = np.exp(-0.5 * ((grid[2000] - values) / width) ** 2).sum() / (50 * width * math.sqrt(2 * math.pi))
     assert density[2000] == pytest.approx(at)
-
-
-@pytest.mark.parametrize("values", [[], [1.0], [2.0, 2.0, 2.0, 2.0], [1.0, 2.0]])
-def test_density_of_too_few_distinct_values_is_empty(values):
-    assert density_of(np.array(values), np.linspace(0, 3, 10)) is None
-
-
-@pytest.mark.slow
-def test_figures_are_vector_text_and_pictures(tmp_path, monkeypatch):
-    monkeypatch.setitem(correlation_figure._STYLE, "pdf.compression", 0)
-    paths = save_scatter_matrix(tmp_path, Results((run("Bicubic", 5), run("Odd $_ name", 5))))
-    assert [path.name for path in paths] == [
-        "scatter_matrix.pdf", "scatter_matrix.png", "with_lpips.pdf", "with_lpips.png"]  # fmt: skip
-    content = paths[0].read_bytes()
-    assert b"/Subtype /Type0" in content  # TrueType outlines, not bitmaps
-    assert b"/Subtype /Type3" not in content
-    assert paths[1].read_bytes().startswith(b"\x89PNG")
-
-
-def test_colour_of_a_known_method_does_not_depend_on_the_others():
-    alone, many = method_colours(["MSG-V"]), method_colours(["Mine", "Yours", "MSG-V", "Bicubic"])
-    assert alone["MSG-V"] == many["MSG-V"]
-    assert len(set(many.values())) == 4
-
-
-def test_colours_of_any_number_of_methods_differ():
-    colours = method_colours([*FIXED, *(f"method {number}" for number in range(40))])
-    assert len({colour.lower() for colour in colours.values()}) == 50

@@ -1,25 +1,19 @@
 """The TensorBoard log of an evaluation: what it holds, read back by TensorBoard's own reader."""
 
 import json
-import re
 
 import cv2
-import matplotlib as mpl
 import numpy as np
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.hparams import plugin_data_pb2
 
 from dsr.evaluation.run_files import load_results, read_run
 from dsr.evaluation.store import sample_path
 from dsr.geometry.shading import render
-from dsr.metrics.catalogue import METRICS
-from dsr.pictures.canvas import HOLE_COLOUR
 from dsr.pictures.depth_views import normals_seen_by
 from dsr.report.dashboard import save_dashboard
-from dsr.utils.runs_table import SCORES
 
 SCENES = ("b", "a")
 
@@ -53,26 +47,6 @@ def test_scalars_are_the_scores_in_table_units(log, tmp_path):
     assert scalars(log, "score/RMSE_v") == {0: pytest.approx(mean)}
 
 
-def test_layout_begins_with_the_metrics_of_looks_as_that_of_trainings_does(log):
-    content = log.Tensors("custom_scalars__config__")[0].tensor_proto.string_val[0]
-    layout = layout_pb2.Layout.FromString(content)
-    charts = {category.title: [chart.title for chart in category.chart] for category in layout.category}
-    assert list(charts)[:2] == ["Looks, simgeo", "Depth and normals, simgeo"]
-    assert charts["Looks, simgeo"] == [
-        "RMSE_v (1/1000)",
-        "RMSE_v1 (1/1000), worst light",
-        "DSSIM_v (1/1000), worst light",
-        "BadPix_v (5, %), worst light",
-    ]
-    assert charts["Depth and normals, simgeo"] == ["RMSE_d (mm)", "BadPix_d (5 cm, %)", "Bump_d"]
-    assert charts["By light, e1 to e4, simgeo"] == ["RMSE_v1 (1/1000)", "DSSIM_v (1/1000)", "BadPix_v (5, %)"]
-    tags = set(log.Tags()["scalars"])
-    names = ["RMSE_v", "RMSE_v1", "DSSIM_v", "BadPix_v_5", "RMSE_d", "BadPix_d_5cm", "Bumpiness_d"]
-    for name, chart in zip(names, [chart for category in layout.category[:2] for chart in category.chart], strict=True):
-        (pattern,) = chart.multiline.tag
-        assert [tag for tag in tags if re.match(pattern, tag)] == [f"scene/{name}/simgeo"]
-
-
 def test_table_of_runs_has_the_columns_of_all_kinds_of_runs(make_run, tmp_path):
     folder = make_run(tmp_path, scenes=("s",), scale=2)
     versions = json.loads((folder / "versions.json").read_text())
@@ -86,11 +60,6 @@ def test_table_of_runs_has_the_columns_of_all_kinds_of_runs(make_run, tmp_path):
                       "steps": "600", "kind": "evaluation"}  # fmt: skip
 
 
-def test_table_of_runs_has_the_headings_of_tables():
-    metrics = {metric.name: metric for metric in METRICS}
-    assert {name: metrics[name].format.chart_title(by_light=metrics[name].per_light) for name in SCORES} == SCORES
-
-
 def test_picture_has_renderings_of_the_result_above_those_of_the_truth(log, tmp_path):
     (run,) = load_results([tmp_path]).runs
     encoded = np.frombuffer(log.Images("renderings/a")[0].encoded_image_string, np.uint8)
@@ -99,43 +68,6 @@ def test_picture_has_renderings_of_the_result_above_those_of_the_truth(log, tmp_
     result, truth = (render(normals_seen_by(scene.camera, depth))[0] for depth in (run.prediction("a"), scene.depth))
     expected = torch.cat([torch.cat(list(result), dim=-1), torch.cat(list(truth), dim=-1)])
     np.testing.assert_allclose(picture[..., 0], 255 * expected.numpy(), atol=1.01)
-
-
-def test_error_colours_are_the_same_for_all_methods(make_run, tmp_path):
-    folder = make_run(tmp_path, scenes=("s",))
-    truth = load_results([folder]).runs[0].sample("s").depth
-    step = 0.005 * truth.nanmedian()
-    shown = []
-    for outlier in (0, 1):
-        depth = truth + step
-        depth[0, 0, 0] += outlier
-        np.savez_compressed(folder / "predictions" / "s.npz", depth=depth[0].numpy(), config="{}", seconds=1)
-        save_dashboard(read_run(folder))
-        encoded = np.frombuffer(read(folder).Images("depth_error/s")[0].encoded_image_string, np.uint8)
-        shown.append(cv2.imdecode(encoded, cv2.IMREAD_COLOR)[4:])
-    assert (shown[0] == shown[1]).all()
-    blue, _, red = shown[0][0, 0].astype(int)
-    assert red > blue
-
-
-def test_expected_errors_have_the_colours_of_measured_ones_of_the_same_size(make_run, tmp_path):
-    folder = make_run(tmp_path, scenes=("s",))
-    truth = load_results([folder]).runs[0].sample("s").depth[0].numpy()
-    step = np.full(truth.shape, 0.005 * np.nanmedian(truth), np.float16)
-    depth = truth + step
-    depth[4:8] = np.nan
-    errors = {"depth_error": step, "angle_error": np.zeros_like(step)}
-    np.savez_compressed(folder / "predictions" / "s.npz", depth=depth, config="{}", seconds=1, **errors)
-    save_dashboard(read_run(folder))
-    log = read(folder)
-    measured, expected = (
-        cv2.imdecode(np.frombuffer(log.Images(f"{name}/s")[0].encoded_image_string, np.uint8), cv2.IMREAD_COLOR)
-        for name in ("depth_error", "expected_error")
-    )
-    assert (measured == expected).all()
-    hole = mpl.colors.to_rgb(HOLE_COLOUR)
-    assert (expected[4:8] == np.rint(255 * np.array(hole[::-1]))).all()
-    assert not (expected[:4] == expected[4]).all(axis=-1).any()
 
 
 def test_second_log_replaces_the_first(make_run, tmp_path):

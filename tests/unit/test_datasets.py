@@ -5,23 +5,16 @@ from pathlib import Path
 import pytest
 import yaml
 
-from dsr.data.folder import Folder
 from dsr.data.icl import FRAMES as ICL_FRAMES
 from dsr.data.icl import ICL
 from dsr.data.middlebury import EVALUATION_2014, TRAINING, Middlebury, MiddleburyLevels, MiddleburyTrain
-from dsr.data.rendered import SimGeo
-from dsr.data.sintel import SEQUENCES, Sintel, sintel_frames
 from dsr.data.sunrgbd import FRAMES as SUN_FRAMES
 from dsr.data.sunrgbd import SunRGBD
 from dsr.data.tofmark import SCENES as TOFMARK_SCENES
 from dsr.data.tofmark import ToFMark
-from dsr.degradation.downsampling import Downsampling
 from dsr.methods.recipe import read_recipe
 from dsr.report.paper import published_row
 from dsr.synthetic.simgeo import SCENES as SIMGEO_SCENES
-from dsr.training.data_module import Part, PatchData
-from dsr.training.degradation import Degradation
-from dsr.training.settings import PatchSettings
 from dsr.utils.configuration import ConfigError, build
 
 CONF = Path(__file__).resolve().parents[2] / "conf" / "dataset"
@@ -57,11 +50,6 @@ def test_icl_nuim_and_middlebury_scenes_have_rows_in_the_paper_tables():
     for scene in (*ICL_FRAMES, *EVALUATION_2014):
         for scale in (4, 8):
             assert published_row(scene, "Bicubic", scale) is not None
-
-
-@pytest.mark.parametrize(("name", "frames"), [("icl", ICL_FRAMES), ("sunrgbd", SUN_FRAMES)])
-def test_configured_frames_are_those_of_the_code(name, frames):
-    assert node(name)["frames"] == dict(frames)
 
 
 @pytest.mark.parametrize(
@@ -118,37 +106,12 @@ def test_evaluation_scenes_are_not_trained_on_by_name(tmp_path):
             MiddleburyTrain(root, [scene])
 
 
-def test_training_scene_does_not_validate_as_one_of_another_dataset(shared):
-    real = shared / "real"
-    train = Part(MiddleburyTrain(str(real), ["piano", "pipes", "adirondack"]))
-    settings, degradation = PatchSettings(patch=32, batch=1, validation_scenes=1), Degradation(4, Downsampling("box"))
-    piano, recycle = (Middlebury(str(real / "middlebury2014"), [name]) for name in ("piano", "recycle"))
-    with pytest.raises(ValueError, match=r"validation\.others: expected scenes that are not trained on, got piano"):
-        PatchData([train], settings, degradation, validation={"others": piano})
-    assert PatchData([train], settings, degradation, validation={"others": recycle}).training_count == 2
-
-
-def test_datasets_declare_whether_they_are_for_evaluation():
-    evaluated = (Middlebury, MiddleburyLevels, ICL, SunRGBD, ToFMark, SimGeo)
-    assert all(kind.evaluation for kind in evaluated)
-    assert not any(kind.evaluation for kind in (MiddleburyTrain, Sintel, Folder))
-
-
 @pytest.mark.parametrize(
     ("method", "range_type"),
     [("bicubic", "perspective"), ("msg_v", "disparity"), ("facets", "disparity"), ("dip", "orthogonal")],
 )
 def test_method_gets_the_range_type_that_it_was_made_for(method, range_type):
     assert read_recipe(method).kind.range_type == range_type
-
-
-def test_sintel_has_58_frames_that_exist():
-    frames = sintel_frames()
-    assert len(frames) == len(set(frames)) == 58
-    for frame in frames:
-        sequence, number = frame.rsplit("_frame_", 1)
-        assert 1 <= int(number) <= SEQUENCES[sequence]
-    assert {frame.rsplit("_frame_", 1)[0] for frame in frames} == set(SEQUENCES)
 
 
 @pytest.mark.parametrize(

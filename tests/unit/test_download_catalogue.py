@@ -2,12 +2,12 @@
 
 import hashlib
 from collections import Counter
-from pathlib import Path, PurePosixPath
+from pathlib import PurePosixPath
 from urllib.parse import urlsplit
 
 import pytest
 
-from dsr.data.download.collections import CATALOGUE, EVALUATION_2014, SCENES_2006, TRAINING_2014, find
+from dsr.data.download.collections import CATALOGUE, EVALUATION_2014, find
 from dsr.data.middlebury import EVALUATION_2014 as EVALUATED
 from dsr.data.middlebury import SCENES
 
@@ -66,26 +66,6 @@ def test_files_of_a_commit_are_pinned_and_the_shared_ones_are_these(shared):
                 assert hashlib.sha256((shared / theirs / name).read_bytes()).hexdigest() == digest
 
 
-def test_item_is_the_same_in_all_collections():
-    by_path = {item.path: item for item in ITEMS}
-    assert all(by_path[item.path] == item for item in ITEMS)
-
-
-def test_middlebury_2014_has_its_23_public_scenes_once():
-    assert len({*EVALUATION_2014, *TRAINING_2014}) == 7 + 16 == len(EVALUATION_2014) + len(TRAINING_2014)
-    paths = [item.path for item in CATALOGUE["middlebury"].items]
-    assert len(paths) == 3 * 7
-    assert "middlebury2014/Vintage-perfect/disp0.pfm" in paths
-    assert not set(CATALOGUE["middlebury"].items) & set(CATALOGUE["middlebury_train"].items)
-
-
-def test_training_scenes_are_those_of_2014_2006_and_2001():
-    items = CATALOGUE["middlebury_train"].items
-    assert len(items) == 3 * 16 + 3 * 21 + 2 * 6
-    assert {*CATALOGUE["middlebury2006"].items, *CATALOGUE["middlebury2001"].items} < set(items)
-    assert len(SCENES_2006) == 21
-
-
 def test_catalogue_scenes_are_those_that_the_readers_expect():
     assert {name.lower() for name in EVALUATION_2014} == set(EVALUATED)
     for year, scenes in SCENES.items():
@@ -93,28 +73,7 @@ def test_catalogue_scenes_are_those_that_the_readers_expect():
         assert folders == set(scenes)
 
 
-def test_icl_has_a_directory_per_trajectory():
-    items = {item.unpack_to: item.urls[0] for item in CATALOGUE["icl"].items}
-    assert len(items) == 8
-    assert items["icl_nuim/living_room_traj2"].endswith("/~ahanda/living_room_traj2_frei_png.tar.gz")
-    assert items["icl_nuim/office_room_traj2"].endswith("/~ahanda/traj2_frei_png.tar.gz")
-
-
-def test_benchmarks_of_the_field_have_as_many_files_as_their_scenes_need():
-    counts = {name: len(CATALOGUE[name].items) for name in ("lu", "middlebury8", "ddrnet")}
-    assert counts == {"lu": 2 * 6, "middlebury8": 2 * 30, "ddrnet": 3 * 22}
-
-
-def test_names_are_found_once_each_in_the_requested_order():
-    found = find(["nyu", "icl", "nyu"], CATALOGUE)
-    assert [collection.name for collection in found] == ["nyu", "icl"]
-
-
 def test_unknown_name_is_refused_with_the_known_ones():
     with pytest.raises(ValueError, match=r"^middelbury: unknown data set; expected some of middlebury, ") as caught:
         find(["nyu", "middelbury"], CATALOGUE)
     assert "\n" not in str(caught.value)
-
-
-def test_manual_instruction_names_the_directory():
-    assert str(Path("/data/tofmark")) in CATALOGUE["tofmark"].instruction(Path("/data"))

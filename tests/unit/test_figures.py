@@ -1,6 +1,5 @@
 """Figures: every scene and method has its panel, colours are comparable, and the PDF's text is text."""
 
-import itertools
 import re
 import shutil
 import subprocess
@@ -12,9 +11,7 @@ import torch
 from dsr.evaluation.run_files import load_results
 from dsr.geometry.shading import lights
 from dsr.pictures import canvas, lights_figure
-from dsr.pictures.canvas import HOLE_COLOUR, colours
 from dsr.pictures.depth_views import Window, strongest_window
-from dsr.pictures.grids import Cell, Row, draw_grid
 from dsr.pictures.lights_figure import sphere_normals
 from dsr.report import figures as figures_of_runs
 from dsr.report.figures import KINDS, Figures, details_of, pages_of, save_page
@@ -94,27 +91,6 @@ def test_columns_are_photo_input_methods_in_the_papers_order_and_truth(results, 
     assert len(panels(figure, "one")) == len(panels(figure, "two") + empty_panels(figure, "two")) == 6
 
 
-def test_method_without_a_result_has_an_empty_labelled_panel(results, drawn, tmp_path):
-    save_grids(tmp_path, results, "renderings")
-    figure = drawn["renderings_simgeo_x4_box_1"]
-    [empty] = empty_panels(figure, "two")
-    [text] = [text for text in figure.texts if text.get_text() == "no result"]
-    assert empty.get_bbox().contains(*(figure.get_size_inches() * text.get_position()))
-    assert (len(panels(figure, "two")), len(panels(figure, "one")), empty_panels(figure, "one")) == (5, 6, [])
-
-
-def test_depth_limits_are_shared_across_a_row_with_a_bar(results, drawn, tmp_path):
-    save_grids(tmp_path, results, "depth")
-    [figure] = drawn.values()
-    for row in ("one", "two"):
-        images = panels(figure, row)
-        assert len({image.get_clim() for image in images if image.get_array().ndim == 2}) == 1
-        [bar] = [axes for axes in figure.axes if axes.get_label() == f"{row}: bar"]
-        assert bar.get_ylabel() == "depth, m"
-        assert bar.get_ylim() == images[-1].get_clim()
-    assert panels(figure, "one")[-1].get_clim() != panels(figure, "two")[-1].get_clim()
-
-
 @pytest.mark.parametrize(("error", "unit", "factor"), [(0.003, "mm", 1e3), (0.3, "cm", 1e2)])
 def test_errors_are_centred_at_zero_and_signed(tmp_path, make_run, drawn, error, unit, factor):
     for name, sign in (("a", 1), ("b", -1)):
@@ -147,13 +123,6 @@ def test_details_are_where_the_results_differ_most_from_the_truth():
     assert second == Window(24, 4, 8, 8)
 
 
-def test_details_without_truth_are_where_results_differ_from_each_other():
-    results = [np.full((40, 40), 0.5), np.full((40, 40), 0.5)]
-    results[0][16:24, 24:32] = 0.9
-    assert details_of(results, None, 1)[0] == Window(16, 24, 8, 8)
-    assert details_of([], None, 1) == []
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_strongest_window_equals_an_exhaustive_search(seed):
     values = np.random.default_rng(seed).random((9, 11))
@@ -162,11 +131,6 @@ def test_strongest_window_equals_an_exhaustive_search(seed):
     assert first[:2] == max(means, key=means.get)
     clear = {at: mean for at, mean in means.items() if abs(at[0] - first.top) >= 3 or abs(at[1] - first.left) >= 4}
     assert strongest_window(values, 3, 4, [first])[:2] == max(clear, key=clear.get)
-
-
-def test_map_without_room_for_a_window_has_none():
-    assert strongest_window(np.ones((3, 9)), 4, 2) is None
-    assert strongest_window(np.ones((5, 5)), 3, 3, [Window(1, 1, 3, 3)]) is None
 
 
 def test_details_and_their_frames_are_the_same_for_all_methods(results, drawn, tmp_path):
@@ -219,52 +183,6 @@ def test_results_that_cannot_be_drawn_are_left_out_with_a_note(results, drawn, t
     assert len(empty_panels(drawn["depth_simgeo_x4_box_1"], "one")) == 2
 
 
-def test_holes_have_their_colour_and_are_explained(results, drawn, tmp_path):
-    change(tmp_path / "runs" / "a" / "predictions" / "one.npz", depth=np.full((24, 24), np.nan))
-    save_grids(tmp_path, results, *KINDS)
-    assert len(drawn) == 3
-    for figure in drawn.values():
-        assert any(text.endswith("pink: holes") for text in texts(figure))
-    assert colours("gray")(np.ma.masked_invalid([np.nan]))[0][:3] == pytest.approx(
-        tuple(int(HOLE_COLOUR[at : at + 2], 16) / 255 for at in (1, 3, 5))
-    )
-
-
-def test_figures_have_five_scenes_a_page_and_one_file_per_setting(tmp_path, make_run, drawn):
-    make_run(tmp_path / "a", scenes=tuple(f"s{number}" for number in range(6)), size=8)
-    make_run(tmp_path / "b", dataset="other", scale=2, downsampling="box, noise 1 %", scenes=("s0",), size=8)
-    save_grids(tmp_path, load_results([tmp_path]), "depth")
-    assert list(drawn) == ["depth_simgeo_x4_box_1", "depth_simgeo_x4_box_2", "depth_other_x2_box_noise_1_1"]
-    assert len(panels(drawn["depth_simgeo_x4_box_1"], "s4")) == 4
-    assert len(panels(drawn["depth_simgeo_x4_box_2"], "s5")) == 4
-
-
-def test_long_names_do_not_overlap_and_aspects_may_differ():
-    rng = np.random.default_rng(0)
-    labels = ["photo", *[f"A method with a long name, variant {number} (published)" for number in range(7)]]
-    rows = [
-        Row(
-            f"a rather long name of scene {number} in a set", h / w, [Cell(rng.random((h, w)), "123 / 45")] * 8, bar="m"
-        )
-        for number, (h, w) in enumerate([(10, 40), (30, 30), (60, 20)])
-    ]
-    figure = draw_grid(labels, rows, ("heading", "below"))
-    figure.canvas.draw()
-    boxes = [text.get_window_extent() for text in figure.texts]
-    for first, second in itertools.combinations(boxes, 2):
-        assert first.shrunk(0.98, 0.98).count_overlaps([second.shrunk(0.98, 0.98)]) == 0
-    assert all(box.x0 >= 0 and box.y0 >= 0 for box in boxes)
-    assert all(box.x1 <= figure.bbox.x1 and box.y1 <= figure.bbox.y1 for box in boxes)
-    for row, (h, w) in zip(rows, [(10, 40), (30, 30), (60, 20)], strict=True):
-        place = panels(figure, row.label)[0].get_window_extent()
-        assert place.height / place.width == pytest.approx(h / w, rel=1e-6)
-
-
-def test_unknown_light_is_refused(results, tmp_path):
-    with pytest.raises(ValueError, match="light: expected one of e1, e2, e3, e4, got 'e5'"):
-        save_grids(tmp_path, results, "renderings", light="e5")
-
-
 def test_sphere_normals_are_unit_vectors_that_face_the_camera():
     x, y, z = sphere_normals(101)
     known = z.isfinite()
@@ -290,9 +208,3 @@ def test_figure_of_lights_shows_their_closed_form(drawn, tmp_path):
         if number < 4:  # the arrow comes from where the light is
             [arrow] = [text for text in axes.texts if text.arrow_patch is not None]
             assert np.dot(arrow.xyann, light[:2]) > np.dot(arrow.xy, light[:2]) > 0
-
-
-def test_figure_of_lights_shows_a_scene(results, drawn, tmp_path):
-    lights_figure.save_lights_figure(tmp_path, results.runs[0].sample("one"))
-    [figure] = drawn.values()
-    assert sum(axes.get_label().split(" ")[0] == "one" for axes in figure.axes) == 4

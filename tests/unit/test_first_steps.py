@@ -3,9 +3,6 @@
 import shutil
 import subprocess
 import sys
-import tomllib
-from importlib.metadata import PackageNotFoundError, requires, version
-from pathlib import Path
 
 import pytest
 import torch
@@ -14,11 +11,9 @@ from packaging.requirements import Requirement
 import dsr
 from dsr.cli import main, make_parser
 from dsr.cli.completion import words_at_end
-from dsr.doctor import about, machine
+from dsr.doctor import machine
 from dsr.methods import weights
-from dsr.utils.versions import DISTRIBUTION, file_hash
 
-REPOSITORY = Path(__file__).resolve().parents[2]
 MISSPELT = {
     "upsmaple": "upsample", "study biuld": "build", "fuse out --outptu mesh.ply": "--output",
     "upsample --rgb a --depth b -o out --mehtod tgv": "--method", "--verison": "--version",
@@ -43,12 +38,6 @@ def test_misspelt_words_are_reported_with_the_one_that_is_meant(line, capsys, tm
     assert (code, last.rpartition("did you mean ")[2]) == (2, f"{MISSPELT[line]}?")
 
 
-def test_words_like_none_are_reported_without_a_guess(capsys):
-    with pytest.raises(SystemExit):
-        main(["zzz"])
-    assert "did you mean" not in capsys.readouterr().err
-
-
 def test_version_names_what_a_result_depends_on(capsys):
     with pytest.raises(SystemExit) as ended:
         main(["--version"])
@@ -56,29 +45,6 @@ def test_version_names_what_a_result_depends_on(capsys):
     assert ended.value.code == 0
     for each in (f"dsr {dsr.__version__}", torch.__version__, weights.version(), sys.version.split()[0]):
         assert each in output
-
-
-def test_the_version_of_the_weights_changes_with_each_file():
-    assert {name: file_hash(weights.packaged_weights(name)) for name in weights.packaged_names()} == weights.known()
-
-
-def test_every_extra_for_users_has_a_purpose():
-    declared = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    assert declared.keys() - {"dev", "docs"} <= about.EXTRAS.keys()
-
-
-def test_requirements_are_those_of_the_metadata():
-    without = {Requirement(each).name for each in requires(DISTRIBUTION) if "extra ==" not in each}
-    assert {each.name for each in about.requirements()} == without
-    assert {each.name for each in about.requirements("onnx")} == {"onnx", "onnxruntime"}
-
-
-def test_lack_compares_versions():
-    assert about.lack(Requirement("numpy")) is None
-    assert (
-        about.lack(Requirement(f"numpy<{version('numpy')}")) == f"numpy is {version('numpy')}, not <{version('numpy')}"
-    )
-    assert about.lack(Requirement("dsr-no-such")) == "dsr-no-such is missing"
 
 
 def test_doctor_says_that_all_is_here(capsys):
@@ -103,18 +69,6 @@ def test_doctor_finds_damaged_weights_and_names_those_to_fetch(monkeypatch, tmp_
     assert (found.level, "msg_x4" in found.message) == ("problem", True)
 
 
-def test_doctor_finds_two_variants_of_opencv(monkeypatch):
-    class Installed:
-        def __init__(self, name):
-            self.metadata = {"Name": name}
-
-    names = ("opencv-python", "opencv-python-headless", "numpy")
-    monkeypatch.setattr(machine, "distributions", lambda: map(Installed, names))
-    [found] = machine.check_opencv()
-    assert found.level == "warning"
-    assert found.advice.startswith("pip uninstall opencv-python opencv-python-headless; pip install ")
-
-
 def test_doctor_finds_a_card_that_torch_cannot_use_and_a_wrong_device(monkeypatch):
     monkeypatch.setattr(machine, "graphics_cards", lambda: ["Card 9"])
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
@@ -122,23 +76,6 @@ def test_doctor_finds_a_card_that_torch_cannot_use_and_a_wrong_device(monkeypatc
     assert machine.check_device()[0].level == "warning"
     monkeypatch.setenv("DSR_DEVICE", "cdua")
     assert machine.check_device()[0].level == "problem"
-
-
-def test_doctor_finds_a_cache_that_cannot_be_written(monkeypatch, tmp_path):
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv("DSR_CACHE", str(tmp_path / "file" / "cache"))
-    found = {each.check: each for each in machine.check_folders()}
-    assert (found["cache"].level, found["results"].level) == ("problem", "ok")
-
-
-def test_doctor_and_version_work_without_metadata(monkeypatch):
-    def absent(_):
-        raise PackageNotFoundError
-
-    for module in (about, machine):
-        monkeypatch.setattr(module, "distribution", absent)
-    assert [each.level for each in machine.check_python()] == ["warning"]
-    assert machine.check_packages() == machine.check_extras() == []
 
 
 COMPLETED = {

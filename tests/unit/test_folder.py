@@ -58,14 +58,6 @@ def test_scene_has_the_name_of_its_folder_and_its_photo_in_0_to_1(scene):
     np.testing.assert_allclose(record.rgb[:, 0, 0].numpy(), [1.0, 0.4, 0.2], rtol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["rgb.jpg", "rgb.jpeg"])
-def test_photo_may_be_a_jpg(scene, name):
-    (scene / "rgb.png").unlink()
-    cv2.imwrite(str(scene / name), np.full((H, W, 3), (0, 128, 255), np.uint8))
-    np.save(scene / "depth.npy", Z)
-    np.testing.assert_allclose(load_scene(scene, "folder").rgb[:, 2, 3].numpy(), [1.0, 0.5, 0.0], atol=0.02)
-
-
 @pytest.mark.parametrize("name", ["depth.npy", "depth.png", "depth.tiff", "depth.pfm"])
 def test_depth_unit_applies_to_every_format(scene, name):
     stored = Z * 8  # whole numbers, for the PNG
@@ -103,19 +95,6 @@ def test_disparity_is_converted_by_baseline_focal_length_and_doffs(scene, baseli
     np.testing.assert_allclose(loaded(scene), Z, rtol=1e-12)
 
 
-def test_disparity_between_minus_doffs_and_0_is_a_far_point(scene):
-    values = np.full((H, W), -1.0)
-    np.save(scene / "disparity.npy", values)
-    describe(scene, baseline=0.5, doffs=3.0)
-    np.testing.assert_allclose(loaded(scene), 0.5 * F / 2.0)
-
-
-def test_depth_unit_does_not_apply_to_disparity(scene):
-    np.save(scene / "disparity.npy", 0.5 * F / Z)
-    describe(scene, baseline=0.5, depth_unit="mm")
-    np.testing.assert_allclose(loaded(scene), Z, rtol=1e-12)
-
-
 def test_infinity_and_nan_are_holes(scene):
     values = Z.copy()
     values[0, 1], values[2, 3], values[3, 7] = np.inf, np.nan, -np.inf
@@ -123,16 +102,6 @@ def test_infinity_and_nan_are_holes(scene):
     expected = Z.copy()
     expected[0, 1] = expected[2, 3] = expected[3, 7] = np.nan
     np.testing.assert_array_equal(loaded(scene), expected)
-
-
-def test_infinite_disparity_is_a_hole(scene):
-    values = 0.5 * F / Z
-    values[1, 1] = np.inf
-    np.save(scene / "disparity.npy", values)
-    describe(scene, baseline=0.5)
-    depth = loaded(scene)
-    assert np.isnan(depth[1, 1])
-    assert np.isfinite(depth).sum() == H * W - 1
 
 
 def test_hole_value_of_the_camera_file_is_compared_before_units(scene):
@@ -197,21 +166,6 @@ def test_mask_applies_to_the_high_resolution_depth_alone(scene):
     record = load_scene(scene, "folder")
     assert int(record.depth.isfinite().sum()) == 1
     assert bool(record.measured[4].isfinite().all())
-
-
-@pytest.mark.parametrize(("size", "ratio"), [((H, W), 1), ((2, 4), 2), ((1, 3), 8 / 3), ((3, 5), 1.6)])
-def test_measured_map_of_any_size_has_the_ratio_of_the_widths(scene, size, ratio):
-    values = np.random.default_rng(0).uniform(1, 2, size)
-    np.save(scene / "depth_lr.npy", values)
-    record = load_scene(scene, "folder")
-    assert list(record.measured) == [ratio]
-    np.testing.assert_array_equal(record.measured[ratio][0].numpy(), values)
-
-
-def test_measured_disparity_of_any_size_is_in_its_own_pixels(scene):
-    np.save(scene / "disparity_lr.npy", np.full((1, 3), 0.5 * F * 3 / 8 / 4.0))
-    describe(scene, baseline=0.5)
-    np.testing.assert_allclose(load_scene(scene, "folder").measured[8 / 3].numpy(), 4.0, rtol=1e-6)
 
 
 def marked(value, size=(H, W)):

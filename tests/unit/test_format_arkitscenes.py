@@ -9,7 +9,7 @@ from refusals import refused
 from small_files import encoded_png as png
 from small_files import written
 
-from dsr.data.arkitscenes import NOTE, ARKitScenes, find_frames, load_frame, read_confidence, read_intrinsics
+from dsr.data.arkitscenes import NOTE, ARKitScenes, find_frames, load_frame
 
 ROWS, COLUMNS = np.mgrid[0:1440, 0:1920]
 TRUTH = (1000 + ROWS + COLUMNS // 2).astype(np.uint16)
@@ -122,9 +122,3 @@ def test_damaged_or_foreign_file_is_refused_in_one_line_that_names_it(tmp_path, 
     assert re.match(
         message, refused(lambda: load_frame(*files, "arkitscenes", NAME, min_confidence=1), files[which], capfd)
     )
-
-
-def test_missing_file_is_refused(tmp_path):
-    for read in (read_confidence, read_intrinsics):
-        with pytest.raises(ValueError, match="there is none"):
-            read(tmp_path / "a.png")

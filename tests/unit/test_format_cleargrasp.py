@@ -175,13 +175,6 @@ def test_depth_that_is_none_is_refused_in_one_line(tmp_path, capfd, depth, messa
     assert refused(lambda: load(*files, "cleargrasp", "a"), files[1], capfd).startswith(message)
 
 
-@pytest.mark.parametrize("which", range(5))
-def test_missing_file_is_refused(tmp_path, capfd, which):
-    files = capture(tmp_path)
-    files[which].unlink()
-    assert "expected" in refused(lambda: load_capture(*files, "cleargrasp", "a"), files[which], capfd)
-
-
 def test_real_captures_agree_outside_of_the_glass(shared):
     data = ClearGrasp(str(shared / "real/cleargrasp"), False)
     assert data.scenes() == ["080", "123"]

@@ -3,7 +3,6 @@
 import json
 import pickle
 import struct
-import tracemalloc
 
 import captures
 import numpy as np
@@ -17,7 +16,7 @@ from dsr.geometry.lens import Lens
 from dsr.io.captures.colmap import add_model, model_file
 from dsr.io.inputs import read_picture
 from dsr.io.layouts import find_pairs_of_folder
-from dsr.io.reading import CameraChoice, Reading
+from dsr.io.reading import Reading
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 3
 F, CX, CY = 60.0, 33.0, 23.5
@@ -230,30 +229,6 @@ def test_model_of_a_recording_leaves_it_its_depth_camera_and_its_times(tmp_path)
         assert after.capture.record() != before.capture.record()
 
 
-def test_model_of_a_recording_whose_cameras_are_damaged_is_taken_with_a_warning(tmp_path):
-    captures.polycam(tmp_path / "scan")
-    for path in (tmp_path / "scan").rglob("*.json"):
-        path.write_text(json.dumps({**json.loads(path.read_text()), "fx": -1.0}))
-    found = find_pairs_of_folder(tmp_path / "scan")
-    write_binary(tmp_path / "model", "PINHOLE", [pair.rgb.name for pair in found.pairs])
-    for number, pair in enumerate(add_model(found, model_file(tmp_path / "model")).pairs):
-        for choice in (CameraChoice(), CameraChoice(fov=60)):
-            picture = read_picture(pair, Reading(camera=choice))
-            np.testing.assert_allclose(picture.pose, pose(number), atol=1e-12)
-            assert (picture.camera == Camera(WIDTH, HEIGHT, F, F + 1, CX - 0.5, CY - 0.5)) == (choice.fov is None)
-            [warning] = [fact for fact in picture.assumptions if fact.code == "cameras-damaged"]
-            assert "camera fx: expected" in str(warning)
-
-
-def test_model_of_a_recording_is_of_no_use_without_its_depth_camera(tmp_path):
-    photos, depths = [captures.photo().repeat(10, 0).repeat(10, 1)], [np.full((288, 320), 1000, np.uint16)]
-    found = find_pairs_of_folder(captures.kinect(tmp_path / "scan.mkv", photos, depths, calibration=[1]))
-    write_binary(tmp_path / "model", "PINHOLE", [f"{pair.rgb.name}.jpg" for pair in found.pairs])
-    [pair] = add_model(found, model_file(tmp_path / "model")).pairs
-    with pytest.raises(ValueError, match=r"scan\.mkv: calibration\.json: "):
-        read_picture(pair, Reading())
-
-
 @pytest.mark.parametrize("kind", ["binary", "text"])
 def test_points_that_the_model_lacks_are_none_of_a_photo(folder, kind):
     """A model of the points with even numbers, and one of none."""
@@ -348,35 +323,6 @@ def test_damaged_model_is_one_line_that_names_the_file(folder, tmp_path, capsys,
     [line] = capsys.readouterr().err.splitlines()
     assert name in line
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("suffix", [".bin", ".txt"])
-def test_a_quarter_of_a_million_points_take_little_memory(folder, suffix):
-    """The places of the points alone are 6 MB; each is kept with its number, 32 bytes."""
-    count = 250_000
-    for path in (folder / "depth").iterdir():
-        path.unlink()
-    write = write_binary if suffix == ".bin" else write_text
-    write(folder / "sparse/0", "PINHOLE", NAMES)
-    path = folder / f"sparse/0/points3D{suffix}"
-    content, others = path.read_bytes(), np.zeros(count, "<u8,<3f8,u1,u1,u1,<f8,<u8")
-    others["f0"] = np.arange(1000, 1000 + count)[::-1]
-    if suffix == ".bin":
-        path.write_bytes(struct.pack("<Q", 400 + count) + others.tobytes() + content[8:])
-    else:
-        path.write_bytes(b"".join(b"%d 0 0 0 1 2 3 0.5\n" % number for number in others["f0"]) + content)
-    pairs = find_pairs_of_folder(folder).pairs
-    expected = [len(observations(number)[3]) for number in range(len(NAMES))]
-    tracemalloc.start()
-    depths = [read_picture(pair, Reading()).depth_lr[0] for pair in pairs]
-    kept, _ = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert kept < 40 * count
-    for number, depth in enumerate(depths):
-        known = depth[depth.isfinite()].numpy()
-        assert expected[number] / 2 < depth.numel() < 2 * expected[number]
-        assert np.isin(known, observations(number)[2].astype(np.float32)).mean() > 0.5
-        assert 1.8 < known.min() < known.max() < 4.3
 
 
 @pytest.mark.parametrize(("place", "value"), [(12, 5.0), (12, np.nan), (44, np.inf)])

@@ -83,11 +83,6 @@ def test_depth_picture_of_another_kind_is_refused(tmp_path, capfd, content, reas
     assert reason in refusal(written(tmp_path / "0.png", content), capfd)
 
 
-@pytest.mark.parametrize("name", ["none.depth", "none.png"])
-def test_missing_file_is_refused(tmp_path, capfd, name):
-    assert "there is none" in refusal(tmp_path / name, capfd)
-
-
 def test_16_bit_picture_keeps_its_values(tmp_path):
     colours = np.zeros((480, 640, 3))
     colours[5, 6] = 65535, 257, 1

@@ -89,10 +89,6 @@ def test_damaged_or_foreign_file_is_refused_in_one_line(labelled, tmp_path, capf
         assert "expected" in refusal(act, path, capfd)
 
 
-def test_missing_file_is_refused(tmp_path, capfd):
-    assert "there is none" in refusal(load, tmp_path / "nyu.mat", capfd)
-
-
 @pytest.mark.parametrize(
     "changes",
     [
@@ -112,11 +108,6 @@ def test_non_finite_or_negative_depth_is_refused(tmp_path, capfd, value):
     raw = RAW.swapaxes(1, 2).copy()
     raw[0, 3, 4] = value
     assert "expected positive depth" in refusal(load, official(tmp_path / "nyu.mat", rawDepths=raw), capfd)
-
-
-def test_frame_of_holes_is_refused(tmp_path, capfd):
-    path = official(tmp_path / "nyu.mat", rawDepths=np.zeros((2, 640, 480), np.float32))
-    assert "all are holes" in refusal(load, path, capfd)
 
 
 def test_damaged_block_is_refused_without_affecting_other_frames(tmp_path, capfd):

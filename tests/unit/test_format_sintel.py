@@ -48,11 +48,6 @@ def test_depth_is_read_row_by_row_and_the_sky_is_a_hole(tmp_path):
     np.testing.assert_array_equal(read_depth(path, 30.0)[0], [[1.5, 2.25, 0.125], [np.nan, np.nan, np.nan]])
 
 
-def test_infinite_depth_is_sky_and_0_is_a_hole(tmp_path):
-    path = written(tmp_path / "frame_0001.dpt", dpt(np.array([[np.inf, 0.0, 3.0]])))
-    np.testing.assert_array_equal(read_depth(path, np.inf)[0], [[np.nan, np.nan, 3.0]])
-
-
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
@@ -91,11 +86,6 @@ def swapped(index, value):
 def test_damaged_camera_file_is_refused_in_one_line(tmp_path, capfd, content):
     path = written(tmp_path / "frame_0001.cam", content)
     refusal(capfd, lambda: read_camera(path, SIZE), path)
-
-
-def test_missing_files_are_refused(tmp_path, capfd):
-    for act, path in ((read_depth, tmp_path / "a.dpt"), (lambda path: read_camera(path, SIZE), tmp_path / "a.cam")):
-        assert "there is none" in refusal(capfd, lambda act=act, path=path: act(path), path)
 
 
 def test_frame_has_photo_depth_and_camera(tmp_path):

@@ -56,11 +56,6 @@ def test_damaged_depth_file_is_refused_in_one_line(tmp_path, capfd, content):
     assert refused(lambda: read_depth(path), path, capfd).startswith("expected ")
 
 
-def test_missing_file_is_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"a\.npy: expected a NumPy array, there is none"):
-        read_depth(tmp_path / "a.npy")
-
-
 def test_frame_has_the_camera_of_all_frames(tmp_path):
     rgb, depth = written(tmp_path / "a.png", photo()), written(tmp_path / "a.npy", npy())
     scene = load_frame(rgb, depth, "tartanair", "office/000000")

@@ -84,17 +84,6 @@ def test_pictures_without_a_range_or_a_camera_are_refused_with_the_reason(pictur
     assert "no camera" in refused(lambda: load_frame(rgb, samples, "t", "b", depth_range=(0.5, 1)), rgb, capfd)
 
 
-@pytest.mark.parametrize("depth_range", [(1.0, 0.5), (0.0, 1.0), (1.0, 1.0), (0.5, np.inf), (np.nan, 1.0)])
-def test_invalid_range_is_refused(pictures, capfd, depth_range):
-    act = lambda: load_frame(*pictures, "t", "b", intrinsics=INTRINSICS, depth_range=depth_range)  # noqa: E731
-    refused(act, "depth_range", capfd)
-
-
-@pytest.mark.parametrize("factor", [0, -4, 23])
-def test_factor_that_does_not_divide_the_size_is_refused(capfd, factor):
-    refused(lambda: block_means(torch.ones(1, *SIZE), factor), "factors", capfd)
-
-
 @pytest.mark.parametrize(
     "content", [b"", b"BM", bmp(GREY)[:1078], bmp(GREY)[:-400], b"text", bmp(GREY * 0), bmp(GREY[:21])]
 )
@@ -161,17 +150,6 @@ def test_matrices_of_every_type_are_read_and_other_content_is_skipped(tmp_path, 
         assert found[name].dtype == array.dtype or name == "logical"
 
 
-def test_file_of_the_other_byte_order_is_read(tmp_path):
-    def element(kind, content):
-        return struct.pack(">II", kind, len(content)) + content + bytes(-len(content) % 8)
-
-    numbers = struct.pack(">6h", *range(6))
-    parts = [(6, struct.pack(">II", 6, 0)), (5, struct.pack(">ii", 2, 3)), (1, b"gt"), (3, numbers)]
-    header = b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack(">H", 0x0100) + b"MI"
-    path = written(tmp_path / "a.mat", header + element(14, b"".join(element(*part) for part in parts)))
-    np.testing.assert_array_equal(read_variables(path)["gt"], [[0.0, 2.0, 4.0], [1.0, 3.0, 5.0]])
-
-
 def test_variable_names_can_be_given_by_the_caller(tmp_path):
     path = old(tmp_path / "a.mat", {"x": GREY / 255, "y": TRUTH, "z": TRUTH + 1, "w": SPARSE})
     rgb, depth, samples = read_matrices(path, {"intensity": "x", "depth": "z"})
@@ -206,19 +184,6 @@ def test_file_of_other_variables_is_refused_with_their_names(tmp_path, capfd, va
     assert reason in refused(lambda: read_matrices(path), path, capfd)
 
 
-@pytest.mark.parametrize(
-    ("mapping", "reason"),
-    [
-        ({"intensity": "none"}, "expected the variable none, got intensity 22 x 40, depth_gt 22 x 40"),
-        ({"depth": "small"}, "small: expected shape (22, 40)"),
-    ],
-)
-def test_wrong_variable_names_of_the_caller_are_refused(tmp_path, capfd, mapping, reason):
-    path = old(tmp_path / "a.mat", {"intensity": GREY, "depth_gt": TRUTH, "small": TRUTH[:9]})
-    assert reason in refused(lambda: read_matrices(path, mapping), path, capfd)
-    refused(lambda: read_matrices(path, {"weights": "depth_gt"}), "variables", capfd)
-
-
 @pytest.mark.parametrize("make", [old, new])
 @pytest.mark.parametrize(
     "damage",
@@ -245,12 +210,6 @@ def test_matrix_larger_than_its_file_can_hold_is_refused_before_it_is_read(tmp_p
     assert content.count(size) == 1
     written(path, content.replace(size, struct.pack("<ii", 10**6, 10**3)))
     assert "cannot reshape" in refused(lambda: read_matrices(path), path, capfd)
-
-
-def test_missing_files_are_refused(tmp_path, capfd):
-    path = tmp_path / "a.mat"
-    assert "there is none" in refused(lambda: read_matrices(path), path, capfd)
-    assert "there is none" in refused(lambda: read_samples(path), path, capfd)
 
 
 def test_scenes_are_listed_once_with_the_metric_file_first(tmp_path):

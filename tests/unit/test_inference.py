@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 from typing import Any
 
 import numpy as np
@@ -16,11 +14,10 @@ from torch import Tensor
 import dsr
 from dsr.geometry.camera import Camera
 from dsr.geometry.resampling import resize_inverse_depth
-from dsr.inference import Plan, find_filled, plan_for, upsample_surface, upsampler
-from dsr.inference.plans import OWN_SIZE
+from dsr.inference import Plan, find_filled, plan_for, upsample_surface
 from dsr.inference.resizing import resize_nearest
 from dsr.inference.working_size import enlarged_by
-from dsr.methods.recipe import list_methods, read_recipe
+from dsr.methods.recipe import read_recipe
 
 
 def _camera(height: int, width: int) -> Camera:
@@ -208,21 +205,6 @@ def test_arrays_and_tensors_give_the_same_result() -> None:
     np.testing.assert_allclose(floats, of_arrays, rtol=1e-4)
 
 
-def test_arrays_of_any_strides_and_byte_order_or_read_only_are_taken_as_they_read() -> None:
-    camera = _camera(24, 32)
-    photo = (_photo(24, 32).permute(1, 2, 0).numpy() * 255).astype(np.uint8)
-    depth = _plane(12, 16, camera)[0].float().numpy()
-    mask = np.ones_like(depth, dtype=bool)
-    mask[2, 3] = False
-    flipped = [np.flip(np.flip(each).copy()) for each in (photo, depth, mask)]
-    photo.flags.writeable = depth.flags.writeable = False
-    assert all(min(each.strides) < 0 for each in flipped)
-    swapped = (photo, depth.astype(">f4"), mask)
-    plain, *others = (dsr.upsample(rgb, z, camera, mask=m) for rgb, z, m in ((photo, depth, mask), flipped, swapped))
-    for other in others:
-        np.testing.assert_array_equal(other, plain)
-
-
 def test_result_without_any_depth_is_refused_rather_than_filled(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         "dsr.methods.classical.interpolation.Interpolation.interpolate",
@@ -262,13 +244,6 @@ def test_mask_makes_holes() -> None:
     fine = dsr.upsample(_photo(48, 64), depth.masked_fill(mask == 0, 5.0), camera, mask=mask, method="bicubic")
     pierced = dsr.upsample(_photo(48, 64), depth.masked_fill(mask == 0, torch.nan), camera, method="bicubic")
     torch.testing.assert_close(fine, pierced)
-
-
-def test_progress_covers_all_steps() -> None:
-    camera, parts = _camera(64, 96), []
-    given = _photo(64, 96), _plane(4, 6, camera), camera
-    upsample_depth(*given, method="facets_box", progress=lambda *part: parts.append(part))
-    assert parts == [(i + 1, 8) for i in range(8)]  # x8, then x4, each an ensemble of four
 
 
 @pytest.mark.parametrize("method", AT_HAND)
@@ -315,27 +290,6 @@ def test_settings_change_the_result_and_are_checked() -> None:
             dsr.upsample(_photo(32, 32), depth, camera, method="tgv", **settings)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("method", [name for name in list_methods() if "ensemble" in read_recipe(name).at(4)])
-def test_settings_of_every_trained_network_are_checked_at_a_factor_that_has_weights(method: str) -> None:
-    upsampler(method, settings={"ensemble": 1}, device="cpu").first()
-    with pytest.raises(ValueError, match=r"^ensemble: "):
-        upsampler(method, settings={"ensemble": 3}, device="cpu").first()
-
-
-def test_depth_almost_of_the_photos_size_counts_as_such() -> None:
-    assert plan((480, 640), (int(480 / OWN_SIZE), int(640 / OWN_SIZE)), method="facets_box").coarsened == 4
-    camera = _camera(40, 60)
-    fine = upsample_depth(_photo(40, 60), _plane(38, 57, camera), camera, method="facets_box")
-    assert float((fine / _plane(40, 60, camera) - 1).abs().max()) < 0.02
-
-
-@pytest.mark.parametrize("method", ["facets", "facets_box", "bilateral"])
-def test_depth_a_little_larger_than_the_photo_is_taken(method: str) -> None:
-    camera = _camera(40, 60)
-    found = upsample_depth(_photo(40, 60), _plane(42, 63, camera), camera, method=method)
-    assert float((found / _plane(40, 60, camera) - 1).abs().max()) < 0.06
-
-
 @pytest.mark.parametrize(
     ("photo", "depth", "factor"),
     [
@@ -348,14 +302,6 @@ def test_depth_a_little_larger_than_the_photo_is_taken(method: str) -> None:
 def test_ratios_next_to_a_factor_take_its_weights(photo: tuple[int, int], depth: tuple[int, int], factor: int) -> None:
     assert plan(photo, depth).scale == factor
     assert read_recipe("facets").weights(max(photo[1] / depth[1], 1)).name == f"facets_x{max(factor, 2)}.safetensors"
-
-
-def test_import_of_the_package_loads_nothing_heavy() -> None:
-    code = "import sys, dsr; assert 'upsample' in dir(dsr); print(sorted({'torch', 'numpy'} & set(sys.modules)))"
-    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert answer.stdout.strip() == "[]"
-    with pytest.raises(AttributeError, match="module 'dsr' has no attribute 'upsampled'"):
-        dsr.upsampled  # noqa: B018
 
 
 def test_pixels_that_a_method_leaves_out_stay_holes() -> None:

@@ -126,12 +126,6 @@ def test_focal_length_of_exif_data_is_relative_to_the_35_mm_diagonal(tmp_path):
     assert assumptions[0].detail.startswith("26 mm")
 
 
-@pytest.mark.parametrize("value", [0, 1, 65535])
-def test_invalid_exif_focal_length_is_ignored(tmp_path, value):
-    assumptions = find_camera(CameraChoice(), photo(tmp_path, {0xA405: value}), SIZE, COARSE)[1]
-    assert assumptions[0].text.startswith("camera: none given")
-
-
 @pytest.mark.parametrize("choice", [{"fov": 0.0}, {"fov": 180.0}, {"fov": math.nan}, {"intrinsics": (1, 0, 1, 1)}])
 def test_impossible_camera_numbers_are_refused(choice):
     with pytest.raises(ValueError, match=f"^{next(iter(choice))}: expected"):

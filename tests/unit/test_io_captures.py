@@ -215,14 +215,6 @@ def test_camera_matrix_of_stray_scanner_is_used_where_frames_have_none(folder):
     assert any(fact.text.startswith("camera: camera_matrix.csv of the whole capture") for fact in picture.assumptions)
 
 
-def test_extracted_photos_of_stray_scanner_may_be_smaller_than_the_video(folder):
-    captures.stray(folder, own_intrinsics=False)
-    for number in range(FRAMES):
-        captures.save(folder / "rgb" / f"{number:06}.png", captures.photo(number)[::2, ::2])
-    picture = read_all(folder)[0]
-    assert picture.camera == Camera(SIZE[1], SIZE[0], *INTRINSICS).rescale(SIZE[1] // 2, SIZE[0] // 2)
-
-
 def test_frames_of_a_video_are_decoded_in_any_order(folder):
     pairs = find_pairs_of_folder(captures.stray(folder)).pairs
     for number in (2, 0, 1, 1, 0, 2):
@@ -250,12 +242,6 @@ def test_first_frame_that_an_edit_list_hides_is_decoded(folder):
     for number, picture in enumerate(read_all(folder)):
         assert abs(255 * float(picture.rgb[0].mean()) - captures.photo(number)[..., 0].mean()) < 8
     assert len(find_pairs_of_folder(folder).assumptions) == 1  # nothing is said of other numbers of frames
-
-
-def test_poses_that_never_change_are_none(folder):
-    captures.record3d(folder / "scan.r3d", poses=[[0, 0, 0, 1, 0, 0, 0]] * FRAMES)
-    assert any("no poses" in fact.text for fact in find_pairs_of_folder(folder).assumptions)
-    assert read_all(folder)[0].pose is None
 
 
 def test_lzfse_data_of_the_real_compressor_are_read(folder):
@@ -325,14 +311,6 @@ def test_member_larger_than_a_map_is_not_unpacked(folder):
     with pytest.raises(ValueError, match=r"scan.r3d/rgbd/1.depth: expected at most 66304 bytes, the archive declares"):
         read_picture(pairs[1], Reading())
     assert read_picture(pairs[2], Reading()).depth_lr.isfinite().all()
-
-
-def test_files_of_another_app_are_left_to_the_other_layouts(folder):
-    write_export(folder)
-    (folder / "metadata.json").write_text('{"version": 2}')
-    found = find_pairs_of_folder(folder)
-    assert found.assumptions[0].text == "folders rgb and depth"
-    assert {pair.capture for pair in found.pairs} == {None}
 
 
 def replace_text(path, old, new):

@@ -168,9 +168,3 @@ def test_maps_of_sensors_in_millimetres_and_metres_are_never_asked_about(shared)
             reported = interpret(str(path), each, holes, Camera.from_fov(60, values.shape[1], values.shape[0]))
             assert (reported.unit, reported.range_type, reported.bits) == (unit, None, 0)
             assert not [each for each in reported.assumptions if each.code]
-
-
-def test_bits_of_sun_rgbd_are_recognised_by_its_own_files(shared):
-    for path in (shared / "real" / "sunrgbd").glob("*/depth*/*.png"):
-        values = read_depth_file(path)
-        assert interpret(str(path), values, find_holes(values, None)[0]).bits == 3

@@ -203,29 +203,11 @@ def test_glb_mesh_from_near_to_far_has_positions_as_floats(tmp_path):
     assert set(tree["nodes"][0]) == {"mesh"}
 
 
-def test_large_photo_becomes_a_texture_of_a_supported_size(tmp_path):
-    picture = np.zeros((1, 5000, 3), np.uint8)
-    picture[:, 2500:] = 200
-    points = np.array([[0, 0, 1], [1, 0, 1], [0, 1, 1.0]])
-    normals, corners = np.tile([0.0, 0, -1], (3, 1)), np.array([[0, 2, 1]])
-    write_glb(tmp_path / "m.glb", points, normals, corners, np.array([[0, 0], [4999, 0], [2600, 0]]), picture)
-    [again] = trimesh.load(tmp_path / "m.glb", process=False).geometry.values()
-    assert again.visual.material.baseColorTexture.size == (4096, 1)
-    assert again.visual.to_color().vertex_colors[:, 0].tolist() == [0, 200, 200]
-
-
 def test_meshes_are_cut_at_steps(tmp_path):
     depth = wall()
     depth[0, :, 12:] = 3
     assert write_mesh(tmp_path / "m.ply", photo(), depth, CAMERA).after == 2 * 17 * 22
     assert write_mesh(tmp_path / "m.ply", photo(), depth, CAMERA, largest_step=0.6).after == 2 * 17 * 23
-
-
-@pytest.mark.parametrize("name", ["m.obj", "m"])
-def test_unknown_mesh_format_is_refused_before_anything_is_written(tmp_path, name):
-    with pytest.raises(ValueError, match=r"m.*: expected a mesh file, .ply or .glb, got"):
-        write_mesh([tmp_path / "a.ply", tmp_path / name], photo(), wall(), CAMERA)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_map_without_two_neighbours_is_refused_and_an_older_file_is_kept(tmp_path):
@@ -247,28 +229,6 @@ def drawn(monkeypatch):
     return figures
 
 
-@pytest.mark.parametrize(
-    ("size", "coarse"), [((18, 24), (5, 6)), ((18, 24), (18, 24)), ((9, 60), (3, 20)), ((60, 9), (15, 2))]
-)
-def test_before_after_picture_is_at_most_2400_pixels_wide(tmp_path, drawn, size, coarse):
-    camera = Camera(size[1], size[0], 30, 30, size[1] / 2, size[0] / 2)
-    write_before_after(tmp_path, photo(camera), bumpy(camera.rescale(*coarse[::-1])), bumpy(camera), camera, "t")
-    [(figure, dpi)] = drawn
-    assert 800 < figure.get_figwidth() * dpi <= 2400
-    assert figure.get_figheight() * dpi < 3300
-    left, right, bottom, top = figure.axes[0].images[0].get_extent()
-    assert (top - bottom) / (right - left) == pytest.approx(size[0] / size[1])
-
-
-@pytest.mark.slow
-def test_before_after_picture_is_written_with_any_title_and_holes(tmp_path):
-    depth = bumpy()
-    depth[0, 1, 2] = torch.nan
-    write_before_after(tmp_path / "b.png", photo(), bumpy(CAMERA.rescale(6, 5)), depth, CAMERA, "a_b $c$ {} \u65e5")
-    assert [path.name for path in tmp_path.iterdir()] == ["b.png"]
-    assert read(tmp_path / "b.png").shape[1] == 1432
-
-
 def test_detail_of_a_before_after_picture_is_where_the_surface_changed(tmp_path, drawn):
     depth = wall()
     depth[0, 10:13, 15:19] += 0.05 * torch.rand(3, 4, generator=torch.Generator().manual_seed(1))
@@ -286,37 +246,3 @@ def test_detail_of_a_before_after_picture_is_where_the_surface_changed(tmp_path,
         assert right >= 19 - 1e-9
         assert bottom >= 13 - 1e-9
     assert len({picture.get_clim() for picture in pictures if picture.cmap.name == "viridis"}) == 1
-
-
-def test_details_of_before_and_after_are_parts_of_the_pictures_above_them(tmp_path, drawn):
-    write_before_after(tmp_path / "b.png", photo(), bumpy(CAMERA.rescale(7, 5)), bumpy(), CAMERA, "t")
-    [(figure, _)] = drawn
-    axes = figure.axes[0]
-    for whole, detail, frame, edge in zip(
-        axes.images[:6:2], axes.images[1:6:2], axes.patches[::2], axes.patches[1::2], strict=True
-    ):
-        left, right, bottom, top = detail.get_extent()
-        across, down = frame.get_width() / edge.get_width(), frame.get_height() / edge.get_height()
-        columns = columns_of(whole, frame.get_x() + across * (np.array([left, right]) - edge.get_x()))
-        rows = rows_of(whole, frame.get_y() + down * (np.array([top, bottom]) - edge.get_y()))
-        part = whole.get_array()[slice(*rows), slice(*columns)]
-        np.testing.assert_array_equal(detail.get_array(), part)
-        clip = detail.get_clip_box().transformed(axes.transData.inverted())
-        assert clip.bounds == pytest.approx((edge.get_x(), edge.get_y(), edge.get_width(), edge.get_height()))
-
-
-def columns_of(image, x):
-    """Columns of a picture at whole pixels, from positions in inches."""
-    left, right, _, _ = image.get_extent()
-    return whole_numbers((x - left) / (right - left) * image.get_array().shape[1])
-
-
-def rows_of(image, y):
-    """Rows, likewise."""
-    _, _, bottom, top = image.get_extent()
-    return whole_numbers((top - y) / (top - bottom) * image.get_array().shape[0])
-
-
-def whole_numbers(values):
-    assert values == pytest.approx(values.round())
-    return values.round().astype(int)

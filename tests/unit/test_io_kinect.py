@@ -4,16 +4,13 @@ import copy
 import functools
 import json
 import pickle
-import sys
 
 import captures
 import cv2
 import numpy as np
 import pytest
 
-from dsr.cli import main
 from dsr.geometry.camera import Camera
-from dsr.io.depth_files import read_depth_file
 from dsr.io.inputs import read_picture
 from dsr.io.layouts import find_pairs_of_folder
 from dsr.io.reading import CameraChoice, Reading, RigFiles
@@ -147,15 +144,6 @@ def test_cameras_of_other_modes_are_parts_of_the_same_image(tmp_path, size, size
     np.testing.assert_allclose(geometry.rig.transform, captures.kinect_motion(), atol=1e-9)
 
 
-def test_command_reads_a_recording(tmp_path, capsys):
-    path, out = write(tmp_path / "scan.mkv"), tmp_path / "out"
-    assert main(["upsample", str(path), "-o", str(out), "--method", "bicubic", "--only", "depth"]) == 0
-    assert "Azure Kinect" in capsys.readouterr().out
-    reported = json.loads((out / "000000" / "info.json").read_text())
-    assert reported["inputs"]["depth"]["file"].startswith("scan.mkv/")
-    assert read_depth_file(out / "000000" / "depth_metres.tiff").shape == SIZE
-
-
 def changed(change):
     calibration = copy.deepcopy(captures.kinect_calibration())
     change(calibration["CalibrationInformation"]["Cameras"])
@@ -235,10 +223,3 @@ def test_frames_of_a_recording_that_was_cut_off_are_read_up_to_there(tmp_path):
     found = find_pairs_of_folder(path)
     assert 1 <= len(found.pairs) < 3
     np.testing.assert_array_equal(found.pairs[0].capture.depth.read(), plane())
-
-
-def test_package_that_is_missing_is_named(tmp_path, monkeypatch):
-    path = write(tmp_path / "scan.mkv")
-    monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(ValueError, match=r"need the package av: pip install -e '.\[captures\]'"):
-        find_pairs_of_folder(path)

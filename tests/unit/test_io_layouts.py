@@ -1,18 +1,15 @@
 """Layouts of data sets and of apps' exports: camera, unit, holes and pose of each frame; archives; what is lacking."""
 
-import errno
 import json
 import os
 import pickle
 import re
-import shutil
 import stat
 import struct
 import subprocess
 import sys
 import zipfile
 import zlib
-from pathlib import Path
 
 import bombs
 import captures
@@ -23,13 +20,10 @@ from captures import FRAMES, INTRINSICS, SIZE
 
 from dsr.cli import main
 from dsr.geometry.camera import Camera
-from dsr.io.formats import FORMATS
 from dsr.io.inputs import FolderUnits, read_picture
 from dsr.io.layouts import find_pairs_of_folder
 from dsr.io.reading import CameraChoice, Reading
-from dsr.utils.files import FullDiskError
 
-FORMAT = {each.name: each for each in FORMATS}
 CAMERA = Camera(SIZE[1], SIZE[0], *INTRINSICS)
 
 
@@ -92,17 +86,6 @@ def test_recordings_of_scannet_in_a_folder_are_distinguished_and_each_says_its_u
     millimetres, fifths = (note.text for note in found.assumptions)
     assert "depth in millimetres;" in millimetres
     assert "depth in 1/5000 m;" in fifths
-
-
-def test_seven_scenes_may_have_photos_as_jpeg_and_poses_with_commas(folder):
-    captures.seven_scenes(folder)
-    np.savetxt(folder / "frame-000001.pose.txt", captures.pose(1), delimiter=",")
-    for number, path in enumerate(sorted(folder.glob("*.color.png"))):
-        captures.save(path.with_suffix(".jpg"), captures.photo(number))
-        path.unlink()
-    pairs = find_pairs_of_folder(folder).pairs
-    assert [pair.name for pair in pairs] == [f"frame-{number:06}" for number in range(FRAMES)]
-    np.testing.assert_allclose(read_picture(pairs[1], Reading()).pose, captures.pose(1), atol=1e-6)
 
 
 def test_seven_scenes_without_a_camera_has_the_usual_one_of_its_kinect(folder):
@@ -353,24 +336,6 @@ def test_folder_of_an_unpacked_zip_file_is_deleted_at_the_end(folder, tmp_path):
     assert list(place.iterdir()) == []
 
 
-def test_zip_file_for_which_the_disk_is_too_small_is_not_called_damaged(folder, tmp_path, monkeypatch):
-    path = packed(tmp_path / "scan.zip", captures.polycam(folder))
-    place = tmp_path / "temporary"
-    place.mkdir()
-    original = Path.open
-
-    def opened(path, mode="r", *rest, **options):
-        if mode == "xb":
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return original(path, mode, *rest, **options)
-
-    monkeypatch.setattr("tempfile.tempdir", str(place))
-    monkeypatch.setattr(Path, "open", opened)
-    with pytest.raises(FullDiskError, match=f"{place}.*: expected space to write the file"):
-        find_pairs_of_folder(path)
-    assert list(place.iterdir()) == []
-
-
 def hostile(path, name="a.jpg", *, link=False, bomb=False):
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         if bomb:
@@ -410,19 +375,6 @@ def test_zip_file_that_unpacks_to_more_than_it_declares_or_is_damaged_is_refused
         find_pairs_of_folder(path)
 
 
-@pytest.mark.parametrize("kind", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-def test_member_that_is_damaged_is_refused_however_it_is_packed(tmp_path, kind):
-    path = tmp_path / "scan.zip"
-    with zipfile.ZipFile(path, "w", kind) as archive:
-        archive.writestr("rgb.png", bytes(range(256)) * 20)
-    content = bytearray(path.read_bytes())
-    for place in range(50, 80):
-        content[place] ^= 0x5A
-    path.write_bytes(content)
-    with pytest.raises(ValueError, match=r"scan.zip: rgb.png: expected a member, got a damaged one"):
-        find_pairs_of_folder(path)
-
-
 def remove(*names):
     def change(folder):
         for name in names:
@@ -456,57 +408,9 @@ def test_capture_that_lacks_a_file_is_refused_with_its_name_and_that_of_the_file
     assert "\n" not in str(caught.value)
 
 
-def unpacked(folder):
-    shutil.unpack_archive(captures.record3d(folder.parent / "scan.r3d"), folder, "zip")
-
-
-WRITTEN = {
-    "Record3D": unpacked,
-    "Stray Scanner": captures.stray, "Polycam": captures.polycam, "ARKitScenes": captures.arkitscenes,
-    "3D Scanner App": captures.scanner_app, "ZED": captures.zed, "Open3D": captures.open3d, "ScanNet": captures.scannet,
-    "ScanNet++ iPhone": captures.scannetpp, "7-Scenes or 3DMatch": captures.seven_scenes,
-    "SUN RGB-D": captures.sunrgbd, "Replica of NICE-SLAM": captures.replica,
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(("name", "need"), [(name, need) for name in WRITTEN for need in FORMAT[name].needs])
-def test_each_part_that_the_table_says_a_layout_needs_is_needed_and_named_where_it_lacks(folder, name, need):
-    WRITTEN[name](folder)
-    assert not any(f"like {name}, without" in fact.text for fact in find_pairs_of_folder(folder).assumptions)
-    remove(*FORMAT[name].needs[need])(folder / "iphone" if name == "ScanNet++ iPhone" else folder)
-    try:
-        said = "; ".join(fact.text for fact in find_pairs_of_folder(folder).assumptions)
-    except ValueError as error:
-        said = str(error)
-    assert f"like {name}, without {need}" in said
-
-
 def test_capture_without_its_cameras_is_read_as_pictures_and_says_so(folder):
     remove("keyframes/*cameras/*")(captures.polycam(folder))
     found = find_pairs_of_folder(folder)
     assert len(found.pairs) == FRAMES
     assert found.assumptions[0].text.startswith("like Polycam, without keyframes/cameras/*.json: ")
     assert not any("like " in fact.text for fact in find_pairs_of_folder(captures.open3d(folder / "o")).assumptions)
-
-
-def test_folder_without_pairs_says_what_it_has(folder):
-    for name in ("a.jpg", "b.jpg", "x/c.MP4", "x/readme", ".hidden"):
-        (folder / name).parent.mkdir(exist_ok=True)
-        (folder / name).touch()
-    with pytest.raises(ValueError, match=r"the folder has 2 .jpg, 1 .mp4, 1 no suffix$"):
-        find_pairs_of_folder(folder)
-    (folder / "empty").mkdir()
-    with pytest.raises(ValueError, match=r"the folder is empty$"):
-        find_pairs_of_folder(folder / "empty")
-
-
-def test_zip_file_of_thousands_of_folders_is_refused_and_one_without_pairs_by_its_own_name(tmp_path):
-    with zipfile.ZipFile(tmp_path / "many.zip", "w") as archive:
-        for number in range(1001):
-            archive.writestr(f"{number}/notes.txt", "")
-    with pytest.raises(ValueError, match=r"many\.zip: expected at most \d+ files in 1000 folders, got 1001 in 1002"):
-        find_pairs_of_folder(tmp_path / "many.zip")
-    with zipfile.ZipFile(tmp_path / "none.zip", "w") as archive:
-        archive.writestr("notes.txt", "")
-    with pytest.raises(ValueError, match=rf"^{tmp_path}/none\.zip: expected photos"):
-        find_pairs_of_folder(tmp_path / "none.zip")

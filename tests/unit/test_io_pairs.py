@@ -1,14 +1,11 @@
 """Pairs of photo and depth map in the layouts that people have, and what has no partner."""
 
-import math
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
 
 from dsr.io.layouts import find_pairs_of_folder
-from dsr.io.pairs import find_pairs_of_lists, key_of, match_times, role_of, time_of, words_of
+from dsr.io.pairs import find_pairs_of_lists
 
 
 def touch(folder, *names):
@@ -68,21 +65,6 @@ def test_damaged_tum_list_is_refused_by_file_and_line(tmp_path):
     (tmp_path / "depth.txt").write_text("")
     with pytest.raises(ValueError, match=r"rgb.txt: line 1: expected a time and a file name, got '10.00'$"):
         find_pairs_of_folder(tmp_path)
-
-
-def test_what_has_no_finite_time_is_no_partner_of_anything():
-    names = [Path(f"{number}.png") for number in range(4)]
-    photos = dict(zip(names, (math.nan, 1.0, math.inf, 5.0), strict=True))
-    depths = dict(zip(names, (1.01, 9.0, math.inf, math.nan), strict=True))
-    assert match_times(photos, depths) == {names[1]: names[0]}
-
-
-def test_many_pictures_of_one_time_take_no_memory_of_all_pairs():
-    alike = dict.fromkeys((Path(f"{number}.png") for number in range(20_000)), 1.0)
-    with pytest.raises(ValueError, match="expected frames of different times, got too many"):
-        match_times(alike, alike)
-    few = dict(list(alike.items())[:100])
-    assert len(match_times(few, few)) == 100
 
 
 def test_nearest_time_is_matched_and_no_depth_map_twice(tmp_path):
@@ -188,14 +170,3 @@ def test_inconsistent_lists_are_refused(tmp_path):
     ]:
         with pytest.raises(ValueError, match=message):
             find_pairs_of_lists(photos, depths, masks)
-
-
-def test_names_are_split_into_words_and_numbers(tmp_path):
-    assert words_of("frame-000012.color") == ["frame", "12", "color"]
-    assert words_of("DepthAligned_0012") == ["depth", "aligned", "12"]
-    assert key_of(tmp_path / "rgbImage_0007.png") == key_of(tmp_path / "depth-raw-7.png") == ("7",)
-    assert [role_of(tmp_path / name) for name in ("x.npy", "x.png", "x_disp.png", "x_normals.png", "x.txt")] == [
-        "depth", "rgb", "depth", "other", "other",
-    ]  # fmt: skip
-    assert time_of(tmp_path / "1700000000123.png") == pytest.approx(1700000000.123)
-    assert time_of(tmp_path / "frame_000012.png") is None

@@ -70,11 +70,6 @@ def test_bad_extrinsics_are_refused_in_one_line(tmp_path, name, content, message
     assert "\n" not in str(caught.value)
 
 
-def test_missing_file_is_named(tmp_path):
-    with pytest.raises(ValueError, match=r"none\.txt: expected a file, there is none"):
-        read_transform(tmp_path / "none.txt")
-
-
 @pytest.mark.parametrize(
     "content",
     [

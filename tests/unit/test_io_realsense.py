@@ -12,7 +12,7 @@ from realsense import COLOR, WRITERS, Recording, Rotation
 from dsr.geometry.camera import Camera
 from dsr.io.inputs import read_picture
 from dsr.io.layouts import find_pairs_of_folder
-from dsr.io.reading import CameraChoice, Reading, RigFiles
+from dsr.io.reading import Reading
 
 pytest.importorskip("rosbags")
 
@@ -30,7 +30,7 @@ def texts(path):
     return [str(each) for each in (*found.assumptions, *read_picture(found.pairs[0], Reading()).assumptions)]
 
 
-@pytest.mark.parametrize("name", ["sdk_2.55.bag", "sdk_2.59.db3"])
+@pytest.mark.parametrize("name", ["sdk_2.55.bag", pytest.param("sdk_2.59.db3", marks=pytest.mark.nightly)])
 def test_recordings_are_read_as_the_sdk_reads_them_and_aligned_as_it_aligns(shared, name):
     """The SDK's aligned maps keep the depth camera's z, which is turned into the colour camera's here."""
     folder = shared / "captures" / "realsense"
@@ -186,37 +186,3 @@ def test_what_describes_the_streams_is_checked(tmp_path, suffix, change, said):
     path = WRITERS[suffix](tmp_path / f"a{suffix}", Recording(**change))
     with pytest.raises(ValueError, match=f"^{tmp_path}/a{suffix}.*{said}"):
         read_all(path)
-
-
-@pytest.mark.parametrize("suffix", WRITERS)
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ({"color_lens": ("Brown Conrady", (0.1, float("nan"), 0, 0, 0))}, "lens: expected"),
-        ({"shift": (float("nan"), 0, 0)}, "expected finite numbers"),
-    ],
-)
-def test_damaged_calibration_does_not_matter_where_both_cameras_are_given(tmp_path, suffix, change, said):
-    [pair, *_] = find_pairs_of_folder(WRITERS[suffix](tmp_path / f"a{suffix}", Recording(**change))).pairs
-    given = CameraChoice(intrinsics=COLOR[2:])
-    with pytest.raises(ValueError, match=said):
-        read_picture(pair, Reading(camera=given))
-    names = ("width", "height", "fx", "fy", "cx", "cy")
-    (tmp_path / "depth.json").write_text(json.dumps(dict(zip(names, realsense.DEPTH, strict=True))))
-    matrix = np.column_stack((realsense.TURN.as_matrix(), realsense.SHIFT))
-    np.savetxt(tmp_path / "depth_to_color.txt", matrix)
-    rig = RigFiles(camera=tmp_path / "depth.json", extrinsics=tmp_path / "depth_to_color.txt")
-    picture = read_picture(pair, Reading(camera=given, rig=rig))
-    expect_plane([picture])
-    [warning] = [fact for fact in picture.assumptions if fact.code]
-    assert warning.code == "cameras-damaged"
-    assert said in str(warning)
-
-
-def test_damaged_camera_of_registered_streams_does_not_matter_where_one_is_given(tmp_path):
-    depths = [realsense.seen_by_depth(number, camera=COLOR) for number in range(captures.FRAMES)]
-    recording = Recording(depth=COLOR, depths=depths, turn=None, color=(64, 48, -1.0, 51.0, 31.0, 24.0))
-    [pair, *_] = find_pairs_of_folder(realsense.bag(tmp_path / "a.bag", recording)).pairs
-    picture = read_picture(pair, Reading(camera=CameraChoice(intrinsics=COLOR[2:])))
-    np.testing.assert_allclose(picture.depth_lr[0], 1e-3 * depths[0], atol=1e-6)
-    assert "cameras-damaged" in [fact.code for fact in picture.assumptions]

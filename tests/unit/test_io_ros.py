@@ -1,7 +1,6 @@
 """Recordings of ROS: cameras for window, binning, rectification and distortion, lone files, and RVL."""
 
 import errno
-import shutil
 import struct
 from types import SimpleNamespace
 
@@ -9,7 +8,6 @@ import captures
 import cv2
 import numpy as np
 import pytest
-import yaml
 from captures import FRAMES, INTRINSICS, SIZE
 
 from dsr.geometry.camera import Camera
@@ -81,12 +79,6 @@ def test_photos_with_distortion_become_those_of_the_pinhole_camera(tmp_path, mod
     assert any(f"{numbers[0]:g}" in str(fact) for fact in picture.assumptions)
 
 
-def test_unknown_distortion_is_said_and_left(tmp_path):
-    picture = read_first(captures.ros(tmp_path / "a", 2, distortion_model="thin_prism", d=[0.1, 0.2]))
-    np.testing.assert_array_equal(np.rint(255 * picture.rgb.permute(1, 2, 0).numpy()), captures.photo())
-    assert any("thin_prism" in str(fact) for fact in picture.assumptions)
-
-
 def test_camera_that_is_not_calibrated_is_assumed_or_given(tmp_path):
     """CameraInfo has zeros for it."""
     [pair, *_] = find_pairs_of_folder(captures.ros(tmp_path / "a.bag", 1, k=[0.0] * 9)).pairs
@@ -110,29 +102,6 @@ def test_camera_info_that_is_none_is_one_line(tmp_path, of_info, said):
     path = captures.ros(tmp_path / "a.bag", 1, **of_info)
     with pytest.raises(ValueError, match=f"^{path}/camera/color/camera_info: {said}"):
         read_first(path)
-
-
-def test_damaged_camera_info_does_not_matter_where_a_camera_is_given(tmp_path):
-    [pair, *_] = find_pairs_of_folder(captures.ros(tmp_path / "a.bag", 1, d=[np.nan, 0, 0, 0, 0])).pairs
-    for choice in (CameraChoice(intrinsics=INTRINSICS), CameraChoice(fov=60)):
-        picture = read_picture(pair, Reading(camera=choice))
-        if choice.fov is None:
-            assert picture.camera == CAMERA
-        assert [fact.code for fact in picture.assumptions if fact.code] == ["cameras-damaged"]
-        assert "camera_info: lens: expected" in " ".join(map(str, picture.assumptions))
-        assert picture.time == pytest.approx(100)
-        np.testing.assert_allclose(picture.depth_lr[0], captures.depth(0), atol=6e-4)
-
-
-def test_distortion_stays_and_is_said_where_a_camera_is_given(tmp_path):
-    lens = [-0.25, 0.1, 0.002, -0.003, 0.01]
-    [pair, *_] = find_pairs_of_folder(captures.ros(tmp_path / "bent.bag", 1, d=lens)).pairs
-    picture = read_picture(pair, Reading(camera=CameraChoice(intrinsics=INTRINSICS)))
-    np.testing.assert_array_equal(np.rint(255 * picture.rgb.permute(1, 2, 0).numpy()), captures.photo())
-    assert any("-0.25 0.1 0.002" in fact.detail for fact in picture.assumptions)
-    [pair, *_] = find_pairs_of_folder(captures.ros(tmp_path / "straight.bag", 1)).pairs
-    picture = read_picture(pair, Reading(camera=CameraChoice(intrinsics=INTRINSICS)))
-    assert not any("distortion" in fact.text for fact in picture.assumptions)
 
 
 @pytest.mark.parametrize("suffix", [".db3", ".mcap"])
@@ -264,69 +233,3 @@ def zstd():
     from rosbags.rosbag2 import storage_mcap  # noqa: PLC0415 - an extra
 
     return storage_mcap.zstd
-
-
-def split(path, contents):
-    """Write a folder of ROS 2 of packed files that a recorder split; of a content that is a name, that file again."""
-    path.mkdir()
-    names = [each if isinstance(each, str) else f"scan_{number}.db3.zstd" for number, each in enumerate(contents)]
-    for name, content in zip(names, contents, strict=True):
-        if not isinstance(content, str):
-            (path / name).write_bytes(content)
-    reported = {"version": 5, "storage_identifier": "sqlite3", "relative_file_paths": names, "message_count": 0,
-            "duration": {"nanoseconds": 0}, "starting_time": {"nanoseconds_since_epoch": 0},
-            "topics_with_message_count": [], "compression_format": "zstd", "compression_mode": "FILE"}  # fmt: skip
-    (path / "metadata.yaml").write_text(yaml.safe_dump({"rosbag2_bagfile_information": reported}))
-    return path
-
-
-def streamed(count, size):
-    """Packed zeros whose header does not declare how many they are."""
-    packing = zstd().ZstdCompressor()
-    return b"".join(packing.compress(bytes(size)) for _ in range(count)) + packing.flush()
-
-
-@pytest.mark.parametrize("declared", [True, False])
-def test_files_of_a_recording_are_unpacked_to_its_allowance_together(tmp_path, monkeypatch, declared):
-    """Ten files of 60 MiB of zeros each, of which four are within 256 MiB."""
-    (tmp_path / "temporary").mkdir()
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
-    one = zstd().compress(bytes(60 << 20)) if declared else streamed(60, 1 << 20)
-    path, written = split(tmp_path / "scan", [one] * 10), []
-    copy = shutil.copyfileobj
-
-    def copied(source, sink):
-        copy(source, sink)
-        written.append(sink.tell())
-
-    monkeypatch.setattr("shutil.copyfileobj", copied)
-    with pytest.raises(ValueError, match=f"^{path}: .*packed files of more than 268435456 bytes"):
-        find_pairs_of_folder(path)
-    assert written == [60 << 20] * 4
-    assert not any((tmp_path / "temporary").iterdir())
-
-
-def test_packed_file_that_is_named_twice_is_refused(tmp_path):
-    path = split(tmp_path / "scan", [zstd().compress(bytes(1 << 10)), "scan_0.db3.zstd"])
-    with pytest.raises(ValueError, match=f"^{path}: .*relative_file_paths names scan_0.db3.zstd twice"):
-        find_pairs_of_folder(path)
-
-
-def test_packed_file_for_which_the_disk_is_too_small_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
-    path = split(tmp_path / "scan", [zstd().compress(bytes(1 << 20))])
-    free = shutil.disk_usage(tmp_path)._replace(free=1 << 19)
-    monkeypatch.setattr("shutil.disk_usage", lambda _: free)
-    monkeypatch.setattr("shutil.copyfileobj", lambda *_: pytest.fail("it was unpacked"))
-    with pytest.raises(FullDiskError, match=r"expected 1\.0 MB to write the file"):
-        find_pairs_of_folder(path)
-
-
-def test_full_folder_of_temporary_files_does_not_matter_to_a_recording_that_is_not_packed(tmp_path, monkeypatch):
-    path = captures.ros(tmp_path / "scan", 2)
-    free = shutil.disk_usage(tmp_path)._replace(free=0)
-    monkeypatch.setattr("shutil.disk_usage", lambda _: free)
-    assert len(find_pairs_of_folder(path).pairs) == FRAMES
-    [content] = path.glob("*.db3")
-    content.write_bytes(content.read_bytes()[:3000])
-    with pytest.raises(ValueError, match=f"^{path}: expected a recording of ROS"):
-        find_pairs_of_folder(path)

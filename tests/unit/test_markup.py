@@ -9,19 +9,15 @@ import pandas as pd
 import pytest
 
 from dsr.evaluation.results import Results, Run
-from dsr.report import table_layouts, tables
 from dsr.report.table_layouts import (
     MISSING,
-    aligned,
-    escaped,
     latex_text,
     to_csv,
     to_document,
     to_latex,
     to_markdown,
-    write_tables,
 )
-from dsr.report.tables import FACTS, Fact, build_tables
+from dsr.report.tables import build_tables
 
 ODD = "a|b_*x* 50% & $1 {c} \\d #e ~f ^g <u> `h` \"i\" 'j'"
 FOLDER = "dsr.data.folder.Folder"
@@ -99,27 +95,6 @@ def test_markdown_has_the_papers_values_the_difference_and_the_ratio():
     assert "nan" not in text.casefold()
 
 
-def test_markdown_table_lines_are_equally_long():
-    for part in to_markdown(the_table()).split("\n\n"):
-        assert len({len(line) for line in part.splitlines() if line.startswith("|")}) <= 1
-    assert aligned(["a", "b"], [["long text", "1"]], 1).splitlines() == [
-        "| a         |   b |", "| --------- | --: |", "| long text |   1 |"]  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("text", "shown"),
-    [
-        ("cube_no_texture", "cube_no_texture"),
-        ("_a_", "\\_a\\_"),
-        ("a|b*", "a\\|b\\*"),
-        ("a\nb", "a b"),
-        ("<b>", "\\<b\\>"),
-    ],
-)
-def test_markdown_shows_names_unchanged(text, shown):
-    assert escaped(text) == shown
-
-
 def test_csv_has_full_precision_the_papers_units_and_no_empty_column():
     frame = pd.read_csv(io.StringIO(to_csv(the_table())))
     row = frame[(frame["scene"] == "lucy") & (frame["method"] == "DIP")].iloc[0]
@@ -139,14 +114,6 @@ def test_csv_has_full_precision_the_papers_units_and_no_empty_column():
     assert not [name for name in frame if "low" in name or frame[name].isna().all()]
     alone = pd.read_csv(io.StringIO(to_csv(the_table(Results((run("A", {"x": 1.25}),))))))
     assert not [name for name in alone if "spread" in name or "paper" in name]
-
-
-def test_study_answers_have_their_intervals_in_every_format():
-    table = the_table(Results((run("A", {"lucy": 1.0}),)), study_of("A"))
-    assert "61.5 [50.2, 71.0]" in to_markdown(table)
-    assert "61.5 [50.2, 71.0]" in to_latex(table)
-    row = pd.read_csv(io.StringIO(to_csv(table))).iloc[0]
-    assert tuple(row[["user_first [%]", "user_first low [%]", "user_first high [%]"]]) == (61.5, 50.25, 71)
 
 
 def test_latex_has_rules_units_marks_and_dashes():
@@ -186,13 +153,6 @@ def test_latex_text_is_escaped_or_named(text, shown):
     assert latex_text(text) == shown
 
 
-def test_table_files_have_distinct_names(tmp_path):
-    paths = write_tables(tmp_path, results())
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(path.name for path in paths)
-    assert {"all.md", "all.tex", "mine_x4_box.csv", "mine_x4_box_published.tex"} <= {path.name for path in paths}
-    assert (tmp_path / "all.md").read_text(encoding="utf-8").count("\n## ") == 1
-
-
 def test_latex_compiles_and_nothing_runs_off_the_page(tmp_path):
     if shutil.which("pdflatex") is None:
         pytest.skip("needs pdflatex")
@@ -208,22 +168,3 @@ def test_latex_compiles_and_nothing_runs_off_the_page(tmp_path):
     assert "Overfull" not in done.stdout
     assert "Float too large" not in done.stdout
     assert "Missing character" not in (tmp_path / "all.log").read_text(encoding="latin-1")
-
-
-def test_another_fact_of_a_row_is_a_column_of_every_layout(monkeypatch):
-    runs = Fact("runs", lambda row: len(row.runs) or None, lambda _: True, number=True)
-    for module in (tables, table_layouts):
-        monkeypatch.setattr(module, "FACTS", (*FACTS, runs))
-    table = next(each for each in build_tables(results()) if each.name == "mine_x4_box")
-    head, _, bicubic, dip, *_ = to_markdown(table).split("\n\n")[1].splitlines()
-    assert [line.split("|")[3:5] for line in (head, bicubic, dip)] == [
-        [" seeds ", " runs "], ["     1 ", "    1 "], ["     3 ", "    3 "],
-    ]  # fmt: skip
-    latex = to_latex(table)
-    assert "Scene & Method & Seeds & Runs & RMSE" in latex
-    assert "@{}llrrrr@{}" in latex
-    assert " & DIP & 3 & 3 & " in latex
-    assert "Runs" not in to_latex(table, published=True)
-    frame = pd.read_csv(io.StringIO(to_csv(table)))
-    ours = frame[frame["scene"] == "lucy"].dropna(subset="runs")
-    assert dict(zip(ours["method"], ours["runs"], strict=True)) == {"Bicubic": 1, "DIP": 3, "MSG-V": 1}

@@ -10,11 +10,9 @@ import captures
 import numpy as np
 import pytest
 
-from dsr.app.view import find_results
 from dsr.cli import main
 from dsr.data import arkitscenes, ddrnet_frames, icl, rgbdd, sintel, sunrgbd, tartanair, tofmark
 from dsr.data.folder import Folder
-from dsr.io.depth_files import read_depth_file
 from dsr.io.inputs import Reading, read_picture
 from dsr.io.layouts import find_pairs_of_folder
 from dsr.io.trajectories import read_poses
@@ -195,24 +193,6 @@ def test_times_in_names_decide_rather_than_their_digits(folder):
     assert frame_numbers(find_pairs_of_folder(folder).pairs)[0] == list(range(FRAMES))
 
 
-@pytest.mark.parametrize("given", ["folders", "as a shell lists them"])
-def test_command_gives_each_frame_its_own_pose(folder, tmp_path, capsys, given):
-    pairs(folder, "plain", *PAIRS["two folders"])
-    kinds = {kind: sorted((folder / kind).iterdir()) for kind in ("rgb", "depth")}
-    assert [path.stem for path in kinds["rgb"]][:4] == ["0", "1", "10", "11"]
-    listed = [folder] if given == "folders" else ["--rgb", *kinds["rgb"], "--depth", *kinds["depth"]]
-    arguments = (*listed, "--poses", write_poses(tmp_path / "poses.txt"), "-o", tmp_path / "out")
-    options = ("--method", "nearest", "--only", "depth", "--depth-unit", "mm", "--fov", "60")
-    assert main(["upsample", *map(str, (*arguments, *options))]) == 0
-    capsys.readouterr()
-    for number in range(FRAMES):
-        result = tmp_path / "out" / f"{number}"
-        pose = np.array(json.loads((result / "info.json").read_text())["pose"])
-        assert pose_numbers([pose]) == [number]
-        assert round(2 * float(read_depth_file(result / "depth_metres.tiff").min() - captures.depth().min())) == number
-    assert [path.name for path in find_results(tmp_path / "out")] == [f"{number}" for number in range(FRAMES)]
-
-
 def test_photos_in_an_order_of_the_users_own_keep_it(folder, tmp_path, capsys):
     pairs(folder, "plain", *PAIRS["two folders"])
     order = list(reversed(range(FRAMES)))
@@ -224,16 +204,6 @@ def test_photos_in_an_order_of_the_users_own_keep_it(folder, tmp_path, capsys):
     capsys.readouterr()
     poses = [json.loads((tmp_path / "out" / f"{number}" / "info.json").read_text())["pose"] for number in order]
     assert pose_numbers(np.array(poses)) == list(range(FRAMES))
-
-
-def test_poses_in_order_have_to_be_as_many_as_frames(folder, tmp_path, capsys):
-    pairs(folder, "plain", *PAIRS["two folders"])
-    (folder / "depth" / "7.png").unlink()
-    path = write_poses(tmp_path / "poses.txt")
-    assert main(["upsample", str(folder), "--poses", str(path), "-o", str(tmp_path / "out")]) == 2
-    [line] = capsys.readouterr().err.splitlines()
-    assert f"{path}: expected a pose for each of the 11 frames" in line
-    assert not (tmp_path / "out").exists()
 
 
 DATA_SETS = {

@@ -22,7 +22,6 @@ from dsr.degradation.downsampling import Downsampling
 from dsr.degradation.random_degradation import Everything
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.msg_net import MSGNet
-from dsr.training.callbacks import Curves
 from dsr.training.data_module import Part, PatchData
 from dsr.training.degradation import Degradation
 from dsr.training.module import SuperResolution, WarmupCosine
@@ -105,13 +104,6 @@ def test_stock_loggers_get_losses_scores_and_pictures(tmp_path: Path) -> None:
         rows = list(csv.DictReader(file))
     assert [row["step"] for row in rows if row["train/loss"]] == ["2"]  # the mean of both
     assert [row["step"] for row in rows if row["val/RMSE_v"]] == ["1", "2"]
-
-
-def test_own_curves_stay_the_only_ones(tmp_path: Path) -> None:
-    own = Curves()
-    trainer = _trainer(tmp_path, max_steps=1, callbacks=[own], limit_val_batches=0)
-    trainer.fit(SuperResolution(MSGNet(4), DepthObjective()), _data())
-    assert [each for each in trainer.callbacks if isinstance(each, Curves)] == [own]  # type: ignore[attr-defined]
 
 
 def test_epochs_and_their_validations_are_the_trainers(tmp_path: Path) -> None:

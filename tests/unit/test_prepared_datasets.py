@@ -1,6 +1,5 @@
 """Data sets in their owners' formats: which scenes, prepared how, kept where."""
 
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +8,7 @@ import pytest
 import torch
 
 import dsr.data.preparation as module
-from dsr.data.preparation import Preparation, PreparedDataset, SceneRecord, make_records, rename_records
+from dsr.data.preparation import Preparation, PreparedDataset, SceneRecord, make_records
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
 from dsr.synthetic.rendering import cache_directory
@@ -117,10 +116,6 @@ def test_other_content_settings_or_version_prepare_anew(files, monkeypatch):
     assert source(files).load("a").depth.nanmean() == pytest.approx(7)
 
 
-def test_inpainting_one_scene_does_not_prepare_the_others_anew(files):
-    assert source(files).fingerprint("a") == source(files, preparation=Preparation(48, fill=("b",))).fingerprint("a")
-
-
 def test_damaged_cache_file_is_prepared_anew(files):
     first = source(files).load("a")
     [name] = kept()
@@ -161,17 +156,6 @@ def test_notes_of_a_scene_are_kept_prepared_or_not(files):
         data = PreparedDataset("things", "x", records, ["a"], None, preparation)
         assert data.load("a").notes == ("not metric",)
     assert source(files).load("a").notes == ()
-
-
-def test_scenes_are_prepared_each_time_without_a_writable_cache(files, monkeypatch):
-    monkeypatch.setenv("DSR_CACHE", os.devnull)
-    assert source(files).load("a").depth.nanmean() == pytest.approx(1)
-
-
-def test_renamed_frames_have_their_new_names(files):
-    records = rename_records(make_records(files, frame, "things"), {"first": "deep/c", "second": "z"})
-    assert sorted(records) == ["a", "b", "first"]
-    assert records["first"].load().name == "first"
 
 
 def test_folder_fingerprint_covers_all_files_and_large_ones_by_size_and_time(files, monkeypatch, tmp_path):

@@ -3,14 +3,10 @@
 import re
 from pathlib import Path
 
-import pytest
-import yaml
-
 from dsr.methods import weights
 from dsr.utils.versions import RESULTS, SCENES
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-FORMS = sorted((REPOSITORY / ".github" / "ISSUE_TEMPLATE").glob("*.yml"))
 
 
 def test_history_of_results_begins_with_todays_versions():
@@ -26,16 +22,3 @@ def test_paths_of_contributing_exist():
     paths = re.findall(r"`((?:src|tests|conf)/[\w*./]+)`", text) + re.findall(r"\]\((\w[\w./]+)", text)
     assert len(paths) > 10
     assert [path for path in paths if "NAME" not in path and not list(REPOSITORY.glob(path))] == []
-
-
-@pytest.mark.parametrize("form", FORMS, ids=lambda path: path.stem)
-def test_forms_of_issues_are_whole_and_ask_for_the_version(form):
-    content = yaml.safe_load(form.read_text())
-    if form.stem == "config":
-        return
-    assert {"name", "description", "body"} <= content.keys()
-    fields = [each for each in content["body"] if each["type"] in ("input", "textarea")]
-    assert len({each["id"] for each in fields}) == len(fields) >= 4
-    assert all(each["attributes"]["label"] for each in fields)
-    assert "dsr --version" in form.read_text()
-    assert any(each.get("validations", {}).get("required") for each in fields)

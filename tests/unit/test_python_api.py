@@ -266,15 +266,6 @@ def test_saved_surface_is_a_result_of_the_command(surface: dsr.Surface[np.ndarra
     assert together
 
 
-def test_surface_shows_itself_in_a_notebook(surface: dsr.Surface[np.ndarray]) -> None:
-    html = surface._repr_html_()
-    assert len(html) < 100_000
-    assert html.count("<img ") == html.count("data:image/webp;base64,") == 1
-    assert "32 x 24" in html
-    assert "64 x 48" in html
-    assert repr(surface).startswith("Surface(64 x 48, ")
-
-
 def test_threads_that_share_an_upsampler_get_what_they_would_get_alone() -> None:
     upsampler = dsr.Upsampler()
     maps = [metres(number) for number in range(3)]

@@ -17,16 +17,13 @@ from dsr.evaluation.results import Results
 from dsr.evaluation.run_files import load_results
 from dsr.geometry.shading import render
 from dsr.pictures.depth_views import normals_seen_by
-from dsr.report.page import save_page, scene_content
-from dsr.report.page.scene_content import calibration_data, views_of
+from dsr.report.page import save_page
 from dsr.report.page.value_pictures import (
     LEVELS,
     PictureStore,
     depth_picture,
     error_picture,
-    expected_picture,
     mask_picture,
-    shading_picture,
 )
 
 SPITEFUL = "<img src=x onerror=alert(1)>\"'&</script><script>alert(2)</script>"
@@ -108,17 +105,8 @@ def test_error_is_stored_by_the_root_of_its_fraction_of_the_largest(error, level
     assert error_picture(np.array([[float(error)]]), 2.0)[0, 0] == pytest.approx(level, abs=1)
 
 
-@pytest.mark.parametrize(("error", "level"), [(0, 0), (2, 255), (9, 255), (0.5, 128), (0.02, 26)])
-def test_expected_error_is_stored_by_the_root_of_its_fraction_of_the_largest(error, level):
-    assert expected_picture(np.array([[float(error)]]), 2.0)[0, 0] == pytest.approx(level, abs=1)
-
-
 def test_depth_is_stored_between_its_limits():
     assert depth_picture(np.array([[0.5, 1, 2, 3, 9.0]]), 1, 3).tolist() == [[0, 0, 128, 255, 255]]
-
-
-def test_shadings_are_stored_side_by_side_from_minus_one_to_one():
-    assert shading_picture(np.array([[[-1.0, 0.0, 1.0]]])).tolist() == [[0, 128, 255]]
 
 
 def test_mask_distinguishes_a_hole_from_a_depth_without_a_normal():
@@ -166,23 +154,6 @@ def test_expected_errors_of_holes_are_masked_and_the_normals_beside_them_have_no
     assert mask[9, 20] == mask[10, 19] == 128
 
 
-def test_expected_errors_do_not_change_the_limits_of_the_measured_ones(make_run, tmp_path):
-    runs = [make_run(tmp_path / str(confident), confident=confident) for confident in (False, True)]
-    plain, sure = (saved(folder, load_results([folder]))[2] for folder in runs)
-    assert sure["error"] == plain["error"]
-    assert "expected" not in plain
-    assert "expected" not in plain["surfaces"][1]
-
-
-def test_expected_errors_of_another_size_are_left_out_and_named(make_run, tmp_path):
-    [run] = load_results([make_run(tmp_path / "run", confident=True)]).runs
-    small = changed(run, expected_errors=lambda _: (torch.ones(1, 8, 8), torch.ones(1, 8, 8)))
-    _, data, scene = saved(tmp_path, Results((small,)))
-    assert "expected" not in scene
-    assert any("expected errors of (1, 32, 32), got (1, 8, 8)" in note for note in data["notes"])
-    assert data["problems"][0]["calibration"] == []
-
-
 def test_calibration_compares_expected_and_measured_errors_of_all_scenes(make_run, tmp_path):
     make_run(tmp_path / "runs" / "plain", scenes=("a", "b"))
     make_run(tmp_path / "runs" / "sure", method="sure", label="Sure", scenes=("a", "b"), confident=True)
@@ -203,42 +174,12 @@ def test_calibration_compares_expected_and_measured_errors_of_all_scenes(make_ru
     assert len(row["angle"]["ratios"]) == 10
 
 
-def test_calibration_of_many_pixels_uses_every_few_of_them(make_run, tmp_path, monkeypatch):
-    views = views_of(load_results([make_run(tmp_path / "run", scenes=("a", "b"), size=64, confident=True)]))
-    [every] = calibration_data(views)
-    monkeypatch.setattr(scene_content, "_MOST_PIXELS", 1500)
-    [some] = calibration_data(views)
-    assert some["depth"] != every["depth"]
-    assert some["depth"]["ratios"] == pytest.approx(every["depth"]["ratios"], rel=0.25)
-
-
-def test_calibration_without_a_defined_value_has_none(make_run, tmp_path):
-    [run] = load_results([make_run(tmp_path / "run", confident=True)]).runs
-    truth = run.sample("cube_no_texture").depth
-    zeros = (torch.zeros(1, 32, 32), torch.zeros(1, 32, 32))
-    exact = changed(run, prediction=lambda _: truth, expected_errors=lambda _: zeros)
-    _, data, _ = saved(tmp_path, Results((exact,)))
-    [row] = data["problems"][0]["calibration"]
-    assert row["depth"] == {"ratios": [None] * 10, "share": None, "least": None}
-
-
 def test_limits_of_errors_and_depth_are_the_same_for_all_methods(make_run, tmp_path):
     runs = [make_run(tmp_path / "runs" / name, method=name, label=name) for name in ("a", "b")]
     _, _, scene = saved(tmp_path, load_results(runs))
     assert [surface["label"] for surface in scene["surfaces"]] == ["input", "a", "b", "truth"]
     assert scene["error"]["limit"] <= scene["error"]["largest"]
     assert not any("limit" in surface["error"] for surface in scene["surfaces"][1:3])
-
-
-def test_photo_and_truth_of_several_methods_and_seeds_are_stored_once(make_run, tmp_path):
-    one = saved(tmp_path / "one", load_results([make_run(tmp_path / "runs" / "a", scale=2)]))[0]
-    make_run(tmp_path / "runs" / "b", scale=4)
-    two = saved(tmp_path / "two", load_results([tmp_path / "runs"]))[0]
-    shared = {name for name in one if name.startswith("p")} & set(two)
-    assert len(shared) == len([name for name in one if name.startswith("p")])
-    scenes = [json.loads(two[name]) for name in ("s0", "s1")]
-    assert scenes[0]["photo"] == scenes[1]["photo"]
-    assert scenes[0]["surfaces"][-1]["normals"] == scenes[1]["surfaces"][-1]["normals"]
 
 
 def test_pictures_above_the_budget_are_reduced_and_the_page_says_so(make_run, tmp_path):
@@ -262,17 +203,6 @@ def test_pictures_of_the_first_levels_are_lossless_and_the_second_takes_what_the
         assert (content[:4] == b"RIFF") == (not level.fast)
 
 
-def test_report_too_large_for_fast_compression_stays_lossless(make_run, tmp_path):
-    results = load_results([make_run(tmp_path / "run", size=208)])
-    pictures = {}
-    for budget in (60, None):
-        page = tmp_path / "page.html"
-        [note] = save_page(page, results, budget_mb=budget or 0.999 * pictures[60] / 1e6)
-        assert note.startswith("pictures: lossless, 8 bits; ")
-        pictures[budget] = sum(len(content) for name, content in blocks(page).items() if name.startswith("p"))
-    assert pictures[None] < pictures[60]
-
-
 def test_reduced_values_are_averages_of_valid_pixels():
     pool = PictureStore(dataclasses.replace(LEVELS[0], longest=2))
     values = np.array([[1.0, 3, 5, np.nan], [1, 3, 7, 9], [np.nan, np.nan, 2, 2], [np.nan, 4, 2, 2]])
@@ -280,12 +210,6 @@ def test_reduced_values_are_averages_of_valid_pixels():
     assert pool.reduced
     assert reduced[known].tolist() == [2, 7, 2]
     assert known.tolist() == [[True, True], [False, True]]
-
-
-@pytest.mark.parametrize("budget", [0, -1, math.nan])
-def test_budget_that_is_not_positive_is_refused(make_run, tmp_path, budget):
-    with pytest.raises(ValueError, match="budget_mb: expected a positive number"):
-        save_page(tmp_path / "index.html", load_results([make_run(tmp_path / "run")]), budget_mb=budget)
 
 
 def test_page_has_mean_and_standard_deviation_of_several_seeds(make_run, tmp_path):
@@ -356,16 +280,6 @@ def test_scene_without_truth_has_renderings_and_no_errors(make_run, tmp_path):
     assert "error" not in scene["surfaces"][1]
 
 
-def test_scene_without_truth_has_expected_errors_with_limits_of_their_own(make_run, tmp_path):
-    [run] = load_results([make_run(tmp_path / "run", confident=True)]).runs
-    stored = dataclasses.replace(run.sample("cube_no_texture"), depth=None)
-    _, data, scene = saved(tmp_path, Results((changed(run, sample=lambda _: stored),)))
-    assert scene["error"]["limit"] == pytest.approx(np.percentile(run.expected_errors("cube_no_texture")[0], 98))
-    assert "error" not in scene["surfaces"][1]
-    assert scene["surfaces"][1]["expected"].keys() == {"depth", "angle"}
-    assert data["problems"][0]["calibration"] == []
-
-
 def test_names_with_tags_are_escaped(make_run, tmp_path):
     [run] = load_results([make_run(tmp_path / "run")]).runs
     spiteful = dataclasses.replace(run, label=SPITEFUL, dataset=SPITEFUL)
@@ -375,18 +289,6 @@ def test_names_with_tags_are_escaped(make_run, tmp_path):
     assert "<img" not in text
     assert "alert(2)</script>" not in text
     assert json.loads(blocks(path)["data"])["methods"] == [SPITEFUL]
-
-
-def test_links_lead_to_the_files_beside_the_page(make_run, tmp_path):
-    report = tmp_path / "report"
-    for name in ("tables/all 1.csv", "tables/all.tex", "figures/x.pdf", "figures/x.log", "other/y.csv"):
-        (report / name).parent.mkdir(parents=True, exist_ok=True)
-        (report / name).touch()
-    results = load_results([make_run(tmp_path / "run")])
-    _, data, _ = saved(tmp_path, results)
-    assert [link["address"] for link in data["links"]] == ["tables/all%201.csv", "tables/all.tex", "figures/x.pdf"]
-    _, data, _ = saved(tmp_path, results, tables=[report / "other" / "y.csv", report / "absent.csv"])
-    assert [link["name"] for link in data["links"]] == ["other/y.csv", "figures/x.pdf"]
 
 
 def test_progress_is_reported_and_an_interrupted_page_leaves_the_old_one(make_run, tmp_path):
@@ -404,11 +306,3 @@ def test_progress_is_reported_and_an_interrupted_page_leaves_the_old_one(make_ru
         save_page(path, results, progress=interrupt)
     assert path.read_bytes() == before
     assert [file.name for file in path.parent.iterdir()] == ["index.html"]
-
-
-def test_settings_times_and_environment_are_listed_by_dotted_key(make_run, tmp_path):
-    _, data, _ = saved(tmp_path, load_results([make_run(tmp_path / "run")]))
-    [run] = data["runs"]
-    assert run["settings"]["method.name"] == "bicubic"
-    assert run["versions"]["packages.dsr"] == "0.1.0"
-    assert data["problems"][0]["seconds"] == {"Bicubic": {"cube_no_texture": 0.25}}

@@ -8,7 +8,7 @@ import torch
 
 from dsr.evaluation.results import BenchmarkSetting
 from dsr.evaluation.run_files import load_results
-from dsr.evaluation.store import prediction_path, sample_path
+from dsr.evaluation.store import sample_path
 from dsr.sample import DepthSample
 
 
@@ -98,11 +98,6 @@ def test_newer_of_two_predictions_counts_with_a_note(make_run, tmp_path):
     assert ": s; " in note
 
 
-def test_directory_named_twice_is_read_once(make_run, tmp_path):
-    make_run(tmp_path / "a", scenes=("s",))
-    assert len(load_results([tmp_path, tmp_path / "a"]).runs) == 1
-
-
 @pytest.mark.parametrize(
     ("name", "content"),
     [
@@ -170,22 +165,6 @@ def test_runs_can_be_chosen_and_unknown_ones_are_refused(make_run, tmp_path):
         results.only(["DIP"])
     with pytest.raises(ValueError, match="there is none"):
         results.only(["Bicubic"], scales=[2])
-
-
-def test_scenes_without_a_solution_are_noted(make_run, tmp_path):
-    make_run(tmp_path / "a", label="EG", method="eg", scenes=("s",))
-    change(tmp_path / "a", "summary.json", unanswered={"t": "t: no edge is closed"})
-    assert load_results([tmp_path]).notes == ("EG at x4 has no solution for t: no edge is closed",)
-
-
-def test_runs_without_any_solution_are_refused_with_the_reason(make_run, tmp_path):
-    make_run(tmp_path / "a", label="EG", method="eg", scenes=("s",))
-    prediction_path(tmp_path / "a", "s").unlink()
-    with pytest.raises(ValueError, match=r"expected runs with a prediction, found none$"):
-        load_results([tmp_path])
-    change(tmp_path / "a", "summary.json", unanswered={"s": "s: no edge is closed"})
-    with pytest.raises(ValueError, match=r"found none; EG at x4 has no solution for s: no edge is closed$"):
-        load_results([tmp_path])
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,6 @@
 """Frames as other programs read them: axes, units, intrinsics and poses, read back by code of their own."""
 
 import json
-from dataclasses import replace
-from datetime import datetime
 from pathlib import Path
 
 import cv2
@@ -46,15 +44,6 @@ def make(tmp_path):
         return Frame(name, camera, pose, folder / "rgbd" / "color.png", folder / "depth_metres.tiff")
 
     return frame
-
-
-def world_points(frame):
-    """Return the points of a frame in the world, (3, H, W), by the definition of a pinhole camera."""
-    rows, columns = np.mgrid[0 : frame.camera.height, 0 : frame.camera.width]
-    z, camera = np.load(frame.depth), frame.camera
-    points = np.stack(((columns - camera.cx) / camera.fx * z, (rows - camera.cy) / camera.fy * z, z))
-    pose = frame.pose.numpy()
-    return np.einsum("ij,jhw->ihw", pose[:3, :3], points) + pose[:3, 3, None, None]
 
 
 def test_rgbd_has_millimetres_and_column_major_intrinsics(make):
@@ -141,12 +130,6 @@ def test_transforms_of_different_cameras_have_intrinsics_for_each_frame(make, tm
     assert [each["fl_x"] for each in entries["frames"]] == [10, 20]
 
 
-def test_single_frame_without_a_pose_stands_at_the_origin(make, tmp_path):
-    write_transforms(tmp_path / "t.json", [make(0, pose=None)])
-    [entry] = json.loads((tmp_path / "t.json").read_text())["frames"]
-    assert entry["transform_matrix"] == np.diag([1.0, -1, -1, 1]).tolist()
-
-
 @pytest.mark.parametrize(("part", "write"), [("nerfstudio", write_transforms), ("gaussian", write_splatting)])
 def test_frames_without_poses_are_refused_in_one_line(make, tmp_path, part, write):
     with pytest.raises(ValueError, match=rf"^{part}: expected a pose of each frame, got none for 1 of 2, .*room/001"):
@@ -169,13 +152,6 @@ def test_open3d_folder_has_colour_depth_intrinsics_and_trajectory(make, tmp_path
     lines = (tmp_path / "o" / "trajectory.log").read_text().splitlines()
     assert lines[0::5] == ["0 0 1", "1 1 2"]
     np.testing.assert_array_equal(np.loadtxt(lines[6:10]), POSE)
-
-
-def test_open3d_folder_without_poses_or_with_two_cameras_says_what_it_has(make, tmp_path):
-    frames = [make(0), make(1, pose=None, camera=Camera(12, 8, 20.0, 21.0, 5.25, 3.5))]
-    names = {file.relative_to(tmp_path).as_posix() for file in write_open3d(tmp_path, frames)}
-    assert {"intrinsics/room_000.json", "intrinsics/room_001.json"} <= names
-    assert not {"trajectory.log", "intrinsic.json"} & names
 
 
 def test_splatting_depth_is_inverse_depth_after_scale_and_offset(make, tmp_path):
@@ -218,16 +194,6 @@ def test_splatting_scene_is_a_colmap_model_of_the_same_points(make, tmp_path):
     assert points[0, 4:7].tolist() == [0, 0, 255]
 
 
-def test_splatting_without_poses_has_depth_alone_and_holes_alone_are_refused(make, tmp_path):
-    frame = make(0, pose=None)
-    write_splatting(tmp_path / "g", [frame])
-    assert [file.name for file in (tmp_path / "g/sparse/0").iterdir()] == ["depth_params.json"]
-    write_depth_file(frame.depth, np.full((8, 12), np.nan, np.float32))
-    with pytest.raises(ValueError, match=r"^gaussian: expected some depth, got holes alone"):
-        write_splatting(tmp_path / "h", [frame])
-    assert not (tmp_path / "h").exists()
-
-
 def read_recording(path):
     """Return the columns of a recording by entity and name, as rerun reads them."""
     chunk = pytest.importorskip("rerun.chunk", reason="pip install -e '.[rerun]'")
@@ -266,34 +232,6 @@ def test_rerun_recording_is_read_back(make, tmp_path):
     assert ("/camera/depth", "time") not in columns
 
 
-@pytest.mark.parametrize(("ups", "axes"), [(("y", "y"), (3, 1, 6)), (("z", "z"), (3, 5, 1)), (("", ""), (3, 2, 5)),
-                                           (("y", ""), (3, 2, 5))])  # fmt: skip
-def test_rerun_world_has_the_captures_axes(make, tmp_path, ups, axes):
-    """The numbers are rerun's: 1 up, 2 down, 3 right, 4 left, 5 forward, 6 back."""
-    pytest.importorskip("rerun", reason="pip install -e '.[rerun]'")
-    write_rerun(tmp_path / "s.rrd", [replace(make(number), up=up) for number, up in enumerate(ups)])
-    columns = read_recording(tmp_path / "s.rrd")
-    [[coordinates]] = columns["/", "ViewCoordinates:xyz"]
-    assert tuple(coordinates) == axes
-    assert all(tuple(each) == (3, 2, 5) for [each] in columns["/camera", "Pinhole:camera_xyz"])
-
-
-@pytest.mark.parametrize("start", [12.5, 1305031102.25])
-def test_rerun_timeline_is_the_frames_times(make, tmp_path, start):
-    pytest.importorskip("rerun", reason="pip install -e '.[rerun]'")
-    write_rerun(tmp_path / "s.rrd", [replace(make(number), time=start + number / 2) for number in range(2)])
-    times = read_recording(tmp_path / "s.rrd")["/camera/depth", "time"]
-    seconds = [each.timestamp() if isinstance(each, datetime) else each.total_seconds() for each in times]
-    np.testing.assert_allclose(seconds, [start, start + 0.5], atol=1e-6)
-
-
-def test_rerun_without_the_library_names_the_extra(make, tmp_path, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "rerun", None)
-    with pytest.raises(ValueError, match=r"^rerun: expected the library rerun-sdk; pip install -e '.\[rerun\]'"):
-        write_rerun(tmp_path / "scene.rrd", [make(0)])
-    assert not (tmp_path / "scene.rrd").exists()
-
-
 @pytest.mark.parametrize(
     "value",
     [
@@ -309,11 +247,6 @@ def test_rerun_without_the_library_names_the_extra(make, tmp_path, monkeypatch):
 def test_pose_that_is_not_rigid_is_refused(value):
     with pytest.raises(ValueError, match=r"^info.json: pose: expected a rigid transform of 4 x 4 numbers, got "):
         parse_pose("info.json: pose", value)
-
-
-def test_pose_is_read_and_none_stays_none():
-    assert parse_pose("x", None) is None
-    assert torch.equal(parse_pose("x", POSE.tolist()), POSE)
 
 
 def test_damaged_depth_of_a_frame_is_refused(make):

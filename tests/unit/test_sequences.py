@@ -102,22 +102,6 @@ def test_holes_are_filled_by_what_others_see_and_stay_without():
     assert torch.equal(empty.depth.isnan(), depth.isnan())
 
 
-def test_single_outlier_gives_way_to_the_other_frames():
-    first, *others = views(deviation=0.002)
-    depth = first.depth.clone()
-    depth[:, 10, 10] = 1.0
-    fused = fuse_views(View(depth, CAMERA, first.pose), others)
-    assert float(fused.depth[0, 10, 10]) == pytest.approx(float(room(first.pose)[0, 10, 10]), abs=0.05)
-
-
-def test_no_neighbours_leave_the_map_as_it_is():
-    first = views()[0]
-    fused = fuse_views(first, [])
-    assert torch.allclose(fused.depth, first.depth, rtol=1e-9)
-    assert bool((fused.votes == 1).all())
-    assert not bool(fused.others.any() | fused.seeing.any())
-
-
 def test_frames_count_by_their_expected_errors():
     first = views()[0]
     flat = torch.ones_like(first.depth)

@@ -4,7 +4,6 @@ import argparse
 import base64
 import copy
 import io
-import itertools
 import json
 import math
 import re
@@ -25,7 +24,7 @@ from dsr.report.study.answers import files_of, read_all, read_answers
 from dsr.report.study.choice import Choice
 from dsr.report.study.intervals import agreement, average_fraction, bootstrap_of_average, wilson
 from dsr.report.study.key import Candidate, Key, Trial, read_key, write_key
-from dsr.report.study.percentages import ALL, AVERAGE, COLUMNS, collect, remarks, tables_of
+from dsr.report.study.percentages import ALL, AVERAGE, COLUMNS, collect, remarks
 from dsr.report.study.questionnaire import build_study, grey_png
 from dsr.utils.console import open_console
 
@@ -98,23 +97,6 @@ def test_wilson_interval_equals_scipy(count, n):
     assert wilson(count, n) == pytest.approx((theirs.low, theirs.high), abs=1e-12)
 
 
-def test_interval_without_answers_is_unknown():
-    assert all(math.isnan(bound) for bound in wilson(0, 0))
-
-
-def test_interval_of_an_average_over_one_scene_is_that_of_the_binomial():
-    asked = np.ones((400, 1), int)
-    chosen = (np.arange(400) < 120).astype(int)[:, None]
-    half = 1.96 * math.sqrt(0.3 * 0.7 / 400)
-    assert bootstrap_of_average(chosen, asked) == pytest.approx((0.3 - half, 0.3 + half), abs=0.005)
-
-
-def test_people_who_answer_alike_everywhere_count_as_one_answer_each():
-    chosen = np.repeat((np.arange(400) < 120).astype(int)[:, None], 9, axis=1)
-    one = bootstrap_of_average(chosen[:, :1], np.ones((400, 1), int))
-    assert bootstrap_of_average(chosen, np.ones((400, 9), int)) == pytest.approx(one)
-
-
 def test_interval_of_an_average_is_wilsons_with_one_answer_a_person_where_all_agree():
     ones = np.ones((12, 5), int)
     assert bootstrap_of_average(ones, ones) == pytest.approx(wilson(12, 12))
@@ -132,10 +114,6 @@ def test_agreement_equals_fleiss_own_example():
         [7, 7, 0, 0, 0], [3, 2, 6, 3, 0], [2, 5, 3, 2, 2], [6, 5, 2, 1, 0], [0, 2, 2, 3, 7],
     ]  # fmt: skip
     assert agreement(np.array(counts)) == pytest.approx((0.378, 0.210), abs=5e-4)
-
-
-def test_agreement_of_one_person_is_unknown():
-    assert all(math.isnan(value) for value in agreement(np.array([[1, 0], [0, 1]])))
 
 
 def test_percentages_of_a_scene_equal_a_count_by_hand(tmp_path):
@@ -163,14 +141,6 @@ def test_averages_are_means_over_scenes_with_an_interval_around_them(tmp_path):
 def test_first_choices_of_all_methods_add_up_to_100_percent(tmp_path):
     shares = collected(tmp_path, *FOUR).groupby(["dataset", "scene"])[["user_first", "user_second", "user_top2"]].sum()
     assert shares.to_numpy() == pytest.approx(np.array([[100, 100, 200]] * len(shares)))
-
-
-def test_average_over_datasets_weighs_their_scenes_equally(tmp_path):
-    other = Trial("paper", "lucy", 4, "box", CANDIDATES)
-    key = Key(KEY.study, "e4", 2, 0, {**KEY.trials, "s2": other})
-    table = collected(tmp_path, *FOUR, key=key)
-    assert row(table, "paper", AVERAGE, "Bicubic")["user_first"] == 50
-    assert row(table, ALL, AVERAGE, "Bicubic")["user_first"] == 37.5
 
 
 def test_scene_counts_only_those_who_saw_it(tmp_path):
@@ -275,25 +245,6 @@ def test_first_finished_of_one_persons_files_counts(tmp_path):
     assert left_out == [f"{files[0]}: duplicate of {files[1]} (the same person), which was finished first"]
 
 
-def test_incomplete_file_does_not_replace_the_persons_complete_one(tmp_path):
-    half = answers("p1", "BV", "BV", minute=1)
-    half["trials"][1]["second"] = None
-    given, left_out = read_all(written(tmp_path, half, answers("p1", "VB", "VB", minute=9)), KEY)
-    assert [each.file.name for each in given] == ["1.json"]
-    assert len(left_out) == 1
-
-
-def test_identical_answers_under_another_name_count_once(tmp_path):
-    given, left_out = read_all(written(tmp_path, FOUR[0], FOUR[0] | {"participant": "p7"}), KEY)
-    assert len(given) == 1
-    assert "identical answers" in left_out[0]
-
-
-def test_identical_choices_of_two_people_both_count(tmp_path):
-    given, left_out = read_all(written(tmp_path, answers("p1", "VB", "VB"), answers("p2", "VB", "VB")), KEY)
-    assert (len(given), left_out) == (2, [])
-
-
 def test_directory_stands_for_its_json_files_and_a_file_named_twice_counts_once(tmp_path):
     (tmp_path / "deep").mkdir()
     files = [*written(tmp_path, FOUR[0]), *written(tmp_path / "deep", FOUR[1])]
@@ -316,14 +267,6 @@ def test_key_round_trips_and_a_damaged_one_is_refused(tmp_path):
         read_key(path)
     with pytest.raises(ValueError, match="there is none"):
         read_key(tmp_path / "none.json")
-
-
-def test_terminal_tables_show_percentages_with_intervals(tmp_path, capsys):
-    tables = list(tables_of(collected(tmp_path, *FOUR)))
-    assert len(tables) == 1
-    open_console().print(tables[0])
-    [line] = [line for line in capsys.readouterr().out.splitlines() if "cube" in line]
-    assert line.split() == ["cube", "MSG-V", "75.0", "(30-95)", "25.0", "(5-70)", "100.0", "(51-100)", "4"]
 
 
 # The page
@@ -387,13 +330,6 @@ def test_page_reveals_no_method_scene_or_directory(tmp_path, runs):
     assert len(sizes) == 1
 
 
-def test_page_order_is_that_of_hashes(tmp_path, runs):
-    content, _ = content_of(build_study(load_results([runs]), tmp_path / "study").page)
-    assert content["scenes"] == sorted(content["scenes"], key=lambda scene: scene["id"])
-    for scene in content["scenes"]:
-        assert list(scene["images"]) == sorted(scene["images"])
-
-
 def test_same_runs_give_the_same_study_and_others_another(tmp_path, runs):
     results = load_results([runs])
     first = build_study(results, tmp_path / "one")
@@ -403,28 +339,12 @@ def test_same_runs_give_the_same_study_and_others_another(tmp_path, runs):
     assert third.key.study != first.key.study
 
 
-def test_key_has_the_methods_in_the_order_of_the_results(tmp_path, runs):
-    results = load_results([runs])
-    for trial in build_study(results, tmp_path / "study").key.trials.values():
-        labels = [candidate.label for candidate in trial.candidates.values()]
-        assert labels == [label for label in results.methods() if label in labels]
-
-
 def test_scene_of_one_method_alone_is_left_out_and_incomplete_ones_are_noted(tmp_path, runs, make_run):
     make_run(runs / "more", scenes=["alone"])
     built = build_study(load_results([runs]), tmp_path / "study")
     assert {trial.scene for trial in built.key.trials.values()} == {"cube_no_texture", "<_script><b>statue"}
     assert any("alone x4 box: only Bicubic has a prediction" in note for note in built.notes)
     assert any("without DIP" in note for note in built.notes)
-
-
-def test_lowest_of_several_seeds_is_shown(tmp_path, runs, make_run):
-    make_run(runs / "again", method="msg_v", label="MSG-V", seed=1)
-    built = build_study(load_results([runs]), tmp_path / "study", Choice(scenes=["cube_no_texture"]))
-    [trial] = built.key.trials.values()
-    assert sorted(each.run for each in trial.candidates.values()) == sorted(
-        str(path) for path in runs.glob("folder_of_*")
-    )
 
 
 @pytest.mark.parametrize(
@@ -476,24 +396,6 @@ def test_missing_truth_is_hidden_in_every_picture_alike():
     assert np.argwhere(~known).tolist() == [[1, 3], [2, 2], [2, 3]]
 
 
-def test_fourth_rendering_of_a_frontal_wall_is_white():
-    camera = Camera(8, 6, 8.0, 8.0, 3.5, 2.5)
-    shades = rendering(torch.full((1, 6, 8), 2.0), camera, "e4")
-    picture = decoded(base64.b64encode(grey_png(shades, np.isfinite(shades))))
-    assert (picture == 255).all()
-
-
-def test_identical_looking_methods_are_reported_and_keep_distinct_ids(tmp_path, make_run):
-    for method in ("msg", "copy"):
-        make_run(tmp_path / method, method=method, label=method)
-    file = "predictions/cube_no_texture.npz"
-    (tmp_path / "copy" / file).write_bytes((tmp_path / "msg" / file).read_bytes())
-    built = build_study(load_results([tmp_path]), tmp_path / "study")
-    [trial] = built.key.trials.values()
-    assert len(trial.candidates) == 2
-    assert any("copy and msg look exactly the same" in note for note in built.notes)
-
-
 class Commands:
     """What the command line adds its commands to."""
 
@@ -518,27 +420,3 @@ def test_command_collects_valid_answers_and_reports_the_others(tmp_path, capsys)
     table = pd.read_csv(tmp_path / "table.csv")
     assert tuple(table.columns) == COLUMNS
     assert row(table, "simgeo", "cube", "MSG-V")["user_first"] == 75
-
-
-def test_command_refuses_a_study_without_a_valid_answer(tmp_path):
-    write_key(tmp_path / "key.json", KEY)
-    files = written(tmp_path, "{", "[]")
-    with pytest.raises(ValueError, match="answers that count, got none in 2 files"):
-        Commands()("collect", tmp_path, *files)
-    assert not (tmp_path / "study.csv").exists()
-
-
-def test_command_builds_with_the_given_options(tmp_path, runs, capsys):
-    words = ("--scale", 4, "--methods", "bicubic", "msg_v", "--repeat", 1, "--send-to", "Post it.")
-    assert Commands()("build", runs, *words, "-o", tmp_path / "study") == []
-    content, text = content_of(tmp_path / "study" / "index.html")
-    assert (content["perPerson"], content["repeat"]) == (2, 1)
-    assert "Post it." in text
-    assert "3 questions for each person" in capsys.readouterr().out
-
-
-def test_permutations_that_the_page_may_draw_are_all_accepted(tmp_path):
-    for number, order in enumerate(itertools.permutations(CANDIDATES)):
-        content = answers(f"p{number}", "VB", "VD")
-        content["trials"][0]["order"] = list(order)
-        assert read_answers(written(tmp_path, content)[0], KEY).given[0].first == "aa"

@@ -16,13 +16,9 @@ from dsr.geometry.camera import Camera
 from dsr.geometry.mesh import triangulate
 from dsr.report.surface_packing import (
     Grid,
-    error_levels,
-    factor_for,
     find_joints,
     pack_grid,
     reduce_depth,
-    reduce_errors,
-    reduce_mask,
 )
 from dsr.report.surface_page import ViewedResult, is_view, pack_result, save_view
 
@@ -84,17 +80,6 @@ def test_inverse_depth_is_read_back_to_24_bits():
     assert np.nanmax(np.abs(inverse - expected)) <= 0.51 * step
 
 
-def test_map_of_one_depth_is_read_back():
-    inverse, _, _ = unpack(*pack_grid(grid(np.full((64, 64), 3.0))))
-    np.testing.assert_allclose(inverse, 1 / 3, rtol=1e-9)
-
-
-def test_plane_takes_few_bytes():
-    v, u = np.mgrid[:64, :64]
-    _, text = pack_grid(grid(1 / (0.2 + 0.003 * u + 0.002 * v)))
-    assert len(text) < 64 * 64
-
-
 @pytest.mark.parametrize("kind", ["certain", "all"])
 def test_flags_join_what_the_mesh_joins(kind):
     depth = waves()
@@ -124,26 +109,6 @@ def test_reduced_surface_is_cut_where_the_whole_one_is():
     assert not find_joints(reduce_depth(depth, 5), 1)[0][:6].all()
 
 
-def test_joints_do_not_depend_on_how_many_pixels_are_held_at_a_time(monkeypatch):
-    whole = find_joints(waves(), 3)
-    monkeypatch.setattr("dsr.report.surface_packing._STRIP", 500)
-    for found, expected in zip(find_joints(waves(), 3), whole, strict=True):
-        np.testing.assert_array_equal(found, expected)
-
-
-def test_error_levels_are_logarithmic_between_the_ends():
-    values = np.array([[0.0, 1.0, math.sqrt(60), 60, 1e9, np.nan]])
-    assert error_levels(values, 1, 60).tolist() == [[1, 1, 128, 255, 255, 0]]
-
-
-@pytest.mark.parametrize(
-    ("size", "most", "factor"),
-    [((1440, 1920), 500_000, 3), ((480, 640), 307_200, 1), ((480, 640), 307_199, 2), ((4, 100_000), 10, 2)],
-)
-def test_factor_is_the_smallest_that_keeps_the_limit(size, most, factor):
-    assert factor_for(*size, most) == factor
-
-
 def test_reduced_plane_is_the_plane_seen_by_the_reduced_camera():
     camera = Camera(30, 21, 40.0, 42.0, 14.0, 9.0)
     inverse_of = lambda camera: 0.3 + (camera.rays()[0] * 0.2 + camera.rays()[1] * 0.1).numpy()  # noqa: E731
@@ -159,16 +124,6 @@ def test_reduction_does_not_mix_surfaces_and_keeps_holes():
     assert set(found[np.isfinite(found)].round(12)) == {2.0, 3.0}
     assert np.isnan(found).tolist()[0] == [True, True, False, False]  # of the second block six pixels are holes
     assert not np.isnan(found[2:]).any()
-
-
-def test_reduced_errors_are_the_mean_of_the_known_ones():
-    errors = np.array([[1.0, 3, np.nan, np.nan], [5, np.nan, np.nan, np.nan]])
-    np.testing.assert_array_equal(reduce_errors(errors, 2), [[3, np.nan]])
-
-
-def test_reduced_mask_is_where_half_of_a_block_is():
-    mask = np.array([[1, 1, 1, 0], [0, 0, 0, 0]]) > 0
-    assert reduce_mask(mask, 2).tolist() == [[True, False]]
 
 
 def result(name="r", **values):
@@ -235,8 +190,3 @@ def test_page_asks_nobody_and_escapes_every_name(tmp_path):
         digest = base64.b64encode(hashlib.sha256(inner.encode()).digest()).decode()
         assert f"{source} 'sha256-{digest}'" in text
     assert 'alt="&lt;img' in text
-
-
-def test_page_says_that_another_file_is_none_of_its_kind(tmp_path):
-    (tmp_path / "page.html").write_text("<!DOCTYPE html><p>mine</p>")
-    assert not is_view(tmp_path / "page.html")
