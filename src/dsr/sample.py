@@ -264,13 +264,6 @@ class DepthSample:
         return None if self.depth is None else self.depth.isfinite()
 
 
-def slope(size: int) -> Scene:
-    """Return a grey slope of ``size`` x ``size`` pixels, 1 to 2 m away, that stands for any scene of this size."""
-    camera = Camera(size, size, size, size, (size - 1) / 2, (size - 1) / 2)
-    depth = torch.linspace(1, 2, size, dtype=torch.float64).repeat(1, size, 1)
-    return Scene("example", "slope", torch.full((3, size, size), 0.5), camera, depth)
-
-
 def _read_unit(entries: Mapping[str, Any]) -> Unit:
     """Return the unit of a sample's description."""
     limits = entries["limits"]

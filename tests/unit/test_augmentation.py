@@ -13,7 +13,7 @@ from dsr.geometry.camera import Camera
 from dsr.geometry.shading import lights, render
 from dsr.geometry.surface import depth_to_normals
 from dsr.sample import Scene
-from dsr.training.augmentation import augment, mirror, rotate90
+from dsr.training.patches import augment, mirror, rotate90
 from dsr.training.settings import PatchSettings
 
 CAMERA = Camera(width=31, height=23, fx=30.0, fy=27.0, cx=13.3, cy=9.9, baseline=0.1, doffs=0.7)

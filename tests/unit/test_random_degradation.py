@@ -17,7 +17,7 @@ from dsr.degradation.random_degradation import Everything
 from dsr.degradation.random_fields import add_folds, displace
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
-from dsr.training.augmentation import soften
+from dsr.training.patches import soften
 
 CLEAN = Everything(noises={"none": 1}, holes={"none": 1}, displaced=0, rounded=0, folds=0, relief=0, told=1)
 

@@ -34,10 +34,9 @@ from dsr.sample import CENTIMETRES, Scene, Unit
 from dsr.training.data_module import WholeScenes, collate_scene
 from dsr.training.degradation import Batch, Degradation, to_tensors
 from dsr.training.module import SuperResolution, WarmupCosine
-from dsr.training.objective import DepthObjective, SurfaceObjective, balance_weight, to_depth
+from dsr.training.objective import DepthObjective, SurfaceObjective, balance_weight, shading_loss, to_depth
 from dsr.training.patches import Patches
 from dsr.training.settings import PatchSettings
-from dsr.training.shading import shading_loss
 
 BOX = Downsampling("box")
 X2 = Degradation(2, BOX)
