@@ -271,25 +271,6 @@ def test_folds_keep_holes_and_shade_their_surroundings() -> None:
         assert float(folded.depth.nan_to_num(1).min()) > 0
 
 
-def test_weak_noise_leaves_the_stairs_of_a_sensor_that_counts_in_steps() -> None:
-    """On a slanted wall; its steps are those of one of the sensors, and most values lie at whole multiples."""
-    ramp = torch.linspace(10, 14, 200).repeat(1, 100, 1)
-    stairs = smoothed = drawn = 0
-    for seed in range(60):
-        counted = random_noise._count(
-            ramp, 0.02 * torch.randn(ramp.shape, generator=_generator(seed)), _generator(seed)
-        )
-        assert float((counted - ramp).abs().max()) < 0.4
-        eighths = (8 * counted - (8 * counted).round()).abs()
-        stairs += bool(eighths.max() < 1e-3)
-        smoothed += bool((eighths.median() > 1e-3) & ((counted - ramp).std() > 0.015))
-        whole = (counted - counted.round()).abs()
-        drawn += bool((whole < 0.1).float().mean() > 0.28)  # 0.2 where no value is favoured
-    assert stairs > 3
-    assert smoothed > 3
-    assert drawn > 3
-
-
 def test_structured_light_loses_pixels_at_steps_and_on_steep_surfaces() -> None:
     """Of a sphere, more at its border than in its middle, and nothing on a wall that faces the sensor."""
     v, u = torch.meshgrid(torch.linspace(-1.2, 1.2, 128), torch.linspace(-1.2, 1.2, 128), indexing="ij")

@@ -82,8 +82,7 @@ class SuperResolution(lightning.LightningModule):
 
     """
 
-    logs_curves = True
-    """Whether it logs losses and speed where the trainer has no :class:`~dsr.training.callbacks.Curves`."""
+    logs_curves = True  # losses and speed, where the trainer has no Curves
 
     def __init__(
         self,
@@ -121,12 +120,7 @@ class SuperResolution(lightning.LightningModule):
         return [] if there else [Curves()]
 
     def forward(self, batch: Batch) -> Tensor:
-        """Return high-resolution depth by the averaged weights, (B, 1, H, W) in metres; NaN where there is none.
-
-        Args:
-            batch: low-resolution maps and photos, as of :func:`dsr.training.degradation.to_tensors`.
-
-        """
+        """Return high-resolution depth by the averaged weights, (B, 1, H, W) in metres; NaN where there is none."""
         with self._exact():
             return to_depth(self.average.answer_scene(batch).to(batch["disparity_lr"].dtype), batch)
 
