@@ -29,7 +29,7 @@ from dsr.methods.networks.facets_method import SPECIAL
 from dsr.methods.recipe import Run, read_recipe
 from dsr.metrics.calibration import error_ratios, measured_errors, squared_error_share
 from dsr.sample import DepthSample
-from dsr.training.augmentation import soften
+from dsr.training.patches import soften
 
 CLEAN = dict(SPECIAL.keys())
 """Depth steps of the maps without noise, by their kernel."""

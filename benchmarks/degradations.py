@@ -34,7 +34,7 @@ from dsr.degradation.random_degradation import Everything
 from dsr.degradation.random_noise import NOISES
 from dsr.geometry.camera import Camera
 from dsr.pictures.depth_views import rendering
-from dsr.training.augmentation import soften
+from dsr.training.patches import soften
 
 SIDE = 256
 """Pixels of a patch, along an axis."""

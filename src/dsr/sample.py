@@ -24,9 +24,9 @@ from dsr.utils.guards import TooLargeError, parse_json
 from dsr.utils.ratios import as_ratio, fits_ratio, round_ratio
 from dsr.utils.records import derived
 
+# Limits of depth in metres: a micrometre, and beyond the Moon. Within them, the inverse and the cube of a depth are
+# ordinary float32 numbers; what lies outside has a wrong unit, or marks a hole or the sky.
 NEAREST, FARTHEST = 1e-6, 1e9
-"""Limits of depth in metres: a micrometre, nearer than any lens focuses, and beyond the Moon. Within them, the inverse
-and the cube of a depth are ordinary float32 numbers; what lies outside has a wrong unit, or marks a hole or the sky."""
 
 
 class AllHolesError(ValueError):
@@ -99,8 +99,7 @@ class Scene:
 
     def __post_init__(self) -> None:
         """Check shapes and value ranges."""
-        _expect_rgb(self.name, self.rgb, self.camera)
-        _expect_regions(self.name, self.regions, self.camera)
+        _expect_photo(self.name, self.rgb, self.regions, self.camera)
         if self.depth is None and not self.measured:
             raise ValueError(f"{self.name}: expected a depth map, high-resolution or measured, got none")
         if self.depth is not None:
@@ -121,10 +120,13 @@ class Scene:
         window = (slice(None), slice(top, top + height), slice(left, left + width))
         measured = {}
         for ratio, depth_lr in self.measured.items():
-            down, across = self._steps(ratio)
-            rows, columns = (top / down, (top + height) / down), (left / across, (left + width) / across)
-            if all(place.denominator == 1 for place in (*rows, *columns)):
-                (first_row, end_row), (first_column, end_column) = map(int, rows), map(int, columns)
+            down = across = Fraction(ratio)  # height and width of a pixel of the map in the photo's pixels
+            if not isinstance(ratio, int):
+                down = Fraction(self.camera.height, depth_lr.shape[-2])
+                across = Fraction(self.camera.width, depth_lr.shape[-1])
+            places = (top / down, (top + height) / down, left / across, (left + width) / across)
+            if all(place.denominator == 1 for place in places):
+                first_row, end_row, first_column, end_column = map(int, places)
                 measured[ratio] = depth_lr[:, first_row:end_row, first_column:end_column]
         depth = None if self.depth is None else self.depth[window]
         if depth is None and not measured:
@@ -132,13 +134,6 @@ class Scene:
         camera = self.camera.crop(top, left, height, width)
         regions = {name: region[window] for name, region in self.regions.items()}
         return derived(self, rgb=self.rgb[window], depth=depth, camera=camera, measured=measured, regions=regions)
-
-    def _steps(self, ratio: float) -> tuple[Fraction, Fraction]:
-        """Return the height and the width of a pixel of a measured map in the photo's pixels."""
-        if isinstance(ratio, int):
-            return Fraction(ratio), Fraction(ratio)
-        height, width = self.measured[ratio].shape[-2:]
-        return Fraction(self.camera.height, height), Fraction(self.camera.width, width)
 
 
 @dataclass(frozen=True)
@@ -174,8 +169,7 @@ class DepthSample:
 
     def __post_init__(self) -> None:
         """Check shapes, value ranges and cameras against each other."""
-        _expect_rgb(self.scene, self.rgb, self.camera)
-        _expect_regions(self.scene, self.regions, self.camera)
+        _expect_photo(self.scene, self.rgb, self.regions, self.camera)
         object.__setattr__(self, "scale", as_ratio(self.scale))
         if not 1 <= self.scale < math.inf:
             raise ValueError(f"{self.scene}: scale: expected a number of 1 or more, got {self.scale}")
@@ -219,6 +213,7 @@ class DepthSample:
         try:
             arrays = read_arrays(path)
             about: dict[str, Any] = parse_json(str(arrays["about"]))
+            limits = about["unit"]["limits"]
             return cls(
                 str(about["dataset"]),
                 str(about["name"]),
@@ -229,7 +224,7 @@ class DepthSample:
                 float(about["scale"]),
                 torch.from_numpy(arrays["depth"])[None] if "depth" in arrays else None,
                 tuple(about["notes"]),
-                _read_unit(about["unit"]),
+                Unit(**{**about["unit"], "limits": None if limits is None else tuple(limits)}),
                 {
                     name.removeprefix(_REGION): torch.from_numpy(values)[None]
                     for name, values in arrays.items()
@@ -249,12 +244,7 @@ class DepthSample:
         return self.depth_lr.isfinite()
 
     def disparity_lr(self, dtype: torch.dtype | None = None) -> Tensor:
-        """Return the low-resolution disparity in pixels of the high-resolution camera, (1, h, w), NaN where missing.
-
-        Args:
-            dtype: to compute in; None for that of ``depth_lr``.
-
-        """
+        """Return the low-resolution disparity in pixels of the high-resolution camera, (1, h, w), NaN where missing."""
         pixels = self.camera.width / self.camera_lr.width  # of the high-resolution camera in a low-resolution one
         return to_range(self.depth_lr.to(dtype or self.depth_lr.dtype), self.camera_lr, "disparity") * pixels
 
@@ -262,19 +252,6 @@ class DepthSample:
     def mask(self) -> Tensor | None:
         """(1, H, W) bool: where the true depth is known; None where there is no truth."""
         return None if self.depth is None else self.depth.isfinite()
-
-
-def slope(size: int) -> Scene:
-    """Return a grey slope of ``size`` x ``size`` pixels, 1 to 2 m away, that stands for any scene of this size."""
-    camera = Camera(size, size, size, size, (size - 1) / 2, (size - 1) / 2)
-    depth = torch.linspace(1, 2, size, dtype=torch.float64).repeat(1, size, 1)
-    return Scene("example", "slope", torch.full((3, size, size), 0.5), camera, depth)
-
-
-def _read_unit(entries: Mapping[str, Any]) -> Unit:
-    """Return the unit of a sample's description."""
-    limits = entries["limits"]
-    return Unit(**{**entries, "limits": None if limits is None else tuple(limits)})
 
 
 _REGION = "region_"  # beginning of the names of arrays that are regions
@@ -309,13 +286,10 @@ def _expect_shape(scene: str, name: str, value: Tensor, shape: tuple[int, ...]) 
         raise ValueError(f"{scene}: {name}: expected shape {shape}, got {tuple(value.shape)}")
 
 
-def _expect_rgb(scene: str, rgb: Tensor, camera: Camera) -> None:
+def _expect_photo(scene: str, rgb: Tensor, regions: Mapping[str, Tensor], camera: Camera) -> None:
     _expect_shape(scene, "rgb", rgb, (3, camera.height, camera.width))
     if not rgb.is_floating_point() or not bool(((rgb >= 0) & (rgb <= 1)).all()):
         raise ValueError(f"{scene}: rgb: expected floating point values in [0, 1]")
-
-
-def _expect_regions(scene: str, regions: Mapping[str, Tensor], camera: Camera) -> None:
     for name, region in regions.items():
         _expect_shape(scene, f"region {name}", region, (1, camera.height, camera.width))
         if region.dtype != torch.uint8 or not name.isidentifier():
@@ -323,13 +297,7 @@ def _expect_regions(scene: str, regions: Mapping[str, Tensor], camera: Camera) -
 
 
 def expect_distances(place: str, depth: Tensor) -> None:
-    """Check that depth is within :data:`NEAREST` and :data:`FARTHEST`.
-
-    Args:
-        place: the file, or the scene and the map, for the message.
-        depth: metres, of any shape; NaN in holes.
-
-    """
+    """Check that depth of any shape is within :data:`NEAREST` and :data:`FARTHEST`; ``place`` is for the message."""
     beyond = depth[(depth < NEAREST) | (depth > FARTHEST)]
     if beyond.numel():
         share = beyond.numel() / depth.numel()

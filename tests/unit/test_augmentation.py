@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
@@ -13,7 +11,7 @@ from dsr.geometry.camera import Camera
 from dsr.geometry.shading import lights, render
 from dsr.geometry.surface import depth_to_normals
 from dsr.sample import Scene
-from dsr.training.augmentation import augment, mirror, rotate90
+from dsr.training.patches import augment, mirror, rotate90
 from dsr.training.settings import PatchSettings
 
 CAMERA = Camera(width=31, height=23, fx=30.0, fy=27.0, cx=13.3, cy=9.9, baseline=0.1, doffs=0.7)
@@ -90,12 +88,6 @@ def test_mirrored_scene_has_the_mirrored_points(vertical: bool) -> None:
     torch.testing.assert_close(shown, expected, rtol=0, atol=1e-12, equal_nan=True)
 
 
-def test_window_has_the_points_of_its_pixels() -> None:
-    cut = _scene().crop(4, 6, 16, 16)
-    torch.testing.assert_close(_points(cut), _points(_scene())[:, 4:20, 6:22], rtol=0, atol=1e-12, equal_nan=True)
-    assert torch.equal(cut.rgb, _scene().rgb[:, 4:20, 6:22])
-
-
 def test_factor_of_a_varied_scene_is_that_of_its_depth() -> None:
     settings = PatchSettings(flip=False, rotate=False, depth_scale=0.5, colour=0.0)
     random, factors = np.random.default_rng(0), []
@@ -115,9 +107,3 @@ def test_scene_without_variation_is_unchanged() -> None:
     assert factor == 1
     assert torch.equal(scene.rgb, _scene().rgb)
     torch.testing.assert_close(_points(scene), _points(_scene()), rtol=0, atol=0, equal_nan=True)
-
-
-@pytest.mark.parametrize("changes", [{"depth_scale": -0.1}, {"depth_scale": 3.1}, {"colour": float("nan")}])
-def test_invalid_variation_is_refused(changes: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=rf"^{next(iter(changes))}: expected 0 (or more|to 3), got"):
-        PatchSettings(**changes)

@@ -35,7 +35,7 @@ from dsr.metrics import losses
 from dsr.metrics.catalogue import PROTOCOLS, catalogue, score_image
 from dsr.metrics.classes import compute_means, visual_metrics
 from dsr.metrics.functional import SurfacePair
-from dsr.metrics.visual_loss import VisualLoss
+from dsr.metrics.losses import VisualLoss
 from dsr.sample import CENTIMETRES, DepthSample, Scene
 from dsr.training.degradation import Degradation
 from dsr.training.module import SuperResolution

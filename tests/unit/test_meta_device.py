@@ -29,7 +29,7 @@ from dsr.metrics.calibration import measured_errors
 from dsr.metrics.catalogue import PROTOCOLS, catalogue
 from dsr.metrics.classes import visual_metrics
 from dsr.metrics.functional import SurfacePair
-from dsr.metrics.visual_loss import VisualLoss
+from dsr.metrics.losses import VisualLoss
 from dsr.training.degradation import Batch, to_tensors
 from dsr.training.module import SuperResolution
 from dsr.training.objective import DepthObjective, SurfaceObjective

@@ -84,13 +84,6 @@ def test_float32_noise_equals_float64_noise(noise: Noise) -> None:
     torch.testing.assert_close(single.double(), double, rtol=1e-6, atol=0, equal_nan=True)
 
 
-@pytest.mark.parametrize("noise", KINDS)
-def test_input_depth_is_unchanged(noise: Noise) -> None:
-    depth = STEPS.clone()
-    noise(depth, _generator())
-    assert torch.equal(depth, STEPS)
-
-
 @pytest.mark.parametrize("method", RANGE_TYPES)
 @pytest.mark.parametrize("noise", SENSORS)
 def test_sensor_noise_applies_to_metric_depth_whatever_is_averaged(noise: Noise, method: RangeType) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import multiprocessing
 import os
-import pickle
 import signal
 import sys
 import time
@@ -217,13 +216,6 @@ def test_part_keeps_its_fraction_and_a_scene_its_turn_with_sparse_depth() -> Non
     assert np.bincount(seen) / 400 == pytest.approx([0.5, 0.25, 0.25], abs=0.07)
 
 
-def test_patches_sent_to_another_process_are_unchanged() -> None:
-    patches = _patches([_scene(i) for i in range(3)], count=12)
-    before = [patches[i] for i in range(6)]
-    travelled = pickle.loads(pickle.dumps(patches))
-    assert _equal([travelled[i] for i in range(6)], before)
-
-
 def test_parts_hold_out_their_last_scenes_under_distinct_names() -> None:
     sources = [_Source([_scene(i) for i in numbers]) for numbers in ((0, 1, 2), (3, 4))]
     data = PatchData([Part(source) for source in sources], _settings(validation_scenes=1), X4)
@@ -297,23 +289,6 @@ def test_patch_has_the_points_of_its_pixels_in_the_scene_up_to_the_mirror(camera
     assert mirrors == {(x, y) for x in (-1, 1) for y in (-1, 1)}
 
 
-def test_plane_stays_a_plane_in_the_mirrored_frame() -> None:
-    patches = _patches()
-    for i in range(20):
-        patch = patches[i]
-        rows, columns, _ = _places(patch)
-        mirror = torch.tensor([columns[0, 1] - columns[0, 0], rows[1, 0] - rows[0, 0], 1])[:, None, None]
-        offset = (mirror * NORMAL * patch["depth"] * patch["rays"]).sum(dim=0)
-        torch.testing.assert_close(offset, torch.full_like(offset, -2.0), rtol=2e-6, atol=0)
-
-
-def test_nothing_is_mirrored_with_flip_off() -> None:
-    patches = _patches(flip=False)
-    for i in range(40):
-        rows, columns, _ = _places(patches[i])
-        assert columns[0, 1] - columns[0, 0] == rows[1, 0] - rows[0, 0] == 1
-
-
 @pytest.mark.parametrize("camera", [CAMERA, STEREO])
 def test_low_resolution_disparity_is_the_box_mean_in_high_resolution_pixels(camera: Camera) -> None:
     patches = _patches([_scene(camera=camera)])
@@ -339,38 +314,6 @@ def test_network_input_depends_on_the_low_resolution_map_alone() -> None:
     torch.testing.assert_close(second["disparity_lr"], first["disparity_lr"], rtol=1e-6, atol=0)
     for one, other in zip(*(normalise(each["disparity_lr"][None]) for each in (first, second)), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
-
-
-@pytest.mark.parametrize("camera", [CAMERA, STEREO])
-def test_turned_patch_has_the_turned_points_of_its_pixels(camera: Camera) -> None:
-    bumps = torch.from_numpy(np.random.default_rng(0).uniform(1, 3, (1, 44, 60)))
-    full = (bumps * camera.rays()).numpy()
-    patches, turns = _patches([_scene(camera=camera, depth=bumps)], count=80, flip=False, rotate=True), set()
-    for i in range(80):
-        patch = patches[i]
-        rows, columns, _ = _places(patch)
-        along = columns[0, 1] - columns[0, 0], rows[0, 1] - rows[0, 0]  # where the picture's u axis points in the scene
-        x, y, z = full[:, rows, columns]
-        down = -along[1], along[0]
-        expected = np.stack((along[0] * x + along[1] * y, down[0] * x + down[1] * y, z))
-        np.testing.assert_allclose((patch["depth"] * patch["rays"]).numpy(), expected, rtol=0, atol=2e-6)
-        turns.add(along)
-    assert turns == {(1, 0), (-1, 0), (0, 1), (0, -1)}
-
-
-def test_depth_scales_are_uniform_within_their_range() -> None:
-    plain, scaled = (_patches(count=60, depth_scale=s) for s in (0.0, 0.5))
-    factors = []
-    for i in range(60):
-        one, other = plain[i], scaled[i]
-        rows, columns, _ = _places(other)
-        ratio = other["depth"][0].numpy() / _tilted(CAMERA).numpy()[0, rows, columns]
-        assert np.ptp(ratio) < 1e-5
-        factors.append(float(ratio.mean()))
-        assert one["rgb"].shape == other["rgb"].shape
-    logs = np.log(factors)
-    assert -0.5 <= logs.min() < -0.4
-    assert 0.4 < logs.max() <= 0.5
 
 
 @pytest.mark.parametrize("camera", [CAMERA, STEREO])
@@ -408,14 +351,6 @@ def test_min_max_of_a_noisy_patch_contains_its_low_resolution_map_or_is_the_clea
         assert high >= float(own.max()) - 1e-5
         clean += [low, high] == pytest.approx([float(coarse.min()), float(coarse.max())], rel=1e-5)
     assert clean > 15
-
-
-def test_min_max_depends_on_the_low_resolution_map_alone() -> None:
-    depth = torch.full((1, 44, 60), 2.0, dtype=torch.float64)
-    depth[0, ::4, ::4] = 1.0  # one pixel of disparity 10 among fifteen of 5 in each block, wherever a patch begins
-    patches = _patches([_scene(depth=depth)], count=20)
-    for i in range(20):
-        assert patches[i]["min_max"].flatten().tolist() == pytest.approx([5.3125, 1.001 * 5.3125], rel=1e-6)
 
 
 def test_min_max_of_a_whole_scene_is_its_low_resolution_maps_and_that_of_a_wall_has_width() -> None:

@@ -17,7 +17,7 @@ from dsr.degradation.random_degradation import Everything
 from dsr.degradation.random_fields import add_folds, displace
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
-from dsr.training.augmentation import soften
+from dsr.training.patches import soften
 
 CLEAN = Everything(noises={"none": 1}, holes={"none": 1}, displaced=0, rounded=0, folds=0, relief=0, told=1)
 
@@ -269,25 +269,6 @@ def test_folds_keep_holes_and_shade_their_surroundings() -> None:
         assert torch.equal(folded.depth.isnan(), depth.isnan())
         assert bool(folded.rgb.isfinite().all())
         assert float(folded.depth.nan_to_num(1).min()) > 0
-
-
-def test_weak_noise_leaves_the_stairs_of_a_sensor_that_counts_in_steps() -> None:
-    """On a slanted wall; its steps are those of one of the sensors, and most values lie at whole multiples."""
-    ramp = torch.linspace(10, 14, 200).repeat(1, 100, 1)
-    stairs = smoothed = drawn = 0
-    for seed in range(60):
-        counted = random_noise._count(
-            ramp, 0.02 * torch.randn(ramp.shape, generator=_generator(seed)), _generator(seed)
-        )
-        assert float((counted - ramp).abs().max()) < 0.4
-        eighths = (8 * counted - (8 * counted).round()).abs()
-        stairs += bool(eighths.max() < 1e-3)
-        smoothed += bool((eighths.median() > 1e-3) & ((counted - ramp).std() > 0.015))
-        whole = (counted - counted.round()).abs()
-        drawn += bool((whole < 0.1).float().mean() > 0.28)  # 0.2 where no value is favoured
-    assert stairs > 3
-    assert smoothed > 3
-    assert drawn > 3
 
 
 def test_structured_light_loses_pixels_at_steps_and_on_steep_surfaces() -> None:

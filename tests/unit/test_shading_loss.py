@@ -13,7 +13,7 @@ from torch.nn import functional
 from dsr.geometry.camera import Camera
 from dsr.geometry.surface import depth_to_normals
 from dsr.metrics.functional import SurfacePair
-from dsr.training.shading import estimate_albedo, estimate_light, harmonics, integrate, shading_loss
+from dsr.training.objective import estimate_albedo, estimate_light, harmonics, integrate, shading_loss
 
 CAMERA = Camera(width=18, height=16, fx=20.0, fy=22.0, cx=8.0, cy=7.0)
 LIGHT = torch.tensor([0.5, -0.1, -0.2, 0.1, 0.03, 0.02, 0.01, -0.03, 0.02], dtype=torch.float64)

@@ -8,7 +8,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from dsr.degradation import random_noise
 from dsr.degradation.holes import Shadows, occluded
 from dsr.degradation.random_degradation import Everything
 from dsr.degradation.random_fields import field_of, waves_of
@@ -148,17 +147,6 @@ def test_stereo_repeats_values_has_waves_of_all_lengths_and_few_pixels_are_far_o
     assert 10 < repeated < 28
 
 
-def test_stereo_counts_disparity_in_fine_steps() -> None:
-    ramp = torch.linspace(10, 14, 200).repeat(1, 100, 1)
-    on_steps = 0
-    for seed in range(40):
-        noise = 0.1 * torch.randn(ramp.shape, generator=_generator(seed))
-        counted = random_noise._count(ramp, noise, _generator(seed), stereo=True)
-        on_steps += bool((64 * counted - (64 * counted).round()).abs().max() < 2e-3)
-        assert float((counted - ramp).abs().max()) < 0.7
-    assert 12 < on_steps < 36
-
-
 def test_structured_light_is_as_noisy_as_measured_ones() -> None:
     """Nguyen et al. 2012: 1.2 mm + 1.9 mm (z - 0.4)^2, times 0.4 to 2.5, and steps of disparity."""
 
@@ -170,15 +158,6 @@ def test_structured_light_is_as_noisy_as_measured_ones() -> None:
     assert 0.0006 < middle < 0.006
     assert near / middle > 0.35, "0.65 by the formula; noise of disparity alone would give 0.25"
     assert 4 < far / middle < 11
-
-
-def test_edges_of_structured_light_jitter_along_themselves() -> None:
-    values = torch.where(torch.arange(100) < 50, 1.0, 0.5).repeat(1, 400, 1)
-    jittered = random_noise._jitter(values, 0.8, _generator())
-    edge = (jittered[0] > 0.75).sum(dim=1).float()
-    assert float(edge.std()) == pytest.approx(0.8, abs=0.3)
-    assert float(edge.mean()) == pytest.approx(50, abs=0.5)
-    assert torch.equal(jittered[..., :40], values[..., :40])
 
 
 def test_lidar_smears_steps_and_is_biased_by_distance() -> None:

@@ -14,8 +14,8 @@ from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera
 from dsr.methods.networks.network import Answer
 from dsr.metrics.functional import SurfacePair, dssim_v, mse_v
+from dsr.metrics.losses import MSE_V, VisualLoss, VisualLossName, make_visual_loss, match_weight
 from dsr.metrics.lpips import LPIPS, lpips_v
-from dsr.metrics.visual_loss import MSE_V, VisualLoss, VisualLossName, make_visual_loss, match_weight
 from dsr.sample import DepthSample, Scene
 from dsr.training.degradation import Batch, to_tensors
 from dsr.training.objective import DepthObjective, balance_weight

@@ -38,8 +38,8 @@ from dsr.data.scene_source import prepare_scenes
 from dsr.methods.networks.network import DisparityNetwork
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, network_name, save_network
+from dsr.training.callbacks import expect_installed, log_config, log_layout, log_settings
 from dsr.training.data_module import PatchData
-from dsr.training.loggers import expect_installed, log_config, log_layout, log_settings
 from dsr.training.module import SuperResolution
 from dsr.utils import interruption
 from dsr.utils.checkpoints import BestCheckpoint, DivergenceError, Interruption

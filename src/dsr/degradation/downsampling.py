@@ -32,8 +32,7 @@ from dsr.utils.records import unchecked
 
 Kernel = Literal["box", "nearest", "bilinear", "bicubic", "gaussian"]
 _LEAST_WEIGHT = 0.5
-_LEAST_SIGMA = 0.1
-"""Minimum sigma as a fraction of the scale: at x2 the nearest pixel centre is 0.25 away, within three sigmas."""
+_LEAST_SIGMA = 0.1  # as a fraction of the scale: at x2 the nearest pixel centre is 0.25 away, within three sigmas
 
 
 @dataclass(frozen=True)
@@ -75,13 +74,8 @@ class Downsampling:
         """Downsample (..., H, W) maps with NaN in holes to (..., H / scale, W / scale).
 
         A low-resolution pixel whose block has no valid pixel is a hole. If less than half of a kernel's weight falls on
-        valid pixels, the result is the mean of the block's valid pixels.
-
-        Args:
-            values: H and W divisible by ``scale``.
-            scale: factor.
-            complete: whether there are no holes; None if not known.
-
+        valid pixels, the result is the mean of the block's valid pixels. ``complete`` says whether there are no holes;
+        None if not known.
         """
         height, width = values.shape[-2:]
         if height % scale or width % scale:
@@ -181,13 +175,20 @@ def make_sample(
 
     """
     if isinstance(downsampling, Measured):
-        ratio = _match_measured(scene, scale)
+        with naming(scene.name):
+            ratio = match_ratio(scale, scene.measured)
         factor = ratio if isinstance(ratio, int) else 1
     else:
         check_scale(scale)
         ratio = factor = int(scale)
         _true_depth(scene)
-    scene, notes = _crop_to_multiple(scene, factor)
+    size, notes = (scene.camera.height, scene.camera.width), scene.notes
+    height, width = (length // factor * factor for length in size)
+    if not height or not width:
+        raise ValueError(f"{scene.name}: expected at least {factor} x {factor} pixels, got {size[0]} x {size[1]}")
+    if (height, width) != size:
+        notes = (*notes, f"cropped from {size[0]} x {size[1]} to {height} x {width}, which {factor} divides")
+        scene = scene.crop(0, 0, height, width)
     if isinstance(generator, int):
         of_noise = scene_generator(generator, scene.dataset, scene.name, ratio)
         of_holes = scene_generator(generator, scene.dataset, scene.name, ratio, "holes")
@@ -216,27 +217,6 @@ def _true_depth(scene: Scene) -> Tensor:
     if scene.depth is None:
         raise ValueError(f"{scene.name}: expected a high-resolution depth map to downsample, there is none")
     return scene.depth
-
-
-def _match_measured(scene: Scene, scale: float | str) -> float:
-    """Return the ratio of the scene's measured map that a scale names."""
-    with naming(scene.name):
-        return match_ratio(scale, scene.measured)
-
-
-def _crop_to_multiple(scene: Scene, factor: int) -> tuple[Scene, tuple[str, ...]]:
-    """Return the scene cropped to a multiple of the factor, and its notes."""
-    camera = scene.camera
-    height, width = (size // factor * factor for size in (camera.height, camera.width))
-    before = f"{camera.height} x {camera.width}"
-    if not height or not width:
-        raise ValueError(f"{scene.name}: expected at least {factor} x {factor} pixels, got {before}")
-    if (height, width) == (camera.height, camera.width):
-        return scene, scene.notes
-    return scene.crop(0, 0, height, width), (
-        *scene.notes,
-        f"cropped from {before} to {height} x {width}, which {factor} divides",
-    )
 
 
 def downsample_depth(

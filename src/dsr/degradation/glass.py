@@ -21,13 +21,12 @@ from dsr.degradation.glass_shapes import Body, Plate, Pose, ball, draw_box, draw
 from dsr.degradation.random_fields import chance, draw, field_of, normal, power, uniform
 from dsr.sample import Scene
 
+# How often each kind of object is drawn
 KINDS: Mapping[str, float] = {"vessel": 0.5, "ball": 0.06, "box": 0.1, "pane": 0.12, "mirror": 0.12, "gloss": 0.1}
-"""How often each kind of object is drawn."""
 _PLACES: Mapping[str, float] = {"upright": 0.65, "lying": 0.15, "before": 0.2}
 _SIDES: Mapping[str, float] = {"behind": 0.45, "mixed": 0.35, "surface": 0.2}
 _HOLES: Mapping[str, float] = {"few": 0.3, "some": 0.5, "most": 0.2}
-_REFLECTED = 0.04
-"""Share of the light that glass reflects at normal incidence."""
+_REFLECTED = 0.04  # share of the light that glass reflects at normal incidence
 
 
 class _State(NamedTuple):
@@ -41,14 +40,8 @@ class _State(NamedTuple):
 def add_glass(scene: Scene, generator: torch.Generator, kinds: Mapping[str, float] = KINDS) -> tuple[Scene, Tensor]:
     """Return a scene with up to four clear, mirroring or glossy objects, and the depth that a sensor measures there.
 
-    Args:
-        scene: a scene with a true depth.
-        kinds: relative frequency of each kind of object, of those of ``KINDS``.
-
-    Returns:
-        The scene, whose true depth is that of the objects' surfaces, and the depth that a sensor sees, (1, H, W) in
-        metres, NaN where nothing. Both, and the photo, are those of ``scene`` beside the objects.
-
+    The scene's true depth is that of the objects' surfaces. The depth that a sensor sees, (1, H, W) in metres, is NaN
+    where it sees nothing. ``kinds`` are the relative frequencies of the kinds of objects.
     """
     assert scene.depth is not None  # noqa: S101 - for the type checker
     state = _State(scene.rgb.float(), scene.depth, scene.depth)
@@ -82,7 +75,12 @@ def _add_body(state: _State, scene: Scene, kind: str, generator: torch.Generator
     mask = body.mask & ~(surface >= state.depth[window])[0]
     if kind == "gloss":
         painted, cue = _paint_gloss(state.rgb, body, generator)
-        seen = _seen_of_gloss(surface, cue, generator)
+        burnt = cue[None] > uniform(0.2, 0.8, generator)
+        seen = surface.masked_fill(burnt, torch.nan)
+        if not chance(0.5, generator):  # wrong in highlights, not missing
+            largest = power(-2.3, -0.8, generator)
+            shift = largest * (normal(generator) + field_of(surface, power(0, 1, generator), generator))
+            seen = torch.where(burnt, surface * (1 + shift.clamp(-0.5, 1)), surface)
     else:
         painted, cue = _paint_clear(state.rgb, body, radius, solid=shape == "ball", generator=generator)
         through = (body.near - body.far).clamp(min=0)[None] * (pose.depth / scene.camera.fx)
@@ -285,15 +283,6 @@ def _paint_gloss(rgb: Tensor, body: Body, generator: torch.Generator) -> tuple[T
     return painted.clamp(0, 1), shine.mean(dim=0).clamp(0, 1)
 
 
-def _seen_of_gloss(surface: Tensor, cue: Tensor, generator: torch.Generator) -> Tensor:
-    """Return the depth that a sensor gives of a glossy object: wrong or missing in highlights, (1, h, w)."""
-    burnt = cue[None] > uniform(0.2, 0.8, generator)
-    if chance(0.5, generator):
-        return surface.masked_fill(burnt, torch.nan)
-    shift = power(-2.3, -0.8, generator) * (normal(generator) + field_of(surface, power(0, 1, generator), generator))
-    return torch.where(burnt, surface * (1 + shift.clamp(-0.5, 1)), surface)
-
-
 def _add_plate(state: _State, focal: float, kind: str, generator: torch.Generator) -> _State:
     """Add a pane or a mirror, with or without a frame."""
     plate = draw_plate((state.rgb.shape[-2], state.rgb.shape[-1]), focal, generator)
@@ -309,7 +298,10 @@ def _add_plate(state: _State, focal: float, kind: str, generator: torch.Generato
     reflected, virtual = _reflect(state, plate, surface, generator)
     if kind == "mirror":
         painted = reflected * uniform(0.7, 0.97, generator)
-        seen = _seen_in_mirror(surface, virtual, generator)
+        seen = virtual
+        if chance(0.3, generator):  # dust shows the surface in places
+            seen = torch.where(field_of(surface, power(0.3, 1.2, generator), generator) > 1.3, surface, virtual)
+        seen = seen.masked_fill(_missing(surface, torch.zeros_like(surface[0]), generator), torch.nan)
     else:
         painted, cue = _paint_pane(state.rgb[window], reflected, plate, generator)
         seen = _seen_through(surface, state.seen[window], cue, torch.zeros_like(surface), generator)
@@ -345,14 +337,6 @@ def _within(places: Tensor, size: int) -> Tensor:
     """Return whole places in an image of a size, turned back at its borders as a photo's are."""
     folded = places.round().long().remainder(2 * (size - 1)) if size > 1 else torch.zeros_like(places).long()
     return torch.minimum(folded, 2 * (size - 1) - folded)
-
-
-def _seen_in_mirror(surface: Tensor, virtual: Tensor, generator: torch.Generator) -> Tensor:
-    """Return the depth that a sensor gives in a mirror: the virtual image, nothing, in places the surface."""
-    seen = virtual
-    if chance(0.3, generator):  # dust
-        seen = torch.where(field_of(surface, power(0.3, 1.2, generator), generator) > 1.3, surface, virtual)
-    return seen.masked_fill(_missing(surface, torch.zeros_like(surface[0]), generator), torch.nan)
 
 
 def _paint_pane(behind: Tensor, reflected: Tensor, plate: Plate, generator: torch.Generator) -> tuple[Tensor, Tensor]:

@@ -12,42 +12,28 @@ from dsr.degradation.random_fields import chance, draw, normal, uniform
 
 
 class Pose(NamedTuple):
-    """Where an object is and how it stands.
+    """Where an object is and how it stands."""
 
-    Args:
-        u, v: the middle of its foot in the image.
-        up: direction of its axis in the image, a unit vector (u, v).
-        pitch: sine of the angle at which one looks down on it.
-        slope: by how many pixels a point is farther for each pixel further up.
-        depth: of its foot in metres.
-
-    """
-
-    u: float
+    u: float  # the middle of its foot in the image
     v: float
-    up: tuple[float, float]
-    pitch: float
-    slope: float
-    depth: float
+    up: tuple[float, float]  # direction of its axis in the image, a unit vector (u, v)
+    pitch: float  # sine of the angle at which one looks down on it
+    slope: float  # by how many pixels a point is farther for each pixel further up
+    depth: float  # of its foot in metres
 
 
 class Body(NamedTuple):
-    """An object in a window of h x w pixels, in coordinates of the image: u right, v down, z towards the camera.
+    """An object in a window of h x w pixels, in coordinates of the image: u right, v down, z towards the camera."""
 
-    ``rows``, ``columns``: the window in the image. ``mask`` (h, w): where the object is. ``near``, ``far`` (h, w): by
-    how many pixels its front and its back are nearer than its foot. ``front``, ``back`` (3, h, w): their unit normals,
-    both on the camera's side. ``lines`` (h, w): rims and edges, 0 to 1. ``up`` (h, w): pixels along the axis.
-    """
-
-    rows: slice
+    rows: slice  # the window in the image
     columns: slice
-    mask: Tensor
-    near: Tensor
-    far: Tensor
-    front: Tensor
-    back: Tensor
-    lines: Tensor
-    up: Tensor
+    mask: Tensor  # (h, w), where the object is
+    near: Tensor  # (h, w), by how many pixels its front is nearer than its foot
+    far: Tensor  # (h, w), likewise its back
+    front: Tensor  # (3, h, w), unit normals on the camera's side
+    back: Tensor  # (3, h, w), likewise
+    lines: Tensor  # (h, w), rims and edges, 0 to 1
+    up: Tensor  # (h, w), pixels along the axis
 
 
 _PROFILES = {"tumbler": 0.3, "bottle": 0.35, "goblet": 0.12, "bowl": 0.1, "jar": 0.13}
@@ -55,13 +41,7 @@ _SAMPLES = 256
 
 
 def draw_vessel(pose: Pose, radius: float, size: tuple[int, int], generator: torch.Generator) -> Body | None:
-    """Return a random surface of revolution, open at the top.
-
-    Args:
-        radius: its largest one in pixels.
-        size: height and width of the image.
-
-    """
+    """Return a random surface of revolution, open at the top; its largest ``radius`` is in pixels of the image."""
     kind = draw(_PROFILES, generator)
     points, aspect = _outline(kind, generator)
     heights, radii = (torch.tensor(each, dtype=torch.float32) for each in zip(*points, strict=True))
@@ -87,16 +67,8 @@ def _outline(kind: str, generator: torch.Generator) -> tuple[list[tuple[float, f
         lip = neck + some(0, 0.1)
         end = shoulder + some(0.08, 0.2)
         waist = some(0.85, 1)
-        points = [
-            (0.0, 0.88),
-            (0.03, 1.0),
-            (shoulder / 2, waist),
-            (shoulder, 1.0),
-            (end, neck),
-            (0.95, neck),
-            (1.0, lip),
-        ]
-        return points, some(3.2, 6.5)
+        top = [(end, neck), (0.95, neck), (1.0, lip)]
+        return [(0.0, 0.88), (0.03, 1.0), (shoulder / 2, waist), (shoulder, 1.0), *top], some(3.2, 6.5)
     if kind == "goblet":
         stem, widest = some(0.3, 0.5), some(0.6, 0.8)
         return [
@@ -227,30 +199,20 @@ def draw_box(pose: Pose, radius: float, size: tuple[int, int], generator: torch.
 
 
 class Plate(NamedTuple):
-    """A plane with an outline, in a window: ``inside`` (h, w) the plate, ``frame`` (h, w) what surrounds it.
-
-    ``edge`` (h, w): where both meet, 0 to 1. ``right``, ``down`` (h, w): pixels from its middle. ``nearness`` (h, w):
-    its inverse depth over that of its middle.
-    """
+    """A plane with an outline, in a window of h x w pixels."""
 
     rows: slice
     columns: slice
-    inside: Tensor
-    frame: Tensor
-    edge: Tensor
-    right: Tensor
+    inside: Tensor  # (h, w), the plate
+    frame: Tensor  # (h, w), what surrounds it
+    edge: Tensor  # (h, w), where both meet, 0 to 1
+    right: Tensor  # (h, w), pixels from its middle
     down: Tensor
-    nearness: Tensor
+    nearness: Tensor  # (h, w), its inverse depth over that of its middle
 
 
 def draw_plate(size: tuple[int, int], focal: float, generator: torch.Generator) -> Plate:
-    """Return a random rectangle or ellipse, flat and tilted by up to about 50 degrees, with a frame in most cases.
-
-    Args:
-        size: height and width of the image.
-        focal: focal length in pixels.
-
-    """
+    """Return a random rectangle or ellipse, flat and tilted by up to about 50 degrees, with a frame in most cases."""
     half = [uniform(0.1, 0.4, generator) * min(size) for _ in range(2)]
     middle = [uniform(0.1, 0.9, generator) * length for length in size]
     turn, shear = 0.15 * normal(generator), 0.2 * normal(generator)

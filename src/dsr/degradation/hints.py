@@ -8,33 +8,21 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-KERNELS = ("box", "nearest", "bilinear", "bicubic", "gaussian")
-"""Kernels in the order of their facts; a sensor's point spread counts as gaussian."""
+KERNELS = ("box", "nearest", "bilinear", "bicubic", "gaussian")  # a sensor's point spread counts as gaussian
 FACTS = len(KERNELS) + 3  # number of the facts of a map
 LARGEST = 0.1  # relative errors beyond this are outliers, and do not count as noise
 _WINDOW = 9  # low-resolution pixels of the window in which the noise is measured
 
 
 class Hints(NamedTuple):
-    """What is known of a low-resolution map.
+    """What is known of a low-resolution map."""
 
-    ``noise`` (1, h, w): the standard deviation of the logarithm of its inverse depth, 0 where not given. ``facts``
-    (``FACTS``,): those of :func:`encode_facts`.
-    """
-
-    noise: Tensor
-    facts: Tensor
+    noise: Tensor  # (1, h, w), the standard deviation of the logarithm of its inverse depth, 0 where not given
+    facts: Tensor  # (FACTS,), those of encode_facts
 
 
 def encode_facts(kernel: str | None = None, soft: bool | None = None, *, noise: bool = False) -> Tensor:
-    """Encode known properties of a map as numbers, (``FACTS``,): all 0 if nothing is known.
-
-    Args:
-        kernel: the kernel that made it, one of ``KERNELS``, as the first five.
-        soft: whether its depth steps are soft, as the next two: sharp, soft.
-        noise: whether its noise is given, as the last.
-
-    """
+    """Encode what is known of a map as (``FACTS``,) numbers: five for the kernel, two for softness, one for noise."""
     facts = torch.zeros(FACTS)
     if kernel is not None:
         if kernel not in KERNELS:
@@ -53,15 +41,9 @@ def known_kernels(facts: Tensor) -> list[str | None]:
 
 
 def relative_error(given: Tensor, result: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the relative difference of maps to results of a multiple of their size, and a weight, 0 where unknown.
+    """Return the relative difference of maps to block means of results, and a weight, 0 where unknown, (B, 1, h, w).
 
-    Args:
-        given: (B, 1, h, w) low-resolution inverse depth, NaN in holes.
-        result: (B, 1, H, W) high-resolution inverse depth, whose block means are compared.
-
-    Returns:
-        Both (B, 1, h, w); 0 in holes and where the difference is an outlier.
-
+    ``given`` (B, 1, h, w) and ``result`` (B, 1, H, W) are inverse depth; the difference is 0 in holes and of outliers.
     """
     scale = result.shape[-1] // given.shape[-1]
     error = given / functional.avg_pool2d(result, scale) - 1
@@ -70,15 +52,9 @@ def relative_error(given: Tensor, result: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def local_noise(given: Tensor, result: Tensor) -> Tensor:
-    """Return the noise of maps around each pixel: root mean squares of their relative differences to results.
+    """Return the noise of maps around each pixel, (B, 1, h, w); 0 where nothing around is known.
 
-    Args:
-        given: (B, 1, h, w) low-resolution inverse depth, NaN in holes, which do not count.
-        result: (B, 1, H, W) high-resolution inverse depth.
-
-    Returns:
-        (B, 1, h, w), the standard deviation of the logarithm of inverse depth; 0 where nothing around is known.
-
+    It is the root mean square of their relative differences to results; arguments as for :func:`relative_error`.
     """
     error, weight = relative_error(given, result)
     padding = (_WINDOW // 2,) * 4

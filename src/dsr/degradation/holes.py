@@ -16,8 +16,8 @@ from torch.nn import functional
 from dsr.degradation.random_fields import chance, field_of, near_steps, uniform
 from dsr.geometry.camera import Camera
 
+# From (1, h, w) depth in metres, NaN where missing, to a (1, h, w) bool mask of the pixels to remove
 Holes = Callable[[Tensor, Camera, torch.Generator], Tensor]
-"""From (1, h, w) depth in metres, NaN where missing, to a (1, h, w) bool mask of the pixels to remove."""
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,12 @@ class Blobs:
     def __call__(self, depth: Tensor, camera: Camera, generator: torch.Generator) -> Tensor:
         """Return the mask of the holes, (1, h, w) bool; their number is exact to the pixel."""
         draws = torch.randn(1, *depth.shape, generator=generator, dtype=torch.float64)
-        for axis in (-2, -1):
-            draws = _blur(draws, self.size / 4, axis)
+        sigma = self.size / 4
+        radius = max(round(3 * sigma), 1)
+        taps = torch.exp(-0.5 * (torch.arange(-radius, radius + 1, dtype=draws.dtype) / sigma).square())
+        for shape, padding in (((-1, 1), (0, 0, radius, radius)), ((1, -1), (radius, radius, 0, 0))):
+            padded = functional.pad(draws, padding, mode="replicate")
+            draws = functional.conv2d(padded, (taps / taps.sum()).view(1, 1, *shape))
         values = draws[0].flatten()
         holes = torch.zeros_like(values, dtype=torch.bool)
         holes[values.argsort(descending=True)[: round(self.share * values.numel())]] = True
@@ -75,11 +79,8 @@ class Shadows:
 def occluded(disparity: Tensor) -> Tensor:
     """Return the mask of the pixels that a nearer one covers in a second image, (..., h, w) bool.
 
-    Beside a step from d1 to d2 it is d1 - d2 pixels wide: on the left where the second camera is to the right.
-
-    Args:
-        disparity: (..., h, w) in pixels, NaN where missing; negative if the second camera is to the left.
-
+    Beside a step from d1 to d2 it is d1 - d2 pixels wide: on the left where the second camera is to the right. The
+    disparity, (..., h, w) in pixels, is negative if the second camera is to the left.
     """
     if bool((disparity < 0).any()):
         return occluded(-disparity.flip(-1)).flip(-1)
@@ -91,16 +92,6 @@ def occluded(disparity: Tensor) -> Tensor:
 def no_holes() -> None:
     """Return no holes, for ``holes=none``."""
     return
-
-
-def _blur(values: Tensor, sigma: float, axis: int) -> Tensor:
-    """Convolve (1, 1, h, w) with a Gaussian along an axis; edge pixels are repeated."""
-    radius = max(round(3 * sigma), 1)
-    taps = torch.exp(-0.5 * (torch.arange(-radius, radius + 1, dtype=values.dtype) / sigma).square())
-    vertical = axis == -2
-    kernel = (taps / taps.sum()).view(1, 1, *((-1, 1) if vertical else (1, -1)))
-    padding = (0, 0, radius, radius) if vertical else (radius, radius, 0, 0)
-    return functional.conv2d(functional.pad(values, padding, mode="replicate"), kernel)
 
 
 def _blobs(values: Tensor, _: Tensor, camera: object, generator: torch.Generator) -> Tensor:

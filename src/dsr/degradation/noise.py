@@ -18,10 +18,8 @@ from dsr.geometry.camera import RangeType
 
 
 class Noise(Protocol):
-    """A noise model.
+    """A noise model: from (..., h, w) values of ``range_type`` (None for the one that is averaged) to noisy ones.
 
-    ``range_type`` is the type of the values that it takes and returns; None for the type that is averaged. It is called
-    with (..., h, w) values of that type, NaN in holes, and a random generator, and returns values of the same shape.
     NaN stays NaN, and what the sensor would not see becomes NaN. Random numbers are drawn on the CPU in float64, so
     they are the same on every device.
     """
@@ -89,8 +87,7 @@ class TimeOfFlight:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        _check_positive("strength", self.strength)
-        _check_positive("stereo_constant", self.stereo_constant)
+        _check_positive(self, "strength", "stereo_constant")
         if not 0 <= self.doffs < math.inf:
             raise ValueError(f"doffs: expected 0 or a positive number, got {self.doffs}")
 
@@ -141,15 +138,11 @@ class Kinect:
         """Check the values."""
         if not 0 <= self.std < math.inf:
             raise ValueError(f"std: expected 0 or a positive number of pixels, got {self.std}")
-        for name in ("step", "stereo_constant", "jump"):
-            _check_positive(name, getattr(self, name))
+        _check_positive(self, "step", "stereo_constant", "jump", "nearest", "farthest")
         if not 0 <= self.dropout <= 1:
             raise ValueError(f"dropout: expected a number from 0 to 1, got {self.dropout}")
         if self.reach < 1 or not float(self.reach).is_integer():
             raise ValueError(f"reach: expected a positive whole number of low-resolution pixels, got {self.reach}")
-        for name in ("nearest", "farthest"):
-            if getattr(self, name) is not None:
-                _check_positive(name, getattr(self, name))
         if self.nearest is not None and self.farthest is not None and self.farthest <= self.nearest:
             raise ValueError(f"farthest: expected more than nearest, {self.nearest}, got {self.farthest}")
 
@@ -159,7 +152,16 @@ class Kinect:
         chances = torch.rand(values.shape, generator=generator, dtype=torch.float64).to(values.device)
         disparity = _positive(self.stereo_constant / values.double()) + self.std * draws
         depth = self.stereo_constant / _positive((disparity / self.step).round() * self.step)
-        lost = (chances < self.dropout) & _beside_edges(values, self.jump, self.reach)
+        edge = torch.zeros_like(values, dtype=torch.bool)
+        for axis in (-2, -1):
+            size = values.shape[axis] - 1
+            near, far = values.narrow(axis, 0, size), values.narrow(axis, 1, size)
+            steps = (near - far).abs() > self.jump * torch.minimum(near, far)  # holes make no jump
+            edge.narrow(axis, 0, size).logical_or_(steps)
+            edge.narrow(axis, 1, size).logical_or_(steps)
+        planes = edge.reshape(-1, 1, *edge.shape[-2:]).float()
+        beside = functional.max_pool2d(planes, 2 * self.reach - 1, stride=1, padding=self.reach - 1).view_as(edge) > 0
+        lost = (chances < self.dropout) & beside
         if self.nearest is not None:
             lost |= depth < self.nearest
         if self.farthest is not None:
@@ -172,24 +174,13 @@ def no_noise() -> None:
     return
 
 
-def _check_positive(name: str, value: float) -> None:
-    if not 0 < value < math.inf:
-        raise ValueError(f"{name}: expected a positive number, got {value}")
+def _check_positive(noise: Noise, *names: str) -> None:
+    for name in names:
+        value = getattr(noise, name)
+        if value is not None and not 0 < value < math.inf:
+            raise ValueError(f"{name}: expected a positive number, got {value}")
 
 
 def _positive(values: Tensor) -> Tensor:
     """Return the values with those that are not positive replaced by NaN."""
     return torch.where(values > 0, values, torch.nan)
-
-
-def _beside_edges(depth: Tensor, jump: float, reach: int) -> Tensor:
-    """Return the mask of pixels within ``reach`` pixels of a relative jump of (..., h, w) depth; holes make no jump."""
-    edge = torch.zeros_like(depth, dtype=torch.bool)
-    for axis in (-2, -1):
-        size = depth.shape[axis] - 1
-        near, far = depth.narrow(axis, 0, size), depth.narrow(axis, 1, size)
-        steps = (near - far).abs() > jump * torch.minimum(near, far)
-        edge.narrow(axis, 0, size).logical_or_(steps)
-        edge.narrow(axis, 1, size).logical_or_(steps)
-    planes = edge.reshape(-1, 1, *edge.shape[-2:]).float()
-    return functional.max_pool2d(planes, 2 * reach - 1, stride=1, padding=reach - 1).view_as(edge) > 0

@@ -118,38 +118,36 @@ class Everything:
 
     def draw_scale(self, scale: int, generator: torch.Generator) -> int:
         """Return a random factor; ``scale`` where there is no choice."""
-        return (
-            scale
-            if self.scales is None
-            else int(draw({str(scale): share for scale, share in self.scales.items()}, generator))
-        )
+        if self.scales is None:
+            return scale
+        return int(draw({str(scale): share for scale, share in self.scales.items()}, generator))
 
     def __call__(
         self, scene: Scene, scale: int, generator: torch.Generator, *, soft: bool = False
     ) -> tuple[DepthSample, Hints]:
-        """Return a scene with a low-resolution map, and hints.
+        """Return a scene or a patch with a true depth with a low-resolution map, and hints.
 
-        Args:
-            scene: a scene or a patch with a true depth.
-            scale: the factor, which divides its size.
-            soft: whether its depth steps are soft, for the hint.
-
+        The factor ``scale`` divides its size; at 1 a map has noise, if any kind is to be drawn.
         """
-        scene = self._change_surfaces(scene, scale, generator)
-        kernel, kind = self._draw_kinds(scale, generator)
+        if chance(self.folds, generator):
+            scene = add_folds(scene, generator)
+        if scale > 1 and chance(self.relief, generator):
+            scene = add_relief(scene, generator)
+        kernel = draw(self.kernels, generator) if scale > 1 else "nearest"
+        kind = draw(self.noises, generator)
+        others = {name: share for name, share in self.noises.items() if name != "none"}
+        if scale == 1 and kind == "none" and sum(others.values()) > 0:
+            kind = draw(others, generator)
         seen = scene.depth
-        if (
-            self.clear and kind in SENSOR_NOISES and not soft and chance(self.clear, generator)
-        ):  # at 0, nothing is drawn
+        # at 0, nothing is drawn
+        if self.clear and kind in SENSOR_NOISES and not soft and chance(self.clear, generator):
             scene, seen = add_glass(scene, generator)
         assert seen is not None  # noqa: S101 - for the type checker
         clean, camera_lr = self._downsample(seen, scene.camera, scale, kernel, kind, generator)
         size = clean.shape[-2], clean.shape[-1]
         luma = functional.adaptive_avg_pool2d(scene.rgb.float().mean(dim=0, keepdim=True)[None], size)[0]
         noisy = clean if kind == "none" else NOISES[kind](clean, luma, generator)
-        noisy = torch.where(
-            clean.isfinite(), noisy, torch.nan
-        )  # what is not known of the truth, or seen, stays unknown
+        noisy = torch.where(clean.isfinite(), noisy, torch.nan)  # what is not known, or seen, stays unknown
         if chance(self.rounded, generator):
             noisy = round_values(noisy, generator)
         holes = draw(self.holes, generator)
@@ -158,30 +156,17 @@ class Everything:
         noisy = torch.where(noisy > 0, noisy, torch.nan)
         if not bool(noisy.isfinite().any()):
             raise AllHolesError(scene.name)
-        rgb = self._change_photo(scene.rgb.float(), self.photo / (1 + (kind == "none")), generator)
+        rgb = scene.rgb.float()
+        if chance(self.textured, generator):
+            rgb = print_pattern(rgb, generator)
+        if chance(self.photo / (1 + (kind == "none")), generator):
+            rgb = take_another_photo(rgb, generator)
         sample = unchecked(
-            DepthSample, dataset=scene.dataset, scene=scene.name, rgb=rgb, depth_lr=noisy.reciprocal(),
+            DepthSample, dataset=scene.dataset, scene=scene.name, rgb=rgb.clamp(0, 1), depth_lr=noisy.reciprocal(),
             camera=scene.camera, camera_lr=camera_lr, scale=scale, depth=scene.depth, notes=(), unit=CENTIMETRES,
             regions={},
         )  # fmt: skip
         return sample, self._hints(clean, noisy, kernel, generator, soft=soft)
-
-    def _change_surfaces(self, scene: Scene, scale: int, generator: torch.Generator) -> Scene:
-        """Return a scene with folds or relief, or as it is."""
-        if chance(self.folds, generator):
-            scene = add_folds(scene, generator)
-        if scale > 1 and chance(self.relief, generator):
-            scene = add_relief(scene, generator)
-        return scene
-
-    def _draw_kinds(self, scale: int, generator: torch.Generator) -> tuple[str, str]:
-        """Return a kernel and a kind of noise; at factor 1 a map has noise, if any kind is to be drawn."""
-        kernel = draw(self.kernels, generator) if scale > 1 else "nearest"
-        kind = draw(self.noises, generator)
-        others = {name: share for name, share in self.noises.items() if name != "none"}
-        if scale == 1 and kind == "none" and sum(others.values()) > 0:
-            kind = draw(others, generator)
-        return kernel, kind
 
     def _downsample(
         self, depth: Tensor, camera: Camera, scale: int, kernel: str, kind: str, generator: torch.Generator
@@ -194,18 +179,10 @@ class Everything:
         if scale == 1:
             return values, camera
         camera = Downsampling("nearest" if kernel == "nearest" else "box").camera(camera, scale)
-        model = (
-            Downsampling("gaussian", sigma=uniform(0.6, 1.1, generator)) if kernel == "spread" else Downsampling(kernel)  # type: ignore[arg-type]  # one of them
-        )
+        model = Downsampling("gaussian" if kernel == "spread" else kernel)  # type: ignore[arg-type]  # one of them
+        if kernel == "spread":
+            model = Downsampling("gaussian", sigma=uniform(0.6, 1.1, generator))
         return (model(values.reciprocal(), scale).reciprocal() if of_depth else model(values, scale)), camera
-
-    def _change_photo(self, rgb: Tensor, share: float, generator: torch.Generator) -> Tensor:
-        """Return a photo with a pattern, or as another camera takes it with a probability of ``share``."""
-        if chance(self.textured, generator):
-            rgb = print_pattern(rgb, generator)
-        if chance(share, generator):
-            rgb = take_another_photo(rgb, generator)
-        return rgb.clamp(0, 1)
 
     def _hints(self, clean: Tensor, noisy: Tensor, kernel: str, generator: torch.Generator, *, soft: bool) -> Hints:
         """Return random hints on a map."""

@@ -44,14 +44,9 @@ def normal(generator: torch.Generator) -> float:
 
 
 def field_of(like: Tensor, sigma: float | tuple[float, float], generator: torch.Generator) -> Tensor:
-    """Return normal noise with a variance of 1, (1, h, w), blurred by a Gaussian.
+    """Return normal noise with a variance of 1, (1, h, w), blurred by a Gaussian of ``sigma`` pixels, or of two (v, u).
 
     Wide Gaussians are drawn on a coarse grid and enlarged, which costs little.
-
-    Args:
-        like: a map of that size.
-        sigma: standard deviation of the Gaussian in pixels, or one along v and one along u.
-
     """
     if sigma == 0:
         return torch.randn(like.shape, generator=generator)
@@ -73,13 +68,9 @@ def field_of(like: Tensor, sigma: float | tuple[float, float], generator: torch.
 
 
 def waves_of(like: Tensor, length: float, generator: torch.Generator, stretch: float = 1) -> Tensor:
-    """Return normal noise of several octaves with a variance of 1, (1, h, w).
+    """Return normal noise of several octaves with a variance of 1, (1, h, w), ``stretch`` times as long along rows.
 
-    Args:
-        like: a map of that size.
-        length: full width at half maximum of its autocorrelation in pixels; white noise for 1 and less.
-        stretch: by how much it is longer along rows, and shorter along columns.
-
+    ``length``: full width at half maximum of its autocorrelation in pixels; white noise for 1 and less.
     """
     if length <= 1:
         return field_of(like, 0, generator)
@@ -151,13 +142,7 @@ def add_folds(scene: Scene, generator: torch.Generator) -> Scene:
 
 
 def displace(values: Tensor, scale: int, generator: torch.Generator) -> Tensor:
-    """Return a map shifted along both axes, and in half of the cases also magnified or shrunk; the border is repeated.
-
-    Args:
-        values: (1, H, W).
-        scale: no pixel moves by more than this many pixels along either axis.
-
-    """
+    """Return a map (1, H, W) shifted by up to ``scale`` pixels along each axis, half of them also magnified."""
     for dim in (-2, -1):
         size = values.shape[dim]
         shift, growth = uniform(-scale, scale, generator), uniform(-scale, scale, generator)
@@ -195,21 +180,12 @@ def take_another_photo(rgb: Tensor, generator: torch.Generator) -> Tensor:
     if chance(1 / 12, generator):
         rgb = torch.lerp(rgb.mean(dim=(-2, -1), keepdim=True), rgb, uniform(0, 0.3, generator))
     if chance(0.5, generator):
-        rgb = _blur(rgb, uniform(0.3, 1.2, generator))
+        sigma = uniform(0.3, 1.2, generator)
+        rgb = torch.from_numpy(ndimage.gaussian_filter(rgb.numpy(), (0, sigma, sigma), mode="nearest", truncate=2.5))
     rgb = (rgb + uniform(0, 0.03, generator) * torch.randn(rgb.shape, generator=generator)).clamp(0, 1)
     if chance(0.5, generator):
-        rgb = _compress(rgb, round(uniform(25, 90, generator)))
+        pixels = (255 * rgb).round().byte().permute(1, 2, 0).numpy()[..., ::-1]
+        _, code = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, round(uniform(25, 90, generator))])
+        decoded = cv2.cvtColor(np.asarray(cv2.imdecode(code, cv2.IMREAD_COLOR)), cv2.COLOR_BGR2RGB)
+        rgb = torch.from_numpy(decoded).permute(2, 0, 1).float() / 255
     return rgb
-
-
-def _blur(rgb: Tensor, sigma: float) -> Tensor:
-    """Return an image blurred by a Gaussian, (3, H, W)."""
-    return torch.from_numpy(ndimage.gaussian_filter(rgb.numpy(), (0, sigma, sigma), mode="nearest", truncate=2.5))
-
-
-def _compress(rgb: Tensor, quality: int) -> Tensor:
-    """Return an image after JPEG compression, (3, H, W)."""
-    pixels = (255 * rgb).round().byte().permute(1, 2, 0).numpy()
-    _, code = cv2.imencode(".jpg", pixels[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
-    decoded = cv2.cvtColor(np.asarray(cv2.imdecode(code, cv2.IMREAD_COLOR)), cv2.COLOR_BGR2RGB)
-    return torch.from_numpy(decoded).permute(2, 0, 1).float() / 255

@@ -61,13 +61,20 @@ def _structured(values: Tensor, luma: Tensor, generator: torch.Generator) -> Ten
     seen = _jitter(seen, uniform(0, 0.8, generator), generator)
     depth = values.reciprocal()
     axial = 0.0012 + 0.0019 * (depth - 0.4).square()
-    axial = axial + 0.0001 / depth.sqrt() * _grazing(values, focal)
+    slope = (
+        values.diff(dim=-1, append=values[..., -1:]).square() + values.diff(dim=-2, append=values[:, -1:]).square()
+    ).sqrt()
+    angle = torch.atan(focal * slope / values)  # between the surface and the view
+    grazing = (angle / (math.pi / 2 - angle)).square().clamp(max=25).nan_to_num(0)
+    axial = axial + 0.0001 / depth.sqrt() * grazing
     noise = stereo_constant * values.square() * axial * power(-0.4, 0.4, generator)
     length = min(power(0, 1.1, generator), _longest(values))
     smooth = chance(0.5, generator)  # a matching window averages: where steps are coarser, plateaus with winding edges
     grain = field_of(values, length / 3.33, generator) if smooth else waves_of(values, length, generator)
     if chance(0.4, generator):
-        grain = grain + uniform(0.2, 1, generator) * _bands(values, generator)
+        strength, width = uniform(0.2, 1, generator), values.shape[-1]
+        bands = torch.randn((1, 1, max(2, round(width / power(0.9, 1.9, generator)))), generator=generator)
+        grain = grain + strength * functional.interpolate(bands, width, mode="nearest-exact").expand_as(values)
     result = _count(stereo_constant * seen, noise.nan_to_num(0) * grain, generator) / stereo_constant
     lost = (torch.rand(values.shape, generator=generator) < uniform(0, 1, generator)) & near_steps(values, 1)
     if chance(0.4, generator):  # the projector's light does not get there
@@ -79,15 +86,6 @@ def _structured(values: Tensor, luma: Tensor, generator: torch.Generator) -> Ten
     if chance(0.25, generator):
         lost |= _steep(values, generator)
     return result.masked_fill(lost, torch.nan)
-
-
-def _grazing(values: Tensor, focal: float) -> Tensor:
-    """Return angle^2 / (90 degrees - angle)^2 of the angle between a surface and the view, in radians, at most 25."""
-    slope = (
-        values.diff(dim=-1, append=values[..., -1:]).square() + values.diff(dim=-2, append=values[:, -1:]).square()
-    ).sqrt()
-    angle = torch.atan(focal * slope / values)
-    return (angle / (math.pi / 2 - angle)).square().clamp(max=25).nan_to_num(0)
 
 
 def _steep(values: Tensor, generator: torch.Generator) -> Tensor:
@@ -105,13 +103,6 @@ def _jitter(values: Tensor, strength: float, generator: torch.Generator) -> Tens
     rows = (torch.arange(height)[:, None] + down).clamp(0, height - 1)
     columns = (torch.arange(width) + across).clamp(0, width - 1)
     return torch.where(near_steps(values, 2), values[:, rows, columns], values)
-
-
-def _bands(values: Tensor, generator: torch.Generator) -> Tensor:
-    """Return vertical bands of 8 to 80 pixels, normal numbers of (1, h, w)."""
-    width = values.shape[-1]
-    bands = torch.randn((1, 1, max(2, round(width / power(0.9, 1.9, generator)))), generator=generator)
-    return functional.interpolate(bands, width, mode="nearest-exact").expand_as(values)
 
 
 def _count(disparity: Tensor, noise: Tensor, generator: torch.Generator, *, stereo: bool = False) -> Tensor:
@@ -158,7 +149,12 @@ def _flight(values: Tensor, luma: Tensor, generator: torch.Generator) -> Tensor:
     length = min(uniform(1, 9, generator), _longest(values)) if chance(0.6, generator) else 1
     grain = waves_of(depth, length, generator)
     if chance(0.5, generator):  # light that comes by other surfaces
-        rounded = (_surroundings(exact, power(0.6, 1.3, generator)) / exact - 1).clamp(min=-0.1)
+        height, width = exact.shape[-2:]
+        coarser = power(0.6, 1.3, generator)
+        coarse = max(2, round(height / coarser)), max(2, round(width / coarser))
+        stack = functional.adaptive_avg_pool2d(torch.stack((exact.nan_to_num(0), exact.isfinite().to(exact))), coarse)
+        sums, weights = functional.interpolate(stack, (height, width), mode="bilinear", align_corners=False)
+        rounded = (sums / weights.clamp(min=1e-6) / exact - 1).clamp(min=-0.1)
         rounded = rounded.clamp(max=0) * torch.exp(-(rounded / 0.04).square())  # inner corners, not steps
         wide = field_of(depth, min(power(0.8, 1.4, generator), _longest(values)), generator)
         depth = depth + exact * (uniform(0, 1, generator) * rounded + uniform(0, 0.01, generator) * (wide + 1))
@@ -183,23 +179,18 @@ def _means(values: Tensor, weights: Tensor, size: int) -> Tensor:
     return window_means(values.nan_to_num(0) * weights, size) / window_means(weights, size).clamp(min=1e-9)
 
 
-def _surroundings(values: Tensor, size: float) -> Tensor:
-    """Return smooth means over about twice ``size`` pixels, holes left out, (1, h, w)."""
-    height, width = values.shape[-2:]
-    coarse = max(2, round(height / size)), max(2, round(width / size))
-    stack = torch.stack((values.nan_to_num(0), values.isfinite().to(values)))
-    sums, weights = functional.interpolate(
-        functional.adaptive_avg_pool2d(stack, coarse), (height, width), mode="bilinear", align_corners=False
-    )
-    return sums / weights.clamp(min=1e-6)
-
-
 def _lidar(values: Tensor, luma: Tensor, generator: torch.Generator) -> Tensor:
     """A phone's lidar: a grid of dots coarser than the map, interpolated, with blobs of doubtful pixels."""
     height, width = values.shape[-2:]
     stride = uniform(1.5, 8, generator)
     size = max(2, round(height / stride)), max(2, round(width / stride))
-    dots = _dots(values, size, uniform(0, 0.5, generator), generator)
+    shift, places = uniform(0, 0.5, generator), []  # each dot is measured up to this part of their distance aside
+    for axis, count in enumerate(size):
+        middles = (torch.arange(count) + 0.5).view((-1, 1) if axis == 0 else (1, -1))
+        aside = shift * (2 * torch.rand(size, generator=generator) - 1)
+        whole = values.shape[axis - 2]
+        places.append(((middles + aside) * (whole / count)).long().clamp(0, whole - 1))
+    dots = values[:, places[0], places[1]]
     smooth = functional.interpolate(dots[None], (height, width), mode="bilinear", align_corners=False)[0]
     smooth = torch.where(smooth.isfinite(), smooth, values)  # not beside holes of the truth
     weight = uniform(0.5, 1, generator)
@@ -211,17 +202,6 @@ def _lidar(values: Tensor, luma: Tensor, generator: torch.Generator) -> Tensor:
     if chance(0.4, generator):  # 2.9 % at 0.35 m, 1.6 % at 1.1 m, 0.6 % at 3 m; whether near or far is not known
         result = result * (1 + uniform(-1, 1, generator) * (0.015 * values**0.7).clamp(max=0.03))
     return result
-
-
-def _dots(values: Tensor, size: tuple[int, int], shift: float, generator: torch.Generator) -> Tensor:
-    """Return a map at a grid of dots, (1, *size), each measured up to ``shift`` of their distance aside."""
-    places = []
-    for axis, count in enumerate(size):
-        middles = (torch.arange(count) + 0.5).view((-1, 1) if axis == 0 else (1, -1))
-        aside = shift * (2 * torch.rand(size, generator=generator) - 1)
-        length = values.shape[axis - 2]
-        places.append(((middles + aside) * (length / count)).long().clamp(0, length - 1))
-    return values[:, places[0], places[1]]
 
 
 def _stereo(values: Tensor, luma: Tensor, generator: torch.Generator) -> Tensor:
@@ -272,7 +252,11 @@ def _lose(
     """Return disparity with holes where only one camera sees a surface, or where both see too little."""
     if chance(0.7, generator):
         hidden = occluded(stereo_constant * values)
-        disparity = _fill(disparity, hidden) if chance(0.25, generator) else disparity.masked_fill(hidden, torch.nan)
+        if chance(0.25, generator):  # some cameras fill such holes with the value to their left
+            places = torch.where(hidden, 0, torch.arange(hidden.shape[-1])).cummax(dim=-1).values
+            disparity = disparity.gather(-1, places)
+        else:
+            disparity = disparity.masked_fill(hidden, torch.nan)
     lost = torch.zeros_like(values, dtype=torch.bool)
     if chance(0.2, generator):
         lost |= dark(values, luma, None, generator)
@@ -298,12 +282,6 @@ def _between(values: Tensor, most: int, generator: torch.Generator) -> Tensor:
     """Return the mask of pixels lost where two surfaces are seen, up to ``most`` pixels from steps, (1, h, w)."""
     reach = int(torch.randint(1, most + 1, (1,), generator=generator))
     return _beside_steps(values, reach) & (field_of(values, 1.5, generator) > uniform(-2, 1, generator))
-
-
-def _fill(values: Tensor, missing: Tensor) -> Tensor:
-    """Return a map in which what is missing has the value to its left, as cameras fill such holes."""
-    places = torch.where(missing, 0, torch.arange(values.shape[-1])).cummax(dim=-1).values
-    return values.gather(-1, places)
 
 
 NOISES: Mapping[str, Callable[[Tensor, Tensor, torch.Generator], Tensor]] = {

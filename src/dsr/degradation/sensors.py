@@ -62,14 +62,10 @@ class Sensor:
 
 
 class ValueSteps(NamedTuple):
-    """Steps of inverse depth that a map's values have: multiples of ``1 / constant``.
+    """Steps of inverse depth that a map's values have: multiples of ``1 / constant``."""
 
-    ``constant``: focal length times baseline over the step of disparity, in metres. ``confidence``: from 0 to 1, how
-    closely the values keep to them, 1 for exactly.
-    """
-
-    constant: float
-    confidence: float
+    constant: float  # focal length times baseline over the step of disparity, in metres
+    confidence: float  # from 0 to 1, how closely the values keep to them
 
 
 _D400_STEP = "Intel, Subpixel Linearity Improvement for RealSense D400 (dev.intelrealsense.com): 1/32 pixel"
@@ -150,7 +146,7 @@ _D400 = replace(
 )
 _WIDE = r"(?!.*([-_ ]w(?![a-z])|lite|[-_ ]sr|[-_ ]lr|tof))"
 
-SENSORS = (
+SENSORS = (  # of several whose pattern fits a name the first is taken
     _stereo(
         "RealSense D415",
         1280,
@@ -263,7 +259,6 @@ SENSORS = (
         r"time.?of.?flight|\btof\b|\bsm-(g977|n97[56]|g98[568])|huawei.*p[34]0 pro|\bvog-",
     ),
 )
-"""Of several whose pattern fits a name the first is taken."""
 
 
 def recognise(device_name: str) -> Sensor | None:
@@ -286,24 +281,18 @@ def _has_figures(sensor: Sensor) -> bool:
 
 
 class Identified(NamedTuple):
-    """The sensor of a map, and what identified it: the request, the file or the values.
-
-    ``constant``: f B over the step of disparity that the map's values show, in metres; None where they show none.
-    """
+    """The sensor of a map, and what identified it: the request, the file or the values."""
 
     sensor: Sensor
     by: Literal["request", "file", "values"]
-    constant: float | None = None
+    constant: float | None = None  # f B over the step of disparity that the map's values show, in metres, if any
 
     def least_error(self, depth: Tensor) -> Tensor:
         """Return :func:`least_error`, in the mode of the sensor that the map's values show."""
         return least_error(self.sensor, depth, self.constant)
 
     def offset_error(self, depth: Tensor) -> Tensor | None:
-        """Return the expected absolute systematic error of depth, in its unit, metres; None where no limit is known.
-
-        It is half of the sensor's limit: the mean of offsets that are equally likely up to it.
-        """
+        """Return the expected systematic error of depth in metres, half of its limit; None where no limit is known."""
         limit = self.sensor.offset
         return None if limit is None else _interpolate(depth, limit) / 2
 
@@ -366,18 +355,10 @@ def _mismatch(sensor: Sensor, constant: float, parts: tuple[float, ...] = _PARTS
 
 
 def least_error(sensor: Sensor, depth: Tensor, constant: float | None = None) -> Tensor:
-    """Return the standard deviation of depth below which a sensor states none.
+    """Return the standard deviation in metres of depth of any shape below which a sensor states none; 0 if not known.
 
     That of its disparity, z^2 noise / (f B), where no noise is less than the rounding to steps, and its spread at that
-    distance; the larger one.
-
-    Args:
-        depth: in metres, any shape.
-        constant: f B over the step of disparity, in metres; None for that of its native width.
-
-    Returns:
-        Metres, in the shape of ``depth``; 0 for a sensor of which neither is known.
-
+    distance; the larger one. ``constant`` is f B over the step of disparity; None for that of its native width.
     """
     least = torch.zeros_like(depth)
     constant = constant or _counts(sensor)
@@ -395,8 +376,7 @@ def _interpolate(depth: Tensor, points: tuple[tuple[float, float], ...]) -> Tens
     return torch.from_numpy(np.interp(depth.detach().double().cpu().numpy(), distances, values)).to(depth)
 
 
-_CONSTANTS = (16.0, 4096.0)
-"""Range of constants that are looked for, in metres: 16 pixel metres in whole pixels to 128 in steps of 1/32."""
+_CONSTANTS = (16.0, 4096.0)  # sought, in metres: 16 pixel metres in whole pixels to 128 in steps of 1/32
 _ROUNDINGS = (1e-3, 1.25e-4, 1e-4)  # metres to which cameras' files are rounded
 _SEEN = 2.0  # A step of depth shows if it is so many times what values are rounded to
 _COMMON = 4  # pixels that a value must have; rarer ones come from resampling
@@ -407,11 +387,9 @@ _CONFIDENT, _SIGNIFICANT = 0.6, 25.0
 _NEAREST = 0.1  # metres; nearer values are left out
 _PIXELS = 2**20  # about how many pixels are looked at; of larger maps some rows
 _MOST = 400  # values that are looked at, drawn at random
-_DENSE = 1.2
-"""Distinct values over the number of steps between the smallest and the largest, from which they keep to no steps."""
+_DENSE = 1.2  # distinct values over steps between the smallest and the largest, from which they keep to no steps
+# Multiples of a step are also multiples of its parts: the largest step with this share of the best confidence is taken.
 _HARMONIC = 0.8
-"""Values that are multiples of a step are also multiples of its parts: the largest step is taken whose confidence is
-at least this share of the best."""
 _FINE = 4  # samples of the spectrum for each cycle that fits into the range of inverse depth
 
 
@@ -433,7 +411,12 @@ def recognise_values(depth: Tensor) -> ValueSteps | None:
     depth = depth[:, :: max(1, round(depth.numel() / _PIXELS))]
     values, counts = torch.unique(depth[depth.isfinite()].double(), return_counts=True)
     distinct = values[(counts >= _COMMON) & (values >= _NEAREST)].cpu().numpy()
-    rounding = next((each for each in _ROUNDINGS if _is_rounded(distinct, each)), None)
+
+    def is_rounded(unit: float) -> bool:  # up to the precision of float32
+        multiples = distinct / unit
+        return bool(np.all(np.abs(multiples - np.round(multiples)) <= 1e-3 + 2e-7 * multiples))
+
+    rounding = next(filter(is_rounded, _ROUNDINGS), None)
     if rounding is None or not len(distinct):
         return None
     found: list[ValueSteps] = []
@@ -448,12 +431,6 @@ def recognise_values(depth: Tensor) -> ValueSteps | None:
         return None
     best = max(each.confidence for each in found)
     return min(each for each in found if each.confidence >= _HARMONIC * best)
-
-
-def _is_rounded(values: np.ndarray, unit: float) -> bool:
-    """Return whether depths are whole multiples of a unit, up to the precision of float32."""
-    multiples = values / unit
-    return bool(np.all(np.abs(multiples - np.round(multiples)) <= 1e-3 + 2e-7 * multiples))
 
 
 def _peaks(inverse: np.ndarray, low: float, high: float) -> list[ValueSteps]:

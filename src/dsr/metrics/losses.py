@@ -1,30 +1,39 @@
-"""Training losses: the paper's Lap_1 + w MSE_v, and L1 and MSE on depth. One value per image, masked, differentiable.
+"""Losses on depth maps and on renderings: one value per image, masked, differentiable.
 
-The visual losses are the metrics' own kernels, see :mod:`dsr.metrics.visual_loss`.
+On depth: Lap_1 of Bojanowski et al., *Optimizing the Latent Space of Generative Networks*, ICML 2018, L1 and MSE. On
+renderings, with the metrics' own kernels: MSE_v (Voynov et al. 2019), and DSSIM_v and LPIPS_v to compare it with. As
+metrics, DSSIM_v and LPIPS_v are the worst of four lights; as losses they are the mean over the lights, because the
+gradient of a maximum is that of one light alone. MSE_v has no lights: it is the same for any three orthonormal ones.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
+from dsr.metrics.functional import SSIM_WINDOW, SurfacePair, dssim_v, mse_v
+from dsr.metrics.lpips import GET_TRUNK, LPIPS, MIN_SIZE, load_lpips, lpips_v
 from dsr.utils.compute_device import in_own_precision, known_true
+from dsr.utils.console import one_line
 
+VisualLossName = Literal["mse_v", "dssim", "lpips"]
 _PIXELS = (-3, -2, -1)
+_TITLES = {"mse_v": "MSE_v", "dssim": "DSSIM_v", "lpips": "LPIPS_v"}
+_MIN_SIZES = {"mse_v": 2, "dssim": SSIM_WINDOW, "lpips": MIN_SIZE}
 
 
 @in_own_precision
 def l1(prediction: Tensor, target: Tensor, *, complete: bool | None = None) -> Tensor:
     """Return the mean absolute difference over valid pixels of (B, 1, H, W) maps, (B,); NaN if none is valid.
 
-    Args:
-        prediction, target: NaN in holes.
-        complete: whether neither has a hole; None if not known.
-
+    ``complete`` says whether neither has a hole (NaN); None if not known.
     """
     difference, valid = _difference(prediction, target, complete)
     return _mean(difference.abs(), valid)
@@ -41,22 +50,23 @@ def mse(prediction: Tensor, target: Tensor, *, complete: bool | None = None) -> 
 def lap1(prediction: Tensor, target: Tensor, *, levels: int = 3, complete: bool | None = None) -> Tensor:
     """Return the Laplacian pyramid loss Lap_1 per pixel, (B,), as :func:`l1`.
 
-    Bojanowski et al., *Optimizing the Latent Space of Generative Networks*, ICML 2018, eq. 2: the sum over levels j of
-    2^(2 j) |L^j(x) - L^j(y)|_1. As level j has 2^(2 j) times fewer pixels, this per pixel is the sum of the levels'
-    mean absolute differences; the last level is the low-pass. The pyramid is linear, so it is built of the difference,
-    which is 0 in holes; each level weights a pixel by the valid fraction of its area. The shorter side has at least
-    3 * 2^(levels - 1) pixels.
+    Eq. 2 is the sum over levels j of 2^(2 j) |L^j(x) - L^j(y)|_1. As level j has 2^(2 j) times fewer pixels, this per
+    pixel is the sum of the levels' mean absolute differences; the last level is the low-pass. The pyramid is linear, so
+    it is built of the difference, which is 0 in holes; each level weights a pixel by the valid fraction of its area.
+    The shorter side has at least 3 * 2^(levels - 1) pixels.
     """
     difference, valid = _difference(prediction, target, complete)
     weight = None if valid is None else valid.to(difference.dtype)
-    terms = []
+    kernel, terms = _kernel(difference.dtype, difference.device), []
+
+    def reduce(x: Tensor) -> Tensor:  # (B, 1, H, W) -> (B, 1, ceil(H / 2), ceil(W / 2))
+        return functional.conv2d(functional.pad(x, (2, 2, 2, 2), mode="replicate"), kernel, stride=2)
+
     for _ in range(levels - 1):
-        level = _reduce(difference)
-        detail = difference - _blur(level, difference.shape[-2:]) / _blurred_ones(
-            level.shape[-2:], difference.shape[-2:], level.dtype, level.device
-        )
+        size, level = difference.shape[-2:], reduce(difference)
+        detail = difference - _blur(level, size) / _blurred_ones(level.shape[-2:], size, level.dtype, level.device)
         terms.append(_mean(detail.abs(), weight))
-        difference, weight = level, None if weight is None else _reduce(weight)
+        difference, weight = level, None if weight is None else reduce(weight)
     return functools.reduce(torch.add, [*terms, _mean(difference.abs(), weight)])
 
 
@@ -76,12 +86,6 @@ def _mean(values: Tensor, weight: Tensor | None) -> Tensor:
         return values.mean(dim=_PIXELS)
     values = values if weight.dtype == torch.bool else values * weight
     return values.sum(dim=_PIXELS) / weight.sum(dim=_PIXELS)
-
-
-def _reduce(values: Tensor) -> Tensor:
-    """Return the next, smaller level, (B, 1, H, W) -> (B, 1, ceil(H / 2), ceil(W / 2)); edge pixels are repeated."""
-    padded = functional.pad(values, (2, 2, 2, 2), mode="replicate")
-    return functional.conv2d(padded, _kernel(values.dtype, values.device), stride=2)
 
 
 def _blur(level: Tensor, size: Sequence[int]) -> Tensor:
@@ -104,3 +108,65 @@ def _kernel(dtype: torch.dtype, device: torch.device) -> Tensor:
     """Return the binomial kernel, (1, 1, 5, 5)."""
     taps = torch.tensor((1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16), dtype=dtype, device=device)
     return torch.outer(taps, taps)[None, None]
+
+
+@dataclass(frozen=True)
+class VisualLoss:
+    """A loss on renderings; :func:`make_visual_loss` loads the network of ``lpips``."""
+
+    name: VisualLossName = "mse_v"
+    network: LPIPS | None = field(default=None, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if self.name not in _TITLES:
+            raise ValueError(f"visual: expected one of {', '.join(_TITLES)}, got {self.name!r}")
+        if self.name == "lpips" and self.network is None:
+            raise ValueError("visual: expected a network for lpips, got none")
+
+    def __call__(self, pair: SurfacePair) -> Tensor:
+        """Return the loss, (B,); NaN for an image without a valid normal."""
+        if self.name == "mse_v":
+            return mse_v(pair)
+        values = dssim_v(pair) if self.network is None else lpips_v(pair, self.network)
+        return values.mean(dim=1)
+
+    @property
+    def title(self) -> str:
+        """Name of the metric."""
+        return _TITLES[self.name]
+
+    def check_size(self, height: int, width: int) -> None:
+        """Raise a ValueError for maps that are smaller than the loss is defined for."""
+        least = _MIN_SIZES[self.name]
+        if min(height, width) < least:
+            raise ValueError(
+                f"visual: {self.name} expects maps of at least {least} x {least} pixels, got {height} x {width}"
+            )
+
+
+MSE_V = VisualLoss()
+
+
+def make_visual_loss(name: VisualLossName, trunk: str | Path | None = None) -> VisualLoss:
+    """Return a loss, with the network that ``lpips`` needs.
+
+    Args:
+        name: ``mse_v``, ``dssim`` or ``lpips``.
+        trunk: file of AlexNet's weights; None to use torch's hub cache.
+
+    """
+    if name != "lpips":
+        return VisualLoss(name)
+    try:
+        return VisualLoss(name, load_lpips(None if trunk is None else Path(trunk).expanduser()))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"visual: lpips needs AlexNet's weights: {one_line(error)}; {GET_TRUNK}") from error
+
+
+@torch.no_grad()
+def match_weight(visual: VisualLoss, pairs: Iterable[SurfacePair]) -> float:
+    """Return the weight that makes a loss as large as MSE_v: the median of their ratios, 1 if no pair has an error."""
+    ratios = torch.cat([torch.ones(0), *(mse_v(pair).cpu() / visual(pair).cpu() for pair in pairs)])
+    ratios = ratios[ratios.isfinite() & (ratios > 0)]
+    return float(ratios.median()) if len(ratios) else 1.0

@@ -76,16 +76,10 @@ class Plane(Surface):
 
 @dataclass(frozen=True, eq=False)
 class Convex(Surface):
-    """A convex body: the part of a ray inside it is one interval.
+    """A convex body: the part of a ray inside it is one interval."""
 
-    Args:
-        centre: (3,) centre in metres.
-        axes: (3, 3) rotation whose columns are the body's own axes.
-
-    """
-
-    centre: Array
-    axes: Array
+    centre: Array  # (3,) in metres
+    axes: Array  # (3, 3) rotation whose columns are the body's own axes
 
     def to_local(self, points: Array) -> Array:
         """Return ``points`` in the body's own frame, shape (3, N)."""

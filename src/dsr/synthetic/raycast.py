@@ -34,18 +34,11 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """The bodies and lights of a scene.
-
-    Args:
-        bodies: bodies that cover the whole view.
-        lights: (3, L) sample points of the area light in metres.
-        spread: radius in metres of the patch that each sample point represents.
-
-    """
+    """The bodies and lights of a scene; the bodies cover the whole view."""
 
     bodies: tuple[Body, ...]
-    lights: Array
-    spread: float
+    lights: Array  # (3, L) sample points of the area light in metres
+    spread: float  # radius in metres of the patch that each sample point represents
 
 
 def area_light(centre: Array, side: Array, up: Array, count: int) -> Array:
@@ -115,7 +108,9 @@ def render(scene: World, camera: Camera) -> tuple[NDArray[np.uint8], Array]:
         depth[part], index = cast(scene, rays[:, part])
         colour[:, part] = shade(scene, depth[part] * rays[:, part], index, scene.lights)
     shape = (camera.height, camera.width)
-    rough = np.flatnonzero(_contrast(_encode(colour).reshape(3, *shape)) > 0.04)
+    image, size = _encode(colour).reshape(3, *shape), (1, 3, 3)
+    contrast = maximum_filter(image, size, mode="nearest") - minimum_filter(image, size, mode="nearest")
+    rough = np.flatnonzero(contrast.max(0).ravel() > 0.04)
     for start in range(0, rough.size, _CHUNK):
         pixels = rough[start : start + _CHUNK]
         colour[:, pixels] = _supersample(scene, camera, rays[:, pixels])
@@ -143,27 +138,13 @@ def _encode(linear: Array) -> Array:
     return np.clip(linear, 0.0, 1.0) ** (1 / 2.2)
 
 
-def _contrast(image: Array) -> Array:
-    """Return the largest difference within 3 x 3 pixels over the channels of (3, H, W), shape (H * W,)."""
-    size = (1, 3, 3)
-    difference = maximum_filter(image, size, mode="nearest") - minimum_filter(image, size, mode="nearest")
-    return np.asarray(difference.max(0).ravel())
-
-
 @dataclass(frozen=True, eq=False)
 class Implicit(Surface):
-    """The zero set of a continuous function, positive outside.
+    """The zero set of a continuous function, positive outside."""
 
-    Args:
-        distance: function from points (3, N) to approximate distances (N,) in metres.
-        bounds: box that contains the surface.
-        step_fraction: fraction of ``distance`` that is a safe step; 1 for a true distance function.
-
-    """
-
-    distance: Field
-    bounds: Box
-    step_fraction: float = 0.7
+    distance: Field  # from points (3, N) to approximate distances (N,) in metres
+    bounds: Box  # contains the surface
+    step_fraction: float = 0.7  # of ``distance``, a safe step; 1 for a true distance function
 
     @cached_property
     def _samples(self) -> NDArray[np.float32]:

@@ -27,17 +27,10 @@ _BYTES = 150  # least memory that a pixel takes while a scene is made; random on
 
 @dataclass(frozen=True)
 class Rendering:
-    """An rgb image with exact depth.
+    """An rgb image with exact orthogonal depth in metres, and their camera."""
 
-    Args:
-        rgb: (H, W, 3) uint8.
-        depth: (H, W) float64 orthogonal depth in metres.
-        camera: camera of both.
-
-    """
-
-    rgb: NDArray[np.uint8]
-    depth: NDArray[np.float64]
+    rgb: NDArray[np.uint8]  # (H, W, 3)
+    depth: NDArray[np.float64]  # (H, W)
     camera: Camera
 
     def __post_init__(self) -> None:

@@ -56,18 +56,16 @@ STATUE_BASE = (0.0, 1.09, 3.02)  # point of the floor on which the statue stands
 def statue_distance(p: Array) -> Array:
     """Return the approximate distance, (N,) metres, to a winged, draped figure with a torch on a fluted plinth.
 
-    ``p`` is (3, N) metres: x right, y up from the floor, z towards the viewer. Each part is computed only near its box.
+    Each part is computed within 5 cm of its box; elsewhere, the distance to the box stands for it.
     """
-    return np.minimum.reduce([_near(p, low, high, part) for low, high, part in _PARTS])
-
-
-def _near(p: Array, low: Vector, high: Vector, part: Field) -> Array:
-    """Return ``part`` within 5 cm of the box from ``low`` to ``high``, the distance to the box elsewhere."""
-    gap = np.maximum(np.maximum(np.array(low)[:, None] - p, p - np.array(high)[:, None]), 0.0)
-    out = np.sqrt((gap**2).sum(0))
-    close = np.flatnonzero(out < 0.05)
-    out[close] = part(p[:, close])
-    return out
+    distances = []
+    for low, high, part in _PARTS:
+        gap = np.maximum(np.maximum(np.array(low)[:, None] - p, p - np.array(high)[:, None]), 0.0)
+        out = np.sqrt((gap**2).sum(0))
+        close = np.flatnonzero(out < 0.05)
+        out[close] = part(p[:, close])
+        distances.append(out)
+    return np.minimum.reduce(distances)
 
 
 def _blend(a: Array, b: Array, width: float) -> Array:
@@ -240,6 +238,7 @@ def _wings(p: Array) -> Array:
     return wing * 0.6
 
 
+# The statue's parts with the lowest and highest corners of their boxes
 _PARTS: tuple[tuple[Vector, Vector, Field], ...] = (
     ((-0.40, 0.0, -0.40), (0.40, 0.25, 0.40), _plinth),
     ((-0.36, 0.23, -0.32), (0.36, 1.24, 0.32), _skirt),
@@ -249,19 +248,13 @@ _PARTS: tuple[tuple[Vector, Vector, Field], ...] = (
     ((0.07, 0.55, -0.10), (0.40, 1.57, 0.26), _lowered_arm),
     ((-0.90, 0.85, -0.28), (0.90, 2.26, -0.02), _wings),
 )
-"""Parts of the statue with their boxes in metres."""
 
 
 def render_scene(name: str, size: int = 512) -> Rendering:
-    """Return the scene ``name``, one of :data:`SCENES`, at ``size`` x ``size`` pixels.
-
-    The view is the same at any size.
-    """
-    scene = build_scene(name)
+    """Return one of :data:`SCENES` at ``size`` x ``size`` pixels; the view is the same at any size."""
     centre = (size - 1) / 2
     camera = Camera(size, size, FOCAL * size, FOCAL * size, centre, centre, baseline=VIRTUAL_BASELINE)
-    rgb, depth = render(scene, camera)
-    return Rendering(rgb, depth, camera)
+    return Rendering(*render(build_scene(name), camera), camera)
 
 
 @lru_cache
@@ -269,53 +262,34 @@ def build_scene(name: str) -> World:
     """Return the bodies and lights of the scene ``name``; the last body is the back wall."""
     if name not in SCENES:
         raise ValueError(f"scene: expected one of {', '.join(SCENES)}, got {name!r}")
+    wall = Plane(np.array([0.0, 0.0, WALL_Z]), np.array([0.0, 0.0, -1.0]))
+    middle = np.array([-1.75, -2.05, 0.6])
     if name == "statue":
-        return _statue_scene()
+        base = np.array(STATUE_BASE)
+        bounds = Box(base - [0.0, 1.13, 0.0], np.eye(3), np.array([0.95, 1.135, 0.46]))
+        statue = Implicit(lambda p: statue_distance((p - base[:, None]) * [[1.0], [-1.0], [-1.0]]), bounds, 0.95)
+        floor = Plane(base, np.array([0.0, -1.0, 0.0]))
+        lights = area_light(middle, np.array([0.32, 0.0, 0.24]), np.array([0.08, 0.24, -0.28]), 3)
+        bodies = (Body(statue, _stone), Body(floor, plain(0.30, 0.29, 0.28)), Body(wall, plain(0.20, 0.24, 0.29)))
+        return World(bodies, lights, spread=0.18)
     style = name.split("_")[-2]  # high, low or no
-    bodies = _cube(style) if name.startswith("cube") else _sphere_cylinder(style)
-    lights = area_light(np.array([-1.75, -2.05, 0.6]), np.array([0.42, 0.0, 0.3]), np.array([0.1, 0.3, -0.35]), 9)
-    return World((*bodies, Body(_wall(), _wall_paint(style))), lights, spread=0.06)
-
-
-def _wall() -> Plane:
-    return Plane(np.array([0.0, 0.0, WALL_Z]), np.array([0.0, 0.0, -1.0]))
-
-
-def _cube(style: str) -> list[Body]:
-    cube = Box(np.array([0.0, 0.02, 3.1]), rotation(41.0, -31.0, 7.0), np.full(3, 0.44))
-    # the faces lie in the middle of a layer of the solid mosaic
-    paint = mosaic(cube.to_local, 0.44 / 14, 11) if style == "high" else plain(0.62, 0.60, 0.57)
-    return [Body(cube, paint)]
-
-
-def _sphere_cylinder(style: str) -> list[Body]:
-    sphere = Sphere(np.array([-0.45, 0.33, 2.84]), np.eye(3), 0.45)
-    cylinder = Cylinder(np.array([0.40, -0.03, 3.2]), rotation(0.0, 33.0, 14.0), 0.37, 0.64)
-    if style == "high":
-        paints = [marble(sphere.to_local), mosaic(unroll_chart(cylinder), 2 * np.pi * 0.37 / 76, 12)]
-    elif style == "low":
-        paints = [blobs(sphere.to_local, 0.25, 21, CLOUD), blobs(cylinder.to_local, 0.25, 22, CLOUD)]
+    clay = plain(0.62, 0.60, 0.57)
+    if name.startswith("cube"):
+        cube = Box(np.array([0.0, 0.02, 3.1]), rotation(41.0, -31.0, 7.0), np.full(3, 0.44))
+        # the faces lie in the middle of a layer of the solid mosaic
+        shown = [Body(cube, mosaic(cube.to_local, 0.44 / 14, 11) if style == "high" else clay)]
     else:
-        paints = [plain(0.62, 0.60, 0.57)] * 2
-    return [Body(surface, paint) for surface, paint in zip((sphere, cylinder), paints, strict=True)]
-
-
-def _wall_paint(style: str) -> Field:
-    if style == "high":
-        return weave
-    return blobs(lambda p: p, 0.45, 23, DUSK) if style == "low" else plain(0.60, 0.62, 0.65)
-
-
-def _statue_scene() -> World:
-    base = np.array(STATUE_BASE)
-    bounds = Box(base - [0.0, 1.13, 0.0], np.eye(3), np.array([0.95, 1.135, 0.46]))
-    statue = Implicit(
-        lambda p: statue_distance((p - base[:, None]) * [[1.0], [-1.0], [-1.0]]), bounds, step_fraction=0.95
-    )
-    floor = Plane(base, np.array([0.0, -1.0, 0.0]))
-    lights = area_light(np.array([-1.75, -2.05, 0.6]), np.array([0.32, 0.0, 0.24]), np.array([0.08, 0.24, -0.28]), 3)
-    bodies = (Body(statue, _stone), Body(floor, plain(0.30, 0.29, 0.28)), Body(_wall(), plain(0.20, 0.24, 0.29)))
-    return World(bodies, lights, spread=0.18)
+        sphere = Sphere(np.array([-0.45, 0.33, 2.84]), np.eye(3), 0.45)
+        cylinder = Cylinder(np.array([0.40, -0.03, 3.2]), rotation(0.0, 33.0, 14.0), 0.37, 0.64)
+        paints = [clay, clay]
+        if style == "high":
+            paints = [marble(sphere.to_local), mosaic(unroll_chart(cylinder), 2 * np.pi * 0.37 / 76, 12)]
+        elif style == "low":
+            paints = [blobs(sphere.to_local, 0.25, 21, CLOUD), blobs(cylinder.to_local, 0.25, 22, CLOUD)]
+        shown = [Body(sphere, paints[0]), Body(cylinder, paints[1])]
+    cloths: dict[str, Field] = {"high": weave, "low": blobs(lambda p: p, 0.45, 23, DUSK), "no": plain(0.60, 0.62, 0.65)}
+    lights = area_light(middle, np.array([0.42, 0.0, 0.3]), np.array([0.1, 0.3, -0.35]), 9)
+    return World((*shown, Body(wall, cloths[style])), lights, spread=0.06)
 
 
 def _stone(points: Array) -> Array:

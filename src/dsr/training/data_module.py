@@ -16,10 +16,10 @@ import torch
 from torch.utils.data import DataLoader, Dataset, default_collate
 
 from dsr.data.scene_source import SceneSource, content_key
-from dsr.degradation.hints import FACTS, encode_facts
+from dsr.degradation.hints import encode_facts
 from dsr.degradation.random_degradation import Everything
 from dsr.methods.classical.interpolation import Interpolation
-from dsr.sample import Scene, slope
+from dsr.sample import Scene
 from dsr.training.degradation import Batch, Degradation, to_tensors
 from dsr.training.patches import Patches, check_patches
 from dsr.training.settings import PatchSettings
@@ -30,13 +30,7 @@ _EPOCH = 1000  # about how many batches an epoch has where the trainer has no nu
 
 @dataclass(frozen=True)
 class Part:
-    """A data set to train on.
-
-    Args:
-        source: the data set.
-        share: how often patches come from it, relative to the other parts.
-
-    """
+    """A data set to train on, and how often patches come from it, relative to the other parts."""
 
     source: SceneSource
     share: float = 1.0
@@ -48,15 +42,7 @@ class Part:
 
 
 class WholeScenes(Dataset[Batch]):
-    """The samples of whole scenes in float64, the type in which evaluation scores them.
-
-    Args:
-        scenes: scenes with a true depth.
-        degradation: how their low-resolution maps are made.
-        seed: seed of the noise.
-        hinted: whether there are hints on the maps, the same as ``eval.py`` gives.
-
-    """
+    """Samples of whole scenes in float64, the type in which evaluation scores them, ``hinted`` as by ``eval.py``."""
 
     def __init__(
         self, scenes: Sequence[Scene], degradation: Degradation, seed: int = 0, *, hinted: bool = False
@@ -71,10 +57,7 @@ class WholeScenes(Dataset[Batch]):
         return len(self._samples)
 
     def __getitem__(self, index: int) -> Batch:
-        """Return one sample's tensors, ``noise`` and ``facts`` if the maps have hints, ``unit``, and ``bicubic``.
-
-        That is the (1, H, W) depth in metres of bicubic interpolation.
-        """
+        """Return a sample's tensors, its ``unit``, hints if there are any, and ``bicubic``, (1, H, W) in metres."""
         sample = self._samples[index]
         tensors = to_tensors(sample, torch.float64)
         tensors["bicubic"] = Interpolation("bicubic")(sample).double()
@@ -129,7 +112,11 @@ class PatchData(lightning.LightningDataModule):
             self._held_out[_make_unique(name, self._held_out)] = (source, source.scenes())
         if not self._held_out:
             raise ValueError("validation_scenes: expected a positive number where there is no other validation")
-        self._refuse_leaks()
+        trained = {content_key(source, name) for source, names in self.used_scenes[: len(parts)] for name in names}
+        for kind, (source, names) in self._held_out.items():
+            for name in names:
+                if content_key(source, name) in trained:  # under whatever name
+                    raise ValueError(f"validation.{kind}: expected scenes that are not trained on, got {name}")
         self._cut: Patches | None = None
         self._validation: list[list[Scene]] = []
 
@@ -157,10 +144,10 @@ class PatchData(lightning.LightningDataModule):
         """Load the scenes; Lightning's ``stage`` makes no difference."""
         if self._cut is not None:
             return
-        groups = [
-            [_halve_precision(part.source.load(name)) for name in names]
-            for part, names in zip(self._parts, self._training_names, strict=True)
-        ]
+        groups: list[list[Scene]] = []
+        for part, names in zip(self._parts, self._training_names, strict=True):
+            scenes = map(part.source.load, names)  # in float32, which takes half the memory
+            groups.append([replace(s, depth=None if s.depth is None else s.depth.float()) for s in scenes])
         shares = [part.share for part in self._parts]
         self._cut = Patches(
             groups,
@@ -172,25 +159,11 @@ class PatchData(lightning.LightningDataModule):
             per_step=self._per_step,
         )
         for kind, (source, names) in self._held_out.items():
-            scenes = [scene for scene in map(source.load, names) if scene.depth is not None]
-            if not scenes:
+            known = [scene for scene in map(source.load, names) if scene.depth is not None]
+            if not known:
                 raise ValueError(f"validation.{kind}: expected scenes with a true depth, there is none")
-            self._held_out[kind] = (source, [scene.name for scene in scenes])
-            self._validation.append(scenes)
-
-    def example_batch(self) -> Batch:
-        """Return a batch of the run's size that needs no scene: a grey slope, repeated."""
-        tensors = to_tensors(self._degradation.sample(slope(self.patches.patch), clean=True))
-        if self._everything is not None:
-            nothing = {"facts": torch.zeros(FACTS), "soft": torch.zeros(())}
-            tensors |= {"noise": torch.zeros_like(tensors["disparity_lr"]), **nothing}
-        return default_collate([tensors] * self.patches.batch)
-
-    def example_scene(self, kind: str) -> Batch:
-        """Return the first scene of a validation set as its loader does."""
-        source, names = self._held_out[kind]
-        scenes = [scene for scene in map(source.load, names[:1]) if scene.depth is not None]
-        return collate_scene([self._whole(scenes)[0]]) if scenes else {}
+            self._held_out[kind] = (source, [scene.name for scene in known])
+            self._validation.append(known)
 
     def first_patches(self, count: int) -> list[Batch]:
         """Return the first ``count`` patches of the run."""
@@ -222,7 +195,10 @@ class PatchData(lightning.LightningDataModule):
         """
         rank, devices = (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)
         parts = (scenes[rank::devices] for scenes in self._validation)
-        samples: Any = (self._whole(part) if part else [{}] for part in parts)
+        hinted = self._everything is not None
+        samples: Any = (
+            WholeScenes(part, self._degradation, self._seed, hinted=hinted) if part else [{}] for part in parts
+        )
         return [DataLoader(each, batch_size=1, collate_fn=collate_scene) for each in samples]
 
     def test_dataloader(self) -> list[DataLoader[Batch]]:
@@ -232,9 +208,6 @@ class PatchData(lightning.LightningDataModule):
     def predict_dataloader(self) -> list[DataLoader[Batch]]:
         """Return the loaders of the validation."""
         return self.val_dataloader()
-
-    def _whole(self, scenes: Sequence[Scene]) -> WholeScenes:
-        return WholeScenes(scenes, self._degradation, self._seed, hinted=self._everything is not None)
 
     def _load_patches(self) -> Patches:
         if self._cut is None:
@@ -257,18 +230,6 @@ class PatchData(lightning.LightningDataModule):
         self._training_names.append(names[: len(names) - count])
         if count:
             self._held_out[_make_unique(source.name, self._held_out)] = (source, names[len(names) - count :])
-
-    def _refuse_leaks(self) -> None:
-        """Refuse a scene that is both trained on and validated with, under whatever name."""
-        trained = {
-            content_key(part.source, name)
-            for part, names in zip(self._parts, self._training_names, strict=True)
-            for name in names
-        }
-        for kind, (source, names) in self._held_out.items():
-            for name in names:
-                if content_key(source, name) in trained:
-                    raise ValueError(f"validation.{kind}: expected scenes that are not trained on, got {name}")
 
 
 class _PatchNumbers:
@@ -319,8 +280,3 @@ def _make_unique(name: str, names: Mapping[str, Any]) -> str:
         number += 1
         candidate = f"{name}_{number}"
     return candidate
-
-
-def _halve_precision(scene: Scene) -> Scene:
-    """Return a scene whose depth is float32, which takes half the memory."""
-    return scene if scene.depth is None else replace(scene, depth=scene.depth.float())

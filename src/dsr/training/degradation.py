@@ -18,12 +18,7 @@ Batch = dict[str, Any]  # tensors by name; whole scenes also have ``unit``, the 
 
 @dataclass(frozen=True)
 class Degradation:
-    """How low-resolution maps are made from high-resolution ones.
-
-    Args:
-        scale, downsampling, noise: as for :func:`dsr.degradation.downsampling.make_sample`.
-
-    """
+    """How low-resolution maps are made; arguments as for :func:`dsr.degradation.downsampling.make_sample`."""
 
     scale: int
     downsampling: Downsampling

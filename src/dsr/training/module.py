@@ -25,15 +25,15 @@ from dsr.methods.networks.weight_files import make_network
 from dsr.metrics.classes import compute_means, in_table_units, visual_metrics
 from dsr.metrics.functional import SurfacePair
 from dsr.sample import Unit
-from dsr.training.callbacks import Curves
+from dsr.training.callbacks import Curves, log_picture
 from dsr.training.degradation import Batch
-from dsr.training.loggers import log_picture
 from dsr.training.objective import Objective, to_depth
-from dsr.training.parts import node_of, partial_node_of, read_node
+from dsr.utils.configuration import load_object
 from dsr.utils.guards import refusing
 from dsr.utils.torch_files import read_torch_file
 
 _RENDERED_SCENES = 4  # number of scenes of each validation set that are rendered for TensorBoard
+_TRUSTED = ("dsr.", "torch.optim.")
 
 
 _PARTS: dict[str, tuple[type, Callable[..., Any]]] = {
@@ -47,14 +47,7 @@ ADAMW = functools.partial(torch.optim.AdamW, lr=1e-3, weight_decay=1e-4)
 
 
 class WarmupCosine(LambdaLR):
-    """Linear warm-up of the learning rate, then its decay to zero as a cosine.
-
-    Args:
-        optimizer: whose rate is the highest one.
-        steps: number of steps of the whole training.
-        warmup: number of steps until the highest rate.
-
-    """
+    """Linear warm-up to the optimiser's learning rate, then its decay to zero as a cosine over the other ``steps``."""
 
     def __init__(self, optimizer: torch.optim.Optimizer, steps: int, warmup: int = 300) -> None:
         if warmup < 0:
@@ -89,8 +82,7 @@ class SuperResolution(lightning.LightningModule):
 
     """
 
-    logs_curves = True
-    """Whether it logs losses and speed where the trainer has no :class:`~dsr.training.callbacks.Curves`."""
+    logs_curves = True  # losses and speed, where the trainer has no Curves
 
     def __init__(
         self,
@@ -128,12 +120,7 @@ class SuperResolution(lightning.LightningModule):
         return [] if there else [Curves()]
 
     def forward(self, batch: Batch) -> Tensor:
-        """Return high-resolution depth by the averaged weights, (B, 1, H, W) in metres; NaN where there is none.
-
-        Args:
-            batch: low-resolution maps and photos, as of :func:`dsr.training.degradation.to_tensors`.
-
-        """
+        """Return high-resolution depth by the averaged weights, (B, 1, H, W) in metres; NaN where there is none."""
         with self._exact():
             return to_depth(self.average.answer_scene(batch).to(batch["disparity_lr"].dtype), batch)
 
@@ -186,9 +173,22 @@ class SuperResolution(lightning.LightningModule):
 
     def validation_step(self, batch: Batch, index: int, dataloader_idx: int = 0) -> None:
         """Score a whole scene, if the batch has one; render the first few for the loggers."""
-        if batch:
-            with self._exact():
-                self._score(batch, index, dataloader_idx)
+        if not batch:
+            return
+        with self._exact():
+            depth = self(batch)
+            scored = [(self.metrics[dataloader_idx], depth)]
+            if self._bicubic_metrics:
+                scored.append((self._bicubic_metrics[dataloader_idx], batch["bicubic"]))
+            unit = Unit(**batch["unit"])
+            for metrics, each in scored:
+                pair = SurfacePair(each, batch["depth"], batch["rays"], unit=unit, image_dtype=torch.float32)
+                metrics.update(pair)  # type: ignore[operator]
+            number = index * self.trainer.world_size + self.trainer.global_rank if self._trainer else 0  # of the scene
+            if self._trainer is not None and self._trainer.loggers and number < _RENDERED_SCENES:
+                depth_lr = to_depth(batch["disparity_lr"].to(batch["depth"].dtype), batch)
+                picture = comparison(depth, batch["depth"], batch["rays"], batch["rgb"], depth_lr)
+                self._pictures[f"renderings/{self.sets[dataloader_idx]}_{number}"] = picture
 
     def test_step(self, batch: Batch, index: int, dataloader_idx: int = 0) -> None:
         """Score a whole scene as a validation does."""
@@ -197,25 +197,6 @@ class SuperResolution(lightning.LightningModule):
     def predict_step(self, batch: Batch, *_: Any) -> Tensor | None:
         """Return a scene's depth, as :meth:`forward`; None for an empty batch."""
         return self(batch) if batch else None
-
-    def _score(self, batch: Batch, index: int, dataloader_idx: int) -> None:
-        """Score a whole scene, and render it if it is one of the first."""
-        depth = self(batch)
-        scored = [(self.metrics[dataloader_idx], depth)]
-        if self._bicubic_metrics:
-            scored.append((self._bicubic_metrics[dataloader_idx], batch["bicubic"]))
-        for metrics, each in scored:
-            pair = SurfacePair(
-                each, batch["depth"], batch["rays"], unit=Unit(**batch["unit"]), image_dtype=torch.float32
-            )
-            metrics.update(pair)  # type: ignore[operator]
-        if self._trainer is None or not self._trainer.loggers:
-            return
-        number = index * self.trainer.world_size + self.trainer.global_rank  # of the scene
-        if number < _RENDERED_SCENES:
-            depth_lr = to_depth(batch["disparity_lr"].to(batch["depth"].dtype), batch)
-            picture = comparison(depth, batch["depth"], batch["rays"], batch["rgb"], depth_lr)
-            self._pictures[f"renderings/{self.sets[dataloader_idx]}_{number}"] = picture
 
     def on_test_epoch_start(self) -> None:
         """Score bicubic interpolation, too."""
@@ -234,7 +215,10 @@ class SuperResolution(lightning.LightningModule):
         if self.trainer.sanity_checking:  # of a few scenes
             self._forget()
             return
-        self._gather()
+        if self.trainer.world_size > 1:
+            all_devices: list[Any] = [None] * self.trainer.world_size
+            torch.distributed.all_gather_object(all_devices, self._pictures)
+            self._pictures = {name: picture for pictures in all_devices for name, picture in pictures.items()}
         for name in sorted(self._pictures):
             for logger in self.loggers:
                 log_picture(logger, name, self._pictures[name], self.global_step)
@@ -278,10 +262,10 @@ class SuperResolution(lightning.LightningModule):
         """Store the scores of bicubic interpolation, and of what the module is made, as plain values."""
         checkpoint["bicubic"] = self.bicubic
         nodes = {
-            "net": node_of(type(self.net), self.net.arguments()),
-            "objective": node_of(type(self.objective), self.objective.arguments()),
-            "optimizer": partial_node_of(self._make_optimizer),
-            "scheduler": partial_node_of(self._make_scheduler) if self._make_scheduler is not None else None,
+            "net": _node_of(type(self.net), self.net.arguments()),
+            "objective": _node_of(type(self.objective), self.objective.arguments()),
+            "optimizer": _partial_node_of(self._make_optimizer),
+            "scheduler": _partial_node_of(self._make_scheduler) if self._make_scheduler is not None else None,
         }
         plain = {"average": self.decay, "validation_sets": list(self.sets)}
         checkpoint["hyper_parameters"] = plain | {name: node for name, node in nodes.items() if node is not None}
@@ -306,7 +290,7 @@ class SuperResolution(lightning.LightningModule):
             if name in parts:
                 continue
             if name in stored:
-                found, arguments = read_node(name, stored[name], kind)
+                found, arguments = _read_node(name, stored[name], kind)
                 try:
                     if name == "net":
                         make_network(Path(checkpoint_path), found, arguments)  # is not larger than the file
@@ -324,14 +308,6 @@ class SuperResolution(lightning.LightningModule):
         with refusing(message, AttributeError, TypeError, ValueError, OverflowError, RuntimeError):
             self.bicubic = {str(kind): {str(k): float(v) for k, v in each.items()} for kind, each in stored.items()}
 
-    def _gather(self) -> None:
-        """Gather the pictures of all devices."""
-        if self.trainer.world_size == 1:
-            return
-        all_devices: list[Any] = [None] * self.trainer.world_size
-        torch.distributed.all_gather_object(all_devices, self._pictures)
-        self._pictures = {name: picture for pictures in all_devices for name, picture in pictures.items()}
-
     def configure_optimizers(self) -> Any:
         """Return the optimiser and, if there is one, its schedule, which is updated after every step."""
         optimizer = self._make_optimizer(self.net.parameters())
@@ -344,3 +320,37 @@ class SuperResolution(lightning.LightningModule):
 def _by_tag(scores: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
     """Return the scores of sets by the names that they are logged by."""
     return {f"{kind}/{name}": value for kind, each in scores.items() for name, value in each.items()}
+
+
+def _node_of(kind: Any, arguments: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return a class as ``_target_`` beside arguments; None if it is no class or they are no plain values."""
+    if not isinstance(kind, type) or not _is_plain(arguments):
+        return None
+    return {"_target_": f"{kind.__module__}.{kind.__qualname__}", **arguments}
+
+
+def _partial_node_of(make: Any) -> dict[str, Any] | None:
+    """Return a class, or a partial of one, likewise, with ``_partial_``; None for any other function."""
+    made = make if isinstance(make, functools.partial) else functools.partial(make)
+    node = _node_of(made.func, made.keywords)
+    return None if node is None or made.args else {**node, "_partial_": True}
+
+
+def _read_node(name: str, node: Mapping[str, Any], kind: type) -> tuple[Any, dict[str, Any]]:
+    """Return the class, a ``kind``, and the arguments that a node names; the checkpoint may come from somebody else."""
+    path = str(node.get("_target_"))
+    if not path.startswith(_TRUSTED):
+        raise ValueError(f"{name}: the checkpoint names {path}, which is neither dsr's nor torch.optim's; give {name}=")
+    found = load_object(name, path, f"a {kind.__name__}")
+    if not (isinstance(found, type) and issubclass(found, kind)):
+        raise ValueError(f"{name}: expected a {kind.__name__} in the checkpoint, {path} is none")
+    return found, {key: value for key, value in node.items() if key not in ("_target_", "_partial_")}
+
+
+def _is_plain(value: Any) -> bool:
+    """Return whether a value consists of what torch reads without running code."""
+    if isinstance(value, Mapping):
+        return all(isinstance(key, str) and _is_plain(each) for key, each in value.items())
+    if isinstance(value, list | tuple):
+        return all(map(_is_plain, value))
+    return value is None or isinstance(value, str | int | float)

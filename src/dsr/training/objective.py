@@ -1,4 +1,12 @@
-"""The losses of trainings: of disparity and renderings, whose weight w may be computed, and of expected errors."""
+"""The losses of trainings: of disparity and renderings, of Facets with its expected errors, and of shading.
+
+The shading loss is that of DDRNet (Yan et al., ECCV 2018): a photo against the shading of a surface under the light
+that explains it. A Lambertian surface with albedo R and normals n, under distant light, has the intensity B = R sum
+over b of l_b H_b(n), where the H_b are the nine spherical harmonics up to the second degree (Ramamoorthi and Hanrahan,
+SIGGRAPH 2001). The l_b of a photo are found by least squares with the normals of the reference depth. The albedo comes
+from the photo alone, by Retinex: steep changes of the logarithmic image are changes of the albedo, the others of the
+shading (Grosse et al., ICCV 2009). DDRNet's authors compute it in advance, for which they recommend Retinex.
+"""
 
 from __future__ import annotations
 
@@ -12,23 +20,27 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.surface import angle_between
+from dsr.methods.classical.finite_differences import grey
+from dsr.methods.networks.dct import dct2, idct2, laplacian_eigenvalues
 from dsr.methods.networks.network import Answer, DisparityNetwork
 from dsr.methods.networks.normalisation import compute_min_max, upsample_bicubic
-from dsr.metrics import losses
 from dsr.metrics.functional import SurfacePair, masked_mean, mse_v
-from dsr.metrics.visual_loss import MSE_V, VisualLoss, VisualLossName, make_visual_loss, match_weight
+from dsr.metrics.losses import MSE_V, VisualLoss, VisualLossName, l1, lap1, make_visual_loss, match_weight, mse
 from dsr.training.degradation import Batch
-from dsr.training.shading import shading_loss
 from dsr.utils.compute_device import in_own_precision
 
 DepthLoss = Literal["lap1", "l1", "mse"]
 _TILT = math.asin(5 / 255)  # 1.1 degrees: changes a rendering under grazing light by 5 of 255, as for BadPix_v(5)
-_DEPTH_LOSSES = {"lap1": losses.lap1, "l1": losses.l1, "mse": losses.mse}
+_DEPTH_LOSSES = {"lap1": lap1, "l1": l1, "mse": mse}
 _PATCHES_FOR_W = 64
+_RIDGE = 1e-4  # weight of the light's squared coefficients, as in DDRNet's code; the errors' weight is one per pixel
+_LARGEST_ALBEDO = 2.0  # albedos have a mean of 1 and are clipped to this, as in DDRNet's code
+_DARKEST = 1 / 255
+_GREY_STEP, _COLOUR_STEP = 0.1, 0.05  # larger changes of log intensity and of colour per pixel are the albedo's
 
 
 class Objective(abc.ABC):
-    """The loss of a training."""
+    """The loss of a training; a dataclass of plain values, or one with ``arguments`` and ``of``."""
 
     @property
     @abc.abstractmethod
@@ -51,24 +63,11 @@ class Objective(abc.ABC):
 
     @abc.abstractmethod
     def __call__(self, answer: Answer, batch: Batch) -> dict[str, Tensor]:
-        """Return ``loss`` and its terms, means over the images of the batch that have valid depth.
-
-        Args:
-            answer: of :meth:`dsr.methods.networks.network.DisparityNetwork.answer_patches`.
-            batch: tensors of :func:`dsr.training.degradation.to_tensors`.
-
-        """
+        """Return ``loss`` and its terms, means over the images of a batch of patches that have valid depth."""
 
     @abc.abstractmethod
     def check(self, net: DisparityNetwork, patch: int, *, hinted: bool) -> None:
-        """Raise a ValueError if a network cannot be trained with this loss, on patches of this size.
-
-        Args:
-            net: the network.
-            patch: height and width of the patches in pixels.
-            hinted: whether there are hints on the maps.
-
-        """
+        """Raise a ValueError if a network cannot be trained with this loss on such patches, ``hinted`` or not."""
 
     def balanced(self, first_patches: Callable[[int], Sequence[Batch]]) -> Self:
         """Return the loss with weights that are computed from as many patches as it asks for; itself without such."""
@@ -86,7 +85,7 @@ class DepthObjective(Objective):
         depth_loss: ``lap1``, ``l1`` or ``mse``.
         w: weight of the visual loss; 0 for none; ``auto`` is computed by :meth:`balanced`, and 1 before.
         visual: the visual loss.
-        shading: weight of :func:`dsr.training.shading.shading_loss`; 0 for none.
+        shading: weight of :func:`shading_loss`; 0 for none.
 
     """
 
@@ -204,15 +203,7 @@ class SurfaceObjective(Objective):
 
     @in_own_precision
     def __call__(self, answer: Answer, batch: Batch) -> dict[str, Tensor]:
-        """Return ``loss`` and its terms.
-
-        Args:
-            answer: of the network, with expected errors. Its ``disparity`` is without offset: baseline times focal
-                length over depth.
-            batch: tensors of :func:`dsr.training.degradation.to_tensors`, and ``soft``, (B,), 1 where the truth's depth
-                steps are soft.
-
-        """
+        """Return ``loss`` and its terms; disparity is without offset, and ``soft`` (B,) is 1 for soft depth steps."""
         disparity, target = answer.disparity, batch["bf"] / batch["depth"]
         unit = target.flatten(1).nanmedian(dim=1).values.view(-1, 1, 1, 1)
         positive = disparity > 0
@@ -221,7 +212,7 @@ class SurfaceObjective(Objective):
         squares = ((disparity - target) / unit).nan_to_num(0).square()
         rmse = (masked_mean(squares, target.isfinite())[:, 0] + 1e-7).sqrt()
         terms = {
-            "lap1": losses.lap1(disparity / unit, target / unit).nanmean(),
+            "lap1": lap1(disparity / unit, target / unit).nanmean(),
             "rmse_v": (mse_v(pair) + 1e-5).sqrt().nanmean(),
             "rmse_soft": (batch["soft"] * rmse).nanmean(),
             "rmse_sharp": ((1 - batch["soft"]) * rmse).nanmean(),
@@ -239,6 +230,67 @@ class SurfaceObjective(Objective):
         loss = loss + self.soft * terms["rmse_soft"] + self.sharp * terms["rmse_sharp"]
         loss = loss + self.errors * (terms["spread"] + terms["angle"])
         return {"loss": loss, **terms}
+
+
+@in_own_precision
+def shading_loss(pair: SurfacePair, rgb: Tensor) -> Tensor:
+    """Return the mean squared difference of photos (B, 3, H, W) and B clipped to [0, 1], (B,); NaN without a normal."""
+    valid = pair.normal_mask
+    normals, reference = (torch.where(valid, each, 0) for each in pair.normals)
+    rgb = rgb.to(normals)
+    intensity, albedo = grey(rgb), estimate_albedo(rgb)
+    light = estimate_light(reference, intensity, albedo, valid)
+    shaded = albedo * torch.einsum("bl,blhw->bhw", light, harmonics(normals))[:, None]
+    squares = torch.where(valid, shaded.clamp(0, 1) - intensity, 0).square()
+    return squares.sum(dim=(-3, -2, -1)) / valid.sum(dim=(-3, -2, -1))
+
+
+def harmonics(normals: Tensor) -> Tensor:
+    """Return the nine spherical harmonics H_b up to constant factors, (B, 9, H, W), of normals, (B, 3, H, W)."""
+    x, y, z = normals.unbind(dim=-3)
+    second = (x * y, y * z, 2 * z.square() - x.square() - y.square(), z * x, x.square() - y.square())
+    return torch.stack((torch.ones_like(x), y, z, x, *second), dim=-3)
+
+
+def estimate_light(normals: Tensor, intensity: Tensor, albedo: Tensor, valid: Tensor) -> Tensor:
+    """Return the coefficients l_b of the light that explains the valid pixels of each photo best, (B, 9)."""
+    # In 64 bits: of nearly flat surfaces the equations are so badly conditioned that 32 leave nothing but rounding.
+    basis = torch.where(valid, albedo * harmonics(normals), 0).flatten(2).double()
+    squares = basis @ basis.transpose(1, 2)
+    squares = squares + _RIDGE * torch.eye(9, dtype=basis.dtype, device=basis.device)
+    return torch.linalg.solve(squares, basis @ intensity.flatten(2).transpose(1, 2).double())[..., 0].to(normals)
+
+
+def estimate_albedo(rgb: Tensor) -> Tensor:
+    """Return the albedo of photos by the Retinex algorithm, (B, 1, H, W), with a mean of 1 before it is clipped to 2.
+
+    Its logarithm has the gradient of the photo's logarithm where that is an edge of intensity or of colour, and else
+    none, as well as least squares allow (a Poisson equation with free borders).
+    """
+    log_rgb = rgb.clamp(min=_DARKEST).log()
+    log_grey = grey(rgb).clamp(min=_DARKEST).log()
+    colour = log_rgb - log_rgb.mean(dim=1, keepdim=True)
+    steps = []
+    for dim in (-1, -2):
+        step = log_grey.diff(dim=dim)
+        change = colour.diff(dim=dim).square().sum(dim=1, keepdim=True).sqrt()
+        steps.append(torch.where((step.abs() > _GREY_STEP) | (change > _COLOUR_STEP), step, 0))
+    albedo = integrate(*steps).exp()
+    return (albedo / albedo.mean(dim=(-3, -2, -1), keepdim=True)).clamp(max=_LARGEST_ALBEDO)
+
+
+def integrate(along_u: Tensor, along_v: Tensor) -> Tensor:
+    """Return the maps (B, 1, H, W) with a mean of 0 whose differences (B, 1, H, W - 1), (B, 1, H - 1, W) are nearest.
+
+    The normal equations are a Poisson equation with Neumann borders, which the discrete cosine transform diagonalises.
+    """
+    zeros_u, zeros_v = torch.zeros_like(along_u[..., :1]), torch.zeros_like(along_v[..., :1, :])
+    divergence = torch.cat((along_u, zeros_u), dim=-1) - torch.cat((zeros_u, along_u), dim=-1)
+    divergence = divergence + torch.cat((along_v, zeros_v), dim=-2) - torch.cat((zeros_v, along_v), dim=-2)
+    height, width = divergence.shape[-2:]
+    eigenvalues = laplacian_eigenvalues(height, width, divergence)
+    eigenvalues[0, 0] = torch.inf  # the mean is free
+    return idct2(dct2(divergence) / eigenvalues)
 
 
 def to_depth(disparity: Tensor, batch: Batch) -> Tensor:

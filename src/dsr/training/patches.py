@@ -1,4 +1,4 @@
-"""Training patches: random windows of scenes.
+"""Training patches: random windows of scenes, mirrored, turned, scaled in depth and changed in colour at random.
 
 Patch number i of a run is a pure function of (seed, i), and of the number of patches of a step where factors are drawn.
 So an interrupted run continues with the same patches, whatever the number of workers, and the patches of a step are the
@@ -10,43 +10,36 @@ from __future__ import annotations
 import contextlib
 import copy
 import itertools
+import math
 from collections.abc import Sequence
 
 import numpy as np
 import torch
+from scipy import ndimage
 from torch import Tensor
+from torch.nn import functional
 from torch.utils.data import Dataset
 
+from dsr.degradation.downsampling import Downsampling
 from dsr.degradation.random_degradation import Everything
 from dsr.geometry.camera import baseline_times_focal
 from dsr.methods.networks.normalisation import compute_min_max
-from dsr.sample import AllHolesError, DepthSample, Scene
-from dsr.training.augmentation import augment, soften
+from dsr.sample import AllHolesError, Scene
 from dsr.training.degradation import Batch, Degradation, to_tensors
 from dsr.training.settings import PatchSettings
 from dsr.utils.records import derived
 
 _WINDOW_TRIES, _SCENE_TRIES = 10, 100
 _MIN_VALID_FRACTION = 0.5
-_SOFT, _SOFTEST = 0.5, 1.3
-"""Pixels; the smallest and the largest standard deviation of what blurs soft depth steps, 0 where means do it, too."""
+_SOFT, _SOFTEST = 0.5, 1.3  # pixels: blur of soft depth steps, from 0 where means do it, too
 
 
 class Patches(Dataset[Batch]):
     """Random patches ``first`` .. ``first + count - 1`` of a run.
 
-    Args:
-        groups: groups of scenes, each with a true depth and at least as large as a patch.
-        settings: how patches are cropped and augmented.
-        degradation: how their low-resolution maps are made.
-        shares: relative frequency of each group; None for equal frequencies.
-        seed: seed of the run.
-        first: number of the first patch.
-        count: number of patches.
-        everything: the distribution of degradations to draw from in place of ``degradation``; all patches of a step
-            have one factor.
-        per_step: number of patches of a step; None for those of a batch.
-
+    The scenes of each group have a true depth and are at least as large as a patch; ``shares`` are the frequencies of
+    the groups, equal if None. ``everything`` is a distribution of degradations to draw from in place of
+    ``degradation``, with one factor for all patches of a step, ``per_step`` or those of a batch.
     """
 
     def __init__(
@@ -76,7 +69,7 @@ class Patches(Dataset[Batch]):
         self._groups, self._settings, self._degradation = groups, settings, degradation
         self._limits = np.cumsum(weights / weights.sum())
         self._seed, self._first, self._count = seed, first, count
-        self._depth_ranges: dict[tuple[int, int], tuple[float, float]] = {}  # by group and number of the scene
+        self._depth_ranges: dict[tuple[int, int], list[float]] = {}  # by group and number of the scene
 
     def __len__(self) -> int:
         return self._count
@@ -119,8 +112,17 @@ class Patches(Dataset[Batch]):
         if everything is None:
             sample = self._degradation.sample(scene, generator)
             patch = to_tensors(sample)
-            whole = self._depth_range(group, index)
-            patch["min_max"] = self._blend_min_max(patch["min_max"], whole, sample, factor, random)
+            if (group, index) not in self._depth_ranges:  # of the scene's low-resolution map, in metres
+                whole = self._degradation.sample(self._groups[group][index], clean=True).depth_lr
+                self._depth_ranges[group, index] = compute_min_max(whole[None]).flatten().tolist()
+            near, far = self._depth_ranges[group, index]
+            # In use a network sees whole images, whose disparities have a larger range than a patch's. So half of the
+            # patches are normalised with the range of the scene's map, the others with one between it and their own.
+            bf, doffs, own = baseline_times_focal(sample.camera), sample.camera.doffs, patch["min_max"]
+            extent = torch.tensor([bf / (factor * far) - doffs, bf / (factor * near) - doffs]).view(2, 1, 1)
+            extent = torch.stack((torch.minimum(extent[0], own[0]), torch.maximum(extent[1], own[1])))
+            weight = random.random() if random.random() < 0.5 else 1.0
+            patch["min_max"] = own + weight * (extent - own)
             return patch
         of_step = np.random.default_rng([self._seed, number // self._per_step, 1])
         drawing = torch.Generator().manual_seed(int(of_step.integers(2**62)))
@@ -149,31 +151,79 @@ class Patches(Dataset[Batch]):
                 return best
         raise ValueError("patches: expected scenes with more known depth than a few pixels")
 
-    @staticmethod
-    def _blend_min_max(
-        own: Tensor, depth_range: tuple[float, float], sample: DepthSample, factor: float, random: np.random.Generator
-    ) -> Tensor:
-        """Return the disparities (2, 1, 1) that become 0 and 1 when a patch is normalised.
 
-        In use a network sees whole images, whose disparities have a larger range than a patch's. So half of the patches
-        are normalised with the range of the scene's low-resolution map, the others with a random range between it and
-        their own.
-        """
-        near, far = depth_range
-        bf, doffs = baseline_times_focal(sample.camera), sample.camera.doffs
-        whole = torch.tensor([bf / (factor * far) - doffs, bf / (factor * near) - doffs]).view(2, 1, 1)
-        whole = torch.stack((torch.minimum(whole[0], own[0]), torch.maximum(whole[1], own[1])))
-        weight = random.random() if random.random() < 0.5 else 1.0
-        return own + weight * (whole - own)
+def augment(scene: Scene, settings: PatchSettings, random: np.random.Generator) -> tuple[Scene, float]:
+    """Return a scene changed at random, rgb, depth and camera alike, and the factor that multiplied its depth."""
+    rgb = scene.rgb
+    if settings.colour:
+        gain = torch.from_numpy(1 + settings.colour * random.standard_normal((3, 1, 1))).float()
+        rgb = (rgb * gain).clamp(0, 1)
+    if random.random() < settings.photo:
+        rgb = simulate_camera(rgb, random)
+    scene = derived(scene, rgb=rgb)
+    if settings.flip:
+        for vertical in (False, True):
+            if random.random() < 0.5:
+                scene = mirror(scene, vertical=vertical)
+    if settings.rotate:
+        scene = rotate90(scene, int(random.integers(4)))
+    factor = math.exp(random.uniform(-settings.depth_scale, settings.depth_scale)) if settings.depth_scale else 1.0
+    return derived(scene, depth=_depth_of(scene) * factor), factor
 
-    def _depth_range(self, group: int, number: int) -> tuple[float, float]:
-        """Return the nearest and the farthest depth of a scene's low-resolution map, in metres."""
-        key = group, number
-        if key not in self._depth_ranges:
-            depth = self._degradation.sample(self._groups[group][number], clean=True).depth_lr
-            low, high = compute_min_max(depth[None]).flatten().tolist()
-            self._depth_ranges[key] = (low, high)
-        return self._depth_ranges[key]
+
+def simulate_camera(rgb: Tensor, random: np.random.Generator) -> Tensor:
+    """Return an rgb image (3, H, W) with another gamma, exp(U(-0.5, 0.5)), and Gaussian blur and noise, up to 0.03."""
+    pixels = rgb.clamp(min=0).numpy() ** math.exp(random.uniform(-0.5, 0.5))
+    sigma = random.uniform(0, 1.0)
+    pixels = ndimage.gaussian_filter(pixels, (0, sigma, sigma), mode="nearest")
+    pixels = pixels + random.uniform(0, 0.03) * random.standard_normal(pixels.shape)
+    return torch.from_numpy(pixels.astype(np.float32)).clamp(0, 1)
+
+
+def soften(scene: Scene, sigma: float = 0.0, *, halve: bool = True) -> Scene:
+    """Return a scene whose depth steps are soft: truths of benchmarks have 2 to 5 mixed pixels across a step.
+
+    Inverse depth is blurred by a Gaussian of ``sigma`` pixels of the result. With ``halve``, the result is half as
+    large: means of 2 x 2 pixels of the photo and of blurred inverse depth.
+    """
+    inverse = _depth_of(scene).reciprocal()
+    if sigma:
+        valid, width = inverse.isfinite(), sigma * (1 + halve)
+        sums, weights = (
+            ndimage.gaussian_filter(each.numpy(), (0, width, width), mode="nearest", truncate=3)
+            for each in (inverse.nan_to_num(0), valid.to(inverse))
+        )
+        inverse = torch.where(valid, torch.from_numpy(sums) / torch.from_numpy(weights), torch.nan)
+    if not halve:
+        return derived(scene, depth=inverse.reciprocal())
+    inverse = Downsampling("box")(inverse, 2)
+    camera = scene.camera.downscale(2)
+    return derived(scene, rgb=functional.avg_pool2d(scene.rgb[None], 2)[0], depth=inverse.reciprocal(), camera=camera)
+
+
+def mirror(scene: Scene, *, vertical: bool = False) -> Scene:
+    """Return the mirror image of a scene and its camera, left to right or, with ``vertical``, top to bottom."""
+    camera = scene.camera
+    if vertical:
+        camera = derived(camera, cy=camera.height - 1 - camera.cy)
+    else:
+        camera = derived(camera, cx=camera.width - 1 - camera.cx)
+    axis = -2 if vertical else -1
+    return derived(scene, rgb=scene.rgb.flip(axis), depth=_depth_of(scene).flip(axis), camera=camera, measured={})
+
+
+def rotate90(scene: Scene, turns: int) -> Scene:
+    """Return the scene rotated counterclockwise by ``turns`` quarter turns, the camera included."""
+    if turns % 4 == 0:
+        return scene
+    rgb, depth = scene.rgb.rot90(turns, (-2, -1)), _depth_of(scene).rot90(turns, (-2, -1))
+    return derived(scene, rgb=rgb, depth=depth, camera=scene.camera.rotate90(turns), measured={})
+
+
+def _depth_of(scene: Scene) -> Tensor:
+    """Return the true depth, which scenes to train with have."""
+    assert scene.depth is not None  # noqa: S101 - for the type checker
+    return scene.depth
 
 
 def check_patches(scenes: Sequence[Scene], settings: PatchSettings, scale: int) -> None:

@@ -26,10 +26,7 @@ class PatchSettings:
         rotate: whether scenes are rotated by random quarter turns, the camera included.
         depth_scale: s, where depth is multiplied by exp(U(-s, s)).
         colour: standard deviation of the gain of each colour channel.
-        photo: fraction of the patches whose rgb is changed by :func:`dsr.training.augmentation.simulate_camera`.
-
-    Raises:
-        ValueError: a value is out of range.
+        photo: fraction of the patches whose rgb is changed by :func:`dsr.training.patches.simulate_camera`.
 
     Example:
         >>> from dsr.training.settings import PatchSettings

@@ -38,8 +38,7 @@ from dsr.methods.networks.normalisation import compute_min_max, mean3x3
 from dsr.methods.noise_level import estimate_noise, normal_noise_deg
 from dsr.metrics.classes import compute_means, in_table_units
 from dsr.metrics.functional import SurfacePair, rmse_v
-from dsr.metrics.losses import lap1, mse
-from dsr.metrics.visual_loss import VisualLossName, make_visual_loss, match_weight
+from dsr.metrics.losses import VisualLossName, lap1, make_visual_loss, match_weight, mse
 from dsr.sample import DepthSample
 from dsr.utils.lightning import ListedScores, StepProgress, ValidationTable, fit, make_trainer
 from dsr.utils.progress import Progress, Steps, StepsProgress

@@ -5,7 +5,7 @@ Cascaded CNNs*, ECCV 2018. The denoising network, a U-net with residual blocks a
 alone and corrects its low frequencies. The refinement network adds detail from the photo's intensity: its features at
 three sizes are brought to the first and joined (*hypercolumns*). Both maps are compared with the reference depth, and
 the second one's shading with the photo, under the light that explains the photo best
-(:func:`dsr.training.shading.shading_loss`). Sizes of layers and losses are those of the authors' code for single
+(:func:`dsr.training.objective.shading_loss`). Sizes of layers and losses are those of the authors' code for single
 frames, github.com/neycyanshi/DDRNet.
 
 What differs from the original:
