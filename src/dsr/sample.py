@@ -20,9 +20,8 @@ from torch import Tensor
 from dsr.geometry.camera import Camera, to_range
 from dsr.utils.arrays import read_arrays
 from dsr.utils.files import replacing
-from dsr.utils.guards import TooLargeError, parse_json
+from dsr.utils.guards import TooLargeError, derived, parse_json
 from dsr.utils.ratios import as_ratio, fits_ratio, round_ratio
-from dsr.utils.records import derived
 
 NEAREST, FARTHEST = 1e-6, 1e9
 """Limits of depth in metres: a micrometre, nearer than any lens focuses, and beyond the Moon. Within them, the inverse

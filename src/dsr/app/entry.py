@@ -37,8 +37,7 @@ from dsr.utils import interruption
 from dsr.utils.configuration import ConfigError, config_directories
 from dsr.utils.console import USAGE_ERROR, one_line, print_error
 from dsr.utils.files import FullDiskError
-from dsr.utils.memory import OutOfMemoryError, refusing_excess
-from dsr.utils.spelling import did_you_mean
+from dsr.utils.guards import OutOfMemoryError, did_you_mean, refusing_excess
 
 
 def run_eval(arguments: Sequence[str] | None = None) -> None:

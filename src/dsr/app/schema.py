@@ -14,9 +14,8 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from dsr.utils.configuration import ConfigError, build
-from dsr.utils.guards import is_number
+from dsr.utils.guards import did_you_mean, is_number
 from dsr.utils.ratios import NATIVE, SCALES
-from dsr.utils.spelling import did_you_mean
 
 Config = Mapping[str, Any]  # a composed configuration as plain values
 Identity = Mapping[str, Any]  # what a run's results depend on: settings, weights, versions, the kind of device

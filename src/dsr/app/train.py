@@ -47,11 +47,10 @@ from dsr.utils.compute_device import fast_precision, pick_device
 from dsr.utils.configuration import ConfigError, build
 from dsr.utils.console import USAGE_ERROR, ConsoleProgress, one_line, without_credentials
 from dsr.utils.files import replacing
-from dsr.utils.guards import expect_stored
+from dsr.utils.guards import did_you_mean
 from dsr.utils.lightning import ListedScores, StepProgress, ValidationTable, fit, make_trainer, without_chatter
 from dsr.utils.progress import Progress
-from dsr.utils.spelling import did_you_mean
-from dsr.utils.torch_files import read_torch_file
+from dsr.utils.torch_files import expect_stored, read_torch_file
 
 MONITOR = "val/RMSE_v"
 _LARGEST_SEED = 2**32 - 1

@@ -37,8 +37,7 @@ from dsr.sample import DepthSample
 from dsr.utils.arrays import read_arrays
 from dsr.utils.console import one_line
 from dsr.utils.files import replacing, write_text
-from dsr.utils.guards import parse_json
-from dsr.utils.memory import refusing_excess
+from dsr.utils.guards import parse_json, refusing_excess
 from dsr.utils.progress import SILENT, Progress
 from dsr.utils.ratios import round_ratio
 

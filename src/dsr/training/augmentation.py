@@ -13,7 +13,7 @@ from torch.nn import functional
 from dsr.degradation.downsampling import Downsampling
 from dsr.sample import Scene
 from dsr.training.settings import PatchSettings
-from dsr.utils.records import derived
+from dsr.utils.guards import derived
 
 _BLUR, _NOISE = 1.0, 0.03
 

@@ -24,7 +24,7 @@ from dsr.sample import AllHolesError, DepthSample, Scene
 from dsr.training.augmentation import augment, soften
 from dsr.training.degradation import Batch, Degradation, to_tensors
 from dsr.training.settings import PatchSettings
-from dsr.utils.records import derived
+from dsr.utils.guards import derived
 
 _WINDOW_TRIES, _SCENE_TRIES = 10, 100
 _MIN_VALID_FRACTION = 0.5

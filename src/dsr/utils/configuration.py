@@ -18,7 +18,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from dsr.utils.spelling import did_you_mean
+from dsr.utils.guards import did_you_mean
 from dsr.utils.versions import how_to_install
 
 Node = Mapping[str, Any]  # ``_target_``, perhaps ``_partial_``, and arguments of the target

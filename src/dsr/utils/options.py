@@ -31,7 +31,7 @@ from types import EllipsisType, MappingProxyType, NoneType
 from typing import Any, Literal, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
 
 from dsr.utils.files import obstacle
-from dsr.utils.spelling import did_you_mean
+from dsr.utils.guards import did_you_mean
 
 _KEY = "option"
 
