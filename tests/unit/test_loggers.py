@@ -6,7 +6,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.custom_scalar import layout_pb2
 
-from dsr.training.loggers import log_layout
+from dsr.training.callbacks import log_layout
 
 
 def test_layout_of_tensorboard_begins_with_looks(tmp_path):

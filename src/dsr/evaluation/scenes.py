@@ -111,13 +111,7 @@ class StalePredictionError(ValueError):
 
 
 def evaluate_scene(study: Evaluation, scene: str, since: float = -math.inf, progress: Progress = SILENT) -> SceneResult:
-    """Predict a scene unless its prediction is there, then score and draw the stored one.
-
-    Args:
-        since: time from which on a stored prediction is reused, to overwrite older ones.
-        progress: display of the method's steps.
-
-    """
+    """Predict a scene unless a prediction later than ``since`` is there, then score and draw the stored one."""
     result = SceneResult()
     path = prediction_path(study.folder, scene)
     try:

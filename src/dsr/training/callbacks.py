@@ -1,16 +1,22 @@
-"""What trainings log beside the scores of validations."""
+"""What trainings log beside the scores of validations, by loggers of Lightning's."""
 
 from __future__ import annotations
 
+import re
 import time
+from collections.abc import Mapping
 from typing import Any
 
 import lightning
 import torch
 from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.loggers import Logger, MLFlowLogger, TensorBoardLogger, WandbLogger
+from torch import Tensor
 
+from dsr.metrics.formats import main_first
 from dsr.training.degradation import Batch
 from dsr.utils.checkpoints import ends_step
+from dsr.utils.runs_table import list_run
 
 
 class Curves(Callback):
@@ -24,7 +30,7 @@ class Curves(Callback):
 
     def __init__(self) -> None:
         self._start, self._patches = time.perf_counter(), 0
-        self._sums: dict[str, torch.Tensor] = {}
+        self._sums: dict[str, Tensor] = {}
         self._rate = 0.0
 
     def state_dict(self) -> dict[str, Any]:
@@ -72,3 +78,53 @@ class Curves(Callback):
     def on_validation_end(self, *_: Any) -> None:
         """Start the clock again."""
         self._start += time.perf_counter()
+
+
+def log_run(
+    logger: Logger, text: str, table: Mapping[str, Any], config: Mapping[str, Any], titles: Mapping[str, str], *,
+    resumed: bool,
+) -> None:  # fmt: skip
+    """Log a run's configuration before it has values: TensorBoard gets its main settings and a layout of its charts.
+
+    Args:
+        text: the configuration as YAML.
+        table: the main settings.
+        titles: of the validation's metrics, by name.
+
+    """
+    if isinstance(logger, TensorBoardLogger):
+        logger.experiment.add_text("config", f"```yaml\n{text}```")
+        logger.experiment.flush()
+        log_layout(logger, titles)
+        logger.log_hyperparams(dict(table))
+        list_run(logger.experiment, "training", table, {})
+    elif not resumed:  # MLflow refuses another device, say
+        logger.log_hyperparams(dict(config))
+
+
+def log_layout(logger: TensorBoardLogger, titles: Mapping[str, str]) -> None:
+    """Lay out TensorBoard's *Custom scalars*: metrics of renderings first, then those of depth, then losses.
+
+    A chart has a metric's mean over all validation sets and, if there are several, the means of each, of the network
+    and of bicubic interpolation.
+    """
+    looks = main_first(name for name in titles if "_v" in name)
+    depth = [name for name in titles if name not in looks]
+    groups = {
+        **{title: {titles[name]: rf"(val|bicubic)(_[^/]*)?/{re.escape(name)}$" for name in names}
+           for title, names in (("Looks", looks), ("Depth and normals", depth))},
+        "Training": {name: f"train/{name}$" for name in ("loss", "gradient_norm")},
+    }  # fmt: skip
+    layout = {title: {name: ["Multiline", [tag]] for name, tag in charts.items()} for title, charts in groups.items()}
+    logger.experiment.add_custom_scalars({title: charts for title, charts in layout.items() if charts})
+
+
+def log_picture(logger: Any, tag: str, picture: Tensor, step: int) -> None:
+    """Log a picture, (3, H, W) uint8, where pictures are shown."""
+    array = picture.permute(1, 2, 0).numpy()
+    if isinstance(logger, TensorBoardLogger):
+        logger.experiment.add_image(tag, picture, step)
+    elif isinstance(logger, WandbLogger):
+        logger.log_image(tag, [array], caption=[f"step {step}"])
+    elif isinstance(logger, MLFlowLogger):
+        logger.experiment.log_image(logger.run_id, array, artifact_file=f"{tag}/{step:06}.png")

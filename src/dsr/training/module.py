@@ -25,9 +25,8 @@ from dsr.methods.networks.weight_files import make_network
 from dsr.metrics.classes import compute_means, in_table_units, visual_metrics
 from dsr.metrics.functional import SurfacePair
 from dsr.sample import Unit
-from dsr.training.callbacks import Curves
+from dsr.training.callbacks import Curves, log_picture
 from dsr.training.degradation import Batch
-from dsr.training.loggers import log_picture
 from dsr.training.objective import Objective, to_depth
 from dsr.training.parts import node_of, partial_node_of, read_node
 from dsr.utils.guards import refusing

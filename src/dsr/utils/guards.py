@@ -184,9 +184,7 @@ def refusing_excess() -> Iterator[None]:
         of_allocator = foreign and any(text in str(error) for text in _OF_ALLOCATORS)
         if not isinstance(error, MemoryError) and not of_allocator:
             raise
-        raise OutOfMemoryError(
-            "not enough memory; a smaller size, scale or batch, or fewer workers need less"
-        ) from error
+        raise OutOfMemoryError(_TOO_LITTLE) from error
 
 
 def is_number(value: Any) -> TypeGuard[float]:

@@ -77,11 +77,6 @@ class Deferred:
 
     number: int = 0
 
-    @property
-    def requested(self) -> bool:
-        """Whether the process was asked to end."""
-        return self.number != 0
-
 
 @contextlib.contextmanager
 def deferred() -> Iterator[Deferred]:

@@ -15,13 +15,7 @@ from dsr.utils.guards import expect_bytes, opened
 
 
 def read_torch_file(path: Path) -> Any:
-    """Return the content of a torch file of plain values and tensors, on the CPU; no code in it is executed.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is damaged or holds other Python objects.
-
-    """
+    """Return the content of a torch file of plain values and tensors, on the CPU; no code in it is executed."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such weights file")
     try:
