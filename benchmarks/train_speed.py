@@ -27,9 +27,8 @@ import torch
 from lightning.pytorch.callbacks import Callback
 from torch import nn
 
-from dsr.app.devices import find_processes
 from dsr.app.schema import TrainConfig, plain_config, register
-from dsr.app.train import _prepare
+from dsr.app.train import _prepare, find_processes
 from dsr.data.rendered import SimGeo
 from dsr.degradation.downsampling import Downsampling
 from dsr.methods.networks.msg_net import MSGNet

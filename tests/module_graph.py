@@ -8,7 +8,7 @@ from pathlib import Path
 SOURCE = Path(__file__).resolve().parents[1] / "src"
 
 LAYERS = (
-    ("dsr.notes",), ("dsr.utils", "dsr.geometry"), ("dsr.sample",),
+    ("dsr.notes", "dsr.utils"), ("dsr.geometry",), ("dsr.sample",),
     ("dsr.degradation", "dsr.metrics", "dsr.synthetic", "dsr.io"),
     ("dsr.data", "dsr.methods", "dsr.pictures"), ("dsr.training", "dsr.evaluation", "dsr.inference", "dsr.doctor"),
     ("dsr.report",), ("dsr.app",), ("dsr.cli", "dsr.__main__"),

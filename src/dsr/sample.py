@@ -20,9 +20,8 @@ from torch import Tensor
 from dsr.geometry.camera import Camera, to_range
 from dsr.utils.arrays import read_arrays
 from dsr.utils.files import replacing
-from dsr.utils.guards import TooLargeError, parse_json
+from dsr.utils.guards import TooLargeError, derived, parse_json
 from dsr.utils.ratios import as_ratio, fits_ratio, round_ratio
-from dsr.utils.records import derived
 
 # Limits of depth in metres: a micrometre, and beyond the Moon. Within them, the inverse and the cube of a depth are
 # ordinary float32 numbers; what lies outside has a wrong unit, or marks a hole or the sky.

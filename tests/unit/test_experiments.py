@@ -7,8 +7,7 @@ from itertools import product
 import pytest
 from omegaconf import OmegaConf
 
-from dsr.app.composition import compose
-from dsr.app.experiments import register_resolvers
+from dsr.app.composition import compose, register_resolvers
 from dsr.app.schema import EvalConfig, TrainConfig, plain_config
 from dsr.app.training_runs import training_data
 from dsr.methods.base import Method

@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from dsr.utils.console import ConsoleProgress
-from dsr.utils.progress import SILENT, clock, duration, megabytes, part_of
+from dsr.utils.progress import SILENT, clock, duration, megabytes, part_of, show_length
 
 
 class Clock:
@@ -137,3 +137,20 @@ def test_times_and_sizes_are_written_for_readers() -> None:
     assert [clock(seconds) for seconds in (0, 269, 3600, 90061)] == ["0:00:00", "0:04:29", "1:00:00", "25:01:01"]
     assert [duration(seconds) for seconds in (40, 720, 12600)] == ["40 s", "12 min", "3.5 h"]
     assert [megabytes(size) for size in (31e3, 3.2e6, 45e6, 1.3e9)] == ["31 kB", "3.2 MB", "45 MB", "1.3 GB"]
+
+
+@pytest.mark.parametrize(
+    ("metres", "digits", "text"),
+    [
+        (150, 2, "150 m"),
+        (0.0996, 2, "0.1 m"),
+        (0.0994, 2, "99 mm"),
+        (999.9, 3, "1 km"),
+        (998.6, 3, "999 m"),
+        (123_456, 2, "120 km"),
+        (0.00123, 2, "1.2 mm"),
+        (0, 3, "0 mm"),
+    ],
+)
+def test_length_is_rounded_before_its_unit_is_chosen(metres: float, digits: int, text: str) -> None:
+    assert show_length(metres, digits) == text

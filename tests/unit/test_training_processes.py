@@ -7,7 +7,7 @@ import torch
 from lightning.pytorch.plugins.environments import LightningEnvironment, SLURMEnvironment
 from lightning.pytorch.utilities import rank_zero_only
 
-from dsr.app.devices import find_processes
+from dsr.app.train import find_processes
 from dsr.utils.configuration import ConfigError
 
 CPU = torch.device("cpu")

@@ -23,7 +23,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from dsr.app.experiments import register_resolvers
+from dsr.app.composition import register_resolvers
 from dsr.app.schema import (
     EvalConfig,
     TrainConfig,
@@ -37,8 +37,7 @@ from dsr.utils import interruption
 from dsr.utils.configuration import ConfigError, config_directories
 from dsr.utils.console import USAGE_ERROR, one_line, print_error
 from dsr.utils.files import FullDiskError
-from dsr.utils.memory import OutOfMemoryError, refusing_excess
-from dsr.utils.spelling import did_you_mean
+from dsr.utils.guards import OutOfMemoryError, did_you_mean, refusing_excess
 
 
 def run_eval(arguments: Sequence[str] | None = None) -> None:
@@ -69,13 +68,7 @@ def run_command(name: str, command: Callable[[DictConfig], Any], arguments: Sequ
     """Compose a configuration from the command line, and run the command on it, in a multirun on each combination.
 
     Exits with 2 and one line on stderr if the configuration cannot be run, with 130 or 143 if interrupted. If a job of
-    a multirun fails, the others of its batch go on.
-
-    Args:
-        name: the configuration's name, without ``.yaml``.
-        command: the function to run; if it returns a number, sweepers minimise it.
-        arguments: command-line arguments, Hydra's options and overrides; None for those of the process.
-
+    a multirun fails, the others of its batch go on. Sweepers minimise the number that the command returns.
     """
     register()
     register_resolvers()

@@ -24,8 +24,7 @@ from rich.console import Console
 
 from dsr.app import run_directory as rundir
 from dsr.app.metrics import check_metrics, chosen_metrics, metric_collection
-from dsr.app.multirun import Plan, runs_here
-from dsr.app.schema import Config, EvalConfig, Identity, given_keys, plain_config, raw_group, user_directories
+from dsr.app.schema import Config, EvalConfig, Identity, Plan, given_keys, plain_config, runs_here, user_directories
 from dsr.data.scene_source import SceneSource, prepare_scenes, regions_of
 from dsr.degradation.downsampling import Downsampling, Measured
 from dsr.degradation.holes import Holes
@@ -52,8 +51,8 @@ from dsr.sample import DepthSample
 from dsr.utils.compute_device import fast_precision, pick_device
 from dsr.utils.configuration import ConfigError
 from dsr.utils.console import ConsoleProgress, note_once, open_console, print_error, show
+from dsr.utils.guards import free_memory
 from dsr.utils.locks import free_first
-from dsr.utils.memory import free_memory
 from dsr.utils.pool import LOST, Pool, computing_threads
 from dsr.utils.progress import SILENT, Progress
 from dsr.utils.ratios import NATIVE, match_ratio
@@ -66,31 +65,17 @@ _WORTH_WORKERS = 30.0  # seconds of work from which workers are started, which t
 
 
 def evaluate(config: DictConfig) -> pd.DataFrame:
-    """Evaluate one method on one data set: write predictions, scores and pictures, print a table.
+    """Evaluate one method on one data set: write predictions, scores and pictures, print a table, return the scores.
 
-    ``run=RUN_DIR`` evaluates the network of a training, on its own validation scenes unless a data set is given.
-
-    Args:
-        config: composed from ``conf/eval.yaml``.
-
-    Returns:
-        The content of ``scores.csv``; if a run was validated with several data sets, their tables concatenated.
-
-    Raises:
-        ConfigError: the configuration cannot be run, or a scene failed (the others' results are written).
-
+    ``run=RUN_DIR`` evaluates the network of a training, on its own validation scenes unless a data set is given; of
+    several data sets the tables are concatenated. If a scene fails, the others' results are written before the error.
     """
     scores = [_run(*_prepare(*study)) for study in _studies(config)]
     return pd.concat(scores, ignore_index=True)
 
 
 def plan(config: DictConfig) -> list[Plan]:
-    """Check what :func:`evaluate` would run as a job of a multirun; nothing is computed or written.
-
-    Raises:
-        ConfigError: the configuration cannot be run.
-
-    """
+    """Check what :func:`evaluate` would run as a job of a multirun; nothing is computed or written."""
     plans = []
     for each in _studies(config):
         prepared, _, _ = _prepare(*each, here=runs_here())
@@ -111,7 +96,8 @@ def _studies(config: DictConfig) -> Iterator[tuple[dict[str, Any], Any, SceneSou
     """Yield what to evaluate: configurations, their methods' nodes, data sets (None for the configuration's own)."""
     plain = plain_config(config)
     if plain["run"] is None:
-        yield plain, raw_group(config, "method"), None
+        raw: Any = OmegaConf.to_container(config, resolve=False)  # for scales other than the run's
+        yield plain, raw["method"], None
         return
     from dsr.app.training_runs import studies_of_run  # noqa: PLC0415 - it imports Lightning, which takes seconds
 
@@ -128,6 +114,7 @@ class _Prepared:
     selected: Selection
     source: SceneSource
     downsampling: Downsampling | Measured
+    degradation: str  # its name, that of the noise and the holes included
     noise: Noise
     holes: Holes
     device: torch.device
@@ -170,9 +157,12 @@ def _prepare(
     if len(hashes) > 1:
         weights_hash = hashlib.sha256("".join(hashes).encode()).hexdigest()
     identity = rundir.identity_of(plain, weights_hash, device, recipe.targets())
-    folder = rundir.folder_of(settings.output_dir or rundir.default_directory("eval", plain, identity))
+    folder = Path(settings.output_dir or rundir.default_directory("eval", plain, identity)).expanduser()
     downsampling, noise, holes = (settings.build(group) for group in ("downsampling", "noise", "holes"))
-    prepared = _Prepared(settings, plain, selected, source, downsampling, noise, holes, device, identity, folder)
+    degradation = rundir.degradation_of(plain, assumes=recipe.abilities.assumes_downsampling)
+    prepared = _Prepared(
+        settings, plain, selected, source, downsampling, degradation, noise, holes, device, identity, folder
+    )
     progress = ConsoleProgress(open_console())
     method = _method(prepared, progress)
     check_metrics(settings.metrics)
@@ -208,15 +198,10 @@ def _method(prepared: _Prepared, progress: Progress) -> Method:
         metrics=functools.partial(metric_collection, settings.metrics),
         workspace=prepared.folder,
         display=progress,
-        about={"method": settings.label or prepared.selected.recipe.name, "degradation": _degradation(prepared)},
+        about={"method": settings.label or prepared.selected.recipe.name, "degradation": prepared.degradation},
         lpips_trunk=settings.metrics.lpips_trunk,
     )
     return prepared.selected.build(run)
-
-
-def _degradation(prepared: _Prepared) -> str:
-    assumes = prepared.selected.recipe.abilities.assumes_downsampling
-    return rundir.degradation_of(vars(prepared.settings), assumes=assumes)
 
 
 def _workers(prepared: _Prepared) -> tuple[int, int]:
@@ -254,7 +239,7 @@ def _study(prepared: _Prepared, method: Method) -> Evaluation:
         folder,
         prepared.source,
         prepared.downsampling,
-        _degradation(prepared),
+        prepared.degradation,
         settings.scale,
         method,
         name,

@@ -25,7 +25,7 @@ from dsr.io.scene_files import RGBD
 from dsr.notes import Assumption, expect_no_warning
 from dsr.utils.console import one_line, show
 from dsr.utils.guards import natural_key
-from dsr.utils.lengths import show_length
+from dsr.utils.progress import show_length
 
 _GREY = 190
 _SEEN = 2.0

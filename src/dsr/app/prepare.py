@@ -22,12 +22,7 @@ from dsr.utils.console import ConsoleProgress, one_line, show
 def prepare_dataset(name: str, overrides: Sequence[str], console: Console, config_dirs: Sequence[Path] = ()) -> None:
     """Prepare every scene of a data set and draw the contact sheet, ``outputs/data/NAME/sheet.png`` or its pages.
 
-    Args:
-        name: the name of a file in ``conf/dataset``.
-        overrides: overrides as on the command line of ``eval.py``, such as ``dataset.size=256``.
-        console: where progress is shown.
-        config_dirs: the user's own directories of configuration files.
-
+    The overrides are those of the command line of ``eval.py``, such as ``dataset.size=256``.
     """
     source = _source(name, overrides, config_dirs)
     progress = ConsoleProgress(console)

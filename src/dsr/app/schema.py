@@ -14,23 +14,22 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from dsr.utils.configuration import ConfigError, build
-from dsr.utils.guards import is_number
+from dsr.utils.guards import did_you_mean, is_number
 from dsr.utils.ratios import NATIVE, SCALES
-from dsr.utils.spelling import did_you_mean
 
 Config = Mapping[str, Any]  # a composed configuration as plain values
 Identity = Mapping[str, Any]  # what a run's results depend on: settings, weights, versions, the kind of device
 NAMED = ("dataset", "downsampling", "noise", "holes", "degradation", "method", "model", "optimizer", "scheduler",
          "trainer")  # fmt: skip
-"""Groups whose choice is in ``names``."""
+# Groups whose choice is in ``names``.
 _LONGEST_NAME = 100
 _MOST = 1024  # workers and threads, more of which no system starts
-_TRAINER = {"max_steps": 12000, "val_check_interval": 1000, "accumulate_grad_batches": 1, "devices": 1,
-            "strategy": "auto", "gradient_clip_val": None}  # fmt: skip
-"""What dsr itself reads of the trainer's arguments, and their defaults."""
+READ_OF_TRAINER = {"max_steps": 12000, "val_check_interval": 1000, "accumulate_grad_batches": 1, "devices": 1,
+                   "strategy": "auto", "gradient_clip_val": None}  # fmt: skip
+# What dsr itself reads of the trainer's arguments, and their defaults.
 SET_BY_DSR = ("plugins", "use_distributed_sampler", "num_nodes", "default_root_dir", "enable_checkpointing",
                "barebones", "inference_mode", "max_epochs", "min_epochs", "max_time")  # fmt: skip
-"""Arguments of the trainer that dsr's trainings have values of their own for."""
+# Arguments of the trainer that dsr's trainings have values of their own for.
 
 
 @dataclass
@@ -56,8 +55,8 @@ def _expect_one_of(key: str, value: object, choices: tuple[Any, ...], hint: str 
         raise ConfigError(f"{key}: expected one of {', '.join(map(str, choices))}, got {value!r:.60}{hint}")
 
 
-def _is_count(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value > 0
+def _is_count(value: object, most: float = math.inf) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 < value <= most
 
 
 @dataclass
@@ -136,7 +135,7 @@ class EvalConfig(RunConfig):
         super().check()
         for name in ("workers", "threads"):
             value = getattr(self, name)
-            if value != "auto" and not (_is_count(value) and value <= _MOST):
+            if value != "auto" and not _is_count(value, _MOST):
                 raise ConfigError(f"{name}: expected auto or a whole number from 1 to {_MOST}, got {value!r}")
         if not self.measured:
             _expect_one_of("scale", self.scale, SCALES, "; downsampling=measured takes a sensor's map of any ratio")
@@ -197,7 +196,7 @@ class TrainConfig(RunConfig):
                 raise ConfigError(f"trainer.{key}: unknown key; dsr sets it itself, a training has trainer.max_steps")
         if isinstance(self.trainer.get("profiler"), str):
             raise ConfigError("trainer.profiler: expected a node with _target_, dirpath and filename")
-        trainer = self.trainer = {**_TRAINER, **self.trainer}
+        trainer = self.trainer = {**READ_OF_TRAINER, **self.trainer}
         _expect_one_of("trainer.strategy", trainer["strategy"], ("auto", "ddp"))
         for name in ("max_steps", "val_check_interval", "accumulate_grad_batches", "devices"):
             if not _is_count(trainer[name]) and (name, trainer[name]) != ("devices", "auto"):
@@ -205,11 +204,6 @@ class TrainConfig(RunConfig):
         clip = trainer["gradient_clip_val"]
         if clip is not None and not (is_number(clip) and clip > 0):
             raise ConfigError(f"trainer.gradient_clip_val: expected a positive number or null, got {clip!r:.60}")
-
-    @property
-    def more_of_trainer(self) -> dict[str, Any]:
-        """The trainer's node without the keys that dsr handles itself; the limit of gradients is only checked here."""
-        return {key: value for key, value in self.trainer.items() if key not in _TRAINER or key == "gradient_clip_val"}
 
     @property
     def steps(self) -> int:
@@ -281,12 +275,23 @@ def plain_config(config: DictConfig) -> dict[str, Any]:
     return plain
 
 
-def raw_group(config: DictConfig, group: str) -> Any:
-    """Return a group of a composed configuration, its interpolations as they are."""
-    return OmegaConf.to_container(config, resolve=False)[group]  # type: ignore[index,call-overload]
-
-
 def register() -> None:
     """Register the schemas with Hydra."""
     ConfigStore.instance().store(name="eval_schema", node=EvalConfig)
     ConfigStore.instance().store(name="train_schema", node=TrainConfig)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The outline of a job of a multirun: directory, identity, and how many scenes or steps are left and done."""
+
+    folder: Path
+    identity: Identity
+    unit: str
+    left: int
+    done: int = 0
+
+
+def runs_here() -> bool:
+    """Return whether the launcher of the multirun runs its jobs in this process, and so with its devices."""
+    return HydraConfig.get().runtime.choices.get("hydra/launcher") == "basic"

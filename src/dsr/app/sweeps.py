@@ -16,8 +16,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 
-from dsr.app.multirun import Plan
-from dsr.app.schema import EvalConfig, Identity, TrainConfig, plain_config
+from dsr.app.schema import EvalConfig, Identity, Plan, TrainConfig, plain_config
 from dsr.utils.configuration import ConfigError
 from dsr.utils.console import USAGE_ERROR, one_line, open_console, print_error, show
 

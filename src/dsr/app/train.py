@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import fnmatch
 import functools
 import math
+import os
 import shutil
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from zipfile import BadZipFile
 
 import lightning
@@ -23,53 +25,51 @@ from lightning.pytorch.callbacks import (
     ModelCheckpoint,
     ProgressBar,
 )
-from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.plugins.environments import (
+    ClusterEnvironment,
+    LightningEnvironment,
+    SLURMEnvironment,
+    TorchElasticEnvironment,
+)
+from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from dsr.app import run_directory as rundir
-from dsr.app.devices import Processes, find_processes
 from dsr.app.metrics import check_metrics, metric_collection
-from dsr.app.multirun import Plan, runs_here
-from dsr.app.schema import Config, Identity, TrainConfig, given_keys, plain_config
+from dsr.app.schema import READ_OF_TRAINER, Config, Identity, Plan, TrainConfig, given_keys, plain_config, runs_here
 from dsr.app.training_runs import WEIGHTS, keyed, read_config, training_data
 from dsr.data.scene_source import prepare_scenes
 from dsr.methods.networks.network import DisparityNetwork
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, network_name, save_network
-from dsr.training.callbacks import expect_installed, log_config, log_layout, log_settings
+from dsr.training.callbacks import log_run
 from dsr.training.data_module import PatchData
 from dsr.training.module import SuperResolution
 from dsr.utils import interruption
 from dsr.utils.checkpoints import BestCheckpoint, DivergenceError, Interruption
 from dsr.utils.compute_device import fast_precision, pick_device
-from dsr.utils.configuration import ConfigError, build
+from dsr.utils.configuration import ConfigError, build, expect_library
 from dsr.utils.console import USAGE_ERROR, ConsoleProgress, one_line, without_credentials
 from dsr.utils.files import replacing
-from dsr.utils.guards import expect_stored
+from dsr.utils.guards import did_you_mean
 from dsr.utils.lightning import ListedScores, StepProgress, ValidationTable, fit, make_trainer, without_chatter
 from dsr.utils.progress import Progress
-from dsr.utils.spelling import did_you_mean
-from dsr.utils.torch_files import read_torch_file
+from dsr.utils.torch_files import expect_stored, read_torch_file
 
 MONITOR = "val/RMSE_v"
 _LARGEST_SEED = 2**32 - 1
 _LAST = Path("checkpoints", "last.ckpt")  # which a training goes on from, in the directory of its run
+_OF_PROCESSES = ("LOCAL_RANK", "NODE_RANK", "MASTER_ADDR", "MASTER_PORT", "WORLD_SIZE")  # which Lightning sets
 _RESUMABLE = ("resume", "device", "trust")  # keys that may stand beside resume=
 
 
 def train(config: DictConfig) -> float:
     """Train a network: checkpoints, a TensorBoard log, and the weights of the best validation RMSE_v.
 
-    An interrupted run is continued from its last checkpoint by the same command or by ``resume=RUN_DIR``.
-
-    Args:
-        config: composed from ``conf/train.yaml``.
-
-    Returns:
-        The mean RMSE_v of the validation of the weights that are kept, as a fraction like those in files.
-
+    An interrupted run is continued from its last checkpoint by the same command or by ``resume=RUN_DIR``. Returns the
+    mean RMSE_v of the validation of the weights that are kept, as a fraction like those in files.
     """
     plain, settings, device = _read(config)
     processes = find_processes(device, settings.trainer["devices"])
@@ -89,8 +89,59 @@ def plan(config: DictConfig) -> list[Plan]:
     prepared = _prepare(plain, settings, device, find_processes(device, settings.trainer["devices"] if here else 1))
     elsewhere = () if here else ("device", "precision")
     rundir.expect_free(prepared.folder, plain, prepared.identity, (*prepared.tolerated, *elsewhere))
-    done = settings.steps if prepared.is_complete and not settings.overwrite else 0
+    done = settings.steps if (prepared.folder / WEIGHTS).exists() and not settings.overwrite else 0
     return [Plan(prepared.folder, prepared.identity, "step", settings.steps - done, done)]
+
+
+@dataclass(frozen=True)
+class Processes:
+    """The processes of a training, one per device; Lightning starts them, unless ``srun`` or ``torchrun`` have."""
+
+    count: int
+    rank: int  # of this one; 0 writes files and prints
+    environment: ClusterEnvironment  # what Lightning learns of the processes from
+
+    @contextlib.contextmanager
+    def running(self) -> Iterator[None]:
+        """Join the processes within this context; those that Lightning has started end with the first one."""
+        before = {name: os.environ.get(name) for name in _OF_PROCESSES}
+        rank_zero_only.rank = self.rank  # type: ignore[attr-defined]
+        if self.rank and isinstance(self.environment, LightningEnvironment):
+            interruption.end_with(os.getppid())
+        try:
+            yield
+        finally:
+            if self.count > 1 and torch.distributed.is_initialized():
+                torch.distributed.destroy_process_group()
+            for name, value in before.items():  # the next job of a multirun starts processes of its own
+                os.environ.pop(name, None)
+                if value is not None:
+                    os.environ[name] = value
+
+
+def find_processes(device: torch.device, devices: int | Literal["auto"]) -> Processes:
+    """Return the processes on a number of devices of a kind; ``auto`` for all that there are, on a CPU one.
+
+    A step of Slurm with one task is a process as any other: Lightning must neither expect that Slurm starts those of
+    further devices, nor answer the signals by which submitit or the user wants a job to be requeued.
+    """
+    index: int | None = device.index  # torch's stubs say int
+    there = torch.cuda.device_count() if device.type == "cuda" and index is None else 1
+    count = there if devices == "auto" else devices
+    if device.type != "cpu" and count > there:
+        raise ConfigError(f"trainer.devices: expected at most {there} for device={device}, got {count}")
+    environment: ClusterEnvironment = LightningEnvironment()
+    tasks = os.environ.get("SLURM_STEP_NUM_TASKS", "")
+    started = None
+    if TorchElasticEnvironment.detect():
+        environment, started = TorchElasticEnvironment(), int(os.environ["WORLD_SIZE"])
+    elif tasks.isdecimal() and int(tasks) > 1:  # not in a job's script, which no srun has started
+        os.environ.setdefault("SLURM_NTASKS_PER_NODE", tasks)  # Lightning asks for it
+        environment, started = SLURMEnvironment(auto_requeue=False), int(tasks)
+    if started not in (None, count):
+        raise ConfigError(f"trainer.devices: expected {started}, the number of processes of this job, got {count}")
+    rank = environment.global_rank() if started else environment.local_rank()
+    return Processes(count, rank if count > 1 else 0, environment)
 
 
 def _read(config: DictConfig, *, here: bool = True) -> tuple[dict[str, Any], TrainConfig, torch.device]:
@@ -131,11 +182,6 @@ class _Prepared:
     resume: Path | None
     tolerated: tuple[str, ...]
 
-    @property
-    def is_complete(self) -> bool:
-        """Whether the training is done already."""
-        return (self.folder / WEIGHTS).exists()
-
 
 def _prepare(plain: Config, settings: TrainConfig, device: torch.device, processes: Processes) -> _Prepared:
     """Check and build all that a training needs, and write nothing."""
@@ -149,7 +195,7 @@ def _prepare(plain: Config, settings: TrainConfig, device: torch.device, process
     check_metrics(settings.metrics)
     module = _module(settings, net, data)
     identity = rundir.identity_of(plain, None, device)
-    folder = rundir.folder_of(settings.output_dir or rundir.default_directory("train", plain, identity))
+    folder = Path(settings.output_dir or rundir.default_directory("train", plain, identity)).expanduser()
     progress = ConsoleProgress(Console(quiet=processes.rank > 0))
     best = BestCheckpoint(folder / _LAST.parent, MONITOR)
     callbacks = [
@@ -162,7 +208,8 @@ def _prepare(plain: Config, settings: TrainConfig, device: torch.device, process
     ]
     loggers = []
     for name, node in settings.logger.items():
-        expect_installed(name)
+        if name in ("wandb", "mlflow"):  # an extra of that name installs the library
+            expect_library(f"logger={name}", name, name)
         for key, value in node.items():
             if isinstance(value, str) and without_credentials(value) != value:
                 raise ConfigError(
@@ -171,7 +218,11 @@ def _prepare(plain: Config, settings: TrainConfig, device: torch.device, process
                 )
         with without_chatter():
             loggers.append(build(f"logger.{name}", {"save_dir": str(folder), **node}))
-    node = settings.more_of_trainer
+    node = {  # the limit of gradients is only checked here
+        key: value
+        for key, value in settings.trainer.items()
+        if key not in READ_OF_TRAINER or key == "gradient_clip_val"
+    }
     unused = "_find_unused_parameters_true" if settings.degradation.get("scales") else ""  # layers of one factor
     trainer = make_trainer(
         device,
@@ -276,7 +327,7 @@ def _train(plain: Config, settings: TrainConfig, prepared: _Prepared, processes:
     folder, first = prepared.folder, processes.rank == 0
     if first:
         rundir.expect_free(folder, plain, prepared.identity, prepared.tolerated)
-        if prepared.is_complete and not settings.overwrite:
+        if (folder / WEIGHTS).exists() and not settings.overwrite:
             raise ConfigError(f"output_dir: {folder / WEIGHTS} is trained already; overwrite=true trains it again")
     _announce(settings, prepared, processes.count)
     _load(prepared)
@@ -334,7 +385,13 @@ def _fit(plain: Config, settings: TrainConfig, prepared: _Prepared, *, first: bo
         **module.objective.facts,
     }
     if first:
-        _describe(plain, prepared, facts)
+        listed = {**facts, "method": facts["model"], "degradation": rundir.degradation_of(plain)}
+        loss = {**plain["loss"], "w": facts["w"]} if "w" in facts else {}
+        collection: Any = module.metrics[0]
+        titles = {name: metric.chart_title for name, metric in collection.items()}
+        text, resumed = OmegaConf.to_yaml(OmegaConf.create(dict(plain))), prepared.resume is not None
+        for logger in trainer.loggers:
+            log_run(logger, text, listed, {**plain, "loss": loss}, titles, resumed=resumed)
     try:
         fit(trainer, module, data, prepared.resume)
     except DivergenceError as error:
@@ -363,15 +420,3 @@ def _fit(plain: Config, settings: TrainConfig, prepared: _Prepared, *, first: bo
     prepared.progress.say(f"weights: {folder / WEIGHTS}")
     score = prepared.best.best_model_score if settings.keep == "best" else trainer.callback_metrics.get(MONITOR)
     return math.nan if score is None else float(score)
-
-
-def _describe(plain: Config, prepared: _Prepared, facts: Mapping[str, Any]) -> None:
-    """Write the configuration and the main settings to the logs, and lay them out."""
-    listed = {**facts, "method": facts["model"], "degradation": rundir.degradation_of(plain)}
-    loss = {**plain["loss"], "w": facts["w"]} if "w" in facts else {}
-    collection: Any = prepared.module.metrics[0]
-    for logger in prepared.trainer.loggers:
-        log_config(logger, f"```yaml\n{OmegaConf.to_yaml(OmegaConf.create(dict(plain)))}```")
-        log_layout(logger, {name: metric.chart_title for name, metric in collection.items()})
-        if isinstance(logger, TensorBoardLogger) or prepared.resume is None:  # MLflow refuses another device, say
-            log_settings(logger, listed, {**plain, "loss": loss})

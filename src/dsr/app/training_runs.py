@@ -24,13 +24,7 @@ _NOT_WITH_RUN = ("method", "scale", "weights")
 
 
 def read_config(folder: Path, trust: Any = None) -> dict[str, Any]:
-    """Read the configuration of a training, which may come from somebody else, from its run's directory.
-
-    Args:
-        folder: the run's directory.
-        trust: the command line's value of the key.
-
-    """
+    """Read the configuration of a training, which may come from somebody else, from its run's directory."""
     path = folder / "config.yaml"
     if not path.is_file():
         raise ConfigError(f"{folder}: expected the directory of a training, it has no readable config.yaml")
@@ -53,10 +47,7 @@ def read_config(folder: Path, trust: Any = None) -> dict[str, Any]:
 def studies_of_run(plain: Config, given: Sequence[str]) -> Iterator[tuple[dict[str, Any], SceneSource | None]]:
     """Yield the evaluations of ``eval.py run=RUN_DIR``: configuration and data set (None for the configuration's own).
 
-    Args:
-        plain: the composed configuration of ``eval.py``.
-        given: the keys that the command line sets.
-
+    ``given`` are the keys that the command line sets.
     """
     folder = Path(plain["run"]).expanduser()
     run = read_config(folder, plain.get("trust"))

@@ -14,7 +14,7 @@ from dsr.app.upsample.stored import find_results, read_result
 from dsr.report.surface_page import Packed, is_view, pack_result, save_view
 from dsr.utils.console import ConsoleProgress, one_line, show
 from dsr.utils.files import expect_target
-from dsr.utils.memory import refusing_excess
+from dsr.utils.guards import refusing_excess
 from dsr.utils.progress import megabytes
 
 _WHOLE_PAGE = 6

@@ -29,7 +29,7 @@ from dsr.doctor.about import version_lines
 from dsr.utils import interruption
 from dsr.utils.console import USAGE_ERROR, one_line, open_console, print_error, show
 from dsr.utils.files import FullDiskError
-from dsr.utils.memory import refusing_excess
+from dsr.utils.guards import refusing_excess
 
 _EXAMPLES = """\
 examples:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from dsr.utils.console import printable
-from dsr.utils.spelling import did_you_mean
+from dsr.utils.guards import did_you_mean
 
 
 class Parser(argparse.ArgumentParser):

@@ -26,9 +26,8 @@ from dsr.degradation.noise import Noise
 from dsr.geometry.camera import Camera, RangeType, from_range, to_range
 from dsr.sample import FARTHEST, NEAREST, AllHolesError, DepthSample, Scene
 from dsr.utils.compute_device import known_true
-from dsr.utils.guards import naming
+from dsr.utils.guards import naming, unchecked
 from dsr.utils.ratios import check_scale, match_ratio
-from dsr.utils.records import unchecked
 
 Kernel = Literal["box", "nearest", "bilinear", "bicubic", "gaussian"]
 _LEAST_WEIGHT = 0.5

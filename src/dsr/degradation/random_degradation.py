@@ -42,7 +42,7 @@ from dsr.degradation.random_fields import (
 from dsr.degradation.random_noise import NOISES
 from dsr.geometry.camera import Camera
 from dsr.sample import CENTIMETRES, AllHolesError, DepthSample, Scene
-from dsr.utils.records import unchecked
+from dsr.utils.guards import unchecked
 
 SENSOR_NOISES = ("waves", "structured", "flight", "lidar", "stereo")
 """Kinds of noise that stand for a sensor, which does not see glass; the others stand for maps made of a surface."""

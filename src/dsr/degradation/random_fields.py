@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from dsr.geometry.hole_size import window_maxima
 from dsr.sample import Scene
-from dsr.utils.records import derived
+from dsr.utils.guards import derived
 
 
 def draw(shares: Mapping[str, float], generator: torch.Generator) -> str:

@@ -20,7 +20,7 @@ from dsr.geometry.camera import baseline_times_focal
 from dsr.geometry.plausible import implausible_distance, plausible_baseline
 from dsr.notes import LIMITS
 from dsr.sample import Scene
-from dsr.utils.lengths import show_length
+from dsr.utils.progress import show_length
 from dsr.utils.ratios import round_ratio
 
 _NEAR, _FAR = 0.1, 30.0

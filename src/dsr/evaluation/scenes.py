@@ -37,8 +37,7 @@ from dsr.sample import DepthSample
 from dsr.utils.arrays import read_arrays
 from dsr.utils.console import one_line
 from dsr.utils.files import replacing, write_text
-from dsr.utils.guards import parse_json
-from dsr.utils.memory import refusing_excess
+from dsr.utils.guards import parse_json, refusing_excess
 from dsr.utils.progress import SILENT, Progress
 from dsr.utils.ratios import round_ratio
 
@@ -112,13 +111,7 @@ class StalePredictionError(ValueError):
 
 
 def evaluate_scene(study: Evaluation, scene: str, since: float = -math.inf, progress: Progress = SILENT) -> SceneResult:
-    """Predict a scene unless its prediction is there, then score and draw the stored one.
-
-    Args:
-        since: time from which on a stored prediction is reused, to overwrite older ones.
-        progress: display of the method's steps.
-
-    """
+    """Predict a scene unless a prediction later than ``since`` is there, then score and draw the stored one."""
     result = SceneResult()
     path = prediction_path(study.folder, scene)
     try:

@@ -1,9 +1,8 @@
 """The files of each scene in the directory of an evaluation: the sample, the prediction and the iterations.
 
-``scenes/SCENE.npz`` is the sample that the method was given, see :meth:`dsr.sample.DepthSample.save`. It is written
-with the prediction, so that scoring and drawing need only the directory. ``predictions/SCENE.npz`` has ``depth``
-(H, W) in metres, NaN where missing, its expected errors where the method says them, and what it was made from.
-``iterations/SCENE.csv`` is the history of a method that iterates.
+``scenes/SCENE.npz`` is the sample that the method was given. ``predictions/SCENE.npz``, see
+:mod:`dsr.evaluation.scenes`, is written with it, so that scoring and drawing need only the directory.
+``iterations/SCENE.csv`` is the history of a method that iterates. A name that leads out of the run is an OutsideError.
 """
 
 from __future__ import annotations
@@ -28,22 +27,18 @@ def expect_scene(folder: Path, scene: str, source: str) -> None:
 
 
 def prediction_path(folder: Path, scene: str) -> Path:
-    """Return where a run keeps a scene's prediction; a name that leads out of the run is an OutsideError."""
-    return _path(folder, scene, _PREDICTION)
+    """Return where a run keeps a scene's prediction."""
+    return path_within(folder, scene, f"{folder}: scene", _PREDICTION)
 
 
 def sample_path(folder: Path, scene: str) -> Path:
-    """Return where a run keeps the sample of a scene; see :func:`prediction_path`."""
-    return _path(folder, scene, _SAMPLE)
+    """Return where a run keeps the sample of a scene."""
+    return path_within(folder, scene, f"{folder}: scene", _SAMPLE)
 
 
 def iterations_path(folder: Path, scene: str) -> Path:
-    """Return where a run keeps the history of a scene's iteration; see :func:`prediction_path`."""
-    return _path(folder, scene, "iterations/{}.csv")
-
-
-def _path(folder: Path, scene: str, form: str) -> Path:
-    return path_within(folder, scene, f"{folder}: scene", form)
+    """Return where a run keeps the history of a scene's iteration."""
+    return path_within(folder, scene, f"{folder}: scene", "iterations/{}.csv")
 
 
 def load_errors(path: Path) -> tuple[Tensor, Tensor] | None:

@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from dsr.geometry.range_type import RANGE_TYPES, RangeType
-from dsr.utils.records import derived
+from dsr.utils.guards import derived
 
 # baseline in metres of the virtual stereo pair of a camera without a second one (Voynov et al. 2019)
 VIRTUAL_BASELINE = 0.2

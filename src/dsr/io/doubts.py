@@ -8,7 +8,7 @@ from torch import Tensor
 from dsr.geometry.camera import Camera, RangeType
 from dsr.geometry.plausible import implausible_distance, judge_camera, plausible_baseline
 from dsr.notes import Assumption
-from dsr.utils.lengths import show_length
+from dsr.utils.progress import show_length
 
 _SAMPLE = 100_000
 """Largest number of pixels that percentiles are taken of."""

@@ -39,7 +39,7 @@ from dsr.io.units import TURNED_BACK, Meaning, expect_narrow, interpret
 from dsr.notes import LIMITS, Assumption
 from dsr.sample import FARTHEST, NEAREST
 from dsr.utils.guards import natural_key, pixels_beside
-from dsr.utils.lengths import show_length
+from dsr.utils.progress import show_length
 
 Kind = tuple[Path, str, str]
 """Folder, suffix and type of value: maps alike in them have one unit."""

@@ -18,7 +18,7 @@ from dsr.geometry.planes import InverseVotes, inverse_votes
 from dsr.io.encoding import expect_known
 from dsr.io.reading import SUNRGBD_BITS
 from dsr.notes import LIMITS, Assumption
-from dsr.utils.lengths import show_length
+from dsr.utils.progress import show_length
 
 TURNED_BACK = f"bits are turned back by {SUNRGBD_BITS}, as SUN RGB-D turns them: millimetres, also in the result"
 _OVERRIDE = "--depth-unit overrides it"

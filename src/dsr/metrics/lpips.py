@@ -20,7 +20,7 @@ from torch.nn.utils import skip_init
 
 from dsr.metrics.functional import SurfacePair
 from dsr.utils.compute_device import in_own_precision
-from dsr.utils.guards import expect_stored
+from dsr.utils.torch_files import expect_stored
 
 TRUNK_FILE = "alexnet-owt-7be5be79.pth"
 TRUNK_URL = f"https://download.pytorch.org/models/{TRUNK_FILE}"

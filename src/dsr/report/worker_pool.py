@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Callable, Generator, Sequence
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
 from dsr.evaluation.results import Results
 from dsr.utils.pool import Pool
@@ -23,46 +24,26 @@ def default_workers(results: Results) -> int:
     return 1 if predictions < _FEW else min(os.cpu_count() or 1, _MOST)
 
 
-class WorkerPool:
-    """Calls functions of the results, to use in a ``with`` statement.
-
-    Args:
-        results: first argument of all functions; each worker gets it once.
-        workers: number of worker processes; 1 for none.
-        say: shows a line of text.
-
-    """
+class WorkerPool(contextlib.ExitStack):
+    """Calls functions whose first argument is the results, which each worker process gets once; 1 worker for none."""
 
     def __init__(self, results: Results, workers: int = 1, say: Callable[[str], None] = SILENT.say) -> None:
+        super().__init__()
         self.results = results
-        threads = max(1, (os.cpu_count() or 1) // workers)
-        self._pool = Pool(workers, _begin, (results,), threads, say) if workers > 1 else None
+        self._pool: Pool | None = None
+        if workers > 1:
+            threads = max(1, (os.cpu_count() or 1) // workers)
+            self._pool = self.enter_context(Pool(workers, _begin, (results,), threads, say))
 
     def map(self, function: Callable[[Results, _Item], _Value], items: Sequence[_Item]) -> Generator[_Value]:
-        """Return the values of ``function(results, item)`` in the order of the items.
+        """Return the values of ``function(results, item)``, of a module's function, in the order of the items.
 
         Workers begin at once; without them, each call is made when its value is asked for.
-
-        Args:
-            function: function of a module, since workers import it.
-            items: second arguments.
-
         """
         if self._pool is None:
             return (function(self.results, item) for item in items)
         calls = [(function, item) for item in items]
         return (value for _, value in self._pool.results(_call, calls, ordered=True))
-
-    def __enter__(self) -> Self:
-        """Return itself."""
-        if self._pool is not None:
-            self._pool.__enter__()
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        """End the workers."""
-        if self._pool is not None:
-            self._pool.__exit__(*error)
 
 
 def _begin(results: Results) -> None:

@@ -19,8 +19,7 @@ from dsr.sample import Scene
 from dsr.utils.arrays import read_arrays
 from dsr.utils.console import note_once, printable
 from dsr.utils.files import replacing
-from dsr.utils.guards import parse_json
-from dsr.utils.memory import expect_memory
+from dsr.utils.guards import expect_memory, parse_json
 
 _BYTES = 150  # least memory that a pixel takes while a scene is made; random ones take four times as much
 

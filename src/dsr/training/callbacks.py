@@ -1,10 +1,10 @@
-"""What trainings log beside the scores of validations, and how Lightning's loggers show it."""
+"""What trainings log beside the scores of validations, by loggers of Lightning's."""
 
 from __future__ import annotations
 
 import re
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import lightning
@@ -16,11 +16,7 @@ from torch import Tensor
 from dsr.metrics.formats import main_first
 from dsr.training.degradation import Batch
 from dsr.utils.checkpoints import ends_step
-from dsr.utils.configuration import expect_library
 from dsr.utils.runs_table import list_run
-
-_CURVES = ("loss", "gradient_norm")
-OPTIONAL = ("wandb", "mlflow")  # loggers that need the library of their name, which an extra of that name installs
 
 
 class Curves(Callback):
@@ -34,7 +30,7 @@ class Curves(Callback):
 
     def __init__(self) -> None:
         self._start, self._patches = time.perf_counter(), 0
-        self._sums: dict[str, torch.Tensor] = {}
+        self._sums: dict[str, Tensor] = {}
         self._rate = 0.0
 
     def state_dict(self) -> dict[str, Any]:
@@ -84,42 +80,40 @@ class Curves(Callback):
         self._start += time.perf_counter()
 
 
-def expect_installed(name: str) -> None:
-    """Raise ConfigError if a logger needs a library that is not installed."""
-    if name in OPTIONAL:
-        expect_library(f"logger={name}", name, name)
+def log_run(
+    logger: Logger, text: str, table: Mapping[str, Any], config: Mapping[str, Any], titles: Mapping[str, str], *,
+    resumed: bool,
+) -> None:  # fmt: skip
+    """Log a run's configuration before it has values: TensorBoard gets its main settings and a layout of its charts.
 
+    Args:
+        text: the configuration as YAML.
+        table: the main settings.
+        titles: of the validation's metrics, by name.
 
-def log_config(logger: Logger | None, text: str) -> None:
-    """Log the configuration as Markdown, so that TensorBoard shows the run before it has values."""
+    """
     if isinstance(logger, TensorBoardLogger):
-        logger.experiment.add_text("config", text)
+        logger.experiment.add_text("config", f"```yaml\n{text}```")
         logger.experiment.flush()
-
-
-def log_settings(logger: Logger | None, table: Mapping[str, Any], config: Mapping[str, Any]) -> None:
-    """Log the main settings to TensorBoard and its table of runs, the complete configuration to other loggers."""
-    if isinstance(logger, TensorBoardLogger):
+        log_layout(logger, titles)
         logger.log_hyperparams(dict(table))
         list_run(logger.experiment, "training", table, {})
-    elif logger is not None:
+    elif not resumed:  # MLflow refuses another device, say
         logger.log_hyperparams(dict(config))
 
 
-def log_layout(logger: Logger | None, metrics: Mapping[str, str], losses: Sequence[str] = _CURVES) -> None:
+def log_layout(logger: TensorBoardLogger, titles: Mapping[str, str]) -> None:
     """Lay out TensorBoard's *Custom scalars*: metrics of renderings first, then those of depth, then losses.
 
     A chart has a metric's mean over all validation sets and, if there are several, the means of each, of the network
-    and of bicubic interpolation. ``metrics`` are the titles of the validation's metrics by name.
+    and of bicubic interpolation.
     """
-    if not isinstance(logger, TensorBoardLogger):
-        return
-    looks = main_first(name for name in metrics if "_v" in name)
-    depth = [name for name in metrics if name not in looks]
+    looks = main_first(name for name in titles if "_v" in name)
+    depth = [name for name in titles if name not in looks]
     groups = {
-        **{title: {metrics[name]: rf"(val|bicubic)(_[^/]*)?/{re.escape(name)}$" for name in names}
+        **{title: {titles[name]: rf"(val|bicubic)(_[^/]*)?/{re.escape(name)}$" for name in names}
            for title, names in (("Looks", looks), ("Depth and normals", depth))},
-        "Training": {name: f"train/{name}$" for name in losses},
+        "Training": {name: f"train/{name}$" for name in ("loss", "gradient_norm")},
     }  # fmt: skip
     layout = {title: {name: ["Multiline", [tag]] for name, tag in charts.items()} for title, charts in groups.items()}
     logger.experiment.add_custom_scalars({title: charts for title, charts in layout.items() if charts})

@@ -27,7 +27,7 @@ from dsr.methods.networks.normalisation import compute_min_max
 from dsr.sample import AllHolesError, Scene
 from dsr.training.degradation import Batch, Degradation, to_tensors
 from dsr.training.settings import PatchSettings
-from dsr.utils.records import derived
+from dsr.utils.guards import derived
 
 _WINDOW_TRIES, _SCENE_TRIES = 10, 100
 _MIN_VALID_FRACTION = 0.5

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from dsr.utils.memory import expect_memory
+from dsr.utils.guards import expect_memory
 
 _MAX_DEPTH_SCALE = 3.0  # depth changes by a factor of exp(3) = 20 at most
 _MIN_SIZE = 16

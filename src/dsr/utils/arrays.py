@@ -13,8 +13,7 @@ import numpy as np
 
 from dsr.utils.guards import array_bytes, bytes_of_archive, expect_bytes, opened, refusing
 
-_LARGEST_HEADER = 1 << 14
-"""Largest size in bytes of the header of an array."""
+_LARGEST_HEADER = 1 << 14  # bytes of the header of an array
 
 
 def read_arrays(path: Path, names: Container[str] | None = None, most: int | None = None) -> dict[str, np.ndarray]:
@@ -69,15 +68,3 @@ def read_array_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
     if any(not 0 <= each < 1 << 62 for each in shape):
         raise ValueError(f"expected the sizes of an array, got {shape}")
     return shape, dtype
-
-
-def open_array(path: Path) -> np.ndarray:
-    """Return the array of an ``.npy`` file, mapped: its header and its size are checked, and values read when used."""
-    try:
-        with opened(path), np.errstate(over="ignore"):  # of sizes that no file has, which are refused
-            array: np.ndarray = np.lib.format.open_memmap(path, mode="r")
-    except FileNotFoundError:
-        raise
-    except Exception as error:  # a damaged header makes NumPy raise TokenError, SyntaxError, OverflowError, ...
-        raise ValueError(f"{path}: expected an array, got a damaged or foreign file") from error
-    return array

@@ -41,8 +41,7 @@ class Divergence(Callback):
     validation come after this one.
 
     Args:
-        patience: steps in a row without a finite loss and gradient that end it; 1 for an optimisation that does not
-            leave out such steps.
+        patience: steps in a row without a finite loss and gradient that end it.
 
     """
 
@@ -98,10 +97,7 @@ def _error(trainer: lightning.Trainer, step: int, what: str) -> DivergenceError:
 class BestCheckpoint(ModelCheckpoint):
     """Keeps ``best.ckpt``, of the lowest score; the first validation is that of the weights before the first step.
 
-    Args:
-        folder: the run's directory of checkpoints. A run goes on wherever it has been moved to.
-        monitor: the score.
-
+    A run goes on wherever it has been moved to.
     """
 
     def __init__(self, folder: Path, monitor: str) -> None:
@@ -139,11 +135,6 @@ class Interruption(Checkpoint):
 
     If a validation follows that step, it is done, too. All devices save and end together. Lightning calls checkpoint
     callbacks after all others, so that what those keep of the step is in the checkpoint.
-
-    Args:
-        path: the checkpoint's path.
-        seconds: between two checkpoints.
-
     """
 
     def __init__(self, path: Path, seconds: float = 600.0) -> None:
@@ -168,21 +159,19 @@ class Interruption(Checkpoint):
 
     def on_train_end(self, *_: Any) -> None:
         """Stop, if this was requested after the last step."""
-        if self.signal.requested:
+        if self.signal.number:
             raise KeyboardInterrupt
 
-    def on_exception(self, *_: Any) -> None:
-        """Let signals act as before; Lightning does not call ``teardown`` after an exception."""
-        self._stack.close()
-
-    def teardown(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, stage: str) -> None:
+    def teardown(self, *_: Any, **__: Any) -> None:
         """Let signals act as before."""
         self._stack.close()
+
+    on_exception = teardown  # after which Lightning does not call ``teardown``
 
     def _act(self, trainer: lightning.Trainer, *, due: bool) -> None:
         """Save if it is time or if any process was asked to end, and in that case end."""
         agree = trainer.strategy.reduce_boolean_decision
-        ends = agree(self.signal.requested, all=False)
+        ends = agree(self.signal.number != 0, all=False)
         if (ends or agree(due, all=False)) and not trainer.fast_dev_run:  # type: ignore[attr-defined]
             trainer.save_checkpoint(self._path)
             self._saved = time.monotonic()

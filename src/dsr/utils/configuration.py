@@ -18,7 +18,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from dsr.utils.spelling import did_you_mean
+from dsr.utils.guards import did_you_mean
 from dsr.utils.versions import how_to_install
 
 Node = Mapping[str, Any]  # ``_target_``, perhaps ``_partial_``, and arguments of the target
@@ -39,30 +39,18 @@ def expect_library(key: str, module: str, extra: str) -> None:
         raise ConfigError(f"{key}: expected {library}, which is not installed; {how_to_install(extra)}")
 
 
-def build(group: str, node: Node, given: Mapping[str, Any] | None = None, name: str | None = None) -> Any:
+def build(group: str, node: Any, given: Mapping[str, Any] | None = None, name: str | None = None) -> Any:
     """Build the object that a node describes.
 
     Args:
         group: the node's place in the configuration, for messages.
-        node: ``_target_``, perhaps ``_partial_``, and arguments of the target.
         given: values of the whole run (scale, weights, device, ...); the target gets those that its signature names.
         name: of the group's choice, for messages.
 
     """
-    _expect_whole(group, node)
-    return _make(group, node, given or {}, name)
-
-
-def check(group: str, node: Node, given: Mapping[str, Any] | None = None) -> None:
-    """Check what can be checked before :func:`build`: that a node has the keys of its target, of the right types."""
-    _expect_whole(group, node)
-    _checked(group, node, given or {}, None)
-
-
-def _expect_whole(group: str, node: Any) -> None:
-    """Refuse a partial where an object is needed; only the arguments of another node may be one."""
-    if isinstance(node, Mapping) and node.get(_PARTIAL):
+    if isinstance(node, Mapping) and node.get(_PARTIAL):  # only the arguments of another node may be one
         raise ConfigError(f"{group}.{_PARTIAL}: expected an object, which a partial is not; leave it out")
+    return _make(group, node, given or {}, name)
 
 
 def _make(group: str, node: Node, given: Mapping[str, Any], name: str | None = None) -> Any:

@@ -14,12 +14,10 @@ import numpy as np
 from dsr.utils.guards import expect_bytes, expect_pixels, pixels_of_file
 from dsr.utils.picture_headers import picture_size, tiff_pages
 
-_BYTES_PER_PIXEL = 16
-"""Bytes in memory for each allowed pixel: four channels of float32."""
+_BYTES_PER_PIXEL = 16  # in memory for each allowed pixel: four channels of float32
+# Photometric interpretations of TIFF: a mosaic of colours, and linear raw values; GDAL's tag, a number as text.
 _RAW, _GDAL_NODATA = (32803, 34892), 42113
-"""Photometric interpretations of TIFF: a mosaic of colours, and linear raw values; GDAL's tag, a number as text."""
-_GREY_AND_OPACITY = 4
-"""Colour type of PNG."""
+_GREY_AND_OPACITY = 4  # colour type of PNG
 
 
 def decode_pixels(place: str | Path, content: bytes, flags: int, most: int | None = None) -> np.ndarray | None:

@@ -1,4 +1,4 @@
-"""Guards against hostile files: limits of the memory that one takes, and checks of its numbers, JSON and names.
+"""Guards: limits of the memory that a file or a task takes, and checks of numbers, JSON and names of files.
 
 A few kilobytes of compressed zeros declare gigabytes. What is allowed grows with what can explain it: a map's size with
 its photo's, otherwise the unpacked size with the size of the file. Real photos and maps stay far below.
@@ -15,38 +15,34 @@ import re
 import stat
 import zipfile
 from collections.abc import Collection, Iterable, Iterator
+from difflib import get_close_matches
 from io import BufferedReader
 from numbers import Real
 from pathlib import Path, PurePath, PurePosixPath
-from typing import Any, NoReturn, TypeGuard
+from typing import Any, NoReturn, TypeGuard, TypeVar
 
-MOST_PIXELS = 1 << 27
-"""Largest number of pixels of a photo or map, 134 megapixels."""
-MOST_FILE = 1 << 30
-"""Largest size in bytes of a picture or map that is read at once."""
-MOST_TEXT = 1 << 24
-"""Largest size in bytes of JSON and text about a run, a result or a camera."""
-MOST_TABLE = 1 << 26
-"""Largest size in bytes of a table."""
-MOST_FACES, MOST_POINTS = 25_000_000, 20_000_000
-"""Largest numbers of triangles and points that are written unless others are asked for."""
-_PIXELS, _PIXELS_PER_BYTE = 1 << 25, 64
-"""Pixels that any file may have, and that each byte of a larger one explains; photos as JPEG have at most 20."""
-_UNPACKED, _RATIO = 1 << 28, 16
-"""Bytes that any archive of arrays may unpack to, and that each byte of a larger one explains."""
-_PER_PHOTO, _FLOOR = 4, 1 << 22
-"""Pixels of a map for each of its photo's, and pixels that any photo explains."""
+from dsr.utils.progress import megabytes
+
+MOST_PIXELS = 1 << 27  # of a photo or map, 134 megapixels
+MOST_FILE = 1 << 30  # bytes of a picture or map that is read at once
+MOST_TEXT = 1 << 24  # bytes of JSON and text about a run, a result or a camera
+MOST_TABLE = 1 << 26  # bytes of a table
+MOST_FACES, MOST_POINTS = 25_000_000, 20_000_000  # triangles and points that are written unless others are asked for
+_PIXELS, _PIXELS_PER_BYTE = 1 << 25, 64  # that any file may have, and that each byte of a larger one explains (JPEG 20)
+_UNPACKED, _RATIO = 1 << 28, 16  # bytes that any archive of arrays may unpack to, and that each byte of it explains
+_PER_PHOTO, _FLOOR = 4, 1 << 22  # pixels of a map for each of its photo's, and pixels that any photo explains
 _CHUNK = 1 << 20
-
-_MOST_DIGITS = 300
-"""Digits of a whole number that a float can still hold."""
-
-_LONGEST = 100
-"""Characters of a name that a message shows."""
+_TOO_LITTLE = "not enough memory; a smaller size, scale or batch, or fewer workers need less"
+_NO_LIMIT = 1 << 40  # bytes of memory assumed where the system does not report them
+_MOST_NEEDED = 1e300  # bytes that a message can still name
+_OF_ALLOCATORS = ("allocate memory", "not enough memory", "Insufficient memory", "out of memory")  # in their errors
+_MOST_DIGITS = 300  # of a whole number that a float can still hold
+_LONGEST = 100  # characters of a name that a message shows
 _TURNS = re.compile("([0-9]+|/)")
 _WITH_COMMA = re.compile(r"[-+]?(\d+(,\d+)?(e[-+]?\d+)?|nan|inf)", re.ASCII | re.IGNORECASE)
+# Texts and numbers of a name in turns, numbers as their number of digits and the digits, ``/`` as -1; and the name.
 NaturalKey = tuple[tuple[str | tuple[int, str], ...], str]
-"""Texts and numbers of a name in turns, numbers as their number of digits and the digits, ``/`` as -1; and the name."""
+_Record = TypeVar("_Record")
 
 
 class TooLargeError(ValueError):
@@ -122,20 +118,6 @@ def opened(path: Path) -> Iterator[BufferedReader]:
         raise OSError(error.errno, error.strerror, str(path)) from error
 
 
-def expect_stored(path: Path) -> None:
-    """Check that no member of a torch file, if it is there, is compressed or shared; torch writes none so."""
-    if not path.exists():
-        return
-    with opened(path) as file:
-        if not zipfile.is_zipfile(file):  # as of torch before version 1.6
-            return
-    with zipfile.ZipFile(path) as packed:
-        members = packed.infolist()
-    if any(member.compress_type != zipfile.ZIP_STORED for member in members):
-        raise ValueError(f"{path}: expected members that are not compressed")
-    expect_bytes(path, sum(member.file_size for member in members), path.stat().st_size)
-
-
 def files_in(packed: zipfile.ZipFile, archive: object) -> list[zipfile.ZipInfo]:
     """Return the files of an archive; a ValueError if one is no file, has no name or leads outside."""
     entries = [each for each in packed.infolist() if not each.filename.endswith("/")]
@@ -164,6 +146,45 @@ def read_member(packed: zipfile.ZipFile, name: str) -> bytes:
     if length != declared:
         raise zipfile.BadZipFile(f"{name}: {length} bytes instead of {declared}")
     return b"".join(parts)
+
+
+class OutOfMemoryError(ValueError):
+    """There is not enough memory for the request."""
+
+
+def free_memory() -> int:
+    """Return the bytes of memory that are free; those of a large machine where the system does not report them."""
+    return _meminfo("MemAvailable:")
+
+
+def expect_memory(name: str, value: object, needed: float) -> None:
+    """Raise OutOfMemoryError for a value that needs more bytes than this machine, whatever else runs on it, has."""
+    there, needed = _meminfo("MemTotal:"), min(needed, _MOST_NEEDED)
+    if needed > there:
+        size = f"at least {megabytes(needed)} of memory, of which there are {megabytes(there)}"
+        raise OutOfMemoryError(f"{name}: expected less, {value} needs {size}")
+
+
+def _meminfo(name: str) -> int:
+    """Return an entry of Linux's ``/proc/meminfo``, in bytes."""
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        return 1024 * next(int(line.split()[1]) for line in lines if line.startswith(name))
+    except (OSError, ValueError, StopIteration):
+        return _NO_LIMIT
+
+
+@contextlib.contextmanager
+def refusing_excess() -> Iterator[None]:
+    """Raise OutOfMemoryError for whatever fails in this context for want of memory."""
+    try:
+        yield
+    except Exception as error:
+        foreign = isinstance(error, RuntimeError) or type(error).__module__.startswith("cv2")
+        of_allocator = foreign and any(text in str(error) for text in _OF_ALLOCATORS)
+        if not isinstance(error, MemoryError) and not of_allocator:
+            raise
+        raise OutOfMemoryError(_TOO_LITTLE) from error
 
 
 def is_number(value: Any) -> TypeGuard[float]:
@@ -229,26 +250,37 @@ def parse_json(text: str | bytes, *, finite: bool = True) -> Any:
         finite: whether NaN and infinity, which Python writes and JSON does not have, are refused.
 
     """
-    only: Any = {"parse_constant": _refuse, "parse_float": _parse_float} if finite else {}
+
+    def refuse(text: str) -> NoReturn:
+        raise ValueError(f"expected finite numbers, got {text[:20]}")
+
+    def parse_int(text: str) -> int:
+        return int(text) if len(text) <= _MOST_DIGITS else refuse(text)
+
+    def parse_float(text: str) -> float:
+        value = float(text)
+        return value if math.isfinite(value) else refuse(text)
+
+    only: Any = {"parse_constant": refuse, "parse_float": parse_float} if finite else {}
     with refusing("nested too deeply", RecursionError):
-        return json.loads(text, parse_int=_parse_int, **only)
+        return json.loads(text, parse_int=parse_int, **only)
 
 
-def _refuse(text: str) -> NoReturn:
-    raise ValueError(f"expected finite numbers, got {text[:20]}")
+def did_you_mean(given: object, known: Iterable[str]) -> str:
+    """Return ``; did you mean NAME?`` to end a message, or an empty text where no known name is like the given one.
 
+    That is the only name with all words of the given one, such as ``--depth-unit`` for ``--unit``, or else the name of
+    the most similar letters.
+    """
 
-def _parse_int(text: str) -> int:
-    if len(text) > _MOST_DIGITS:
-        _refuse(text)
-    return int(text)
+    def words_of(name: str) -> set[str]:
+        return {word.rstrip("s") for word in re.findall(r"[^\W_]+", name.lower())}
 
-
-def _parse_float(text: str) -> float:
-    value = float(text)
-    if math.isinf(value):
-        _refuse(text)
-    return value
+    names, words = {name.lower(): name for name in known}, words_of(str(given))
+    near = [name for name in names if words and words <= words_of(name)]
+    if len(near) != 1:
+        near = get_close_matches(str(given).lower(), names, 1)
+    return f"; did you mean {names[near[0]]}?" if near else ""
 
 
 class OutsideError(ValueError):
@@ -291,3 +323,15 @@ def natural_key(name: str | PurePath) -> NaturalKey:
         digits = str(parts[place]).lstrip("0")
         parts[place] = (-1, "") if digits == "/" else (len(digits), digits)
     return tuple(parts), text
+
+
+def unchecked(kind: type[_Record], **values: Any) -> _Record:
+    """Return a record of all its fields' values, of which the maker is sure, without its checks."""
+    record = object.__new__(kind)
+    vars(record).update(values)
+    return record
+
+
+def derived(record: _Record, **changes: Any) -> _Record:
+    """Return a copy of a record with other values of some fields, which are not checked."""
+    return unchecked(type(record), **{**vars(record), **changes})

@@ -17,10 +17,9 @@ import time
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
-
-from dsr.utils import surroundings
 
 MESSAGE = "interrupted; what is finished is kept, the same command continues from there"
 _BETWEEN_LOOKS = 0.5  # seconds between two looks of a worker after its parent
@@ -32,7 +31,7 @@ def start(module: str, function: str) -> NoReturn:
     for number in (signal.SIGINT, signal.SIGTERM):
         if signal.getsignal(number) != signal.SIG_IGN:  # as in a shell's background job
             signal.signal(number, _interrupt)
-    surroundings.close()
+    _leave_working_directory()
     ignore_warnings_of_numbers()
     try:
         code = getattr(importlib.import_module(module), function)()
@@ -43,6 +42,15 @@ def start(module: str, function: str) -> NoReturn:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 1
     sys.exit(code)
+
+
+def _leave_working_directory() -> None:
+    """Load no code from the working directory, which may hold a stranger's files, in this process and its workers."""
+    os.environ["PYTHONSAFEPATH"] = "1"  # of worker processes, which are started with -c
+    os.environ["LD_LIBRARY_PATH"] = os.environ.get("LD_LIBRARY_PATH") or str(Path(__file__).parent)
+    # OpenCV puts a colon before it, and the working directory would stand for an empty entry
+    if getattr(sys.modules["__main__"], "__spec__", None) is not None and sys.path[:1] == [os.getcwd()]:  # noqa: PTH109
+        del sys.path[0]  # where ``python -m`` puts it
 
 
 def _interrupt(number: int, _: FrameType | None) -> None:
@@ -68,11 +76,6 @@ class Deferred:
     """The number of the signal that has come meanwhile, 0 for none."""
 
     number: int = 0
-
-    @property
-    def requested(self) -> bool:
-        """Whether the process was asked to end."""
-        return self.number != 0
 
 
 @contextlib.contextmanager

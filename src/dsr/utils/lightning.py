@@ -9,7 +9,7 @@ import signal
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from dsr.utils.progress import Progress, Task
 from dsr.utils.runs_table import SCORES, list_scores
 
 LOG_EVERY = 10  # steps between two values of a training in its log
+_UNITS = {"RMSE_d": " mm", "RMSE_v": "", "DSSIM_v": "", "LPIPS_v": ""}  # of the scores that are shown, as in tables
 _SECONDS_BETWEEN_LOSSES = 0.2  # between two losses that are shown, each of which waits for the device
 
 
@@ -35,10 +36,6 @@ class ValidationTable(Callback):
 
     The module's ``validation_scores`` are in metres and fractions, ``shown_scores``, which are logged, in the units of
     tables; both by set and by metric.
-
-    Args:
-        path: the file's path.
-
     """
 
     def __init__(self, path: Path) -> None:
@@ -60,12 +57,7 @@ class ValidationTable(Callback):
 
 
 class ListedScores(Callback):
-    """Keeps the scores in TensorBoard's table of runs up to date: those of the validation that the result is from.
-
-    Args:
-        best: keeps the best checkpoint, whose validation it is; None for the last one.
-
-    """
+    """Keeps the scores in TensorBoard's table of runs up to date: of the best validation, or without one the last."""
 
     def __init__(self, best: ModelCheckpoint | None = None) -> None:
         self._best = best
@@ -87,11 +79,7 @@ class ListedScores(Callback):
 class StepProgress(Callback):
     """Shows the steps of a training with the latest loss, the scenes of a validation, and its scores.
 
-    Args:
-        progress: where they are shown.
-        name: the name of the steps, such as ``train``.
-        subject: the beginning of lines about validations, such as a scene's name; empty for none.
-
+    Lines about validations begin with the ``subject``, such as a scene's name.
     """
 
     def __init__(self, progress: Progress, name: str, subject: str = "") -> None:
@@ -127,7 +115,10 @@ class StepProgress(Callback):
         """Print the scores of the validation, and first those of bicubic interpolation."""
         self._validation.close()
         scored: Any = pl_module
-        scores, bicubic = (scores_line(scored.shown_scores.get(kind, {})) for kind in ("val", "bicubic"))
+        scores, bicubic = (
+            "  ".join(f"{name} {each[name]:.1f}{unit}" for name, unit in _UNITS.items() if name in each)
+            for each in (scored.shown_scores.get(kind, {}) for kind in ("val", "bicubic"))
+        )
         if scores:
             parts = (f"{self._subject}step {trainer.global_step:>6}", _loss_text(trainer), f"validation: {scores}")
             self._progress.say("  ".join(filter(None, parts)))
@@ -145,12 +136,7 @@ class StepProgress(Callback):
 
 
 class LastValidation(Callback):
-    """Validates after the last step if the interval does not divide the number of steps; the first callback.
-
-    Args:
-        interval: between validations, in steps.
-
-    """
+    """Validates after the last step if the interval in steps does not divide their number; the first callback."""
 
     def __init__(self, interval: int) -> None:
         self._interval = interval
@@ -178,16 +164,9 @@ def make_trainer(
     make: Callable[..., lightning.Trainer] = lightning.Trainer,
     **named: Any,
 ) -> lightning.Trainer:
-    """Return a trainer for a number of steps, with a validation after every few and after the last one.
+    """Return a trainer that ``make`` makes, for a number of steps, with a validation after every ``interval`` of them.
 
-    Args:
-        interval: steps between two validations.
-        accumulate: batches of a step.
-        environment: what Lightning learns of the processes of several devices from; None where it starts them itself,
-            whatever Slurm or MPI say.
-        make: makes the trainer of its arguments.
-        **named: its other arguments.
-
+    Without an ``environment`` Lightning starts the processes of several devices, whatever Slurm or MPI say.
     """
     index: int | None = device.index  # torch's stubs say int
     with without_chatter():
@@ -249,12 +228,6 @@ def _loss_text(trainer: lightning.Trainer) -> str:
     """Return the loss of the last step; empty if there is none."""
     loss = trainer.callback_metrics.get("train/loss")
     return "" if loss is None else f"loss {float(loss):.4f}"
-
-
-def scores_line(scores: Mapping[str, float]) -> str:
-    """Return the main ones of scores in the units of tables, mm and 1/1000, for a reader; empty if there are none."""
-    units = {"RMSE_d": " mm", "RMSE_v": "", "DSSIM_v": "", "LPIPS_v": ""}
-    return "  ".join(f"{name} {scores[name]:.1f}{unit}" for name, unit in units.items() if name in scores)
 
 
 @contextlib.contextmanager

@@ -28,17 +28,18 @@ class InUseError(ValueError):
 def at_work(folder: Path, settings: str) -> Iterator[None]:
     """Within this context a directory, which is made if need be, belongs to commands with the same settings.
 
-    The last command that leaves removes the locks, and the directory if it was made for them and is empty.
-
-    Raises:
-        InUseError: a command with other settings is at work there.
-
+    The last command that leaves removes the locks, and the directory if it was made for them and is empty. If a command
+    with other settings is at work there, this is an InUseError.
     """
     made = [each for each in (folder, *folder.parents) if not each.exists()]
     place = folder / LOCKS
     beginning = f"command-{_digest(settings)}-"
     own = place / f"{beginning}{socket.gethostname()}-{os.getpid()}.lock"
-    lock = _acquired(own)
+    lock = FileLock(own)
+    while not lock.is_locked:
+        place.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(FileNotFoundError):  # the last command has just removed the directory
+            lock.acquire()
     try:
         for other in place.glob("command-*"):
             if not other.name.startswith(beginning) and _is_held(other):
@@ -78,16 +79,6 @@ def free_first(folder: Path, scenes: Sequence[str], *, wait: bool = True) -> Ite
             return
         if waiting:
             time.sleep(_BETWEEN_LOOKS)
-
-
-def _acquired(path: Path) -> FileLock:
-    """Return a new lock that is held."""
-    while True:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with contextlib.suppress(FileNotFoundError):  # the last command has just removed the directory
-            lock = FileLock(path)
-            lock.acquire()
-            return lock
 
 
 def _is_held(path: Path) -> bool:

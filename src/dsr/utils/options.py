@@ -23,7 +23,7 @@ Example:
 from __future__ import annotations
 
 import math
-from argparse import SUPPRESS, ArgumentParser, Namespace
+from argparse import SUPPRESS, Namespace
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
@@ -31,7 +31,7 @@ from types import EllipsisType, MappingProxyType, NoneType
 from typing import Any, Literal, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
 
 from dsr.utils.files import obstacle
-from dsr.utils.spelling import did_you_mean
+from dsr.utils.guards import did_you_mean
 
 _KEY = "option"
 
@@ -48,9 +48,8 @@ class OptionError(ValueError):
 
 
 def _shown(value: Any) -> str:
-    if isinstance(value, tuple):
-        return " ".join(map(_shown, value))
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    values = value if isinstance(value, tuple) else (value,)
+    return " ".join(f"{each:g}" if isinstance(each, float) else str(each) for each in values)
 
 
 class Rule(NamedTuple):
@@ -103,8 +102,6 @@ def some_of(choices: Collection[str], shown: Callable[[Any], str] = repr) -> Rul
 
 
 class _Option(NamedTuple):
-    """See :func:`option`."""
-
     help: str
     metavar: str | tuple[str, ...] | None
     flags: str
@@ -230,18 +227,13 @@ class Options:
 Record = TypeVar("Record", bound=Options)
 
 
-def add_options(parser: ArgumentParser, record: type[Options]) -> None:
-    """Add the options of a record to a command's parser; :func:`build` reads them."""
-    _add(parser, record, needed=True)
-
-
-def _add(place: Any, record: type[Options], *, needed: bool) -> None:
+def add_options(place: Any, record: type[Options], *, needed: bool = True) -> None:
     """Add the options of a record, which are required only if it is ``needed``, to a parser or a group of it."""
     excluding: dict[str, Any] = {}
     for each in _stated(record):
         if each.option is None:
             inner = place.add_argument_group(each.title) if each.title else place
-            _add(inner, each.hint, needed=needed and not each.optional)
+            add_options(inner, each.hint, needed=needed and not each.optional)
             continue
         where, alone = place, each.option.alone
         if alone:
@@ -276,12 +268,7 @@ def _keywords(each: _Stated, option: _Option, *, needed: bool) -> dict[str, Any]
 
 
 def build(record: type[Record], given: Namespace) -> Record:
-    """Return a record of the options given on the command line.
-
-    Raises:
-        ValueError: a value is not what its option expects; the message begins with the option's flag.
-
-    """
+    """Return a record of the options given on the command line; the message of an error begins with the flag."""
     given = _with_presets(record, given)
     values: dict[str, Any] = {}
     for each in _stated(record):

@@ -26,19 +26,12 @@ _PNM = re.compile(rb"P[1-6](?:\s+|#[^\n]*\n)+(\d{1,9})(?:\s+|#[^\n]*\n)+(\d{1,9}
 
 @dataclass(frozen=True)
 class PictureSize:
-    """What a decoder will make of a picture.
-
-    Args:
-        height, width: in pixels.
-        bytes_per_pixel: at most, of the decoded pixels.
-        tile: pixels of a tile, which is decoded whole; 0 without tiles.
-
-    """
+    """What a decoder will make of a picture."""
 
     height: int
     width: int
-    bytes_per_pixel: int
-    tile: int = 0
+    bytes_per_pixel: int  # at most
+    tile: int = 0  # pixels of a tile, which is decoded whole; 0 without tiles
 
 
 def picture_size(file: IO[bytes]) -> PictureSize | None:
@@ -185,18 +178,11 @@ _NOT_READ = {
     b"FUJIFILM": "a raw photo", b"IIU\0": "a raw photo",
 }  # fmt: skip
 _BRANDS = {b"avi": "AVIF", b"hei": "HEIC", b"hev": "HEIC", b"mif": "HEIC", b"crx": "a raw photo"}
-_COMPRESSIONS = {1, 5, 6, 7, 8, 32773, 32946}
-"""Of TIFF, which OpenCV reads."""
+_COMPRESSIONS = {1, 5, 6, 7, 8, 32773, 32946}  # of TIFF, which OpenCV reads
 
 
 def format_not_read(content: bytes, *, stored: bool) -> str:
-    """Return what a picture is that OpenCV cannot decode; empty if it is damaged, or of an unknown format.
-
-    Args:
-        content: of the file.
-        stored: whether its values were wanted as they are, and not in 8 bits.
-
-    """
+    """Return what a picture is that OpenCV cannot decode, in 8 bits or as ``stored``; empty if damaged or unknown."""
     if content[4:8] == b"ftyp":
         return _BRANDS.get(content[8:11], "a video")
     if content[:2] in (b"II", b"MM") and picture_size(io.BytesIO(content)) is not None:

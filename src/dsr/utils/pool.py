@@ -25,12 +25,7 @@ LOST = "worker processes were killed twice, perhaps for want of memory; fewer wo
 class Pool:
     """Worker processes, to use in a ``with`` statement; the end of an interrupted one terminates them.
 
-    Args:
-        count: how many at most.
-        prepare: function of ``arguments`` that each worker calls first; None for none.
-        threads: of each worker; None for those that torch takes.
-        say: shows a line of text.
-
+    Each worker first calls ``prepare(*arguments)``, and computes with a number of threads, or with those of torch.
     """
 
     def __init__(
@@ -69,9 +64,7 @@ class Pool:
     ) -> Generator[tuple[_Item, _Value]]:
         """Begin to work on items, and return each with its value, as they come or in their order.
 
-        Raises:
-            ChildProcessError: workers were killed twice; raised instead of what is left.
-
+        If workers are killed twice, a ChildProcessError is raised instead of what is left.
         """
         return self._results(function, items, *self._submit(function, items), ordered=ordered)
 

@@ -4,13 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
-_DECIMALS = 3
-_ASPECT = 0.02
-
 SCALES = (2, 4, 8, 16)
-NATIVE = "native"
-"""The scale that stands for the ratio of a scene's measured map, whatever it is."""
-_TOLERANCE = 0.01
+NATIVE = "native"  # the scale that stands for the ratio of a scene's measured map, whatever it is
+_DECIMALS, _ASPECT, _TOLERANCE = 3, 0.02, 0.01
 
 
 def as_ratio(value: float) -> float:
@@ -35,12 +31,7 @@ def check_scale(scale: float | str) -> None:
 
 
 def match_ratio(scale: float | str, measured: Collection[float]) -> float:
-    """Return the ratio of the measured map that a scale names.
-
-    Args:
-        scale: the ratio, to within 1 %, or ``native`` for the only one.
-
-    """
+    """Return the ratio of the measured map that a scale names to within 1 %, or ``native`` for the only one."""
     have = ", ".join(f"x{round_ratio(ratio)}" for ratio in sorted(measured)) or "none"
     if isinstance(scale, str):
         if len(measured) != 1:

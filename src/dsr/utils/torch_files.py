@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,17 +11,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dsr.utils.guards import expect_stored
+from dsr.utils.guards import expect_bytes, opened
 
 
 def read_torch_file(path: Path) -> Any:
-    """Return the content of a torch file of plain values and tensors, on the CPU; no code in it is executed.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is damaged or holds other Python objects.
-
-    """
+    """Return the content of a torch file of plain values and tensors, on the CPU; no code in it is executed."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such weights file")
     try:
@@ -55,3 +50,17 @@ def _expect_plain_tensors(path: Path, content: Any) -> None:
         elif isinstance(value, (Mapping, list, tuple)) and id(value) not in seen:
             seen.add(id(value))
             todo += value.values() if isinstance(value, Mapping) else value
+
+
+def expect_stored(path: Path) -> None:
+    """Check that no member of a torch file, if it is there, is compressed or shared; torch writes none so."""
+    if not path.exists():
+        return
+    with opened(path) as file:
+        if not zipfile.is_zipfile(file):  # as of torch before version 1.6
+            return
+    with zipfile.ZipFile(path) as packed:
+        members = packed.infolist()
+    if any(member.compress_type != zipfile.ZIP_STORED for member in members):
+        raise ValueError(f"{path}: expected members that are not compressed")
+    expect_bytes(path, sum(member.file_size for member in members), path.stat().st_size)

@@ -16,23 +16,18 @@ def _whole(value: Any) -> Any:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
+# Numbers of a file: a finite one; a whole one that 64 bits hold, which may be written as 640.0. True and text are none.
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-"""A finite number of a file; true, text, NaN and infinity are none."""
-Whole = Annotated[int, Field(strict=True, ge=-(2**63), lt=2**63), BeforeValidator(_whole)]
-"""A whole number of a file that 64 bits hold, which may be written as 640.0; true and text are none."""
-
-
+Whole = Annotated[
+    int,
+    Field(strict=True, ge=-(2**63), lt=2**63),
+    BeforeValidator(_whole),
+]
 Content = TypeVar("Content", bound=BaseModel)
 
 
 def parse_model(model: type[Content], content: str | bytes, place: object, expected: str = "") -> Content:
-    """Parse JSON into a model.
-
-    Args:
-        place: where it is from, for the message.
-        expected: what the message says after that, such as ``expected a camera; ``.
-
-    """
+    """Parse JSON into a model; a message begins with the place that it is from, and ``expected a camera; ``, say."""
     try:
         return model.model_validate_json(decode_text(content) if isinstance(content, bytes) else content)
     except ValidationError as error:
@@ -40,12 +35,7 @@ def parse_model(model: type[Content], content: str | bytes, place: object, expec
 
 
 def describe(error: ValidationError, known: Iterable[str] = ()) -> str:
-    """Return the first thing that is wrong, such as ``trials.a1.scale: expected a valid integer, got 'x'``.
-
-    Args:
-        known: the keys to name where one is unknown.
-
-    """
+    """Return the first thing that is wrong, such as ``trials.a1.scale: expected a valid integer, got 'x'``."""
     first = error.errors(include_url=False, include_context=False)[0]
     key = ".".join(map(str, first["loc"]))
     message = re.sub(r"^(\w+ should (be|have) |Value error, )", "", first["msg"])

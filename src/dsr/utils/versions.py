@@ -15,8 +15,7 @@ from typing import Any
 from dsr.utils.guards import opened
 from dsr.utils.progress import Task
 
-DISTRIBUTION = "depthsr"
-"""The name in pyproject.toml; the dsr of PyPI is another project."""
+DISTRIBUTION = "depthsr"  # the name in pyproject.toml; the dsr of PyPI is another project
 RESULTS = 7
 """Version of what predicts and trains, raised with each change of its results, so that older predictions are not used
 again. ``tests/golden/test_results.py`` notices such a change."""

@@ -20,7 +20,7 @@ from typing import Any, Literal
 
 from dsr.app.browser.work import SHOWN, What
 from dsr.utils.console import one_line
-from dsr.utils.memory import free_memory
+from dsr.utils.guards import free_memory
 from dsr.utils.progress import megabytes
 
 _MOST_UPLOADS, _MOST_WAITING = 4, 8

@@ -25,8 +25,8 @@ from dsr.app.upsample.reporting import Reporter
 from dsr.app.upsample.request import UpsampleRequest
 from dsr.notes import Assumption
 from dsr.utils.console import one_line, printable, shorten
+from dsr.utils.guards import refusing_excess
 from dsr.utils.interruption import start
-from dsr.utils.memory import refusing_excess
 from dsr.utils.options import add_options, build
 from dsr.utils.progress import Progress, Task, Unit
 
@@ -215,7 +215,7 @@ def _result(request: UpsampleRequest, folder: Path) -> None:
 def _facts(camera: Camera, info: Mapping[str, Any]) -> dict[str, str]:
     """Return the camera and the unit as they were read."""
     from dsr.geometry.plausible import view_of  # noqa: PLC0415
-    from dsr.utils.lengths import show_length  # noqa: PLC0415
+    from dsr.utils.progress import show_length  # noqa: PLC0415
 
     depth = info["input_depth"]
     unit = f"{depth['unit']:g} pixels" if depth["range_type"] == "disparity" else show_length(depth["unit"])

@@ -37,11 +37,9 @@ from dsr.io.pairs import Pair
 from dsr.methods.base import MapNoise, Outliers, Surface
 from dsr.methods.glass import NOTED
 from dsr.notes import CHECKS, Assumption, expect_no_warning
-from dsr.utils.guards import readable
-from dsr.utils.lengths import show_length
+from dsr.utils.guards import readable, refusing_excess
 from dsr.utils.locks import scene_lock
-from dsr.utils.memory import refusing_excess
-from dsr.utils.progress import Progress, megabytes
+from dsr.utils.progress import Progress, megabytes, show_length
 from dsr.utils.versions import package_versions
 
 TO_DO, COMPLETE = "to do", "complete already"

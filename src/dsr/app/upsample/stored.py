@@ -22,7 +22,7 @@ from dsr.io.frames import UPS
 from dsr.sample import expect_distances
 from dsr.utils.arrays import array_headers
 from dsr.utils.guards import TooLargeError, is_number, natural_key, parse_json, pixels_beside, read_limited
-from dsr.utils.lengths import show_length
+from dsr.utils.progress import show_length
 
 if TYPE_CHECKING:
     from dsr.report.surface_page import ViewedResult

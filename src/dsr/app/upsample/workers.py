@@ -13,7 +13,7 @@ from dsr.app.upsample.reporting import Messages, Record, Reporter
 from dsr.app.upsample.request import UpsampleRequest
 from dsr.io.pairs import Pair
 from dsr.utils.console import one_line
-from dsr.utils.memory import refusing_excess
+from dsr.utils.guards import refusing_excess
 from dsr.utils.pool import LOST, Pool
 from dsr.utils.progress import Progress
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from dsr.utils.spelling import did_you_mean
+from dsr.utils.guards import did_you_mean
 
 MIDDLEBURY = "Its owners permit using and publishing the images and disparity maps, and ask for the citation."
 RESEARCH = "Its owners state no licence: for research, see the homepage."

@@ -33,7 +33,7 @@ from dsr.io.pairs import Pair, PairingResult, match_times
 from dsr.io.trajectories import describe_capture, intrinsics_camera
 from dsr.notes import Assumption
 from dsr.utils.guards import naming, numbers_in
-from dsr.utils.lengths import show_length
+from dsr.utils.progress import show_length
 
 _VERSION = "/file_version"
 _OLDEST = 2
