@@ -83,11 +83,13 @@ class RunConfig:
     @classmethod
     def of(cls, plain: Config) -> Self:
         """Return the settings of a composed configuration; OmegaConf checks names and types, :meth:`check` values."""
-        try:
-            merged = OmegaConf.merge(OmegaConf.structured(cls), dict(plain))
-            values: dict[str, Any] = OmegaConf.to_container(merged, resolve=True)  # type: ignore[assignment]
-        except OmegaConfBaseException as error:
-            raise ConfigError(explain_value(error, error.full_key or "")) from error
+        merged = OmegaConf.structured(cls)
+        for key, value in plain.items():
+            try:
+                merged.merge_with({key: value})
+            except OmegaConfBaseException as error:
+                raise ConfigError(explain_value(error, error.full_key or key)) from error
+        values: dict[str, Any] = OmegaConf.to_container(merged, resolve=True)  # type: ignore[assignment]
         for key, value in values.items():
             if value == MISSING:  # within a node it may be missing: a part of a mixture need not be used
                 raise ConfigError(f"{key}: missing; give it as {key}=...")
@@ -226,7 +228,7 @@ def explain_value(error: OmegaConfBaseException, key: str) -> str:
     first = str(error).partition("\n")[0]
     if " not in " in first and error.parent_node is not None:
         keys = [str(each) for each in error.parent_node if not str(each).startswith("_")]
-        meant = did_you_mean(key.rpartition(".")[2], keys)
+        meant = did_you_mean(key.rpartition(".")[2], keys if "." in key else [*keys, "experiment"])
         return f"{key}: unknown key; expected one of {', '.join(keys)}{meant}; +{key}=... adds one"
     return f"{key}: {first}" if key else first
 

@@ -12,10 +12,12 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 
+from dsr.app.entry import explain, fail
 from dsr.app.schema import EvalConfig, Identity, Plan, TrainConfig, plain_config
 from dsr.utils.configuration import ConfigError
 from dsr.utils.console import USAGE_ERROR, one_line, open_console, print_error, show
@@ -32,7 +34,11 @@ class CheckJobs(Callback):
         problems: list[str] = []
         owners: dict[Path, Identity] = {}
         before = HydraConfig.instance().cfg
-        for overrides, job in _jobs(config):
+        try:
+            jobs = _jobs(config)
+        except HydraException as error:
+            fail(explain(error))
+        for overrides, job in jobs:
             HydraConfig.instance().set_config(job)
             composed = copy.deepcopy(job)
             with read_write(composed), open_dict(composed):
