@@ -39,7 +39,7 @@ USAGE_ERRORS = {
     "dataset=fodler": r"dataset=fodler: unknown; expected one of arkitscenes, .*; did you mean folder\?",
     "datset=folder": r"datset: unknown key; expected .*; did you mean dataset\?",
     "scal=8": r"scal: unknown key; expected .*; did you mean scale\?",
-    "dataset.rot=x": r"dataset.rot: unknown key; expected .* root, .*; did you mean root\?; \+dataset.rot=",
+    "dataset.rot=x": r"dataset.rot: unknown key; expected .* root, .*; \+dataset.rot=.*; did you mean root\?",
     "seed=four": "seed: ",
     "overwrite=maybe": "overwrite: ",
     "method=null": "",

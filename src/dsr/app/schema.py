@@ -229,7 +229,7 @@ def explain_value(error: OmegaConfBaseException, key: str) -> str:
     if " not in " in first and error.parent_node is not None:
         keys = [str(each) for each in error.parent_node if not str(each).startswith("_")]
         meant = did_you_mean(key.rpartition(".")[2], keys if "." in key else [*keys, "experiment"])
-        return f"{key}: unknown key; expected one of {', '.join(keys)}{meant}; +{key}=... adds one"
+        return f"{key}: unknown key; expected one of {', '.join(keys)}; +{key}=... adds one{meant}"
     return f"{key}: {first}" if key else first
 
 
