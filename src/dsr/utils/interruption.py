@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import multiprocessing
 import os
 import signal
 import sys
@@ -41,6 +42,9 @@ def start(module: str, function: str) -> NoReturn:
     except BrokenPipeError:  # nobody reads the output any longer, as in | head
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 1
+    finally:
+        for worker in multiprocessing.active_children():  # those of data loaders outlast SIGTERM
+            worker.kill()
     sys.exit(code)
 
 
