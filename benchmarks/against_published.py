@@ -20,9 +20,9 @@ import torch
 
 from dsr.data.folder import Folder
 from dsr.degradation.downsampling import Downsampling, make_sample
-from dsr.methods.networks.weight_choice import packaged_weights
 from dsr.methods.networks.weight_files import read_header
 from dsr.methods.recipe import Known, Run, read_recipe
+from dsr.methods.weights import packaged_weights
 from dsr.metrics.catalogue import Metric, catalogue, score_image
 from dsr.metrics.lpips import load_lpips
 from dsr.metrics.metric import WORST

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from dsr.methods.networks.msg_net import MSGNet
 from dsr.methods.networks.network import NetworkUpsampler
-from dsr.methods.networks.published import load_msg_weights
+from dsr.methods.networks.trained import load_msg_weights
 
 SCALE = 4
 TARGETS = {"float32": 3.0, "bfloat16": 8.0}

@@ -54,9 +54,9 @@ from dsr.methods.glass import probability_of_glass
 from dsr.methods.inpainting import inpaint
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.msg_net import MSGNet
-from dsr.methods.networks.weight_choice import packaged_names, packaged_weights
 from dsr.methods.noise_level import estimate_noise, estimate_sensor_noise
 from dsr.methods.recipe import Known, Run, read_recipe
+from dsr.methods.weights import packaged_names, packaged_weights
 from dsr.sample import Scene
 from dsr.training.degradation import Degradation, to_tensors
 from dsr.training.module import SuperResolution

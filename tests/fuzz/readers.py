@@ -206,7 +206,7 @@ def _weights(place: Place) -> None:
 
 def _published(*names: str) -> Callable[[Place], None]:
     def read(place: Place) -> None:
-        from dsr.methods.networks.published import load_msg_weights  # noqa: PLC0415
+        from dsr.methods.networks.trained import load_msg_weights  # noqa: PLC0415
 
         _each(place, names, lambda path: load_msg_weights(path, 2))
 

@@ -17,8 +17,8 @@ from dsr.data.rendered import SimGeo
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.methods.networks.network import NetworkUpsampler
 from dsr.methods.networks.trained import TrainedNetwork
-from dsr.methods.networks.weight_choice import packaged_weights
 from dsr.methods.recipe import read_recipe
+from dsr.methods.weights import packaged_weights
 from dsr.metrics.catalogue import Metric, catalogue, score_image
 from dsr.metrics.lpips import load_lpips
 from dsr.metrics.metric import WORST

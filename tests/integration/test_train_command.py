@@ -330,7 +330,7 @@ def test_stopped_process_ends_at_a_step_and_a_killed_one_goes_on_from_its_checkp
 ):
     many = (*SMOKE, "trainer.max_steps=24", "trainer.val_check_interval=4", "output_dir=out")
     if number != signal.SIGKILL:
-        many = (*many[:-1], "trainer.max_steps=500", many[-1])
+        many = (*many[:-1], "trainer.max_steps=500", "patches.workers=2", many[-1])
     with Program(TRAIN, *many, cwd=tmp_path, env=environment) as process:
         deadline = time.monotonic() + 60
         while not (tmp_path / "out/checkpoints/last.ckpt").exists() and time.monotonic() < deadline:

@@ -11,7 +11,7 @@ from dsr.app.composition import compose, register_resolvers
 from dsr.app.schema import EvalConfig, TrainConfig, plain_config
 from dsr.app.training_runs import training_data
 from dsr.methods.base import Method
-from dsr.methods.networks.weight_choice import packaged_names
+from dsr.methods.weights import packaged_names
 from dsr.utils.configuration import ConfigError, build, config_directories, list_choices, load_target
 
 DIRECTORIES = config_directories()

@@ -21,7 +21,7 @@ from dsr.methods.networks.normalisation import resize_bicubic
 from dsr.methods.networks.peers.local_filters import SVLRM
 from dsr.methods.networks.peers.peer import PEERS, Peer
 from dsr.methods.networks.peers.peer_network import PeerNetwork, PeerUpsampler, fold_batch_norm, load_peer
-from dsr.methods.networks.weight_choice import has_weights, nearest_scale
+from dsr.methods.networks.weight_files import has_weights, nearest_scale
 from dsr.methods.recipe import read_recipe
 from dsr.sample import DepthSample
 from dsr.utils.configuration import ConfigError

@@ -13,8 +13,7 @@ from bombs import Trap
 from torch import Tensor
 
 from dsr.methods.networks.msg_net import MSGNet
-from dsr.methods.networks.published import load_msg_weights
-from dsr.methods.networks.trained import TrainedNetwork
+from dsr.methods.networks.trained import TrainedNetwork, load_msg_weights
 
 Layer = tuple[str, str, list[Tensor]]
 

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from dsr.inference.defaults import DEFAULT, USUAL_SCALE
-from dsr.methods.networks.weight_choice import SLACK, nearest_scale
+from dsr.methods.networks.weight_files import SLACK, nearest_scale
 from dsr.methods.recipe import Recipe
 from dsr.utils.progress import duration
 

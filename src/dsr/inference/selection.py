@@ -12,7 +12,7 @@ from dsr.inference.any_ratio import AnyRatio, finds_noise
 from dsr.inference.defaults import Fill
 from dsr.inference.plans import steps_of
 from dsr.methods.base import Method
-from dsr.methods.networks.weight_choice import has_weights
+from dsr.methods.networks.weight_files import has_weights
 from dsr.methods.recipe import Recipe, Run
 from dsr.utils.configuration import ConfigError
 

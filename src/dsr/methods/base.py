@@ -27,22 +27,13 @@ class NoSolutionError(ValueError):
 
 @dataclass(frozen=True)
 class Cost:
-    """The rough cost of a method, measured on two CPU cores.
+    """The rough cost of a method, measured on two CPU cores."""
 
-    Args:
-        memory: bytes for each pixel that it computes.
-        seconds: seconds for a million of these pixels; None if they are not known.
-        photo: bytes for each pixel of the photo.
-        tile: bytes for each pixel of a tile, for a method that computes large pictures in tiles.
-        program: bytes of the program itself.
-
-    """
-
-    memory: float
-    seconds: float | None = None
-    photo: float = 0
-    tile: float = 0
-    program: float = 4e8
+    memory: float  # bytes for each pixel that it computes
+    seconds: float | None = None  # for a million of these pixels, if known
+    photo: float = 0  # bytes for each pixel of the photo
+    tile: float = 0  # bytes for each pixel of a tile, of a method that computes large pictures in tiles
+    program: float = 4e8  # bytes of the program itself
 
     def bytes_for(self, photo: int, computed: int) -> float:
         """Return the memory in bytes for a photo, and a computed picture, of so many pixels."""
@@ -93,17 +84,12 @@ class Abilities:
 
 
 class MapNoise(NamedTuple):
-    """Estimated noise of a low-resolution map.
+    """Estimated noise of a low-resolution map."""
 
-    ``deviation``: its standard deviation in metres, at ``distance`` metres. ``extent``: over how many low-resolution
-    pixels it is alike, the full width at half maximum of its autocorrelation; 1 for white noise. ``reduced``: by what
-    the size of the map was divided because of that.
-    """
-
-    deviation: float
-    extent: float
+    deviation: float  # standard deviation in metres, at ``distance`` metres
+    extent: float  # full width at half maximum of its autocorrelation in low-resolution pixels; 1 for white noise
     distance: float
-    reduced: int = 1
+    reduced: int = 1  # by what the size of the map was divided because of the extent
 
 
 class Outliers(NamedTuple):
@@ -114,24 +100,18 @@ class Outliers(NamedTuple):
 
 
 class Surface(NamedTuple):
-    """A result with its expected errors.
+    """A result with its expected errors, (1, H, W) each, None for a method that does not predict them.
 
-    ``depth`` (1, H, W): orthogonal depth in metres, NaN where missing. ``depth_error``, ``angle_error`` (1, H, W): the
-    expected absolute error of the depth in metres and that of the normal in degrees; None for a method that does not
-    say. Pixels that a method leaves out on purpose have errors and no depth. ``noise``: of the low-resolution map; None
-    for a method that does not estimate it. ``outliers``: what was treated as holes before the method saw the map.
-    ``filled`` (1, H, W) bool: where there is depth that was not measured, since the nearest pixel of the map is a hole
-    or an outlier; None where that is not known. ``glass``: the share of the pixels that probably show glass, mirrors
-    or gloss, of which a larger error is expected; None where nobody looked.
+    Pixels that a method leaves out on purpose have errors and no depth.
     """
 
-    depth: Tensor
-    depth_error: Tensor | None = None
-    angle_error: Tensor | None = None
-    noise: MapNoise | None = None
-    outliers: Outliers | None = None
-    filled: Tensor | None = None
-    glass: float | None = None
+    depth: Tensor  # orthogonal, in metres, NaN where missing
+    depth_error: Tensor | None = None  # expected absolute error in metres
+    angle_error: Tensor | None = None  # expected error of the normal in degrees
+    noise: MapNoise | None = None  # of the low-resolution map, if it is estimated
+    outliers: Outliers | None = None  # what was treated as holes before the method saw the map
+    filled: Tensor | None = None  # bool: depth whose nearest pixel of the map is a hole or an outlier, if known
+    glass: float | None = None  # share of pixels that probably show glass, mirrors or gloss; None if not looked for
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Surface:
         """Return the surface with a function applied to each of its maps."""
@@ -277,11 +257,7 @@ class Method(abc.ABC):
         """Return the HR orthogonal depth, (1, H, W) in metres on the sample's device, NaN where missing.
 
         A method never reads ``sample.depth``. One that takes several steps calls ``progress`` with the steps done and
-        their total.
-
-        Raises:
-            NoSolutionError: the method has no solution for this image.
-
+        their total. It raises a :class:`NoSolutionError` if there is no solution for this image.
         """
 
     def surface(self, sample: DepthSample, progress: Steps | None = None) -> Surface:
@@ -326,16 +302,7 @@ def whole_scale(sample: DepthSample) -> int:
 
 
 def expect_limits(tolerance: float, **counts: int) -> None:
-    """Check the stopping criteria of an iteration.
-
-    Args:
-        tolerance: the change below which the iteration stops.
-        **counts: maximum numbers of steps, by the parameter's name.
-
-    Raises:
-        ValueError: the tolerance is negative, or a count less than 1.
-
-    """
+    """Check the stopping criteria of an iteration: a change, and maximum numbers of steps by the parameter's name."""
     for name, count in counts.items():
         if count < 1:
             raise ValueError(f"{name}: expected at least 1, got {count}")

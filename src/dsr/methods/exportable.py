@@ -41,13 +41,7 @@ def _scripted(function: Callable[P, T]) -> Callable[P, T]:
 def fill_in_graph(values: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Fill the holes of maps as :func:`dsr.methods.inpainting.inpaint` does, as a loop in the graph.
 
-    Args:
-        values: (B, 1, h, w), 0 in holes.
-        weight: (B, 1, h, w), 1 where a value is known and 0 in holes.
-
-    Returns:
-        Both for the filled map; the weight is 0 in an image without a known value.
-
+    Both are (B, 1, h, w), 0 in holes; ``weight`` is 1 elsewhere, and in the result 0 in an image without a known value.
     """
     before = torch.zeros_like(weight.sum())
     while bool(weight.sum() != before):
@@ -77,14 +71,8 @@ def neighbours_of(x: Tensor) -> Tensor:
 def fill_by_colour_in_graph(x: Tensor, affinity: Tensor, alike: float) -> Tensor:
     """Fill the holes of a map as :func:`dsr.methods.inpainting.inpaint` does with a photo.
 
-    Args:
-        x: (1, 1, h, w), NaN in holes.
-        affinity: (1, 8, h, w) of each pixel and its neighbours.
-        alike: affinity from which a pixel is filled before others.
-
-    Returns:
-        (1, 1, h, w), NaN in an image without a known value.
-
+    ``x`` (1, 1, h, w) is NaN in holes, ``affinity`` (1, 8, h, w) that of each pixel and its neighbours; pixels of an
+    affinity of ``alike`` are filled before others. An image without a known value stays NaN.
     """
     known = torch.isfinite(x).to(affinity.dtype)
     values = torch.where(known > 0, x, torch.zeros_like(x))
@@ -120,14 +108,7 @@ def median_in_graph(x: Tensor, known: Tensor) -> Tensor:
 def quantiles_in_graph(x: Tensor, known: Tensor, fractions: Tensor) -> Tensor:
     """Return quantiles of the known values of each row, interpolated linearly; NaN for a row without one.
 
-    Args:
-        x: (B, N).
-        known: (B, N) bool.
-        fractions: (Q,) in 0..1.
-
-    Returns:
-        (B, Q).
-
+    ``x`` and ``known`` are (B, N), ``fractions`` (Q,) in 0..1, the result (B, Q).
     """
     count = known.sum(dim=1, keepdim=True)
     ordered = torch.where(known, x, torch.inf).sort(dim=1).values

@@ -21,41 +21,27 @@ from torch.nn import functional
 from dsr.geometry.hole_size import is_scattered, wide_holes, window_maxima
 
 _WEIGHTS = Path(__file__).with_suffix(".safetensors")
-GRID = 320
-"""Pixels of the longer side of the grid on which features are computed."""
-FEATURES = 26
-"""Of a pixel, without units: means of holes, texture, roughness, depth steps, brightness and saturation."""
-_LAYERS, _MEMBERS = (48, 32), 4
-"""Sizes of the hidden layers of a network, and how many networks there are."""
+GRID = 320  # pixels of the longer side of the grid on which features are computed
+FEATURES = 26  # without units: means of holes, texture, roughness, depth steps, brightness and saturation
+_LAYERS, _MEMBERS = (48, 32), 4  # sizes of the hidden layers of a network, and how many networks there are
+# pixels of the grid: standard deviations of means of holes, of holes amid a surface, of the photo's texture and of the
+# map's roughness; and reaches of depth steps
 _HOLES, _AMID, _TEXTURE, _ROUGHNESS, _NEAR = (2, 4, 8, 16), (4, 8, 16), (3, 6, 12), (3, 8), (3, 8, 16)
-"""Pixels of the grid: standard deviations of means of holes, of holes amid a surface, of the photo's texture and of the
-map's roughness; and reaches of depth steps."""
-_AMID_REACH, _AMID_STEP = 16, 0.06
-"""A hole is amid a surface if the logarithms of the depths so near differ by less."""
-WIDE = 40.0
-"""Width of holes of the grid that are no sign of glass, as what is out of a sensor's range or was cut away is."""
-_EVIDENCE = 0.02
-"""Mean of the holes around a pixel, at least; where a sensor loses nothing, texture is taken for glass."""
-_BURNT, _DARK = 0.9, 0.1
-"""Grey levels above and below which a pixel counts as burnt out and as dark."""
-_BEHIND = 0.06
-"""Relative error of depth that was measured through a clear object."""
-NOTED = 0.02
-"""Relative error because of glass from which a pixel counts as glass."""
+_AMID_REACH, _AMID_STEP = 16, 0.06  # a hole is amid a surface if the logarithms of the depths so near differ by less
+WIDE = 40.0  # width of holes of the grid that are no sign of glass, as what is out of range or was cut away is
+_EVIDENCE = 0.02  # least mean of the holes around a pixel: where a sensor loses nothing, texture is taken for glass
+_BURNT, _DARK = 0.9, 0.1  # grey levels above and below which a pixel is burnt out and dark
+_BEHIND = 0.06  # relative error of depth that was measured through a transparent object
+NOTED = 0.02  # relative error because of glass from which a pixel is reported as glass
+# Probabilities of glass from which it is expected in part, and in full: those of simulated objects, in the scenes of
+# whose training they are more common than elsewhere.
 _PERHAPS, _PROBABLY = 0.1, 0.3
-"""Probabilities of glass from which it is expected in part, and in full: those of simulated objects, in the scenes of
-whose training they are more common than elsewhere."""
 
 
 class GlassFinder(nn.Module):
-    """The probability that measured depth is wrong as in glass, by features of a pixel.
+    """The probability that measured depth is wrong as in glass, by features of a pixel."""
 
-    Attributes:
-        middle, scale: (FEATURES,) what features are normalised by.
-
-    """
-
-    middle: Tensor
+    middle: Tensor  # (FEATURES,), as ``scale``: what features are normalised by
     scale: Tensor
 
     def __init__(self) -> None:
@@ -124,16 +110,11 @@ def probability_of_glass(rgb: Tensor, inverse: Tensor) -> Tensor:
         finder = glass_finder(rgb.device)
         features = glass_features(rgb, inverse)[:, near].T
         found[near] = finder(finder.normalise(features)).mean(dim=-1).sigmoid()
-    return _resize(found[None], (height, width))
+    return functional.interpolate(found[None, None], (height, width), mode="bilinear", align_corners=False)[0]
 
 
 def expect_glass(rgb: Tensor, inverse: Tensor) -> Tensor:
-    """Return the relative error of depth to expect because of glass, (1, H, W), 0 to 0.06.
-
-    Args:
-        rgb, inverse: see :func:`probability_of_glass`.
-
-    """
+    """Return the relative error of depth to expect because of glass, (1, H, W), 0 to 0.06."""
     share = (probability_of_glass(rgb, inverse) - _PERHAPS) / (_PROBABLY - _PERHAPS)
     return _BEHIND * share.clamp(0, 1)
 
@@ -141,12 +122,8 @@ def expect_glass(rgb: Tensor, inverse: Tensor) -> Tensor:
 def glass_features(rgb: Tensor, inverse: Tensor, grid: int = GRID, wide: float | None = WIDE) -> Tensor:
     """Return the features of the pixels of a grid, (FEATURES, g, g') float32, whose sides are 16 or more.
 
-    Args:
-        rgb, inverse: see :func:`probability_of_glass`; at least half of a pixel of the grid is known.
-        grid: pixels of its longer side.
-        wide: width of holes that do not count, in pixels of the grid, as those thinner than three pixels of the map do
-            not; None if all count, as in the training, whose objects may be as large.
-
+    At least half of a pixel of the grid is known. ``grid`` are the pixels of its longer side; holes wider than ``wide``
+    of them do not count, except in the training, whose objects may be as large.
     """
     size = _grid_size(rgb.shape[-2], rgb.shape[-1], grid)
     photo = functional.interpolate(rgb[None].float(), size, mode="bilinear", antialias=True, align_corners=False)[0]
@@ -204,14 +181,9 @@ def _grid_size(height: int, width: int, longer: int) -> tuple[int, int]:
 
 
 def _holes(known: Tensor, size: tuple[int, int], wide: float | None) -> Tensor:
-    """Return which part of each pixel of the grid is a hole that counts, (1, g, g').
+    """Return which part of each pixel of the grid is a hole that counts, (1, g, g'); ``known`` is (1, h, w) bool.
 
-    Args:
-        known: (1, h, w) bool.
-        size: of the grid.
-        wide: width of holes that do not count, in pixels of the grid, as those thinner than three pixels of the map do
-            not; None if all count.
-
+    Holes wider than ``wide`` do not count, nor those thinner than three pixels of the map; all count if it is None.
     """
     missing = (~known).float()
     if wide is not None and min(known.shape[-2:]) > 2:
@@ -242,14 +214,7 @@ def _blur(values: Tensor, deviation: float) -> Tensor:
     for kernel, padding in ((taps[:, None], (0, 0, reach, reach)), (taps[None], (reach, reach, 0, 0))):
         padded = functional.pad(found[:, None], padding, mode="replicate")
         found = functional.conv2d(padded, kernel[None, None])[:, 0]
-    return found if factor == 1 else _enlarge(found, factor)[..., : size[0], : size[1]]
-
-
-def _enlarge(values: Tensor, factor: int) -> Tensor:
-    """Return values, (c, g, g'), enlarged by a factor."""
-    return functional.interpolate(values[None], scale_factor=factor, mode="bilinear", align_corners=False)[0]
-
-
-def _resize(values: Tensor, size: tuple[int, int]) -> Tensor:
-    """Return values, (c, g, g'), at a size."""
-    return functional.interpolate(values[None], size, mode="bilinear", align_corners=False)[0]
+    if factor == 1:
+        return found
+    found = functional.interpolate(found[None], scale_factor=factor, mode="bilinear", align_corners=False)[0]
+    return found[..., : size[0], : size[1]]

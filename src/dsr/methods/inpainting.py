@@ -39,7 +39,9 @@ def inpaint(x: Tensor, photo: Tensor | None = None) -> Tensor:
         colours = functional.adaptive_avg_pool2d(photo.to(x.dtype), (x.shape[-2], x.shape[-1]))
     colours = functional.avg_pool2d(functional.pad(colours, (1, 1, 1, 1), mode="replicate"), 3, stride=1)
     if exporting():
-        return fill_by_colour_in_graph(x, _affinity(colours), _ALIKE)
+        difference = (neighbours_of(colours) - colours[:, None]).square().sum(dim=2)  # (B, 8, h, w)
+        affinity = (difference / (-2 * _CONTRAST**2)).exp().clamp(min=_LEAST)
+        return fill_by_colour_in_graph(x, affinity, _ALIKE)
     return torch.stack([_fill_by_colour(each[0], colour) for each, colour in zip(x, colours, strict=True)])[:, None]
 
 
@@ -58,12 +60,6 @@ def _fill_evenly(x: Tensor) -> Tensor:
         values = torch.where(new, total / torch.where(fraction > 0, fraction, 1), values)
         weight = torch.where(new, 1, weight)
     return torch.where(weight > 0, values, torch.nan)
-
-
-def _affinity(colours: Tensor) -> Tensor:
-    """Return how alike the colours of each pixel and its eight neighbours are, (B, 3, h, w) to (B, 8, h, w)."""
-    difference = (neighbours_of(colours) - colours[:, None]).square().sum(dim=2)
-    return (difference / (-2 * _CONTRAST**2)).exp().clamp(min=_LEAST)
 
 
 def _fill_by_colour(x: Tensor, colours: Tensor) -> Tensor:

@@ -22,12 +22,7 @@ def estimate_noise(depth_lr: Tensor) -> float:
     on straight edges; here of the logarithm of depth, with the 10th percentile instead of the mean: noise is
     everywhere, while steps and curves of the surface are not.
 
-    Args:
-        depth_lr: (1, 1, h, w) in metres, NaN in holes.
-
-    Returns:
-        Standard deviation of relative depth; 0 without a valid 3 x 3 window.
-
+    ``depth_lr`` is (1, 1, h, w) in metres, NaN in holes; the result is 0 without a valid 3 x 3 window.
     """
     return _low_quantile(depth_lr.double().log(), 1, _FRACTION) / _QUANTILE / 6
 
@@ -39,13 +34,8 @@ def estimate_sensor_noise(values: Tensor) -> float:
     makes many of them 0, and the larger of the estimates from neighbouring pixels and from every second one, because
     the first misses noise that is correlated between neighbours.
 
-    Args:
-        values: (1, 1, h, w), in a unit in which planes are linear and noise is alike everywhere, such as disparity; NaN
-            in holes.
-
-    Returns:
-        Standard deviation in the unit of the map; 0 without a valid window.
-
+    ``values`` (1, 1, h, w), NaN in holes, are in a unit in which planes are linear and noise is alike everywhere, such
+    as disparity; the result is in it, and 0 without a valid window.
     """
     return max(_low_quantile(values.double(), stride, _QUARTER) for stride in _STRIDES) / _QUARTILE / 6
 
@@ -66,11 +56,6 @@ def normal_noise_deg(noise: float, camera: Camera) -> float:
     """Return the standard deviation, in degrees, by which relative depth noise tilts the normals of a frontal surface.
 
     Two neighbouring pixels at depth z are z / f metres apart; noise of standard deviation s z in each makes a slope of
-    standard deviation sqrt(2) s f.
-
-    Args:
-        noise: relative standard deviation of depth, s.
-        camera: of the low-resolution map.
-
+    standard deviation sqrt(2) s f, for the low-resolution map's camera.
     """
     return math.degrees(math.atan(math.sqrt(2) * noise * camera.fx))

@@ -22,10 +22,15 @@ from omegaconf.errors import OmegaConfBaseException
 from dsr.degradation.downsampling import Downsampling
 from dsr.methods.base import Abilities, Method
 from dsr.methods.networks.network import DisparityNetwork
-from dsr.methods.networks.published import load_msg_weights
-from dsr.methods.networks.trained import NETWORKS
-from dsr.methods.networks.weight_choice import find_weights, has_weights
-from dsr.methods.networks.weight_files import is_dsr_weights, load_network, network_name, read_header
+from dsr.methods.networks.trained import NETWORKS, load_msg_weights
+from dsr.methods.networks.weight_files import (
+    find_weights,
+    has_weights,
+    is_dsr_weights,
+    load_network,
+    network_name,
+    read_header,
+)
 from dsr.utils.configuration import ConfigError, Node, build, config_directories, list_choices, load_target
 from dsr.utils.ratios import SCALES
 
@@ -142,14 +147,10 @@ class Recipe:
         return replace(self, node=_merge(self.node, {"weights": {"path": str(path)}}))
 
     def weights(self, factor: float) -> Path | None:
-        """Return the file of weights for a factor; None for a method that needs none.
-
-        Raises:
-            ConfigError: there is none; it says where to get it.
-
-        """
-        needs = self.abilities.needs is not None
-        return find_weights(self.at(factor).get("weights"), factor, self.name) if needs else None
+        """Return the file of weights for a factor, else raise a ConfigError; None for a method that needs none."""
+        if self.abilities.needs is None:
+            return None
+        return find_weights(self.at(factor).get("weights"), factor, self.name)
 
     def build(self, factor: float, run: Run | None = None, **decided: Any) -> Method:
         """Build the method for a factor.
@@ -157,10 +158,6 @@ class Recipe:
         Args:
             run: what the run gives; None for what :class:`Run` has.
             **decided: arguments that the caller decides in place of the method's file, if the class names them.
-
-        Raises:
-            ConfigError: a key is unknown, missing or of another type, the method rejects a value, or there are no
-                weights.
 
         """
         given = {**vars(run or Run()), "scale": factor}
@@ -176,13 +173,7 @@ class Recipe:
         return method
 
     def network(self, factor: int) -> DisparityNetwork:
-        """Load the network of dsr that the method runs, in float32 on the CPU.
-
-        Raises:
-            ConfigError: it has no network of dsr, or there are no weights.
-            ValueError: the weights are damaged or of another model or scale.
-
-        """
+        """Load the network of dsr that the method runs, in float32 on the CPU."""
         if self.abilities.needs != "network":
             names = list_methods(self.directories)
             known = [name for name in names if read_recipe(name, None, self.directories).abilities.needs == "network"]
@@ -231,9 +222,6 @@ def list_methods(directories: Sequence[Path] = ()) -> list[str]:
 
 def read_recipe(name: str, settings: Mapping[str, Any] | None = None, directories: Sequence[Path] = ()) -> Recipe:
     """Read the file of a method; ``settings`` are arguments to change, by name.
-
-    Raises:
-        ConfigError: there is no such method, or its file cannot be read.
 
     Example:
         >>> from dsr.methods.recipe import read_recipe

@@ -45,12 +45,8 @@ class AxisTile:
 def split_axis(size: int, tile: int, radius: int, overlap: int) -> list[AxisTile]:
     """Split an axis of low-resolution pixels into tiles whose sizes differ by one pixel at most.
 
-    Args:
-        size: size of the image.
-        tile: maximum size of a tile without its overlaps.
-        radius: receptive-field radius.
-        overlap: overlap of neighbouring tiles, even; no tile is smaller.
-
+    ``tile`` is the maximum size of a tile without its overlaps, ``radius`` that of the receptive field,
+    ``overlap`` that of neighbouring tiles, even; no tile is smaller.
     """
     count = max(1, min(math.ceil(size / tile), size // max(overlap, 1)))
     edges, half, found = [round(i * size / count) for i in range(count + 1)], overlap // 2, []
@@ -69,17 +65,10 @@ def blend_tiles(
     scale: int,
     progress: Steps | None = None,
 ) -> Tensor:
-    """Compute an image tile by tile and blend the tiles.
+    """Compute an image, (B, C, scale * h, scale * w), tile by tile and blend the tiles.
 
-    Args:
-        compute: function from rows and columns of low-resolution pixels to their high-resolution pixels, (B, C,
-            scale * rows, scale * columns). It may leave out the last high-resolution row and column.
-        rows: tiles along the rows, from :func:`split_axis`.
-        columns: tiles along the columns.
-
-    Returns:
-        (B, C, scale * h, scale * w), less the row and column that ``compute`` leaves out.
-
+    ``compute`` maps rows and columns of low-resolution pixels to their high-resolution pixels. It may leave out the
+    last high-resolution row and column, which the result then lacks.
     """
     total: Tensor | None = None
     for done, (row, column) in enumerate(itertools.product(rows, columns), 1):

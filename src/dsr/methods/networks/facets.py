@@ -35,13 +35,10 @@ from dsr.methods.networks.facets_layers import (
 from dsr.methods.networks.facets_planes import NEIGHBOURS, Stencil, mix_planes, stencil
 from dsr.methods.networks.network import DisparityNetwork, NormalisedNetwork
 
+# differences of normalised disparity that become about 1 in the network's compressed and linear inputs
 _FAINT, _STRONG = 1e-3, 0.25
-"""Differences of normalised disparity that become about 1 in the network's compressed and linear inputs."""
-
-_RARE = -5.0
-"""Logit of what is added to the choices of Facets."""
-_WIDENED = ("photo.weight", "coarse.weight")
-"""Layers that may have more inputs, after those of the other network."""
+_RARE = -5.0  # logit of what is added to the choices of Facets
+_WIDENED = ("photo.weight", "coarse.weight")  # may have more inputs, after those of the other network
 
 
 class Facets(NormalisedNetwork):
@@ -116,16 +113,20 @@ def _lr_input(around: Stencil) -> Tensor:
 def start_from_facets(net: DisparityNetwork, first: Facets, levels: int) -> None:
     """Take over the weights of Facets for the same or another factor; both sets of a block's weights start as its own.
 
-    Args:
-        net: a :class:`~dsr.methods.networks.facets_unet.FacetsUNet`, changed in place.
-        first: the trained network.
-        levels: smoothed copies of the map, whose values and slopes ``net`` offers beside the map's own.
-
+    ``net`` is a :class:`~dsr.methods.networks.facets_unet.FacetsUNet`, changed in place, ``levels`` the number of
+    smoothed copies of the map, whose values and slopes it offers beside the map's own.
     """
     theirs = dict(first.state_dict())
     planes = {name: theirs.pop(name) for name in ("planes.weight", "planes.bias")}
     finer = _levels(net) - _levels(first)
-    _copy(net, [(each, value) for name, value in theirs.items() for each in _ways(_shift(name, finer))])
+    taken = []
+    for name, value in theirs.items():
+        if name.startswith("trunk."):
+            number, rest = name.removeprefix("trunk.").split(".", 1)
+            taken += [(f"trunk.{number}.ways.{way}.{rest}", value) for way in range(2)]
+        else:
+            taken.append((_shift(name, finer), value))
+    _copy(net, taken)
     own = net.state_dict()
     for name, value in planes.items():
         moves, picks = value.split((3 * first.facets, 6))
@@ -141,18 +142,27 @@ def start_from_facets(net: DisparityNetwork, first: Facets, levels: int) -> None
 def start_from_another_factor(net: DisparityNetwork, first: DisparityNetwork) -> None:
     """Take over the weights for a factor: layers between resolutions that it has not begin as means and repetitions.
 
-    Args:
-        net: a :class:`~dsr.methods.networks.facets_unet.FacetsUNet`, changed in place.
-        first: another one with the same width, blocks and facets.
-
+    Both are a :class:`~dsr.methods.networks.facets_unet.FacetsUNet` with the same width, blocks and facets.
     """
     theirs, finer = first.state_dict(), _levels(net) - _levels(first)
-    whole = all(net.state_dict()[name].shape == value.shape for name, value in theirs.items() if _wide(name))
-    _copy(net, [(_shift(name, finer), value) for name, value in theirs.items() if whole or not _wide(name)])
-    down, up, join = (net.get_submodule(name) for name in ("down", "up", "join"))
+    own = net.state_dict()  # the channels of the U-net, ``wide``, may differ
+    whole = all(own[name].shape == value.shape for name, value in theirs.items() if name.startswith("wide."))
+    taken = {name: value for name, value in theirs.items() if whole or not name.startswith("wide.")}
+    _copy(net, [(_shift(name, finer), value) for name, value in taken.items()])
+    layers = {name: list(net.get_submodule(name).children()) for name in ("down", "up", "join")}
     for level in range(finer):
-        _average_pairs(list(down.children())[-1 - level])
-        _repeat_pairs(list(up.children())[level], list(join.children())[level])
+        weight: Tensor = silence(layers["down"][-1 - level]).get_parameter("weight")
+        for channel in range(min(weight.shape[:2])):  # means of 2 x 2 pixels
+            weight[channel, channel, 1:3, 1:3] = 0.25
+        weight = silence(layers["up"][level]).get_parameter("weight")
+        for channel in range(min(weight.shape[0] // 4, weight.shape[1])):  # each pixel four times
+            weight[4 * channel : 4 * channel + 4, channel] = 1
+        join = layers["join"][level]
+        for parameter in join.parameters():
+            parameter.mul_(0.1)
+        weight = join.get_parameter("weight")
+        for channel in range(min(weight.shape[:2])):  # and little else
+            weight[channel, channel, 1, 1] += 1
 
 
 def _copy(net: DisparityNetwork, named: list[tuple[str, Tensor]]) -> None:
@@ -172,40 +182,7 @@ def _levels(net: DisparityNetwork) -> int:
     return len(list(net.get_submodule("up").children()))
 
 
-def _wide(name: str) -> bool:
-    """Return whether a parameter is one of the U-net, whose channels are an argument."""
-    return name.startswith("wide.")
-
-
 def _shift(name: str, steps: int) -> str:
     """Return a parameter's name at another factor, where the layers towards the full resolution have other numbers."""
     kind, number, *rest = name.split(".")
     return ".".join((kind, str(int(number) + steps), *rest)) if kind in ("up", "join") else name
-
-
-def _ways(name: str) -> list[str]:
-    """Return the names that a parameter of Facets has in both sets of a block's weights; its own elsewhere."""
-    kind, _, rest = name.partition(".")
-    if kind != "trunk":
-        return [name]
-    number, _, rest = rest.partition(".")
-    return [f"trunk.{number}.ways.{way}.{rest}" for way in range(2)]
-
-
-def _average_pairs(down: nn.Module) -> None:
-    """Make a convolution that halves the resolution return the means of 2 x 2 pixels."""
-    weight: Tensor = silence(down).get_parameter("weight")
-    for channel in range(min(weight.shape[:2])):
-        weight[channel, channel, 1:3, 1:3] = 0.25
-
-
-def _repeat_pairs(up: nn.Module, join: nn.Module) -> None:
-    """Make convolutions that double the resolution return each pixel four times, and little else."""
-    weight: Tensor = silence(up).get_parameter("weight")
-    for channel in range(min(weight.shape[0] // 4, weight.shape[1])):
-        weight[4 * channel : 4 * channel + 4, channel] = 1
-    for parameter in join.parameters():
-        parameter.mul_(0.1)
-    weight = join.get_parameter("weight")
-    for channel in range(min(weight.shape[:2])):
-        weight[channel, channel, 1, 1] += 1

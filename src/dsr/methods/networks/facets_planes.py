@@ -167,13 +167,8 @@ def mix_planes(planes: Tensor, found: Tensor, scale: int) -> tuple[Tensor, Tenso
 
     What is mixed are the differences to the first plane of the pixel's own low-resolution pixel, in the type of
     ``found``, at least float32; that plane is added in the type of ``planes``, in which it is reproduced exactly.
-
-    Args:
-        planes: (B, facets, 3, h, w).
-        found: (B, 9 * facets + n, H, W): logits, to which those of a quadratic B-spline are added, and n more channels,
-            which are returned in at least float32.
-        scale: H / h.
-
+    ``planes`` are (B, facets, 3, h, w), ``found`` (B, 9 * facets + n, H, W): logits, to which those of a quadratic
+    B-spline are added, and n more channels, which are returned in at least float32.
     """
     batch, facets, _, height, width = planes.shape
     s, count = scale, NEIGHBOURS * facets

@@ -204,15 +204,9 @@ class FacetsUNet(DisparityNetwork):
     ) -> Answer:
         """Return high-resolution disparity and its expected errors.
 
-        Args:
-            rgb: (B, 3, H, W) in [0, 1].
-            disparity: (B, 1, h, w), positive; non-finite values are holes.
-            noise: (B, 1, h, w) standard deviation of the logarithm of disparity; None for not known.
-            hints: (B, ``FACTS``) what is known of the maps; None for nothing.
-            progress: called after each band of rows that is done.
-            filled: the disparity without holes; None to inpaint it.
-            kernels: those that the hints give; None to read them.
-
+        ``rgb`` is (B, 3, H, W) in [0, 1], ``disparity`` (B, 1, h, w), positive, with non-finite holes, ``noise``
+        (B, 1, h, w) the standard deviation of its logarithm and ``hints`` (B, ``FACTS``), if they are known; ``filled``
+        the disparity without holes and ``kernels`` those of the hints, if they were computed before.
         """
         expect_rgb_size(rgb, disparity, 1 if self.scale < 4 and rgb.shape[-1] == disparity.shape[-1] else self.scale)
         known = disparity.isfinite()

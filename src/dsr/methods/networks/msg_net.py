@@ -22,7 +22,6 @@ from torch.nn import functional
 
 from dsr.degradation.downsampling import check_scale
 from dsr.methods.classical.finite_differences import LUMA
-from dsr.methods.exportable import exporting
 from dsr.methods.inpainting import inpaint
 from dsr.methods.networks.network import DisparityNetwork
 from dsr.methods.networks.normalisation import compute_min_max, mean3x3, normalise, upsample_bicubic
@@ -36,15 +35,14 @@ class ConvLayer(nn.Module):
     """A convolution that keeps the size, or a transposed one that doubles it, followed by a PReLU."""
 
     def __init__(self, conv: nn.Conv2d | nn.ConvTranspose2d, slopes: int) -> None:
-        """Append a PReLU with ``slopes`` parameters (1, one per channel, or 0 for no PReLU) to ``conv``."""
-        super().__init__()
+        super().__init__()  # a PReLU with one slope, one per channel, or none
         self.conv = conv
         self.activation = nn.PReLU(slopes) if slopes else nn.Identity()
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (B, C_in, H, W) to (B, C_out, H', W')."""
         x = self.conv(x)
-        if isinstance(self.activation, nn.PReLU) and self.activation.num_parameters == 1 and not exporting():
+        if isinstance(self.activation, nn.PReLU) and self.activation.num_parameters == 1:
             # In place, to save memory, but only in inference mode, where no gradient can be requested.
             if torch.is_inference(x):
                 return functional.leaky_relu_(x, float(self.activation.weight))
@@ -58,14 +56,12 @@ class _SharedPReLU(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, slope: Tensor) -> Tensor:
-        """Return x if positive, else slope * x."""
         ctx.save_for_backward(x)
         ctx.slope = float(slope)
         return functional.leaky_relu(x, ctx.slope)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the gradients of x and of the slope, (1,)."""
         (x,) = ctx.saved_tensors
         sum_type = torch.promote_types(x.dtype, torch.float32)
         of_slope = (gradient * x.clamp(max=0)).sum(dtype=sum_type).reshape(1)
@@ -76,7 +72,6 @@ class Level(nn.Module):
     """One doubling of the resolution: transposed convolution, fusion with the guidance, refinement."""
 
     def __init__(self, up: ConvLayer, fuse: ConvLayer, refine: ConvLayer) -> None:
-        """Store the three layers."""
         super().__init__()
         self.up, self.fuse, self.refine = up, fuse, refine
 
@@ -298,18 +293,16 @@ class MSGNet(DisparityNetwork):
                 nn.init.zeros_(layer.bias)
         self.reconstruct.conv.weight.mul_(0.05)
 
-    def _layer(self, conv: nn.Conv2d | nn.ConvTranspose2d, *, active: bool = True) -> ConvLayer:
-        slopes = 1 if self.variant.shared_slopes else conv.out_channels
-        return ConvLayer(conv, slopes if active else 0)
-
     def _conv(self, before: int, after: int, *, kernel: int = 5, active: bool = True) -> ConvLayer:
-        return self._layer(nn.Conv2d(before, after, kernel, padding=kernel // 2), active=active)
+        slopes = 1 if self.variant.shared_slopes else after
+        return ConvLayer(nn.Conv2d(before, after, kernel, padding=kernel // 2), slopes if active else 0)
 
     def _up(self, *, first: bool) -> ConvLayer:
         same_size = self.variant.same_size
         padding, extra = 2 if first or same_size else 1, 1 if same_size else 0
         before = 2 * FEATURES if first else FEATURES
-        return self._layer(nn.ConvTranspose2d(before, FEATURES, 5, 2, padding, extra))
+        slopes = 1 if self.variant.shared_slopes else FEATURES
+        return ConvLayer(nn.ConvTranspose2d(before, FEATURES, 5, 2, padding, extra), slopes)
 
 
 def output_drift(net: MSGNet, guidance: Tensor, disparity: Tensor, *, crop: bool = True) -> Tensor:

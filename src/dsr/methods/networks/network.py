@@ -34,20 +34,12 @@ _UNKNOWN = torch.tensor(math.nan)
 
 @dataclass(frozen=True)
 class Answer:
-    """The outputs of a network for a batch of images, all (B, 1, H, W); those of 16 bits become float32.
+    """The outputs of a network for a batch of images, all (B, 1, H, W); those of 16 bits become float32."""
 
-    Args:
-        disparity: in the unit of the input.
-        spread: expected absolute error of the logarithm of disparity; NaN of a network that states no errors.
-        angle: expected error of the normal in radians; NaN likewise.
-        stages: disparities of the network's intermediate stages, if any, which a training compares with the truth, too.
-
-    """
-
-    disparity: Tensor
-    spread: Tensor = _UNKNOWN
-    angle: Tensor = _UNKNOWN
-    stages: tuple[Tensor, ...] = ()
+    disparity: Tensor  # in the unit of the input
+    spread: Tensor = _UNKNOWN  # expected absolute error of the logarithm of disparity, if the network predicts it
+    angle: Tensor = _UNKNOWN  # expected error of the normal in radians, likewise
+    stages: tuple[Tensor, ...] = ()  # disparities of intermediate stages, which a training compares with the truth, too
 
     def __post_init__(self) -> None:
         vars(self).update(widened(vars(self)), stages=tuple(map(widened, self.stages)))
@@ -106,18 +98,12 @@ class DisparityNetwork(nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def upsample(self, rgb: Tensor, disparity: Tensor, min_max: Tensor | None = None) -> Tensor:
-        """Return high-resolution disparity.
+        """Return high-resolution disparity, (B, 1, H, W) in the dtype of ``disparity``; NaN without a valid pixel.
 
-        Args:
-            rgb: (B, 3, H, W) in [0, 1], H = scale * h and W = scale * w.
-            disparity: (B, 1, h, w) in pixels of the high-resolution camera; non-finite values are holes.
-            min_max: (B, 2, 1, 1) minimum and maximum low-resolution disparity of the image that this is a window of,
-                for the normalisation; None for those of ``disparity``. With a receptive-field radius, a network takes
-                all of its :meth:`context` as further arguments.
-
-        Returns:
-            (B, 1, H, W) in the dtype of ``disparity``; NaN for an image without a valid pixel.
-
+        ``rgb`` is (B, 3, H, W) in [0, 1], ``disparity`` (B, 1, h, w) in pixels of the high-resolution camera with
+        non-finite holes, ``min_max`` (B, 2, 1, 1) the range of the image that this is a window of, for the
+        normalisation; None for that of ``disparity``. With a receptive-field radius, a network takes all of its
+        :meth:`context` as further arguments.
         """
 
     def context(self, rgb: Tensor, disparity: Tensor) -> tuple[Tensor | None, ...]:
@@ -214,9 +200,6 @@ class NetworkUpsampler(Method):
             Super Resolution*, CVPR 2016, section 3.6.
         tile: side of a tile in high-resolution pixels; None for ``TILE``, and no tiles up to ``UNTILED`` pixels.
 
-    Raises:
-        ValueError: the precision or the ensemble is not supported, or not for a network that leaves out pixels.
-
     """
 
     abilities = Abilities(repeats=True, needs="network", cost=Cost(40, photo=40, tile=700))
@@ -266,11 +249,7 @@ class NetworkUpsampler(Method):
     def upsample_disparity(self, rgb: Tensor, disparity_lr: Tensor, progress: Steps | None = None) -> Tensor:
         """Return high-resolution disparity, averaged over the test-time augmentations, (B, 1, H, W).
 
-        Args:
-            rgb: (B, 3, H, W) in [0, 1].
-            disparity_lr: (B, 1, h, w) in pixels of the high-resolution camera; non-finite values are holes.
-            progress: called after each augmentation of the image or of each tile.
-
+        ``progress`` is called after each augmentation of the image or of each tile.
         """
         net, scale = self.net, self.net.scale
         rows, columns = self._tiles(*rgb.shape[-2:])

@@ -70,9 +70,6 @@ class NetworkFile(Method):
             network that sees the photo alone; None for the photo's.
         multiple: the number that has to divide the height and width; the photo is continued at the right and bottom.
 
-    Raises:
-        ValueError: the file is missing, damaged or of another kind, or a declaration does not fit it.
-
     """
 
     abilities = Abilities(ratios="any", own_size=True, cost=Cost(1000))
@@ -123,12 +120,7 @@ class NetworkFile(Method):
 
     @torch.inference_mode()
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
-        """Return the high-resolution orthogonal depth, (1, H, W) in metres on the sample's device.
-
-        Raises:
-            ValueError: the network cannot be run on pictures of this size, or returns something else than a map.
-
-        """
+        """Return the high-resolution orthogonal depth, (1, H, W) in metres on the sample's device."""
         photo_size = sample.camera.height, sample.camera.width
         size = self._size or photo_size
         known = sample.mask_lr[None].to(self.device)

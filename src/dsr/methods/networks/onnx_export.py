@@ -10,11 +10,10 @@ fixed ranges; for Facets it needs minutes instead of seconds, and rules out size
 
 from __future__ import annotations
 
-import contextlib
 import importlib
 import math
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -56,13 +55,8 @@ class OnnxGraph(nn.Module):
         """Return high-resolution inverse depth, (1, 1, H, W) in the unit of the input, and the expected errors.
 
         The errors are those of Facets: the expected absolute error of the depth over the depth, and that of the normal
-        in degrees, (1, 1, H, W) each.
-
-        Args:
-            photo: (1, 3, H, W) in 0..1, red first; H = scale h and W = scale w.
-            inverse_depth: (1, 1, h, w) in 1 / metres or any other unit, positive where ``valid``.
-            valid: (1, 1, h, w) bool, false in holes.
-
+        in degrees, (1, 1, H, W) each. The photo is (1, 3, scale h, scale w) in 0..1, inverse depth (1, 1, h, w),
+        positive where ``valid``, of the same shape.
         """
         height, width = photo.shape[-2:]
         values = torch.where(valid, inverse_depth, torch.nan)
@@ -113,41 +107,32 @@ def example_inputs(size_lr: tuple[int, int], scale: int) -> tuple[Tensor, Tensor
 
 @torch.no_grad()
 def _trace(path: Path, graph: OnnxGraph) -> None:
-    """Write the graph of a network."""
+    """Write the graph of a network, with the operators that the exporter lacks."""
     low = {2: "h", 3: "w"}
     high = low if graph.scale == 1 else {2: "H", 3: "W"}
     axes = {"photo": high, "inverse_depth": low, "valid": low, **dict.fromkeys(graph.outputs, high)}
-    with _operators():
-        torch.onnx.export(
-            graph,
-            example_inputs(_TRACED, graph.scale),
-            str(path),
-            input_names=list(INPUTS),
-            output_names=list(graph.outputs),
-            dynamic_axes=axes,
-            opset_version=_OPSET,
-            dynamo=False,
-        )
-
-
-@contextlib.contextmanager
-def _operators() -> Iterator[None]:
-    """Make known to the exporter the operators that it lacks, and silence what it warns of."""
-    added: dict[str, Callable[..., Any]] = {"aten::asinh": _asinh, "aten::_upsample_bicubic2d_aa": _bicubic}
+    added: dict[str, Callable[..., Any]] = {
+        "aten::asinh": lambda context, x: context.op("Asinh", x),
+        "aten::_upsample_bicubic2d_aa": _bicubic,
+    }
     for name, function in added.items():
         torch.onnx.register_custom_op_symbolic(name, function, _OPSET)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of sizes that a trace might fix, which the check would find
-            yield
+            torch.onnx.export(
+                graph,
+                example_inputs(_TRACED, graph.scale),
+                str(path),
+                input_names=list(INPUTS),
+                output_names=list(graph.outputs),
+                dynamic_axes=axes,
+                opset_version=_OPSET,
+                dynamo=False,
+            )
     finally:
         for name in added:
             torch.onnx.unregister_custom_op_symbolic(name, _OPSET)
-
-
-def _asinh(context: Any, x: Any) -> Any:
-    """Return the node of an inverse hyperbolic sine."""
-    return context.op("Asinh", x)
 
 
 def _bicubic(context: Any, x: Any, size: Any, _align: Any, *_scales: Any) -> Any:

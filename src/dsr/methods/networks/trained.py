@@ -1,12 +1,20 @@
-"""The networks by the names in files of weights, and the method that runs one of them."""
+"""The networks by the names in files of weights, the method that runs one of them, and MSG-Net's published weights.
+
+``.pth`` (Voynov et al. 2019) is read by torch's own unpickler for plain tensors, ``.caffemodel`` (Hui et al. 2016) by a
+reader of the protobuf wire format (protobuf.dev/programming-guides/encoding). Neither executes code from a file.
+"""
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import torch
+from torch import Tensor
 
 from dsr.methods.networks.ddrnet import DDRNet
 from dsr.methods.networks.dynamic_guidance import DynamicGuidance
@@ -15,14 +23,17 @@ from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.msg_net import MSGNet, VariantName
 from dsr.methods.networks.network import DisparityNetwork, NetworkUpsampler, Precision
 from dsr.methods.networks.pdn import PrimalDualNetwork
-from dsr.methods.networks.published import load_msg_weights
 from dsr.methods.networks.sparse_to_dense import SparseToDense
-from dsr.methods.networks.weight_files import is_dsr_weights, load_network
+from dsr.methods.networks.weight_files import is_dsr_weights, load_network, load_parameters
+from dsr.utils.guards import MOST_FILE, read_limited
+from dsr.utils.ratios import SCALES
+from dsr.utils.torch_files import read_torch_file
 
 _KINDS: tuple[type[DisparityNetwork], ...] = (
     MSGNet, Facets, FacetsUNet, PrimalDualNetwork, DynamicGuidance, SparseToDense, DDRNet,
 )  # fmt: skip
 NETWORKS: Mapping[str, type[DisparityNetwork]] = MappingProxyType({kind.__name__: kind for kind in _KINDS})
+_PARTS = ("conv.weight", "conv.bias", "activation.weight")
 
 
 class TrainedNetwork(NetworkUpsampler):
@@ -36,10 +47,6 @@ class TrainedNetwork(NetworkUpsampler):
         ensemble: number of test-time augmentations, see :class:`~dsr.methods.networks.network.NetworkUpsampler`; None
             for 4 with dsr files and 1 with published ones.
         networks: network classes by their :func:`~dsr.methods.networks.weight_files.network_name` in dsr files.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is damaged or of another model, variant or scale, or the ensemble is not supported.
 
     """
 
@@ -58,3 +65,122 @@ class TrainedNetwork(NetworkUpsampler):
         dsr = variant is None or (weights.is_file() and is_dsr_weights(weights))
         net = load_network(weights, networks, scale, model) if dsr else load_msg_weights(weights, scale, variant)
         super().__init__(net, precision, device, (4 if dsr else 1) if ensemble is None else ensemble)
+
+
+def load_msg_weights(path: Path, scale: int, variant: VariantName | None = None) -> MSGNet:
+    """Load the network of one of the authors' files, in float32 on the CPU.
+
+    The file is ``.pth`` of Voynov et al. or ``.caffemodel`` of Hui et al., recognised by its content, and has to be of
+    the scale and, unless that is None, of the variant.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such weights file")
+    data = read_limited(path, MOST_FILE)
+    is_torch = data.startswith((b"PK\x03\x04", b"\x80"))
+    found: VariantName = "voynov" if is_torch else "hui"
+    levels, tensors = _from_torch(path) if is_torch else _from_caffe(path, data)
+    if variant is not None and found != variant:
+        raise ValueError(f"{path}: expected weights of variant {variant}, got those of variant {found}")
+    if 2**levels != scale:
+        raise ValueError(f"{path}: weights are for scale {2**levels}, the run is at scale {scale}")
+    with torch.device("meta"):  # without memory and random numbers
+        net = MSGNet(scale, found)
+    load_parameters(net, tensors, path, f"MSG-Net ({found}) at scale {scale}")
+    return net
+
+
+def _layer_names(path: Path, levels: int) -> list[str]:
+    """Return the names of dsr's layers in the order of the data flow."""
+    if levels < 1 or 2**levels not in SCALES:
+        raise ValueError(f"{path}: expected MSG-Net for a scale of {SCALES}, got {levels} upsampling levels")
+    guidance = [f"guidance.{i}" for i in range(levels + 1)]
+    depth = [f"levels.{level}.{part}" for level in range(levels) for part in ("up", "fuse", "refine")]
+    return [*guidance, "stem", *depth, "smooth", "reconstruct"]
+
+
+def _from_torch(path: Path) -> tuple[int, dict[str, Tensor]]:
+    """Return the number of levels and the tensors by dsr's names of a file with the key ``model_state_dict``."""
+    content = read_torch_file(path)
+    found = content.get("model_state_dict") if isinstance(content, dict) else None
+    if not isinstance(found, dict) or not all(isinstance(value, Tensor) for value in found.values()):
+        keys = ", ".join(map(str, list(content)[:4])) if isinstance(content, dict) else type(content).__name__
+        raise ValueError(f"{path}: expected tensors under the key model_state_dict, got {keys}")
+    indices = re.findall(r"^upsampling_X\.(\d{1,3})\.", "\n".join(map(str, found)), re.MULTILINE)
+    levels = max(map(int, indices), default=0) // 3  # 3 layers per level, then 2
+    names = _layer_names(path, levels)
+    guidance = [f"feature_extraction_Y.{max(i, 2 * i - 2)}" for i in range(levels + 1)]  # which also count poolings
+    theirs = [*guidance, "feature_extraction_X", *(f"upsampling_X.{i}" for i in range(3 * levels + 2))]
+    ours = {f"{old}.{part}": f"{new}.{part}" for old, new in zip(theirs, names, strict=True) for part in _PARTS}
+    return levels, {ours.get(name, str(name)): value for name, value in found.items()}
+
+
+def _from_caffe(path: Path, data: bytes) -> tuple[int, dict[str, Tensor]]:
+    """Return the same of a NetParameter; its layers are identified by their order, which is that of the data flow."""
+    try:
+        layers = []
+        for message in _fields(memoryview(data)).get(100, []):
+            layer = _fields(message)
+            name, kind = (bytes(layer.get(number, [b""])[0]).decode("utf-8", "replace") for number in (1, 2))
+            if blobs := [_read_blob(blob) for blob in layer.get(7, [])]:
+                layers.append((name, kind, blobs))
+    except (ValueError, TypeError, IndexError, KeyError) as error:
+        raise ValueError(f"{path}: expected a torch or Caffe model, got a damaged one or neither ({error})") from error
+    if not layers:
+        raise ValueError(f"{path}: expected a torch or Caffe model, got {len(data)} bytes without a Caffe layer")
+    levels = sum(kind == "Deconvolution" for _, kind, _ in layers)
+    names, ours = iter(_layer_names(path, levels)), ""
+    tensors: dict[str, Tensor] = {}
+    for name, kind, blobs in layers:
+        is_activation = kind == "PReLU"  # it follows the layer that it belongs to
+        ours = ours if is_activation else next(names, name)
+        keys = [f"{ours}.{part}" for part in (_PARTS[2:] if is_activation else _PARTS[:2])]
+        for i, blob in enumerate(blobs):
+            fits = i < len(keys) and keys[i] not in tensors
+            tensors[keys[i] if fits else f"{name} blob {i}"] = blob
+    return levels, tensors
+
+
+def _read_blob(message: memoryview) -> Tensor:
+    """Return a BlobProto's values in its shape; both are packed or one by one."""
+    fields = _fields(message)
+    sizes: list[int] = []
+    for value in _fields(fields[7][0]).get(1, []):
+        place = 0
+        while not isinstance(value, int) and place < len(value):
+            size, place = _read_varint(value, place)
+            sizes.append(size)
+        sizes += [value] if isinstance(value, int) else []
+    data = bytearray(b"".join(map(bytes, fields[5])))
+    if 4 * math.prod(sizes) != len(data):
+        raise ValueError(f"a blob of shape {tuple(sizes)} holds {len(data)} bytes")
+    return torch.frombuffer(data, dtype=torch.float32).reshape(sizes)
+
+
+def _fields(message: memoryview) -> dict[int, list[Any]]:
+    """Return the values of a message's fields by their numbers: an int for a varint, else the value's bytes."""
+    found: dict[int, list[Any]] = {}
+    place = 0
+    while place < len(message):
+        key, place = _read_varint(message, place)
+        value: int | memoryview
+        if key & 7 == 0:
+            value, place = _read_varint(message, place)
+        else:
+            size, place = _read_varint(message, place) if key & 7 == 2 else ({1: 8, 5: 4}[key & 7], place)
+            value, place = message[place : place + size], place + size
+            if len(value) < size:
+                raise ValueError(f"field {key >> 3} is cut off")
+        found.setdefault(key >> 3, []).append(value)
+    return found
+
+
+def _read_varint(message: memoryview, place: int) -> tuple[int, int]:
+    """Return the variable-length integer at a place, and the place after it."""
+    value = 0
+    for shift in range(0, 70, 7):
+        byte = message[place]
+        place += 1
+        value |= (byte & 0x7F) << shift
+        if byte < 0x80:
+            return value, place
+    raise ValueError("a number is longer than 64 bits")

@@ -1,9 +1,15 @@
-"""Weights files of dsr's networks: ``.safetensors`` with the metadata from which the network is rebuilt."""
+"""Weights of networks: which file a method takes, and dsr's files, ``.safetensors`` with what rebuilds the network.
+
+The node ``weights`` of a method's configuration is a file or directory alone, or has these keys. ``path``: a file, or
+a directory with published files. ``packaged``: the name of weights that come with dsr, or the factors of several by
+their names. ``file``: the name of the published file in a directory; ``files``: the factors of several by their names.
+``source``: where the published files are from, for messages.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
@@ -14,8 +20,13 @@ import torch
 from torch import Tensor, nn
 
 from dsr.methods.networks.network import DisparityNetwork
+from dsr.methods.weights import left_out, packaged_names, packaged_weights
+from dsr.utils.configuration import ConfigError
 from dsr.utils.guards import expect_bytes, opened, parse_json, refusing
+from dsr.utils.ratios import round_ratio
 
+SLACK = 1.05  # by how much a scale may exceed the factor of weights that are used for it
+_NODE = ("file", "files", "packaged", "path", "source")
 FORMAT = "dsr-network-1"
 _KEY, _SHARED = "dsr", "shared"
 _DAMAGED = "expected a safetensors file, got a damaged one"
@@ -27,6 +38,66 @@ LINKS: Mapping[str, str] = MappingProxyType(
         "soft": "for bicubic maps without noise, with soft depth steps",
     }
 )  # keys of the files beside a file that it names, and what they are for
+
+
+def find_weights(node: Any, scale: float, method: str) -> Path:
+    """Return the file of weights for a factor, else raise a ConfigError; ``method`` is its name, for messages."""
+    node = node if isinstance(node, Mapping) else {"path": node}
+    unknown = next((key for key in node if key not in _NODE), None)
+    if unknown is not None:
+        raise ConfigError(f"weights.{unknown}: unknown key; expected {', '.join(_NODE)}")
+    given = None if node.get("path") is None else Path(str(node["path"])).expanduser()
+    published = [node["file"]] if node.get("file") else []
+    if files := node.get("files"):
+        trained = nearest_scale(files.values(), scale)
+        published = [str(file) for file, factor in files.items() if factor == trained]
+    if given is not None and given.is_dir() and published:
+        given = next((given / file for file in published if (given / file).is_file()), given / published[0])
+    if given is not None and not given.is_dir():
+        if not given.is_file():
+            raise ConfigError(f"weights: method={method}: expected a file of weights, got {given} (no such file)")
+        return given
+    packaged = node.get("packaged")
+    if isinstance(packaged, Mapping):
+        there = {str(name): factor for name, factor in packaged.items() if packaged_weights(str(name)) is not None}
+        nearest = nearest_scale(there.values(), scale / SLACK) if there else None
+        found = next((packaged_weights(name) for name, factor in there.items() if factor == nearest), None)
+    else:
+        found = None if packaged is None else packaged_weights(packaged)
+    if found is not None:
+        return found
+    from_authors = f", or a directory with {published[0]} (from {node.get('source')})" if published else ""
+    needs = f"scale {round_ratio(scale)} needs weights=FILE{from_authors}"
+    if published and packaged is None:
+        text = f"{needs}; its authors publish them, dsr does not come with them"
+    elif isinstance(packaged, str) and packaged in left_out():
+        text = f"{packaged} does not come with this installation; `dsr data get weights`, or weights=FILE"
+    else:
+        text = f"dsr comes with {', '.join(packaged_names())}; {needs}"
+    raise ConfigError(f"weights: method={method}: {text}")
+
+
+def has_weights(node: Any, scale: float) -> bool:
+    """Return whether there are weights for a factor, for which a file of dsr's that the node names has to be made."""
+    try:
+        found = find_weights(node, scale, "")
+    except ConfigError:
+        return False
+    named = node.get("path") if isinstance(node, Mapping) else node
+    if named is None or Path(str(named)).expanduser().is_dir() or not is_dsr_weights(found):
+        return True
+    return bool(read_header(found)["arguments"].get("scale") == scale)
+
+
+def nearest_scale(trained: Collection[float], scale: float) -> float:
+    """Return the trained factor whose weights suit a factor: itself, else the smallest whole one above, or the largest.
+
+    Weights for a factor that is not whole were trained on one sensor's maps and suit no others.
+    """
+    if scale in trained:
+        return scale
+    whole = [each for each in trained if float(each).is_integer()]
+    return min((each for each in whole if each >= scale), default=max(whole))
 
 
 def save_network(
@@ -81,13 +152,7 @@ def is_dsr_weights(path: Path) -> bool:
 
 
 def read_header(path: Path) -> dict[str, Any]:
-    """Read the metadata of a dsr weights file: ``network``, ``arguments``, ``model``, ``facts``.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is damaged or not a dsr weights file.
-
-    """
+    """Read the metadata of a dsr weights file: ``network``, ``arguments``, ``model``, ``facts``."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such weights file")
     with refusing(f"{path}: {_DAMAGED}", Exception), safetensors.safe_open(path, framework="pt") as file:
@@ -106,15 +171,7 @@ def load_network(
 ) -> DisparityNetwork:
     """Load the network of a dsr weights file, in float32 on the CPU.
 
-    Args:
-        networks: network classes by name.
-        scale: scale that the run requires, None for any.
-        model: model that the run requires, None for any.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is damaged, not a dsr weights file, or of another model, scale or architecture.
-
+    ``networks`` are the classes by name, ``scale`` and ``model`` those that the run requires, None for any.
     """
     path = Path(path)
     header = read_header(path)

@@ -17,7 +17,7 @@ from dsr.methods.networks.peers.dornet import DORNet
 from dsr.methods.networks.peers.local_filters import FDKN, SVLRM
 from dsr.methods.networks.peers.peer_network import PeerNetwork, PeerUpsampler, Range, load_peer
 from dsr.methods.networks.peers.pgsr import PGSR
-from dsr.methods.networks.weight_choice import nearest_scale
+from dsr.methods.networks.weight_files import nearest_scale
 from dsr.utils.configuration import Node
 from dsr.utils.versions import file_hash
 

@@ -40,13 +40,7 @@ _OVERLAP = 16  # of neighbouring tiles in pixels
 
 
 def load_peer(path: Path, network: type[PeerNetwork], scale: float) -> PeerNetwork:
-    """Load a network, whose weights were trained for a factor, of its authors' file, in float32 on the CPU.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is damaged, holds other Python objects than tensors, or is of another network.
-
-    """
+    """Load a network, whose weights were trained for a factor, of its authors' file, in float32 on the CPU."""
     tensors = network.convert(read_tensors(path))
     with torch.device("meta"):  # without memory and random numbers
         net = network(scale)
