@@ -54,10 +54,11 @@ class Curves(Callback):
     ) -> None:
         """Add the values of a batch, and log their means when it is time."""
         self._patches += len(batch["rgb"]) * trainer.world_size
-        for name, value in trainer.callback_metrics.items():
-            if name.startswith("train/"):
-                entry = torch.stack((value.detach(), torch.ones_like(value))) * value.isfinite()
-                self._sums[name] = self._sums.get(name, 0) + entry.nan_to_num().to(pl_module.device)
+        logged = {name: value for name, value in trainer.callback_metrics.items() if name.startswith("train/")}
+        values = torch.stack([value.detach().to(pl_module.device) for value in logged.values()])
+        entries = torch.stack((values, torch.ones_like(values)), 1) * values.isfinite()[:, None]
+        for name, entry in zip(logged, entries.nan_to_num(), strict=True):
+            self._sums[name] = self._sums.get(name, 0) + entry
         every: int = trainer.log_every_n_steps  # type: ignore[attr-defined]
         if trainer.max_steps > 0:
             every = min(every, trainer.max_steps)
