@@ -141,6 +141,8 @@ def explain(error: Exception) -> str:
     if isinstance(error, MissingConfigException) and error.options:
         group, _, choice = str(error.missing_cfg_file).rpartition("/")
         meant = did_you_mean(choice, error.options)
+        if group in ("hydra/sweeper", "hydra/launcher"):
+            meant += f"; others are plugins, such as pip install hydra-{choice}-{group.partition('/')[2]}"
         return f"{group}={choice}: unknown; expected one of {', '.join(error.options)}{meant}"
     if isinstance(error, OverrideParseException):
         return f"{error.override}: expected KEY=VALUE; special characters need quotes within quotes, 'KEY=\"VALUE\"'"
@@ -148,7 +150,8 @@ def explain(error: Exception) -> str:
     override = re.search(r"(?:override|argument) '?([^\s=']+\w)", str(error))
     key = override[1] if override else str(getattr(cause, "full_key", None) or "")
     if str(error).startswith("Ambiguous value"):
-        return f"{key}: expected one value, got several; -m runs each of them, {key}=[...] is a list"
+        together = "metrics.protocols=[...] computes all of them" if key == "metrics" else f"{key}=[...] is a list"
+        return f"{key}: expected one value, got several; -m runs each of them, {together}"
     if "No match in the defaults list" in str(error):
         return f"{key}: expected a choice that the command has; +{key}=... adds one"
     return explain_value(cause, key) if isinstance(cause, OmegaConfBaseException) else one_line(error)

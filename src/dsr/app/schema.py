@@ -23,6 +23,11 @@ NAMED = ("dataset", "downsampling", "noise", "holes", "degradation", "method", "
          "trainer")  # fmt: skip
 # Groups whose choice is in ``names``.
 _LONGEST_NAME = 100
+# what Lightning's users look for elsewhere
+_ELSEWHERE = {
+    "ckpt_path": "resume=RUN_DIR of train.py or run=RUN_DIR of eval.py",
+    "precision": "precision=bfloat16 or float32",
+}
 _MOST = 1024  # workers and threads, more of which no system starts
 READ_OF_TRAINER = {"max_steps": 12000, "val_check_interval": 1000, "accumulate_grad_batches": 1, "devices": 1,
                    "strategy": "auto", "gradient_clip_val": None}  # fmt: skip
@@ -228,7 +233,10 @@ def explain_value(error: OmegaConfBaseException, key: str) -> str:
     first = str(error).partition("\n")[0]
     if " not in " in first and error.parent_node is not None:
         keys = [str(each) for each in error.parent_node if not str(each).startswith("_")]
-        meant = did_you_mean(key.rpartition(".")[2], keys if "." in key else [*keys, "experiment"])
+        name = key.rpartition(".")[2]
+        if name in _ELSEWHERE:
+            return f"{key}: unknown key; expected {_ELSEWHERE[name]}"
+        meant = did_you_mean(name, keys if "." in key else [*keys, "experiment"])
         return f"{key}: unknown key; expected one of {', '.join(keys)}; +{key}=... adds one{meant}"
     return f"{key}: {first}" if key else first
 
@@ -267,9 +275,10 @@ def plain_config(config: DictConfig) -> dict[str, Any]:
     named = {group: str(node["_target_"]).rpartition(".")[2] for group, node in nodes.items() if "_target_" in node}
     if HydraConfig.initialized():
         choices = HydraConfig.get().runtime.choices
-        for group in named.keys() - choices.keys():
-            if any(each.startswith(f"{group}=[") for each in given_overrides()):
-                raise ConfigError(f"{group}: expected one choice, got a list; -m {group}=A,B runs each of several")
+        for group, _, value in (override.partition("=") for override in given_overrides()):
+            if value.startswith("[") and group in (*NAMED, "metrics"):
+                all_of_them = f", metrics.protocols={value} computes all of them" if group == "metrics" else ""
+                raise ConfigError(f"{group}: expected one choice, got a list; -m runs each of several{all_of_them}")
         named |= {group: name for group, name in choices.items() if group in NAMED}
     plain["names"] = named | {
         group: str(name) for group, name in (plain.get("names") or {}).items() if name is not None

@@ -44,7 +44,8 @@ def start(module: str, function: str) -> NoReturn:
         code = 1
     finally:
         for worker in multiprocessing.active_children():  # those of data loaders outlast SIGTERM
-            worker.kill()
+            with contextlib.suppress(AttributeError):  # joblib's have no kill, and end by themselves
+                worker.kill()
     sys.exit(code)
 
 

@@ -161,7 +161,7 @@ def make_trainer(
     devices: int = 1,
     accumulate: int = 1,
     environment: ClusterEnvironment | None = None,
-    make: Callable[..., lightning.Trainer] = lightning.Trainer,
+    make: Callable[..., lightning.Trainer] | None = None,
     **named: Any,
 ) -> lightning.Trainer:
     """Return a trainer that ``make`` makes, for a number of steps, with a validation after every ``interval`` of them.
@@ -170,7 +170,7 @@ def make_trainer(
     """
     index: int | None = device.index  # torch's stubs say int
     with without_chatter():
-        return make(
+        return (make or lightning.Trainer)(
             accelerator="gpu" if device.type == "cuda" else device.type,
             devices=devices if index is None or devices > 1 else [index],
             max_steps=steps,
