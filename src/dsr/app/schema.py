@@ -236,8 +236,9 @@ def explain_value(error: OmegaConfBaseException, key: str) -> str:
         name = key.rpartition(".")[2]
         if name in _ELSEWHERE:
             return f"{key}: unknown key; expected {_ELSEWHERE[name]}"
+        adds = f"; +{key}=... adds one" if "." in key else ""  # at the top there are no others
         meant = did_you_mean(name, keys if "." in key else [*keys, "experiment"])
-        return f"{key}: unknown key; expected one of {', '.join(keys)}; +{key}=... adds one{meant}"
+        return f"{key}: unknown key; expected one of {', '.join(keys)}{adds}{meant}"
     return f"{key}: {first}" if key else first
 
 

@@ -12,6 +12,7 @@ from dsr.app.schema import Config, TrainConfig, user_directories
 from dsr.app.trust import Trust, expect_trusted, read_plain_yaml
 from dsr.data.scene_source import SceneSource, SceneSubset
 from dsr.degradation.downsampling import Downsampling
+from dsr.methods.networks.network import DisparityNetwork
 from dsr.training.data_module import Part, PatchData
 from dsr.training.degradation import Degradation
 from dsr.training.settings import PatchSettings
@@ -61,7 +62,12 @@ def studies_of_run(plain: Config, given: Sequence[str]) -> Iterator[tuple[dict[s
     own = {key: run[key] for key in _FROM_RUN if key not in chosen}
     name = run["names"]["model"]
     network = run["model"]["net"]
-    method = {"model": name, **load_target("model.net", network).method}
+    kind = load_target("model.net", network)
+    if not (isinstance(kind, type) and issubclass(kind, DisparityNetwork)):
+        raise ConfigError(
+            f"{folder / 'config.yaml'}: model.net._target_: expected a network, got {network['_target_']}"
+        )
+    method = {"model": name, **kind.method}
     if not str(network["_target_"]).startswith("dsr."):
         method["network"] = str(network["_target_"])
     names = {**plain["names"], **{key: run["names"][key] for key in own if key in run["names"]}, "method": name}

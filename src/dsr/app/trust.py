@@ -45,6 +45,10 @@ class Trust:
         return cls(value is True, own if isinstance(value, bool) else own | {*named})
 
 
+_LIGHTNING = ("logger", "callbacks", "trainer")  # nodes of Lightning's classes, which write files
+_PLACES = ("save_dir", "dir", "root_dir", "tracking_uri")  # of loggers; dsr gives them the run's directory
+
+
 def read_plain_yaml(path: Path) -> dict[str, Any]:
     """Return the keys of a YAML file; aliases, which a bomb is made of, and interpolations are refused."""
     depth = 0
@@ -71,7 +75,8 @@ def expect_trusted(path: Path, config: Config, trust: Trust) -> None:
         return
     allowed = _targets_in(config_directories()[0]) | trust.targets
     for key, target in imported(config):
-        if target not in allowed and not (key[0] == "metrics" and target.startswith("dsr.metrics.")):
+        foreign = target not in allowed and not (key[0] == "metrics" and target.startswith("dsr.metrics."))
+        if foreign or (target.startswith("lightning.") and key[0] not in _LIGHTNING and target not in trust.targets):
             raise ConfigError(
                 f"{path}: {'.'.join(key)}: expected a target of dsr's own, got {target!r}, whose code would run; "
                 f"if you trust it, trust={target} allows it, trust=true allows all"
@@ -81,8 +86,9 @@ def expect_trusted(path: Path, config: Config, trust: Trust) -> None:
             expect_name(f"{path}: {'.'.join(key)}", str(value))
         if key[:-1] in (("validation",), ("dataset", "parts")):
             expect_name(f"{path}: {'.'.join(key)}", key[-1])
-        if key[0] in ("logger", "callbacks", "trainer") and isinstance(value, str):
-            leads = re.match(r"[/\\~]|\w+:", value) or ".." in re.split(r"[/\\]", value)
+        if key[0] in _LIGHTNING and isinstance(value, str):
+            leads = re.match(r"\s*[/\\~]|\w+:", value) or "$" in value or ".." in re.split(r"[/\\]", value)
+            leads = leads or (key[0] == "logger" and key[-1] in _PLACES and value != "mlruns")
             if leads and value != os.environ.get("MLFLOW_TRACKING_URI"):
                 raise ConfigError(
                     f"{path}: {'.'.join(key)}: expected nothing outside of the run, got {value!r:.60}; "
