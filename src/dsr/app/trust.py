@@ -1,8 +1,8 @@
 """Which targets and files a run's ``config.yaml`` may name: it may have been written by somebody else.
 
 A ``_target_`` is imported and called with the arguments beside it. A person who types one, or keeps it in a directory
-of their own (``--config-dir``), decides that; a ``config.yaml`` in a directory that came from elsewhere does not. Such
-a file may name the targets that the files of dsr's own ``conf`` name. Others need ``trust``.
+of their own (``--config-dir``), decides that; a ``config.yaml`` in a directory that came from elsewhere does not. In
+each group such a file may name the targets that the group's files in dsr's own ``conf`` name. Others need ``trust``.
 """
 
 from __future__ import annotations
@@ -26,14 +26,17 @@ from dsr.utils.guards import read_limited
 _LARGEST = 1 << 18  # bytes of a run's configuration
 _DEEPEST = 30  # nested keys and lists
 _TARGETS = ("_target_", "network")  # keys whose value is imported
+_GROUP_OF = {"validation": "dataset", "patches": "trainer"}  # whose files name the targets of a key
+_LIGHTNING = ("logger", "callbacks", "trainer")  # nodes of Lightning's classes, which write files
+_PLACES = ("save_dir", "dir", "root_dir", "tracking_uri")  # of loggers; dsr gives them the run's directory
 
 
 @dataclass(frozen=True)
 class Trust:
-    """Which targets besides dsr's the person who runs the command allows: all, or those named."""
+    """Which targets besides dsr's the person who runs the command allows: all, or those named, each with its group."""
 
     anything: bool = False
-    targets: frozenset[str] = frozenset()
+    targets: frozenset[tuple[str, str]] = frozenset()
 
     @classmethod
     def of(cls, value: Any, directories: Sequence[Path] = ()) -> Trust:
@@ -42,11 +45,7 @@ class Trust:
         if not isinstance(value, bool) and not (isinstance(named, list) and all(isinstance(e, str) for e in named)):
             raise ConfigError(f"trust: expected true, false, or targets such as module.Name, got {value!r}")
         own = frozenset().union(*map(_targets_in, directories))
-        return cls(value is True, own if isinstance(value, bool) else own | {*named})
-
-
-_LIGHTNING = ("logger", "callbacks", "trainer")  # nodes of Lightning's classes, which write files
-_PLACES = ("save_dir", "dir", "root_dir", "tracking_uri")  # of loggers; dsr gives them the run's directory
+        return cls(value is True, own if isinstance(value, bool) else own | {("", each) for each in named})
 
 
 def read_plain_yaml(path: Path) -> dict[str, Any]:
@@ -75,11 +74,12 @@ def expect_trusted(path: Path, config: Config, trust: Trust) -> None:
         return
     allowed = _targets_in(config_directories()[0]) | trust.targets
     for key, target in imported(config):
-        foreign = target not in allowed and not (key[0] == "metrics" and target.startswith("dsr.metrics."))
-        if foreign or (target.startswith("lightning.") and key[0] not in _LIGHTNING and target not in trust.targets):
+        group = key[1] if key[1] in ("optimizer", "scheduler") else _GROUP_OF.get(key[0], key[0])
+        of_metrics = group == "metrics" and target.startswith("dsr.metrics.")
+        if not of_metrics and allowed.isdisjoint({("", target), (group, target)}):
             raise ConfigError(
-                f"{path}: {'.'.join(key)}: expected a target of dsr's own, got {target!r}, whose code would run; "
-                f"if you trust it, trust={target} allows it, trust=true allows all"
+                f"{path}: {'.'.join(key)}: expected a target of dsr's own {group}, got {target!r}, whose code would "
+                f"run; if you trust it, trust={target} allows it, trust=true allows all"
             )
     for key, value in _nodes(config):
         if key[0] == "names" and key[1:]:
@@ -114,8 +114,16 @@ def imported(config: Config) -> Iterator[tuple[tuple[str, ...], str]]:
 
 
 @functools.cache
-def _targets_in(directory: Path) -> frozenset[str]:
-    """Return the targets that a directory's files name, but methods' own, which a training's configuration has not."""
-    files = [path for path in directory.rglob("*.yaml") if path.parent.name != "method"]
+def _targets_in(directory: Path) -> frozenset[tuple[str, str]]:
+    """Return the group and the target of all that a directory's files name; files outside of groups have the group "".
+
+    Methods' files are left out: a training's configuration has no method.
+    """
     pattern = re.compile(rf"\b(?:{'|'.join(_TARGETS)}): *([\w.]+)")
-    return frozenset(target for path in files for target in pattern.findall(path.read_text(encoding="utf-8")))
+    found: set[tuple[str, str]] = set()
+    for path in directory.rglob("*.yaml"):
+        *groups, _ = path.relative_to(directory).parts
+        if groups != ["method"]:
+            group = groups[0] if groups and groups != ["experiment"] else ""
+            found |= {(group, target) for target in pattern.findall(path.read_text(encoding="utf-8"))}
+    return frozenset(found)
