@@ -6,6 +6,7 @@ been composed and checked, so that a mistyped argument is reported immediately.
 
 from __future__ import annotations
 
+import importlib
 import os
 import re
 import sys
@@ -43,25 +44,23 @@ from dsr.utils.guards import OutOfMemoryError, did_you_mean, refusing_excess
 def run_eval(arguments: Sequence[str] | None = None) -> None:
     """Run ``eval.py``, which is ``dsr eval``, with the given arguments or those of the process."""
 
-    def command(config: DictConfig) -> float:
-        EvalConfig.of(plain_config(config))
-        from dsr.app.evaluate import evaluate, objective  # noqa: PLC0415 - they import torch
-
-        return objective(evaluate(config))
+    def command(config: DictConfig) -> Any:
+        module = module_of("eval", config)
+        return module.objective(module.evaluate(config))
 
     run_command("eval", command, arguments)
 
 
 def run_train(arguments: Sequence[str] | None = None) -> None:
     """Run ``train.py``, which is ``dsr train``, with the given arguments or those of the process."""
+    run_command("train", lambda config: module_of("train", config).train(config), arguments)
 
-    def command(config: DictConfig) -> float:
-        TrainConfig.of(plain_config(config))
-        from dsr.app.train import train  # noqa: PLC0415 - it imports torch
 
-        return train(config)
-
-    run_command("train", command, arguments)
+def module_of(name: str, config: DictConfig) -> Any:
+    """Check the configuration of ``train`` or ``eval``, and return the module of the command, which imports torch."""
+    kind, module = (TrainConfig, "train") if name == "train" else (EvalConfig, "evaluate")
+    kind.of(plain_config(config))
+    return importlib.import_module(f"dsr.app.{module}")
 
 
 def run_command(name: str, command: Callable[[DictConfig], Any], arguments: Sequence[str] | None = None) -> None:
@@ -126,9 +125,13 @@ def fail(message: str) -> NoReturn:
 
 
 def _damaged_file() -> str:
-    """Return which of the user's configuration files cannot be read, one line; empty if all can."""
+    """Return why the user's configuration files cannot be read, one line; empty if they can."""
     folder = get_args_parser().parse_known_args(sys.argv[1:])[0].config_dir
-    for path in sorted(Path(folder or "nowhere").glob("*/*.yaml")):
+    try:
+        own = config_directories([] if folder is None else [Path(folder)])[1:]
+    except ConfigError as error:
+        return str(error)
+    for path in sorted(path for place in own for path in place.glob("*/*.yaml")):
         try:
             OmegaConf.load(path)
         except Exception as error:  # damaged YAML raises many types

@@ -19,22 +19,22 @@ from dsr.utils.ratios import NATIVE, SCALES
 
 Config = Mapping[str, Any]  # a composed configuration as plain values
 Identity = Mapping[str, Any]  # what a run's results depend on: settings, weights, versions, the kind of device
+# Groups whose choice is in ``names``.
 NAMED = ("dataset", "downsampling", "noise", "holes", "degradation", "method", "model", "optimizer", "scheduler",
          "trainer")  # fmt: skip
-# Groups whose choice is in ``names``.
-_LONGEST_NAME = 100
-# what Lightning's users look for elsewhere
-_ELSEWHERE = {
+# Keys that users of Lightning look for, and those that dsr has for them.
+_OF_LIGHTNING = {
     "ckpt_path": "resume=RUN_DIR of train.py or run=RUN_DIR of eval.py",
     "precision": "precision=bfloat16 or float32",
 }
+_LONGEST_NAME = 100
 _MOST = 1024  # workers and threads, more of which no system starts
+# Arguments of the trainer that dsr reads itself, and their defaults.
 READ_OF_TRAINER = {"max_steps": 12000, "val_check_interval": 1000, "accumulate_grad_batches": 1, "devices": 1,
                    "strategy": "auto", "gradient_clip_val": None}  # fmt: skip
-# What dsr itself reads of the trainer's arguments, and their defaults.
+# Arguments of the trainer that dsr gives itself.
 SET_BY_DSR = ("plugins", "use_distributed_sampler", "num_nodes", "default_root_dir", "enable_checkpointing",
                "barebones", "inference_mode", "max_epochs", "min_epochs", "max_time")  # fmt: skip
-# Arguments of the trainer that dsr's trainings have values of their own for.
 
 
 @dataclass
@@ -234,8 +234,8 @@ def explain_value(error: OmegaConfBaseException, key: str) -> str:
     if " not in " in first and error.parent_node is not None:
         keys = [str(each) for each in error.parent_node if not str(each).startswith("_")]
         name = key.rpartition(".")[2]
-        if name in _ELSEWHERE:
-            return f"{key}: unknown key; expected {_ELSEWHERE[name]}"
+        if name in _OF_LIGHTNING:
+            return f"{key}: unknown key; expected {_OF_LIGHTNING[name]}"
         adds = f"; +{key}=... adds one" if "." in key else ""  # at the top there are no others
         meant = did_you_mean(name, keys if "." in key else [*keys, "experiment"])
         return f"{key}: unknown key; expected one of {', '.join(keys)}{adds}{meant}"

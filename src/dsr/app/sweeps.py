@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +16,8 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 
-from dsr.app.entry import explain, fail
-from dsr.app.schema import EvalConfig, Identity, Plan, TrainConfig, plain_config
+from dsr.app.entry import explain, fail, module_of
+from dsr.app.schema import Identity, Plan
 from dsr.utils.configuration import ConfigError
 from dsr.utils.console import USAGE_ERROR, one_line, open_console, print_error, show
 
@@ -44,7 +43,7 @@ class CheckJobs(Callback):
             with read_write(composed), open_dict(composed):
                 del composed["hydra"]
             try:
-                for plan in _plan(str(config_name), composed):
+                for plan in module_of(str(config_name), composed).plan(composed):
                     plans.append(plan)
                     if owners.setdefault(plan.folder.resolve(), plan.identity) != plan.identity:
                         raise ConfigError(
@@ -62,19 +61,6 @@ class CheckJobs(Callback):
         more = f" ({done} more are complete)" if done else ""
         for unit in {plan.unit for plan in plans}:
             show(open_console(), f"{len(plans)} runs, {unit}s to do: {left}{more}")
-
-
-def _plan(name: str, config: DictConfig) -> Sequence[Plan]:
-    """Return the plans of a job, after a check of its configuration that does not import torch."""
-    if name == "train":
-        TrainConfig.of(plain_config(config))
-        from dsr.app.train import plan as plan_training  # noqa: PLC0415
-
-        return plan_training(config)
-    EvalConfig.of(plain_config(config))
-    from dsr.app.evaluate import plan as plan_evaluation  # noqa: PLC0415
-
-    return plan_evaluation(config)
 
 
 def _jobs(config: DictConfig) -> list[tuple[list[str], DictConfig]]:
