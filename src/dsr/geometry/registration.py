@@ -139,7 +139,7 @@ def find_displacement(depth_lr: Tensor, rgb: Tensor) -> Displacement | None:
     ratio = min(rgb.shape[-2] / (height * every), rgb.shape[-1] / (width * every))
     factor = max(min(WORKING_SIZE // max(height, width), math.floor(ratio)), 1)
     size = (factor * height, factor * width)
-    radius = max(round(max(size) * _MAX_SHIFT), round(_LEAST_RADIUS * factor))
+    radius = max(round(max(size) * _MAX_SHIFT), _LEAST_RADIUS * factor)
     gap = max(round(_SHADOW * max(depth.shape)), 1)
     edges = find_edges(depth, math.ceil(radius / factor), gap).scale_up(factor)
     if edges.count < _LEAST_EDGES or int(edges.tiles().max()) + 1 < _LEAST_TILES:
