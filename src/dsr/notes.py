@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 _OPTION = re.compile(r"(?<!\S)(?:--([a-z]+(?:-[a-z]+)*)|-(o))(?!\w|[-/\\.]\S)")
 _ARGUMENTS = {"depth-unit": "unit", "o": "folder"}  # options of the command that have another name in Python
 
-CHECKS = 4  # number of the present checks; another one where a warning is added, or a limit changes
+CHECKS = 4  # version of the checks: to be increased when a warning is added or a limit changes
 
 
 # By code: the value from which on a warning is given, or the command refuses or asks. What to do about each is in
@@ -111,7 +111,7 @@ def read_warning(entry: Mapping[str, Any]) -> Assumption:
 
 
 def expect_no_warning(where: str, notes: Iterable[Assumption], *, brief: bool = False) -> None:
-    """Take warnings for an error, as ``--strict`` asks; a brief message is without figures, equal for all pictures."""
+    """Raise an error for warnings, as ``--strict`` asks; ``brief`` leaves out the figures of a single picture."""
     messages = [each.text if brief else each.message for each in notes if each.code]
     if messages:
         more = f", and {len(messages) - 1} more" if len(messages) > 1 else ""

@@ -98,7 +98,7 @@ class Scene:
 
     def __post_init__(self) -> None:
         """Check shapes and value ranges."""
-        _expect_photo(self.name, self.rgb, self.regions, self.camera)
+        _expect_photo_and_regions(self.name, self.rgb, self.regions, self.camera)
         if self.depth is None and not self.measured:
             raise ValueError(f"{self.name}: expected a depth map, high-resolution or measured, got none")
         if self.depth is not None:
@@ -109,6 +109,13 @@ class Scene:
                 raise ValueError(f"{self.name}: measured: expected a ratio of 1 or more, got {ratio}")
             what, size = f"measured depth at x{round_ratio(ratio)}", (self.camera.height, self.camera.width)
             _expect_depth(self.name, what, depth, _reduced_size(size, ratio, depth.shape[-2:]))
+
+    @property
+    def true_depth(self) -> Tensor:
+        """``depth``, where a scene without it is an error."""
+        if self.depth is None:
+            raise ValueError(f"{self.name}: expected a true depth, there is none")
+        return self.depth
 
     def crop(self, top: int, left: int, height: int, width: int) -> Scene:
         """Return a window of the scene: ``height`` x ``width`` pixels from row ``top`` and column ``left`` on.
@@ -168,7 +175,7 @@ class DepthSample:
 
     def __post_init__(self) -> None:
         """Check shapes, value ranges and cameras against each other."""
-        _expect_photo(self.scene, self.rgb, self.regions, self.camera)
+        _expect_photo_and_regions(self.scene, self.rgb, self.regions, self.camera)
         object.__setattr__(self, "scale", as_ratio(self.scale))
         if not 1 <= self.scale < math.inf:
             raise ValueError(f"{self.scene}: scale: expected a number of 1 or more, got {self.scale}")
@@ -285,7 +292,7 @@ def _expect_shape(scene: str, name: str, value: Tensor, shape: tuple[int, ...]) 
         raise ValueError(f"{scene}: {name}: expected shape {shape}, got {tuple(value.shape)}")
 
 
-def _expect_photo(scene: str, rgb: Tensor, regions: Mapping[str, Tensor], camera: Camera) -> None:
+def _expect_photo_and_regions(scene: str, rgb: Tensor, regions: Mapping[str, Tensor], camera: Camera) -> None:
     _expect_shape(scene, "rgb", rgb, (3, camera.height, camera.width))
     if not rgb.is_floating_point() or not bool(((rgb >= 0) & (rgb <= 1)).all()):
         raise ValueError(f"{scene}: rgb: expected floating point values in [0, 1]")

@@ -180,7 +180,8 @@ def make_sample(
     else:
         check_scale(scale)
         ratio = factor = int(scale)
-        _true_depth(scene)
+        if scene.depth is None:
+            raise ValueError(f"{scene.name}: expected a high-resolution depth map to downsample, there is none")
     size, notes = (scene.camera.height, scene.camera.width), scene.notes
     height, width = (length // factor * factor for length in size)
     if not height or not width:
@@ -198,9 +199,7 @@ def make_sample(
         camera_lr = scene.camera.reduce(depth_lr.shape[-1], depth_lr.shape[-2])
     else:
         noisy = None if noise is None else (noise, of_noise)
-        depth_lr, camera_lr = downsample_depth(
-            _true_depth(scene), scene.camera, factor, downsampling, range_type, noisy
-        )
+        depth_lr, camera_lr = downsample_depth(scene.true_depth, scene.camera, factor, downsampling, range_type, noisy)
     if holes is not None:
         depth_lr = depth_lr.masked_fill(holes(depth_lr, camera_lr, of_holes), torch.nan)
     if not bool(depth_lr.isfinite().any()):
@@ -209,13 +208,6 @@ def make_sample(
         DepthSample, dataset=scene.dataset, scene=scene.name, rgb=scene.rgb, depth_lr=depth_lr, camera=scene.camera,
         camera_lr=camera_lr, scale=ratio, depth=scene.depth, notes=notes, unit=scene.unit, regions=scene.regions,
     )  # fmt: skip
-
-
-def _true_depth(scene: Scene) -> Tensor:
-    """Return the scene's high-resolution depth."""
-    if scene.depth is None:
-        raise ValueError(f"{scene.name}: expected a high-resolution depth map to downsample, there is none")
-    return scene.depth
 
 
 def downsample_depth(

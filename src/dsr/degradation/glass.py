@@ -43,8 +43,7 @@ def add_glass(scene: Scene, generator: torch.Generator, kinds: Mapping[str, floa
     The scene's true depth is that of the objects' surfaces. The depth that a sensor sees, (1, H, W) in metres, is NaN
     where it sees nothing. ``kinds`` are the relative frequencies of the kinds of objects.
     """
-    assert scene.depth is not None  # noqa: S101 - for the type checker
-    state = _State(scene.rgb.float(), scene.depth, scene.depth)
+    state = _State(scene.rgb.float(), scene.true_depth, scene.true_depth)
     kind = draw(kinds, generator)
     count = 1 if kind in ("pane", "mirror") else 1 + int(4 * uniform(0, 1, generator) ** 2)
     for _ in range(count):

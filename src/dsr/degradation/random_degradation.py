@@ -138,11 +138,10 @@ class Everything:
         others = {name: share for name, share in self.noises.items() if name != "none"}
         if scale == 1 and kind == "none" and sum(others.values()) > 0:
             kind = draw(others, generator)
-        seen = scene.depth
+        seen = scene.true_depth
         # at 0, nothing is drawn
         if self.clear and kind in SENSOR_NOISES and not soft and chance(self.clear, generator):
             scene, seen = add_glass(scene, generator)
-        assert seen is not None  # noqa: S101 - for the type checker
         clean, camera_lr = self._downsample(seen, scene.camera, scale, kernel, kind, generator)
         size = clean.shape[-2], clean.shape[-1]
         luma = functional.adaptive_avg_pool2d(scene.rgb.float().mean(dim=0, keepdim=True)[None], size)[0]

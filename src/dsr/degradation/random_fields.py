@@ -115,8 +115,7 @@ def near_steps(values: Tensor, reach: int, jump: float = 0.04) -> Tensor:
 
 def add_relief(scene: Scene, generator: torch.Generator) -> Scene:
     """Return a scene whose true depth has grain of 1 to 4 pixels, as of a scan, or is rounded, as in a file."""
-    assert scene.depth is not None  # noqa: S101 - for the type checker
-    values = scene.depth.reciprocal()
+    values = scene.true_depth.reciprocal()
     if chance(0.3, generator):
         return derived(scene, depth=round_values(values, generator).reciprocal())
     grain = field_of(values.float(), uniform(0, 1.5, generator) if chance(0.6, generator) else 0, generator)
@@ -125,8 +124,7 @@ def add_relief(scene: Scene, generator: torch.Generator) -> Scene:
 
 def add_folds(scene: Scene, generator: torch.Generator) -> Scene:
     """Return a scene with smooth folds on parts of its surfaces, shaded by a light from a random side."""
-    assert scene.depth is not None  # noqa: S101 - for the type checker
-    like = scene.depth.float()
+    like = scene.true_depth.float()
     sizes = power(0.3, 1.4, generator), power(0.3, 1.4, generator)
     field = field_of(like, sizes, generator)
     if chance(0.4, generator):  # creases
@@ -138,7 +136,7 @@ def add_folds(scene: Scene, generator: torch.Generator) -> Scene:
     down, across = (functional.pad(height.diff(dim=dim), pad) for dim, pad in ((-2, (0, 0, 0, 1)), (-1, (0, 1, 0, 0))))
     light = 1 + strength * scene.camera.fx * (math.cos(angle) * across + math.sin(angle) * down)
     rgb = (scene.rgb * light.clamp(0.2, 1.8).to(scene.rgb)).clamp(0, 1)
-    return derived(scene, rgb=rgb, depth=scene.depth * (1 + height.clamp(-0.2, 0.2)).to(scene.depth))
+    return derived(scene, rgb=rgb, depth=scene.true_depth * (1 + height.clamp(-0.2, 0.2)).to(scene.true_depth))
 
 
 def displace(values: Tensor, scale: int, generator: torch.Generator) -> Tensor:

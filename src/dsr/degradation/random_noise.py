@@ -121,9 +121,7 @@ def _count(disparity: Tensor, noise: Tensor, generator: torch.Generator, *, ster
         counted = (counted / step).round() * step
     if chance(0.3, generator):
         size = 2 * int(torch.randint(1, 3, (1,), generator=generator)) + 1
-        error = counted - disparity
-        known = error.isfinite().to(error)
-        counted = disparity + window_means(error.nan_to_num(0), size) / window_means(known, size).clamp(min=1e-6)
+        counted = disparity + _means(counted - disparity, torch.ones_like(disparity), size)
     return counted
 
 

@@ -378,7 +378,7 @@ def _interpolate(depth: Tensor, points: tuple[tuple[float, float], ...]) -> Tens
 
 _CONSTANTS = (16.0, 4096.0)  # sought, in metres: 16 pixel metres in whole pixels to 128 in steps of 1/32
 _ROUNDINGS = (1e-3, 1.25e-4, 1e-4)  # metres to which cameras' files are rounded
-_SEEN = 2.0  # A step of depth shows if it is so many times what values are rounded to
+_SEEN = 2.0  # smallest step of depth that shows, over what values are rounded to
 _COMMON = 4  # pixels that a value must have; rarer ones come from resampling
 _BAND = 1.2  # ratio of the constants that are looked for in the same values, those far enough to show them
 _FEWEST, _CYCLES = 12, 8  # distinct values, and steps between the smallest and the largest, that are needed

@@ -39,9 +39,9 @@ _HOLE = 0.5  # strength of the border of a wider hole
 _AROUND, _FAINT, _STRONGEST = 31, 0.004, 3.0
 _CONTOUR = 4.0  # extent in pixels over which the edges of a contour run alike
 _FITS = 3.0  # significance from which both surely agree
-# edges exist in a depth map of so many pixels on its longer side, with contours of so many pixels on the grid, of at
-# least this mean coherence, and with an agreement by chance of a smaller standard deviation: then 3 of 383 right pairs
-# get the warning of another photo, and 31 without these conditions
+# a depth map has edges to judge by if its longer side has at least so many pixels, its contours have so many pixels on
+# the grid and this mean coherence, and the agreement by chance has a smaller standard deviation than this: 3 of 383
+# right pairs get the warning of another photo, and 31 without these conditions
 _SIDE, _LENGTH, _COHERENCE, _SPREAD = 80, 300, 0.6, 0.045
 _ELSEWHERE, _LEAD = 5.0, 2.0  # significance beyond the reach, and its lead, from which on photo and depth are apart
 _SMALLEST = 16  # least side of the grid in pixels
@@ -52,7 +52,7 @@ _WAYS: dict[str, tuple[bool, tuple[int, ...]]] = {
     "turned by 90 degrees to the right": (True, (1,)),
     "turned by 90 degrees to the left": (True, (0,)),
 }  # what is done to a photo to compare it: whether rows and columns are exchanged, and what is reversed then
-# widths of the depth map's field of view over the photo's, that are compared as well
+# widths of the depth map's field of view over the photo's that are compared as well
 _ZOOMS = (0.68, 0.72, 0.76, 0.8, 0.85, 0.9, 1.1, 1.17, 1.24, 1.31, 1.39, 1.47)
 
 
@@ -177,8 +177,8 @@ class Verdict:
 def judge(depth: Array, rgb: Tensor, zooms: Sequence[float] = _ZOOMS) -> Verdict | None:
     """Compare the edges of a depth map with those of a photo: as given, mirrored, rotated, and of other fields of view.
 
-    Depth is (h, w) in any unit of depth or of its reciprocal, NaN in holes; the photo is (3, H, W) in [0, 1]. Zooms are
-    widths of the depth map's field of view over the photo's. Returns None if the depth map or the photo has no edge.
+    Depth is (h, w) in any unit of depth or of its reciprocal, NaN in holes; the photo is (3, H, W) in [0, 1]. ``zooms``
+    are widths of the depth map's field of view over the photo's. Returns None if one of the two has no edge.
     """
     size = working_size(depth, rgb)
     pixel = max(size) / max(depth.shape)

@@ -61,8 +61,8 @@ class Lens:
 def undistort(picture: np.ndarray, camera: Camera, lens: Lens, hole: float | None = None) -> np.ndarray:
     """Return a picture, (h, w) or (h, w, 3), as the pinhole camera of the same intrinsics sees it.
 
-    A photo is interpolated and continued at its border. With a ``hole``, the picture is a map: its pixels have the
-    value of the nearest one, and those that lie outside of it the hole's.
+    Without a ``hole``, the picture is a photo: it is interpolated, and continued at its border. With one, it is a map:
+    a pixel gets the value of the nearest one, and ``hole`` outside of the map.
     """
     if picture.shape[:2] != (camera.height, camera.width) or max(picture.shape[:2]) > _MOST:
         got = f"{picture.shape[1]} x {picture.shape[0]}"

@@ -56,9 +56,9 @@ def triangulate(
     triangle. Memory: about 110 bytes per pixel, and 80 bytes for :func:`vertex_normals`.
 
     Depth is (1, H, W) in metres, NaN in holes. A pair is cut from the relative change ``largest_step`` on, beyond what
-    the slopes on both sides predict. ``isolated`` keeps vertices without a triangle. ``tolerance``, (1, H, W), is how
-    far in metres pixels lie beside the mesh, mostly and by about twice that at most, so that flat parts get large
-    triangles, see :func:`dsr.geometry.adaptive_mesh.join`; None for a mesh of all pixels.
+    the slopes on both sides predict. ``isolated`` keeps vertices without a triangle. ``tolerance``, (1, H, W), is the
+    largest deviation of most pixels from the mesh in metres (a few deviate by about twice as much), so that flat parts
+    get large triangles, see :func:`dsr.geometry.adaptive_mesh.join`; None for a mesh of all pixels.
     """
     if tuple(depth.shape) != (1, camera.height, camera.width):
         raise ValueError(f"depth: expected shape {(1, camera.height, camera.width)}, got {tuple(depth.shape)}")

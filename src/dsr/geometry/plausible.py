@@ -10,7 +10,7 @@ from dsr.geometry.camera import Camera
 from dsr.notes import LIMITS
 
 _USUAL_VIEW = (20.0, 120.0)  # horizontal fields of view in degrees
-_FITTING = 0.05  # up to which numbers fit another size, or have their principal point in the middle
+_FITTING = 0.05  # relative error up to which numbers fit another size, or the principal point is in the middle
 _SCALES = (2.0, 3.0, 4.0, 8.0, 1.5, 2.5)
 _NUMBERS = ("fx", "fy", "cx", "cy")
 
@@ -18,9 +18,9 @@ _NUMBERS = ("fx", "fy", "cx", "cy")
 class Remark(NamedTuple):
     """What was found about a camera.
 
-    A ``note`` is correct at times; a ``warning`` is probably, and a ``problem`` certainly, wrong. ``kind`` is equal for
-    all cameras, ``code`` one of :data:`dsr.notes.LIMITS`, empty for a note, and ``value`` what the limit was compared
-    with.
+    The camera of a ``note`` may be right, that of a ``warning`` is probably wrong, and that of a ``problem`` is wrong.
+    ``kind`` is a text without the camera's numbers, ``code`` one of :data:`dsr.notes.LIMITS`, empty for a note, and
+    ``value`` what the limit was compared with.
     """
 
     level: Literal["note", "warning", "problem"]
@@ -59,7 +59,7 @@ def plausible_baseline(baseline: float) -> bool:
 
 
 def implausible_distance(low: float, high: float) -> Literal["depth-near", "depth-far"] | None:
-    """Return which limit a depth map is beyond with all that it shows, from ``low`` to ``high`` metres, if any."""
+    """Return the limit beyond which a whole depth map lies, which extends from ``low`` to ``high`` metres, if any."""
     if high < LIMITS["depth-near"]:
         return "depth-near"
     return "depth-far" if low > LIMITS["depth-far"] else None

@@ -40,7 +40,7 @@ _LENGTHS = {
 
 
 class Reading(NamedTuple):
-    """What poses may be: what makes poses as :mod:`dsr.geometry.rigid_motion` has them of those."""
+    """A convention that poses may have, and their conversion to the one of :mod:`dsr.geometry.rigid_motion`."""
 
     direction: str = ""
     turn: str = ""
@@ -48,7 +48,7 @@ class Reading(NamedTuple):
     length: str = ""
 
     def __call__(self, pose: Matrix) -> Matrix:
-        """Return the pose that a pose is if it is read so."""
+        """Return a pose of this convention in that of :mod:`dsr.geometry.rigid_motion`."""
         rotation = pose[:3, :3]
         if self.turn == "with rotations by columns":
             rotation = rotation.T
@@ -77,8 +77,6 @@ _GAPS = (0, 1, 3, 10, 30)  # places of the frames of a group that are compared w
 _GROUPS = 4  # groups of frames of a sequence
 _TIE = 0.9  # readings whose evidence is at least this much of the best one's cannot be distinguished from it
 _MOST_NAMES = 3  # readings that a message names
-
-
 _TOLERANCE = 0.04  # difference of two depths over the farther one, up to which frames agree in a pixel
 _OVERLAP = 0.3  # share of a frame's points in another one's view, below which the two are not compared
 _EXPLAINED = 0.7  # share of the pixels in which frames have to agree under another reading

@@ -37,13 +37,13 @@ _LEAST_RADIUS = 4  # smallest radius of the search in pixels of the depth map
 _SCALES = tuple(1 + step / 200 for step in range(-10, 11))
 _WEAK = 2.0  # standard errors below which a shift along one axis is left out: its edges may all run along that axis
 _ABOVE_SHIFT = 2.5  # standard errors by which a displacement with a scale must exceed the best shift
-_MUCH = 1.1  # factor of the gradients that is a lot for a change of scale to gain
+_MUCH = 1.1  # ratio of the gradients with a scale to those without, above which one standard error is enough
 _COARSE = 2  # step of the search for the best shift in working pixels
 _SMALLEST = 0.3  # smallest displacement of a corner that is undone, in low-resolution pixels
 _SHADOW = 0.02  # width of the widest shadow beside an edge as a fraction of the longer side
 _SAME_SURFACE = 0.02  # relative difference of inverse depth up to which neighbours are averaged
-# a certain displacement has gradients so many times those at a typical shift, and exceeds by so many standard errors
-# those at a typical shift, at the best other shift, and without a displacement; 5 of 383 right pairs have one
+# a displacement is certain if its gradients are so many times those of a typical shift, and larger by so many standard
+# errors than those of a typical shift, of the best other shift, and of none; 5 of 383 right pairs have one
 _CONTRAST, _BY_CHANCE, _BY_OTHERS, _BY_NONE = 1.2, 2.8, 2.0, 3.0
 
 
@@ -55,7 +55,7 @@ class Displacement:
     down: float
     scale: float = 1.0  # about the middle c of the map
     certain: bool = False  # agreement is significantly better there than elsewhere, and than with no displacement
-    visible: bool = False  # at least a pixel of the depth map, and one that the eye sees in the photo
+    visible: bool = False  # certain, at least a pixel of the depth map, and large enough to see in the photo
     moved: float = 0.0  # of a corner, in pixels of the photo, at most ``WORKING_SIZE`` on its longer side
 
     def __str__(self) -> str:
@@ -139,7 +139,7 @@ def find_displacement(depth_lr: Tensor, rgb: Tensor) -> Displacement | None:
     ratio = min(rgb.shape[-2] / (height * every), rgb.shape[-1] / (width * every))
     factor = max(min(WORKING_SIZE // max(height, width), math.floor(ratio)), 1)
     size = (factor * height, factor * width)
-    radius = max(round(max(size) * _MAX_SHIFT), round(_LEAST_RADIUS * factor))
+    radius = max(round(max(size) * _MAX_SHIFT), _LEAST_RADIUS * factor)
     gap = max(round(_SHADOW * max(depth.shape)), 1)
     edges = find_edges(depth, math.ceil(radius / factor), gap).scale_up(factor)
     if edges.count < _LEAST_EDGES or int(edges.tiles().max()) + 1 < _LEAST_TILES:

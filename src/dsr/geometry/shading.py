@@ -12,7 +12,7 @@ from torch.nn import functional
 from dsr.geometry.lights import LIGHT_NAMES, LIGHTS, VIEWING_LIGHT
 from dsr.geometry.surface import depth_to_normals
 
-_SHORTEST, _LONGEST = 128, 256  # the longer side of a panel is at least and at most so long, pixels
+_SHORTEST, _LONGEST = 128, 256  # least and largest longer side of a panel, pixels
 _LABEL = 16  # height of the line above a panel, pixels
 
 

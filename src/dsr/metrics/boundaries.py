@@ -5,8 +5,8 @@ of the same two pixels is above the same threshold. This is scale-invariant and 
 
 - Depth Pro (Bochkovskii et al., *Depth Pro: Sharp Monocular Metric Depth in Less Than a Second*, ICLR 2025; apple/
   ml-depth-pro 9efe5c1, ``src/depth_pro/eval/boundary_metrics.py``): neighbours in a row or column, thresholds 1.05 to
-  1.25; precision and recall are means over four directions, and a direction without edges counts 0. So a truth may have
-  less than 1 against itself, which is the ceiling beside it.
+  1.25; precision and recall are means over four directions, and a direction without edges counts 0. So a truth may
+  score less than 1 against itself; ``DepthPro_ceiling`` is that score.
 - MoGe (Wang et al., *MoGe-2*, 2025; microsoft/MoGe 0744441, ``moge/test/metrics.py``): pixels up to a radius
   apart in any direction, counted together, a border of the radius left out. Its code has the names of precision and
   recall the wrong way round, which F1 does not see, and weights thresholds by 0.05 to 0.25 where Depth Pro has 1.05 to

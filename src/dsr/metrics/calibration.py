@@ -72,9 +72,9 @@ def ence(expected: Tensor, measured: Tensor, parts: int = 10) -> Tensor:
     of it. Errors with heavier tails than a Gaussian's have a larger RMSE, even where they are expected rightly.
     """
     expected, measured = _ordered(expected, measured)
+    parts = max(1, min(parts, len(expected)))  # a part without a pixel has no mean
     variances, squares = (DEVIATION * expected).square().tensor_split(parts), measured.square().tensor_split(parts)
-    rmv = torch.stack([part.mean() for part in variances if len(part)] or [variances[0].mean()]).sqrt()
-    rmse = torch.stack([part.mean() for part in squares if len(part)] or [squares[0].mean()]).sqrt()
+    rmv, rmse = (torch.stack([part.mean() for part in each]).sqrt() for each in (variances, squares))
     return ((rmse - rmv).abs() / rmv).mean()
 
 

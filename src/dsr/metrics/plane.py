@@ -1,8 +1,8 @@
 """Metrics of depth maps of a board whose plane is the ground truth, known within its outline alone.
 
 A constant offset, the median difference, does not count, nor do pixels that are more than 60 mm off it: those belong to
-another surface, and ``Plane_covered`` is the fraction of the others. What blur does shows within some pixels of the
-outline, so that a region of these is scored for itself.
+another surface, and ``Plane_covered`` is the fraction of the others. Blur shows near the outline, so a region of these
+pixels has scores of its own.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What trainings log beside the scores of validations, by loggers of Lightning's."""
+"""What trainings log besides validation scores, through Lightning's loggers."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def log_layout(logger: TensorBoardLogger, titles: Mapping[str, str]) -> None:
 
 
 def log_picture(logger: Any, tag: str, picture: Tensor, step: int) -> None:
-    """Log a picture, (3, H, W) uint8, where pictures are shown."""
+    """Log a picture, (3, H, W) uint8, if the logger shows pictures."""
     array = picture.permute(1, 2, 0).numpy()
     if isinstance(logger, TensorBoardLogger):
         logger.experiment.add_image(tag, picture, step)

@@ -8,7 +8,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import lightning
@@ -24,6 +24,7 @@ from dsr.training.degradation import Batch, Degradation, to_tensors
 from dsr.training.patches import Patches, check_patches
 from dsr.training.settings import PatchSettings
 from dsr.utils import interruption
+from dsr.utils.guards import derived
 
 _EPOCH = 1000  # about how many batches an epoch has where the trainer has no number of steps
 
@@ -42,7 +43,7 @@ class Part:
 
 
 class WholeScenes(Dataset[Batch]):
-    """Samples of whole scenes in float64, the type in which evaluation scores them, ``hinted`` as by ``eval.py``."""
+    """Samples of whole scenes in float64, in which evaluation scores them; ``hinted`` adds the hints of ``eval.py``."""
 
     def __init__(
         self, scenes: Sequence[Scene], degradation: Degradation, seed: int = 0, *, hinted: bool = False
@@ -146,8 +147,9 @@ class PatchData(lightning.LightningDataModule):
             return
         groups: list[list[Scene]] = []
         for part, names in zip(self._parts, self._training_names, strict=True):
-            scenes = map(part.source.load, names)  # in float32, which takes half the memory
-            groups.append([replace(s, depth=None if s.depth is None else s.depth.float()) for s in scenes])
+            scenes = map(part.source.load, names)
+            # float32 takes half the memory
+            groups.append([derived(s, depth=None if s.depth is None else s.depth.float()) for s in scenes])
         shares = [part.share for part in self._parts]
         self._cut = Patches(
             groups,

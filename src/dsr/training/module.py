@@ -184,8 +184,10 @@ class SuperResolution(lightning.LightningModule):
             for metrics, each in scored:
                 pair = SurfacePair(each, batch["depth"], batch["rays"], unit=unit, image_dtype=torch.float32)
                 metrics.update(pair)  # type: ignore[operator]
-            number = index * self.trainer.world_size + self.trainer.global_rank if self._trainer else 0  # of the scene
-            if self._trainer is not None and self._trainer.loggers and number < _RENDERED_SCENES:
+            if self._trainer is None or not self._trainer.loggers:
+                return
+            number = index * self.trainer.world_size + self.trainer.global_rank  # of the scene
+            if number < _RENDERED_SCENES:
                 depth_lr = to_depth(batch["disparity_lr"].to(batch["depth"].dtype), batch)
                 picture = comparison(depth, batch["depth"], batch["rays"], batch["rgb"], depth_lr)
                 self._pictures[f"renderings/{self.sets[dataloader_idx]}_{number}"] = picture

@@ -40,7 +40,7 @@ _GREY_STEP, _COLOUR_STEP = 0.1, 0.05  # larger changes of log intensity and of c
 
 
 class Objective(abc.ABC):
-    """The loss of a training; a dataclass of plain values, or one with ``arguments`` and ``of``."""
+    """The loss of a training: a dataclass of plain values, or a class that overrides ``arguments`` and ``of``."""
 
     @property
     @abc.abstractmethod
@@ -70,7 +70,7 @@ class Objective(abc.ABC):
         """Raise a ValueError if a network cannot be trained with this loss on such patches, ``hinted`` or not."""
 
     def balanced(self, first_patches: Callable[[int], Sequence[Batch]]) -> Self:
-        """Return the loss with weights that are computed from as many patches as it asks for; itself without such."""
+        """Return the loss with weights that are computed from the first patches; itself if it has no such weights."""
         return self
 
 
@@ -309,7 +309,7 @@ def balance_weight(patches: Sequence[Batch], visual: VisualLoss = MSE_V) -> floa
     """
     if not patches:
         raise ValueError("patches: expected one or more to compute w from, got none")
-    ratios, pairs = [], []
+    ratios = []
     for patch in patches:
         x = patch["rays"][0, 0].double()
         focal = (x.numel() - 1) / float(x[-1] - x[0])
@@ -317,14 +317,14 @@ def balance_weight(patches: Sequence[Batch], visual: VisualLoss = MSE_V) -> floa
         extent = float(_range(patch["disparity_lr"][None]))
         ratios.append(float(patch["bf"]) * math.tan(_TILT) / (focal * depth * extent))
     w = float(torch.tensor(ratios, dtype=torch.float64).median()) / ((2 - 2 * math.cos(_TILT)) / 3)
-    if visual.name == "mse_v":
-        return w
-    for patch in patches:
-        batch = {name: value[None] for name, value in patch.items()}
-        scale = batch["depth"].shape[-1] // batch["disparity_lr"].shape[-1]
-        depth_map = to_depth(upsample_bicubic(batch["disparity_lr"], scale), batch)
-        pairs.append(SurfacePair(depth_map, batch["depth"], batch["rays"]))
-    return w * match_weight(visual, pairs)
+    return w if visual.name == "mse_v" else w * match_weight(visual, map(_interpolated, patches))
+
+
+def _interpolated(patch: Batch) -> SurfacePair:
+    """Return the bicubic interpolation of a patch's low-resolution disparity, and the patch."""
+    batch = {name: value[None] for name, value in patch.items()}
+    scale = batch["depth"].shape[-1] // batch["disparity_lr"].shape[-1]
+    return SurfacePair(to_depth(upsample_bicubic(batch["disparity_lr"], scale), batch), batch["depth"], batch["rays"])
 
 
 def _range(disparity: Tensor) -> Tensor:

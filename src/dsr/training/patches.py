@@ -105,8 +105,8 @@ class Patches(Dataset[Batch]):
         scene = derived(self._groups[group][index].crop(top, left, window, window), measured={})
         if soft:
             scene = soften(scene, random.uniform(0 if halved else _SOFT, _SOFTEST), halve=halved)
-        if everything is None and scene.depth is not None:
-            scene = derived(scene, depth=scene.depth.double())
+        if everything is None:
+            scene = derived(scene, depth=scene.true_depth.double())
         scene, factor = augment(scene, self._settings, random)
         generator = torch.Generator().manual_seed(int(random.integers(2**63)))
         if everything is None:
@@ -141,7 +141,7 @@ class Patches(Dataset[Batch]):
             number, best, highest = int(random.integers(len(scenes))), None, 0.0
             for _ in range(_WINDOW_TRIES):
                 top, left = (int(random.integers(length - size + 1)) for length in scenes[number].rgb.shape[-2:])
-                window = scenes[number].depth[:, top : top + size, left : left + size]  # type: ignore[index]  # checked
+                window = scenes[number].true_depth[:, top : top + size, left : left + size]
                 fraction = float(window.isfinite().float().mean())
                 if fraction > highest:
                     best, highest = (number, top, left), fraction
@@ -168,7 +168,7 @@ def augment(scene: Scene, settings: PatchSettings, random: np.random.Generator) 
     if settings.rotate:
         scene = rotate90(scene, int(random.integers(4)))
     factor = math.exp(random.uniform(-settings.depth_scale, settings.depth_scale)) if settings.depth_scale else 1.0
-    return derived(scene, depth=_depth_of(scene) * factor), factor
+    return derived(scene, depth=scene.true_depth * factor), factor
 
 
 def simulate_camera(rgb: Tensor, random: np.random.Generator) -> Tensor:
@@ -186,7 +186,7 @@ def soften(scene: Scene, sigma: float = 0.0, *, halve: bool = True) -> Scene:
     Inverse depth is blurred by a Gaussian of ``sigma`` pixels of the result. With ``halve``, the result is half as
     large: means of 2 x 2 pixels of the photo and of blurred inverse depth.
     """
-    inverse = _depth_of(scene).reciprocal()
+    inverse = scene.true_depth.reciprocal()
     if sigma:
         valid, width = inverse.isfinite(), sigma * (1 + halve)
         sums, weights = (
@@ -209,21 +209,15 @@ def mirror(scene: Scene, *, vertical: bool = False) -> Scene:
     else:
         camera = derived(camera, cx=camera.width - 1 - camera.cx)
     axis = -2 if vertical else -1
-    return derived(scene, rgb=scene.rgb.flip(axis), depth=_depth_of(scene).flip(axis), camera=camera, measured={})
+    return derived(scene, rgb=scene.rgb.flip(axis), depth=scene.true_depth.flip(axis), camera=camera, measured={})
 
 
 def rotate90(scene: Scene, turns: int) -> Scene:
     """Return the scene rotated counterclockwise by ``turns`` quarter turns, the camera included."""
     if turns % 4 == 0:
         return scene
-    rgb, depth = scene.rgb.rot90(turns, (-2, -1)), _depth_of(scene).rot90(turns, (-2, -1))
+    rgb, depth = scene.rgb.rot90(turns, (-2, -1)), scene.true_depth.rot90(turns, (-2, -1))
     return derived(scene, rgb=rgb, depth=depth, camera=scene.camera.rotate90(turns), measured={})
-
-
-def _depth_of(scene: Scene) -> Tensor:
-    """Return the true depth, which scenes to train with have."""
-    assert scene.depth is not None  # noqa: S101 - for the type checker
-    return scene.depth
 
 
 def check_patches(scenes: Sequence[Scene], settings: PatchSettings, scale: int) -> None:
