@@ -301,7 +301,7 @@ def _evaluate_scenes(prepared: _Prepared, study: Evaluation, progress: Progress)
     if left:
         with Pool(min(workers, len(left)), _begin, (prepared, since), threads, progress.say) as pool:
             results = _rounds(pool, list(left))
-            for scene, result in progress.track(results, "evaluate", len(left), label=itemgetter(0)):
+            for scene, result in progress.track(results, "evaluate", len(scenes), done=len(found), label=itemgetter(0)):
                 found[scene] = result
     return {scene: found[scene] for scene in scenes}
 

@@ -163,6 +163,7 @@ class ConsoleProgress(Progress):
         name: str,
         total: int | None = None,
         *,
+        done: int = 0,
         label: Callable[[Item], str] = str,
         lines: bool = True,
     ) -> Iterator[Item]:
@@ -170,17 +171,17 @@ class ConsoleProgress(Progress):
         if total is None:
             items = list(items)
             total = len(items)
-        with self.task(name, total) as task:
+        with self.task(name, total, done=done) as task:
             bar = self._bars.tasks[-1] if os.getpid() == self._process else None
             before = self._now()
-            for done, item in enumerate(items):
-                task(done, remark=label(item))
+            for number, item in enumerate(items, done):
+                task(number, remark=label(item))
                 yield item
                 now = self._now()
-                worthwhile = total <= _MANY or done + 1 == total or now - before >= _LONG
+                worthwhile = total <= _MANY or number + 1 == total or now - before >= _LONG
                 told = lines and not self._console.is_terminal and worthwhile and bar is not None
                 self._next_line = now + _NEXT_LINE if told else self._next_line
-                task(done + 1)
+                task(number + 1)
                 if told and bar is not None:
                     amount, *times = _facts_of(bar)
                     self.say(f"{_name_of(bar)}: {', '.join((amount, f'{now - before:.1f} s', *times))}")

@@ -37,13 +37,14 @@ class Progress:
         name: str,
         total: int | None = None,
         *,
+        done: int = 0,
         label: Callable[[Item], str] = str,
         lines: bool = True,
     ) -> Iterator[Item]:
         """Yield items, and show how many are done.
 
         Args:
-            total: number of items; None where ``items`` can be counted.
+            total: number of items, those included that are ``done`` already; None where ``items`` can be counted.
             lines: whether each item gets a line if the output is not a terminal; False if the caller prints one.
 
         """
