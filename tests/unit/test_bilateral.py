@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from depth_steps import step_beside_a_photo_edge
 from torch import Tensor
 
 from dsr.degradation.downsampling import Downsampling, make_sample
@@ -161,9 +162,7 @@ def test_joint_bilateral_is_the_mean_weighted_by_distance_and_colour(
 
 @pytest.mark.parametrize("slopes", [True, False])
 def test_step_along_a_photo_edge_stays_sharp_within_a_low_resolution_pixel(slopes: bool) -> None:
-    columns = torch.arange(64).expand(48, 64)
-    rgb = torch.where(columns < 32, 0.2, 0.8).double().expand(3, 48, 64).contiguous()
-    truth = torch.where(columns < 32, 5.0, 9.0).double()
+    rgb, truth = step_beside_a_photo_edge()
     sample = _joint_bilateral_sample(truth, rgb)
     ours = np.abs(_disparity(sample, JointBilateral(slopes=slopes)(sample)) - truth.numpy())
     bilinear = np.abs(_disparity(sample, Interpolation("bilinear")(sample)) - truth.numpy())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from depth_steps import step_beside_a_photo_edge
 from torch import Tensor
 
 from dsr.degradation.downsampling import Downsampling, Kernel, make_sample
@@ -63,9 +64,7 @@ def test_smoother_solves_lines_of_any_length(length: int) -> None:
 
 @pytest.mark.parametrize("slopes", [True, False])
 def test_step_along_a_photo_edge_stays_sharp_within_a_low_resolution_pixel(slopes: bool) -> None:
-    columns = torch.arange(64).expand(48, 64)
-    rgb = torch.where(columns < 32, 0.2, 0.8).double().expand(3, 48, 64).contiguous()
-    truth = torch.where(columns < 32, 5.0, 9.0).double()
+    rgb, truth = step_beside_a_photo_edge()
     sample = _sample(truth, rgb)
     results = (FastGlobalSmoother(slopes=slopes), Interpolation("bilinear"))
     ours, bilinear = (to_range(method(sample), sample.camera, "disparity")[0] for method in results)
