@@ -27,7 +27,7 @@ from unittest.mock import MagicMock
 import torch
 from torch import Tensor, nn
 
-from dsr.methods.networks.normalisation import normalise_imagenet
+from dsr.methods.images import normalise_imagenet
 from dsr.methods.networks.peers.peer_network import PeerUpsampler, read_tensors
 from dsr.methods.recipe import Run, read_recipe
 

@@ -51,10 +51,9 @@ from dsr.inference.plausibility import find_outliers, within_measured
 from dsr.inference.sequences import View, fuse_views
 from dsr.inference.working_size import find_noise, find_sensor
 from dsr.methods.glass import probability_of_glass
-from dsr.methods.inpainting import inpaint
+from dsr.methods.images import estimate_noise, estimate_sensor_noise, inpaint
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.msg_net import MSGNet
-from dsr.methods.noise_level import estimate_noise, estimate_sensor_noise
 from dsr.methods.recipe import Known, Run, read_recipe
 from dsr.methods.weights import packaged_names, packaged_weights
 from dsr.sample import Scene

@@ -13,9 +13,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.camera import Camera, from_range, to_range
+from dsr.methods.images import upsample_bicubic
 from dsr.methods.networks.msg_net import VariantName
 from dsr.methods.networks.network import Precision
-from dsr.methods.networks.normalisation import upsample_bicubic
 from dsr.methods.networks.trained import TrainedNetwork
 from dsr.sample import DepthSample
 

@@ -7,9 +7,8 @@ import torch
 from small_scenes import maps, photos
 from torch import Tensor
 
-from dsr.methods.classical.finite_differences import upsample_linear_border
+from dsr.methods.images import compute_min_max, upsample_linear_border
 from dsr.methods.networks.ddrnet import DDRNet
-from dsr.methods.networks.normalisation import compute_min_max
 
 # (inputs, outputs, size) of the convolutions of the authors' convResnet and hypercolumn
 DENOISING = [(1, 32, 3), (32, 64, 3), (64, 128, 3), *[(128, 128, 3)] * 4, (256, 64, 3), (128, 32, 3), (64, 1, 3)]

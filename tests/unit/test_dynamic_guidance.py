@@ -9,7 +9,7 @@ from small_scenes import maps, photos, plane_map
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.methods.classical.finite_differences import box_mean, repeat_blocks, upsample_linear_border
+from dsr.methods.images import box_mean, repeat_blocks, upsample_linear_border
 from dsr.methods.networks.dynamic_guidance import (
     WIDTHS,
     DynamicGuidance,

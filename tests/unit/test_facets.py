@@ -10,7 +10,7 @@ from small_scenes import maps, photos, plane_map
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.methods.inpainting import inpaint
+from dsr.methods.images import inpaint
 from dsr.methods.networks.facets import Facets
 from dsr.methods.networks.facets_planes import stencil
 

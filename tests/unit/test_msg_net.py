@@ -12,9 +12,9 @@ from scipy import ndimage
 from torch import Tensor
 
 from dsr.geometry.camera import Camera, from_range, to_range
+from dsr.methods.images import mean3x3, normalise, upsample_bicubic
 from dsr.methods.networks.msg_net import VARIANTS, MSGNet, VariantName, guidance_map, output_drift
 from dsr.methods.networks.network import NetworkUpsampler
-from dsr.methods.networks.normalisation import mean3x3, normalise, upsample_bicubic
 from dsr.sample import DepthSample
 from dsr.utils.ratios import SCALES
 

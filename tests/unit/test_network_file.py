@@ -15,10 +15,10 @@ from torch.nn import functional
 
 from dsr.geometry.camera import to_range
 from dsr.methods.base import Method
+from dsr.methods.images import resize_bicubic
 from dsr.methods.networks.msg_net import MSGNet
 from dsr.methods.networks.network import NetworkUpsampler
 from dsr.methods.networks.network_file import NetworkFile
-from dsr.methods.networks.normalisation import resize_bicubic
 from dsr.methods.networks.onnx_export import OnnxGraph, write_onnx
 from dsr.sample import DepthSample
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from dsr.methods.inpainting import inpaint
+from dsr.methods.images import inpaint
 
 
 def _two_surfaces(height: int = 24, width: int = 32) -> tuple[torch.Tensor, torch.Tensor]:

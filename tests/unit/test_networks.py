@@ -9,11 +9,11 @@ import pytest
 import torch
 from small_scenes import maps, photos
 
+from dsr.methods.images import compute_min_max
 from dsr.methods.networks.ddrnet import DDRNet
 from dsr.methods.networks.dynamic_guidance import DynamicGuidance
 from dsr.methods.networks.facets import Facets
 from dsr.methods.networks.network import DisparityNetwork, NetworkUpsampler
-from dsr.methods.networks.normalisation import compute_min_max
 from dsr.methods.networks.pdn import PrimalDualNetwork
 from dsr.methods.networks.sparse_to_dense import SparseToDense
 

@@ -23,7 +23,7 @@ from dsr.degradation.downsampling import Downsampling, Measured, make_sample
 from dsr.degradation.noise import GaussianMultiplicative, Kinect
 from dsr.degradation.random_degradation import Everything
 from dsr.geometry.camera import Camera
-from dsr.methods.networks.normalisation import normalise
+from dsr.methods.images import normalise
 from dsr.sample import CENTIMETRES, Scene, Unit
 from dsr.training.data_module import Part, PatchData, WholeScenes
 from dsr.training.degradation import Batch, Degradation, to_tensors

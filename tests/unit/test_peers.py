@@ -16,8 +16,7 @@ from torch import Tensor, nn
 
 from dsr.geometry.camera import Camera, from_range
 from dsr.methods.base import Cost
-from dsr.methods.inpainting import inpaint
-from dsr.methods.networks.normalisation import resize_bicubic
+from dsr.methods.images import inpaint, resize_bicubic
 from dsr.methods.networks.peers.local_filters import SVLRM
 from dsr.methods.networks.peers.peer import PEERS, Peer
 from dsr.methods.networks.peers.peer_network import PeerNetwork, PeerUpsampler, fold_batch_norm, load_peer

@@ -13,7 +13,7 @@ from PIL import Image
 from small_scenes import plane, sample_of
 from torch import Tensor
 
-from dsr.methods.inpainting import inpaint
+from dsr.methods.images import inpaint
 from dsr.methods.recipe import read_recipe
 from dsr.utils.configuration import ConfigError
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from dsr.geometry.camera import Camera
 from dsr.inference import upsample_surface
 from dsr.inference.rims import settle_holes
-from dsr.methods.inpainting import inpaint
+from dsr.methods.images import inpaint
 
 NEAR, FAR = 1.0, 2.5
 CAMERA = Camera(width=160, height=128, fx=150.0, fy=150.0, cx=79.5, cy=63.5)

@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.surface import depth_to_normals
-from dsr.methods.noise_level import estimate_noise, estimate_sensor_noise, normal_noise_deg
+from dsr.methods.images import estimate_noise, estimate_sensor_noise, normal_noise_deg
 
 
 def _ramp() -> Tensor:

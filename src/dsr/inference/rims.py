@@ -23,7 +23,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.hole_size import distance_to_known, is_scattered
-from dsr.methods.inpainting import inpaint
+from dsr.methods.images import inpaint
 
 _STEP = 1.1
 """Ratio of the depths around a pixel from which they are of two surfaces."""

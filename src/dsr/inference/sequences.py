@@ -22,7 +22,7 @@ from dsr.geometry.camera import Camera
 from dsr.geometry.rigid_motion import Matrix, as_rigid, relative
 from dsr.geometry.warping import source_pixels, warp_depth
 from dsr.inference.working_size import find_noise
-from dsr.methods.noise_level import estimate_sensor_noise
+from dsr.methods.images import estimate_sensor_noise
 
 _DEVIATIONS = 3.0
 """Difference of two readings of a surface, in standard deviations of the difference, beyond which they disagree."""

@@ -11,7 +11,7 @@ import numpy as np
 from torch import Tensor
 
 from dsr.geometry.camera import Camera, RangeType
-from dsr.methods.inpainting import inpaint
+from dsr.methods.images import inpaint
 from dsr.methods.tiling import TILE, UNTILED
 from dsr.sample import DepthSample
 from dsr.utils.configuration import Node

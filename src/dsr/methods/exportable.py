@@ -39,7 +39,7 @@ def _scripted(function: Callable[P, T]) -> Callable[P, T]:
 
 @_scripted
 def fill_in_graph(values: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Fill the holes of maps as :func:`dsr.methods.inpainting.inpaint` does, as a loop in the graph.
+    """Fill the holes of maps as :func:`dsr.methods.images.inpaint` does, as a loop in the graph.
 
     Both are (B, 1, h, w), 0 in holes; ``weight`` is 1 elsewhere, and in the result 0 in an image without a known value.
     """
@@ -69,7 +69,7 @@ def neighbours_of(x: Tensor) -> Tensor:
 
 @_scripted
 def fill_by_colour_in_graph(x: Tensor, affinity: Tensor, alike: float) -> Tensor:
-    """Fill the holes of a map as :func:`dsr.methods.inpainting.inpaint` does with a photo.
+    """Fill the holes of a map as :func:`dsr.methods.images.inpaint` does with a photo.
 
     ``x`` (1, 1, h, w) is NaN in holes, ``affinity`` (1, 8, h, w) that of each pixel and its neighbours; pixels of an
     affinity of ``alike`` are filled before others. An image without a known value stays NaN.

@@ -10,7 +10,7 @@ import torch
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.degradation.noise import Noise
 from dsr.geometry.camera import baseline_times_focal
-from dsr.methods.networks.normalisation import compute_min_max
+from dsr.methods.images import compute_min_max
 from dsr.sample import DepthSample, Scene
 
 Batch = dict[str, Any]  # tensors by name; whole scenes also have ``unit``, the benchmark's as plain values

@@ -20,10 +20,9 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.surface import angle_between
-from dsr.methods.classical.finite_differences import grey
+from dsr.methods.images import compute_min_max, grey, upsample_bicubic
 from dsr.methods.networks.dct import dct2, idct2, laplacian_eigenvalues
 from dsr.methods.networks.network import Answer, DisparityNetwork
-from dsr.methods.networks.normalisation import compute_min_max, upsample_bicubic
 from dsr.metrics.functional import SurfacePair, masked_mean, mse_v
 from dsr.metrics.losses import MSE_V, VisualLoss, VisualLossName, l1, lap1, make_visual_loss, match_weight, mse
 from dsr.training.degradation import Batch

@@ -23,7 +23,7 @@ from torch.utils.data import Dataset
 from dsr.degradation.downsampling import Downsampling
 from dsr.degradation.random_degradation import Everything
 from dsr.geometry.camera import baseline_times_focal
-from dsr.methods.networks.normalisation import compute_min_max
+from dsr.methods.images import compute_min_max
 from dsr.sample import AllHolesError, Scene
 from dsr.training.degradation import Batch, Degradation, to_tensors
 from dsr.training.settings import PatchSettings

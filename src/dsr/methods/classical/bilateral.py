@@ -28,7 +28,7 @@ from torch import Tensor
 from dsr.geometry.camera import RangeType
 from dsr.methods.base import Abilities, Cost
 from dsr.methods.classical.photo_guided import Guided, GuidedMethod, expect_positive, expect_window
-from dsr.methods.inpainting import inpaint
+from dsr.methods.images import inpaint
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 

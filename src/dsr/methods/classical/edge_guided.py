@@ -35,9 +35,8 @@ from torch.nn import functional
 from dsr.geometry.camera import from_range
 from dsr.methods.base import Abilities, Cost, Method, whole_scale
 from dsr.methods.classical.edge_map import predict_edge_map
-from dsr.methods.classical.finite_differences import box_mean, repeat_blocks, upsample_linear_border
 from dsr.methods.classical.photo_guided import estimate_slopes, expect_positive, expect_window
-from dsr.methods.inpainting import inpaint
+from dsr.methods.images import box_mean, inpaint, repeat_blocks, upsample_linear_border
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps, part_of
 

@@ -45,9 +45,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.methods.base import NoSolutionError
-from dsr.methods.classical.finite_differences import box_mean, extend_linearly, upsample_linear_border
 from dsr.methods.classical.photo_guided import estimate_slopes
-from dsr.methods.inpainting import inpaint
+from dsr.methods.images import box_mean, extend_linearly, inpaint, upsample_linear_border
 from dsr.utils.progress import Steps
 
 PATCH = 11  # rows and columns of a patch, in high-resolution pixels

@@ -17,7 +17,7 @@ from torch import Tensor
 from dsr.degradation.downsampling import cubic_kernel
 from dsr.geometry.camera import RANGE_TYPES, Camera, RangeType, from_range, to_range
 from dsr.methods.base import Abilities, Cost, InverseSample, InverseSurface, Method
-from dsr.methods.networks.normalisation import lr_coordinates
+from dsr.methods.images import lr_coordinates
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 

@@ -20,8 +20,7 @@ from torch import Tensor
 
 from dsr.geometry.camera import from_range
 from dsr.methods.base import Abilities, Cost, Method
-from dsr.methods.inpainting import inpaint
-from dsr.methods.networks.normalisation import lr_coordinates
+from dsr.methods.images import inpaint, lr_coordinates
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 

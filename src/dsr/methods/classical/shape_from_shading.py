@@ -35,9 +35,8 @@ from torch import Tensor
 
 from dsr.geometry.camera import RangeType
 from dsr.methods.base import Abilities, Cost, Method, expect_limits, whole_scale
-from dsr.methods.classical.finite_differences import upsample_linear_border
 from dsr.methods.classical.srfs_admm import ShadingProblem, ShadingSolver, Weights
-from dsr.methods.inpainting import inpaint
+from dsr.methods.images import inpaint, upsample_linear_border
 from dsr.sample import DepthSample
 from dsr.utils.decoding import decode_pixels
 from dsr.utils.guards import MOST_FILE, pixels_beside, read_limited

@@ -35,8 +35,8 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.surface import length
-from dsr.methods.classical.finite_differences import box_mean, repeat_blocks
 from dsr.methods.classical.potts import Regions, boundary_length, fit_albedo, fuse
+from dsr.methods.images import box_mean, repeat_blocks
 
 _TINY = 1e-12  # minimum length of m, which avoids division by 0
 

@@ -35,18 +35,18 @@ from torch import Tensor
 
 from dsr.geometry.camera import from_range
 from dsr.methods.base import Abilities, Cost, Method, expect_limits, whole_scale
-from dsr.methods.classical.finite_differences import (
+from dsr.methods.images import (
     box_mean,
     divergence,
+    estimate_sensor_noise,
     gradient,
     grey,
+    inpaint,
+    normalise,
     repeat_blocks,
     sum_adjacent,
     upsample_linear_border,
 )
-from dsr.methods.inpainting import inpaint
-from dsr.methods.networks.normalisation import normalise
-from dsr.methods.noise_level import estimate_sensor_noise
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
 

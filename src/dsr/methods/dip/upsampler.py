@@ -31,11 +31,9 @@ from dsr.degradation.downsampling import Downsampling, downsample_depth, scene_g
 from dsr.geometry.shading import comparison
 from dsr.geometry.surface import depth_to_normals
 from dsr.methods.base import WORKSPACE, Abilities, Cost, Method, whole_scale
-from dsr.methods.classical.finite_differences import grey
 from dsr.methods.dip.skip_net import SkipNet, levels_for
+from dsr.methods.images import compute_min_max, estimate_noise, grey, mean3x3, normal_noise_deg
 from dsr.methods.networks.network import DTYPES, Precision
-from dsr.methods.networks.normalisation import compute_min_max, mean3x3
-from dsr.methods.noise_level import estimate_noise, normal_noise_deg
 from dsr.metrics.classes import compute_means, in_table_units
 from dsr.metrics.functional import SurfacePair, rmse_v
 from dsr.metrics.losses import VisualLossName, lap1, make_visual_loss, match_weight, mse

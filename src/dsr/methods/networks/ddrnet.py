@@ -23,7 +23,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dsr.methods.classical.finite_differences import grey, upsample_linear_border
+from dsr.methods.images import grey, upsample_linear_border
 from dsr.methods.networks.network import NormalisedNetwork
 from dsr.utils.ratios import check_scale
 

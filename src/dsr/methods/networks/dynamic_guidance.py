@@ -51,7 +51,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.degradation.downsampling import check_scale
-from dsr.methods.classical.finite_differences import box_mean, upsample_linear_border
+from dsr.methods.images import box_mean, upsample_linear_border
 from dsr.methods.networks.network import NormalisedNetwork
 
 WIDTHS = tuple(1e-3 * 4**j for j in range(6))  # tau_j, in the unit of the map: from 1/1000 to about 1

@@ -37,9 +37,8 @@ from torch.nn import functional
 
 from dsr.degradation.downsampling import Downsampling
 from dsr.degradation.hints import FACTS, known_kernels
-from dsr.methods.classical.finite_differences import repeat_blocks
 from dsr.methods.exportable import every, exporting, median_in_graph, quantiles_in_graph
-from dsr.methods.inpainting import inpaint
+from dsr.methods.images import inpaint, repeat_blocks, upsample_bicubic
 from dsr.methods.networks.facets import Facets, start_from_another_factor, start_from_facets
 from dsr.methods.networks.facets_layers import (
     HEAD,
@@ -56,7 +55,6 @@ from dsr.methods.networks.facets_layers import (
 )
 from dsr.methods.networks.facets_planes import NEIGHBOURS, Stencil, average_planes, mix_planes, smooth, stencil
 from dsr.methods.networks.network import Answer, DisparityNetwork, expect_rgb_size
-from dsr.methods.networks.normalisation import upsample_bicubic
 from dsr.utils.progress import Steps
 
 # layers at the low resolution

@@ -21,10 +21,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.degradation.downsampling import check_scale
-from dsr.methods.classical.finite_differences import LUMA
-from dsr.methods.inpainting import inpaint
+from dsr.methods.images import LUMA, compute_min_max, inpaint, mean3x3, normalise, upsample_bicubic
 from dsr.methods.networks.network import DisparityNetwork
-from dsr.methods.networks.normalisation import compute_min_max, mean3x3, normalise, upsample_bicubic
 
 VariantName = Literal["hui", "voynov", "dsr"]
 

@@ -18,8 +18,7 @@ from torch.nn import functional
 
 from dsr.geometry.camera import from_range, to_range
 from dsr.methods.base import Abilities, Cost, InverseSample, InverseSurface, Method
-from dsr.methods.inpainting import inpaint
-from dsr.methods.networks.normalisation import compute_min_max
+from dsr.methods.images import compute_min_max, inpaint
 from dsr.methods.tiling import TILE, UNTILED, AxisTile, blend_tiles, split_axis
 from dsr.sample import DepthSample
 from dsr.utils.compute_device import widened

@@ -17,7 +17,6 @@ from torch.nn import functional
 
 from dsr.geometry.camera import RANGE_TYPES
 from dsr.methods.base import Abilities, Cost, Method
-from dsr.methods.classical.finite_differences import LUMA
 from dsr.methods.external import (
     QUANTITIES,
     Fit,
@@ -27,8 +26,7 @@ from dsr.methods.external import (
     to_depth,
     within_limits,
 )
-from dsr.methods.inpainting import inpaint
-from dsr.methods.networks.normalisation import normalise, normalise_imagenet, resize_bicubic
+from dsr.methods.images import LUMA, inpaint, normalise, normalise_imagenet, resize_bicubic
 from dsr.methods.networks.onnx_export import import_library
 from dsr.sample import DepthSample
 from dsr.utils.guards import expect_one_of, refusing

@@ -58,8 +58,8 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from dsr.degradation.downsampling import check_scale
-from dsr.methods.classical.finite_differences import extend_linearly, upsample_linear_border
 from dsr.methods.exportable import apply
+from dsr.methods.images import extend_linearly, upsample_linear_border
 from dsr.methods.networks.facets_planes import stencil
 from dsr.methods.networks.network import NormalisedNetwork
 

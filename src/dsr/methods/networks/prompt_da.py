@@ -25,8 +25,7 @@ from torch.nn import functional
 
 from dsr.methods.base import Abilities, Cost, Method
 from dsr.methods.external import within_limits
-from dsr.methods.inpainting import inpaint
-from dsr.methods.networks.normalisation import normalise_imagenet, resize_bicubic
+from dsr.methods.images import inpaint, normalise_imagenet, resize_bicubic
 from dsr.sample import DepthSample
 from dsr.utils.configuration import expect_library
 from dsr.utils.guards import expect_bytes, parse_json, read_limited, refusing

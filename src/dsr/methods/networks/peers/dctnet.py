@@ -19,8 +19,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.methods.base import Cost
+from dsr.methods.images import normalise_imagenet
 from dsr.methods.networks.dct import dct2, idct2, laplacian_eigenvalues
-from dsr.methods.networks.normalisation import normalise_imagenet
 from dsr.methods.networks.peers.peer_network import PeerNetwork, rename
 
 FEATURES = 64

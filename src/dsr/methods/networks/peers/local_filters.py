@@ -23,7 +23,7 @@ from torch.nn import functional
 
 from dsr.degradation.downsampling import cubic_kernel
 from dsr.methods.base import Cost
-from dsr.methods.classical.finite_differences import grey
+from dsr.methods.images import grey
 from dsr.methods.networks.peers.peer_network import SWAPPED_LUMA, PeerNetwork, fold_batch_norm, rename
 
 _WIDTH, _DEPTH, _SLOPE = 64, 10, 0.1

@@ -22,10 +22,8 @@ from torch.nn import functional
 
 from dsr.geometry.camera import RANGE_TYPES, RangeType, from_range, to_range
 from dsr.methods.base import Abilities, Cost, Method
-from dsr.methods.classical.finite_differences import LUMA
-from dsr.methods.inpainting import inpaint
+from dsr.methods.images import LUMA, compute_min_max, inpaint, normalise, resize_bicubic
 from dsr.methods.networks.network import DTYPES, Precision
-from dsr.methods.networks.normalisation import compute_min_max, normalise, resize_bicubic
 from dsr.methods.networks.weight_files import load_parameters
 from dsr.methods.tiling import TILE, UNTILED, blend_tiles, split_axis
 from dsr.sample import DepthSample

@@ -19,8 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.methods.base import Cost
-from dsr.methods.classical.finite_differences import grey
-from dsr.methods.networks.normalisation import normalise_imagenet
+from dsr.methods.images import grey, normalise_imagenet
 from dsr.methods.networks.peers.peer_network import SWAPPED_LUMA, PeerNetwork, fold_batch_norm, rename
 
 _FACTOR, _WIDTH, _SHARED, _LAST = 4, 32, 16, 64

@@ -1,0 +1,268 @@
+"""Operations on images and maps that methods share: values, sizes, differences, holes and noise."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from dsr.geometry.camera import Camera
+from dsr.methods.exportable import exporting, fill_by_colour_in_graph, fill_in_graph, neighbours_of
+
+LUMA = (0.299, 0.587, 0.114)  # weights of red, green and blue in the luma (ITU-R BT.601)
+_IMAGENET_MEAN, _IMAGENET_DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+_REACH = 2  # half width of Keys' kernel in low-resolution pixels
+_CONTRAST = 0.02  # standard deviation of the difference of the colours of a surface's neighbouring pixels in [0, 1]
+_ALIKE = 0.3  # affinity from which two pixels count as of one surface
+_LEAST = 1e-4  # affinity of pixels of different surfaces
+_FRACTION, _QUANTILE = 0.1, 0.12566  # a tenth of a normal variable's absolute values are below so many deviations
+_QUARTER, _QUARTILE = 0.25, 0.31864  # a quarter of them are below so many
+_STRIDES = (1, 2)  # distances of compared pixels: noise that neighbours share shows at a distance of two pixels
+
+
+def grey(rgb: Tensor, weights: Sequence[float] = LUMA) -> Tensor:
+    """Return the weighted sum of the channels of (B, 3, H, W) images, by default the luma, (B, 1, H, W)."""
+    return (rgb * rgb.new_tensor(weights)[:, None, None]).sum(dim=1, keepdim=True)
+
+
+def normalise_imagenet(rgb: Tensor) -> Tensor:
+    """Return images, (B, 3, H, W) in 0..1, minus the mean colour of ImageNet, divided by its standard deviation."""
+    mean, deviation = (rgb.new_tensor(values).view(3, 1, 1) for values in (_IMAGENET_MEAN, _IMAGENET_DEVIATION))
+    return (rgb - mean) / deviation
+
+
+class Normalised(NamedTuple):
+    """A map normalised to 0..1 per sample, (B, 1, H, W), and its minimum and range, (B, 1, 1, 1), to undo it."""
+
+    values: Tensor
+    minimum: Tensor
+    value_range: Tensor
+
+
+def normalise(x: Tensor, min_max: Tensor | None = None) -> Normalised:
+    """Return (x - min) / (max - min) per sample of (B, 1, H, W), over the finite values; the others become 0.
+
+    A constant map becomes 0 with a range of 0. Without a finite value, the minimum is NaN. ``min_max`` (B, 2, 1, 1) are
+    the minimum and maximum to use; None for those of the map.
+    """
+    min_max = compute_min_max(x) if min_max is None else min_max.to(x)
+    minimum = min_max[:, :1]
+    value_range = min_max[:, 1:] - minimum  # -inf where nothing is finite
+    values = torch.where(x.isfinite(), x - minimum, 0) / torch.where(value_range > 0, value_range, 1)
+    return Normalised(values, torch.where(value_range >= 0, minimum, torch.nan), value_range)
+
+
+def compute_min_max(x: Tensor) -> Tensor:
+    """Return the minimum and the maximum finite value of each map of (B, 1, H, W), (B, 2, 1, 1).
+
+    They are infinity and minus infinity for a map without a finite value.
+    """
+    invalid, dims = ~x.isfinite(), (-3, -2, -1)
+    lowest = x.masked_fill(invalid, torch.inf).amin(dims, keepdim=True)
+    return torch.cat((lowest, x.masked_fill(invalid, -torch.inf).amax(dims, keepdim=True)), dim=1)
+
+
+def mean3x3(x: Tensor) -> Tensor:
+    """Return the 3 x 3 mean of (B, C, H, W); edge pixels are repeated."""
+    return functional.avg_pool2d(functional.pad(x, (1, 1, 1, 1), mode="replicate"), 3, stride=1)
+
+
+def box_mean(x: Tensor, scale: int) -> Tensor:
+    """Return the mean of each scale x scale block, (B, C, H, W) -> (B, C, H / scale, W / scale)."""
+    return functional.avg_pool2d(x, scale)
+
+
+def repeat_blocks(x: Tensor, scale: int) -> Tensor:
+    """Repeat each pixel as a scale x scale block, (B, C, h, w) -> (B, C, scale h, scale w)."""
+    batch, channels, height, width = x.shape
+    blocks = x[:, :, :, None, :, None].expand(batch, channels, height, scale, width, scale)
+    return blocks.reshape(batch, channels, height * scale, width * scale)
+
+
+def resize_bicubic(x: Tensor, size: tuple[int, int]) -> Tensor:
+    """Enlarge (B, 1, h, w) to (B, 1, *size) as Pillow does: Keys' cubic kernel with a = -0.5, cut off at the border."""
+    return functional.interpolate(x, size=size, mode="bicubic", align_corners=False, antialias=True)
+
+
+def upsample_bicubic(x: Tensor, scale: int) -> Tensor:
+    """Upsample (B, 1, h, w) to (B, 1, scale h, scale w), as :func:`resize_bicubic` does."""
+    height, width = x.shape[-2:]
+    return resize_bicubic(x, (scale * height, scale * width))
+
+
+def upsample_linear_border(lr: Tensor, scale: int) -> Tensor:
+    """Upsample (B, 1, h, w) bicubically to (B, 1, scale h, scale w); planes are exact up to the border."""
+    if scale == 1:
+        return lr.clone()
+    edge = _REACH * scale
+    return upsample_bicubic(extend_linearly(lr, _REACH), scale)[..., edge:-edge, edge:-edge].contiguous()
+
+
+def extend_linearly(x: Tensor, border: int) -> Tensor:
+    """Extrapolate (B, C, h, w) linearly by ``border`` pixels on each side; planes are continued exactly."""
+    for dim in (-1, -2):
+        count = x.shape[dim]
+        first, last = x.narrow(dim, 0, 1), x.narrow(dim, count - 1, 1)
+        before = first - x.narrow(dim, min(1, count - 1), 1)  # 0 where there is a single pixel
+        after = last - x.narrow(dim, max(count - 2, 0), 1)
+        steps = torch.arange(1, border + 1, dtype=x.dtype, device=x.device).view(-1, *[1] * (-1 - dim))
+        x = torch.cat((first + steps.flip(0) * before, x, last + steps * after), dim=dim)
+    return x
+
+
+def lr_coordinates(camera: Camera, camera_lr: Camera, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor]:
+    """Return the low-resolution row of each high-resolution row, (H,), and likewise the columns, (W,), in float64."""
+    rows = torch.arange(camera.height, dtype=torch.float64, device=device)
+    columns = torch.arange(camera.width, dtype=torch.float64, device=device)
+    return (
+        (rows - camera.cy) / camera.fy * camera_lr.fy + camera_lr.cy,
+        (columns - camera.cx) / camera.fx * camera_lr.fx + camera_lr.cx,
+    )
+
+
+def gradient(x: Tensor) -> Tensor:
+    """Return forward differences along u and v, (B, C, H, W) -> (B, 2, C, H, W); 0 in the last column and row."""
+    along_u, along_v = functional.pad(x.diff(dim=-1), (0, 1)), functional.pad(x.diff(dim=-2), (0, 0, 0, 1))
+    return torch.stack((along_u, along_v), dim=1)
+
+
+def divergence(p: Tensor) -> Tensor:
+    """Return minus the adjoint of :func:`gradient`, (B, 2, C, H, W) -> (B, C, H, W).
+
+    The last column of p along u and its last row along v are ignored.
+    """
+    return _collect(p, -1)
+
+
+def sum_adjacent(p: Tensor) -> Tensor:
+    """Return the sum of the values at the differences that use each pixel, (B, 2, C, H, W) -> (B, C, H, W)."""
+    return _collect(p, 1)
+
+
+def _collect(p: Tensor, sign: int) -> Tensor:
+    """Add the values of differences, (B, 2, C, H, W), to their first pixels and, with a sign, to their second ones."""
+    total = torch.zeros_like(p[:, 0])
+    for direction, dim in ((0, -1), (1, -2)):
+        count = p.shape[dim] - 1
+        values = p[:, direction].narrow(dim, 0, count)
+        total.narrow(dim, 0, count).add_(values)
+        total.narrow(dim, 1, count).add_(values, alpha=sign)
+    return total
+
+
+def inpaint(x: Tensor, photo: Tensor | None = None) -> Tensor:
+    """Replace the non-finite values of (B, 1, h, w) by means of the valid ones in 3 x 3 pixels, from outside in.
+
+    With a photo, the means are weighted by how alike the colours are, and pixels of the colour of a valid neighbour are
+    filled before others, so that values stop at the photo's edges. An image without a valid value stays unchanged. The
+    photo is (B, 3, H, W) in [0, 1], of any size.
+    """
+    if not exporting() and bool(x.isfinite().all()):
+        return x
+    if photo is None:
+        return _fill_evenly(x)
+    if exporting():  # one factor for both axes
+        colours = mean3x3(functional.avg_pool2d(photo.to(x.dtype), int(photo.shape[-1] // x.shape[-1])))
+        difference = (neighbours_of(colours) - colours[:, None]).square().sum(dim=2)  # (B, 8, h, w)
+        affinity = (difference / (-2 * _CONTRAST**2)).exp().clamp(min=_LEAST)
+        return fill_by_colour_in_graph(x, affinity, _ALIKE)
+    colours = mean3x3(functional.adaptive_avg_pool2d(photo.to(x.dtype), (x.shape[-2], x.shape[-1])))
+    return torch.stack([_fill_by_colour(each[0], colour) for each, colour in zip(x, colours, strict=True)])[:, None]
+
+
+def _fill_evenly(x: Tensor) -> Tensor:
+    """Return the maps, (B, 1, h, w), filled with plain means."""
+    valid = x.isfinite()
+    values, weight = torch.where(valid, x, 0), valid.to(x.dtype)
+    if exporting():
+        values, weight = fill_in_graph(values, weight)
+        return torch.where(weight > 0, values, torch.nan)
+    for _ in range(max(x.shape[-2:])):
+        total, fraction = (functional.avg_pool2d(each, 3, stride=1, padding=1) for each in (values, weight))
+        new = (weight == 0) & (fraction > 0)
+        if not bool(new.any()):
+            break
+        values = torch.where(new, total / torch.where(fraction > 0, fraction, 1), values)
+        weight = torch.where(new, 1, weight)
+    return torch.where(weight > 0, values, torch.nan)
+
+
+def _fill_by_colour(x: Tensor, colours: Tensor) -> Tensor:
+    """Return a map, (h, w), filled with means weighted by the colours, (3, h, w)."""
+    height, width = x.shape
+    values = functional.pad(x, (1, 1, 1, 1), value=torch.nan).flatten()
+    colour = functional.pad(colours, (1, 1, 1, 1)).flatten(1)
+    inside = functional.pad(torch.ones_like(x, dtype=torch.bool), (1, 1, 1, 1)).flatten()
+    steps = [row * (width + 2) + column for row in (-1, 0, 1) for column in (-1, 0, 1) if row or column]
+    around = torch.tensor(steps, device=x.device)
+    unknown = values.isnan() & inside
+    known = values.isfinite()
+    places = unknown.nonzero()[:, 0]
+    front = places[known[places[:, None] + around].any(dim=1)]  # beside what has just become known
+    waiting, every = torch.zeros_like(known), False  # beside known pixels, none of which is alike
+    while front.numel():
+        beside = front[:, None] + around  # (n, 8)
+        difference = (colour[:, beside] - colour[:, front, None]).square().sum(dim=0)
+        affinity = (difference / (-2 * _CONTRAST**2)).exp().clamp(min=_LEAST) * known[beside]
+        first = (affinity.amax(dim=1) >= _ALIKE) | every
+        waiting[front] = ~first
+        filled, affinity, beside = front[first], affinity[first], beside[first]
+        values[filled] = (affinity * values[beside].nan_to_num(0)).sum(dim=1) / affinity.sum(dim=1)
+        known[filled] = True
+        unknown[filled] = False
+        beside = beside.flatten()
+        front = beside[unknown[beside]].unique()
+        every = not front.numel()
+        if every:
+            front = waiting.nonzero()[:, 0]
+    return values.view(height + 2, width + 2)[1:-1, 1:-1]
+
+
+def estimate_noise(depth_lr: Tensor) -> float:
+    """Return the standard deviation of a depth map's relative noise, estimated from the map alone.
+
+    Immerkaer, *Fast Noise Variance Estimation*, CVIU 1996: the difference of two Laplacians, which is 0 on planes and
+    on straight edges; here of the logarithm of depth, with the 10th percentile instead of the mean: noise is
+    everywhere, while steps and curves of the surface are not.
+
+    ``depth_lr`` is (1, 1, h, w) in metres, NaN in holes; the result is 0 without a valid 3 x 3 window.
+    """
+    return _low_quantile(depth_lr.double().log(), 1, _FRACTION) / _QUANTILE / 6
+
+
+def estimate_sensor_noise(values: Tensor) -> float:
+    """Return the standard deviation of a map's noise, also where a sensor rounds its values or neighbours share noise.
+
+    As :func:`estimate_noise`, with two differences: a quarter of the responses instead of a tenth, because rounding
+    makes many of them 0, and the larger of the estimates from neighbouring pixels and from every second one, because
+    the first misses noise that is correlated between neighbours.
+
+    ``values`` (1, 1, h, w), NaN in holes, are in a unit in which planes are linear and noise is alike everywhere, such
+    as disparity; the result is in it, and 0 without a valid window.
+    """
+    return max(_low_quantile(values.double(), stride, _QUARTER) for stride in _STRIDES) / _QUARTILE / 6
+
+
+def _low_quantile(values: Tensor, stride: int, fraction: float) -> float:
+    """Return a quantile of the absolute differences of two Laplacians of a map, whose taps are ``stride`` apart."""
+    if min(values.shape[-2:]) < 2 * stride + 1:
+        return 0.0
+    row = torch.tensor([1.0, -2.0, 1.0], dtype=torch.float64, device=values.device)
+    responses = functional.conv2d(values, torch.outer(row, row)[None, None], dilation=stride).abs()
+    valid = responses[responses.isfinite()]
+    if not len(valid):
+        return 0.0
+    return float(valid.kthvalue(max(round(fraction * len(valid)), 1)).values)
+
+
+def normal_noise_deg(noise: float, camera: Camera) -> float:
+    """Return the standard deviation, in degrees, by which relative depth noise tilts the normals of a frontal surface.
+
+    Two neighbouring pixels at depth z are z / f metres apart; noise of standard deviation s z in each makes a slope of
+    standard deviation sqrt(2) s f, for the low-resolution map's camera.
+    """
+    return math.degrees(math.atan(math.sqrt(2) * noise * camera.fx))
