@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import copy
+from typing import get_args
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 from scipy import ndimage
 from torch import Tensor
 
 from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.methods.images import mean3x3, normalise, upsample_bicubic
-from dsr.methods.networks.msg_net import VARIANTS, MSGNet, VariantName, guidance_map, output_drift
+from dsr.methods.networks.msg_net import MSGNet, VariantName, guidance_map
 from dsr.methods.networks.network import NetworkUpsampler
 from dsr.sample import DepthSample
 from dsr.utils.ratios import SCALES
@@ -62,33 +62,7 @@ def test_hui_network_sizes_are_caffes_511_255_127() -> None:
         assert net(torch.zeros(1, 1, 511, 39), torch.zeros(1, 1, 64, 5)).shape == (1, 1, 511, 39)
 
 
-def test_guidance_of_another_size_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"guidance: expected \(32, 32\).*got \(31, 32\)"):
-        _net(4)(torch.zeros(1, 1, 31, 32), torch.zeros(1, 1, 8, 8))
-
-
-def test_3x3_mean_equals_scipy_with_mirrored_borders() -> None:
-    x = torch.rand(2, 1, 5, 7, dtype=torch.float64)
-    expected = [ndimage.convolve(image, np.full((3, 3), 1 / 9), mode="reflect") for image in x[:, 0].numpy()]
-    torch.testing.assert_close(mean3x3(x)[:, 0], torch.from_numpy(np.stack(expected)))
-
-
-@pytest.mark.parametrize("scale", [2, 4, 8])
-def test_bicubic_upsampling_equals_pillow_on_a_float_image(scale: int) -> None:
-    image = np.random.default_rng(0).random((6, 9), dtype=np.float32)
-    expected = np.asarray(Image.fromarray(image).resize((9 * scale, 6 * scale), Image.Resampling.BICUBIC))
-    ours = upsample_bicubic(torch.from_numpy(image)[None, None], scale)[0, 0]
-    torch.testing.assert_close(ours, torch.from_numpy(expected.copy()), rtol=0, atol=1e-6)
-
-
-def test_normalisation_is_per_sample_over_finite_values_and_holes_become_0() -> None:
-    x = torch.tensor([[2.0, torch.nan, 6.0], [3.0, torch.inf, 4.0]])[:, None, None]
-    values, minimum, span = normalise(x)
-    assert values[:, 0, 0].tolist() == [[0, 0, 1], [0, 0, 1]]
-    assert (minimum.flatten().tolist(), span.flatten().tolist()) == ([2, 3], [4, 1])
-
-
-@pytest.mark.parametrize("variant", list(VARIANTS))
+@pytest.mark.parametrize("variant", get_args(VariantName))
 def test_constant_map_stays_constant_and_an_empty_map_becomes_holes(variant: VariantName) -> None:
     rgb, disparity = torch.full((2, 3, 64, 64), 0.3), torch.full((2, 1, 16, 16), 7.0, dtype=torch.float64)
     disparity[1] = torch.nan
@@ -104,7 +78,7 @@ def test_hui_guidance_is_bt601_luma_minus_its_mean() -> None:
     luma = (luma - luma.min()) / (luma.max() - luma.min())
     luma -= ndimage.uniform_filter(luma, 3, mode="reflect")
     expected = (luma - luma.min()) / (luma.max() - luma.min())
-    torch.testing.assert_close(guidance_map(rgb, VARIANTS["hui"])[0, 0], torch.from_numpy(expected))
+    torch.testing.assert_close(guidance_map(rgb, "hui")[0, 0], torch.from_numpy(expected))
 
 
 def test_voynov_guidance_is_the_clipped_red_of_the_released_code() -> None:
@@ -114,10 +88,10 @@ def test_voynov_guidance_is_the_clipped_red_of_the_released_code() -> None:
     luma = (luma - luma.min()) / (luma.max() - luma.min())
     luma -= ndimage.uniform_filter(luma, 3, mode="reflect")
     expected = (luma - luma.min()) / (luma.max() - luma.min())
-    torch.testing.assert_close(guidance_map(rgb, VARIANTS["voynov"])[0, 0], torch.from_numpy(expected))
+    torch.testing.assert_close(guidance_map(rgb, "voynov")[0, 0], torch.from_numpy(expected))
 
 
-@pytest.mark.parametrize("variant", list(VARIANTS))
+@pytest.mark.parametrize("variant", get_args(VariantName))
 def test_batch_of_two_equals_two_single_images(variant: VariantName) -> None:
     net, (rgb, disparity) = _net(4, variant), _scene(4, 20, 17, batch=2)
     disparity[1] *= 3
@@ -136,7 +110,7 @@ def test_gradients_of_pre_and_postprocessing_equal_finite_differences() -> None:
     def around_an_absent_network(rgb: Tensor, values: Tensor) -> Tensor:
         inpaint = torch.full_like(disparity, torch.nan).masked_scatter(known, values)
         low, minimum, span = normalise(inpaint)
-        outside = upsample_bicubic(mean3x3(low), 2) * guidance_map(rgb, VARIANTS["voynov"])
+        outside = upsample_bicubic(mean3x3(low), 2) * guidance_map(rgb, "voynov")
         return outside * span + minimum
 
     inputs = (rgb.double().requires_grad_(), disparity[known].requires_grad_())
@@ -152,32 +126,25 @@ def test_training_reaches_every_parameter_around_holes_too() -> None:
 
 
 @pytest.mark.parametrize(
-    ("scale", "height", "width"),
-    [(2, 40, 90), (4, 64, 40), (4, 16, 33), (4, 9, 90), (4, 20, 20), (8, 8, 8), (16, 20, 16), (4, 4, 4)],
+    ("scale", "height", "width"), [(2, 40, 90), (4, 64, 40), (4, 16, 33), (4, 32, 48), (8, 8, 8), (16, 20, 16)]
 )
-def test_drift_of_the_crop_equals_that_of_the_whole_image(scale: int, height: int, width: int) -> None:
+def test_drift_is_the_mean_of_the_output_for_a_probe_of_one_half(scale: int, height: int, width: int) -> None:
     net, (rgb, disparity) = _net(scale), _scene(scale, height, width, batch=2)
-    guidance, values = guidance_map(rgb, net.variant), normalise(disparity).values
-    with torch.inference_mode():
-        fast, slow = (output_drift(net, guidance, values, crop=crop) for crop in (True, False))
-    assert slow.shape == (2, 1, 1, 1)
-    torch.testing.assert_close(fast, slow, rtol=0, atol=1e-6)
-
-
-def test_drift_is_the_mean_of_the_output_for_a_probe_of_one_half() -> None:
-    net, (rgb, disparity) = _net(4), _scene(4, 32, 48)
     guidance, probe = guidance_map(rgb, net.variant), normalise(disparity).values
     with torch.inference_mode():
-        drift = output_drift(net, guidance, probe)
-        probe[..., :8, :12] = 0.5
-        low_pass = torch.from_numpy(ndimage.convolve(probe[0, 0].numpy(), np.full((3, 3), 1 / 9), mode="reflect"))
+        drift = net.drift(guidance, probe)
+        probe[..., : height // 4, : width // 4] = 0.5
+        kernel = np.full((1, 1, 3, 3), 1 / 9)
+        low_pass = torch.from_numpy(ndimage.convolve(probe.numpy(), kernel, mode="reflect"))
         output = net(guidance, (probe - low_pass).float())
-    assert drift.item() == pytest.approx(output[0, 0, 2:6, 3:9].mean().item(), abs=1e-6)
+    rows, columns = (slice(n // 16, n // 4 - n // 16) for n in (height, width))
+    expected = output[..., rows, columns].mean((-2, -1), keepdim=True).double()
+    torch.testing.assert_close(drift, expected, rtol=0, atol=1e-6)
 
 
 def test_drift_is_0_where_its_region_is_empty() -> None:
     net, (rgb, disparity) = _net(4), _scene(4, 3, 40)
-    assert output_drift(net, guidance_map(rgb, net.variant), normalise(disparity).values).tolist() == [[[[0.0]]]]
+    assert net.drift(guidance_map(rgb, net.variant), normalise(disparity).values).tolist() == [[[[0.0]]]]
 
 
 @pytest.mark.parametrize("scale", SCALES)
@@ -196,7 +163,7 @@ def test_receptive_field_bounds_the_input_rows_that_matter(scale: int, rows: int
     assert used[1] == seen
 
 
-@pytest.mark.parametrize("variant", list(VARIANTS))
+@pytest.mark.parametrize("variant", get_args(VariantName))
 def test_channels_last_and_inference_mode_change_nothing(variant: VariantName) -> None:
     net, (rgb, disparity) = _net(4, variant), _scene(4, 24, 31)
     with torch.no_grad():

@@ -101,14 +101,14 @@ def test_caffe_model_round_trips_its_parameters(tmp_path: Path, scale: int, pack
     net = MSGNet(scale, "hui")
     path = _write(tmp_path / "net.caffemodel", _caffemodel(_caffe_layers(net), packed=packed))
     loaded = load_msg_weights(path, scale)
-    assert loaded.variant.name == "hui"
+    assert loaded.variant == "hui"
     torch.testing.assert_close(dict(loaded.state_dict()), dict(net.state_dict()), rtol=0, atol=0)
 
 
 def test_torch_file_round_trips_its_parameters(tmp_path: Path) -> None:
     net = MSGNet(4)
     loaded = load_msg_weights(_save(tmp_path / "net.pth", {"model_state_dict": _author_state(net)}), 4, "voynov")
-    assert loaded.variant.name == "voynov"
+    assert loaded.variant == "voynov"
     torch.testing.assert_close(dict(loaded.state_dict()), dict(net.state_dict()), rtol=0, atol=0)
 
 
