@@ -1,20 +1,13 @@
 """DDRNet: a network that denoises a depth map, then one that refines it with the photo.
 
 Yan, Wu, Wang, Xu, An, Guo and Liu, *DDRNet: Depth Map Denoising and Refinement for Consumer Depth Cameras Using
-Cascaded CNNs*, ECCV 2018. The denoising network, a U-net with residual blocks at a quarter of the size, sees the depth
-alone and corrects its low frequencies. The refinement network adds detail from the photo's intensity: its features at
-three sizes are brought to the first and joined (*hypercolumns*). Both maps are compared with the reference depth, and
-the second one's shading with the photo, under the light that explains the photo best
-(:func:`dsr.training.objective.shading_loss`). Sizes of layers and losses are those of the authors' code for single
-frames, github.com/neycyanshi/DDRNet.
+Cascaded CNNs*, ECCV 2018; sizes and losses are those of the authors' code for single frames,
+github.com/neycyanshi/DDRNet. Both maps are compared with the reference depth, and the second one's shading with the
+photo (:func:`dsr.training.objective.shading_loss`).
 
-What differs from the original:
-
-- The input is not a sensor's map, but the bicubic upsampling of a low-resolution one, exact on planes. It works on
-  disparity, normalised to -1..1 by the low-resolution map; the original on depth of 0.5 to 3 m.
-- The refinement network, too, learns a residual. That of the authors' code outputs the map itself.
-- The sizes are halved at most as often as the scale can be, once at x2 and twice otherwise, so that tiles of
-  low-resolution pixels keep them aligned.
+What differs: the input is the bicubic upsampling of a low-resolution map, exact on planes, of disparity normalised to
+-1..1; the refinement network learns a residual, too; the sizes are halved at most as often as the scale can be, once at
+x2 and twice otherwise, so that tiles of low-resolution pixels keep them aligned.
 """
 
 from __future__ import annotations
@@ -42,7 +35,7 @@ class DDRNet(NormalisedNetwork):
     Args:
         scale: upsampling factor, 2, 4, 8 or 16.
         denoising: channels of the first layer of the denoising network.
-        refinement: channels of the first layers of the refinement network, even.
+        refinement: channels of the first layers of the refinement network, a multiple of 4.
 
     """
 
@@ -55,10 +48,10 @@ class DDRNet(NormalisedNetwork):
                 f"got {denoising} and {refinement}"
             )
         self.scale, self.denoising, self.refinement = scale, denoising, refinement
-        self.halvings = min(_HALVINGS, scale.bit_length() - 1)
-        self.denoise = Denoising(denoising, self.halvings)
-        self.refine = Refinement(refinement, self.halvings)
-        radius_hr = self.denoise.receptive_field_radius + self.refine.receptive_field_radius
+        halvings = min(_HALVINGS, scale.bit_length() - 1)
+        self.denoise = Denoising(denoising, halvings)
+        self.refine = Refinement(refinement, halvings)
+        radius_hr = self.denoise.radius + self.refine.radius
         self.receptive_field_radius = -(-radius_hr // scale) + _UPSAMPLING
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
@@ -67,26 +60,22 @@ class DDRNet(NormalisedNetwork):
 
     def compute_stages(self, rgb: Tensor, values: Tensor, *context: Tensor | None) -> tuple[Tensor, Tensor]:
         """Return the denoised and the refined map, (B, 1, H, W) each, normalised to 0..1."""
-        weight = self.denoise.last.weight
+        dtype = self.denoise.last.weight.dtype
         enlarged = 2 * upsample_linear_border(values, self.scale) - 1
-        denoised = enlarged + self.denoise(enlarged.to(weight.dtype)).to(values.dtype)
-        intensity = 2 * grey(rgb).to(weight.dtype) - 1
-        refined = denoised + self.refine(denoised.to(weight.dtype), intensity).to(values.dtype)
+        denoised = enlarged + self.denoise(enlarged.to(dtype)).to(values.dtype)
+        intensity = 2 * grey(rgb).to(dtype) - 1
+        refined = denoised + self.refine(denoised.to(dtype), intensity).to(values.dtype)
         return (denoised + 1) / 2, (refined + 1) / 2
 
 
 class Denoising(nn.Module):
-    """The denoising network: a U-net whose coarsest level has residual blocks.
+    """The denoising network: a U-net whose coarsest level has residual blocks; its channels double with each halving.
 
-    Args:
-        width: channels of the first layer; they double with each halving of the size.
-        halvings: how often the size is halved.
-
+    ``radius`` is that of the receptive field in pixels of the map.
     """
 
     def __init__(self, width: int, halvings: int) -> None:
         super().__init__()
-        self.halvings = halvings
         widths = [width * 2**level for level in range(halvings + 1)]
         self.first = nn.Conv2d(1, width, 3, padding=1)
         self.down = nn.ModuleList(nn.Conv2d(n, 2 * n, 3, stride=2, padding=1) for n in widths[:-1])
@@ -95,13 +84,9 @@ class Denoising(nn.Module):
             nn.ConvTranspose2d(4 * n, n, 3, stride=2, padding=1, output_padding=1) for n in reversed(widths[:-1])
         )
         self.last = nn.Conv2d(2 * width, 1, 3, padding=1)
+        coarsest = 2**halvings
+        self.radius = 2 + (coarsest - 1) + 2 * _BLOCKS * coarsest + 2 * (coarsest - 1)
         _initialise(self, self.last)
-
-    @property
-    def receptive_field_radius(self) -> int:
-        """Receptive-field radius in pixels of the map."""
-        coarsest = 2**self.halvings
-        return 2 + (coarsest - 1) + 2 * _BLOCKS * coarsest + 2 * (coarsest - 1)
 
     def forward(self, depth: Tensor) -> Tensor:
         """Map (B, 1, H, W) to the residual, (B, 1, H, W)."""
@@ -118,37 +103,27 @@ class Denoising(nn.Module):
 
 
 class Refinement(nn.Module):
-    """The refinement network: hypercolumns of depth and intensity.
+    """The refinement network: features of depth and intensity at three sizes, brought to the first (*hypercolumns*).
 
-    Args:
-        width: channels at the map's own size; they double with each halving of it.
-        halvings: how often the size is halved.
-
+    ``radius`` is that of the receptive field in pixels of the map: of convolutions, pooling and enlargement.
     """
 
     def __init__(self, width: int, halvings: int) -> None:
         super().__init__()
-        self.halvings = halvings
         self.depth, self.intensity = (nn.Conv2d(1, width // 2, 3, padding=1) for _ in range(2))
         self.joined = nn.Conv2d(width, width, 3, padding=1)
         self.levels = nn.ModuleList()
-        before = 2 * width
+        before, columns = 2 * width, width
+        self.radius = 2 + 2 * 2**halvings - 1
         for level in range(1, halvings + 1):
             after = width * 2**level
             layers = [nn.Conv2d(n, after, 3, padding=1) for n in (before, *[after] * level)]
             self.levels.append(nn.ModuleList(layers))
-            before = 2 * after
-        columns = width * (2 ** (halvings + 1) - 1)
+            before, columns = 2 * after, columns + after
+            self.radius += len(layers) * 2**level
         self.mix = nn.ModuleList([nn.Conv2d(columns, width, 1), nn.Conv2d(width, width // 4, 1)])
         self.last = nn.Conv2d(width // 4, 1, 1)
         _initialise(self, self.last)
-
-    @property
-    def receptive_field_radius(self) -> int:
-        """Receptive-field radius in pixels of the map: of the convolutions, the pooling and the enlargement."""
-        coarsest = 2**self.halvings
-        convolutions = 2 + sum((level + 1) * 2**level for level in range(1, self.halvings + 1))
-        return convolutions + (coarsest - 1) + coarsest
 
     def forward(self, depth: Tensor, intensity: Tensor) -> Tensor:
         """Map depth and intensity, (B, 1, H, W) each, to the residual, (B, 1, H, W)."""
@@ -177,7 +152,6 @@ class _PreactivatedBlock(nn.Module):
         self.first, self.second = (nn.Conv2d(width, width, 3, padding=1) for _ in range(2))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map (B, C, H, W) to (B, C, H, W)."""
         return x + self.second(functional.relu(self.first(functional.relu(x))))
 
 
@@ -190,6 +164,5 @@ def _initialise(net: nn.Module, last: nn.Conv2d) -> None:
     for layer in net.modules():
         if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d):
             nn.init.kaiming_normal_(layer.weight, a=_SLOPE)
-            if layer.bias is not None:
-                layer.bias.data.zero_()
-    last.weight.data.zero_()
+            nn.init.zeros_(layer.get_parameter("bias"))
+    nn.init.zeros_(last.weight)

@@ -1,22 +1,13 @@
 """Sparse-to-Dense: a residual encoder-decoder that completes a few samples of depth.
 
 Ma and Karaman, *Sparse-to-Dense: Depth Prediction from Sparse Depth Samples and a Single Image*, ICRA 2018. The photo
-and an image that holds the samples, and 0 elsewhere, are one input of four channels (early fusion). ResNet-18 (He et
-al., CVPR 2016) encodes it at 1/32 of its size; a 1 x 1 convolution halves the channels; four up-projections (Laina et
-al., *Deeper Depth Prediction with Fully Convolutional Residual Networks*, 3DV 2016) double the size four times; a 3 x 3
-convolution and a bilinear enlargement make the map. It is trained with the mean absolute error.
+and an image that holds the samples, and 0 elsewhere, are one input. ResNet-18 (He et al., CVPR 2016) encodes it at 1/32
+of its size; four up-projections (Laina et al., 3DV 2016) double the size, and a bilinear enlargement follows.
 
-An up-projection inserts zeros between the pixels, then applies two branches, a 5 x 5 and a 3 x 3 convolution, and a
-5 x 5 convolution alone, and adds them. Zeros and a 5 x 5 convolution are one transposed convolution, which takes a
-quarter of the time.
-
-What differs from the original:
-
-- The samples are a low-resolution map: pixel (i, j) becomes the sample at (scale i + scale // 2, scale j + scale // 2),
-  the pixel next to the centre of its block. The original draws random pixels of the true depth.
-- It works on disparity, normalised by the low-resolution map to 1..2, so that 0 is no value.
-- The trunk has half the channels by default, and starts from random weights instead of ImageNet's.
-- The final enlargement aligns the images' outer edges, the original's the centres of their outer pixels.
+What differs: the samples are a low-resolution map, whose pixel (i, j) lies at (scale i + scale // 2, scale j +
+scale // 2), next to the centre of its block; the original draws random pixels of the true depth. It works on disparity,
+normalised by the low-resolution map to 1..2, so that 0 is no value. The trunk has half the channels by default, and
+starts from random weights. The enlargement aligns the images' outer edges, not the centres of their outer pixels.
 """
 
 from __future__ import annotations
@@ -82,6 +73,14 @@ class SparseToDense(NormalisedNetwork):
             return result[..., :height, :width].to(values.dtype) - 1
 
 
+def place_samples(values: Tensor, scale: int) -> Tensor:
+    """Return (B, 1, scale h, scale w) with values (B, 1, h, w) at the pixel next to each block's centre, else 0."""
+    *lead, height, width = values.shape
+    before, after = scale // 2, scale - 1 - scale // 2
+    blocks = functional.pad(values.view(*lead, height, 1, width, 1), (before, after, 0, 0, before, after))
+    return blocks.view(*lead, height * scale, width * scale)
+
+
 class ResidualBlock(nn.Module):
     """Two 3 x 3 convolutions and a shortcut; a block that changes the number of channels halves the size."""
 
@@ -105,19 +104,20 @@ class ResidualBlock(nn.Module):
 
 
 class UpProjection(nn.Module):
-    """An up-projection, which doubles the size and halves the channels."""
+    """An up-projection, which doubles the size and halves the channels.
+
+    Zeros are inserted between the pixels. A 5 x 5 and a 3 x 3 convolution, and a 5 x 5 convolution alone, are added.
+    Zeros and a 5 x 5 convolution are one transposed convolution, which takes a quarter of the time.
+    """
 
     def __init__(self, before: int) -> None:
         super().__init__()
         after = before // 2
+        upper, lower = (nn.ConvTranspose2d(before, after, 5, 2, 2, output_padding=1, bias=False) for _ in range(2))
         self.upper = nn.Sequential(
-            _zeros_and_5x5(before, after),
-            BatchNorm(after),
-            nn.ReLU(),
-            nn.Conv2d(after, after, 3, padding=1, bias=False),
-            BatchNorm(after),
+            upper, BatchNorm(after), nn.ReLU(), nn.Conv2d(after, after, 3, padding=1, bias=False), BatchNorm(after)
         )
-        self.lower = nn.Sequential(_zeros_and_5x5(before, after), BatchNorm(after))
+        self.lower = nn.Sequential(lower, BatchNorm(after))
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (B, before, H, W) to (B, before / 2, 2 H, 2 W)."""
@@ -140,16 +140,3 @@ class BatchNorm(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Normalise (B, C, H, W) with the statistics of the batch in a training, and else with their moving average."""
         return functional.batch_norm(x, self.running_mean, self.running_var, self.weight, self.bias, self.training)
-
-
-def place_samples(values: Tensor, scale: int) -> Tensor:
-    """Return (B, 1, scale h, scale w) with values (B, 1, h, w) at the pixel next to each block's centre, else 0."""
-    *lead, height, width = values.shape
-    before, after = scale // 2, scale - 1 - scale // 2
-    blocks = functional.pad(values.view(*lead, height, 1, width, 1), (before, after, 0, 0, before, after))
-    return blocks.view(*lead, height * scale, width * scale)
-
-
-def _zeros_and_5x5(before: int, after: int) -> nn.ConvTranspose2d:
-    """Return the layer that inserts zeros right and below of each pixel, then applies a 5 x 5 convolution."""
-    return nn.ConvTranspose2d(before, after, 5, stride=2, padding=2, output_padding=1, bias=False)
