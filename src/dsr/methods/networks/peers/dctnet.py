@@ -5,11 +5,12 @@ each feature channel, with depth d, photo r and attention w, the network minimis
 The normal equations (1 + lambda L^2) x = d + lambda L (w L r) are diagonal in the cosine basis.
 
 As in the authors' code, the right-hand side has a Laplacian of 3 x 3 weights divided by 16, at a mirrored border, and
-the left-hand side the eigenvalues of the Laplacian of four neighbours.
+the left-hand side the eigenvalues of the Laplacian of four neighbours. Layers have the names of the authors' files.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import ClassVar
@@ -21,22 +22,11 @@ from torch.nn import functional
 from dsr.methods.base import Cost
 from dsr.methods.images import normalise_imagenet
 from dsr.methods.networks.dct import dct2, idct2, laplacian_eigenvalues
-from dsr.methods.networks.peers.peer_network import PeerNetwork, rename
+from dsr.methods.networks.peers.peer_network import PeerNetwork
 
 FEATURES = 64
 _LAYERS = 4
 _CHUNK = 2**20  # values that the transforms process at once, so that they stay in the processor's cache
-_UNUSED = "WPNet.conv_dilation."
-_RENAMED = {
-    r"^WPNet\.": "attention.",
-    r"^Encoder_coupled\.init_deep\.0\.": "depth_head.",
-    r"^Encoder_coupled\.init_rgb\.0\.": "rgb_head.",
-    r"^Encoder_coupled\.coupled_feat_extractor\.": "layers.",
-    r"\.kernel_(shared|depth|rgb)_([12])$": r".conv\2.\1.weight",
-    r"\.bias_(shared|depth|rgb)_([12])$": r".conv\2.\1.bias",
-    r"^Decoder_depth\.Decoder_Deep\.": "decoder.",
-}
-"""Regular expressions of the authors' names, and their replacements here."""
 
 
 class EdgeAttention(nn.Module):
@@ -64,36 +54,28 @@ class EdgeAttention(nn.Module):
         return self.conv4(coarse + self.conv_f(x)).sigmoid()
 
 
-class CoupledConv(nn.Module):
-    """A convolution of the depth's features and one of the photo's, which share half of their kernels."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        half = FEATURES // 2
-        self.shared, self.depth, self.rgb = (nn.Conv2d(FEATURES, half, 3, padding=1) for _ in range(3))
-
-    def forward(self, depth: Tensor, rgb: Tensor) -> tuple[Tensor, Tensor]:
-        """Map two tensors of (B, 64, H, W) to two of the same shape."""
-        results = []
-        for x, own in ((depth, self.depth), (rgb, self.rgb)):
-            weight = torch.cat([self.shared.weight, own.weight]).contiguous(memory_format=torch.channels_last)
-            bias = torch.cat([conv.get_parameter("bias") for conv in (self.shared, own)])
-            results.append(functional.conv2d(x, weight, bias, padding=1))
-        return results[0], results[1]
-
-
 class CoupledLayer(nn.Module):
-    """A residual block of two coupled convolutions."""
+    """A residual block of two convolutions of the depth's features and of the photo's; half of the kernels are shared."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.conv1, self.conv2 = CoupledConv(), CoupledConv()
+        for number in (1, 2):
+            for kind in ("shared", "depth", "rgb"):
+                conv = nn.Conv2d(FEATURES, FEATURES // 2, 3)
+                self.register_parameter(f"kernel_{kind}_{number}", conv.weight)
+                self.register_parameter(f"bias_{kind}_{number}", conv.get_parameter("bias"))
 
     def forward(self, depth: Tensor, rgb: Tensor) -> tuple[Tensor, Tensor]:
         """Map two tensors of (B, 64, H, W) to two of the same shape."""
-        first = [each.relu_() for each in self.conv1(depth, rgb)]
-        second = self.conv2(*first)
-        return second[0].add_(depth).relu_(), second[1].add_(rgb).relu_()
+        depth = self._conv(self._conv(depth, "depth", 1).relu_(), "depth", 2).add_(depth).relu_()
+        return depth, self._conv(self._conv(rgb, "rgb", 1).relu_(), "rgb", 2).add_(rgb).relu_()
+
+    def _conv(self, x: Tensor, kind: str, number: int) -> Tensor:
+        weight, bias = (
+            torch.cat([self.get_parameter(f"{part}_{each}_{number}") for each in ("shared", kind)])
+            for part in ("kernel", "bias")
+        )
+        return functional.conv2d(x, weight.contiguous(memory_format=torch.channels_last), bias, padding=1)
 
 
 class DCTNet(PeerNetwork):
@@ -112,31 +94,32 @@ class DCTNet(PeerNetwork):
     def __init__(self, scale: float) -> None:
         super().__init__(scale)
         self.lambd = nn.Parameter(torch.zeros(1, FEATURES, 1, 1))
-        self.depth_head = nn.Conv2d(1, FEATURES, 3, padding=1)
-        self.rgb_head = nn.Conv2d(3, FEATURES, 3, padding=1)
-        self.layers = nn.ModuleList(CoupledLayer() for _ in range(_LAYERS))
-        self.attention = EdgeAttention()
-        self.decoder = nn.Sequential(
-            nn.Conv2d(FEATURES, FEATURES // 2, 3, padding=1),
-            nn.ReLU(inplace=True),
-            nn.Conv2d(FEATURES // 2, FEATURES // 4, 3, padding=1),
-            nn.ReLU(inplace=True),
-            nn.Conv2d(FEATURES // 4, 1, 3, padding=1),
-            nn.ReLU(inplace=True),
+        self.WPNet = EdgeAttention()
+        self.Encoder_coupled = nn.ModuleDict(
+            {
+                "init_deep": nn.Sequential(nn.Conv2d(1, FEATURES, 3, padding=1)),
+                "init_rgb": nn.Sequential(nn.Conv2d(3, FEATURES, 3, padding=1)),
+                "coupled_feat_extractor": nn.ModuleList(CoupledLayer() for _ in range(_LAYERS)),
+            }
         )
+        decoder = nn.Sequential()
+        for before, after in itertools.pairwise((FEATURES, FEATURES // 2, FEATURES // 4, 1)):
+            decoder.extend([nn.Conv2d(before, after, 3, padding=1), nn.ReLU(inplace=True)])
+        self.Decoder_depth = nn.ModuleDict({"Decoder_Deep": decoder})
 
     @classmethod
     def convert(cls, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return the parameters by their names here, without the one layer that the authors do not use."""
-        return rename({name: value for name, value in tensors.items() if not name.startswith(_UNUSED)}, _RENAMED)
+        """Drop the one layer that the authors do not use."""
+        return {name: value for name, value in tensors.items() if not name.startswith("WPNet.conv_dilation.")}
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
         """Refine an enlarged map; see :meth:`PeerNetwork.forward`."""
-        depth = self.depth_head(values).relu_()
-        guide = self.rgb_head(normalise_imagenet(rgb)).relu_()
-        for layer in self.layers:
+        encoder = self.Encoder_coupled
+        depth = encoder["init_deep"](values).relu_()
+        guide = encoder["init_rgb"](normalise_imagenet(rgb)).relu_()
+        for layer in encoder["coupled_feat_extractor"]:
             depth, guide = layer(depth, guide)
-        return self.decoder(transfer_edges(depth, guide, self.attention(guide), self.lambd.exp()))
+        return self.Decoder_depth["Decoder_Deep"](transfer_edges(depth, guide, self.WPNet(guide), self.lambd.exp()))
 
 
 def transfer_edges(depth: Tensor, guide: Tensor, weight: Tensor, strength: Tensor) -> Tensor:

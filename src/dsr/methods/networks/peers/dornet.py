@@ -2,12 +2,9 @@
 
 Wang, Yan, Pan, Gao, Zhang, Yang, *DORNet: A Degradation Oriented and Regularized Network for Blind Depth
 Super-Resolution*, CVPR 2025. An encoder describes the degradation of the enlarged map by features of each pixel and by
-one vector of the image. They steer deformable convolutions of the photo's features, which are then added to the
-depth's. The branch that learns the degradation by simulating it is needed for training only and left out.
-
-Modulated deformable convolution: Zhu, Hu, Lin, Dai, *Deformable ConvNets v2: More Deformable, Better Results*, CVPR
-2019. Each tap of a 3 x 3 kernel reads the features at its own position plus an offset, which differs from pixel to
-pixel, and the value is multiplied by a mask.
+one vector of the image. They steer deformable convolutions (Zhu, Hu, Lin, Dai, *Deformable ConvNets v2*, CVPR 2019) of
+the photo's features, which are then added to the depth's. The branch that learns the degradation by simulating it is
+needed for training only and left out. Layers have the names of the authors' files.
 """
 
 from __future__ import annotations
@@ -21,52 +18,13 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.methods.base import Cost
-from dsr.methods.networks.peers.peer_network import PeerNetwork, fold_batch_norm, rename
+from dsr.methods.networks.peers.peer_network import PeerNetwork, fold_batch_norm
 
 _CHUNK = 2**20  # values that are read at once, so that they stay in the processor's cache
 
 FEATURES = 24
 _INNER = 6  # features in the bottlenecks
-_STAGES = 5
 _SENSOR_RATIO = 8 / 3  # of RGB-D-D's photos to the maps of its phone
-_UNUSED = "Dab."
-_BLOCK = (("backbone", 0), ("backbone", 3), ("shortcut", 0))
-_NORMALISED = {
-    "Enc.E.0": "Enc.E.1",
-    "Enc.E.3": "Enc.E.4",
-    **{f"Enc.E_pre.{i}.{conv}.{j}": f"Enc.E_pre.{i}.{conv}.{j + 1}" for i in range(3) for conv, j in _BLOCK},
-}
-"""Convolutions of the authors' files, and the batch normalisations that follow them."""
-_RENAMED = {
-    r"^R\.head\.0\.": "depth_head.",
-    r"^R\.head_rgb\.0\.": "rgb_head.",
-    r"^R\.tail\.0\.": "tail.",
-    r"^R\.c_d5\.0\.": "merge.",
-    r"^R\.c_d5\.1\.": "R.c_d5.",
-    r"^R\.c_r([1-4])\.": r"rgb_convs.\1.",
-    r"^R\.dgm([1-5])\.": r"transfers.\1.",
-    r"^R\.c_d([1-5])\.body\.2\.": r"refinements.\1.conv.",
-    r"^R\.c_d([1-5])\.body\.([01])\.": r"refinements.\1.blocks.\2.",
-    r"\.DA_rgb\.dcnrgb\.conv_offset_mask\.": ".offsets.",
-    r"\.DA_rgb\.dcnrgb\.c1\.": ".scale.",
-    r"\.DA_rgb\.dcnrgb\.c2\.": ".mix.",
-    r"\.DA_rgb\.dcnrgb\.": ".deformable.",
-    r"\.DA_rgb\.rcab1\.": ".block.",
-    r"\.DA_rgb\.conv\.": ".conv.",
-    r"\.fb\.conv([123])\.": r".fusion\1.",
-    r"\.fb\.conv\.": ".fuse.",
-    r"\.body\.0\.": ".conv1.",
-    r"\.body\.2\.": ".conv2.",
-    r"\.body\.3\.conv_du\.0\.": ".squeeze.",
-    r"\.body\.3\.conv_du\.2\.": ".excite.",
-    r"^Enc\.E_pre\.": "encoder.blocks.",
-    r"^Enc\.E\.0\.": "encoder.down1.",
-    r"^Enc\.E\.3\.": "encoder.down2.",
-    r"\.backbone\.0\.": ".conv1.",
-    r"\.backbone\.3\.": ".conv2.",
-    r"\.shortcut\.0\.": ".shortcut.",
-}
-"""Regular expressions of the authors' names, and their replacements here."""
 
 
 def deformable_conv3x3(x: Tensor, offsets: Tensor, mask: Tensor, weight: Tensor) -> Tensor:
@@ -104,44 +62,48 @@ def _sampling_grid(offsets: Tensor, top: int, height: int) -> Tensor:
 class ChannelAttention(nn.Module):
     """A residual block whose features are weighted by factors of the whole image (Zhang et al., *RCAN*, ECCV 2018)."""
 
-    def __init__(self, slope: float) -> None:
+    def __init__(self, width: int, inner: int, slope: float) -> None:
         super().__init__()
-        self.slope = slope
-        self.conv1, self.conv2 = _conv(FEATURES, FEATURES), _conv(FEATURES, FEATURES)
-        self.squeeze, self.excite = nn.Conv2d(FEATURES, _INNER, 1), nn.Conv2d(_INNER, FEATURES, 1)
+        factors = nn.Sequential(nn.Conv2d(width, inner, 1), nn.ReLU(), nn.Conv2d(inner, width, 1), nn.Sigmoid())
+        self.body = nn.Sequential(
+            conv3x3(width, width),
+            nn.LeakyReLU(slope, inplace=True),
+            conv3x3(width, width),
+            nn.ModuleDict({"conv_du": factors}),
+        )
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map (B, 24, H, W) to the same shape."""
-        y = self.conv2(functional.leaky_relu_(self.conv1(x), self.slope))
-        factors = self.excite(self.squeeze(y.mean(dim=(-2, -1), keepdim=True)).relu()).sigmoid()
-        return torch.addcmul(x, y, factors)
+        """Map (B, C, H, W) to the same shape."""
+        y = self.body[:3](x)
+        return torch.addcmul(x, y, self.body[3]["conv_du"](y.mean(dim=(-2, -1), keepdim=True)))
 
 
 class ResidualGroup(nn.Module):
     """Two blocks with channel attention, a convolution, and a connection around all."""
 
-    def __init__(self) -> None:
+    def __init__(self, width: int, inner: int, slope: float, bias: bool = True) -> None:
         super().__init__()
-        self.blocks = nn.Sequential(ChannelAttention(0.2), ChannelAttention(0.2))
-        self.conv = _conv(FEATURES, FEATURES)
+        blocks = [ChannelAttention(width, inner, slope) for _ in range(2)]
+        self.body = nn.Sequential(*blocks, conv3x3(width, width, bias))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map (B, 24, H, W) to the same shape."""
-        return self.conv(self.blocks(x)).add_(x)
+        """Map (B, C, H, W) to the same shape."""
+        return self.body(x).add_(x)
 
 
 class EncoderBlock(nn.Module):
     """A residual block; batch normalisation is part of the convolutions."""
 
-    def __init__(self, inputs: int, outputs: int) -> None:
+    def __init__(self, before: int, after: int) -> None:
         super().__init__()
-        self.conv1, self.conv2 = _conv(inputs, outputs), _conv(outputs, outputs)
-        self.shortcut = nn.Conv2d(inputs, outputs, 1)
+        self.backbone = nn.Sequential(
+            conv3x3(before, after), nn.Identity(), nn.LeakyReLU(0.1, inplace=True), conv3x3(after, after)
+        )
+        self.shortcut = nn.Sequential(nn.Conv2d(before, after, 1))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map (B, inputs, H, W) to (B, outputs, H, W)."""
-        y = self.conv2(functional.leaky_relu_(self.conv1(x), 0.1))
-        return functional.leaky_relu_(y.add_(self.shortcut(x)), 0.1)
+        """Map (B, before, H, W) to (B, after, H, W)."""
+        return functional.leaky_relu_(self.backbone(x).add_(self.shortcut(x)), 0.1)
 
 
 class DegradationEncoder(nn.Module):
@@ -149,16 +111,39 @@ class DegradationEncoder(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        sizes = ((1, FEATURES // 2), (FEATURES // 2, FEATURES), (FEATURES, FEATURES))
-        self.blocks = nn.Sequential(*(EncoderBlock(*size) for size in sizes))
-        self.down1 = nn.Conv2d(FEATURES, 2 * FEATURES, 3, stride=2, padding=1)
-        self.down2 = nn.Conv2d(2 * FEATURES, 4 * FEATURES, 3, stride=2, padding=1)
+        self.E_pre = nn.Sequential(
+            EncoderBlock(1, FEATURES // 2), EncoderBlock(FEATURES // 2, FEATURES), EncoderBlock(FEATURES, FEATURES)
+        )
+        self.E = nn.Sequential(
+            nn.Conv2d(FEATURES, 2 * FEATURES, 3, stride=2, padding=1),
+            nn.Identity(),  # batch normalisation, which is part of the convolution
+            nn.LeakyReLU(0.1, inplace=True),
+            nn.Conv2d(2 * FEATURES, 4 * FEATURES, 3, stride=2, padding=1),
+        )
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Map (B, 1, H, W) to the features of each pixel, (B, 24, H, W), and of the image, (B, 96, 1, 1)."""
-        local = self.blocks(x)
-        coarse = self.down2(functional.leaky_relu_(self.down1(local), 0.1))
-        return local, coarse.mean(dim=(-2, -1), keepdim=True)
+        local = self.E_pre(x)
+        return local, self.E(local).mean(dim=(-2, -1), keepdim=True)
+
+
+class DeformableConv(nn.Module):
+    """A deformable and a 1 x 1 convolution, steered by the features of the degradation."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = conv3x3(FEATURES, FEATURES).weight
+        self.conv_offset_mask = conv3x3(FEATURES, 27)
+        self.c1 = nn.Conv2d(4 * FEATURES, FEATURES, 1, bias=False)
+        self.c2 = nn.Conv2d(FEATURES, FEATURES, 1, bias=False)
+
+    def forward(self, x: Tensor, local: Tensor, vector: Tensor) -> Tensor:
+        """Map (B, 24, H, W) to the same shape; ``local`` is (B, 24, H, W), ``vector`` (B, 96, 1, 1)."""
+        steering = self.conv_offset_mask(local)
+        scale = self.c1(vector)[:, None]  # (B, 1, 24, 1, 1): a factor of each input feature
+        # the 1 x 1 convolution after the deformable one is part of the kernels
+        mixed = torch.einsum("ed,dcij->ecij", self.c2.weight[..., 0, 0], self.weight)
+        return deformable_conv3x3(x, steering[:, :18], steering[:, 18:].sigmoid(), mixed * scale)
 
 
 class Transfer(nn.Module):
@@ -166,28 +151,46 @@ class Transfer(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.block = ChannelAttention(0)
-        self.deformable = _conv(FEATURES, FEATURES, bias=False)
-        self.offsets = _conv(FEATURES, 27)
-        self.scale = nn.Conv2d(4 * FEATURES, FEATURES, 1, bias=False)
-        self.mix = nn.Conv2d(FEATURES, FEATURES, 1, bias=False)
-        self.conv = _conv(FEATURES, FEATURES)
-        self.fusion1, self.fusion2 = nn.Conv2d(FEATURES, _INNER, 1), nn.Conv2d(FEATURES, _INNER, 1)
-        self.fusion3 = nn.Conv2d(_INNER, FEATURES, 1)
-        self.fuse = _conv(2 * FEATURES, FEATURES)
+        width, inner = FEATURES, _INNER
+        align = {"dcnrgb": DeformableConv(), "rcab1": ChannelAttention(width, inner, 0), "conv": conv3x3(width, width)}
+        fuse = {"conv1": nn.Conv2d(width, inner, 1), "conv2": nn.Conv2d(width, inner, 1)}
+        fuse |= {"conv3": nn.Conv2d(inner, width, 1), "conv": conv3x3(2 * width, width)}
+        self.DA_rgb, self.fb = nn.ModuleDict(align), nn.ModuleDict(fuse)
 
     def forward(self, depth: Tensor, rgb: Tensor, local: Tensor, vector: Tensor) -> Tensor:
         """Return the depth's features, (B, 24, H, W), of those of photo and degradation; ``vector`` (B, 96, 1, 1)."""
-        rgb = self.block(rgb)
-        steering = self.offsets(local)
-        scale = self.scale(vector)[:, None]  # (B, 1, 24, 1, 1): a factor of each input feature
-        # the 1 x 1 convolution after the deformable one is part of the kernels
-        mixed = torch.einsum("ed,dcij->ecij", self.mix.weight[..., 0, 0], self.deformable.weight)
-        aligned = deformable_conv3x3(rgb, steering[:, :18], steering[:, 18:].sigmoid(), mixed * scale)
-        rgb = self.conv(aligned + rgb)
-        gate = self.fusion1(local).sigmoid_()
-        rgb = rgb + self.fusion3(self.fusion2(rgb) * gate)
-        return self.fuse(torch.cat((rgb, depth), dim=1)).add_(depth)
+        rgb = self.DA_rgb["rcab1"](rgb)
+        rgb = self.DA_rgb["conv"](self.DA_rgb["dcnrgb"](rgb, local, vector) + rgb)
+        gate = self.fb["conv1"](local).sigmoid_()
+        rgb = rgb + self.fb["conv3"](self.fb["conv2"](rgb) * gate)
+        return self.fb["conv"](torch.cat((rgb, depth), dim=1)).add_(depth)
+
+
+class Restoration(nn.Module):
+    """The branch that refines the map: five transfers, each but the last followed by a residual group."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.head, self.head_rgb = nn.Sequential(conv3x3(1, FEATURES)), nn.Sequential(conv3x3(3, FEATURES))
+        self.dgm1, self.dgm2, self.dgm3, self.dgm4, self.dgm5 = (Transfer() for _ in range(5))
+        self.c_d1, self.c_d2, self.c_d3, self.c_d4, last = (ResidualGroup(FEATURES, _INNER, 0.2) for _ in range(5))
+        self.c_d5 = nn.Sequential(nn.Conv2d(5 * FEATURES, FEATURES, 1), last)
+        self.c_r1, self.c_r2, self.c_r3, self.c_r4 = (conv3x3(FEATURES, FEATURES) for _ in range(4))
+        self.tail = nn.Sequential(conv3x3(FEATURES, 1))
+
+    def forward(self, rgb: Tensor, values: Tensor, local: Tensor, vector: Tensor) -> Tensor:
+        """Map a photo, an enlarged map and the features of the degradation to a refined map, (B, 1, H, W)."""
+        head, guide = self.head(values), self.head_rgb(rgb)
+        # the first of the depth's features and the last of the photo's stay as they are
+        first = self.c_d1(self.dgm1(head, guide, local, vector))
+        guide = functional.leaky_relu_(self.c_r1(guide), 0.1)
+        second = self.c_d2(functional.leaky_relu_(self.dgm2(first, guide, local, vector), 0.1))
+        guide = functional.leaky_relu_(self.c_r2(guide), 0.1)
+        third = self.c_d3(functional.leaky_relu_(self.dgm3(second, guide, local, vector), 0.1))
+        guide = functional.leaky_relu_(self.c_r3(guide), 0.1)
+        fourth = self.c_d4(functional.leaky_relu_(self.dgm4(third, guide, local, vector), 0.1))
+        fifth = self.dgm5(fourth, self.c_r4(guide), local, vector)
+        return self.tail(self.c_d5(torch.cat((first, second, third, fourth, fifth), dim=1)).add_(head))
 
 
 class DORNet(PeerNetwork):
@@ -205,43 +208,27 @@ class DORNet(PeerNetwork):
     def __init__(self, scale: float) -> None:
         super().__init__(scale)
         self.depth_range = (0.0, 5.0) if scale == _SENSOR_RATIO else None  # of weights trained on RGB-D-D's phone
-        self.encoder = DegradationEncoder()
-        self.depth_head, self.rgb_head = _conv(1, FEATURES), _conv(3, FEATURES)
-        self.rgb_convs = nn.ModuleDict({str(i + 1): _conv(FEATURES, FEATURES) for i in range(_STAGES - 1)})
-        self.transfers = nn.ModuleDict({str(i + 1): Transfer() for i in range(_STAGES)})
-        self.refinements = nn.ModuleDict({str(i + 1): ResidualGroup() for i in range(_STAGES)})
-        self.merge = nn.Conv2d(_STAGES * FEATURES, FEATURES, 1)
-        self.tail = _conv(FEATURES, 1)
+        self.R, self.Enc = Restoration(), DegradationEncoder()
 
     @classmethod
     def convert(cls, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return the parameters by their names here, without those that training alone needs."""
-        tensors = {name: value for name, value in tensors.items() if not name.startswith(_UNUSED)}
-        for conv, norm in _NORMALISED.items():
+        """Merge the batch normalisations into the convolutions, and drop the branch that training alone needs."""
+        tensors = {name: value for name, value in tensors.items() if not name.startswith("Dab.")}
+        convs = [f"Enc.E_pre.{i}.{part}" for i in range(3) for part in ("backbone.0", "backbone.3", "shortcut.0")]
+        for conv in convs:  # these have no bias of their own
             weight = tensors.get(f"{conv}.weight")
-            if weight is not None and conv.startswith("Enc.E_pre."):  # these have no bias of their own
+            if weight is not None:
                 tensors.setdefault(f"{conv}.bias", weight.new_zeros(weight.shape[:1]))
-            fold_batch_norm(tensors, conv, norm)
-        return rename(tensors, _RENAMED)
+        for conv in ("Enc.E.0", "Enc.E.3", *convs):
+            layer, _, index = conv.rpartition(".")
+            fold_batch_norm(tensors, conv, f"{layer}.{int(index) + 1}")
+        return tensors
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
         """Refine an enlarged map; see :meth:`PeerNetwork.forward`."""
-        local, vector = self.encoder(values)
-        head = depth = self.depth_head(values)
-        guide = self.rgb_head(rgb)
-        stages = []
-        for stage, transfer in self.transfers.items():
-            depth = transfer(depth, guide, local, vector)
-            if stage in self.rgb_convs:
-                # the last of the photo's features and the first of the depth's stay as they are
-                depth = self.refinements[stage](depth if stage == "1" else functional.leaky_relu_(depth, 0.1))
-                guide = self.rgb_convs[stage](guide)
-                guide = guide if stage == str(_STAGES - 1) else functional.leaky_relu_(guide, 0.1)
-            stages.append(depth)
-        merged = self.refinements[str(_STAGES)](self.merge(torch.cat(stages, dim=1)))
-        return self.tail(merged.add_(head))
+        return self.R(rgb, values, *self.Enc(values))
 
 
-def _conv(inputs: int, outputs: int, bias: bool = True) -> nn.Conv2d:
+def conv3x3(before: int, after: int, bias: bool = True) -> nn.Conv2d:
     """Make a 3 x 3 convolution that keeps the size."""
-    return nn.Conv2d(inputs, outputs, 3, padding=1, bias=bias)
+    return nn.Conv2d(before, after, 3, padding=1, bias=bias)

@@ -8,6 +8,8 @@ github.com/sunny2109/SVLRM.
 FDKN, the fast deformable kernel network: Kim, Ponce, Ham, *Deformable Kernel Networks for Joint Image Filtering*, IJCV
 2021 (arXiv 1910.08373). For each pixel the network estimates nine positions around it and their weights, from the
 enlarged map and the photo, and adds the weighted sum of the map there. Weights: github.com/cvlab-yonsei/dkn (GPL-3).
+
+Layers have the names of the authors' files.
 """
 
 from __future__ import annotations
@@ -24,21 +26,13 @@ from torch.nn import functional
 from dsr.degradation.downsampling import cubic_kernel
 from dsr.methods.base import Cost
 from dsr.methods.images import grey
-from dsr.methods.networks.peers.peer_network import SWAPPED_LUMA, PeerNetwork, fold_batch_norm, rename
+from dsr.methods.networks.peers.peer_network import SWAPPED_LUMA, PeerNetwork, fold_batch_norm
 
 _WIDTH, _DEPTH, _SLOPE = 64, 10, 0.1
 _CUBIC = -0.75  # parameter of the cubic kernel
 
 _FACTOR, _TAPS, _RADIUS = 4, 3, 7
 _WIDTHS = (16, 32, 32, 64, 64, 128, 128)
-_NAMES = {
-    r"^ImageKernel\.": "rgb_kernel.",
-    r"^DepthKernel\.": "depth_kernel.",
-    **{rf"\.conv{index + 1}\.": f".layers.{index}." for index in range(len(_WIDTHS) - 1)},
-    r"\.conv_weight\.": ".weights.",
-    r"\.conv_offset\.": ".offsets.",
-}
-"""Regular expressions of the authors' names, and their replacements here."""
 
 
 class SVLRM(PeerNetwork):
@@ -101,7 +95,7 @@ class FDKN(PeerNetwork):
 
     def __init__(self, scale: float) -> None:
         super().__init__(scale)
-        self.rgb_kernel, self.depth_kernel = _Kernel(), _Kernel()
+        self.ImageKernel, self.DepthKernel = _Kernel(), _Kernel()
 
     @classmethod
     def convert(cls, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -109,11 +103,11 @@ class FDKN(PeerNetwork):
         for branch in ("ImageKernel", "DepthKernel"):
             for index in (1, 3, 5):
                 fold_batch_norm(tensors, f"{branch}.conv{index}", f"{branch}.conv{index}_bn")
-        return rename(tensors, _NAMES)
+        return tensors
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
         """Refine an enlarged map; see :meth:`PeerNetwork.forward`."""
-        branches = zip(self.rgb_kernel(grey(rgb, SWAPPED_LUMA)), self.depth_kernel(values), strict=True)
+        branches = zip(self.ImageKernel(grey(rgb, SWAPPED_LUMA)), self.DepthKernel(values), strict=True)
         weights, offsets = (functional.pixel_shuffle(rgb * depth, _FACTOR).float() for rgb, depth in branches)
         return values + _sample(values, weights - weights.mean(dim=1, keepdim=True), offsets)
 
@@ -123,15 +117,16 @@ class _Kernel(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.layers = nn.ModuleList(nn.Conv2d(before, after, 3, padding=1) for before, after in pairwise(_WIDTHS))
-        self.weights = nn.Conv2d(_WIDTHS[-1], _TAPS**2 * _FACTOR**2, 1)
-        self.offsets = nn.Conv2d(_WIDTHS[-1], 2 * _TAPS**2 * _FACTOR**2, 1)
+        for index, (before, after) in enumerate(pairwise(_WIDTHS)):
+            self.add_module(f"conv{index + 1}", nn.Conv2d(before, after, 3, padding=1))
+        self.conv_weight = nn.Conv2d(_WIDTHS[-1], _TAPS**2 * _FACTOR**2, 1)
+        self.conv_offset = nn.Conv2d(_WIDTHS[-1], 2 * _TAPS**2 * _FACTOR**2, 1)
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
         x = functional.pixel_unshuffle(image, _FACTOR)
-        for layer in self.layers:
-            x = functional.relu_(layer(x))
-        return self.weights(x).sigmoid_(), self.offsets(x)
+        for index in range(1, len(_WIDTHS)):
+            x = functional.relu_(self.get_submodule(f"conv{index}")(x))
+        return self.conv_weight(x).sigmoid_(), self.conv_offset(x)
 
 
 def _sample(values: Tensor, weights: Tensor, offsets: Tensor) -> Tensor:

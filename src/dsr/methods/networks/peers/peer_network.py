@@ -11,7 +11,6 @@ from __future__ import annotations
 import abc
 import copy
 import math
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import ClassVar, Literal, get_args
@@ -53,16 +52,6 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
         keys = ", ".join(map(str, list(content)[:4])) if isinstance(content, dict) else type(content).__name__
         raise ValueError(f"{path}: expected a network's tensors by name, got {keys}")
     return {str(name).removeprefix("module."): value for name, value in content.items()}
-
-
-def rename(tensors: Mapping[str, Tensor], names: Mapping[str, str]) -> dict[str, Tensor]:
-    """Return tensors by new names: replacements of regular expressions, one after the other, for every name."""
-    renamed = {}
-    for name, value in tensors.items():
-        for pattern, replacement in names.items():
-            name = re.sub(pattern, replacement, name)  # noqa: PLW2901 - each replaces its part
-        renamed[name] = value
-    return renamed
 
 
 def fold_batch_norm(tensors: dict[str, Tensor], conv: str, norm: str, eps: float = 1e-5) -> None:
