@@ -23,7 +23,7 @@ from dsr.geometry.hole_size import is_scattered, wide_holes, window_maxima
 _WEIGHTS = Path(__file__).with_suffix(".safetensors")
 GRID = 320  # pixels of the longer side of the grid on which features are computed
 FEATURES = 26  # without units: means of holes, texture, roughness, depth steps, brightness and saturation
-_LAYERS, _MEMBERS = (48, 32), 4  # sizes of the hidden layers of a network, and how many networks there are
+_MEMBERS = 4  # networks, whose logits are averaged
 # pixels of the grid: standard deviations of means of holes, of holes amid a surface, of the photo's texture and of the
 # map's roughness; and reaches of depth steps
 _HOLES, _AMID, _TEXTURE, _ROUGHNESS, _NEAR = (2, 4, 8, 16), (4, 8, 16), (3, 6, 12), (3, 8), (3, 8, 16)
@@ -46,17 +46,10 @@ class GlassFinder(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        first, second = _LAYERS
-        self.members = nn.ModuleList(
-            nn.Sequential(
-                nn.Linear(FEATURES, first),
-                nn.ReLU(inplace=True),
-                nn.Linear(first, second),
-                nn.ReLU(inplace=True),
-                nn.Linear(second, 1),
-            )
-            for _ in range(_MEMBERS)
-        )
+        self.members = nn.ModuleList()
+        for _ in range(_MEMBERS):
+            first, second, last = nn.Linear(FEATURES, 48), nn.Linear(48, 32), nn.Linear(32, 1)
+            self.members.append(nn.Sequential(first, nn.ReLU(inplace=True), second, nn.ReLU(inplace=True), last))
         self.register_buffer("middle", torch.zeros(FEATURES))
         self.register_buffer("scale", torch.ones(FEATURES))
 
@@ -81,22 +74,10 @@ def glass_finder(device: torch.device) -> GlassFinder:
 
 @torch.no_grad()
 def probability_of_glass(rgb: Tensor, inverse: Tensor) -> Tensor:
-    """Return how probable it is that depth is not that of the surface which the photo shows, as in glass.
+    """Return how probable it is that depth is not that of the surface which the photo shows, (1, H, W) float32.
 
-    Args:
-        rgb: (3, H, W) the photo, in [0, 1].
-        inverse: (1, h, w) inverse depth as measured, in 1/m, of the same view; NaN in holes.
-
-    Returns:
-        (1, H, W) float32; 0 where no hole is near, and everywhere in a map of single points.
-
-    Example:
-        >>> import torch
-        >>> from dsr.methods.glass import probability_of_glass
-        >>> wall = probability_of_glass(torch.rand(3, 48, 64), torch.full((1, 24, 32), 0.5))
-        >>> wall.shape, float(wall.max())
-        (torch.Size([1, 48, 64]), 0.0)
-
+    ``rgb`` (3, H, W) is the photo in [0, 1], ``inverse`` (1, h, w) the inverse depth as measured, in 1/m, NaN in holes.
+    It is 0 where no hole is near, and everywhere in a map of single points.
     """
     height, width = rgb.shape[-2:]
     inverse = inverse.to(rgb.device, torch.float32)
@@ -176,8 +157,8 @@ def _on_grid(inverse: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
 
 def _grid_size(height: int, width: int, longer: int) -> tuple[int, int]:
     """Return the size of the grid of a photo, whose longer side is given."""
-    rows, columns = (max(16, round(n * longer / max(height, width))) for n in (height, width))
-    return rows, columns
+    longest = max(height, width)
+    return max(16, round(height * longer / longest)), max(16, round(width * longer / longest))
 
 
 def _holes(known: Tensor, size: tuple[int, int], wide: float | None) -> Tensor:

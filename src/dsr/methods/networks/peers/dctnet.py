@@ -55,7 +55,7 @@ class EdgeAttention(nn.Module):
 
 
 class CoupledLayer(nn.Module):
-    """A residual block of two convolutions of the depth's features and of the photo's; half of the kernels are shared."""
+    """A residual block of two convolutions of the depth's features and of the photo's, which share half the kernels."""
 
     def __init__(self) -> None:
         super().__init__()
