@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.camera import Camera
-from dsr.methods.exportable import exporting, fill_by_colour_in_graph, fill_in_graph, neighbours_of
+from dsr.methods.exportable import exporting, fill_by_colour_in_graph, neighbours_of
 
 LUMA = (0.299, 0.587, 0.114)  # weights of red, green and blue in the luma (ITU-R BT.601)
 _IMAGENET_MEAN, _IMAGENET_DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -164,7 +164,9 @@ def inpaint(x: Tensor, photo: Tensor | None = None) -> Tensor:
     if not exporting() and bool(x.isfinite().all()):
         return x
     if photo is None:
-        return _fill_evenly(x)
+        known = x.isfinite()
+        values, weight = _fill_evenly(torch.where(known, x, 0), known.to(x.dtype))
+        return torch.where(weight > 0, values, torch.nan)
     if exporting():  # one factor for both axes
         colours = mean3x3(functional.avg_pool2d(photo.to(x.dtype), int(photo.shape[-1] // x.shape[-1])))
         difference = (neighbours_of(colours) - colours[:, None]).square().sum(dim=2)  # (B, 8, h, w)
@@ -174,21 +176,21 @@ def inpaint(x: Tensor, photo: Tensor | None = None) -> Tensor:
     return torch.stack([_fill_by_colour(each[0], colour) for each, colour in zip(x, colours, strict=True)])[:, None]
 
 
-def _fill_evenly(x: Tensor) -> Tensor:
-    """Return the maps, (B, 1, h, w), filled with plain means."""
-    valid = x.isfinite()
-    values, weight = torch.where(valid, x, 0), valid.to(x.dtype)
-    if exporting():
-        values, weight = fill_in_graph(values, weight)
-        return torch.where(weight > 0, values, torch.nan)
-    for _ in range(max(x.shape[-2:])):
-        total, fraction = (functional.avg_pool2d(each, 3, stride=1, padding=1) for each in (values, weight))
+@torch.jit.script_if_tracing
+def _fill_evenly(values: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Fill maps, (B, 1, h, w) with 0 in holes, with plain means; a graph keeps the loop.
+
+    ``weight`` is 0 in holes and 1 elsewhere; the result has 0 in an image without a known value.
+    """
+    more = True
+    while more:
+        total = functional.avg_pool2d(values, [3, 3], [1, 1], [1, 1])
+        fraction = functional.avg_pool2d(weight, [3, 3], [1, 1], [1, 1])
         new = (weight == 0) & (fraction > 0)
-        if not bool(new.any()):
-            break
-        values = torch.where(new, total / torch.where(fraction > 0, fraction, 1), values)
-        weight = torch.where(new, 1, weight)
-    return torch.where(weight > 0, values, torch.nan)
+        more = bool(new.any())
+        values = torch.where(new, total / fraction.clamp(min=0.01), values)  # a ninth or more where it counts
+        weight = weight.masked_fill(new, 1.0)
+    return values, weight
 
 
 def _fill_by_colour(x: Tensor, colours: Tensor) -> Tensor:
