@@ -138,6 +138,18 @@ def test_patches_get_the_answer_of_the_upsampling_prepared_or_not(net: Disparity
         assert torch.equal(net.answer_patches(each).disparity, net.upsample(rgb, coarse))
 
 
+def test_training_reaches_every_parameter(net: DisparityNetwork) -> None:
+    net.train().requires_grad_()
+    coarse = maps(16, 16, 2).float()
+    coarse[..., 8:] += 20  # a depth discontinuity, across which weights count
+    answer = net.answer_patches({"rgb": photos(64, 64, 2), "disparity_lr": coarse, "min_max": compute_min_max(coarse)})
+    torch.stack([each.square().mean() for each in (answer.disparity, *answer.stages)]).sum().backward()
+    for name, parameter in net.named_parameters():
+        assert parameter.grad is not None, name
+        assert bool(parameter.grad.isfinite().all()), name
+        assert bool(parameter.grad.any()), name
+
+
 def test_photo_of_another_size_is_refused(net: DisparityNetwork) -> None:
     with pytest.raises(ValueError, match=r"^rgb: expected \(24, 28\) pixels for a map of \(6, 7\) at scale 4"):
         net.upsample(photos(24, 24), maps(6, 7))

@@ -163,17 +163,6 @@ def test_plane_is_reproduced_for_any_weights_where_it_is_not_too_steep_for_epsil
     torch.testing.assert_close(result, fine, rtol=0, atol=1e-6)
 
 
-def test_training_reaches_every_parameter() -> None:
-    net = PrimalDualNetwork(2, width=4, layers=2, window=3, iterations=2)
-    torch.nn.init.normal_(net.head.weight, std=0.3)
-    coarse = _map(6, 6)
-    coarse[..., 3:] += 20  # a step, across which the weights count
-    net.upsample(_photo(12, 12), coarse).square().mean().backward()
-    for name, parameter in net.named_parameters():
-        assert parameter.grad is not None, name
-        assert bool((parameter.grad != 0).any()), name
-
-
 def test_convolutions_may_run_in_bfloat16() -> None:
     net, rgb, coarse = _net(), _photo(24, 28), _map(6, 7)
     exact = net.upsample(rgb, coarse)

@@ -62,7 +62,7 @@ class CoupledLayer(nn.Module):
         for number in (1, 2):
             for kind in ("shared", "depth", "rgb"):
                 conv = nn.Conv2d(FEATURES, FEATURES // 2, 3)
-                self.register_parameter(f"kernel_{kind}_{number}", conv.weight)
+                self.register_parameter(f"kernel_{kind}_{number}", conv.get_parameter("weight"))
                 self.register_parameter(f"bias_{kind}_{number}", conv.get_parameter("bias"))
 
     def forward(self, depth: Tensor, rgb: Tensor) -> tuple[Tensor, Tensor]:
@@ -117,7 +117,7 @@ class DCTNet(PeerNetwork):
         encoder = self.Encoder_coupled
         depth = encoder["init_deep"](values).relu_()
         guide = encoder["init_rgb"](normalise_imagenet(rgb)).relu_()
-        for layer in encoder["coupled_feat_extractor"]:
+        for layer in encoder["coupled_feat_extractor"].children():
             depth, guide = layer(depth, guide)
         return self.Decoder_depth["Decoder_Deep"](transfer_edges(depth, guide, self.WPNet(guide), self.lambd.exp()))
 

@@ -75,7 +75,8 @@ class ChannelAttention(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Map (B, C, H, W) to the same shape."""
         y = self.body[:3](x)
-        return torch.addcmul(x, y, self.body[3]["conv_du"](y.mean(dim=(-2, -1), keepdim=True)))
+        factors = self.body.get_submodule("3.conv_du")(y.mean(dim=(-2, -1), keepdim=True))
+        return torch.addcmul(x, y, factors)
 
 
 class ResidualGroup(nn.Module):
