@@ -1,36 +1,54 @@
-"""The published networks of the field, part by part, against plain loops, OpenCV and torch's own layers."""
+"""The published networks of the field, part by part, against plain loops, OpenCV, SciPy and torch's own layers."""
 
 from __future__ import annotations
+
+import math
 
 import cv2
 import numpy as np
 import pytest
+import scipy.fft
+import scipy.ndimage
 import torch
 from torch.nn import functional
 
-from dsr.methods.networks.peers import local_filters, pgsr
+from dsr.methods.networks.dct import dct2, idct2
+from dsr.methods.networks.peers import dctnet, dornet, local_filters, pgsr
+from dsr.methods.networks.peers.dctnet import DCTNet, laplacian, transfer_edges
+from dsr.methods.networks.peers.dornet import DORNet, deformable_conv3x3
 from dsr.methods.networks.peers.local_filters import FDKN, SVLRM
 from dsr.methods.networks.peers.pgsr import PGSR
 
-_FOLDED = {SVLRM: 0, FDKN: 4 * (32 + 64 + 128), PGSR: 2 * (7 * 8 + 4)}
+_FOLDED = {SVLRM: 0, FDKN: 4 * (32 + 64 + 128), PGSR: 2 * (7 * 8 + 4), DCTNet: 0}
 """Parameters of the batch normalisations, which are merged into the convolutions."""
-_UNUSED = {SVLRM: 0, FDKN: 0, PGSR: 3 * (2 * (16 * 64 * 9 + 64) + 16 * 9 + 1) + 4 * (48 * 32 * 9 + 32)}
+_UNUSED = {
+    SVLRM: 0, FDKN: 0, PGSR: 3 * (2 * (16 * 64 * 9 + 64) + 16 * 9 + 1) + 4 * (48 * 32 * 9 + 32),
+    DCTNet: 16 * 16 * 9 + 16,
+}  # fmt: skip
 """Parameters that serve the training, or nothing."""
+SIZES = [(4, 6), (5, 7), (5, 4), (6, 5), (1, 3), (4, 1), (1, 2), (1, 1)]
 
 
-@pytest.mark.parametrize(("network", "published"), [(SVLRM, 371_650), (FDKN, 693_856), (PGSR, 728_737)])
+def random(*shape, seed=0, dtype=torch.float64):
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+
+
+@pytest.mark.parametrize(
+    ("network", "published"), [(SVLRM, 371_650), (FDKN, 693_856), (PGSR, 728_737), (DCTNet, 482_865)]
+)
 def test_network_has_the_published_number_of_parameters(network, published: int) -> None:
     parameters = sum(value.numel() for value in network(8).parameters())
     assert parameters + _FOLDED[network] + _UNUSED[network] == published
 
 
-@pytest.mark.parametrize("network", [SVLRM, FDKN, PGSR])
+@pytest.mark.parametrize("network", [SVLRM, FDKN, PGSR, DCTNet, DORNet])
 def test_each_image_of_a_batch_is_computed_by_itself(network) -> None:
     torch.manual_seed(2)
     net, rgb, values = network(4).eval(), torch.rand(2, 3, 16, 24), torch.rand(2, 1, 16, 24)
-    both = net(rgb, values)
-    assert both.shape == (2, 1, 16, 24)
-    torch.testing.assert_close(both[1:], net(rgb[1:], values[1:]), rtol=1e-4, atol=1e-5)
+    with torch.inference_mode():
+        both = net(rgb, values)
+        assert both.shape == (2, 1, 16, 24)
+        torch.testing.assert_close(both[1:], net(rgb[1:], values[1:]), rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("scale", [4, 8])
@@ -118,3 +136,133 @@ def test_pgsr_runs_in_bfloat16() -> None:
     exact = net(rgb, values)
     with torch.autocast("cpu", torch.bfloat16):
         torch.testing.assert_close(net(rgb, values).float(), exact, rtol=0, atol=0.02)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_dct2_and_idct2_are_scipys_transforms(size) -> None:
+    x = random(2, 3, *size)
+    np.testing.assert_allclose(dct2(x).numpy(), scipy.fft.dctn(x.numpy(), axes=(-2, -1)), atol=1e-13)
+    np.testing.assert_allclose(idct2(x).numpy(), scipy.fft.idctn(x.numpy(), axes=(-2, -1)), atol=1e-13)
+
+
+def test_dct2_of_float32_is_float32_and_accurate() -> None:
+    x = random(2, 48, 50, dtype=torch.float32)
+    coefficients = dct2(x)
+    assert coefficients.dtype == torch.float32
+    expected = scipy.fft.dctn(x.double().numpy(), axes=(-2, -1))
+    np.testing.assert_allclose(coefficients.numpy(), expected, atol=1e-6 * np.abs(expected).max())
+    torch.testing.assert_close(idct2(coefficients), x, atol=2e-6, rtol=0)
+
+
+@pytest.mark.parametrize("size", [(3, 4), (4, 3)])
+def test_dct2_and_idct2_have_the_right_gradients(size) -> None:
+    x = random(*size).requires_grad_()
+    assert torch.autograd.gradcheck(dct2, (x,), fast_mode=True)
+    assert torch.autograd.gradcheck(idct2, (x,), fast_mode=True)
+
+
+def test_laplacian_is_scipys_convolution_with_a_mirrored_border() -> None:
+    x = random(2, 3, 5, 4)
+    kernel = np.ones((3, 3))
+    kernel[1, 1] = -8
+    expected = scipy.ndimage.convolve(x.numpy(), kernel[None, None] / 16, mode="mirror")
+    np.testing.assert_allclose(laplacian(x).numpy(), expected, atol=1e-14)
+
+
+def test_transfer_edges_solves_the_linear_system() -> None:
+    height, width = 5, 6
+    depth, guide, weight = (random(2, 3, height, width, seed=seed) for seed in range(3))
+    strength = torch.tensor([0.1, 1.0, 30.0], dtype=torch.float64).view(1, 3, 1, 1)
+    # the Laplacian of four neighbours, without those outside
+    second = [np.diag(np.r_[-1, -2 * np.ones(n - 2), -1]) + np.eye(n, k=1) + np.eye(n, k=-1) for n in (height, width)]
+    four = np.kron(second[0], np.eye(width)) + np.kron(np.eye(height), second[1])
+    right = depth + strength * laplacian(weight * laplacian(guide))
+    solved = transfer_edges(depth, guide, weight, strength)
+    for channel, factor in enumerate(strength.flatten()):
+        matrix = np.eye(height * width) + float(factor) * four @ four
+        expected = np.linalg.solve(matrix, right[:, channel].reshape(2, -1).numpy().T).T
+        np.testing.assert_allclose(solved[:, channel].reshape(2, -1).numpy(), expected, atol=1e-12)
+
+
+def test_transfer_edges_does_not_depend_on_the_chunks(monkeypatch) -> None:
+    inputs = [random(2, 5, 4, 6, seed=seed) for seed in range(3)]
+    strength = random(1, 5, 1, 1, seed=3).exp()
+    whole = transfer_edges(*inputs, strength)
+    monkeypatch.setattr(dctnet, "_CHUNK", 2 * 4 * 6)
+    torch.testing.assert_close(transfer_edges(*inputs, strength), whole)
+
+
+def make_inputs(batch=2, channels=3, outputs=4, height=5, width=6):
+    return (
+        random(batch, channels, height, width),
+        2 * random(batch, 18, height, width, seed=1),
+        random(batch, 9, height, width, seed=2).sigmoid(),
+        random(batch, outputs, channels, 3, 3, seed=3),
+    )
+
+
+def interpolate(image, y, x):
+    """The bilinear value of (H, W) at a position; 0 outside."""
+    value = 0.0
+    for row in (math.floor(y), math.floor(y) + 1):
+        for column in (math.floor(x), math.floor(x) + 1):
+            if 0 <= row < image.shape[0] and 0 <= column < image.shape[1]:
+                value += (1 - abs(y - row)) * (1 - abs(x - column)) * image[row, column]
+    return value
+
+
+def convolve_in_loops(x, offsets, mask, weight):
+    batch, channels, height, width = x.shape
+    result = np.zeros((batch, weight.shape[1], height, width))
+    for b, row, column, tap in np.ndindex(batch, height, width, 9):
+        dy, dx = offsets[b, 2 * tap : 2 * tap + 2, row, column]
+        y, x_position = row + tap // 3 - 1 + dy, column + tap % 3 - 1 + dx
+        for channel in range(channels):
+            value = mask[b, tap, row, column] * interpolate(x[b, channel], y, x_position)
+            result[b, :, row, column] += weight[b, :, channel, tap // 3, tap % 3] * value
+    return result
+
+
+def test_deformable_conv3x3_equals_plain_loops() -> None:
+    inputs = make_inputs()
+    expected = convolve_in_loops(*(each.numpy() for each in inputs))
+    np.testing.assert_allclose(deformable_conv3x3(*inputs).numpy(), expected, atol=1e-12)
+
+
+def test_deformable_conv3x3_without_offsets_is_a_convolution() -> None:
+    x, offsets, mask, weight = make_inputs(batch=1)
+    result = deformable_conv3x3(x, 0 * offsets, torch.ones_like(mask), weight)
+    torch.testing.assert_close(result, functional.conv2d(x, weight[0], padding=1))
+
+
+def test_deformable_conv3x3_does_not_depend_on_the_chunks(monkeypatch) -> None:
+    inputs = make_inputs()
+    whole = deformable_conv3x3(*inputs)
+    monkeypatch.setattr(dornet, "_CHUNK", 1)
+    torch.testing.assert_close(deformable_conv3x3(*inputs), whole)
+
+
+def test_dornet_folds_batch_normalisation_into_convolutions_with_and_without_a_bias() -> None:
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(1, 24, 8, 8, generator=generator)
+    for conv, norm, has_bias in (
+        ("Enc.E.0", "Enc.E.1", True),
+        ("Enc.E_pre.1.shortcut.0", "Enc.E_pre.1.shortcut.1", False),
+    ):
+        weight = torch.randn(48, 24, 3, 3, generator=generator)
+        bias = torch.randn(48, generator=generator) if has_bias else None
+        parts = {part: torch.rand(48, generator=generator) + 0.5 for part in ("weight", "bias")}
+        statistics = {part: torch.rand(48, generator=generator) + 0.5 for part in ("running_mean", "running_var")}
+        tensors = {f"{conv}.weight": weight, **{f"{norm}.{name}": each for name, each in (parts | statistics).items()}}
+        tensors |= {f"{norm}.num_batches_tracked": torch.tensor(7), "Dab.fc1.weight": weight}
+        tensors |= {} if bias is None else {f"{conv}.bias": bias}
+        converted = DORNet.convert(tensors)
+        assert set(converted) == {f"{conv}.weight", f"{conv}.bias"}
+        expected = functional.batch_norm(functional.conv2d(x, weight, bias), **statistics, **parts)
+        folded = functional.conv2d(x, converted[f"{conv}.weight"], converted[f"{conv}.bias"])
+        torch.testing.assert_close(folded, expected, atol=1e-4, rtol=1e-4)
+
+
+def test_dornet_has_a_range_of_depth_with_the_weights_for_a_phone_alone() -> None:
+    assert DORNet(8 / 3).depth_range == (0, 5)
+    assert DORNet(4).depth_range is None
