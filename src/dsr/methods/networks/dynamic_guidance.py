@@ -1,20 +1,15 @@
 """Learned dynamic guidance: an energy with learned filters, minimised for a few steps, each with its own parameters.
 
 Gu, Zuo, Guo, Chen, Chen and Zhang, *Learning Dynamic Guidance for Depth Image Enhancement*, CVPR 2017, and TPAMI 2020.
-Filters k_l of the map x are penalised with weights at each pixel i from the image g, besides a data term:
+A *stage* moves the map x towards the low-resolution map d, with block means A and bicubic upsampling U, and then down
+the gradient of sum over l of w_l(g) rho_l(k_l y), the weighted responses of filters k_l, whose adjoint is k_l':
 
-    E(x) = sum over l and i of w_l(g)_i rho_l((k_l x)_i),    w_l(g) = exp(-sum over m of c_lm (b_m * g)^2), c_lm >= 0.
+    y = x - fidelity * U(A x - d),    x = y - sum over l of k_l' (w_l(g) rho_l'(k_l y)),
+    w_l(g) = exp(-sum over m of c_lm (b_m * g)^2),    rho_l(z) = sum over j of a_j tau_j^2 / 2 log(1 + z^2 / tau_j^2).
 
-Gradient descent is truncated after a few steps, the *stages*, whose parameters are learned from the result. A stage is
-
-    y = x - fidelity * U(A x - d),    A x the block means, d the low-resolution map, U bicubic upsampling,
-    x = y - sum over l of k_l' (w_l(g) rho_l'(k_l y)),    k_l y where the filter lies inside, k_l' the adjoint.
-
-What differs: the k_l have unit norm and response 0 on a plane, so that planes are reproduced under any image. rho_l is
-a mixture of Lorentzians (Roth and Black, *Fields of Experts*, IJCV 2009) of fixed widths, sum over j of
-a_j tau_j^2 / 2 log(1 + z^2 / tau_j^2), there of Gaussian radial basis functions; a negative a_j amplifies responses,
-which sharpens edges. The data step is iterative back-projection (Irani and Peleg 1991), the form of w_l is ours, all
-stages are trained at once, on disparity.
+What differs: the k_l have unit norm and response 0 on a plane, so that planes are reproduced under any image g; rho_l
+is a mixture of Lorentzians (Roth and Black, IJCV 2009), there of Gaussian radial basis functions; the data step is
+iterative back-projection (Irani and Peleg 1991); the form of w_l is ours; all stages are trained at once, on disparity.
 """
 
 from __future__ import annotations

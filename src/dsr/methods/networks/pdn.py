@@ -1,16 +1,13 @@
 """PDN: a convolutional network and an unrolled primal-dual iteration, trained as one.
 
 Riegler, Ferstl, Rüther and Bischof, *A Deep Primal-Dual Network for Guided Depth Super-Resolution*, BMVC 2016, with the
-sizes of the authors' code (github.com/griegler/primal-dual-networks, gdsr). Convolutions predict a residual, which is
-added to the upsampled map, and weights for each pixel. With the sum f and the weights w, the second stage minimises
+sizes of the authors' code (github.com/griegler/primal-dual-networks, gdsr). Convolutions predict a residual, with which
+the upsampled map becomes f, and weights w. A fixed number of steps of Chambolle and Pock (2011, algorithm 3) minimises
 
     E(u) = sum over pairs (i, i + d) of h(u[i + d] - u[i], w[i, d]) + data / 2 * sum (u - f)^2,
 
-with d half of the offsets of a square window and h the Huber function as in the authors' code, x^2 / (2 huber) where
-|x| <= huber w, else w |x| - huber / 2 w^2, in a fixed number of steps of Chambolle and Pock (2011, algorithm 3),
-
-    p = clip((p + sigma K(u + theta (u - u_before))) / (1 + sigma huber), -w, w),
-    u = (u - tau K' p + tau data f) / (1 + tau data),    K the differences of the pairs, K' the adjoint.
+with d half of the offsets of a square window and h(x, w) = x^2 / (2 huber) where |x| <= huber w, else
+w |x| - huber / 2 w^2.
 
 What differs: it works on disparity, upsampled exactly on planes; the convolutions see differences and slopes, faint
 ones enlarged, and the colours; the residual is in multiples of the low-resolution map's *bend*, the largest second

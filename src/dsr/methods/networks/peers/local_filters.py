@@ -1,15 +1,12 @@
-"""SVLRM and FDKN: networks that estimate a filter for each pixel.
+"""SVLRM and FDKN: networks that estimate a filter for each pixel. Layers have the names of the authors' files.
 
-SVLRM, spatially variant linear representation models: Pan, Dong, Ren, Lin, Tang, Yang, *Spatially Variant Linear
-Representation Models for Joint Filtering*, CVPR 2019. The refined map is a linear function of the grey photo whose gain
-and offset, one of each per pixel, a plain convolutional network estimates from the enlarged map and the photo. Weights:
-github.com/sunny2109/SVLRM.
+SVLRM: Pan, Dong, Ren, Lin, Tang, Yang, *Spatially Variant Linear Representation Models for Joint Filtering*, CVPR 2019,
+github.com/sunny2109/SVLRM. The refined map is a linear function of the grey photo; a plain convolutional network
+estimates gain and offset of each pixel from the enlarged map and the photo.
 
 FDKN, the fast deformable kernel network: Kim, Ponce, Ham, *Deformable Kernel Networks for Joint Image Filtering*, IJCV
-2021 (arXiv 1910.08373). For each pixel the network estimates nine positions around it and their weights, from the
-enlarged map and the photo, and adds the weighted sum of the map there. Weights: github.com/cvlab-yonsei/dkn (GPL-3).
-
-Layers have the names of the authors' files.
+2021 (arXiv 1910.08373), github.com/cvlab-yonsei/dkn (GPL-3). For each pixel the network estimates nine positions around
+it and their weights, from the enlarged map and the photo, and adds the weighted sum of the map there.
 """
 
 from __future__ import annotations
@@ -48,9 +45,9 @@ class SVLRM(PeerNetwork):
     def __init__(self, scale: float) -> None:
         super().__init__(scale)
         self.first_layer = nn.Conv2d(2, _WIDTH, 3, padding=1)
-        self.feature_block = nn.ModuleDict(
-            {str(2 * index): nn.Conv2d(_WIDTH, _WIDTH, 3, padding=1) for index in range(_DEPTH)}
-        )
+        self.feature_block = nn.Sequential()
+        for _ in range(_DEPTH):
+            self.feature_block.extend([nn.Conv2d(_WIDTH, _WIDTH, 3, padding=1), nn.LeakyReLU(_SLOPE, inplace=True)])
         self.final_layer = nn.Conv2d(_WIDTH, 2, 3, padding=1)
 
     def enlarge(self, values_lr: Tensor, size: tuple[int, int]) -> Tensor:
@@ -59,29 +56,25 @@ class SVLRM(PeerNetwork):
         The authors' training takes the last pixel of each block as the low-resolution value and enlarges the map as if
         it were the middle one, so the network has learnt to undo such a shift.
         """
-        for dim, new in ((-2, size[0]), (-1, size[1])):
-            values_lr = _resize(values_lr, dim, new, (self.scale - 1) / 2)
-        return values_lr
+        shift, (height, width) = (self.scale - 1) / 2, values_lr.shape[-2:]
+        down = _cubic_interpolation(height, size[0], shift).to(values_lr)
+        across = _cubic_interpolation(width, size[1], shift).to(values_lr)
+        return down @ values_lr @ across.T
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
         """Refine an enlarged map; see :meth:`PeerNetwork.forward`."""
         luma = grey(rgb)
         x = functional.leaky_relu(self.first_layer(torch.cat((values, luma), dim=1)), _SLOPE)
-        for layer in self.feature_block.values():
-            x = functional.leaky_relu(layer(x), _SLOPE)
-        gain, offset = self.final_layer(x).split(1, dim=1)
+        gain, offset = self.final_layer(self.feature_block(x)).split(1, dim=1)
         return gain * luma + offset
 
 
-def _resize(values: Tensor, dim: int, new: int, shift: float) -> Tensor:
-    """Return cubic interpolation along a dimension, at positions further on by ``shift`` new pixels."""
-    old = values.shape[dim]
+def _cubic_interpolation(old: int, new: int, shift: float) -> Tensor:
+    """Return the matrix (new, old) that interpolates at positions further on by ``shift`` new pixels."""
     place = (torch.arange(new, dtype=torch.float64) + 0.5 + shift) * (old / new) - 0.5
-    first = place.floor()
-    index = first.long()[:, None] + torch.arange(-1, 3)
+    index = place.floor().long()[:, None] + torch.arange(-1, 3)
     weight = cubic_kernel((place[:, None] - index).abs(), _CUBIC)
-    matrix = torch.zeros(new, old, dtype=torch.float64).scatter_add_(1, index.clamp(0, old - 1), weight).to(values)
-    return matrix @ values if dim == -2 else values @ matrix.T
+    return torch.zeros(new, old, dtype=torch.float64).scatter_add_(1, index.clamp(0, old - 1), weight)
 
 
 class FDKN(PeerNetwork):
@@ -107,8 +100,10 @@ class FDKN(PeerNetwork):
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
         """Refine an enlarged map; see :meth:`PeerNetwork.forward`."""
-        branches = zip(self.ImageKernel(grey(rgb, SWAPPED_LUMA)), self.DepthKernel(values), strict=True)
-        weights, offsets = (functional.pixel_shuffle(rgb * depth, _FACTOR).float() for rgb, depth in branches)
+        rgb_weights, rgb_offsets = self.ImageKernel(grey(rgb, SWAPPED_LUMA))
+        depth_weights, depth_offsets = self.DepthKernel(values)
+        weights = functional.pixel_shuffle(rgb_weights * depth_weights, _FACTOR).float()
+        offsets = functional.pixel_shuffle(rgb_offsets * depth_offsets, _FACTOR).float()
         return values + _sample(values, weights - weights.mean(dim=1, keepdim=True), offsets)
 
 
@@ -141,14 +136,9 @@ def _sample(values: Tensor, weights: Tensor, offsets: Tensor) -> Tensor:
     for tap in range(_TAPS**2):
         # The grid's first pixel is the window's middle one, less half a pixel, and its rows lie across.
         across, down = (offsets[:, 2 * tap + axis] + place - 0.5 for axis, place in enumerate(divmod(tap, _TAPS)))
-        inside = _fraction_inside(across) * _fraction_inside(down)
-        x, y = (each.clamp(-_RADIUS, _RADIUS) + start for each, start in ((across, columns), (down, rows)))
+        inside = (_RADIUS + 1 - across.abs()).clamp(0, 1) * (_RADIUS + 1 - down.abs()).clamp(0, 1)
+        x, y = across.clamp(-_RADIUS, _RADIUS) + columns, down.clamp(-_RADIUS, _RADIUS) + rows
         grid = torch.stack((2 * x / max(width - 1, 1) - 1, 2 * y / max(height - 1, 1) - 1), dim=-1)
         sampled = functional.grid_sample(values, grid, align_corners=True)
         total += sampled * (weights[:, tap] * inside)[:, None]
     return total
-
-
-def _fraction_inside(displacement: Tensor) -> Tensor:
-    """Return the weight that interpolation along an axis gives to pixels of the window."""
-    return (_RADIUS + 1 - displacement.abs()).clamp(0, 1)
