@@ -54,9 +54,6 @@ def find_frames(root: Path, split: Split | None = None) -> dict[str, Files]:
         root: directory of ``Training`` and ``Validation``, or any directory above or below.
         split: of the frames; None for all. What is in no directory ``Training`` is for validation.
 
-    Raises:
-        ValueError: there is no such directory.
-
     """
     found: dict[str, Files] = {}
     for folder in ("wide", "color"):
@@ -90,9 +87,6 @@ def load_frame(
         intrinsics_path: ``.pincam`` file; None for 60 degrees of horizontal view.
         min_confidence: pixels of the lidar below this confidence become holes.
 
-    Raises:
-        ValueError: a file is missing, damaged, or of another size; the message names it.
-
     """
     rgb, depth, measured = read_picture(rgb_path), read_millimetres(depth_path), read_millimetres(measured_path)
     for path, image, size in ((rgb_path, rgb, _SIZE), (depth_path, depth, _SIZE), (measured_path, measured, _SIZE_LR)):
@@ -112,12 +106,7 @@ def load_frame(
 
 
 def read_confidence(path: Path) -> np.ndarray:
-    """Return the lidar's confidence, (192, 256) uint8 from 0 to 2.
-
-    Raises:
-        ValueError: it is missing, damaged, of another size, or has other values.
-
-    """
+    """Return the lidar's confidence, (192, 256) uint8 from 0 to 2."""
     confidence = read_levels(path)
     expect_size(path, confidence.shape, _SIZE_LR)
     if confidence.max() > _HIGHEST_CONFIDENCE:
@@ -126,12 +115,7 @@ def read_confidence(path: Path) -> np.ndarray:
 
 
 def read_intrinsics(path: Path) -> Camera:
-    """Return the camera of a ``.pincam`` file, of 1920 x 1440 pixels with their centres at integers.
-
-    Raises:
-        ValueError: it is missing, or that of no such camera.
-
-    """
+    """Return the camera of a ``.pincam`` file, of 1920 x 1440 pixels with their centres at integers."""
     width, height, fx, fy, cx, cy = read_numbers(path, 6).tolist()
     if (height, width) != _SIZE:
         raise ValueError(f"{path}: expected a camera of 1440 x 1920 pixels, got {height:g} x {width:g}")
@@ -146,7 +130,6 @@ def _find_intrinsics(place: Path, frame: str) -> Path | None:
 
 
 NOTE = f"there is no .pincam file: {ASSUMED_FOV:g} degrees of horizontal view are assumed"
-"""Of scenes without intrinsics."""
 
 
 class ARKitScenes(PreparedDataset):
@@ -158,9 +141,6 @@ class ARKitScenes(PreparedDataset):
         scenes: names of the scenes to use, such as ``41069021_305.244``; None and ``found`` for all of the split in
             ``root``.
         min_confidence: lowest confidence of the lidar's pixels, 0 to 2; the others become holes.
-
-    Raises:
-        ValueError: a scene is not on disk, or a value is out of range.
 
     """
 

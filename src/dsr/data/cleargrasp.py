@@ -68,16 +68,13 @@ from dsr.sample import Scene
 
 Split = Literal["val", "test", "train"]
 SPLITS: tuple[Split, ...] = ("val", "test", "train")
-EDGE = 5
-"""Width of the region ``edges`` on either side of the outline, pixels."""
-VIEW = (1.2112585306167603, 0.7428327202796936)
-"""Angles of view of the rendered pictures, across and down, radians."""
+EDGE = 5  # width of the region ``edges`` on either side of the outline, pixels
+VIEW = (1.2112585306167603, 0.7428327202796936)  # angles of view of the rendered pictures, across and down, radians
 _REAL = ("{}-transparent-rgb-img.jpg", "{}-transparent-depth-img.exr", "{}-opaque-depth-img.exr", "{}-mask.png")
 _SYNTHETIC = (
     "rgb-imgs/{}-rgb.jpg", "depth-imgs-rectified/{}-depth-rectified.exr", "segmentation-masks/{}-segmentation-mask.png"
 )  # fmt: skip
 NOTE = "true depth comes in 16-bit floats, steps of 0.5 to 1 mm: scores of normals and renderings show these, too"
-"""For readers of the scores."""
 _KEYS = ("xres", "yres", "fx", "fy", "cx", "cy")
 _ENTRY = re.compile(rf"^({'|'.join(_KEYS)})\s*:\s*([-+.\deE]+)\s*(?:#.*)?$", re.MULTILINE)
 
@@ -88,9 +85,6 @@ def find_captures(root: Path, split: Split | None = None) -> dict[str, tuple[Pat
     Args:
         root: directory of the captures, or one above it.
         split: of the captures, of which the folder's or an upper folder's name ends in it; None for all.
-
-    Raises:
-        ValueError: there is no such directory.
 
     """
     found = {}
@@ -110,9 +104,6 @@ def find_renderings(root: Path, split: Split | None = None) -> dict[str, tuple[P
     Args:
         root: directory of the objects' folders, or one above it.
         split: see :func:`find_captures`.
-
-    Raises:
-        ValueError: there is no such directory.
 
     """
     found = {}
@@ -134,12 +125,7 @@ def _is_of(folder: Path, split: Split | None) -> bool:
 def load_capture(
     rgb_path: Path, measured_path: Path, truth_path: Path, mask_path: Path, camera_path: Path, dataset: str, name: str
 ) -> Scene:
-    """Return a capture, with the depth of the clear objects as measured at x1, and that of their twins as the truth.
-
-    Raises:
-        ValueError: a file is missing, damaged, or does not fit the others; the message names it.
-
-    """
+    """Return a capture, with the depth of the clear objects as measured at x1, and that of their twins as the truth."""
     rgb, measured, truth = read_picture(rgb_path), read_depth(measured_path), read_depth(truth_path)
     camera = read_camera(camera_path)
     size = (camera.height, camera.width)
@@ -149,12 +135,7 @@ def load_capture(
 
 
 def load_rendering(rgb_path: Path, depth_path: Path, mask_path: Path, dataset: str, name: str) -> Scene:
-    """Return a rendered scene with its exact orthogonal depth.
-
-    Raises:
-        ValueError: a file is missing, damaged, or does not fit the others; the message names it.
-
-    """
+    """Return a rendered scene with its exact orthogonal depth."""
     rgb, stored = read_picture(rgb_path), read_depth(depth_path, smooth=True)
     height, width = rgb.shape[1:]
     expect_size(depth_path, tuple(stored.shape[1:]), (height, width))
@@ -182,9 +163,6 @@ def read_depth(path: Path, *, smooth: bool = False) -> Tensor:
         path: the file.
         smooth: whether the steps of 16-bit floats are smoothed, each value within half a step.
 
-    Raises:
-        ValueError: it is missing, damaged, negative, or all holes.
-
     """
     values = read_depth_file(path)
     depth = to_depth(path, np.nan_to_num(values.astype(np.float64), nan=0, posinf=0))
@@ -197,12 +175,7 @@ def read_depth(path: Path, *, smooth: bool = False) -> Tensor:
 
 
 def read_regions(path: Path, size: Sequence[int]) -> dict[str, Tensor]:
-    """Return the regions that a mask of ``size`` = (height, width) gives, (1, H, W) uint8.
-
-    Raises:
-        ValueError: it is missing, damaged, or of another size.
-
-    """
+    """Return the regions that a mask of ``size`` = (height, width) gives, (1, H, W) uint8."""
     mask = read_mask(path).astype(np.uint8)
     expect_size(path, mask.shape, tuple(size))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * EDGE + 1, 2 * EDGE + 1))
@@ -213,12 +186,7 @@ def read_regions(path: Path, size: Sequence[int]) -> dict[str, Tensor]:
 
 
 def read_camera(path: Path) -> Camera:
-    """Return the camera of a ``camera_intrinsics.yaml``, pixel centres at integers.
-
-    Raises:
-        ValueError: it is missing, lacks a key, or is that of no camera.
-
-    """
+    """Return the camera of a ``camera_intrinsics.yaml``, pixel centres at integers."""
     text = read_bytes(path, f"a text file with {', '.join(_KEYS)}").decode("utf-8", "replace")
     found = dict(_ENTRY.findall(text))
     try:
@@ -237,9 +205,6 @@ class ClearGrasp(PreparedDataset):
         split: ``val``, with the objects that the authors' networks were trained on; ``test``, with others; ``train``,
             rendered, to train on; None for what is in ``root``.
         scenes: names of the scenes to use, such as ``real-val_d435_000000080``; None and ``found`` for all.
-
-    Raises:
-        ValueError: a scene is not on disk, or a value is out of range.
 
     """
 

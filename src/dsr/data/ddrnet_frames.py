@@ -34,10 +34,6 @@ def find_frames(root: Path) -> dict[str, tuple[Path, Path, Path]]:
     """Return photos, sensor's and true depth, the first arguments of :func:`load_frame`, by name, in order.
 
     A name is the frame's group below ``root`` and its file's name, such as ``20170907/group1/frame_000001``.
-
-    Raises:
-        ValueError: there is no such directory.
-
     """
     found = {}
     others = ("depth_map/{}.png", "high_quality_depth/{}.png")
@@ -47,12 +43,7 @@ def find_frames(root: Path) -> dict[str, tuple[Path, Path, Path]]:
 
 
 def load_frame(rgb_path: Path, measured_path: Path, truth_path: Path, dataset: str, name: str) -> Scene:
-    """Return one frame with the sensor's map, measured at the photo's size.
-
-    Raises:
-        ValueError: a file is missing, damaged, or not of 640 x 480 pixels; the message names it.
-
-    """
+    """Return one frame with the sensor's map, measured at the photo's size."""
     size = (CAMERA.height, CAMERA.width)
     rgb, measured, truth = read_picture(rgb_path), read_millimetres(measured_path), read_millimetres(truth_path)
     for path, image in ((rgb_path, rgb), (measured_path, measured), (truth_path, truth)):
@@ -66,9 +57,6 @@ class DDRNetFrames(PreparedDataset):
     Args:
         root: directory of ``color_map``, ``depth_map`` and ``high_quality_depth``, or one above it.
         scenes: names of the scenes to use; None and ``found`` for all in ``root``.
-
-    Raises:
-        ValueError: a scene is not on disk.
 
     """
 

@@ -74,7 +74,6 @@ BENCHMARKS: Mapping[str, Benchmark] = MappingProxyType(
         "middlebury8": Benchmark("Middlebury", 30, 3740 / 3, 0.48, 200.0),
     }
 )
-"""The benchmarks by the name of the data set."""
 
 
 def find_frames(root: Path, dataset: str) -> dict[str, tuple[Path, Path]]:
@@ -83,9 +82,6 @@ def find_frames(root: Path, dataset: str) -> dict[str, tuple[Path, Path]]:
     Args:
         root: directory of ``RGB`` and ``Depth``, or one above it.
         dataset: key of ``BENCHMARKS``.
-
-    Raises:
-        ValueError: there is no such directory.
 
     """
     found: dict[str, tuple[Path, Path]] = {}
@@ -104,9 +100,6 @@ def load_frame(rgb_path: Path, levels_path: Path, dataset: str, name: str) -> Sc
         rgb_path: photo.
         levels_path: map of 8 bits, in which 0 is a level and no hole.
         dataset: of the scene returned, a key of ``BENCHMARKS``, which says the camera.
-
-    Raises:
-        ValueError: a file is missing, damaged, or does not fit the other; the message names it.
 
     """
     rgb, levels = read_picture(rgb_path), read_levels(levels_path)
@@ -130,13 +123,9 @@ class EightBit(PreparedDataset):
         scenes: names of the scenes to use, such as ``RGBD_01`` or ``Middlebury_01``; None for all of the benchmark,
             ``found`` for all in ``root``.
 
-    Raises:
-        ValueError: a scene is not on disk, or a value is out of range.
-
     """
 
-    soft_edges: ClassVar[bool] = True
-    """Pixels at depth steps are mixtures of both sides."""
+    soft_edges: ClassVar[bool] = True  # pixels at depth steps are mixtures of both sides
 
     def __init__(self, root: str, benchmark: Literal["lu", "middlebury8"], scenes: SceneSelection = None) -> None:
         if benchmark not in BENCHMARKS:

@@ -46,9 +46,6 @@ class Folder:
         without_offset: names of the scenes whose ``doffs`` in ``camera.json`` is replaced by 0, as the paper does with
             Vintage; see :class:`dsr.data.middlebury.Middlebury`.
 
-    Raises:
-        ValueError: the directory is missing or has no scene, or none of a name in ``without_offset``.
-
     """
 
     evaluation = False
@@ -95,9 +92,6 @@ def load_scene(folder: Path, dataset: str, *, offset: bool = True) -> Scene:
     Args:
         folder: with the files.
         offset: whether ``doffs`` of ``camera.json`` counts, as it has to geometrically, or is taken for 0.
-
-    Raises:
-        ValueError: a file is missing, damaged, or does not fit the others; the message names it.
 
     """
     description = read_camera(folder / "camera.json")

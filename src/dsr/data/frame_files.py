@@ -25,24 +25,14 @@ Found = TypeVar("Found")
 
 
 def read_bytes(path: Path, what: str) -> bytes:
-    """Return the content of a file.
-
-    Raises:
-        ValueError: there is none; ``what`` says what was expected.
-
-    """
+    """Return the content of a file."""
     if not path.is_file():
         raise ValueError(f"{path}: expected {what}, there is none")
     return read_limited(path, MOST_FILE)
 
 
 def read_picture(path: Path) -> Tensor:
-    """Return a picture of 8 or 16 bits a channel, (3, H, W) float32 in [0, 1].
-
-    Raises:
-        ValueError: it is missing, damaged, or no such picture.
-
-    """
+    """Return a picture of 8 or 16 bits a channel, (3, H, W) float32 in [0, 1]."""
     pixels = read_pixels(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     if pixels.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"{path}: expected a picture of 8 or 16 bits a channel, got {pixels.dtype}")
@@ -51,12 +41,7 @@ def read_picture(path: Path) -> Tensor:
 
 
 def read_16bit(path: Path) -> np.ndarray:
-    """Return the values of a grey picture of 16 bits, (H, W) uint16.
-
-    Raises:
-        ValueError: it is missing, damaged, or no such picture.
-
-    """
+    """Return the values of a grey picture of 16 bits, (H, W) uint16."""
     pixels = read_pixels(path, cv2.IMREAD_UNCHANGED)
     if pixels.ndim != 2 or pixels.dtype != np.uint16:
         channels = 1 if pixels.ndim == 2 else pixels.shape[2]
@@ -65,12 +50,7 @@ def read_16bit(path: Path) -> np.ndarray:
 
 
 def read_millimetres(path: Path) -> Tensor:
-    """Return a depth picture of 16 bits that holds millimetres, 0 for a hole: (1, H, W) float64 in metres, NaN there.
-
-    Raises:
-        ValueError: it is missing, damaged, no such picture, or all holes.
-
-    """
+    """Return a depth picture of 16 bits in millimetres, 0 for a hole, as (1, H, W) float64 in metres, NaN there."""
     return to_depth(path, read_16bit(path) / 1000)
 
 
@@ -81,9 +61,6 @@ def to_depth(path: Path, values: np.ndarray, farthest: float = math.inf) -> Tens
         path: the file that the values come from, for the message.
         values: (H, W) metres; 0 is a hole.
         farthest: metres; what lies beyond, the sky, becomes a hole.
-
-    Raises:
-        ValueError: a value is negative or NaN, or all are holes.
 
     """
     with np.errstate(invalid="ignore"):  # damaged bytes may be signalling NaN, which a cast warns of
@@ -114,10 +91,6 @@ def to_camera(source: Path | str, matrix: np.ndarray, size: tuple[int, int]) -> 
         matrix: (3, 3), in pixels.
         size: (height, width) of the pictures.
 
-    Raises:
-        ValueError: it is no such matrix, a focal length is beyond 0.1 to 100 picture widths, or the principal point
-            lies outside of the picture.
-
     """
     height, width = size
     (fx, skew, cx), (lower, fy, cy), last = matrix.tolist()
@@ -130,23 +103,13 @@ def to_camera(source: Path | str, matrix: np.ndarray, size: tuple[int, int]) -> 
 
 
 def given_camera(intrinsics: tuple[float, float, float, float], size: tuple[int, int]) -> Camera:
-    """Return the camera of a caller's (fx, fy, cx, cy) for pictures of ``size`` = (height, width).
-
-    Raises:
-        ValueError: they are those of no such camera, see :func:`to_camera`.
-
-    """
+    """Return the camera of a caller's (fx, fy, cx, cy) for pictures of ``size`` = (height, width)."""
     fx, fy, cx, cy = intrinsics
     return to_camera("intrinsics", np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), size)
 
 
 def load_pair(rgb_path: Path, depth_path: Path, dataset: str, name: str) -> Scene:
-    """Return a photo and its depth in millimetres, for which no camera is published, as a scene.
-
-    Raises:
-        ValueError: a file is missing, damaged, or does not fit the other; the message names it.
-
-    """
+    """Return a photo and its depth in millimetres, for which no camera is published, as a scene."""
     rgb, depth = read_picture(rgb_path), read_millimetres(depth_path)
     height, width = rgb.shape[1:]
     expect_size(depth_path, tuple(depth.shape[1:]), (height, width))
@@ -158,10 +121,6 @@ def walk(root: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
 
     A name that the caller takes off the list of folders is not entered; hidden folders are not either. Links are,
     unless they lead back.
-
-    Raises:
-        ValueError: there is no such directory.
-
     """
     if not root.is_dir():
         raise ValueError(f"{root}: expected a directory, there is none")
@@ -198,9 +157,6 @@ def find_beside(
     Yields:
         The folder that ``photos`` lies in, the frame, and its files: the photo, then the others. A frame that lacks one
         of them is left out.
-
-    Raises:
-        ValueError: there is no such directory.
 
     """
     for place, below, _ in walk(root):

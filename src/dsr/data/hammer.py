@@ -37,8 +37,7 @@ from dsr.sample import Scene
 
 Sensor = Literal["d435", "tof", "l515"]
 Split = Literal["test", "train"]
-TEST = (12, 13, 14)
-"""Numbers of the scenes to test on."""
+TEST = (12, 13, 14)  # numbers of the scenes to test on
 _SEQUENCE = re.compile(r"scene(\d+)_traj\d+(_naked)?_\d+")
 _PHOTO = re.compile(r"(\d+)\.png")
 
@@ -53,9 +52,6 @@ def find_frames(
         sensor: the camera that measured.
         split: of the scenes; None for both.
         naked: whether to take sequences without objects, instead of those with them.
-
-    Raises:
-        ValueError: there is no such directory.
 
     """
     found = {}
@@ -75,12 +71,7 @@ def find_frames(
 def load_frame(
     rgb_path: Path, measured_path: Path, truth_path: Path, intrinsics_path: Path, dataset: str, name: str
 ) -> Scene:
-    """Return one frame with a camera's map, measured at the photo's size.
-
-    Raises:
-        ValueError: a file is missing, damaged, or does not fit the others; the message names it.
-
-    """
+    """Return one frame with a camera's map, measured at the photo's size."""
     rgb, measured, truth = read_picture(rgb_path), read_millimetres(measured_path), read_millimetres(truth_path)
     size = (rgb.shape[1], rgb.shape[2])
     for path, image in ((measured_path, measured), (truth_path, truth)):
@@ -98,9 +89,6 @@ class Hammer(PreparedDataset):
         split: ``test``, to evaluate on, or ``train``, to train on.
         naked: whether to use the sequences without objects, instead of those with them.
         scenes: names of the scenes to use, such as ``scene12_traj1_1_000000``; None and ``found`` for all of the split.
-
-    Raises:
-        ValueError: a scene is not on disk, or a value is out of range.
 
     """
 

@@ -52,11 +52,9 @@ from dsr.geometry.camera import Camera
 from dsr.io.images import read_levels
 from dsr.sample import Scene
 
-COUNT = 100
-"""Number of scenes."""
+COUNT = 100  # number of scenes
 SIZE = (480, 640)
-FARTHEST = 50.0
-"""Depth of the largest value in pictures, metres."""
+FARTHEST = 50.0  # depth of the largest value in pictures, metres
 _VALID = ("mask_invalid", "mask_transp")
 _PLANES = ("mask_wall", "mask_table", "mask_floor")
 _MASKS = (*_VALID, "edges", *_PLANES)
@@ -69,9 +67,6 @@ def find_matrices(root: Path) -> dict[str, tuple[Path]]:
 
     Args:
         root: directory of the files, or one above it; results of methods, ``*_results.mat``, are left out.
-
-    Raises:
-        ValueError: there is no such directory.
 
     """
     found: dict[str, tuple[Path]] = {}
@@ -87,9 +82,6 @@ def find_pictures(root: Path) -> dict[str, Pictures]:
     Args:
         root: directory of ``rgb``, ``depth`` and ``calib``, or one above it.
 
-    Raises:
-        ValueError: there is no such directory.
-
     """
     found: dict[str, Pictures] = {}
     needed = ("depth/{}.png", "calib/{}.txt", *(f"{mask}/{{}}.png" for mask in _VALID))
@@ -100,12 +92,7 @@ def find_pictures(root: Path) -> dict[str, Pictures]:
 
 
 def load_matrices(path: Path, dataset: str, name: str) -> Scene:
-    """Return the scene of a MATLAB file.
-
-    Raises:
-        ValueError: it is missing or damaged, or a matrix is missing or of another size; the message names it.
-
-    """
+    """Return the scene of a MATLAB file."""
     stored = {key.removeprefix("data."): values for key, values in read_variables(path).items()}
     needed = ("rgb", "depth", "calib", *_VALID)
     missing = [key for key in needed if key not in stored]
@@ -134,9 +121,6 @@ def load_pictures(rgb_path: Path, depth_path: Path, calibration_path: Path, *pat
         calibration_path: intrinsics.
         paths: the masks of pixels that are invalid, of those that are transparent, of edges, walls, tables and floors,
             the last four None where there is none; then the names of data set and scene.
-
-    Raises:
-        ValueError: a file is missing, damaged or of another size; the message names it.
 
     """
     *mask_paths, dataset, name = paths
@@ -188,9 +172,6 @@ class IBims(PreparedDataset):
     Args:
         root: directory of the MATLAB files, or of the folders of pictures, or one above them.
         scenes: names of the scenes to use, such as ``corridor_01``; None for all 100, ``found`` for those in ``root``.
-
-    Raises:
-        ValueError: a scene is not on disk.
 
     """
 

@@ -32,10 +32,8 @@ from dsr.io.depth_files import ICL_CAMERA as CAMERA
 from dsr.io.images import read_numbers
 from dsr.sample import Scene
 
-FARTHEST = 100.0
-"""Largest depth in metres; longer rays have hit nothing."""
-LEVELS = 5000
-"""Levels per metre of the depth pictures."""
+FARTHEST = 100.0  # largest depth in metres; longer rays have hit nothing
+LEVELS = 5000  # levels per metre of the depth pictures
 _RENDERED = re.compile(r"scene_00_(\d+)\.depth")
 _SIZE = (480, 640)
 
@@ -45,10 +43,6 @@ def find_frames(root: Path) -> dict[str, tuple[Path, Path]]:
 
     A name is the frame's folder below ``root`` and its number, such as ``living_room_traj2/0120``, or the folder alone
     where it holds one frame. A frame that lacks one of its two files is left out.
-
-    Raises:
-        ValueError: there is no such directory.
-
     """
     found: dict[str, tuple[Path, Path]] = {}
     for folder, below, files in walk(root):
@@ -67,12 +61,7 @@ def find_frames(root: Path) -> dict[str, tuple[Path, Path]]:
 
 
 def read_depth(path: Path) -> Tensor:
-    """Return a depth file, ``.depth`` or ``.png``, as orthogonal depth, (1, 480, 640) float64 in metres, NaN in holes.
-
-    Raises:
-        ValueError: it is missing, damaged, of another size, or has negative values.
-
-    """
+    """Return a ``.depth`` or ``.png`` file as orthogonal depth, (1, 480, 640) float64 in metres, NaN in holes."""
     if path.suffix.lower() == ".depth":
         centimetres = read_numbers(path, _SIZE[0] * _SIZE[1]).reshape(_SIZE)
         return from_range(to_depth(path, centimetres / 100, FARTHEST), CAMERA, "perspective")
@@ -82,12 +71,7 @@ def read_depth(path: Path) -> Tensor:
 
 
 def load_frame(rgb_path: Path, depth_path: Path, dataset: str, name: str) -> Scene:
-    """Return one frame at 640 x 480.
-
-    Raises:
-        ValueError: a file is missing, damaged or of another size; the message names it.
-
-    """
+    """Return one frame at 640 x 480."""
     rgb = read_picture(rgb_path)
     expect_size(rgb_path, tuple(rgb.shape[1:]), _SIZE)
     return Scene(dataset, name, rgb, CAMERA, read_depth(depth_path))
@@ -119,9 +103,6 @@ class ICL(PreparedDataset):
         size: height and width in pixels; None for the original size.
         crop: see :class:`dsr.data.preparation.Preparation`.
         frames: frame of each of the paper's names.
-
-    Raises:
-        ValueError: a scene is not on disk, or a value is out of range.
 
     """
 

@@ -106,9 +106,6 @@ def load_2014(folder: Path, dataset: str, name: str, *, offset: bool = True) -> 
         folder: with the files.
         offset: whether doffs of ``calib.txt`` counts, as it has to geometrically, or is taken for 0.
 
-    Raises:
-        ValueError: a file is missing, damaged, or does not fit the others; the message names it.
-
     """
     camera = read_calibration(folder / "calib.txt")
     path = folder / "disp0.pfm"
@@ -132,9 +129,6 @@ def load_levels(files: Files, dataset: str, name: str, year: int, *, smooth: boo
         files: of the scene.
         year: that of the data set, which says how levels count.
         smooth: whether the steps of the rounding are smoothed; see :mod:`dsr.data.reference_depth`.
-
-    Raises:
-        ValueError: a file is missing, damaged, or does not fit the others; the message names it.
 
     """
     levels = read_levels(files.disparity).astype(np.float64)
@@ -164,10 +158,6 @@ def read_calibration(path: Path) -> Camera:
 
     Lines are ``key=value`` with blanks anywhere; ``cam0`` is a matrix as MATLAB writes it, ``baseline`` in millimetres,
     the rest in pixels.
-
-    Raises:
-        ValueError: it is missing or damaged, or a key is missing or out of range.
-
     """
     if not path.is_file():
         raise ValueError(f"{path}: expected a calibration, there is none")
@@ -244,8 +234,7 @@ SCENES = {
     2006: _names(collections.SCENES_2006),
 }
 TRAINING_2014 = _names(collections.TRAINING_2014)
-TRAINING = {2001: SCENES[2001], 2006: SCENES[2006], 2014: TRAINING_2014}
-"""Scenes to train on by year."""
+TRAINING = {2001: SCENES[2001], 2006: SCENES[2006], 2014: TRAINING_2014}  # scenes to train on by year
 _FILES_2014 = ("im0.png", "calib.txt", "disp0.pfm", "disp0GT.pfm")
 
 
@@ -259,9 +248,6 @@ class Middlebury(PreparedDataset):
         fill: names of the scenes whose holes are inpainted.
         without_offset: names of the scenes whose disparity offset is replaced by 0, which makes their depth wrong. The
             paper does so with Vintage, but not with Recycle and Playroom.
-
-    Raises:
-        ValueError: a scene is not on disk, or a value is out of range.
 
     """
 
@@ -289,9 +275,6 @@ class MiddleburyLevels(PreparedDataset):
         fill: names of the scenes whose holes are inpainted.
         smooth: whether the steps that rounding to whole levels makes are smoothed; see
             :mod:`dsr.data.reference_depth`.
-
-    Raises:
-        ValueError: a scene is not on disk, or a value is out of range.
 
     """
 
@@ -321,9 +304,6 @@ class MiddleburyTrain(PreparedDataset):
         scenes: names of the scenes to use; None for all of the years, ``found`` for all in ``root``.
         size: largest length of the shorter side in pixels; None for the original size.
         years: years to use.
-
-    Raises:
-        ValueError: a scene is not on disk, or a value is out of range.
 
     """
 

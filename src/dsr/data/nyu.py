@@ -60,10 +60,6 @@ def find_frames(path: Path) -> dict[str, tuple[Path, int]]:
     """Return the file and the frame's number, the first two arguments of :func:`load_frame`, by name "0001" to "1449".
 
     Numbers count from 1, as in the official split of the frames.
-
-    Raises:
-        ValueError: the file is missing, damaged or another one.
-
     """
     with _opened(path) as arrays:
         return {f"{number:04d}": (path, number) for number in range(1, len(arrays["images"]) + 1)}
@@ -77,9 +73,6 @@ def load_frame(path: Path, number: int, dataset: str, name: str, *, filled: bool
         number: of the frame, from 1.
         filled: take the authors' filled depth instead of the Kinect's with its holes.
         crop: cut off the border, which leaves 427 x 561 pixels.
-
-    Raises:
-        ValueError: the file is missing, damaged or another one, or has no such frame.
 
     """
     key = "depths" if filled else "rawDepths"
@@ -104,10 +97,6 @@ def find_files(root: Path) -> dict[str, tuple[Path, Path]]:
     """Return the photos and depths that lie in files of their own, arguments of :func:`load_files`, by name, in order.
 
     Names are those of the frames in the labelled file: ``RGB/1000.jpg`` is "1001".
-
-    Raises:
-        ValueError: there is no such directory.
-
     """
     found: dict[str, tuple[Path, Path]] = {}
     for _, number, (photo, depth) in find_beside(root, "RGB", _PHOTO, ("Depth/{}.npy",)):
@@ -116,12 +105,7 @@ def find_files(root: Path) -> dict[str, tuple[Path, Path]]:
 
 
 def load_files(rgb_path: Path, depth_path: Path, dataset: str, name: str) -> Scene:
-    """Return one frame of files of their own, with its border and the filled depth.
-
-    Raises:
-        ValueError: a file is missing, damaged, or not of 640 x 480 pixels; the message names it.
-
-    """
+    """Return one frame of files of their own, with its border and the filled depth."""
     size = (CAMERA.height, CAMERA.width)
     rgb, depth = read_picture(rgb_path), to_depth(depth_path, read_map(depth_path))
     expect_size(rgb_path, tuple(rgb.shape[1:]), size)
@@ -176,9 +160,6 @@ class NYU(PreparedDataset):
         split: ``test``, the last 449 frames, to evaluate on, or ``train``, the first 1000, to train on, as in the
             literature on guided depth super-resolution: 640 x 480 pixels with the border and the inpainted depth,
             whatever ``size``, ``crop`` and ``filled`` are. None for all frames.
-
-    Raises:
-        ValueError: the file is missing or damaged, a scene is not there, or a value is out of range.
 
     """
 

@@ -27,8 +27,7 @@ from dsr.utils.versions import SCENES, file_hash
 
 _MIN_SIZE = 32
 _MAX_LISTED = 30
-_MAX_HASHED = 1 << 28
-"""Largest size in bytes of files whose content is hashed."""
+_MAX_HASHED = 1 << 28  # largest size in bytes of files whose content is hashed
 
 
 @dataclass(frozen=True)
@@ -121,9 +120,6 @@ class Preparation:
         enlarge: whether smaller scenes are enlarged.
         fill: names of the scenes whose holes are inpainted; see :mod:`dsr.data.reference_depth`.
 
-    Raises:
-        ValueError: a value is out of range.
-
     """
 
     size: int | None = 512
@@ -159,9 +155,6 @@ class PreparedDataset:
         scenes: names of the scenes to use; None for those of ``named``, ``found`` for all that are on disk.
         preparation: how scenes are resized, cropped and inpainted.
         count: number of scenes that belong to the data set, where their names are not known; None otherwise.
-
-    Raises:
-        ValueError: a scene is not on disk; the message says how to get it.
 
     """
 
@@ -266,12 +259,7 @@ def _hash_of(path: Path, size: int, changed: int) -> str:
 
 
 def content_hash(path: Path) -> str:
-    """Return the SHA-256 of a file; of a file above 256 MiB, its name, size and time of the last change.
-
-    Raises:
-        ValueError: there is no such file.
-
-    """
+    """Return the SHA-256 of a file; of a file above 256 MiB, its name, size and time of the last change."""
     if not path.is_file():
         raise ValueError(f"{path}: expected a file, there is none")
     status = path.stat()

@@ -32,20 +32,15 @@ from torch.nn import functional
 
 from dsr.sample import Scene
 
-JUMP = 0.02
-"""Relative difference of depth above which neighbours belong to different surfaces."""
-_MIN_RADIUS = 1.5
-"""Smallest radius of the weights in old pixels: it leaves two pixels at a border, which a slope needs."""
+JUMP = 0.02  # relative difference of depth above which neighbours belong to different surfaces
+_MIN_RADIUS = 1.5  # smallest radius of the weights in old pixels: it leaves two pixels at a border, which a slope needs
 _RIDGE = 1e-9
 
-_STEP = 0.05
-"""Smallest relative gap between the sorted inverse depths of a rim that is a depth step."""
+_STEP = 0.05  # smallest relative gap between the sorted inverse depths of a rim that is a depth step
 _SIDES = ((0, 1), (1, 0), (0, -1), (-1, 0))
 
-_CONTOUR = 2.0
-"""Weight of the value at a contour, which lies half a pixel from the pixels on its sides."""
-_ANCHOR = 1e-6
-"""Weight of the level itself, for plateaus without a contour."""
+_CONTOUR = 2.0  # weight of the value at a contour, which lies half a pixel from the pixels on its sides
+_ANCHOR = 1e-6  # weight of the level itself, for plateaus without a contour
 _TOLERANCE = 1e-5
 
 
@@ -56,9 +51,6 @@ def resize(scene: Scene, height: int, width: int) -> Scene:
         scene: scene with a high-resolution depth.
         height: height of the result in pixels.
         width: width of the result in pixels.
-
-    Raises:
-        ValueError: the scene has no high-resolution depth.
 
     """
     if scene.depth is None:

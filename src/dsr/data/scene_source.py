@@ -36,12 +36,7 @@ class SceneSource(Protocol):
         ...
 
     def load(self, scene: str) -> Scene:
-        """Return one scene.
-
-        Raises:
-            ValueError: a file is missing or damaged; the message names it.
-
-        """
+        """Return one scene, or raise a ValueError that names a file that is missing or damaged."""
         ...
 
     def fingerprint(self, scene: str) -> str:
@@ -120,12 +115,7 @@ class SceneSubset:
 
 
 def select_scenes(available: Sequence[str], wanted: SceneSelection) -> list[str]:
-    """Return the ``wanted`` scenes, or all available ones for None.
-
-    Raises:
-        ValueError: a wanted scene is not available or is named twice, the list is empty, or a name is not UTF-8.
-
-    """
+    """Return the ``wanted`` scenes, or all available ones for None."""
     if wanted == "found":
         wanted = None
     if wanted is not None and (not wanted or len(set(wanted)) < len(wanted)):

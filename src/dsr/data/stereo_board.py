@@ -74,7 +74,6 @@ BOARDS = MappingProxyType(
         ),
     }
 )
-"""By the name of the frame."""
 INSIDE, BORDER = 12, 36
 """Pixels inside the outline up to which its own error of a pixel or two counts, and up to which the border reaches."""
 _PHOTO = re.compile(r"(\d+)\.(?:png|jpg)")
@@ -85,9 +84,6 @@ def find_frames(root: Path) -> dict[str, tuple[Path, Path, str]]:
 
     Args:
         root: directory of ``color`` and ``depth``, or one above it.
-
-    Raises:
-        ValueError: there is no such directory.
 
     """
     found = {}
@@ -108,9 +104,6 @@ def load_frame(rgb_path: Path, depth_path: Path, board: str, dataset: str, name:
         depth_path: camera's depth.
         board: which of :data:`BOARDS`.
         dataset, name: of the scene.
-
-    Raises:
-        ValueError: a file is missing, damaged, or not of 1920 x 1080 pixels; the message names it.
 
     """
     rgb, measured = read_picture(rgb_path), read_millimetres(depth_path)
@@ -147,9 +140,6 @@ class StereoBoard(PreparedDataset):
     Args:
         root: directory of ``color`` and ``depth``, or one above it.
         scenes: names of the scenes to use, such as ``14``; None for all five, ``found`` for those in ``root``.
-
-    Raises:
-        ValueError: a scene is not on disk.
 
     """
 

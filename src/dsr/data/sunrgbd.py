@@ -50,18 +50,12 @@ from dsr.geometry.camera import Camera
 from dsr.io.images import read_numbers
 from dsr.sample import Scene
 
-Intrinsics = tuple[float, float, float, float]
-"""(fx, fy, cx, cy) in pixels."""
+Intrinsics = tuple[float, float, float, float]  # (fx, fy, cx, cy) in pixels
 _PICTURES = (".jpg", ".jpeg", ".png")
 
 
 def find_frames(root: Path) -> dict[str, tuple[Path]]:
-    """Return the scene folders, the first argument of :func:`load_frame`, by path below ``root``, in order.
-
-    Raises:
-        ValueError: there is no such directory.
-
-    """
+    """Return the scene folders, the first argument of :func:`load_frame`, by path below ``root``, in order."""
     found = {}
     for folder, below, _ in walk(root):
         if "image" in below and ("depth" in below or "depth_bfx" in below):
@@ -71,23 +65,13 @@ def find_frames(root: Path) -> dict[str, tuple[Path]]:
 
 
 def read_depth(path: Path) -> Tensor:
-    """Return a depth picture, (1, H, W) float64 in metres, NaN in holes.
-
-    Raises:
-        ValueError: it is missing, damaged, or not of 16 bits.
-
-    """
+    """Return a depth picture, (1, H, W) float64 in metres, NaN in holes."""
     levels = read_16bit(path)
     return to_depth(path, ((levels >> 3) | (levels << 13)) / 1000)
 
 
 def read_intrinsics(path: Path, size: tuple[int, int]) -> Camera:
-    """Return the camera that an ``intrinsics.txt`` gives pictures of ``size`` = (height, width).
-
-    Raises:
-        ValueError: it is missing, or not the matrix of such a camera.
-
-    """
+    """Return the camera that an ``intrinsics.txt`` gives pictures of ``size`` = (height, width)."""
     return to_camera(path, read_numbers(path, 9).reshape(3, 3), size)
 
 
@@ -101,9 +85,6 @@ def load_frame(
         refined: take ``depth_bfx``, the authors' filled depth, instead of ``depth``.
         intrinsics: for a folder without ``intrinsics.txt``.
 
-    Raises:
-        ValueError: a file is missing, damaged, or does not fit the others; the message names it.
-
     """
     rgb_path, depth_path, *matrix = frame_files(folder, refined=refined)
     given = matrix[0] if matrix else intrinsics
@@ -113,12 +94,7 @@ def load_frame(
 
 
 def load_pair(rgb_path: Path, depth_path: Path, dataset: str, name: str, intrinsics: Path | Intrinsics) -> Scene:
-    """Return the scene of two files, wherever they lie, and of their intrinsics or the file that has them.
-
-    Raises:
-        ValueError: a file is missing or damaged, or the two differ in size.
-
-    """
+    """Return the scene of two files, wherever they lie, and of their intrinsics or the file that has them."""
     rgb, depth = read_picture(rgb_path), read_depth(depth_path)
     size = (rgb.shape[1], rgb.shape[2])
     expect_size(depth_path, tuple(depth.shape[1:]), size)
@@ -128,12 +104,7 @@ def load_pair(rgb_path: Path, depth_path: Path, dataset: str, name: str, intrins
 
 
 def frame_files(folder: Path, *, refined: bool = False) -> tuple[Path, ...]:
-    """Return the files of a scene folder that are read: colour, depth, and intrinsics.txt where there is one.
-
-    Raises:
-        ValueError: there is not one picture of colour and one of depth.
-
-    """
+    """Return the files of a scene folder that are read: colour, depth, and intrinsics.txt where there is one."""
     matrix = folder / "intrinsics.txt"
     depth = "depth_bfx" if refined else "depth"
     return (_only(folder / "image"), _only(folder / depth), *([matrix] if matrix.is_file() else []))
@@ -177,9 +148,6 @@ class SunRGBD(PreparedDataset):
         refined: whether the authors' refined depth without holes is the true depth.
         frames: folder of each of the twelve names.
         intrinsics: fx, fy, cx, cy in pixels for folders without ``intrinsics.txt``.
-
-    Raises:
-        ValueError: a scene is not on disk, or a value is out of range.
 
     """
 

@@ -25,8 +25,7 @@ from dsr.sample import Scene
 from dsr.utils.guards import opened
 
 CAMERA = Camera(640, 480, 320.0, 320.0, 320.0, 240.0)
-FARTHEST = 1000.0
-"""Largest depth in metres; the sky has a larger one."""
+FARTHEST = 1000.0  # largest depth in metres; the sky has a larger one
 _SIZE = (480, 640)
 _COLOUR = re.compile(r"(\d{1,9})_left\.png")
 
@@ -36,10 +35,6 @@ def find_frames(root: Path) -> dict[str, tuple[Path, Path]]:
 
     A name is the frame's folder below ``root``, without ``image_left``, and its number as the files have it, such as
     ``office/Easy/P000/000000``. A frame that lacks one of its two files is left out.
-
-    Raises:
-        ValueError: there is no such directory.
-
     """
     found = {}
     for folder, below, files in walk(root):
@@ -56,12 +51,7 @@ def find_frames(root: Path) -> dict[str, tuple[Path, Path]]:
 
 
 def read_depth(path: Path, farthest: float = FARTHEST) -> Tensor:
-    """Return a depth file, (1, 480, 640) float64 in metres, NaN where it is beyond ``farthest`` metres.
-
-    Raises:
-        ValueError: it is missing, damaged, of another size or type, or has negative values.
-
-    """
+    """Return a depth file, (1, 480, 640) float64 in metres, NaN where it is beyond ``farthest`` metres."""
     if not path.is_file():
         raise ValueError(f"{path}: expected a NumPy array, there is none")
     shape, dtype, length = _header(path)
@@ -73,12 +63,7 @@ def read_depth(path: Path, farthest: float = FARTHEST) -> Tensor:
 
 
 def load_frame(rgb_path: Path, depth_path: Path, dataset: str, name: str, *, farthest: float = FARTHEST) -> Scene:
-    """Return one frame at 640 x 480; depths beyond ``farthest`` metres are holes.
-
-    Raises:
-        ValueError: a file is missing, damaged or of another size; the message names it.
-
-    """
+    """Return one frame at 640 x 480; depths beyond ``farthest`` metres are holes."""
     rgb = read_picture(rgb_path)
     expect_size(rgb_path, tuple(rgb.shape[1:]), _SIZE)
     return Scene(dataset, name, rgb, CAMERA, read_depth(depth_path, farthest))
@@ -107,9 +92,6 @@ class TartanAir(PreparedDataset):
         size: height and width in pixels; None for the original size.
         crop: see :class:`dsr.data.preparation.Preparation`.
         farthest: depth in metres beyond which pixels are sky, that is, missing.
-
-    Raises:
-        ValueError: a scene is not on disk, or a value is out of range.
 
     """
 

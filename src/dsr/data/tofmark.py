@@ -38,8 +38,7 @@ from dsr.data.scene_source import SceneSelection
 from dsr.io.images import read_levels
 from dsr.sample import Scene
 
-FACTORS = (4, 8)
-"""Of the measured maps: about 40 % of the 4 x 4 blocks have a sample, and nearly all of 8 x 8."""
+FACTORS = (4, 8)  # of the measured maps: about 40 % of the 4 x 4 blocks have a sample, and nearly all of 8 x 8
 _MILLIMETRES = 50.0
 _SMALLEST = 16
 _SPARSE = 0.2
@@ -57,12 +56,7 @@ _OTHERS = {
 
 
 def find_frames(root: Path) -> dict[str, tuple[Path, Path | None]]:
-    """Return the first two arguments of :func:`load_frame` by name ("books"), in order: a .mat file, else the pictures.
-
-    Raises:
-        ValueError: there is no such directory.
-
-    """
+    """Return the first arguments of :func:`load_frame` by name ("books"), in order: a .mat file, else the pictures."""
     found: dict[str, tuple[Path, Path | None]] = {}
     for folder, _, files in walk(root):
         for file in files:
@@ -95,9 +89,6 @@ def load_frame(
         variables: names in the ``.mat`` file of "intensity", "depth" and "samples"; the others are found.
         factors: of the measured maps.
 
-    Raises:
-        ValueError: an argument that the files need is missing, or a file is missing, damaged, or does not fit.
-
     """
     if intrinsics is None:
         raise ValueError(
@@ -118,12 +109,7 @@ def load_frame(
 
 
 def read_samples(path: Path) -> tuple[Tensor, Tensor]:
-    """Return the levels of a ``*_depth.bmp`` over 255, (1, H, W) float64 in [0, 1], and where there is a sample, bool.
-
-    Raises:
-        ValueError: it is missing, damaged, not of 8 bits, or without a sample.
-
-    """
+    """Return the levels of a ``*_depth.bmp`` over 255, (1, H, W) float64, and where there is a sample, bool."""
     levels = torch.from_numpy(read_levels(path))[None]
     if not levels.any():
         raise ValueError(f"{path}: expected at least one sample, all pixels are 0")
@@ -142,9 +128,6 @@ def read_matrices(
     Returns:
         (3, H, W) float32 in [0, 1], and (1, H, W) float64 in metres, NaN in holes, for depth and samples, None for what
         there is not.
-
-    Raises:
-        ValueError: the file is missing or damaged, or its variables are not certain; the message lists them.
 
     """
     found = read_variables(path)
@@ -174,9 +157,6 @@ def block_means(depth: Tensor, factor: int) -> Tensor:
 
     Returns:
         (1, H // factor, W // factor) metres, NaN where a block has no sample.
-
-    Raises:
-        ValueError: the factor is not positive, or larger than the map.
 
     """
     if not 1 <= factor <= min(depth.shape[1:]):
@@ -255,8 +235,7 @@ def _listed(found: Mapping[str, np.ndarray]) -> str:
 
 
 SCENES = ("books", "devil", "shark")
-ESTIMATED = (549.2, 549.2, 375.2, 334.3)
-"""fx, fy, cx, cy in pixels of the 610 x 810 photos."""
+ESTIMATED = (549.2, 549.2, 375.2, 334.3)  # fx, fy, cx, cy in pixels of the 610 x 810 photos
 
 
 class ToFMark(PreparedDataset):
@@ -268,9 +247,6 @@ class ToFMark(PreparedDataset):
         intrinsics: fx, fy, cx, cy in pixels; None for the estimated ones.
         depth_range: depth in metres of levels 1 and 255 of the pictures, which hold no scale.
         variables: names of ``intensity``, ``depth`` and ``samples`` in the ``.mat`` files, where they are not found.
-
-    Raises:
-        ValueError: a scene is not on disk, or a value is out of range.
 
     """
 

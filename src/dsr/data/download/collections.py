@@ -283,16 +283,10 @@ FIELD = (
         patterns=("**/highres_depth/*.png", "**/lowres_depth/*.png"),
     ),
 )
-"""The collections."""
 
 
 def find(names: Iterable[str], catalogue: Mapping[str, Collection]) -> list[Collection]:
-    """Return the collections of these names, each once.
-
-    Raises:
-        ValueError: a name is unknown.
-
-    """
+    """Return the collections of these names, each once."""
     unknown = [name for name in names if name not in catalogue]
     if unknown:
         expected = f"expected some of {', '.join(catalogue)}{did_you_mean(unknown[0], catalogue)}"

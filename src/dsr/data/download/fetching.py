@@ -47,8 +47,7 @@ RETRIES = Retry(
     respect_retry_after_header=False,
 )
 """How often a server that does not answer, or is busy, is asked again."""
-_TIMEOUT = (10.0, 60.0)
-"""Seconds for a connection, and between two pieces of an answer."""
+_TIMEOUT = (10.0, 60.0)  # seconds for a connection, and between two pieces of an answer
 _UNPACKED = 1.25
 """Size of what an archive of pictures unpacks to, as a multiple of its own: for a first check of the disk."""
 _CHUNK = 1 << 16
@@ -58,8 +57,7 @@ _BEGINNINGS: Mapping[str, tuple[bytes, ...]] = {
     ".pfm": (b"Pf", b"PF"), ".pgm": (b"P2", b"P5"), ".png": (b"\x89PNG\r\n\x1a\n",), ".ppm": (b"P3", b"P6"),
     ".safetensors": (b"{",), ".zip": (b"PK",),
 }  # fmt: skip
-_COUNTED = {".safetensors": 8}
-"""Bytes before that beginning, which count something."""
+_COUNTED = {".safetensors": 8}  # bytes before that beginning, which count something
 _DAMAGE = (
     zipfile.BadZipFile, tarfile.TarError, EOFError, zlib.error, lzma.LZMAError, KeyError, RuntimeError, UnicodeError,
     OSError,
@@ -93,9 +91,6 @@ class Checksums(dict[str, Entry]):
 
     Args:
         root: that directory.
-
-    Raises:
-        ValueError: the file is damaged.
 
     """
 
@@ -143,12 +138,7 @@ def _entry(name: str, fields: Any) -> Entry:
 
 @contextlib.contextmanager
 def lock_directory(root: Path) -> Iterator[None]:
-    """Lock the directory of the data sets, if it exists and can be written, against other ``dsr data`` commands.
-
-    Raises:
-        ValueError: another command has locked it.
-
-    """
+    """Lock the directory of the data sets, if it exists and can be written, against other ``dsr data`` commands."""
     with (
         refusing(f"{root}: another `dsr data` command is writing there; wait for it to end", Timeout),
         FileLock(root / ".dsr-data.lock", blocking=False) if os.access(root, os.W_OK) else contextlib.nullcontext(),
@@ -179,10 +169,6 @@ def get(
     Returns:
         What could not be had and why, a line each; the others are there. A full disk ends it.
 
-    Raises:
-        ValueError: ``checksums.json`` is damaged, another command is writing into ``root``, or the mirror is no
-            address.
-
     """
     problems: list[str] = []
     server = None if mirror is None else Server.of(mirror)
@@ -199,8 +185,7 @@ def get(
     return problems
 
 
-_Credentials = tuple[bytes, bytes] | None
-"""A name and a password, as they are sent."""
+_Credentials = tuple[bytes, bytes] | None  # A name and a password, as they are sent
 
 
 class Server(NamedTuple):
@@ -211,12 +196,7 @@ class Server(NamedTuple):
 
     @classmethod
     def of(cls, given: str) -> Server:
-        """Return the server of an address, which may have a name and a password.
-
-        Raises:
-            ValueError: it is no address, or has an @ in its path; the message is without name and password.
-
-        """
+        """Return the server of an address, which may have a name and a password."""
         scheme, _, rest = given.partition("://")
         before, at, place = rest.rpartition("@")
         address = f"{scheme}://{place}".rstrip("/")
@@ -524,12 +504,7 @@ def _take_member(archive: Path, name: str, path: Path) -> None:
 
 
 def state(collection: Collection, root: Path) -> str:
-    """Return ``complete``, ``partial N of M``, ``absent`` or ``manual``, judged by names and sizes.
-
-    Raises:
-        ValueError: ``checksums.json`` is damaged.
-
-    """
+    """Return ``complete``, ``partial N of M``, ``absent`` or ``manual``, judged by names and sizes."""
     if not collection.items:
         found = all(any(_matches(collection, root, pattern)) for pattern in collection.patterns)
         return "complete" if found else "manual"
@@ -545,9 +520,6 @@ def checksums_of(collection: Collection, root: Path) -> str:
     Returns:
         ``pinned`` for those that dsr knows, ``noted`` for those that were written down when the files first came,
         ``unknown`` for those that will be, and how many there are of each where there are several kinds.
-
-    Raises:
-        ValueError: ``checksums.json`` is damaged.
 
     """
     recorded = {name for name, entry in Checksums(root).items() if entry.sha256 is not None}
@@ -578,9 +550,6 @@ def verify(collection: Collection, root: Path, progress: Progress, *, accept_cha
 
     Returns:
         What is wrong, a line each.
-
-    Raises:
-        ValueError: ``checksums.json`` is damaged, or another command is writing into ``root``.
 
     """
     new: dict[str, Entry] = {}
