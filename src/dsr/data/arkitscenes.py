@@ -50,10 +50,8 @@ Files = tuple[Path, Path, Path, Path | None, Path | None]
 def find_frames(root: Path, split: Split | None = None) -> dict[str, Files]:
     """Return the first five arguments of :func:`load_frame` by name "41069021_305.244", in order.
 
-    Args:
-        root: directory of ``Training`` and ``Validation``, or any directory above or below.
-        split: of the frames; None for all. What is in no directory ``Training`` is for validation.
-
+    ``root`` may be any directory above or below ``Training`` and ``Validation``; what is in no ``Training`` is for
+    validation.
     """
     found: dict[str, Files] = {}
     for folder in ("wide", "color"):
@@ -79,14 +77,8 @@ def load_frame(
 ) -> Scene:
     """Return one frame with the lidar's map as the measured one.
 
-    Args:
-        rgb_path: photo.
-        depth_path: laser scanner's depth.
-        measured_path: lidar's depth.
-        confidence_path: the lidar's confidence, None where there is none.
-        intrinsics_path: ``.pincam`` file; None for 60 degrees of horizontal view.
-        min_confidence: pixels of the lidar below this confidence become holes.
-
+    Without ``intrinsics_path``, 60 degrees of horizontal view are assumed. Pixels of the lidar below ``min_confidence``
+    become holes.
     """
     rgb, depth, measured = read_picture(rgb_path), read_millimetres(depth_path), read_millimetres(measured_path)
     for path, image, size in ((rgb_path, rgb, _SIZE), (depth_path, depth, _SIZE), (measured_path, measured, _SIZE_LR)):

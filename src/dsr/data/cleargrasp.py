@@ -82,10 +82,7 @@ _ENTRY = re.compile(rf"^({'|'.join(_KEYS)})\s*:\s*([-+.\deE]+)\s*(?:#.*)?$", re.
 def find_captures(root: Path, split: Split | None = None) -> dict[str, tuple[Path, ...]]:
     """Return the first arguments of :func:`load_capture` by name "real-val/d435/000000080", in order.
 
-    Args:
-        root: directory of the captures, or one above it.
-        split: of the captures, of which the folder's or an upper folder's name ends in it; None for all.
-
+    The name of a folder of a split, or of one above it, ends in the split's.
     """
     found = {}
     for folder, _, files in walk(root):
@@ -99,13 +96,7 @@ def find_captures(root: Path, split: Split | None = None) -> dict[str, tuple[Pat
 
 
 def find_renderings(root: Path, split: Split | None = None) -> dict[str, tuple[Path, ...]]:
-    """Return the first arguments of :func:`load_rendering` by name "square-plastic-bottle-val/000000000", in order.
-
-    Args:
-        root: directory of the objects' folders, or one above it.
-        split: see :func:`find_captures`.
-
-    """
+    """Return the first arguments of :func:`load_rendering` by name "square-plastic-bottle-val/000000000", in order."""
     found = {}
     for folder, below, _ in walk(root):
         if {each.partition("/")[0] for each in _SYNTHETIC} <= set(below) and _is_of(folder, split):
@@ -159,10 +150,7 @@ def orthogonal(camera: Camera) -> Tensor:
 def read_depth(path: Path, *, smooth: bool = False) -> Tensor:
     """Return the depth of an EXR file, (1, H, W) float64 in metres, NaN where it is 0 or not finite.
 
-    Args:
-        path: the file.
-        smooth: whether the steps of 16-bit floats are smoothed, each value within half a step.
-
+    ``smooth`` removes the steps of 16-bit floats, each value within half a step.
     """
     values = read_depth_file(path)
     depth = to_depth(path, np.nan_to_num(values.astype(np.float64), nan=0, posinf=0))

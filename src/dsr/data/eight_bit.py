@@ -77,13 +77,7 @@ BENCHMARKS: Mapping[str, Benchmark] = MappingProxyType(
 
 
 def find_frames(root: Path, dataset: str) -> dict[str, tuple[Path, Path]]:
-    """Return the photos and maps of a benchmark, the first two arguments of :func:`load_frame`, by name, in order.
-
-    Args:
-        root: directory of ``RGB`` and ``Depth``, or one above it.
-        dataset: key of ``BENCHMARKS``.
-
-    """
+    """Return the photos and maps of a benchmark, the first two arguments of :func:`load_frame`, by name, in order."""
     found: dict[str, tuple[Path, Path]] = {}
     prefix = BENCHMARKS[dataset].prefix
     for spelling in ("output", "ouput"):
@@ -94,14 +88,7 @@ def find_frames(root: Path, dataset: str) -> dict[str, tuple[Path, Path]]:
 
 
 def load_frame(rgb_path: Path, levels_path: Path, dataset: str, name: str) -> Scene:
-    """Return one scene, whose errors are counted in levels.
-
-    Args:
-        rgb_path: photo.
-        levels_path: map of 8 bits, in which 0 is a level and no hole.
-        dataset: of the scene returned, a key of ``BENCHMARKS``, which says the camera.
-
-    """
+    """Return one scene, whose errors are counted in levels; in its map of 8 bits, 0 is a level and no hole."""
     rgb, levels = read_picture(rgb_path), read_levels(levels_path)
     height, width = rgb.shape[1:]
     expect_size(levels_path, levels.shape, (height, width))

@@ -87,13 +87,7 @@ class Folder:
 
 
 def load_scene(folder: Path, dataset: str, *, offset: bool = True) -> Scene:
-    """Return the scene in ``folder``.
-
-    Args:
-        folder: with the files.
-        offset: whether ``doffs`` of ``camera.json`` counts, as it has to geometrically, or is taken for 0.
-
-    """
+    """Return the scene in ``folder``; without ``offset``, ``doffs`` of ``camera.json`` is taken for 0."""
     description = read_camera(folder / "camera.json")
     if not offset:
         if not description.camera.doffs:

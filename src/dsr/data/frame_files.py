@@ -55,13 +55,9 @@ def read_millimetres(path: Path) -> Tensor:
 
 
 def to_depth(path: Path, values: np.ndarray, farthest: float = math.inf) -> Tensor:
-    """Return depth with its holes marked, (1, H, W) float64 in metres.
+    """Return depth with its holes marked, (1, H, W) float64 in metres, of values (H, W) in metres, 0 in holes.
 
-    Args:
-        path: the file that the values come from, for the message.
-        values: (H, W) metres; 0 is a hole.
-        farthest: metres; what lies beyond, the sky, becomes a hole.
-
+    What lies beyond ``farthest``, the sky, becomes a hole. ``path`` is for the message.
     """
     with np.errstate(invalid="ignore"):  # damaged bytes may be signalling NaN, which a cast warns of
         values = values.astype(np.float64)
@@ -86,11 +82,8 @@ def expect_size(path: Path, size: tuple[int, ...], expected: tuple[int, ...]) ->
 def to_camera(source: Path | str, matrix: np.ndarray, size: tuple[int, int]) -> Camera:
     """Return the camera of an intrinsic matrix [fx 0 cx; 0 fy cy; 0 0 1], pixel centres at integers.
 
-    Args:
-        source: the file or argument that the matrix comes from, for the message.
-        matrix: (3, 3), in pixels.
-        size: (height, width) of the pictures.
-
+    A focal length beyond 0.1 to 100 picture widths, or a principal point outside of the picture of ``size`` = (height,
+    width), is refused; ``source`` is the file or argument that the message names.
     """
     height, width = size
     (fx, skew, cx), (lower, fy, cy), last = matrix.tolist()
@@ -157,7 +150,6 @@ def find_beside(
     Yields:
         The folder that ``photos`` lies in, the frame, and its files: the photo, then the others. A frame that lacks one
         of them is left out.
-
     """
     for place, below, _ in walk(root):
         if photos in below:

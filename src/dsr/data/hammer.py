@@ -45,15 +45,7 @@ _PHOTO = re.compile(r"(\d+)\.png")
 def find_frames(
     root: Path, sensor: Sensor = "d435", split: Split | None = None, naked: bool = False
 ) -> dict[str, tuple[Path, Path, Path, Path]]:
-    """Return photo, measured and true depth, and intrinsics by name "scene12_traj1_1/000000", in order.
-
-    Args:
-        root: directory of the sequences, or one above it.
-        sensor: the camera that measured.
-        split: of the scenes; None for both.
-        naked: whether to take sequences without objects, instead of those with them.
-
-    """
+    """Return photo, measured and true depth, and intrinsics by name "scene12_traj1_1/000000", in order."""
     found = {}
     others = (f"depth_{sensor}/{{}}.png", "_gt/{}.png", "intrinsics.txt")
     for place, frame, (photo, measured, truth, intrinsics) in find_beside(root, "rgb", _PHOTO, others):

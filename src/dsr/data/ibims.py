@@ -65,9 +65,7 @@ Pictures = tuple[Path, Path, Path, *tuple[Path | None, ...]]
 def find_matrices(root: Path) -> dict[str, tuple[Path]]:
     """Return the MATLAB files of scenes, the first argument of :func:`load_matrices`, by name, in order.
 
-    Args:
-        root: directory of the files, or one above it; results of methods, ``*_results.mat``, are left out.
-
+    Results of methods, ``*_results.mat``, are left out.
     """
     found: dict[str, tuple[Path]] = {}
     for folder, _, files in walk(root):
@@ -77,12 +75,7 @@ def find_matrices(root: Path) -> dict[str, tuple[Path]]:
 
 
 def find_pictures(root: Path) -> dict[str, Pictures]:
-    """Return the files of scenes in folders, the first arguments of :func:`load_pictures`, by name, in order.
-
-    Args:
-        root: directory of ``rgb``, ``depth`` and ``calib``, or one above it.
-
-    """
+    """Return the files of scenes in folders, the first arguments of :func:`load_pictures`, by name, in order."""
     found: dict[str, Pictures] = {}
     needed = ("depth/{}.png", "calib/{}.txt", *(f"{mask}/{{}}.png" for mask in _VALID))
     for place, name, (photo, depth, calibration, *_) in find_beside(root, "rgb", _PHOTO, needed):
@@ -113,16 +106,7 @@ def load_matrices(path: Path, dataset: str, name: str) -> Scene:
 
 
 def load_pictures(rgb_path: Path, depth_path: Path, calibration_path: Path, *paths: Path | str | None) -> Scene:
-    """Return the scene of pictures.
-
-    Args:
-        rgb_path: photo.
-        depth_path: depth, 16 bits.
-        calibration_path: intrinsics.
-        paths: the masks of pixels that are invalid, of those that are transparent, of edges, walls, tables and floors,
-            the last four None where there is none; then the names of data set and scene.
-
-    """
+    """Return the scene of pictures; ``paths`` are the files of :data:`_MASKS`, then the names of data set and scene."""
     *mask_paths, dataset, name = paths
     rgb, depth = read_picture(rgb_path), read_16bit(depth_path)
     given = {key: path for key, path in zip(_MASKS, mask_paths, strict=True) if isinstance(path, Path)}

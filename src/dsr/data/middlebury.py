@@ -100,13 +100,7 @@ def find_levels(root: Path) -> dict[str, Files]:
 
 
 def load_2014(folder: Path, dataset: str, name: str, *, offset: bool = True) -> Scene:
-    """Return a scene of 2014.
-
-    Args:
-        folder: with the files.
-        offset: whether doffs of ``calib.txt`` counts, as it has to geometrically, or is taken for 0.
-
-    """
+    """Return the scene of 2014 in ``folder``; without ``offset``, doffs of ``calib.txt`` is taken for 0."""
     camera = read_calibration(folder / "calib.txt")
     path = folder / "disp0.pfm"
     if not path.is_file() and (folder / "disp0GT.pfm").is_file():
@@ -123,13 +117,9 @@ def load_2014(folder: Path, dataset: str, name: str, *, offset: bool = True) -> 
 
 
 def load_levels(files: Files, dataset: str, name: str, year: int, *, smooth: bool = True) -> Scene:
-    """Return a scene of 2001 to 2006.
+    """Return a scene of 2001 to 2006; the year of the data set says how levels count.
 
-    Args:
-        files: of the scene.
-        year: that of the data set, which says how levels count.
-        smooth: whether the steps of the rounding are smoothed; see :mod:`dsr.data.reference_depth`.
-
+    ``smooth`` removes the steps of the rounding, see :mod:`dsr.data.reference_depth`.
     """
     levels = read_levels(files.disparity).astype(np.float64)
     height, width = levels.shape

@@ -66,14 +66,9 @@ def find_frames(path: Path) -> dict[str, tuple[Path, int]]:
 
 
 def load_frame(path: Path, number: int, dataset: str, name: str, *, filled: bool = False, crop: bool = True) -> Scene:
-    """Return one frame.
+    """Return a frame by its number from 1, with the Kinect's depth, or the authors' ``filled`` one.
 
-    Args:
-        path: the labelled ``.mat`` file.
-        number: of the frame, from 1.
-        filled: take the authors' filled depth instead of the Kinect's with its holes.
-        crop: cut off the border, which leaves 427 x 561 pixels.
-
+    ``crop`` cuts off the border, which leaves 427 x 561 pixels.
     """
     key = "depths" if filled else "rawDepths"
     with _opened(path) as arrays:

@@ -63,12 +63,7 @@ def make_records(
 ) -> dict[str, SceneRecord]:
     """Return the records of frames on disk, by their names with _ in place of /.
 
-    Args:
-        frames: first arguments of ``load`` by name, as from :func:`list_frames`.
-        load: function that reads a frame, given these, the names of data set and scene, and ``settings``.
-        dataset: name of the data set.
-        settings: further arguments of ``load``.
-
+    ``load`` gets a frame's entry of ``frames``, the names of data set and scene, and ``settings``.
     """
     records = {}
     for frame, arguments in frames.items():
@@ -91,13 +86,7 @@ def _files_of(path: Path) -> list[Path]:
 
 
 def rename_records(records: Mapping[str, SceneRecord], names: Mapping[str, str]) -> dict[str, SceneRecord]:
-    """Return the records, some of them under other names.
-
-    Args:
-        records: records by name.
-        names: names of frames by their new names, with / or _; frames that are not in ``records`` are left out.
-
-    """
+    """Return the records, some of them under other names; frames that are not in ``records`` are left out."""
     frames = {name: frame.replace("/", "_") for name, frame in names.items()}
     new = {name: _with_scene_name(records[frame], name) for name, frame in frames.items() if frame in records}
     replaced = new.keys() | set(frames.values())

@@ -51,11 +51,7 @@ _DEPTH, _MEASURED = "{0}_HR_gt.png", "{0}_LR_fill_depth.png"
 def find_frames(root: Path, split: Split | None = None, measured: bool = False) -> dict[str, Files]:
     """Return photos, true depth and, if ``measured``, the phone's depth, by their number "20200509112638", in order.
 
-    Args:
-        root: directory of the data set, or one above it.
-        split: of the images, None for both; those in ``RGB`` and ``Depth`` are test images.
-        measured: whether to find only images that have the phone's depth.
-
+    Images in ``RGB`` and ``Depth`` are test images.
     """
     found: dict[str, Files] = {}
     for name, files in _find_owners_layout(root, split, measured=measured):

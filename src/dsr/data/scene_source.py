@@ -63,14 +63,7 @@ class Prepared(Protocol):
 
 
 def prepare_scenes(source: SceneSource, names: Sequence[str], progress: Progress) -> None:
-    """Have a data set that renders or resizes its scenes make some of them ready.
-
-    Args:
-        source: the data set.
-        names: scenes to make ready.
-        progress: shows how many are ready.
-
-    """
+    """Have a data set that renders or resizes its scenes make some of them ready."""
     if isinstance(source, Prepared):
         for _ in progress.track(source.prepare(names, progress.say), "prepare", len(names)):
             pass
@@ -87,13 +80,7 @@ def regions_of(source: SceneSource) -> tuple[str, ...]:
 
 
 class SceneSubset:
-    """A subset of the scenes of a data set.
-
-    Args:
-        source: the data set.
-        names: names of the scenes.
-
-    """
+    """Some of the scenes of a data set."""
 
     def __init__(self, source: SceneSource, names: Sequence[str]) -> None:
         self.name, self.evaluation = source.name, source.evaluation

@@ -80,12 +80,7 @@ _PHOTO = re.compile(r"(\d+)\.(?:png|jpg)")
 
 
 def find_frames(root: Path) -> dict[str, tuple[Path, Path, str]]:
-    """Return photo, depth and name, the first arguments of :func:`load_frame`, by name "8", in order.
-
-    Args:
-        root: directory of ``color`` and ``depth``, or one above it.
-
-    """
+    """Return photo, depth and name, the first arguments of :func:`load_frame`, by name "8", in order."""
     found = {}
     for _, name, (photo, depth) in find_beside(root, "color", _PHOTO, ("depth/{}.png",)):
         if name in BOARDS:
@@ -98,13 +93,6 @@ def load_frame(rgb_path: Path, depth_path: Path, board: str, dataset: str, name:
 
     Its regions are ``board``, deeper inside the outline than :data:`INSIDE` pixels, and of that ``border``, not deeper
     than :data:`BORDER`: what is blurred across the outline shows there.
-
-    Args:
-        rgb_path: photo.
-        depth_path: camera's depth.
-        board: which of :data:`BOARDS`.
-        dataset, name: of the scene.
-
     """
     rgb, measured = read_picture(rgb_path), read_millimetres(depth_path)
     for path, image in ((rgb_path, rgb), (depth_path, measured)):

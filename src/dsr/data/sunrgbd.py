@@ -78,13 +78,9 @@ def read_intrinsics(path: Path, size: tuple[int, int]) -> Camera:
 def load_frame(
     folder: Path, dataset: str, name: str, *, refined: bool = False, intrinsics: Intrinsics | None = None
 ) -> Scene:
-    """Return the scene of a folder.
+    """Return the scene of a folder, with the sensor's depth or the authors' ``refined`` one.
 
-    Args:
-        folder: the scene's.
-        refined: take ``depth_bfx``, the authors' filled depth, instead of ``depth``.
-        intrinsics: for a folder without ``intrinsics.txt``.
-
+    ``intrinsics`` are for a folder without ``intrinsics.txt``.
     """
     rgb_path, depth_path, *matrix = frame_files(folder, refined=refined)
     given = matrix[0] if matrix else intrinsics

@@ -88,7 +88,6 @@ def load_frame(
         depth_range: metres of level 1 and of level 255 of ``samples_path``, which needs it.
         variables: names in the ``.mat`` file of "intensity", "depth" and "samples"; the others are found.
         factors: of the measured maps.
-
     """
     if intrinsics is None:
         raise ValueError(
@@ -119,16 +118,9 @@ def read_samples(path: Path) -> tuple[Tensor, Tensor]:
 def read_matrices(
     path: Path, variables: Mapping[str, str] | None = None
 ) -> tuple[Tensor, Tensor | None, Tensor | None]:
-    """Read a ``.mat`` file: the picture, the true depth and the samples.
+    """Return the picture, (3, H, W) float32 in [0, 1], and depth and samples, (1, H, W) float64 in metres, of a file.
 
-    Args:
-        path: the file, of MATLAB 5 or 7.3.
-        variables: names of variables, a field of a structure as "structure.field", by "intensity", "depth", "samples".
-
-    Returns:
-        (3, H, W) float32 in [0, 1], and (1, H, W) float64 in metres, NaN in holes, for depth and samples, None for what
-        there is not.
-
+    None stands for what there is not. ``variables`` names variables, a field of a structure as "structure.field".
     """
     found = read_variables(path)
     chosen = dict(variables or {})
@@ -149,16 +141,7 @@ def read_matrices(
 
 
 def block_means(depth: Tensor, factor: int) -> Tensor:
-    """Return the mean of the known depths in each ``factor`` x ``factor`` block, taken of 1/z, as depth.
-
-    Args:
-        depth: (1, H, W) metres, NaN where there is no sample.
-        factor: rows and columns of a block; those beyond the last whole block are left out.
-
-    Returns:
-        (1, H // factor, W // factor) metres, NaN where a block has no sample.
-
-    """
+    """Return the mean of 1/z in each ``factor`` x ``factor`` block of a depth map (1, H, W), as depth."""
     if not 1 <= factor <= min(depth.shape[1:]):
         raise ValueError(f"factors: expected from 1 to {min(depth.shape[1:])}, got {factor}")
     height, width = depth.shape[1] // factor, depth.shape[2] // factor
