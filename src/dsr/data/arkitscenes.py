@@ -28,10 +28,10 @@ import torch
 from dsr.data.frame_files import (
     expect_size,
     find_beside,
+    given_camera,
     in_natural_order,
+    read_frame,
     read_millimetres,
-    read_picture,
-    to_camera,
 )
 from dsr.data.preparation import Preparation, PreparedDataset, add_note, list_frames, make_records
 from dsr.data.scene_source import SceneSelection
@@ -80,9 +80,9 @@ def load_frame(
     Without ``intrinsics_path``, 60 degrees of horizontal view are assumed. Pixels of the lidar below ``min_confidence``
     become holes.
     """
-    rgb, depth, measured = read_picture(rgb_path), read_millimetres(depth_path), read_millimetres(measured_path)
-    for path, image, size in ((rgb_path, rgb, _SIZE), (depth_path, depth, _SIZE), (measured_path, measured, _SIZE_LR)):
-        expect_size(path, tuple(image.shape[1:]), size)
+    rgb, depth = read_frame(rgb_path, depth_path, size=_SIZE)
+    measured = read_millimetres(measured_path)
+    expect_size(measured_path, measured, _SIZE_LR)
     if min_confidence > 0:
         if confidence_path is None:
             raise ValueError(f"{measured_path}: expected its confidence in the folder confidence, there is none")
@@ -91,16 +91,16 @@ def load_frame(
         if not measured.isfinite().any():
             raise ValueError(f"{confidence_path}: expected a pixel of confidence {min_confidence}, there is none")
     height, width = _SIZE
-    camera = (
-        Camera.from_fov(ASSUMED_FOV, width, height) if intrinsics_path is None else read_intrinsics(intrinsics_path)
-    )
+    camera = Camera.from_fov(ASSUMED_FOV, width, height)
+    if intrinsics_path is not None:
+        camera = read_intrinsics(intrinsics_path)
     return Scene(dataset, name, rgb, camera, depth, {width / _SIZE_LR[1]: measured})
 
 
 def read_confidence(path: Path) -> np.ndarray:
     """Return the lidar's confidence, (192, 256) uint8 from 0 to 2."""
     confidence = read_levels(path)
-    expect_size(path, confidence.shape, _SIZE_LR)
+    expect_size(path, confidence, _SIZE_LR)
     if confidence.max() > _HIGHEST_CONFIDENCE:
         raise ValueError(f"{path}: expected confidence from 0 to {_HIGHEST_CONFIDENCE}, got {confidence.max()}")
     return confidence
@@ -108,10 +108,10 @@ def read_confidence(path: Path) -> np.ndarray:
 
 def read_intrinsics(path: Path) -> Camera:
     """Return the camera of a ``.pincam`` file, of 1920 x 1440 pixels with their centres at integers."""
-    width, height, fx, fy, cx, cy = read_numbers(path, 6).tolist()
+    width, height, *intrinsics = read_numbers(path, 6).tolist()
     if (height, width) != _SIZE:
         raise ValueError(f"{path}: expected a camera of 1440 x 1920 pixels, got {height:g} x {width:g}")
-    return to_camera(path, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), _SIZE)
+    return given_camera(intrinsics, _SIZE, path)
 
 
 def _find_intrinsics(place: Path, frame: str) -> Path | None:

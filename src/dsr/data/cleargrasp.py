@@ -50,11 +50,11 @@ from torch import Tensor
 
 from dsr.data.frame_files import (
     expect_size,
+    given_camera,
     in_natural_order,
     name_of,
     read_bytes,
     read_picture,
-    to_camera,
     to_depth,
     walk,
 )
@@ -121,7 +121,7 @@ def load_capture(
     camera = read_camera(camera_path)
     size = (camera.height, camera.width)
     for path, image in ((rgb_path, rgb), (measured_path, measured), (truth_path, truth)):
-        expect_size(path, tuple(image.shape[1:]), size)
+        expect_size(path, image, size)
     return Scene(dataset, name, rgb, camera, truth, {1: measured}, regions=read_regions(mask_path, size))
 
 
@@ -129,7 +129,7 @@ def load_rendering(rgb_path: Path, depth_path: Path, mask_path: Path, dataset: s
     """Return a rendered scene with its exact orthogonal depth."""
     rgb, stored = read_picture(rgb_path), read_depth(depth_path, smooth=True)
     height, width = rgb.shape[1:]
-    expect_size(depth_path, tuple(stored.shape[1:]), (height, width))
+    expect_size(depth_path, stored, (height, width))
     fx, fy = (size / 2 / math.tan(angle / 2) for size, angle in zip((width, height), VIEW, strict=True))
     camera = Camera(width, height, fx, fy, (width - 1) / 2, (height - 1) / 2)
     depth = stored * orthogonal(camera)
@@ -139,10 +139,7 @@ def load_rendering(rgb_path: Path, depth_path: Path, mask_path: Path, dataset: s
 def orthogonal(camera: Camera) -> Tensor:
     """Return the factors from the stored depth of a rendered picture to orthogonal depth, (1, H, W) float64."""
     columns, rows = torch.arange(camera.width, dtype=torch.float64), torch.arange(camera.height, dtype=torch.float64)
-    across, down = (
-        (pixels / size - 0.5) * angle
-        for pixels, size, angle in zip((columns, rows), (camera.width, camera.height), VIEW, strict=True)
-    )
+    across, down = (columns / camera.width - 0.5) * VIEW[0], (rows / camera.height - 0.5) * VIEW[1]
     product = across.cos() * down.cos()[:, None]
     return 1 / (product * camera.rays().double().norm(dim=0))[None]
 
@@ -165,12 +162,11 @@ def read_depth(path: Path, *, smooth: bool = False) -> Tensor:
 def read_regions(path: Path, size: Sequence[int]) -> dict[str, Tensor]:
     """Return the regions that a mask of ``size`` = (height, width) gives, (1, H, W) uint8."""
     mask = read_mask(path).astype(np.uint8)
-    expect_size(path, mask.shape, tuple(size))
+    expect_size(path, mask, tuple(size))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * EDGE + 1, 2 * EDGE + 1))
     edges = cv2.dilate(mask, disc) - cv2.erode(mask, disc)
-    return {
-        name: torch.from_numpy(each)[None] for name, each in (("glass", mask), ("outside", 1 - mask), ("edges", edges))
-    }
+    regions = {"glass": mask, "outside": 1 - mask, "edges": edges}
+    return {name: torch.from_numpy(each)[None] for name, each in regions.items()}
 
 
 def read_camera(path: Path) -> Camera:
@@ -178,10 +174,10 @@ def read_camera(path: Path) -> Camera:
     text = read_bytes(path, f"a text file with {', '.join(_KEYS)}").decode("utf-8", "replace")
     found = dict(_ENTRY.findall(text))
     try:
-        width, height, fx, fy, cx, cy = (float(found[key]) for key in _KEYS)
+        width, height, *intrinsics = (float(found[key]) for key in _KEYS)
     except (KeyError, ValueError) as error:
         raise ValueError(f"{path}: expected a number at each of {', '.join(_KEYS)}, got {found}") from error
-    return to_camera(path, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), (round(height), round(width)))
+    return given_camera(intrinsics, (round(height), round(width)), path)
 
 
 class ClearGrasp(PreparedDataset):
@@ -201,11 +197,8 @@ class ClearGrasp(PreparedDataset):
     def __init__(self, root: str, synthetic: bool, split: Split | None = None, scenes: SceneSelection = None) -> None:
         if split not in (None, *SPLITS):
             raise ValueError(f"split: expected one of {', '.join(SPLITS)}, or null, got {split}")
-        name, find, load = (
-            ("cleargrasp_synthetic", find_renderings, load_rendering)
-            if synthetic
-            else ("cleargrasp", find_captures, load_capture)
-        )
-        found = add_note(make_records(list_frames(find, root, split), load, name), NOTE)
+        name = "cleargrasp_synthetic" if synthetic else "cleargrasp"
+        frames = list_frames(find_renderings if synthetic else find_captures, root, split)
+        found = add_note(make_records(frames, load_rendering if synthetic else load_capture, name), NOTE)
         super().__init__(name, root, found, None, scenes, Preparation(None))
         self.evaluation = split != "train"

@@ -20,7 +20,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from dsr.data.frame_files import expect_size, find_beside, name_of, read_millimetres, read_picture
+from dsr.data.frame_files import find_beside, name_of, read_frame
 from dsr.data.preparation import Preparation, PreparedDataset, list_frames, make_records
 from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera
@@ -44,10 +44,7 @@ def find_frames(root: Path) -> dict[str, tuple[Path, Path, Path]]:
 
 def load_frame(rgb_path: Path, measured_path: Path, truth_path: Path, dataset: str, name: str) -> Scene:
     """Return one frame with the sensor's map, measured at the photo's size."""
-    size = (CAMERA.height, CAMERA.width)
-    rgb, measured, truth = read_picture(rgb_path), read_millimetres(measured_path), read_millimetres(truth_path)
-    for path, image in ((rgb_path, rgb), (measured_path, measured), (truth_path, truth)):
-        expect_size(path, tuple(image.shape[1:]), size)
+    rgb, measured, truth = read_frame(rgb_path, measured_path, truth_path, size=(CAMERA.height, CAMERA.width))
     return Scene(dataset, name, rgb, CAMERA, truth, {1: measured})
 
 

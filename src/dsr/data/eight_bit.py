@@ -91,7 +91,7 @@ def load_frame(rgb_path: Path, levels_path: Path, dataset: str, name: str) -> Sc
     """Return one scene, whose errors are counted in levels; in its map of 8 bits, 0 is a level and no hole."""
     rgb, levels = read_picture(rgb_path), read_levels(levels_path)
     height, width = rgb.shape[1:]
-    expect_size(levels_path, levels.shape, (height, width))
+    expect_size(levels_path, levels, (height, width))
     camera = BENCHMARKS[dataset].camera(height, width)
     depth = from_range(torch.from_numpy(levels).double()[None], camera, "disparity")
     unit = Unit("levels", inverse=True, factor=baseline_times_focal(camera), offset=camera.doffs, limits=(0.0, 255.0))

@@ -71,15 +71,16 @@ def to_depth(path: Path, values: np.ndarray, farthest: float = math.inf) -> Tens
     return torch.from_numpy(np.where(known, values, np.nan))[None]
 
 
-def expect_size(path: Path, size: tuple[int, ...], expected: tuple[int, ...]) -> None:
-    """Refuse a map that is not ``expected`` = (height, width)."""
-    if tuple(size) != tuple(expected):
+def expect_size(path: Path, image: Tensor | np.ndarray, expected: Sequence[int]) -> None:
+    """Refuse an image, (..., H, W), that is not ``expected`` = (height, width)."""
+    height, width = image.shape[-2:]
+    if (height, width) != tuple(expected):
         raise ValueError(
-            f"{path}: expected {expected[0]} x {expected[1]} pixels (height x width), got {' x '.join(map(str, size))}"
+            f"{path}: expected {expected[0]} x {expected[1]} pixels (height x width), got {height} x {width}"
         )
 
 
-def to_camera(source: Path | str, matrix: np.ndarray, size: tuple[int, int]) -> Camera:
+def to_camera(source: Path | str, matrix: np.ndarray, size: Sequence[int]) -> Camera:
     """Return the camera of an intrinsic matrix [fx 0 cx; 0 fy cy; 0 0 1], pixel centres at integers.
 
     A focal length beyond 0.1 to 100 picture widths, or a principal point outside of the picture of ``size`` = (height,
@@ -95,17 +96,24 @@ def to_camera(source: Path | str, matrix: np.ndarray, size: tuple[int, int]) -> 
     return Camera(width, height, fx, fy, cx, cy)
 
 
-def given_camera(intrinsics: tuple[float, float, float, float], size: tuple[int, int]) -> Camera:
-    """Return the camera of a caller's (fx, fy, cx, cy) for pictures of ``size`` = (height, width)."""
+def given_camera(intrinsics: Sequence[float], size: Sequence[int], source: Path | str = "intrinsics") -> Camera:
+    """Return the camera of (fx, fy, cx, cy) for pictures of ``size``; see :func:`to_camera`."""
     fx, fy, cx, cy = intrinsics
-    return to_camera("intrinsics", np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), size)
+    return to_camera(source, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), size)
+
+
+def read_frame(rgb_path: Path, *depth_paths: Path, size: tuple[int, int] | None = None) -> list[Tensor]:
+    """Return a photo and depth pictures in millimetres, all of ``size`` = (height, width), or the photo's."""
+    rgb, maps = read_picture(rgb_path), [read_millimetres(path) for path in depth_paths]
+    for path, image in zip((rgb_path, *depth_paths), (rgb, *maps), strict=True):
+        expect_size(path, image, size or rgb.shape[1:])
+    return [rgb, *maps]
 
 
 def load_pair(rgb_path: Path, depth_path: Path, dataset: str, name: str) -> Scene:
     """Return a photo and its depth in millimetres, for which no camera is published, as a scene."""
-    rgb, depth = read_picture(rgb_path), read_millimetres(depth_path)
+    rgb, depth = read_frame(rgb_path, depth_path)
     height, width = rgb.shape[1:]
-    expect_size(depth_path, tuple(depth.shape[1:]), (height, width))
     return Scene(dataset, name, rgb, Camera.from_fov(ASSUMED_FOV, width, height), depth)
 
 

@@ -22,14 +22,7 @@ import re
 from pathlib import Path
 from typing import Literal, get_args
 
-from dsr.data.frame_files import (
-    expect_size,
-    find_beside,
-    in_natural_order,
-    read_millimetres,
-    read_picture,
-    to_camera,
-)
+from dsr.data.frame_files import find_beside, in_natural_order, read_frame, to_camera
 from dsr.data.preparation import Preparation, PreparedDataset, list_frames, make_records
 from dsr.data.scene_source import SceneSelection
 from dsr.io.images import read_numbers
@@ -51,11 +44,9 @@ def find_frames(
     for place, frame, (photo, measured, truth, intrinsics) in find_beside(root, "rgb", _PHOTO, others):
         sequence = place.resolve().parent.name
         match = _SEQUENCE.fullmatch(sequence)
-        if (
-            match is not None
-            and bool(match[2]) == naked
-            and split in (None, "test" if int(match[1]) in TEST else "train")
-        ):
+        if match is None or bool(match[2]) != naked:
+            continue
+        if split in (None, "test" if int(match[1]) in TEST else "train"):
             found[f"{sequence}/{frame}"] = (photo, measured, truth, intrinsics)
     return in_natural_order(found)
 
@@ -64,11 +55,8 @@ def load_frame(
     rgb_path: Path, measured_path: Path, truth_path: Path, intrinsics_path: Path, dataset: str, name: str
 ) -> Scene:
     """Return one frame with a camera's map, measured at the photo's size."""
-    rgb, measured, truth = read_picture(rgb_path), read_millimetres(measured_path), read_millimetres(truth_path)
-    size = (rgb.shape[1], rgb.shape[2])
-    for path, image in ((measured_path, measured), (truth_path, truth)):
-        expect_size(path, tuple(image.shape[1:]), size)
-    camera = to_camera(intrinsics_path, read_numbers(intrinsics_path, 9).reshape(3, 3), size)
+    rgb, measured, truth = read_frame(rgb_path, measured_path, truth_path)
+    camera = to_camera(intrinsics_path, read_numbers(intrinsics_path, 9).reshape(3, 3), rgb.shape[1:])
     return Scene(dataset, name, rgb, camera, truth, {1: measured})
 
 

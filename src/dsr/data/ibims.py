@@ -111,9 +111,9 @@ def load_pictures(rgb_path: Path, depth_path: Path, calibration_path: Path, *pat
     rgb, depth = read_picture(rgb_path), read_16bit(depth_path)
     given = {key: path for key, path in zip(_MASKS, mask_paths, strict=True) if isinstance(path, Path)}
     masks = {key: read_levels(path) for key, path in given.items()}
-    sizes = {rgb_path: tuple(rgb.shape[1:]), depth_path: depth.shape, **{given[key]: masks[key].shape for key in masks}}
-    for path, size in sizes.items():
-        expect_size(path, size, SIZE)
+    expect_size(rgb_path, rgb, SIZE)
+    for path, image in ((depth_path, depth), *((given[key], mask) for key, mask in masks.items())):
+        expect_size(path, image, SIZE)
     text = read_bytes(calibration_path, "a text file of fx,fy,cx,cy").decode("utf-8", "replace")
     try:
         fx, fy, cx, cy = map(float, text.replace(",", " ").split())

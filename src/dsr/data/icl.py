@@ -66,14 +66,14 @@ def read_depth(path: Path) -> Tensor:
         centimetres = read_numbers(path, _SIZE[0] * _SIZE[1]).reshape(_SIZE)
         return from_range(to_depth(path, centimetres / 100, FARTHEST), CAMERA, "perspective")
     levels = read_16bit(path)
-    expect_size(path, levels.shape, _SIZE)
+    expect_size(path, levels, _SIZE)
     return to_depth(path, levels / LEVELS)
 
 
 def load_frame(rgb_path: Path, depth_path: Path, dataset: str, name: str) -> Scene:
     """Return one frame at 640 x 480."""
     rgb = read_picture(rgb_path)
-    expect_size(rgb_path, tuple(rgb.shape[1:]), _SIZE)
+    expect_size(rgb_path, rgb, _SIZE)
     return Scene(dataset, name, rgb, CAMERA, read_depth(depth_path))
 
 

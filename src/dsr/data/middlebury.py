@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -106,7 +106,7 @@ def load_2014(folder: Path, dataset: str, name: str, *, offset: bool = True) -> 
     if not path.is_file() and (folder / "disp0GT.pfm").is_file():
         path = folder / "disp0GT.pfm"
     values = read_map(path)
-    expect_size(path, values.shape, (camera.height, camera.width))
+    expect_size(path, values, (camera.height, camera.width))
     values[~np.isfinite(values)] = np.nan
     low = -camera.doffs if offset else 0.0
     if np.nanmin(values, initial=np.inf) <= low:
@@ -123,14 +123,14 @@ def load_levels(files: Files, dataset: str, name: str, year: int, *, smooth: boo
     """
     levels = read_levels(files.disparity).astype(np.float64)
     height, width = levels.shape
-    camera, per_pixel = _CAMERAS[year](files, height, width)
+    camera, per_pixel = _levels_camera(files, year, height, width)
     levels[levels == 0] = np.nan
     depth = _depth(files.disparity, (smooth_levels(levels) if smooth else levels) / per_pixel, camera)
     measured: dict[float, Tensor] = {}
     for factor, path in files.measured.items():
         camera_lr = camera.downscale(factor)
         values = read_levels(path).astype(np.float64)
-        expect_size(path, values.shape, (camera_lr.height, camera_lr.width))
+        expect_size(path, values, (camera_lr.height, camera_lr.width))
         values[values == 0] = np.nan
         measured[factor] = _depth(path, values / (per_pixel * factor), camera_lr)
     return Scene(dataset, name, _photo(files.photo, camera), camera, depth, measured)
@@ -173,7 +173,7 @@ def _number(path: Path, key: str, text: str) -> float:
 
 def _photo(path: Path, camera: Camera) -> Tensor:
     rgb = read_picture(path)
-    expect_size(path, tuple(rgb.shape[1:]), (camera.height, camera.width))
+    expect_size(path, rgb, (camera.height, camera.width))
     return rgb
 
 
@@ -184,8 +184,13 @@ def _depth(path: Path, disparity: np.ndarray, camera: Camera) -> Tensor:
     return from_range(torch.from_numpy(disparity)[None], camera, "disparity")
 
 
-def _camera_2006(files: Files, height: int, width: int) -> tuple[Camera, float]:
-    """Return the camera of 2005 and 2006 at a map's size, and levels per pixel."""
+def _levels_camera(files: Files, year: int, height: int, width: int) -> tuple[Camera, float]:
+    """Return the camera of a data set of levels at a map's size, and levels per pixel."""
+    if year == 2003:
+        return Camera(width, height, **_TEDDY), 4
+    cx, cy = (width - 1) / 2, (height - 1) / 2
+    if year == 2001:
+        return Camera(width, height, **{**_TEDDY, "cx": cx, "cy": cy}), 8
     per_pixel = round(_FULL_HEIGHT / height)
     if per_pixel not in (1, 2, 3):
         raise ValueError(f"{files.disparity}: expected a height near {_FULL_HEIGHT}, a half or a third, got {height}")
@@ -194,21 +199,7 @@ def _camera_2006(files: Files, height: int, width: int) -> tuple[Camera, float]:
         text = read_limited(files.shift).decode("utf-8", "replace").strip()
         shift = _number(files.shift, "dmin", text)
     focal = _FULL_FOCAL / per_pixel
-    centre = ((width - 1) / 2, (height - 1) / 2)
-    return Camera(width, height, focal, focal, *centre, _BASELINE, shift / per_pixel), per_pixel
-
-
-def _camera_2003(files: Files, height: int, width: int) -> tuple[Camera, float]:
-    return Camera(width, height, **_TEDDY), 4
-
-
-def _camera_2001(files: Files, height: int, width: int) -> tuple[Camera, float]:
-    return Camera(width, height, **{**_TEDDY, "cx": (width - 1) / 2, "cy": (height - 1) / 2}), 8
-
-
-_CAMERAS: Mapping[int, Callable[[Files, int, int], tuple[Camera, float]]] = MappingProxyType(
-    {2001: _camera_2001, 2003: _camera_2003, 2005: _camera_2006, 2006: _camera_2006}
-)
+    return Camera(width, height, focal, focal, cx, cy, _BASELINE, shift / per_pixel), per_pixel
 
 
 def _names(folders: Sequence[str]) -> tuple[str, ...]:
@@ -216,14 +207,8 @@ def _names(folders: Sequence[str]) -> tuple[str, ...]:
     return tuple(name.casefold() for name in folders)
 
 
-EVALUATION_2014 = _names(collections.EVALUATION_2014)
-SCENES = {
-    2001: _names(collections.SCENES_2001),
-    2003: _names(collections.SCENES_2003),
-    2005: _names(collections.SCENES_2005),
-    2006: _names(collections.SCENES_2006),
-}
-TRAINING_2014 = _names(collections.TRAINING_2014)
+EVALUATION_2014, TRAINING_2014 = _names(collections.EVALUATION_2014), _names(collections.TRAINING_2014)
+SCENES = {year: _names(getattr(collections, f"SCENES_{year}")) for year in YEARS}
 TRAINING = {2001: SCENES[2001], 2006: SCENES[2006], 2014: TRAINING_2014}  # scenes to train on by year
 _FILES_2014 = ("im0.png", "calib.txt", "disp0.pfm", "disp0GT.pfm")
 

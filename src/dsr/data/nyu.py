@@ -103,8 +103,8 @@ def load_files(rgb_path: Path, depth_path: Path, dataset: str, name: str) -> Sce
     """Return one frame of files of their own, with its border and the filled depth."""
     size = (CAMERA.height, CAMERA.width)
     rgb, depth = read_picture(rgb_path), to_depth(depth_path, read_map(depth_path))
-    expect_size(rgb_path, tuple(rgb.shape[1:]), size)
-    expect_size(depth_path, tuple(depth.shape[1:]), size)
+    expect_size(rgb_path, rgb, size)
+    expect_size(depth_path, depth, size)
     return Scene(dataset, name, rgb, CAMERA, depth)
 
 
@@ -174,9 +174,8 @@ class NYU(PreparedDataset):
         if split not in SPLITS:
             raise ValueError(f"split: expected one of {', '.join(SPLITS)}, or null, got {split}")
         named = [f"{number:04d}" for number in SPLITS[split]]
-        found = _records(root, filled=True, crop=False) or make_records(
-            list_frames(find_files, root), load_files, "nyu"
-        )
+        files = make_records(list_frames(find_files, root), load_files, "nyu")
+        found = _records(root, filled=True, crop=False) or files
         found = {name: found[name] for name in named if name in found}
         super().__init__("nyu", root, found, named, scenes, Preparation(None))
         self.evaluation = split == "test"

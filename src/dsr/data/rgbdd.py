@@ -67,7 +67,7 @@ def load_measured_frame(rgb_path: Path, depth_path: Path, measured_path: Path, d
     """Return one image as :func:`~dsr.data.frame_files.load_pair` does, with the phone's depth as the measured map."""
     scene, measured = load_pair(rgb_path, depth_path, dataset, name), read_millimetres(measured_path)
     size = (round(scene.camera.height / RATIO), round(scene.camera.width / RATIO))
-    expect_size(measured_path, tuple(measured.shape[1:]), size)
+    expect_size(measured_path, measured, size)
     return replace(scene, measured={scene.camera.width / size[1]: measured})
 
 

@@ -88,7 +88,7 @@ def load_frame(
     """Return one frame; depths beyond ``farthest`` metres are holes."""
     rgb, depth = read_picture(rgb_path), read_depth(depth_path, farthest)
     size = (rgb.shape[1], rgb.shape[2])
-    expect_size(depth_path, tuple(depth.shape[1:]), size)
+    expect_size(depth_path, depth, size)
     return Scene(dataset, name, rgb, read_camera(camera_path, size), depth)
 
 

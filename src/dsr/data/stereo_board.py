@@ -27,7 +27,7 @@ import cv2
 import numpy as np
 import torch
 
-from dsr.data.frame_files import expect_size, find_beside, in_natural_order, read_millimetres, read_picture
+from dsr.data.frame_files import find_beside, in_natural_order, read_frame
 from dsr.data.preparation import Preparation, PreparedDataset, list_frames, make_records
 from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera
@@ -94,9 +94,7 @@ def load_frame(rgb_path: Path, depth_path: Path, board: str, dataset: str, name:
     Its regions are ``board``, deeper inside the outline than :data:`INSIDE` pixels, and of that ``border``, not deeper
     than :data:`BORDER`: what is blurred across the outline shows there.
     """
-    rgb, measured = read_picture(rgb_path), read_millimetres(depth_path)
-    for path, image in ((rgb_path, rgb), (depth_path, measured)):
-        expect_size(path, tuple(image.shape[1:]), (CAMERA.height, CAMERA.width))
+    rgb, measured = read_frame(rgb_path, depth_path, size=(CAMERA.height, CAMERA.width))
     inside = depth_inside(BOARDS[board])
     regions = {"board": inside > INSIDE, "border": (inside > INSIDE) & (inside <= BORDER)}
     truth = torch.from_numpy(plane_depth(BOARDS[board]))[None]

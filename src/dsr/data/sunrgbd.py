@@ -93,7 +93,7 @@ def load_pair(rgb_path: Path, depth_path: Path, dataset: str, name: str, intrins
     """Return the scene of two files, wherever they lie, and of their intrinsics or the file that has them."""
     rgb, depth = read_picture(rgb_path), read_depth(depth_path)
     size = (rgb.shape[1], rgb.shape[2])
-    expect_size(depth_path, tuple(depth.shape[1:]), size)
+    expect_size(depth_path, depth, size)
     if isinstance(intrinsics, Path):
         return Scene(dataset, name, rgb, read_intrinsics(intrinsics, size), depth)
     return Scene(dataset, name, rgb, given_camera(intrinsics, size), depth)

@@ -65,7 +65,7 @@ def read_depth(path: Path, farthest: float = FARTHEST) -> Tensor:
 def load_frame(rgb_path: Path, depth_path: Path, dataset: str, name: str, *, farthest: float = FARTHEST) -> Scene:
     """Return one frame at 640 x 480; depths beyond ``farthest`` metres are holes."""
     rgb = read_picture(rgb_path)
-    expect_size(rgb_path, tuple(rgb.shape[1:]), _SIZE)
+    expect_size(rgb_path, rgb, _SIZE)
     return Scene(dataset, name, rgb, CAMERA, read_depth(depth_path, farthest))
 
 

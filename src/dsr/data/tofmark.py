@@ -99,7 +99,7 @@ def load_frame(
     else:
         rgb = read_picture(path)
         samples = _metres(samples_path, *read_samples(samples_path), depth_range)
-        expect_size(samples_path, tuple(samples.shape[1:]), tuple(rgb.shape[1:]))
+        expect_size(samples_path, samples, tuple(rgb.shape[1:]))
     camera = given_camera(intrinsics, (rgb.shape[1], rgb.shape[2]))
     measured: dict[float, Tensor] = {}
     if samples is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -210,8 +211,8 @@ def _catalogue() -> dict[str, Collection]:
     text = Path(__file__).with_name("collections.yaml").read_text("utf-8")
     catalogue = {}
     for name, entries in yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader)).items():  # noqa: S506
-        fields = {key: tuple(value) if isinstance(value, list) else value for key, value in entries.items()}
-        catalogue[name] = Collection(name, items=_ITEMS.get(name, ()), **fields)
+        lists: dict[str, Any] = {key: tuple(entries.pop(key)) for key in ("folders", "patterns") if key in entries}
+        catalogue[name] = Collection(name, items=_ITEMS.get(name, ()), **entries, **lists)
     return catalogue
 
 
