@@ -25,14 +25,7 @@ from typing import Literal
 import numpy as np
 import torch
 
-from dsr.data.frame_files import (
-    expect_size,
-    find_beside,
-    given_camera,
-    in_natural_order,
-    read_frame,
-    read_millimetres,
-)
+from dsr.data.frame_files import expect_size, find_beside, given_camera, in_natural_order, read_frame, read_millimetres
 from dsr.data.preparation import Preparation, PreparedDataset, add_note, list_frames, make_records
 from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import ASSUMED_FOV, Camera
@@ -137,11 +130,7 @@ class ARKitScenes(PreparedDataset):
     """
 
     def __init__(
-        self,
-        root: str,
-        split: Split = "validation",
-        scenes: SceneSelection = None,
-        min_confidence: int = 0,
+        self, root: str, split: Split = "validation", scenes: SceneSelection = None, min_confidence: int = 0
     ) -> None:
         if split not in SPLITS:
             raise ValueError(f"split: expected one of {', '.join(SPLITS)}, got {split}")

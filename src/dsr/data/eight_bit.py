@@ -40,22 +40,13 @@ from dsr.sample import Scene, Unit
 
 @dataclass(frozen=True)
 class Benchmark:
-    """A benchmark of 8-bit levels.
+    """A benchmark of 8-bit levels."""
 
-    Args:
-        prefix: what its files' names begin with, before the number.
-        count: number of its scenes.
-        focal: focal length in pixels.
-        baseline: distance of the second camera in metres.
-        offset: added to levels to give disparity.
-
-    """
-
-    prefix: str
-    count: int
-    focal: float
-    baseline: float
-    offset: float
+    prefix: str  # of its files' names, before the number
+    count: int  # number of its scenes
+    focal: float  # in pixels
+    baseline: float  # distance of the second camera in metres
+    offset: float  # added to levels to give disparity
 
     @property
     def scenes(self) -> tuple[str, ...]:

@@ -129,13 +129,7 @@ def _camera(path: Path, matrix: np.ndarray) -> Camera:
 
 
 def _scene(
-    path: Path,
-    rgb: Tensor,
-    camera: Camera,
-    depth: np.ndarray,
-    masks: Mapping[str, np.ndarray],
-    dataset: str,
-    name: str,
+    path: Path, rgb: Tensor, camera: Camera, depth: np.ndarray, masks: Mapping[str, np.ndarray], dataset: str, name: str
 ) -> Scene:
     """Return the scene of depth in metres, 0 in holes, and masks."""
     valid = np.all([masks[key] > 0 for key in _VALID], axis=0)

@@ -52,19 +52,12 @@ _NOISY = MappingProxyType({4: "_depth_2_n.png", 8: "_depth_3_n.png"})
 
 @dataclass(frozen=True)
 class Files:
-    """The files of a scene of 2001 to 2006.
-
-    Args:
-        photo, disparity: of the left view.
-        shift: ``dmin.txt``, None where there is none.
-        measured: noisy low-resolution disparities by factor.
-
-    """
+    """The files of a scene of 2001 to 2006."""
 
     photo: Path
     disparity: Path
-    shift: Path | None
-    measured: Mapping[int, Path]
+    shift: Path | None  # dmin.txt
+    measured: Mapping[int, Path]  # noisy low-resolution disparities by factor
 
 
 def find_2014(root: Path) -> dict[str, Path]:

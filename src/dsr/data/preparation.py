@@ -32,22 +32,13 @@ _MAX_HASHED = 1 << 28  # largest size in bytes of files whose content is hashed
 
 @dataclass(frozen=True)
 class SceneRecord:
-    """A scene on disk.
+    """A scene on disk."""
 
-    Args:
-        files: files and folders that the scene is read from; a folder stands for all files in it.
-        load: function that reads the scene at its original size.
-        frame: part of the files that holds the scene, where they hold several.
-        settings: how the files are read.
-        note: remark for readers of the scene's scores; empty for none.
-
-    """
-
-    files: tuple[Path, ...]
-    load: Callable[[], Scene]
-    frame: str = ""
-    settings: str = ""
-    note: str = ""
+    files: tuple[Path, ...]  # that the scene is read from; a folder stands for all files in it
+    load: Callable[[], Scene]  # at its original size
+    frame: str = ""  # part of the files that holds the scene, where they hold several
+    settings: str = ""  # how the files are read
+    note: str = ""  # for readers of the scene's scores
 
 
 def list_frames(
@@ -143,8 +134,7 @@ class PreparedDataset:
         named: names of the scenes that belong to the data set; None for all that are on disk.
         scenes: names of the scenes to use; None for those of ``named``, ``found`` for all that are on disk.
         preparation: how scenes are resized, cropped and inpainted.
-        count: number of scenes that belong to the data set, where their names are not known; None otherwise.
-
+        count: number of scenes that belong to the data set, where their names are not known.
     """
 
     evaluation = True

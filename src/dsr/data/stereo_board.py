@@ -37,18 +37,11 @@ from dsr.sample import Scene
 
 @dataclass(frozen=True)
 class Board:
-    """The board in a frame.
+    """The board in a frame."""
 
-    Args:
-        normal: of its plane, of length 1, in the camera's axes (right, down, forward).
-        distance: of its plane from the camera along the normal, metres.
-        outline: (column, row) of its corners, in pixels of the photo.
-
-    """
-
-    normal: tuple[float, float, float]
-    distance: float
-    outline: tuple[tuple[float, float], ...]
+    normal: tuple[float, float, float]  # of its plane, of length 1, in the camera's axes (right, down, forward)
+    distance: float  # of its plane from the camera along the normal, metres
+    outline: tuple[tuple[float, float], ...]  # (column, row) of its corners, in pixels of the photo
 
 
 CAMERA = Camera(1920, 1080, 1368.937, 1370.763, 936.091, 541.831)

@@ -37,14 +37,7 @@ from dsr.data.frame_files import (
     to_depth,
     walk,
 )
-from dsr.data.preparation import (
-    Preparation,
-    PreparedDataset,
-    SceneRecord,
-    list_frames,
-    make_records,
-    rename_records,
-)
+from dsr.data.preparation import Preparation, PreparedDataset, SceneRecord, list_frames, make_records, rename_records
 from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera
 from dsr.io.images import read_numbers

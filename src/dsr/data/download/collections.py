@@ -38,53 +38,29 @@ SCENES_2001 = ("barn1", "barn2", "bull", "poster", "sawtooth", "venus")
 
 @dataclass(frozen=True)
 class Item:
-    """A file to fetch.
+    """A file to fetch."""
 
-    Args:
-        path: below the directory of the data sets, with slashes; a mirror has the file under the same path.
-        urls: where it is, tried in order; ``ADDRESS#NAME`` is the member NAME of a zip archive.
-        unpack_to: the directory, below that of the data sets, that the archive is unpacked into; None for a file that
-            stays as it is.
-        contains: what there must be in ``unpack_to`` afterwards, such as ``training/final``.
-        sha256: of the file, where it is known beforehand.
-
-    """
-
-    path: str
-    urls: tuple[str, ...]
-    unpack_to: str | None = None
-    contains: tuple[str, ...] = ()
-    sha256: str | None = None
+    path: str  # below the directory of the data sets, with slashes; a mirror has the file under the same path
+    urls: tuple[str, ...]  # tried in order; ADDRESS#NAME is the member NAME of a zip archive
+    unpack_to: str | None = None  # directory that an archive is unpacked into, below that of the data sets
+    contains: tuple[str, ...] = ()  # what there must be in it afterwards, such as "training/final"
+    sha256: str | None = None  # where it is known beforehand
 
 
 @dataclass(frozen=True)
 class Collection:
-    """Files that go together.
+    """Files that go together."""
 
-    Args:
-        name: as it is typed.
-        title: what it is, a few words.
-        homepage: address of its page.
-        licence: its terms, as far as its owners state them.
-        citation: authors, title, venue, year.
-        folders: its directories below that of the data sets.
-        size: of the downloads in bytes, about; None where that is not known.
-        items: what is fetched; empty where nobody but the user can.
-        manual: how to get it by hand, with ``{folder}`` for its directory; None where ``items`` are all there is.
-        patterns: of the files that the user puts into the first of ``folders``, as for :meth:`pathlib.Path.glob`.
-
-    """
-
-    name: str
+    name: str  # as it is typed
     title: str
     homepage: str
-    licence: str
+    licence: str  # its terms, as far as its owners state them
     citation: str
-    folders: tuple[str, ...]
-    size: float | None
-    items: tuple[Item, ...] = field(default=(), repr=False)
-    manual: str | None = None
-    patterns: tuple[str, ...] = ()
+    folders: tuple[str, ...]  # below the directory of the data sets
+    size: float | None  # of the downloads in bytes, about
+    items: tuple[Item, ...] = field(default=(), repr=False)  # empty where nobody but the user can fetch it
+    manual: str | None = None  # how to get it by hand, with {folder} for its directory
+    patterns: tuple[str, ...] = ()  # of the files that the user puts into the first of the folders
 
     def instruction(self, root: Path) -> str:
         """Return how to get it by hand."""
