@@ -1,20 +1,16 @@
 """``dataset=cleargrasp`` and ``dataset=cleargrasp_synthetic``: glass and clear plastic, with true depth.
 
-Sajjan et al., "ClearGrasp: 3D Shape Estimation of Transparent Objects for Manipulation", ICRA 2020; README.md,
-``eval_depth_completion/eval_depth_completion.py`` and ``z-ignore-scripts-helper/data_processing_script.py`` of
-github.com/Shreeyak/cleargrasp (Apache 2.0), with samples in ``data/sample_dataset``.
+Sajjan et al., "ClearGrasp: 3D Shape Estimation of Transparent Objects for Manipulation", ICRA 2020; its code and
+samples are in github.com/Shreeyak/cleargrasp (Apache 2.0).
 
-``cleargrasp`` has captures of a RealSense at 1280 x 720, and of the same scene with painted twins in the objects'
-places. Of the first, the photo is the scene's, and the depth its measured map: ``downsampling=measured scale=1`` takes
-it as the input. The twins' depth is the truth, as good as a stereo camera's of painted surfaces:
+``cleargrasp`` has captures of a RealSense at 1280 x 720, with their depth as the measured map, and of the same scene
+with painted twins in the objects' places, whose depth is the truth: ``downsampling=measured scale=1``.
 
     real-val/d435/000000080-transparent-rgb-img.jpg      000000080-transparent-depth-img.exr   metres, 0 or NaN = hole
     real-val/d435/000000080-opaque-depth-img.exr         000000080-mask.png                    not 0: the objects
     real-val/d435/camera_intrinsics.yaml                 xres yres fx fy cx cy
 
-likewise ``real-test``, with objects that no network of the authors' was trained on. Depth is in 16-bit floats, whose
-steps are 0.5 mm from 0.5 to 1 m and 1 mm beyond: the truth is for depth, not for normals, as a note beside the scores
-says.
+likewise ``real-test``. Depth is in 16-bit floats, whose steps are 0.5 mm from 0.5 to 1 m and 1 mm beyond.
 
 ``cleargrasp_synthetic`` has rendered scenes with exact depth, to downsample, in a folder for each object:
 
@@ -22,14 +18,11 @@ says.
     synthetic-val/square-plastic-bottle-val/depth-imgs-rectified/000000000-depth-rectified.exr      see below
     synthetic-val/square-plastic-bottle-val/segmentation-masks/000000000-segmentation-mask.png
 
-likewise ``synthetic-test`` and the training set, whose folders end in ``-train``. What the renderer gave, the distance
-along the ray, is stored times cos(a) cos(b), where the angles a and b grow from 0 in the middle of the picture by the
-same amount in each column and row, to half of the view's 1.2112585 and 0.7428327 radians at its sides. That is not
-orthogonal depth, as which the authors use it: it is up to 2 % off. Here the product is undone, and the distance
-converted. In the sample 000000002, half of all pixels are then within 0.025 % of the table's plane, before 0.38 %. The
-camera is that of the view, with its axis through the middle of the picture. The steps of the 16-bit floats are smoothed
-as those of 8-bit maps are (:func:`dsr.data.reference_depth.smooth_levels`): the table's normals are then 11 degrees off
-in the mean, before 22.
+likewise ``synthetic-test`` and the training set, whose folders end in ``-train``. Stored is the distance along the ray,
+times cos(a) cos(b), where the angles a and b grow from 0 in the middle of the picture by the same amount in each column
+and row, to half of :data:`VIEW` at its sides. That is up to 2 % off orthogonal depth, as which the authors use it; here
+the product is undone, and the distance converted. The steps of the 16-bit floats are smoothed as those of 8-bit maps
+are (:func:`dsr.data.reference_depth.smooth_levels`).
 
 Regions of all are ``glass``, the mask of the objects, ``outside``, all the rest, and ``edges``, within
 :data:`EDGE` pixels of the mask's outline, on either side.

@@ -1,18 +1,13 @@
-"""``dataset=ddrnet``: a real sensor's maps at the photo's own size, with a truth.
+"""``dataset=ddrnet``: a person before a structured-light camera, at the photo's own size, with fused geometry as truth.
 
-``downsampling=measured scale=1`` takes these maps as the input.
-
-DDRNet's real frames: one person before a structured-light camera, with fused geometry as the truth.
-
-Yan et al., "DDRNet: Depth Map Denoising and Refinement for Consumer Depth Cameras Using Cascaded CNNs", ECCV 2018;
-github.com/neycyanshi/DDRNet.
+``downsampling=measured scale=1`` takes the sensor's maps as the input. Yan et al., "DDRNet: Depth Map Denoising and
+Refinement for Consumer Depth Cameras Using Cascaded CNNs", ECCV 2018; github.com/neycyanshi/DDRNet.
 
     GROUP/color_map/frame_000001.png            the photo, 640 x 480
     GROUP/depth_map/frame_000001.png            the sensor's depth, registered to the photo, 16 bits, mm, 0 = hole
     GROUP/high_quality_depth/frame_000001.png   the depth of geometry fused from many frames, mm, 0 = unknown
 
-The authors have other folders beside these (``depth_filled``, ``mask``, ``albedo``), which they made of them. The
-camera is that of their losses (src/losses.py), taken as it is: pixel centres at integers.
+The camera is that of the authors' losses (src/losses.py), taken as it is: pixel centres at integers.
 """
 
 from __future__ import annotations

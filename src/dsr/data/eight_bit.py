@@ -1,7 +1,5 @@
 """``dataset=lu`` and ``dataset=middlebury8``: the 8-bit benchmarks of guided depth super-resolution.
 
-Lu's six pairs and thirty of Middlebury.
-
     DIR/RGB/RGBD_01_ouput_color.png            the photo; the name is spelt that way in Lu's, "output" in Middlebury's
     DIR/Depth/RGBD_01_output_depth.png         8 bits, nearer is brighter, without holes; 0 is a level like any other
 
@@ -9,14 +7,10 @@ Lu et al., "Depth Enhancement via Low-Rank Matrix Completion", CVPR 2014, record
 structured-light sensor and filled their holes, as well as those of thirty pairs of Middlebury 2001 to 2006
 (``Middlebury_01`` to ``Middlebury_30``, at a third of the size of 2005 and 2006). The field computes errors in levels.
 
-Levels are taken for disparity, but what depth a level stands for is not published. So the cameras here are invented, in
-such a way that disparity in pixels is the level and every level, even some below 0 which interpolation may make, has a
-positive depth: depth = focal * baseline / (level + offset).
-
-- Lu: f = 525 pixels, usual for such sensors; 0.5 m and 75 levels put level 255 at 0.80 m and level 0 at 3.5 m.
-- Middlebury: f = 3740 / 3 pixels and a baseline of 160 mm, published for 2005 and 2006, with three levels to a pixel,
-  which three times the baseline stands for; the offset is the shift of Art, 200 levels. Level 255 is at 1.3 m, level 0
-  at 3.0 m.
+What depth a level stands for is not published. So the cameras here are invented, in such a way that disparity in pixels
+is the level and every level, even some below 0 which interpolation may make, has a positive depth, focal * baseline /
+(level + offset): of Lu 0.80 m at level 255 and 3.5 m at 0, with the focal length that is usual for such sensors; of
+Middlebury 1.3 m and 3.0 m, with the camera of 2005 and 2006, three levels to a pixel, and the shift of Art.
 """
 
 from __future__ import annotations

@@ -1,26 +1,20 @@
 """``dataset=ibims``: rooms before a laser scanner, with their planes and depth edges marked (Koch et al., 2018).
 
-Koch, Liebel, Fraundorfer, Körner, "Evaluation of CNN-based Single-Image Depth Estimation Methods", ECCV Workshops 2018;
-``evaluate_ibims.py`` and ``evaluate_ibims_error_metrics.py``, version 0.9, of its authors (a copy is in
-``mde/capsules/meter/ibims_official`` of github.com/bulatko/DepthART); its terms are on doi.org/10.14459/2018mp1455541.
+Koch, Liebel, Fraundorfer, Körner, "Evaluation of CNN-based Single-Image Depth Estimation Methods", ECCV Workshops 2018.
 100 scenes of 640 x 480 pixels, each a MATLAB file with a structure ``data``:
 
     ibims1_core_mat/corridor_01.mat    rgb, depth in metres, 0 = hole, calib, edges, mask_invalid and mask_transp,
                                        0 where a pixel is not to be counted, mask_wall, mask_table and mask_floor, in
                                        which planes are numbered from 1
 
-or, with the same in it, as pictures:
+or, with the same in it, as pictures, a folder for each:
 
     ibims1_core_raw/rgb/corridor_01.png        ibims1_core_raw/depth/corridor_01.png     16 bits, v 50 / 65535 metres
-    ibims1_core_raw/calib/corridor_01.txt      fx,fy,cx,cy
-    ibims1_core_raw/edges/corridor_01.png      and so on, a folder for each; where a scene has no table, there is no
-                                               file in ``mask_table``
+    ibims1_core_raw/calib/corridor_01.txt      ibims1_core_raw/edges/corridor_01.png     and so on; fx,fy,cx,cy
 
 ``calib`` is the transpose of a matrix of intrinsics, and its pixels are counted from 1: the principal point is less by
 1 here. As in the authors' evaluation, pixels whose depth is 0, invalid, or behind something transparent have no truth.
-
-Regions are ``planes``, numbered from 1 (walls, then tables, then floors; the authors score those alone that have 5 % of
-the picture), and ``edges``, lines of a pixel, where a scene has such.
+Regions are ``planes``, numbered from 1 (walls, then tables, then floors), and ``edges``, lines of a pixel.
 """
 
 from __future__ import annotations

@@ -1,18 +1,15 @@
-"""``dataset=icl``: synthetic rooms with exact depth (Handa et al., ICRA 2014).
+"""``dataset=icl``: synthetic rooms with exact depth.
 
-Voynov et al. 2019 evaluate on six frames, which they name by what they show, not by number. Their size and crop follow
-from their camera of Plant: frames are resized to a height of 512 and cropped to the square in the middle. Which frames
-they used is unknown. Those below are spread over the trajectories; ``dataset.frames`` takes others.
-
-Handa et al., "A Benchmark for RGB-D Visual Odometry, 3D Reconstruction and SLAM", ICRA 2014.
+Handa et al., "A Benchmark for RGB-D Visual Odometry, 3D Reconstruction and SLAM", ICRA 2014. Voynov et al. 2019
+evaluate on six frames, which they name by what they show. Their size and crop follow from their camera of Plant: frames
+are resized to a height of 512 and cropped to the square in the middle. Which frames they used is unknown. Those below
+are spread over the trajectories; ``dataset.frames`` takes others.
 
     DIR/scene_00_NNNN.png, .depth     as rendered: colour (8 or 16 bits), distances along the rays in centimetres
     DIR/rgb/N.png, DIR/depth/N.png    as for the TUM benchmark: orthogonal depth, 5000 levels a metre, 0 for a hole
     DIR/rgb.png, DIR/depth.png        the same, one frame a folder
 
-All are 640 x 480 of one camera, 481.20, -480.00, 319.50, 239.50. The POV-Ray camera beside a rendered frame (.txt) is
-not read: what it adds is the pose, and its cam_right, cam_up and cam_dir give these intrinsics again
-(640 / 1.33 = 481.2, 480 / 1 = 480).
+All are 640 x 480 of one camera, 481.20, -480.00, 319.50, 239.50.
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""``dataset=nyu``: indoor scenes of a Kinect, which the paper does not use.
-
-NYU Depth v2, the 1449 labelled frames.
+"""``dataset=nyu``: NYU Depth v2, the 1449 labelled frames: indoor scenes of a Kinect, which the paper does not use.
 
 Silberman et al., "Indoor Segmentation and Support Inference from RGBD Images", ECCV 2012.
 
@@ -13,11 +11,7 @@ The camera is camera_params.m of the official toolbox, which counts pixels from 
 
 Guided depth super-resolution trains on the first 1000 frames and tests on the last 449 (Kim et al., "Deformable Kernel
 Networks for Joint Image Filtering", IJCV 2021), 640 x 480 pixels with the border and the filled depth. DCTNet (Zhao et
-al., CVPR 2022) has the latter as files, whose numbers count from 0:
-
-    DIR/RGB/1000.jpg   DIR/Depth/1000.npy         frame 1001, float32 metres, to frame 1449
-
-The first image of the test split in the repository of Kim et al. is 1000.jpg.
+al., CVPR 2022) has the latter as files, ``RGB/1000.jpg`` and ``Depth/1000.npy`` in metres, numbered from 0.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
-"""``dataset=sunrgbd``: indoor scenes of four sensors (Song et al., CVPR 2015).
+"""``dataset=sunrgbd``: indoor scenes of four sensors (Song et al., "SUN RGB-D", CVPR 2015).
 
 Voynov et al. 2019 evaluate on twelve images and do not say which. This data set has three of each sensor.
-
-Song et al., "SUN RGB-D: A RGB-D Scene Understanding Benchmark Suite", CVPR 2015.
 
     SCENE/image/*.jpg        colour
     SCENE/depth/*.png        the sensor's depth, projected into the colour camera
@@ -10,12 +8,9 @@ Song et al., "SUN RGB-D: A RGB-D Scene Understanding Benchmark Suite", CVPR 2015
     SCENE/intrinsics.txt     3 x 3, in three lines or one
 
 16-bit depth pictures hold millimetres turned left by three bits: mm = (v >> 3) | (v << 13), 0 for a hole. The official
-toolbox (read3dPoints.m) sets what is farther than 8 m to 8 m; here it stays as measured.
-
-intrinsics.txt is taken as it is, pixel centres at integers from 0. That is right where the authors cut NYU's frames:
-the cut begins at column 40, row 44 of the full frame (img_0063, by matching), while the principal point is less by 41
-and 45, which turns MATLAB's count from 1 into a count from 0. The toolbox goes on counting from 1
-(read_3d_pts_general.m), so for other sensors the principal point is uncertain by one pixel, a shear of 1 / fx.
+toolbox (read3dPoints.m) sets what is farther than 8 m to 8 m; here it stays as measured. intrinsics.txt is taken as it
+is, pixel centres at integers from 0, which is right for NYU's frames; the toolbox counts from 1, so for other sensors
+the principal point is uncertain by one pixel.
 """
 
 from __future__ import annotations

@@ -2,23 +2,14 @@
 
 Voynov et al. 2019 use Books, Devil and Shark with the maps of the real sensor as the input: ``downsampling=measured``.
 
-The benchmark's files hold no camera. It was estimated from the scene Books that the paper's authors published with a
-camera and metric depth: 72 of 100 correspondences between the two photos fit one pose and one camera of square pixels
-without distortion, with a root mean square error of 0.95 pixels.
-
-ToFMark: a time-of-flight camera beside an intensity camera (Ferstl et al., ICCV 2013).
-
-"Image Guided Depth Upsampling using Anisotropic Total Generalized Variation". Books, Devil and Shark, 610 x 810:
-
     benchmarking_dataset_NAME.mat     intensity, true depth, and the sensor's samples projected into the intensity image
     NAME.bmp, NAME_depth.bmp          intensity and samples in 8 bits; 0 = no sample, which 97.5 % of the pixels are
 
-No names of variables are published for the ``.mat`` files, so variables are recognised by their names and sizes, or
-named by the caller. Depths are orthogonal, in millimetres where their median exceeds 50, else in metres.
-
-In ``*_depth.bmp`` 255 is the farthest sample: the wall behind the objects is bright, and along Books the levels go with
-metric depth z of the same scene (correlation 0.97; -0.96 with 1/z; linear in z, median residual 16 mm, against 30 mm if
-linear in 1/z). What depth a level stands for is lost, and no file holds a camera: both are the caller's to give.
+all of 610 x 810 pixels. No names of variables are published for the ``.mat`` files, so variables are recognised by
+their names and sizes, or named by the caller. Depths are orthogonal, in millimetres where their median exceeds 50, else
+in metres. In ``*_depth.bmp`` 255 is the farthest sample, and levels are linear in depth; what depth a level stands for
+is the caller's to give. No file holds a camera: :data:`ESTIMATED` fits 72 correspondences with the scene Books, which
+the paper's authors published with a camera, up to 0.95 pixels (root mean square).
 """
 
 from __future__ import annotations
