@@ -20,9 +20,8 @@ from dsr.data.frame_files import expect_size, name_of, read_picture, to_depth, w
 from dsr.data.preparation import Preparation, PreparedDataset, list_frames, make_records
 from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera
-from dsr.io.images import read_map
+from dsr.io.images import read_values
 from dsr.sample import Scene
-from dsr.utils.guards import opened
 
 CAMERA = Camera(640, 480, 320.0, 320.0, 320.0, 240.0)
 FARTHEST = 1000.0  # largest depth in metres; the sky has a larger one
@@ -52,13 +51,9 @@ def find_frames(root: Path) -> dict[str, tuple[Path, Path]]:
 
 def read_depth(path: Path, farthest: float = FARTHEST) -> Tensor:
     """Return a depth file, (1, 480, 640) float64 in metres, NaN where it is beyond ``farthest`` metres."""
-    if not path.is_file():
-        raise ValueError(f"{path}: expected a NumPy array, there is none")
-    shape, dtype, length = _header(path)
-    if (shape, dtype) != (_SIZE, np.dtype("<f4")) or length != 4 * _SIZE[0] * _SIZE[1]:
-        raise ValueError(f"{path}: expected 480 x 640 float32, got {length} bytes that say {dtype} of shape {shape}")
-    with np.errstate(invalid="ignore"):  # as in to_depth
-        values = read_map(path)
+    values = read_values(path)
+    if (values.shape, values.dtype) != (_SIZE, np.dtype("<f4")):
+        raise ValueError(f"{path}: expected 480 x 640 float32, got {values.dtype} of shape {values.shape}")
     return to_depth(path, values, farthest)
 
 
@@ -67,20 +62,6 @@ def load_frame(rgb_path: Path, depth_path: Path, dataset: str, name: str, *, far
     rgb = read_picture(rgb_path)
     expect_size(rgb_path, rgb, _SIZE)
     return Scene(dataset, name, rgb, CAMERA, read_depth(depth_path, farthest))
-
-
-def _header(path: Path) -> tuple[tuple[int, ...], np.dtype, int]:
-    """Return the shape and the type in the header of a .npy file, and the number of bytes behind it."""
-    with opened(path) as file:
-        try:
-            version = np.lib.format.read_magic(file)
-            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-            shape, _, dtype = read(file)
-        except Exception as error:  # a damaged header makes NumPy raise ValueError, TokenError, SyntaxError, ...
-            raise ValueError(
-                f"{path}: expected a NumPy array, got {path.stat().st_size} bytes of another kind"
-            ) from error
-        return shape, dtype, path.stat().st_size - file.tell()
 
 
 class TartanAir(PreparedDataset):
