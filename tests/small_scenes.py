@@ -9,7 +9,7 @@ from torch import Tensor
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.sample import DepthSample, Scene
-from dsr.synthetic.ray_surfaces import rotation
+from dsr.synthetic.raycast import rotation
 
 BALLS = [(-0.7, -0.4, 2.6, 0.4), (0.6, 0.3, 2.2, 0.35), (0.1, -0.7, 3.0, 0.3), (-0.5, 0.6, 2.4, 0.3)]
 

@@ -134,16 +134,6 @@ def test_office_ceiling_is_flat_in_orthogonal_depth(shared):
     assert bend(along) > 5 * bend(orthogonal)
 
 
-def test_camera_of_a_rendered_frame_agrees_with_the_published_one(shared):
-    lines = (shared / "real/icl_nuim/office/scene_00_0000.txt").read_text().splitlines()
-    vectors = {line.split("=")[0].strip(): line.partition("[")[2].partition("]")[0] for line in lines if "[" in line}
-    ahead, right, up = (
-        np.linalg.norm(np.array(vectors[f"cam_{key}"].split(","), float)) for key in ("dir", "right", "up")
-    )
-    assert 640 * ahead / right == pytest.approx(CAMERA.fx, abs=0.01)
-    assert 480 * ahead / up == pytest.approx(CAMERA.fy)
-
-
 def test_living_room_has_the_size_of_a_room(shared):
     folder = shared / "real/icl_nuim/living"
     scene = load_frame(folder / "rgb.png", folder / "depth.png", "icl_nuim", "living")

@@ -43,7 +43,7 @@ def test_depth_is_read_as_orthogonal_metres_and_the_sky_is_a_hole(tmp_path):
 @pytest.mark.parametrize(
     "content",
     [
-        b"", b"\x93NUMPY", npy()[:100], npy()[:1000], npy()[:-4], npy() + b"\0", b"text, no array", b"PK\x03\x04" * 50,
+        b"", b"\x93NUMPY", npy()[:100], npy()[:1000], npy()[:-4], b"text, no array", b"PK\x03\x04" * 50,
         npy(VALUES[:, :639]), npy(VALUES.T), npy(VALUES[None]), npy(VALUES, "<f8"), npy(VALUES, "<u2"),
         npy(VALUES, ">f4"),
         npy(VALUES[:1], shape=(480, 640)), npy(VALUES, shape=(10**9, 10**9)), npy(VALUES, shape=(-480, -640)),

@@ -116,13 +116,6 @@ def test_other_content_settings_or_version_prepare_anew(files, monkeypatch):
     assert source(files).load("a").depth.nanmean() == pytest.approx(7)
 
 
-def test_damaged_cache_file_is_prepared_anew(files):
-    first = source(files).load("a")
-    [name] = kept()
-    (cache_directory() / "prepared" / "things" / name).write_bytes(b"half a file")
-    assert np.array_equal(source(files).load("a").depth, first.depth, equal_nan=True)
-
-
 def test_preparation_makes_what_is_missing_and_yields_every_scene(files):
     data = source(files, wanted="found")
     data.load("b")

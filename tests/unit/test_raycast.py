@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from dsr.geometry.camera import Camera
-from dsr.synthetic.ray_surfaces import Box, Cylinder, Plane, Sphere
-from dsr.synthetic.raycast import Body, Implicit, World, area_light, cast, render
+from dsr.synthetic.raycast import Body, Box, Cylinder, Implicit, Plane, Sphere, World, area_light, cast, render
 
 BACK = Plane(np.array([0.0, 0.0, 4.0]), np.array([0.0, 0.0, -1.0]))
 AHEAD = np.array([[0.0], [0.0], [1.0]])

@@ -8,7 +8,7 @@ import torch
 from dsr.geometry.camera import Camera
 from dsr.geometry.rigid_motion import as_rigid
 from dsr.inference.sequences import View, fuse_views
-from dsr.synthetic.ray_surfaces import rotation
+from dsr.synthetic.raycast import rotation
 
 CAMERA = Camera.centred(96, 72, 90.0)
 

@@ -9,7 +9,7 @@ import torch
 from dsr.geometry.camera import Camera
 from dsr.geometry.rigid_motion import as_rigid, from_quaternion, invert, relative
 from dsr.geometry.warping import registered_camera, source_pixels, warp_depth
-from dsr.synthetic.ray_surfaces import rotation
+from dsr.synthetic.raycast import rotation
 
 SENSOR = Camera(96, 72, 90.0, 88.0, 46.0, 36.5)
 PHOTO = Camera(120, 90, 130.0, 131.0, 60.0, 44.0)

@@ -25,14 +25,7 @@ from typing import Literal
 import numpy as np
 import torch
 
-from dsr.data.frame_files import (
-    expect_size,
-    find_beside,
-    in_natural_order,
-    read_millimetres,
-    read_picture,
-    to_camera,
-)
+from dsr.data.frame_files import expect_size, find_beside, given_camera, in_natural_order, read_frame, read_millimetres
 from dsr.data.preparation import Preparation, PreparedDataset, add_note, list_frames, make_records
 from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import ASSUMED_FOV, Camera
@@ -50,13 +43,8 @@ Files = tuple[Path, Path, Path, Path | None, Path | None]
 def find_frames(root: Path, split: Split | None = None) -> dict[str, Files]:
     """Return the first five arguments of :func:`load_frame` by name "41069021_305.244", in order.
 
-    Args:
-        root: directory of ``Training`` and ``Validation``, or any directory above or below.
-        split: of the frames; None for all. What is in no directory ``Training`` is for validation.
-
-    Raises:
-        ValueError: there is no such directory.
-
+    ``root`` may be any directory above or below ``Training`` and ``Validation``; what is in no ``Training`` is for
+    validation.
     """
     found: dict[str, Files] = {}
     for folder in ("wide", "color"):
@@ -82,21 +70,12 @@ def load_frame(
 ) -> Scene:
     """Return one frame with the lidar's map as the measured one.
 
-    Args:
-        rgb_path: photo.
-        depth_path: laser scanner's depth.
-        measured_path: lidar's depth.
-        confidence_path: the lidar's confidence, None where there is none.
-        intrinsics_path: ``.pincam`` file; None for 60 degrees of horizontal view.
-        min_confidence: pixels of the lidar below this confidence become holes.
-
-    Raises:
-        ValueError: a file is missing, damaged, or of another size; the message names it.
-
+    Without ``intrinsics_path``, 60 degrees of horizontal view are assumed. Pixels of the lidar below ``min_confidence``
+    become holes.
     """
-    rgb, depth, measured = read_picture(rgb_path), read_millimetres(depth_path), read_millimetres(measured_path)
-    for path, image, size in ((rgb_path, rgb, _SIZE), (depth_path, depth, _SIZE), (measured_path, measured, _SIZE_LR)):
-        expect_size(path, tuple(image.shape[1:]), size)
+    rgb, depth = read_frame(rgb_path, depth_path, size=_SIZE)
+    measured = read_millimetres(measured_path)
+    expect_size(measured_path, measured, _SIZE_LR)
     if min_confidence > 0:
         if confidence_path is None:
             raise ValueError(f"{measured_path}: expected its confidence in the folder confidence, there is none")
@@ -105,37 +84,27 @@ def load_frame(
         if not measured.isfinite().any():
             raise ValueError(f"{confidence_path}: expected a pixel of confidence {min_confidence}, there is none")
     height, width = _SIZE
-    camera = (
-        Camera.from_fov(ASSUMED_FOV, width, height) if intrinsics_path is None else read_intrinsics(intrinsics_path)
-    )
+    camera = Camera.from_fov(ASSUMED_FOV, width, height)
+    if intrinsics_path is not None:
+        camera = read_intrinsics(intrinsics_path)
     return Scene(dataset, name, rgb, camera, depth, {width / _SIZE_LR[1]: measured})
 
 
 def read_confidence(path: Path) -> np.ndarray:
-    """Return the lidar's confidence, (192, 256) uint8 from 0 to 2.
-
-    Raises:
-        ValueError: it is missing, damaged, of another size, or has other values.
-
-    """
+    """Return the lidar's confidence, (192, 256) uint8 from 0 to 2."""
     confidence = read_levels(path)
-    expect_size(path, confidence.shape, _SIZE_LR)
+    expect_size(path, confidence, _SIZE_LR)
     if confidence.max() > _HIGHEST_CONFIDENCE:
         raise ValueError(f"{path}: expected confidence from 0 to {_HIGHEST_CONFIDENCE}, got {confidence.max()}")
     return confidence
 
 
 def read_intrinsics(path: Path) -> Camera:
-    """Return the camera of a ``.pincam`` file, of 1920 x 1440 pixels with their centres at integers.
-
-    Raises:
-        ValueError: it is missing, or that of no such camera.
-
-    """
-    width, height, fx, fy, cx, cy = read_numbers(path, 6).tolist()
+    """Return the camera of a ``.pincam`` file, of 1920 x 1440 pixels with their centres at integers."""
+    width, height, *intrinsics = read_numbers(path, 6).tolist()
     if (height, width) != _SIZE:
         raise ValueError(f"{path}: expected a camera of 1440 x 1920 pixels, got {height:g} x {width:g}")
-    return to_camera(path, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), _SIZE)
+    return given_camera(intrinsics, _SIZE, path)
 
 
 def _find_intrinsics(place: Path, frame: str) -> Path | None:
@@ -146,7 +115,6 @@ def _find_intrinsics(place: Path, frame: str) -> Path | None:
 
 
 NOTE = f"there is no .pincam file: {ASSUMED_FOV:g} degrees of horizontal view are assumed"
-"""Of scenes without intrinsics."""
 
 
 class ARKitScenes(PreparedDataset):
@@ -159,17 +127,10 @@ class ARKitScenes(PreparedDataset):
             ``root``.
         min_confidence: lowest confidence of the lidar's pixels, 0 to 2; the others become holes.
 
-    Raises:
-        ValueError: a scene is not on disk, or a value is out of range.
-
     """
 
     def __init__(
-        self,
-        root: str,
-        split: Split = "validation",
-        scenes: SceneSelection = None,
-        min_confidence: int = 0,
+        self, root: str, split: Split = "validation", scenes: SceneSelection = None, min_confidence: int = 0
     ) -> None:
         if split not in SPLITS:
             raise ValueError(f"split: expected one of {', '.join(SPLITS)}, got {split}")

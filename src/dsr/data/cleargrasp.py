@@ -1,20 +1,16 @@
 """``dataset=cleargrasp`` and ``dataset=cleargrasp_synthetic``: glass and clear plastic, with true depth.
 
-Sajjan et al., "ClearGrasp: 3D Shape Estimation of Transparent Objects for Manipulation", ICRA 2020; README.md,
-``eval_depth_completion/eval_depth_completion.py`` and ``z-ignore-scripts-helper/data_processing_script.py`` of
-github.com/Shreeyak/cleargrasp (Apache 2.0), with samples in ``data/sample_dataset``.
+Sajjan et al., "ClearGrasp: 3D Shape Estimation of Transparent Objects for Manipulation", ICRA 2020; its code and
+samples are in github.com/Shreeyak/cleargrasp (Apache 2.0).
 
-``cleargrasp`` has captures of a RealSense at 1280 x 720, and of the same scene with painted twins in the objects'
-places. Of the first, the photo is the scene's, and the depth its measured map: ``downsampling=measured scale=1`` takes
-it as the input. The twins' depth is the truth, as good as a stereo camera's of painted surfaces:
+``cleargrasp`` has captures of a RealSense at 1280 x 720, with their depth as the measured map, and of the same scene
+with painted twins in the objects' places, whose depth is the truth: ``downsampling=measured scale=1``.
 
     real-val/d435/000000080-transparent-rgb-img.jpg      000000080-transparent-depth-img.exr   metres, 0 or NaN = hole
     real-val/d435/000000080-opaque-depth-img.exr         000000080-mask.png                    not 0: the objects
     real-val/d435/camera_intrinsics.yaml                 xres yres fx fy cx cy
 
-likewise ``real-test``, with objects that no network of the authors' was trained on. Depth is in 16-bit floats, whose
-steps are 0.5 mm from 0.5 to 1 m and 1 mm beyond: the truth is for depth, not for normals, as a note beside the scores
-says.
+likewise ``real-test``. Depth is in 16-bit floats, whose steps are 0.5 mm from 0.5 to 1 m and 1 mm beyond.
 
 ``cleargrasp_synthetic`` has rendered scenes with exact depth, to downsample, in a folder for each object:
 
@@ -22,14 +18,11 @@ says.
     synthetic-val/square-plastic-bottle-val/depth-imgs-rectified/000000000-depth-rectified.exr      see below
     synthetic-val/square-plastic-bottle-val/segmentation-masks/000000000-segmentation-mask.png
 
-likewise ``synthetic-test`` and the training set, whose folders end in ``-train``. What the renderer gave, the distance
-along the ray, is stored times cos(a) cos(b), where the angles a and b grow from 0 in the middle of the picture by the
-same amount in each column and row, to half of the view's 1.2112585 and 0.7428327 radians at its sides. That is not
-orthogonal depth, as which the authors use it: it is up to 2 % off. Here the product is undone, and the distance
-converted. In the sample 000000002, half of all pixels are then within 0.025 % of the table's plane, before 0.38 %. The
-camera is that of the view, with its axis through the middle of the picture. The steps of the 16-bit floats are smoothed
-as those of 8-bit maps are (:func:`dsr.data.reference_depth.smooth_levels`): the table's normals are then 11 degrees off
-in the mean, before 22.
+likewise ``synthetic-test`` and the training set, whose folders end in ``-train``. Stored is the distance along the ray,
+times cos(a) cos(b), where the angles a and b grow from 0 in the middle of the picture by the same amount in each column
+and row, to half of :data:`VIEW` at its sides. That is up to 2 % off orthogonal depth, as which the authors use it; here
+the product is undone, and the distance converted. The steps of the 16-bit floats are smoothed as those of 8-bit maps
+are (:func:`dsr.data.reference_depth.smooth_levels`).
 
 Regions of all are ``glass``, the mask of the objects, ``outside``, all the rest, and ``edges``, within
 :data:`EDGE` pixels of the mask's outline, on either side.
@@ -50,11 +43,11 @@ from torch import Tensor
 
 from dsr.data.frame_files import (
     expect_size,
+    given_camera,
     in_natural_order,
     name_of,
     read_bytes,
     read_picture,
-    to_camera,
     to_depth,
     walk,
 )
@@ -68,16 +61,13 @@ from dsr.sample import Scene
 
 Split = Literal["val", "test", "train"]
 SPLITS: tuple[Split, ...] = ("val", "test", "train")
-EDGE = 5
-"""Width of the region ``edges`` on either side of the outline, pixels."""
-VIEW = (1.2112585306167603, 0.7428327202796936)
-"""Angles of view of the rendered pictures, across and down, radians."""
+EDGE = 5  # width of the region ``edges`` on either side of the outline, pixels
+VIEW = (1.2112585306167603, 0.7428327202796936)  # angles of view of the rendered pictures, across and down, radians
 _REAL = ("{}-transparent-rgb-img.jpg", "{}-transparent-depth-img.exr", "{}-opaque-depth-img.exr", "{}-mask.png")
 _SYNTHETIC = (
     "rgb-imgs/{}-rgb.jpg", "depth-imgs-rectified/{}-depth-rectified.exr", "segmentation-masks/{}-segmentation-mask.png"
 )  # fmt: skip
 NOTE = "true depth comes in 16-bit floats, steps of 0.5 to 1 mm: scores of normals and renderings show these, too"
-"""For readers of the scores."""
 _KEYS = ("xres", "yres", "fx", "fy", "cx", "cy")
 _ENTRY = re.compile(rf"^({'|'.join(_KEYS)})\s*:\s*([-+.\deE]+)\s*(?:#.*)?$", re.MULTILINE)
 
@@ -85,13 +75,7 @@ _ENTRY = re.compile(rf"^({'|'.join(_KEYS)})\s*:\s*([-+.\deE]+)\s*(?:#.*)?$", re.
 def find_captures(root: Path, split: Split | None = None) -> dict[str, tuple[Path, ...]]:
     """Return the first arguments of :func:`load_capture` by name "real-val/d435/000000080", in order.
 
-    Args:
-        root: directory of the captures, or one above it.
-        split: of the captures, of which the folder's or an upper folder's name ends in it; None for all.
-
-    Raises:
-        ValueError: there is no such directory.
-
+    The name of a folder of a split, or of one above it, ends in the split's.
     """
     found = {}
     for folder, _, files in walk(root):
@@ -105,16 +89,7 @@ def find_captures(root: Path, split: Split | None = None) -> dict[str, tuple[Pat
 
 
 def find_renderings(root: Path, split: Split | None = None) -> dict[str, tuple[Path, ...]]:
-    """Return the first arguments of :func:`load_rendering` by name "square-plastic-bottle-val/000000000", in order.
-
-    Args:
-        root: directory of the objects' folders, or one above it.
-        split: see :func:`find_captures`.
-
-    Raises:
-        ValueError: there is no such directory.
-
-    """
+    """Return the first arguments of :func:`load_rendering` by name "square-plastic-bottle-val/000000000", in order."""
     found = {}
     for folder, below, _ in walk(root):
         if {each.partition("/")[0] for each in _SYNTHETIC} <= set(below) and _is_of(folder, split):
@@ -134,30 +109,20 @@ def _is_of(folder: Path, split: Split | None) -> bool:
 def load_capture(
     rgb_path: Path, measured_path: Path, truth_path: Path, mask_path: Path, camera_path: Path, dataset: str, name: str
 ) -> Scene:
-    """Return a capture, with the depth of the clear objects as measured at x1, and that of their twins as the truth.
-
-    Raises:
-        ValueError: a file is missing, damaged, or does not fit the others; the message names it.
-
-    """
+    """Return a capture, with the depth of the clear objects as measured at x1, and that of their twins as the truth."""
     rgb, measured, truth = read_picture(rgb_path), read_depth(measured_path), read_depth(truth_path)
     camera = read_camera(camera_path)
     size = (camera.height, camera.width)
     for path, image in ((rgb_path, rgb), (measured_path, measured), (truth_path, truth)):
-        expect_size(path, tuple(image.shape[1:]), size)
+        expect_size(path, image, size)
     return Scene(dataset, name, rgb, camera, truth, {1: measured}, regions=read_regions(mask_path, size))
 
 
 def load_rendering(rgb_path: Path, depth_path: Path, mask_path: Path, dataset: str, name: str) -> Scene:
-    """Return a rendered scene with its exact orthogonal depth.
-
-    Raises:
-        ValueError: a file is missing, damaged, or does not fit the others; the message names it.
-
-    """
+    """Return a rendered scene with its exact orthogonal depth."""
     rgb, stored = read_picture(rgb_path), read_depth(depth_path, smooth=True)
     height, width = rgb.shape[1:]
-    expect_size(depth_path, tuple(stored.shape[1:]), (height, width))
+    expect_size(depth_path, stored, (height, width))
     fx, fy = (size / 2 / math.tan(angle / 2) for size, angle in zip((width, height), VIEW, strict=True))
     camera = Camera(width, height, fx, fy, (width - 1) / 2, (height - 1) / 2)
     depth = stored * orthogonal(camera)
@@ -167,10 +132,7 @@ def load_rendering(rgb_path: Path, depth_path: Path, mask_path: Path, dataset: s
 def orthogonal(camera: Camera) -> Tensor:
     """Return the factors from the stored depth of a rendered picture to orthogonal depth, (1, H, W) float64."""
     columns, rows = torch.arange(camera.width, dtype=torch.float64), torch.arange(camera.height, dtype=torch.float64)
-    across, down = (
-        (pixels / size - 0.5) * angle
-        for pixels, size, angle in zip((columns, rows), (camera.width, camera.height), VIEW, strict=True)
-    )
+    across, down = (columns / camera.width - 0.5) * VIEW[0], (rows / camera.height - 0.5) * VIEW[1]
     product = across.cos() * down.cos()[:, None]
     return 1 / (product * camera.rays().double().norm(dim=0))[None]
 
@@ -178,13 +140,7 @@ def orthogonal(camera: Camera) -> Tensor:
 def read_depth(path: Path, *, smooth: bool = False) -> Tensor:
     """Return the depth of an EXR file, (1, H, W) float64 in metres, NaN where it is 0 or not finite.
 
-    Args:
-        path: the file.
-        smooth: whether the steps of 16-bit floats are smoothed, each value within half a step.
-
-    Raises:
-        ValueError: it is missing, damaged, negative, or all holes.
-
+    ``smooth`` removes the steps of 16-bit floats, each value within half a step.
     """
     values = read_depth_file(path)
     depth = to_depth(path, np.nan_to_num(values.astype(np.float64), nan=0, posinf=0))
@@ -197,35 +153,24 @@ def read_depth(path: Path, *, smooth: bool = False) -> Tensor:
 
 
 def read_regions(path: Path, size: Sequence[int]) -> dict[str, Tensor]:
-    """Return the regions that a mask of ``size`` = (height, width) gives, (1, H, W) uint8.
-
-    Raises:
-        ValueError: it is missing, damaged, or of another size.
-
-    """
+    """Return the regions that a mask of ``size`` = (height, width) gives, (1, H, W) uint8."""
     mask = read_mask(path).astype(np.uint8)
-    expect_size(path, mask.shape, tuple(size))
+    expect_size(path, mask, tuple(size))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * EDGE + 1, 2 * EDGE + 1))
     edges = cv2.dilate(mask, disc) - cv2.erode(mask, disc)
-    return {
-        name: torch.from_numpy(each)[None] for name, each in (("glass", mask), ("outside", 1 - mask), ("edges", edges))
-    }
+    regions = {"glass": mask, "outside": 1 - mask, "edges": edges}
+    return {name: torch.from_numpy(each)[None] for name, each in regions.items()}
 
 
 def read_camera(path: Path) -> Camera:
-    """Return the camera of a ``camera_intrinsics.yaml``, pixel centres at integers.
-
-    Raises:
-        ValueError: it is missing, lacks a key, or is that of no camera.
-
-    """
+    """Return the camera of a ``camera_intrinsics.yaml``, pixel centres at integers."""
     text = read_bytes(path, f"a text file with {', '.join(_KEYS)}").decode("utf-8", "replace")
     found = dict(_ENTRY.findall(text))
     try:
-        width, height, fx, fy, cx, cy = (float(found[key]) for key in _KEYS)
+        width, height, *intrinsics = (float(found[key]) for key in _KEYS)
     except (KeyError, ValueError) as error:
         raise ValueError(f"{path}: expected a number at each of {', '.join(_KEYS)}, got {found}") from error
-    return to_camera(path, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), (round(height), round(width)))
+    return given_camera(intrinsics, (round(height), round(width)), path)
 
 
 class ClearGrasp(PreparedDataset):
@@ -238,9 +183,6 @@ class ClearGrasp(PreparedDataset):
             rendered, to train on; None for what is in ``root``.
         scenes: names of the scenes to use, such as ``real-val_d435_000000080``; None and ``found`` for all.
 
-    Raises:
-        ValueError: a scene is not on disk, or a value is out of range.
-
     """
 
     regions: ClassVar[tuple[str, ...]] = ("glass", "outside", "edges")
@@ -248,11 +190,8 @@ class ClearGrasp(PreparedDataset):
     def __init__(self, root: str, synthetic: bool, split: Split | None = None, scenes: SceneSelection = None) -> None:
         if split not in (None, *SPLITS):
             raise ValueError(f"split: expected one of {', '.join(SPLITS)}, or null, got {split}")
-        name, find, load = (
-            ("cleargrasp_synthetic", find_renderings, load_rendering)
-            if synthetic
-            else ("cleargrasp", find_captures, load_capture)
-        )
-        found = add_note(make_records(list_frames(find, root, split), load, name), NOTE)
+        name = "cleargrasp_synthetic" if synthetic else "cleargrasp"
+        frames = list_frames(find_renderings if synthetic else find_captures, root, split)
+        found = add_note(make_records(frames, load_rendering if synthetic else load_capture, name), NOTE)
         super().__init__(name, root, found, None, scenes, Preparation(None))
         self.evaluation = split != "train"

@@ -1,18 +1,13 @@
-"""``dataset=ddrnet``: a real sensor's maps at the photo's own size, with a truth.
+"""``dataset=ddrnet``: a person before a structured-light camera, at the photo's own size, with fused geometry as truth.
 
-``downsampling=measured scale=1`` takes these maps as the input.
-
-DDRNet's real frames: one person before a structured-light camera, with fused geometry as the truth.
-
-Yan et al., "DDRNet: Depth Map Denoising and Refinement for Consumer Depth Cameras Using Cascaded CNNs", ECCV 2018;
-github.com/neycyanshi/DDRNet.
+``downsampling=measured scale=1`` takes the sensor's maps as the input. Yan et al., "DDRNet: Depth Map Denoising and
+Refinement for Consumer Depth Cameras Using Cascaded CNNs", ECCV 2018; github.com/neycyanshi/DDRNet.
 
     GROUP/color_map/frame_000001.png            the photo, 640 x 480
     GROUP/depth_map/frame_000001.png            the sensor's depth, registered to the photo, 16 bits, mm, 0 = hole
     GROUP/high_quality_depth/frame_000001.png   the depth of geometry fused from many frames, mm, 0 = unknown
 
-The authors have other folders beside these (``depth_filled``, ``mask``, ``albedo``), which they made of them. The
-camera is that of their losses (src/losses.py), taken as it is: pixel centres at integers.
+The camera is that of the authors' losses (src/losses.py), taken as it is: pixel centres at integers.
 """
 
 from __future__ import annotations
@@ -20,7 +15,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from dsr.data.frame_files import expect_size, find_beside, name_of, read_millimetres, read_picture
+from dsr.data.frame_files import find_beside, name_of, read_frame
 from dsr.data.preparation import Preparation, PreparedDataset, list_frames, make_records
 from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera
@@ -34,10 +29,6 @@ def find_frames(root: Path) -> dict[str, tuple[Path, Path, Path]]:
     """Return photos, sensor's and true depth, the first arguments of :func:`load_frame`, by name, in order.
 
     A name is the frame's group below ``root`` and its file's name, such as ``20170907/group1/frame_000001``.
-
-    Raises:
-        ValueError: there is no such directory.
-
     """
     found = {}
     others = ("depth_map/{}.png", "high_quality_depth/{}.png")
@@ -47,16 +38,8 @@ def find_frames(root: Path) -> dict[str, tuple[Path, Path, Path]]:
 
 
 def load_frame(rgb_path: Path, measured_path: Path, truth_path: Path, dataset: str, name: str) -> Scene:
-    """Return one frame with the sensor's map, measured at the photo's size.
-
-    Raises:
-        ValueError: a file is missing, damaged, or not of 640 x 480 pixels; the message names it.
-
-    """
-    size = (CAMERA.height, CAMERA.width)
-    rgb, measured, truth = read_picture(rgb_path), read_millimetres(measured_path), read_millimetres(truth_path)
-    for path, image in ((rgb_path, rgb), (measured_path, measured), (truth_path, truth)):
-        expect_size(path, tuple(image.shape[1:]), size)
+    """Return one frame with the sensor's map, measured at the photo's size."""
+    rgb, measured, truth = read_frame(rgb_path, measured_path, truth_path, size=(CAMERA.height, CAMERA.width))
     return Scene(dataset, name, rgb, CAMERA, truth, {1: measured})
 
 
@@ -66,9 +49,6 @@ class DDRNetFrames(PreparedDataset):
     Args:
         root: directory of ``color_map``, ``depth_map`` and ``high_quality_depth``, or one above it.
         scenes: names of the scenes to use; None and ``found`` for all in ``root``.
-
-    Raises:
-        ValueError: a scene is not on disk.
 
     """
 

@@ -65,12 +65,7 @@ _FRAMES: tuple[tuple[Callable[[Path], Mapping[str, tuple[Any, ...]]], Callable[.
 
 
 def find_scenes(folder: Path) -> Iterator[tuple[str, Loader]]:
-    """Yield the name and the loader of each scene in a directory, or of the scene that the directory is.
-
-    Raises:
-        ValueError: there is no such directory.
-
-    """
+    """Yield the name and the loader of each scene in a directory, or of the scene that the directory is."""
     if not folder.is_dir():
         raise ValueError(f"{folder}: expected a directory, there is none")
     for place in (folder, *_subfolders(folder)):

@@ -1,7 +1,5 @@
 """``dataset=lu`` and ``dataset=middlebury8``: the 8-bit benchmarks of guided depth super-resolution.
 
-Lu's six pairs and thirty of Middlebury.
-
     DIR/RGB/RGBD_01_ouput_color.png            the photo; the name is spelt that way in Lu's, "output" in Middlebury's
     DIR/Depth/RGBD_01_output_depth.png         8 bits, nearer is brighter, without holes; 0 is a level like any other
 
@@ -9,14 +7,10 @@ Lu et al., "Depth Enhancement via Low-Rank Matrix Completion", CVPR 2014, record
 structured-light sensor and filled their holes, as well as those of thirty pairs of Middlebury 2001 to 2006
 (``Middlebury_01`` to ``Middlebury_30``, at a third of the size of 2005 and 2006). The field computes errors in levels.
 
-Levels are taken for disparity, but what depth a level stands for is not published. So the cameras here are invented, in
-such a way that disparity in pixels is the level and every level, even some below 0 which interpolation may make, has a
-positive depth: depth = focal * baseline / (level + offset).
-
-- Lu: f = 525 pixels, usual for such sensors; 0.5 m and 75 levels put level 255 at 0.80 m and level 0 at 3.5 m.
-- Middlebury: f = 3740 / 3 pixels and a baseline of 160 mm, published for 2005 and 2006, with three levels to a pixel,
-  which three times the baseline stands for; the offset is the shift of Art, 200 levels. Level 255 is at 1.3 m, level 0
-  at 3.0 m.
+What depth a level stands for is not published. So the cameras here are invented, in such a way that disparity in pixels
+is the level and every level, even some below 0 which interpolation may make, has a positive depth, focal * baseline /
+(level + offset): of Lu 0.80 m at level 255 and 3.5 m at 0, with the focal length that is usual for such sensors; of
+Middlebury 1.3 m and 3.0 m, with the camera of 2005 and 2006, three levels to a pixel, and the shift of Art.
 """
 
 from __future__ import annotations
@@ -40,22 +34,13 @@ from dsr.sample import Scene, Unit
 
 @dataclass(frozen=True)
 class Benchmark:
-    """A benchmark of 8-bit levels.
+    """A benchmark of 8-bit levels."""
 
-    Args:
-        prefix: what its files' names begin with, before the number.
-        count: number of its scenes.
-        focal: focal length in pixels.
-        baseline: distance of the second camera in metres.
-        offset: added to levels to give disparity.
-
-    """
-
-    prefix: str
-    count: int
-    focal: float
-    baseline: float
-    offset: float
+    prefix: str  # of its files' names, before the number
+    count: int  # number of its scenes
+    focal: float  # in pixels
+    baseline: float  # distance of the second camera in metres
+    offset: float  # added to levels to give disparity
 
     @property
     def scenes(self) -> tuple[str, ...]:
@@ -74,20 +59,10 @@ BENCHMARKS: Mapping[str, Benchmark] = MappingProxyType(
         "middlebury8": Benchmark("Middlebury", 30, 3740 / 3, 0.48, 200.0),
     }
 )
-"""The benchmarks by the name of the data set."""
 
 
 def find_frames(root: Path, dataset: str) -> dict[str, tuple[Path, Path]]:
-    """Return the photos and maps of a benchmark, the first two arguments of :func:`load_frame`, by name, in order.
-
-    Args:
-        root: directory of ``RGB`` and ``Depth``, or one above it.
-        dataset: key of ``BENCHMARKS``.
-
-    Raises:
-        ValueError: there is no such directory.
-
-    """
+    """Return the photos and maps of a benchmark, the first two arguments of :func:`load_frame`, by name, in order."""
     found: dict[str, tuple[Path, Path]] = {}
     prefix = BENCHMARKS[dataset].prefix
     for spelling in ("output", "ouput"):
@@ -98,20 +73,10 @@ def find_frames(root: Path, dataset: str) -> dict[str, tuple[Path, Path]]:
 
 
 def load_frame(rgb_path: Path, levels_path: Path, dataset: str, name: str) -> Scene:
-    """Return one scene, whose errors are counted in levels.
-
-    Args:
-        rgb_path: photo.
-        levels_path: map of 8 bits, in which 0 is a level and no hole.
-        dataset: of the scene returned, a key of ``BENCHMARKS``, which says the camera.
-
-    Raises:
-        ValueError: a file is missing, damaged, or does not fit the other; the message names it.
-
-    """
+    """Return one scene, whose errors are counted in levels; in its map of 8 bits, 0 is a level and no hole."""
     rgb, levels = read_picture(rgb_path), read_levels(levels_path)
     height, width = rgb.shape[1:]
-    expect_size(levels_path, levels.shape, (height, width))
+    expect_size(levels_path, levels, (height, width))
     camera = BENCHMARKS[dataset].camera(height, width)
     depth = from_range(torch.from_numpy(levels).double()[None], camera, "disparity")
     unit = Unit("levels", inverse=True, factor=baseline_times_focal(camera), offset=camera.doffs, limits=(0.0, 255.0))
@@ -130,13 +95,9 @@ class EightBit(PreparedDataset):
         scenes: names of the scenes to use, such as ``RGBD_01`` or ``Middlebury_01``; None for all of the benchmark,
             ``found`` for all in ``root``.
 
-    Raises:
-        ValueError: a scene is not on disk, or a value is out of range.
-
     """
 
-    soft_edges: ClassVar[bool] = True
-    """Pixels at depth steps are mixtures of both sides."""
+    soft_edges: ClassVar[bool] = True  # pixels at depth steps are mixtures of both sides
 
     def __init__(self, root: str, benchmark: Literal["lu", "middlebury8"], scenes: SceneSelection = None) -> None:
         if benchmark not in BENCHMARKS:

@@ -24,6 +24,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dsr.data.frame_files import expect_size
 from dsr.data.scene_source import WITHOUT_OFFSET, SceneSelection, select_scenes
 from dsr.geometry.camera import Camera, RangeType, from_range
 from dsr.io.images import MAP_SUFFIXES, CameraFile, read_camera, read_map, read_mask, read_rgb
@@ -45,9 +46,6 @@ class Folder:
         name: name in ``scores.csv``.
         without_offset: names of the scenes whose ``doffs`` in ``camera.json`` is replaced by 0, as the paper does with
             Vintage; see :class:`dsr.data.middlebury.Middlebury`.
-
-    Raises:
-        ValueError: the directory is missing or has no scene, or none of a name in ``without_offset``.
 
     """
 
@@ -90,16 +88,7 @@ class Folder:
 
 
 def load_scene(folder: Path, dataset: str, *, offset: bool = True) -> Scene:
-    """Return the scene in ``folder``.
-
-    Args:
-        folder: with the files.
-        offset: whether ``doffs`` of ``camera.json`` counts, as it has to geometrically, or is taken for 0.
-
-    Raises:
-        ValueError: a file is missing, damaged, or does not fit the others; the message names it.
-
-    """
+    """Return the scene in ``folder``; without ``offset``, ``doffs`` of ``camera.json`` is taken for 0."""
     description = read_camera(folder / "camera.json")
     if not offset:
         if not description.camera.doffs:
@@ -108,7 +97,7 @@ def load_scene(folder: Path, dataset: str, *, offset: bool = True) -> Scene:
     camera = description.camera
     rgb_path = _first(folder, _RGB_NAMES)
     rgb = read_rgb(rgb_path)
-    _expect_size(rgb_path, rgb.shape[:2], (camera.height, camera.width))
+    expect_size(rgb_path, rgb[..., 0], (camera.height, camera.width))
     measured: dict[float, Tensor] = {}
     for path in sorted(folder.iterdir()):
         match = _MEASURED.fullmatch(path.stem)
@@ -165,14 +154,14 @@ def _read_depth(
 ) -> Tensor:
     """Return a map as orthogonal depth, (1, H, W) in metres, NaN in holes."""
     values = read_map(path, pixels_beside(camera.height, camera.width))
-    _expect_size(path, values.shape, (camera.height, camera.width))
+    expect_size(path, values, (camera.height, camera.width))
     unit = 1.0 if quantity == "disparity" else _depth_unit(path, description)
     values[np.isinf(values)] = np.nan  # infinity stands for an unknown disparity at Middlebury
     if description.hole_value is not None:
         values[values == description.hole_value] = np.nan
     if mask_path is not None and mask_path.is_file():
         mask = read_mask(mask_path, pixels_beside(camera.height, camera.width))
-        _expect_size(mask_path, mask.shape, values.shape)
+        expect_size(mask_path, mask, values.shape)
         values[~mask] = np.nan
     if np.isnan(values).all():
         raise ValueError(f"{path}: expected at least one known pixel, all are holes")
@@ -207,11 +196,3 @@ def _range_type(path: Path, quantity: str, description: CameraFile) -> RangeType
     if description.range_type == "disparity":
         raise ValueError(f"{path}: camera.json's range_type is 'disparity', expected 'orthogonal' or 'perspective'")
     return description.range_type or "orthogonal"
-
-
-def _expect_size(path: Path, size: tuple[int, ...], expected: tuple[int, ...]) -> None:
-    if tuple(size) != tuple(expected):
-        raise ValueError(
-            f"{path}: expected {expected[0]} x {expected[1]} pixels (height x width, from camera.json), "
-            f"got {' x '.join(map(str, size))}"
-        )

@@ -25,24 +25,14 @@ Found = TypeVar("Found")
 
 
 def read_bytes(path: Path, what: str) -> bytes:
-    """Return the content of a file.
-
-    Raises:
-        ValueError: there is none; ``what`` says what was expected.
-
-    """
+    """Return the content of a file."""
     if not path.is_file():
         raise ValueError(f"{path}: expected {what}, there is none")
     return read_limited(path, MOST_FILE)
 
 
 def read_picture(path: Path) -> Tensor:
-    """Return a picture of 8 or 16 bits a channel, (3, H, W) float32 in [0, 1].
-
-    Raises:
-        ValueError: it is missing, damaged, or no such picture.
-
-    """
+    """Return a picture of 8 or 16 bits a channel, (3, H, W) float32 in [0, 1]."""
     pixels = read_pixels(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     if pixels.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"{path}: expected a picture of 8 or 16 bits a channel, got {pixels.dtype}")
@@ -51,12 +41,7 @@ def read_picture(path: Path) -> Tensor:
 
 
 def read_16bit(path: Path) -> np.ndarray:
-    """Return the values of a grey picture of 16 bits, (H, W) uint16.
-
-    Raises:
-        ValueError: it is missing, damaged, or no such picture.
-
-    """
+    """Return the values of a grey picture of 16 bits, (H, W) uint16."""
     pixels = read_pixels(path, cv2.IMREAD_UNCHANGED)
     if pixels.ndim != 2 or pixels.dtype != np.uint16:
         channels = 1 if pixels.ndim == 2 else pixels.shape[2]
@@ -65,26 +50,14 @@ def read_16bit(path: Path) -> np.ndarray:
 
 
 def read_millimetres(path: Path) -> Tensor:
-    """Return a depth picture of 16 bits that holds millimetres, 0 for a hole: (1, H, W) float64 in metres, NaN there.
-
-    Raises:
-        ValueError: it is missing, damaged, no such picture, or all holes.
-
-    """
+    """Return a depth picture of 16 bits in millimetres, 0 for a hole, as (1, H, W) float64 in metres, NaN there."""
     return to_depth(path, read_16bit(path) / 1000)
 
 
 def to_depth(path: Path, values: np.ndarray, farthest: float = math.inf) -> Tensor:
-    """Return depth with its holes marked, (1, H, W) float64 in metres.
+    """Return depth with its holes marked, (1, H, W) float64 in metres, of values (H, W) in metres, 0 in holes.
 
-    Args:
-        path: the file that the values come from, for the message.
-        values: (H, W) metres; 0 is a hole.
-        farthest: metres; what lies beyond, the sky, becomes a hole.
-
-    Raises:
-        ValueError: a value is negative or NaN, or all are holes.
-
+    What lies beyond ``farthest``, the sky, becomes a hole. ``path`` is for the message.
     """
     with np.errstate(invalid="ignore"):  # damaged bytes may be signalling NaN, which a cast warns of
         values = values.astype(np.float64)
@@ -98,26 +71,20 @@ def to_depth(path: Path, values: np.ndarray, farthest: float = math.inf) -> Tens
     return torch.from_numpy(np.where(known, values, np.nan))[None]
 
 
-def expect_size(path: Path, size: tuple[int, ...], expected: tuple[int, ...]) -> None:
-    """Refuse a map that is not ``expected`` = (height, width)."""
-    if tuple(size) != tuple(expected):
+def expect_size(path: Path, image: Tensor | np.ndarray, expected: Sequence[int]) -> None:
+    """Refuse an image, (..., H, W), that is not ``expected`` = (height, width)."""
+    height, width = image.shape[-2:]
+    if (height, width) != tuple(expected):
         raise ValueError(
-            f"{path}: expected {expected[0]} x {expected[1]} pixels (height x width), got {' x '.join(map(str, size))}"
+            f"{path}: expected {expected[0]} x {expected[1]} pixels (height x width), got {height} x {width}"
         )
 
 
-def to_camera(source: Path | str, matrix: np.ndarray, size: tuple[int, int]) -> Camera:
+def to_camera(source: Path | str, matrix: np.ndarray, size: Sequence[int]) -> Camera:
     """Return the camera of an intrinsic matrix [fx 0 cx; 0 fy cy; 0 0 1], pixel centres at integers.
 
-    Args:
-        source: the file or argument that the matrix comes from, for the message.
-        matrix: (3, 3), in pixels.
-        size: (height, width) of the pictures.
-
-    Raises:
-        ValueError: it is no such matrix, a focal length is beyond 0.1 to 100 picture widths, or the principal point
-            lies outside of the picture.
-
+    A focal length beyond 0.1 to 100 picture widths, or a principal point outside of the picture of ``size`` = (height,
+    width), is refused; ``source`` is the file or argument that the message names.
     """
     height, width = size
     (fx, skew, cx), (lower, fy, cy), last = matrix.tolist()
@@ -129,27 +96,24 @@ def to_camera(source: Path | str, matrix: np.ndarray, size: tuple[int, int]) -> 
     return Camera(width, height, fx, fy, cx, cy)
 
 
-def given_camera(intrinsics: tuple[float, float, float, float], size: tuple[int, int]) -> Camera:
-    """Return the camera of a caller's (fx, fy, cx, cy) for pictures of ``size`` = (height, width).
-
-    Raises:
-        ValueError: they are those of no such camera, see :func:`to_camera`.
-
-    """
+def given_camera(intrinsics: Sequence[float], size: Sequence[int], source: Path | str = "intrinsics") -> Camera:
+    """Return the camera of (fx, fy, cx, cy) for pictures of ``size``; see :func:`to_camera`."""
     fx, fy, cx, cy = intrinsics
-    return to_camera("intrinsics", np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), size)
+    return to_camera(source, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), size)
+
+
+def read_frame(rgb_path: Path, *depth_paths: Path, size: tuple[int, int] | None = None) -> list[Tensor]:
+    """Return a photo and depth pictures in millimetres, all of ``size`` = (height, width), or the photo's."""
+    rgb, maps = read_picture(rgb_path), [read_millimetres(path) for path in depth_paths]
+    for path, image in zip((rgb_path, *depth_paths), (rgb, *maps), strict=True):
+        expect_size(path, image, size or rgb.shape[1:])
+    return [rgb, *maps]
 
 
 def load_pair(rgb_path: Path, depth_path: Path, dataset: str, name: str) -> Scene:
-    """Return a photo and its depth in millimetres, for which no camera is published, as a scene.
-
-    Raises:
-        ValueError: a file is missing, damaged, or does not fit the other; the message names it.
-
-    """
-    rgb, depth = read_picture(rgb_path), read_millimetres(depth_path)
+    """Return a photo and its depth in millimetres, for which no camera is published, as a scene."""
+    rgb, depth = read_frame(rgb_path, depth_path)
     height, width = rgb.shape[1:]
-    expect_size(depth_path, tuple(depth.shape[1:]), (height, width))
     return Scene(dataset, name, rgb, Camera.from_fov(ASSUMED_FOV, width, height), depth)
 
 
@@ -158,10 +122,6 @@ def walk(root: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
 
     A name that the caller takes off the list of folders is not entered; hidden folders are not either. Links are,
     unless they lead back.
-
-    Raises:
-        ValueError: there is no such directory.
-
     """
     if not root.is_dir():
         raise ValueError(f"{root}: expected a directory, there is none")
@@ -198,10 +158,6 @@ def find_beside(
     Yields:
         The folder that ``photos`` lies in, the frame, and its files: the photo, then the others. A frame that lacks one
         of them is left out.
-
-    Raises:
-        ValueError: there is no such directory.
-
     """
     for place, below, _ in walk(root):
         if photos in below:

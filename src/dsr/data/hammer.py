@@ -22,14 +22,7 @@ import re
 from pathlib import Path
 from typing import Literal, get_args
 
-from dsr.data.frame_files import (
-    expect_size,
-    find_beside,
-    in_natural_order,
-    read_millimetres,
-    read_picture,
-    to_camera,
-)
+from dsr.data.frame_files import find_beside, in_natural_order, read_frame, to_camera
 from dsr.data.preparation import Preparation, PreparedDataset, list_frames, make_records
 from dsr.data.scene_source import SceneSelection
 from dsr.io.images import read_numbers
@@ -37,8 +30,7 @@ from dsr.sample import Scene
 
 Sensor = Literal["d435", "tof", "l515"]
 Split = Literal["test", "train"]
-TEST = (12, 13, 14)
-"""Numbers of the scenes to test on."""
+TEST = (12, 13, 14)  # numbers of the scenes to test on
 _SEQUENCE = re.compile(r"scene(\d+)_traj\d+(_naked)?_\d+")
 _PHOTO = re.compile(r"(\d+)\.png")
 
@@ -46,28 +38,15 @@ _PHOTO = re.compile(r"(\d+)\.png")
 def find_frames(
     root: Path, sensor: Sensor = "d435", split: Split | None = None, naked: bool = False
 ) -> dict[str, tuple[Path, Path, Path, Path]]:
-    """Return photo, measured and true depth, and intrinsics by name "scene12_traj1_1/000000", in order.
-
-    Args:
-        root: directory of the sequences, or one above it.
-        sensor: the camera that measured.
-        split: of the scenes; None for both.
-        naked: whether to take sequences without objects, instead of those with them.
-
-    Raises:
-        ValueError: there is no such directory.
-
-    """
+    """Return photo, measured and true depth, and intrinsics by name "scene12_traj1_1/000000", in order."""
     found = {}
     others = (f"depth_{sensor}/{{}}.png", "_gt/{}.png", "intrinsics.txt")
     for place, frame, (photo, measured, truth, intrinsics) in find_beside(root, "rgb", _PHOTO, others):
         sequence = place.resolve().parent.name
         match = _SEQUENCE.fullmatch(sequence)
-        if (
-            match is not None
-            and bool(match[2]) == naked
-            and split in (None, "test" if int(match[1]) in TEST else "train")
-        ):
+        if match is None or bool(match[2]) != naked:
+            continue
+        if split in (None, "test" if int(match[1]) in TEST else "train"):
             found[f"{sequence}/{frame}"] = (photo, measured, truth, intrinsics)
     return in_natural_order(found)
 
@@ -75,17 +54,9 @@ def find_frames(
 def load_frame(
     rgb_path: Path, measured_path: Path, truth_path: Path, intrinsics_path: Path, dataset: str, name: str
 ) -> Scene:
-    """Return one frame with a camera's map, measured at the photo's size.
-
-    Raises:
-        ValueError: a file is missing, damaged, or does not fit the others; the message names it.
-
-    """
-    rgb, measured, truth = read_picture(rgb_path), read_millimetres(measured_path), read_millimetres(truth_path)
-    size = (rgb.shape[1], rgb.shape[2])
-    for path, image in ((measured_path, measured), (truth_path, truth)):
-        expect_size(path, tuple(image.shape[1:]), size)
-    camera = to_camera(intrinsics_path, read_numbers(intrinsics_path, 9).reshape(3, 3), size)
+    """Return one frame with a camera's map, measured at the photo's size."""
+    rgb, measured, truth = read_frame(rgb_path, measured_path, truth_path)
+    camera = to_camera(intrinsics_path, read_numbers(intrinsics_path, 9).reshape(3, 3), rgb.shape[1:])
     return Scene(dataset, name, rgb, camera, truth, {1: measured})
 
 
@@ -98,9 +69,6 @@ class Hammer(PreparedDataset):
         split: ``test``, to evaluate on, or ``train``, to train on.
         naked: whether to use the sequences without objects, instead of those with them.
         scenes: names of the scenes to use, such as ``scene12_traj1_1_000000``; None and ``found`` for all of the split.
-
-    Raises:
-        ValueError: a scene is not on disk, or a value is out of range.
 
     """
 

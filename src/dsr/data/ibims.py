@@ -1,26 +1,20 @@
 """``dataset=ibims``: rooms before a laser scanner, with their planes and depth edges marked (Koch et al., 2018).
 
-Koch, Liebel, Fraundorfer, Körner, "Evaluation of CNN-based Single-Image Depth Estimation Methods", ECCV Workshops 2018;
-``evaluate_ibims.py`` and ``evaluate_ibims_error_metrics.py``, version 0.9, of its authors (a copy is in
-``mde/capsules/meter/ibims_official`` of github.com/bulatko/DepthART); its terms are on doi.org/10.14459/2018mp1455541.
+Koch, Liebel, Fraundorfer, Körner, "Evaluation of CNN-based Single-Image Depth Estimation Methods", ECCV Workshops 2018.
 100 scenes of 640 x 480 pixels, each a MATLAB file with a structure ``data``:
 
     ibims1_core_mat/corridor_01.mat    rgb, depth in metres, 0 = hole, calib, edges, mask_invalid and mask_transp,
                                        0 where a pixel is not to be counted, mask_wall, mask_table and mask_floor, in
                                        which planes are numbered from 1
 
-or, with the same in it, as pictures:
+or, with the same in it, as pictures, a folder for each:
 
     ibims1_core_raw/rgb/corridor_01.png        ibims1_core_raw/depth/corridor_01.png     16 bits, v 50 / 65535 metres
-    ibims1_core_raw/calib/corridor_01.txt      fx,fy,cx,cy
-    ibims1_core_raw/edges/corridor_01.png      and so on, a folder for each; where a scene has no table, there is no
-                                               file in ``mask_table``
+    ibims1_core_raw/calib/corridor_01.txt      ibims1_core_raw/edges/corridor_01.png     and so on; fx,fy,cx,cy
 
 ``calib`` is the transpose of a matrix of intrinsics, and its pixels are counted from 1: the principal point is less by
 1 here. As in the authors' evaluation, pixels whose depth is 0, invalid, or behind something transparent have no truth.
-
-Regions are ``planes``, numbered from 1 (walls, then tables, then floors; the authors score those alone that have 5 % of
-the picture), and ``edges``, lines of a pixel, where a scene has such.
+Regions are ``planes``, numbered from 1 (walls, then tables, then floors), and ``edges``, lines of a pixel.
 """
 
 from __future__ import annotations
@@ -52,11 +46,9 @@ from dsr.geometry.camera import Camera
 from dsr.io.images import read_levels
 from dsr.sample import Scene
 
-COUNT = 100
-"""Number of scenes."""
+COUNT = 100  # number of scenes
 SIZE = (480, 640)
-FARTHEST = 50.0
-"""Depth of the largest value in pictures, metres."""
+FARTHEST = 50.0  # depth of the largest value in pictures, metres
 _VALID = ("mask_invalid", "mask_transp")
 _PLANES = ("mask_wall", "mask_table", "mask_floor")
 _MASKS = (*_VALID, "edges", *_PLANES)
@@ -67,12 +59,7 @@ Pictures = tuple[Path, Path, Path, *tuple[Path | None, ...]]
 def find_matrices(root: Path) -> dict[str, tuple[Path]]:
     """Return the MATLAB files of scenes, the first argument of :func:`load_matrices`, by name, in order.
 
-    Args:
-        root: directory of the files, or one above it; results of methods, ``*_results.mat``, are left out.
-
-    Raises:
-        ValueError: there is no such directory.
-
+    Results of methods, ``*_results.mat``, are left out.
     """
     found: dict[str, tuple[Path]] = {}
     for folder, _, files in walk(root):
@@ -82,15 +69,7 @@ def find_matrices(root: Path) -> dict[str, tuple[Path]]:
 
 
 def find_pictures(root: Path) -> dict[str, Pictures]:
-    """Return the files of scenes in folders, the first arguments of :func:`load_pictures`, by name, in order.
-
-    Args:
-        root: directory of ``rgb``, ``depth`` and ``calib``, or one above it.
-
-    Raises:
-        ValueError: there is no such directory.
-
-    """
+    """Return the files of scenes in folders, the first arguments of :func:`load_pictures`, by name, in order."""
     found: dict[str, Pictures] = {}
     needed = ("depth/{}.png", "calib/{}.txt", *(f"{mask}/{{}}.png" for mask in _VALID))
     for place, name, (photo, depth, calibration, *_) in find_beside(root, "rgb", _PHOTO, needed):
@@ -100,12 +79,7 @@ def find_pictures(root: Path) -> dict[str, Pictures]:
 
 
 def load_matrices(path: Path, dataset: str, name: str) -> Scene:
-    """Return the scene of a MATLAB file.
-
-    Raises:
-        ValueError: it is missing or damaged, or a matrix is missing or of another size; the message names it.
-
-    """
+    """Return the scene of a MATLAB file."""
     stored = {key.removeprefix("data."): values for key, values in read_variables(path).items()}
     needed = ("rgb", "depth", "calib", *_VALID)
     missing = [key for key in needed if key not in stored]
@@ -126,26 +100,14 @@ def load_matrices(path: Path, dataset: str, name: str) -> Scene:
 
 
 def load_pictures(rgb_path: Path, depth_path: Path, calibration_path: Path, *paths: Path | str | None) -> Scene:
-    """Return the scene of pictures.
-
-    Args:
-        rgb_path: photo.
-        depth_path: depth, 16 bits.
-        calibration_path: intrinsics.
-        paths: the masks of pixels that are invalid, of those that are transparent, of edges, walls, tables and floors,
-            the last four None where there is none; then the names of data set and scene.
-
-    Raises:
-        ValueError: a file is missing, damaged or of another size; the message names it.
-
-    """
+    """Return the scene of pictures; ``paths`` are the files of :data:`_MASKS`, then the names of data set and scene."""
     *mask_paths, dataset, name = paths
     rgb, depth = read_picture(rgb_path), read_16bit(depth_path)
     given = {key: path for key, path in zip(_MASKS, mask_paths, strict=True) if isinstance(path, Path)}
     masks = {key: read_levels(path) for key, path in given.items()}
-    sizes = {rgb_path: tuple(rgb.shape[1:]), depth_path: depth.shape, **{given[key]: masks[key].shape for key in masks}}
-    for path, size in sizes.items():
-        expect_size(path, size, SIZE)
+    expect_size(rgb_path, rgb, SIZE)
+    for path, image in ((depth_path, depth), *((given[key], mask) for key, mask in masks.items())):
+        expect_size(path, image, SIZE)
     text = read_bytes(calibration_path, "a text file of fx,fy,cx,cy").decode("utf-8", "replace")
     try:
         fx, fy, cx, cy = map(float, text.replace(",", " ").split())
@@ -161,13 +123,7 @@ def _camera(path: Path, matrix: np.ndarray) -> Camera:
 
 
 def _scene(
-    path: Path,
-    rgb: Tensor,
-    camera: Camera,
-    depth: np.ndarray,
-    masks: Mapping[str, np.ndarray],
-    dataset: str,
-    name: str,
+    path: Path, rgb: Tensor, camera: Camera, depth: np.ndarray, masks: Mapping[str, np.ndarray], dataset: str, name: str
 ) -> Scene:
     """Return the scene of depth in metres, 0 in holes, and masks."""
     valid = np.all([masks[key] > 0 for key in _VALID], axis=0)
@@ -188,9 +144,6 @@ class IBims(PreparedDataset):
     Args:
         root: directory of the MATLAB files, or of the folders of pictures, or one above them.
         scenes: names of the scenes to use, such as ``corridor_01``; None for all 100, ``found`` for those in ``root``.
-
-    Raises:
-        ValueError: a scene is not on disk.
 
     """
 

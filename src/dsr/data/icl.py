@@ -1,18 +1,15 @@
-"""``dataset=icl``: synthetic rooms with exact depth (Handa et al., ICRA 2014).
+"""``dataset=icl``: synthetic rooms with exact depth.
 
-Voynov et al. 2019 evaluate on six frames, which they name by what they show, not by number. Their size and crop follow
-from their camera of Plant: frames are resized to a height of 512 and cropped to the square in the middle. Which frames
-they used is unknown. Those below are spread over the trajectories; ``dataset.frames`` takes others.
-
-Handa et al., "A Benchmark for RGB-D Visual Odometry, 3D Reconstruction and SLAM", ICRA 2014.
+Handa et al., "A Benchmark for RGB-D Visual Odometry, 3D Reconstruction and SLAM", ICRA 2014. Voynov et al. 2019
+evaluate on six frames, which they name by what they show. Their size and crop follow from their camera of Plant: frames
+are resized to a height of 512 and cropped to the square in the middle. Which frames they used is unknown. Those below
+are spread over the trajectories; ``dataset.frames`` takes others.
 
     DIR/scene_00_NNNN.png, .depth     as rendered: colour (8 or 16 bits), distances along the rays in centimetres
     DIR/rgb/N.png, DIR/depth/N.png    as for the TUM benchmark: orthogonal depth, 5000 levels a metre, 0 for a hole
     DIR/rgb.png, DIR/depth.png        the same, one frame a folder
 
-All are 640 x 480 of one camera, 481.20, -480.00, 319.50, 239.50. The POV-Ray camera beside a rendered frame (.txt) is
-not read: what it adds is the pose, and its cam_right, cam_up and cam_dir give these intrinsics again
-(640 / 1.33 = 481.2, 480 / 1 = 480).
+All are 640 x 480 of one camera, 481.20, -480.00, 319.50, 239.50.
 """
 
 from __future__ import annotations
@@ -32,10 +29,8 @@ from dsr.io.depth_files import ICL_CAMERA as CAMERA
 from dsr.io.images import read_numbers
 from dsr.sample import Scene
 
-FARTHEST = 100.0
-"""Largest depth in metres; longer rays have hit nothing."""
-LEVELS = 5000
-"""Levels per metre of the depth pictures."""
+FARTHEST = 100.0  # largest depth in metres; longer rays have hit nothing
+LEVELS = 5000  # levels per metre of the depth pictures
 _RENDERED = re.compile(r"scene_00_(\d+)\.depth")
 _SIZE = (480, 640)
 
@@ -45,10 +40,6 @@ def find_frames(root: Path) -> dict[str, tuple[Path, Path]]:
 
     A name is the frame's folder below ``root`` and its number, such as ``living_room_traj2/0120``, or the folder alone
     where it holds one frame. A frame that lacks one of its two files is left out.
-
-    Raises:
-        ValueError: there is no such directory.
-
     """
     found: dict[str, tuple[Path, Path]] = {}
     for folder, below, files in walk(root):
@@ -67,29 +58,19 @@ def find_frames(root: Path) -> dict[str, tuple[Path, Path]]:
 
 
 def read_depth(path: Path) -> Tensor:
-    """Return a depth file, ``.depth`` or ``.png``, as orthogonal depth, (1, 480, 640) float64 in metres, NaN in holes.
-
-    Raises:
-        ValueError: it is missing, damaged, of another size, or has negative values.
-
-    """
+    """Return a ``.depth`` or ``.png`` file as orthogonal depth, (1, 480, 640) float64 in metres, NaN in holes."""
     if path.suffix.lower() == ".depth":
         centimetres = read_numbers(path, _SIZE[0] * _SIZE[1]).reshape(_SIZE)
         return from_range(to_depth(path, centimetres / 100, FARTHEST), CAMERA, "perspective")
     levels = read_16bit(path)
-    expect_size(path, levels.shape, _SIZE)
+    expect_size(path, levels, _SIZE)
     return to_depth(path, levels / LEVELS)
 
 
 def load_frame(rgb_path: Path, depth_path: Path, dataset: str, name: str) -> Scene:
-    """Return one frame at 640 x 480.
-
-    Raises:
-        ValueError: a file is missing, damaged or of another size; the message names it.
-
-    """
+    """Return one frame at 640 x 480."""
     rgb = read_picture(rgb_path)
-    expect_size(rgb_path, tuple(rgb.shape[1:]), _SIZE)
+    expect_size(rgb_path, rgb, _SIZE)
     return Scene(dataset, name, rgb, CAMERA, read_depth(depth_path))
 
 
@@ -119,9 +100,6 @@ class ICL(PreparedDataset):
         size: height and width in pixels; None for the original size.
         crop: see :class:`dsr.data.preparation.Preparation`.
         frames: frame of each of the paper's names.
-
-    Raises:
-        ValueError: a scene is not on disk, or a value is out of range.
 
     """
 

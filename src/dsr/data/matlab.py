@@ -19,10 +19,8 @@ import numpy as np
 from dsr.utils.console import one_line
 from dsr.utils.guards import read_limited
 
-_LARGEST = 1 << 25
-"""Largest number of elements that the matrices of a file may have together."""
-_BLOCK = 1 << 24
-"""Number of elements that a block of an array in HDF5 may have, which is unpacked whole."""
+_LARGEST = 1 << 25  # largest number of elements that the matrices of a file may have together
+_BLOCK = 1 << 24  # number of elements that a block of an array in HDF5 may have, which is unpacked whole
 _MATRIX, _COMPRESSED, _STRUCTURE = 14, 15, 2
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
@@ -33,10 +31,6 @@ def read_variables(path: Path) -> dict[str, np.ndarray]:
 
     A field of a structure is named "structure.field"; cells, text and sparse matrices are left out. Version 5 is read
     by its published description ("MAT-File Format", MathWorks), 7.3 as the HDF5 that it is.
-
-    Raises:
-        ValueError: it is missing, damaged, or another kind of file, or a matrix is too large to be one.
-
     """
     if not path.is_file():
         raise ValueError(f"{path}: expected a MATLAB file, there is none")
@@ -87,12 +81,7 @@ def _old_variables(content: memoryview) -> dict[str, Any]:
 
 
 def expect_own_values(array: h5py.Dataset) -> None:
-    """Refuse an array of HDF5 whose values lie in another file, or in blocks that are too large to be unpacked.
-
-    Raises:
-        ValueError: it is such an array.
-
-    """
+    """Refuse an array of HDF5 whose values lie in another file, or in blocks that are too large to be unpacked."""
     if array.external or array.is_virtual:
         raise ValueError(f"{array.name} has its values in another file")
     if array.chunks is not None and math.prod(array.chunks) > _BLOCK:

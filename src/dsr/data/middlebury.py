@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -52,19 +52,12 @@ _NOISY = MappingProxyType({4: "_depth_2_n.png", 8: "_depth_3_n.png"})
 
 @dataclass(frozen=True)
 class Files:
-    """The files of a scene of 2001 to 2006.
-
-    Args:
-        photo, disparity: of the left view.
-        shift: ``dmin.txt``, None where there is none.
-        measured: noisy low-resolution disparities by factor.
-
-    """
+    """The files of a scene of 2001 to 2006."""
 
     photo: Path
     disparity: Path
-    shift: Path | None
-    measured: Mapping[int, Path]
+    shift: Path | None  # dmin.txt
+    measured: Mapping[int, Path]  # noisy low-resolution disparities by factor
 
 
 def find_2014(root: Path) -> dict[str, Path]:
@@ -100,22 +93,13 @@ def find_levels(root: Path) -> dict[str, Files]:
 
 
 def load_2014(folder: Path, dataset: str, name: str, *, offset: bool = True) -> Scene:
-    """Return a scene of 2014.
-
-    Args:
-        folder: with the files.
-        offset: whether doffs of ``calib.txt`` counts, as it has to geometrically, or is taken for 0.
-
-    Raises:
-        ValueError: a file is missing, damaged, or does not fit the others; the message names it.
-
-    """
+    """Return the scene of 2014 in ``folder``; without ``offset``, doffs of ``calib.txt`` is taken for 0."""
     camera = read_calibration(folder / "calib.txt")
     path = folder / "disp0.pfm"
     if not path.is_file() and (folder / "disp0GT.pfm").is_file():
         path = folder / "disp0GT.pfm"
     values = read_map(path)
-    expect_size(path, values.shape, (camera.height, camera.width))
+    expect_size(path, values, (camera.height, camera.width))
     values[~np.isfinite(values)] = np.nan
     low = -camera.doffs if offset else 0.0
     if np.nanmin(values, initial=np.inf) <= low:
@@ -126,27 +110,20 @@ def load_2014(folder: Path, dataset: str, name: str, *, offset: bool = True) -> 
 
 
 def load_levels(files: Files, dataset: str, name: str, year: int, *, smooth: bool = True) -> Scene:
-    """Return a scene of 2001 to 2006.
+    """Return a scene of 2001 to 2006; the year of the data set says how levels count.
 
-    Args:
-        files: of the scene.
-        year: that of the data set, which says how levels count.
-        smooth: whether the steps of the rounding are smoothed; see :mod:`dsr.data.reference_depth`.
-
-    Raises:
-        ValueError: a file is missing, damaged, or does not fit the others; the message names it.
-
+    ``smooth`` removes the steps of the rounding, see :mod:`dsr.data.reference_depth`.
     """
     levels = read_levels(files.disparity).astype(np.float64)
     height, width = levels.shape
-    camera, per_pixel = _CAMERAS[year](files, height, width)
+    camera, per_pixel = _levels_camera(files, year, height, width)
     levels[levels == 0] = np.nan
     depth = _depth(files.disparity, (smooth_levels(levels) if smooth else levels) / per_pixel, camera)
     measured: dict[float, Tensor] = {}
     for factor, path in files.measured.items():
         camera_lr = camera.downscale(factor)
         values = read_levels(path).astype(np.float64)
-        expect_size(path, values.shape, (camera_lr.height, camera_lr.width))
+        expect_size(path, values, (camera_lr.height, camera_lr.width))
         values[values == 0] = np.nan
         measured[factor] = _depth(path, values / (per_pixel * factor), camera_lr)
     return Scene(dataset, name, _photo(files.photo, camera), camera, depth, measured)
@@ -164,10 +141,6 @@ def read_calibration(path: Path) -> Camera:
 
     Lines are ``key=value`` with blanks anywhere; ``cam0`` is a matrix as MATLAB writes it, ``baseline`` in millimetres,
     the rest in pixels.
-
-    Raises:
-        ValueError: it is missing or damaged, or a key is missing or out of range.
-
     """
     if not path.is_file():
         raise ValueError(f"{path}: expected a calibration, there is none")
@@ -193,7 +166,7 @@ def _number(path: Path, key: str, text: str) -> float:
 
 def _photo(path: Path, camera: Camera) -> Tensor:
     rgb = read_picture(path)
-    expect_size(path, tuple(rgb.shape[1:]), (camera.height, camera.width))
+    expect_size(path, rgb, (camera.height, camera.width))
     return rgb
 
 
@@ -204,8 +177,13 @@ def _depth(path: Path, disparity: np.ndarray, camera: Camera) -> Tensor:
     return from_range(torch.from_numpy(disparity)[None], camera, "disparity")
 
 
-def _camera_2006(files: Files, height: int, width: int) -> tuple[Camera, float]:
-    """Return the camera of 2005 and 2006 at a map's size, and levels per pixel."""
+def _levels_camera(files: Files, year: int, height: int, width: int) -> tuple[Camera, float]:
+    """Return the camera of a data set of levels at a map's size, and levels per pixel."""
+    if year == 2003:
+        return Camera(width, height, **_TEDDY), 4
+    cx, cy = (width - 1) / 2, (height - 1) / 2
+    if year == 2001:
+        return Camera(width, height, **{**_TEDDY, "cx": cx, "cy": cy}), 8
     per_pixel = round(_FULL_HEIGHT / height)
     if per_pixel not in (1, 2, 3):
         raise ValueError(f"{files.disparity}: expected a height near {_FULL_HEIGHT}, a half or a third, got {height}")
@@ -214,21 +192,7 @@ def _camera_2006(files: Files, height: int, width: int) -> tuple[Camera, float]:
         text = read_limited(files.shift).decode("utf-8", "replace").strip()
         shift = _number(files.shift, "dmin", text)
     focal = _FULL_FOCAL / per_pixel
-    centre = ((width - 1) / 2, (height - 1) / 2)
-    return Camera(width, height, focal, focal, *centre, _BASELINE, shift / per_pixel), per_pixel
-
-
-def _camera_2003(files: Files, height: int, width: int) -> tuple[Camera, float]:
-    return Camera(width, height, **_TEDDY), 4
-
-
-def _camera_2001(files: Files, height: int, width: int) -> tuple[Camera, float]:
-    return Camera(width, height, **{**_TEDDY, "cx": (width - 1) / 2, "cy": (height - 1) / 2}), 8
-
-
-_CAMERAS: Mapping[int, Callable[[Files, int, int], tuple[Camera, float]]] = MappingProxyType(
-    {2001: _camera_2001, 2003: _camera_2003, 2005: _camera_2006, 2006: _camera_2006}
-)
+    return Camera(width, height, focal, focal, cx, cy, _BASELINE, shift / per_pixel), per_pixel
 
 
 def _names(folders: Sequence[str]) -> tuple[str, ...]:
@@ -236,16 +200,9 @@ def _names(folders: Sequence[str]) -> tuple[str, ...]:
     return tuple(name.casefold() for name in folders)
 
 
-EVALUATION_2014 = _names(collections.EVALUATION_2014)
-SCENES = {
-    2001: _names(collections.SCENES_2001),
-    2003: _names(collections.SCENES_2003),
-    2005: _names(collections.SCENES_2005),
-    2006: _names(collections.SCENES_2006),
-}
-TRAINING_2014 = _names(collections.TRAINING_2014)
-TRAINING = {2001: SCENES[2001], 2006: SCENES[2006], 2014: TRAINING_2014}
-"""Scenes to train on by year."""
+EVALUATION_2014, TRAINING_2014 = _names(collections.EVALUATION_2014), _names(collections.TRAINING_2014)
+SCENES = {year: _names(getattr(collections, f"SCENES_{year}")) for year in YEARS}
+TRAINING = {2001: SCENES[2001], 2006: SCENES[2006], 2014: TRAINING_2014}  # scenes to train on by year
 _FILES_2014 = ("im0.png", "calib.txt", "disp0.pfm", "disp0GT.pfm")
 
 
@@ -259,9 +216,6 @@ class Middlebury(PreparedDataset):
         fill: names of the scenes whose holes are inpainted.
         without_offset: names of the scenes whose disparity offset is replaced by 0, which makes their depth wrong. The
             paper does so with Vintage, but not with Recycle and Playroom.
-
-    Raises:
-        ValueError: a scene is not on disk, or a value is out of range.
 
     """
 
@@ -289,9 +243,6 @@ class MiddleburyLevels(PreparedDataset):
         fill: names of the scenes whose holes are inpainted.
         smooth: whether the steps that rounding to whole levels makes are smoothed; see
             :mod:`dsr.data.reference_depth`.
-
-    Raises:
-        ValueError: a scene is not on disk, or a value is out of range.
 
     """
 
@@ -321,9 +272,6 @@ class MiddleburyTrain(PreparedDataset):
         scenes: names of the scenes to use; None for all of the years, ``found`` for all in ``root``.
         size: largest length of the shorter side in pixels; None for the original size.
         years: years to use.
-
-    Raises:
-        ValueError: a scene is not on disk, or a value is out of range.
 
     """
 

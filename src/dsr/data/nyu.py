@@ -1,6 +1,4 @@
-"""``dataset=nyu``: indoor scenes of a Kinect, which the paper does not use.
-
-NYU Depth v2, the 1449 labelled frames.
+"""``dataset=nyu``: NYU Depth v2, the 1449 labelled frames: indoor scenes of a Kinect, which the paper does not use.
 
 Silberman et al., "Indoor Segmentation and Support Inference from RGBD Images", ECCV 2012.
 
@@ -13,11 +11,7 @@ The camera is camera_params.m of the official toolbox, which counts pixels from 
 
 Guided depth super-resolution trains on the first 1000 frames and tests on the last 449 (Kim et al., "Deformable Kernel
 Networks for Joint Image Filtering", IJCV 2021), 640 x 480 pixels with the border and the filled depth. DCTNet (Zhao et
-al., CVPR 2022) has the latter as files, whose numbers count from 0:
-
-    DIR/RGB/1000.jpg   DIR/Depth/1000.npy         frame 1001, float32 metres, to frame 1449
-
-The first image of the test split in the repository of Kim et al. is 1000.jpg.
+al., CVPR 2022) has the latter as files, ``RGB/1000.jpg`` and ``Depth/1000.npy`` in metres, numbered from 0.
 """
 
 from __future__ import annotations
@@ -60,27 +54,15 @@ def find_frames(path: Path) -> dict[str, tuple[Path, int]]:
     """Return the file and the frame's number, the first two arguments of :func:`load_frame`, by name "0001" to "1449".
 
     Numbers count from 1, as in the official split of the frames.
-
-    Raises:
-        ValueError: the file is missing, damaged or another one.
-
     """
     with _opened(path) as arrays:
         return {f"{number:04d}": (path, number) for number in range(1, len(arrays["images"]) + 1)}
 
 
 def load_frame(path: Path, number: int, dataset: str, name: str, *, filled: bool = False, crop: bool = True) -> Scene:
-    """Return one frame.
+    """Return a frame by its number from 1, with the Kinect's depth, or the authors' ``filled`` one.
 
-    Args:
-        path: the labelled ``.mat`` file.
-        number: of the frame, from 1.
-        filled: take the authors' filled depth instead of the Kinect's with its holes.
-        crop: cut off the border, which leaves 427 x 561 pixels.
-
-    Raises:
-        ValueError: the file is missing, damaged or another one, or has no such frame.
-
+    ``crop`` cuts off the border, which leaves 427 x 561 pixels.
     """
     key = "depths" if filled else "rawDepths"
     with _opened(path) as arrays:
@@ -104,10 +86,6 @@ def find_files(root: Path) -> dict[str, tuple[Path, Path]]:
     """Return the photos and depths that lie in files of their own, arguments of :func:`load_files`, by name, in order.
 
     Names are those of the frames in the labelled file: ``RGB/1000.jpg`` is "1001".
-
-    Raises:
-        ValueError: there is no such directory.
-
     """
     found: dict[str, tuple[Path, Path]] = {}
     for _, number, (photo, depth) in find_beside(root, "RGB", _PHOTO, ("Depth/{}.npy",)):
@@ -116,16 +94,11 @@ def find_files(root: Path) -> dict[str, tuple[Path, Path]]:
 
 
 def load_files(rgb_path: Path, depth_path: Path, dataset: str, name: str) -> Scene:
-    """Return one frame of files of their own, with its border and the filled depth.
-
-    Raises:
-        ValueError: a file is missing, damaged, or not of 640 x 480 pixels; the message names it.
-
-    """
+    """Return one frame of files of their own, with its border and the filled depth."""
     size = (CAMERA.height, CAMERA.width)
     rgb, depth = read_picture(rgb_path), to_depth(depth_path, read_map(depth_path))
-    expect_size(rgb_path, tuple(rgb.shape[1:]), size)
-    expect_size(depth_path, tuple(depth.shape[1:]), size)
+    expect_size(rgb_path, rgb, size)
+    expect_size(depth_path, depth, size)
     return Scene(dataset, name, rgb, CAMERA, depth)
 
 
@@ -177,9 +150,6 @@ class NYU(PreparedDataset):
             literature on guided depth super-resolution: 640 x 480 pixels with the border and the inpainted depth,
             whatever ``size``, ``crop`` and ``filled`` are. None for all frames.
 
-    Raises:
-        ValueError: the file is missing or damaged, a scene is not there, or a value is out of range.
-
     """
 
     def __init__(
@@ -198,9 +168,8 @@ class NYU(PreparedDataset):
         if split not in SPLITS:
             raise ValueError(f"split: expected one of {', '.join(SPLITS)}, or null, got {split}")
         named = [f"{number:04d}" for number in SPLITS[split]]
-        found = _records(root, filled=True, crop=False) or make_records(
-            list_frames(find_files, root), load_files, "nyu"
-        )
+        files = make_records(list_frames(find_files, root), load_files, "nyu")
+        found = _records(root, filled=True, crop=False) or files
         found = {name: found[name] for name in named if name in found}
         super().__init__("nyu", root, found, named, scenes, Preparation(None))
         self.evaluation = split == "test"

@@ -27,28 +27,18 @@ from dsr.utils.versions import SCENES, file_hash
 
 _MIN_SIZE = 32
 _MAX_LISTED = 30
-_MAX_HASHED = 1 << 28
-"""Largest size in bytes of files whose content is hashed."""
+_MAX_HASHED = 1 << 28  # largest size in bytes of files whose content is hashed
 
 
 @dataclass(frozen=True)
 class SceneRecord:
-    """A scene on disk.
+    """A scene on disk."""
 
-    Args:
-        files: files and folders that the scene is read from; a folder stands for all files in it.
-        load: function that reads the scene at its original size.
-        frame: part of the files that holds the scene, where they hold several.
-        settings: how the files are read.
-        note: remark for readers of the scene's scores; empty for none.
-
-    """
-
-    files: tuple[Path, ...]
-    load: Callable[[], Scene]
-    frame: str = ""
-    settings: str = ""
-    note: str = ""
+    files: tuple[Path, ...]  # that the scene is read from; a folder stands for all files in it
+    load: Callable[[], Scene]  # at its original size
+    frame: str = ""  # part of the files that holds the scene, where they hold several
+    settings: str = ""  # how the files are read
+    note: str = ""  # for readers of the scene's scores
 
 
 def list_frames(
@@ -64,12 +54,7 @@ def make_records(
 ) -> dict[str, SceneRecord]:
     """Return the records of frames on disk, by their names with _ in place of /.
 
-    Args:
-        frames: first arguments of ``load`` by name, as from :func:`list_frames`.
-        load: function that reads a frame, given these, the names of data set and scene, and ``settings``.
-        dataset: name of the data set.
-        settings: further arguments of ``load``.
-
+    ``load`` gets a frame's entry of ``frames``, the names of data set and scene, and ``settings``.
     """
     records = {}
     for frame, arguments in frames.items():
@@ -92,13 +77,7 @@ def _files_of(path: Path) -> list[Path]:
 
 
 def rename_records(records: Mapping[str, SceneRecord], names: Mapping[str, str]) -> dict[str, SceneRecord]:
-    """Return the records, some of them under other names.
-
-    Args:
-        records: records by name.
-        names: names of frames by their new names, with / or _; frames that are not in ``records`` are left out.
-
-    """
+    """Return the records, some of them under other names; frames that are not in ``records`` are left out."""
     frames = {name: frame.replace("/", "_") for name, frame in names.items()}
     new = {name: _with_scene_name(records[frame], name) for name, frame in frames.items() if frame in records}
     replaced = new.keys() | set(frames.values())
@@ -120,9 +99,6 @@ class Preparation:
             no window.
         enlarge: whether smaller scenes are enlarged.
         fill: names of the scenes whose holes are inpainted; see :mod:`dsr.data.reference_depth`.
-
-    Raises:
-        ValueError: a value is out of range.
 
     """
 
@@ -158,11 +134,7 @@ class PreparedDataset:
         named: names of the scenes that belong to the data set; None for all that are on disk.
         scenes: names of the scenes to use; None for those of ``named``, ``found`` for all that are on disk.
         preparation: how scenes are resized, cropped and inpainted.
-        count: number of scenes that belong to the data set, where their names are not known; None otherwise.
-
-    Raises:
-        ValueError: a scene is not on disk; the message says how to get it.
-
+        count: number of scenes that belong to the data set, where their names are not known.
     """
 
     evaluation = True
@@ -266,12 +238,7 @@ def _hash_of(path: Path, size: int, changed: int) -> str:
 
 
 def content_hash(path: Path) -> str:
-    """Return the SHA-256 of a file; of a file above 256 MiB, its name, size and time of the last change.
-
-    Raises:
-        ValueError: there is no such file.
-
-    """
+    """Return the SHA-256 of a file; of a file above 256 MiB, its name, size and time of the last change."""
     if not path.is_file():
         raise ValueError(f"{path}: expected a file, there is none")
     status = path.stat()

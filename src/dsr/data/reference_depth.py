@@ -32,35 +32,20 @@ from torch.nn import functional
 
 from dsr.sample import Scene
 
-JUMP = 0.02
-"""Relative difference of depth above which neighbours belong to different surfaces."""
-_MIN_RADIUS = 1.5
-"""Smallest radius of the weights in old pixels: it leaves two pixels at a border, which a slope needs."""
+JUMP = 0.02  # relative difference of depth above which neighbours belong to different surfaces
+_MIN_RADIUS = 1.5  # smallest radius of the weights in old pixels: it leaves two pixels at a border, which a slope needs
 _RIDGE = 1e-9
 
-_STEP = 0.05
-"""Smallest relative gap between the sorted inverse depths of a rim that is a depth step."""
+_STEP = 0.05  # smallest relative gap between the sorted inverse depths of a rim that is a depth step
 _SIDES = ((0, 1), (1, 0), (0, -1), (-1, 0))
 
-_CONTOUR = 2.0
-"""Weight of the value at a contour, which lies half a pixel from the pixels on its sides."""
-_ANCHOR = 1e-6
-"""Weight of the level itself, for plateaus without a contour."""
+_CONTOUR = 2.0  # weight of the value at a contour, which lies half a pixel from the pixels on its sides
+_ANCHOR = 1e-6  # weight of the level itself, for plateaus without a contour
 _TOLERANCE = 1e-5
 
 
 def resize(scene: Scene, height: int, width: int) -> Scene:
-    """Return a scene at another size, its camera included; measured low-resolution maps are left out.
-
-    Args:
-        scene: scene with a high-resolution depth.
-        height: height of the result in pixels.
-        width: width of the result in pixels.
-
-    Raises:
-        ValueError: the scene has no high-resolution depth.
-
-    """
+    """Return a scene at another size, its camera included; measured low-resolution maps are left out."""
     if scene.depth is None:
         raise ValueError(
             f"{scene.name}: expected a high-resolution depth map to resize, there is none (dataset.size=null)"
@@ -75,13 +60,8 @@ def resize(scene: Scene, height: int, width: int) -> Scene:
 def fit(scene: Scene, size: int, place: float | None = 0.5, *, enlarge: bool = True) -> Scene:
     """Return a scene resized so that its shorter side is ``size`` pixels long, and cropped to a square.
 
-    Args:
-        scene: scene with a high-resolution depth.
-        size: length of the shorter side in pixels.
-        place: position of the square along the longer side, from 0 (top or left) to 1 (bottom or right); None for no
-            cropping.
-        enlarge: whether smaller scenes are enlarged.
-
+    ``place`` is the square's position along the longer side, from 0 (top or left) to 1 (bottom or right); None for no
+    cropping. Smaller scenes are enlarged only with ``enlarge``.
     """
     height, width = scene.camera.height, scene.camera.width
     shorter = min(height, width)
@@ -96,17 +76,7 @@ def fit(scene: Scene, size: int, place: float | None = 0.5, *, enlarge: bool = T
 
 
 def resize_depth(depth: Tensor, height: int, width: int) -> Tensor:
-    """Return a depth map at another size, resized as the module describes.
-
-    Args:
-        depth: (1, H, W) orthogonal depth in metres, NaN where missing.
-        height: height of the result in pixels.
-        width: width of the result in pixels.
-
-    Returns:
-        (1, height, width) float64.
-
-    """
+    """Return a depth map (1, H, W), NaN where missing, resized as the module describes, float64."""
     inverse = depth[0].double().reciprocal()
     rows, columns = _Axis(inverse.shape[0], height), _Axis(inverse.shape[1], width)
     own = inverse[rows.nearest][:, columns.nearest]
@@ -163,15 +133,7 @@ def _plane_at_centre(sums: list[Tensor], area: float) -> Tensor:
 
 
 def inpaint_depth(depth: Tensor) -> Tensor:
-    """Return a depth map with its holes inpainted.
-
-    Args:
-        depth: (1, H, W) orthogonal depth in metres, NaN where missing; at least one pixel is valid.
-
-    Returns:
-        (1, H, W) float64; valid pixels are unchanged.
-
-    """
+    """Return a depth map (1, H, W) with its holes, NaN, inpainted, float64; valid pixels are unchanged."""
     inverse = 1 / depth[0].double().numpy()
     holes = np.isnan(inverse)
     if not holes.any():
@@ -224,15 +186,9 @@ def _clear_wrapped(step: tuple[int, int], number: np.ndarray, known: np.ndarray)
 
 
 def smooth_levels(levels: np.ndarray, largest_step: int = 2) -> np.ndarray:
-    """Return a map whose values vary smoothly between the levels.
+    """Return a map (H, W) whose values vary smoothly between its levels, whole numbers, within half a level of them.
 
-    Args:
-        levels: (H, W) whole numbers, NaN where missing.
-        largest_step: largest difference of neighbours' levels within a surface.
-
-    Returns:
-        (H, W) float64, within half a level of ``levels``, NaN where they are NaN.
-
+    ``largest_step`` is the largest difference of neighbours' levels within a surface; NaN stays NaN.
     """
     known = np.isfinite(levels)
     own = levels[known].astype(np.float64)

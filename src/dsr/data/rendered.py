@@ -20,8 +20,7 @@ from dsr.synthetic.simgeo import SCENES, SCENES_VERSION, render_scene
 from dsr.utils.pool import Pool
 from dsr.utils.progress import SILENT
 
-_WORTH_WORKERS = 5.0
-"""Seconds of rendering from which worker processes are used; they take some seconds to start."""
+_WORTH_WORKERS = 5.0  # seconds of rendering from which worker processes are used; they take some seconds to start
 
 
 class Procedural:
@@ -31,9 +30,6 @@ class Procedural:
         count: number of scenes.
         size: height and width in pixels.
         seed: seed of the scenes; each is a pure function of seed, number and size.
-
-    Raises:
-        ValueError: a value is out of range.
 
     """
 
@@ -101,9 +97,6 @@ class SimGeo:
         root: directory that may hold ``lucy``; without it the statue is used.
         scenes: names of the scenes to use; None for all.
         size: height and width in pixels, 512 in the paper.
-
-    Raises:
-        ValueError: an unknown scene or a size below 32.
 
     """
 

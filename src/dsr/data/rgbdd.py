@@ -40,10 +40,8 @@ from dsr.data.scene_source import SceneSelection
 from dsr.sample import Scene
 
 Split = Literal["test", "train"]
-COUNTS = {"test": 405, "train": 2215}
-"""Numbers of scenes."""
-RATIO = 8 / 3
-"""Of the photo's size and that of the phone's depth."""
+COUNTS = {"test": 405, "train": 2215}  # numbers of scenes
+RATIO = 8 / 3  # of the photo's size and that of the phone's depth
 Files = tuple[Path, ...]
 _PHOTO = re.compile(r"(\d+)_RGB\.jpg")
 _PARTS = ("models", "plants", "portraits")
@@ -53,14 +51,7 @@ _DEPTH, _MEASURED = "{0}_HR_gt.png", "{0}_LR_fill_depth.png"
 def find_frames(root: Path, split: Split | None = None, measured: bool = False) -> dict[str, Files]:
     """Return photos, true depth and, if ``measured``, the phone's depth, by their number "20200509112638", in order.
 
-    Args:
-        root: directory of the data set, or one above it.
-        split: of the images, None for both; those in ``RGB`` and ``Depth`` are test images.
-        measured: whether to find only images that have the phone's depth.
-
-    Raises:
-        ValueError: there is no such directory.
-
+    Images in ``RGB`` and ``Depth`` are test images.
     """
     found: dict[str, Files] = {}
     for name, files in _find_owners_layout(root, split, measured=measured):
@@ -73,15 +64,10 @@ def find_frames(root: Path, split: Split | None = None, measured: bool = False) 
 
 
 def load_measured_frame(rgb_path: Path, depth_path: Path, measured_path: Path, dataset: str, name: str) -> Scene:
-    """Return one image as :func:`~dsr.data.frame_files.load_pair` does, with the phone's depth as the measured map.
-
-    Raises:
-        ValueError: a file is missing, damaged, or does not fit the others; the message names it.
-
-    """
+    """Return one image as :func:`~dsr.data.frame_files.load_pair` does, with the phone's depth as the measured map."""
     scene, measured = load_pair(rgb_path, depth_path, dataset, name), read_millimetres(measured_path)
     size = (round(scene.camera.height / RATIO), round(scene.camera.width / RATIO))
-    expect_size(measured_path, tuple(measured.shape[1:]), size)
+    expect_size(measured_path, measured, size)
     return replace(scene, measured={scene.camera.width / size[1]: measured})
 
 
@@ -106,13 +92,9 @@ class RGBDD(PreparedDataset):
         scenes: names of the scenes to use, such as ``20200509112638``; None for all of the split, ``found`` for all in
             ``root``.
 
-    Raises:
-        ValueError: a scene is not on disk, or a value is out of range.
-
     """
 
-    soft_edges: ClassVar[bool] = True
-    """Pixels at depth steps are mixtures of both sides."""
+    soft_edges: ClassVar[bool] = True  # pixels at depth steps are mixtures of both sides
 
     def __init__(self, root: str, real: bool, split: Split = "test", scenes: SceneSelection = None) -> None:
         if split not in COUNTS:

@@ -36,12 +36,7 @@ class SceneSource(Protocol):
         ...
 
     def load(self, scene: str) -> Scene:
-        """Return one scene.
-
-        Raises:
-            ValueError: a file is missing or damaged; the message names it.
-
-        """
+        """Return one scene, or raise a ValueError that names a file that is missing or damaged."""
         ...
 
     def fingerprint(self, scene: str) -> str:
@@ -68,14 +63,7 @@ class Prepared(Protocol):
 
 
 def prepare_scenes(source: SceneSource, names: Sequence[str], progress: Progress) -> None:
-    """Have a data set that renders or resizes its scenes make some of them ready.
-
-    Args:
-        source: the data set.
-        names: scenes to make ready.
-        progress: shows how many are ready.
-
-    """
+    """Have a data set that renders or resizes its scenes make some of them ready."""
     if isinstance(source, Prepared):
         for _ in progress.track(source.prepare(names, progress.say), "prepare", len(names)):
             pass
@@ -92,13 +80,7 @@ def regions_of(source: SceneSource) -> tuple[str, ...]:
 
 
 class SceneSubset:
-    """A subset of the scenes of a data set.
-
-    Args:
-        source: the data set.
-        names: names of the scenes.
-
-    """
+    """Some of the scenes of a data set."""
 
     def __init__(self, source: SceneSource, names: Sequence[str]) -> None:
         self.name, self.evaluation = source.name, source.evaluation
@@ -120,12 +102,7 @@ class SceneSubset:
 
 
 def select_scenes(available: Sequence[str], wanted: SceneSelection) -> list[str]:
-    """Return the ``wanted`` scenes, or all available ones for None.
-
-    Raises:
-        ValueError: a wanted scene is not available or is named twice, the list is empty, or a name is not UTF-8.
-
-    """
+    """Return the ``wanted`` scenes, or all available ones for None."""
     if wanted == "found":
         wanted = None
     if wanted is not None and (not wanted or len(set(wanted)) < len(wanted)):

@@ -37,8 +37,7 @@ SEQUENCES = MappingProxyType({
     "sleeping_2": 50, "temple_2": 50, "temple_3": 50,
 })  # fmt: skip
 """Frames of each training sequence, 1064 in all."""
-FARTHEST = 1000.0
-"""Largest depth in metres; the sky has a larger one."""
+FARTHEST = 1000.0  # largest depth in metres; the sky has a larger one
 _TAG = struct.pack("<f", 202021.25)
 _DPT_HEADER = struct.Struct("<4sii")
 _CAM_LENGTH = 4 + 8 * (9 + 12)
@@ -48,10 +47,6 @@ def find_frames(root: Path, rendering: Literal["clean", "final"] = "final") -> d
     """Return colour, depth and camera files, the first three arguments of :func:`load_frame`, by name, in order.
 
     A name is ``SEQUENCE/frame_NNNN``. ``root`` holds ``training``, or is it. A frame that lacks a file is left out.
-
-    Raises:
-        ValueError: there is no such directory.
-
     """
     if not root.is_dir():
         raise ValueError(f"{root}: expected a directory, there is none")
@@ -67,12 +62,7 @@ def find_frames(root: Path, rendering: Literal["clean", "final"] = "final") -> d
 
 
 def read_depth(path: Path, farthest: float = FARTHEST) -> Tensor:
-    """Return a ``.dpt`` file, (1, H, W) float64 in metres, NaN where it is beyond ``farthest`` metres.
-
-    Raises:
-        ValueError: it is missing, damaged, of another length than its header says, or has negative values.
-
-    """
+    """Return a ``.dpt`` file, (1, H, W) float64 in metres, NaN where it is beyond ``farthest`` metres."""
     content = read_bytes(path, "a .dpt file")
     if len(content) < _DPT_HEADER.size or not content.startswith(_TAG):
         raise ValueError(f"{path}: expected a .dpt file (tag 202021.25), got {_opening(content)}")
@@ -85,12 +75,7 @@ def read_depth(path: Path, farthest: float = FARTHEST) -> Tensor:
 
 
 def read_camera(path: Path, size: tuple[int, int]) -> Camera:
-    """Return the intrinsics of a ``.cam`` file for pictures of ``size`` = (height, width).
-
-    Raises:
-        ValueError: it is missing or damaged, or not the camera of such pictures.
-
-    """
+    """Return the intrinsics of a ``.cam`` file for pictures of ``size`` = (height, width)."""
     content = read_bytes(path, "a .cam file")
     if len(content) != _CAM_LENGTH or not content.startswith(_TAG):
         raise ValueError(f"{path}: expected a .cam file (tag 202021.25, {_CAM_LENGTH} bytes), got {_opening(content)}")
@@ -100,15 +85,10 @@ def read_camera(path: Path, size: tuple[int, int]) -> Camera:
 def load_frame(
     rgb_path: Path, depth_path: Path, camera_path: Path, dataset: str, name: str, *, farthest: float = FARTHEST
 ) -> Scene:
-    """Return one frame; depths beyond ``farthest`` metres are holes.
-
-    Raises:
-        ValueError: a file is missing, damaged, or does not fit the others; the message names it.
-
-    """
+    """Return one frame; depths beyond ``farthest`` metres are holes."""
     rgb, depth = read_picture(rgb_path), read_depth(depth_path, farthest)
     size = (rgb.shape[1], rgb.shape[2])
-    expect_size(depth_path, tuple(depth.shape[1:]), size)
+    expect_size(depth_path, depth, size)
     return Scene(dataset, name, rgb, read_camera(camera_path, size), depth)
 
 
@@ -117,8 +97,7 @@ def _opening(content: bytes) -> str:
     return f"{len(content)} bytes that start with {content[:4]!r}"
 
 
-_SEQUENCES_WITH_THREE = 12
-"""Number of sequences of which three frames are used, not two: 2 x 23 + 12 = 58."""
+_SEQUENCES_WITH_THREE = 12  # number of sequences of which three frames are used, not two: 2 x 23 + 12 = 58
 
 
 def sintel_frames() -> tuple[str, ...]:
@@ -139,9 +118,6 @@ class Sintel(PreparedDataset):
         size: largest length of the shorter side in pixels; None for the original size.
         rendering: ``clean``, or ``final`` with blur, fog and the like.
         farthest: depth in metres beyond which pixels are sky, that is, missing.
-
-    Raises:
-        ValueError: a scene is not on disk, or a value is out of range.
 
     """
 

@@ -27,7 +27,7 @@ import cv2
 import numpy as np
 import torch
 
-from dsr.data.frame_files import expect_size, find_beside, in_natural_order, read_millimetres, read_picture
+from dsr.data.frame_files import find_beside, in_natural_order, read_frame
 from dsr.data.preparation import Preparation, PreparedDataset, list_frames, make_records
 from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera
@@ -37,18 +37,11 @@ from dsr.sample import Scene
 
 @dataclass(frozen=True)
 class Board:
-    """The board in a frame.
+    """The board in a frame."""
 
-    Args:
-        normal: of its plane, of length 1, in the camera's axes (right, down, forward).
-        distance: of its plane from the camera along the normal, metres.
-        outline: (column, row) of its corners, in pixels of the photo.
-
-    """
-
-    normal: tuple[float, float, float]
-    distance: float
-    outline: tuple[tuple[float, float], ...]
+    normal: tuple[float, float, float]  # of its plane, of length 1, in the camera's axes (right, down, forward)
+    distance: float  # of its plane from the camera along the normal, metres
+    outline: tuple[tuple[float, float], ...]  # (column, row) of its corners, in pixels of the photo
 
 
 CAMERA = Camera(1920, 1080, 1368.937, 1370.763, 936.091, 541.831)
@@ -74,22 +67,13 @@ BOARDS = MappingProxyType(
         ),
     }
 )
-"""By the name of the frame."""
 INSIDE, BORDER = 12, 36
 """Pixels inside the outline up to which its own error of a pixel or two counts, and up to which the border reaches."""
 _PHOTO = re.compile(r"(\d+)\.(?:png|jpg)")
 
 
 def find_frames(root: Path) -> dict[str, tuple[Path, Path, str]]:
-    """Return photo, depth and name, the first arguments of :func:`load_frame`, by name "8", in order.
-
-    Args:
-        root: directory of ``color`` and ``depth``, or one above it.
-
-    Raises:
-        ValueError: there is no such directory.
-
-    """
+    """Return photo, depth and name, the first arguments of :func:`load_frame`, by name "8", in order."""
     found = {}
     for _, name, (photo, depth) in find_beside(root, "color", _PHOTO, ("depth/{}.png",)):
         if name in BOARDS:
@@ -102,20 +86,8 @@ def load_frame(rgb_path: Path, depth_path: Path, board: str, dataset: str, name:
 
     Its regions are ``board``, deeper inside the outline than :data:`INSIDE` pixels, and of that ``border``, not deeper
     than :data:`BORDER`: what is blurred across the outline shows there.
-
-    Args:
-        rgb_path: photo.
-        depth_path: camera's depth.
-        board: which of :data:`BOARDS`.
-        dataset, name: of the scene.
-
-    Raises:
-        ValueError: a file is missing, damaged, or not of 1920 x 1080 pixels; the message names it.
-
     """
-    rgb, measured = read_picture(rgb_path), read_millimetres(depth_path)
-    for path, image in ((rgb_path, rgb), (depth_path, measured)):
-        expect_size(path, tuple(image.shape[1:]), (CAMERA.height, CAMERA.width))
+    rgb, measured = read_frame(rgb_path, depth_path, size=(CAMERA.height, CAMERA.width))
     inside = depth_inside(BOARDS[board])
     regions = {"board": inside > INSIDE, "border": (inside > INSIDE) & (inside <= BORDER)}
     truth = torch.from_numpy(plane_depth(BOARDS[board]))[None]
@@ -147,9 +119,6 @@ class StereoBoard(PreparedDataset):
     Args:
         root: directory of ``color`` and ``depth``, or one above it.
         scenes: names of the scenes to use, such as ``14``; None for all five, ``found`` for those in ``root``.
-
-    Raises:
-        ValueError: a scene is not on disk.
 
     """
 

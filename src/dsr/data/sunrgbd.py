@@ -1,8 +1,6 @@
-"""``dataset=sunrgbd``: indoor scenes of four sensors (Song et al., CVPR 2015).
+"""``dataset=sunrgbd``: indoor scenes of four sensors (Song et al., "SUN RGB-D", CVPR 2015).
 
 Voynov et al. 2019 evaluate on twelve images and do not say which. This data set has three of each sensor.
-
-Song et al., "SUN RGB-D: A RGB-D Scene Understanding Benchmark Suite", CVPR 2015.
 
     SCENE/image/*.jpg        colour
     SCENE/depth/*.png        the sensor's depth, projected into the colour camera
@@ -10,12 +8,9 @@ Song et al., "SUN RGB-D: A RGB-D Scene Understanding Benchmark Suite", CVPR 2015
     SCENE/intrinsics.txt     3 x 3, in three lines or one
 
 16-bit depth pictures hold millimetres turned left by three bits: mm = (v >> 3) | (v << 13), 0 for a hole. The official
-toolbox (read3dPoints.m) sets what is farther than 8 m to 8 m; here it stays as measured.
-
-intrinsics.txt is taken as it is, pixel centres at integers from 0. That is right where the authors cut NYU's frames:
-the cut begins at column 40, row 44 of the full frame (img_0063, by matching), while the principal point is less by 41
-and 45, which turns MATLAB's count from 1 into a count from 0. The toolbox goes on counting from 1
-(read_3d_pts_general.m), so for other sensors the principal point is uncertain by one pixel, a shear of 1 / fx.
+toolbox (read3dPoints.m) sets what is farther than 8 m to 8 m; here it stays as measured. intrinsics.txt is taken as it
+is, pixel centres at integers from 0, which is right for NYU's frames; the toolbox counts from 1, so for other sensors
+the principal point is uncertain by one pixel.
 """
 
 from __future__ import annotations
@@ -37,31 +32,18 @@ from dsr.data.frame_files import (
     to_depth,
     walk,
 )
-from dsr.data.preparation import (
-    Preparation,
-    PreparedDataset,
-    SceneRecord,
-    list_frames,
-    make_records,
-    rename_records,
-)
+from dsr.data.preparation import Preparation, PreparedDataset, SceneRecord, list_frames, make_records, rename_records
 from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera
 from dsr.io.images import read_numbers
 from dsr.sample import Scene
 
-Intrinsics = tuple[float, float, float, float]
-"""(fx, fy, cx, cy) in pixels."""
+Intrinsics = tuple[float, float, float, float]  # (fx, fy, cx, cy) in pixels
 _PICTURES = (".jpg", ".jpeg", ".png")
 
 
 def find_frames(root: Path) -> dict[str, tuple[Path]]:
-    """Return the scene folders, the first argument of :func:`load_frame`, by path below ``root``, in order.
-
-    Raises:
-        ValueError: there is no such directory.
-
-    """
+    """Return the scene folders, the first argument of :func:`load_frame`, by path below ``root``, in order."""
     found = {}
     for folder, below, _ in walk(root):
         if "image" in below and ("depth" in below or "depth_bfx" in below):
@@ -71,39 +53,22 @@ def find_frames(root: Path) -> dict[str, tuple[Path]]:
 
 
 def read_depth(path: Path) -> Tensor:
-    """Return a depth picture, (1, H, W) float64 in metres, NaN in holes.
-
-    Raises:
-        ValueError: it is missing, damaged, or not of 16 bits.
-
-    """
+    """Return a depth picture, (1, H, W) float64 in metres, NaN in holes."""
     levels = read_16bit(path)
     return to_depth(path, ((levels >> 3) | (levels << 13)) / 1000)
 
 
 def read_intrinsics(path: Path, size: tuple[int, int]) -> Camera:
-    """Return the camera that an ``intrinsics.txt`` gives pictures of ``size`` = (height, width).
-
-    Raises:
-        ValueError: it is missing, or not the matrix of such a camera.
-
-    """
+    """Return the camera that an ``intrinsics.txt`` gives pictures of ``size`` = (height, width)."""
     return to_camera(path, read_numbers(path, 9).reshape(3, 3), size)
 
 
 def load_frame(
     folder: Path, dataset: str, name: str, *, refined: bool = False, intrinsics: Intrinsics | None = None
 ) -> Scene:
-    """Return the scene of a folder.
+    """Return the scene of a folder, with the sensor's depth or the authors' ``refined`` one.
 
-    Args:
-        folder: the scene's.
-        refined: take ``depth_bfx``, the authors' filled depth, instead of ``depth``.
-        intrinsics: for a folder without ``intrinsics.txt``.
-
-    Raises:
-        ValueError: a file is missing, damaged, or does not fit the others; the message names it.
-
+    ``intrinsics`` are for a folder without ``intrinsics.txt``.
     """
     rgb_path, depth_path, *matrix = frame_files(folder, refined=refined)
     given = matrix[0] if matrix else intrinsics
@@ -113,27 +78,17 @@ def load_frame(
 
 
 def load_pair(rgb_path: Path, depth_path: Path, dataset: str, name: str, intrinsics: Path | Intrinsics) -> Scene:
-    """Return the scene of two files, wherever they lie, and of their intrinsics or the file that has them.
-
-    Raises:
-        ValueError: a file is missing or damaged, or the two differ in size.
-
-    """
+    """Return the scene of two files, wherever they lie, and of their intrinsics or the file that has them."""
     rgb, depth = read_picture(rgb_path), read_depth(depth_path)
     size = (rgb.shape[1], rgb.shape[2])
-    expect_size(depth_path, tuple(depth.shape[1:]), size)
+    expect_size(depth_path, depth, size)
     if isinstance(intrinsics, Path):
         return Scene(dataset, name, rgb, read_intrinsics(intrinsics, size), depth)
     return Scene(dataset, name, rgb, given_camera(intrinsics, size), depth)
 
 
 def frame_files(folder: Path, *, refined: bool = False) -> tuple[Path, ...]:
-    """Return the files of a scene folder that are read: colour, depth, and intrinsics.txt where there is one.
-
-    Raises:
-        ValueError: there is not one picture of colour and one of depth.
-
-    """
+    """Return the files of a scene folder that are read: colour, depth, and intrinsics.txt where there is one."""
     matrix = folder / "intrinsics.txt"
     depth = "depth_bfx" if refined else "depth"
     return (_only(folder / "image"), _only(folder / depth), *([matrix] if matrix.is_file() else []))
@@ -177,9 +132,6 @@ class SunRGBD(PreparedDataset):
         refined: whether the authors' refined depth without holes is the true depth.
         frames: folder of each of the twelve names.
         intrinsics: fx, fy, cx, cy in pixels for folders without ``intrinsics.txt``.
-
-    Raises:
-        ValueError: a scene is not on disk, or a value is out of range.
 
     """
 

@@ -20,13 +20,11 @@ from dsr.data.frame_files import expect_size, name_of, read_picture, to_depth, w
 from dsr.data.preparation import Preparation, PreparedDataset, list_frames, make_records
 from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera
-from dsr.io.images import read_map
+from dsr.io.images import read_values
 from dsr.sample import Scene
-from dsr.utils.guards import opened
 
 CAMERA = Camera(640, 480, 320.0, 320.0, 320.0, 240.0)
-FARTHEST = 1000.0
-"""Largest depth in metres; the sky has a larger one."""
+FARTHEST = 1000.0  # largest depth in metres; the sky has a larger one
 _SIZE = (480, 640)
 _COLOUR = re.compile(r"(\d{1,9})_left\.png")
 
@@ -36,10 +34,6 @@ def find_frames(root: Path) -> dict[str, tuple[Path, Path]]:
 
     A name is the frame's folder below ``root``, without ``image_left``, and its number as the files have it, such as
     ``office/Easy/P000/000000``. A frame that lacks one of its two files is left out.
-
-    Raises:
-        ValueError: there is no such directory.
-
     """
     found = {}
     for folder, below, files in walk(root):
@@ -56,46 +50,18 @@ def find_frames(root: Path) -> dict[str, tuple[Path, Path]]:
 
 
 def read_depth(path: Path, farthest: float = FARTHEST) -> Tensor:
-    """Return a depth file, (1, 480, 640) float64 in metres, NaN where it is beyond ``farthest`` metres.
-
-    Raises:
-        ValueError: it is missing, damaged, of another size or type, or has negative values.
-
-    """
-    if not path.is_file():
-        raise ValueError(f"{path}: expected a NumPy array, there is none")
-    shape, dtype, length = _header(path)
-    if (shape, dtype) != (_SIZE, np.dtype("<f4")) or length != 4 * _SIZE[0] * _SIZE[1]:
-        raise ValueError(f"{path}: expected 480 x 640 float32, got {length} bytes that say {dtype} of shape {shape}")
-    with np.errstate(invalid="ignore"):  # as in to_depth
-        values = read_map(path)
+    """Return a depth file, (1, 480, 640) float64 in metres, NaN where it is beyond ``farthest`` metres."""
+    values = read_values(path)
+    if (values.shape, values.dtype) != (_SIZE, np.dtype("<f4")):
+        raise ValueError(f"{path}: expected 480 x 640 float32, got {values.dtype} of shape {values.shape}")
     return to_depth(path, values, farthest)
 
 
 def load_frame(rgb_path: Path, depth_path: Path, dataset: str, name: str, *, farthest: float = FARTHEST) -> Scene:
-    """Return one frame at 640 x 480; depths beyond ``farthest`` metres are holes.
-
-    Raises:
-        ValueError: a file is missing, damaged or of another size; the message names it.
-
-    """
+    """Return one frame at 640 x 480; depths beyond ``farthest`` metres are holes."""
     rgb = read_picture(rgb_path)
-    expect_size(rgb_path, tuple(rgb.shape[1:]), _SIZE)
+    expect_size(rgb_path, rgb, _SIZE)
     return Scene(dataset, name, rgb, CAMERA, read_depth(depth_path, farthest))
-
-
-def _header(path: Path) -> tuple[tuple[int, ...], np.dtype, int]:
-    """Return the shape and the type in the header of a .npy file, and the number of bytes behind it."""
-    with opened(path) as file:
-        try:
-            version = np.lib.format.read_magic(file)
-            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-            shape, _, dtype = read(file)
-        except Exception as error:  # a damaged header makes NumPy raise ValueError, TokenError, SyntaxError, ...
-            raise ValueError(
-                f"{path}: expected a NumPy array, got {path.stat().st_size} bytes of another kind"
-            ) from error
-        return shape, dtype, path.stat().st_size - file.tell()
 
 
 class TartanAir(PreparedDataset):
@@ -107,9 +73,6 @@ class TartanAir(PreparedDataset):
         size: height and width in pixels; None for the original size.
         crop: see :class:`dsr.data.preparation.Preparation`.
         farthest: depth in metres beyond which pixels are sky, that is, missing.
-
-    Raises:
-        ValueError: a scene is not on disk, or a value is out of range.
 
     """
 

@@ -2,23 +2,14 @@
 
 Voynov et al. 2019 use Books, Devil and Shark with the maps of the real sensor as the input: ``downsampling=measured``.
 
-The benchmark's files hold no camera. It was estimated from the scene Books that the paper's authors published with a
-camera and metric depth: 72 of 100 correspondences between the two photos fit one pose and one camera of square pixels
-without distortion, with a root mean square error of 0.95 pixels.
-
-ToFMark: a time-of-flight camera beside an intensity camera (Ferstl et al., ICCV 2013).
-
-"Image Guided Depth Upsampling using Anisotropic Total Generalized Variation". Books, Devil and Shark, 610 x 810:
-
     benchmarking_dataset_NAME.mat     intensity, true depth, and the sensor's samples projected into the intensity image
     NAME.bmp, NAME_depth.bmp          intensity and samples in 8 bits; 0 = no sample, which 97.5 % of the pixels are
 
-No names of variables are published for the ``.mat`` files, so variables are recognised by their names and sizes, or
-named by the caller. Depths are orthogonal, in millimetres where their median exceeds 50, else in metres.
-
-In ``*_depth.bmp`` 255 is the farthest sample: the wall behind the objects is bright, and along Books the levels go with
-metric depth z of the same scene (correlation 0.97; -0.96 with 1/z; linear in z, median residual 16 mm, against 30 mm if
-linear in 1/z). What depth a level stands for is lost, and no file holds a camera: both are the caller's to give.
+all of 610 x 810 pixels. No names of variables are published for the ``.mat`` files, so variables are recognised by
+their names and sizes, or named by the caller. Depths are orthogonal, in millimetres where their median exceeds 50, else
+in metres. In ``*_depth.bmp`` 255 is the farthest sample, and levels are linear in depth; what depth a level stands for
+is the caller's to give. No file holds a camera: :data:`ESTIMATED` fits 72 correspondences with the scene Books, which
+the paper's authors published with a camera, up to 0.95 pixels (root mean square).
 """
 
 from __future__ import annotations
@@ -38,8 +29,7 @@ from dsr.data.scene_source import SceneSelection
 from dsr.io.images import read_levels
 from dsr.sample import Scene
 
-FACTORS = (4, 8)
-"""Of the measured maps: about 40 % of the 4 x 4 blocks have a sample, and nearly all of 8 x 8."""
+FACTORS = (4, 8)  # of the measured maps: about 40 % of the 4 x 4 blocks have a sample, and nearly all of 8 x 8
 _MILLIMETRES = 50.0
 _SMALLEST = 16
 _SPARSE = 0.2
@@ -57,12 +47,7 @@ _OTHERS = {
 
 
 def find_frames(root: Path) -> dict[str, tuple[Path, Path | None]]:
-    """Return the first two arguments of :func:`load_frame` by name ("books"), in order: a .mat file, else the pictures.
-
-    Raises:
-        ValueError: there is no such directory.
-
-    """
+    """Return the first arguments of :func:`load_frame` by name ("books"), in order: a .mat file, else the pictures."""
     found: dict[str, tuple[Path, Path | None]] = {}
     for folder, _, files in walk(root):
         for file in files:
@@ -94,10 +79,6 @@ def load_frame(
         depth_range: metres of level 1 and of level 255 of ``samples_path``, which needs it.
         variables: names in the ``.mat`` file of "intensity", "depth" and "samples"; the others are found.
         factors: of the measured maps.
-
-    Raises:
-        ValueError: an argument that the files need is missing, or a file is missing, damaged, or does not fit.
-
     """
     if intrinsics is None:
         raise ValueError(
@@ -109,7 +90,7 @@ def load_frame(
     else:
         rgb = read_picture(path)
         samples = _metres(samples_path, *read_samples(samples_path), depth_range)
-        expect_size(samples_path, tuple(samples.shape[1:]), tuple(rgb.shape[1:]))
+        expect_size(samples_path, samples, tuple(rgb.shape[1:]))
     camera = given_camera(intrinsics, (rgb.shape[1], rgb.shape[2]))
     measured: dict[float, Tensor] = {}
     if samples is not None:
@@ -118,12 +99,7 @@ def load_frame(
 
 
 def read_samples(path: Path) -> tuple[Tensor, Tensor]:
-    """Return the levels of a ``*_depth.bmp`` over 255, (1, H, W) float64 in [0, 1], and where there is a sample, bool.
-
-    Raises:
-        ValueError: it is missing, damaged, not of 8 bits, or without a sample.
-
-    """
+    """Return the levels of a ``*_depth.bmp`` over 255, (1, H, W) float64, and where there is a sample, bool."""
     levels = torch.from_numpy(read_levels(path))[None]
     if not levels.any():
         raise ValueError(f"{path}: expected at least one sample, all pixels are 0")
@@ -133,19 +109,9 @@ def read_samples(path: Path) -> tuple[Tensor, Tensor]:
 def read_matrices(
     path: Path, variables: Mapping[str, str] | None = None
 ) -> tuple[Tensor, Tensor | None, Tensor | None]:
-    """Read a ``.mat`` file: the picture, the true depth and the samples.
+    """Return the picture, (3, H, W) float32 in [0, 1], and depth and samples, (1, H, W) float64 in metres, of a file.
 
-    Args:
-        path: the file, of MATLAB 5 or 7.3.
-        variables: names of variables, a field of a structure as "structure.field", by "intensity", "depth", "samples".
-
-    Returns:
-        (3, H, W) float32 in [0, 1], and (1, H, W) float64 in metres, NaN in holes, for depth and samples, None for what
-        there is not.
-
-    Raises:
-        ValueError: the file is missing or damaged, or its variables are not certain; the message lists them.
-
+    None stands for what there is not. ``variables`` names variables, a field of a structure as "structure.field".
     """
     found = read_variables(path)
     chosen = dict(variables or {})
@@ -166,19 +132,7 @@ def read_matrices(
 
 
 def block_means(depth: Tensor, factor: int) -> Tensor:
-    """Return the mean of the known depths in each ``factor`` x ``factor`` block, taken of 1/z, as depth.
-
-    Args:
-        depth: (1, H, W) metres, NaN where there is no sample.
-        factor: rows and columns of a block; those beyond the last whole block are left out.
-
-    Returns:
-        (1, H // factor, W // factor) metres, NaN where a block has no sample.
-
-    Raises:
-        ValueError: the factor is not positive, or larger than the map.
-
-    """
+    """Return the mean of 1/z in each ``factor`` x ``factor`` block of a depth map (1, H, W), as depth."""
     if not 1 <= factor <= min(depth.shape[1:]):
         raise ValueError(f"factors: expected from 1 to {min(depth.shape[1:])}, got {factor}")
     height, width = depth.shape[1] // factor, depth.shape[2] // factor
@@ -255,8 +209,7 @@ def _listed(found: Mapping[str, np.ndarray]) -> str:
 
 
 SCENES = ("books", "devil", "shark")
-ESTIMATED = (549.2, 549.2, 375.2, 334.3)
-"""fx, fy, cx, cy in pixels of the 610 x 810 photos."""
+ESTIMATED = (549.2, 549.2, 375.2, 334.3)  # fx, fy, cx, cy in pixels of the 610 x 810 photos
 
 
 class ToFMark(PreparedDataset):
@@ -268,9 +221,6 @@ class ToFMark(PreparedDataset):
         intrinsics: fx, fy, cx, cy in pixels; None for the estimated ones.
         depth_range: depth in metres of levels 1 and 255 of the pictures, which hold no scale.
         variables: names of ``intensity``, ``depth`` and ``samples`` in the ``.mat`` files, where they are not found.
-
-    Raises:
-        ValueError: a scene is not on disk, or a value is out of range.
 
     """
 

@@ -16,25 +16,8 @@ from functools import lru_cache
 import numpy as np
 
 from dsr.geometry.camera import VIRTUAL_BASELINE, Camera
-from dsr.synthetic.ray_surfaces import (
-    CLOUD,
-    DUSK,
-    Array,
-    Box,
-    Cylinder,
-    Field,
-    Plane,
-    Sphere,
-    blobs,
-    marble,
-    mosaic,
-    noise,
-    plain,
-    rotation,
-    unroll_chart,
-    weave,
-)
-from dsr.synthetic.raycast import Body, Implicit, World, area_light, render
+from dsr.synthetic import raycast as rc
+from dsr.synthetic.raycast import Array, Body, Field, mix, noise, rotation
 from dsr.synthetic.rendering import Rendering
 
 Vector = tuple[float, float, float]
@@ -248,51 +231,120 @@ _PARTS: tuple[tuple[Vector, Vector, Field], ...] = (
     ((0.07, 0.55, -0.10), (0.40, 1.57, 0.26), _lowered_arm),
     ((-0.90, 0.85, -0.28), (0.90, 2.26, -0.02), _wings),
 )
+_CLAY = np.array(((0.06, 0.07, 0.13), (0.10, 0.26, 0.30), (0.72, 0.64, 0.48), (0.70, 0.28, 0.12), (0.36, 0.09, 0.07)))
+_CLOUD = np.array(((0.45, 0.10, 0.16), (0.80, 0.30, 0.12), (0.85, 0.72, 0.42), (0.55, 0.62, 0.30), (0.10, 0.36, 0.30)))
+_DUSK = np.array(((0.13, 0.15, 0.33), (0.24, 0.38, 0.58), (0.60, 0.68, 0.72), (0.66, 0.56, 0.62), (0.34, 0.22, 0.40)))
 
 
-def render_scene(name: str, size: int = 512) -> Rendering:
-    """Return one of :data:`SCENES` at ``size`` x ``size`` pixels; the view is the same at any size."""
-    centre = (size - 1) / 2
-    camera = Camera(size, size, FOCAL * size, FOCAL * size, centre, centre, baseline=VIRTUAL_BASELINE)
-    return Rendering(*render(build_scene(name), camera), camera)
+def _plain(*rgb: float) -> Field:
+    """Return the paint of one linear RGB colour."""
+    return lambda points: np.broadcast_to(np.array(rgb)[:, None], points.shape)
 
 
-@lru_cache
-def build_scene(name: str) -> World:
-    """Return the bodies and lights of the scene ``name``; the last body is the back wall."""
-    if name not in SCENES:
-        raise ValueError(f"scene: expected one of {', '.join(SCENES)}, got {name!r}")
-    wall = Plane(np.array([0.0, 0.0, WALL_Z]), np.array([0.0, 0.0, -1.0]))
-    middle = np.array([-1.75, -2.05, 0.6])
-    if name == "statue":
-        base = np.array(STATUE_BASE)
-        bounds = Box(base - [0.0, 1.13, 0.0], np.eye(3), np.array([0.95, 1.135, 0.46]))
-        statue = Implicit(lambda p: statue_distance((p - base[:, None]) * [[1.0], [-1.0], [-1.0]]), bounds, 0.95)
-        floor = Plane(base, np.array([0.0, -1.0, 0.0]))
-        lights = area_light(middle, np.array([0.32, 0.0, 0.24]), np.array([0.08, 0.24, -0.28]), 3)
-        bodies = (Body(statue, _stone), Body(floor, plain(0.30, 0.29, 0.28)), Body(wall, plain(0.20, 0.24, 0.29)))
-        return World(bodies, lights, spread=0.18)
-    style = name.split("_")[-2]  # high, low or no
-    clay = plain(0.62, 0.60, 0.57)
-    if name.startswith("cube"):
-        cube = Box(np.array([0.0, 0.02, 3.1]), rotation(41.0, -31.0, 7.0), np.full(3, 0.44))
-        # the faces lie in the middle of a layer of the solid mosaic
-        shown = [Body(cube, mosaic(cube.to_local, 0.44 / 14, 11) if style == "high" else clay)]
-    else:
-        sphere = Sphere(np.array([-0.45, 0.33, 2.84]), np.eye(3), 0.45)
-        cylinder = Cylinder(np.array([0.40, -0.03, 3.2]), rotation(0.0, 33.0, 14.0), 0.37, 0.64)
-        paints = [clay, clay]
-        if style == "high":
-            paints = [marble(sphere.to_local), mosaic(unroll_chart(cylinder), 2 * np.pi * 0.37 / 76, 12)]
-        elif style == "low":
-            paints = [blobs(sphere.to_local, 0.25, 21, CLOUD), blobs(cylinder.to_local, 0.25, 22, CLOUD)]
-        shown = [Body(sphere, paints[0]), Body(cylinder, paints[1])]
-    cloths: dict[str, Field] = {"high": weave, "low": blobs(lambda p: p, 0.45, 23, DUSK), "no": plain(0.60, 0.62, 0.65)}
-    lights = area_light(middle, np.array([0.42, 0.0, 0.3]), np.array([0.1, 0.3, -0.35]), 9)
-    return World((*shown, Body(wall, cloths[style])), lights, spread=0.06)
+def _mosaic(chart: Field, cell: float, seed: int) -> Field:
+    """Return a mosaic of small tiles of ``cell`` metres in the coordinates of ``chart``: random hue, dark joints."""
+
+    def paint(points: Array) -> Array:
+        place = chart(points) / cell + 0.5
+        tile = np.floor(place).astype(np.intp)
+        hue = rc.random_table(seed)[tuple(tile & 31)]
+        checker = np.where(tile.sum(0) % 2, 0.35 * hue, 0.45 + 0.55 * hue)
+        edge = np.abs(place - tile - 0.5).max(0)
+        grain = 0.8 + 0.4 * noise(points, 0.006, seed)
+        return np.where(edge > 0.43, 0.10, mix(_CLAY, checker)) * grain
+
+    return paint
+
+
+def _marble(chart: Field) -> Field:
+    """Return fine warped veins through the solid."""
+
+    def paint(points: Array) -> Array:
+        p = chart(points)
+        warp = noise(p, 0.22, 31) + 0.5 * noise(p, 0.09, 32) + 0.25 * noise(p, 0.035, 33)
+        vein = 0.5 + 0.5 * np.sin(130 * (0.35 * p[0] + p[1]) + 17 * warp)
+        return mix(_CLAY, 0.15 + 0.75 * vein) * (0.75 + 0.5 * noise(p, 0.007, 34))
+
+    return paint
+
+
+def _blobs(chart: Field, cell: float, seed: int, palette: Array) -> Field:
+    """Return broad blobs of colour, about ``cell`` metres wide."""
+
+    def paint(points: Array) -> Array:
+        p = chart(points) + 3.7 * cell
+        value = 0.7 * noise(rc.TILT @ p, cell, seed, 3) + 0.3 * noise(p, cell / 2, seed + 50, 3)
+        return mix(palette, np.clip(3.2 * value - 1.1, 0, 1))
+
+    return paint
+
+
+def _weave(points: Array) -> Array:
+    """Return the cloth on the wall: a herringbone of two greys with a fine grain."""
+    x, y = points[0], points[1] + 0.012 * noise(points, 0.15, 41)
+    zigzag = np.abs((x / 0.28) % 1 - 0.5) * 0.28
+    stripe = 0.5 + 0.5 * np.clip(3 * np.sin(2 * np.pi * (y + zigzag) / 0.052), -1, 1)
+    grain = 0.65 + 0.7 * noise(points, 0.011, 42)
+    return mix(np.array([[0.16, 0.20, 0.26], [0.62, 0.60, 0.54]]), stripe) * grain
+
+
+def _unroll_chart(cylinder: rc.Cylinder) -> Field:
+    """Return the chart that maps points to the cylinder's (arc length, height, depth below the side) in metres."""
+
+    def unroll(points: Array) -> Array:
+        x, y, z = cylinder.to_local(points)
+        below = cylinder.radius - np.hypot(x, z)
+        cap = cylinder.half - np.abs(y) < np.abs(below)
+        arc = np.arctan2(z, x) * cylinder.radius
+        return np.where(cap, np.stack((x, z, np.sign(y) + 0 * x)), np.stack((arc, y, 0 * x)))
+
+    return unroll
 
 
 def _stone(points: Array) -> Array:
     """Return light grey with faint mottling."""
     shade = 0.95 + 0.05 * noise(points, 0.05, 51) + 0.05 * noise(points, 0.008, 52)
     return np.array([[0.66], [0.64], [0.60]]) * shade
+
+
+def render_scene(name: str, size: int = 512) -> Rendering:
+    """Return one of :data:`SCENES` at ``size`` x ``size`` pixels; the view is the same at any size."""
+    centre = (size - 1) / 2
+    camera = Camera(size, size, FOCAL * size, FOCAL * size, centre, centre, baseline=VIRTUAL_BASELINE)
+    return Rendering(*rc.render(build_scene(name), camera), camera)
+
+
+@lru_cache
+def build_scene(name: str) -> rc.World:
+    """Return the bodies and lights of the scene ``name``; the last body is the back wall."""
+    if name not in SCENES:
+        raise ValueError(f"scene: expected one of {', '.join(SCENES)}, got {name!r}")
+    wall = rc.Plane(np.array([0.0, 0.0, WALL_Z]), np.array([0.0, 0.0, -1.0]))
+    middle = np.array([-1.75, -2.05, 0.6])
+    if name == "statue":
+        base = np.array(STATUE_BASE)
+        bounds = rc.Box(base - [0.0, 1.13, 0.0], np.eye(3), np.array([0.95, 1.135, 0.46]))
+        statue = rc.Implicit(lambda p: statue_distance((p - base[:, None]) * [[1.0], [-1.0], [-1.0]]), bounds, 0.95)
+        floor = rc.Plane(base, np.array([0.0, -1.0, 0.0]))
+        lights = rc.area_light(middle, np.array([0.32, 0.0, 0.24]), np.array([0.08, 0.24, -0.28]), 3)
+        bodies = (Body(statue, _stone), Body(floor, _plain(0.30, 0.29, 0.28)), Body(wall, _plain(0.20, 0.24, 0.29)))
+        return rc.World(bodies, lights, spread=0.18)
+    style = name.split("_")[-2]  # high, low or no
+    clay = _plain(0.62, 0.60, 0.57)
+    if name.startswith("cube"):
+        cube = rc.Box(np.array([0.0, 0.02, 3.1]), rotation(41.0, -31.0, 7.0), np.full(3, 0.44))
+        # the faces lie in the middle of a layer of the solid mosaic
+        shown = [Body(cube, _mosaic(cube.to_local, 0.44 / 14, 11) if style == "high" else clay)]
+    else:
+        sphere = rc.Sphere(np.array([-0.45, 0.33, 2.84]), np.eye(3), 0.45)
+        cylinder = rc.Cylinder(np.array([0.40, -0.03, 3.2]), rotation(0.0, 33.0, 14.0), 0.37, 0.64)
+        paints = [clay, clay]
+        if style == "high":
+            paints = [_marble(sphere.to_local), _mosaic(_unroll_chart(cylinder), 2 * np.pi * 0.37 / 76, 12)]
+        elif style == "low":
+            paints = [_blobs(sphere.to_local, 0.25, 21, _CLOUD), _blobs(cylinder.to_local, 0.25, 22, _CLOUD)]
+        shown = [Body(sphere, paints[0]), Body(cylinder, paints[1])]
+    cloths: dict[str, Field] = {"high": _weave, "no": _plain(0.60, 0.62, 0.65)}
+    cloths["low"] = _blobs(lambda p: p, 0.45, 23, _DUSK)
+    lights = rc.area_light(middle, np.array([0.42, 0.0, 0.3]), np.array([0.1, 0.3, -0.35]), 9)
+    return rc.World((*shown, Body(wall, cloths[style])), lights, spread=0.06)

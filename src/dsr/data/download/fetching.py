@@ -39,18 +39,12 @@ from dsr.utils.guards import files_in, leads_outside, natural_key, opened, parse
 from dsr.utils.progress import Progress, Task, megabytes
 from dsr.utils.versions import file_hash
 
-RETRIES = Retry(
-    3,
-    backoff_factor=1.0,
-    status_forcelist=(408, 425, 429, 500, 502, 503, 504),
-    raise_on_status=False,
-    respect_retry_after_header=False,
+_BUSY = (408, 425, 429, 500, 502, 503, 504)
+RETRIES = Retry(  # of a server that does not answer, or is busy
+    3, backoff_factor=1.0, status_forcelist=_BUSY, raise_on_status=False, respect_retry_after_header=False
 )
-"""How often a server that does not answer, or is busy, is asked again."""
-_TIMEOUT = (10.0, 60.0)
-"""Seconds for a connection, and between two pieces of an answer."""
-_UNPACKED = 1.25
-"""Size of what an archive of pictures unpacks to, as a multiple of its own: for a first check of the disk."""
+_TIMEOUT = (10.0, 60.0)  # seconds for a connection, and between two pieces of an answer
+_UNPACKED = 1.25  # size of what an archive of pictures unpacks to, as a multiple of its own, for a check of the disk
 _CHUNK = 1 << 16
 _PAGE = (b"<!doctype", b"<html", b"<head")
 _BEGINNINGS: Mapping[str, tuple[bytes, ...]] = {
@@ -58,14 +52,11 @@ _BEGINNINGS: Mapping[str, tuple[bytes, ...]] = {
     ".pfm": (b"Pf", b"PF"), ".pgm": (b"P2", b"P5"), ".png": (b"\x89PNG\r\n\x1a\n",), ".ppm": (b"P3", b"P6"),
     ".safetensors": (b"{",), ".zip": (b"PK",),
 }  # fmt: skip
-_COUNTED = {".safetensors": 8}
-"""Bytes before that beginning, which count something."""
-_DAMAGE = (
+_COUNTED = {".safetensors": 8}  # bytes before that beginning, which count something
+_DAMAGE = (  # an OSError without a number is gzip's, an invalid argument a place before the file's beginning
     zipfile.BadZipFile, tarfile.TarError, EOFError, zlib.error, lzma.LZMAError, KeyError, RuntimeError, UnicodeError,
     OSError,
 )  # fmt: skip
-"""What a damaged or encrypted archive raises; an OSError without a number is gzip's, and an invalid argument is a place
-before the file's beginning."""
 
 
 class _BrokenOffError(ValueError):
@@ -74,30 +65,15 @@ class _BrokenOffError(ValueError):
 
 @dataclass(frozen=True)
 class Entry:
-    """What is known of a file.
+    """What is known of a file."""
 
-    Args:
-        sha256: its checksum; None for an archive that the user unpacked.
-        size: in bytes.
-        files: of an archive, the sizes of the files that it unpacked to, by their path in its directory.
-
-    """
-
-    sha256: str | None
-    size: int
-    files: Mapping[str, int] | None = None
+    sha256: str | None  # None for an archive that the user unpacked
+    size: int  # in bytes
+    files: Mapping[str, int] | None = None  # of an archive, the sizes of what it unpacked to, by path in its directory
 
 
 class Checksums(dict[str, Entry]):
-    """The entries of ``checksums.json``, by path below the directory of the data sets.
-
-    Args:
-        root: that directory.
-
-    Raises:
-        ValueError: the file is damaged.
-
-    """
+    """The entries of ``checksums.json``, by path below the directory of the data sets."""
 
     def __init__(self, root: Path) -> None:
         super().__init__()
@@ -143,12 +119,7 @@ def _entry(name: str, fields: Any) -> Entry:
 
 @contextlib.contextmanager
 def lock_directory(root: Path) -> Iterator[None]:
-    """Lock the directory of the data sets, if it exists and can be written, against other ``dsr data`` commands.
-
-    Raises:
-        ValueError: another command has locked it.
-
-    """
+    """Lock the directory of the data sets, if it exists and can be written, against other ``dsr data`` commands."""
     with (
         refusing(f"{root}: another `dsr data` command is writing there; wait for it to end", Timeout),
         FileLock(root / ".dsr-data.lock", blocking=False) if os.access(root, os.W_OK) else contextlib.nullcontext(),
@@ -165,24 +136,12 @@ def get(
     accept_changed: bool = False,
     keep_archives: bool = False,
 ) -> list[str]:
-    """Fetch files that are missing or differ from their record.
+    """Fetch files that are missing or differ from their record; return what could not be had and why, a line each.
 
-    An interruption keeps what has come of a file beside it, ``.part``, and the next call goes on from there.
-
-    Args:
-        items: what to fetch; a path that occurs twice is fetched once.
-        mirror: address of a server to try first; it has each file under its path below the directory of the data sets.
-            A name and a password in it, ``https://name:password@host``, are sent, and neither shown nor stored.
-        accept_changed: whether a file may have another checksum than recorded.
-        keep_archives: whether archives stay after they were unpacked; those that were there before do anyway.
-
-    Returns:
-        What could not be had and why, a line each; the others are there. A full disk ends it.
-
-    Raises:
-        ValueError: ``checksums.json`` is damaged, another command is writing into ``root``, or the mirror is no
-            address.
-
+    An interruption keeps what has come of a file beside it, ``.part``, and the next call goes on from there. A full
+    disk ends the call. ``mirror`` is the address of a server to try first, which has each file under its path; name
+    and password in it, ``https://name:password@host``, are sent, and neither shown nor stored. ``accept_changed``
+    takes files with another checksum than recorded. Archives that were there before are kept anyway.
     """
     problems: list[str] = []
     server = None if mirror is None else Server.of(mirror)
@@ -199,8 +158,7 @@ def get(
     return problems
 
 
-_Credentials = tuple[bytes, bytes] | None
-"""A name and a password, as they are sent."""
+_Credentials = tuple[bytes, bytes] | None  # A name and a password, as they are sent
 
 
 class Server(NamedTuple):
@@ -211,12 +169,7 @@ class Server(NamedTuple):
 
     @classmethod
     def of(cls, given: str) -> Server:
-        """Return the server of an address, which may have a name and a password.
-
-        Raises:
-            ValueError: it is no address, or has an @ in its path; the message is without name and password.
-
-        """
+        """Return the server of an address, which may have a name and a password."""
         scheme, _, rest = given.partition("://")
         before, at, place = rest.rpartition("@")
         address = f"{scheme}://{place}".rstrip("/")
@@ -434,22 +387,11 @@ def _read_note(part: Path, url: str) -> dict[str, Any]:
 
 
 def unpack(archive: Path, target: Path, moved: Task, contains: Sequence[str] = ()) -> dict[str, int]:
-    """Unpack a zip or tar archive into a directory, beside the files that are there already.
+    """Unpack a zip or tar archive into a directory, and return the sizes of the files by their path in it.
 
     Everything is unpacked beside ``target`` first; an interruption before the end leaves nothing in it. Links become
-    copies of the files that they lead to; those to directories are left out.
-
-    Args:
-        moved: gets how many bytes are unpacked, and of how many.
-        contains: what the archive must have.
-
-    Returns:
-        The sizes of the files, by their path in ``target``.
-
-    Raises:
-        ValueError: it is damaged or no archive, lacks something, or has a member that leads outside ``target``.
-        FullDiskError: the disk is too small for what it declares, or is full.
-
+    copies of the files that they lead to; those to directories are left out. An archive that is damaged, lacks one of
+    ``contains``, or has a member that leads outside ``target`` is refused.
     """
     files: dict[str, int] = {}
     with temporary_folder(target.parent, target.name) as work:
@@ -524,12 +466,7 @@ def _take_member(archive: Path, name: str, path: Path) -> None:
 
 
 def state(collection: Collection, root: Path) -> str:
-    """Return ``complete``, ``partial N of M``, ``absent`` or ``manual``, judged by names and sizes.
-
-    Raises:
-        ValueError: ``checksums.json`` is damaged.
-
-    """
+    """Return ``complete``, ``partial N of M``, ``absent`` or ``manual``, judged by names and sizes."""
     if not collection.items:
         found = all(any(_matches(collection, root, pattern)) for pattern in collection.patterns)
         return "complete" if found else "manual"
@@ -540,15 +477,9 @@ def state(collection: Collection, root: Path) -> str:
 
 
 def checksums_of(collection: Collection, root: Path) -> str:
-    """Return where the checksums are from that a collection's files have to have.
+    """Return ``pinned``, ``noted`` or ``unknown`` for the checksums that a collection's files have to have.
 
-    Returns:
-        ``pinned`` for those that dsr knows, ``noted`` for those that were written down when the files first came,
-        ``unknown`` for those that will be, and how many there are of each where there are several kinds.
-
-    Raises:
-        ValueError: ``checksums.json`` is damaged.
-
+    dsr knows the pinned ones; the others are noted when the files first come. Several kinds are counted.
     """
     recorded = {name for name, entry in Checksums(root).items() if entry.sha256 is not None}
     if not collection.items:
@@ -568,20 +499,10 @@ def absent(items: Iterable[Item], root: Path) -> list[Item]:
 
 
 def verify(collection: Collection, root: Path, progress: Progress, *, accept_changed: bool = False) -> list[str]:
-    """Check the files of a collection against their recorded sizes and checksums; those without get them recorded.
+    """Check the files of a collection against their records, and return what is wrong, a line each.
 
-    Of unpacked archives the names and sizes of the files are checked.
-
-    Args:
-        collection: what to check.
-        accept_changed: whether to record anew what differs.
-
-    Returns:
-        What is wrong, a line each.
-
-    Raises:
-        ValueError: ``checksums.json`` is damaged, or another command is writing into ``root``.
-
+    Files without a record get one; ``accept_changed`` records anew what differs. Of unpacked archives the names and
+    sizes of the files are checked.
     """
     new: dict[str, Entry] = {}
     with lock_directory(root):

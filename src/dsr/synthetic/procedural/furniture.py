@@ -9,15 +9,11 @@ import numpy as np
 
 from dsr.synthetic.procedural.organic import plant
 from dsr.synthetic.procedural.reliefs import blanket
-from dsr.synthetic.procedural.shape import Shape, box, extrusion, lathe, merge, rotation_about, tube
+from dsr.synthetic.procedural.shape import Shape, box, extrusion, lathe, merge, tube
 from dsr.synthetic.procedural.solids import frustum, hollow, random_solid, rounded_box
-from dsr.synthetic.ray_surfaces import Array
+from dsr.synthetic.raycast import Array
 
 Parts = list[Shape]
-
-
-def _at(shape: Shape, x: float, y: float, z: float) -> Shape:
-    return shape.translate([x, y, z])
 
 
 def _rod(start: Array | list[float], end: Array | list[float], radius: float) -> Shape:
@@ -25,7 +21,7 @@ def _rod(start: Array | list[float], end: Array | list[float], radius: float) ->
     return tube(np.linspace(start, end, 3), radius, 14)
 
 
-def table(rng: np.random.Generator, size: Array | None = None, height: float | None = None) -> Parts:
+def table(rng: np.random.Generator, size: tuple[float, float] | None = None, height: float | None = None) -> Parts:
     """Return [top, legs] of a table, desk or stool."""
     wide, deep = rng.uniform([0.8, 0.5], [1.8, 1.0]) if size is None else size
     high = rng.uniform(0.4, 0.8) if height is None else height
@@ -34,25 +30,25 @@ def table(rng: np.random.Generator, size: Array | None = None, height: float | N
     if kind == 0:  # round, on one foot
         radius = min(wide, deep) / 2
         foot = merge([frustum(0.6 * radius, 0.55 * radius, 0.03), frustum(0.04, 0.04, high - thick)])
-        return [_at(frustum(radius, radius, thick), 0, 0, high - thick), foot]
-    top = _at(rounded_box(np.array([wide, deep, thick]), 0.3 * thick, 4), 0, 0, high - thick)
+        return [frustum(radius, radius, thick).translate(0, 0, high - thick), foot]
+    top = rounded_box(np.array([wide, deep, thick]), 0.3 * thick, 4).translate(0, 0, high - thick)
     spots = [(sx * (wide / 2 - inset), sy * (deep / 2 - inset)) for sx in (-1, 1) for sy in (-1, 1)]
     if kind == 1:  # slanted round legs
         legs = [_rod([0.9 * x, 0.9 * y, high - thick], [x, y, 0], rng.uniform(0.015, 0.03)) for x, y in spots]
         return [top, merge(legs)]
     if kind == 2:  # two side boards
         side = box([thick, 0.94 * deep, high - thick])
-        return [top, merge([_at(side, s * (wide / 2 - inset), 0, 0) for s in (-1, 1)])]
+        return [top, merge([side.translate(s * (wide / 2 - inset), 0, 0) for s in (-1, 1)])]
     leg = box([*[rng.uniform(0.035, 0.08)] * 2, high - thick])
     rail = box([wide - 2 * inset, 0.02, 0.08])
-    rails = [_at(rail, 0, s * (deep / 2 - inset), high - thick - 0.08) for s in (-1, 1)]
-    return [top, merge([_at(leg, x, y, 0) for x, y in spots] + rails)]
+    rails = [rail.translate(0, s * (deep / 2 - inset), high - thick - 0.08) for s in (-1, 1)]
+    return [top, merge([leg.translate(x, y, 0) for x, y in spots] + rails)]
 
 
 def chair(rng: np.random.Generator) -> Parts:
     """Return [seat and back, legs and slats] of a chair."""
     wide, deep, seat, back = rng.uniform([0.38, 0.38, 0.42, 0.4], [0.5, 0.5, 0.5, 0.65])
-    pillow = _at(rounded_box(np.array([wide, deep, 0.05]), 0.02, 5), 0, 0, seat - 0.05)
+    pillow = rounded_box(np.array([wide, deep, 0.05]), 0.02, 5).translate(0, 0, seat - 0.05)
     radius = rng.uniform(0.012, 0.025)
     bars = []
     for s in (-1, 1):
@@ -64,9 +60,9 @@ def chair(rng: np.random.Generator) -> Parts:
             x = (k + 0.5) / 6.5 * wide - wide / 2 + 0.03
             bars.append(_rod([x, deep / 2 - 0.03, seat], [x, deep / 2 - 0.03, seat + 0.92 * back], 0.4 * radius))
         board = box([wide - 0.04, 0.02, 0.08])
-        return [merge([pillow, _at(board, 0, deep / 2 - 0.03, seat + back - 0.1)]), merge(bars)]
+        return [merge([pillow, board.translate(0, deep / 2 - 0.03, seat + back - 0.1)]), merge(bars)]
     panel = rounded_box(np.array([wide - 0.03, 0.035, 0.7 * back]), 0.015, 4)
-    return [merge([pillow, _at(panel, 0, deep / 2 - 0.03, seat + 0.28 * back)]), merge(bars)]
+    return [merge([pillow, panel.translate(0, deep / 2 - 0.03, seat + 0.28 * back)]), merge(bars)]
 
 
 def sofa(rng: np.random.Generator) -> Parts:
@@ -74,16 +70,16 @@ def sofa(rng: np.random.Generator) -> Parts:
     seats = int(rng.integers(1, 4))
     width, deep, seat = 0.62 * seats, rng.uniform(0.6, 0.75), rng.uniform(0.36, 0.45)
     arm, r = rng.uniform(0.12, 0.22), rng.uniform(0.02, 0.07)
-    body = [_at(rounded_box(np.array([width + 2 * arm, deep, seat - 0.12]), 0.02), 0, 0, 0.03)]
+    body = [rounded_box(np.array([width + 2 * arm, deep, seat - 0.12]), 0.02).translate(0, 0, 0.03)]
     high = seat + rng.uniform(0.1, 0.25)
-    body += [_at(rounded_box(np.array([arm, deep, high]), r), s * (width + arm) / 2, 0, 0.02) for s in (-1, 1)]
-    body += [_at(rounded_box(np.array([width + 1.6 * arm, 0.2, seat + 0.42]), r), 0, deep / 2 - 0.08, 0.02)]
+    body += [rounded_box(np.array([arm, deep, high]), r).translate(s * (width + arm) / 2, 0, 0.02) for s in (-1, 1)]
+    body += [rounded_box(np.array([width + 1.6 * arm, 0.2, seat + 0.42]), r).translate(0, deep / 2 - 0.08, 0.02)]
     soft = []
     for k in range(seats):
         x = (k - (seats - 1) / 2) * 0.62
-        soft.append(_at(rounded_box(np.array([0.6, deep - 0.18, 0.16]), 0.05), x, -0.07, seat - 0.1))
-        pillow = blanket(rng, np.array([0.5, 0.45]), 0.13, 60).rotate(rotation_about(0, 68 + rng.uniform(-8, 8)))
-        soft.append(_at(pillow.rotate(rotation_about(2, rng.uniform(-15, 15))), x, deep / 2 - 0.3, seat + 0.28))
+        soft.append(rounded_box(np.array([0.6, deep - 0.18, 0.16]), 0.05).translate(x, -0.07, seat - 0.1))
+        pillow = blanket(rng, np.array([0.5, 0.45]), 0.13, 60).turn(0, 68 + rng.uniform(-8, 8))
+        soft.append(pillow.turn(2, rng.uniform(-15, 15)).translate(x, deep / 2 - 0.3, seat + 0.28))
     return [merge(body), merge(soft)]
 
 
@@ -92,11 +88,11 @@ def shelf(rng: np.random.Generator, *, low: bool = False) -> Parts:
     wide, deep = rng.uniform(0.6, 1.6), rng.uniform(0.25, 0.4)
     rows = int(rng.integers(2, 4) if low else rng.integers(3, 6))
     pitch, thick = rng.uniform(0.28, 0.4), rng.uniform(0.015, 0.035)
-    boards = [_at(box([wide - thick, deep - 0.005, thick]), 0, 0, k * pitch) for k in range(rows + 1)]
+    boards = [box([wide - thick, deep - 0.005, thick]).translate(0, 0, k * pitch) for k in range(rows + 1)]
     side = box([thick, deep, rows * pitch + thick])
-    boards += [_at(side, s * wide / 2, 0, 0.001) for s in (-1, 1)]
+    boards += [side.translate(s * wide / 2, 0, 0.001) for s in (-1, 1)]
     if rng.random() < 0.7:
-        boards.append(_at(box([wide - thick, 0.01, rows * pitch]), 0, deep / 2 - 0.006, 0.002))
+        boards.append(box([wide - thick, 0.01, rows * pitch]).translate(0, deep / 2 - 0.006, 0.002))
     groups: list[Parts] = [[], [], [], []]
     for k in range(rows):
         x = -wide / 2 + 2 * thick
@@ -115,17 +111,17 @@ def _shelf_item(rng: np.random.Generator, groups: list[Parts], at: Array, room: 
         book = box([wide - 0.002, deep, high])
         if rng.random() < 0.08:
             lean = rng.uniform(5, 14)
-            book = book.rotate(rotation_about(1, lean))
-            book = book.translate([0, 0, -book.vertices[:, 2].min()])
+            book = book.turn(1, lean)
+            book = book.translate(0, 0, -book.vertices[:, 2].min())
             wide += 0.25 * high
-        group.append(_at(book, at[0] + wide / 2, -at[1] / 2 + deep / 2 + rng.uniform(0.01, 0.04), at[2]))
+        group.append(book.translate(at[0] + wide / 2, -at[1] / 2 + deep / 2 + rng.uniform(0.01, 0.04), at[2]))
         return float(wide)
     if kind < 0.9:
         size = rng.uniform(0.1, 0.9 * min(room, at[1]))
         thing = random_solid(rng).scale(size)
         wide = np.ptp(thing.vertices[:, 0])
         if np.ptp(thing.vertices[:, 2]) < room and wide < 0.25:
-            group.append(_at(thing, at[0] + wide / 2, rng.uniform(-0.2, 0.1) * at[1], at[2]))
+            group.append(thing.translate(at[0] + wide / 2, rng.uniform(-0.2, 0.1) * at[1], at[2]))
         return float(wide + 0.02)
     return float(rng.uniform(0.03, 0.15))
 
@@ -140,9 +136,9 @@ def cabinet(rng: np.random.Generator) -> Parts:
     for i in range(columns):
         for j in range(rows):
             x, z = (i + 0.5) * w - wide / 2, 0.05 + j * h
-            body.append(_at(box([w - 2 * gap, out, h - 2 * gap]), x, -deep / 2 - out / 2 + 1e-3, z + gap))
-            knob = frustum(0.014, 0.018, 0.03).rotate(rotation_about(0, 90))
-            knobs.append(_at(knob, x + 0.35 * w * (rows < 3), -deep / 2 - out, z + 0.5 * h))
+            body.append(box([w - 2 * gap, out, h - 2 * gap]).translate(x, -deep / 2 - out / 2 + 1e-3, z + gap))
+            knob = frustum(0.014, 0.018, 0.03).turn(0, 90)
+            knobs.append(knob.translate(x + 0.35 * w * (rows < 3), -deep / 2 - out, z + 0.5 * h))
     return [merge(body), merge(knobs)]
 
 
@@ -150,12 +146,8 @@ def lamp(rng: np.random.Generator, height: float) -> Parts:
     """Return [shade, stand] of a lamp."""
     base, top = rng.uniform(0.1, 0.22) * np.sqrt(height), rng.uniform(0.06, 0.15) * np.sqrt(height)
     tall = rng.uniform(0.18, 0.3) * height
-    shade = lathe(
-        [
-            np.array([[base, height - tall], [top, height]]),
-            np.array([[base - 4e-3, height - tall], [top - 4e-3, height]]),
-        ]
-    )
+    outside = np.array([[base, height - tall], [top, height]])
+    shade = lathe([outside, outside - [4e-3, 0]])
     foot = frustum(0.7 * base, 0.6 * base, 0.03)
     return [shade, merge([foot, frustum(0.012, 0.012, height - 0.3 * tall)])]
 
@@ -165,10 +157,9 @@ def pot_plant(rng: np.random.Generator, height: float) -> Parts:
     leaves, stems = plant(rng)
     wide = rng.uniform(0.1, 0.2)
     pot = hollow(wide * np.array([0.7, 0.85, 1.0, 1.05]), 0.28, 0.015)
-    earth = frustum(0.85 * wide, 0.85 * wide, 0.02).translate([0, 0, 0.2])
+    earth = frustum(0.85 * wide, 0.85 * wide, 0.02).translate(0, 0, 0.2)
     return [
-        s.scale(height / 1.2)
-        for s in (leaves.translate([0, 0, 0.2]), merge([stems.translate([0, 0, 0.2]), earth]), pot)
+        s.scale(height / 1.2) for s in (leaves.translate(0, 0, 0.2), merge([stems.translate(0, 0, 0.2), earth]), pot)
     ]
 
 
@@ -177,8 +168,8 @@ def blinds(rng: np.random.Generator, width: float, height: float) -> Parts:
     pitch = rng.uniform(0.03, 0.09)
     count = int(height / pitch)
     if rng.random() < 0.6:
-        slat = box([width, 0.8 * pitch, 0.003]).rotate(rotation_about(0, rng.uniform(-70, 70)))
-        return [merge([_at(slat, width / 2, 0, (k + 0.5) * pitch) for k in range(count)])]
+        slat = box([width, 0.8 * pitch, 0.003]).turn(0, rng.uniform(-70, 70))
+        return [merge([slat.translate(width / 2, 0, (k + 0.5) * pitch) for k in range(count)])]
     radius = rng.uniform(0.005, 0.015)
     bars = [_rod([x, 0, 0], [x, 0, height], radius) for x in np.arange(0, width, 1.6 * pitch)]
     bars += [_rod([0, 0, z], [width, 0, z], 1.5 * radius) for z in (0.0, height)]
@@ -196,8 +187,8 @@ def window(rng: np.random.Generator, width: float, height: float) -> Parts:
         for j in range(rows):
             low, high = np.array([i * w, j * h]) + rim, np.array([(i + 1) * w, (j + 1) * h])
             holes.append(np.array([low, [low[0], high[1]], high, [high[0], low[1]]]))
-    frame = extrusion([outer, *holes], out).rotate(rotation_about(0, 90)).translate([0, 0, 0])
-    pane = box([width - rim, 0.004, height - rim]).translate([width / 2, 0, rim / 2])
+    frame = extrusion([outer, *holes], out).turn(0, 90).translate(0, 0, 0)
+    pane = box([width - rim, 0.004, height - rim]).translate(width / 2, 0, rim / 2)
     return [pane, frame]
 
 
@@ -207,17 +198,20 @@ def picture(rng: np.random.Generator) -> Parts:
     rim, out = rng.uniform(0.015, 0.06), rng.uniform(0.01, 0.04)
     outer = np.array([[-wide, -high], [wide, -high], [wide, high], [-wide, high]]) / 2
     inner = (outer - np.sign(outer) * rim)[::-1]
-    frame = extrusion([outer, inner], out).rotate(rotation_about(0, 90))
-    sheet = box([wide - rim, 0.004, high - rim]).translate([0, 0, -(high - rim) / 2])
+    frame = extrusion([outer, inner], out).turn(0, 90)
+    sheet = box([wide - rim, 0.004, high - rim]).translate(0, 0, -(high - rim) / 2)
     return [sheet, frame]
 
 
 def bed(rng: np.random.Generator) -> Parts:
     """Return [frame, bedding] of a bed whose head is at the largest y."""
     wide, long, high = rng.uniform([0.9, 1.9, 0.3], [1.6, 2.1, 0.5])
-    frame = [_at(box([wide, long, 0.6 * high]), 0, 0, 0.05), _at(box([wide, 0.05, high + 0.5]), 0, long / 2, 0)]
-    bedding = [_at(rounded_box(np.array([wide, long - 0.05, 0.2]), 0.06), 0, -0.02, high - 0.18)]
-    bedding.append(_at(blanket(rng, np.array([wide + 0.1, 1.3]), 0.14, 200), 0, -0.3, high - 0.03))
+    frame = [
+        box([wide, long, 0.6 * high]).translate(0, 0, 0.05),
+        box([wide, 0.05, high + 0.5]).translate(0, long / 2, 0),
+    ]
+    bedding = [rounded_box(np.array([wide, long - 0.05, 0.2]), 0.06).translate(0, -0.02, high - 0.18)]
+    bedding.append(blanket(rng, np.array([wide + 0.1, 1.3]), 0.14, 200).translate(0, -0.3, high - 0.03))
     for s in (-1, 1) if wide > 1.2 else (0,):
-        bedding.append(_at(blanket(rng, np.array([0.6, 0.4]), 0.16, 80), s * wide / 4, long / 2 - 0.3, high))
+        bedding.append(blanket(rng, np.array([0.6, 0.4]), 0.16, 80).translate(s * wide / 4, long / 2 - 0.3, high))
     return [merge(frame), merge(bedding)]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh  # type: ignore[import-untyped]
@@ -17,17 +18,17 @@ from numpy.typing import NDArray
 
 from dsr.synthetic.procedural.paints import fractal
 from dsr.synthetic.procedural.shape import Index, Shape, merge, unit
-from dsr.synthetic.ray_surfaces import Array
+from dsr.synthetic.raycast import Array
 
 _GRAZING = 0.12  # smallest cosine between ray and normal that a displacement is divided by
 
 Cookie = Callable[[Array], Array]
+Corner = Sequence[float]
 SETS = 16  # number of sets into which the samples of a light are divided; neighbouring pixels use different sets
 _SAMPLES_PER_SET = 3
 
 
-@dataclass(frozen=True, eq=False)
-class Hits:
+class Hits(NamedTuple):
     """The points where N rays from the camera meet the surfaces."""
 
     depth: Array  # (N,) ray parameter, which is the orthogonal depth; inf where nothing is hit
@@ -121,12 +122,12 @@ class Lighting:
     occlusion_distance: float  # metres within which surfaces occlude each other's ambient light
 
 
-def random_lighting(rng: np.random.Generator, tracer: Tracer, seen: Hits, low: Array, high: Array) -> Lighting:
+def random_lighting(rng: np.random.Generator, tracer: Tracer, seen: Hits, low: Corner, high: Corner) -> Lighting:
     """Return random lights for the surfaces of a preview; the lamp may hang in a box from ``low`` to ``high``."""
     middle = np.median(seen.points, axis=1)
     extent = float(np.median(seen.depth))
     points, normals = seen.points, seen.normals
-    best, position = -1.0, high
+    best, position = -1.0, middle
     for _ in range(8):
         way = unit(rng.normal(size=(1, 3)) * [1, 1, 0.6] + [0, -0.5, 0.7])[0]
         spot = np.clip(middle + extent * rng.uniform(0.5, 2.5) * way, low, high)
@@ -147,12 +148,10 @@ def _build(rng: np.random.Generator, position: Array, middle: Array, extent: flo
     frame = np.linalg.svd(unit(toward[None]))[2][1:]  # (2, 3): across the way to the lamp
     cells = _stratified(rng, SETS * _SAMPLES_PER_SET) * 2 - 1
     lamp = position + radius * (cells @ frame).reshape(_SAMPLES_PER_SET, SETS, 3).transpose(1, 0, 2)
-    warm = np.array([1.0, 1.0, 1.0]) + rng.uniform(-0.25, 0.35) * np.array([0.5, 0.0, -0.6])
+    warm = 1.0 + rng.uniform(-0.25, 0.35) * np.array([0.5, 0.0, -0.6])
     ambient_fraction = rng.uniform(0.12, 0.9)
-    ambient, sky = (
-        ambient_fraction * 0.7 * (2 - warm),
-        ambient_fraction * rng.uniform(0.0, 0.6) * np.array([0.9, 1.0, 1.15]),
-    )
+    ambient = ambient_fraction * 0.7 * (2 - warm)
+    sky = ambient_fraction * rng.uniform(0.0, 0.6) * np.array([0.9, 1.0, 1.15])
     cookie = _cookie(rng, frame, middle, distance) if rng.random() < 0.22 else lambda points: np.ones(points.shape[1])
     strength = (1.15 - ambient_fraction) * distance**2
     cells = _stratified(rng, SETS * _SAMPLES_PER_SET)
@@ -195,24 +194,24 @@ def offset_points(hits: Hits, extent: float) -> Array:
     return hits.points + rise * hits.normals
 
 
-def visibility(tracer: Tracer, lighting: Lighting, hits: Hits, which: Index, extent: float) -> tuple[Array, Array]:
-    """Return the visible fractions (N,) of the lamp and of the surroundings, from the sample sets ``which`` (N,)."""
-    start = offset_points(hits, extent)
-    lamp, open_ = np.zeros(len(which)), np.zeros(len(which))
-    n = hits.normals
+def visibility(tracer: Tracer, lighting: Lighting, hits: Hits, which: Index, extent: float) -> Array:
+    """Return the visible fractions (2, N) of lamp and surroundings, from the sample sets ``which`` (N or more,)."""
+    start, n = offset_points(hits, extent), hits.normals
+    which = which[: n.shape[1]]
     side = np.where(np.abs(n[2]) < 0.9, np.stack((-n[1], n[0], 0 * n[2])), np.stack((0 * n[0], -n[2], n[1])))
     side /= np.sqrt((side**2).sum(0))
-    up = np.stack((n[1] * side[2] - n[2] * side[1], n[2] * side[0] - n[0] * side[2], n[0] * side[1] - n[1] * side[0]))
+    up = _cross(n, side)
+    seen = np.zeros((2, len(which)))
     for k in range(_SAMPLES_PER_SET):
         toward = lighting.lamp[which, k].T - start
         facing = np.flatnonzero((toward * n).sum(0) > 0)
-        lamp[facing] += ~tracer.is_blocked(start[:, facing], toward[:, facing])
+        seen[0, facing] += ~tracer.is_blocked(start[:, facing], toward[:, facing])
         a, b, c = lighting.occlusion_distance * lighting.directions[which, k].T
-        open_ += ~tracer.is_blocked(start, a * side + b * up + c * n)
-    return lamp / _SAMPLES_PER_SET, open_ / _SAMPLES_PER_SET
+        seen[1] += ~tracer.is_blocked(start, a * side + b * up + c * n)
+    return seen / _SAMPLES_PER_SET
 
 
-def incident_light(lighting: Lighting, points: Array, normals: Array, seen: tuple[Array, Array]) -> tuple[Array, Array]:
+def incident_light(lighting: Lighting, points: Array, normals: Array, seen: Array) -> tuple[Array, Array]:
     """Return the light (3, N) that arrives at surfaces, and the lamp's at normal incidence (N,) for highlights."""
     toward = lighting.lamp.mean((0, 1))[:, None] - points
     square = (toward**2).sum(0)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -13,7 +14,7 @@ from dsr.synthetic.procedural.paints import PAINTS, Paint, Palette, palette
 from dsr.synthetic.procedural.photo import Body
 from dsr.synthetic.procedural.reliefs import spectrum
 from dsr.synthetic.procedural.shape import Shape, random_rotation
-from dsr.synthetic.ray_surfaces import Array
+from dsr.synthetic.raycast import Array
 
 Image = NDArray[np.uint8]  # (S, S, 3); a value stands for the linear light (value / 255)**2
 _SIDE = 384
@@ -177,10 +178,11 @@ _USUAL_PAINTS: dict[str, tuple[Callable[[np.random.Generator, str, float], Paint
 }
 
 
-class MaterialSampler:
-    """Samples the materials of one scene, from plain to patterned; some scenes have a single paint."""
+class SceneBuilder:
+    """The bodies of one scene, each in a random material, from plain to patterned; some scenes have a single paint."""
 
     def __init__(self, rng: np.random.Generator) -> None:
+        self.bodies: list[Body] = []
         self._rng = rng
         self._pattern_probability = float(rng.choice([0.0, 0.25, 0.6, 0.95], p=[0.12, 0.33, 0.35, 0.2]))
         self._any_colour_probability = float(rng.choice([0.08, 0.3, 0.8]))
@@ -192,17 +194,25 @@ class MaterialSampler:
             self._shared = p.solid_colour(rng, str(rng.choice(["white", "stone", "wall"])), 1.0)
         self._turn = random_rotation(rng)
 
-    def sample_body(self, shape: Shape, family: str, scale: float = 1.0) -> Body:
-        """Return ``shape`` in a random material of ``family`` with a pattern for objects of ``scale`` metres."""
+    def add(self, shape: Shape, family: str, scale: float = 1.0) -> None:
+        """Add a shape in a random material of ``family`` with a pattern for objects of ``scale`` metres."""
+        self.bodies.append(self.sample(shape, family, scale))
+
+    def add_all(self, shapes: Sequence[Shape], families: Sequence[str], scale: float) -> None:
+        """Add shapes, each in a material of the family at its place, those beyond the last family of the last."""
+        for k, shape in enumerate(shapes):
+            self.add(shape, families[min(k, len(families) - 1)], scale)
+
+    def sample(self, shape: Shape, family: str, scale: float = 1.0) -> Body:
+        """Return what :meth:`add` adds."""
         rng = self._rng
         gloss = float(rng.choice([0.0, 0.0, 0.1, 0.5])) * (2.5 if family == "metal" else 1.0)
         shine = float(np.exp(rng.uniform(2, 5)))
-        if self._shared is not None and not (family == "print" and rng.random() < 0.5):
-            place = shape.vertices @ self._turn.T  # the coordinates of the scene are those of the paint
-            chart = np.column_stack((place[:, :2], shape.chart[:, 2]))
-            whole = Shape(shape.vertices, shape.faces, shape.normals, chart, place)
-            return Body(whole, self._shared, gloss, shine)
-        return Body(shape, self.paint(family, scale), gloss, shine)
+        if self._shared is None or (family == "print" and rng.random() < 0.5):
+            return Body(shape, self.paint(family, scale), gloss, shine)
+        place = shape.vertices @ self._turn.T  # the coordinates of the scene are those of the paint
+        chart = np.column_stack((place[:, :2], shape.chart[:, 2]))
+        return Body(replace(shape, chart=chart, rest=place), self._shared, gloss, shine)
 
     def paint(self, family: str, scale: float) -> Paint:
         """Return a random paint: nearly one colour, of a kind that is usual for the family, or of any kind."""

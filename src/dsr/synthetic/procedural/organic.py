@@ -9,7 +9,7 @@ from skimage.measure import marching_cubes
 
 from dsr.synthetic.procedural.shape import Shape, merge, rotation_about, surface, tube, unit
 from dsr.synthetic.procedural.solids import place_on_ground
-from dsr.synthetic.ray_surfaces import Array
+from dsr.synthetic.raycast import Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +210,7 @@ def plant(rng: np.random.Generator) -> list[Shape]:
             size = rng.uniform(0.35, 0.6) if slender else rng.uniform(0.15, 0.3)
             blade = leaf(rng, size, size * (0.08 if slender else rng.uniform(0.22, 0.4)))
             turn = rotation_about(2, yaw + rng.uniform(-90, 90)) @ rotation_about(1, -rng.uniform(0, 70))
-            leaves.append(blade.rotate(turn).translate(spot))
+            leaves.append(blade.rotate(turn).translate(*spot))
     return [merge(leaves), merge(stems)]
 
 

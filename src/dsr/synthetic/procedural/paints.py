@@ -12,11 +12,10 @@ from collections.abc import Callable
 import numpy as np
 
 from dsr.synthetic.procedural.shape import random_rotation
-from dsr.synthetic.ray_surfaces import Array, noise, rotation
+from dsr.synthetic.raycast import TILT, Array, mix, noise
 
 Paint = Callable[[Array, Array], Array]
 Palette = Array
-_TILT = rotation(37.0, 31.0, 29.0)  # so that the noise's lattice is not parallel to edges
 _FAMILIES = {
     "wood": ((0.40, 0.22, 0.10), (0.16, 0.07, 0.03), (0.60, 0.42, 0.24), (0.30, 0.15, 0.07)),
     "stone": ((0.55, 0.52, 0.47), (0.33, 0.31, 0.29), (0.70, 0.66, 0.58), (0.20, 0.19, 0.19)),
@@ -48,15 +47,9 @@ def _seed(rng: np.random.Generator) -> int:
 
 def fractal(points: Array, cell: float, seed: int, octaves: int = 3) -> Array:
     """Return noise in about [0, 1] of several scales, the coarsest ``cell`` metres, shape (N,)."""
-    place = _TILT @ points
+    place = TILT @ points
     total = sum(0.5**k * noise(place + 0.37 * k * cell, cell * 0.47**k, seed + k) for k in range(octaves))
     return np.asarray(total / (2 - 0.5 ** (octaves - 1)))
-
-
-def mix(colours: Palette, position: Array) -> Array:
-    """Return the colours (3, N) at ``position`` (N,) in [0, 1] along a palette (K, 3)."""
-    knots = np.linspace(0, 1, len(colours))
-    return np.stack([np.interp(position, knots, channel) for channel in colours.T])
 
 
 def solid_colour(rng: np.random.Generator, family: str, scale: float) -> Paint:
@@ -207,9 +200,8 @@ def woven(rng: np.random.Generator, family: str, scale: float) -> Paint:
     def paint(p: Array, chart: Array) -> Array:
         u, v = chart[0] / period, chart[1] / period
         turn = np.abs((u / max(zig, 1.0)) % 1 - 0.5) * zig
-        value = (
-            0.5 + 0.25 * np.clip(3 * np.sin(2 * np.pi * (v + turn)), -1, 1) + 0.2 * np.sin(2 * np.pi * u) * (zig == 0)
-        )
+        warp, weft = np.clip(3 * np.sin(2 * np.pi * (v + turn)), -1, 1), np.sin(2 * np.pi * u) * (zig == 0)
+        value = 0.5 + 0.25 * warp + 0.2 * weft
         return mix(colours, np.clip(value + 0.4 * (noise(p, 0.5 * period, seed) - 0.5), 0, 1))
 
     return paint

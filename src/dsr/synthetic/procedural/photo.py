@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
+from scipy.ndimage import gaussian_filter
 
+from dsr.geometry.camera import Camera
 from dsr.synthetic.procedural.lighting import SETS, Hits, Lighting, Tracer, incident_light, visibility
 from dsr.synthetic.procedural.paints import Paint
-from dsr.synthetic.procedural.shape import Shape, unit
-from dsr.synthetic.ray_surfaces import Array
+from dsr.synthetic.procedural.shape import Index, Shape, unit
+from dsr.synthetic.raycast import Array, encode, local_contrast
 
 _CHUNK = 1 << 15
 _SUBPIXELS = ((-0.375, -0.125), (0.125, -0.375), (0.375, 0.125), (-0.125, 0.375))
@@ -30,44 +31,78 @@ class Body:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """The rays of a camera."""
+class Viewpoint:
+    """The pose and the intrinsics of a camera in a layout."""
 
-    eye: Array  # (3,) origin of the rays in metres
-    rays: Array  # (3, H, W) directions of length 1 along the optical axis
-    right: Array  # (3,) step of the directions from pixel to pixel
-    down: Array  # (3,)
+    eye: Array  # (3,) position of the camera in metres, z up
+    target: Array  # (3,) point in the middle of the picture in metres
+    focal: float  # focal length in image widths
+    roll: float  # rotation about the viewing direction in degrees
+    centre: Array  # (2,) principal point in image widths from the left and upper edge
+
+    def axes(self) -> Array:
+        """Return the camera's right, down and forward axes as rows (3, 3)."""
+        forward = unit((self.target - self.eye)[None])[0]
+        right = unit(np.cross(forward, [0.0, 0.0, 1.0])[None])[0]
+        down = np.cross(forward, right)
+        c, s = np.cos(np.deg2rad(self.roll)), np.sin(np.deg2rad(self.roll))
+        return np.stack((c * right + s * down, c * down - s * right, forward))
+
+    def rays(self, camera: Camera) -> Array:
+        """Return the directions (3, H * W) of the camera's rays in the layout, of length 1 along the optical axis."""
+        return np.einsum("ik,ihw->khw", self.axes(), camera.rays().numpy()).reshape(3, -1)
 
 
-def radiance(tracer: Tracer, bodies: Sequence[Body], view: View, lighting: Lighting) -> tuple[Array, Array]:
+def aim_camera(rng: np.random.Generator, eye: Array, target: Array, low: float, high: float) -> Viewpoint:
+    """Return a camera at ``eye`` that looks at ``target``, with a random focal length from ``low`` to ``high``."""
+    roll = rng.normal(0, 2) if rng.random() < 0.75 else rng.uniform(-25, 25)
+    centre = 0.5 + rng.normal(0, 0.015, 2)
+    return Viewpoint(eye, target, float(np.exp(rng.uniform(np.log(low), np.log(high)))), float(roll), centre)
+
+
+def radiance(
+    tracer: Tracer, bodies: Sequence[Body], viewpoint: Viewpoint, camera: Camera, lighting: Lighting
+) -> tuple[Array, Array]:
     """Return the linear RGB (3, H, W) and the depth (H, W) of a view."""
-    shape = view.rays.shape[1:]
-    rays = view.rays.reshape(3, -1)
-    parts = [tracer.trace(view.eye, rays[:, i : i + _CHUNK]) for i in range(0, rays.shape[1], _CHUNK)]
-    names = Hits.__dataclass_fields__
-    hits = Hits(**{name: np.concatenate([getattr(part, name) for part in parts], axis=-1) for name in names})
+    eye, rays, shape = viewpoint.eye, viewpoint.rays(camera), (camera.height, camera.width)
+    parts = [tracer.trace(eye, rays[:, i : i + _CHUNK]) for i in range(0, rays.shape[1], _CHUNK)]
+    hits = Hits(*(np.concatenate(columns, axis=-1) for columns in zip(*parts, strict=True)))
     extent = float(np.median(hits.depth))
     v, u = np.indices(shape)
     which = ((u % 4 + 4 * (v % 4)) * 7 % SETS).ravel()  # of light samples; each 4 x 4 window has every set once
-    pieces = [
-        visibility(tracer, lighting, part, which[i * _CHUNK :][: len(part.depth)], extent)
-        for i, part in enumerate(parts)
-    ]
-    seen = _smooth_visibility(np.stack([np.concatenate(p) for p in zip(*pieces, strict=True)]), hits, shape)
-    colour = shade(bodies, hits, lighting, view.eye, seen)
-    display = np.clip(colour / (2.5 * np.median(colour) + 1e-9), 0, 1) ** (1 / 2.2)
-    grey = display.reshape(3, *shape).astype(np.float32)  # differences within 3 x 3 pixels, of the channels the largest
-    difference = maximum_filter(grey, (1, 3, 3), mode="nearest") - minimum_filter(grey, (1, 3, 3), mode="nearest")
-    contrast = difference.max(0).ravel().astype(np.float64)
+    seen = [visibility(tracer, lighting, part, which[i * _CHUNK :], extent) for i, part in enumerate(parts)]
+    smooth = _smooth_visibility(np.concatenate(seen, axis=1), hits, shape)
+    colour = shade(bodies, hits, lighting, eye, smooth)
+    display = encode(colour / (2.5 * np.median(colour) + 1e-9)).reshape(3, *shape)
+    contrast = local_contrast(display.astype(np.float32)).ravel().astype(np.float64)
     limit = max(0.04, float(np.quantile(contrast, 1 - _MAX_SUPERSAMPLED)))
     rough = np.flatnonzero(contrast > limit)
+    right, down, _ = viewpoint.axes()[..., None]
     for start in range(0, rough.size, _CHUNK):
         pixels = rough[start : start + _CHUNK]
-        colour[:, pixels] = _supersample(tracer, bodies, view, lighting, hits, seen, pixels)
+        total = np.zeros((3, pixels.size))
+        for du, dv in _SUBPIXELS:
+            fine = tracer.trace(eye, rays[:, pixels] + du * (right / camera.fx) + dv * (down / camera.fy))
+            near = _like_neighbour(hits, fine, pixels, shape, (int(np.sign(du)), int(np.sign(dv))))
+            total += shade(bodies, fine, lighting, eye, smooth[:, near])
+        colour[:, pixels] = total / len(_SUBPIXELS)
     return colour.reshape(3, *shape), hits.depth.reshape(shape)
 
 
-def _smooth_visibility(seen: Array, hits: Hits, shape: tuple[int, ...]) -> Array:
+def _like_neighbour(hits: Hits, fine: Hits, pixels: Index, shape: tuple[int, int], side: tuple[int, int]) -> Index:
+    """Return which pixel on a side of each of ``pixels`` (N,), itself included, is nearest in depth to ``fine``."""
+    row, column = np.divmod(pixels, shape[1])
+    best, nearest = pixels, np.full(pixels.size, np.inf)
+    for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        v = np.clip(row + i * side[1], 0, shape[0] - 1)
+        u = np.clip(column + j * side[0], 0, shape[1] - 1)
+        other = v * shape[1] + u
+        away = np.abs(hits.depth[other] - fine.depth) + 1e3 * (hits.body[other] != fine.body)
+        best, nearest = np.where(away < nearest, other, best), np.minimum(away, nearest)
+    return best
+
+
+def _smooth_visibility(seen: Array, hits: Hits, shape: tuple[int, int]) -> Array:
     """Return the visibilities (2, N) averaged over 4 x 4 pixels of the same surface."""
     height, width = shape
     values = seen.reshape(2, height, width).astype(np.float32)
@@ -90,7 +125,7 @@ def _smooth_visibility(seen: Array, hits: Hits, shape: tuple[int, ...]) -> Array
 
 def shade(bodies: Sequence[Body], hits: Hits, lighting: Lighting, eye: Array, seen: Array) -> Array:
     """Return the linear RGB (3, N) of the hits, given the visibilities (2, N) of lamp and surroundings."""
-    light, direct = incident_light(lighting, hits.points, hits.normals, (seen[0], seen[1]))
+    light, direct = incident_light(lighting, hits.points, hits.normals, seen)
     half = _unit(_unit(lighting.lamp.mean((0, 1))[:, None] - hits.points) + _unit(eye[:, None] - hits.points))
     mirror = np.maximum((half * hits.normals).sum(0), 0.0)
     out = np.empty_like(light)
@@ -110,33 +145,6 @@ def _unit(vectors: Array) -> Array:
     return vectors / np.sqrt((vectors**2).sum(0))
 
 
-def _supersample(
-    tracer: Tracer,
-    bodies: Sequence[Body],
-    view: View,
-    lighting: Lighting,
-    hits: Hits,
-    seen: Array,
-    pixels: NDArray[np.intp],
-) -> Array:
-    """Return the mean linear RGB (3, N) of four rays within each of ``pixels``, with the visibility of a neighbour."""
-    total = np.zeros((3, pixels.size))
-    height, width = view.rays.shape[1:]
-    row, column = np.divmod(pixels, width)
-    rays = view.rays.reshape(3, -1)[:, pixels]
-    for du, dv in _SUBPIXELS:
-        fine = tracer.trace(view.eye, rays + du * view.right[:, None] + dv * view.down[:, None])
-        best, nearest = pixels, np.full(pixels.size, np.inf)
-        for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
-            v = np.clip(row + i * int(np.sign(dv)), 0, height - 1)
-            u = np.clip(column + j * int(np.sign(du)), 0, width - 1)
-            other = v * width + u
-            away = np.abs(hits.depth[other] - fine.depth) + 1e3 * (hits.body[other] != fine.body)
-            best, nearest = np.where(away < nearest, other, best), np.minimum(away, nearest)
-        total += shade(bodies, fine, lighting, view.eye, seen[:, best])
-    return total / len(_SUBPIXELS)
-
-
 def develop(linear: Array, rng: np.random.Generator) -> NDArray[np.uint8]:
     """Return the photo (H, W, 3) of linear RGB (3, H, W): exposure, white balance, lens, noise, tone curve."""
     height, width = linear.shape[1:]
@@ -152,39 +160,3 @@ def develop(linear: Array, rng: np.random.Generator) -> NDArray[np.uint8]:
     image = np.where(image > 0.8, 0.8 + 0.2 * np.tanh((image - 0.8) / 0.2), image)  # a shoulder
     encoded = np.clip(image, 0, 1) ** (1 / gamma)
     return np.ascontiguousarray(np.rint(255 * encoded).astype(np.uint8).transpose(1, 2, 0))
-
-
-@dataclass(frozen=True, eq=False)
-class Viewpoint:
-    """The pose and the intrinsics of a camera in a layout."""
-
-    eye: Array  # (3,) position of the camera in metres, z up
-    target: Array  # (3,) point in the middle of the picture in metres
-    focal: float  # focal length in image widths
-    roll: float  # rotation about the viewing direction in degrees
-    centre: Array  # (2,) principal point in image widths from the left and upper edge
-
-    def axes(self) -> Array:
-        """Return the camera's right, down and forward axes as rows (3, 3)."""
-        forward = unit((self.target - self.eye)[None])[0]
-        right = unit(np.cross(forward, [0.0, 0.0, 1.0])[None])[0]
-        down = np.cross(forward, right)
-        c, s = np.cos(np.deg2rad(self.roll)), np.sin(np.deg2rad(self.roll))
-        return np.stack((c * right + s * down, c * down - s * right, forward))
-
-
-def aim_camera(rng: np.random.Generator, eye: Array, target: Array, low: float = 0.6, high: float = 1.8) -> Viewpoint:
-    """Return a camera at ``eye`` that looks at ``target``, with a random focal length from ``low`` to ``high``."""
-    roll = rng.normal(0, 2) if rng.random() < 0.75 else rng.uniform(-25, 25)
-    centre = 0.5 + rng.normal(0, 0.015, 2)
-    return Viewpoint(eye, target, float(np.exp(rng.uniform(np.log(low), np.log(high)))), float(roll), centre)
-
-
-@dataclass(frozen=True, eq=False)
-class SceneLayout:
-    """The bodies of a scene, which fill the view of every camera, and where its cameras and lamps may be."""
-
-    bodies: Sequence[Body]
-    views: Callable[[np.random.Generator], Viewpoint]
-    low: Array  # (3,) corners of the box in which lamps may hang, in metres
-    high: Array

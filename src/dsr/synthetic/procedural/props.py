@@ -7,54 +7,46 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from dsr.synthetic.procedural import furniture as f
-from dsr.synthetic.procedural.materials import MaterialSampler
+from dsr.synthetic.procedural.materials import SceneBuilder
 from dsr.synthetic.procedural.organic import branches, creature, figure, pebble, plant
-from dsr.synthetic.procedural.photo import Body
 from dsr.synthetic.procedural.reliefs import RELIEFS, blanket, curtain, relief
-from dsr.synthetic.procedural.shape import Shape, box, merge, quad, rotation_about, surface
+from dsr.synthetic.procedural.shape import Shape, box, merge, quad, surface
 from dsr.synthetic.procedural.solids import bowl, letter, random_solid, vase
-from dsr.synthetic.ray_surfaces import Array
+from dsr.synthetic.raycast import Array
 
 
-def shell(rng: np.random.Generator, materials: MaterialSampler, size: Array) -> list[Body]:
-    """Return floor, ceiling and walls of a room of ``size`` (3,) around the origin of its floor."""
+def shell(rng: np.random.Generator, scene: SceneBuilder, size: Array) -> None:
+    """Add floor, ceiling and walls of a room of ``size`` (3,) around the origin of its floor."""
     x, y, z = size
     low = [-x / 2, -y / 2, 0.0]
     walls = [quad(low, [x, 0, 0], [0, 0, z]), quad([-x / 2, y / 2, 0], [x, 0, 0], [0, 0, z])]
     walls += [quad([side * x / 2, -y / 2, 0], [0, y, 0], [0, 0, z]) for side in (-1, 1)]
-    bodies = [materials.sample_body(quad(low, [x, 0, 0], [0, y, 0]), "wood", 1.2)]
-    bodies.append(materials.sample_body(quad([-x / 2, -y / 2, z], [x, 0, 0], [0, y, 0]), "white", 1.0))
-    if rng.random() < 0.6:
-        bodies.append(materials.sample_body(merge(walls), "wall", 1.2))
-    else:
-        bodies += [materials.sample_body(wall, "wall", 1.2) for wall in walls]
+    scene.add(quad(low, [x, 0, 0], [0, y, 0]), "wood", 1.2)
+    scene.add(quad([-x / 2, -y / 2, z], [x, 0, 0], [0, y, 0]), "white", 1.0)
+    scene.add_all([merge(walls)] if rng.random() < 0.6 else walls, ["wall"], 1.2)
     if rng.random() < 0.6:  # skirting board
         tall = rng.uniform(0.06, 0.15)
-        boards = [box([x, 0.02, tall]).translate([0, y / 2 - 0.01, 0])]
-        boards += [box([0.02, y, tall]).translate([side * (x / 2 - 0.01), 0, 0]) for side in (-1, 1)]
-        bodies.append(materials.sample_body(merge(boards), "white", 1.0))
+        boards = [box([x, 0.02, tall]).translate(0, y / 2 - 0.01, 0)]
+        boards += [box([0.02, y, tall]).translate(side * (x / 2 - 0.01), 0, 0) for side in (-1, 1)]
+        scene.add(merge(boards), "white", 1.0)
     if rng.random() < 0.25:  # the back wall is masonry
-        stone = relief(rng, RELIEFS[rng.integers(4)], 1.0, 320).rotate(rotation_about(0, 90)).translate([0, 0, 0.5])
-        bodies.append(materials.sample_body(stone.scale([x, 2.0, z]).translate([0, y / 2 - 0.002, 0]), "brick", 1.0))
-    return bodies
+        stone = relief(rng, RELIEFS[rng.integers(4)], 1.0, 320).turn(0, 90).translate(0, 0, 0.5)
+        scene.add(stone.scale([x, 2.0, z]).translate(0, y / 2 - 0.002, 0), "brick", 1.0)
 
 
-def fill_room(rng: np.random.Generator, materials: MaterialSampler, size: Array) -> list[Body]:
-    """Return furniture along the back and side walls and in the middle, and what hangs on the walls."""
-    bodies: list[Body] = []
-    for wall, (turn, length) in enumerate(((0, size[0]), (90, size[1]), (-90, size[1]))):
-        out = (size[1] if wall == 0 else size[0]) / 2
+def fill_room(rng: np.random.Generator, scene: SceneBuilder, size: Array) -> None:
+    """Add furniture along the back and side walls and in the middle, and what hangs on the walls."""
+    for turn, length, out in ((0, size[0], size[1] / 2), (90, size[1], size[0] / 2), (-90, size[1], size[0] / 2)):
         x = -length / 2 + rng.uniform(0.1, 0.8)
         while x < length / 2 - 0.6:
             parts, families = _wall_piece(rng)
             low, high = _extent(parts)
             if x + high[0] - low[0] < length / 2 - 0.05:
-                shift = np.array([x - low[0], out - high[1] - rng.uniform(0.025, 0.1), 0.0])
-                bodies += _sample_bodies(materials, parts, families, rotation_about(2, turn), shift)
+                y = out - high[1] - rng.uniform(0.025, 0.1)
+                _place(scene, parts, families, (x - low[0], y, 0.0), turn)
             x += high[0] - low[0] + rng.uniform(0.05, 1.0)
-        bodies += _hangings(rng, materials, rotation_about(2, turn), length, out, size[2])
-    bodies += _middle(rng, materials, size)
-    return bodies
+        _hang(rng, scene, turn, length, out, size[2])
+    _fill_middle(rng, scene, size)
 
 
 def _extent(parts: Sequence[Shape]) -> tuple[Array, Array]:
@@ -63,19 +55,11 @@ def _extent(parts: Sequence[Shape]) -> tuple[Array, Array]:
     return points.min(0), points.max(0)
 
 
-def _sample_bodies(
-    materials: MaterialSampler,
-    parts: Sequence[Shape],
-    families: Sequence[str],
-    turn: Array,
-    shift: Array | Sequence[float],
-) -> list[Body]:
-    """Return the parts, translated by ``shift`` and then rotated, each in a material of its family."""
-    last = families[-1]
-    names = [*families, *[last] * len(parts)]
-    return [
-        materials.sample_body(s.translate(shift).rotate(turn), name, 0.6) for s, name in zip(parts, names, strict=False)
-    ]
+def _place(
+    scene: SceneBuilder, parts: Sequence[Shape], families: Sequence[str], at: Sequence[float], turn: float = 0
+) -> None:
+    """Add the parts, shifted to ``at`` and then rotated by ``turn`` degrees, each in a material of its family."""
+    scene.add_all([part.translate(*at).turn(2, turn) for part in parts], families, 0.6)
 
 
 def _wall_piece(rng: np.random.Generator) -> tuple[list[Shape], list[str]]:
@@ -87,7 +71,7 @@ def _wall_piece(rng: np.random.Generator) -> tuple[list[Shape], list[str]]:
         (lambda: _set_table(rng), ["wood", "metal", "any"]),
         (lambda: f.lamp(rng, rng.uniform(1.2, 1.7)), ["white", "metal"]),
         (lambda: f.pot_plant(rng, rng.uniform(0.6, 1.6)), ["plant", "plant", "stone"]),
-        (lambda: [s.rotate(rotation_about(2, 25.0)) for s in f.chair(rng)], ["cloth", "wood"]),
+        (lambda: [s.turn(2, 25.0) for s in f.chair(rng)], ["cloth", "wood"]),
         (lambda: f.bed(rng), ["wood", "cloth"]),
         (lambda: _boxes(rng), ["any", "print"]),
     )
@@ -97,8 +81,8 @@ def _wall_piece(rng: np.random.Generator) -> tuple[list[Shape], list[str]]:
 
 def _boxes(rng: np.random.Generator) -> list[Shape]:
     """Return two boxes, one on the other."""
-    boxes = [box(rng.uniform(0.25, 0.6, 3)).rotate(rotation_about(2, rng.uniform(-30, 30))) for _ in range(2)]
-    return [boxes[0], boxes[1].translate([0, 0, boxes[0].vertices[:, 2].max() + 1e-3])]
+    boxes = [box(rng.uniform(0.25, 0.6, 3)).turn(2, rng.uniform(-30, 30)) for _ in range(2)]
+    return [boxes[0], boxes[1].translate(0, 0, boxes[0].vertices[:, 2].max() + 1e-3)]
 
 
 def _set_table(rng: np.random.Generator) -> list[Shape]:
@@ -108,68 +92,56 @@ def _set_table(rng: np.random.Generator) -> list[Shape]:
     for spot in scatter(rng, high[:2] - low[:2] - 0.2, int(rng.integers(1, 6)), 0.28):
         size = rng.uniform(0.12, 0.4)
         things = f.lamp(rng, 0.5) if rng.random() < 0.15 else [random_solid(rng).scale(size)]
-        parts += [s.translate([*spot, high[2]]) for s in things]
+        parts += [s.translate(spot[0], spot[1], high[2]) for s in things]
     return parts
 
 
-def _hangings(
-    rng: np.random.Generator, materials: MaterialSampler, turn: Array, length: float, out: float, high: float
-) -> list[Body]:
-    """Return pictures, windows with curtains or blinds, and shelves on a wall at y = ``out``, rotated by ``turn``."""
-    bodies: list[Body] = []
+def _hang(rng: np.random.Generator, scene: SceneBuilder, turn: float, length: float, out: float, high: float) -> None:
+    """Add pictures, windows with curtains or blinds, and shelves on a wall at y = ``out``, rotated by ``turn``."""
     x = -length / 2 + rng.uniform(0.3, 1.0)
     while x < length / 2 - 1.0:
         kind, wide = rng.random(), rng.uniform(0.6, 1.5)
         if kind < 0.5:
-            at = [x + 0.4, out - 0.004, rng.uniform(1.3, 1.8)]
-            bodies += _sample_bodies(materials, f.picture(rng), ["print", "wood"], turn, at)
+            at = x + 0.4, out - 0.004, rng.uniform(1.3, 1.8)
+            _place(scene, f.picture(rng), ["print", "wood"], at, turn)
             wide = 0.9
         elif kind < 0.75 and x + wide < length / 2:
             sill, tall = rng.uniform(0.7, 1.0), rng.uniform(0.9, 1.2)
-            bodies += _sample_bodies(
-                materials, f.window(rng, wide, tall), ["white", "white"], turn, [x, out - 0.003, sill]
-            )
+            _place(scene, f.window(rng, wide, tall), ["white"], (x, out - 0.003, sill), turn)
             if rng.random() < 0.4:
-                bodies += _sample_bodies(materials, f.blinds(rng, wide, tall), ["white"], turn, [x, out - 0.1, sill])
+                _place(scene, f.blinds(rng, wide, tall), ["white"], (x, out - 0.1, sill), turn)
             if rng.random() < 0.6:
                 for side in (x - 0.35, x + wide - 0.1):
-                    sheet = [curtain(rng, 0.45, min(high - 0.15, sill + tall + 0.2))]
-                    bodies += _sample_bodies(materials, sheet, ["cloth"], turn, [side, out - 0.16, 0.03])
+                    sheet = curtain(rng, 0.45, min(high - 0.15, sill + tall + 0.2))
+                    _place(scene, [sheet], ["cloth"], (side, out - 0.16, 0.03), turn)
         elif kind < 0.85:
-            board = [box([wide, 0.2, 0.025]).translate([0, -0.1, 0])]
-            board += [
-                s.scale(rng.uniform(0.12, 0.25)).translate([rng.uniform(-0.4, 0.4) * wide, -0.1, 0.026])
-                for s in (random_solid(rng), vase(rng))
-            ]
-            bodies += _sample_bodies(
-                materials, board, ["wood", "any"], turn, [x + wide / 2, out - 0.003, rng.uniform(1.1, 1.7)]
-            )
+            board = [box([wide, 0.2, 0.025]).translate(0, -0.1, 0)]
+            for thing in (random_solid(rng), vase(rng)):
+                small = thing.scale(rng.uniform(0.12, 0.25))
+                board.append(small.translate(rng.uniform(-0.4, 0.4) * wide, -0.1, 0.026))
+            at = x + wide / 2, out - 0.003, rng.uniform(1.1, 1.7)
+            _place(scene, board, ["wood", "any"], at, turn)
         x += wide + rng.uniform(0.2, 1.2)
-    return bodies
 
 
-def _middle(rng: np.random.Generator, materials: MaterialSampler, size: Array) -> list[Body]:
-    """Return a carpet, a table with chairs, and single objects in the middle of the room."""
-    bodies: list[Body] = []
+def _fill_middle(rng: np.random.Generator, scene: SceneBuilder, size: Array) -> None:
+    """Add a carpet, a table with chairs, and single objects in the middle of the room."""
     spot = rng.uniform([-0.2, -0.05], [0.2, 0.2]) * size[:2]
     if rng.random() < 0.5:
         rug = blanket(rng, rng.uniform([1.2, 1.0], [2.4, 1.8]), rng.uniform(0.008, 0.03), 120)
-        bodies += _sample_bodies(materials, [rug], ["cloth"], np.eye(3), [*spot, 0.001])
-    turn = rotation_about(2, rng.uniform(0, 360))
+        _place(scene, [rug], ["cloth"], (*spot, 0.001))
+    turn = rng.uniform(0, 360)
     if rng.random() < 0.55:
-        bodies += _sample_bodies(materials, _set_table(rng), ["wood", "metal", "any"], np.eye(3), [*spot, 0.005])
+        _place(scene, _set_table(rng), ["wood", "metal", "any"], (*spot, 0.005))
         for k in range(int(rng.integers(0, 4))):
-            seat = [
-                s.translate([0, 0.75, 0]).rotate(rotation_about(2, 90 * k + rng.uniform(-20, 20))) for s in f.chair(rng)
-            ]
-            bodies += _sample_bodies(materials, seat, ["cloth", "wood"], np.eye(3), [*spot, 0.003])
+            seat = [s.translate(0, 0.75, 0).turn(2, 90 * k + rng.uniform(-20, 20)) for s in f.chair(rng)]
+            _place(scene, seat, ["cloth", "wood"], (*spot, 0.003))
     for _ in range(rng.integers(0, 4)):
-        things = [random_solid(rng).scale(rng.uniform(0.2, 0.6))]
+        thing = random_solid(rng).scale(rng.uniform(0.2, 0.6))
         if rng.random() < 0.15:
-            things = [figure(rng, 80).scale(rng.uniform(0.8, 1.6))]
+            thing = figure(rng, 80).scale(rng.uniform(0.8, 1.6))
         at = rng.uniform([-0.4, -0.15], [0.4, 0.35]) * size[:2]
-        bodies += _sample_bodies(materials, [s.rotate(turn) for s in things], ["any"], np.eye(3), [*at, 0.004])
-    return bodies
+        _place(scene, [thing.turn(2, turn)], ["any"], (*at, 0.004))
 
 
 def scatter(rng: np.random.Generator, size: Array, count: int, apart: float) -> list[Array]:
@@ -182,13 +154,16 @@ def scatter(rng: np.random.Generator, size: Array, count: int, apart: float) -> 
     return spots
 
 
-def tableware(rng: np.random.Generator, materials: MaterialSampler, size: Array) -> list[Body]:
-    """Return objects on a table of ``size`` (2,) metres whose top is at z = 0."""
-    bodies: list[Body] = []
+def tableware(rng: np.random.Generator, scene: SceneBuilder, wide: float, deep: float) -> None:
+    """Add objects on a table of ``wide`` x ``deep`` metres whose top is at z = 0."""
     pitch = rng.uniform(0.11, 0.3)
-    for spot in scatter(rng, size - 0.1, int(rng.integers(3, 24)), 1.05 * pitch):
+    for spot in scatter(rng, np.array([wide, deep]) - 0.1, int(rng.integers(3, 24)), 1.05 * pitch):
         kind = rng.random()
         large = pitch * rng.uniform(0.6, 1.15)
+        if 0.3 <= kind < 0.36:
+            parts = [part.translate(spot[0], spot[1], 0) for part in f.pot_plant(rng, 1.6 * large)]
+            scene.add_all(parts, ["plant", "plant", "stone"], 0.1)
+            continue
         family = "any"
         if kind < 0.1:
             thing = pebble(rng).scale(large)
@@ -198,30 +173,19 @@ def tableware(rng: np.random.Generator, materials: MaterialSampler, size: Array)
             thing = figure(rng, 64).scale(1.6 * large)
         elif kind < 0.3:
             thing, family = _books(rng, large), "print"
-        elif kind < 0.36:
-            for part, name in zip(f.pot_plant(rng, 1.6 * large), ("plant", "plant", "stone"), strict=True):
-                bodies.append(materials.sample_body(part.translate([*spot, 0]), name, 0.1))
-            continue
         elif kind < 0.5:
             thing = (bowl if rng.random() < 0.6 else letter)(rng).scale(large)
         else:
             thing = random_solid(rng).scale(large)
-        bodies.append(
-            materials.sample_body(
-                thing.rotate(rotation_about(2, rng.uniform(0, 360))).translate([*spot, 1e-4]), family, large
-            )
-        )
-    return bodies
+        scene.add(thing.turn(2, rng.uniform(0, 360)).translate(spot[0], spot[1], 1e-4), family, large)
 
 
 def _books(rng: np.random.Generator, large: float) -> Shape:
     """Return a pile of books."""
     z, books = 0.0, []
     for _ in range(rng.integers(1, 6)):
-        book = box(large * rng.uniform([0.6, 0.8, 0.08], [0.8, 1.0, 0.22])).rotate(
-            rotation_about(2, rng.uniform(-25, 25))
-        )
-        books.append(book.translate([0, 0, z]))
+        book = box(large * rng.uniform([0.6, 0.8, 0.08], [0.8, 1.0, 0.22])).turn(2, rng.uniform(-25, 25))
+        books.append(book.translate(0, 0, z))
         z = books[-1].vertices[:, 2].max() + 1e-4
     return merge(books)
 
@@ -248,37 +212,46 @@ def random_positions(rng: np.random.Generator, count: int) -> list[Array]:
     """Return ``count`` random positions (3,) around the origin for large shapes."""
     if count == 1:
         return [rng.uniform(-0.1, 0.1, 3)]
-    return [
-        np.array([*spot[:1], rng.uniform(-0.4, 0.4), *spot[1:]]) for spot in scatter(rng, np.full(2, 1.5), count, 0.45)
-    ]
+    spots = scatter(rng, np.full(2, 1.5), count, 0.45)
+    return [np.array([x, rng.uniform(-0.4, 0.4), z]) for x, z in spots]
 
 
-def backdrop(rng: np.random.Generator, materials: MaterialSampler, back: float, floor: float) -> list[Body]:
-    """Return a background that fills the view: wall and floor, a sweep, a curved wall, a curtain or a relief."""
+def backdrop(rng: np.random.Generator, scene: SceneBuilder, back: float, floor: float) -> None:
+    """Add a background that fills the view: wall and floor, a sweep, a curved wall, a curtain or a relief."""
     kind = rng.integers(5)
-    ground = materials.sample_body(box([30, 30, 0.1]).translate([0, 0, floor - 0.101]), "wood", 1.0)
-    far = materials.sample_body(quad([-25, back + 6, -10], [50, 0, 0], [0, 0, 40]), "wall", 2.0)
+    ground = scene.sample(box([30, 30, 0.1]).translate(0, 0, floor - 0.101), "wood", 1.0)
+    if kind != 1:
+        scene.bodies.append(ground)
+    scene.add(quad([-25, back + 6, -10], [50, 0, 0], [0, 0, 40]), "wall", 2.0)
     if kind == 0:
-        turn = rotation_about(2, rng.uniform(-25, 25))
-        wall = box([24, 0.1, 24]).translate([0, 0.05, -12]).rotate(turn)
-        return [ground, far, materials.sample_body(wall.translate([0, back, 0]), "wall", 0.8)]
-    if kind == 1:  # a photographer's sweep
+        wall = box([24, 0.1, 24]).translate(0, 0.05, -12).turn(2, rng.uniform(-25, 25))
+        scene.add(wall.translate(0, back, 0), "wall", 0.8)
+    elif kind == 1:  # a photographer's sweep, which is the floor too
         s = np.linspace(0, np.pi / 2, 24)
         radius = rng.uniform(0.3, 1.2)
         y = np.concatenate(([-14], back - radius + radius * np.sin(s), [back]))
         z = floor + np.concatenate(([0], radius * (1 - np.cos(s)), [16]))
-        x = np.linspace(-12, 12, 3)
-        points = np.stack([np.broadcast_to(a, (26, 3)) for a in (x, y[:, None], z[:, None])], axis=-1)
         slope = np.concatenate(([0], s, [np.pi / 2]))[:, None]
-        normals = np.stack([np.broadcast_to(a, (26, 3)) for a in (0 * slope, -np.sin(slope), np.cos(slope))], axis=-1)
-        return [far, materials.sample_body(surface(points, normals), "wall", 0.8)]
-    if kind == 2:  # a bent wall
+        scene.add(
+            surface(
+                _grid(np.linspace(-12, 12, 3), y[:, None], z[:, None]),
+                _grid(np.zeros(3), -np.sin(slope), np.cos(slope)),
+            ),
+            "wall",
+            0.8,
+        )
+    elif kind == 2:  # a bent wall
         angle, radius = np.linspace(-np.pi, 0, 121) + np.pi / 2, rng.uniform(2.2, 6.0)
         x, y = radius * np.sin(angle), back - radius + radius * np.cos(angle)
-        points = np.stack([np.broadcast_to(a, (2, 121)) for a in (x, y, np.array([[-14.0], [14.0]]))], axis=-1)
-        return [ground, far, materials.sample_body(surface(points), "wall", 0.8)]
-    if kind == 3:
+        scene.add(surface(_grid(x, y, np.array([[-14.0], [14.0]]))), "wall", 0.8)
+    elif kind == 3:
         sheet = curtain(rng, 5.0, 4.0).scale([1, float(rng.uniform(0.5, 2.5)), 1])
-        return [ground, far, materials.sample_body(sheet.translate([-2.5, back, floor]), "cloth", 0.5)]
-    wall = relief(rng, RELIEFS[rng.integers(len(RELIEFS))], 5.0, 340).rotate(rotation_about(0, 90))
-    return [ground, far, materials.sample_body(wall.translate([0, back, 1.0]), "brick", 0.8)]
+        scene.add(sheet.translate(-2.5, back, floor), "cloth", 0.5)
+    else:
+        wall = relief(rng, RELIEFS[rng.integers(len(RELIEFS))], 5.0, 340).turn(0, 90)
+        scene.add(wall.translate(0, back, 1.0), "brick", 0.8)
+
+
+def _grid(*coordinates: Array) -> Array:
+    """Return the grid of points (R, C, 3) of three coordinates that broadcast to (R, C)."""
+    return np.stack(np.broadcast_arrays(*coordinates), axis=-1)

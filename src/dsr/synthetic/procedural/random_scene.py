@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,8 +10,8 @@ import numpy as np
 from dsr.geometry.camera import Camera
 from dsr.synthetic.procedural.arrangements import LAYOUTS
 from dsr.synthetic.procedural.lighting import Hits, Lighting, Tracer, random_lighting
-from dsr.synthetic.procedural.materials import MaterialSampler
-from dsr.synthetic.procedural.photo import SceneLayout, View, Viewpoint, develop, radiance
+from dsr.synthetic.procedural.materials import SceneBuilder
+from dsr.synthetic.procedural.photo import Body, Viewpoint, develop, radiance
 from dsr.synthetic.rendering import Rendering
 
 PROCEDURAL_VERSION = 1  # version of the scenes; it has to be increased whenever an image changes
@@ -24,7 +25,7 @@ class RandomScene:
     """A scene that can be rendered at any size."""
 
     layout_name: str  # key of its layout in LAYOUTS
-    layout: SceneLayout
+    bodies: Sequence[Body]
     tracer: Tracer
     viewpoint: Viewpoint
     lighting: Lighting
@@ -50,17 +51,19 @@ def random_scene(rng: np.random.Generator, layout_name: str | None = None) -> Ra
     weights = np.array([weight for _, weight in LAYOUTS.values()])
     for _ in range(_LAYOUT_TRIES):
         name = layout_name if layout_name is not None else names[rng.choice(len(names), p=weights / weights.sum())]
-        layout = LAYOUTS[name][0](rng, MaterialSampler(rng))
-        tracer = Tracer([body.shape for body in layout.bodies])
+        builder = SceneBuilder(rng)
+        layout = LAYOUTS[name][0](rng, builder)
+        tracer = Tracer([body.shape for body in builder.bodies])
         for _ in range(_CAMERA_TRIES):
             viewpoint = layout.views(rng)
-            view = _view(viewpoint, make_camera(viewpoint, _PREVIEW_SIZE))
-            seen = tracer.trace(view.eye, view.rays.reshape(3, -1))
+            seen = tracer.trace(viewpoint.eye, viewpoint.rays(make_camera(viewpoint, _PREVIEW_SIZE)))
             if _is_usable(seen):
                 lighting = random_lighting(rng, tracer, seen, layout.low, layout.high)
                 scale = min(np.exp(rng.normal(0, 0.3)), _MAX_MEDIAN_DEPTH / float(np.median(seen.depth)))
                 metres = float(max(scale, 1.5 * _MIN_DEPTH / float(seen.depth.min())))  # per unit, within the limits
-                return RandomScene(name, layout, tracer, viewpoint, lighting, metres, int(rng.integers(1 << 31)))
+                return RandomScene(
+                    name, builder.bodies, tracer, viewpoint, lighting, metres, int(rng.integers(1 << 31))
+                )
     raise RuntimeError("no view of the scene was usable")  # pragma: no cover
 
 
@@ -81,17 +84,9 @@ def make_camera(viewpoint: Viewpoint, size: int) -> Camera:
     return Camera(size, size, focal, focal, float(cx), float(cy))
 
 
-def _view(viewpoint: Viewpoint, camera: Camera) -> View:
-    """Return the camera's rays in the frame of the layout."""
-    axes = viewpoint.axes()
-    rays = np.einsum("ik,ihw->khw", axes, camera.rays().numpy())
-    return View(viewpoint.eye, rays, axes[0] / camera.fx, axes[1] / camera.fy)
-
-
 def render(scene: RandomScene, size: int) -> Rendering:
     """Return the photo and the depth of a scene."""
     camera = make_camera(scene.viewpoint, size)
-    view = _view(scene.viewpoint, camera)
-    linear, depth = radiance(scene.tracer, scene.layout.bodies, view, scene.lighting)
+    linear, depth = radiance(scene.tracer, scene.bodies, scene.viewpoint, camera, scene.lighting)
     rgb = develop(linear, np.random.default_rng(scene.seed))
     return Rendering(rgb, scene.metres * depth, camera)

@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
 from dsr.synthetic.procedural.shape import Shape, surface
-from dsr.synthetic.ray_surfaces import Array
+from dsr.synthetic.raycast import Array
 
 Heights = tuple[Array, Array, float]
 _FACE = cv2.FONT_HERSHEY_TRIPLEX

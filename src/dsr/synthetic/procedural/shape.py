@@ -13,7 +13,7 @@ import mapbox_earcut
 import numpy as np
 from numpy.typing import NDArray
 
-from dsr.synthetic.ray_surfaces import Array
+from dsr.synthetic.raycast import Array, rotation_about
 
 Index = NDArray[np.intp]
 
@@ -28,13 +28,17 @@ class Shape:
     chart: Array  # (V, 3) for paint: two coordinates in metres and a tone in [0, 1], such as the height of a relief
     rest: Array  # (V, 3) coordinates of the vertices in the shape's own frame, for solid paint
 
-    def translate(self, shift: Sequence[float] | Array) -> Shape:
-        """Return the shape translated by ``shift`` (3,) metres."""
-        return replace(self, vertices=self.vertices + np.asarray(shift, dtype=np.float64))
+    def translate(self, x: float, y: float, z: float) -> Shape:
+        """Return the shape shifted by some metres."""
+        return replace(self, vertices=self.vertices + np.array([x, y, z], dtype=np.float64))
 
-    def rotate(self, turn: Array) -> Shape:
-        """Return the shape rotated about the origin by the matrix ``turn`` (3, 3)."""
-        return replace(self, vertices=self.vertices @ turn.T, normals=self.normals @ turn.T)
+    def rotate(self, rotation: Array) -> Shape:
+        """Return the shape rotated about the origin by the matrix ``rotation`` (3, 3)."""
+        return replace(self, vertices=self.vertices @ rotation.T, normals=self.normals @ rotation.T)
+
+    def turn(self, axis: int, degrees: float) -> Shape:
+        """Return the shape rotated about one of its axes."""
+        return self.rotate(rotation_about(axis, degrees))
 
     def scale(self, factors: Sequence[float] | float) -> Shape:
         """Return the shape scaled along its axes, its paint coordinates with it."""
@@ -47,14 +51,6 @@ def unit(vectors: Array) -> Array:
     """Return ``vectors`` (..., 3) at length 1; zero becomes (0, 0, 1)."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.where(length > 1e-300, vectors / np.maximum(length, 1e-300), [0.0, 0.0, 1.0])
-
-
-def rotation_about(axis: int, degrees: float) -> Array:
-    """Return the matrix (3, 3) of the rotation about the coordinate axis ``axis``."""
-    i, j = ((1, 2), (2, 0), (0, 1))[axis]
-    turn, angle = np.eye(3), np.deg2rad(degrees)
-    turn[[i, i, j, j], [i, j, i, j]] = np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)
-    return turn
 
 
 def random_rotation(rng: np.random.Generator) -> Array:
@@ -86,7 +82,8 @@ def surface(points: Array, normals: Array | None = None, tone: Array | None = No
         normals = np.cross(around, along)
     flat = points.reshape(-1, 3)
     corner = np.arange(rows * columns).reshape(rows, columns)
-    a, b, c, d = (corner[i].ravel() for i in _QUADS)
+    a, b = corner[:-1, :-1].ravel(), corner[:-1, 1:].ravel()
+    c, d = corner[1:, :-1].ravel(), corner[1:, 1:].ravel()
     shorter = ((flat[a] - flat[d]) ** 2).sum(1) < ((flat[b] - flat[c]) ** 2).sum(1)
     first = np.where(shorter[:, None], np.stack((a, b, d), 1), np.stack((a, b, c), 1))
     second = np.where(shorter[:, None], np.stack((a, d, c), 1), np.stack((b, d, c), 1))
@@ -95,11 +92,7 @@ def surface(points: Array, normals: Array | None = None, tone: Array | None = No
     chart[1:, :, 1] = np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=2).mean(1))[:, None]
     if tone is not None:
         chart[..., 2] = tone
-    flat = points.reshape(-1, 3)
     return Shape(flat, np.concatenate((first, second)), unit(normals.reshape(-1, 3)), chart.reshape(-1, 3), flat)
-
-
-_QUADS = (np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:])
 
 
 def lathe(sections: Sequence[Array], segments: int = 80) -> Shape:
@@ -108,15 +101,12 @@ def lathe(sections: Sequence[Array], segments: int = 80) -> Shape:
     Its sections, (K, 2) each, are radius and height along smooth pieces; edges between pieces are sharp.
     """
     angle = np.linspace(0, 2 * np.pi, segments + 1)
-    circle = np.stack((np.cos(angle), np.sin(angle)), axis=1)
+    out, up = np.stack((np.cos(angle), np.sin(angle), 0 * angle), axis=1), np.array([0.0, 0.0, 1.0])
     parts = []
     for section in sections:
         tangent = np.gradient(section, axis=0) if len(section) > 2 else np.repeat(np.diff(section, axis=0), 2, axis=0)
-        points = np.concatenate((section[:, :1, None] * circle, np.zeros((len(section), len(angle), 1))), axis=2)
-        points[..., 2] = section[:, 1:]
-        normals = np.concatenate((tangent[:, 1:, None] * circle, np.zeros((len(section), len(angle), 1))), axis=2)
-        normals[..., 2] = -tangent[:, :1]
-        parts.append(surface(points, normals))
+        points = section[:, :1, None] * out + section[:, 1:, None] * up
+        parts.append(surface(points, tangent[:, 1:, None] * out - tangent[:, :1, None] * up))
     return merge(parts)
 
 
@@ -125,16 +115,20 @@ def extrusion(outlines: Sequence[Array], height: float, crease: float = 32.0) ->
 
     Corners of the outline below the ``crease`` angle in degrees get smooth normals.
     """
-    sides = [_side(outline, height, crease) for outline in outlines]
+    parts = [_side(outline, height, crease) for outline in outlines]
     flat = np.concatenate(outlines)
     ends = np.cumsum([len(o) for o in outlines]).astype(np.uint32)
     faces = mapbox_earcut.triangulate_float64(np.ascontiguousarray(flat), ends).reshape(-1, 3).astype(np.intp)
-    caps = []
     for z in (0.0, height):
-        points = np.column_stack((flat, np.full(len(flat), z)))
+        points = _at_height(flat, z)
         normals = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
-        caps.append(Shape(points, faces, normals, np.column_stack((flat, 0 * flat[:, 0])), points))
-    return merge([*sides, *caps])
+        parts.append(Shape(points, faces, normals, _at_height(flat, 0.0), points))
+    return merge(parts)
+
+
+def _at_height(flat: Array, z: float) -> Array:
+    """Return the points (K, 3) at height ``z`` over points (K, 2)."""
+    return np.column_stack((flat, np.full(len(flat), z)))
 
 
 def _side(outline: Array, height: float, crease: float) -> Shape:
@@ -146,14 +140,14 @@ def _side(outline: Array, height: float, crease: float) -> Shape:
     start = np.where(smooth[:, None], unit(normal + np.roll(normal, 1, axis=0)), normal)
     end = np.where(np.roll(smooth, -1)[:, None], unit(normal + np.roll(normal, -1, axis=0)), normal)
     arc = np.concatenate(([0.0], np.cumsum(np.linalg.norm(edge, axis=1))))
-    corners = [(outline, 0.0, start, arc[:-1]), (after, 0.0, end, arc[1:])]
-    corners += [(outline, height, start, arc[:-1]), (after, height, end, arc[1:])]
-    points = np.concatenate([np.column_stack((p, np.full(len(p), z))) for p, z, _, _ in corners])
-    chart = np.concatenate([np.column_stack((u, np.full(len(u), z), 0 * u)) for _, z, _, u in corners])
+    foot, along = np.concatenate((outline, after)), np.concatenate((arc[:-1], arc[1:]))
+    points = np.concatenate([_at_height(foot, z) for z in (0.0, height)])
+    chart = np.concatenate([np.column_stack((along, np.full(len(along), z), 0 * along)) for z in (0.0, height)])
+    normals = np.concatenate((start, end, start, end))
     k = np.arange(len(outline))
     a, b, c, d = k, k + len(k), k + 2 * len(k), k + 3 * len(k)
     faces = np.concatenate((np.stack((a, b, c), 1), np.stack((b, d, c), 1)))
-    return Shape(points, faces, np.concatenate([n for _, _, n, _ in corners]), chart, points)
+    return Shape(points, faces, normals, chart, points)
 
 
 def tube(path: Array, radius: Array | float, segments: int = 20) -> Shape:

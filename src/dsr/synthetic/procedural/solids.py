@@ -22,7 +22,7 @@ from dsr.synthetic.procedural.shape import (
     tube,
     unit,
 )
-from dsr.synthetic.ray_surfaces import Array
+from dsr.synthetic.raycast import Array
 
 Maker = Callable[[np.random.Generator], Shape]
 _GLYPHS = "ABCDEFGHJKLMNPRSTUVXYZ23456789&QO"
@@ -31,7 +31,7 @@ _GLYPHS = "ABCDEFGHJKLMNPRSTUVXYZ23456789&QO"
 def place_on_ground(shape: Shape) -> Shape:
     """Return the shape moved so that it stands on z = 0 with its middle over the origin."""
     low, high = shape.vertices.min(0), shape.vertices.max(0)
-    return shape.translate([-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2]])
+    return shape.translate(-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2])
 
 
 def block(rng: np.random.Generator) -> Shape:
@@ -60,7 +60,7 @@ def rounded_box(size: Array, radius: float, steps: int = 8) -> Shape:
     centre[..., :2], centre[..., 2] = side * half[:2], lift[:, None] * half[2]
     span = 2 * half
     lids = [quad([-half[0], -half[1], z], [span[0], 0, 0], [0, span[1], 0]) for z in (-size[2] / 2, size[2] / 2)]
-    return merge([surface(centre + radius * normal, normal), *lids]).translate([0, 0, size[2] / 2])
+    return merge([surface(centre + radius * normal, normal), *lids]).translate(0, 0, size[2] / 2)
 
 
 def superquadric(rng: np.random.Generator) -> Shape:
@@ -129,8 +129,8 @@ def bowl(rng: np.random.Generator) -> Shape:
         cup = hollow(radius * np.array([rng.uniform(0.6, 1), 0.95, 1, 1]), height, 0.02)
         bend = np.linspace(-0.55, 0.55, 15) * np.pi
         handle = np.column_stack((0.45 * height * np.cos(bend) * 0.8, 0 * bend, 0.38 * height * np.sin(bend)))
-        grip = tube(handle, rng.uniform(0.025, 0.045), 14).translate([radius * 0.97, 0, height * 0.5])
-        return merge([cup, grip]).rotate(rotation_about(2, rng.uniform(0, 360)))
+        grip = tube(handle, rng.uniform(0.025, 0.045), 14).translate(radius * 0.97, 0, height * 0.5)
+        return merge([cup, grip]).turn(2, rng.uniform(0, 360))
     depth = rng.uniform(0.05, 0.12) if kind < 0.6 else rng.uniform(0.2, 0.4)
     return hollow(0.48 * np.array([0.5, 0.72, 0.9, 1.0]) ** rng.uniform(0.6, 1.6), depth, 0.015)
 
@@ -155,17 +155,17 @@ def prism(rng: np.random.Generator) -> Shape:
     if kind == 0:  # a regular polygon or a star
         count = int(rng.integers(3, 9))
         if rng.random() < 0.5:
-            outlines = [_ring(0.45, count, rng.uniform(0, 6))]
+            outlines = [ring(0.45, count, rng.uniform(0, 6))]
         else:
-            outlines = [_ring(np.where(np.arange(2 * count) % 2, rng.uniform(0.15, 0.35), 0.48), 2 * count)]
+            outlines = [ring(np.where(np.arange(2 * count) % 2, rng.uniform(0.15, 0.35), 0.48), 2 * count)]
     elif kind == 1:  # a toothed wheel with a round hole
         teeth, deep = int(rng.integers(8, 22)), rng.uniform(0.03, 0.08)
         radii = np.tile([0.46, 0.46, 0.46 - deep, 0.46 - deep], teeth)
-        outlines = [_ring(radii, 4 * teeth), _ring(rng.uniform(0.06, 0.3), 48)[::-1]]
+        outlines = [ring(radii, 4 * teeth), ring(rng.uniform(0.06, 0.3), 48)[::-1]]
     elif kind == 2:  # a smooth closed curve
         angle = np.arange(120) * 2 * np.pi / 120
         waves = sum(rng.uniform(-0.09, 0.09) * np.cos(k * angle + rng.uniform(0, 6)) for k in range(2, 6))
-        outlines = [_ring(0.36 + waves, 120)]
+        outlines = [ring(0.36 + waves, 120)]
     else:  # a rectangular frame
         half = rng.uniform(0.2, 0.48, 2)
         corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half
@@ -176,7 +176,7 @@ def prism(rng: np.random.Generator) -> Shape:
     return place_on_ground(shape.rotate(rotation_about(2, rng.uniform(0, 360)) @ rotation_about(0, 90)))
 
 
-def _ring(radius: Array | float, count: int, phase: float = 0.0) -> Array:
+def ring(radius: Array | float, count: int, phase: float = 0.0) -> Array:
     """Return ``count`` points at ``radius`` around the origin, (count, 2)."""
     angle = phase + np.arange(count) * 2 * np.pi / count
     return np.stack((np.cos(angle), np.sin(angle)), axis=1) * np.broadcast_to(radius, (count,))[:, None]
@@ -205,7 +205,7 @@ def coil(rng: np.random.Generator) -> Shape:
     a = 2 * np.pi * s
     radius = 0.3 + 0.12 * np.cos(q * a)
     path = np.column_stack((radius * np.cos(p * a), radius * np.sin(p * a), 0.14 * np.sin(q * a)))
-    return place_on_ground(tube(path, rng.uniform(0.02, 0.06), 14).rotate(rotation_about(0, rng.choice([0.0, 80.0]))))
+    return place_on_ground(tube(path, rng.uniform(0.02, 0.06), 14).turn(0, rng.choice([0.0, 80.0])))
 
 
 SOLIDS: tuple[Maker, ...] = (block, superquadric, cylinder, torus, vase, bowl, prism, letter, coil)

@@ -1,18 +1,24 @@
-"""dataset=simgeo: six embedded scenes behind a cache, the paper's Lucy where it is to be had."""
+"""dataset=simgeo, six embedded scenes with the paper's Lucy where it is to be had; dataset=procedural: random ones."""
 
 import json
+import multiprocessing
+import os
+import threading
+import time
 
 import cv2
 import numpy as np
 import pytest
 
 from dsr.data import rendered
-from dsr.data.rendered import SimGeo
+from dsr.data.rendered import Procedural, SimGeo
+from dsr.synthetic.procedural.random_scene import render_random_scene
 from dsr.synthetic.rendering import cache_directory
 from dsr.synthetic.simgeo import SCENES, render_scene
 from dsr.utils.console import note_once
 
 SIZE = 64
+SMALL = 48  # of a procedural scene
 NAME = "cube_no_texture"
 
 
@@ -28,86 +34,50 @@ def calls(monkeypatch):
     """Return the list of renderings made from here on."""
     made = []
 
-    def counted(name, size):
-        made.append((name, size))
-        return render_scene(name, size)
+    def counted(*args):
+        made.append(args)
+        return render_scene(*args)
 
     monkeypatch.setattr(rendered, "render_scene", counted)
     return made
 
 
-def assert_rendered(scene, name=NAME):
-    expected = render_scene(name, SIZE)
+def assert_rendered(scene, expected=None):
+    expected = expected or render_scene(NAME, SIZE)
     np.testing.assert_array_equal((scene.rgb * 255).round().byte().permute(1, 2, 0).numpy(), expected.rgb)
-    assert scene.depth is not None
     np.testing.assert_array_equal(scene.depth[0].numpy(), expected.depth)
     assert scene.camera == expected.camera
 
 
-def test_simgeo_has_five_scenes_like_the_papers_and_a_statue():
-    assert SimGeo(size=SIZE).scenes() == list(SCENES)
-    assert len(SCENES) == 6
-    assert "statue" in SCENES
-
-
-def test_scene_is_its_rendering_with_depth_in_metres(cache, calls):
-    scene = SimGeo(size=SIZE).load(NAME)
-    assert (scene.dataset, scene.name) == ("simgeo", NAME)
-    assert scene.rgb.shape == (3, SIZE, SIZE)
-    assert_rendered(scene)
-    assert calls == [(NAME, SIZE)]
-
-
-def test_rendering_is_made_once_and_then_read_from_the_cache(cache, calls):
-    SimGeo(size=SIZE).load(NAME)
-    again = SimGeo(size=SIZE).load(NAME)
-    assert calls == [(NAME, SIZE)]
-    assert_rendered(again)
-
-
-def test_second_load_reads_the_cache(cache):
-    SimGeo(size=SIZE).load(NAME)
-    [file] = cache.rglob("*.npz")
-    with np.load(file) as kept:
-        content = dict(kept)
-    content["depth"] = content["depth"] + 1
-    np.savez(file, **content)
-    np.testing.assert_array_equal(SimGeo(size=SIZE).load(NAME).depth[0].numpy(), render_scene(NAME, SIZE).depth + 1)
-
-
-def test_sizes_do_not_share_a_rendering(cache, calls):
-    SimGeo(size=SIZE).load(NAME)
+def test_scene_is_rendered_once_and_then_read_from_the_cache(cache, calls):
+    for _ in range(2):
+        scene = SimGeo(size=SIZE).load(NAME)
+        assert (scene.dataset, scene.name) == ("simgeo", NAME)
+        assert_rendered(scene)
+        assert calls == [(NAME, SIZE)]
     assert SimGeo(size=32).load(NAME).rgb.shape == (3, 32, 32)
     assert calls == [(NAME, SIZE), (NAME, 32)]
 
 
-@pytest.mark.parametrize(
-    "damage",
-    ["empty", "truncated", "foreign", "without a camera", "a wrong camera", "other sizes", "another type"],
-)
-def test_damaged_cache_file_is_replaced_and_it_is_said(cache, calls, damage, capfd):
+DAMAGES = {
+    "empty": lambda file, kept: file.write_bytes(b""),
+    "truncated": lambda file, kept: file.write_bytes(file.read_bytes()[:-100]),
+    "foreign": lambda file, kept: file.write_bytes(b"something else"),
+    "without a camera": lambda file, kept: np.savez(file, rgb=kept["rgb"], depth=kept["depth"]),
+    "other sizes": lambda file, kept: np.savez(file, **{**kept, "depth": kept["depth"][:-1]}),
+    "another type": lambda file, kept: np.savez(file, **{**kept, "rgb": kept["rgb"].astype("U8")}),
+    "a wrong camera": lambda file, kept: np.savez(file, **{**kept, "camera": json.dumps({"wide": 3})}),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damaged_cache_file_is_replaced_with_a_note(cache, calls, damage, capfd):
     SimGeo(size=SIZE).load(NAME)
     [file] = cache.rglob("*.npz")
     with np.load(file) as kept:
-        content = dict(kept)
-    if damage == "empty":
-        file.write_bytes(b"")
-    elif damage == "truncated":
-        file.write_bytes(file.read_bytes()[:-100])
-    elif damage == "foreign":
-        file.write_bytes(b"something else")
-    elif damage == "without a camera":
-        np.savez(file, rgb=content["rgb"], depth=content["depth"])
-    elif damage == "other sizes":
-        np.savez(file, **{**content, "depth": content["depth"][:-1]})
-    elif damage == "another type":
-        np.savez(file, **{**content, "rgb": content["rgb"].astype("U8")})
-    else:
-        np.savez(file, **{**content, "camera": json.dumps({"wide": 3})})
+        DAMAGES[damage](file, dict(kept))
     note_once.cache_clear()
-    assert capfd.readouterr() == ("", "")
     assert_rendered(SimGeo(size=SIZE).load(NAME))
-    assert len(calls) == 2
     reported = capfd.readouterr().err
     assert reported.startswith(f"note: {file}: damaged")
     assert reported.count("\n") == 1
@@ -119,9 +89,8 @@ def test_damaged_cache_file_is_replaced_and_it_is_said(cache, calls, damage, cap
 def test_unwritable_cache_is_ignored(tmp_path, monkeypatch, calls):
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv("DSR_CACHE", str(tmp_path / "file"))
-    source = SimGeo(size=SIZE)
-    assert_rendered(source.load(NAME))
-    assert_rendered(source.load(NAME))
+    for _ in range(2):
+        assert_rendered(SimGeo(size=SIZE).load(NAME))
     assert len(calls) == 2
     assert (tmp_path / "file").read_text() == "in the way"
 
@@ -155,10 +124,9 @@ def lucy(tmp_path):
 
 def test_lucy_replaces_the_statue_where_available(lucy):
     source = SimGeo(str(lucy.parent), size=SIZE)
-    assert source.scenes() == [*(name for name in SCENES if name != "statue"), "lucy"]
+    assert source.scenes() == [*SCENES[:5], "lucy"]
     scene = source.load("lucy")
     assert (scene.dataset, scene.name) == ("simgeo", "lucy")
-    assert scene.depth is not None
     assert bool((scene.depth == 2.5).all())
 
 
@@ -174,7 +142,8 @@ def test_fingerprint_of_lucy_follows_her_files_and_that_of_renderings_their_size
 @pytest.mark.parametrize("root", [None, "nowhere"])
 def test_statue_stands_in_for_a_missing_lucy(tmp_path, root):
     source = SimGeo(None if root is None else str(tmp_path / root), size=SIZE)
-    assert source.scenes()[-1] == "statue"
+    assert source.scenes() == list(SCENES)
+    assert SCENES[5] == "statue"
 
 
 def test_chosen_scenes_alone_are_available_and_an_unknown_one_is_refused(lucy):
@@ -186,3 +155,55 @@ def test_chosen_scenes_alone_are_available_and_an_unknown_one_is_refused(lucy):
 def test_size_below_32_is_refused():
     with pytest.raises(ValueError, match=r"^size: expected at least 32 pixels, got 31"):
         SimGeo(size=31)
+
+
+def test_procedural_scene_is_the_rendering_of_its_number_made_once(cache, monkeypatch):
+    scene = Procedural(count=3, size=SMALL, seed=5).load("00002")
+    assert (scene.dataset, scene.name) == ("procedural", "00002")
+    assert_rendered(scene, render_random_scene(5, 2, SMALL))
+    monkeypatch.setattr(rendered, "render_random_scene", lambda *_: pytest.fail("rendered again"))
+    assert Procedural(count=3, size=SMALL, seed=5).load("00002").depth.equal(scene.depth)
+
+
+@pytest.mark.slow
+def test_preparing_renders_what_is_missing_and_names_every_scene(cache):
+    source = Procedural(count=3, size=SMALL)
+    source.load("00001")
+    assert sorted(source.prepare(source.scenes())) == ["00000", "00001", "00002"]
+    assert len(list(cache.rglob("*.npz"))) == 3
+    assert list(source.prepare(["00002", "00000"])) == ["00002", "00000"]
+
+
+@pytest.mark.slow
+def test_scene_of_a_killed_worker_is_rendered_by_another(cache, monkeypatch):
+    monkeypatch.setattr(rendered, "_WORTH_WORKERS", 0)
+    monkeypatch.setattr(os, "cpu_count", lambda: 1)
+    others = {child.pid for child in multiprocessing.active_children()}
+
+    def kill_a_worker():
+        while not (workers := [each for each in multiprocessing.active_children() if each.pid not in others]):
+            time.sleep(0.01)
+        workers[0].kill()
+
+    thread = threading.Thread(target=kill_a_worker, daemon=True)
+    thread.start()
+    said, names = [], ["00000", "00001", "00002"]
+    assert list(Procedural(count=3, size=SMALL).prepare(names, said.append)) == names
+    thread.join(60)
+    assert len(said) == 1
+    assert len(list(cache.rglob("*.npz"))) == 3
+
+
+@pytest.mark.slow
+def test_seeds_and_sizes_do_not_share_scenes(cache):
+    sources = [Procedural(count=1, size=SMALL), Procedural(count=1, size=SMALL, seed=1), Procedural(count=1, size=64)]
+    for source in sources:
+        source.load("00000")
+    assert len(list(cache.rglob("*.npz"))) == 3
+    assert len({source.fingerprint("00000") for source in sources}) == 3
+
+
+@pytest.mark.parametrize("wrong", [{"count": 0}, {"size": 16}, {"seed": -1}])
+def test_values_out_of_range_are_refused(wrong):
+    with pytest.raises(ValueError, match="dataset: expected count at least 1, size at least 32, seed at least 0"):
+        Procedural(**wrong)
