@@ -343,7 +343,7 @@ def geometry() -> Iterator[tuple[str, Job]]:
     yield "frames that vote", fused
     large = _large_scene()
     assert large.depth is not None
-    yield "edges", lambda: _numbers(find_edges(large.depth[0].numpy(), 8).count)
+    yield "edges", lambda: _numbers(sum(each.shape[1] for each in find_edges(large.depth[0].numpy(), 8, 0)))
     for shift, larger in ((5, 1.0), (0, 1.01), (0, 1.03), (3, 1.02)):
         yield f"displacement {shift}, {larger}", lambda shift=shift, larger=larger: _displaced(large, shift, larger)
 
