@@ -9,7 +9,6 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from fractions import Fraction
 from pathlib import Path
 from typing import Any, Self
 
@@ -34,25 +33,15 @@ class AllHolesError(ValueError):
 
 @dataclass(frozen=True)
 class Unit:
-    """The quantity and the unit that a benchmark prints its errors in.
+    """The quantity and the unit that a benchmark prints its errors in, of depth in metres."""
 
-    Args:
-        name: of the unit, such as ``cm``.
-        inverse: whether the quantity is ``factor / depth - offset`` (disparity), else ``factor * depth``.
-        factor: see ``inverse``; depth in metres.
-        offset: see ``inverse``.
-        limits: smallest and largest value that a prediction may have; the benchmark clamps to them. None for any value.
-
-    """
-
-    name: str
-    inverse: bool = False
+    name: str  # such as ``cm``
+    inverse: bool = False  # whether the quantity is ``factor / depth - offset`` (disparity), else ``factor * depth``
     factor: float = 100.0
     offset: float = 0.0
-    limits: tuple[float, float] | None = None
+    limits: tuple[float, float] | None = None  # to which the benchmark clamps predictions
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if not 0 < self.factor < math.inf:
             raise ValueError(f"unit {self.name}: factor: expected a positive number, got {self.factor}")
         if self.offset and not self.inverse:
@@ -97,7 +86,6 @@ class Scene:
     regions: Mapping[str, Tensor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check shapes and value ranges."""
         _expect_photo_and_regions(self.name, self.rgb, self.regions, self.camera)
         if self.depth is None and not self.measured:
             raise ValueError(f"{self.name}: expected a depth map, high-resolution or measured, got none")
@@ -120,19 +108,19 @@ class Scene:
     def crop(self, top: int, left: int, height: int, width: int) -> Scene:
         """Return a window of the scene: ``height`` x ``width`` pixels from row ``top`` and column ``left`` on.
 
-        A measured map is cropped along with it where the window consists of whole pixels of the map, and left out
-        otherwise.
+        A measured map is left out if the window does not consist of whole pixels of the map.
         """
         window = (slice(None), slice(top, top + height), slice(left, left + width))
         measured = {}
         for ratio, depth_lr in self.measured.items():
-            down = across = Fraction(ratio)  # height and width of a pixel of the map in the photo's pixels
+            (rows, columns), (rows_lr, columns_lr) = (ratio, ratio), (1, 1)
             if not isinstance(ratio, int):
-                down = Fraction(self.camera.height, depth_lr.shape[-2])
-                across = Fraction(self.camera.width, depth_lr.shape[-1])
-            places = (top / down, (top + height) / down, left / across, (left + width) / across)
-            if all(place.denominator == 1 for place in places):
-                first_row, end_row, first_column, end_column = map(int, places)
+                rows, columns = self.camera.height, self.camera.width
+                rows_lr, columns_lr = depth_lr.shape[-2:]
+            places = [(row * rows_lr, rows) for row in (top, top + height)]
+            places += [(column * columns_lr, columns) for column in (left, left + width)]
+            if all(place % side == 0 for place, side in places):
+                first_row, end_row, first_column, end_column = (int(place // side) for place, side in places)
                 measured[ratio] = depth_lr[:, first_row:end_row, first_column:end_column]
         depth = None if self.depth is None else self.depth[window]
         if depth is None and not measured:
@@ -174,7 +162,6 @@ class DepthSample:
     regions: Mapping[str, Tensor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check shapes, value ranges and cameras against each other."""
         _expect_photo_and_regions(self.scene, self.rgb, self.regions, self.camera)
         object.__setattr__(self, "scale", as_ratio(self.scale))
         if not 1 <= self.scale < math.inf:
@@ -253,11 +240,6 @@ class DepthSample:
         """Return the low-resolution disparity in pixels of the high-resolution camera, (1, h, w), NaN where missing."""
         pixels = self.camera.width / self.camera_lr.width  # of the high-resolution camera in a low-resolution one
         return to_range(self.depth_lr.to(dtype or self.depth_lr.dtype), self.camera_lr, "disparity") * pixels
-
-    @property
-    def mask(self) -> Tensor | None:
-        """(1, H, W) bool: where the true depth is known; None where there is no truth."""
-        return None if self.depth is None else self.depth.isfinite()
 
 
 _REGION = "region_"  # beginning of the names of arrays that are regions

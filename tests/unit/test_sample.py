@@ -67,9 +67,6 @@ def test_valid_masks_are_true_where_depth_is_known() -> None:
     sample = _sample(depth_lr=_with((1, 2, 4), torch.nan), depth=_with((1, 4, 8), torch.nan))
     assert sample.mask_lr.dtype == torch.bool
     assert (~sample.mask_lr).nonzero().tolist() == [[0, 1, 2]]
-    assert sample.mask is not None
-    assert (~sample.mask).nonzero().tolist() == [[0, 1, 2]]
-    assert _sample(depth=None).mask is None
 
 
 @pytest.mark.parametrize("make", [_scene, _sample])

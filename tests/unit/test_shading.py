@@ -7,8 +7,7 @@ import torch
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.lights import LIGHT_NAMES
-from dsr.geometry.shading import comparison, lights, render, render_for_viewing, shade
-from dsr.geometry.surface import depth_to_normals
+from dsr.geometry.surface import comparison, depth_to_normals, lights, render, render_for_viewing, shade
 
 PROTOCOL = -np.array(
     [

@@ -31,8 +31,7 @@ from dsr.geometry.mesh import (
     triangulate,
     vertex_normals,
 )
-from dsr.geometry.shading import render
-from dsr.geometry.surface import depth_to_normals
+from dsr.geometry.surface import depth_to_normals, render
 from dsr.io.glb import write_glb
 from dsr.io.photos import to_jpeg, write_png
 from dsr.sample import expect_distances

@@ -28,8 +28,7 @@ from torch.nn import functional
 from torch.utils.data import DataLoader
 
 from dsr.degradation.downsampling import Downsampling, downsample_depth, scene_generator
-from dsr.geometry.shading import comparison
-from dsr.geometry.surface import depth_to_normals
+from dsr.geometry.surface import comparison, depth_to_normals
 from dsr.methods.base import WORKSPACE, Abilities, Cost, Method, whole_scale
 from dsr.methods.classical.finite_differences import grey
 from dsr.methods.dip.skip_net import SkipNet, levels_for
