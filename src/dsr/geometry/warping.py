@@ -62,16 +62,11 @@ def warp_depth(depth: Tensor, camera: Camera, transforms: Tensor, target: Camera
 
 
 def source_pixels(depth: Tensor, camera: Camera, transforms: Tensor, target: Camera) -> tuple[Tensor, Tensor]:
-    """Return where the pixels of a map of :func:`warp_depth` come from.
-
-    They are columns and rows in pixels of ``camera``, (B, H, W) float64 each, NaN in holes.
-    """
+    """Return the columns and rows in ``camera`` that a map of :func:`warp_depth` is from, (B, H, W) float64 each."""
     inverse = torch.linalg.inv(transforms.double())
     points = depth.double() * target.rays(device=depth.device)  # (B, 3, H, W)
-    x, y, z = (
-        torch.einsum("bij,bjhw->bihw", inverse[:, :3, :3].expand(len(depth), 3, 3), points)
-        + inverse[:, :3, 3][:, :, None, None]
-    ).unbind(1)
+    turned = torch.einsum("bij,bjhw->bihw", inverse[:, :3, :3].expand(len(depth), 3, 3), points)
+    x, y, z = (turned + inverse[:, :3, 3][:, :, None, None]).unbind(1)
     return camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
 
 
@@ -171,18 +166,13 @@ def _rasterise(corners: _Corners, batch: int, target: Camera) -> Tensor:
         one = part[number]
         across = wide[one].long()
         u, v = first_u[one] + within % across, first_v[one] + within // across
-        inverse, inside = _interpolate(corners, one, u, v)
+        (u0, u1, u2), (v0, v1, v2) = corners.u[one].unbind(1), corners.v[one].unbind(1)
+        area = (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0)
+        second = ((u - u0) * (v2 - v0) - (u2 - u0) * (v - v0)) / area
+        third = ((u1 - u0) * (v - v0) - (u - u0) * (v1 - v0)) / area
+        weights = torch.stack((1 - second - third, second, third), 1)
+        inverse, inside = (weights * corners.inverse[one]).sum(1), (weights >= _INSIDE).all(1)
         place = (corners.item[one] * target.height + v.long()) * target.width + u.long()
         buffer.scatter_reduce_(0, place[inside], inverse[inside], "amax")
         start = stop
     return buffer
-
-
-def _interpolate(corners: _Corners, one: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the inverse depth of triangles ``one`` at pixels, and whether these are inside."""
-    (u0, u1, u2), (v0, v1, v2) = corners.u[one].unbind(1), corners.v[one].unbind(1)
-    area = (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0)
-    second = ((u - u0) * (v2 - v0) - (u2 - u0) * (v - v0)) / area
-    third = ((u1 - u0) * (v - v0) - (u - u0) * (v1 - v0)) / area
-    weights = torch.stack((1 - second - third, second, third), 1)
-    return (weights * corners.inverse[one]).sum(1), (weights >= _INSIDE).all(1)
