@@ -29,7 +29,7 @@ def degrees_per_pixel(focal: float) -> float:
 def wide_holes(known: Tensor, width: float) -> Tensor:
     """Return the parts of the holes of a map, (1, h, w) bool, that are wider than max(``width``, 5) pixels.
 
-    It is the morphological opening of the holes by a disc, so a narrow part of a wide hole is not wide. At the border of
+    It is the morphological opening of the holes by a disc: a narrow part of a wide hole is not wide. At the border of
     the map, a hole is wide from half of the width on, since it can be filled from one side only.
     """
     radius = max(width / 2, _NARROW)

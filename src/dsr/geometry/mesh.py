@@ -218,15 +218,19 @@ def find_connections(inverse: np.ndarray, largest_step: float = LARGEST_STEP) ->
 
 def _connected(inverse: np.ndarray, largest_step: float) -> np.ndarray:
     """Return whether each pixel and its right neighbour lie on one surface, (H, W - 1) bool; False beside holes."""
-    rows, found = max(1, _STRIP // inverse.shape[1]), []
+    width, widest = inverse.shape[1], 2 * max(_HALF_WIDTHS)
+    rows, found = max(1, _STRIP // width), []
     for start in range(0, len(inverse), rows):
         strip = inverse[start : start + rows]
+        padded = np.pad(strip, ((0, 0), (widest, widest)), constant_values=np.nan)
         change = np.diff(strip, axis=1)
         scale = largest_step * np.minimum(strip[:, :-1], strip[:, 1:])
         step = np.zeros(change.shape, dtype=bool)
         for half_width in _HALF_WIDTHS:
-            far, near = _shift(strip, half_width)[:, :-1], _shift(strip, 1 - half_width)[:, :-1]
-            beyond, before = _shift(strip, 2 * half_width)[:, :-1], _shift(strip, 1 - 2 * half_width)[:, :-1]
+            far, near, beyond, before = (
+                padded[:, widest + by : widest + by + width - 1]
+                for by in (half_width, 1 - half_width, 2 * half_width, 1 - 2 * half_width)
+            )
             total, pairs = far - near, 2 * half_width - 1
             excess, own = np.abs(total), np.abs(change)
             for slope in ((beyond - far) / half_width, (near - before) / half_width):
@@ -235,15 +239,6 @@ def _connected(inverse: np.ndarray, largest_step: float) -> np.ndarray:
             step |= (excess > scale) & (own > (1.0 if half_width == 1 else _OWN_FRACTION) * scale)
         found.append(np.isfinite(change) & ~step)
     return np.concatenate(found)
-
-
-def _shift(values: np.ndarray, by: int) -> np.ndarray:
-    """Return the map shifted by ``by`` columns, (H, W), NaN beyond the border."""
-    shifted = np.full_like(values, np.nan)
-    width = values.shape[1]
-    if abs(by) < width:
-        shifted[:, max(-by, 0) : width - max(by, 0)] = values[:, max(by, 0) : width + min(by, 0)]
-    return shifted
 
 
 def simplify(mesh: Mesh, most: int, camera: Camera) -> Mesh:

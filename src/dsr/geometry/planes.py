@@ -94,10 +94,25 @@ class InverseVotes(NamedTuple):
 
 
 def range_votes(values: Array, camera: Camera, step: float = 0.0) -> RangeVotes:
-    """Count the planar windows of a map that support each range type; see :func:`plane_votes`."""
-    votes = plane_votes(values, camera, step)
-    flat, ray, reverse = (int((np.abs(votes - k) < _NEAR).sum()) for k in (0, 1, -1))
-    return RangeVotes(votes.size, flat, ray, reverse)
+    """Count the planar windows of a map that support each range type, by their exponents k.
+
+    The values are (H, W), positive, in any unit, NaN in holes; ``step`` is their rounding step as a fraction of them.
+    """
+    windows = _windows(values, camera)
+    if not windows.inverse.size:
+        return RangeVotes(0, 0, 0, 0)
+    columns = np.stack((np.ones_like(windows.u), windows.u, windows.v, -windows.bend * windows.inverse), axis=-1)
+    scale = np.sqrt(np.square(columns).mean(axis=1, keepdims=True))
+    columns = columns / scale
+    fit, weight, residual = _robust_fit(columns, windows)
+    bent = columns[..., 3] * scale[..., 3]
+    linear = _solve(columns[..., :3], weight, bent)
+    signal = _spread(bent - (columns[..., :3] @ linear[..., None])[..., 0], weight)
+    noise = np.hypot(_spread(residual, weight), step / np.sqrt(12))
+    planar = (weight.mean(axis=1) > _INLIERS) & (noise < _NOISE * signal)
+    exponents = (fit[:, 3] / scale[:, 0, 3])[planar]
+    flat, ray, reverse = (int((np.abs(exponents - k) < _NEAR).sum()) for k in (0, 1, -1))
+    return RangeVotes(exponents.size, flat, ray, reverse)
 
 
 def inverse_votes(values: Array) -> InverseVotes:
@@ -116,7 +131,7 @@ def inverse_votes(values: Array) -> InverseVotes:
         columns = np.stack((np.ones_like(windows.u), windows.u, windows.v), axis=-1)
         fit, weight, residual = _robust_fit(columns, windows)
         deviations.append(_spread(residual, weight))
-        rise = _spread(_product(columns[..., 1:], fit[:, 1:]), weight)
+        rise = _spread((columns[..., 1:] @ fit[:, 1:, None])[..., 0], weight)
         planar.append((weight.mean(axis=1) > _INLIERS) & (deviations[-1] < _STEEP * rise))
     of_reciprocals, of_values = deviations
     curved = np.maximum(of_reciprocals, of_values) > _CURVED
@@ -133,32 +148,20 @@ def thinned(values: Array, camera: Camera) -> tuple[Array, Camera]:
     return values[::every, ::every], camera.decimate(every, 0)
 
 
-def plane_votes(values: Array, camera: Camera, step: float = 0.0) -> Array:
-    """Estimate the exponent k of each planar window: near 0 orthogonal, 1 along the ray, -1 the reverse.
-
-    The values are (H, W), positive, in any unit, NaN in holes; ``step`` is their rounding step as a fraction of them.
-    """
-    windows = _windows(values, camera)
-    if not windows.inverse.size:
-        return np.empty(0)
-    columns = np.stack((np.ones_like(windows.u), windows.u, windows.v, -windows.bend * windows.inverse), axis=-1)
-    scale = np.sqrt(np.square(columns).mean(axis=1, keepdims=True))
-    columns = columns / scale
-    fit, weight, residual = _robust_fit(columns, windows)
-    bent = columns[..., 3] * scale[..., 3]
-    bent = bent - _product(columns[..., :3], _solve(columns[..., :3], weight, bent))
-    noise = np.hypot(_spread(residual, weight), step / np.sqrt(12))
-    planar = (weight.mean(axis=1) > _INLIERS) & (noise < _NOISE * _spread(bent, weight))
-    exponents: Array = (fit[:, 3] / scale[:, 0, 3])[planar]
-    return exponents
-
-
 def _windows(values: Array, camera: Camera) -> _Windows:
     """Return the windows of a map that have enough valid pixels."""
     valid = np.isfinite(values)
     with np.errstate(over="ignore"):
         inverse = np.where(valid, np.nanmedian(values) / values, 0).clip(max=_LARGEST)
-    tops, lefts, sizes = _places(*values.shape)
+    places = []
+    height, width = values.shape
+    for fraction in _SIZES:  # windows overlap by half
+        size = int(min(height, width) * fraction)
+        if size >= _CELLS:
+            tops = np.linspace(0, height - size, round(2 * (height - size) / size) + 1).astype(int)
+            lefts = np.linspace(0, width - size, round(2 * (width - size) / size) + 1).astype(int)
+            places += [(top, left, size) for top in tops for left in lefts]
+    tops, lefts, sizes = np.array(places, dtype=int).reshape(-1, 3).T
     ends = np.round(np.arange(_CELLS + 1) * sizes[:, None] / _CELLS).astype(int)
     rows, columns = tops[:, None] + ends, lefts[:, None] + ends
     count = _totals(valid.astype(np.float64), rows, columns)
@@ -174,19 +177,6 @@ def _windows(values: Array, camera: Camera) -> _Windows:
     u, v = np.broadcast_to(u[:, None, :], bend.shape), np.broadcast_to(v[:, :, None], bend.shape)
     means, whole, u, v, bend = (field.reshape(len(means), _CELLS**2) for field in (means, whole, u, v, bend))
     return _Windows(means / _medians(means, whole), whole, u, v, bend)
-
-
-def _places(height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the first rows, first columns and sizes of windows that overlap by half."""
-    found = []
-    for fraction in _SIZES:
-        size = int(min(height, width) * fraction)
-        if size >= _CELLS:
-            tops = np.linspace(0, height - size, round(2 * (height - size) / size) + 1).astype(int)
-            lefts = np.linspace(0, width - size, round(2 * (width - size) / size) + 1).astype(int)
-            found += [(top, left, size) for top in tops for left in lefts]
-    tops, lefts, sizes = np.array(found, dtype=int).reshape(-1, 3).T
-    return tops, lefts, sizes
 
 
 def _totals(values: Array, rows: np.ndarray, columns: np.ndarray) -> Array:
@@ -206,7 +196,7 @@ def _robust_fit(columns: Array, windows: _Windows) -> tuple[Array, Array, Array]
     weight = valid
     for iteration in range(_ITERATIONS + 1):
         fit = _solve(columns, weight, windows.inverse)
-        residual = windows.inverse - _product(columns, fit)
+        residual = windows.inverse - (columns @ fit[..., None])[..., 0]
         size = np.abs(residual)
         scale = _SIGMA * _medians(size, windows.valid) + _EXACT
         if iteration < _ITERATIONS // 2:
@@ -230,11 +220,6 @@ def _solve(columns: Array, weight: Array, target: Array) -> Array:
     ridge = _EXACT * np.eye(columns.shape[-1]) * (1 + weight.sum(axis=1))[:, None, None]
     solution: Array = np.linalg.solve(weighted @ columns + ridge, weighted @ target[..., None])[..., 0]
     return solution
-
-
-def _product(columns: Array, fit: Array) -> Array:
-    product: Array = (columns @ fit[..., None])[..., 0]
-    return product
 
 
 def _spread(values: Array, weight: Array) -> Array:
