@@ -59,31 +59,20 @@ CENTIMETRES = Unit("cm")
 class Scene:
     """A photo and its high-resolution depth, before any downsampling.
 
-    Args:
-        dataset, name: together they identify the scene.
-        rgb: (3, H, W) floating point, in [0, 1].
-        camera: the camera of both.
-        depth: (1, H, W) true depth, or None where it is not known.
-        measured: low-resolution depth maps that a sensor measured, (1, h, w) by the ratio of the photo's width to w: 1,
-            2.667, 4. At a whole ratio, the map has H // ratio x W // ratio pixels and leaves out what remains of the
-            photo at the bottom and the right; at any other it covers the whole photo, and their aspect ratios may
-            differ by 2 %.
-        notes: what somebody who reads the scores should know, such as "depth is not metric".
-        unit: the unit in which the data set's benchmark prints errors.
-        regions: parts of the scene that tables show on their own, by name: (1, H, W) uint8, 0 outside; a region of
-            several objects, such as planes, numbers them from 1.
-
+    At a whole ratio, a measured map has H // ratio x W // ratio pixels and leaves out what remains of the photo at the
+    bottom and the right; at any other it covers the whole photo, and their aspect ratios may differ by 2 %. A region of
+    several objects, such as planes, numbers them from 1.
     """
 
     dataset: str
-    name: str
-    rgb: Tensor
-    camera: Camera
-    depth: Tensor | None = None
-    measured: Mapping[float, Tensor] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
-    unit: Unit = CENTIMETRES
-    regions: Mapping[str, Tensor] = field(default_factory=dict)
+    name: str  # that identifies the scene in its data set
+    rgb: Tensor  # (3, H, W) floating point, in [0, 1]
+    camera: Camera  # of photo and depth
+    depth: Tensor | None = None  # (1, H, W), None where it is not known
+    measured: Mapping[float, Tensor] = field(default_factory=dict)  # a sensor's maps, (1, h, w), by the ratio W / w
+    notes: tuple[str, ...] = ()  # for readers of the scores, such as "depth is not metric"
+    unit: Unit = CENTIMETRES  # in which the data set's benchmark prints errors
+    regions: Mapping[str, Tensor] = field(default_factory=dict)  # parts with own tables: (1, H, W) uint8, 0 outside
 
     def __post_init__(self) -> None:
         _expect_photo_and_regions(self.name, self.rgb, self.regions, self.camera)
@@ -134,30 +123,18 @@ class Scene:
 class DepthSample:
     """A photo, a low-resolution depth map, and the high-resolution one where it is known.
 
-    Args:
-        dataset, scene: names; together they identify the sample.
-        rgb: (3, H, W) floating point, in [0, 1].
-        depth_lr: (1, h, w) low-resolution depth; H = h * scale and W = w * scale, where the scale is not whole to
-            within a low-resolution pixel or 2 %.
-        camera: the camera of the photo and of ``depth``.
-        camera_lr: the camera of ``depth_lr``.
-        scale: the upsampling factor W / w: 1, 2.667, 4.
-        depth: (1, H, W) true high-resolution depth, or None where it is not known.
-        notes: what somebody who reads the scores should know, such as "cropped from 513 x 512".
-        unit: the unit in which the data set's benchmark prints errors.
-        regions: as of a :class:`Scene`.
-
+    Where the scale is not whole, H = h * scale and W = w * scale to within a low-resolution pixel or 2 %.
     """
 
     dataset: str
-    scene: str
-    rgb: Tensor
-    depth_lr: Tensor
-    camera: Camera
-    camera_lr: Camera
-    scale: float
-    depth: Tensor | None = None
-    notes: tuple[str, ...] = field(default=())
+    scene: str  # that identifies the sample in its data set
+    rgb: Tensor  # (3, H, W) floating point, in [0, 1]
+    depth_lr: Tensor  # (1, h, w)
+    camera: Camera  # of photo and ``depth``
+    camera_lr: Camera  # of ``depth_lr``
+    scale: float  # the upsampling factor W / w: 1, 2.667, 4
+    depth: Tensor | None = None  # (1, H, W), None where it is not known
+    notes: tuple[str, ...] = ()  # for readers of the scores, such as "cropped from 513 x 512"
     unit: Unit = CENTIMETRES
     regions: Mapping[str, Tensor] = field(default_factory=dict)
 

@@ -1,18 +1,13 @@
 """Triangle meshes of depth maps, cut at depth steps, and fewer triangles and points for those beyond a limit.
 
-The inverse depth of a plane is linear in the pixel at any viewing angle. So two neighbouring pixels lie on different
-sides of a step if inverse depth changes by more than the slopes on both sides predict. A threshold on the difference of
-the two depths would cut floors at a distance. Steps that interpolation has spread over a few pixels are found from the
-change over windows of up to five pairs of pixels.
-
-With a tolerance, triangles are large where the surface is flat: a hierarchy of right triangles (Evans, Kirkpatrick and
-Townsend, *Right-Triangulated Irregular Networks*, Algorithmica 2001). A triangle is halved from its right angle to the
-middle of its longest side, as long as leaving out the pixel in that middle changes the inverse depth there by too much.
-The pixels of a smaller triangle count for the larger ones that hold it, so that neighbours always share whole sides.
-
-Meshes are simplified by quadric edge collapses (Garland and Heckbert, *Surface Simplification Using Quadric Error
-Metrics*, SIGGRAPH 1997), as the library `fast-simplification` (the extra ``mesh``) has them: flat regions become few
-large triangles, and curved ones keep theirs. Without the library, rows and columns are left out.
+The inverse depth of a plane is linear in the pixel at any viewing angle. So neighbouring pixels lie on different sides
+of a step if inverse depth changes by more than the slopes on both sides predict, over windows of up to five pairs of
+pixels where interpolation has spread the step. With a tolerance, flat parts get large triangles of a hierarchy (Evans,
+Kirkpatrick and Townsend, *Right-Triangulated Irregular Networks*, Algorithmica 2001): a triangle is halved as long as
+leaving out the middle of its longest side changes the inverse depth there by too much, and the pixels of a smaller
+triangle count for the larger ones that hold it, so that neighbours share whole sides. Meshes are simplified by quadric
+edge collapses (Garland and Heckbert, SIGGRAPH 1997) of the library `fast-simplification` (the extra ``mesh``); without
+it, rows and columns are left out.
 """
 
 from __future__ import annotations

@@ -77,15 +77,11 @@ _STILL = 1.2  # times as many pixels have to disagree under the poses as without
 
 
 class Agreement(NamedTuple):
-    """How far pairs of frames agree under each of :data:`READINGS` and, last, without motion, (pairs, readings + 1).
+    """How far pairs of frames agree under each of :data:`READINGS` and, last, without motion, (pairs, readings + 1)."""
 
-    ``overlap``: share of a frame's points that lie in the other's view. ``agreed``: share of these whose depths agree.
-    ``moved``: distance of the two places as given, over the median depth, (pairs,).
-    """
-
-    overlap: np.ndarray
-    agreed: np.ndarray
-    moved: np.ndarray
+    overlap: np.ndarray  # share of a frame's points that lie in the other's view
+    agreed: np.ndarray  # share of these whose depths agree
+    moved: np.ndarray  # distance of the two places as given, over the median depth, (pairs,)
 
 
 def sample(count: int) -> list[tuple[int, ...]]:

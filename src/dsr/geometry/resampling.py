@@ -2,12 +2,11 @@
 
 Along each axis, a line is fitted to the old pixels around each new one, with triangular weights wide enough for
 antialiasing; the new pixel is the value of the line at its centre. Planes, whose inverse depth is linear in the pixel,
-therefore stay planes to rounding, up to the border. A second difference above ``JUMP`` times the value at one of these
-old pixels is a depth step: the new pixel then takes, of the four old ones around its centre, the value nearest to the
-fitted one, as a value between two surfaces would belong to neither. Compared with antialiased bicubic resizing this
-lowers RMSE_v on Lucy from 0.137 to 0.061 for a photo twice as large as the depth map, and from 0.176 to 0.141 for one
-7.5 times as large; on Plant, whose ground truth has many mixed pixels, it raises RMSE_v from 0.129 to 0.144 and from
-0.176 to 0.185.
+stay planes to rounding, up to the border. A second difference above ``JUMP`` times the value at one of these old pixels
+is a depth step: the new pixel then takes, of the four old ones around its centre, the value nearest to the fitted one.
+Compared with antialiased bicubic resizing this lowers RMSE_v on Lucy from 0.137 to 0.061 for a photo twice as large as
+the depth map, and from 0.176 to 0.141 for one 7.5 times as large; on Plant, whose ground truth has many mixed pixels,
+it raises RMSE_v from 0.129 to 0.144 and from 0.176 to 0.185.
 """
 
 from __future__ import annotations

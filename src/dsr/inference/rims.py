@@ -1,16 +1,12 @@
 """Holes between a nearer and a farther surface: each pixel is assigned to one of them by the colours of the photo.
 
-Stereo and structured light lose what lies beside and between near objects: the strip that one of two cameras does not
-see, the loop between an arm and a head, the gaps between the legs of a chair. What is filled in from the rim there is
-a sheet between the two surfaces, or closes the loop. So each pixel of such a hole is compared with the measured pixels
-around it, up to three times as far as the rim, as in a joint bilateral filter: the two of each surface that are nearest
-and most alike in colour stand for it. It gets the farther depth where that surface explains its colour at least as well
-as the nearer one, the nearer where that does clearly better, and what other holes get in between. Where that is of
-the same surface anyway, a pixel is left to the method, which knows slopes and its own errors. The probability that a
-pixel is of the other surface counts in its expected error; for those left to the method only if the depths around them
-have a step, as those of a slope are all of one surface.
-
-See ``benchmarks/holes.py`` for the figures.
+Stereo and structured light lose what lies beside and between near objects, such as the loop between an arm and a head;
+filling from the rim would span a sheet between the two surfaces. So each pixel of such a hole is compared with the
+measured pixels around it, up to three times as far as the rim, as in a joint bilateral filter: the two of each surface
+that are nearest and most alike in colour stand for it. The pixel gets the farther depth if that surface explains its
+colour at least as well as the nearer one, and the nearer if that does clearly better. A pixel is left to the method,
+which knows slopes and its own errors, if filling from the rim gives the same surface. The probability that a pixel is
+of the other surface counts in its expected error. See ``benchmarks/holes.py`` for the figures.
 """
 
 from __future__ import annotations

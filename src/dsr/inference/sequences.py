@@ -35,19 +35,13 @@ _PASSES = 2  # passes of the robust mean
 class View:
     """A depth map with its camera's place.
 
-    Args:
-        depth: (1, h, w) orthogonal depth in metres, NaN in holes.
-        camera: camera of these pixels.
-        pose: transform from the camera's frame (x right, y down, z forward) to the world's, 4 x 4, metres.
-        deviation: (1, h, w) expected standard deviation of each pixel in metres; None to estimate it, as one number for
-            the inverse depth of all views.
-
+    Without a deviation, one number for the inverse depth of all views is estimated.
     """
 
-    depth: Tensor
+    depth: Tensor  # (1, h, w) orthogonal depth in metres, NaN in holes
     camera: Camera
-    pose: Matrix
-    deviation: Tensor | None = None
+    pose: Matrix  # from the camera's frame (x right, y down, z forward) to the world's, 4 x 4, metres
+    deviation: Tensor | None = None  # (1, h, w) expected standard deviation of each pixel in metres
 
     def __post_init__(self) -> None:
         shape = (1, self.camera.height, self.camera.width)

@@ -1,14 +1,12 @@
 """The size at which a sensor's map is upsampled: smaller than the map where its noise is correlated over many pixels.
 
-A network takes correlated noise that is wider than its receptive field for the shape of the surface. At a size at which
-the noise of neighbouring pixels is independent again the network averages it; the details that are lost there were
-hidden by the noise anyway.
+A network takes correlated noise that is wider than its receptive field for shape. At a size at which the noise of
+neighbouring pixels is independent again the network averages it; the details lost there were hidden by the noise.
 
 Noise is distinguished from shape by its correlation in windows of increasing size, after a plane in inverse depth is
-subtracted: noise is correlated over the same number of pixels in each, while bends of surfaces are over a third of
-the window, whatever its size. The flattest tenth of the windows counts. A surface that is covered with bumps may look
-the same. The noise of a sensor, however, is never as smooth as a bumpy surface, since depth is counted in steps, and no
-window is free of it.
+subtracted: noise is correlated over the same number of pixels in each, while bends of surfaces are over a third of the
+window, whatever its size. The flattest tenth of the windows counts. A surface that is covered with bumps may look the
+same; but a sensor's noise is never as smooth, since depth is counted in steps, and no window is free of it.
 """
 
 from __future__ import annotations
