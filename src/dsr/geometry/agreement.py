@@ -193,7 +193,7 @@ def photo_outlines(photo: _Floats, pixel: float) -> Outlines:
 
     ``pixel`` is the width of a pixel of the depth map on the grid.
     """
-    right, down = _gradient(_blur(photo, max(pixel, 1.0) ** 0.5))
+    right, down = _gradient(photo, max(pixel, 1.0) ** 0.5)
     steepest = (right * right + down * down).argmax(axis=-1)[..., None]
     right = np.take_along_axis(right, steepest, axis=-1)[..., 0]
     down = np.take_along_axis(down, steepest, axis=-1)[..., 0]
@@ -204,17 +204,18 @@ def photo_outlines(photo: _Floats, pixel: float) -> Outlines:
 
 def depth_outlines(depth: Array, size: Size) -> Outlines:
     """Return the edges of a depth map, (h, w) in any unit of depth or of its reciprocal, on a grid; from 0 to 1."""
-    rows, columns = (((np.arange(n) + 0.5) * m / n).astype(np.intp) for n, m in zip(size, depth.shape, strict=True))
+    rows = ((np.arange(size[0]) + 0.5) * depth.shape[0] / size[0]).astype(np.intp)
+    columns = ((np.arange(size[1]) + 0.5) * depth.shape[1] / size[1]).astype(np.intp)
     small = _bridge(depth[rows][:, columns].astype(np.float64), max(round(_GAP * max(size)), 1))
     valid = np.isfinite(small)
     if not valid.any():
         return _outlines(np.zeros(size, np.float32), *np.zeros((2, *size), np.float32))
     nearest = ndimage.distance_transform_edt(~valid, return_distances=False, return_indices=True)
     logarithm = ndimage.median_filter(np.log(small[tuple(nearest)]).astype(np.float32), 3)
-    right, down = _gradient(_blur(logarithm, 0.7 * max(size[1] / depth.shape[1], 1)))
+    right, down = _gradient(logarithm, 0.7 * max(size[1] / depth.shape[1], 1))
     strength = ((2 * np.hypot(right, down) - JUMP / 2) / JUMP).clip(0, 1)
     strength[ndimage.binary_dilation(~valid)] = 0
-    into, below = _gradient(_blur(valid.astype(np.float32), 1.0))
+    into, below = _gradient(valid.astype(np.float32), 1.0)
     border = _HOLE * (2 * np.hypot(into, below) / 0.35).clip(0, 1)
     beside = border > strength
     right, down = np.where(beside, into, right), np.where(beside, below, down)
@@ -291,8 +292,9 @@ def _blur(values: _Floats, deviation: float) -> _Floats:
     return np.asarray(cv2.GaussianBlur(np.ascontiguousarray(values), (0, 0), deviation))
 
 
-def _gradient(values: _Floats) -> tuple[_Floats, _Floats]:
-    """Return the change to the right and down per pixel, from three rows and columns."""
-    right = cv2.Sobel(values, cv2.CV_32F, 1, 0, scale=1 / 8, borderType=cv2.BORDER_REPLICATE)
-    down = cv2.Sobel(values, cv2.CV_32F, 0, 1, scale=1 / 8, borderType=cv2.BORDER_REPLICATE)
+def _gradient(values: _Floats, blur: float) -> tuple[_Floats, _Floats]:
+    """Return the change of blurred values to the right and down per pixel, from three rows and columns."""
+    smooth = _blur(values, blur)
+    right = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8, borderType=cv2.BORDER_REPLICATE)
+    down = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1 / 8, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(right, np.float32), np.asarray(down, np.float32)

@@ -40,6 +40,7 @@ from dsr.methods.recipe import Recipe, Run, read_recipe
 from dsr.sample import DepthSample, expect_distances
 from dsr.utils.compute_device import fast_precision, pick_device
 from dsr.utils.configuration import ConfigError
+from dsr.utils.guards import expect_one_of
 from dsr.utils.progress import Steps
 
 # arguments of methods that are set here: holes are restored afterwards, and validation has no ground truth
@@ -86,7 +87,11 @@ class AnyRatio(Method):
         precision: str | None = None,
         seed: int = 0,
     ) -> None:
-        _check_options(fill, max_hole, working_size)
+        expect_one_of("fill", fill, get_args(Fill))
+        if not 0 < max_hole < math.inf:
+            raise ValueError(f"max_hole: expected a positive number of degrees, got {max_hole}")
+        if working_size is not None and working_size not in SIZES:
+            raise ValueError(f"working_size: expected one of {', '.join(map(str, SIZES))}, got {working_size}")
         self.recipe, self._scale, self._fill = recipe, scale, fill
         self._max_hole, self._working_size = max_hole, working_size
         precision = precision or (fast_precision(device) if recipe.abilities.tolerant else "float32")
@@ -390,16 +395,6 @@ def _in_depth(
     result = inverse_hr.reciprocal_()
     share = None if glass is None else float((glass > NOTED).double().mean())
     return Surface(result, spread * result, angle, found.noise, glass=share)
-
-
-def _check_options(fill: str, max_hole: float, working_size: int | None) -> None:
-    """Raise ValueError for a value that :func:`upsample_surface` does not know."""
-    if fill not in get_args(Fill):
-        raise ValueError(f"fill: expected one of {', '.join(get_args(Fill))}, got {fill!r}")
-    if not 0 < max_hole < math.inf:
-        raise ValueError(f"max_hole: expected a positive number of degrees, got {max_hole}")
-    if working_size is not None and working_size not in SIZES:
-        raise ValueError(f"working_size: expected one of {', '.join(map(str, SIZES))}, got {working_size}")
 
 
 def expect_picture(rgb: Tensor, depth: Tensor, camera: Camera) -> None:
