@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from dsr.geometry.camera import Camera
 
@@ -52,7 +53,7 @@ def warp_depth(depth: Tensor, camera: Camera, transforms: Tensor, target: Camera
     inverse = depth[:, 0].double().reciprocal()  # (B, h, w)
     inverse = torch.where(inverse.isfinite() & (inverse > 0), inverse, torch.nan)
     transforms = transforms.to(inverse).expand(batch, 4, 4)
-    across, down = _joined(inverse, 2), _joined(inverse, 1)
+    across, down = _joined(inverse), _joined(inverse.mT).mT
     surfaces = _rasterise(_project(_triangles(inverse, across, down), camera, transforms, target), batch, target)
     rims = _rasterise(_project(_squares(inverse, across, down), camera, transforms, target), batch, target)
     hidden = (surfaces > 0) & (rims <= (1 + _RIM) * surfaces)
@@ -79,16 +80,13 @@ def registered_camera(camera: Camera, photo: Camera) -> Camera:
     return photo.rescale(max(round(scale * photo.width), 2), max(round(scale * photo.height), 2))
 
 
-def _joined(inverse: Tensor, dim: int) -> Tensor:
-    """Return whether each pixel and its next one along a dimension are on one surface; one less in that dimension."""
-    steps = inverse.diff(dim=dim)
-    padding = torch.full_like(steps.narrow(dim, 0, 1), torch.nan)
-    before = torch.cat((padding, steps.narrow(dim, 0, steps.shape[dim] - 1)), dim)
-    after = torch.cat((steps.narrow(dim, 1, steps.shape[dim] - 1), padding), dim)
+def _joined(inverse: Tensor) -> Tensor:
+    """Return whether each pixel and the next one in its row are on one surface, (B, h, w - 1)."""
+    steps = inverse.diff(dim=-1)
+    before = functional.pad(steps[..., :-1], (1, 0), value=torch.nan)
+    after = functional.pad(steps[..., 1:], (0, 1), value=torch.nan)
     beyond = torch.stack((steps.abs(), (steps - before).abs(), (steps - after).abs())).nan_to_num(torch.inf).amin(0)
-    size = steps.shape[dim]
-    near = torch.maximum(inverse.narrow(dim, 0, size), inverse.narrow(dim, 1, size))
-    return steps.isfinite() & (beyond <= STEP * near)
+    return steps.isfinite() & (beyond <= STEP * torch.maximum(inverse[..., :-1], inverse[..., 1:]))
 
 
 def _triangles(inverse: Tensor, across: Tensor, down: Tensor) -> _Corners:
@@ -115,8 +113,8 @@ def _squares(inverse: Tensor, across: Tensor, down: Tensor) -> _Corners:
     complete[:, 1:-1, 1:-1] = whole[:, :-1, :-1] & whole[:, :-1, 1:] & whole[:, 1:, :-1] & whole[:, 1:, 1:]
     item, row, column = torch.nonzero(inverse.isfinite() & ~complete, as_tuple=True)
     centre = inverse[item, row, column]
-    slope_u = _slope(inverse, across, 2)[item, row, column]
-    slope_v = _slope(inverse, down, 1)[item, row, column]
+    slope_u = _slope(inverse, across)[item, row, column]
+    slope_v = _slope(inverse.mT, down.mT)[item, column, row]
     parts = []
     for corners in (((-1, -1), (-1, 1), (1, -1)), ((1, 1), (1, -1), (-1, 1))):  # (down, right), in half pixels
         dv, du = (torch.tensor(each).to(inverse) / 2 for each in zip(*corners, strict=True))
@@ -125,13 +123,11 @@ def _squares(inverse: Tensor, across: Tensor, down: Tensor) -> _Corners:
     return _Corners(*(torch.cat(each) for each in zip(*parts, strict=True)))
 
 
-def _slope(inverse: Tensor, joined: Tensor, dim: int) -> Tensor:
-    """Return the mean change to the neighbours on the same surface along a dimension, 0 without one."""
-    steps = torch.where(joined, inverse.diff(dim=dim), 0)
-    none = torch.zeros_like(inverse.narrow(dim, 0, 1))
-    total = torch.cat((steps, none), dim) + torch.cat((none, steps), dim)
-    count = torch.cat((joined.to(none), none), dim) + torch.cat((none, joined.to(none)), dim)
-    return total / count.clamp(min=1)
+def _slope(inverse: Tensor, joined: Tensor) -> Tensor:
+    """Return the mean change to the neighbours in the row that are on the same surface, 0 without one."""
+    steps, count = torch.where(joined, inverse.diff(dim=-1), 0), joined.to(inverse)
+    total = functional.pad(steps, (0, 1)) + functional.pad(steps, (1, 0))
+    return total / (functional.pad(count, (0, 1)) + functional.pad(count, (1, 0))).clamp(min=1)
 
 
 def _project(corners: _Corners, camera: Camera, transforms: Tensor, target: Camera) -> _Corners:
