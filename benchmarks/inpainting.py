@@ -24,8 +24,7 @@ from torch import Tensor
 from dsr.data.folder import Folder
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.degradation.holes import Blobs, Holes, Shadows
-from dsr.geometry.shading import render
-from dsr.geometry.surface import depth_to_normals
+from dsr.geometry.surface import depth_to_normals, render
 from dsr.methods.recipe import Run, read_recipe
 from dsr.metrics.functional import SurfacePair, rmse_d, rmse_v
 from dsr.sample import DepthSample, Scene

@@ -21,7 +21,7 @@ from skimage.filters import scharr_h, scharr_v
 from skimage.metrics import structural_similarity
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.shading import lights
+from dsr.geometry.surface import lights
 from dsr.metrics.catalogue import catalogue, score_image
 from dsr.metrics.functional import BUMPINESS_DISPARITY, SurfacePair
 from dsr.metrics.lpips import _CONVOLUTIONS, LPIPS, lpips_v

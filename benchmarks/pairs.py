@@ -194,7 +194,7 @@ def rendered(job: tuple[int, Path | None]) -> list[Right]:
 def examine(rgb: Tensor, depth: Tensor, *, right: bool = False) -> Outcome:
     """Return what ``dsr upsample`` finds; in a wrong pair its displacement only where nothing else is detected."""
     verdict = judge(depth[0].numpy(), rgb)
-    if verdict is not None and not right and (verdict.turned or verdict.apart or verdict.other):
+    if verdict is not None and not right and verdict.kind in ("turned", "apart", "other"):
         code = verdict.statement
     else:
         camera = Camera(rgb.shape[-1], rgb.shape[-2], 1.0, 1.0, 0.0, 0.0)

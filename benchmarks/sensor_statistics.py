@@ -30,7 +30,7 @@ from dsr.data import sunrgbd
 from dsr.data.rendered import Procedural
 from dsr.degradation.random_noise import NOISES
 from dsr.geometry.camera import Camera
-from dsr.geometry.shading import render_for_viewing
+from dsr.geometry.surface import render_for_viewing
 from dsr.io.depth_files import read_depth_file
 from dsr.pictures.depth_views import normals_seen_by
 

@@ -43,8 +43,7 @@ from dsr.geometry.hole_size import distance_to_known, wide_holes
 from dsr.geometry.mesh import triangulate
 from dsr.geometry.registration import find_displacement, find_edges, undo
 from dsr.geometry.resampling import pad_inverse_depth, resize_inverse_depth
-from dsr.geometry.shading import render, render_for_viewing
-from dsr.geometry.surface import depth_to_normals
+from dsr.geometry.surface import depth_to_normals, render, render_for_viewing
 from dsr.geometry.warping import warp_depth
 from dsr.inference.any_ratio import upsample_surface
 from dsr.inference.plausibility import find_outliers, within_measured
@@ -342,7 +341,7 @@ def geometry() -> Iterator[tuple[str, Job]]:
     yield "frames that vote", fused
     large = _large_scene()
     assert large.depth is not None
-    yield "edges", lambda: _numbers(find_edges(large.depth[0].numpy(), 8).count)
+    yield "edges", lambda: _numbers(sum(each.shape[1] for each in find_edges(large.depth[0].numpy(), 8, 0)))
     for shift, larger in ((5, 1.0), (0, 1.01), (0, 1.03), (3, 1.02)):
         yield f"displacement {shift}, {larger}", lambda shift=shift, larger=larger: _displaced(large, shift, larger)
 

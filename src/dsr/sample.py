@@ -9,7 +9,6 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from fractions import Fraction
 from pathlib import Path
 from typing import Any, Self
 
@@ -34,25 +33,15 @@ class AllHolesError(ValueError):
 
 @dataclass(frozen=True)
 class Unit:
-    """The quantity and the unit that a benchmark prints its errors in.
+    """The quantity and the unit that a benchmark prints its errors in, of depth in metres."""
 
-    Args:
-        name: of the unit, such as ``cm``.
-        inverse: whether the quantity is ``factor / depth - offset`` (disparity), else ``factor * depth``.
-        factor: see ``inverse``; depth in metres.
-        offset: see ``inverse``.
-        limits: smallest and largest value that a prediction may have; the benchmark clamps to them. None for any value.
-
-    """
-
-    name: str
-    inverse: bool = False
+    name: str  # such as ``cm``
+    inverse: bool = False  # whether the quantity is ``factor / depth - offset`` (disparity), else ``factor * depth``
     factor: float = 100.0
     offset: float = 0.0
-    limits: tuple[float, float] | None = None
+    limits: tuple[float, float] | None = None  # to which the benchmark clamps predictions
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if not 0 < self.factor < math.inf:
             raise ValueError(f"unit {self.name}: factor: expected a positive number, got {self.factor}")
         if self.offset and not self.inverse:
@@ -70,34 +59,22 @@ CENTIMETRES = Unit("cm")
 class Scene:
     """A photo and its high-resolution depth, before any downsampling.
 
-    Args:
-        dataset, name: together they identify the scene.
-        rgb: (3, H, W) floating point, in [0, 1].
-        camera: the camera of both.
-        depth: (1, H, W) true depth, or None where it is not known.
-        measured: low-resolution depth maps that a sensor measured, (1, h, w) by the ratio of the photo's width to w: 1,
-            2.667, 4. At a whole ratio, the map has H // ratio x W // ratio pixels and leaves out what remains of the
-            photo at the bottom and the right; at any other it covers the whole photo, and their aspect ratios may
-            differ by 2 %.
-        notes: what somebody who reads the scores should know, such as "depth is not metric".
-        unit: the unit in which the data set's benchmark prints errors.
-        regions: parts of the scene that tables show on their own, by name: (1, H, W) uint8, 0 outside; a region of
-            several objects, such as planes, numbers them from 1.
-
+    At a whole ratio, a measured map has H // ratio x W // ratio pixels and leaves out what remains of the photo at the
+    bottom and the right; at any other it covers the whole photo, and their aspect ratios may differ by 2 %. A region of
+    several objects, such as planes, numbers them from 1.
     """
 
     dataset: str
-    name: str
-    rgb: Tensor
-    camera: Camera
-    depth: Tensor | None = None
-    measured: Mapping[float, Tensor] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
-    unit: Unit = CENTIMETRES
-    regions: Mapping[str, Tensor] = field(default_factory=dict)
+    name: str  # that identifies the scene in its data set
+    rgb: Tensor  # (3, H, W) floating point, in [0, 1]
+    camera: Camera  # of photo and depth
+    depth: Tensor | None = None  # (1, H, W), None where it is not known
+    measured: Mapping[float, Tensor] = field(default_factory=dict)  # a sensor's maps, (1, h, w), by the ratio W / w
+    notes: tuple[str, ...] = ()  # for readers of the scores, such as "depth is not metric"
+    unit: Unit = CENTIMETRES  # in which the data set's benchmark prints errors
+    regions: Mapping[str, Tensor] = field(default_factory=dict)  # parts with own tables: (1, H, W) uint8, 0 outside
 
     def __post_init__(self) -> None:
-        """Check shapes and value ranges."""
         _expect_photo_and_regions(self.name, self.rgb, self.regions, self.camera)
         if self.depth is None and not self.measured:
             raise ValueError(f"{self.name}: expected a depth map, high-resolution or measured, got none")
@@ -120,19 +97,19 @@ class Scene:
     def crop(self, top: int, left: int, height: int, width: int) -> Scene:
         """Return a window of the scene: ``height`` x ``width`` pixels from row ``top`` and column ``left`` on.
 
-        A measured map is cropped along with it where the window consists of whole pixels of the map, and left out
-        otherwise.
+        A measured map is left out if the window does not consist of whole pixels of the map.
         """
         window = (slice(None), slice(top, top + height), slice(left, left + width))
         measured = {}
         for ratio, depth_lr in self.measured.items():
-            down = across = Fraction(ratio)  # height and width of a pixel of the map in the photo's pixels
+            (rows, columns), (rows_lr, columns_lr) = (ratio, ratio), (1, 1)
             if not isinstance(ratio, int):
-                down = Fraction(self.camera.height, depth_lr.shape[-2])
-                across = Fraction(self.camera.width, depth_lr.shape[-1])
-            places = (top / down, (top + height) / down, left / across, (left + width) / across)
-            if all(place.denominator == 1 for place in places):
-                first_row, end_row, first_column, end_column = map(int, places)
+                rows, columns = self.camera.height, self.camera.width
+                rows_lr, columns_lr = depth_lr.shape[-2:]
+            places = [(row * rows_lr, rows) for row in (top, top + height)]
+            places += [(column * columns_lr, columns) for column in (left, left + width)]
+            if all(place % side == 0 for place, side in places):
+                first_row, end_row, first_column, end_column = (int(place // side) for place, side in places)
                 measured[ratio] = depth_lr[:, first_row:end_row, first_column:end_column]
         depth = None if self.depth is None else self.depth[window]
         if depth is None and not measured:
@@ -146,35 +123,22 @@ class Scene:
 class DepthSample:
     """A photo, a low-resolution depth map, and the high-resolution one where it is known.
 
-    Args:
-        dataset, scene: names; together they identify the sample.
-        rgb: (3, H, W) floating point, in [0, 1].
-        depth_lr: (1, h, w) low-resolution depth; H = h * scale and W = w * scale, where the scale is not whole to
-            within a low-resolution pixel or 2 %.
-        camera: the camera of the photo and of ``depth``.
-        camera_lr: the camera of ``depth_lr``.
-        scale: the upsampling factor W / w: 1, 2.667, 4.
-        depth: (1, H, W) true high-resolution depth, or None where it is not known.
-        notes: what somebody who reads the scores should know, such as "cropped from 513 x 512".
-        unit: the unit in which the data set's benchmark prints errors.
-        regions: as of a :class:`Scene`.
-
+    Where the scale is not whole, H = h * scale and W = w * scale to within a low-resolution pixel or 2 %.
     """
 
     dataset: str
-    scene: str
-    rgb: Tensor
-    depth_lr: Tensor
-    camera: Camera
-    camera_lr: Camera
-    scale: float
-    depth: Tensor | None = None
-    notes: tuple[str, ...] = field(default=())
+    scene: str  # that identifies the sample in its data set
+    rgb: Tensor  # (3, H, W) floating point, in [0, 1]
+    depth_lr: Tensor  # (1, h, w)
+    camera: Camera  # of photo and ``depth``
+    camera_lr: Camera  # of ``depth_lr``
+    scale: float  # the upsampling factor W / w: 1, 2.667, 4
+    depth: Tensor | None = None  # (1, H, W), None where it is not known
+    notes: tuple[str, ...] = ()  # for readers of the scores, such as "cropped from 513 x 512"
     unit: Unit = CENTIMETRES
     regions: Mapping[str, Tensor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check shapes, value ranges and cameras against each other."""
         _expect_photo_and_regions(self.scene, self.rgb, self.regions, self.camera)
         object.__setattr__(self, "scale", as_ratio(self.scale))
         if not 1 <= self.scale < math.inf:
@@ -253,11 +217,6 @@ class DepthSample:
         """Return the low-resolution disparity in pixels of the high-resolution camera, (1, h, w), NaN where missing."""
         pixels = self.camera.width / self.camera_lr.width  # of the high-resolution camera in a low-resolution one
         return to_range(self.depth_lr.to(dtype or self.depth_lr.dtype), self.camera_lr, "disparity") * pixels
-
-    @property
-    def mask(self) -> Tensor | None:
-        """(1, H, W) bool: where the true depth is known; None where there is no truth."""
-        return None if self.depth is None else self.depth.isfinite()
 
 
 _REGION = "region_"  # beginning of the names of arrays that are regions

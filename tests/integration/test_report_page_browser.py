@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from dsr.evaluation.run_files import load_results
-from dsr.geometry.shading import lights, render, shade
+from dsr.geometry.surface import lights, render, shade
 from dsr.pictures.depth_views import normals_seen_by
 from dsr.report.page import save_page
 from dsr.report.table_layouts import write_tables

@@ -10,7 +10,7 @@ from small_results import CAMERA, HOLE, SIZE, waves, write_result
 
 from dsr.cli import main
 from dsr.geometry.mesh import triangulate
-from dsr.geometry.shading import render_for_viewing
+from dsr.geometry.surface import render_for_viewing
 from dsr.pictures.depth_views import normals_seen_by
 
 SPITEFUL = "<img src=x onerror=alert(1)>'&"

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.shading import lights, render
-from dsr.geometry.surface import depth_to_normals
+from dsr.geometry.surface import depth_to_normals, lights, render
 from dsr.sample import Scene
 from dsr.training.patches import augment, mirror, rotate90
 from dsr.training.settings import PatchSettings

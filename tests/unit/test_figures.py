@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from dsr.evaluation.run_files import load_results
-from dsr.geometry.shading import lights
+from dsr.geometry.surface import lights
 from dsr.pictures import canvas, lights_figure
 from dsr.pictures.depth_views import Window, strongest_window
 from dsr.pictures.lights_figure import sphere_normals

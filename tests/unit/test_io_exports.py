@@ -11,8 +11,7 @@ import trimesh
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.mesh import triangulate, vertex_normals
-from dsr.geometry.shading import render
-from dsr.geometry.surface import depth_to_normals
+from dsr.geometry.surface import depth_to_normals, render
 from dsr.io import exports
 from dsr.io.exports import Written, write_cloud, write_mesh, write_normals, write_renderings
 from dsr.io.glb import write_glb

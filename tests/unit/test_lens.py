@@ -103,7 +103,6 @@ def test_depth_takes_the_nearest_pixel_and_what_no_pixel_saw_is_a_hole(name):
 def test_a_lens_without_coefficients_does_nothing_unless_it_is_a_fisheye():
     assert not Lens("brown_conrady", (0.0,) * 5).bends
     assert Lens("kannala_brandt", (0.0,) * 4).bends
-    assert Lens("thin_prism_fisheye", (0.0,) * 8).bends
 
 
 @pytest.mark.parametrize(

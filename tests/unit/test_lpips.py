@@ -22,8 +22,7 @@ from small_lpips import random_lpips, random_trunk
 from torch import Tensor, nn
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.shading import render
-from dsr.geometry.surface import depth_to_normals
+from dsr.geometry.surface import depth_to_normals, render
 from dsr.metrics import lpips
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS, TRUNK_FILE, TRUNK_HASH, TRUNK_URL, find_trunk, load_lpips, lpips_v

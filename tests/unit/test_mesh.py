@@ -1,6 +1,7 @@
-"""Meshes of depth maps: planes stay whole however they slant, steps are cut, faces look at the camera."""
+"""Meshes of depth maps: planes stay whole, steps are cut, faces look at the camera, limits are kept."""
 
 import math
+import sys
 
 import numpy as np
 import pytest
@@ -9,7 +10,8 @@ import trimesh
 
 from dsr.geometry import mesh as mesh_module
 from dsr.geometry.camera import Camera
-from dsr.geometry.mesh import triangulate, vertex_normals
+from dsr.geometry.mesh import project, select_points, simplify, thin, triangulate, vertex_normals
+from dsr.io.exports import Written, write_cloud, write_mesh
 
 CAMERA = Camera(40, 30, 50, 50, 19.5, 14.5)
 
@@ -247,14 +249,7 @@ def test_pixels_lie_beside_the_mesh_by_little_more_than_allowed(tolerance):
     depth = ball()
     mesh = triangulate(depth, OTHER, tolerance=tolerance * depth)
     y, x = (each[depth[0].isfinite()].numpy() for each in grid())
-    rays = np.stack(
-        (
-            (x - OTHER.cx) / OTHER.fx,
-            (y - OTHER.cy) / OTHER.fy,
-            np.ones(len(x)),
-        ),
-        axis=1,
-    )
+    rays = np.stack(((x - OTHER.cx) / OTHER.fx, (y - OTHER.cy) / OTHER.fy, np.ones(len(x))), axis=1)
     shape = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     places, ray, _ = shape.ray.intersects_location(np.zeros_like(rays), rays, multiple_hits=False)
     assert len(ray) > 0.95 * len(rays)
@@ -280,3 +275,83 @@ def test_pixels_without_tolerance_are_all_kept():
     )
     np.testing.assert_array_equal(kept[:, :60], whole[:, :60])
     assert kept[:, 60:].mean() < 0.6
+
+
+SMALL = Camera(40, 30, 45, 45, 19.5, 14.5)
+TRIANGLES = 2 * 29 * 39
+
+
+def wavy():
+    rows, columns = torch.meshgrid(torch.arange(30.0), torch.arange(40.0), indexing="ij")
+    return (2 + 0.05 * torch.sin(rows / 5) * torch.cos(columns / 6))[None]
+
+
+def test_project_undoes_the_rays():
+    mesh = triangulate(wavy(), SMALL)
+    places = project(mesh.vertices, SMALL)
+    np.testing.assert_allclose(places, np.stack((mesh.pixels % 40, mesh.pixels // 40), axis=1), atol=1e-4)
+
+
+def test_simplify_keeps_the_surface_and_its_outline():
+    pytest.importorskip("fast_simplification")
+    mesh = triangulate(wavy(), SMALL)
+    less = simplify(mesh, 400, SMALL)
+    assert 300 < len(less.faces) <= 400
+    assert less.faces.max() == len(less.vertices) - 1
+    columns, rows = project(less.vertices, SMALL).T
+    np.testing.assert_allclose(less.vertices[:, 2], 2 + 0.05 * np.sin(rows / 5) * np.cos(columns / 6), atol=0.004)
+    np.testing.assert_allclose(less.vertices.min(axis=0)[:2], mesh.vertices.min(axis=0)[:2], atol=0.02)
+    np.testing.assert_allclose(less.vertices.max(axis=0)[:2], mesh.vertices.max(axis=0)[:2], atol=0.02)
+    places = np.stack((less.pixels % 40, less.pixels // 40), axis=1)
+    assert np.abs(places - project(less.vertices, SMALL)).max() <= 0.5 + 1e-4
+
+
+@pytest.mark.parametrize(("most", "stride"), [(1200, 2), (TRIANGLES - 1, 2), (300, 3), (100, 5)])
+def test_thin_takes_the_smallest_stride(most, stride):
+    mesh, found = thin(wavy(), SMALL, most, 0.5)
+    assert found == stride
+    rows, columns = len(range(0, 30, stride)), len(range(0, 40, stride))
+    assert len(mesh.faces) == 2 * (rows - 1) * (columns - 1) <= most
+
+
+@pytest.mark.parametrize("most", [1200, 1199, 1000, 601, 100])
+def test_select_points_are_close_to_the_limit_and_spread_evenly(most):
+    mesh = triangulate(wavy(), SMALL, isolated=True)
+    chosen = select_points(mesh, most, SMALL)
+    assert 0.85 * most <= len(chosen) <= most
+    rows, columns = (np.unique(each) for each in np.divmod(mesh.pixels[chosen], 40))
+    assert len(rows) * len(columns) == len(chosen)
+    for places in (rows, columns):
+        assert np.diff(places).max() - np.diff(places).min() <= 1
+
+
+def test_full_density_is_written_by_default(tmp_path):
+    photo = torch.rand(3, 30, 40)
+    assert write_mesh(tmp_path / "m.ply", photo, wavy(), SMALL) == Written(TRIANGLES, TRIANGLES)
+    assert write_cloud(tmp_path / "c.ply", photo, wavy(), SMALL) == Written(1200, 1200)
+    assert len(trimesh.load(tmp_path / "m.ply", process=False).faces) == TRIANGLES
+    assert len(trimesh.load(tmp_path / "c.ply").vertices) == 1200
+
+
+def test_simplified_mesh_is_read_back_with_the_photo_at_its_place(tmp_path):
+    pytest.importorskip("fast_simplification")
+    columns = torch.arange(40.0).expand(30, 40) / 39
+    photo = torch.stack((columns, columns, columns))
+    written = write_mesh([tmp_path / "m.ply", tmp_path / "m.glb"], photo, wavy(), SMALL, most=500)
+    assert written.before == TRIANGLES
+    assert written.after <= 500
+    assert written.how == "quadric decimation"
+    ply = trimesh.load(tmp_path / "m.ply", process=False)
+    assert len(ply.faces) == written.after
+    red = project(np.asarray(ply.vertices), SMALL)[:, 0] / 39 * 255
+    assert np.abs(ply.visual.vertex_colors[:, 0] - red).max() < 255 / 39
+    [glb] = trimesh.load(tmp_path / "m.glb", process=False).geometry.values()
+    np.testing.assert_allclose(glb.visual.uv[:, 0] * 40 - 0.5, red / 255 * 39, atol=0.01)
+
+
+def test_mesh_without_the_library_says_its_stride(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "fast_simplification", None)
+    written = write_mesh(tmp_path / "m.ply", torch.rand(3, 30, 40), wavy(), SMALL, most=600)
+    assert written.before == TRIANGLES
+    assert 0 < written.after <= 600
+    assert written.how.startswith("a stride of 2 pixels; pip install -e '.[mesh]' in a checkout simplifies")

@@ -15,7 +15,7 @@ from PIL import Image
 
 from dsr.evaluation.results import Results
 from dsr.evaluation.run_files import load_results
-from dsr.geometry.shading import render
+from dsr.geometry.surface import render
 from dsr.pictures.depth_views import normals_seen_by
 from dsr.report.page import save_page
 from dsr.report.page.value_pictures import (

@@ -42,17 +42,18 @@ def check_registration(scene: Scene) -> list[Finding]:
     verdict = judge(metres(scene), scene.rgb)
     if verdict is None:
         return [Finding("registration", "note", "no edges in the depth map or in the photo for this check")]
-    if verdict.turned:
-        return [Finding("registration", "problem", str(verdict), "flip, rotate or crop the photo or the depth")]
+    text = f"{verdict.statement} ({verdict.figures})"
+    if verdict.kind == "turned":
+        return [Finding("registration", "problem", text, "flip, rotate or crop the photo or the depth")]
     found = find_displacement(torch.from_numpy(metres(scene))[None], scene.rgb)
     if found is not None and found.certain:
         return [_report(found, math.ceil(max(scene.rgb.shape[1:]) / WORKING_SIZE))]
-    if verdict.fits:
+    if verdict.kind == "fits":
         return [Finding("registration", "ok", verdict.statement)]
-    if verdict.apart or verdict.other:
-        return [Finding("registration", "warning", str(verdict), "check that photo and depth belong together")]
+    if verdict.kind in ("apart", "other"):
+        return [Finding("registration", "warning", text, "check that photo and depth belong together")]
     advice = "check that they belong together; few edges or noisy depth can have the same effect"
-    return [Finding("registration", "note", str(verdict), advice)]
+    return [Finding("registration", "note", text, advice)]
 
 
 def _report(found: Displacement, every: int) -> Finding:

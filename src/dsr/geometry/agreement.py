@@ -11,10 +11,8 @@ all other displacements, is the significance.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple, TypeVar
+from typing import Literal, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -62,21 +60,6 @@ class Outlines(NamedTuple):
     strength: _Floats
     direction: NDArray[np.complex64]
 
-    def contours(self) -> tuple[float, float]:
-        """Return the length of coherent edges in pixels, and the mean coherence of all: 1 if neighbours run alike."""
-        alike = np.hypot(_blur(self.direction.real, _CONTOUR), _blur(self.direction.imag, _CONTOUR))
-        coherence = alike / (_blur(self.strength, _CONTOUR) + 1e-3)
-        length = float((self.strength * (2 * coherence - 1).clip(0, 1)).sum())
-        return length, float((self.strength * coherence).sum() / (self.strength.sum() + 1e-6))
-
-
-class Fields(NamedTuple):
-    """The Fourier transforms of outlines, of the strength without its mean, and the norm of the strength."""
-
-    strength: NDArray[np.complex64]
-    direction: NDArray[np.complex64]
-    norm: float
-
 
 class Agreement(NamedTuple):
     """How well the edges of depth and photo agree."""
@@ -89,89 +72,18 @@ class Agreement(NamedTuple):
     down: float  # and of the height
 
 
-@dataclass(frozen=True)
-class Verdict:
+class Verdict(NamedTuple):
     """Evidence from edges on whether a photo and a depth map belong together."""
 
+    kind: Literal["turned", "apart", "other", "fits", "unclear"]
+    statement: str
+    figures: str
+    code: str  # of the warning, one of LIMITS; empty without one
+    value: float  # what the warning's limit was compared with
     as_given: Agreement
-    way: str  # the mirroring or rotation, or the ratio of the fields of view, with the best agreement
-    better: Agreement  # of that way
+    margin: float  # by how much more significant the agreement of the best mirroring, rotation or zoom is
     contours: bool  # whether the depth map has enough of them
-    size: Size  # height and width of the photo in pixels
-
-    @property
-    def margin(self) -> float:
-        """How much more significant the agreement of the best other way is."""
-        return self.better.significance - max(self.as_given.significance, 0.0)
-
-    @property
-    def code(self) -> str:
-        """Of the warning that the other way gets."""
-        return "photo-turned" if self.way in _WAYS else "field-of-view"
-
-    @property
-    def turned(self) -> bool:
-        """Whether the other way fits clearly better."""
-        return self.margin >= LIMITS[self.code]
-
-    @property
-    def fits(self) -> bool:
-        """Whether both surely belong together."""
-        return self.as_given.significance >= _FITS and not self.turned and not self.apart
-
-    @property
-    def apart(self) -> bool:
-        """Whether both agree at a displacement that is larger than the edges of sensors are wide."""
-        found = self.as_given
-        lead = found.elsewhere - max(found.significance, 0.0)
-        return not self.turned and found.elsewhere >= _ELSEWHERE and lead >= _LEAD and self.pixels >= SHIFT
-
-    @property
-    def conclusive(self) -> bool:
-        """Whether edges exist: whether a photo of the same would surely agree."""
-        return self.contours and self.as_given.spread < _SPREAD
-
-    @property
-    def other(self) -> bool:
-        """Whether the photo is probably of something else."""
-        by_chance = self.as_given.significance < LIMITS["photo-other"]
-        return by_chance and self.conclusive and not self.turned and not self.apart
-
-    def __str__(self) -> str:
-        """Return what was found, for people."""
-        return f"{self.statement} ({self.figures})"
-
-    @property
-    def statement(self) -> str:
-        """What was found."""
-        if self.turned and self.way not in _WAYS:
-            return f"the depth map's field of view looks {self.way} times as wide as the photo's"
-        if self.turned:
-            return f"the depth map fits better with the photo {self.way}"
-        if self.apart:
-            return "the photo's edges lie beside the depth edges"
-        if self.other:
-            return "the photo seems to show something else than the depth map"
-        return "the photo's edges match the depth edges" + ("" if self.fits else " no better than by chance")
-
-    @property
-    def figures(self) -> str:
-        """The figures of it."""
-        score = self.as_given.score
-        if self.turned:
-            return f"{self.better.score:.2f} against {score:.2f}"
-        if self.apart:
-            right, down = self.as_given.right, self.as_given.down
-            across = f"{abs(right):.0%} of the width to the {'right' if right > 0 else 'left'}"
-            return f"{across}, {abs(down):.0%} of the height {'below' if down > 0 else 'above'}"
-        return f"{score:.2f}, by chance up to {2 * self.as_given.spread:.2f}"
-
-    @property
-    def pixels(self) -> float:
-        """The displacement where they agree, in pixels of the photo, at most ``WORKING_SIZE`` on its longer side."""
-        height, width = self.size
-        pixels = max(abs(self.as_given.right) * width, abs(self.as_given.down) * height)
-        return pixels * min(WORKING_SIZE / max(self.size), 1.0)
+    conclusive: bool  # whether a photo of the same would surely agree
 
 
 def judge(depth: Array, rgb: Tensor, zooms: Sequence[float] = _ZOOMS) -> Verdict | None:
@@ -186,30 +98,67 @@ def judge(depth: Array, rgb: Tensor, zooms: Sequence[float] = _ZOOMS) -> Verdict
     seen = photo_outlines(photo, pixel)
     if not outlines.strength.any() or not seen.strength.any():
         return None
-    fields = transform(outlines)
+    fields = _transform(outlines)
     across = photo_outlines(np.asarray(cv2.resize(photo.transpose(1, 0, 2), size[::-1]), np.float32), pixel)
     ways = {}
     for name, (exchanged, axes) in _WAYS.items():
         given = across if exchanged else seen
         strength, direction = np.flip(given.strength, axes), np.flip(given.direction, axes)
         reversed_ = Outlines(strength, direction if len(axes) == 2 else direction.conj())
-        ways[name] = compare(fields, transform(reversed_))
-    length, coherence = outlines.contours()
-    enough = max(depth.shape) >= _SIDE and length >= _LENGTH and coherence >= _COHERENCE
-    double = min(2 * size[0], rgb.shape[-2]), min(2 * size[1], rgb.shape[-1])
-    twice = from_numpy(reduce_photo(rgb, double)).permute(2, 0, 1) if enough and zooms else rgb
-    for zoom in zooms if enough else ():
-        part, view = _middle(depth, zoom), _middle(twice, 1 / zoom)
-        edges = photo_outlines(reduce_photo(view, size), max(size) / max(part.shape))
-        ways[f"{zoom:g}"] = compare(transform(depth_outlines(part, size)), transform(edges))
-    best = max(ways, key=lambda name: ways[name].significance)
-    return Verdict(compare(fields, transform(seen)), best, ways[best], enough, (rgb.shape[-2], rgb.shape[-1]))
+        ways[name] = _compare(fields, _transform(reversed_))
+    contours = max(depth.shape) >= _SIDE and _has_contours(outlines)
+    if contours and zooms:
+        double = min(2 * size[0], rgb.shape[-2]), min(2 * size[1], rgb.shape[-1])
+        twice = from_numpy(reduce_photo(rgb, double)).permute(2, 0, 1)
+        for zoom in zooms:
+            part, view = _middle(depth, zoom), _middle(twice, 1 / zoom)
+            edges = photo_outlines(reduce_photo(view, size), max(size) / max(part.shape))
+            ways[f"{zoom:g}"] = _compare(_transform(depth_outlines(part, size)), _transform(edges))
+    return _conclude(_compare(fields, _transform(seen)), ways, contours=contours, size=tuple(rgb.shape[-2:]))
+
+
+def _has_contours(outlines: Outlines) -> bool:
+    """Return whether edges are long enough and run alike: coherence is 1 if neighbours have the same direction."""
+    strength, direction = outlines
+    alike = np.hypot(_blur(direction.real, _CONTOUR), _blur(direction.imag, _CONTOUR))
+    coherence = alike / (_blur(strength, _CONTOUR) + 1e-3)
+    length = float((strength * (2 * coherence - 1).clip(0, 1)).sum())
+    return length >= _LENGTH and float((strength * coherence).sum() / (strength.sum() + 1e-6)) >= _COHERENCE
+
+
+def _conclude(given: Agreement, ways: dict[str, Agreement], *, contours: bool, size: tuple[int, ...]) -> Verdict:
+    """Return the verdict on the agreement as given and in other ways, of a photo of (height, width) pixels."""
+    way = max(ways, key=lambda name: ways[name].significance)
+    margin = ways[way].significance - max(given.significance, 0.0)
+    conclusive = contours and given.spread < _SPREAD
+    evidence = (given, margin, contours, conclusive)
+    code = "photo-turned" if way in _WAYS else "field-of-view"
+    if margin >= LIMITS[code]:
+        text = f"the depth map's field of view looks {way} times as wide as the photo's"
+        if way in _WAYS:
+            text = f"the depth map fits better with the photo {way}"
+        return Verdict("turned", text, f"{ways[way].score:.2f} against {given.score:.2f}", code, margin, *evidence)
+    pixels = max(abs(given.right) * size[1], abs(given.down) * size[0]) * min(WORKING_SIZE / max(size), 1.0)
+    lead = given.elsewhere - max(given.significance, 0.0)
+    if given.elsewhere >= _ELSEWHERE and lead >= _LEAD and pixels >= SHIFT:
+        across = f"{abs(given.right):.0%} of the width to the {'right' if given.right > 0 else 'left'}"
+        figures = f"{across}, {abs(given.down):.0%} of the height {'below' if given.down > 0 else 'above'}"
+        text = "the photo's edges lie beside the depth edges"
+        return Verdict("apart", text, figures, "edges-beside", pixels, *evidence)
+    figures = f"{given.score:.2f}, by chance up to {2 * given.spread:.2f}"
+    if given.significance < LIMITS["photo-other"] and conclusive:
+        text = "the photo seems to show something else than the depth map"
+        return Verdict("other", text, figures, "photo-other", given.significance, *evidence)
+    text = "the photo's edges match the depth edges"
+    if given.significance >= _FITS:
+        return Verdict("fits", text, figures, "", given.significance, *evidence)
+    return Verdict("unclear", f"{text} no better than by chance", figures, "", given.significance, *evidence)
 
 
 def significances(depths: Sequence[Outlines], photos: Sequence[Outlines]) -> Array:
     """Return the significance of the agreement of each depth map with each photo on the same grid, (N, M)."""
-    seen = [transform(photo) for photo in photos]
-    rows = [[compare(fields, photo).significance for photo in seen] for fields in map(transform, depths)]
+    seen = [_transform(photo) for photo in photos]
+    rows = [[_compare(fields, photo).significance for photo in seen] for fields in map(_transform, depths)]
     return np.array(rows, np.float64).reshape(len(depths), len(photos))
 
 
@@ -244,9 +193,10 @@ def photo_outlines(photo: _Floats, pixel: float) -> Outlines:
 
     ``pixel`` is the width of a pixel of the depth map on the grid.
     """
-    right, down = _gradient(_blur(photo, max(pixel, 1.0) ** 0.5))
+    right, down = _gradient(photo, max(pixel, 1.0) ** 0.5)
     steepest = (right * right + down * down).argmax(axis=-1)[..., None]
-    right, down = (np.take_along_axis(each, steepest, axis=-1)[..., 0] for each in (right, down))
+    right = np.take_along_axis(right, steepest, axis=-1)[..., 0]
+    down = np.take_along_axis(down, steepest, axis=-1)[..., 0]
     size = np.hypot(right, down)
     around = cv2.blur(size, (_AROUND, _AROUND), borderType=cv2.BORDER_REFLECT)
     return _outlines(np.minimum(size / (around + _FAINT), _STRONGEST), right, down)
@@ -254,34 +204,45 @@ def photo_outlines(photo: _Floats, pixel: float) -> Outlines:
 
 def depth_outlines(depth: Array, size: Size) -> Outlines:
     """Return the edges of a depth map, (h, w) in any unit of depth or of its reciprocal, on a grid; from 0 to 1."""
-    rows, columns = (((np.arange(n) + 0.5) * m / n).astype(np.intp) for n, m in zip(size, depth.shape, strict=True))
+    rows = ((np.arange(size[0]) + 0.5) * depth.shape[0] / size[0]).astype(np.intp)
+    columns = ((np.arange(size[1]) + 0.5) * depth.shape[1] / size[1]).astype(np.intp)
     small = _bridge(depth[rows][:, columns].astype(np.float64), max(round(_GAP * max(size)), 1))
     valid = np.isfinite(small)
     if not valid.any():
         return _outlines(np.zeros(size, np.float32), *np.zeros((2, *size), np.float32))
     nearest = ndimage.distance_transform_edt(~valid, return_distances=False, return_indices=True)
     logarithm = ndimage.median_filter(np.log(small[tuple(nearest)]).astype(np.float32), 3)
-    right, down = _gradient(_blur(logarithm, 0.7 * max(size[1] / depth.shape[1], 1)))
+    right, down = _gradient(logarithm, 0.7 * max(size[1] / depth.shape[1], 1))
     strength = ((2 * np.hypot(right, down) - JUMP / 2) / JUMP).clip(0, 1)
     strength[ndimage.binary_dilation(~valid)] = 0
-    into, below = _gradient(_blur(valid.astype(np.float32), 1.0))
+    into, below = _gradient(valid.astype(np.float32), 1.0)
     border = _HOLE * (2 * np.hypot(into, below) / 0.35).clip(0, 1)
     beside = border > strength
     right, down = np.where(beside, into, right), np.where(beside, below, down)
     return _outlines(np.where(beside, border, strength), right, down)
 
 
-def transform(outlines: Outlines) -> Fields:
-    """Return the Fourier transforms of outlines."""
+class _Fields(NamedTuple):
+    """The Fourier transforms of outlines, of the strength without its mean, and the norm of the strength."""
+
+    strength: NDArray[np.complex64]
+    direction: NDArray[np.complex64]
+    norm: float
+
+
+def _transform(outlines: Outlines) -> _Fields:
     strength, direction = outlines
-    norm = float(np.linalg.norm(strength))
-    strong, directed = (np.fft.fft2(each).astype(np.complex64) for each in (strength - strength.mean(), direction))
-    return Fields(strong, directed, norm)
+    strong = np.fft.fft2(strength - strength.mean()).astype(np.complex64)
+    return _Fields(strong, np.fft.fft2(direction).astype(np.complex64), float(np.linalg.norm(strength)))
 
 
-def compare(depth: Fields, photo: Fields) -> Agreement:
+def _compare(depth: _Fields, photo: _Fields) -> Agreement:
     """Return the agreement of the edges of a depth map with those of a photo on the same grid."""
-    v, u, fast, beyond = _displacements(*depth.strength.shape)
+    height, width = depth.strength.shape
+    v, u = np.fft.fftfreq(height)[:, None], np.fft.fftfreq(width)[None]  # frequencies, and displacements over the size
+    fast = (1 - np.exp(-2 * (np.pi * _SLOW) ** 2 * (v * v + u * u))).astype(np.float32)
+    far = 2 * _REACH + 2
+    beyond = (np.abs(v * height) > far) | (np.abs(u * width) > far)
     spectrum = _ANY_DIRECTION * depth.strength.conj() * photo.strength + depth.direction.conj() * photo.direction
     scores = np.fft.ifft2(spectrum * fast).real / max(depth.norm * photo.norm, 1e-9)
     best = ndimage.maximum_filter(scores, 2 * _REACH + 1, mode="wrap")
@@ -296,18 +257,6 @@ def compare(depth: Fields, photo: Fields) -> Agreement:
         float(u[0, column]),
         float(v[row, 0]),
     )
-
-
-@functools.lru_cache(maxsize=8)
-def _displacements(height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return what a grid's size determines: displacements, weights of frequencies, and what is beyond the reach.
-
-    The displacements, down (H, 1) and right (1, W), are in fractions of the size. The weights leave out slow changes.
-    """
-    v, u = np.fft.fftfreq(height)[:, None], np.fft.fftfreq(width)[None]
-    fast = 1 - np.exp(-2 * (np.pi * _SLOW) ** 2 * (v * v + u * u))
-    far = 2 * _REACH + 2
-    return v, u, fast.astype(np.float32), (np.abs(v * height) > far) | (np.abs(u * width) > far)
 
 
 def _outlines(strength: _Floats, right: _Floats, down: _Floats) -> Outlines:
@@ -343,7 +292,9 @@ def _blur(values: _Floats, deviation: float) -> _Floats:
     return np.asarray(cv2.GaussianBlur(np.ascontiguousarray(values), (0, 0), deviation))
 
 
-def _gradient(values: _Floats) -> tuple[_Floats, _Floats]:
-    """Return the change to the right and down per pixel, from three rows and columns."""
-    sobel = functools.partial(cv2.Sobel, values, cv2.CV_32F, scale=1 / 8, borderType=cv2.BORDER_REPLICATE)
-    return np.asarray(sobel(dx=1, dy=0), np.float32), np.asarray(sobel(dx=0, dy=1), np.float32)
+def _gradient(values: _Floats, blur: float) -> tuple[_Floats, _Floats]:
+    """Return the change of blurred values to the right and down per pixel, from three rows and columns."""
+    smooth = _blur(values, blur)
+    right = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8, borderType=cv2.BORDER_REPLICATE)
+    down = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1 / 8, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(right, np.float32), np.asarray(down, np.float32)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import importlib
 import math
 from dataclasses import FrozenInstanceError, dataclass, replace
-from numbers import Real
 from pathlib import Path
 from typing import Any, Self
 
@@ -19,7 +18,7 @@ from torch import Tensor
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from dsr.geometry.range_type import RANGE_TYPES, RangeType
-from dsr.utils.guards import derived
+from dsr.utils.guards import derived, expect_one_of, is_number, naming
 
 # baseline in metres of the virtual stereo pair of a camera without a second one (Voynov et al. 2019)
 VIRTUAL_BASELINE = 0.2
@@ -38,9 +37,6 @@ class Camera:
         cx, cy: principal point in pixels, pixel centres at integers.
         baseline: distance to the second camera in metres, None where there is none.
         doffs: difference of the two principal points' x in pixels.
-
-    Raises:
-        ValueError: a value is not finite, a size or focal length is not positive.
 
     Example:
         >>> import dsr
@@ -65,16 +61,16 @@ class Camera:
         """Check every field, take the absolute value of ``fy``, and make NumPy's numbers Python's."""
         for name in ("width", "height"):
             value = getattr(self, name)
-            if not _is_number(value) or not float(value).is_integer() or value < 1:
+            if not is_number(value) or not float(value).is_integer() or value < 1:
                 raise ValueError(f"camera {name}: expected a positive whole number, got {value!r:.60}")
         for name in ("fx", "fy", "cx", "cy", "doffs"):
-            if not _is_number(getattr(self, name)):
+            if not is_number(getattr(self, name)):
                 raise ValueError(f"camera {name}: expected a finite number, got {getattr(self, name)!r:.60}")
         if self.fx <= 0:
             raise ValueError(f"camera fx: expected a positive number of pixels, got {self.fx!r}")
         if self.fy == 0:
             raise ValueError("camera fy: expected a number of pixels other than 0")
-        if self.baseline is not None and not (_is_number(self.baseline) and self.baseline > 0):
+        if self.baseline is not None and not (is_number(self.baseline) and self.baseline > 0):
             raise ValueError(f"camera baseline: expected a positive number of metres, got {self.baseline!r}")
         object.__setattr__(self, "fy", abs(self.fy))
         for name, value in vars(self).items():
@@ -93,13 +89,8 @@ class Camera:
 
     @classmethod
     def from_fov(cls, degrees: float, width: int, height: int) -> Self:
-        """Return the camera with a horizontal field of view in degrees and the principal point in the middle.
-
-        Raises:
-            ValueError: the field of view is not between 0 and 180 degrees.
-
-        """
-        if not _is_number(degrees) or not 0 < degrees < 180:
+        """Return the camera with a horizontal field of view in degrees and the principal point in the middle."""
+        if not is_number(degrees) or not 0 < degrees < 180:
             raise ValueError(f"degrees: expected a horizontal field of view above 0 and below 180, got {degrees!r:.60}")
         return cls.centred(width, height, width / 2 / math.tan(math.radians(degrees) / 2))
 
@@ -107,13 +98,8 @@ class Camera:
     def from_matrix(cls, matrix: Any, width: int, height: int) -> Self:
         """Return the camera of a matrix of intrinsics.
 
-        Args:
-            matrix: (fx 0 cx; 0 fy cy; 0 0 1) in pixels, as nested lists, an array or a tensor; or a larger matrix that
-                begins with it, 3 x 4 as ROS's P, or 4 x 4.
-            width, height: size of its image in pixels.
-
-        Raises:
-            ValueError: it is no such matrix.
+        The matrix, (fx 0 cx; 0 fy cy; 0 0 1) in pixels, may be nested lists, an array or a tensor, and larger: 3 x 4 as
+        ROS's P, or 4 x 4.
 
         Example:
             >>> import dsr
@@ -121,23 +107,13 @@ class Camera:
             Camera(width=640, height=480, fx=525.0, fy=525.0, cx=319.5, cy=239.5, baseline=None, doffs=0.0)
 
         """
-        try:
+        with naming("matrix"):
             (fx, _, cx), (_, fy, cy), _ = expect_intrinsics(matrix).tolist()
-        except ValueError as error:
-            raise ValueError(f"matrix: {error}") from error
         return cls(width, height, fx, fy, cx, cy)
 
     @classmethod
     def from_json(cls, path: str | Path) -> Self:
-        """Return the camera of a file that states its image's size, too: :func:`dsr.io.cameras.read_sized_camera`.
-
-        Args:
-            path: dsr's ``camera.json``, Open3D's JSON, or ``cam_params.json`` as NICE-SLAM has it.
-
-        Raises:
-            ValueError: it is missing, damaged or of another format.
-
-        """
+        """Return the camera of dsr's ``camera.json``, Open3D's JSON, or ``cam_params.json`` as NICE-SLAM has it."""
         read = importlib.import_module("dsr.io.cameras").read_sized_camera  # files are read on a floor above
         return cls(**vars(read(Path(path))))
 
@@ -206,8 +182,7 @@ class Camera:
     def rotate90(self, turns: int = 1) -> Camera:
         """Return the camera of the image turned by ``turns`` quarter turns counterclockwise, as ``torch.rot90`` does.
 
-        The focal lengths are swapped and the principal point is rotated. The baseline stays unchanged, because it only
-        serves to convert between depth and disparity.
+        The baseline stays unchanged, because it only serves to convert between depth and disparity.
         """
         camera = self
         for _ in range(turns % 4):
@@ -249,46 +224,24 @@ def expect_intrinsics(matrix: Any) -> np.ndarray:
         raise ValueError(f"{expected} of shape (3, 3), got {values.shape}")
     values = values[:3, :3]
     upright = np.isfinite(values).all() and values[0, 0] > 0 and values[1, 1] > 0
-    if (
-        not upright
-        or not np.allclose(values[2], (0, 0, 1))
-        or values[1, 0] != 0
-        or abs(values[0, 1]) > _SKEW * values[0, 0]
-    ):
+    straight = values[1, 0] == 0 and abs(values[0, 1]) <= _SKEW * values[0, 0]
+    if not (upright and straight and np.allclose(values[2], (0, 0, 1))):
         raise ValueError(f"{expected}, got {values.tolist()}")
     return values
 
 
-def _is_number(value: object) -> bool:
-    """Return whether a value is a finite number; true and false are none, and neither is 10**400."""
-    if isinstance(value, (bool, np.bool_)) or not isinstance(value, Real):
-        return False
-    try:
-        return math.isfinite(value)
-    except OverflowError:
-        return False
-
-
 def to_range(depth: Tensor, camera: Camera, range_type: RangeType) -> Tensor:
-    """Convert orthogonal depth to another range type; NaN (a hole) stays NaN.
+    """Convert orthogonal depth, (..., H, W) in metres, to another range type; NaN (a hole) stays NaN.
 
-    Args:
-        depth: (..., H, W) distance to the image plane in metres.
-        camera: the camera of these pixels.
-        range_type: ``orthogonal`` (metres), ``perspective`` (metres along the ray, p = z |r|) or ``disparity``
-            (pixels, d = baseline * fx / z - doffs, with a virtual baseline of 0.2 m where the camera has none).
-
-    Returns:
-        (..., H, W) in the unit of the type.
-
+    ``perspective`` is the distance along the ray in metres, p = z |r|; ``disparity`` is in pixels,
+    d = baseline * fx / z - doffs, with a virtual baseline of 0.2 m where the camera has none.
     """
+    expect_one_of("range_type", range_type, RANGE_TYPES)
     if range_type == "orthogonal":
         return depth
     if range_type == "perspective":
         return depth * camera.ray_lengths(dtype=depth.dtype, device=depth.device)
-    if range_type == "disparity":
-        return baseline_times_focal(camera) / depth - camera.doffs
-    raise ValueError(f"range_type: expected one of {', '.join(RANGE_TYPES)}, got {range_type!r}")
+    return baseline_times_focal(camera) / depth - camera.doffs
 
 
 def from_range(values: Tensor, camera: Camera, range_type: RangeType) -> Tensor:
@@ -296,14 +249,13 @@ def from_range(values: Tensor, camera: Camera, range_type: RangeType) -> Tensor:
 
     A disparity at or below -doffs lies at or beyond infinity and becomes NaN, a hole.
     """
+    expect_one_of("range_type", range_type, RANGE_TYPES)
     if range_type == "orthogonal":
         return values
     if range_type == "perspective":
         return values / camera.ray_lengths(dtype=values.dtype, device=values.device)
-    if range_type == "disparity":
-        shifted = values + camera.doffs
-        return baseline_times_focal(camera) / torch.where(shifted > 0, shifted, torch.nan)  # no 0 * inf in gradients
-    raise ValueError(f"range_type: expected one of {', '.join(RANGE_TYPES)}, got {range_type!r}")
+    shifted = values + camera.doffs
+    return baseline_times_focal(camera) / torch.where(shifted > 0, shifted, torch.nan)  # no 0 * inf in gradients
 
 
 def baseline_times_focal(camera: Camera) -> float:

@@ -10,10 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-# radius in pixels below which a hole is not wide, however coarse the map is
-_NARROW = 2.5
-# share of measured pixels whose four neighbours are measured, below which a map is one of single points
-_TOGETHER = 0.5
+_NARROW = 2.5  # radius in pixels below which a hole is not wide, however coarse the map is
+_TOGETHER = 0.5  # share of measured pixels whose four neighbours are measured, below which a map is of single points
 
 
 def distance_to_known(known: Tensor) -> Tensor:
@@ -31,9 +29,8 @@ def degrees_per_pixel(focal: float) -> float:
 def wide_holes(known: Tensor, width: float) -> Tensor:
     """Return the parts of the holes of a map, (1, h, w) bool, that are wider than max(``width``, 5) pixels.
 
-    It is the morphological opening of the holes by a disc: what is left of them where no disc of this width fits. A
-    narrow part of a wide hole is not wide. At the border of the map, a hole is wide from half of the width on, since it
-    can be filled from one side only.
+    It is the morphological opening of the holes by a disc: a narrow part of a wide hole is not wide. At the border of
+    the map, a hole is wide from half of the width on, since it can be filled from one side only.
     """
     radius = max(width / 2, _NARROW)
     core = distance_to_known(known) - 0.5 > radius  # from the known pixel's edge

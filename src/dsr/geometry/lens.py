@@ -32,16 +32,12 @@ _MOST = (1 << 15) - 2  # largest width and height that OpenCV's remap takes
 
 @dataclass(frozen=True)
 class Lens:
-    """A lens: where in the picture the points of a pinhole camera lie.
+    """A lens: where in the picture the points of a pinhole camera lie."""
 
-    ``model`` is one of those of the module's text, and there are as many ``coefficients`` as the model has.
-    """
-
-    model: str
-    coefficients: tuple[float, ...]
+    model: str  # one of those of the module's text
+    coefficients: tuple[float, ...]  # as many as the model has
 
     def __post_init__(self) -> None:
-        """Check model and coefficients."""
         if self.model not in _COUNTS:
             raise ValueError(f"lens: expected a model of {', '.join(_COUNTS)}, got {self.model!r:.60}")
         count, counts = len(self.coefficients), _COUNTS[self.model]

@@ -1,13 +1,13 @@
 """Triangle meshes of depth maps, cut at depth steps, and fewer triangles and points for those beyond a limit.
 
-The inverse depth of a plane is linear in the pixel at any viewing angle. So two neighbouring pixels lie on different
-sides of a step if inverse depth changes by more than the slopes on both sides predict. A threshold on the difference of
-the two depths would cut floors at a distance. Steps that interpolation has spread over a few pixels are found from the
-change over windows of up to five pairs of pixels.
-
-Meshes are simplified by quadric edge collapses (Garland and Heckbert, *Surface Simplification Using Quadric Error
-Metrics*, SIGGRAPH 1997), as the library `fast-simplification` (the extra ``mesh``) has them: flat regions become few
-large triangles, and curved ones keep theirs. Without the library, rows and columns are left out.
+The inverse depth of a plane is linear in the pixel at any viewing angle. So neighbouring pixels lie on different sides
+of a step if inverse depth changes by more than the slopes on both sides predict, over windows of up to five pairs of
+pixels where interpolation has spread the step. With a tolerance, flat parts get large triangles of a hierarchy (Evans,
+Kirkpatrick and Townsend, *Right-Triangulated Irregular Networks*, Algorithmica 2001): a triangle is halved as long as
+leaving out the middle of its longest side changes the inverse depth there by too much, and the pixels of a smaller
+triangle count for the larger ones that hold it, so that neighbours share whole sides. Meshes are simplified by quadric
+edge collapses (Garland and Heckbert, SIGGRAPH 1997) of the library `fast-simplification` (the extra ``mesh``); without
+it, rows and columns are left out.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from typing import NamedTuple
 import numpy as np
 from torch import Tensor
 
-from dsr.geometry.adaptive_mesh import join
 from dsr.geometry.camera import Camera
 
 LARGEST_STEP = 0.02  # maximum relative deviation of a neighbour's depth from the slope of the surface
 _HALF_WIDTHS = (1, 2, 3)  # half widths of the windows in pixels
 _OWN_FRACTION = 0.25  # fraction of largest_step by which a pair within a wider window must itself change to be cut
+_LEVELS = 6  # the largest triangles have two sides of 2 to this power pixels
 _STRIP = 1 << 21  # pixels whose steps are found, and triangles whose normals are summed, at a time
 
 QUADRIC = "quadric decimation"
@@ -58,22 +58,19 @@ def triangulate(
     Depth is (1, H, W) in metres, NaN in holes. A pair is cut from the relative change ``largest_step`` on, beyond what
     the slopes on both sides predict. ``isolated`` keeps vertices without a triangle. ``tolerance``, (1, H, W), is the
     largest deviation of most pixels from the mesh in metres (a few deviate by about twice as much), so that flat parts
-    get large triangles, see :func:`dsr.geometry.adaptive_mesh.join`; None for a mesh of all pixels.
+    get large triangles; None for a mesh of all pixels.
     """
     if tuple(depth.shape) != (1, camera.height, camera.width):
         raise ValueError(f"depth: expected shape {(1, camera.height, camera.width)}, got {tuple(depth.shape)}")
     if not largest_step > 0 or stride < 1:
         raise ValueError(f"mesh: expected a positive step and stride, got {largest_step} and {stride}")
     strided = depth[0, ::stride, ::stride].detach().cpu().double().numpy()
-    valid = np.isfinite(strided)
     allowed = None
     if tolerance is not None:
         allowed = tolerance[0, ::stride, ::stride].detach().cpu().double().numpy() / strided**2
     faces, dense = _faces(1 / strided, largest_step, allowed)
-    kept = valid.ravel().copy()
-    if not isolated:
-        kept[:] = False
-        kept[faces.ravel()] = True
+    kept = np.isfinite(strided).ravel() if isolated else np.zeros(strided.size, bool)
+    kept[faces.ravel()] = True
     vertex_of = np.cumsum(kept, dtype=np.int32) - 1
     rows, columns = np.divmod(np.flatnonzero(kept), strided.shape[1])
     rows, columns = rows * stride, columns * stride
@@ -118,9 +115,92 @@ def _faces(inverse: np.ndarray, largest_step: float, allowed: np.ndarray | None)
     )
     kept, large = np.ones(first.shape, bool), np.empty((0, 3), np.int32)
     if allowed is not None:
-        kept, large = join(inverse, top & bottom & left & right, allowed)
+        kept, large = _join(inverse, top & bottom & left & right, allowed)
     small = [np.stack([corner[where & kept] for corner in corners], axis=1) for where, corners in choices]
     return np.concatenate((*small, large)), sum(int(np.count_nonzero(where)) for where, _ in choices)
+
+
+def _join(inverse: np.ndarray, whole: np.ndarray, tolerance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Join the pixels of inverse depth, (H, W) with NaN in holes, by triangles of up to 64 x 64 pixels.
+
+    ``whole``, (H - 1, W - 1), tells which squares of four pixels are one surface; the others keep all their pixels.
+    Leaving out a pixel may change the inverse depth there by ``tolerance``, (H, W), at each halving, NaN for not at
+    all: up to 2 % of the pixels differ by more, about twice as much at most. Returns which squares are left for two
+    triangles each, and all other triangles, (M, 3) indices, counterclockwise as the camera sees them.
+    """
+    height, width = whole.shape
+    side = 1 << _LEVELS
+    rows, columns = (-(-size // side) for size in whole.shape)  # of the largest squares
+    values, allowed = np.full((2, rows * side + 1, columns * side + 1), np.nan, np.float32)
+    values[: height + 1, : width + 1], allowed[: height + 1, : width + 1] = inverse, tolerance
+    split = ~np.pad(whole, ((0, rows * side - height), (0, columns * side - width)))
+    triangles, small = _leaves(_needed(values, allowed, split), rows, columns)
+    pitch = values.shape[1]
+    squares = np.minimum.reduce(small // pitch, axis=1) * pitch + np.minimum.reduce(small % pitch, axis=1)
+    found = np.bincount(squares, minlength=values.size)
+    dense = (found == 2).reshape(values.shape)[:height, :width]
+    triangles = np.concatenate((triangles, small[found[squares] == 1]))
+    place = triangles // pitch * (width + 1) + triangles % pitch
+    return dense, place.astype(np.int32)
+
+
+def _needed(values: np.ndarray, allowed: np.ndarray, split: np.ndarray) -> np.ndarray:
+    """Return the largest change by leaving out a pixel, or one that only exists where it does, over what is allowed."""
+    needed = np.zeros(values.shape, np.float32)
+    for corner in (needed[:-1, :-1], needed[1:, :-1], needed[:-1, 1:], needed[1:, 1:]):
+        corner[split] = np.inf
+    for level in range(_LEVELS):
+        half = 1 << level
+        side = 2 * half
+        _sides(values, allowed, needed, half)
+        _sides(values.T, allowed.T, needed.T, half)
+        lattice = values[::side, ::side]
+        falling = np.add.outer(np.arange(len(lattice) - 1), np.arange(lattice.shape[1] - 1)) % 2 == 0
+        ends = np.where(falling, lattice[:-1, :-1] + lattice[1:, 1:], lattice[:-1, 1:] + lattice[1:, :-1])
+        at = np.s_[half::side, half::side]
+        beside = (needed[:-1:side, half::side], needed[side::side, half::side],
+                  needed[half::side, :-1:side], needed[half::side, side::side])  # fmt: skip
+        needed[at] = np.maximum.reduce((needed[at], _change(values[at], ends, allowed[at]), *beside))
+    return needed
+
+
+def _sides(values: np.ndarray, allowed: np.ndarray, needed: np.ndarray, half: int) -> None:
+    """Note what the pixels in the middles of the horizontal sides of squares are needed for."""
+    side = 2 * half
+    at = np.s_[::side, half::side]
+    middles = needed[at]
+    ends = values[::side, :-1:side] + values[::side, side::side]
+    middles[:] = np.maximum(middles, _change(values[at], ends, allowed[at]))
+    if half > 1:
+        smaller = needed[half // 2 :: half, half // 2 :: half]  # of the squares around
+        smaller = np.maximum(smaller[:, ::2], smaller[:, 1::2])
+        middles[:-1] = np.maximum(middles[:-1], smaller[::2])
+        middles[1:] = np.maximum(middles[1:], smaller[1::2])
+
+
+def _change(values: np.ndarray, ends: np.ndarray, allowed: np.ndarray) -> np.ndarray:
+    """Return how far values are from the mean of two, given by its sum, over what is allowed; infinite if unknown."""
+    return np.nan_to_num(np.abs(values - ends / 2) / allowed, nan=np.inf)
+
+
+def _leaves(needed: np.ndarray, rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the triangles, (M, 3), and those of half a square of four pixels, as indices with the right angle last."""
+    pitch, side = needed.shape[1], 1 << _LEVELS
+    row, column = np.divmod(np.arange(rows * columns), columns)
+    first = (row * pitch + column) * side
+    second, third, fourth = first + side, first + side * pitch, first + side * pitch + side
+    falling = (row + column) % 2 == 0
+    upper = np.where(falling, (first, fourth, second), (third, second, first))
+    lower = np.where(falling, (fourth, first, third), (second, third, fourth))
+    corners, done = np.concatenate((upper, lower), axis=1), []
+    for _ in range(2 * _LEVELS):
+        a, b, c = corners
+        split = needed.ravel()[(a + b) // 2] > 1
+        done.append(corners[:, ~split])
+        a, b, c = corners[:, split]
+        middle = (a + b) // 2
+        corners = np.concatenate(((c, a, middle), (b, c, middle)), axis=1)
+    return np.concatenate(done, axis=1).T, corners.T
 
 
 def find_connections(inverse: np.ndarray, largest_step: float = LARGEST_STEP) -> tuple[np.ndarray, np.ndarray]:
@@ -133,15 +213,19 @@ def find_connections(inverse: np.ndarray, largest_step: float = LARGEST_STEP) ->
 
 def _connected(inverse: np.ndarray, largest_step: float) -> np.ndarray:
     """Return whether each pixel and its right neighbour lie on one surface, (H, W - 1) bool; False beside holes."""
-    rows, found = max(1, _STRIP // inverse.shape[1]), []
+    width, widest = inverse.shape[1], 2 * max(_HALF_WIDTHS)
+    rows, found = max(1, _STRIP // width), []
     for start in range(0, len(inverse), rows):
         strip = inverse[start : start + rows]
+        padded = np.pad(strip, ((0, 0), (widest, widest)), constant_values=np.nan)
         change = np.diff(strip, axis=1)
         scale = largest_step * np.minimum(strip[:, :-1], strip[:, 1:])
         step = np.zeros(change.shape, dtype=bool)
         for half_width in _HALF_WIDTHS:
-            far, near = _shift(strip, half_width)[:, :-1], _shift(strip, 1 - half_width)[:, :-1]
-            beyond, before = _shift(strip, 2 * half_width)[:, :-1], _shift(strip, 1 - 2 * half_width)[:, :-1]
+            far, near, beyond, before = (
+                padded[:, widest + by : widest + by + width - 1]
+                for by in (half_width, 1 - half_width, 2 * half_width, 1 - 2 * half_width)
+            )
             total, pairs = far - near, 2 * half_width - 1
             excess, own = np.abs(total), np.abs(change)
             for slope in ((beyond - far) / half_width, (near - before) / half_width):
@@ -150,15 +234,6 @@ def _connected(inverse: np.ndarray, largest_step: float) -> np.ndarray:
             step |= (excess > scale) & (own > (1.0 if half_width == 1 else _OWN_FRACTION) * scale)
         found.append(np.isfinite(change) & ~step)
     return np.concatenate(found)
-
-
-def _shift(values: np.ndarray, by: int) -> np.ndarray:
-    """Return the map shifted by ``by`` columns, (H, W), NaN beyond the border."""
-    shifted = np.full_like(values, np.nan)
-    width = values.shape[1]
-    if abs(by) < width:
-        shifted[:, max(-by, 0) : width - max(by, 0)] = values[:, max(by, 0) : width + min(by, 0)]
-    return shifted
 
 
 def simplify(mesh: Mesh, most: int, camera: Camera) -> Mesh:
@@ -197,9 +272,11 @@ def select_points(mesh: Mesh, most: int, camera: Camera) -> np.ndarray:
     rows, columns = np.divmod(mesh.pixels, camera.width)
     step = math.sqrt(count / most)
     while True:
-        chosen = _is_chosen(camera.height, step)[rows] & _is_chosen(camera.width, step)[columns]
-        if np.count_nonzero(chosen) <= most:
-            return np.flatnonzero(chosen)
+        chosen_rows = np.arange(0, camera.height, step).astype(int)
+        chosen_columns = np.arange(0, camera.width, step).astype(int)
+        chosen = np.flatnonzero(np.isin(rows, chosen_rows) & np.isin(columns, chosen_columns))
+        if len(chosen) <= most:
+            return chosen
         step *= 1.02
 
 
@@ -208,10 +285,3 @@ def project(points: np.ndarray, camera: Camera) -> np.ndarray:
     x, y, z = points.astype(np.float64).T
     places = np.stack((x / z * camera.fx + camera.cx, y / z * camera.fy + camera.cy), axis=1)
     return places.clip(0, (camera.width - 1, camera.height - 1))
-
-
-def _is_chosen(size: int, step: float) -> np.ndarray:
-    """Return which of ``size`` rows or columns are nearest to multiples of a step of at least 1, (size,) bool."""
-    chosen = np.zeros(size, bool)
-    chosen[np.arange(0, size, step).astype(int)] = True
-    return chosen

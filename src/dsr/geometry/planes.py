@@ -13,7 +13,6 @@ is needed to distinguish them.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -44,8 +43,7 @@ _STEEP = 0.25
 _REDUCED = 320  # largest size of the longer side of a map that is judged whole; larger ones are thinned out
 
 
-@dataclass(frozen=True)
-class Windows:
+class _Windows(NamedTuple):
     """Square windows of a map of inverse depth, averaged within cells, (N, cells) each."""
 
     inverse: Array  # 1 / s, as a multiple of the window's median; 0 where invalid
@@ -96,10 +94,25 @@ class InverseVotes(NamedTuple):
 
 
 def range_votes(values: Array, camera: Camera, step: float = 0.0) -> RangeVotes:
-    """Count the planar windows of a map that support each range type; see :func:`plane_votes`."""
-    votes = plane_votes(values, camera, step)
-    flat, ray, reverse = (int((np.abs(votes - k) < _NEAR).sum()) for k in (0, 1, -1))
-    return RangeVotes(votes.size, flat, ray, reverse)
+    """Count the planar windows of a map that support each range type, by their exponents k.
+
+    The values are (H, W), positive, in any unit, NaN in holes; ``step`` is their rounding step as a fraction of them.
+    """
+    windows = _windows(values, camera)
+    if not windows.inverse.size:
+        return RangeVotes(0, 0, 0, 0)
+    columns = np.stack((np.ones_like(windows.u), windows.u, windows.v, -windows.bend * windows.inverse), axis=-1)
+    scale = np.sqrt(np.square(columns).mean(axis=1, keepdims=True))
+    columns = columns / scale
+    fit, weight, residual = _robust_fit(columns, windows)
+    bent = columns[..., 3] * scale[..., 3]
+    linear = _solve(columns[..., :3], weight, bent)
+    signal = _spread(bent - (columns[..., :3] @ linear[..., None])[..., 0], weight)
+    noise = np.hypot(_spread(residual, weight), step / np.sqrt(12))
+    planar = (weight.mean(axis=1) > _INLIERS) & (noise < _NOISE * signal)
+    exponents = (fit[:, 3] / scale[:, 0, 3])[planar]
+    flat, ray, reverse = (int((np.abs(exponents - k) < _NEAR).sum()) for k in (0, 1, -1))
+    return RangeVotes(exponents.size, flat, ray, reverse)
 
 
 def inverse_votes(values: Array) -> InverseVotes:
@@ -116,9 +129,9 @@ def inverse_votes(values: Array) -> InverseVotes:
         if not windows.inverse.size:
             return InverseVotes(0, 0)
         columns = np.stack((np.ones_like(windows.u), windows.u, windows.v), axis=-1)
-        fit, weight = _robust_fit(columns, windows)
-        deviations.append(_spread(windows.inverse - _product(columns, fit), weight))
-        rise = _spread(_product(columns[..., 1:], fit[:, 1:]), weight)
+        fit, weight, residual = _robust_fit(columns, windows)
+        deviations.append(_spread(residual, weight))
+        rise = _spread((columns[..., 1:] @ fit[:, 1:, None])[..., 0], weight)
         planar.append((weight.mean(axis=1) > _INLIERS) & (deviations[-1] < _STEEP * rise))
     of_reciprocals, of_values = deviations
     curved = np.maximum(of_reciprocals, of_values) > _CURVED
@@ -135,65 +148,35 @@ def thinned(values: Array, camera: Camera) -> tuple[Array, Camera]:
     return values[::every, ::every], camera.decimate(every, 0)
 
 
-def plane_votes(values: Array, camera: Camera, step: float = 0.0) -> Array:
-    """Estimate the exponent k of each planar window: near 0 orthogonal, 1 along the ray, -1 the reverse.
-
-    The values are (H, W), positive, in any unit, NaN in holes; ``step`` is their rounding step as a fraction of them.
-    """
-    windows = _windows(values, camera)
-    if not windows.inverse.size:
-        return np.empty(0)
-    columns = np.stack((np.ones_like(windows.u), windows.u, windows.v, -windows.bend * windows.inverse), axis=-1)
-    scale = np.sqrt(np.square(columns).mean(axis=1, keepdims=True))
-    columns = columns / scale
-    fit, weight = _robust_fit(columns, windows)
-    residual = windows.inverse - _product(columns, fit)
-    bent = columns[..., 3] * scale[..., 3]
-    bent = bent - _product(columns[..., :3], _solve(columns[..., :3], weight, bent))
-    signal, noise = (_spread(values, weight) for values in (bent, residual))
-    noise = np.hypot(noise, step / np.sqrt(12))
-    planar = (weight.mean(axis=1) > _INLIERS) & (noise < _NOISE * signal)
-    exponents: Array = (fit[:, 3] / scale[:, 0, 3])[planar]
-    return exponents
-
-
-def _windows(values: Array, camera: Camera) -> Windows:
+def _windows(values: Array, camera: Camera) -> _Windows:
     """Return the windows of a map that have enough valid pixels."""
     valid = np.isfinite(values)
     with np.errstate(over="ignore"):
         inverse = np.where(valid, np.nanmedian(values) / values, 0).clip(max=_LARGEST)
-    tops, lefts, sizes = _places(*values.shape)
+    places = []
+    height, width = values.shape
+    for fraction in _SIZES:  # windows overlap by half
+        size = int(min(height, width) * fraction)
+        if size >= _CELLS:
+            tops = np.linspace(0, height - size, round(2 * (height - size) / size) + 1).astype(int)
+            lefts = np.linspace(0, width - size, round(2 * (width - size) / size) + 1).astype(int)
+            places += [(top, left, size) for top in tops for left in lefts]
+    tops, lefts, sizes = np.array(places, dtype=int).reshape(-1, 3).T
     ends = np.round(np.arange(_CELLS + 1) * sizes[:, None] / _CELLS).astype(int)
     rows, columns = tops[:, None] + ends, lefts[:, None] + ends
-    area = np.diff(rows)[:, :, None] * np.diff(columns)[:, None, :]
     count = _totals(valid.astype(np.float64), rows, columns)
-    whole = count > _WHOLE * area
+    whole = count > _WHOLE * np.diff(rows)[:, :, None] * np.diff(columns)[:, None, :]
     enough = whole.mean(axis=(1, 2)) > _MIN_VALID
     rows, columns, whole, count = rows[enough], columns[enough], whole[enough], count[enough]
     means = np.where(whole, _totals(inverse, rows, columns) / np.maximum(count, 1), 0)
-    v, u = (((part[:, 1:] + part[:, :-1]) - 1) / 2 for part in (rows, columns))
+    v, u = ((rows[:, 1:] + rows[:, :-1]) - 1) / 2, ((columns[:, 1:] + columns[:, :-1]) - 1) / 2
     slopes = np.square((u - camera.cx) / camera.fx)[:, None, :] + np.square((v - camera.cy) / camera.fy)[:, :, None]
     bend = np.log1p(slopes) / 2
     bend -= bend.mean(axis=(1, 2), keepdims=True)
     u, v = (2 * (part - part.mean(axis=1, keepdims=True)) / sizes[enough, None] for part in (u, v))
     u, v = np.broadcast_to(u[:, None, :], bend.shape), np.broadcast_to(v[:, :, None], bend.shape)
-    shape = (len(means), _CELLS**2)
-    means, whole, u, v, bend = (field.reshape(shape) for field in (means, whole, u, v, bend))
-    return Windows(means / _medians(means, whole), whole, u, v, bend)
-
-
-def _places(height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the first rows, first columns and sizes of windows that overlap by half."""
-    found = []
-    for fraction in _SIZES:
-        size = int(min(height, width) * fraction)
-        if size >= _CELLS:
-            tops, lefts = (
-                np.linspace(0, n - size, round(2 * (n - size) / size) + 1).astype(int) for n in (height, width)
-            )
-            found += [(top, left, size) for top in tops for left in lefts]
-    tops, lefts, sizes = np.array(found, dtype=int).reshape(-1, 3).T
-    return tops, lefts, sizes
+    means, whole, u, v, bend = (field.reshape(len(means), _CELLS**2) for field in (means, whole, u, v, bend))
+    return _Windows(means / _medians(means, whole), whole, u, v, bend)
 
 
 def _totals(values: Array, rows: np.ndarray, columns: np.ndarray) -> Array:
@@ -203,24 +186,24 @@ def _totals(values: Array, rows: np.ndarray, columns: np.ndarray) -> Array:
     return totals
 
 
-def _robust_fit(columns: Array, windows: Windows) -> tuple[Array, Array]:
-    """Return coefficients (N, 4), and weights (N, cells), 1 for inliers and 0 for outliers.
+def _robust_fit(columns: Array, windows: _Windows) -> tuple[Array, Array, Array]:
+    """Return coefficients (N, k), weights (N, cells), 1 for inliers and 0 for outliers, and residuals (N, cells).
 
     The first iterations minimise absolute deviations, which tolerates up to half of the cells as outliers; the others
     use Tukey's biweight.
     """
     valid = windows.valid.astype(np.float64)
     weight = valid
-    for iteration in range(_ITERATIONS):
-        size = np.abs(windows.inverse - _product(columns, _solve(columns, weight, windows.inverse)))
-        ratio = size / (_SIGMA * _medians(size, windows.valid) + _EXACT)
+    for iteration in range(_ITERATIONS + 1):
+        fit = _solve(columns, weight, windows.inverse)
+        residual = windows.inverse - (columns @ fit[..., None])[..., 0]
+        size = np.abs(residual)
+        scale = _SIGMA * _medians(size, windows.valid) + _EXACT
         if iteration < _ITERATIONS // 2:
-            weight = valid * (1 / np.maximum(ratio, 0.05))
-        else:
-            weight = valid * np.square((1 - np.square(ratio / 4)).clip(min=0))
-    fit = _solve(columns, weight, windows.inverse)
-    size = np.abs(windows.inverse - _product(columns, fit))
-    return fit, valid * (size < 3 * (_SIGMA * _medians(size, windows.valid) + _EXACT))
+            weight = valid * (1 / np.maximum(size / scale, 0.05))
+        elif iteration < _ITERATIONS:
+            weight = valid * np.square((1 - np.square(size / scale / 4)).clip(min=0))
+    return fit, valid * (size < 3 * scale), residual
 
 
 def _medians(values: Array, valid: np.ndarray) -> Array:
@@ -237,11 +220,6 @@ def _solve(columns: Array, weight: Array, target: Array) -> Array:
     ridge = _EXACT * np.eye(columns.shape[-1]) * (1 + weight.sum(axis=1))[:, None, None]
     solution: Array = np.linalg.solve(weighted @ columns + ridge, weighted @ target[..., None])[..., 0]
     return solution
-
-
-def _product(columns: Array, fit: Array) -> Array:
-    product: Array = (columns @ fit[..., None])[..., 0]
-    return product
 
 
 def _spread(values: Array, weight: Array) -> Array:

@@ -16,19 +16,14 @@ _NUMBERS = ("fx", "fy", "cx", "cy")
 
 
 class Remark(NamedTuple):
-    """What was found about a camera.
-
-    The camera of a ``note`` may be right, that of a ``warning`` is probably wrong, and that of a ``problem`` is wrong.
-    ``kind`` is a text without the camera's numbers, ``code`` one of :data:`dsr.notes.LIMITS`, empty for a note, and
-    ``value`` what the limit was compared with.
-    """
+    """A remark on a camera: that of a ``note`` may be right, of a ``warning`` hardly, and of a ``problem`` is wrong."""
 
     level: Literal["note", "warning", "problem"]
-    kind: str
+    kind: str  # a text without the camera's numbers
     message: str
     advice: str
-    code: str = ""
-    value: float | None = None
+    code: str = ""  # one of LIMITS, empty for a note
+    value: float | None = None  # what the limit was compared with
 
 
 def judge_camera(camera: Camera, size_lr: tuple[int, int] | None = None) -> list[Remark]:
@@ -36,8 +31,39 @@ def judge_camera(camera: Camera, size_lr: tuple[int, int] | None = None) -> list
 
     ``size_lr`` is the (height, width) of a depth map that another camera may have taken.
     """
+    found = []
+    view, (low, high) = view_of(camera), _USUAL_VIEW
+    if not low <= view <= high:
+        text = f"fx {camera.fx:.4g} px gives a horizontal field of view of {view:.3g} degrees"
+        remark = ("hardly any camera has this field of view", f"{text}; {low:g} to {high:g} are usual")
+        if LIMITS["view-narrow"] <= view <= LIMITS["view-wide"]:
+            found.append(Remark("note", *remark, "correct for a telephoto or a very wide lens"))
+        else:
+            degrees = f"60 degrees correspond to {0.866 * camera.width:.0f} px"
+            advice = f"give fx and fy in pixels of this image, not in mm; {degrees}"
+            found.append(Remark("warning", *remark, advice, "view-narrow" if view < low else "view-wide", view))
     other = _other_picture(camera, size_lr)
-    return [*_view(camera), *([other] if other else _centre_and_shape(camera))]
+    if other is not None:
+        return [*found, Remark("problem", *other, "other-picture", offset_of(camera))]
+    offset, ratio = offset_of(camera), _ratio(camera)
+    if offset > LIMITS["other-picture"]:
+        right, below = _from_middle(camera.cx, camera.cy, camera.width, camera.height)
+        message = (
+            f"principal point ({camera.cx:.4g}, {camera.cy:.4g}) px is {abs(right):.0%} of the width "
+            f"{'right' if right > 0 else 'left'} of the centre and {abs(below):.0%} of the height "
+            f"{'below' if below > 0 else 'above'} it"
+        )
+        remark = ("the principal point is far from the middle", message)
+        if offset <= LIMITS["off-centre"]:
+            found.append(Remark("note", *remark, "correct for a cropped image"))
+        else:
+            advice = "check cx and cy; if the image was cropped or resized, the camera must be adapted"
+            found.append(Remark("warning", *remark, advice, "off-centre", offset))
+    if ratio > LIMITS["focal-ratio"]:
+        message = f"fx {camera.fx:.4g} and fy {camera.fy:.4g} px differ by {ratio - 1:.0%}"
+        advice = "pixels are usually square: check both, and the aspect ratio of the image"
+        found.append(Remark("warning", "fx and fy differ", message, advice, "focal-ratio", ratio))
+    return found
 
 
 def expect_possible(camera: Camera, name: str) -> None:
@@ -91,53 +117,30 @@ def _ratio(camera: Camera) -> float:
     return max(camera.fx, camera.fy) / min(camera.fx, camera.fy)
 
 
-def _view(camera: Camera) -> list[Remark]:
-    """Judge the field of view."""
-    view, (low, high) = view_of(camera), _USUAL_VIEW
-    if low <= view <= high:
-        return []
-    kind = "hardly any camera has this field of view"
-    message = (
-        f"fx {camera.fx:.4g} px gives a horizontal field of view of {view:.3g} degrees; {low:g} to {high:g} are usual"
-    )
-    if LIMITS["view-narrow"] <= view <= LIMITS["view-wide"]:
-        return [Remark("note", kind, message, "correct for a telephoto or a very wide lens")]
-    degrees = f"60 degrees correspond to {0.866 * camera.width:.0f} px"
-    advice = f"give fx and fy in pixels of this image, not in mm; {degrees}"
-    return [Remark("warning", kind, message, advice, "view-narrow" if view < low else "view-wide", view)]
-
-
-def _other_picture(camera: Camera, size_lr: tuple[int, int] | None) -> Remark | None:
-    """Judge whether the numbers fit better in another order, or to an image of another size."""
-    offset = offset_of(camera)
-    if offset <= LIMITS["other-picture"] and _ratio(camera) <= LIMITS["focal-ratio"]:
+def _other_picture(camera: Camera, size_lr: tuple[int, int] | None) -> tuple[str, str, str] | None:
+    """Return kind, message and advice if the numbers fit better in another order, or to an image of another size."""
+    if offset_of(camera) <= LIMITS["other-picture"] and _ratio(camera) <= LIMITS["focal-ratio"]:
         return None
     text = f"fx {camera.fx:.4g}, fy {camera.fy:.4g}, cx {camera.cx:.4g}, cy {camera.cy:.4g} px"
     order = _better_order(camera)
     if order is not None:
         message = f"{text} fit the {camera.height} x {camera.width} image in another order"
         advice = f"correct the order: {', '.join(f'{name} is the number given as {other}' for name, other in order)}"
-        return Remark("problem", "the intrinsics are in another order", message, advice, "other-picture", offset)
-    across, down = (2 * camera.cx + 1) / camera.width, (2 * camera.cy + 1) / camera.height
-
-    def fits(wide: float, high: float) -> bool:
-        return abs(across / wide - 1) < _FITTING and abs(down / high - 1) < _FITTING
-
+        return "the intrinsics are in another order", message, advice
     kind = "the intrinsics fit another picture"
+    across, down = (2 * camera.cx + 1) / camera.width, (2 * camera.cy + 1) / camera.height
     if size_lr is not None and size_lr != (camera.height, camera.width):
         height, width = size_lr
-        if fits(width / camera.width, height / camera.height):
-            message = (
-                f"{text} fit the depth map of {width} x {height}, not the photo of {camera.width} x {camera.height}"
-            )
-            advice = "give the intrinsics of the photo's camera, in pixels of the photo"
-            return Remark("problem", kind, message, advice, "other-picture", offset)
+        wide, high = width / camera.width, height / camera.height
+        if abs(across / wide - 1) < _FITTING and abs(down / high - 1) < _FITTING:
+            of_map, of_photo = f"{width} x {height}", f"{camera.width} x {camera.height}"
+            message = f"{text} fit the depth map of {of_map}, not the photo of {of_photo}"
+            return kind, message, "give the intrinsics of the photo's camera, in pixels of the photo"
     for scale in (*_SCALES, *(1 / scale for scale in _SCALES)):
-        if fits(scale, scale):
+        if abs(across / scale - 1) < _FITTING and abs(down / scale - 1) < _FITTING:
             size = f"{camera.height * scale:.0f} x {camera.width * scale:.0f}"
             message = f"{text} fit an image {scale:.3g} times as large ({size})"
-            advice = f"divide them by {scale:.3g}, unless the image was cropped"
-            return Remark("problem", kind, message, advice, "other-picture", offset)
+            return kind, message, f"divide them by {scale:.3g}, unless the image was cropped"
     return None
 
 
@@ -150,34 +153,9 @@ def _better_order(camera: Camera) -> list[tuple[str, str]] | None:
         if min(fx, fy) <= 0:
             continue
         other = Camera(camera.width, camera.height, fx, fy, cx, cy)
-        centred = offset_of(other) < _FITTING
-        square = _ratio(other) < 1.03
-        fits = centred and square and _USUAL_VIEW[0] <= view_of(other) <= _USUAL_VIEW[1]
+        usual = _USUAL_VIEW[0] <= view_of(other) <= _USUAL_VIEW[1]
         moved = [(_NUMBERS[place], _NUMBERS[index]) for place, index in enumerate(order) if place != index]
+        fits = offset_of(other) < _FITTING and _ratio(other) < 1.03 and usual
         if fits and (best is None or len(moved) < len(best)):
             best = moved
     return best
-
-
-def _centre_and_shape(camera: Camera) -> list[Remark]:
-    """Judge the principal point, and the ratio of the focal lengths."""
-    found = []
-    right, below = _from_middle(camera.cx, camera.cy, camera.width, camera.height)
-    offset, ratio = offset_of(camera), _ratio(camera)
-    if offset > LIMITS["other-picture"]:
-        kind = "the principal point is far from the middle"
-        message = (
-            f"principal point ({camera.cx:.4g}, {camera.cy:.4g}) px is {abs(right):.0%} of the width "
-            f"{'right' if right > 0 else 'left'} of the centre and {abs(below):.0%} of the height "
-            f"{'below' if below > 0 else 'above'} it"
-        )
-        advice = "check cx and cy; if the image was cropped or resized, the camera must be adapted"
-        if offset <= LIMITS["off-centre"]:
-            found.append(Remark("note", kind, message, "correct for a cropped image"))
-        else:
-            found.append(Remark("warning", kind, message, advice, "off-centre", offset))
-    if ratio > LIMITS["focal-ratio"]:
-        message = f"fx {camera.fx:.4g} and fy {camera.fy:.4g} px differ by {ratio - 1:.0%}"
-        advice = "pixels are usually square: check both, and the aspect ratio of the image"
-        found.append(Remark("warning", "fx and fy differ", message, advice, "focal-ratio", ratio))
-    return found

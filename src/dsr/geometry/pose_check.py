@@ -19,15 +19,14 @@ from dsr.geometry.tsdf import PosedMap
 from dsr.notes import LIMITS, Assumption
 
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-_FORWARD_DOWN = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # as TartanAir has it
-_FORWARD_UP = np.diag([1.0, -1.0, -1.0, 1.0]) @ _FORWARD_DOWN  # x forward, y left, z up, of robots (ROS)
+_FORWARD_DOWN = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 _DIRECTIONS = ("", "from world to camera")
 _ROTATIONS = ("", "with rotations by columns", "with quaternions w x y z")
 _AXES: dict[str, Matrix] = {
     "": np.eye(4),
     "of cameras with y up and z backward": _OPENGL,
-    "of cameras with x forward and z down": _FORWARD_DOWN,
-    "of cameras with x forward and z up": _FORWARD_UP,
+    "of cameras with x forward and z down": _FORWARD_DOWN,  # as TartanAir has it
+    "of cameras with x forward and z up": _OPENGL @ _FORWARD_DOWN,  # y left, of robots (ROS)
 }
 _LENGTHS = {
     "": 1.0,
@@ -39,32 +38,24 @@ _LENGTHS = {
 }
 
 
-class Reading(NamedTuple):
-    """A convention that poses may have, and their conversion to the one of :mod:`dsr.geometry.rigid_motion`."""
-
-    direction: str = ""
-    turn: str = ""
-    axes: str = ""
-    length: str = ""
-
-    def __call__(self, pose: Matrix) -> Matrix:
-        """Return a pose of this convention in that of :mod:`dsr.geometry.rigid_motion`."""
-        rotation = pose[:3, :3]
-        if self.turn == "with rotations by columns":
-            rotation = rotation.T
-        elif self.turn == "with quaternions w x y z":  # it was read as x y z w
-            w, x, y, z = quaternion_of(rotation)
-            rotation = rotation_of_quaternion((x, y, z, w))
-        changed = np.block([[rotation, _LENGTHS[self.length] * pose[:3, 3:]], [pose[3:]]])
-        return (invert(changed) if self.direction else changed) @ _AXES[self.axes]
+def _read(pose: Matrix, direction: str, turn: str, axes: str, length: str) -> Matrix:
+    """Return a pose of a convention in that of :mod:`dsr.geometry.rigid_motion`."""
+    rotation = pose[:3, :3]
+    if turn == "with rotations by columns":
+        rotation = rotation.T
+    elif turn == "with quaternions w x y z":  # it was read as x y z w
+        w, x, y, z = quaternion_of(rotation)
+        rotation = rotation_of_quaternion((x, y, z, w))
+    changed = np.block([[rotation, _LENGTHS[length] * pose[:3, 3:]], [pose[3:]]])
+    return (invert(changed) if direction else changed) @ _AXES[axes]
 
 
-# all readings by name, those first that change less; "" is as given
+# the arguments of all readings by name, those first that change less; "" is as given
 READINGS = {
     ", ".join(filter(None, reading)): reading
     for reading in sorted(
         (
-            Reading(direction, turn, axes, length)
+            (direction, turn, axes, length)
             for turn, direction, axes, length in itertools.product(_ROTATIONS, _DIRECTIONS, _AXES, _LENGTHS)
             if not turn or not (axes or (direction and turn == "with rotations by columns"))
         ),
@@ -86,15 +77,11 @@ _STILL = 1.2  # times as many pixels have to disagree under the poses as without
 
 
 class Agreement(NamedTuple):
-    """How far pairs of frames agree under each of :data:`READINGS` and, last, without motion, (pairs, readings + 1).
+    """How far pairs of frames agree under each of :data:`READINGS` and, last, without motion, (pairs, readings + 1)."""
 
-    ``overlap``: share of a frame's points that lie in the other's view. ``agreed``: share of these whose depths agree.
-    ``moved``: distance of the two places as given, over the median depth, (pairs,).
-    """
-
-    overlap: np.ndarray
-    agreed: np.ndarray
-    moved: np.ndarray
+    overlap: np.ndarray  # share of a frame's points that lie in the other's view
+    agreed: np.ndarray  # share of these whose depths agree
+    moved: np.ndarray  # distance of the two places as given, over the median depth, (pairs,)
 
 
 def sample(count: int) -> list[tuple[int, ...]]:
@@ -124,17 +111,13 @@ def compare(groups: Iterable[Sequence[Reduced]]) -> Agreement:
 
 
 class Reduced(NamedTuple):
-    """A reduced map, its camera, some of its points, (3, N), and its poses by all readings, (readings + 1, 4, 4)."""
+    """A reduced map, its camera, some points with their median depth, and the poses by all readings."""
 
     depth: np.ndarray
     camera: Camera
-    points: np.ndarray
-    poses: np.ndarray
-
-    @property
-    def middle(self) -> float:
-        """The median depth of the points."""
-        return float(np.median(self.points[2])) if self.points.size else np.nan
+    points: np.ndarray  # (3, N)
+    middle: float
+    poses: np.ndarray  # (readings + 1, 4, 4)
 
 
 def prepare(each: PosedMap) -> Reduced:
@@ -145,9 +128,11 @@ def prepare(each: PosedMap) -> Reduced:
     apart = max(camera.width // _ACROSS, 1)
     part = (slice(None), *[slice(apart // 2, None, apart)] * 2)
     points = (depth * camera.rays().numpy())[part].reshape(3, -1)
+    points = points[:, np.isfinite(points[2])]
+    middle = float(np.median(points[2])) if points.size else np.nan
     with np.errstate(over="ignore", invalid="ignore"):  # of numbers that no pose has
-        poses = np.stack([*(read(each.pose) for read in READINGS.values()), np.eye(4)])
-    return Reduced(depth, camera, points[:, np.isfinite(points[2])], poses)
+        poses = np.stack([*(_read(each.pose, *reading) for reading in READINGS.values()), np.eye(4)])
+    return Reduced(depth, camera, points, middle, poses)
 
 
 def _compare(frame: Reduced, other: Reduced) -> tuple[np.ndarray, np.ndarray]:

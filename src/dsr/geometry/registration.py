@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -65,49 +66,29 @@ class Displacement:
         return f"{across}, {down}" + (f", scale {self.scale:.4f}" if self.scale != 1 else "")
 
 
-@dataclass(frozen=True)
-class Edges:
-    """The edges of a depth map in pixels of a photo: where its gradients to the right, and down, are read.
+class Edges(NamedTuple):
+    """Edges of a depth map in pixels of a photo: rows and columns, (2, N), of pixels where its gradients are read.
 
-    ``right`` and ``below`` are rows and columns, (2, N), in the map of gradients to the right (down), of pixels whose
-    right (lower) neighbour has another depth.
+    ``right`` (``below``) has the pixels whose right (lower) neighbour has another depth.
     """
 
     right: Array
     below: Array
 
-    @property
-    def count(self) -> int:
-        """The number of edges."""
-        return int(self.right.shape[1] + self.below.shape[1])
-
-    def tiles(self) -> NDArray[np.intp]:
-        """Return the index of the tile of each edge, first of ``right``, then of ``below``."""
-        places = (np.concatenate((self.right, self.below), axis=1) // _TILE).astype(np.intp)
-        return np.unique(places, axis=1, return_inverse=True)[1].ravel()
-
-    def scale_up(self, factor: int) -> Edges:
-        """Return the edges in pixels of a photo that is a whole factor larger than the depth map."""
-        middle = (factor - 1) / 2
-        right = np.stack((factor * self.right[0] + middle, factor * (self.right[1] + 1) - 1))
-        below = np.stack((factor * (self.below[0] + 1) - 1, factor * self.below[1] + middle))
-        return Edges(right, below)
-
 
 @dataclass(frozen=True)
 class _Comparison:
-    """Depth edges and a photo's gradients at one working size.
+    """Depth edges, the tile of each, and a photo's gradients at one working size, (height, width).
 
-    ``tiles`` are those of the edges, ``size`` is the height and width of the working photo, ``whole`` the longer side
-    of the photo, at most ``WORKING_SIZE``, and ``pixel`` the width of a pixel of the depth map in working pixels.
+    ``pixel`` is the width of a pixel of the depth map in working pixels, ``radius`` the largest shift.
     """
 
     edges: Edges
-    gradients: Gradients
     tiles: np.ndarray
+    gradients: Gradients
     size: tuple[int, int]
-    whole: int
-    pixel: float
+    pixel: int
+    radius: int
 
     def scaled(self, scale: float) -> Edges:
         """Return the edges scaled about the middle."""
@@ -122,7 +103,7 @@ class _Comparison:
         edges, shift = self.scaled(scale), np.array((down, right))[:, None]
         found = [
             ndimage.map_coordinates(gradient, places + shift, order=1, mode="constant")
-            for places, gradient in zip((edges.right, edges.below), gradients or self.gradients, strict=True)
+            for places, gradient in zip(edges, gradients or self.gradients, strict=True)
         ]
         return np.asarray(np.bincount(self.tiles, np.concatenate(found)), dtype=np.float64)
 
@@ -140,30 +121,28 @@ def find_displacement(depth_lr: Tensor, rgb: Tensor) -> Displacement | None:
     factor = max(min(WORKING_SIZE // max(height, width), math.floor(ratio)), 1)
     size = (factor * height, factor * width)
     radius = max(round(max(size) * _MAX_SHIFT), _LEAST_RADIUS * factor)
-    gap = max(round(_SHADOW * max(depth.shape)), 1)
-    edges = find_edges(depth, math.ceil(radius / factor), gap).scale_up(factor)
-    if edges.count < _LEAST_EDGES or int(edges.tiles().max()) + 1 < _LEAST_TILES:
+    found = find_edges(depth, math.ceil(radius / factor), max(round(_SHADOW * max(depth.shape)), 1))
+    middle = (factor - 1) / 2
+    right = np.stack((factor * found.right[0] + middle, factor * (found.right[1] + 1) - 1))
+    below = np.stack((factor * (found.below[0] + 1) - 1, factor * found.below[1] + middle))
+    places = (np.concatenate((right, below), axis=1) // _TILE).astype(np.intp)
+    tiles = np.unique(places, axis=1, return_inverse=True)[1].ravel()
+    if len(tiles) < _LEAST_EDGES or int(tiles.max()) + 1 < _LEAST_TILES:
         return None
     photo = functional.interpolate(rgb[None].float().cpu(), size, mode="bilinear", antialias=True)[0]
-    gradients = edge_gradients(photo.double().numpy())
-    whole = min(max(rgb.shape[-2:]), WORKING_SIZE)
-    comparison = _Comparison(edges, gradients, edges.tiles(), size, whole, float(factor))
-    blur = 0.5 * comparison.pixel + 0.3  # about the uncertainty of an edge in the depth map
-    blurred = ndimage.gaussian_filter(gradients[0], blur), ndimage.gaussian_filter(gradients[1], blur)
-    coarse = _best_shifts(comparison, blurred, radius)
-    shift = _refine(comparison, blurred, coarse[_SCALES.index(1.0)][1:], scaling=False)
-    similar = max(
-        (_refine(comparison, blurred, start, scaling=True) for start in {max(coarse)[1:], shift}),
-        key=lambda each: float(comparison.sums(*each).sum()),
-    )
-    with_scale, without = comparison.sums(*similar), comparison.sums(*shift)
-    errors = standard_errors(with_scale - without)
-    better = errors > _ABOVE_SHIFT or (errors > 1 and with_scale.sum() > _MUCH * without.sum())
-    down, right, scale = found = similar if better else shift
-    for simpler in ((0.0, 0.0, 1.0), (0.0, right, scale), (down, 0.0, scale)):
-        if simpler != found and standard_errors(comparison.sums(*found) - comparison.sums(*simpler)) < _WEAK:
-            return _judge(comparison, simpler, radius, every)
-    return _judge(comparison, found, radius, every)
+    gradients = _edge_gradients(photo.double().numpy())
+    comparison = _Comparison(Edges(right, below), tiles, gradients, size, factor, radius)
+    down, across, scale = best = _search(comparison)
+    for simpler in ((0.0, 0.0, 1.0), (0.0, across, scale), (down, 0.0, scale)):
+        gains = comparison.sums(*best) - comparison.sums(*simpler)
+        if simpler != best and _standard_errors(gains) < _WEAK:
+            best = simpler
+            break
+    certain, corner = _judge(comparison, best)
+    back = every / factor
+    moved = corner * min(max(rgb.shape[-2:]), WORKING_SIZE) / max(size)
+    visible = certain and corner >= max(SHIFT, factor)  # the working size has no more pixels than the photo
+    return Displacement(best[1] * back, best[0] * back, best[2], certain, visible, moved)
 
 
 def undo(depth_lr: Tensor, displacement: Displacement) -> Tensor:
@@ -173,10 +152,10 @@ def undo(depth_lr: Tensor, displacement: Displacement) -> Tensor:
     taken, whichever covers more of the new pixel. A pixel most of which is a hole, or outside the map, becomes a hole.
     """
     height, width = depth_lr.shape[-2:]
-    v, u = (
-        (torch.arange(n, dtype=torch.float64) - (n - 1) / 2 - shift) / displacement.scale + (n - 1) / 2
-        for n, shift in ((height, displacement.down), (width, displacement.right))
-    )
+    middle_v, middle_u = (height - 1) / 2, (width - 1) / 2
+    v = torch.arange(height, dtype=torch.float64) - middle_v - displacement.down
+    u = torch.arange(width, dtype=torch.float64) - middle_u - displacement.right
+    v, u = v / displacement.scale + middle_v, u / displacement.scale + middle_u
     inverse = functional.pad(depth_lr.double().cpu().reciprocal(), (1, 1, 1, 1), value=torch.nan)[0]
     rows, columns = v.floor().clamp(-1, height - 1), u.floor().clamp(-1, width - 1)
     down, right = (v - rows).clamp(0, 1), (u - columns).clamp(0, 1)
@@ -201,17 +180,16 @@ def undo(depth_lr: Tensor, displacement: Displacement) -> Tensor:
     return moved.masked_fill(outside[0][:, None] | outside[1], torch.nan)[None].to(depth_lr)
 
 
-def find_edges(depth: Array, margin: int, gap: int | None = None) -> Edges:
+def find_edges(depth: Array, margin: int, gap: int) -> Edges:
     """Return the jumps of depth, (H, W) with NaN in holes, away from the border; a subset if there are very many.
 
     ``margin`` is the smallest distance from the border in pixels, ``gap`` the widest hole in pixels across which a jump
-    counts, as a sensor's shadow beside an edge: the edge is then where the nearer surface ends. None leaves out jumps
-    within two pixels of a hole.
+    counts, as a sensor's shadow beside an edge: the edge is then where the nearer surface ends.
     """
-    safe = np.ones(depth.shape, bool) if gap is not None else ~ndimage.binary_dilation(np.isnan(depth), iterations=2)
+    safe = np.ones(depth.shape, bool)
     safe[:margin] = safe[-margin:] = safe[:, :margin] = safe[:, -margin:] = False
-    right = _jumps(depth, safe, gap or 0)
-    below = _jumps(depth.T, safe.T, gap or 0)[::-1]
+    right = _jumps(depth, safe, gap)
+    below = _jumps(depth.T, safe.T, gap)[::-1]
     every = math.ceil((right.shape[1] + below.shape[1]) / _MOST_EDGES) or 1
     return Edges(right[:, ::every], below[:, ::every])
 
@@ -230,7 +208,7 @@ def _jumps(depth: Array, safe: NDArray[np.bool_], gap: int) -> Array:
     return np.stack((rows[kept], place[kept])).astype(np.float64)
 
 
-def edge_gradients(photo: Array) -> Gradients:
+def _edge_gradients(photo: Array) -> Gradients:
     """Return the largest gradients of the channels of a photo, (3, H, W), relative to their local mean, up to 4."""
     blurred = ndimage.gaussian_filter(photo, (0, 0.7, 0.7))
     right, below = np.abs(np.diff(blurred, axis=2)).max(axis=0), np.abs(np.diff(blurred, axis=1)).max(axis=0)
@@ -238,7 +216,7 @@ def edge_gradients(photo: Array) -> Gradients:
     return ratios[0], ratios[1]
 
 
-def mean_gradients(each: Iterable[Edges], gradients: Gradients, radius: int) -> Iterator[Array]:
+def _mean_gradients(each: Iterable[Edges], gradients: Gradients, radius: int) -> Iterator[Array]:
     """Yield the mean gradient at some edges for every shift down and right up to a radius, (2 r + 1, 2 r + 1)."""
     largest = np.max([gradient.shape for gradient in gradients], axis=0)
     height, width = (cv2.getOptimalDFTSize(int(n) + radius + 1) for n in largest)  # no shift wraps around
@@ -246,31 +224,45 @@ def mean_gradients(each: Iterable[Edges], gradients: Gradients, radius: int) -> 
     shifts = np.arange(-radius, radius + 1)
     for edges in each:
         total = np.zeros((height, width // 2 + 1), complex)
-        for (rows, columns), spectrum in zip((edges.right, edges.below), spectra, strict=True):
+        for (rows, columns), spectrum in zip(edges, spectra, strict=True):
             row = np.clip(np.rint(rows).astype(np.intp), 0, height - 1)
             column = np.clip(np.rint(columns).astype(np.intp), 0, width - 1)
             there = np.bincount(row * width + column, minlength=height * width).reshape(height, width)
             total += spectrum * np.conj(np.fft.rfft2(there))
         near = np.fft.ifft(total, axis=0)[shifts]
-        yield np.fft.irfft(near, width, axis=1)[:, shifts] / max(edges.count, 1)
+        count = edges.right.shape[1] + edges.below.shape[1]
+        yield np.fft.irfft(near, width, axis=1)[:, shifts] / max(count, 1)
 
 
-def standard_errors(gains: Array) -> float:
+def _standard_errors(gains: Array) -> float:
     """Return the sum over the tiles, in standard errors."""
     return float(gains.sum() / max(np.sqrt(np.square(gains).sum()), 1e-12))
 
 
-def _best_shifts(comparison: _Comparison, gradients: Gradients, radius: int) -> list[tuple[float, float, float, float]]:
-    """Return for each scale the largest mean gradient of shifts by every second pixel, down, right and the scale."""
-    right, below = (each[::_COARSE, ::_COARSE] for each in gradients)
+def _search(comparison: _Comparison) -> tuple[float, float, float]:
+    """Return the best shift down and right with its scale, which is 1 unless another one clearly gains.
+
+    A search by every second pixel and in steps of scale gives the starts of those to fractions of a pixel.
+    """
+    blur = 0.5 * comparison.pixel + 0.3  # about the uncertainty of an edge in the depth map
+    right, below = (ndimage.gaussian_filter(gradient, blur) for gradient in comparison.gradients)
     scaled = (comparison.scaled(scale) for scale in _SCALES)
     coarse = (Edges(edges.right / _COARSE, edges.below / _COARSE) for edges in scaled)
-    found = []
-    for scale, mean in zip(_SCALES, mean_gradients(coarse, (right, below), radius // _COARSE), strict=True):
+    reach = comparison.radius // _COARSE
+    every = slice(None, None, _COARSE), slice(None, None, _COARSE)
+    starts = []
+    for scale, mean in zip(_SCALES, _mean_gradients(coarse, (right[every], below[every]), reach), strict=True):
         row, column = np.unravel_index(mean.argmax(), mean.shape)
-        down, across = (float(_COARSE * (place - radius // _COARSE)) for place in (row, column))
-        found.append((float(mean.max()), down, across, scale))
-    return found
+        starts.append((float(mean.max()), float(_COARSE * (row - reach)), float(_COARSE * (column - reach)), scale))
+    shift = _refine(comparison, (right, below), starts[_SCALES.index(1.0)][1:], scaling=False)
+    similar = max(
+        (_refine(comparison, (right, below), start, scaling=True) for start in {max(starts)[1:], shift}),
+        key=lambda each: float(comparison.sums(*each).sum()),
+    )
+    with_scale, without = comparison.sums(*similar), comparison.sums(*shift)
+    errors = _standard_errors(with_scale - without)
+    better = errors > _ABOVE_SHIFT or (errors > 1 and with_scale.sum() > _MUCH * without.sum())
+    return similar if better else shift
 
 
 def _refine(
@@ -283,7 +275,7 @@ def _refine(
 
     def loss(x: Array) -> float:
         scale = x[2] / reach if scaling else start[2]
-        return -float(comparison.sums(x[0], x[1], scale, gradients).sum()) / comparison.edges.count
+        return -float(comparison.sums(x[0], x[1], scale, gradients).sum()) / len(comparison.tiles)
 
     first = np.array((start[0], start[1], start[2] * reach)[: 3 if scaling else 2])
     simplex = np.stack((first, *(first + 1.5 * comparison.pixel**0.5 * axis for axis in np.eye(len(first)))))
@@ -292,29 +284,26 @@ def _refine(
     return float(best[0]), float(best[1]), float(best[2] / reach) if scaling else start[2]
 
 
-def _judge(comparison: _Comparison, found: tuple[float, float, float], radius: int, every: int) -> Displacement:
-    """Return a displacement in pixels of the map, and whether it is significant."""
-    down, right, scale = found
+def _judge(comparison: _Comparison, found: tuple[float, float, float]) -> tuple[bool, float]:
+    """Return whether a displacement is significant, and by how many working pixels it moves a corner."""
+    (down, right, scale), radius = found, comparison.radius
     sums = comparison.sums(*found)
-    [mean] = mean_gradients([comparison.scaled(scale)], comparison.gradients, radius)
+    [mean] = _mean_gradients([comparison.scaled(scale)], comparison.gradients, radius)
     median = float(np.median(mean))
     shifts = np.arange(-radius, radius + 1)
-    apart = max(_APART, round(2 * comparison.pixel))
+    apart = max(_APART, 2 * comparison.pixel)
     near = (np.abs(shifts - down) <= apart)[:, None] & (np.abs(shifts - right) <= apart)
     other = np.unravel_index(np.where(near, -1, mean).argmax(), mean.shape)
     elsewhere = comparison.sums(float(other[0] - radius), float(other[1] - radius), scale)
     counts = np.bincount(comparison.tiles)
     middle = (np.array(comparison.size) - 1) / 2
-    corner = max(abs(down) + abs(scale - 1) * middle[0], abs(right) + abs(scale - 1) * middle[1])
+    corner = float(max(abs(down) + abs(scale - 1) * middle[0], abs(right) + abs(scale - 1) * middle[1]))
     certain = (
         sums.sum() > _CONTRAST * median * counts.sum()
-        and standard_errors(sums - median * counts) > _BY_CHANCE
-        and standard_errors(sums - elsewhere) > _BY_OTHERS
-        and standard_errors(sums - comparison.sums(0, 0, 1)) > _BY_NONE
+        and _standard_errors(sums - median * counts) > _BY_CHANCE
+        and _standard_errors(sums - elsewhere) > _BY_OTHERS
+        and _standard_errors(sums - comparison.sums(0, 0, 1)) > _BY_NONE
         and max(abs(down), abs(right)) < radius
         and corner >= _SMALLEST * comparison.pixel
     )
-    back = every / comparison.pixel
-    moved = float(corner) * comparison.whole / max(comparison.size)
-    visible = corner >= max(SHIFT, comparison.pixel)  # at the working size, which has no more pixels than the photo
-    return Displacement(right * back, down * back, scale, bool(certain), bool(certain and visible), moved)
+    return bool(certain), corner

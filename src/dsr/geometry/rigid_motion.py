@@ -6,7 +6,7 @@ A pose is the transform from a camera's frame (x right, y down, z forward) to th
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,28 +22,26 @@ def as_rigid(values: Sequence[Sequence[float]] | np.ndarray, name: str) -> Matri
 
     Errors begin with ``name``, such as the file that the numbers are from.
     """
+    expected = f"{name}: expected a matrix of 3 x 4 or 4 x 4 numbers, got"
     try:
         if not isinstance(values, np.ndarray) and any(isinstance(each, bool | str) for row in values for each in row):
             raise TypeError
         matrix = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{name}: expected a matrix of 3 x 4 or 4 x 4 numbers, got something else") from None
+        raise ValueError(f"{expected} something else") from None
     if matrix.shape not in ((3, 4), (4, 4)):
-        raise ValueError(
-            f"{name}: expected a matrix of 3 x 4 or 4 x 4 numbers, got {' x '.join(map(str, matrix.shape))}"
-        )
+        raise ValueError(f"{expected} {' x '.join(map(str, matrix.shape))}")
     if not np.isfinite(matrix).all():
         raise ValueError(f"{name}: expected finite numbers, got {matrix[~np.isfinite(matrix)][0]}")
     if matrix.shape == (4, 4) and not np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6):
         columns = np.allclose(matrix[:, 3], (0, 0, 0, 1), atol=1e-6)
         hint = "; are rows and columns exchanged?" if columns else ""
-        raise ValueError(f"{name}: expected 0 0 0 1 as the last row, got {_text(matrix[3])}{hint}")
+        row = " ".join(f"{value:.4g}" for value in matrix[3])
+        raise ValueError(f"{name}: expected 0 0 0 1 as the last row, got {row}{hint}")
     turn = matrix[:3, :3]
     if not orthonormal_error(turn) <= _TOLERANCE:  # NaN is none either
-        lengths = [math.hypot(*row) for row in turn]
-        raise ValueError(
-            f"{name}: expected a rigid transform, got rows of length {_text(lengths)} that do not form one"
-        )
+        lengths = " ".join(f"{math.hypot(*row):.4g}" for row in turn)
+        raise ValueError(f"{name}: expected a rigid transform, got rows of length {lengths} that do not form one")
     if np.linalg.det(turn) < 0:
         raise ValueError(f"{name}: expected a rigid transform, got one that mirrors")
     left, _, right = np.linalg.svd(turn)
@@ -71,9 +69,7 @@ def from_quaternion(translation: Sequence[float], quaternion: Sequence[float], n
     length = math.hypot(*quaternion)
     if not abs(length - 1) <= 0.01:
         raise ValueError(f"{name}: expected a quaternion of length 1, got {length:g}")
-    return as_rigid(
-        np.column_stack((rotation_of_quaternion(quaternion), np.asarray(translation, dtype=np.float64))), name
-    )
+    return as_rigid(np.column_stack((rotation_of_quaternion(quaternion), translation)), name)
 
 
 def rotation_of_quaternion(quaternion: Sequence[float]) -> Matrix:
@@ -110,8 +106,3 @@ def invert(transform: Matrix) -> Matrix:
 def relative(pose: Matrix, to: Matrix) -> Matrix:
     """Return the transform from the frame of the camera at ``pose`` to that of the camera at ``to``."""
     return invert(to) @ pose
-
-
-def _text(values: Iterable[float]) -> str:
-    """Return numbers for a message."""
-    return " ".join(f"{value:.4g}" for value in values)

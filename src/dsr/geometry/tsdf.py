@@ -30,24 +30,20 @@ _AT_ONCE = 2048  # blocks that are updated at a time
 
 
 class PosedMap(NamedTuple):
-    """A depth map with its camera's place.
+    """A depth map with its camera's place."""
 
-    ``depth`` (H, W): orthogonal depth in metres, NaN in holes. ``pose``: camera to world, 4 x 4, metres. ``deviation``
-    (H, W): expected error in metres, by which it is weighted; None to weight all pixels alike.
-    """
-
-    depth: np.ndarray
+    depth: np.ndarray  # (H, W) in metres, NaN in holes
     camera: Camera
-    pose: Matrix
-    deviation: np.ndarray | None = None
+    pose: Matrix  # camera to world
+    deviation: np.ndarray | None = None  # (H, W) expected error in metres; None to weight all pixels alike
 
 
 class FusedMesh(NamedTuple):
-    """``vertices`` (N, 3) in metres, in the world's frame; ``normals`` (N, 3), outward; ``faces`` (M, 3)."""
+    """A mesh in the world's frame."""
 
-    vertices: np.ndarray
-    normals: np.ndarray
-    faces: np.ndarray
+    vertices: np.ndarray  # (N, 3) in metres
+    normals: np.ndarray  # (N, 3), outward
+    faces: np.ndarray  # (M, 3)
 
 
 def fuse_maps(maps: Callable[[], Iterable[PosedMap]], voxel: float) -> FusedMesh:
@@ -61,10 +57,8 @@ def fuse_maps(maps: Callable[[], Iterable[PosedMap]], voxel: float) -> FusedMesh
     layer = math.prod(int(extent) + 1 for extent in np.ptp(blocks[:, :2], axis=0))  # of any size
     excess = max(len(blocks) / MOST_BLOCKS, layer / _LARGEST_LAYER)
     if excess > 1:
-        raise ValueError(
-            f"voxel: expected one of at least about {voxel * excess**0.5:.2g} m for surfaces as large as these, "
-            f"got {voxel:g}"
-        )
+        least = f"{voxel * excess**0.5:.2g} m for surfaces as large as these"
+        raise ValueError(f"voxel: expected one of at least about {least}, got {voxel:g}")
     distance = np.zeros((len(blocks), _SIDE**3), np.float32)
     weight = np.zeros_like(distance)
     for each in maps():
@@ -132,10 +126,10 @@ def _extract(blocks: NDArray[np.int64], distance: np.ndarray, weight: np.ndarray
         for number in np.flatnonzero((blocks[:, 2] == layer) | (blocks[:, 2] == layer + 1)):
             i, j = _SIDE * (blocks[number] - low)[:2]
             known = np.where(weight[number] > 0, distance[number], np.nan).reshape(_SIDE, _SIDE, _SIDE)
-            here = blocks[number, 2] == layer
-            volume[i : i + _SIDE, j : j + _SIDE, slice(_SIDE) if here else slice(_SIDE, None)] = (
-                known if here else known[..., :1]
-            )
+            if blocks[number, 2] == layer:
+                volume[i : i + _SIDE, j : j + _SIDE, :_SIDE] = known
+            else:
+                volume[i : i + _SIDE, j : j + _SIDE, _SIDE:] = known[..., :1]
         found = _march(volume)
         if found is not None:
             places, outward, corners = found

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from dsr.geometry.camera import Camera
 
@@ -52,7 +53,7 @@ def warp_depth(depth: Tensor, camera: Camera, transforms: Tensor, target: Camera
     inverse = depth[:, 0].double().reciprocal()  # (B, h, w)
     inverse = torch.where(inverse.isfinite() & (inverse > 0), inverse, torch.nan)
     transforms = transforms.to(inverse).expand(batch, 4, 4)
-    across, down = _joined(inverse, 2), _joined(inverse, 1)
+    across, down = _joined(inverse), _joined(inverse.mT).mT
     surfaces = _rasterise(_project(_triangles(inverse, across, down), camera, transforms, target), batch, target)
     rims = _rasterise(_project(_squares(inverse, across, down), camera, transforms, target), batch, target)
     hidden = (surfaces > 0) & (rims <= (1 + _RIM) * surfaces)
@@ -62,16 +63,11 @@ def warp_depth(depth: Tensor, camera: Camera, transforms: Tensor, target: Camera
 
 
 def source_pixels(depth: Tensor, camera: Camera, transforms: Tensor, target: Camera) -> tuple[Tensor, Tensor]:
-    """Return where the pixels of a map of :func:`warp_depth` come from.
-
-    They are columns and rows in pixels of ``camera``, (B, H, W) float64 each, NaN in holes.
-    """
+    """Return the columns and rows in ``camera`` that a map of :func:`warp_depth` is from, (B, H, W) float64 each."""
     inverse = torch.linalg.inv(transforms.double())
     points = depth.double() * target.rays(device=depth.device)  # (B, 3, H, W)
-    x, y, z = (
-        torch.einsum("bij,bjhw->bihw", inverse[:, :3, :3].expand(len(depth), 3, 3), points)
-        + inverse[:, :3, 3][:, :, None, None]
-    ).unbind(1)
+    turned = torch.einsum("bij,bjhw->bihw", inverse[:, :3, :3].expand(len(depth), 3, 3), points)
+    x, y, z = (turned + inverse[:, :3, 3][:, :, None, None]).unbind(1)
     return camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
 
 
@@ -84,16 +80,13 @@ def registered_camera(camera: Camera, photo: Camera) -> Camera:
     return photo.rescale(max(round(scale * photo.width), 2), max(round(scale * photo.height), 2))
 
 
-def _joined(inverse: Tensor, dim: int) -> Tensor:
-    """Return whether each pixel and its next one along a dimension are on one surface; one less in that dimension."""
-    steps = inverse.diff(dim=dim)
-    padding = torch.full_like(steps.narrow(dim, 0, 1), torch.nan)
-    before = torch.cat((padding, steps.narrow(dim, 0, steps.shape[dim] - 1)), dim)
-    after = torch.cat((steps.narrow(dim, 1, steps.shape[dim] - 1), padding), dim)
+def _joined(inverse: Tensor) -> Tensor:
+    """Return whether each pixel and the next one in its row are on one surface, (B, h, w - 1)."""
+    steps = inverse.diff(dim=-1)
+    before = functional.pad(steps[..., :-1], (1, 0), value=torch.nan)
+    after = functional.pad(steps[..., 1:], (0, 1), value=torch.nan)
     beyond = torch.stack((steps.abs(), (steps - before).abs(), (steps - after).abs())).nan_to_num(torch.inf).amin(0)
-    size = steps.shape[dim]
-    near = torch.maximum(inverse.narrow(dim, 0, size), inverse.narrow(dim, 1, size))
-    return steps.isfinite() & (beyond <= STEP * near)
+    return steps.isfinite() & (beyond <= STEP * torch.maximum(inverse[..., :-1], inverse[..., 1:]))
 
 
 def _triangles(inverse: Tensor, across: Tensor, down: Tensor) -> _Corners:
@@ -120,8 +113,8 @@ def _squares(inverse: Tensor, across: Tensor, down: Tensor) -> _Corners:
     complete[:, 1:-1, 1:-1] = whole[:, :-1, :-1] & whole[:, :-1, 1:] & whole[:, 1:, :-1] & whole[:, 1:, 1:]
     item, row, column = torch.nonzero(inverse.isfinite() & ~complete, as_tuple=True)
     centre = inverse[item, row, column]
-    slope_u = _slope(inverse, across, 2)[item, row, column]
-    slope_v = _slope(inverse, down, 1)[item, row, column]
+    slope_u = _slope(inverse, across)[item, row, column]
+    slope_v = _slope(inverse.mT, down.mT)[item, column, row]
     parts = []
     for corners in (((-1, -1), (-1, 1), (1, -1)), ((1, 1), (1, -1), (-1, 1))):  # (down, right), in half pixels
         dv, du = (torch.tensor(each).to(inverse) / 2 for each in zip(*corners, strict=True))
@@ -130,13 +123,11 @@ def _squares(inverse: Tensor, across: Tensor, down: Tensor) -> _Corners:
     return _Corners(*(torch.cat(each) for each in zip(*parts, strict=True)))
 
 
-def _slope(inverse: Tensor, joined: Tensor, dim: int) -> Tensor:
-    """Return the mean change to the neighbours on the same surface along a dimension, 0 without one."""
-    steps = torch.where(joined, inverse.diff(dim=dim), 0)
-    none = torch.zeros_like(inverse.narrow(dim, 0, 1))
-    total = torch.cat((steps, none), dim) + torch.cat((none, steps), dim)
-    count = torch.cat((joined.to(none), none), dim) + torch.cat((none, joined.to(none)), dim)
-    return total / count.clamp(min=1)
+def _slope(inverse: Tensor, joined: Tensor) -> Tensor:
+    """Return the mean change to the neighbours in the row that are on the same surface, 0 without one."""
+    steps, count = torch.where(joined, inverse.diff(dim=-1), 0), joined.to(inverse)
+    total = functional.pad(steps, (0, 1)) + functional.pad(steps, (1, 0))
+    return total / (functional.pad(count, (0, 1)) + functional.pad(count, (1, 0))).clamp(min=1)
 
 
 def _project(corners: _Corners, camera: Camera, transforms: Tensor, target: Camera) -> _Corners:
@@ -171,18 +162,13 @@ def _rasterise(corners: _Corners, batch: int, target: Camera) -> Tensor:
         one = part[number]
         across = wide[one].long()
         u, v = first_u[one] + within % across, first_v[one] + within // across
-        inverse, inside = _interpolate(corners, one, u, v)
+        (u0, u1, u2), (v0, v1, v2) = corners.u[one].unbind(1), corners.v[one].unbind(1)
+        area = (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0)
+        second = ((u - u0) * (v2 - v0) - (u2 - u0) * (v - v0)) / area
+        third = ((u1 - u0) * (v - v0) - (u - u0) * (v1 - v0)) / area
+        weights = torch.stack((1 - second - third, second, third), 1)
+        inverse, inside = (weights * corners.inverse[one]).sum(1), (weights >= _INSIDE).all(1)
         place = (corners.item[one] * target.height + v.long()) * target.width + u.long()
         buffer.scatter_reduce_(0, place[inside], inverse[inside], "amax")
         start = stop
     return buffer
-
-
-def _interpolate(corners: _Corners, one: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the inverse depth of triangles ``one`` at pixels, and whether these are inside."""
-    (u0, u1, u2), (v0, v1, v2) = corners.u[one].unbind(1), corners.v[one].unbind(1)
-    area = (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0)
-    second = ((u - u0) * (v2 - v0) - (u2 - u0) * (v - v0)) / area
-    third = ((u1 - u0) * (v - v0) - (u - u0) * (v1 - v0)) / area
-    weights = torch.stack((1 - second - third, second, third), 1)
-    return (weights * corners.inverse[one]).sum(1), (weights >= _INSIDE).all(1)

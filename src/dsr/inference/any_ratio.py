@@ -40,12 +40,12 @@ from dsr.methods.recipe import Recipe, Run, read_recipe
 from dsr.sample import DepthSample, expect_distances
 from dsr.utils.compute_device import fast_precision, pick_device
 from dsr.utils.configuration import ConfigError
+from dsr.utils.guards import expect_one_of
 from dsr.utils.progress import Steps
 
+# arguments of methods that are set here: holes are restored afterwards, and validation has no ground truth
 _DECIDED = MappingProxyType({"fill_holes": True, "validate_every": 0})
-"""Arguments of methods that are set here: holes are restored afterwards, and validation has no ground truth."""
-_LARGEST_RATIO = 16
-"""Largest ratio of the sizes that a smaller working size may lead to: there are no weights for larger ones."""
+_LARGEST_RATIO = 16  # that a smaller working size may lead to: there are no weights for larger ones
 
 
 class AnyRatio(Method):
@@ -73,9 +73,6 @@ class AnyRatio(Method):
         precision: dtype of the convolutions; None for the device's fast one where that costs no accuracy.
         seed: of random numbers.
 
-    Raises:
-        ValueError: an option is not as above.
-
     """
 
     def __init__(
@@ -90,7 +87,11 @@ class AnyRatio(Method):
         precision: str | None = None,
         seed: int = 0,
     ) -> None:
-        _check_options(fill, max_hole, working_size)
+        expect_one_of("fill", fill, get_args(Fill))
+        if not 0 < max_hole < math.inf:
+            raise ValueError(f"max_hole: expected a positive number of degrees, got {max_hole}")
+        if working_size is not None and working_size not in SIZES:
+            raise ValueError(f"working_size: expected one of {', '.join(map(str, SIZES))}, got {working_size}")
         self.recipe, self._scale, self._fill = recipe, scale, fill
         self._max_hole, self._working_size = max_hole, working_size
         precision = precision or (fast_precision(device) if recipe.abilities.tolerant else "float32")
@@ -103,22 +104,11 @@ class AnyRatio(Method):
         return self.first().flag
 
     def first(self) -> Method:
-        """Return the method for its smallest factor, which checks the settings.
-
-        Raises:
-            ValueError: a setting is unknown, of another type, or the method rejects it: the message begins with its
-                name and a colon; or the method's own file has such a value: it begins with ``method=NAME:``.
-
-        """
+        """Return the method for its smallest factor, which checks the settings."""
         return self._method(min((step for steps in self._steps.values() for step in steps), default=USUAL_SCALE))
 
     def check_working_size(self) -> None:
-        """Check that a working size other than the map's own has an effect.
-
-        Raises:
-            ValueError: it has none with this method and scale.
-
-        """
+        """Check that a working size other than the map's own has an effect with this method and scale."""
         size = self._working_size
         if size not in (None, 1) and not self._may_reduce:
             raise ValueError(
@@ -178,10 +168,6 @@ class AnyRatio(Method):
         Returns:
             Depth, (1, H, W) float32 in metres, its expected errors, and which depth is filled in, on the device of
             ``depth``; and its outliers.
-
-        Raises:
-            ValueError: a shape or value is not as above, the sizes do not fit together or to the scale, the method has
-                no solution, or the map's values contradict the named sensor.
 
         """
         expect_picture(rgb, depth, camera)
@@ -345,12 +331,6 @@ def upsampler(
         scale: see :class:`AnyRatio`, also for ``fill``, ``max_hole`` and ``working_size``.
         settings: arguments of the method that differ from its file, by name.
         device: ``auto`` for a GPU if there is one, or a device as torch names it.
-        fill: see there.
-        max_hole: see there.
-        working_size: see there.
-
-    Raises:
-        ValueError: there is no such method or device, or an option is not as described.
 
     Example:
         >>> import torch
@@ -415,16 +395,6 @@ def _in_depth(
     result = inverse_hr.reciprocal_()
     share = None if glass is None else float((glass > NOTED).double().mean())
     return Surface(result, spread * result, angle, found.noise, glass=share)
-
-
-def _check_options(fill: str, max_hole: float, working_size: int | None) -> None:
-    """Raise ValueError for a value that :func:`upsample_surface` does not know."""
-    if fill not in get_args(Fill):
-        raise ValueError(f"fill: expected one of {', '.join(get_args(Fill))}, got {fill!r}")
-    if not 0 < max_hole < math.inf:
-        raise ValueError(f"max_hole: expected a positive number of degrees, got {max_hole}")
-    if working_size is not None and working_size not in SIZES:
-        raise ValueError(f"working_size: expected one of {', '.join(map(str, SIZES))}, got {working_size}")
 
 
 def expect_picture(rgb: Tensor, depth: Tensor, camera: Camera) -> None:

@@ -23,48 +23,33 @@ from dsr.geometry.surface import angle_between, depth_to_normals
 from dsr.inference.resizing import resize_nearest, size_of
 from dsr.methods.base import Outliers
 
-FAR = 4.0
-"""Ratio of two depths from which one is far from the other."""
-_APART = math.log(FAR)
-LARGEST = 20
-"""Rows and columns of the largest patch that is an outlier, in a map of :data:`_USUAL_WIDTH` pixels or more."""
+_APART = math.log(4.0)  # logarithm of the ratio of two depths from which one is far from the other
+LARGEST = 20  # rows and columns of the largest patch that is an outlier, in a map of _USUAL_WIDTH pixels or more
 _USUAL_WIDTH = 640
+# depth in metres up to which a value is a sensor's end, in a map whose median is at least the second
 _NEAREST, _USUAL_DEPTH = 0.05, 0.2
-"""Depth in metres up to which a value is a sensor's end, in a map whose median is at least the second."""
+# pixels around each one whose measured values bound the plausible ones: of the map for outliers, of the photo for a
+# result
 RADIUS = 24
-"""Pixels around each one whose measured values bound the plausible ones: of the map for outliers, of the photo for a
-result."""
+# pixels around a patch in which another surface explains it, and the ratio of their depths up to which it does
 _NEARBY, _ALIKE = 64, 1.5
-"""Pixels around a patch in which another surface explains it, and the ratio of their depths up to which it does."""
-_ROUNDING = 1e-3
-"""Relative excess that is left to a result, so that flat surfaces stay as a method rounds them."""
-_SPARSE = 1 / 16
-"""Share of measured pixels in a window below which it does not limit the depth in a hole."""
-
-_WINDOW = 5
-"""Low-resolution pixels over which differences are averaged."""
+_ROUNDING = 1e-3  # relative excess that is left to a result, so that flat surfaces stay as a method rounds them
+_SPARSE = 1 / 16  # share of measured pixels in a window below which it does not limit the depth in a hole
+_WINDOW = 5  # low-resolution pixels over which differences are averaged
+# relative error of depth in holes: beside measured pixels, and added per degree from them; with ``facets`` on
+# Middlebury 2014 and ICL-NUIM, errors are 1.7 % at 0.3, 4.8 % at 0.85, 7.3 % at 2.5 and 11 % at 5 degrees
 _NEAR, _PER_DEGREE = 0.02, 0.03
-"""Relative error of depth in holes: beside measured pixels, and added per degree from them. With ``facets`` on
-Middlebury 2014 and ICL-NUIM, errors are 1.7 % at 0.3, 4.8 % at 0.85, 7.3 % at 2.5 and 11 % at 5 degrees."""
-_GUESSED = 45.0
-"""Degrees between the normals, in holes."""
+_GUESSED = 45.0  # degrees between the normals, in holes
 
 
 def find_outliers(depth: Tensor) -> Tensor:
-    """Return where a map's depth cannot be.
+    """Return where the depth of a map, (1, h, w) in metres with NaN in holes, cannot be, (1, h, w) bool.
 
     That is where it is nearer than 5 cm in a map of usual distances, and in connected patches of up to 20 x 20 pixels,
     less in maps narrower than 640 pixels, that are at least 4 times as near or as far as all larger surfaces within 24
     pixels. A patch is real, and not found, if it is part of a larger surface, however thin, if there is a larger
     surface of its depth nearby, as behind a gap or where a chair leg is broken into pieces, or if it reaches into the
     picture from the front.
-
-    Args:
-        depth: (1, h, w) in metres, NaN in holes.
-
-    Returns:
-        (1, h, w) bool.
-
     """
     known = depth.isfinite()
     found = torch.zeros_like(known)
@@ -79,15 +64,9 @@ def find_outliers(depth: Tensor) -> Tensor:
 
 
 def find_filled(result: Tensor, depth: Tensor) -> Tensor:
-    """Return where a result has depth that was not measured: the nearest pixel of the map is a hole or an outlier.
+    """Return where a result, (1, H, W), has depth that was not measured: the nearest pixel of the map is missing.
 
-    Args:
-        result: (1, H, W) depth, NaN where it is missing.
-        depth: (1, h, w) the map in metres, NaN in holes.
-
-    Returns:
-        (1, H, W) bool.
-
+    A pixel of the map, (1, h, w) in metres, is missing if it is a hole, NaN, or an outlier.
     """
     missing = depth.isnan() | find_outliers(depth)
     return resize_nearest(missing, size_of(result)).to(result.device) & result.isfinite()
@@ -96,25 +75,17 @@ def find_filled(result: Tensor, depth: Tensor) -> Tensor:
 def count_patches(mask: Tensor) -> Outliers:
     """Return the number of pixels of a mask, (1, h, w) bool, and of their patches, connected also at corners."""
     pixels = int(mask.sum())
-    return Outliers(pixels, cv2.connectedComponents(_bytes(mask[0].cpu().numpy()))[0] - 1 if pixels else 0)
+    return Outliers(pixels, cv2.connectedComponents(mask[0].cpu().numpy().astype(np.uint8))[0] - 1 if pixels else 0)
 
 
 def within_measured(result: Tensor, given: Tensor, radius: int = RADIUS) -> Tensor:
-    """Return inverse depth clamped to the range that planes through the measured values around each pixel allow.
+    """Return inverse depth, (1, H, W), clamped to the range that planes through measured values around a pixel allow.
 
-    A plane's inverse depth is linear in the pixel, so that it leaves the values in a window, of which at least half
-    lies inside the map, by no more than half of their range. Holes are wider to cross: where one is further than a
-    third of the radius from measured pixels, the window is three times as large. No depth becomes more than twice as
-    far as all around it. Where the window has no measured pixel, or too few, nothing changes.
-
-    Args:
-        result: (1, H, W) inverse depth in 1/m, NaN in holes.
-        given: (1, h, w) the measured one, NaN in holes.
-        radius: of the square window, in pixels of the result.
-
-    Returns:
-        (1, H, W) in the dtype of ``result``.
-
+    A plane's inverse depth is linear in the pixel, so that it leaves the measured values, (1, h, w) with NaN in holes,
+    in a window of this radius in pixels of the result, of which at least half lies inside the map, by no more than half
+    of their range. Holes are wider to cross: where one is further than a third of the radius from measured pixels, the
+    window is three times as large. No depth becomes more than twice as far as all around it. Where the window has no
+    measured pixel, or too few, nothing changes.
     """
     given = given.to(result)
     size = (result.shape[-2], result.shape[-1])
@@ -123,11 +94,14 @@ def within_measured(result: Tensor, given: Tensor, radius: int = RADIUS) -> Tens
     low, high = _bounds(given, known, reach)
     if not bool(known.all()):
         away = distance_to_known(known)
-        silent = ~known & ((_share(known, reach) < _SPARSE) | (away > reach))
+        window = (2 * reach + 1, 2 * reach + 1)
+        measured = known[0].cpu().numpy().astype(np.float32)
+        share = torch.from_numpy(cv2.boxFilter(measured, -1, window, borderType=cv2.BORDER_REFLECT))[None]
+        silent = ~known & ((share.to(known.device) < _SPARSE) | (away > reach))
         further = (away > reach / 3) & ~silent
         if bool(further.any()):
-            wide = _bounds(given, known, 3 * reach)
-            low, high = (torch.where(further, a, b) for a, b in zip(wide, (low, high), strict=True))
+            wide_low, wide_high = _bounds(given, known, 3 * reach)
+            low, high = torch.where(further, wide_low, low), torch.where(further, wide_high, high)
         low, high = low.masked_fill(silent, -torch.inf), high.masked_fill(silent, torch.inf)
     low, high = (functional.interpolate(each[None], size, mode="nearest-exact")[0] for each in (low, high))
     return result.clamp(low, high)
@@ -146,13 +120,6 @@ def _bounds(given: Tensor, known: Tensor, reach: int) -> tuple[Tensor, Tensor]:
     )
 
 
-def _share(known: Tensor, reach: int) -> Tensor:
-    """Return the share of known pixels in the square windows, (1, h, w)."""
-    window = (2 * reach + 1, 2 * reach + 1)
-    found = cv2.boxFilter(known[0].cpu().numpy().astype(np.float32), -1, window, borderType=cv2.BORDER_REFLECT)
-    return torch.from_numpy(found)[None].to(known.device)
-
-
 def _isolated(values: np.ndarray, largest: int) -> np.ndarray:
     """Return where patches are far from all around them in the logarithm of depth, (h, w), NaN in holes."""
     found = np.zeros(values.shape, bool)
@@ -160,42 +127,27 @@ def _isolated(values: np.ndarray, largest: int) -> np.ndarray:
     if not small.any():
         return found
     surfaces = np.where(small, np.nan, values)
-    nearest, farthest = (sign * _largest_around(sign * surfaces) for sign in (-1, 1))
+    known = torch.from_numpy(surfaces)[None]
+    nearest = -window_maxima((-known).nan_to_num(nan=-torch.inf), RADIUS)[0].numpy()  # infinite without any
+    farthest = window_maxima(known.nan_to_num(nan=-torch.inf), RADIUS)[0].numpy()
     far = small & (((values <= nearest - _APART) & np.isfinite(nearest)) | (values >= farthest + _APART))
     far &= np.isfinite(farthest)
-    count, labels, boxes, _ = cv2.connectedComponentsWithStats(_bytes(far), connectivity=8)
+    count, labels, boxes, _ = cv2.connectedComponentsWithStats(far.astype(np.uint8), connectivity=8)
     for label in range(1, count):
-        window = _around(boxes[label], 1)
+        left, top, width, height = (int(each) for each in boxes[label, :4])
+        window, nearby = (
+            np.s_[max(top - margin, 0) : top + height + margin, max(left - margin, 0) : left + width + margin]
+            for margin in (1, _NEARBY)
+        )
         patch = labels[window] == label
-        if boxes[label, 2:4].max() > largest or _touches(values[window], patch):
+        if max(width, height) > largest or _touches(values[window], patch):
             continue
-        middle = np.median(values[window][patch])
-        others = surfaces[_around(boxes[label], _NEARBY)] - middle
-        if not (np.abs(others) < math.log(_ALIKE)).any() and not _reaches_in(boxes[label], others, values.shape):
+        others = surfaces[nearby] - np.median(values[window][patch])
+        inside = left and top and left + width < values.shape[1] and top + height < values.shape[0]
+        reaches_in = not inside and np.nanmin(others) > 0  # at the border, in front of what is around it
+        if not (np.abs(others) < math.log(_ALIKE)).any() and not reaches_in:
             found[window] |= patch
     return found
-
-
-def _largest_around(values: np.ndarray) -> np.ndarray:
-    """Return the largest value in the window around each pixel, (h, w), NaN in holes; minus infinity for none."""
-    filled = torch.from_numpy(np.nan_to_num(values, nan=-np.inf))[None]
-    return window_maxima(filled, RADIUS)[0].numpy()
-
-
-def _around(box: np.ndarray, margin: int) -> tuple[slice, slice]:
-    """Return the rows and columns of a box of OpenCV with a margin."""
-    left, top, width, height = (int(each) for each in box[:4])
-    return (
-        slice(max(top - margin, 0), top + height + margin),
-        slice(max(left - margin, 0), left + width + margin),
-    )
-
-
-def _reaches_in(box: np.ndarray, others: np.ndarray, size: tuple[int, int]) -> bool:
-    """Return whether a patch lies at the border of a map, before what is around it."""
-    left, top, width, height = (int(each) for each in box[:4])
-    inside = left and top and left + width < size[1] and top + height < size[0]
-    return not inside and bool(np.nanmin(others) > 0)
 
 
 def _small_regions(values: np.ndarray, largest: int) -> np.ndarray:
@@ -222,22 +174,11 @@ def _touches(values: np.ndarray, patch: np.ndarray) -> bool:
     return False
 
 
-def _bytes(mask: np.ndarray) -> np.ndarray:
-    """Return a mask as OpenCV takes it."""
-    return np.ascontiguousarray(mask, np.uint8)
-
-
 def expect_errors(inverse: Tensor, given: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Return the expected relative error of the depth and the expected error of the normal in degrees.
+    """Return the expected relative error of the depth and the expected error of the normal in degrees, (1, H, W) each.
 
-    Args:
-        inverse: (1, H, W) the result: inverse depth in 1/m.
-        given: (1, h, w) inverse depth of the input, NaN in holes.
-        camera: the photo's, of H x W pixels.
-
-    Returns:
-        Two maps (1, H, W).
-
+    The result is inverse depth, (1, H, W) in pixels of the camera; ``given`` is that of the input, (1, h, w), NaN in
+    holes.
     """
     size, size_lr = (inverse.shape[-2], inverse.shape[-1]), (given.shape[-2], given.shape[-1])
     camera_lr = camera.rescale(size_lr[1], size_lr[0])
@@ -248,25 +189,22 @@ def expect_errors(inverse: Tensor, given: Tensor, camera: Camera) -> tuple[Tenso
     both = known[None] & (smooth > 0) & (result > 0)
     off = torch.where(both, (result / smooth).log().abs(), 0)
     rays = camera_lr.rays()[None].to(inverse.device)
-    depths = (torch.where(both, each, torch.nan).reciprocal().double() for each in (result, smooth))
-    angle = angle_between(*(depth_to_normals(depth, rays) for depth in depths)).to(inverse)
+    normals, smooth_normals = (
+        depth_to_normals(torch.where(both, each, torch.nan).reciprocal().double(), rays) for each in (result, smooth)
+    )
+    angle = angle_between(normals, smooth_normals).to(inverse)
     tilted = angle.isfinite().to(inverse)
     angle = _mean(angle.nan_to_num(0), tilted, _WINDOW)
     away = distance_to_known(known).to(inverse) * degrees_per_pixel(camera_lr.fx)
     hole = ~known[None]
     spread = _mean(off, weight, _WINDOW) + torch.where(hole, _NEAR + _PER_DEGREE * away, 0).clamp(max=1)
     angle = torch.where(hole, angle.clamp(min=_GUESSED), angle)
-    return _enlarge(spread, size), _enlarge(angle, size)
+    spread, angle = (functional.interpolate(each, size, mode="bilinear")[0] for each in (spread, angle))
+    return spread, angle
 
 
 def _mean(values: Tensor, weight: Tensor, window: int) -> Tensor:
     """Return the means of the valid values around each pixel; 0 where there is none."""
-    total, count = (
-        functional.avg_pool2d(each, window, stride=1, padding=window // 2) for each in (values * weight, weight)
-    )
+    total = functional.avg_pool2d(values * weight, window, stride=1, padding=window // 2)
+    count = functional.avg_pool2d(weight, window, stride=1, padding=window // 2)
     return torch.where(count > 0, total / torch.where(count > 0, count, 1), 0)
-
-
-def _enlarge(values: Tensor, size: tuple[int, int]) -> Tensor:
-    """Return (1, *size), bilinear."""
-    return functional.interpolate(values, size, mode="bilinear", align_corners=False)[0]

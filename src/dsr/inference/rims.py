@@ -1,16 +1,12 @@
 """Holes between a nearer and a farther surface: each pixel is assigned to one of them by the colours of the photo.
 
-Stereo and structured light lose what lies beside and between near objects: the strip that one of two cameras does not
-see, the loop between an arm and a head, the gaps between the legs of a chair. What is filled in from the rim there is
-a sheet between the two surfaces, or closes the loop. So each pixel of such a hole is compared with the measured pixels
-around it, up to three times as far as the rim, as in a joint bilateral filter: the two of each surface that are nearest
-and most alike in colour stand for it. It gets the farther depth where that surface explains its colour at least as well
-as the nearer one, the nearer where that does clearly better, and what other holes get in between. Where that is of
-the same surface anyway, a pixel is left to the method, which knows slopes and its own errors. The probability that a
-pixel is of the other surface counts in its expected error; for those left to the method only if the depths around them
-have a step, as those of a slope are all of one surface.
-
-See ``benchmarks/holes.py`` for the figures.
+Stereo and structured light lose what lies beside and between near objects, such as the loop between an arm and a head;
+filling from the rim would span a sheet between the two surfaces. So each pixel of such a hole is compared with the
+measured pixels around it, up to three times as far as the rim, as in a joint bilateral filter: the two of each surface
+that are nearest and most alike in colour stand for it. The pixel gets the farther depth if that surface explains its
+colour at least as well as the nearer one, and the nearer if that does clearly better. A pixel is left to the method,
+which knows slopes and its own errors, if filling from the rim gives the same surface. The probability that a pixel is
+of the other surface counts in its expected error. See ``benchmarks/holes.py`` for the figures.
 """
 
 from __future__ import annotations
@@ -25,48 +21,34 @@ from torch.nn import functional
 from dsr.geometry.hole_size import distance_to_known, is_scattered
 from dsr.methods.images import inpaint
 
-_STEP = 1.1
-"""Ratio of the depths around a pixel from which they are of two surfaces."""
+_STEP = 1.1  # ratio of the depths around a pixel from which they are of two surfaces
+# samples from a pixel to the end of its window, beyond which every second one counts up to twice as far; and how wide
+# they are apart in pixels, for each pixel to the rim and two more
 _RADIUS, _PER_STRIDE = 6, 0.25
-"""Samples from a pixel to the end of its window, beyond which every second one counts up to twice as far; and how wide
-they are apart in pixels, for each pixel to the rim and two more."""
-_CONTRAST = 0.03
-"""Standard deviation of the difference of the colours of a surface, on the scale of [0, 1]."""
-_LEAST = 1e-4
-"""Affinity of pixels of different colours."""
+_CONTRAST = 0.03  # standard deviation of the difference of the colours of a surface, on the scale of [0, 1]
+_LEAST = 1e-4  # affinity of pixels of different colours
+# distances beyond the rim over which a pixel counts less: as a witness of a surface, and for its depth
 _SPREAD, _CLOSE = 0.5, 0.2
-"""Distances beyond the rim over which a pixel counts less: as a witness of a surface, and for its depth."""
 _WITNESSES = 2
-_CLEARLY = 1.0
-"""Logarithm of the ratio of how well they explain a pixel from which on one surface is clearly better."""
-_DIFFERENT = 0.1
-"""Logarithm of the ratio of depths from which what would be filled in from the rim is of another surface."""
+_CLEARLY = 1.0  # logarithm of the ratio of how well they explain a pixel from which on one surface is clearly better
+_DIFFERENT = 0.1  # logarithm of the ratio of depths from which what would be filled in is of another surface
+# quantiles of the depths around a pixel, from 5 to 95 %; these have a step if two that are so many apart, a quarter of
+# the depths, have more than this part of the range between them
 _LEVELS, _APART, _PART = 19, 5, 0.5
-"""Quantiles of the depths around a pixel, from 5 to 95 %; these have a step if two that are so many apart, a quarter of
-the depths, have more than this part of the range between them."""
-_MOST = 1 << 14
-"""Pixels at a time."""
+_MOST = 1 << 14  # pixels at a time
 
 
 class Settled(NamedTuple):
-    """A map whose holes between two surfaces are filled, and how wrong that may be.
+    """A map whose holes between two surfaces are filled, and how wrong that may be, (1, h, w) each."""
 
-    ``inverse`` (1, h, w): inverse depth in 1/m, NaN in the other holes; ``doubt`` (1, h, w): the relative error that is
-    to be expected as a pixel may be of the other surface, 0 elsewhere.
-    """
-
-    inverse: Tensor
-    doubt: Tensor
+    inverse: Tensor  # in 1/m, NaN in the other holes
+    doubt: Tensor  # the relative error to expect because a pixel may be of the other surface, 0 elsewhere
 
 
 def settle_holes(inverse: Tensor, rgb: Tensor, holes: Tensor) -> Settled:
-    """Return a map whose holes between two surfaces are filled with the depth of one of them.
+    """Return a map, (1, h, w) inverse depth, whose holes between two surfaces have the depth of one of them.
 
-    Args:
-        inverse: (1, h, w) inverse depth in 1/m, NaN in holes.
-        rgb: (3, H, W) in [0, 1], of the same view.
-        holes: (1, h, w) bool, those to fill; other holes stay as they are.
-
+    ``rgb`` is (3, H, W) of the same view; ``holes``, (1, h, w) bool, are those to fill, others stay as they are.
     """
     known = inverse.isfinite()
     settled, doubt, of_method = inverse.clone(), torch.zeros_like(inverse), torch.zeros_like(inverse)
@@ -93,11 +75,7 @@ def _settle(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return inverse depth at pixels, NaN where it is not decided, its doubt and that of the method's, (n,) each.
 
-    Args:
-        inverse: (h, w) the map.
-        colours: (3, h, w) the photo.
-        rows, columns, away: (n,) the pixels and their distance to the nearest known one.
-
+    The map is (h, w), the photo (3, h, w); the pixels and their distance to the nearest known one are (n,) each.
     """
     steps = torch.arange(-_RADIUS, _RADIUS + 1, device=inverse.device)
     fine = torch.cartesian_prod(steps, steps)
@@ -123,7 +101,7 @@ def _settle(
     difference = colours.flatten(1)[:, index] - colours[:, rows[two], columns[two], None]
     affinity = (difference.square().sum(0) / (-2 * _CONTRAST**2)).exp() + _LEAST
     beyond = ((distance - away[:, None]) / (away[:, None] + 2)).clamp(min=0)
-    witness, close = ((-beyond / each).exp() * affinity for each in (_SPREAD, _CLOSE))
+    witness, close = (-beyond / _SPREAD).exp() * affinity, (-beyond / _CLOSE).exp() * affinity
     says, depths = [], []
     for surface in (known & ~nearer, known & nearer):
         most = min(_WITNESSES, values.shape[1])

@@ -24,39 +24,26 @@ from dsr.geometry.warping import source_pixels, warp_depth
 from dsr.inference.working_size import find_noise
 from dsr.methods.images import estimate_sensor_noise
 
+# difference of two readings of a surface, in standard deviations of the difference, beyond which they disagree
 _DEVIATIONS = 3.0
-"""Difference of two readings of a surface, in standard deviations of the difference, beyond which they disagree."""
-_SLACK = 0.01
-"""Difference that counts as none, relative to inverse depth: poses and cameras are not exact."""
-_LEAST_NOISE = 2e-4
-"""Smallest standard deviation of inverse depth, relative to its median: depth maps are stored in whole millimetres."""
-_PASSES = 2
-"""Passes of the robust mean."""
+_SLACK = 0.01  # difference that counts as none, relative to inverse depth: poses and cameras are not exact
+_LEAST_NOISE = 2e-4  # of inverse depth, relative to its median: depth maps are stored in whole millimetres
+_PASSES = 2  # passes of the robust mean
 
 
 @dataclass(frozen=True)
 class View:
     """A depth map with its camera's place.
 
-    Args:
-        depth: (1, h, w) orthogonal depth in metres, NaN in holes.
-        camera: camera of these pixels.
-        pose: transform from the camera's frame (x right, y down, z forward) to the world's, 4 x 4, metres.
-        deviation: (1, h, w) expected standard deviation of each pixel in metres; None to estimate it, as one number for
-            the inverse depth of all views.
-
-    Raises:
-        ValueError: a shape is not as above, or the pose is not rigid.
-
+    Without a deviation, one number for the inverse depth of all views is estimated.
     """
 
-    depth: Tensor
+    depth: Tensor  # (1, h, w) orthogonal depth in metres, NaN in holes
     camera: Camera
-    pose: Matrix
-    deviation: Tensor | None = None
+    pose: Matrix  # from the camera's frame (x right, y down, z forward) to the world's, 4 x 4, metres
+    deviation: Tensor | None = None  # (1, h, w) expected standard deviation of each pixel in metres
 
     def __post_init__(self) -> None:
-        """Check the shapes and the pose."""
         shape = (1, self.camera.height, self.camera.width)
         if tuple(self.depth.shape) != shape:
             raise ValueError(f"depth: expected shape {shape}, the camera's, got {tuple(self.depth.shape)}")
@@ -73,29 +60,17 @@ class View:
 
 
 class Fused(NamedTuple):
-    """Depth on which frames voted.
+    """Depth on which frames voted, (1, h, w) each."""
 
-    ``depth`` (1, h, w): orthogonal depth in metres, NaN in holes. ``deviation`` (1, h, w): its expected standard
-    deviation in metres, if the frames' noise is independent. ``votes`` (1, h, w): the number of frames that agree.
-    ``others`` and ``seeing`` (1, h, w): the number of neighbours that agree, and that see something there.
-    """
-
-    depth: Tensor
-    deviation: Tensor
-    votes: Tensor
-    others: Tensor
-    seeing: Tensor
+    depth: Tensor  # in metres, NaN in holes
+    deviation: Tensor  # its expected standard deviation in metres, if the frames' noise is independent
+    votes: Tensor  # the number of frames that agree
+    others: Tensor  # the number of neighbours that agree
+    seeing: Tensor  # the number of neighbours that see something there
 
 
 def fuse_views(reference: View, neighbours: Sequence[View]) -> Fused:
-    """Fuse the depth of neighbouring frames into that of a reference frame.
-
-    Args:
-        reference: frame whose view the result has.
-        neighbours: frames that see the same surfaces; none leaves the reference as it is.
-
-    Returns:
-        The depth in the dtype of the reference.
+    """Fuse the depth of neighbouring frames, which see the same surfaces, into that of a reference frame.
 
     Example:
         >>> import numpy as np
@@ -143,10 +118,8 @@ def _seen_from(reference: View, view: View, noise: float) -> tuple[Tensor, Tenso
     depth = warp_depth(view.depth[None].double().cpu(), view.camera, move, reference.camera)
     _, deviation = _own(view, noise)
     u, v = source_pixels(depth, view.camera, move, reference.camera)
-    rows, columns = (
-        place[0].nan_to_num(0).round().long().clamp(0, n - 1)
-        for place, n in ((v, view.camera.height), (u, view.camera.width))
-    )
+    rows = v[0].nan_to_num(0).round().long().clamp(0, view.camera.height - 1)
+    columns = u[0].nan_to_num(0).round().long().clamp(0, view.camera.width - 1)
     before = view.depth[0].double().cpu()[rows, columns]  # inverse depth's deviation scales with its square
     seen = depth[0, 0].reciprocal()
     ratio = (seen * before).square().nan_to_num(1.0)

@@ -1,14 +1,12 @@
 """The size at which a sensor's map is upsampled: smaller than the map where its noise is correlated over many pixels.
 
-A network takes correlated noise that is wider than its receptive field for the shape of the surface. At a size at which
-the noise of neighbouring pixels is independent again the network averages it; the details that are lost there were
-hidden by the noise anyway.
+A network takes correlated noise that is wider than its receptive field for shape. At a size at which the noise of
+neighbouring pixels is independent again the network averages it; the details lost there were hidden by the noise.
 
 Noise is distinguished from shape by its correlation in windows of increasing size, after a plane in inverse depth is
-subtracted: noise is correlated over the same number of pixels in each, while bends of surfaces are over a third of
-the window, whatever its size. The flattest tenth of the windows counts. A surface that is covered with bumps may look
-the same. The noise of a sensor, however, is never as smooth as a bumpy surface, since depth is counted in steps, and no
-window is free of it.
+subtracted: noise is correlated over the same number of pixels in each, while bends of surfaces are over a third of the
+window, whatever its size. The flattest tenth of the windows counts. A surface that is covered with bumps may look the
+same; but a sensor's noise is never as smooth, since depth is counted in steps, and no window is free of it.
 """
 
 from __future__ import annotations
@@ -26,41 +24,28 @@ from dsr.inference.defaults import SIZES
 from dsr.inference.resizing import resize_nearest, size_of
 from dsr.methods.base import InverseSurface, MapNoise, NoiseLaw
 
-_LARGEST_BLOCK = 16
-
 T = TypeVar("T", float, Tensor)
-_NOISY = 0.4
-"""Standard deviation of a sensor's disparity in its steps, at least; rounding alone has 0.29."""
-CORRELATED = 5.0
-"""Pixels over which noise is correlated that a network takes for shape in part."""
-_WINDOWS = (8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384)
-"""Pixels."""
-_LARGEST_WINDOW = 0.6
-"""Of the map's smaller side."""
-_MOST = 1500
-"""About how many windows of a size are looked at, and the flattest ones that are correlated."""
-_MOST_CORRELATED = 200
+_LARGEST_BLOCK = 16
+_NOISY = 0.4  # standard deviation of a sensor's disparity in its steps, at least; rounding alone has 0.29
+CORRELATED = 5.0  # pixels over which noise is correlated that a network takes for shape in part
+_WINDOWS = (8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384)  # pixels
+_LARGEST_WINDOW = 0.6  # of the map's smaller side
+_MOST, _MOST_CORRELATED = 1500, 200  # about how many windows of a size are looked at, and the flattest for correlation
 _FEWEST = 6
-_KNOWN = 0.95
-"""Share of a window's pixels that has to be known."""
-_WIDTHS = 5
-"""Windows are as many correlation lengths wide, or wider, where they hold noise."""
-_LEAST, _LARGEST = 2e-4, 0.02
-"""Standard deviations relative to the depth that count as noise."""
+_KNOWN = 0.95  # share of a window's pixels that has to be known
+_WIDTHS = 5  # windows are as many correlation lengths wide, or wider, where they hold noise
+_LEAST, _LARGEST = 2e-4, 0.02  # standard deviations relative to the depth that count as noise
+# least noise in windows of 8 pixels over that in the windows of noise: 0.06 to 0.4 for sensors, less than 0.01 for
+# bumpy surfaces that are rendered, computed or rounded
 _FINE = 0.03
-"""Least noise in windows of 8 pixels over that in the windows of noise: 0.06 to 0.4 for sensors, less than 0.01 for
-bumpy surfaces that are rendered, computed or rounded."""
-_LEVEL = 0.4
-"""Least noise of any window over that of the tenth in order: 0.55 to 0.95 for sensors, 0.1 for bumpy surfaces."""
-_LENGTHS = 2.3
-"""Correlation lengths over the factor: noise of that full width is nearly independent after it."""
+_LEVEL = 0.4  # least noise of any window over that of the tenth in order: 0.55 to 0.95 for sensors, 0.1 for bumpy ones
+_LENGTHS = 2.3  # correlation lengths over the factor: noise of that full width is nearly independent after it
+# standard deviation of the result's error over that of correlated noise of the map, where surfaces are calm: 0.35 to
+# 0.7 before an exact plane, 0.3 to 0.65 for simulated sensors
 _LEFT = 0.45
-"""Standard deviation of the result's error over that of correlated noise of the map, where surfaces are calm: 0.35 to
-0.7 before an exact plane, 0.3 to 0.65 for simulated sensors."""
+# expected errors over their median up to which they are of noise, and from which on they are of something else
 _CALM, _UNSURE = 1.5, 4.0
-"""Expected errors over their median up to which they are of noise, and from which on they are of something else."""
-_LARGE = 2**19
-"""Pixels from which on a map is looked at in half its size."""
+_LARGE = 2**19  # pixels from which on a map is looked at in half its size
 
 
 def enlarged_by(values: Tensor) -> int:
@@ -69,46 +54,31 @@ def enlarged_by(values: Tensor) -> int:
     if bool((filled == filled.flatten()[0]).all()):
         return 1
     for block in range(_LARGEST_BLOCK, 1, -1):
-        one = filled[..., ::block, ::block]
-        if all(
-            torch.equal(
-                filled[..., i::block, j::block],
-                one[..., : _count(filled, -2, i, block), : _count(filled, -1, j, block)],
-            )
-            for i in range(block)
-            for j in range(block)
-        ):
+        if _is_repeated(filled[..., :block, :], block) and _is_repeated(filled, block):  # the first rows decide mostly
             return block
     return 1
 
 
-def _count(values: Tensor, dim: int, start: int, step: int) -> int:
-    """Return the length of ``values[start::step]`` along ``dim``."""
-    return len(range(start, values.shape[dim], step))
+def _is_repeated(values: Tensor, block: int) -> bool:
+    """Return whether a map, (..., H, W), consists of squares of equal values, up to the border."""
+    repeated = values[..., ::block, ::block].repeat_interleave(block, -2).repeat_interleave(block, -1)
+    return torch.equal(values, repeated[..., : values.shape[-2], : values.shape[-1]])
 
 
 class _Planes(NamedTuple):
-    """Planes a u + b v + c of square windows of inverse depth, (n,) each, and how far the pixels are from them.
+    """Planes a u + b v + c of square windows of inverse depth, (n,) each, and how far the pixels are from them."""
 
-    ``rows``, ``columns``: of the upper left pixels; ``deviation``: root mean square, relative to the ``mean``.
-    """
-
-    rows: Tensor
+    rows: Tensor  # of the upper left pixels
     columns: Tensor
     a: Tensor
     b: Tensor
     c: Tensor
     mean: Tensor
-    deviation: Tensor
+    deviation: Tensor  # root mean square, relative to the mean
 
 
 def find_noise(depth: Tensor) -> MapNoise | None:
-    """Return the noise of a sensor's map; None where it has none that differs from shape.
-
-    Args:
-        depth: (1, h, w) in metres, NaN in holes.
-
-    """
+    """Return the noise of a sensor's map, (1, h, w) in metres; None where it has none that differs from shape."""
     inverse = depth[0].double().reciprocal()
     step = 2 if inverse.numel() > _LARGE else 1
     if step > 1:
@@ -149,9 +119,6 @@ def find_sensor(depth: Tensor, name: str = "auto", device_name: str = "") -> Ide
         name: of a sensor or a device; ``auto``, or ``none`` for none.
         device_name: of the device, as its files state it; empty where they do not.
 
-    Raises:
-        ValueError: there is no such sensor, or the map's values keep to steps that it does not have.
-
     Example:
         >>> import torch
         >>> from dsr.inference import find_sensor
@@ -171,13 +138,7 @@ def find_sensor(depth: Tensor, name: str = "auto", device_name: str = "") -> Ide
 def known_noise(sensor: Identified | None, noise: MapNoise | None, factor: int) -> NoiseLaw | None:
     """Return the noise that a method is given because it may take it for shape; None for noise that it judges better.
 
-    That is correlated noise of a sensor that counts disparity.
-
-    Args:
-        sensor: what measured the map, if that is known.
-        noise: what was found of it.
-        factor: by what the size of the map is divided.
-
+    That is correlated noise of a sensor that counts disparity; the size of the map is divided by ``factor``.
     """
     counts = sensor is not None and sensor.sensor.stereo_constant is not None
     if not counts or noise is None or noise.extent < max(CORRELATED, factor):
@@ -186,11 +147,9 @@ def known_noise(sensor: Identified | None, noise: MapNoise | None, factor: int) 
 
 
 def working_size_of(extent: float) -> int:
-    """Return the divisor of the map's size for noise that is correlated over some pixels: a power of 2 from 4 on, or 1.
+    """Return the divisor of the map's size for noise: a power of 2 from 4 on, or 1.
 
-    Args:
-        extent: full width at half maximum of the noise's autocorrelation, in pixels.
-
+    ``extent`` is the full width at half maximum of the noise's autocorrelation in pixels.
     """
     factor = 2 ** int(math.log2(max(extent / _LENGTHS, 1)))
     return 1 if factor < SIZES[2] else min(factor, SIZES[-1])
@@ -215,14 +174,9 @@ def left_of(deviation: T) -> T:
 def limit_to_noise(spread: Tensor, noise: MapNoise, measured: Tensor, stereo: Tensor | None = None) -> Tensor:
     """Return expected relative errors, (1, H, W), reduced to what the noise of the map leaves, where all is calm.
 
-    A network that does not know over how many pixels noise is correlated expects more of it to remain.
-
-    Args:
-        spread: of the network.
-        noise: of the map at its own size.
-        measured: (1, h, w) inverse depth of the map in 1/m, NaN in holes, of which more is expected.
-        stereo: (1, H, W) inverse depth of the result, for noise that grows with the square of the distance.
-
+    A network that does not know over how many pixels noise is correlated expects more of it to remain. ``measured``,
+    (1, h, w), is the map's inverse depth, NaN in holes; ``stereo``, (1, H, W), is that of the result, for noise that
+    grows with the square of the distance.
     """
     at = measured.nanmedian().to(spread) if stereo is None else noise.distance**-2 / stereo.clamp(min=1e-6)
     left = left_of(noise.deviation) * at
@@ -233,10 +187,7 @@ def limit_to_noise(spread: Tensor, noise: MapNoise, measured: Tensor, stereo: Te
 def mix_where_calm(found: InverseSurface, smoother: InverseSurface, measured: Tensor, reach: int) -> InverseSurface:
     """Return a result, (1, H, W), and where all is calm a smoother one; both state their errors.
 
-    Args:
-        measured: see :func:`limit_to_noise`.
-        reach: pixels of the result over which the one turns into the other.
-
+    The one turns into the other over ``reach`` pixels; for ``measured``, see :func:`limit_to_noise`.
     """
     if found.spread is None or smoother.spread is None or found.angle is None or smoother.angle is None:
         return found
@@ -279,9 +230,8 @@ def _fit_planes(sums: Tensor, size: int) -> _Planes | None:
     """Return the planes of windows that are known, by least squares of :func:`_sum_up`; None for too few."""
     _, height, width = (n - 1 for n in sums.shape)
     stride = max(size // 2, int(math.sqrt(height * width / _MOST)))
-    (top, bottom), (left, right) = (
-        (slice(0, n - size + 1, stride), slice(size, n + 1, stride)) for n in (height, width)
-    )
+    top, bottom = slice(0, height - size + 1, stride), slice(size, height + 1, stride)
+    left, right = slice(0, width - size + 1, stride), slice(size, width + 1, stride)
     means = sums[:, bottom, right] - sums[:, top, right] - sums[:, bottom, left] + sums[:, top, left]
     means = means / size**2
     rows, columns = torch.nonzero(means[0] >= _KNOWN, as_tuple=True)

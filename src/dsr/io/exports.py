@@ -31,8 +31,7 @@ from dsr.geometry.mesh import (
     triangulate,
     vertex_normals,
 )
-from dsr.geometry.shading import render
-from dsr.geometry.surface import depth_to_normals
+from dsr.geometry.surface import depth_to_normals, render
 from dsr.io.glb import write_glb
 from dsr.io.photos import to_jpeg, write_png
 from dsr.sample import expect_distances
@@ -43,7 +42,7 @@ from dsr.utils.guards import MOST_FACES, MOST_POINTS
 from dsr.utils.versions import how_to_install
 
 FLAT = "large triangles where the surface is flat"
-"""What makes a mesh smaller without a limit, see :mod:`dsr.geometry.adaptive_mesh`."""
+"""What makes a mesh smaller without a limit, see :mod:`dsr.geometry.mesh`."""
 CAMERA_FRAME = "camera frame: x right, y down, z forward; metres"
 
 _STRIP = 1 << 20

@@ -25,8 +25,7 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.shading import lights, shade
-from dsr.geometry.surface import angle_between, depth_to_normals, length, normal_mask
+from dsr.geometry.surface import angle_between, depth_to_normals, length, lights, normal_mask, shade
 from dsr.sample import CENTIMETRES, Unit
 from dsr.utils.compute_device import in_own_precision, known_true, widened
 

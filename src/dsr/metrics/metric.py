@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dsr.geometry.shading import LIGHT_NAMES
+from dsr.geometry.lights import LIGHT_NAMES
 from dsr.metrics.formats import MetricFormat
 from dsr.metrics.functional import SurfacePair
 from dsr.utils.compute_device import in_own_precision

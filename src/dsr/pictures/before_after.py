@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.shading import render_for_viewing
+from dsr.geometry.surface import render_for_viewing
 from dsr.io.exports import normal_strips
 from dsr.pictures.canvas import Canvas, colours, without_collections, write_figure
 from dsr.pictures.depth_views import limits_of, reduced, strongest_window
@@ -51,7 +51,7 @@ def write_before_after(path: Path, rgb: Tensor, depth_lr: Tensor, depth: Tensor,
     """Draw the photo, the input and the result, both as a surface lit from above and as depth.
 
     The input is rendered at its own resolution, without interpolation, and both by
-    :func:`dsr.geometry.shading.render_for_viewing`. The detail is the window in which the two renderings differ most.
+    :func:`dsr.geometry.surface.render_for_viewing`. The detail is the window in which the two renderings differ most.
     The picture is at most 2400 pixels wide.
 
     Args:

@@ -13,8 +13,7 @@ from torch.nn import functional
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.lights import FIGURE_LIGHT, direction_of
-from dsr.geometry.shading import shade
-from dsr.geometry.surface import depth_to_normals
+from dsr.geometry.surface import depth_to_normals, shade
 
 
 def normals_seen_by(camera: Camera, depth: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from matplotlib.patches import Circle
 from torch import Tensor
 
 from dsr.geometry.lights import LIGHTS, Direction
-from dsr.geometry.shading import render
+from dsr.geometry.surface import render
 from dsr.pictures.canvas import colours, save_both
 from dsr.pictures.depth_views import rendering
 from dsr.sample import DepthSample

@@ -11,7 +11,7 @@ from matplotlib.transforms import Bbox
 from torch import Tensor
 
 from dsr.geometry.lights import LIGHT_NAMES
-from dsr.geometry.shading import render
+from dsr.geometry.surface import render
 from dsr.metrics.formats import Formats, describe_directions, in_tables
 from dsr.pictures.canvas import Canvas, fitted, without_collections, write_figure
 from dsr.pictures.depth_views import angles_between, limits_of, normals_seen_by

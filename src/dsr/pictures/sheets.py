@@ -20,7 +20,7 @@ from torch import Tensor
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.lights import LIGHT_NAMES
-from dsr.geometry.shading import render
+from dsr.geometry.surface import render
 from dsr.pictures.canvas import HOLE_COLOUR, colours, write_figure
 from dsr.pictures.depth_views import limits_of, normals_seen_by, reduced
 from dsr.sample import Scene

@@ -16,7 +16,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from dsr.evaluation.results import Run, formats_of, method_settings
 from dsr.geometry.lights import LIGHT_NAMES
-from dsr.geometry.shading import render
+from dsr.geometry.surface import render
 from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.metrics.formats import HEADLINES, LOOKS, MetricFormat, main_first
 from dsr.pictures.canvas import colours

@@ -15,7 +15,7 @@ import torch
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.lights import VIEWING_LIGHT
-from dsr.geometry.shading import VIEWING_TONES, render_for_viewing
+from dsr.geometry.surface import VIEWING_TONES, render_for_viewing
 from dsr.io.exports import normal_strips
 from dsr.io.photos import data_url, to_jpeg
 from dsr.pictures.canvas import HOLE_COLOUR

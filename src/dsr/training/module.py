@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR, LRScheduler
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
-from dsr.geometry.shading import comparison
+from dsr.geometry.surface import comparison
 from dsr.methods.networks.network import DisparityNetwork
 from dsr.methods.networks.weight_files import make_network
 from dsr.metrics.classes import compute_means, in_table_units, visual_metrics

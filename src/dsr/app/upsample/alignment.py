@@ -33,7 +33,7 @@ def align(picture: Picture, *, register: bool) -> Picture:
     if min(picture.depth_lr.shape[-2:]) < 2:
         return picture
     verdict = judge(picture.depth_lr[0].cpu().numpy(), picture.rgb)
-    if verdict is not None and verdict.turned:  # no displacement is the cure
+    if verdict is not None and verdict.kind == "turned":  # no displacement is the cure
         return replace(picture, assumptions=(*picture.assumptions, *_doubts(verdict)))
     found = find_displacement(picture.depth_lr, picture.rgb)
     certain = found is not None and found.certain
@@ -77,17 +77,16 @@ class Order:
 
 def _doubts(verdict: Verdict) -> list[Assumption]:
     """Return a warning if a pair can hardly belong together."""
-    if verdict.turned:
-        cure = "turn one of the two" if verdict.code == "photo-turned" else "crop one of the two, or register them"
-        detail = f"agreement of edges {verdict.figures}; {cure}"
-        return [Assumption(verdict.statement, detail, verdict.code, verdict.margin)]
-    if verdict.apart:
-        detail = f"{verdict.figures}; was one of the two cropped?"
-        return [Assumption(verdict.statement, detail, "edges-beside", verdict.pixels)]
-    if verdict.other:
-        detail = f"agreement of edges {verdict.figures}; are the two of the same moment?"
-        return [Assumption(verdict.statement, detail, "photo-other", verdict.as_given.significance)]
-    return []
+    if not verdict.code:
+        return []
+    cure = {
+        "photo-turned": "turn one of the two",
+        "field-of-view": "crop one of the two, or register them",
+        "edges-beside": "was one of the two cropped?",
+        "photo-other": "are the two of the same moment?",
+    }[verdict.code]
+    score = "" if verdict.kind == "apart" else "agreement of edges "
+    return [Assumption(verdict.statement, f"{score}{verdict.figures}; {cure}", verdict.code, verdict.value)]
 
 
 def _cure(found: Displacement | None) -> Assumption:

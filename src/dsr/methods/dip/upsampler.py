@@ -28,8 +28,7 @@ from torch.nn import functional
 from torch.utils.data import DataLoader
 
 from dsr.degradation.downsampling import Downsampling, downsample_depth, scene_generator
-from dsr.geometry.shading import comparison
-from dsr.geometry.surface import depth_to_normals
+from dsr.geometry.surface import comparison, depth_to_normals
 from dsr.methods.base import WORKSPACE, Abilities, Cost, Method, whole_scale
 from dsr.methods.dip.skip_net import SkipNet, levels_for
 from dsr.methods.images import compute_min_max, estimate_noise, grey, mean3x3, normal_noise_deg

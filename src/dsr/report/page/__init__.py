@@ -118,7 +118,7 @@ def save_page(
     """Write a page with the scores, renderings, errors, times and settings of runs, atomically.
 
     The page works as a local file, without a server. It computes the renderings from 8-bit normals, so they differ from
-    :func:`dsr.geometry.shading.render` by quantization only.
+    :func:`dsr.geometry.surface.render` by quantization only.
 
     Args:
         path: HTML file.

@@ -17,8 +17,7 @@ from torch import Tensor
 from dsr.evaluation.results import BenchmarkSetting, Results, Run, one_per_method
 from dsr.geometry.camera import Camera
 from dsr.geometry.lights import BASIS
-from dsr.geometry.shading import shade
-from dsr.geometry.surface import normal_mask
+from dsr.geometry.surface import normal_mask, shade
 from dsr.metrics.calibration import error_ratios, measured_errors, squared_error_share
 from dsr.pictures.depth_views import limits_of, normals_seen_by
 from dsr.report.page.value_pictures import (

@@ -1,4 +1,4 @@
-"""Depth that cannot be: what is taken for holes, what survives, and where results may lie."""
+"""Depth that cannot be: what is taken for holes, where results may lie, and expected errors."""
 
 import cv2
 import numpy as np
@@ -7,7 +7,7 @@ import torch
 
 from dsr.geometry.camera import Camera
 from dsr.inference import upsample_surface
-from dsr.inference.plausibility import count_patches, find_outliers, within_measured
+from dsr.inference.plausibility import count_patches, expect_errors, find_outliers, within_measured
 
 HEIGHT, WIDTH = 96, 640
 FRAMES = {
@@ -113,14 +113,8 @@ def test_result_keeps_to_the_measured_values_around_it():
     given[:, 20:24, 30:36] = torch.nan  # a narrow hole
     given[:, :, 185:] = torch.nan  # and a wide one, whose right end nothing is known of
     result = given.nan_to_num(0.5)
-    for row, column, value in (
-        (5, 10, 40.0),
-        (22, 33, 0.001),
-        (6, 90, 5.0),
-        (6, 110, 0.01),
-        (7, 150, 1.4),
-        (8, 195, 3),
-    ):
+    given_values = ((5, 10, 40.0), (22, 33, 0.001), (6, 90, 5.0), (6, 110, 0.01), (7, 150, 1.4), (8, 195, 3))
+    for row, column, value in given_values:
         result[0, row, column] = value
     kept = within_measured(result, given)
     expected = result.clone()
@@ -175,3 +169,46 @@ def test_bad_patches_in_a_real_map_change_nothing_around_them(frame):
     inverse, margin = found.depth.reciprocal(), (high - low) / 2 + 1e-5
     outside = (inverse < low - margin) | (inverse > high + margin)
     assert not (outside & high.isfinite())[inverse.isfinite()].any()
+
+
+CAMERA = Camera.from_fov(60, 96, 64)
+
+
+def slanted(height, width):
+    """Return inverse depth of a slanted plane, (1, height, width)."""
+    across = (torch.arange(width) + 0.5) / width
+    return (0.5 + 0.1 * across).expand(1, height, width).clone()
+
+
+def test_a_plane_that_agrees_with_its_input_has_next_to_no_errors():
+    spread, angle = expect_errors(slanted(64, 96), slanted(16, 24), CAMERA)
+    assert spread.shape == angle.shape == (1, 64, 96)
+    inside = (..., slice(20, -20), slice(20, -20))
+    assert float(spread[inside].max()) < 1e-5
+    assert float(angle[inside].max()) < 0.1
+
+
+def test_copied_noise_is_expected_to_be_wrong():
+    noise = 0.01 * torch.randn(1, 16, 24, generator=torch.Generator().manual_seed(0))
+    given = slanted(16, 24) * (1 + noise)
+    copied = given.repeat_interleave(4, -1).repeat_interleave(4, -2)
+    rough, tilted = expect_errors(copied, given, CAMERA)
+    smooth, flat = expect_errors(slanted(64, 96), given, CAMERA)
+    assert 0.003 < float(rough.mean()) < 0.015
+    assert float(smooth.mean()) < 0.7 * float(rough.mean())
+    assert float(flat.mean()) < 0.7 * float(tilted.mean())
+
+
+def test_errors_are_larger_at_steps_and_grow_into_holes():
+    given = slanted(16, 24)
+    given[..., 12:] *= 2
+    given[:, 4:12, 2:8] = torch.nan
+    result = slanted(64, 96)
+    result[..., 48:] *= 2
+    spread, angle = expect_errors(result, given, CAMERA)
+    assert float(spread[0, 60, 48]) > 10 * float(spread[0, 60, 80])
+    row = spread[0, 32, 8:17]
+    assert bool((row.diff() > 0).all())
+    assert float(row[0]) > 0.02
+    assert float(angle[0, 32, 20]) >= 45
+    assert float(angle[0, 32, 80]) < 1
