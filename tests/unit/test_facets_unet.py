@@ -15,12 +15,7 @@ from dsr.degradation.hints import FACTS, KERNELS, encode_facts
 from dsr.methods.networks import facets_planes, facets_unet
 from dsr.methods.networks.facets import Facets
 from dsr.methods.networks.facets_layers import enlarge, enlarge_and_join
-from dsr.methods.networks.facets_planes import (
-    NEIGHBOURS,
-    average_planes,
-    mix_planes,
-    spline_logits,
-)
+from dsr.methods.networks.facets_planes import NEIGHBOURS, average_planes, mix_planes
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.network import Answer
 from dsr.methods.networks.trained import NETWORKS
@@ -281,8 +276,10 @@ def test_mixed_planes_are_planes_at_each_pixel_weighted_by_a_softmax() -> None:
     choice = torch.randn((1, 2 * NEIGHBOURS, 6, 8), generator=generator, dtype=torch.float64)
     found, _ = mix_planes(planes, choice, 2)
     offsets = torch.tensor([-0.25, 0.25], dtype=torch.float64)
-    weights = (choice.view(NEIGHBOURS, 2, 6, 8) + spline_logits(offsets).repeat(1, 3, 4)[:, None]).flatten(0, 1)
-    weights = weights.softmax(dim=0).view(NEIGHBOURS, 2, 6, 8)
+    splines = torch.tensor([[9, 22, 1], [1, 22, 9]], dtype=torch.float64) / 32  # of the pixels of a row, by neighbour
+    prior = torch.einsum("yi,xj->ijyx", splines, splines).flatten(0, 1).repeat(1, 3, 4) + 1e-4
+    weights = choice.view(NEIGHBOURS, 2, 6, 8).exp() * prior[:, None]
+    weights = weights / weights.sum(dim=(0, 1))
     for row, column in itertools.product(range(6), range(8)):
         y, x = row // 2, column // 2
         expected = 0.0

@@ -7,6 +7,7 @@ axis but two: (B, facets, 3, h, w). Everything here reproduces planes exactly.
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from typing import Any, NamedTuple
 
@@ -23,18 +24,13 @@ _CHUNK = 2**17  # values that a processor's cache holds several of
 
 
 class Stencil(NamedTuple):
-    """Differences of a low-resolution map to its neighbours, per low-resolution pixel.
+    """Differences of a low-resolution map to its neighbours, per low-resolution pixel."""
 
-    ``value`` (B, 1, h, w); ``slopes`` (B, 2, 3, h, w): backward, central and forward difference along u and v; ``bend``
-    (B, 1, h, w): the largest absolute second difference within 3 x 3 pixels; ``turns`` (B, 2, h, w): the second
-    differences along u and v; ``mean`` (B, 1, h, w) of 3 x 3.
-    """
-
-    value: Tensor
-    slopes: Tensor
-    bend: Tensor
-    turns: Tensor
-    mean: Tensor
+    value: Tensor  # (B, 1, h, w)
+    slopes: Tensor  # (B, 2, 3, h, w): backward, central and forward difference along u and v
+    bend: Tensor  # (B, 1, h, w): the largest absolute second difference within 3 x 3 pixels
+    turns: Tensor  # (B, 2, h, w): the second differences along u and v
+    mean: Tensor  # (B, 1, h, w), of 3 x 3 pixels
 
 
 def stencil(values: Tensor) -> Stencil:
@@ -62,13 +58,14 @@ def smooth(values: Tensor, weight: Tensor, levels: int) -> list[Tensor]:
     found = []
     for level in range(levels):
         step = 2**level
-        padded_weight = functional.pad(weight, (step,) * 4, mode="replicate")
-        both = torch.stack((extend_linearly(values, step) * padded_weight, padded_weight))
+        weight = functional.pad(weight, (step,) * 4, mode="replicate")
+        both = torch.stack((extend_linearly(values, step) * weight, weight))
         for dim in (-2, -1):  # weights 1, 2, 1 along both axes
             size = both.shape[dim] - 2 * step
             before, here, after = (both.narrow(dim, i * step, size) for i in range(3))
-            both = (before + after) / 4 + here / 2
-        values, weight = both[0] / both[1], both[1]
+            both = torch.add(before + after, here, alpha=2)
+        total, weight = both
+        values = total / weight
         found.append(values)
     return found
 
@@ -79,87 +76,78 @@ def average_planes(planes: Tensor, weights: Tensor, reach: int) -> Tensor:
     ``planes`` are (B, facets, 3, h, w), ``weights`` (B, facets, 9, h, w), row by row.
     """
     if exporting():
-        return (weights.unflatten(2, (3, 3))[:, :, None] * _extend_to_centre(planes, reach)).sum(dim=(3, 4))
-    average: Tensor = _AveragePlanes.apply(planes, weights, reach)
+        near = _extend_to_centre(_repeat_border(planes, reach), planes.shape, reach)
+        return (weights.unflatten(2, (3, 3))[:, :, None] * near).sum(dim=(3, 4))
+    average: Tensor = _AveragePlanes.apply(_repeat_border(planes, reach), weights, reach)
     return average
 
 
 class _AveragePlanes(torch.autograd.Function):
-    """:func:`average_planes` without a copy of all planes for each of the nine neighbours."""
+    """:func:`average_planes` of planes with a border, summed up neighbour by neighbour."""
 
     @staticmethod
-    def forward(ctx: Any, planes: Tensor, weights: Tensor, reach: int) -> Tensor:
-        padded = functional.pad(planes.flatten(1, 2), (reach,) * 4, mode="replicate").unflatten(1, planes.shape[1:3])
-        near = _windows(padded, planes.shape, reach)
-        down, across = _offsets(planes, reach)
-        total = torch.zeros_like(planes, memory_format=torch.contiguous_format)
-        for i in range(3):
-            value = near[:, :, 0, i] - across * near[:, :, 1, i] - down[i] * near[:, :, 2, i]  # (B, facets, 3, h, w)
-            for j in range(3):
-                total[:, :, 0].addcmul_(weights[:, :, 3 * i + j], value[:, :, j])
-                total[:, :, 1:].addcmul_(weights[:, :, 3 * i + j, None], near[:, :, 1:, i, j])
-        ctx.save_for_backward(padded, weights)
+    def forward(ctx: Any, padded: Tensor, weights: Tensor, reach: int) -> Tensor:
+        near = _extend_to_centre(padded, weights.shape, reach)
+        ctx.save_for_backward(near, weights)
         ctx.reach = reach
+        planes, factors = near.flatten(3, 4).unbind(dim=3), weights[:, :, None].unbind(dim=3)
+        total = factors[0] * planes[0]
+        for factor, plane in zip(factors[1:], planes[1:], strict=True):
+            total.addcmul_(factor, plane)
         return total
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None]:
-        padded, weights = ctx.saved_tensors
-        near, (down, across) = _windows(padded, gradient.shape, ctx.reach), _offsets(gradient, ctx.reach)
-        of_value = gradient[:, :, :1, None, None]  # (B, facets, 1, 1, 1, h, w)
-        of_u = gradient[:, :, 1:2, None, None] - across * of_value
-        of_v = gradient[:, :, 2:, None, None] - down * of_value
-        of_weights = of_value * near[:, :, :1]  # (B, facets, 1, 3, 3, h, w)
-        of_weights.addcmul_(of_u, near[:, :, 1:2]).addcmul_(of_v, near[:, :, 2:])
-        parts = torch.cat([each.expand_as(of_weights) for each in (of_value, of_u, of_v)], dim=2)
-        of_padded = torch.zeros_like(padded)
-        sums = _windows(of_padded, gradient.shape, ctx.reach)
-        for k in range(NEIGHBOURS):
-            i, j = divmod(k, 3)
-            sums[:, :, :, i, j].addcmul_(weights[:, :, k, None], parts[:, :, :, i, j])
-        for dim in (-2, -1):  # what lies beyond the border is the border's
-            size = of_padded.shape[dim] - 2 * ctx.reach
-            before, inner, after = of_padded.split((ctx.reach, size, ctx.reach), dim)
-            inner.narrow(dim, 0, 1).add_(before.sum(dim, keepdim=True))
-            inner.narrow(dim, size - 1, 1).add_(after.sum(dim, keepdim=True))
-            of_padded = inner
-        return of_padded, of_weights.flatten(2, 4), None
+        near, weights = ctx.saved_tensors
+        gradient = gradient[:, :, :, None, None]  # (B, facets, 3, 1, 1, h, w)
+        of_weights = (near * gradient).sum(dim=2).flatten(2, 3)
+        found = weights.unflatten(2, (3, 3))[:, :, None] * gradient
+        down, across = _distances(found, ctx.reach)
+        found[:, :, 1:2].addcmul_(across, found[:, :, :1])
+        found[:, :, 2:].addcmul_(down, found[:, :, :1])
+        for axis, dim in ((4, -1), (3, -2)):  # windows back to their places
+            windows = found.unbind(dim=axis)
+            size = list(windows[0].shape)
+            size[dim] += 2 * ctx.reach
+            found = gradient.new_zeros(size)
+            for step, window in enumerate(windows):
+                found.narrow(dim, step * ctx.reach, window.shape[dim]).add_(window)
+        return found, of_weights, None
 
 
-def _windows(padded: Tensor, size: torch.Size, reach: int) -> Tensor:
-    """Return the 3 x 3 neighbours of pixels, (..., h + 2 reach, w + 2 reach) to (..., 3, 3, h, w): a view."""
+def _repeat_border(planes: Tensor, reach: int) -> Tensor:
+    """Return planes, (B, facets, 3, h, w), with those of the border in place of those beyond it."""
+    padded = functional.pad(planes.flatten(1, 2), (reach,) * 4, mode="replicate")
+    return padded.unflatten(1, planes.shape[1:3])
+
+
+def _extend_to_centre(padded: Tensor, size: torch.Size, reach: int) -> Tensor:
+    """Return the planes of the 3 x 3 pixels around each of (..., h, w), extended to it, (B, facets, 3, 3, 3, h, w)."""
     height, width = size[-2:]
-    if exporting():
+    if exporting():  # a window may not be of a size that is not known
         rows = torch.stack([padded[..., i * reach : i * reach + height, :] for i in range(3)], dim=-3)
-        return torch.stack([rows[..., j * reach : j * reach + width] for j in range(3)], dim=-3)
-    return padded.unfold(-2, height, reach).unfold(-2, width, reach)
+        near = torch.stack([rows[..., j * reach : j * reach + width] for j in range(3)], dim=-3)
+    else:
+        near = padded.unfold(-2, height, reach).unfold(-2, width, reach)
+    down, across = _distances(near, reach)
+    value, along_u, along_v = near.split(1, dim=2)
+    return torch.cat((value + across * along_u + down * along_v, along_u, along_v), dim=2)
 
 
-@functools.lru_cache(64)
-def _offsets_along(size: int, reach: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    with torch.inference_mode(mode=False):  # a cached tensor may later be used with gradients
-        places = torch.arange(size, dtype=dtype, device=device)
-        return torch.stack([(places + step).clamp(0, size - 1) - places for step in (-reach, 0, reach)])
-
-
-def _offsets(planes: Tensor, reach: int) -> tuple[Tensor, Tensor]:
-    """Return how far the rows, (3, 1, h, 1), and columns, (3, 1, w), before, at and after each are, if inside."""
-    height, width = planes.shape[-2:]
-    along = _offsets_along.__wrapped__ if exporting() else _offsets_along  # sizes of a graph are no constants
-    down, across = along(height, reach, planes.dtype, planes.device), along(width, reach, planes.dtype, planes.device)
+def _distances(near: Tensor, reach: int) -> tuple[Tensor, Tensor]:
+    """Return how far each pixel is from the rows, (3, 1, h, 1), and columns, (3, 1, w), before, at and after it."""
+    height, width = near.shape[-2:]
+    along = _distances_along.__wrapped__ if exporting() else _distances_along  # sizes of a graph are no constants
+    down, across = along(height, reach, near.dtype, near.device), along(width, reach, near.dtype, near.device)
     return down[:, None, :, None], across[:, None]
 
 
-def _extend_to_centre(planes: Tensor, reach: int) -> Tensor:
-    """Return the planes of the 3 x 3 pixels around each, extended to its centre, (B, facets, 3, 3, 3, h, w).
-
-    Planes are (B, facets, 3, h, w). In place of those beyond the border are the border's.
-    """
-    padded = functional.pad(planes.flatten(1, 2), (reach,) * 4, mode="replicate").unflatten(1, planes.shape[1:3])
-    near, (down, across) = _windows(padded, planes.shape, reach), _offsets(planes, reach)
-    value = near[:, :, :1] - across * near[:, :, 1:2] - down * near[:, :, 2:]
-    return torch.cat((value, near[:, :, 1:]), dim=2)
+@functools.lru_cache(64)
+@torch.inference_mode(mode=False)  # so that gradients can be computed with it
+def _distances_along(size: int, reach: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    places = torch.arange(size, dtype=dtype, device=device)
+    return torch.stack((places, torch.zeros_like(places), -places.flip(0))).clamp(-reach, reach)
 
 
 def mix_planes(planes: Tensor, found: Tensor, scale: int) -> tuple[Tensor, Tensor]:
@@ -171,42 +159,39 @@ def mix_planes(planes: Tensor, found: Tensor, scale: int) -> tuple[Tensor, Tenso
     B-spline are added, and n more channels, which are returned in at least float32.
     """
     batch, facets, _, height, width = planes.shape
-    s, count = scale, NEIGHBOURS * facets
-
-    def side_by_side(values: Tensor) -> Tensor:
-        """Return values of the pixels of each low-resolution pixel, (B, s s, h w), as (B, 1, s h, s w)."""
-        blocks = values.view(batch, s, s, height, width).permute(0, 3, 1, 4, 2)
-        return blocks.reshape(batch, 1, height * s, width * s)
-
+    count = NEIGHBOURS * facets
     dtype = torch.promote_types(found.dtype, torch.float32)
-    basis, prior = _mixing_constants(s, facets, planes.dtype, planes.device)
+    basis, prior = _mixing_constants(scale, facets, planes.dtype, planes.device)
     with torch.autocast(planes.device.type, enabled=False):
         first = planes[:, 0]
-        near = _extend_to_centre(planes, 1).permute(0, 3, 4, 1, 2, 5, 6) - first[:, None, None, None]
-        near = near.reshape(batch, count, 3, height, width).to(dtype)
-        base = side_by_side(basis @ first.flatten(2))
+        base = functional.pixel_shuffle((basis @ first.flatten(2)).unflatten(2, (height, width)), scale)
+        near = _extend_to_centre(_repeat_border(planes, 1), planes.shape, 1).permute(0, 3, 4, 1, 2, 5, 6)
+        near = (near - first[:, None, None, None]).reshape(batch, count, 3, height, width).to(dtype)
         basis, prior = basis.to(dtype), prior.to(dtype)
         if not exporting():
             mixed, others = _MixPlanes.apply(near, found, prior, basis)
             return base + mixed, others
-        # the pixels of a low-resolution pixel become an axis of their own
-        logits = found[:, :count].reshape(batch, count, height, s, width, s).permute(0, 1, 3, 5, 2, 4)
-        logits = logits.reshape(batch, count, s * s, height * width)
-        weights = (logits.to(dtype) + prior).softmax(dim=1)
-        mixed = (weights * (basis @ near.flatten(3))).sum(dim=1)
-        return base + side_by_side(mixed), found[:, count:].to(dtype)
+        logits = functional.pixel_unshuffle(found[:, :count].to(dtype), scale).view(batch, count, -1, height * width)
+        mixed = ((logits + prior).softmax(dim=1) * (basis @ near.flatten(3))).sum(dim=1)
+        return base + functional.pixel_shuffle(mixed.unflatten(2, (height, width)), scale), found[:, count:].to(dtype)
 
 
 @functools.lru_cache(64)
+@torch.inference_mode(mode=False)  # so that gradients can be computed with them
 def _mixing_constants(scale: int, facets: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Return value and slopes' factors of high-resolution pixels, (s s, 3), and logits of a B-spline, (9 f, s s, 1)."""
-    with torch.inference_mode(mode=False):  # cached tensors may later be used with gradients
-        # from the centre of the low-resolution pixel, in low-resolution pixels
-        offsets = (torch.arange(scale, dtype=dtype, device=device) + 0.5) / scale - 0.5
-        ones = torch.ones(scale, scale, dtype=dtype, device=device)
-        basis = torch.stack((ones, ones * offsets, ones * offsets[:, None]), dim=-1).view(scale * scale, 3)
-        logits = spline_logits(offsets).repeat_interleave(facets, dim=0)
-        return basis, logits.view(NEIGHBOURS * facets, scale * scale, 1)
+    """Return factors of the value and the slopes at high-resolution pixels, (s s, 3), and logits, (9 f, s s, 1).
+
+    The logits are logarithms of the quadratic B-spline's weights, to which a small constant is added, so that no
+    neighbour is excluded.
+    """
+    # from the centre of the low-resolution pixel, in low-resolution pixels
+    offsets = (torch.arange(scale, dtype=dtype, device=device) + 0.5) / scale - 0.5
+    ones = torch.ones(scale, scale, dtype=dtype, device=device)
+    basis = torch.stack((ones, ones * offsets, ones * offsets[:, None]), dim=-1).view(scale * scale, 3)
+    spline = torch.stack((0.5 * (0.5 - offsets) ** 2, 0.75 - offsets**2, 0.5 * (0.5 + offsets) ** 2))  # (3, s)
+    weights = spline[:, None, :, None] * spline[None, :, None, :]  # (3, 3, s, s)
+    logits = (weights + 1e-4).log().view(NEIGHBOURS, scale * scale, 1)
+    return basis, logits.repeat_interleave(facets, dim=0)
 
 
 class _MixPlanes(torch.autograd.Function):
@@ -214,14 +199,12 @@ class _MixPlanes(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, near: Tensor, found: Tensor, prior: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
-        count, (height, width), s = near.shape[1], near.shape[-2:], math.isqrt(len(basis))
+        count, scale = near.shape[1], math.isqrt(len(basis))
         mixed = near.new_empty(found.shape[0], 1, *found.shape[-2:])
-        logits, target, kept = _blocks(found[:, :count], s), _blocks(mixed, s), []
-        for part in _chunks(near.shape[0] * count * s * s, height, width):
-            weights = (
-                logits[part].to(near.dtype, memory_format=torch.contiguous_format, copy=True).flatten(4).flatten(2, 3)
-            )
-            weights = weights.add_(prior).softmax(dim=1)
+        logits, target, kept = _blocks(found[:, :count], scale), _blocks(mixed, scale), []
+        for part in _parts(logits):
+            weights = logits[part].to(near.dtype, memory_format=torch.contiguous_format, copy=True)
+            weights = weights.flatten(4).flatten(2, 3).add_(prior).softmax(dim=1)
             if any(ctx.needs_input_grad):
                 kept.append(weights)
             offered = basis @ near[part].flatten(3)
@@ -233,12 +216,11 @@ class _MixPlanes(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor, of_others: Tensor) -> tuple[Tensor, Tensor, None, None]:
         near, found, mixed, basis, *kept = ctx.saved_tensors
-        count, (height, width), s = near.shape[1], near.shape[-2:], math.isqrt(len(basis))
+        count, scale = near.shape[1], math.isqrt(len(basis))
         of_near, of_found = torch.empty_like(near), torch.empty_like(found)
         of_found[:, count:] = of_others
-        target, gradients, values = _blocks(of_found[:, :count], s), _blocks(gradient, s), _blocks(mixed, s)
-        parts = _chunks(near.shape[0] * count * s * s, height, width)
-        for part, weights in zip(parts, kept, strict=True):
+        target, gradients, values = _blocks(of_found[:, :count], scale), _blocks(gradient, scale), _blocks(mixed, scale)
+        for part, weights in zip(_parts(target), kept, strict=True):
             weighted = weights * gradients[part].flatten(4).flatten(2, 3)
             of_near[part] = (basis.T @ weighted).view_as(near[part])
             above = (basis @ near[part].flatten(3)).sub_(values[part].flatten(4).flatten(2, 3))
@@ -251,22 +233,11 @@ def _blocks(values: Tensor, scale: int) -> Tensor:
     return values.unflatten(3, (-1, scale)).unflatten(2, (-1, scale)).permute(0, 1, 3, 5, 2, 4)
 
 
-def _chunks(values: int, height: int, width: int) -> list[tuple[Any, ...]]:
-    """Return indices of parts of the last two axes of (..., h, w) that a cache holds, each pixel with some values."""
+def _parts(blocks: Tensor) -> list[tuple[Any, ...]]:
+    """Return indices of parts of (..., h, w), each with about as many values as a cache holds."""
+    height, width = blocks.shape[-2:]
+    values = blocks.numel() // (height * width)
     columns = min(width, max(1, _CHUNK // values))
     rows = max(1, _CHUNK // (values * columns))
-    return [
-        (..., slice(top, top + rows), slice(left, left + columns))
-        for top in range(0, height, rows)
-        for left in range(0, width, columns)
-    ]
-
-
-def spline_logits(offsets: Tensor) -> Tensor:
-    """Return the logarithm of the quadratic B-spline's weights of the 3 x 3 neighbours, (9, scale, scale).
-
-    A small constant is added to each weight, so that no neighbour is excluded.
-    """
-    one = torch.stack((0.5 * (0.5 - offsets) ** 2, 0.75 - offsets**2, 0.5 * (0.5 + offsets) ** 2))  # (3, scale)
-    both = one[:, None, :, None] * one[None, :, None, :]
-    return (both + 1e-4).log().flatten(0, 1)
+    corners = itertools.product(range(0, height, rows), range(0, width, columns))
+    return [(..., slice(top, top + rows), slice(left, left + columns)) for top, left in corners]

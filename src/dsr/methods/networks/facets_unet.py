@@ -236,7 +236,7 @@ class FacetsUNet(DisparityNetwork):
         ``values`` (B, 1, h, w) are disparity over its median, without holes, ``known`` (B, 1, h, w) false where one was
         filled in, ``noise`` the standard deviation of their logarithm where that is known.
         """
-        scale, given = rgb.shape[-1] // values.shape[-1], values
+        scale, given = int(rgb.shape[-1] // values.shape[-1]), values
         dtype = self.photo.weight.dtype
         with torch.autocast(rgb.device.type, enabled=False):  # the map keeps its precision
             parts = [photo_input(rgb)]
