@@ -24,7 +24,17 @@ from rich.console import Console
 
 from dsr.app import run_directory as rundir
 from dsr.app.metrics import check_metrics, chosen_metrics, metric_collection
-from dsr.app.schema import Config, EvalConfig, Identity, Plan, given_keys, plain_config, runs_here, user_directories
+from dsr.app.schema import (
+    Config,
+    EvalConfig,
+    Identity,
+    Plan,
+    given_keys,
+    given_overrides,
+    plain_config,
+    runs_here,
+    user_directories,
+)
 from dsr.data.scene_source import SceneSource, prepare_scenes, regions_of
 from dsr.degradation.downsampling import Downsampling, Measured
 from dsr.degradation.holes import Holes
@@ -157,7 +167,9 @@ def _prepare(
     if len(hashes) > 1:
         weights_hash = hashlib.sha256("".join(hashes).encode()).hexdigest()
     identity = rundir.identity_of(plain, weights_hash, device, recipe.targets())
-    folder = Path(settings.output_dir or rundir.default_directory("eval", plain, identity)).expanduser()
+    folder = Path(
+        settings.output_dir or rundir.default_directory("eval", plain, identity, given_overrides())
+    ).expanduser()
     downsampling, noise, holes = (settings.build(group) for group in ("downsampling", "noise", "holes"))
     degradation = rundir.degradation_of(plain, assumes=recipe.abilities.assumes_downsampling)
     prepared = _Prepared(

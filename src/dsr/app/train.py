@@ -38,7 +38,17 @@ from rich.console import Console
 
 from dsr.app import run_directory as rundir
 from dsr.app.metrics import check_metrics, metric_collection
-from dsr.app.schema import READ_OF_TRAINER, Config, Identity, Plan, TrainConfig, given_keys, plain_config, runs_here
+from dsr.app.schema import (
+    READ_OF_TRAINER,
+    Config,
+    Identity,
+    Plan,
+    TrainConfig,
+    given_keys,
+    given_overrides,
+    plain_config,
+    runs_here,
+)
 from dsr.app.training_runs import WEIGHTS, keyed, read_config, training_data
 from dsr.data.scene_source import prepare_scenes
 from dsr.methods.networks.network import DisparityNetwork
@@ -195,7 +205,9 @@ def _prepare(plain: Config, settings: TrainConfig, device: torch.device, process
     check_metrics(settings.metrics)
     module = _module(settings, net, data)
     identity = rundir.identity_of(plain, None, device)
-    folder = Path(settings.output_dir or rundir.default_directory("train", plain, identity)).expanduser()
+    folder = Path(
+        settings.output_dir or rundir.default_directory("train", plain, identity, given_overrides())
+    ).expanduser()
     progress = ConsoleProgress(Console(quiet=processes.rank > 0))
     best = BestCheckpoint(folder / _LAST.parent, MONITOR)
     callbacks = [
