@@ -52,7 +52,7 @@ from dsr.evaluation.scenes import (
 )
 from dsr.evaluation.store import load_errors, prediction_path
 from dsr.inference.selection import Selection, select
-from dsr.methods.base import WORKSPACE, Method
+from dsr.methods.base import WORKSPACE
 from dsr.methods.networks.weight_files import files_of_weights
 from dsr.methods.recipe import Known, Recipe, Run
 from dsr.metrics.formats import Formats
@@ -134,7 +134,7 @@ class _Prepared:
 
 def _prepare(
     plain: Config, node: Any, source: SceneSource | None, *, here: bool = True
-) -> tuple[_Prepared, Method, ConsoleProgress]:
+) -> tuple[_Prepared, Evaluation, ConsoleProgress]:
     """Check all that an evaluation needs, and write nothing."""
     settings = EvalConfig.of(plain)
     if source is None:
@@ -176,11 +176,11 @@ def _prepare(
         settings, plain, selected, source, downsampling, degradation, noise, holes, device, identity, folder
     )
     progress = ConsoleProgress(open_console())
-    method = _method(prepared, progress)
     check_metrics(settings.metrics)
+    study = _study(prepared, progress)
     _workers(prepared)
     rundir.expect_free(folder, plain, identity, () if here else ("device", "precision"))
-    return prepared, method, progress
+    return prepared, study, progress
 
 
 def _scale(settings: EvalConfig, source: SceneSource) -> float:
@@ -192,28 +192,6 @@ def _scale(settings: EvalConfig, source: SceneSource) -> float:
         return match_ratio(settings.scale, source.load(first).measured)
     except (ValueError, OSError) as error:
         raise ConfigError(failure_line(first, error)) from error
-
-
-def _method(prepared: _Prepared, progress: Progress) -> Method:
-    """Build the method of a run."""
-    settings, downsampling, known = prepared.settings, prepared.downsampling, Known()
-    if isinstance(downsampling, Downsampling):  # nothing is known of the maps of a sensor
-        edges: Literal["soft", "sharp"] = "soft" if getattr(prepared.source, "soft_edges", False) else "sharp"
-        known = Known(downsampling.assumed_model().kernel, edges, clean=settings.names["noise"] == "none")
-    run = Run(
-        device=prepared.device,
-        precision=settings.precision,
-        seed=settings.seed,
-        downsampling=downsampling.assumed_model(),
-        known=known,
-        alignment=settings.metrics.alignment,
-        metrics=functools.partial(metric_collection, settings.metrics),
-        workspace=prepared.folder,
-        display=progress,
-        about={"method": settings.label or prepared.selected.recipe.name, "degradation": prepared.degradation},
-        lpips_trunk=settings.metrics.lpips_trunk,
-    )
-    return prepared.selected.build(run)
 
 
 def _workers(prepared: _Prepared) -> tuple[int, int]:
@@ -237,20 +215,38 @@ def _workers(prepared: _Prepared) -> tuple[int, int]:
     return max(1, min(count, scenes)), threads
 
 
-def _study(prepared: _Prepared, method: Method) -> Evaluation:
-    """Return what evaluates the scenes of a run."""
+def _study(prepared: _Prepared, progress: Progress) -> Evaluation:
+    """Build the method and the metrics of a run, and return what evaluates its scenes."""
     settings, folder, name = prepared.settings, prepared.folder, prepared.selected.recipe.name
-    metrics = chosen_metrics(settings.metrics, regions_of(prepared.source))
+    downsampling, known = prepared.downsampling, Known()
+    if isinstance(downsampling, Downsampling):  # nothing is known of the maps of a sensor
+        edges: Literal["soft", "sharp"] = "soft" if getattr(prepared.source, "soft_edges", False) else "sharp"
+        known = Known(downsampling.assumed_model().kernel, edges, clean=settings.names["noise"] == "none")
+    run = Run(
+        device=prepared.device,
+        precision=settings.precision,
+        seed=settings.seed,
+        downsampling=downsampling.assumed_model(),
+        known=known,
+        alignment=settings.metrics.alignment,
+        metrics=functools.partial(metric_collection, settings.metrics),
+        workspace=folder,
+        display=progress,
+        about={"method": settings.label or name, "degradation": prepared.degradation},
+        lpips_trunk=settings.metrics.lpips_trunk,
+    )
+    method = prepared.selected.build(run)
     label = settings.label or name
     if method.name is not None and label == name:
         label = method.name
     if method.flag:  # marks scores
         name, label = f"{name}_{method.flag}", f"{label} ({method.flag})"
+    metrics = chosen_metrics(settings.metrics, regions_of(prepared.source))
     formats = {metric.name: metric.format for metric in metrics}
     return Evaluation(
         folder,
         prepared.source,
-        prepared.downsampling,
+        downsampling,
         prepared.degradation,
         settings.scale,
         method,
@@ -267,7 +263,7 @@ def _study(prepared: _Prepared, method: Method) -> Evaluation:
     )
 
 
-def _run(prepared: _Prepared, method: Method, progress: ConsoleProgress) -> pd.DataFrame:
+def _run(prepared: _Prepared, study: Evaluation, progress: ConsoleProgress) -> pd.DataFrame:
     """Evaluate each scene once, by this command or by another one of the same settings; return the scores."""
     from dsr.report.dashboard import save_dashboard  # noqa: PLC0415 - slow to import
 
@@ -278,8 +274,7 @@ def _run(prepared: _Prepared, method: Method, progress: ConsoleProgress) -> pd.D
             shutil.rmtree(folder / WORKSPACE, ignore_errors=True)
         _seed(settings.seed)
         prepare_scenes(source, source.scenes(), progress)
-        study = _study(prepared, method)
-        for remark in method.remarks(source.name, source.scenes(), study.scale):
+        for remark in study.method.remarks(source.name, source.scenes(), study.scale):
             note_once(remark)
         try:
             results = _evaluate_scenes(prepared, study, progress)
@@ -342,7 +337,7 @@ def _begin(prepared: _Prepared, since: float) -> None:
     global _worker  # noqa: PLW0603 - the process's own
     _seed(prepared.settings.seed)
     with contextlib.redirect_stderr(io.StringIO()):
-        _worker = _study(prepared, _method(prepared, SILENT)), since
+        _worker = _study(prepared, SILENT), since
 
 
 def _in_worker(scene: str) -> SceneResult | None:
