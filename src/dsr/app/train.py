@@ -64,7 +64,7 @@ from dsr.utils.configuration import ConfigError, build, expect_library
 from dsr.utils.console import USAGE_ERROR, ConsoleProgress, one_line, without_credentials
 from dsr.utils.files import replacing
 from dsr.utils.guards import did_you_mean
-from dsr.utils.lightning import ListedScores, StepProgress, ValidationTable, fit, make_trainer, without_chatter
+from dsr.utils.lightning import ScoreTables, StepProgress, fit, make_trainer, without_chatter
 from dsr.utils.progress import Progress
 from dsr.utils.torch_files import expect_stored, read_torch_file
 
@@ -212,8 +212,7 @@ def _prepare(plain: Config, settings: TrainConfig, device: torch.device, process
     best = BestCheckpoint(folder / _LAST.parent, MONITOR)
     callbacks = [
         *_own_callbacks(settings, module),
-        ValidationTable(folder / "validation.csv"),
-        ListedScores(best),
+        ScoreTables(folder / "validation.csv", best),
         best,
         StepProgress(progress, "train"),
         Interruption(folder / _LAST),
