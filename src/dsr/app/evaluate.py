@@ -52,7 +52,7 @@ from dsr.evaluation.scenes import (
 )
 from dsr.evaluation.store import load_errors, prediction_path
 from dsr.inference.selection import Selection, select
-from dsr.methods.base import WORKSPACE
+from dsr.methods.base import WORKSPACE, Method
 from dsr.methods.networks.weight_files import files_of_weights
 from dsr.methods.recipe import Known, Recipe, Run
 from dsr.metrics.formats import Formats
@@ -134,7 +134,7 @@ class _Prepared:
 
 def _prepare(
     plain: Config, node: Any, source: SceneSource | None, *, here: bool = True
-) -> tuple[_Prepared, Evaluation, ConsoleProgress]:
+) -> tuple[_Prepared, Method, ConsoleProgress]:
     """Check all that an evaluation needs, and write nothing."""
     settings = EvalConfig.of(plain)
     if source is None:
@@ -177,10 +177,10 @@ def _prepare(
     )
     progress = ConsoleProgress(open_console())
     check_metrics(settings.metrics)
-    study = _study(prepared, progress)
+    method = _method(prepared, progress)
     _workers(prepared)
     rundir.expect_free(folder, plain, identity, () if here else ("device", "precision"))
-    return prepared, study, progress
+    return prepared, method, progress
 
 
 def _scale(settings: EvalConfig, source: SceneSource) -> float:
@@ -215,10 +215,9 @@ def _workers(prepared: _Prepared) -> tuple[int, int]:
     return max(1, min(count, scenes)), threads
 
 
-def _study(prepared: _Prepared, progress: Progress) -> Evaluation:
-    """Build the method and the metrics of a run, and return what evaluates its scenes."""
-    settings, folder, name = prepared.settings, prepared.folder, prepared.selected.recipe.name
-    downsampling, known = prepared.downsampling, Known()
+def _method(prepared: _Prepared, progress: Progress) -> Method:
+    """Build the method of a run."""
+    settings, downsampling, known = prepared.settings, prepared.downsampling, Known()
     if isinstance(downsampling, Downsampling):  # nothing is known of the maps of a sensor
         edges: Literal["soft", "sharp"] = "soft" if getattr(prepared.source, "soft_edges", False) else "sharp"
         known = Known(downsampling.assumed_model().kernel, edges, clean=settings.names["noise"] == "none")
@@ -230,12 +229,17 @@ def _study(prepared: _Prepared, progress: Progress) -> Evaluation:
         known=known,
         alignment=settings.metrics.alignment,
         metrics=functools.partial(metric_collection, settings.metrics),
-        workspace=folder,
+        workspace=prepared.folder,
         display=progress,
-        about={"method": settings.label or name, "degradation": prepared.degradation},
+        about={"method": settings.label or prepared.selected.recipe.name, "degradation": prepared.degradation},
         lpips_trunk=settings.metrics.lpips_trunk,
     )
-    method = prepared.selected.build(run)
+    return prepared.selected.build(run)
+
+
+def _study(prepared: _Prepared, method: Method) -> Evaluation:
+    """Return what evaluates the scenes of a run, with its metrics, of which LPIPS's weights may be fetched."""
+    settings, folder, name = prepared.settings, prepared.folder, prepared.selected.recipe.name
     label = settings.label or name
     if method.name is not None and label == name:
         label = method.name
@@ -246,7 +250,7 @@ def _study(prepared: _Prepared, progress: Progress) -> Evaluation:
     return Evaluation(
         folder,
         prepared.source,
-        downsampling,
+        prepared.downsampling,
         prepared.degradation,
         settings.scale,
         method,
@@ -263,7 +267,7 @@ def _study(prepared: _Prepared, progress: Progress) -> Evaluation:
     )
 
 
-def _run(prepared: _Prepared, study: Evaluation, progress: ConsoleProgress) -> pd.DataFrame:
+def _run(prepared: _Prepared, method: Method, progress: ConsoleProgress) -> pd.DataFrame:
     """Evaluate each scene once, by this command or by another one of the same settings; return the scores."""
     from dsr.report.dashboard import save_dashboard  # noqa: PLC0415 - slow to import
 
@@ -274,7 +278,8 @@ def _run(prepared: _Prepared, study: Evaluation, progress: ConsoleProgress) -> p
             shutil.rmtree(folder / WORKSPACE, ignore_errors=True)
         _seed(settings.seed)
         prepare_scenes(source, source.scenes(), progress)
-        for remark in study.method.remarks(source.name, source.scenes(), study.scale):
+        study = _study(prepared, method)
+        for remark in method.remarks(source.name, source.scenes(), study.scale):
             note_once(remark)
         try:
             results = _evaluate_scenes(prepared, study, progress)
@@ -337,7 +342,7 @@ def _begin(prepared: _Prepared, since: float) -> None:
     global _worker  # noqa: PLW0603 - the process's own
     _seed(prepared.settings.seed)
     with contextlib.redirect_stderr(io.StringIO()):
-        _worker = _study(prepared, SILENT), since
+        _worker = _study(prepared, _method(prepared, SILENT)), since
 
 
 def _in_worker(scene: str) -> SceneResult | None:
