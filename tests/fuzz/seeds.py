@@ -289,12 +289,14 @@ def dsr_weights(folder: Path) -> None:
 
 def torch_weights(folder: Path) -> None:
     """Write the authors' file of MSG-Net: of torch's present and earlier format."""
-    from dsr.methods.networks import trained  # noqa: PLC0415
     from dsr.methods.networks.msg_net import MSGNet  # noqa: PLC0415
 
-    theirs = zip(trained._author_names(1), trained._layer_names(1), strict=True)
-    ours = {f"{b}.{part}": f"{a}.{part}" for a, b in theirs for part in trained.PARTS}
-    state = {ours[name]: value for name, value in MSGNet(2, "voynov").state_dict().items() if name in ours}
+    values = MSGNet(2, "voynov").state_dict()
+    layers = [name.removesuffix(".conv.weight") for name in values if name.endswith(".conv.weight")]
+    guidance = ("feature_extraction_Y.0", "feature_extraction_Y.1", "feature_extraction_X")
+    theirs = dict(zip(layers, (*guidance, *(f"upsampling_X.{i}" for i in range(5))), strict=True))
+    state = {f"{theirs[layer]}{name.removeprefix(layer)}": value
+             for name, value in values.items() for layer in layers if name.startswith(f"{layer}.")}  # fmt: skip
     torch.save({"model_state_dict": state, "epoch": 3}, folder / "voynov.pth")
     torch.save({"model_state_dict": state}, folder / "earlier.pth", _use_new_zipfile_serialization=False)
 

@@ -306,7 +306,7 @@ USAGE_ERRORS = {
     "an added key of a group": (["+method.sharp=1"], "method.sharp: unknown key; method=bicubic takes order, "),
     "a group taken away": (["~method"], "method: missing"),
     "a scale that is none": (["scale=3"], "scale: "),
-    "a type in a group": (["dataset.size=big"], "dataset.size: expected a whole number, got 'big'"),
+    "a type in a group": (["dataset.size=big"], "dataset.size: expected integer, got 'big'"),
     "a range": (["dataset.size=8"], "dataset.size: "),
     "a device that is not here": (["device=gpu"], "device: expected auto, cpu or a device of this machine"),
     "no worker": (["workers=0"], "workers: "),

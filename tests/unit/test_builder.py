@@ -106,12 +106,12 @@ def test_missing_key_is_refused_with_how_to_set_it():
 @pytest.mark.parametrize(
     ("key", "value", "expected"),
     [
-        ("root", 3, "text, got 3"), ("root", None, "text, got None"), ("root", "", ""),
+        ("root", 3, "string, got 3"), ("root", None, "string, got None"), ("root", "", ""),
         ("names", "a", ".*, got 'a'"), ("names", [1], ".*, got \\[1\\]"),
-        ("share", "x", "a number, got 'x'"), ("share", True, "a number, got True"),
-        ("count", 1.5, "a whole number, got 1.5"), ("count", True, "a whole number, got True"),
-        ("order", "mid", ".*, got 'mid'"), ("flag", "yes", "true or false, got 'yes'"),
-        ("flag", 1, "true or false, got 1"), ("file", 1, ".*, got 1"),
+        ("share", "x", "number, got 'x'"), ("share", True, "number, got True"),
+        ("count", 1.5, "integer, got 1.5"), ("count", True, "integer, got True"),
+        ("order", "mid", ".*, got 'mid'"), ("flag", "yes", "boolean, got 'yes'"),
+        ("flag", 1, "boolean, got 1"), ("file", 1, ".*, got 1"),
     ],
 )  # fmt: skip
 def test_value_of_the_wrong_type_is_refused_with_the_expected_type(key, value, expected):

@@ -60,7 +60,7 @@ def composed(kind, *overrides):
 
 def name_of(kind, *overrides):
     plain = composed(kind, *overrides)
-    return default_directory(kind, plain, identity_of(plain, None, CPU)).name
+    return default_directory(kind, plain, identity_of(plain, None, CPU), overrides).name
 
 
 @pytest.mark.parametrize(
@@ -68,13 +68,13 @@ def name_of(kind, *overrides):
     [
         ("train", "model=msg_v scale=8", "msg_v_x8_seed0"),
         ("train", "model=msg_v scale=8 loss.w=0.72", "msg_v_x8_w0.72_seed0"),
-        ("train", "model=msg loss.w=auto seed=3", "msg_x4_seed3"),
+        ("train", "model=msg loss.w=auto seed=3", "msg_x4_w-auto_seed3"),
         ("train", "trainer=smoke trainer.max_steps=4 model.objective.w=0",
-         "msg_v_x4_smoke_model.objective.w0_max_steps4_seed0"),
+         "msg_v_x4_smoke_w0_max_steps4_seed0"),
         ("train", "noise=tof patches.scenes=5", "msg_v_x4_tof_scenes5_seed0"),
         ("eval", "method=bicubic", "bicubic_x4_simgeo_seed0"),
         ("eval", "method=dip_v scale=8 dataset=icl method.w=2 method.oracle=true",
-         "dip_v_x8_icl_w2_oracle-true_seed0"),
+         "dip_v_x8_icl_oracle-true_w2_seed0"),
         ("eval", "downsampling=nearest noise=gaussian_multiplicative noise.std=0.01 dataset.scenes=[lucy,plant]",
          "msg_v_x4_simgeo_nearest_gaussian_multiplicative_scenes-lucy+plant_std0.01_seed0"),
     ],

@@ -10,7 +10,6 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from dsr.app.schema import NAMED, register
-from dsr.data.download.collections import CATALOGUE
 from dsr.utils.configuration import config_directories
 from dsr.utils.console import note_once
 from dsr.utils.files import data_root
@@ -59,6 +58,8 @@ def register_resolvers() -> None:
 
 def _present(*names: str) -> str:
     """Return the data sets that are on this machine or embedded, separated by commas; print a note on the others."""
+    from dsr.data.download.collections import CATALOGUE  # noqa: PLC0415 - only a few experiments ask for it
+
     folders = {name: CATALOGUE[name].folders if name in CATALOGUE else () for name in names}
     absent = [name for name in names if not all((data_root() / folder).is_dir() for folder in folders[name])]
     if absent:

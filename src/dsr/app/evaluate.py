@@ -24,7 +24,17 @@ from rich.console import Console
 
 from dsr.app import run_directory as rundir
 from dsr.app.metrics import check_metrics, chosen_metrics, metric_collection
-from dsr.app.schema import Config, EvalConfig, Identity, Plan, given_keys, plain_config, runs_here, user_directories
+from dsr.app.schema import (
+    Config,
+    EvalConfig,
+    Identity,
+    Plan,
+    given_keys,
+    given_overrides,
+    plain_config,
+    runs_here,
+    user_directories,
+)
 from dsr.data.scene_source import SceneSource, prepare_scenes, regions_of
 from dsr.degradation.downsampling import Downsampling, Measured
 from dsr.degradation.holes import Holes
@@ -157,15 +167,17 @@ def _prepare(
     if len(hashes) > 1:
         weights_hash = hashlib.sha256("".join(hashes).encode()).hexdigest()
     identity = rundir.identity_of(plain, weights_hash, device, recipe.targets())
-    folder = Path(settings.output_dir or rundir.default_directory("eval", plain, identity)).expanduser()
+    folder = Path(
+        settings.output_dir or rundir.default_directory("eval", plain, identity, given_overrides())
+    ).expanduser()
     downsampling, noise, holes = (settings.build(group) for group in ("downsampling", "noise", "holes"))
     degradation = rundir.degradation_of(plain, assumes=recipe.abilities.assumes_downsampling)
     prepared = _Prepared(
         settings, plain, selected, source, downsampling, degradation, noise, holes, device, identity, folder
     )
     progress = ConsoleProgress(open_console())
-    method = _method(prepared, progress)
     check_metrics(settings.metrics)
+    method = _method(prepared, progress)
     _workers(prepared)
     rundir.expect_free(folder, plain, identity, () if here else ("device", "precision"))
     return prepared, method, progress
@@ -180,6 +192,27 @@ def _scale(settings: EvalConfig, source: SceneSource) -> float:
         return match_ratio(settings.scale, source.load(first).measured)
     except (ValueError, OSError) as error:
         raise ConfigError(failure_line(first, error)) from error
+
+
+def _workers(prepared: _Prepared) -> tuple[int, int]:
+    """Return how many scenes are worked on at a time, and with how many threads each.
+
+    The threads must not depend on the number of workers, which changes no bit of the results.
+    """
+    settings, scenes, cores = prepared.settings, len(prepared.source.scenes()), torch.get_num_threads()
+    count, threads = (None if value == "auto" else int(value) for value in (settings.workers, settings.threads))
+    on_cpu = prepared.device.type == "cpu"
+    if count is not None and count > 1 and not on_cpu:
+        raise ConfigError(
+            f"workers: expected 1 with device={prepared.device}, got {count}; "
+            "start the command once per device, with the same output_dir"
+        )
+    together = on_cpu and not prepared.selected.recipe.abilities.optimises  # else one scene at a time has all cores
+    if threads is None:
+        threads = max(1, cores // max(1, scenes)) if together else cores
+    if count is None:
+        count = min(max(1, cores // threads), max(1, free_memory() // _MEMORY)) if together else 1
+    return max(1, min(count, scenes)), threads
 
 
 def _method(prepared: _Prepared, progress: Progress) -> Method:
@@ -204,36 +237,15 @@ def _method(prepared: _Prepared, progress: Progress) -> Method:
     return prepared.selected.build(run)
 
 
-def _workers(prepared: _Prepared) -> tuple[int, int]:
-    """Return how many scenes are worked on at a time, and with how many threads each.
-
-    The threads must not depend on the number of workers, which changes no bit of the results.
-    """
-    settings, scenes, cores = prepared.settings, len(prepared.source.scenes()), torch.get_num_threads()
-    count, threads = (None if value == "auto" else int(value) for value in (settings.workers, settings.threads))
-    on_cpu = prepared.device.type == "cpu"
-    if count is not None and count > 1 and not on_cpu:
-        raise ConfigError(
-            f"workers: expected 1 with device={prepared.device}, got {count}; "
-            "start the command once per device, with the same output_dir"
-        )
-    together = on_cpu and not prepared.selected.recipe.abilities.optimises  # else one scene at a time has all cores
-    if threads is None:
-        threads = max(1, cores // max(1, scenes)) if together else cores
-    if count is None:
-        count = min(max(1, cores // threads), max(1, free_memory() // _MEMORY)) if together else 1
-    return max(1, min(count, scenes)), threads
-
-
 def _study(prepared: _Prepared, method: Method) -> Evaluation:
-    """Return what evaluates the scenes of a run."""
+    """Return what evaluates the scenes of a run, with its metrics, of which LPIPS's weights may be fetched."""
     settings, folder, name = prepared.settings, prepared.folder, prepared.selected.recipe.name
-    metrics = chosen_metrics(settings.metrics, regions_of(prepared.source))
     label = settings.label or name
     if method.name is not None and label == name:
         label = method.name
     if method.flag:  # marks scores
         name, label = f"{name}_{method.flag}", f"{label} ({method.flag})"
+    metrics = chosen_metrics(settings.metrics, regions_of(prepared.source))
     formats = {metric.name: metric.format for metric in metrics}
     return Evaluation(
         folder,

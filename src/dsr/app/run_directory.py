@@ -1,32 +1,28 @@
 """The directory of a run: named by its configuration, and never overwritten unless the user asks for it.
 
-A name consists of the method or model, the scale, in evaluations the data set, the choices and settings that differ
-from the defaults, and the seed: ``msg_v_x8_w0.72_seed0``. The defaults of a choice's settings are those of its file.
-What a run computes, such as the weight ``w`` for ``loss.w=auto``, is not in its name.
+A name consists of the method or model, the scale, in evaluations the data set, the choices that are not the default,
+the settings that the command line overrides, and the seed: ``msg_v_x8_w0.72_seed0``.
 """
 
 from __future__ import annotations
 
 import contextlib
-import functools
 import hashlib
 import json
 import os
 import re
 import socket
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
-from dsr.app.composition import compose
-from dsr.app.schema import NAMED, Config, Identity, given_keys, plain_config, user_directories
+from dsr.app.schema import NAMED, Config, Identity
 from dsr.app.trust import imported
 from dsr.utils import locks
-from dsr.utils.configuration import ConfigError, config_directories, list_choices
+from dsr.utils.configuration import ConfigError, config_directories
 from dsr.utils.files import TargetError, expect_own, expect_target, write_text
 from dsr.utils.guards import parse_json, read_limited
 from dsr.utils.ratios import round_ratio
@@ -38,13 +34,10 @@ _NO_BITS = ("log_every_n_steps", "profiler", "detect_anomaly", "enable_progress_
 # Keys of a configuration that are not in a run's identity, which has the weights by their content.
 _NOT_IDENTITY = ("output_dir", "overwrite", "metrics", "weights", "resume", "run", "trust", "workers", "threads",
                  "logger")  # fmt: skip
-# Keys that are no settings that differ: they are in each name, or a matter of the machine.
-_ELSEWHERE = (*_NOT_IDENTITY, "names", "scale", "seed", "device", "precision")
-_NO_SETTINGS = ("_target_", "_partial_", "validation_of", "weights_files")
-_REFERENCE = re.compile(r"\$\{([a-z_][\w.]*)\}")  # a value that is that of another key
+# Overrides that a name does not list: what is in it anyway, and what changes no result.
+_IN_NAME = (*NAMED, "names.dataset", "scale", "seed")
+_NOT_NAMED = {*_NOT_IDENTITY, "device"} - {"weights", "run"}
 _LONGEST, _LONGEST_VALUE = 100, 60
-_ABSENT = object()
-_compose = functools.lru_cache(maxsize=256)(compose)  # its result is not to be changed
 
 
 def identity_of(
@@ -66,91 +59,39 @@ def identity_of(
     return {**kept, "device": device.type, "weights_sha256": weights_hash, **code, **more}
 
 
-def default_directory(kind: str, config: Config, identity: Identity) -> Path:
-    """Return outputs/KIND/NAME.
+def default_directory(kind: str, config: Config, identity: Identity, overrides: Sequence[str] = ()) -> Path:
+    """Return outputs/KIND/NAME for a run with these overrides of the command line.
 
     The first eight digits of the identity's hash follow where the name does not say everything, or where the directory
     of that name holds a run of another identity. The same identity gives the same directory.
     """
-    name, complete = _run_name(kind, config, identity)
-    plain = Path("outputs") / kind / name
-    marked = plain.with_name(f"{name}-{_hash_of(identity)[:8]}")
-    return plain if complete and not marked.is_dir() and _changes_in(plain, identity) == [] else marked
+    head = "method" if kind == "eval" else "model"
+    listed: Any = OmegaConf.load(config_directories()[0] / f"{kind}.yaml")
+    usual = {group: name for each in listed["defaults"] if not isinstance(each, str) for group, name in each.items()}
+    parts = [config["names"][head], f"x{round_ratio(config['scale'])}"]
+    for group, name in config["names"].items():
+        if group in usual and group != head and (name != usual[group] or (kind, group) == ("eval", "dataset")):
+            parts.append(name)
+    complete = True
+    for key, _, value in sorted(each.lstrip("+~").partition("=") for each in overrides):
+        if key not in _IN_NAME and (key == "metrics.alignment" or key.partition(".")[0] not in _NOT_NAMED):
+            setting, whole = _setting(key, value)
+            parts.append(setting)
+            complete = complete and whole
+    name = "_".join(map(str, parts))
+    plain = Path("outputs", kind, f"{name[:_LONGEST]}_seed{config['seed']}")
+    marked = plain.with_name(f"{plain.name}-{_hash_of(identity)[:8]}")
+    free = not marked.is_dir() and _changes_in(plain, identity) == []
+    return plain if complete and len(name) <= _LONGEST and free else marked
 
 
-def _run_name(kind: str, config: Config, identity: Identity) -> tuple[str, bool]:
-    """Return the name of a run of ``eval`` or ``train``, and whether it has every setting that is not the default."""
-    head = "method" if "method" in config else "model"
-    places = config_directories(user_directories())
-    listed: Any = OmegaConf.load(places[0] / f"{kind}.yaml")
-    usual = {str(group): str(name) for each in listed["defaults"] if not isinstance(each, str)
-             for group, name in each.items() if group in NAMED and group in config["names"]}  # fmt: skip
-    chosen = {group: str(config["names"][group]) for group in usual}
-    known = [f"{group}={name}" for group, name in chosen.items() if name in list_choices(group, places)]
-    composed = _compose(kind, (*known, f"scale={config['scale']}"), places[1:])
-    names = [name for group, name in chosen.items()
-             if group != head and (name != usual[group] or (kind, group) == ("eval", "dataset"))]  # fmt: skip
-    settings = [_setting(key, value) for key, value in _differing(config, composed, head).items()]
-    if config.get("run") is not None:
-        settings.append((_setting("run", Path(config["run"]).absolute().name)[0], False))
-    elif identity["weights_sha256"] is not None and (
-        config.get("weights") != plain_config(composed).get("weights")
-        or any(key.startswith("method.weights") for key in given_keys())
-    ):
-        settings.append((f"weights-{str(identity['weights_sha256'])[:8]}", True))
-    if "alignment" in identity:
-        settings.append(_setting("alignment", identity["alignment"]))
-    if "precision" in given_keys():
-        settings.append((str(config["precision"]), True))
-    begin = (config["names"][head], f"x{round_ratio(config['scale'])}")
-    name = "_".join((*begin, *names, *(text for text, _ in settings)))
-    complete = len(known) == len(chosen) and all(whole for _, whole in settings) and len(name) <= _LONGEST
-    return f"{name[:_LONGEST]}_seed{config['seed']}", complete
-
-
-def _differing(config: Config, composed: DictConfig, head: str) -> dict[str, Any]:
-    """Return the settings that differ from the defaults, by the last part of their keys if it is the only one.
-
-    The default of a value that is another key's, as in ``${loss.w}``, is what ``config`` has for that key.
-    """
-    found: dict[str, Any] = {}
-    count: Counter[str] = Counter()
-
-    def compare(key: str, value: Any, usual: Any, text: Any) -> None:
-        if isinstance(text, str) and (reference := _REFERENCE.fullmatch(text)):
-            usual = functools.reduce(lambda node, part: node[part], reference[1].split("."), config)
-            if value == usual:
-                return
-        if not isinstance(value, Mapping) or ("." in key and "_target_" not in value):
-            count[key.rpartition(".")[2]] += 1
-            if value != usual and key.rpartition(".")[2] not in _NO_SETTINGS:
-                found[key] = value
-            return
-        for name, inner in value.items():
-            parts = (each.get(name, _ABSENT) if isinstance(each, Mapping) else _ABSENT for each in (usual, text))
-            compare(f"{key}.{name}", inner, *parts)
-
-    skipped = (*_ELSEWHERE, head) if config.get("run") is not None else _ELSEWHERE
-    plain, texts = plain_config(composed), OmegaConf.to_container(composed, resolve=False)
-    for group, node in config.items():
-        if group not in skipped and isinstance(node, Mapping):
-            compare(group, node, plain.get(group, {}), texts.get(group, {}))  # type: ignore[union-attr]
-    ends = {key: key.rpartition(".")[2] for key in found}
-    return {ends[key] if count[ends[key]] == 1 else key: value for key, value in found.items()}
-
-
-def _setting(key: str, value: Any) -> tuple[str, bool]:
-    """Return a setting in short, and whether that is all of it."""
-    if isinstance(value, bool | None):
-        return f"{key}-{'null' if value is None else str(value).lower()}", True
-    if isinstance(value, int | float):
-        return f"{key}{value}", True
-    if isinstance(value, Mapping):
-        return key, False
-    text = value if isinstance(value, str) else "+".join(map(str, value))
-    end = "-".join(Path(text).parts[-2:])
-    short = re.sub(r"[^\w.+-]+", "-", end)[:_LONGEST_VALUE].strip("-")
-    return f"{key}-{short}", short == text
+def _setting(key: str, value: str) -> tuple[str, bool]:
+    """Return an override in short, and whether that is all of it."""
+    text = value.strip("[]\"'").replace(",", "+")
+    short = re.sub(r"[^\w.+-]+", "-", "-".join(Path(text).parts[-2:]))[:_LONGEST_VALUE].strip("-")
+    name = "" if key == "experiment" else key.rpartition(".")[2]
+    joint = "-" if name and short and not short[0].isdigit() else ""
+    return f"{name}{joint}{short}", short == text
 
 
 def _hash_of(identity: Identity) -> str:

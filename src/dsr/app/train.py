@@ -38,7 +38,17 @@ from rich.console import Console
 
 from dsr.app import run_directory as rundir
 from dsr.app.metrics import check_metrics, metric_collection
-from dsr.app.schema import READ_OF_TRAINER, Config, Identity, Plan, TrainConfig, given_keys, plain_config, runs_here
+from dsr.app.schema import (
+    READ_OF_TRAINER,
+    Config,
+    Identity,
+    Plan,
+    TrainConfig,
+    given_keys,
+    given_overrides,
+    plain_config,
+    runs_here,
+)
 from dsr.app.training_runs import WEIGHTS, keyed, read_config, training_data
 from dsr.data.scene_source import prepare_scenes
 from dsr.methods.networks.network import DisparityNetwork
@@ -54,7 +64,7 @@ from dsr.utils.configuration import ConfigError, build, expect_library
 from dsr.utils.console import USAGE_ERROR, ConsoleProgress, one_line, without_credentials
 from dsr.utils.files import replacing
 from dsr.utils.guards import did_you_mean
-from dsr.utils.lightning import ListedScores, StepProgress, ValidationTable, fit, make_trainer, without_chatter
+from dsr.utils.lightning import ScoreTables, StepProgress, fit, make_trainer, without_chatter
 from dsr.utils.progress import Progress
 from dsr.utils.torch_files import expect_stored, read_torch_file
 
@@ -195,13 +205,14 @@ def _prepare(plain: Config, settings: TrainConfig, device: torch.device, process
     check_metrics(settings.metrics)
     module = _module(settings, net, data)
     identity = rundir.identity_of(plain, None, device)
-    folder = Path(settings.output_dir or rundir.default_directory("train", plain, identity)).expanduser()
+    folder = Path(
+        settings.output_dir or rundir.default_directory("train", plain, identity, given_overrides())
+    ).expanduser()
     progress = ConsoleProgress(Console(quiet=processes.rank > 0))
     best = BestCheckpoint(folder / _LAST.parent, MONITOR)
     callbacks = [
         *_own_callbacks(settings, module),
-        ValidationTable(folder / "validation.csv"),
-        ListedScores(best),
+        ScoreTables(folder / "validation.csv", best),
         best,
         StepProgress(progress, "train"),
         Interruption(folder / _LAST),
@@ -324,13 +335,30 @@ def _own_callbacks(settings: TrainConfig, module: SuperResolution) -> list[Callb
 
 def _train(plain: Config, settings: TrainConfig, prepared: _Prepared, processes: Processes) -> float:
     """Train in one of the processes, the first of which has the directory for itself, and return the best score."""
-    folder, first = prepared.folder, processes.rank == 0
+    folder, first, data, module = prepared.folder, processes.rank == 0, prepared.data, prepared.module
     if first:
         rundir.expect_free(folder, plain, prepared.identity, prepared.tolerated)
         if (folder / WEIGHTS).exists() and not settings.overwrite:
             raise ConfigError(f"output_dir: {folder / WEIGHTS} is trained already; overwrite=true trains it again")
-    _announce(settings, prepared, processes.count)
-    _load(prepared)
+    held_out = ", ".join(f"{len(names)} of {kind}" for kind, (_, names) in data.validation_scenes().items())
+    parameters = sum(each.numel() for each in module.net.parameters())
+    patch, several = data.patches.patch, f" x {settings.accumulate} batches" if settings.accumulate > 1 else ""
+    several += f" x {processes.count} devices" if processes.count > 1 else ""
+    logs = (f"tensorboard --logdir {folder}" if name == "tensorboard" else name for name in settings.logger)
+    for line in (
+        f"model  {settings.names['model']} x{settings.scale}, {parameters:,} parameters, {settings.precision}",
+        f"data   {data.training_count} scenes of {settings.names['dataset']} to train on, {held_out} to validate with",
+        f"steps  {settings.steps} of {data.patches.batch} patches of {patch} x {patch}{several}"
+        f"{', resumed' if prepared.resume else ''}",
+        f"log    {', '.join(logs)}",
+    ):
+        prepared.progress.say(line)
+    for source, names in data.used_scenes:
+        prepare_scenes(source, names, prepared.progress)
+    with keyed():
+        data.setup()
+        module.objective = module.objective.balanced(data.first_patches)  # its weights may depend on the scenes
+    prepared.progress.say(f"loss   {module.objective.formula}")
     if not first:
         return _fit(plain, settings, prepared, first=False)
     with rundir.at_work(folder, plain, prepared.identity, alone=True):
@@ -341,35 +369,6 @@ def _train(plain: Config, settings: TrainConfig, prepared: _Prepared, processes:
             for name in ("checkpoints", "tensorboard", "csv", "wandb"):
                 shutil.rmtree(folder / name, ignore_errors=True)
         return _fit(plain, settings, prepared, first=True)
-
-
-def _announce(settings: TrainConfig, prepared: _Prepared, devices: int) -> None:
-    """Show what the run will do."""
-    data, module, patches = prepared.data, prepared.module, prepared.data.patches
-    held_out = ", ".join(f"{len(names)} of {kind}" for kind, (_, names) in data.validation_scenes().items())
-    parameters = sum(each.numel() for each in module.net.parameters())
-    several = f" x {settings.accumulate} batches" if settings.accumulate > 1 else ""
-    several += f" x {devices} devices" if devices > 1 else ""
-    resumed = ", resumed" if prepared.resume else ""
-    logs = (f"tensorboard --logdir {prepared.folder}" if name == "tensorboard" else name for name in settings.logger)
-    for line in (
-        f"model  {settings.names['model']} x{settings.scale}, {parameters:,} parameters, {settings.precision}",
-        f"data   {data.training_count} scenes of {settings.names['dataset']} to train on, {held_out} to validate with",
-        f"steps  {settings.steps} of {patches.batch} patches of {patches.patch} x {patches.patch}{several}{resumed}",
-        f"log    {', '.join(logs)}",
-    ):
-        prepared.progress.say(line)
-
-
-def _load(prepared: _Prepared) -> None:
-    """Prepare and load the scenes, and compute the weights of the loss that depend on them."""
-    data, module = prepared.data, prepared.module
-    for source, names in data.used_scenes:
-        prepare_scenes(source, names, prepared.progress)
-    with keyed():
-        data.setup()
-        module.objective = module.objective.balanced(data.first_patches)
-    prepared.progress.say(f"loss   {module.objective.formula}")
 
 
 def _fit(plain: Config, settings: TrainConfig, prepared: _Prepared, *, first: bool) -> float:

@@ -14,7 +14,7 @@ import math
 import re
 import time
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -198,27 +198,26 @@ def _score(study: Evaluation, scene: str, result: SceneResult) -> None:
     errors = align_errors(errors, given, depth, study.alignment)
     result.notes = tuple(sample.notes)
     result.truth = None if sample.depth is None else f"{zlib.crc32(sample.depth.numpy().tobytes()):08x}"
-    result.rows = [] if sample.depth is None else list(_rows(study, sample, depth, errors))
+    if sample.depth is not None:
+        truth = sample.depth.to(study.device, torch.float64)
+        regions = {name: region.to(study.device) for name, region in sample.regions.items()}
+        stated = None if errors is None else (errors[0].to(study.device), errors[1].to(study.device))
+        scores = score_image(
+            depth.to(study.device, torch.float64),
+            truth,
+            sample.camera.rays(device=study.device),
+            study.metrics,
+            sample.unit,
+            regions=regions,
+            errors=stated,
+        )
+        about = (sample.dataset, sample.scene, round_ratio(sample.scale), study.downsampling_name, study.method_name,
+                 study.seed)  # fmt: skip
+        for each in scores:
+            values = (*about, each.metric, each.variant, each.value, each.valid_share)
+            result.rows.append(dict(zip(SCORE_COLUMNS, values, strict=True)))
     headlines = {row["metric"]: row["value"] for row in result.rows if row["variant"] in HEADLINES}
     study.illustrate(sample, depth, headlines)
-
-
-def _rows(
-    study: Evaluation, sample: DepthSample, depth: Tensor, errors: tuple[Tensor, Tensor] | None
-) -> Iterator[dict[str, Any]]:
-    """Yield the rows of one scene with ground truth."""
-    assert sample.depth is not None  # noqa: S101 - for mypy
-    rays = sample.camera.rays(device=study.device)
-    truth = sample.depth.to(study.device, torch.float64)
-    regions = {name: region.to(study.device) for name, region in sample.regions.items()}
-    stated = None if errors is None else (errors[0].to(study.device), errors[1].to(study.device))
-    depth = depth.to(study.device, torch.float64)
-    about = (
-        sample.dataset, sample.scene, round_ratio(sample.scale), study.downsampling_name, study.method_name, study.seed,
-    )  # fmt: skip
-    for each in score_image(depth, truth, rays, study.metrics, sample.unit, regions=regions, errors=stated):
-        values = (*about, each.metric, each.variant, each.value, each.valid_share)
-        yield dict(zip(SCORE_COLUMNS, values, strict=True))
 
 
 def write_tables(study: Evaluation, results: Mapping[str, SceneResult]) -> pd.DataFrame:

@@ -13,10 +13,11 @@ import functools
 import importlib
 import importlib.util
 import inspect
-import types
-from collections.abc import Callable, Collection, Mapping, Sequence
+import json
+import re
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, get_type_hints
 
 from dsr.utils.guards import did_you_mean
 from dsr.utils.versions import how_to_install
@@ -88,8 +89,8 @@ def _checked(group: str, node: Node, given: Mapping[str, Any], name: str | None)
             raise ConfigError(f"{group}.{key}: {choice} needs it: {group}.{key}=...")
         if value == "":  # which as a path would be the current directory
             raise ConfigError(f"{group}.{key}: expected a text of one character or more, or null for none")
-        if key in hints and not _is_node(value) and not _fits(value, hints[key]):
-            raise ConfigError(f"{group}.{key}: expected {_describe(hints[key])}, got {value!r:.60}")
+        if key in hints and not _is_node(value):
+            _expect_type(f"{group}.{key}", value, hints[key])
     return target, {**arguments, **given}
 
 
@@ -137,41 +138,19 @@ def load_object(key: str, path: Any, what: str) -> Any:
         raise ConfigError(f"{key}: cannot import {path!r} ({error})") from error
 
 
-def _fits(value: Any, hint: Any) -> bool:
-    """Return whether a configuration value is of an annotated type."""
-    origin = get_origin(hint)
-    if origin in (Union, types.UnionType):
-        return any(_fits(value, choice) for choice in get_args(hint))
-    if origin is Literal:
-        return value in get_args(hint)
-    if origin is not None and issubclass(origin, Sequence):
-        return isinstance(value, list) and all(_fits(item, get_args(hint)[0]) for item in value)
-    if origin is not None and issubclass(origin, Mapping):
-        return isinstance(value, Mapping) and all(_fits(item, get_args(hint)[1]) for item in value.values())
-    accepted: Any = {float: (int, float), Path: str, Any: object}.get(hint, hint)
-    if origin is not None or not isinstance(accepted, type | tuple):
-        return origin is not Callable  # which no plain value is; another kind is its target's to check
-    return isinstance(value, accepted) and (hint in (bool, Any) or not isinstance(value, bool))
+def _expect_type(key: str, value: Any, hint: Any) -> None:
+    """Check that a configuration value, which is JSON's, is of an annotated type; a whole number is a number, too."""
+    from pydantic import TypeAdapter, ValidationError  # noqa: PLC0415 - a refused command line needs none
 
-
-def _describe(hint: Any) -> str:
-    """Return a type for a reader."""
-    origin = get_origin(hint)
-    if origin in (Union, types.UnionType):
-        *others, last = (_describe(choice) for choice in get_args(hint))
-        return f"{', '.join(others)} or {last}"
-    if origin is Literal:
-        names = [str(choice) for choice in get_args(hint)]
-        return names[0] if len(names) == 1 else f"one of {', '.join(names)}"
-    if origin is not None and issubclass(origin, Sequence):
-        return f"a list of {_describe(get_args(hint)[0])}"
-    if origin is not None and issubclass(origin, Mapping):
-        return f"keys, each with {_describe(get_args(hint)[1])}"
-    if origin is Callable:
-        return "a node with _target_"
-    types_of = {float: "a number", int: "a whole number", str: "text", bool: "true or false", Any: "a value",
-                type(None): "null"}  # fmt: skip
-    return types_of.get(hint, getattr(hint, "__name__", str(hint)))
+    kind: TypeAdapter[Any] = TypeAdapter(hint, config={"strict": True, "arbitrary_types_allowed": True})
+    try:
+        kind.validate_json(json.dumps(value))
+    except ValidationError as error:
+        reasons = []
+        for each in error.errors():
+            of_node = each["type"] in ("needs_python_object", "callable_type")
+            reasons.append("a node" if of_node else re.sub(r"^\w+ should (be|have) (a valid )?", "", each["msg"]))
+        raise ConfigError(f"{key}: expected {' or '.join(dict.fromkeys(reasons))}, got {value!r:.60}") from error
 
 
 def config_directories(more: Sequence[Path] = ()) -> tuple[Path, ...]:

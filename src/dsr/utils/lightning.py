@@ -31,15 +31,20 @@ _UNITS = {"RMSE_d": " mm", "RMSE_v": "", "DSSIM_v": "", "LPIPS_v": ""}  # of the
 _SECONDS_BETWEEN_LOSSES = 0.2  # between two losses that are shown, each of which waits for the device
 
 
-class ValidationTable(Callback):
-    """Keeps the raw scores of all validations in a file, to the last digit: step, set, metric and value.
+class ScoreTables(Callback):
+    """Keeps the scores of validations: all of them in a file, the best in TensorBoard's table of runs.
 
-    The module's ``validation_scores`` are in metres and fractions, ``shown_scores``, which are logged, in the units of
-    tables; both by set and by metric.
+    The file has the raw values to the last digit: step, set, metric and value. The module's ``validation_scores`` are
+    in metres and fractions, ``shown_scores``, which are logged, in the units of tables; both by set and by metric.
+
+    Args:
+        path: of the file.
+        best: what finds the best validation, before it has seen the one at hand; without it the last one is listed.
+
     """
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, path: Path, best: ModelCheckpoint | None = None) -> None:
+        self._path, self._best = path, best
 
     def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Add the scores of a validation; rows of later steps, from before an interruption, are dropped."""
@@ -54,26 +59,13 @@ class ValidationTable(Callback):
                 for kind, each in scored.validation_scores.items() for name, value in each.items()]  # fmt: skip
         with replacing(self._path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
             csv.writer(file, lineterminator="\n").writerows([("step", "set", "metric", "value"), *kept, *rows])
-
-
-class ListedScores(Callback):
-    """Keeps the scores in TensorBoard's table of runs up to date: of the best validation, or without one the last."""
-
-    def __init__(self, best: ModelCheckpoint | None = None) -> None:
-        self._best = best
-
-    def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Write the scores, unless those of an earlier validation are better."""
-        if trainer.sanity_checking or not trainer.is_global_zero:
-            return
-        scored: Any = pl_module
-        scores = {name: value for name, value in scored.shown_scores.get("val", {}).items() if name in SCORES}
-        best = None if self._best is None else self._best.best_model_score  # so far: checkpoints are the last callbacks
+        best = None if self._best is None else self._best.best_model_score
         if best is not None and trainer.callback_metrics[str(self._best.monitor)] >= best:  # type: ignore[union-attr]
             return
+        scores = {name: value for name, value in scored.shown_scores.get("val", {}).items() if name in SCORES}
         for logger in trainer.loggers:
             if isinstance(logger, TensorBoardLogger):
-                list_scores(logger.experiment, scores, trainer.global_step)
+                list_scores(logger.experiment, scores, step)
 
 
 class StepProgress(Callback):

@@ -37,7 +37,7 @@ from dsr.metrics.classes import compute_means, in_table_units
 from dsr.metrics.functional import SurfacePair, rmse_v
 from dsr.metrics.losses import VisualLossName, lap1, make_visual_loss, match_weight, mse
 from dsr.sample import DepthSample
-from dsr.utils.lightning import ListedScores, StepProgress, ValidationTable, fit, make_trainer
+from dsr.utils.lightning import ScoreTables, StepProgress, fit, make_trainer
 from dsr.utils.progress import Progress, Steps, StepsProgress
 from dsr.utils.runs_table import list_run
 
@@ -156,7 +156,7 @@ class DeepImagePrior(Method):
                 folder = self.workspace / WORKSPACE / sample.scene
                 shutil.rmtree(folder, ignore_errors=True)  # of an interrupted run
                 if module.metrics is not None and self.validate_every:
-                    callbacks += [ValidationTable(folder / "validation.csv"), ListedScores()]
+                    callbacks.append(ScoreTables(folder / "validation.csv"))
                 logger = TensorBoardLogger(folder.parent, name="", version=sample.scene, default_hp_metric=False)
                 settings = {"scene": sample.scene, "dataset": sample.dataset, "scale": self.scale, "w": module.w,
                             "visual": self.visual, "data_loss": self.data_loss, "steps": self.steps,
