@@ -193,9 +193,9 @@ def test_thresholds_are_exceeded_only_beyond_them() -> None:
     target = torch.full((1, 1, 2, 4), 2.0, dtype=torch.float64)
     prediction = target * torch.tensor([1.25, 1.2501, 0.8, 0.7999], dtype=torch.float64)
     pair = SurfacePair(prediction, target, FIELD_CAMERA.crop(0, 0, 2, 4).rays()[None])
-    assert depth.field_errors(pair)["delta1"].item() == 0.5
+    assert depth.field_errors(pair)["Beyond_delta1"].item() == 0.5
     pair = SurfacePair(target + torch.tensor([0.0499, -0.0499, 0.0501, -0.0501]), target, pair.rays)
-    assert depth.field_errors(pair)["5cm"].item() == 0.5
+    assert depth.field_errors(pair)["Beyond_5cm"].item() == 0.5
 
 
 def test_collection_has_the_metrics_of_the_benchmarks_that_it_saw() -> None:

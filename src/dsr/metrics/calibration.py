@@ -24,9 +24,8 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.surface import angle_between, depth_to_normals
-from dsr.metrics.formats import MetricFormat, column
+from dsr.metrics.formats import Metric, MetricFormat, column, depth_mask, normal_mask, target_mask
 from dsr.metrics.functional import SurfacePair, angle, masked_mean
-from dsr.metrics.metric import Metric, depth_mask, normal_mask, target_mask
 
 DEVIATION = math.sqrt(math.pi / 2)  # standard deviation of a Gaussian over its mean absolute value
 STEPS = 100  # steps of a sparsification curve
@@ -150,14 +149,18 @@ _Comparison = Callable[[Tensor, Tensor], Tensor]
 
 def of_depth(pair: SurfacePair, compare: _Comparison) -> Tensor:
     """Return a comparison of the expected and the measured errors of each image's orthogonal depth in metres, (B,)."""
-    assert pair.depth_error is not None  # noqa: S101 - the metric applies
     return _per_image(compare, pair.depth_error, (pair.prediction - pair.target).abs(), pair.depth_mask)
 
 
 def of_normals(pair: SurfacePair, compare: _Comparison) -> Tensor:
     """Return a comparison of the expected and the measured errors of each image's normals in degrees, (B,)."""
-    assert pair.angle_error is not None  # noqa: S101 - the metric applies
     return _per_image(compare, pair.angle_error, angle(pair), pair.normal_mask)
+
+
+def _per_image(compare: _Comparison, expected: Tensor | None, measured: Tensor, mask: Tensor) -> Tensor:
+    assert expected is not None  # noqa: S101 - the metric applies
+    pairs = zip(expected.masked_fill(~mask, torch.nan), measured, strict=True)
+    return torch.stack([compare(*errors) for errors in pairs])
 
 
 def factor_off(expected: Tensor, measured: Tensor) -> Tensor:
@@ -172,37 +175,19 @@ def covered(pair: SurfacePair) -> Tensor:
     return masked_mean(pair.depth_mask & pair.depth_error.isfinite(), pair.target_mask).squeeze(1)
 
 
-def _per_image(compare: _Comparison, expected: Tensor, measured: Tensor, mask: Tensor) -> Tensor:
-    expected = expected.masked_fill(~mask, torch.nan)
-    return torch.stack([compare(*each) for each in zip(expected, measured, strict=True)])
-
-
 def _of_depth(name: str, compare: _Comparison, shown: MetricFormat, unit: str | None = None) -> Metric:
     function = partial(of_depth, compare=compare)
     return Metric(f"Calibration_{name}", function, depth_mask, shown, min_size=1, unit=unit, stated="depth_error")
 
 
+_ause_v = column("AUSE", f"normals, {STEPS} steps", 1, 3)
+_covered = partial(Metric, min_size=1, stated="depth_error", regional=True, whole=True)
 METRICS: tuple[Metric, ...] = (
-    _of_depth("ENCE", ence, column("ENCE", "depth, %", 1e2, 1)),
+    _of_depth("ENCE", ence, column("ENCE", "depth, %", 1e2)),
     _of_depth("AUSE_d", ause, column("AUSE", f"depth, {STEPS} steps", 1, 3)),
-    Metric(
-        "Calibration_AUSE_v",
-        partial(of_normals, compare=ause),
-        normal_mask,
-        column("AUSE", f"normals, {STEPS} steps", 1, 3),
-        stated="angle_error",
-    ),
+    Metric("Calibration_AUSE_v", partial(of_normals, compare=ause), normal_mask, _ause_v, stated="angle_error"),
     _of_depth("AUC_20mm", off_auc, column("AUC", "off by 20 mm", 1, 3, higher_is_better=True), unit="cm"),
     _of_depth("stated", stated_ratio, MetricFormat("Stated", "of true error", position=None)),
     _of_depth("factor", factor_off, column("Stated off", "factor", 1, 2)),
-    Metric(
-        "Calibration_covered",
-        covered,
-        target_mask,
-        column("Covered", "stated, %", 1e2, 1, higher_is_better=True),
-        min_size=1,
-        stated="depth_error",
-        regional=True,
-        whole=True,
-    ),
+    _covered("Calibration_covered", covered, target_mask, column("Covered", "stated, %", 1e2, higher_is_better=True)),
 )

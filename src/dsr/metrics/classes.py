@@ -21,10 +21,9 @@ from torch import Tensor
 from dsr.geometry.camera import Camera
 from dsr.metrics.alignment import align_pair
 from dsr.metrics.catalogue import PROTOCOLS, catalogue
-from dsr.metrics.formats import MetricFormat
+from dsr.metrics.formats import VARIANTS, WORST, Metric, MetricFormat
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS
-from dsr.metrics.metric import VARIANTS, WORST, Metric
 
 
 class PerImageMean(torchmetrics.Metric):

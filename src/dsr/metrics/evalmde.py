@@ -27,9 +27,8 @@ from torch import Tensor
 from dsr.geometry.surface import length
 from dsr.metrics.boundaries import boundary_f1
 from dsr.metrics.depth import covered
-from dsr.metrics.formats import column
+from dsr.metrics.formats import Metric, column, target_mask
 from dsr.metrics.functional import SurfacePair, once_per_pair
-from dsr.metrics.metric import Metric, target_mask
 from dsr.utils.compute_device import in_own_precision
 
 SCALES = (1, 2, 4, 8)

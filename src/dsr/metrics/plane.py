@@ -10,9 +10,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dsr.metrics.formats import column
+from dsr.metrics.formats import Metric, column, depth_mask, target_mask
 from dsr.metrics.functional import SurfacePair, masked_mean, masked_median, once_per_pair
-from dsr.metrics.metric import Metric, depth_mask, target_mask
 from dsr.utils.compute_device import in_own_precision
 
 NEAR = 0.06  # metres between a prediction and the plane up to which it is of the plane
@@ -82,16 +81,9 @@ def covered(pair: SurfacePair) -> Tensor:
     return masked_mean(compare(pair)[0], pair.target_mask).squeeze(1)
 
 
+_covered = column("Covered", "plane, %", 1e2, higher_is_better=True)
 METRICS: tuple[Metric, ...] = (
     Metric("Plane_std", deviation, depth_mask, column("Std", "plane, mm", 1e3, 2), unit="cm"),
-    Metric("Plane_angle", angle, depth_mask, column("Angle", "plane, central, deg", 1, 1), min_size=3),
-    Metric(
-        "Plane_covered",
-        covered,
-        target_mask,
-        column("Covered", "plane, %", 1e2, 1, higher_is_better=True),
-        unit="cm",
-        regional=True,
-        whole=True,
-    ),
+    Metric("Plane_angle", angle, depth_mask, column("Angle", "plane, central, deg"), min_size=3),
+    Metric("Plane_covered", covered, target_mask, _covered, unit="cm", regional=True, whole=True),
 )  # the metrics of metrics=plane

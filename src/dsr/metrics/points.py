@@ -26,12 +26,11 @@ from functools import partial
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
+from dsr.geometry.hole_size import window_maxima
 from dsr.metrics.depth import covered
-from dsr.metrics.formats import column
+from dsr.metrics.formats import Metric, column, depth_mask, target_mask
 from dsr.metrics.functional import SurfacePair, masked_mean, once_per_pair
-from dsr.metrics.metric import Metric, depth_mask, target_mask
 
 EDGE_RATIO = 1.05
 EDGE_RADIUS = 16
@@ -39,14 +38,11 @@ FLYING = 0.01  # distance of a flying pixel from every true point, as a fraction
 
 
 def nearest(points: Tensor, valid: Tensor, cloud: Tensor, known: Tensor) -> Tensor:
-    """Return the distance of each point from the nearest one of another cloud, exactly, by a k-d tree on the CPU.
+    """Return the distance of each valid point (B, 3, H, W) from the nearest known one of a cloud (B, 3, H, W), exactly.
 
-    Points and cloud are (B, 3, H, W), ``valid`` and ``known`` (B, 1, H, W) bool the points that there are. The
-    distances, (B, 1, H, W), are 0 where there is no point, and infinite where there is no other one.
+    The distances, (B, 1, H, W), are 0 where there is no point, and infinite where there is no other one.
     """
     distances = torch.zeros_like(points[:, :1])
-    if points.is_meta:  # values are needed, and there are none
-        return distances
     for found, *image in zip(distances, points, valid, cloud, known, strict=True):
         own, has, other, there = (each.detach().cpu() for each in image)
         tree = cKDTree(other[:, there[0]].T.double().numpy(), balanced_tree=False, compact_nodes=False)
@@ -57,15 +53,10 @@ def nearest(points: Tensor, valid: Tensor, cloud: Tensor, known: Tensor) -> Tens
 
 @once_per_pair
 def distances(pair: SurfacePair) -> tuple[Tensor, Tensor]:
-    """Return the distances of the predicted points from the true cloud, and of the true ones from the predicted cloud.
-
-    They are (B, 1, H, W) in metres, 0 without a point.
-    """
+    """Return the distances in metres of the predicted points from the true cloud, and the other way, (B, 1, H, W)."""
     predicted, true = pair.prediction * pair.rays, pair.given[1] * pair.rays
-    return (
-        nearest(predicted, pair.depth_mask, true, pair.target_mask),
-        nearest(true, pair.target_mask, predicted, pair.depth_mask),
-    )
+    to_truth = nearest(predicted, pair.depth_mask, true, pair.target_mask)
+    return to_truth, nearest(true, pair.target_mask, predicted, pair.depth_mask)
 
 
 def chamfer(pair: SurfacePair) -> Tensor:
@@ -92,36 +83,23 @@ def flying(pair: SurfacePair) -> Tensor:
         sides = truth.narrow(dim, 0, size), truth.narrow(dim, 1, size)
         near, far = torch.minimum(*sides), torch.maximum(*sides)
         edge = far > EDGE_RATIO * near  # false where one is NaN
+        near, far = torch.where(edge, near, torch.inf), torch.where(edge, far, 0)
         for start in (0, 1):
-            part = front.narrow(dim, start, size)
-            part.copy_(torch.where(edge, torch.minimum(part, near), part))
-            part = back.narrow(dim, start, size)
-            part.copy_(torch.where(edge, torch.maximum(part, far), part))
-    for window, padding in (((1, 2 * EDGE_RADIUS + 1), (0, EDGE_RADIUS)), ((2 * EDGE_RADIUS + 1, 1), (EDGE_RADIUS, 0))):
-        front = -max_pool2d(-front, window, stride=1, padding=padding)
-        back = max_pool2d(back, window, stride=1, padding=padding)
+            beside = front.narrow(dim, start, size), back.narrow(dim, start, size)
+            beside[0].copy_(torch.minimum(beside[0], near))
+            beside[1].copy_(torch.maximum(beside[1], far))
+    front, back = -window_maxima(-front, EDGE_RADIUS), window_maxima(back, EDGE_RADIUS)
     between = (front < pair.prediction) & (pair.prediction < back)
     return masked_mean(between & (distances(pair)[0] > FLYING * pair.prediction), pair.depth_mask).squeeze(1)
 
 
+_fraction = partial(column, factor=1e2, digits=2, higher_is_better=True)
+_of_points = partial(Metric, min_size=1, unit="cm", whole=True)
 METRICS: tuple[Metric, ...] = (
-    Metric(
-        "Points_flying",
-        flying,
-        depth_mask,
-        column("Flying", "1 % of depth, %", 1e2, 2),
-        min_size=1,
-        unit="cm",
-        regional=False,  # the outlines of a region's objects are edges of what lies outside
-        whole=True,
-    ),
-    *(
-        Metric(f"Points_{name}", function, target_mask, shown, min_size=1, unit="cm", whole=True)
-        for name, function, shown in (
-            ("chamfer", chamfer, column("Chamfer", "mm", 1e3, 2)),
-            ("F_1cm", partial(f_score, threshold=0.01), column("F at 1 cm", "%", 1e2, 2, higher_is_better=True)),
-            ("F_5cm", partial(f_score, threshold=0.05), column("F at 5 cm", "%", 1e2, 2, higher_is_better=True)),
-            ("covered", covered, column("Covered", "points, %", 1e2, 1, higher_is_better=True)),
-        )
-    ),
+    # not of regions: the outlines of a region's objects are edges of what lies outside
+    _of_points("Points_flying", flying, depth_mask, column("Flying", "1 % of depth, %", 1e2, 2), regional=False),
+    _of_points("Points_chamfer", chamfer, target_mask, column("Chamfer", "mm", 1e3, 2)),
+    _of_points("Points_F_1cm", partial(f_score, threshold=0.01), target_mask, _fraction("F at 1 cm", "%")),
+    _of_points("Points_F_5cm", partial(f_score, threshold=0.05), target_mask, _fraction("F at 5 cm", "%")),
+    _of_points("Points_covered", covered, target_mask, _fraction("Covered", "points, %", digits=1)),
 )

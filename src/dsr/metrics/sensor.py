@@ -10,15 +10,14 @@ leaving out what is difficult, so the fraction of scored pixels, ``Sensor_covere
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 
 import torch
 from torch import Tensor
 
-from dsr.metrics.formats import MetricFormat, column
-from dsr.metrics.functional import SSIM_WINDOW, SurfacePair, angle, masked_mean, masked_median, once_per_pair, ssim_map
-from dsr.metrics.metric import Metric, part_of
+from dsr.metrics import functional
+from dsr.metrics.formats import Metric, column, of_parts
+from dsr.metrics.functional import SSIM_WINDOW, SurfacePair, angle, masked_mean, masked_median, once_per_pair
 
 TRUTH_EROSION = 3
 PREDICTION_EROSION = 1
@@ -49,10 +48,7 @@ class SensorComparison:
         )
 
 
-@once_per_pair
-def compare(pair: SurfacePair) -> SensorComparison:
-    """Return the comparison of a pair."""
-    return SensorComparison(pair)
+compare = once_per_pair(SensorComparison)
 
 
 def erode(mask: Tensor, steps: int) -> Tensor:
@@ -84,11 +80,8 @@ def sensor_errors(pair: SurfacePair) -> dict[str, Tensor]:
 
 def dssim_v(pair: SurfacePair) -> Tensor:
     """Return DSSIM_v over the scored pixels per light, (B, 4), see :func:`dsr.metrics.functional.dssim_v`."""
-    comparison = compare(pair)
     border = SSIM_WINDOW // 2  # no scored pixel is so close to it
-    scored = comparison.scored[..., border:-border, border:-border]
-    lights = zip(*(maps.unbind(1) for maps in comparison.surfaces.renderings), strict=True)
-    return torch.cat([1 - masked_mean(ssim_map(x, y)[:, None], scored) for x, y in lights], dim=1)
+    return functional.dssim_v(compare(pair).surfaces, compare(pair).scored[..., border:-border, border:-border])
 
 
 def _inner(pair: SurfacePair) -> Tensor:
@@ -99,24 +92,14 @@ def _scored(pair: SurfacePair) -> Tensor:
     return compare(pair).scored
 
 
-def _error(name: str, shown: MetricFormat, mask: Callable[[SurfacePair], Tensor] = _scored) -> Metric:
-    return Metric(f"Sensor_{name}", partial(part_of, function=sensor_errors, part=name), mask, shown, whole=True)
-
-
+_errors = partial(of_parts, "Sensor_", sensor_errors, whole=True)
+_angles = {"angle_mean": column("Angle", "mean, deg"), "angle_median": column("Angle", "median, deg")}
+_offsets = {"offset": column("Offset", "mm", 1e3, 2), "RMSE_d": column("RMSE_d", "sensor, mm", 1e3, 2)}
+_dssim = column("DSSIM_v", "sensor, 1/1000", 1e3, 0)
 METRICS: tuple[Metric, ...] = (
-    _error("RMSE_v", column("RMSE_v", "sensor, 1/1000", 1e3, 0)),
-    Metric(
-        "Sensor_DSSIM_v",
-        dssim_v,
-        _scored,
-        column("DSSIM_v", "sensor, 1/1000", 1e3, 0),
-        per_light=True,
-        min_size=SSIM_WINDOW,
-        whole=True,
-    ),
-    _error("angle_mean", column("Angle", "mean, deg", 1, 1)),
-    _error("angle_median", column("Angle", "median, deg", 1, 1)),
-    _error("covered", column("Covered", "%", 1e2, 1, higher_is_better=True), _inner),
-    _error("offset", column("Offset", "mm", 1e3, 2)),
-    _error("RMSE_d", column("RMSE_d", "sensor, mm", 1e3, 2)),
+    *_errors(_scored, {"RMSE_v": column("RMSE_v", "sensor, 1/1000", 1e3, 0)}),
+    Metric("Sensor_DSSIM_v", dssim_v, _scored, _dssim, per_light=True, min_size=SSIM_WINDOW, whole=True),
+    *_errors(_scored, _angles),
+    *_errors(_inner, {"covered": column("Covered", "%", 1e2, higher_is_better=True)}),
+    *_errors(_scored, _offsets),
 )  # the metrics of metrics=sensor
