@@ -147,20 +147,6 @@ def test_planarity_of_planes_is_exact() -> None:
     assert flatness == pytest.approx(0.01, rel=1e-2)
 
 
-def test_scores_of_a_batch_are_those_of_its_images() -> None:
-    maps = [holed(), steps(1)]
-    maps[1][0][5:9, 10:50] = np.nan
-    batch = pair_of(*(np.stack(each) for each in zip(*maps, strict=True)))
-    for metric in METRICS:
-        singles = torch.cat([metric.function(pair_of(*each)) for each in maps])
-        torch.testing.assert_close(metric.function(batch), singles, msg=metric.name)
-    planes = {"planes": torch.ones(2, 1, 120, 160, dtype=torch.uint8)}
-    found = boundaries.planarity(batch.replaced(regions=planes))
-    for index, each in enumerate(maps):
-        single = boundaries.planarity(pair_of(*each).replaced(regions={"planes": planes["planes"][:1]}))
-        torch.testing.assert_close({name: value[index : index + 1] for name, value in found.items()}, single)
-
-
 def test_holes_of_a_prediction_miss_the_edges_there_and_are_reported() -> None:
     _, truth = steps()
     prediction = truth.copy()
@@ -174,13 +160,6 @@ def test_holes_of_a_prediction_miss_the_edges_there_and_are_reported() -> None:
     assert part["DBE_completeness"] > full["DBE_completeness"] == 0
     assert part["DepthPro_ceiling"] == full["DepthPro_ceiling"]
     assert part["Boundary_covered"] == pytest.approx(1 - 30 * 60 / truth.size)
-
-
-def test_images_without_truth_have_no_score() -> None:
-    prediction, truth = (torch.from_numpy(each)[None] for each in steps())
-    rows = list(score_image(prediction, torch.full_like(truth, torch.nan), CAMERA.rays(), METRICS))
-    assert len(rows) == len(METRICS)
-    assert all(math.isnan(row.value) and row.valid_share == 0 for row in rows)
 
 
 @pytest.mark.parametrize("size", list(itertools.product((1, 2, 3, 6, 7), (1, 8))))

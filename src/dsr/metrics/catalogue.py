@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dsr.metrics import boundaries, calibration, depth, evalmde, functional, plane, points, sensor
+from dsr.metrics import boundaries, calibration, depth, evalmde, functional, points, sensor
 from dsr.metrics.formats import Metric, MetricFormat, depth_mask, normal_mask
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS, MIN_SIZE, lpips_v
@@ -37,62 +37,49 @@ def _bad_pixels(percent: int, unit: str, shown: str, position: int | None = None
     return Metric(f"BadPix_d_{percent}{unit}", function, depth_mask, form, min_size=1)
 
 
-_thousandths = partial(MetricFormat, unit="1/1000", factor=1e3, digits=0)
+_by_light = partial(Metric, per_light=True)
+_visual = partial(MetricFormat, unit="1/1000", factor=1e3, digits=0)
+_windows, _curvatures = attrgetter("ssim_mask"), attrgetter("bumpiness_mask")
 # the paper's metrics in the order of scores.csv; those with a position are the columns of its tables
 METRICS: tuple[Metric, ...] = (
     Metric("RMSE_d", functional.rmse_d, depth_mask, MetricFormat("RMSE_d", "mm", 1e3, 1, position=1), min_size=1),
     *(_bad_pixels(percent, "cm", "cm", 2 if percent == 5 else None) for percent in (1, 5, 10)),
     *(_bad_pixels(percent, "pct", "% of depth") for percent in (1, 5, 10)),
     *(
-        Metric(
+        _by_light(
             f"BadPix_v_{level}",
             partial(functional.bad_pix_v, threshold=level),
             normal_mask,
             MetricFormat("BadPix_v", f"{level}, %", 1e2, 1, position=3 if level == 5 else None),
-            per_light=True,
         )
         for level in (1, 5, 10)
     ),
+    _by_light("DSSIM_v", functional.dssim_v, _windows, _visual("DSSIM_v", position=4), min_size=functional.SSIM_WINDOW),
+    _by_light("LPIPS_v", lpips_v, normal_mask, _visual("LPIPS_v", position=5), min_size=MIN_SIZE, perceptual=True),
+    Metric("RMSE_v", functional.rmse_v, normal_mask, _visual("RMSE_v", position=7)),
+    _by_light("RMSE_v1", functional.rmse_v1, normal_mask, _visual("RMSE_v1", position=None)),
     Metric(
-        "DSSIM_v",
-        functional.dssim_v,
-        attrgetter("ssim_mask"),
-        _thousandths("DSSIM_v", position=4),
-        per_light=True,
-        min_size=functional.SSIM_WINDOW,
-    ),
-    Metric(
-        "LPIPS_v",
-        lpips_v,
-        normal_mask,
-        _thousandths("LPIPS_v", position=5),
-        per_light=True,
-        min_size=MIN_SIZE,
-        perceptual=True,
-    ),
-    Metric("RMSE_v", functional.rmse_v, normal_mask, _thousandths("RMSE_v", position=7)),
-    Metric("RMSE_v1", functional.rmse_v1, normal_mask, _thousandths("RMSE_v1", position=None), per_light=True),
-    Metric(
-        "Bumpiness_d",
-        functional.bumpiness_d,
-        attrgetter("bumpiness_mask"),
-        MetricFormat("Bump_d", digits=2, position=6),
-        min_size=3,
+        "Bumpiness_d", functional.bumpiness_d, _curvatures, MetricFormat("Bump_d", digits=2, position=6), min_size=3
     ),
 )
-_FAMILIES = {
-    "depth": depth.DEPTH,
-    "normals": depth.NORMALS,
-    "points": points.METRICS,
-    "evalmde": evalmde.METRICS,
-    "boundaries": boundaries.METRICS,
-    "calibration": calibration.METRICS,
-    "plane": plane.METRICS,
+
+
+def _family(name: str, metrics: Sequence[Metric]) -> tuple[Metric, ...]:
+    return tuple(replace(metric, format=replace(metric.format, family=name)) for metric in metrics)
+
+
+PROTOCOLS: Mapping[str, tuple[Metric, ...]] = {
+    "paper": METRICS,
+    "field": depth.FIELD,
+    "sensor": sensor.SENSOR,
+    "depth": _family("depth", depth.DEPTH),
+    "normals": _family("normals", depth.NORMALS),
+    "points": _family("points", points.METRICS),
+    "evalmde": _family("evalmde", evalmde.METRICS),
+    "boundaries": _family("boundaries", boundaries.METRICS),
+    "calibration": _family("calibration", calibration.METRICS),
+    "plane": _family("plane", sensor.PLANE),
 }
-# sets of metrics by name; the paper's, those that the field prints and those for real sensors share a table
-PROTOCOLS: dict[str, tuple[Metric, ...]] = {"paper": METRICS, "field": depth.FIELD, "sensor": sensor.METRICS}
-for _name, _metrics in _FAMILIES.items():
-    PROTOCOLS[_name] = tuple(replace(each, format=replace(each.format, family=_name)) for each in _metrics)
 KNOWN_FORMATS = {metric.name: metric.format for metric in METRICS}
 
 

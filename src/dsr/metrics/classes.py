@@ -42,6 +42,7 @@ class PerImageMean(torchmetrics.Metric):
     is_differentiable = False
     full_state_update = False
     applied: Tensor  # whether the metric is for all pairs, or was for one so far
+    total: Tensor
     count: Tensor
 
     def __init__(self, metric: Metric | str, variant: str = WORST, **settings: Any) -> None:
@@ -53,15 +54,15 @@ class PerImageMean(torchmetrics.Metric):
             metric = known[metric]
         if variant not in VARIANTS:
             raise ValueError(f"variant: expected one of {', '.join(VARIANTS)}, got {variant!r}")
-        self._metric = metric
-        named = metric.worst if variant == WORST else variant
-        self._variant = named if metric.per_light else ""
-        self._total = f"total_{metric.name}_{self._variant}"  # else compute groups merge metrics of equal first values
-        self.add_state(self._total, torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
+        self._metric, self._variant = metric, ""
+        if metric.per_light:
+            self._variant = metric.worst if variant == WORST else variant
+        applied = torch.tensor(metric.unit is metric.region is metric.stated is None)
+        self.add_state("total", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
         self.add_state("count", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
-        self.add_state(
-            "applied", torch.tensor(metric.unit is metric.region is metric.stated is None), dist_reduce_fx="max"
-        )
+        self.add_state("applied", applied, dist_reduce_fx="max")
+        # a state of its own name, without which compute groups merge metrics whose first values are equal
+        self.add_state(f"of_{metric.name}_{self._variant}", torch.zeros(()), dist_reduce_fx="sum")
 
     @property
     def format(self) -> MetricFormat:
@@ -96,13 +97,12 @@ class PerImageMean(torchmetrics.Metric):
         self.applied = torch.ones_like(self.applied)
         values = self._metric.variants(pair)[self._variant]
         valid = pair.target_mask.flatten(1).any(dim=1)
-        setattr(self, self._total, getattr(self, self._total) + torch.where(valid, values, 0).sum().to(self.count))
+        self.total = self.total + torch.where(valid, values, 0).sum().to(self.total)
         self.count = self.count + valid.sum().to(self.count)
 
     def compute(self) -> Tensor:
         """Return the mean, NaN where no image could be scored."""
-        total: Tensor = getattr(self, self._total)
-        return total / self.count
+        return self.total / self.count
 
     def plot(self, val: Any = None, ax: Any = None) -> Any:
         """Plot a value, or several in a row; of matplotlib's axes, None for new ones."""
@@ -164,10 +164,7 @@ def visual_metrics(
     alignment: str = "none",
     **settings: Any,
 ) -> SurfaceMetrics:
-    """Return all metrics of some protocols, each of the worst of four lights, as one collection.
-
-    Perceptual metrics need the network; ``alignment`` is that of :class:`SurfaceMetrics`.
-    """
+    """Return the metrics of :func:`dsr.metrics.catalogue.catalogue`, of the worst of four lights, as one collection."""
     chosen = catalogue(network, extra, protocols)
     metrics: dict[str, Any] = {metric.name: PerImageMean(metric, **settings) for metric in chosen}
     return SurfaceMetrics(metrics, alignment=alignment, compute_groups=False)
@@ -185,6 +182,6 @@ def compute_means(metrics: torchmetrics.MetricCollection) -> dict[str, Tensor]:
 
 
 def in_table_units(metrics: torchmetrics.MetricCollection, means: Mapping[str, float]) -> dict[str, float]:
-    """Return means of metrics of a collection of :func:`visual_metrics`, by name, in the units of tables."""
+    """Return means of a collection of :func:`visual_metrics`, by name, in the units of tables."""
     collection: Any = metrics
     return {name: value * collection[name].format.factor for name, value in means.items()}

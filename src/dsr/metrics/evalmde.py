@@ -1,18 +1,15 @@
 """RelNormal and SAWA-H of EvalMDE, and the parts of SAWA-H singly.
 
 Wu et al., *Toward a Better Understanding of Monocular Depth Evaluation* (arXiv 2510.19814); princeton-vl/EvalMDE
-ea9e21c, ``evalmde/metrics`` (``rel_normal.py``, ``sawa_h.py``, ``standard.py``, ``boundary.py``), ``evalmde/utils``
-(``depth.py``, ``downsample.py``). SAWA-H is a sum of errors, weighted to agree with human judgment; lower is better:
+ea9e21c, ``evalmde/metrics`` and ``evalmde/utils``. SAWA-H is a sum of errors, weighted to agree with human judgment:
 
     SAWA-H = 3.65 wkdr + 0.18 beyond_disparity + 0.01 beyond_depth + 0.20 (1 - boundary F1) + 1.94 RelNormal
 
-What differs from their code: WKDR is of all pairs of pixels, of which theirs draws 10^7 without a seed, so that SAWA-H
-scatters by 3e-4 there; Sobol points are in 64 bits, theirs in 32 bits move RelNormal by 6e-7 on their example.
+WKDR is of all pairs of pixels, of which theirs draws 10^7 without a seed; Sobol points are in 64 bits, not 32.
 
 Pixels without a truth are left out. Holes of a prediction count as errors: pi in RelNormal, as theirs do; a pair of
-pixels in the wrong order; beyond the ratio; no edges where the truth has some. (Their other parts take the depth there
-to be 1 m.) Only false edges are spared by holes, so ``EvalMDE_covered``, the fraction of the true pixels that have a
-prediction, belongs to every score.
+pixels in the wrong order; beyond the ratio; no edges where the truth has some. Only false edges are spared by holes,
+so ``EvalMDE_covered`` belongs to every score.
 """
 
 from __future__ import annotations
@@ -32,8 +29,7 @@ from dsr.metrics.functional import SurfacePair, once_per_pair
 from dsr.utils.compute_device import in_own_precision
 
 SCALES = (1, 2, 4, 8)
-# pixels: the largest distance of two normals along each axis at scale 1, and the smallest such limit at any scale
-RADIUS, SMALLEST_RADIUS = 32, 3
+RADIUS, SMALLEST_RADIUS = 32, 3  # pixels: limits of the distance of two normals along each axis, at scale 1 and at any
 PAIRS = 10**6
 CHUNK = 1 << 15  # how many points or pairs are worked on at a time
 STEEPEST = 1e-5  # sine of the angle between the two edges of a triangle below which it has no normal
@@ -47,9 +43,8 @@ def rel_normal(pair: SurfacePair) -> Tensor:
     """Return RelNormal, (B,) in radians, the mean error of the angle between two normals; lower is better.
 
     At each of four scales, 10^6 pairs of pixels up to 32 pixels of scale 1 apart, and the mean of the scales' means. At
-    a coarser scale each block has the depth of the pixel with a truth that is nearest to its centre. Normals are of the
-    triangle of a pixel and those two to the right and two below. A pair counts if the truth has both normals, as an
-    error of pi if the prediction has not.
+    a coarser scale each block has the depth of the pixel with a truth that is nearest to its centre. A pair counts if
+    the truth has both normals, as an error of pi if the prediction has not.
     """
     shape, found = pair.target.shape, []
     target = torch.where(pair.target_mask, pair.given[1], 1)
@@ -66,8 +61,7 @@ def rel_normal(pair: SurfacePair) -> Tensor:
 def nearest_to_centres(mask: Tensor, scale: int) -> Tensor:
     """Return which pixel stands for each block: the set one nearest to its centre, the first of equally near ones.
 
-    The mask is (B, 1, H, W) bool; blocks of ``scale`` pixels at the lower and right border may be smaller. Returns
-    indices into the flattened map, (B, ceil(H / scale), ceil(W / scale)) int64; of any pixel where none is set.
+    Indices into the flattened mask (B, 1, H, W), (B, ceil(H / scale), ceil(W / scale)); of any pixel where none is set.
     """
     (height, width), device = mask.shape[-2:], mask.device
     padded = torch.nn.functional.pad(mask, (0, -width % scale, 0, -height % scale))
@@ -86,8 +80,7 @@ def nearest_to_centres(mask: Tensor, scale: int) -> Tensor:
 def sobol_pairs(height: int, width: int, device: torch.device) -> list[Tensor]:
     """Return the pairs of normals that RelNormal compares, for each scale (2, 10^6) int32 indices into its normal map.
 
-    They are the first of an unscrambled Sobol sequence in four dimensions inside the map (position, offset), sorted
-    by the first index, so that what is read lies together.
+    They are the first of an unscrambled Sobol sequence in four dimensions inside the map (position, offset), sorted.
     """
     engine, found = torch.quasirandom.SobolEngine(4), []
     draws: list[Tensor] = []
@@ -114,7 +107,7 @@ def wkdr(pair: SurfacePair) -> Tensor:
     """Return the fraction of pairs of pixels that the prediction has in another order, (B,), lower is better.
 
     Of all ordered pairs (i, j) of pixels with a truth, those for which only one map has depth i < depth j, and those
-    with a hole of the prediction. It is 1 less the accuracy of the authors' code, which has no weights.
+    with a hole of the prediction.
     """
     from scipy.stats import kendalltau  # noqa: PLC0415 - it takes half a second to import
 
@@ -137,16 +130,13 @@ def wkdr(pair: SurfacePair) -> Tensor:
 
 @once_per_pair
 def beyond_disparity(pair: SurfacePair) -> Tensor:
-    """Return the fraction of pixels with a ratio to the true depth of 1.25^.125 or more, (B,), lower is better.
-
-    The prediction's inverse depth is first fitted to the true one by a factor and an offset, by least squares.
-    """
+    """Return the fraction of pixels with a ratio to the true depth of 1.25^.125 or more, (B,), after a fit of 1 / z."""
     return _beyond(pair, 1 / _aligned(pair, 1 / pair.prediction, 1 / pair.target))
 
 
 @once_per_pair
 def beyond_depth(pair: SurfacePair) -> Tensor:
-    """Return the same as :func:`beyond_disparity` with depth itself fitted to the true depth, (B,), lower is better."""
+    """Return the fraction as of :func:`beyond_disparity`, after a fit of z, (B,)."""
     return _beyond(pair, _aligned(pair, pair.prediction, pair.target))
 
 
@@ -197,7 +187,7 @@ def _pair_error(rows: Tensor, first: Tensor, second: Tensor) -> Tensor:
 
 
 def _aligned(pair: SurfacePair, values: Tensor, target: Tensor) -> Tensor:
-    """Return values with the factor and offset that fit them best to a target, clamped, (B, 1, H, W) in 64 bits."""
+    """Return values with the factor and offset of least squares to a target, clamped, (B, 1, H, W) in 64 bits."""
     weights = pair.depth_mask.double()
     count = weights.sum(dim=(2, 3), keepdim=True)
     values, target = values.double(), target.double()

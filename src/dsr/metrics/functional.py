@@ -4,13 +4,8 @@ Voynov et al., *Perceptual Deep Depth Super-Resolution*, ICCV 2019, section 3, w
 tables. Lower is better throughout; units are metres and fractions. A :class:`SurfacePair` computes what several
 metrics use (masks, perspective depths, normals, renderings) once, on first access.
 
-    pair = SurfacePair(prediction, target, camera.rays()[None])
-    rmse_v(pair)      # (B,)
-    dssim_v(pair)     # (B, 4), lights e1..e4
-
-Masks: a pixel is valid if both depths are; a normal, if all pixels that it is computed from are. Invalid pixels are
-left out of every mean, and are 0 in both renderings inside windows that contain them. An image without a valid pixel
-gets NaN.
+A pixel is valid if both depths are; a normal, if all pixels that it is computed from are. Invalid pixels are left out
+of every mean, and are 0 in both renderings inside windows that contain them. An image without a valid pixel gets NaN.
 """
 
 from __future__ import annotations
@@ -181,7 +176,7 @@ class SurfacePair:
     @cached_property
     def perspective_error(self) -> Tensor:
         """(B, 1, H, W) absolute difference of the perspective depths in metres; 0 where invalid."""
-        return (self.prediction - self.target).abs() * self.ray_lengths * self.depth_mask
+        return (self.prediction - self.target).abs() * self.ray_lengths
 
     @cached_property
     def ssim_mask(self) -> Tensor:
@@ -258,7 +253,7 @@ def bumpiness_d(pair: SurfacePair) -> Tensor:
     """
     difference = (BUMPINESS_DISPARITY * (1 / pair.prediction - 1 / pair.target)).to(pair.image_dtype)
     squares = torch.zeros_like(difference)
-    for first in _scharr(difference * pair.depth_mask):
+    for first in _scharr(difference):
         for second in _scharr(first):
             squares = squares + second.square()
     return 100 * masked_mean(squares.sqrt().clamp(max=BUMPINESS_CLIP), pair.bumpiness_mask).squeeze(1)

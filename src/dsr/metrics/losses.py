@@ -57,17 +57,13 @@ def lap1(prediction: Tensor, target: Tensor, *, levels: int = 3, complete: bool 
     """
     difference, valid = _difference(prediction, target, complete)
     weight = None if valid is None else valid.to(difference.dtype)
-    kernel, terms = _kernel(difference.dtype, difference.device), []
-
-    def reduce(x: Tensor) -> Tensor:  # (B, 1, H, W) -> (B, 1, ceil(H / 2), ceil(W / 2))
-        return functional.conv2d(functional.pad(x, (2, 2, 2, 2), mode="replicate"), kernel, stride=2)
-
+    total = difference.new_zeros(len(difference))
     for _ in range(levels - 1):
-        size, level = difference.shape[-2:], reduce(difference)
-        detail = difference - _blur(level, size) / _blurred_ones(level.shape[-2:], size, level.dtype, level.device)
-        terms.append(_mean(detail.abs(), weight))
-        difference, weight = level, None if weight is None else reduce(weight)
-    return functools.reduce(torch.add, [*terms, _mean(difference.abs(), weight)])
+        lower, size = _reduce(difference), difference.shape[-2:]
+        detail = difference - _blur(lower, size) / _blur(torch.ones_like(lower[:1]), size)
+        total = total + _mean(detail.abs(), weight)
+        difference, weight = lower, None if weight is None else _reduce(weight)
+    return total + _mean(difference.abs(), weight)
 
 
 def _difference(prediction: Tensor, target: Tensor, complete: bool | None) -> tuple[Tensor, Tensor | None]:
@@ -88,6 +84,12 @@ def _mean(values: Tensor, weight: Tensor | None) -> Tensor:
     return values.sum(dim=_PIXELS) / weight.sum(dim=_PIXELS)
 
 
+def _reduce(values: Tensor) -> Tensor:
+    """Blur (B, 1, H, W) and keep every second row and column."""
+    kernel = _kernel(values.dtype, values.device)
+    return functional.conv2d(functional.pad(values, (2, 2, 2, 2), mode="replicate"), kernel, stride=2)
+
+
 def _blur(level: Tensor, size: Sequence[int]) -> Tensor:
     """Insert zeros between the pixels of a level up to the size of the level before, and blur."""
     extra = [full - 2 * half + 1 for full, half in zip(size, level.shape[-2:], strict=True)]
@@ -95,15 +97,8 @@ def _blur(level: Tensor, size: Sequence[int]) -> Tensor:
     return functional.conv_transpose2d(level, kernel, stride=2, padding=2, output_padding=extra)
 
 
-@functools.lru_cache(maxsize=64)
-@torch.inference_mode(mode=False)  # so that gradients can be computed with them
-def _blurred_ones(size: Sequence[int], larger: Sequence[int], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Return what normalises :func:`_blur`, (1, 1, *larger)."""
-    return _blur(torch.ones(1, 1, *size, dtype=dtype, device=device), larger)
-
-
 @functools.cache
-@torch.inference_mode(mode=False)
+@torch.inference_mode(mode=False)  # so that gradients can be computed with it
 def _kernel(dtype: torch.dtype, device: torch.device) -> Tensor:
     """Return the binomial kernel, (1, 1, 5, 5)."""
     taps = torch.tensor((1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16), dtype=dtype, device=device)

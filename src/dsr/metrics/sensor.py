@@ -1,11 +1,14 @@
-"""Metrics of refined depth maps of real sensors, against a ground truth that is also measured.
+"""Metrics of depth maps of real sensors: against a ground truth that is also measured, and of a board.
 
-Neither map is perfect: the sensor has a constant bias, which is not shape, the truth ends at ragged borders, and a few
-pixels of either belong to another surface. Therefore the scored pixels are those at least four pixels away from unknown
-truth, and two away from unknown predictions and from those more than 0.1 m off; distances are counted along rows and
-columns. The median difference over them is subtracted from the prediction, and normals and renderings are compared as
-in the paper's metrics, with unknown pixels replaced by the truth's median depth. A method must not look better for
-leaving out what is difficult, so the fraction of scored pixels, ``Sensor_covered``, belongs to every score.
+- ``metrics=sensor``: neither map is perfect. The sensor has a constant bias, which is not shape, the truth ends at
+  ragged borders, and a few pixels of either belong to another surface. Therefore the scored pixels are those at least
+  four pixels away from unknown truth, and two away from unknown predictions and from those more than 0.1 m off, along
+  rows and columns. The median difference over them is subtracted from the prediction, and normals and renderings are
+  compared as in the paper's metrics, with unknown pixels replaced by the truth's median depth.
+- ``metrics=plane``: the plane of a board is the ground truth, known within its outline alone. The median difference is
+  subtracted, and pixels more than 60 mm off belong to another surface.
+
+``Sensor_covered`` and ``Plane_covered``, the fractions of scored pixels, belong to every score.
 """
 
 from __future__ import annotations
@@ -16,12 +19,14 @@ import torch
 from torch import Tensor
 
 from dsr.metrics import functional
-from dsr.metrics.formats import Metric, column, of_parts
+from dsr.metrics.formats import Metric, column, depth_mask, of_parts, target_mask
 from dsr.metrics.functional import SSIM_WINDOW, SurfacePair, angle, masked_mean, masked_median, once_per_pair
+from dsr.utils.compute_device import in_own_precision
 
 TRUTH_EROSION = 3
 PREDICTION_EROSION = 1
 LARGEST_ERROR = 0.1  # metres; a prediction further off is another surface, not a shape of this one
+NEAR = 0.06  # the same of a board
 
 
 class SensorComparison:
@@ -92,14 +97,75 @@ def _scored(pair: SurfacePair) -> Tensor:
     return compare(pair).scored
 
 
+@once_per_pair
+def compare_board(pair: SurfacePair) -> tuple[Tensor, Tensor]:
+    """Return the pixels of the board, and prediction - truth less its median in metres, 0 elsewhere; (B, 1, H, W)."""
+    difference = pair.prediction - pair.target
+    off = difference - masked_median(difference, pair.depth_mask)
+    scored = pair.depth_mask & (off.abs() < NEAR)
+    return scored, torch.where(scored, off, 0)
+
+
+def board_deviation(pair: SurfacePair) -> Tensor:
+    """Return the standard deviation of depth about the plane in metres, (B,); lower is better."""
+    scored, off = compare_board(pair)
+    mean = masked_mean(off, scored)[..., None, None]
+    return masked_mean((off - mean).square(), scored).sqrt().squeeze(1)
+
+
+@in_own_precision
+def board_angle(pair: SurfacePair) -> Tensor:
+    """Return the mean angle between the normals, by differences over two pixels, and the plane's, (B,) in degrees."""
+    points = pair.given[0] * pair.rays
+    along_u, along_v = torch.full_like(points, torch.nan), torch.full_like(points, torch.nan)
+    along_u[..., 1:-1] = points[..., 2:] - points[..., :-2]
+    along_v[..., 1:-1, :] = points[..., 2:, :] - points[..., :-2, :]
+    normals = torch.linalg.cross(along_u, along_v, dim=1)
+    normals = normals / normals.norm(dim=1, keepdim=True)
+    board = pair.given[1] * pair.rays
+    true = torch.stack([plane_normal(each[:, mask[0]].T) for each, mask in zip(board, pair.target_mask, strict=True)])
+    cosine = torch.einsum("bchw,bc->bhw", normals, true.to(normals))[:, None].abs().clamp(max=1)
+    angles = torch.rad2deg(cosine.acos())
+    return masked_mean(angles, compare_board(pair)[0] & angles.isfinite()).squeeze(1)
+
+
+def plane_normal(points: Tensor) -> Tensor:
+    """Return the normal of the plane through points (N, 3), (3,), of least squares along the axis that it faces most.
+
+    NaN for points in a line.
+    """
+    centred = points - points.mean(dim=0)
+    moments = centred.T @ centred
+    others = torch.tensor([[1, 2], [0, 2], [0, 1]], device=points.device)
+    minors = torch.stack([moments[each][:, each] for each in others])
+    sizes = torch.linalg.det(minors)
+    axis = int(sizes.argmax())
+    if len(points) < 3 or not sizes[axis] > 0:
+        return points.new_full((3,), torch.nan)
+    normal = points.new_ones(3)
+    normal[others[axis]] = -torch.linalg.solve(minors[axis], moments[others[axis], axis])
+    return normal / normal.norm()
+
+
+def board_covered(pair: SurfacePair) -> Tensor:
+    """Return the fraction of the board's pixels where the prediction is of the board, (B,); higher is better."""
+    return masked_mean(compare_board(pair)[0], pair.target_mask).squeeze(1)
+
+
 _errors = partial(of_parts, "Sensor_", sensor_errors, whole=True)
 _angles = {"angle_mean": column("Angle", "mean, deg"), "angle_median": column("Angle", "median, deg")}
 _offsets = {"offset": column("Offset", "mm", 1e3, 2), "RMSE_d": column("RMSE_d", "sensor, mm", 1e3, 2)}
 _dssim = column("DSSIM_v", "sensor, 1/1000", 1e3, 0)
-METRICS: tuple[Metric, ...] = (
+SENSOR: tuple[Metric, ...] = (
     *_errors(_scored, {"RMSE_v": column("RMSE_v", "sensor, 1/1000", 1e3, 0)}),
     Metric("Sensor_DSSIM_v", dssim_v, _scored, _dssim, per_light=True, min_size=SSIM_WINDOW, whole=True),
     *_errors(_scored, _angles),
     *_errors(_inner, {"covered": column("Covered", "%", 1e2, higher_is_better=True)}),
     *_errors(_scored, _offsets),
-)  # the metrics of metrics=sensor
+)
+_board_covered = column("Covered", "plane, %", 1e2, higher_is_better=True)
+PLANE: tuple[Metric, ...] = (
+    Metric("Plane_std", board_deviation, depth_mask, column("Std", "plane, mm", 1e3, 2), unit="cm"),
+    Metric("Plane_angle", board_angle, depth_mask, column("Angle", "plane, central, deg"), min_size=3),
+    Metric("Plane_covered", board_covered, target_mask, _board_covered, unit="cm", regional=True, whole=True),
+)
