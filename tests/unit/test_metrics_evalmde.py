@@ -75,9 +75,10 @@ def test_affine_maps_of_depth_and_of_disparity_are_fitted() -> None:
     _, truth = steps()
     truth = 3 * truth.astype(float) - 5
     of_depth, of_disparity = pair_of(0.3 * truth + 0.7, truth), pair_of(1 / (0.4 / truth + 0.1), truth)
-    assert evalmde.beyond_depth(of_depth).item() == evalmde.beyond_disparity(of_disparity).item() == 0
-    assert evalmde.beyond_depth(of_disparity).item() > 0
-    assert evalmde.beyond_disparity(of_depth).item() > 0
+    depth, disparity = _scores(of_depth), _scores(of_disparity)
+    assert depth["beyond_depth"] == disparity["beyond_disparity"] == 0
+    assert depth["beyond_disparity"] > 0
+    assert disparity["beyond_depth"] > 0
 
 
 def test_two_tilted_halves_have_the_angle_between_them() -> None:

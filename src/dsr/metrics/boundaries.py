@@ -47,10 +47,7 @@ def known_maps(pair: SurfacePair) -> tuple[Tensor, Tensor]:
 
 
 def count_edges(first: Tensor, second: Tensor) -> Tensor:
-    """Return how many ratios are above each of :data:`RATIOS`, (B, 3, T): in the first map, in the second, in both.
-
-    The two (B, ...) are ratios of the same pairs of pixels in two maps; NaN is below.
-    """
+    """Return how many ratios (B, ...) are above each of :data:`RATIOS`, (B, 3, T): in one map, the other, both."""
     images, steps = len(first), len(RATIOS) + 1
     first, second = first.flatten(1), second.flatten(1)
     image, place = ((first > RATIOS[0]) | (second > RATIOS[0])).nonzero(as_tuple=True)  # the others are above none
@@ -127,8 +124,7 @@ def depth_boundary_error(found: Tensor, true: Tensor, quantile: float | None = N
 
     The accuracy is the mean distance of found boundaries to true ones, (B, 1, H, W) bool, of those less than
     :data:`DBE_RANGE` away; the completeness that of true boundaries to found ones, without limit. Both are that range
-    where no boundary is found within it, and NaN without true ones. Others' copies limit the completeness, too, or use
-    thresholds of .15 and .3. A ``quantile`` of the distances may take the place of their mean.
+    where no boundary is found within it, and NaN without true ones. ``quantile`` replaces the mean.
     """
     from scipy.ndimage import distance_transform_edt  # noqa: PLC0415 - as above
 
@@ -164,8 +160,7 @@ def boundary_errors(pair: SurfacePair) -> dict[str, Tensor]:
 def directed_depth_error(pair: SurfacePair) -> dict[str, Tensor]:
     """Return iBims-1's directed depth error about a plane at 3 m, three fractions of pixels, (B,) each.
 
-    They are on the right side, in front of it though the truth is not, and beyond it though the truth is not. Their
-    code overwrites depths by 0 and 1 before it has compared all of them, so that planes nearer than 1 m came out wrong.
+    They are on the right side, in front of it though the truth is not, and beyond it though the truth is not.
     """
     before, truly = pair.prediction <= DDE_PLANE, pair.target <= DDE_PLANE
     parts = {"right": before == truly, "before": before & ~truly, "beyond": ~before & truly}

@@ -1,11 +1,7 @@
-"""torchmetrics classes of the paper's metrics: the mean over images, by default of the worst of four lights.
+"""torchmetrics classes of the metrics: the mean over images, by default of the worst of four lights.
 
-    DSSIMv()(preds, target, camera)                     # the value of this batch
-    metrics = visual_metrics(network)                   # a MetricCollection
-    metrics.update(preds, target, camera)               # or a SurfacePair
-    metrics.compute()                                   # {"RMSE_d": ..., "DSSIM_v": ..., ...}
-
-Masks, normals and renderings are computed once for all the metrics of such a collection, by the pair.
+They are updated with (prediction, target, camera) or with a SurfacePair; a collection computes masks, normals and
+renderings once for all of its metrics.
 """
 
 from __future__ import annotations
@@ -21,7 +17,7 @@ from torch import Tensor
 from dsr.geometry.camera import Camera
 from dsr.metrics.alignment import align_pair
 from dsr.metrics.catalogue import PROTOCOLS, catalogue
-from dsr.metrics.formats import VARIANTS, WORST, Metric, MetricFormat
+from dsr.metrics.formats import VARIANTS, WORST, Metric
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS
 
@@ -57,6 +53,7 @@ class PerImageMean(torchmetrics.Metric):
         self._metric, self._variant = metric, ""
         if metric.per_light:
             self._variant = metric.worst if variant == WORST else variant
+        self.format, self.chart_title = metric.format, metric.format.chart_title(by_light=metric.per_light)
         applied = torch.tensor(metric.unit is metric.region is metric.stated is None)
         self.add_state("total", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
         self.add_state("count", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
@@ -65,19 +62,9 @@ class PerImageMean(torchmetrics.Metric):
         self.add_state(f"of_{metric.name}_{self._variant}", torch.zeros(()), dist_reduce_fx="sum")
 
     @property
-    def format(self) -> MetricFormat:
-        """How tables and figures show the metric."""
-        return self._metric.format
-
-    @property
-    def chart_title(self) -> str:
-        """The title of a chart of the metric."""
-        return self.format.chart_title(by_light=self._metric.per_light)
-
-    @property
     def higher_is_better(self) -> bool:  # type: ignore[override]  # torchmetrics has a constant per class
         """Whether larger values are better."""
-        return self._metric.format.higher_is_better
+        return self.format.higher_is_better
 
     @torch.no_grad()
     def update(
@@ -87,10 +74,7 @@ class PerImageMean(torchmetrics.Metric):
         camera: Camera | Sequence[Camera] | Tensor | np.ndarray | None = None,
         mask: Tensor | np.ndarray | None = None,
     ) -> None:
-        """Add a batch, as for :meth:`dsr.metrics.functional.SurfacePair.of`.
-
-        A pair of another benchmark than the metric's, or without the expected errors that it compares, is left out.
-        """
+        """Add a batch, as for :meth:`dsr.metrics.functional.SurfacePair.of`, unless the metric is not for it."""
         pair = SurfacePair.of(preds, target, camera, mask)
         if not self._metric.applies(pair):
             return

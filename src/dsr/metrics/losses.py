@@ -1,9 +1,8 @@
 """Losses on depth maps and on renderings: one value per image, masked, differentiable.
 
 On depth: Lap_1 of Bojanowski et al., *Optimizing the Latent Space of Generative Networks*, ICML 2018, L1 and MSE. On
-renderings, with the metrics' own kernels: MSE_v (Voynov et al. 2019), and DSSIM_v and LPIPS_v to compare it with. As
-metrics, DSSIM_v and LPIPS_v are the worst of four lights; as losses they are the mean over the lights, because the
-gradient of a maximum is that of one light alone. MSE_v has no lights: it is the same for any three orthonormal ones.
+renderings, with the metrics' own kernels: MSE_v (Voynov et al. 2019), and DSSIM_v and LPIPS_v to compare it with, as
+means over the lights in place of the worst, because the gradient of a maximum is that of one light alone.
 """
 
 from __future__ import annotations
@@ -25,8 +24,8 @@ from dsr.utils.console import one_line
 
 VisualLossName = Literal["mse_v", "dssim", "lpips"]
 _PIXELS = (-3, -2, -1)
-_TITLES = {"mse_v": "MSE_v", "dssim": "DSSIM_v", "lpips": "LPIPS_v"}
-_MIN_SIZES = {"mse_v": 2, "dssim": SSIM_WINDOW, "lpips": MIN_SIZE}
+# titles of the visual losses, and the smallest height and width in pixels that they are defined for
+_VISUAL = {"mse_v": ("MSE_v", 2), "dssim": ("DSSIM_v", SSIM_WINDOW), "lpips": ("LPIPS_v", MIN_SIZE)}
 
 
 @in_own_precision
@@ -48,12 +47,10 @@ def mse(prediction: Tensor, target: Tensor, *, complete: bool | None = None) -> 
 
 @in_own_precision
 def lap1(prediction: Tensor, target: Tensor, *, levels: int = 3, complete: bool | None = None) -> Tensor:
-    """Return the Laplacian pyramid loss Lap_1 per pixel, (B,), as :func:`l1`.
+    """Return the Laplacian pyramid loss Lap_1 per pixel, (B,), as :func:`l1`: eq. 2, the sum of the levels' means.
 
-    Eq. 2 is the sum over levels j of 2^(2 j) |L^j(x) - L^j(y)|_1. As level j has 2^(2 j) times fewer pixels, this per
-    pixel is the sum of the levels' mean absolute differences; the last level is the low-pass. The pyramid is linear, so
-    it is built of the difference, which is 0 in holes; each level weights a pixel by the valid fraction of its area.
-    The shorter side has at least 3 * 2^(levels - 1) pixels.
+    The pyramid is linear, so it is built of the difference, which is 0 in holes; each level weights a pixel by the
+    valid fraction of its area. The shorter side has at least 3 * 2^(levels - 1) pixels.
     """
     difference, valid = _difference(prediction, target, complete)
     weight = None if valid is None else valid.to(difference.dtype)
@@ -114,8 +111,8 @@ class VisualLoss:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        if self.name not in _TITLES:
-            raise ValueError(f"visual: expected one of {', '.join(_TITLES)}, got {self.name!r}")
+        if self.name not in _VISUAL:
+            raise ValueError(f"visual: expected one of {', '.join(_VISUAL)}, got {self.name!r}")
         if self.name == "lpips" and self.network is None:
             raise ValueError("visual: expected a network for lpips, got none")
 
@@ -129,15 +126,13 @@ class VisualLoss:
     @property
     def title(self) -> str:
         """Name of the metric."""
-        return _TITLES[self.name]
+        return _VISUAL[self.name][0]
 
     def check_size(self, height: int, width: int) -> None:
         """Raise a ValueError for maps that are smaller than the loss is defined for."""
-        least = _MIN_SIZES[self.name]
+        least, came = _VISUAL[self.name][1], f"got {height} x {width}"
         if min(height, width) < least:
-            raise ValueError(
-                f"visual: {self.name} expects maps of at least {least} x {least} pixels, got {height} x {width}"
-            )
+            raise ValueError(f"visual: {self.name} expects maps of at least {least} x {least} pixels, {came}")
 
 
 MSE_V = VisualLoss()

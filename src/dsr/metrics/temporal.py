@@ -39,8 +39,7 @@ def flicker(depths: Tensor, static: Tensor | None = None) -> Tensor:
     positive. A pixel counts if it has a depth in two frames or more. ``static``, (1, 1, H, W) bool, are the pixels
     where nothing moves. A fraction, (); NaN if no pixel counts.
     """
-    spread, mask = _spread(depths, static)
-    return masked_mean(spread, mask).squeeze()
+    return masked_mean(*_spread(depths, static)).squeeze()
 
 
 @in_own_precision
