@@ -103,7 +103,7 @@ def sobol_pairs(height: int, width: int, device: torch.device) -> list[Tensor]:
 
 
 def wkdr(pair: SurfacePair) -> Tensor:
-    """Return the fraction of ordered pairs (i, j) of pixels with a truth that the prediction has in another order, (B,).
+    """Return the fraction of ordered pairs (i, j) of true pixels that the prediction has in another order, (B,).
 
     These are the pairs for which only one map has depth i < depth j, and those with a hole of the prediction.
     """
