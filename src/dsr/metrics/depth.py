@@ -74,11 +74,12 @@ def field_errors(pair: SurfacePair) -> dict[str, Tensor]:
 
 @once_per_pair
 def normal_errors(pair: SurfacePair) -> dict[str, Tensor]:
-    """Return the mean and median angle in degrees and the fractions below some angles, (B,) each."""
+    """Return the mean and median angle in degrees, the fractions below some angles, and the coverage, (B,) each."""
     angles, mask = angle(pair), pair.normal_mask
     found = {"mean": masked_mean(angles, mask), "median": masked_median(angles, mask)}
     for name, degrees in _WITHIN.items():
         found[name] = masked_mean(angles < degrees, mask)
+    found["covered"] = masked_mean(mask, true_normal_mask(pair))
     return {name: value.flatten() for name, value in found.items()}
 
 
@@ -90,11 +91,6 @@ def covered(pair: SurfacePair) -> Tensor:
 def true_normal_mask(pair: SurfacePair) -> Tensor:
     """Return the pixels with a true normal."""
     return mask_of_normals(pair.target_mask)
-
-
-def normals_covered(pair: SurfacePair) -> Tensor:
-    """Return the fraction of the true normals that have a predicted one."""
-    return masked_mean(pair.normal_mask, true_normal_mask(pair)).squeeze(1)
 
 
 _fraction = partial(column, factor=1e2, higher_is_better=True)
@@ -126,10 +122,11 @@ _field = {
     "Beyond_delta1": column("Beyond", "1.25 x, %", 1e2, 2),
 }
 _levels = {"RMSE_levels": column("RMSE", "levels", digits=3), "MAE_levels": column("MAE", "levels", digits=3)}
-_everywhere = partial(Metric, regional=True, whole=True)
+_covered = _fraction("Covered", "%")
+_normals_covered = {"covered": _fraction("Covered", "normals, %")}
 DEPTH = (
     *of_parts("Depth_", depth_errors, depth_mask, _depth, min_size=1, unit="cm"),
-    _everywhere("Depth_covered", covered, target_mask, _fraction("Covered", "%"), min_size=1, unit="cm"),
+    Metric("Depth_covered", covered, target_mask, _covered, min_size=1, unit="cm", regional=True, whole=True),
 )
 FIELD = (
     *of_parts("", field_errors, depth_mask, _field, min_size=1, unit="cm"),
@@ -137,5 +134,5 @@ FIELD = (
 )
 NORMALS = (
     *of_parts("Normal_", normal_errors, normal_mask, _normal),
-    _everywhere("Normal_covered", normals_covered, true_normal_mask, _fraction("Covered", "normals, %")),
+    *of_parts("Normal_", normal_errors, true_normal_mask, _normals_covered, regional=True, whole=True),
 )

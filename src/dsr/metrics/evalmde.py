@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.surface import length
-from dsr.metrics.boundaries import boundary_f1
+from dsr.metrics.boundaries import depth_pro_scores
 from dsr.metrics.depth import covered
 from dsr.metrics.formats import column, of_parts, target_mask
 from dsr.metrics.functional import SurfacePair, once_per_pair
@@ -138,7 +138,7 @@ def evalmde_errors(pair: SurfacePair) -> dict[str, Tensor]:
         "WKDR": wkdr(pair),
         "beyond_disparity": _beyond(pair, 1 / _aligned(pair, 1 / z, 1 / t)),
         "beyond_depth": _beyond(pair, _aligned(pair, z, t)),
-        "boundary": 1 - boundary_f1(pair),
+        "boundary": 1 - depth_pro_scores(pair)["F1"],
     }
     weighted = [weight * parts[name].double() for name, weight in WEIGHTS.items()]
     return {"SAWA_H": torch.stack(weighted).sum(dim=0), **parts, "covered": covered(pair)}

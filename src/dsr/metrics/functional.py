@@ -267,10 +267,10 @@ def angle(pair: SurfacePair) -> Tensor:
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
     """Return the mean over the last two axes of ``values`` (B, C, H, W) where ``mask`` (B, 1, H, W) is set, (B, C)."""
+    values = values if values.is_floating_point() else values.double()
     if known_true(mask):
-        return values.mean(dim=(-2, -1)) if values.is_floating_point() else values.double().mean(dim=(-2, -1))
-    total = torch.where(mask, values, 0).sum(dim=(-2, -1), dtype=None if values.is_floating_point() else torch.float64)
-    return total / mask.sum(dim=(-2, -1))
+        return values.mean(dim=(-2, -1))
+    return torch.where(mask, values, 0).sum(dim=(-2, -1)) / mask.sum(dim=(-2, -1))
 
 
 def masked_median(values: Tensor, mask: Tensor) -> Tensor:

@@ -28,13 +28,32 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from dsr.geometry.hole_size import window_maxima
-from dsr.metrics.depth import covered
-from dsr.metrics.formats import Metric, column, depth_mask, target_mask
+from dsr.metrics.formats import Metric, column, depth_mask, of_parts, target_mask
 from dsr.metrics.functional import SurfacePair, masked_mean, once_per_pair
 
 EDGE_RATIO = 1.05
 EDGE_RADIUS = 16
 FLYING = 0.01  # distance of a flying pixel from every true point, as a fraction of its depth
+
+
+@once_per_pair
+def point_errors(pair: SurfacePair) -> dict[str, Tensor]:
+    """Return the errors of the points by name, (B,) each; NaN without a predicted point."""
+    predicted, true = pair.prediction * pair.rays, pair.given[1] * pair.rays
+    to_truth = nearest(predicted, pair.depth_mask, true, pair.target_mask)
+    to_prediction = nearest(true, pair.target_mask, predicted, pair.depth_mask)
+    flying = between_edges(pair) & (to_truth > FLYING * pair.prediction)
+    found = {
+        "flying": masked_mean(flying, pair.depth_mask),
+        "chamfer": (masked_mean(to_truth, pair.depth_mask) + masked_mean(to_prediction, pair.target_mask)) / 2,
+        "covered": masked_mean(pair.depth_mask, pair.target_mask),
+    }
+    for name, threshold in (("F_1cm", 0.01), ("F_5cm", 0.05)):
+        precision = masked_mean(to_truth < threshold, pair.depth_mask)
+        recall = masked_mean(to_prediction < threshold, pair.target_mask)
+        score = 2 * precision * recall / (precision + recall)
+        found[name] = torch.where(precision + recall == 0, 0, score)
+    return {name: value.squeeze(1) for name, value in found.items()}
 
 
 def nearest(points: Tensor, valid: Tensor, cloud: Tensor, known: Tensor) -> Tensor:
@@ -51,31 +70,8 @@ def nearest(points: Tensor, valid: Tensor, cloud: Tensor, known: Tensor) -> Tens
     return distances
 
 
-@once_per_pair
-def distances(pair: SurfacePair) -> tuple[Tensor, Tensor]:
-    """Return the distances in metres of the predicted points from the true cloud, and the other way, (B, 1, H, W)."""
-    predicted, true = pair.prediction * pair.rays, pair.given[1] * pair.rays
-    to_truth = nearest(predicted, pair.depth_mask, true, pair.target_mask)
-    return to_truth, nearest(true, pair.target_mask, predicted, pair.depth_mask)
-
-
-def chamfer(pair: SurfacePair) -> Tensor:
-    """Return the Chamfer distance in metres, (B,); lower is better. NaN without a predicted point."""
-    to_truth, to_prediction = distances(pair)
-    return (masked_mean(to_truth, pair.depth_mask) + masked_mean(to_prediction, pair.target_mask)).squeeze(1) / 2
-
-
-def f_score(pair: SurfacePair, threshold: float) -> Tensor:
-    """Return the F-score at a threshold in metres, (B,), 0 to 1; higher is better. NaN without a predicted point."""
-    to_truth, to_prediction = distances(pair)
-    precision = masked_mean(to_truth < threshold, pair.depth_mask)
-    recall = masked_mean(to_prediction < threshold, pair.target_mask)
-    score = 2 * precision * recall / (precision + recall)
-    return torch.where(precision + recall == 0, 0, score).squeeze(1)
-
-
-def flying(pair: SurfacePair) -> Tensor:
-    """Return the fraction of the predicted points that fly between two surfaces, (B,); lower is better."""
+def between_edges(pair: SurfacePair) -> Tensor:
+    """Return whether a prediction is between the front and the back of the true edges around it, (B, 1, H, W) bool."""
     truth = torch.where(pair.target_mask, pair.given[1], torch.nan)
     front, back = torch.full_like(truth, torch.inf), torch.zeros_like(truth)  # of the true edges at a pixel
     for dim in (-1, -2):
@@ -89,17 +85,21 @@ def flying(pair: SurfacePair) -> Tensor:
             beside[0].copy_(torch.minimum(beside[0], near))
             beside[1].copy_(torch.maximum(beside[1], far))
     front, back = -window_maxima(-front, EDGE_RADIUS), window_maxima(back, EDGE_RADIUS)
-    between = (front < pair.prediction) & (pair.prediction < back)
-    return masked_mean(between & (distances(pair)[0] > FLYING * pair.prediction), pair.depth_mask).squeeze(1)
+    return (front < pair.prediction) & (pair.prediction < back)
 
 
-_fraction = partial(column, factor=1e2, digits=2, higher_is_better=True)
-_of_points = partial(Metric, min_size=1, unit="cm", whole=True)
+_points = partial(of_parts, "Points_", point_errors, min_size=1, unit="cm", whole=True)
+_fraction = partial(column, factor=1e2, higher_is_better=True)
 METRICS: tuple[Metric, ...] = (
     # not of regions: the outlines of a region's objects are edges of what lies outside
-    _of_points("Points_flying", flying, depth_mask, column("Flying", "1 % of depth, %", 1e2, 2), regional=False),
-    _of_points("Points_chamfer", chamfer, target_mask, column("Chamfer", "mm", 1e3, 2)),
-    _of_points("Points_F_1cm", partial(f_score, threshold=0.01), target_mask, _fraction("F at 1 cm", "%")),
-    _of_points("Points_F_5cm", partial(f_score, threshold=0.05), target_mask, _fraction("F at 5 cm", "%")),
-    _of_points("Points_covered", covered, target_mask, _fraction("Covered", "points, %", digits=1)),
+    *_points(depth_mask, {"flying": column("Flying", "1 % of depth, %", 1e2, 2)}, regional=False),
+    *_points(
+        target_mask,
+        {
+            "chamfer": column("Chamfer", "mm", 1e3, 2),
+            "F_1cm": _fraction("F at 1 cm", "%", digits=2),
+            "F_5cm": _fraction("F at 5 cm", "%", digits=2),
+            "covered": _fraction("Covered", "points, %"),
+        },
+    ),
 )

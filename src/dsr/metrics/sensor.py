@@ -106,27 +106,31 @@ def compare_board(pair: SurfacePair) -> tuple[Tensor, Tensor]:
     return scored, torch.where(scored, off, 0)
 
 
-def board_deviation(pair: SurfacePair) -> Tensor:
-    """Return the standard deviation of depth about the plane in metres, (B,); lower is better."""
+@once_per_pair
+@in_own_precision
+def board_errors(pair: SurfacePair) -> dict[str, Tensor]:
+    """Return the scores of a board by name, (B,) each.
+
+    ``std`` is the standard deviation of depth about the plane in metres, ``angle`` the mean angle between the normals,
+    by differences over two pixels, and the plane's in degrees, ``covered`` the fraction of pixels of the board.
+    """
     scored, off = compare_board(pair)
     mean = masked_mean(off, scored)[..., None, None]
-    return masked_mean((off - mean).square(), scored).sqrt().squeeze(1)
-
-
-@in_own_precision
-def board_angle(pair: SurfacePair) -> Tensor:
-    """Return the mean angle between the normals, by differences over two pixels, and the plane's, (B,) in degrees."""
-    points = pair.given[0] * pair.rays
+    points, board = pair.given[0] * pair.rays, pair.given[1] * pair.rays
     along_u, along_v = torch.full_like(points, torch.nan), torch.full_like(points, torch.nan)
     along_u[..., 1:-1] = points[..., 2:] - points[..., :-2]
     along_v[..., 1:-1, :] = points[..., 2:, :] - points[..., :-2, :]
     normals = torch.linalg.cross(along_u, along_v, dim=1)
     normals = normals / normals.norm(dim=1, keepdim=True)
-    board = pair.given[1] * pair.rays
     true = torch.stack([plane_normal(each[:, mask[0]].T) for each, mask in zip(board, pair.target_mask, strict=True)])
     cosine = torch.einsum("bchw,bc->bhw", normals, true.to(normals))[:, None].abs().clamp(max=1)
     angles = torch.rad2deg(cosine.acos())
-    return masked_mean(angles, compare_board(pair)[0] & angles.isfinite()).squeeze(1)
+    found = {
+        "std": masked_mean((off - mean).square(), scored).sqrt(),
+        "angle": masked_mean(angles, scored & angles.isfinite()),
+        "covered": masked_mean(scored, pair.target_mask),
+    }
+    return {name: value.squeeze(1) for name, value in found.items()}
 
 
 def plane_normal(points: Tensor) -> Tensor:
@@ -147,11 +151,6 @@ def plane_normal(points: Tensor) -> Tensor:
     return normal / normal.norm()
 
 
-def board_covered(pair: SurfacePair) -> Tensor:
-    """Return the fraction of the board's pixels where the prediction is of the board, (B,); higher is better."""
-    return masked_mean(compare_board(pair)[0], pair.target_mask).squeeze(1)
-
-
 _errors = partial(of_parts, "Sensor_", sensor_errors, whole=True)
 _angles = {"angle_mean": column("Angle", "mean, deg"), "angle_median": column("Angle", "median, deg")}
 _offsets = {"offset": column("Offset", "mm", 1e3, 2), "RMSE_d": column("RMSE_d", "sensor, mm", 1e3, 2)}
@@ -163,9 +162,10 @@ SENSOR: tuple[Metric, ...] = (
     *_errors(_inner, {"covered": column("Covered", "%", 1e2, higher_is_better=True)}),
     *_errors(_scored, _offsets),
 )
-_board_covered = column("Covered", "plane, %", 1e2, higher_is_better=True)
+_board = partial(of_parts, "Plane_", board_errors)
+_board_covered = {"covered": column("Covered", "plane, %", 1e2, higher_is_better=True)}
 PLANE: tuple[Metric, ...] = (
-    Metric("Plane_std", board_deviation, depth_mask, column("Std", "plane, mm", 1e3, 2), unit="cm"),
-    Metric("Plane_angle", board_angle, depth_mask, column("Angle", "plane, central, deg"), min_size=3),
-    Metric("Plane_covered", board_covered, target_mask, _board_covered, unit="cm", regional=True, whole=True),
+    *_board(depth_mask, {"std": column("Std", "plane, mm", 1e3, 2)}, unit="cm"),
+    *_board(depth_mask, {"angle": column("Angle", "plane, central, deg")}, min_size=3),
+    *_board(target_mask, _board_covered, unit="cm", regional=True, whole=True),
 )
