@@ -11,6 +11,7 @@ import importlib.metadata
 import socket
 import warnings
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -43,7 +44,7 @@ class LPIPS(nn.Module):
     mean: Tensor
     std: Tensor
 
-    def __init__(self, trunk: dict[str, Tensor]) -> None:
+    def __init__(self, trunk: dict[str, Any]) -> None:
         super().__init__()
         self.convolutions = nn.ModuleDict(
             {str(i): skip_init(nn.Conv2d, a, b, k, stride=s, padding=p) for i, (a, b, k, s, p) in _CONVOLUTIONS.items()}
