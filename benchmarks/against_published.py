@@ -24,8 +24,8 @@ from dsr.methods.networks.weight_files import read_header
 from dsr.methods.recipe import Known, Run, read_recipe
 from dsr.methods.weights import packaged_weights
 from dsr.metrics.catalogue import Metric, catalogue, score_image
+from dsr.metrics.formats import WORST
 from dsr.metrics.lpips import load_lpips
-from dsr.metrics.metric import WORST
 
 SCENES = ("lucy", "plant")
 METRICS = ("RMSE_v", "DSSIM_v", "BadPix_v_5", "Bumpiness_d", "LPIPS_v", "RMSE_d")

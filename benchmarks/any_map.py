@@ -39,7 +39,7 @@ from dsr.geometry.surface import angle_between, depth_to_normals
 from dsr.methods.networks.facets_method import AnyMap, Edges
 from dsr.methods.networks.weight_files import read_header
 from dsr.metrics.catalogue import PROTOCOLS, score_image
-from dsr.metrics.metric import WORST
+from dsr.metrics.formats import WORST
 from dsr.sample import DepthSample
 
 SCALES = [4, 8]

@@ -30,7 +30,7 @@ from dsr.inference import upsampler
 from dsr.io.images import read_numbers
 from dsr.methods.recipe import read_recipe
 from dsr.metrics.catalogue import PROTOCOLS, score_image
-from dsr.metrics.metric import WORST
+from dsr.metrics.formats import WORST
 from dsr.pictures.depth_views import Window
 from dsr.sample import DepthSample, Scene
 

@@ -79,8 +79,7 @@ from dsr.metrics import functional
 from dsr.metrics.boundaries import depth_boundaries, depth_boundary_error
 from dsr.metrics.calibration import OFF, off_auc, stated_ratio
 from dsr.metrics.functional import SurfacePair
-from dsr.metrics.plane import angle, compare, deviation
-from dsr.metrics.sensor import LARGEST_ERROR, SensorComparison
+from dsr.metrics.sensor import LARGEST_ERROR, SensorComparison, board_errors, compare_board
 from dsr.sample import DepthSample, Scene
 
 FILTERS = ((19, 0.03, 3.0), (41, 0.05, 9.0), (81, 0.06, 18.0))
@@ -128,9 +127,13 @@ def score_board(frame: Plane, surface: Surface) -> dict[str, float]:
     """Score a result before the board."""
     maps = surface.depth[None].double(), frame.depth[None].double(), frame.sample.camera.rays()[None]
     board, border = (SurfacePair(*maps, frame.regions[each][None] > 0) for each in ("board", "border"))
-    found = {"std": 1e3 * float(deviation(board)), "edge": 1e3 * float(deviation(border)), "angle": float(angle(board))}
+    found = {
+        "std": 1e3 * float(board_errors(board)["std"]),
+        "edge": 1e3 * float(board_errors(border)["std"]),
+        "angle": float(board_errors(board)["angle"]),
+    }
     if surface.depth_error is not None:
-        scored, off = compare(board)
+        scored, off = compare_board(board)
         off = off.abs().masked_fill(~scored, torch.nan)[0]
         found["stated"] = float(stated_ratio(surface.depth_error, off))
     return found

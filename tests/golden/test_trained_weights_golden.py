@@ -20,8 +20,8 @@ from dsr.methods.networks.trained import TrainedNetwork
 from dsr.methods.recipe import read_recipe
 from dsr.methods.weights import packaged_weights
 from dsr.metrics.catalogue import Metric, catalogue, score_image
+from dsr.metrics.formats import WORST
 from dsr.metrics.lpips import load_lpips
-from dsr.metrics.metric import WORST
 from dsr.sample import DepthSample
 
 REPOSITORY = Path(__file__).resolve().parents[2]

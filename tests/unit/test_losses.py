@@ -1,20 +1,27 @@
-"""Training losses, against a pyramid written in plain numpy, closed forms and finite differences."""
+"""Training losses, against a pyramid in plain numpy, closed forms, finite differences and the metrics' kernels."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
 import torch
+from small_lpips import random_lpips
 from torch import Tensor
 
+from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera
 from dsr.methods.networks.network import Answer
-from dsr.metrics.losses import l1, lap1, mse
-from dsr.training.degradation import Batch
-from dsr.training.objective import DepthLoss, DepthObjective
+from dsr.metrics.functional import SurfacePair, dssim_v, mse_v
+from dsr.metrics.losses import VisualLoss, VisualLossName, l1, lap1, make_visual_loss, match_weight, mse
+from dsr.metrics.lpips import LPIPS, lpips_v
+from dsr.sample import DepthSample, Scene
+from dsr.training.degradation import Batch, to_tensors
+from dsr.training.objective import DepthLoss, DepthObjective, balance_weight
 
 Loss = Callable[..., Tensor]
 LOSSES: dict[str, Loss] = {"l1": l1, "mse": mse, "lap1": lap1}
@@ -102,11 +109,6 @@ def test_constant_offset_gives_its_absolute_value(size: tuple[int, int], c: floa
     assert mse(x + c, x).item() == pytest.approx(c**2, rel=1e-13)
 
 
-def test_lap1_with_one_level_is_l1() -> None:
-    x, y = _with_holes(_map(0), 2), _map(1)
-    assert lap1(x, y, levels=1).item() == pytest.approx(l1(x, y).item(), rel=1e-14)
-
-
 @pytest.mark.parametrize("name", LOSSES)
 def test_losses_are_symmetric_zero_at_the_target_and_positive_elsewhere(name: str) -> None:
     x, y = _with_holes(_map(0), 2), _with_holes(_map(1), 3)
@@ -129,7 +131,7 @@ def test_pixels_under_holes_do_not_matter(name: str, garbage: float) -> None:
 
 @pytest.mark.parametrize("name", LOSSES)
 def test_image_without_a_valid_pixel_has_loss_nan_and_leaves_the_others_unchanged(name: str) -> None:
-    x, y = _map(0, batch=2), _map(1, batch=2)
+    x, y = _with_holes(_map(0, batch=2), 2), _map(1, batch=2)
     y[0] = torch.nan
     values = LOSSES[name](x, y)
     assert values.shape == (2,)
@@ -146,13 +148,6 @@ def test_gradients_are_finite_and_zero_in_holes(name: str) -> None:
     assert bool(x.grad.isfinite().all())
     assert bool((x.grad[y.isnan()] == 0).all())
     assert bool(x.grad[1].any())
-
-
-@pytest.mark.parametrize("name", LOSSES)
-def test_batch_of_two_equals_two_single_images(name: str) -> None:
-    x, y = _with_holes(_map(0, batch=2), 2), _map(1, batch=2)
-    singles = [LOSSES[name](x[i : i + 1], y[i : i + 1]) for i in range(2)]
-    torch.testing.assert_close(LOSSES[name](x, y), torch.cat(singles), rtol=1e-14, atol=0)
 
 
 @pytest.mark.parametrize("name", LOSSES)
@@ -226,3 +221,122 @@ def test_objective_has_finite_gradients_at_the_truth_and_beyond_infinity() -> No
         DepthObjective("lap1", 0.7)(Answer(guess), batch)["loss"].backward()
         assert guess.grad is not None
         assert bool(guess.grad.isfinite().all())
+
+
+# Losses of renderings
+
+SIZE = 32
+CAMERA = Camera(SIZE, SIZE, 40.0, 40.0, 15.5, 15.5)
+VISUAL: tuple[VisualLossName, ...] = get_args(VisualLossName)
+
+
+@pytest.fixture(scope="module")
+def network() -> LPIPS:
+    return random_lpips()
+
+
+def _loss(name: VisualLossName, network: LPIPS) -> VisualLoss:
+    return VisualLoss(name, network if name == "lpips" else None)
+
+
+def _surface(seed: int, size: int = SIZE) -> Tensor:
+    """Return a wavy surface, (1, 1, size, size) float64."""
+    random = torch.Generator().manual_seed(seed)
+    x = torch.arange(size, dtype=torch.float64)
+    frequency, phase = torch.rand(2, 2, generator=random, dtype=torch.float64)
+    waves = torch.sin((0.3 + 0.3 * frequency[0]) * x + 6 * phase[0]) * torch.cos((0.3 + frequency[1]) * x[:, None])
+    return 2 + 0.02 * waves[None, None]
+
+
+def _sample(size: int = SIZE, scale: int = 2) -> DepthSample:
+    camera = Camera(size, size, 1.2 * size, 1.2 * size, (size - 1) / 2, (size - 1) / 2)
+    scene = Scene("set", "waves", torch.full((3, size, size), 0.5), camera, _surface(3, size)[0])
+    return make_sample(scene, scale, Downsampling("box"), "disparity")
+
+
+def test_a_visual_loss_is_the_metric_averaged_over_the_lights(network: LPIPS) -> None:
+    pair = SurfacePair(
+        torch.cat((_surface(0), _surface(1))), torch.cat((_surface(2), _surface(3))), CAMERA.rays()[None]
+    )
+    assert torch.equal(VisualLoss()(pair), mse_v(pair))
+    torch.testing.assert_close(VisualLoss("dssim")(pair), dssim_v(pair).mean(dim=1), rtol=0, atol=0)
+    torch.testing.assert_close(VisualLoss("lpips", network)(pair), lpips_v(pair, network).mean(dim=1), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("holes", [False, True])
+@pytest.mark.parametrize("name", VISUAL)
+def test_gradient_of_a_visual_loss_is_that_of_its_value(name: VisualLossName, holes: bool, network: LPIPS) -> None:
+    loss, target, rays = _loss(name, network), _surface(2), CAMERA.rays()[None]
+    if holes:
+        target[..., 5:9, 20:23] = torch.nan
+    if loss.network is not None:
+        loss.network.double()
+    start = _surface(0)
+
+    def value(surface: Tensor) -> Tensor:
+        return loss(SurfacePair(surface, target, rays)).sum()
+
+    surface = start.clone().requires_grad_()
+    value(surface).backward()
+    assert surface.grad is not None
+    for seed in range(3):  # along random directions
+        random = torch.Generator().manual_seed(seed)
+        step = 1e-9 * torch.randn(start.shape, generator=random, dtype=torch.float64)
+        numeric = (value(start + step) - value(start - step)) / 2
+        analytic = (surface.grad * step).sum()
+        assert numeric.item() == pytest.approx(analytic.item(), rel=1e-4, abs=1e-13)
+
+
+@pytest.mark.parametrize("name", VISUAL)
+def test_image_without_a_valid_pixel_has_no_loss_and_no_gradient(name: VisualLossName, network: LPIPS) -> None:
+    prediction = torch.cat((_surface(0), _surface(1))).float().requires_grad_()
+    target = torch.cat((_surface(2), torch.full_like(_surface(2), torch.nan))).float()
+    loss = _loss(name, network.float())(SurfacePair(prediction, target, CAMERA.rays(dtype=torch.float32)[None]))
+    assert loss.isfinite().tolist() == [True, False]
+    loss.nanmean().backward()
+    assert prediction.grad is not None
+    assert bool(prediction.grad.isfinite().all())
+    assert float(prediction.grad[0].abs().max()) > 0
+    assert float(prediction.grad[1].abs().max()) == 0
+
+
+@pytest.mark.parametrize("name", VISUAL)
+def test_objectives_have_the_visual_loss_as_a_term(name: VisualLossName, network: LPIPS) -> None:
+    loss, sample = _loss(name, network.float()), _sample(64)
+    batch: Batch = {key: value[None] for key, value in to_tensors(sample).items()}
+    disparity = 1.02 * batch["bf"] / batch["depth"] + 0.02 * torch.sin(torch.arange(64.0))
+    terms = DepthObjective("l1", 0.3, visual=loss)(Answer(disparity), batch)
+    assert terms.keys() == {"loss", "l1", name}
+    assert terms["loss"].item() == pytest.approx((terms["l1"] + 0.3 * terms[name]).item(), rel=1e-6)
+    expected = loss(SurfacePair(batch["bf"] / disparity, batch["depth"], batch["rays"]))
+    assert terms[name].item() == pytest.approx(expected.item(), rel=1e-6)
+
+
+def test_automatic_weight_makes_a_loss_as_large_as_mse_v_for_interpolation() -> None:
+    patches = [to_tensors(_sample(size)) for size in (32, 40, 48)]
+    w, other = balance_weight(patches), balance_weight(patches, VisualLoss("dssim"))
+    ratios = []
+    for patch in patches:
+        batch = {key: value[None] for key, value in patch.items()}
+        enlarged = torch.nn.functional.interpolate(
+            batch["disparity_lr"], scale_factor=2, mode="bicubic", antialias=True
+        )
+        pair = SurfacePair(batch["bf"] / enlarged, batch["depth"], batch["rays"])
+        ratios.append((mse_v(pair) / dssim_v(pair).mean()).item())
+    assert other == pytest.approx(w * sorted(ratios)[1], rel=1e-5)
+    pair = SurfacePair(_surface(0), _surface(0), CAMERA.rays()[None])
+    assert match_weight(VisualLoss("dssim"), [pair]) == match_weight(VisualLoss("dssim"), []) == 1
+
+
+def test_lpips_without_its_weights_is_one_line_that_says_what_to_do(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"set metrics\.lpips_trunk=FILE or") as caught:
+        make_visual_loss("lpips", tmp_path / "none.pth")
+    assert "\n" not in str(caught.value)
+    damaged = tmp_path / "damaged.pth"
+    damaged.write_bytes(b"not weights")
+    with pytest.raises(ValueError, match=r"^visual: lpips needs AlexNet's weights: .*damaged\.pth"):
+        make_visual_loss("lpips", damaged)
+    with pytest.raises(ValueError, match=r"^visual: expected one of mse_v, dssim, lpips, got 'ssim'$"):
+        make_visual_loss("ssim")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"^visual: expected a network for lpips, got none$"):
+        VisualLoss("lpips")

@@ -25,7 +25,7 @@ from dsr.geometry.camera import Camera
 from dsr.geometry.surface import depth_to_normals, render
 from dsr.metrics import lpips
 from dsr.metrics.functional import SurfacePair
-from dsr.metrics.lpips import LPIPS, TRUNK_FILE, TRUNK_HASH, TRUNK_URL, find_trunk, load_lpips, lpips_v
+from dsr.metrics.lpips import LPIPS, TRUNK_FILE, TRUNK_URL, find_trunk, load_lpips, lpips_v
 
 
 @pytest.fixture(scope="module")
@@ -39,21 +39,11 @@ def _images(seed: int, size: tuple[int, int] = (40, 47), batch: int = 1) -> Tens
 
 def _reference(trunk: dict[str, Tensor], first: Tensor, second: Tensor, mask: Tensor | None = None) -> Tensor:
     """Return LPIPS v0.1, from torchvision's AlexNet as a stack of layers, in float64."""
-    layers = [
-        nn.Conv2d(3, 64, 11, stride=4, padding=2),
-        nn.ReLU(),
-        nn.MaxPool2d(3, 2),
-        nn.Conv2d(64, 192, 5, padding=2),
-        nn.ReLU(),
-        nn.MaxPool2d(3, 2),
-        nn.Conv2d(192, 384, 3, padding=1),
-        nn.ReLU(),
-        nn.Conv2d(384, 256, 3, padding=1),
-        nn.ReLU(),
-        nn.Conv2d(256, 256, 3, padding=1),
-        nn.ReLU(),
-    ]
-    features = nn.Sequential(*layers).double()
+    first_layers = nn.Conv2d(3, 64, 11, stride=4, padding=2), nn.ReLU(), nn.MaxPool2d(3, 2)
+    second_layers = nn.Conv2d(64, 192, 5, padding=2), nn.ReLU(), nn.MaxPool2d(3, 2)
+    sizes = ((192, 384), (384, 256), (256, 256))
+    others = [layer for size in sizes for layer in (nn.Conv2d(*size, 3, padding=1), nn.ReLU())]
+    features = nn.Sequential(*first_layers, *second_layers, *others).double()
     features.load_state_dict({name.removeprefix("features."): value for name, value in trunk.items()})
     heads = torch.load(Path(heads_home.__file__).parent / "lpips_models" / "alex.pth", "cpu", weights_only=True)
     shift, scale = (
@@ -151,17 +141,6 @@ def test_lpips_v_is_the_distance_of_each_lights_rendering_in_three_channels(netw
         torch.testing.assert_close(values[:, light].double(), expected, rtol=1e-4, atol=0)
 
 
-def test_batch_of_complete_and_incomplete_pairs_equals_single_pairs(network: LPIPS) -> None:
-    pairs = [_pair(seed=1), _pair(seed=2, holes=True)]
-    joined = SurfacePair(
-        torch.cat([pair.prediction for pair in pairs]),
-        torch.cat([torch.where(pair.depth_mask, pair.target, torch.nan) for pair in pairs]),
-        pairs[0].rays,
-    )
-    expected = torch.cat([lpips_v(pair, network) for pair in pairs])
-    torch.testing.assert_close(lpips_v(joined, network), expected, rtol=1e-5, atol=0)
-
-
 def test_missing_or_misshapen_tensor_is_refused_by_name() -> None:
     trunk = random_trunk()
     del trunk["features.8.bias"]
@@ -207,16 +186,11 @@ def _unexpected(*_: Any, **__: Any) -> Any:
     raise AssertionError("nothing should be downloaded")
 
 
-def test_configured_weights_file_comes_first(hub: Path, tmp_path: Path) -> None:
+def test_configured_and_then_cached_weights_come_before_a_download(hub: Path, tmp_path: Path) -> None:
     hub.mkdir(parents=True)
     (hub / TRUNK_FILE).touch()
     (tmp_path / "mine.pth").touch()
     assert find_trunk(tmp_path / "mine.pth") == tmp_path / "mine.pth"
-
-
-def test_cached_weights_file_comes_before_a_download(hub: Path) -> None:
-    hub.mkdir(parents=True)
-    (hub / TRUNK_FILE).touch()
     assert find_trunk(None) == hub / TRUNK_FILE
 
 
@@ -256,9 +230,7 @@ def test_download_goes_into_the_cache(hub: Path, monkeypatch: pytest.MonkeyPatch
 FAILURES: dict[str, Exception | _Response] = {
     "offline": urllib.error.URLError("no route to host"),
     "missing": urllib.error.HTTPError(TRUNK_URL, 404, "not found", Message(), None),
-    "unreachable": OSError("network is unreachable"),
     "timeout": _Response(b"half of it", TimeoutError("timed out")),
-    "reset": _Response(b"half of it", ConnectionResetError("reset")),
     "incomplete": _Response(b"half of it", http.client.IncompleteRead(b"", 7)),
     "hash": _Response(b"another file altogether"),
 }
@@ -280,8 +252,3 @@ def test_failed_download_is_an_os_error_and_leaves_nothing(
         find_trunk(None)
     assert list(hub.iterdir()) == []
     assert socket.getdefaulttimeout() == before
-
-
-def test_trunk_is_the_official_file() -> None:
-    assert f"alexnet-owt-{TRUNK_HASH}.pth" == TRUNK_FILE
-    assert f"https://download.pytorch.org/models/{TRUNK_FILE}" == TRUNK_URL

@@ -30,6 +30,7 @@ from dsr.metrics.catalogue import PROTOCOLS, catalogue
 from dsr.metrics.classes import visual_metrics
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.losses import VisualLoss
+from dsr.sample import CENTIMETRES, Unit
 from dsr.training.degradation import Batch, to_tensors
 from dsr.training.module import SuperResolution
 from dsr.training.objective import DepthObjective, SurfaceObjective
@@ -106,7 +107,8 @@ def test_loss_of_a_training_reads_no_value(depth_loss: Any, visual: Any) -> None
 @pytest.mark.parametrize("metric", METRICS, ids=lambda metric: metric.name)
 def test_metric_reads_no_value(metric: Any) -> None:
     [metric] = [each for each in catalogue(random_lpips(), protocols=VALIDATED) if each.name == metric.name]
-    pair = SurfacePair(*_maps(differentiable=True))
+    unit = CENTIMETRES if metric.unit is None else Unit(metric.unit, inverse=True, factor=30.0, offset=0.0)
+    pair = SurfacePair(*_maps(differentiable=True), unit=unit)
     for value in metric.variants(pair).values():
         assert value.shape == (2,)
     metric.valid_fraction(pair)

@@ -36,10 +36,12 @@ def _mask(array: Array) -> Tensor:
 
 def test_f1_is_that_of_the_authors_code() -> None:
     """Executed: apple/ml-depth-pro 9efe5c1, with NaN for unknown truth in both, and microsoft/MoGe 0744441, masked."""
-    assert boundaries.boundary_f1(pair_of(*steps())).item() == pytest.approx(0.9412966260255751, abs=1e-9)
-    assert boundaries.boundary_f1(pair_of(*holed())).item() == pytest.approx(0.9410074986768165, abs=1e-9)
-    found = [boundaries.moge_f1(pair_of(*holed()), radius).item() for radius in (1, 2, 3)]
-    assert found == pytest.approx([0.9343173556422164, 0.9498005727791907, 0.9622220048683943], abs=1e-6)
+    assert boundaries.depth_pro_scores(pair_of(*steps()))["F1"].item() == pytest.approx(0.9412966260255751, abs=1e-9)
+    assert boundaries.depth_pro_scores(pair_of(*holed()))["F1"].item() == pytest.approx(0.9410074986768165, abs=1e-9)
+    found = boundaries.moge_scores(pair_of(*holed()))
+    assert [value.item() for value in found.values()] == pytest.approx(
+        [0.9343173556422164, 0.9498005727791907, 0.9622220048683943], abs=1e-6
+    )
 
 
 def test_ceiling_is_the_truth_against_itself() -> None:
@@ -48,9 +50,9 @@ def test_ceiling_is_the_truth_against_itself() -> None:
     few[:, 4:], few[2:, 7:] = 2.3, 2.6
     for each, expected in ((truth, 1), (few, 0.21316425120772947)):
         pair = pair_of(each, each, CAMERA.crop(0, 0, *each.shape))
-        assert boundaries.boundary_f1(pair).item() == pytest.approx(expected)
-        assert boundaries.boundary_ceiling(pair).item() == pytest.approx(expected)
-        assert boundaries.boundary_ceiling(pair_of(*steps())).item() == 1
+        assert boundaries.depth_pro_scores(pair)["F1"].item() == pytest.approx(expected)
+        assert boundaries.depth_pro_scores(pair)["ceiling"].item() == pytest.approx(expected)
+        assert boundaries.depth_pro_scores(pair_of(*steps()))["ceiling"].item() == 1
 
 
 def test_f1_of_a_step_is_a_count() -> None:
@@ -64,10 +66,10 @@ def test_f1_of_a_step_is_a_count() -> None:
     # 5 of 10 edges to the right are found; one to the bottom is predicted where the displaced part ends
     precision, recall = (5 / 10) / 4, (5 / 10) / 4
     assert precision == recall
-    assert boundaries.boundary_f1(pair).item() == pytest.approx(recall * passed / THRESHOLDS.sum())
+    assert boundaries.depth_pro_scores(pair)["F1"].item() == pytest.approx(recall * passed / THRESHOLDS.sum())
     # MoGe leaves out a border: rows 1 to 8, of which 4 are found, and the one edge downwards
     share = (THRESHOLDS[:3] - 1).sum() / (THRESHOLDS - 1).sum()
-    assert boundaries.moge_f1(pair).item() == pytest.approx(2 * 4 / (8 + 9) * share)
+    assert boundaries.moge_scores(pair)["1"].item() == pytest.approx(2 * 4 / (8 + 9) * share)
 
 
 def test_boundary_error_is_that_of_the_authors_code() -> None:
@@ -113,57 +115,38 @@ def test_boundary_error_is_a_distance() -> None:
 
 def test_directed_error_is_that_of_the_authors_code_from_a_metre_on() -> None:
     """Executed: the same file's ``compute_directed_depth_error`` of the pixels with a truth."""
-    pair = pair_of(*holed())
-    for plane, expected in ((2.5, [0.96210191, 0, 0.03789809]), (3.0, [0.95440552, 0.00244161, 0.04315287])):
-        assert list(boundaries.directed_depth_error(pair, plane)) == pytest.approx(expected, abs=1e-8)
-    near = pair_of(*(each / 10 for each in holed()))  # where theirs counts its own marks
-    assert boundaries.directed_depth_error(near, 0.25) == boundaries.directed_depth_error(pair, 2.5)
+    found = boundaries.directed_depth_error(pair_of(*holed()))
+    assert list(found.values()) == pytest.approx([0.95440552, 0.00244161, 0.04315287], abs=1e-8)
 
 
-def test_planarity_is_that_of_the_authors_code() -> None:
-    """Executed: the same file's ``compute_planarity_error``, of a large plane and of one that is too small."""
-    planes = torch.zeros(1, 2, 120, 160, dtype=torch.bool)
-    planes[:, 0, 10:], planes[:, 1, :10] = True, True
-    x, forward, up = 0.1, -0.2, 0.97
-    normals = torch.tensor([x, -up, forward]).expand(1, 2, 3) / math.hypot(x, forward, up)
-    share = 0.05 * 640 * 480 / (120 * 160)
-    flatness, orientation = boundaries.planarity(pair_of(*holed()), planes, normals, share)
-    np.testing.assert_allclose(flatness.numpy(), [[0.3394655151, np.nan]], rtol=1e-5)
-    np.testing.assert_allclose(orientation.numpy(), [[77.97643416, np.nan]], rtol=1e-5)
+def _planarity(prediction: Array, truth: Array, planes: Array, camera: Camera = CAMERA) -> tuple[float, float]:
+    pair = pair_of(prediction, truth, camera)
+    found = boundaries.planarity(pair.replaced(regions={"planes": torch.from_numpy(planes)[None, None]}))
+    return found["flatness"].item(), found["orientation"].item()
+
+
+def test_flatness_is_that_of_the_authors_code() -> None:
+    """Executed: the same file's ``compute_planarity_error``, of a large plane; another is too small."""
+    planes = np.ones((120, 160), np.uint8)
+    planes[:10], planes[:4] = 0, 2
+    assert _planarity(*holed(), planes)[0] == pytest.approx(0.3394655151, rel=1e-5)
 
 
 def test_planarity_of_planes_is_exact() -> None:
     camera = Camera(80, 60, 70.0, 71.0, 40.0, 30.0)
     rays = camera.rays().numpy().astype(float)
     true, tilted = np.array((0.1, 0.2, 1.0)), np.array((0.1, 0.5, 1.0))
-    planes = torch.zeros(1, 2, 60, 80, dtype=torch.bool)
-    planes[0, 0, :30], planes[0, 1, 30:] = True, True
+    planes = np.ones((60, 80), np.uint8)
+    planes[30:] = 2
     maps = [2 / np.einsum("c,chw->hw", each, rays) for each in (true, tilted)]
     maps[1][:30] = 3 * maps[0][:30]  # a factor is no error
     maps[1][2, 3:9] = np.nan
     angle = math.degrees(math.acos(true @ tilted / np.linalg.norm(true) / np.linalg.norm(tilted)))
-    for normals in (None, -torch.from_numpy(true / np.linalg.norm(true)).expand(1, 2, 3)):
-        flatness, orientation = boundaries.planarity(pair_of(maps[1], maps[0], camera), planes, normals)
-        np.testing.assert_allclose(flatness.numpy(), [[0, 0]], atol=1e-6)
-        np.testing.assert_allclose(orientation.numpy(), [[0, angle]], atol=1e-4)
+    assert _planarity(maps[1], maps[0], planes, camera) == pytest.approx((0, angle / 2), abs=1e-4)
     # a wave of amplitude 1 cm about a plane that faces the camera
     wave = 2 + 0.01 * np.where(np.indices((60, 80)).sum(axis=0) % 2, 1, -1)
-    flatness, _ = boundaries.planarity(pair_of(wave, np.full_like(wave, 2), camera), planes[:, :1] | planes[:, 1:])
-    assert flatness.item() == pytest.approx(0.01, rel=1e-2)
-
-
-def test_scores_of_a_batch_are_those_of_its_images() -> None:
-    maps = [holed(), steps(1)]
-    maps[1][0][5:9, 10:50] = np.nan
-    batch = pair_of(*(np.stack(each) for each in zip(*maps, strict=True)))
-    for metric in METRICS:
-        singles = torch.cat([metric.function(pair_of(*each)) for each in maps])
-        torch.testing.assert_close(metric.function(batch), singles, msg=metric.name)
-    planes = torch.ones(2, 1, 120, 160, dtype=torch.bool)
-    images = (boundaries.planarity(pair_of(*each), planes[:1]) for each in maps)
-    pairs = zip(boundaries.planarity(batch, planes), *images, strict=True)
-    for found, *singles in pairs:
-        torch.testing.assert_close(found, torch.cat(singles))
+    flatness, _ = _planarity(wave, np.full_like(wave, 2), np.ones_like(planes), camera)
+    assert flatness == pytest.approx(0.01, rel=1e-2)
 
 
 def test_holes_of_a_prediction_miss_the_edges_there_and_are_reported() -> None:
@@ -179,13 +162,6 @@ def test_holes_of_a_prediction_miss_the_edges_there_and_are_reported() -> None:
     assert part["DBE_completeness"] > full["DBE_completeness"] == 0
     assert part["DepthPro_ceiling"] == full["DepthPro_ceiling"]
     assert part["Boundary_covered"] == pytest.approx(1 - 30 * 60 / truth.size)
-
-
-def test_images_without_truth_have_no_score() -> None:
-    prediction, truth = (torch.from_numpy(each)[None] for each in steps())
-    rows = list(score_image(prediction, torch.full_like(truth, torch.nan), CAMERA.rays(), METRICS))
-    assert len(rows) == len(METRICS)
-    assert all(math.isnan(row.value) and row.valid_share == 0 for row in rows)
 
 
 @pytest.mark.parametrize("size", list(itertools.product((1, 2, 3, 6, 7), (1, 8))))

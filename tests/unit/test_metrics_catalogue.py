@@ -7,12 +7,13 @@ import math
 import numpy as np
 import pytest
 import torch
+from depth_steps import Array, holed, pair_of, steps
 from small_lpips import random_lpips
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
 from dsr.metrics import functional
-from dsr.metrics.catalogue import Score, catalogue, score_image
+from dsr.metrics.catalogue import PROTOCOLS, Score, catalogue, score_image
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS
 
@@ -98,10 +99,39 @@ def test_holes_of_the_truth_do_not_shrink_the_window() -> None:
     assert rows["DSSIM_v", "max"].valid_share == pytest.approx(33 / 34, rel=1e-12)  # of the rows 3 ... 36, but row 3
 
 
-def test_prediction_without_a_valid_pixel_scores_nan_on_none(network: LPIPS) -> None:
-    prediction, target = _maps()
-    rows = _scores(torch.full_like(prediction, torch.nan), target, network)
-    assert all(math.isnan(score.value) and score.valid_share == 0 for score in rows.values())
+every_protocol = pytest.mark.parametrize("protocol", PROTOCOLS)
+
+
+@every_protocol
+def test_scores_of_a_batch_are_those_of_its_images(protocol: str, network: LPIPS, one_thread: None) -> None:
+    maps = [holed(), steps(1)]
+    maps[1][0][5:9, 10:50] = np.nan
+
+    def pair(*given: Array) -> SurfacePair:
+        found = pair_of(*given)
+        errors = 0.1 * found.given[0], 10 * found.given[0]
+        regions = {"planes": torch.ones_like(found.target, dtype=torch.uint8)}
+        return found.replaced(regions=regions, depth_error=errors[0], angle_error=errors[1])
+
+    batch, singles = pair(*(np.stack(each) for each in zip(*maps, strict=True))), [pair(*each) for each in maps]
+    for metric in catalogue(network, protocols=(protocol,)):
+        if metric.applies(batch):
+            for variant, values in metric.variants(batch).items():
+                expected = torch.cat([metric.variants(each)[variant] for each in singles])
+                torch.testing.assert_close(values, expected, rtol=1e-5, atol=1e-6, msg=metric.name)
+
+
+@every_protocol
+def test_images_without_truth_or_prediction_have_no_score(protocol: str, network: LPIPS) -> None:
+    depth, nothing = torch.full((1, 40, 48), 2.0), torch.full((1, 40, 48), torch.nan)
+    metrics, errors = catalogue(network, protocols=(protocol,)), (depth, depth)
+    rows = list(score_image(depth, nothing, CAMERA.rays(), metrics, errors=errors))
+    assert rows
+    assert all(math.isnan(row.value) for row in rows)
+    if protocol not in ("evalmde", "boundaries"):
+        rows = list(score_image(nothing, depth, CAMERA.rays(), metrics, errors=errors))
+        assert all(row.value == 0 if row.metric.endswith("covered") else math.isnan(row.value) for row in rows)
+        assert protocol != "paper" or all(row.valid_share == 0 for row in rows)
 
 
 @pytest.mark.parametrize(

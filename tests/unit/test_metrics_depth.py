@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from depth_steps import pair_of
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
@@ -28,11 +29,6 @@ METRICS = catalogue(protocols=("depth", "normals"))
 def _scores(prediction: Any, truth: Any, **more: Any) -> dict[str, float]:
     maps = (torch.as_tensor(each, dtype=torch.float64)[None] for each in (prediction, truth))
     return {row.metric: row.value for row in score_image(*maps, CAMERA.rays(), METRICS, **more)}
-
-
-def _pair(prediction: Any, truth: Any) -> SurfacePair:
-    maps = (torch.as_tensor(each, dtype=torch.float64)[None, None] for each in (prediction, truth))
-    return SurfacePair(*maps, CAMERA.rays()[None])
 
 
 def test_errors_are_those_of_monodepth2_marigold_and_kittis_development_kit() -> None:
@@ -62,7 +58,7 @@ def test_accuracies_are_fractions_below_a_ratio() -> None:
         assert found[f"Depth_delta_{name}"] == pytest.approx((ratio < limit).mean())
     assert 0 < found["Depth_delta_105"] < found["Depth_delta_110"] < found["Depth_delta_125"] < 1
     exactly = np.where(U < 12, 1.25, np.where(U < 18, 1.2, 0.8))
-    assert depth.depth_errors(_pair(exactly, np.ones_like(U)))["delta_125"].item() == 0.25
+    assert depth.depth_errors(pair_of(exactly, np.ones_like(U), CAMERA))["delta_125"].item() == 0.25
 
 
 def test_a_factor_of_all_depths_has_errors_in_closed_form() -> None:
@@ -116,16 +112,6 @@ def test_holes_are_left_out_and_counted() -> None:
     nothing = _scores(np.full_like(TRUTH, np.nan), TRUTH)
     assert nothing.pop("Depth_covered") == nothing.pop("Normal_covered") == 0
     assert all(math.isnan(value) for value in nothing.values())
-
-
-def test_batch_has_the_values_of_its_images() -> None:
-    holed = np.where(U * V == 12, np.nan, PREDICTION)
-    pairs = [_pair(PREDICTION, TRUTH), _pair(holed, TRUTH + 0.1)]
-    maps = (torch.cat(each) for each in zip(*(pair.given for pair in pairs), strict=True))
-    batch = SurfacePair(*maps, CAMERA.rays()[None])
-    for metric in (*depth.DEPTH, *depth.NORMALS):
-        singles = [metric.function(pair) for pair in pairs]
-        torch.testing.assert_close(metric.function(batch), torch.cat(singles), rtol=1e-12, atol=1e-14)
 
 
 FIELD_CAMERA = Camera(width=24, height=20, fx=30.0, fy=30.0, cx=11.5, cy=9.5, baseline=0.5, doffs=40.0)
@@ -193,9 +179,9 @@ def test_thresholds_are_exceeded_only_beyond_them() -> None:
     target = torch.full((1, 1, 2, 4), 2.0, dtype=torch.float64)
     prediction = target * torch.tensor([1.25, 1.2501, 0.8, 0.7999], dtype=torch.float64)
     pair = SurfacePair(prediction, target, FIELD_CAMERA.crop(0, 0, 2, 4).rays()[None])
-    assert depth.field_errors(pair)["delta1"].item() == 0.5
+    assert depth.field_errors(pair)["Beyond_delta1"].item() == 0.5
     pair = SurfacePair(target + torch.tensor([0.0499, -0.0499, 0.0501, -0.0501]), target, pair.rays)
-    assert depth.field_errors(pair)["5cm"].item() == 0.5
+    assert depth.field_errors(pair)["Beyond_5cm"].item() == 0.5
 
 
 def test_collection_has_the_metrics_of_the_benchmarks_that_it_saw() -> None:

@@ -51,13 +51,7 @@ def test_scores_of_a_map_with_unknown_truth_are_those_of_their_code() -> None:
         "boundary": 0.0589925013,
         "covered": 1,
     }
-    weights = dict(
-        zip(
-            ("WKDR", "beyond_disparity", "beyond_depth", "boundary", "RelNormal"),
-            (3.65, 0.18, 0.01, 0.2, 1.94),
-            strict=True,
-        )
-    )
+    weights = {"WKDR": 3.65, "beyond_disparity": 0.18, "beyond_depth": 0.01, "boundary": 0.2, "RelNormal": 1.94}
     expected["SAWA_H"] = sum(weight * expected[name] for name, weight in weights.items())
     assert found == pytest.approx(expected, abs=5e-6)
 
@@ -81,9 +75,10 @@ def test_affine_maps_of_depth_and_of_disparity_are_fitted() -> None:
     _, truth = steps()
     truth = 3 * truth.astype(float) - 5
     of_depth, of_disparity = pair_of(0.3 * truth + 0.7, truth), pair_of(1 / (0.4 / truth + 0.1), truth)
-    assert evalmde.beyond_depth(of_depth).item() == evalmde.beyond_disparity(of_disparity).item() == 0
-    assert evalmde.beyond_depth(of_disparity).item() > 0
-    assert evalmde.beyond_disparity(of_depth).item() > 0
+    depth, disparity = _scores(of_depth), _scores(of_disparity)
+    assert depth["beyond_depth"] == disparity["beyond_disparity"] == 0
+    assert depth["beyond_disparity"] > 0
+    assert disparity["beyond_depth"] > 0
 
 
 def test_two_tilted_halves_have_the_angle_between_them() -> None:
@@ -158,21 +153,9 @@ def test_pairs_are_the_first_of_the_sequence_inside_the_map() -> None:
         np.testing.assert_array_equal(pairs.numpy(), expected[:, np.lexsort(expected[::-1])])
 
 
-def test_scores_of_a_batch_are_those_of_its_images() -> None:
-    maps = [holed(), steps(1)]
-    maps[1][0][5:9, 10:50] = np.nan
-    batch = pair_of(*(np.stack(each) for each in zip(*maps, strict=True)))
-    for metric in METRICS:
-        singles = torch.cat([metric.function(pair_of(*each)) for each in maps])
-        torch.testing.assert_close(metric.function(batch), singles, msg=metric.name)
-
-
-def test_images_without_truth_or_too_small_have_no_score() -> None:
-    prediction, truth = (torch.from_numpy(each)[None] for each in steps())
-    for maps in ((prediction, torch.full_like(truth, torch.nan)), (prediction[:, :16], truth[:, :16])):
-        rows = list(score_image(*maps, CAMERA.rays()[:, : maps[0].shape[1]], METRICS))
-        assert len(rows) == len(METRICS)
-        assert all(math.isnan(row.value) for row in rows)
+def test_too_small_images_have_no_score() -> None:
+    prediction, truth = (torch.from_numpy(each)[None, :16] for each in steps())
+    assert all(math.isnan(row.value) for row in score_image(prediction, truth, CAMERA.rays()[:, :16], METRICS))
 
 
 def test_prediction_of_holes_alone_has_the_largest_errors() -> None:

@@ -11,20 +11,13 @@ import torch
 from scipy.spatial.distance import cdist
 
 from dsr.geometry.camera import Camera
-from dsr.metrics import points
 from dsr.metrics.catalogue import catalogue, score_image
-from dsr.metrics.functional import SurfacePair
 
 CAMERA = Camera(width=48, height=40, fx=60.0, fy=60.0, cx=23.5, cy=19.5)
 RAYS = CAMERA.rays()[None]
 V, U = np.mgrid[:40, :48].astype(float)
 STEP = np.where(U < 24, 1.0, 2.0)
 METRICS = catalogue(protocols=("points",))
-
-
-def _pair(prediction: Any, truth: Any) -> SurfacePair:
-    maps = (torch.as_tensor(each, dtype=torch.float64)[None, None] for each in (prediction, truth))
-    return SurfacePair(*maps, RAYS)
 
 
 def _scores(prediction: Any, truth: Any) -> dict[str, float]:
@@ -119,11 +112,3 @@ def test_hole_does_not_win() -> None:
     nothing = _scores(np.full_like(U, np.nan), STEP)
     assert nothing.pop("Points_covered") == 0
     assert all(math.isnan(value) for value in nothing.values())
-
-
-def test_batch_has_the_values_of_its_images() -> None:
-    pairs = [_pair(*_holed(seed)) for seed in (0, 1)]
-    maps = (torch.cat(each) for each in zip(*(pair.given for pair in pairs), strict=True))
-    batch = SurfacePair(*maps, RAYS)
-    for metric in points.METRICS:
-        torch.testing.assert_close(metric.function(batch), torch.cat([metric.function(pair) for pair in pairs]))

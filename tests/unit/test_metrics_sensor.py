@@ -1,16 +1,21 @@
-"""The metrics for real sensors, against numpy, scipy and scikit-image, step by step as the protocol has them."""
+"""The metrics of real sensors, against numpy, scipy and scikit-image, and of a board, against closed forms."""
 
 from __future__ import annotations
 
+import json
 import math
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
+from depth_steps import pair_of
 from reference_metrics import LIGHTS, Array, Intrinsics, Reference
 from scipy import ndimage
 from skimage.metrics import structural_similarity
 
+from dsr.data.frame_files import read_millimetres
 from dsr.geometry.camera import Camera
 from dsr.metrics import sensor
 from dsr.metrics.catalogue import Score, catalogue, score_image
@@ -108,15 +113,6 @@ def test_prediction_that_is_nowhere_near_covers_nothing() -> None:
     assert math.isnan(_rows(prediction, np.full_like(truth, np.nan))["Sensor_covered", ""].value)
 
 
-def test_scores_of_a_batch_are_those_of_its_images() -> None:
-    maps = [tuple(torch.from_numpy(each)[None, None] for each in _maps(seed)) for seed in (0, 1)]
-    rays = CAMERA.rays()[None]
-    batch = SurfacePair(*(torch.cat(each) for each in zip(*maps, strict=True)), rays)
-    for metric in METRICS:
-        singles = [metric.function(SurfacePair(*each, rays)) for each in maps]
-        torch.testing.assert_close(metric.function(batch), torch.cat(singles))
-
-
 @pytest.mark.parametrize("steps", [0, 1, 3])
 def test_erosion_is_scipys(steps: int) -> None:
     mask = np.random.default_rng(0).random((2, 1, 17, 23)) < 0.9
@@ -124,13 +120,73 @@ def test_erosion_is_scipys(steps: int) -> None:
     np.testing.assert_array_equal(sensor.erode(torch.from_numpy(mask), steps)[:, 0].numpy(), expected)
 
 
-@pytest.mark.parametrize("count", [0, 1, 2, 7, 8])
-def test_masked_median_is_numpys(count: int) -> None:
-    values = torch.randn(1, 1, 2, 4, generator=torch.Generator().manual_seed(count), dtype=torch.float64)
-    mask = torch.zeros(8, dtype=torch.bool)
-    mask[:count] = True
-    mask = mask.flip(0).view(1, 1, 2, 4)
-    found = sensor.masked_median(values, mask)
-    expected = np.median(values[mask].numpy()) if count else np.nan
-    assert found.shape == (1, 1, 1, 1)
-    assert found.item() == pytest.approx(expected, nan_ok=True)
+BOARD_CAMERA = Camera(width=64, height=48, fx=60.0, fy=62.0, cx=31.0, cy=24.5)
+V, U = np.mgrid[:48, :64].astype(float)
+X, Y = (U - 31) / 60, (V - 24.5) / 62
+
+
+def _plane(x: float, y: float, distance: float) -> Array:
+    """Return the depth of the plane whose normal is along (x, y, 1)."""
+    return distance * math.sqrt(x * x + y * y + 1) / (x * X + y * Y + 1)
+
+
+def _board(prediction: Array, truth: Array) -> SurfacePair:
+    return pair_of(prediction, truth, BOARD_CAMERA)
+
+
+def test_steep_planes_are_fitted_along_the_axis_that_they_face() -> None:
+    random = np.random.default_rng(0)
+    for normal in np.array([[1, 0.1, 0.02], [0.05, -1, 0.1], [0.2, 0.1, 1]]):
+        unit = normal / np.linalg.norm(normal)
+        spread = random.normal(size=(50, 3)) + 3 * unit
+        points = spread - (spread @ unit - 3)[:, None] * unit
+        found = sensor.plane_normal(torch.from_numpy(points)).numpy()
+        np.testing.assert_allclose(found * np.sign(found @ unit), unit, atol=1e-12)
+    assert sensor.plane_normal(torch.eye(3)[:2]).isnan().all()
+    assert sensor.plane_normal(torch.arange(5.0)[:, None] * torch.ones(3)).isnan().all()
+
+
+def test_waves_about_a_plane_have_the_deviation_of_their_amplitude_whatever_the_offset() -> None:
+    truth = _plane(0.2, 0.1, 1.5)
+    waves = 0.01 * np.sin(2 * np.pi * U / 8 + 0.3)
+    found = sensor.board_errors(_board(truth + 0.05 + waves, truth))
+    assert found["std"].item() == pytest.approx(0.01 / math.sqrt(2), rel=1e-3)
+    assert found["covered"].item() == 1
+
+
+@pytest.mark.parametrize("tilt", [0.05, 0.3])
+def test_angle_is_that_between_two_planes(tilt: float) -> None:
+    truth, prediction = np.full_like(X, 1.2), _plane(math.tan(tilt), 0, 1.2 * math.cos(tilt))
+    pair = _board(np.where(np.abs(prediction - 1.2) < 0.05, prediction, np.nan), truth)
+    assert sensor.board_errors(pair)["angle"].item() == pytest.approx(math.degrees(tilt), rel=1e-6)
+
+
+def test_other_surfaces_and_holes_do_not_count_and_lower_the_coverage() -> None:
+    truth = np.where((V > 5) & (V < 40) & (U > 5) & (U < 50), _plane(0.2, 0.1, 1.5), np.nan)
+    noise = 0.002 * np.random.default_rng(1).standard_normal(truth.shape)
+    prediction = truth + noise
+    prediction[10:14, 10:20], prediction[20:24, 10:20] = np.nan, prediction[20:24, 10:20] + 0.2
+    found = sensor.board_errors(_board(prediction, truth))
+    kept = np.isfinite(truth)
+    kept[10:14, 10:20] = kept[20:24, 10:20] = False
+    assert found["covered"].item() == pytest.approx(kept.sum() / np.isfinite(truth).sum())
+    assert found["std"].item() == pytest.approx(noise[kept].std(), rel=1e-9)
+
+
+def test_frames_before_a_board_have_their_known_scores(shared: Path) -> None:
+    folder = shared / "real" / "stereo_board"
+    facts = json.loads((folder / "board.json").read_text())
+    rays, found = Camera(**facts["camera"]).rays()[None], []
+    for name, frame in facts["frames"].items():
+        plane = torch.from_numpy(cv2.imread(str(folder / "plane" / f"{name}.png"), cv2.IMREAD_UNCHANGED) / 1e4)
+        outline = np.zeros(tuple(plane.shape), np.uint8)
+        cv2.fillPoly(outline, [np.round(frame["polygon"]).astype(np.int32)], 1)
+        inside = torch.from_numpy(cv2.distanceTransform(outline, cv2.DIST_L2, 5))
+        depth = read_millimetres(folder / "depth" / f"{name}.png")[None].double()
+        truth = plane.masked_fill(plane == 0, torch.nan)[None, None]
+        masks = (inside[None, None] > 12, (inside[None, None] > 12) & (inside[None, None] <= 36))
+        board, border = (SurfacePair(depth, truth, rays, mask) for mask in masks)
+        deviations = [1e3 * sensor.board_errors(each)["std"].item() for each in (board, border)]
+        found.append([*deviations, sensor.board_errors(board)["angle"].item()])
+    # published as 9.7, 10.1 and 35.6; these are of a script in numpy with the plane's normal of board.json
+    np.testing.assert_allclose(np.mean(found, axis=0), (9.786, 10.15, 36.82), rtol=1e-3)

@@ -2,18 +2,15 @@
 
 The field's ways, of which an evaluation takes one (``metrics.alignment``):
 
-- ``scale``: the prediction times the ratio of the medians of the two maps. It is the median scaling of Zhou et al.,
-  *Unsupervised Learning of Depth and Ego-Motion from Video*, CVPR 2017; ``evaluate_depth.py`` of nianticlabs/monodepth2
-  (b676244), which clamps to 80 m afterwards.
-- ``affine``: least squares of a z + b, clamped at 1e-4 m. ``src/util/alignment.py`` of prs-eth/Marigold (b1dffaa);
-  ``depth_affine_lst_sq_clip_by_0`` in ``evalmde/utils/depth.py`` of princeton-vl/EvalMDE (ea9e21c).
-- ``affine_disparity``: least squares of a / z + b, the inverse depth, clamped at 1e-4 / m. Ranftl et al., *Towards
-  Robust Monocular Depth Estimation* (MiDaS), TPAMI 2022; EvalMDE's ``disparity_affine_clip_by_0``.
-- ``robust``: the a z + b of the least sum of |a z + b - t| / t, clamped as ``affine`` is. Wang et al., *MoGe*, CVPR
-  2025; ``align_depth_affine`` in ``moge/utils/alignment.py`` of microsoft/MoGe (0744441), which solves it for 64 x 64
-  of the pixels. Here all count, by iteratively reweighted least squares.
-
-A prediction fitted to the truth has fewer errors than one that knows its scale: tables say which one they are of.
+- ``scale``: the prediction times the ratio of the medians of the two maps (Zhou et al., CVPR 2017; nianticlabs/
+  monodepth2 b676244, ``evaluate_depth.py``, which clamps to 80 m afterwards).
+- ``affine``: least squares of a z + b, clamped at 1e-4 m (``src/util/alignment.py`` of prs-eth/Marigold b1dffaa;
+  ``depth_affine_lst_sq_clip_by_0`` in ``evalmde/utils/depth.py`` of princeton-vl/EvalMDE ea9e21c).
+- ``affine_disparity``: least squares of a / z + b, the inverse depth, clamped at 1e-4 / m (Ranftl et al., *MiDaS*,
+  TPAMI 2022; EvalMDE's ``disparity_affine_clip_by_0``).
+- ``robust``: the a z + b of the least sum of |a z + b - t| / t, clamped as ``affine`` is (Wang et al., *MoGe*, CVPR
+  2025; ``align_depth_affine`` in ``moge/utils/alignment.py`` of microsoft/MoGe 0744441, which solves it for 64 x 64 of
+  the pixels). Here all count, by iteratively reweighted least squares.
 """
 
 from __future__ import annotations
@@ -31,8 +28,8 @@ ALIGNMENTS = {
     "robust": "by scale and shift of depth, least absolute relative errors",
 }  # what each alignment does, for notes
 LEAST = 1e-4  # metres or 1 / metres: smallest value that a shift may leave
-# of the reweighted least squares: steps, and the relative error from which on weights stay finite
-_ITERATIONS, _SMALLEST_ERROR = 50, 1e-6
+_ITERATIONS = 50  # of the reweighted least squares
+_SMALLEST_ERROR = 1e-6  # relative, from which on their weights stay finite
 
 
 def align(prediction: Tensor, target: Tensor, mask: Tensor | None, how: str) -> Tensor:
@@ -43,14 +40,10 @@ def align(prediction: Tensor, target: Tensor, mask: Tensor | None, how: str) -> 
     """
     if how not in ALIGNMENTS:
         raise ValueError(f"alignment: expected one of {', '.join(ALIGNMENTS)}, got {how!r}")
-    if prediction.shape != target.shape or prediction.dim() != 4:
-        came = f"{tuple(prediction.shape)} and {tuple(target.shape)}"
-        raise ValueError(f"prediction, target: expected two depth maps of shape (B, 1, H, W), got {came}")
     if how == "none":
         return prediction
     known = prediction.isfinite() & (prediction > 0)
-    valid = known & target.isfinite() & (target > 0)
-    valid = valid if mask is None else valid & mask
+    valid = known & target.isfinite() & (target > 0) & (True if mask is None else mask)
     z = torch.where(known, prediction, 1).double()
     truth = torch.where(valid, target, 1).double()
     if how == "scale":
@@ -96,8 +89,7 @@ def align_pair(pair: SurfacePair, how: str) -> SurfacePair:
     if pair.depth_error is not None and pair.angle_error is not None:
         errors = align_errors((pair.depth_error, pair.angle_error), prediction, aligned, how)
     depth_error, angle_error = errors or (None, None)
-    return SurfacePair(aligned, target, pair.rays, pair.target_mask, unit=pair.unit, regions=pair.regions,
-                       depth_error=depth_error, angle_error=angle_error, image_dtype=pair.image_dtype)  # fmt: skip
+    return pair.replaced(prediction=aligned, depth_error=depth_error, angle_error=angle_error)
 
 
 def _least_squares(x: Tensor, y: Tensor, weights: Tensor) -> Tensor:

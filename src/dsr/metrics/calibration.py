@@ -1,16 +1,13 @@
 """Comparison of the errors that a method expects of its result with the measured ones.
 
-Expected errors are calibrated if they are right on average both where they are small and where they are large, see
-:func:`error_ratios` and :func:`ence`. They are informative if they are largest where the result is worst, see
-:func:`squared_error_share`, :func:`ause` and :func:`off_auc`. These functions take expected and measured
-absolute errors of the same pixels, of any shape, and return float64. Pixels without either error, NaN, are left out,
-and ``Calibration_covered`` says how many have both; without any pixel the result is NaN.
+These functions take expected and measured absolute errors of the same pixels, of any shape, and return float64. Pixels
+without either error, NaN, are left out; without any pixel the result is NaN.
 
-ENCE is that of Levi et al., *Evaluating and Calibrating Uncertainty Prediction in Regression Tasks*, Sensors 2022
-(arXiv 1905.11659), with parts of equal numbers of pixels, while ``ENCE.py`` of EFS-OpenSource/calibration-framework
-(cc19d1b) has bins of equal width. AUSE is that of Ilg et al., *Uncertainty Estimates and Multi-Hypotheses Networks for
-Optical Flow*, ECCV 2018, with the subsets of ``compute_aucs`` in ``evaluate.py`` of mattpoggi/mono-uncertainty
-(543772b), which has 50 steps, does not divide by the mean error, and keeps all pixels of equal expected error or none.
+ENCE is that of Levi et al., *Evaluating and Calibrating Uncertainty Prediction in Regression Tasks*, Sensors 2022, with
+parts of equal numbers of pixels, while ``ENCE.py`` of EFS-OpenSource/calibration-framework (cc19d1b) has bins of equal
+width. AUSE is that of Ilg et al., *Uncertainty Estimates and Multi-Hypotheses Networks for Optical Flow*, ECCV 2018,
+with the subsets of ``compute_aucs`` in ``evaluate.py`` of mattpoggi/mono-uncertainty (543772b), which has 50 steps,
+does not divide by the mean error, and keeps all pixels of equal expected error or none.
 """
 
 from __future__ import annotations
@@ -24,9 +21,8 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.surface import angle_between, depth_to_normals
-from dsr.metrics.formats import MetricFormat, column
-from dsr.metrics.functional import SurfacePair, angle, masked_mean
-from dsr.metrics.metric import Metric, depth_mask, normal_mask, target_mask
+from dsr.metrics.formats import Metric, MetricFormat, column, depth_mask, normal_mask, of_parts, target_mask
+from dsr.metrics.functional import SurfacePair, angle, masked_mean, once_per_pair
 
 DEVIATION = math.sqrt(math.pi / 2)  # standard deviation of a Gaussian over its mean absolute value
 STEPS = 100  # steps of a sparsification curve
@@ -38,8 +34,8 @@ def measured_errors(prediction: Tensor, target: Tensor, rays: Tensor) -> tuple[T
 
     Prediction and target are (B, 1, H, W) orthogonal depth in metres, NaN in holes, the rays (B or 1, 3, H, W).
     """
-    first, second = (depth_to_normals(depth, rays) for depth in (prediction, target))
-    return (prediction - target).abs(), angle_between(first, second)
+    angles = angle_between(depth_to_normals(prediction, rays), depth_to_normals(target, rays))
+    return (prediction - target).abs(), angles
 
 
 def error_ratios(expected: Tensor, measured: Tensor, parts: int = 10) -> Tensor:
@@ -68,13 +64,12 @@ def ence(expected: Tensor, measured: Tensor, parts: int = 10) -> Tensor:
     """Return the expected normalised calibration error: the mean of |RMSE - RMV| / RMV over equal parts of the pixels.
 
     The parts are those of :func:`error_ratios`. RMSE is the root of a part's mean squared error, RMV that of its mean
-    variance, for which an expected absolute error counts as that of a Gaussian: its standard deviation is sqrt(pi / 2)
-    of it. Errors with heavier tails than a Gaussian's have a larger RMSE, even where they are expected rightly.
+    variance, where an expected absolute error is a Gaussian's, of a standard deviation of sqrt(pi / 2) of it.
     """
     expected, measured = _ordered(expected, measured)
     parts = max(1, min(parts, len(expected)))  # a part without a pixel has no mean
-    variances, squares = (DEVIATION * expected).square().tensor_split(parts), measured.square().tensor_split(parts)
-    rmv, rmse = (torch.stack([part.mean() for part in each]).sqrt() for each in (variances, squares))
+    rmv = torch.stack([part.mean() for part in (DEVIATION * expected).square().tensor_split(parts)]).sqrt()
+    rmse = torch.stack([part.mean() for part in measured.square().tensor_split(parts)]).sqrt()
     return ((rmse - rmv).abs() / rmv).mean()
 
 
@@ -101,7 +96,7 @@ def ause(expected: Tensor, measured: Tensor, steps: int = STEPS) -> Tensor:
     errors; the area is by trapezoids. It depends on the number of steps: by a sixth from 20 to 100.
     """
     measured = measured.masked_fill(~expected.isfinite(), torch.nan)
-    curve, oracle = (sparsification(each, measured, steps) for each in (expected, measured))
+    curve, oracle = sparsification(expected, measured, steps), sparsification(measured, measured, steps)
     return torch.trapezoid((curve - oracle) / curve[0], dx=1 / steps)
 
 
@@ -130,9 +125,6 @@ def stated_ratio(expected: Tensor, measured: Tensor) -> Tensor:
 
 def _ordered(expected: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
     """Return the errors of pixels that have both, in the order of the expected ones, (N,) float64 each."""
-    if expected.shape != measured.shape:
-        came = f"{tuple(expected.shape)} and {tuple(measured.shape)}"
-        raise ValueError(f"expected, measured: expected errors of the same pixels, got shapes {came}")
     valid = expected.isfinite() & measured.isfinite()
     expected, measured = expected[valid].double(), measured[valid].double()
     halves = expected.half()
@@ -145,25 +137,18 @@ def _ordered(expected: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
     return expected[order], measured[order]
 
 
-_Comparison = Callable[[Tensor, Tensor], Tensor]
+@once_per_pair
+def depth_calibration(pair: SurfacePair) -> dict[str, Tensor]:
+    """Return the comparisons of the expected and the measured errors of depth in metres by name, (B,) each."""
+    measured = (pair.prediction - pair.target).abs()
+    functions = {"ENCE": ence, "AUSE_d": ause, "AUC_20mm": off_auc, "stated": stated_ratio}
+    found = {name: _per_image(each, pair.depth_error, measured, pair.depth_mask) for name, each in functions.items()}
+    return {**found, "factor": torch.maximum(found["stated"], 1 / found["stated"])}
 
 
-def of_depth(pair: SurfacePair, compare: _Comparison) -> Tensor:
-    """Return a comparison of the expected and the measured errors of each image's orthogonal depth in metres, (B,)."""
-    assert pair.depth_error is not None  # noqa: S101 - the metric applies
-    return _per_image(compare, pair.depth_error, (pair.prediction - pair.target).abs(), pair.depth_mask)
-
-
-def of_normals(pair: SurfacePair, compare: _Comparison) -> Tensor:
-    """Return a comparison of the expected and the measured errors of each image's normals in degrees, (B,)."""
-    assert pair.angle_error is not None  # noqa: S101 - the metric applies
-    return _per_image(compare, pair.angle_error, angle(pair), pair.normal_mask)
-
-
-def factor_off(expected: Tensor, measured: Tensor) -> Tensor:
-    """Return the factor between the medians of expected and measured errors, 1 or more, lower is better."""
-    ratio = stated_ratio(expected, measured)
-    return torch.maximum(ratio, 1 / ratio)
+def ause_v(pair: SurfacePair) -> Tensor:
+    """Return the area under the sparsification error of the normals in degrees, (B,)."""
+    return _per_image(ause, pair.angle_error, angle(pair), pair.normal_mask)
 
 
 def covered(pair: SurfacePair) -> Tensor:
@@ -172,37 +157,23 @@ def covered(pair: SurfacePair) -> Tensor:
     return masked_mean(pair.depth_mask & pair.depth_error.isfinite(), pair.target_mask).squeeze(1)
 
 
-def _per_image(compare: _Comparison, expected: Tensor, measured: Tensor, mask: Tensor) -> Tensor:
-    expected = expected.masked_fill(~mask, torch.nan)
-    return torch.stack([compare(*each) for each in zip(expected, measured, strict=True)])
+def _per_image(
+    compare: Callable[[Tensor, Tensor], Tensor], expected: Tensor | None, measured: Tensor, mask: Tensor
+) -> Tensor:
+    assert expected is not None  # noqa: S101 - the metric applies
+    errors = zip(expected.masked_fill(~mask, torch.nan), measured, strict=True)
+    return torch.stack([compare(*each) for each in errors])
 
 
-def _of_depth(name: str, compare: _Comparison, shown: MetricFormat, unit: str | None = None) -> Metric:
-    function = partial(of_depth, compare=compare)
-    return Metric(f"Calibration_{name}", function, depth_mask, shown, min_size=1, unit=unit, stated="depth_error")
-
-
+_of_depth = partial(of_parts, "Calibration_", depth_calibration, depth_mask, min_size=1, stated="depth_error")
+_covered = partial(Metric, min_size=1, stated="depth_error", regional=True, whole=True)
 METRICS: tuple[Metric, ...] = (
-    _of_depth("ENCE", ence, column("ENCE", "depth, %", 1e2, 1)),
-    _of_depth("AUSE_d", ause, column("AUSE", f"depth, {STEPS} steps", 1, 3)),
+    *_of_depth({"ENCE": column("ENCE", "depth, %", 1e2), "AUSE_d": column("AUSE", f"depth, {STEPS} steps", 1, 3)}),
     Metric(
-        "Calibration_AUSE_v",
-        partial(of_normals, compare=ause),
-        normal_mask,
-        column("AUSE", f"normals, {STEPS} steps", 1, 3),
-        stated="angle_error",
+        "Calibration_AUSE_v", ause_v, normal_mask, column("AUSE", f"normals, {STEPS} steps", 1, 3), stated="angle_error"
     ),
-    _of_depth("AUC_20mm", off_auc, column("AUC", "off by 20 mm", 1, 3, higher_is_better=True), unit="cm"),
-    _of_depth("stated", stated_ratio, MetricFormat("Stated", "of true error", position=None)),
-    _of_depth("factor", factor_off, column("Stated off", "factor", 1, 2)),
-    Metric(
-        "Calibration_covered",
-        covered,
-        target_mask,
-        column("Covered", "stated, %", 1e2, 1, higher_is_better=True),
-        min_size=1,
-        stated="depth_error",
-        regional=True,
-        whole=True,
-    ),
+    *_of_depth({"AUC_20mm": column("AUC", "off by 20 mm", 1, 3, higher_is_better=True)}, unit="cm"),
+    *_of_depth({"stated": MetricFormat("Stated", "of true error", position=None)}),
+    *_of_depth({"factor": column("Stated off", "factor", 1, 2)}),
+    _covered("Calibration_covered", covered, target_mask, column("Covered", "stated, %", 1e2, higher_is_better=True)),
 )

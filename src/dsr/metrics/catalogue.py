@@ -11,11 +11,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dsr.metrics import boundaries, calibration, depth, evalmde, functional, plane, points, sensor
-from dsr.metrics.formats import MetricFormat
+from dsr.metrics import boundaries, calibration, depth, evalmde, functional, points, sensor
+from dsr.metrics.formats import Metric, MetricFormat, depth_mask, normal_mask
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS, MIN_SIZE, lpips_v
-from dsr.metrics.metric import Metric, depth_mask, normal_mask
 from dsr.sample import CENTIMETRES, Unit
 
 __all__ = [
@@ -31,81 +30,55 @@ __all__ = [
 ]
 
 
+def _bad_pixels(percent: int, unit: str, shown: str, position: int | None = None) -> Metric:
+    """Return BadPix_d of a threshold in centimetres, or in per cent of depth."""
+    function = partial(functional.bad_pix_d, threshold=percent / 100, relative=unit == "pct")
+    form = MetricFormat("BadPix_d", f"{percent} {shown}, %", 1e2, 2, position=position)
+    return Metric(f"BadPix_d_{percent}{unit}", function, depth_mask, form, min_size=1)
+
+
+_by_light = partial(Metric, per_light=True)
+_visual = partial(MetricFormat, unit="1/1000", factor=1e3, digits=0)
+_windows, _curvatures = attrgetter("ssim_mask"), attrgetter("bumpiness_mask")
 # the paper's metrics in the order of scores.csv; those with a position are the columns of its tables
 METRICS: tuple[Metric, ...] = (
     Metric("RMSE_d", functional.rmse_d, depth_mask, MetricFormat("RMSE_d", "mm", 1e3, 1, position=1), min_size=1),
+    *(_bad_pixels(percent, "cm", "cm", 2 if percent == 5 else None) for percent in (1, 5, 10)),
+    *(_bad_pixels(percent, "pct", "% of depth") for percent in (1, 5, 10)),
     *(
-        Metric(
-            f"BadPix_d_{percent}{unit}",
-            partial(functional.bad_pix_d, threshold=percent / 100, relative=unit == "pct"),
-            depth_mask,
-            MetricFormat("BadPix_d", f"{percent} {of}, %", 1e2, 2, position=2 if percent == second else None),
-            min_size=1,
-        )
-        for unit, of, second in (("cm", "cm", 5), ("pct", "% of depth", None))
-        for percent in (1, 5, 10)
-    ),
-    *(
-        Metric(
+        _by_light(
             f"BadPix_v_{level}",
             partial(functional.bad_pix_v, threshold=level),
             normal_mask,
             MetricFormat("BadPix_v", f"{level}, %", 1e2, 1, position=3 if level == 5 else None),
-            per_light=True,
         )
         for level in (1, 5, 10)
     ),
+    _by_light("DSSIM_v", functional.dssim_v, _windows, _visual("DSSIM_v", position=4), min_size=functional.SSIM_WINDOW),
+    _by_light("LPIPS_v", lpips_v, normal_mask, _visual("LPIPS_v", position=5), min_size=MIN_SIZE, perceptual=True),
+    Metric("RMSE_v", functional.rmse_v, normal_mask, _visual("RMSE_v", position=7)),
+    _by_light("RMSE_v1", functional.rmse_v1, normal_mask, _visual("RMSE_v1", position=None)),
     Metric(
-        "DSSIM_v",
-        functional.dssim_v,
-        attrgetter("ssim_mask"),
-        MetricFormat("DSSIM_v", "1/1000", 1e3, 0, position=4),
-        per_light=True,
-        min_size=functional.SSIM_WINDOW,
-    ),
-    Metric(
-        "LPIPS_v",
-        lpips_v,
-        normal_mask,
-        MetricFormat("LPIPS_v", "1/1000", 1e3, 0, position=5),
-        per_light=True,
-        min_size=MIN_SIZE,
-        perceptual=True,
-    ),
-    Metric("RMSE_v", functional.rmse_v, normal_mask, MetricFormat("RMSE_v", "1/1000", 1e3, 0, position=7)),
-    Metric(
-        "RMSE_v1",
-        functional.rmse_v1,
-        normal_mask,
-        MetricFormat("RMSE_v1", "1/1000", 1e3, 0, position=None),
-        per_light=True,
-    ),
-    Metric(
-        "Bumpiness_d",
-        functional.bumpiness_d,
-        attrgetter("bumpiness_mask"),
-        MetricFormat("Bump_d", digits=2, position=6),
-        min_size=3,
+        "Bumpiness_d", functional.bumpiness_d, _curvatures, MetricFormat("Bump_d", digits=2, position=6), min_size=3
     ),
 )
-# sets of metrics by name: the paper's, those that the field prints, those for real sensors, of depth estimation, of
-# EvalMDE, of boundaries, of stated errors and of planes
+
+
+def _family(name: str, metrics: Sequence[Metric]) -> tuple[Metric, ...]:
+    return tuple(replace(metric, format=replace(metric.format, family=name)) for metric in metrics)
+
+
 PROTOCOLS: Mapping[str, tuple[Metric, ...]] = {
     "paper": METRICS,
     "field": depth.FIELD,
-    "sensor": sensor.METRICS,
-    **{
-        name: tuple(replace(metric, format=replace(metric.format, family=name)) for metric in metrics)
-        for name, metrics in {
-            "depth": depth.DEPTH,
-            "normals": depth.NORMALS,
-            "points": points.METRICS,
-            "evalmde": evalmde.METRICS,
-            "boundaries": boundaries.METRICS,
-            "calibration": calibration.METRICS,
-            "plane": plane.METRICS,
-        }.items()
-    },
+    "sensor": sensor.SENSOR,
+    "depth": _family("depth", depth.DEPTH),
+    "normals": _family("normals", depth.NORMALS),
+    "points": _family("points", points.METRICS),
+    "evalmde": _family("evalmde", evalmde.METRICS),
+    "boundaries": _family("boundaries", boundaries.METRICS),
+    "calibration": _family("calibration", calibration.METRICS),
+    "plane": _family("plane", sensor.PLANE),
 }
 KNOWN_FORMATS = {metric.name: metric.format for metric in METRICS}
 
@@ -125,16 +98,14 @@ def catalogue(
     metrics = (*(metric for name in dict.fromkeys(protocols) for metric in PROTOCOLS[name]), *extra)
     of_regions = [each for each in metrics if each.in_regions]
     metrics = (*metrics, *(each.within(region) for region in regions for each in of_regions))
-    names = [metric.name for metric in metrics]
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f"{name}: expected metrics of different names, got two of this one")
-    if network is None:
-        return tuple(metric for metric in metrics if not metric.perceptual)
-    return tuple(
-        replace(metric, function=partial(metric.function, network=network)) if metric.perceptual else metric
-        for metric in metrics
-    )
+    found: dict[str, Metric] = {}
+    for metric in metrics:
+        if metric.name in found:
+            raise ValueError(f"{metric.name}: expected metrics of different names, got two of this one")
+        found[metric.name] = metric
+        if metric.perceptual:
+            found[metric.name] = replace(metric, function=partial(metric.function, network=network))
+    return tuple(metric for metric in found.values() if network is not None or not metric.perceptual)
 
 
 class Score(NamedTuple):
@@ -166,31 +137,27 @@ def score_image(
     and ``errors`` the method's expected errors, (1, H, W): of depth in metres, of normals in degrees. Metrics for other
     units, absent regions or absent errors are left out.
     """
-    valid = prediction.isfinite()[0]
-    window: list[slice] = []  # rows and columns of the smallest one with all predicted pixels; all if there are none
-    for axis in (1, 0):
-        hits = valid.any(dim=axis).nonzero()
-        window.append(slice(int(hits[0]), int(hits[-1]) + 1) if len(hits) else slice(0, valid.shape[1 - axis]))
-    windows = [[slice(None), slice(None)]]
-    if valid[*window].shape != valid.shape:
-        windows.append(window)
-    pairs = []
-    for rows, columns in windows:
-        depth_error, angle_error = (None, None) if errors is None else (e[None, :, rows, columns] for e in errors)
-        pairs.append(
-            SurfacePair(
-                prediction[None, :, rows, columns],
-                target[None, :, rows, columns],
-                rays[None, :, rows, columns],
-                unit=unit,
-                regions={name: region[None, :, rows, columns] for name, region in (regions or {}).items()},
-                depth_error=depth_error,
-                angle_error=angle_error,
-                image_dtype=torch.float32,
-            )
+
+    def pair_of(rows: slice, columns: slice) -> SurfacePair:
+        parts = [values[None, :, rows, columns] for values in (prediction, target, rays, *(errors or ()))]
+        return SurfacePair(
+            *parts[:3],
+            unit=unit,
+            regions={name: region[None, :, rows, columns] for name, region in (regions or {}).items()},
+            depth_error=parts[3] if errors else None,
+            angle_error=parts[4] if errors else None,
+            image_dtype=torch.float32,
         )
+
+    whole = inner = pair_of(slice(None), slice(None))
+    valid = prediction.isfinite()[0]
+    if valid.any():
+        v, u = valid.nonzero().unbind(1)
+        rows, columns = slice(int(v.min()), int(v.max()) + 1), slice(int(u.min()), int(u.max()) + 1)
+        if valid[rows, columns].shape != valid.shape:
+            inner = pair_of(rows, columns)
     for metric in metrics:
-        pair = pairs[0] if metric.whole else pairs[-1]
+        pair = whole if metric.whole else inner
         if not metric.applies(pair):
             continue
         share = metric.valid_fraction(pair).item() * (pair.target.numel() / target.numel())

@@ -1,11 +1,7 @@
-"""torchmetrics classes of the paper's metrics: the mean over images, by default of the worst of four lights.
+"""torchmetrics classes of the metrics: the mean over images, by default of the worst of four lights.
 
-    DSSIMv()(preds, target, camera)                     # the value of this batch
-    metrics = visual_metrics(network)                   # a MetricCollection
-    metrics.update(preds, target, camera)               # or a SurfacePair
-    metrics.compute()                                   # {"RMSE_d": ..., "DSSIM_v": ..., ...}
-
-Masks, normals and renderings are computed once for all the metrics of such a collection, by the pair.
+They are updated with (prediction, target, camera) or with a SurfacePair; a collection computes masks, normals and
+renderings once for all of its metrics.
 """
 
 from __future__ import annotations
@@ -21,10 +17,9 @@ from torch import Tensor
 from dsr.geometry.camera import Camera
 from dsr.metrics.alignment import align_pair
 from dsr.metrics.catalogue import PROTOCOLS, catalogue
-from dsr.metrics.formats import MetricFormat
+from dsr.metrics.formats import VARIANTS, WORST, Metric
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS
-from dsr.metrics.metric import VARIANTS, WORST, Metric
 
 
 class PerImageMean(torchmetrics.Metric):
@@ -43,6 +38,7 @@ class PerImageMean(torchmetrics.Metric):
     is_differentiable = False
     full_state_update = False
     applied: Tensor  # whether the metric is for all pairs, or was for one so far
+    total: Tensor
     count: Tensor
 
     def __init__(self, metric: Metric | str, variant: str = WORST, **settings: Any) -> None:
@@ -54,30 +50,21 @@ class PerImageMean(torchmetrics.Metric):
             metric = known[metric]
         if variant not in VARIANTS:
             raise ValueError(f"variant: expected one of {', '.join(VARIANTS)}, got {variant!r}")
-        self._metric = metric
-        named = metric.worst if variant == WORST else variant
-        self._variant = named if metric.per_light else ""
-        self._total = f"total_{metric.name}_{self._variant}"  # else compute groups merge metrics of equal first values
-        self.add_state(self._total, torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
+        self._metric, self._variant = metric, ""
+        if metric.per_light:
+            self._variant = metric.worst if variant == WORST else variant
+        self.format, self.chart_title = metric.format, metric.format.chart_title(by_light=metric.per_light)
+        applied = torch.tensor(metric.unit is metric.region is metric.stated is None)
+        self.add_state("total", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
         self.add_state("count", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
-        self.add_state(
-            "applied", torch.tensor(metric.unit is metric.region is metric.stated is None), dist_reduce_fx="max"
-        )
-
-    @property
-    def format(self) -> MetricFormat:
-        """How tables and figures show the metric."""
-        return self._metric.format
-
-    @property
-    def chart_title(self) -> str:
-        """The title of a chart of the metric."""
-        return self.format.chart_title(by_light=self._metric.per_light)
+        self.add_state("applied", applied, dist_reduce_fx="max")
+        # a state of its own name, without which compute groups merge metrics whose first values are equal
+        self.add_state(f"of_{metric.name}_{self._variant}", torch.zeros(()), dist_reduce_fx="sum")
 
     @property
     def higher_is_better(self) -> bool:  # type: ignore[override]  # torchmetrics has a constant per class
         """Whether larger values are better."""
-        return self._metric.format.higher_is_better
+        return self.format.higher_is_better
 
     @torch.no_grad()
     def update(
@@ -87,23 +74,19 @@ class PerImageMean(torchmetrics.Metric):
         camera: Camera | Sequence[Camera] | Tensor | np.ndarray | None = None,
         mask: Tensor | np.ndarray | None = None,
     ) -> None:
-        """Add a batch, as for :meth:`dsr.metrics.functional.SurfacePair.of`.
-
-        A pair of another benchmark than the metric's, or without the expected errors that it compares, is left out.
-        """
+        """Add a batch, as for :meth:`dsr.metrics.functional.SurfacePair.of`, unless the metric is not for it."""
         pair = SurfacePair.of(preds, target, camera, mask)
         if not self._metric.applies(pair):
             return
         self.applied = torch.ones_like(self.applied)
         values = self._metric.variants(pair)[self._variant]
         valid = pair.target_mask.flatten(1).any(dim=1)
-        setattr(self, self._total, getattr(self, self._total) + torch.where(valid, values, 0).sum().to(self.count))
+        self.total = self.total + torch.where(valid, values, 0).sum().to(self.total)
         self.count = self.count + valid.sum().to(self.count)
 
     def compute(self) -> Tensor:
         """Return the mean, NaN where no image could be scored."""
-        total: Tensor = getattr(self, self._total)
-        return total / self.count
+        return self.total / self.count
 
     def plot(self, val: Any = None, ax: Any = None) -> Any:
         """Plot a value, or several in a row; of matplotlib's axes, None for new ones."""
@@ -165,10 +148,7 @@ def visual_metrics(
     alignment: str = "none",
     **settings: Any,
 ) -> SurfaceMetrics:
-    """Return all metrics of some protocols, each of the worst of four lights, as one collection.
-
-    Perceptual metrics need the network; ``alignment`` is that of :class:`SurfaceMetrics`.
-    """
+    """Return the metrics of :func:`dsr.metrics.catalogue.catalogue`, of the worst of four lights, as one collection."""
     chosen = catalogue(network, extra, protocols)
     metrics: dict[str, Any] = {metric.name: PerImageMean(metric, **settings) for metric in chosen}
     return SurfaceMetrics(metrics, alignment=alignment, compute_groups=False)
@@ -186,6 +166,6 @@ def compute_means(metrics: torchmetrics.MetricCollection) -> dict[str, Tensor]:
 
 
 def in_table_units(metrics: torchmetrics.MetricCollection, means: Mapping[str, float]) -> dict[str, float]:
-    """Return means of metrics of a collection of :func:`visual_metrics`, by name, in the units of tables."""
+    """Return means of a collection of :func:`visual_metrics`, by name, in the units of tables."""
     collection: Any = metrics
     return {name: value * collection[name].format.factor for name, value in means.items()}

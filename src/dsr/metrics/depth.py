@@ -6,8 +6,8 @@
 - ``metrics=field``: RMSE and MAE of depth super-resolution in centimetres (NYU, RGB-D-D) or in 8-bit levels
   (Middlebury, Lu), and the fractions of pixels off by more than 5 cm or by a ratio of more than 1.25.
 - ``metrics=normals``: mean, median and fractions below five angles of Bae and Davison, CVPR 2024 (baegwangbin/DSINE
-  ef0c2af). Both normal maps are forward differences of depth; central differences have smaller
-  angles for a noisy map, by a fifth and more.
+  ef0c2af). Both normal maps are forward differences of depth; central differences have smaller angles for a noisy map,
+  by a fifth and more.
 
 Depth is orthogonal, in metres, neither capped nor cropped. Missing predictions are left out of every mean; the
 fractions ``covered`` stand beside them.
@@ -21,9 +21,8 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.surface import normal_mask as mask_of_normals
-from dsr.metrics.formats import column
+from dsr.metrics.formats import Metric, column, depth_mask, normal_mask, of_parts, target_mask
 from dsr.metrics.functional import SurfacePair, angle, masked_mean, masked_median, once_per_pair
-from dsr.metrics.metric import Metric, depth_mask, normal_mask, part_of, target_mask
 
 _DELTAS = {"delta_105": 1.05, "delta_110": 1.1, "delta_125": 1.25, "delta_125_2": 1.25**2, "delta_125_3": 1.25**3}
 _WITHIN = {"within_5": 5, "within_7_5": 7.5, "within_11_25": 11.25, "within_22_5": 22.5, "within_30": 30}  # degrees
@@ -53,9 +52,9 @@ def depth_errors(pair: SurfacePair) -> dict[str, Tensor]:
 
 @once_per_pair
 def field_errors(pair: SurfacePair) -> dict[str, Tensor]:
-    """Return the errors of depth super-resolution by name, (B,) each: RMSE and MAE are in the benchmark's unit.
+    """Return the errors of depth super-resolution by name, (B,) each.
 
-    In that unit, the prediction is clamped to the limits, as 8-bit levels are.
+    RMSE and MAE are in the benchmark's unit, in which the prediction is clamped to the limits, as 8-bit levels are.
     """
     z, t = pair.prediction, pair.target
     mean = partial(masked_mean, mask=pair.depth_mask)  # (B, 1)
@@ -65,21 +64,22 @@ def field_errors(pair: SurfacePair) -> dict[str, Tensor]:
     error = (converted - pair.unit.convert(t)).abs()
     ratio = torch.maximum(z / t, 1 / (z / t))
     found = {
-        "RMSE": mean(error.square()).sqrt(),
-        "MAE": mean(error),
-        "5cm": mean((z - t).abs() > 0.05),
-        "delta1": mean(ratio > 1.25),
+        f"RMSE_{pair.unit.name}": mean(error.square()).sqrt(),
+        f"MAE_{pair.unit.name}": mean(error),
+        "Beyond_5cm": mean((z - t).abs() > 0.05),
+        "Beyond_delta1": mean(ratio > 1.25),
     }
     return {name: value.squeeze(1) for name, value in found.items()}
 
 
 @once_per_pair
 def normal_errors(pair: SurfacePair) -> dict[str, Tensor]:
-    """Return the mean and median angle in degrees and the fractions below some angles, (B,) each."""
-    angles = angle(pair)
-    found = {"mean": masked_mean(angles, pair.normal_mask), "median": masked_median(angles, pair.normal_mask)}
+    """Return the mean and median angle in degrees, the fractions below some angles, and the coverage, (B,) each."""
+    angles, mask = angle(pair), pair.normal_mask
+    found = {"mean": masked_mean(angles, mask), "median": masked_median(angles, mask)}
     for name, degrees in _WITHIN.items():
-        found[name] = masked_mean(angles < degrees, pair.normal_mask)
+        found[name] = masked_mean(angles < degrees, mask)
+    found["covered"] = masked_mean(mask, true_normal_mask(pair))
     return {name: value.flatten() for name, value in found.items()}
 
 
@@ -93,76 +93,46 @@ def true_normal_mask(pair: SurfacePair) -> Tensor:
     return mask_of_normals(pair.target_mask)
 
 
-def normals_covered(pair: SurfacePair) -> Tensor:
-    """Return the fraction of the true normals that have a predicted one."""
-    return masked_mean(pair.normal_mask, true_normal_mask(pair)).squeeze(1)
-
-
 _fraction = partial(column, factor=1e2, higher_is_better=True)
+_depth = {
+    "AbsRel": column("AbsRel", "%", 1e2, 2),
+    "SqRel": column("SqRel", "m", 1, 4),
+    "RMSE": column("RMSE", "m", 1, 4),
+    "MAE": column("MAE", "m", 1, 4),
+    "RMSE_log": column("RMSElog", "", 1, 4),
+    "log10": column("log10", "", 1, 4),
+    "SIlog": column("SIlog", "x 100", 1e2, 2),
+    "iRMSE": column("iRMSE", "1/km", 1e3, 2),
+    "iMAE": column("iMAE", "1/km", 1e3, 2),
+    "delta_105": _fraction("delta 1.05", "%", digits=2),
+    "delta_110": _fraction("delta 1.10", "%", digits=2),
+    "delta_125": _fraction("delta 1.25", "%", digits=2),
+    "delta_125_2": _fraction("delta 1.25^2", "%", digits=2),
+    "delta_125_3": _fraction("delta 1.25^3", "%", digits=2),
+}
+_normal = {
+    "mean": column("Mean angle", "forward, deg", 1, 2),
+    "median": column("Median angle", "forward, deg", 1, 2),
+    **{name: _fraction(f"< {degrees:g} deg", "forward, %") for name, degrees in _WITHIN.items()},
+}
+_field = {
+    "RMSE_cm": column("RMSE", "cm", digits=3),
+    "MAE_cm": column("MAE", "cm", digits=3),
+    "Beyond_5cm": column("Beyond", "5 cm, %", 1e2, 2),
+    "Beyond_delta1": column("Beyond", "1.25 x, %", 1e2, 2),
+}
+_levels = {"RMSE_levels": column("RMSE", "levels", digits=3), "MAE_levels": column("MAE", "levels", digits=3)}
+_covered = _fraction("Covered", "%")
+_normals_covered = {"covered": _fraction("Covered", "normals, %")}
 DEPTH = (
-    *(
-        Metric(
-            f"Depth_{name}",
-            partial(part_of, function=depth_errors, part=name),
-            depth_mask,
-            shown,
-            min_size=1,
-            unit="cm",
-        )
-        for name, shown in {
-            "AbsRel": column("AbsRel", "%", 1e2, 2),
-            "SqRel": column("SqRel", "m", 1, 4),
-            "RMSE": column("RMSE", "m", 1, 4),
-            "MAE": column("MAE", "m", 1, 4),
-            "RMSE_log": column("RMSElog", "", 1, 4),
-            "log10": column("log10", "", 1, 4),
-            "SIlog": column("SIlog", "x 100", 1e2, 2),
-            "iRMSE": column("iRMSE", "1/km", 1e3, 2),
-            "iMAE": column("iMAE", "1/km", 1e3, 2),
-            "delta_105": _fraction("delta 1.05", "%", digits=2),
-            "delta_110": _fraction("delta 1.10", "%", digits=2),
-            "delta_125": _fraction("delta 1.25", "%", digits=2),
-            "delta_125_2": _fraction("delta 1.25^2", "%", digits=2),
-            "delta_125_3": _fraction("delta 1.25^3", "%", digits=2),
-        }.items()
-    ),
-    Metric(
-        "Depth_covered",
-        covered,
-        target_mask,
-        _fraction("Covered", "%"),
-        min_size=1,
-        unit="cm",
-        regional=True,
-        whole=True,
-    ),
+    *of_parts("Depth_", depth_errors, depth_mask, _depth, min_size=1, unit="cm"),
+    Metric("Depth_covered", covered, target_mask, _covered, min_size=1, unit="cm", regional=True, whole=True),
 )
-FIELD = tuple(
-    Metric(name, partial(part_of, function=field_errors, part=part), depth_mask, shown, min_size=1, unit=unit)
-    for name, part, shown, unit in (
-        ("RMSE_cm", "RMSE", column("RMSE", "cm", digits=3), "cm"),
-        ("MAE_cm", "MAE", column("MAE", "cm", digits=3), "cm"),
-        ("Beyond_5cm", "5cm", column("Beyond", "5 cm, %", 1e2, 2), "cm"),
-        ("Beyond_delta1", "delta1", column("Beyond", "1.25 x, %", 1e2, 2), "cm"),
-        ("RMSE_levels", "RMSE", column("RMSE", "levels", digits=3), "levels"),
-        ("MAE_levels", "MAE", column("MAE", "levels", digits=3), "levels"),
-    )
+FIELD = (
+    *of_parts("", field_errors, depth_mask, _field, min_size=1, unit="cm"),
+    *of_parts("", field_errors, depth_mask, _levels, min_size=1, unit="levels"),
 )
 NORMALS = (
-    *(
-        Metric(f"Normal_{name}", partial(part_of, function=normal_errors, part=name), normal_mask, shown)
-        for name, shown in {
-            "mean": column("Mean angle", "forward, deg", 1, 2),
-            "median": column("Median angle", "forward, deg", 1, 2),
-            **{name: _fraction(f"< {degrees:g} deg", "forward, %") for name, degrees in _WITHIN.items()},
-        }.items()
-    ),
-    Metric(
-        "Normal_covered",
-        normals_covered,
-        true_normal_mask,
-        _fraction("Covered", "normals, %"),
-        regional=True,
-        whole=True,
-    ),
+    *of_parts("Normal_", normal_errors, normal_mask, _normal),
+    *of_parts("Normal_", normal_errors, true_normal_mask, _normals_covered, regional=True, whole=True),
 )

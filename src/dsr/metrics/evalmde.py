@@ -1,18 +1,15 @@
 """RelNormal and SAWA-H of EvalMDE, and the parts of SAWA-H singly.
 
 Wu et al., *Toward a Better Understanding of Monocular Depth Evaluation* (arXiv 2510.19814); princeton-vl/EvalMDE
-ea9e21c, ``evalmde/metrics`` (``rel_normal.py``, ``sawa_h.py``, ``standard.py``, ``boundary.py``), ``evalmde/utils``
-(``depth.py``, ``downsample.py``). SAWA-H is a sum of errors, weighted to agree with human judgment; lower is better:
+ea9e21c, ``evalmde/metrics`` and ``evalmde/utils``. SAWA-H is a sum of errors, weighted to agree with human judgment:
 
     SAWA-H = 3.65 wkdr + 0.18 beyond_disparity + 0.01 beyond_depth + 0.20 (1 - boundary F1) + 1.94 RelNormal
 
-What differs from their code: WKDR is of all pairs of pixels, of which theirs draws 10^7 without a seed, so that SAWA-H
-scatters by 3e-4 there; Sobol points are in 64 bits, theirs in 32 bits move RelNormal by 6e-7 on their example.
+WKDR is of all pairs of pixels, of which theirs draws 10^7 without a seed; Sobol points are in 64 bits, not 32.
 
 Pixels without a truth are left out. Holes of a prediction count as errors: pi in RelNormal, as theirs do; a pair of
-pixels in the wrong order; beyond the ratio; no edges where the truth has some. (Their other parts take the depth there
-to be 1 m.) Only false edges are spared by holes, so ``EvalMDE_covered``, the fraction of the true pixels that have a
-prediction, belongs to every score.
+pixels in the wrong order; beyond the ratio; no edges where the truth has some. Only false edges are spared by holes,
+so ``EvalMDE_covered`` belongs to every score.
 """
 
 from __future__ import annotations
@@ -25,32 +22,29 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.surface import length
-from dsr.metrics.boundaries import boundary_f1
+from dsr.metrics.boundaries import depth_pro_scores
 from dsr.metrics.depth import covered
-from dsr.metrics.formats import column
+from dsr.metrics.formats import column, of_parts, target_mask
 from dsr.metrics.functional import SurfacePair, once_per_pair
-from dsr.metrics.metric import Metric, target_mask
 from dsr.utils.compute_device import in_own_precision
 
 SCALES = (1, 2, 4, 8)
-# pixels: the largest distance of two normals along each axis at scale 1, and the smallest such limit at any scale
-RADIUS, SMALLEST_RADIUS = 32, 3
+RADIUS, SMALLEST_RADIUS = 32, 3  # pixels: limits of the distance of two normals along each axis, at scale 1 and at any
 PAIRS = 10**6
 CHUNK = 1 << 15  # how many points or pairs are worked on at a time
 STEEPEST = 1e-5  # sine of the angle between the two edges of a triangle below which it has no normal
 RATIO = 1.25**0.125
 NEAREST = 1e-4  # lower limit of aligned depth in metres and of aligned disparity in 1/m
 MIN_SIZE = 2 * SCALES[-1] + 1  # of a map with a normal at the coarsest scale
+WEIGHTS = {"WKDR": 3.65, "beyond_disparity": 0.18, "beyond_depth": 0.01, "boundary": 0.20, "RelNormal": 1.94}
 
 
-@once_per_pair
 def rel_normal(pair: SurfacePair) -> Tensor:
     """Return RelNormal, (B,) in radians, the mean error of the angle between two normals; lower is better.
 
     At each of four scales, 10^6 pairs of pixels up to 32 pixels of scale 1 apart, and the mean of the scales' means. At
-    a coarser scale each block has the depth of the pixel with a truth that is nearest to its centre. Normals are of the
-    triangle of a pixel and those two to the right and two below. A pair counts if the truth has both normals, as an
-    error of pi if the prediction has not.
+    a coarser scale each block has the depth of the pixel with a truth that is nearest to its centre. A pair counts if
+    the truth has both normals, as an error of pi if the prediction has not.
     """
     shape, found = pair.target.shape, []
     target = torch.where(pair.target_mask, pair.given[1], 1)
@@ -67,8 +61,7 @@ def rel_normal(pair: SurfacePair) -> Tensor:
 def nearest_to_centres(mask: Tensor, scale: int) -> Tensor:
     """Return which pixel stands for each block: the set one nearest to its centre, the first of equally near ones.
 
-    The mask is (B, 1, H, W) bool; blocks of ``scale`` pixels at the lower and right border may be smaller. Returns
-    indices into the flattened map, (B, ceil(H / scale), ceil(W / scale)) int64; of any pixel where none is set.
+    Indices into the flattened mask (B, 1, H, W), (B, ceil(H / scale), ceil(W / scale)); of any pixel where none is set.
     """
     (height, width), device = mask.shape[-2:], mask.device
     padded = torch.nn.functional.pad(mask, (0, -width % scale, 0, -height % scale))
@@ -87,8 +80,7 @@ def nearest_to_centres(mask: Tensor, scale: int) -> Tensor:
 def sobol_pairs(height: int, width: int, device: torch.device) -> list[Tensor]:
     """Return the pairs of normals that RelNormal compares, for each scale (2, 10^6) int32 indices into its normal map.
 
-    They are the first of an unscrambled Sobol sequence in four dimensions inside the map (position, offset), sorted
-    by the first index, so that what is read lies together.
+    They are the first of an unscrambled Sobol sequence in four dimensions inside the map (position, offset), sorted.
     """
     engine, found = torch.quasirandom.SobolEngine(4), []
     draws: list[Tensor] = []
@@ -110,12 +102,10 @@ def sobol_pairs(height: int, width: int, device: torch.device) -> list[Tensor]:
     return found
 
 
-@once_per_pair
 def wkdr(pair: SurfacePair) -> Tensor:
-    """Return the fraction of pairs of pixels that the prediction has in another order, (B,), lower is better.
+    """Return the fraction of ordered pairs (i, j) of true pixels that the prediction has in another order, (B,).
 
-    Of all ordered pairs (i, j) of pixels with a truth, those for which only one map has depth i < depth j, and those
-    with a hole of the prediction. It is 1 less the accuracy of the authors' code, which has no weights.
+    These are the pairs for which only one map has depth i < depth j, and those with a hole of the prediction.
     """
     from scipy.stats import kendalltau  # noqa: PLC0415 - it takes half a second to import
 
@@ -137,31 +127,21 @@ def wkdr(pair: SurfacePair) -> Tensor:
 
 
 @once_per_pair
-def beyond_disparity(pair: SurfacePair) -> Tensor:
-    """Return the fraction of pixels with a ratio to the true depth of 1.25^.125 or more, (B,), lower is better.
+def evalmde_errors(pair: SurfacePair) -> dict[str, Tensor]:
+    """Return SAWA-H and its parts by name, (B,) each; lower is better.
 
-    The prediction's inverse depth is first fitted to the true one by a factor and an offset, by least squares.
+    The parts ``beyond`` are the fractions of pixels with a ratio to the true depth of 1.25^.125 or more, after a fit.
     """
-    return _beyond(pair, 1 / _aligned(pair, 1 / pair.prediction, 1 / pair.target))
-
-
-@once_per_pair
-def beyond_depth(pair: SurfacePair) -> Tensor:
-    """Return the same as :func:`beyond_disparity` with depth itself fitted to the true depth, (B,), lower is better."""
-    return _beyond(pair, _aligned(pair, pair.prediction, pair.target))
-
-
-def boundary_error(pair: SurfacePair) -> Tensor:
-    """Return 1 less the boundary F1 of Depth Pro, (B,), see :func:`dsr.metrics.boundaries.boundary_f1`."""
-    return 1 - boundary_f1(pair)
-
-
-WEIGHTS = {wkdr: 3.65, beyond_disparity: 0.18, beyond_depth: 0.01, boundary_error: 0.20, rel_normal: 1.94}
-
-
-def sawa_h(pair: SurfacePair) -> Tensor:
-    """Return SAWA-H, (B,), without unit, lower is better: the sum of the parts by :data:`WEIGHTS`."""
-    return torch.stack([weight * part(pair).double() for part, weight in WEIGHTS.items()]).sum(dim=0)
+    z, t = pair.prediction, pair.target
+    parts = {
+        "RelNormal": rel_normal(pair),
+        "WKDR": wkdr(pair),
+        "beyond_disparity": _beyond(pair, 1 / _aligned(pair, 1 / z, 1 / t)),
+        "beyond_depth": _beyond(pair, _aligned(pair, z, t)),
+        "boundary": 1 - depth_pro_scores(pair)["F1"],
+    }
+    weighted = [weight * parts[name].double() for name, weight in WEIGHTS.items()]
+    return {"SAWA_H": torch.stack(weighted).sum(dim=0), **parts, "covered": covered(pair)}
 
 
 def _taken(values: Tensor, source: Tensor) -> Tensor:
@@ -198,7 +178,7 @@ def _pair_error(rows: Tensor, first: Tensor, second: Tensor) -> Tensor:
 
 
 def _aligned(pair: SurfacePair, values: Tensor, target: Tensor) -> Tensor:
-    """Return values with the factor and offset that fit them best to a target, clamped, (B, 1, H, W) in 64 bits."""
+    """Return values with the factor and offset of least squares to a target, clamped, (B, 1, H, W) in 64 bits."""
     weights = pair.depth_mask.double()
     count = weights.sum(dim=(2, 3), keepdim=True)
     values, target = values.double(), target.double()
@@ -215,15 +195,13 @@ def _beyond(pair: SurfacePair, aligned: Tensor) -> Tensor:
     return 1 - within.double() / pair.target_mask.sum(dim=(1, 2, 3))
 
 
-METRICS: tuple[Metric, ...] = tuple(
-    Metric(f"EvalMDE_{name}", function, target_mask, shown, min_size=MIN_SIZE, whole=True)
-    for name, function, shown in (
-        ("SAWA_H", sawa_h, column("SAWA-H", "", 1, 3)),
-        ("RelNormal", rel_normal, column("RelNormal", "rad", 1, 3)),
-        ("WKDR", wkdr, column("WKDR", "%", 1e2, 2)),
-        ("beyond_disparity", beyond_disparity, column("Beyond", "1.028 x, disparity fitted, %", 1e2, 1)),
-        ("beyond_depth", beyond_depth, column("Beyond", "1.028 x, depth fitted, %", 1e2, 1)),
-        ("boundary", boundary_error, column("1 - F1", "Depth Pro, %", 1e2, 1)),
-        ("covered", covered, column("Covered", "%", 1e2, 1, higher_is_better=True)),
-    )
-)
+_formats = {
+    "SAWA_H": column("SAWA-H", "", digits=3),
+    "RelNormal": column("RelNormal", "rad", digits=3),
+    "WKDR": column("WKDR", "%", 1e2, 2),
+    "beyond_disparity": column("Beyond", "1.028 x, disparity fitted, %", 1e2),
+    "beyond_depth": column("Beyond", "1.028 x, depth fitted, %", 1e2),
+    "boundary": column("1 - F1", "Depth Pro, %", 1e2),
+    "covered": column("Covered", "%", 1e2, higher_is_better=True),
+}
+METRICS = tuple(of_parts("EvalMDE_", evalmde_errors, target_mask, _formats, min_size=MIN_SIZE, whole=True))

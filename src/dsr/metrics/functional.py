@@ -4,13 +4,8 @@ Voynov et al., *Perceptual Deep Depth Super-Resolution*, ICCV 2019, section 3, w
 tables. Lower is better throughout; units are metres and fractions. A :class:`SurfacePair` computes what several
 metrics use (masks, perspective depths, normals, renderings) once, on first access.
 
-    pair = SurfacePair(prediction, target, camera.rays()[None])
-    rmse_v(pair)      # (B,)
-    dssim_v(pair)     # (B, 4), lights e1..e4
-
-Masks: a pixel is valid if both depths are; a normal, if all pixels that it is computed from are. Invalid pixels are
-left out of every mean, and are 0 in both renderings inside windows that contain them. An image without a valid pixel
-gets NaN.
+A pixel is valid if both depths are; a normal, if all pixels that it is computed from are. Invalid pixels are left out
+of every mean, and are 0 in both renderings inside windows that contain them. An image without a valid pixel gets NaN.
 """
 
 from __future__ import annotations
@@ -79,40 +74,26 @@ class SurfacePair:
         angle_error: Tensor | None = None,
         image_dtype: torch.dtype | None = None,
     ) -> None:
-        prediction, target, depth_error, angle_error = map(widened, (prediction, target, depth_error, angle_error))
-        if prediction.dim() != 4 or prediction.shape[1] != 1 or prediction.shape != target.shape:
-            raise ValueError(
-                "prediction, target: expected two depth maps of shape (B, 1, H, W), "
-                f"got {tuple(prediction.shape)} and {tuple(target.shape)}"
-            )
+        prediction, target = widened(prediction), widened(target)
+        shape, sizes = target.shape, f"{tuple(prediction.shape)} and {tuple(target.shape)}"
+        if prediction.dim() != 4 or prediction.shape[1] != 1 or prediction.shape != shape:
+            raise ValueError(f"prediction, target: expected two depth maps of shape (B, 1, H, W), got {sizes}")
         if not (prediction.is_floating_point() and target.is_floating_point()):
             raise ValueError(f"prediction, target: expected metres as floats, got {prediction.dtype}, {target.dtype}")
-        if rays.shape not in ((1, 3, *target.shape[-2:]), (len(target), 3, *target.shape[-2:])):
-            raise ValueError(
-                f"rays: expected shape (B or 1, 3, {target.shape[-2]}, {target.shape[-1]}), got {tuple(rays.shape)}"
-            )
-        if mask is not None and (mask.dtype != torch.bool or mask.shape != target.shape):
-            came = f"{mask.dtype} {tuple(mask.shape)}"
-            raise ValueError(f"mask: expected bool of shape {tuple(target.shape)}, got {came}")
-        for name, error in (("depth_error", depth_error), ("angle_error", angle_error)):
-            if error is not None and error.shape != target.shape:
-                raise ValueError(f"{name}: expected shape {tuple(target.shape)}, got {tuple(error.shape)}")
-        self.depth_error, self.angle_error = depth_error, angle_error
-        self.target_mask = target.isfinite() & (target > 0)
-        if mask is not None:
-            self.target_mask = self.target_mask & mask
+        if rays.shape not in ((1, 3, *shape[-2:]), (len(target), 3, *shape[-2:])):
+            raise ValueError(f"rays: expected shape (B or 1, 3, {shape[-2]}, {shape[-1]}), got {tuple(rays.shape)}")
+        if mask is not None and (mask.dtype != torch.bool or mask.shape != shape):
+            raise ValueError(f"mask: expected bool of shape {tuple(shape)}, got {mask.dtype} {tuple(mask.shape)}")
+        self.given, self.rays, self.mask = (prediction, target), rays.to(target.dtype), mask
+        self.unit, self.regions, self.image_dtype = unit, dict(regions or {}), image_dtype or target.dtype
+        self.depth_error, self.angle_error = widened(depth_error), widened(angle_error)
+        known = target.isfinite() & (target > 0)
+        self.target_mask = known if mask is None else known & mask
         self.depth_mask = self.target_mask & prediction.isfinite() & (prediction > 0)
         self.complete = known_true(self.depth_mask)
-        self.rays = rays.to(target.dtype)
-        self.unit = unit
-        self.mask, self.regions = mask, dict(regions or {})
-        self.image_dtype = image_dtype or target.dtype
-        self.given = prediction, target
+        self.prediction = torch.where(self.depth_mask, prediction, 1.0)  # finite, which keeps NaN out of gradients
+        self.target = torch.where(self.depth_mask, target, 1.0)
         self.derived: dict[Any, Any] = {}  # what once_per_pair and within keep
-        self.prediction, self.target = prediction, target
-        if not self.complete:  # a finite stand-in keeps NaN out of sums and gradients
-            self.prediction = torch.where(self.depth_mask, prediction, 1.0)
-            self.target = torch.where(self.depth_mask, target, 1.0)
 
     @classmethod
     def of(
@@ -134,55 +115,51 @@ class SurfacePair:
             lack = "target" if target is None else "camera"
             raise ValueError(f"{lack}: expected preds, target and camera, or a SurfacePair alone; got none")
         first, second = torch.as_tensor(preds), torch.as_tensor(target)
-        if isinstance(camera, Camera | Sequence):
-            cameras = [camera] if isinstance(camera, Camera) else camera
-            if not all(isinstance(each, Camera) for each in cameras):
-                raise ValueError(f"camera: expected dsr.Camera, a list of them, or rays; got {cameras!r:.60}")
-            count = 1 if isinstance(camera, Camera) else len(first)
-            if len(cameras) != count or len({(each.height, each.width) for each in cameras}) != 1:
-                raise ValueError(f"camera: expected one for each of {len(first)} maps, of one size, got {len(cameras)}")
-            rays = torch.stack([each.rays(device=second.device) for each in cameras])
+        if isinstance(camera, Camera):
+            rays = camera.rays(device=second.device)
+        elif isinstance(camera, Sequence):
+            if not all(isinstance(each, Camera) for each in camera):
+                raise ValueError(f"camera: expected dsr.Camera, a list of them, or rays; got {camera!r:.60}")
+            if len(camera) != len(first) or len({(each.height, each.width) for each in camera}) != 1:
+                raise ValueError(f"camera: expected one for each of {len(first)} maps, of one size, got {len(camera)}")
+            rays = torch.stack([each.rays(device=second.device) for each in camera])
         else:
             rays = torch.as_tensor(camera)
-            rays = rays[None] if rays.ndim == 3 else rays
+        rays = rays[None] if rays.ndim == 3 else rays
         return cls(first, second, rays, None if mask is None else torch.as_tensor(mask))
+
+    def replaced(self, **changes: Any) -> SurfacePair:
+        """Return a pair with other arguments; those that are not named stay."""
+        prediction, target = self.given
+        names = ("rays", "mask", "unit", "regions", "depth_error", "angle_error", "image_dtype")
+        kept = {name: getattr(self, name) for name in names}
+        return SurfacePair(**{"prediction": prediction, "target": target, **kept, **changes})
 
     def within(self, region: str) -> SurfacePair:
         """Return the pair in a region alone."""
         if region not in self.derived:
-            mask = self.regions[region] > 0
-            self.derived[region] = SurfacePair(
-                *self.given,
-                self.rays,
-                mask if self.mask is None else mask & self.mask,
-                unit=self.unit,
-                regions={region: self.regions[region]},
-                depth_error=self.depth_error,
-                angle_error=self.angle_error,
-                image_dtype=self.image_dtype,
-            )
+            inside = self.regions[region] > 0
+            self.derived[region] = self.replaced(mask=inside if self.mask is None else inside & self.mask)
         found: SurfacePair = self.derived[region]
         return found
 
     @cached_property
     def normals(self) -> tuple[Tensor, Tensor]:
         """The two normal maps, (B, 3, H, W); meaningful where ``normal_mask`` is set."""
-        first, second = (
-            depth_to_normals(depth, self.rays, self.image_dtype) for depth in (self.prediction, self.target)
-        )
-        return first, second
+        first = depth_to_normals(self.prediction, self.rays, self.image_dtype)
+        return first, depth_to_normals(self.target, self.rays, self.image_dtype)
 
     @cached_property
     def normal_mask(self) -> Tensor:
         """(B, 1, H, W) bool: where both normals are valid."""
-        return self.depth_mask if self.complete else normal_mask(self.depth_mask)
+        return normal_mask(self.depth_mask)
 
     @cached_property
     def shadings(self) -> tuple[Tensor, Tensor]:
         """The two maps of e . n for the four lights, (B, 4, H, W), unclipped; 0 where invalid."""
         directions = lights(dtype=self.image_dtype, device=self.target.device)
         first, second = (in_own_precision(shade)(normals, directions) for normals in self.normals)
-        return (first, second) if self.complete else (first * self.normal_mask, second * self.normal_mask)
+        return first * self.normal_mask, second * self.normal_mask
 
     @cached_property
     def renderings(self) -> tuple[Tensor, Tensor]:
@@ -198,25 +175,17 @@ class SurfacePair:
     @cached_property
     def perspective_error(self) -> Tensor:
         """(B, 1, H, W) absolute difference of the perspective depths in metres; 0 where invalid."""
-        error = (self.prediction - self.target).abs() * self.ray_lengths
-        return error if self.complete else error * self.depth_mask
-
-    @cached_property
-    def rendering_error(self) -> Tensor:
-        """(B, 4, H, W) absolute difference of the renderings; 0 where invalid."""
-        first, second = self.renderings
-        return (first - second).abs()
+        return (self.prediction - self.target).abs() * self.ray_lengths
 
     @cached_property
     def ssim_mask(self) -> Tensor:
         """(B, 1, H - 6, W - 6) bool: window centres whose normal is valid."""
-        return self.normal_mask[..., SSIM_WINDOW // 2 : -(SSIM_WINDOW // 2), SSIM_WINDOW // 2 : -(SSIM_WINDOW // 2)]
+        border = SSIM_WINDOW // 2
+        return self.normal_mask[..., border:-border, border:-border]
 
     @cached_property
     def bumpiness_mask(self) -> Tensor:
         """(B, 1, H, W) bool: where the 5 x 5 pixels of a second derivative are valid or outside the map."""
-        if self.complete:
-            return self.depth_mask
         missing = (~self.depth_mask).to(self.target.dtype)
         return torch.nn.functional.max_pool2d(missing, 5, stride=1, padding=2) == 0
 
@@ -257,11 +226,12 @@ def rmse_v1(pair: SurfacePair) -> Tensor:
 
 def bad_pix_v(pair: SurfacePair, threshold: float) -> Tensor:
     """Return the fraction of pixels whose renderings differ by more than ``threshold`` / 255, per light, (B, 4)."""
-    return masked_mean(pair.rendering_error > threshold / 255, pair.normal_mask)
+    first, second = pair.renderings
+    return masked_mean((first - second).abs() > threshold / 255, pair.normal_mask)
 
 
-def dssim_v(pair: SurfacePair) -> Tensor:
-    """Return DSSIM_v = 1 - SSIM per light, (B, 4).
+def dssim_v(pair: SurfacePair, mask: Tensor | None = None) -> Tensor:
+    """Return DSSIM_v = 1 - SSIM per light, (B, 4), over windows at the centres in a mask, by default all valid ones.
 
     SSIM (Wang et al. 2004) with a 7 x 7 uniform window, sample covariance and a data range of 2; windows that
     would extend beyond the border are left out.
@@ -269,8 +239,9 @@ def dssim_v(pair: SurfacePair) -> Tensor:
     first, second = pair.renderings
     if min(first.shape[-2:]) < SSIM_WINDOW:
         raise ValueError(f"DSSIM_v: expected a map of at least 7 x 7 pixels, got {tuple(first.shape[-2:])}")
+    mask = pair.ssim_mask if mask is None else mask
     lights_apart = zip(first.unbind(1), second.unbind(1), strict=True)  # one light's maps stay in the cache
-    return torch.cat([1 - masked_mean(ssim_map(x, y)[:, None], pair.ssim_mask) for x, y in lights_apart], dim=1)
+    return torch.cat([1 - masked_mean(ssim_map(x, y)[:, None], mask) for x, y in lights_apart], dim=1)
 
 
 def bumpiness_d(pair: SurfacePair) -> Tensor:
@@ -280,11 +251,10 @@ def bumpiness_d(pair: SurfacePair) -> Tensor:
     Derivatives are Scharr filters, 0 on the map's outermost pixel after each.
     """
     difference = (BUMPINESS_DISPARITY * (1 / pair.prediction - 1 / pair.target)).to(pair.image_dtype)
-    if not pair.complete:
-        difference = difference * pair.depth_mask
-    along_v, along_u = _scharr(difference)
-    squares = sum(second.square() for first in (along_v, along_u) for second in _scharr(first))
-    assert isinstance(squares, Tensor)  # noqa: S101 - sum() of tensors is one
+    squares = torch.zeros_like(difference)
+    for first in _scharr(difference):
+        for second in _scharr(first):
+            squares = squares + second.square()
     return 100 * masked_mean(squares.sqrt().clamp(max=BUMPINESS_CLIP), pair.bumpiness_mask).squeeze(1)
 
 
@@ -296,10 +266,10 @@ def angle(pair: SurfacePair) -> Tensor:
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
     """Return the mean over the last two axes of ``values`` (B, C, H, W) where ``mask`` (B, 1, H, W) is set, (B, C)."""
+    values = values if values.is_floating_point() else values.double()
     if known_true(mask):
-        return values.mean(dim=(-2, -1)) if values.is_floating_point() else values.double().mean(dim=(-2, -1))
-    total = torch.where(mask, values, 0).sum(dim=(-2, -1), dtype=None if values.is_floating_point() else torch.float64)
-    return total / mask.sum(dim=(-2, -1))
+        return values.mean(dim=(-2, -1))
+    return torch.where(mask, values, 0).sum(dim=(-2, -1)) / mask.sum(dim=(-2, -1))
 
 
 def masked_median(values: Tensor, mask: Tensor) -> Tensor:

@@ -1,9 +1,8 @@
 """Losses on depth maps and on renderings: one value per image, masked, differentiable.
 
 On depth: Lap_1 of Bojanowski et al., *Optimizing the Latent Space of Generative Networks*, ICML 2018, L1 and MSE. On
-renderings, with the metrics' own kernels: MSE_v (Voynov et al. 2019), and DSSIM_v and LPIPS_v to compare it with. As
-metrics, DSSIM_v and LPIPS_v are the worst of four lights; as losses they are the mean over the lights, because the
-gradient of a maximum is that of one light alone. MSE_v has no lights: it is the same for any three orthonormal ones.
+renderings, with the metrics' own kernels: MSE_v (Voynov et al. 2019), and DSSIM_v and LPIPS_v to compare it with, as
+means over the lights in place of the worst, because the gradient of a maximum is that of one light alone.
 """
 
 from __future__ import annotations
@@ -25,8 +24,8 @@ from dsr.utils.console import one_line
 
 VisualLossName = Literal["mse_v", "dssim", "lpips"]
 _PIXELS = (-3, -2, -1)
-_TITLES = {"mse_v": "MSE_v", "dssim": "DSSIM_v", "lpips": "LPIPS_v"}
-_MIN_SIZES = {"mse_v": 2, "dssim": SSIM_WINDOW, "lpips": MIN_SIZE}
+# titles of the visual losses, and the smallest height and width in pixels that they are defined for
+_VISUAL = {"mse_v": ("MSE_v", 2), "dssim": ("DSSIM_v", SSIM_WINDOW), "lpips": ("LPIPS_v", MIN_SIZE)}
 
 
 @in_own_precision
@@ -48,26 +47,20 @@ def mse(prediction: Tensor, target: Tensor, *, complete: bool | None = None) -> 
 
 @in_own_precision
 def lap1(prediction: Tensor, target: Tensor, *, levels: int = 3, complete: bool | None = None) -> Tensor:
-    """Return the Laplacian pyramid loss Lap_1 per pixel, (B,), as :func:`l1`.
+    """Return the Laplacian pyramid loss Lap_1 per pixel, (B,), as :func:`l1`: eq. 2, the sum of the levels' means.
 
-    Eq. 2 is the sum over levels j of 2^(2 j) |L^j(x) - L^j(y)|_1. As level j has 2^(2 j) times fewer pixels, this per
-    pixel is the sum of the levels' mean absolute differences; the last level is the low-pass. The pyramid is linear, so
-    it is built of the difference, which is 0 in holes; each level weights a pixel by the valid fraction of its area.
-    The shorter side has at least 3 * 2^(levels - 1) pixels.
+    The pyramid is linear, so it is built of the difference, which is 0 in holes; each level weights a pixel by the
+    valid fraction of its area. The shorter side has at least 3 * 2^(levels - 1) pixels.
     """
     difference, valid = _difference(prediction, target, complete)
     weight = None if valid is None else valid.to(difference.dtype)
-    kernel, terms = _kernel(difference.dtype, difference.device), []
-
-    def reduce(x: Tensor) -> Tensor:  # (B, 1, H, W) -> (B, 1, ceil(H / 2), ceil(W / 2))
-        return functional.conv2d(functional.pad(x, (2, 2, 2, 2), mode="replicate"), kernel, stride=2)
-
+    total = difference.new_zeros(len(difference))
     for _ in range(levels - 1):
-        size, level = difference.shape[-2:], reduce(difference)
-        detail = difference - _blur(level, size) / _blurred_ones(level.shape[-2:], size, level.dtype, level.device)
-        terms.append(_mean(detail.abs(), weight))
-        difference, weight = level, None if weight is None else reduce(weight)
-    return functools.reduce(torch.add, [*terms, _mean(difference.abs(), weight)])
+        lower, size = _reduce(difference), difference.shape[-2:]
+        detail = difference - _blur(lower, size) / _blur(torch.ones_like(lower[:1]), size)
+        total = total + _mean(detail.abs(), weight)
+        difference, weight = lower, None if weight is None else _reduce(weight)
+    return total + _mean(difference.abs(), weight)
 
 
 def _difference(prediction: Tensor, target: Tensor, complete: bool | None) -> tuple[Tensor, Tensor | None]:
@@ -88,6 +81,12 @@ def _mean(values: Tensor, weight: Tensor | None) -> Tensor:
     return values.sum(dim=_PIXELS) / weight.sum(dim=_PIXELS)
 
 
+def _reduce(values: Tensor) -> Tensor:
+    """Blur (B, 1, H, W) and keep every second row and column."""
+    kernel = _kernel(values.dtype, values.device)
+    return functional.conv2d(functional.pad(values, (2, 2, 2, 2), mode="replicate"), kernel, stride=2)
+
+
 def _blur(level: Tensor, size: Sequence[int]) -> Tensor:
     """Insert zeros between the pixels of a level up to the size of the level before, and blur."""
     extra = [full - 2 * half + 1 for full, half in zip(size, level.shape[-2:], strict=True)]
@@ -95,15 +94,8 @@ def _blur(level: Tensor, size: Sequence[int]) -> Tensor:
     return functional.conv_transpose2d(level, kernel, stride=2, padding=2, output_padding=extra)
 
 
-@functools.lru_cache(maxsize=64)
-@torch.inference_mode(mode=False)  # so that gradients can be computed with them
-def _blurred_ones(size: Sequence[int], larger: Sequence[int], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Return what normalises :func:`_blur`, (1, 1, *larger)."""
-    return _blur(torch.ones(1, 1, *size, dtype=dtype, device=device), larger)
-
-
 @functools.cache
-@torch.inference_mode(mode=False)
+@torch.inference_mode(mode=False)  # so that gradients can be computed with it
 def _kernel(dtype: torch.dtype, device: torch.device) -> Tensor:
     """Return the binomial kernel, (1, 1, 5, 5)."""
     taps = torch.tensor((1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16), dtype=dtype, device=device)
@@ -119,8 +111,8 @@ class VisualLoss:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        if self.name not in _TITLES:
-            raise ValueError(f"visual: expected one of {', '.join(_TITLES)}, got {self.name!r}")
+        if self.name not in _VISUAL:
+            raise ValueError(f"visual: expected one of {', '.join(_VISUAL)}, got {self.name!r}")
         if self.name == "lpips" and self.network is None:
             raise ValueError("visual: expected a network for lpips, got none")
 
@@ -134,15 +126,13 @@ class VisualLoss:
     @property
     def title(self) -> str:
         """Name of the metric."""
-        return _TITLES[self.name]
+        return _VISUAL[self.name][0]
 
     def check_size(self, height: int, width: int) -> None:
         """Raise a ValueError for maps that are smaller than the loss is defined for."""
-        least = _MIN_SIZES[self.name]
+        least, came = _VISUAL[self.name][1], f"got {height} x {width}"
         if min(height, width) < least:
-            raise ValueError(
-                f"visual: {self.name} expects maps of at least {least} x {least} pixels, got {height} x {width}"
-            )
+            raise ValueError(f"visual: {self.name} expects maps of at least {least} x {least} pixels, {came}")
 
 
 MSE_V = VisualLoss()

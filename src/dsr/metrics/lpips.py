@@ -6,13 +6,12 @@ with torchmetrics. The trunk is torchvision's ImageNet AlexNet, found by :func:`
 
 from __future__ import annotations
 
-import contextlib
 import http.client
+import importlib.metadata
 import socket
 import warnings
-from collections.abc import Iterator
-from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -27,8 +26,6 @@ TRUNK_URL = f"https://download.pytorch.org/models/{TRUNK_FILE}"
 # what to do where the trunk is missing, for messages
 GET_TRUNK = f"get {TRUNK_URL} and set metrics.lpips_trunk=FILE or $DSR_LPIPS_TRUNK"
 TRUNK_HASH = "7be5be79"  # first digits of the official file's SHA-256, as in its name
-_MEAN = (-0.030, -0.088, -0.188)
-_STD = (0.458, 0.448, 0.450)
 _CONVOLUTIONS = {  # index in torchvision's `features`: (in, out, kernel, stride, padding)
     0: (3, 64, 11, 4, 2),
     3: (64, 192, 5, 1, 2),
@@ -47,7 +44,7 @@ class LPIPS(nn.Module):
     mean: Tensor
     std: Tensor
 
-    def __init__(self, trunk: dict[str, Tensor]) -> None:
+    def __init__(self, trunk: dict[str, Any]) -> None:
         super().__init__()
         self.convolutions = nn.ModuleDict(
             {str(i): skip_init(nn.Conv2d, a, b, k, stride=s, padding=p) for i, (a, b, k, s, p) in _CONVOLUTIONS.items()}
@@ -55,15 +52,14 @@ class LPIPS(nn.Module):
         for index, layer in self.convolutions.items():
             for name, parameter in layer.named_parameters():
                 value = trunk.get(f"features.{index}.{name}")
-                if not isinstance(value, Tensor) or value.shape != parameter.shape:
-                    came = "nothing" if value is None else str(tuple(getattr(value, "shape", ())))
-                    expected = tuple(parameter.shape)
-                    raise ValueError(f"features.{index}.{name}: expected a tensor of shape {expected}, got {came}")
+                shape, came = tuple(parameter.shape), tuple(value.shape) if isinstance(value, Tensor) else "nothing"
+                if came != shape:
+                    raise ValueError(f"features.{index}.{name}: expected a tensor of shape {shape}, got {came}")
                 parameter.data.copy_(value)
         for level, head in enumerate(_linear_heads()):
             self.register_buffer(f"head{level}", head)
-        self.register_buffer("mean", torch.tensor(_MEAN).view(1, 3, 1, 1))
-        self.register_buffer("std", torch.tensor(_STD).view(1, 3, 1, 1))
+        self.register_buffer("mean", torch.tensor((-0.030, -0.088, -0.188)).view(1, 3, 1, 1))
+        self.register_buffer("std", torch.tensor((0.458, 0.448, 0.450)).view(1, 3, 1, 1))
         self.requires_grad_(requires_grad=False)
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs
         self.eval()
@@ -84,9 +80,6 @@ class LPIPS(nn.Module):
 
         With a mask, (B, 1, H, W) bool, each feature is weighted by the fraction of its pixels that is set.
         """
-        if min(first.shape[-2:]) < MIN_SIZE:
-            came = tuple(first.shape[-2:])
-            raise ValueError(f"LPIPS: expected images of at least {MIN_SIZE} x {MIN_SIZE} pixels, got {came}")
         total = first.new_zeros(len(first))
         images = torch.cat((first, second)).contiguous(memory_format=torch.channels_last)
         for level, features in enumerate(self.features(images)):
@@ -94,10 +87,10 @@ class LPIPS(nn.Module):
             distance = ((a - b).square() * getattr(self, f"head{level}")).sum(dim=1)  # (B, h, w)
             if mask is None:
                 total = total + distance.mean(dim=(-2, -1))
-            else:
-                weight = nn.functional.adaptive_avg_pool2d(mask.to(a.dtype), (a.shape[-2], a.shape[-1])).squeeze(1)
-                weighted = torch.where(weight > 0, distance * weight, 0)  # no 0 * NaN in gradients
-                total = total + weighted.sum(dim=(-2, -1)) / weight.sum(dim=(-2, -1))
+                continue
+            weight = nn.functional.adaptive_avg_pool2d(mask.to(a.dtype), (a.shape[-2], a.shape[-1])).squeeze(1)
+            weighted = torch.where(weight > 0, distance * weight, 0)  # no 0 * NaN in gradients
+            total = total + weighted.sum(dim=(-2, -1)) / weight.sum(dim=(-2, -1))
         return total
 
 
@@ -105,12 +98,12 @@ def lpips_v(pair: SurfacePair, network: LPIPS) -> Tensor:
     """Return LPIPS_v per light, (B, 4): LPIPS of the renderings, repeated to three channels, scaled to [-1, 1]."""
     network.to(pair.target.device)
     batch, count, height, width = pair.renderings[0].shape
-    as_images = [
+    first, second = (
         (2 * maps.to(network.mean.dtype) - 1).reshape(batch * count, 1, height, width).expand(-1, 3, -1, -1)
         for maps in pair.renderings
-    ]
+    )
     mask = None if pair.complete else pair.normal_mask.repeat_interleave(count, dim=0)
-    return network(*as_images, mask).view(batch, count)
+    return network(first, second, mask).view(batch, count)
 
 
 def find_trunk(configured: Path | None) -> Path:
@@ -120,13 +113,17 @@ def find_trunk(configured: Path | None) -> Path:
             raise FileNotFoundError(f"expected a file, got {configured} (no such file)")
         return configured
     cached = Path(torch.hub.get_dir()) / "checkpoints" / TRUNK_FILE
-    if not cached.is_file():
-        cached.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            with _socket_timeout(_DOWNLOAD_TIMEOUT):
-                torch.hub.download_url_to_file(TRUNK_URL, str(cached), hash_prefix=TRUNK_HASH, progress=True)
-        except (OSError, http.client.HTTPException, RuntimeError) as error:  # RuntimeError: another hash
-            raise OSError(f"could not be downloaded: {getattr(error, 'reason', error)}") from error
+    if cached.is_file():
+        return cached
+    cached.parent.mkdir(parents=True, exist_ok=True)
+    timeout = socket.getdefaulttimeout()
+    socket.setdefaulttimeout(_DOWNLOAD_TIMEOUT)
+    try:
+        torch.hub.download_url_to_file(TRUNK_URL, str(cached), hash_prefix=TRUNK_HASH, progress=True)
+    except (OSError, http.client.HTTPException, RuntimeError) as error:  # RuntimeError: another hash
+        raise OSError(f"could not be downloaded: {getattr(error, 'reason', error)}") from error
+    finally:
+        socket.setdefaulttimeout(timeout)
     return cached
 
 
@@ -148,19 +145,7 @@ def load_lpips(configured: Path | None = None) -> LPIPS:
 
 def _linear_heads() -> list[Tensor]:
     """Return the five linear heads of LPIPS v0.1, each (1, C, 1, 1), from the torchmetrics wheel."""
-    found = find_spec("torchmetrics")  # importing it takes two seconds
-    if found is None or found.origin is None:
-        raise ModuleNotFoundError("torchmetrics: expected the package with the linear heads of LPIPS, found none")
-    file = Path(found.origin).parent / "functional" / "image" / "lpips_models" / "alex.pth"
-    state = torch.load(file, map_location="cpu", weights_only=True)
+    wheel = importlib.metadata.distribution("torchmetrics")  # importing it takes two seconds
+    file = wheel.locate_file("torchmetrics/functional/image/lpips_models/alex.pth")
+    state = torch.load(str(file), map_location="cpu", weights_only=True)
     return [state[f"lin{level}.model.1.weight"] for level in range(len(_CONVOLUTIONS))]
-
-
-@contextlib.contextmanager
-def _socket_timeout(seconds: float) -> Iterator[None]:
-    before = socket.getdefaulttimeout()
-    socket.setdefaulttimeout(seconds)
-    try:
-        yield
-    finally:
-        socket.setdefaulttimeout(before)

@@ -26,27 +26,42 @@ from functools import partial
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
-from dsr.metrics.depth import covered
-from dsr.metrics.formats import column
+from dsr.geometry.hole_size import window_maxima
+from dsr.metrics.formats import Metric, column, depth_mask, of_parts, target_mask
 from dsr.metrics.functional import SurfacePair, masked_mean, once_per_pair
-from dsr.metrics.metric import Metric, depth_mask, target_mask
 
 EDGE_RATIO = 1.05
 EDGE_RADIUS = 16
 FLYING = 0.01  # distance of a flying pixel from every true point, as a fraction of its depth
 
 
-def nearest(points: Tensor, valid: Tensor, cloud: Tensor, known: Tensor) -> Tensor:
-    """Return the distance of each point from the nearest one of another cloud, exactly, by a k-d tree on the CPU.
+@once_per_pair
+def point_errors(pair: SurfacePair) -> dict[str, Tensor]:
+    """Return the errors of the points by name, (B,) each; NaN without a predicted point."""
+    predicted, true = pair.prediction * pair.rays, pair.given[1] * pair.rays
+    to_truth = nearest(predicted, pair.depth_mask, true, pair.target_mask)
+    to_prediction = nearest(true, pair.target_mask, predicted, pair.depth_mask)
+    flying = between_edges(pair) & (to_truth > FLYING * pair.prediction)
+    found = {
+        "flying": masked_mean(flying, pair.depth_mask),
+        "chamfer": (masked_mean(to_truth, pair.depth_mask) + masked_mean(to_prediction, pair.target_mask)) / 2,
+        "covered": masked_mean(pair.depth_mask, pair.target_mask),
+    }
+    for name, threshold in (("F_1cm", 0.01), ("F_5cm", 0.05)):
+        precision = masked_mean(to_truth < threshold, pair.depth_mask)
+        recall = masked_mean(to_prediction < threshold, pair.target_mask)
+        score = 2 * precision * recall / (precision + recall)
+        found[name] = torch.where(precision + recall == 0, 0, score)
+    return {name: value.squeeze(1) for name, value in found.items()}
 
-    Points and cloud are (B, 3, H, W), ``valid`` and ``known`` (B, 1, H, W) bool the points that there are. The
-    distances, (B, 1, H, W), are 0 where there is no point, and infinite where there is no other one.
+
+def nearest(points: Tensor, valid: Tensor, cloud: Tensor, known: Tensor) -> Tensor:
+    """Return the distance of each valid point (B, 3, H, W) from the nearest known one of a cloud (B, 3, H, W), exactly.
+
+    The distances, (B, 1, H, W), are 0 where there is no point, and infinite where there is no other one.
     """
     distances = torch.zeros_like(points[:, :1])
-    if points.is_meta:  # values are needed, and there are none
-        return distances
     for found, *image in zip(distances, points, valid, cloud, known, strict=True):
         own, has, other, there = (each.detach().cpu() for each in image)
         tree = cKDTree(other[:, there[0]].T.double().numpy(), balanced_tree=False, compact_nodes=False)
@@ -55,36 +70,8 @@ def nearest(points: Tensor, valid: Tensor, cloud: Tensor, known: Tensor) -> Tens
     return distances
 
 
-@once_per_pair
-def distances(pair: SurfacePair) -> tuple[Tensor, Tensor]:
-    """Return the distances of the predicted points from the true cloud, and of the true ones from the predicted cloud.
-
-    They are (B, 1, H, W) in metres, 0 without a point.
-    """
-    predicted, true = pair.prediction * pair.rays, pair.given[1] * pair.rays
-    return (
-        nearest(predicted, pair.depth_mask, true, pair.target_mask),
-        nearest(true, pair.target_mask, predicted, pair.depth_mask),
-    )
-
-
-def chamfer(pair: SurfacePair) -> Tensor:
-    """Return the Chamfer distance in metres, (B,); lower is better. NaN without a predicted point."""
-    to_truth, to_prediction = distances(pair)
-    return (masked_mean(to_truth, pair.depth_mask) + masked_mean(to_prediction, pair.target_mask)).squeeze(1) / 2
-
-
-def f_score(pair: SurfacePair, threshold: float) -> Tensor:
-    """Return the F-score at a threshold in metres, (B,), 0 to 1; higher is better. NaN without a predicted point."""
-    to_truth, to_prediction = distances(pair)
-    precision = masked_mean(to_truth < threshold, pair.depth_mask)
-    recall = masked_mean(to_prediction < threshold, pair.target_mask)
-    score = 2 * precision * recall / (precision + recall)
-    return torch.where(precision + recall == 0, 0, score).squeeze(1)
-
-
-def flying(pair: SurfacePair) -> Tensor:
-    """Return the fraction of the predicted points that fly between two surfaces, (B,); lower is better."""
+def between_edges(pair: SurfacePair) -> Tensor:
+    """Return whether a prediction is between the front and the back of the true edges around it, (B, 1, H, W) bool."""
     truth = torch.where(pair.target_mask, pair.given[1], torch.nan)
     front, back = torch.full_like(truth, torch.inf), torch.zeros_like(truth)  # of the true edges at a pixel
     for dim in (-1, -2):
@@ -92,36 +79,27 @@ def flying(pair: SurfacePair) -> Tensor:
         sides = truth.narrow(dim, 0, size), truth.narrow(dim, 1, size)
         near, far = torch.minimum(*sides), torch.maximum(*sides)
         edge = far > EDGE_RATIO * near  # false where one is NaN
+        near, far = torch.where(edge, near, torch.inf), torch.where(edge, far, 0)
         for start in (0, 1):
-            part = front.narrow(dim, start, size)
-            part.copy_(torch.where(edge, torch.minimum(part, near), part))
-            part = back.narrow(dim, start, size)
-            part.copy_(torch.where(edge, torch.maximum(part, far), part))
-    for window, padding in (((1, 2 * EDGE_RADIUS + 1), (0, EDGE_RADIUS)), ((2 * EDGE_RADIUS + 1, 1), (EDGE_RADIUS, 0))):
-        front = -max_pool2d(-front, window, stride=1, padding=padding)
-        back = max_pool2d(back, window, stride=1, padding=padding)
-    between = (front < pair.prediction) & (pair.prediction < back)
-    return masked_mean(between & (distances(pair)[0] > FLYING * pair.prediction), pair.depth_mask).squeeze(1)
+            beside = front.narrow(dim, start, size), back.narrow(dim, start, size)
+            beside[0].copy_(torch.minimum(beside[0], near))
+            beside[1].copy_(torch.maximum(beside[1], far))
+    front, back = -window_maxima(-front, EDGE_RADIUS), window_maxima(back, EDGE_RADIUS)
+    return (front < pair.prediction) & (pair.prediction < back)
 
 
+_points = partial(of_parts, "Points_", point_errors, min_size=1, unit="cm", whole=True)
+_fraction = partial(column, factor=1e2, higher_is_better=True)
 METRICS: tuple[Metric, ...] = (
-    Metric(
-        "Points_flying",
-        flying,
-        depth_mask,
-        column("Flying", "1 % of depth, %", 1e2, 2),
-        min_size=1,
-        unit="cm",
-        regional=False,  # the outlines of a region's objects are edges of what lies outside
-        whole=True,
-    ),
-    *(
-        Metric(f"Points_{name}", function, target_mask, shown, min_size=1, unit="cm", whole=True)
-        for name, function, shown in (
-            ("chamfer", chamfer, column("Chamfer", "mm", 1e3, 2)),
-            ("F_1cm", partial(f_score, threshold=0.01), column("F at 1 cm", "%", 1e2, 2, higher_is_better=True)),
-            ("F_5cm", partial(f_score, threshold=0.05), column("F at 5 cm", "%", 1e2, 2, higher_is_better=True)),
-            ("covered", covered, column("Covered", "points, %", 1e2, 1, higher_is_better=True)),
-        )
+    # not of regions: the outlines of a region's objects are edges of what lies outside
+    *_points(depth_mask, {"flying": column("Flying", "1 % of depth, %", 1e2, 2)}, regional=False),
+    *_points(
+        target_mask,
+        {
+            "chamfer": column("Chamfer", "mm", 1e3, 2),
+            "F_1cm": _fraction("F at 1 cm", "%", digits=2),
+            "F_5cm": _fraction("F at 5 cm", "%", digits=2),
+            "covered": _fraction("Covered", "points, %"),
+        },
     ),
 )

@@ -1,28 +1,32 @@
-"""Metrics of refined depth maps of real sensors, against a ground truth that is also measured.
+"""Metrics of depth maps of real sensors: against a ground truth that is also measured, and of a board.
 
-Neither map is perfect: the sensor has a constant bias, which is not shape, the truth ends at ragged borders, and a few
-pixels of either belong to another surface. Therefore the scored pixels are those at least four pixels away from unknown
-truth, and two away from unknown predictions and from those more than 0.1 m off; distances are counted along rows and
-columns. The median difference over them is subtracted from the prediction, and normals and renderings are compared as
-in the paper's metrics, with unknown pixels replaced by the truth's median depth. A method must not look better for
-leaving out what is difficult, so the fraction of scored pixels, ``Sensor_covered``, belongs to every score.
+- ``metrics=sensor``: neither map is perfect. The sensor has a constant bias, which is not shape, the truth ends at
+  ragged borders, and a few pixels of either belong to another surface. Therefore the scored pixels are those at least
+  four pixels away from unknown truth, and two away from unknown predictions and from those more than 0.1 m off, along
+  rows and columns. The median difference over them is subtracted from the prediction, and normals and renderings are
+  compared as in the paper's metrics, with unknown pixels replaced by the truth's median depth.
+- ``metrics=plane``: the plane of a board is the ground truth, known within its outline alone. The median difference is
+  subtracted, and pixels more than 60 mm off belong to another surface.
+
+``Sensor_covered`` and ``Plane_covered``, the fractions of scored pixels, belong to every score.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 
 import torch
 from torch import Tensor
 
-from dsr.metrics.formats import MetricFormat, column
-from dsr.metrics.functional import SSIM_WINDOW, SurfacePair, angle, masked_mean, masked_median, once_per_pair, ssim_map
-from dsr.metrics.metric import Metric, part_of
+from dsr.metrics import functional
+from dsr.metrics.formats import Metric, column, depth_mask, of_parts, target_mask
+from dsr.metrics.functional import SSIM_WINDOW, SurfacePair, angle, masked_mean, masked_median, once_per_pair
+from dsr.utils.compute_device import in_own_precision
 
 TRUTH_EROSION = 3
 PREDICTION_EROSION = 1
 LARGEST_ERROR = 0.1  # metres; a prediction further off is another surface, not a shape of this one
+NEAR = 0.06  # the same of a board
 
 
 class SensorComparison:
@@ -49,10 +53,7 @@ class SensorComparison:
         )
 
 
-@once_per_pair
-def compare(pair: SurfacePair) -> SensorComparison:
-    """Return the comparison of a pair."""
-    return SensorComparison(pair)
+compare = once_per_pair(SensorComparison)
 
 
 def erode(mask: Tensor, steps: int) -> Tensor:
@@ -84,11 +85,8 @@ def sensor_errors(pair: SurfacePair) -> dict[str, Tensor]:
 
 def dssim_v(pair: SurfacePair) -> Tensor:
     """Return DSSIM_v over the scored pixels per light, (B, 4), see :func:`dsr.metrics.functional.dssim_v`."""
-    comparison = compare(pair)
     border = SSIM_WINDOW // 2  # no scored pixel is so close to it
-    scored = comparison.scored[..., border:-border, border:-border]
-    lights = zip(*(maps.unbind(1) for maps in comparison.surfaces.renderings), strict=True)
-    return torch.cat([1 - masked_mean(ssim_map(x, y)[:, None], scored) for x, y in lights], dim=1)
+    return functional.dssim_v(compare(pair).surfaces, compare(pair).scored[..., border:-border, border:-border])
 
 
 def _inner(pair: SurfacePair) -> Tensor:
@@ -99,24 +97,75 @@ def _scored(pair: SurfacePair) -> Tensor:
     return compare(pair).scored
 
 
-def _error(name: str, shown: MetricFormat, mask: Callable[[SurfacePair], Tensor] = _scored) -> Metric:
-    return Metric(f"Sensor_{name}", partial(part_of, function=sensor_errors, part=name), mask, shown, whole=True)
+@once_per_pair
+def compare_board(pair: SurfacePair) -> tuple[Tensor, Tensor]:
+    """Return the pixels of the board, and prediction - truth less its median in metres, 0 elsewhere; (B, 1, H, W)."""
+    difference = pair.prediction - pair.target
+    off = difference - masked_median(difference, pair.depth_mask)
+    scored = pair.depth_mask & (off.abs() < NEAR)
+    return scored, torch.where(scored, off, 0)
 
 
-METRICS: tuple[Metric, ...] = (
-    _error("RMSE_v", column("RMSE_v", "sensor, 1/1000", 1e3, 0)),
-    Metric(
-        "Sensor_DSSIM_v",
-        dssim_v,
-        _scored,
-        column("DSSIM_v", "sensor, 1/1000", 1e3, 0),
-        per_light=True,
-        min_size=SSIM_WINDOW,
-        whole=True,
-    ),
-    _error("angle_mean", column("Angle", "mean, deg", 1, 1)),
-    _error("angle_median", column("Angle", "median, deg", 1, 1)),
-    _error("covered", column("Covered", "%", 1e2, 1, higher_is_better=True), _inner),
-    _error("offset", column("Offset", "mm", 1e3, 2)),
-    _error("RMSE_d", column("RMSE_d", "sensor, mm", 1e3, 2)),
-)  # the metrics of metrics=sensor
+@once_per_pair
+@in_own_precision
+def board_errors(pair: SurfacePair) -> dict[str, Tensor]:
+    """Return the scores of a board by name, (B,) each.
+
+    ``std`` is the standard deviation of depth about the plane in metres, ``angle`` the mean angle between the normals,
+    by differences over two pixels, and the plane's in degrees, ``covered`` the fraction of pixels of the board.
+    """
+    scored, off = compare_board(pair)
+    mean = masked_mean(off, scored)[..., None, None]
+    points, board = pair.given[0] * pair.rays, pair.given[1] * pair.rays
+    along_u, along_v = torch.full_like(points, torch.nan), torch.full_like(points, torch.nan)
+    along_u[..., 1:-1] = points[..., 2:] - points[..., :-2]
+    along_v[..., 1:-1, :] = points[..., 2:, :] - points[..., :-2, :]
+    normals = torch.linalg.cross(along_u, along_v, dim=1)
+    normals = normals / normals.norm(dim=1, keepdim=True)
+    true = torch.stack([plane_normal(each[:, mask[0]].T) for each, mask in zip(board, pair.target_mask, strict=True)])
+    cosine = torch.einsum("bchw,bc->bhw", normals, true.to(normals))[:, None].abs().clamp(max=1)
+    angles = torch.rad2deg(cosine.acos())
+    found = {
+        "std": masked_mean((off - mean).square(), scored).sqrt(),
+        "angle": masked_mean(angles, scored & angles.isfinite()),
+        "covered": masked_mean(scored, pair.target_mask),
+    }
+    return {name: value.squeeze(1) for name, value in found.items()}
+
+
+def plane_normal(points: Tensor) -> Tensor:
+    """Return the normal of the plane through points (N, 3), (3,), of least squares along the axis that it faces most.
+
+    NaN for points in a line.
+    """
+    centred = points - points.mean(dim=0)
+    moments = centred.T @ centred
+    others = torch.tensor([[1, 2], [0, 2], [0, 1]], device=points.device)
+    minors = torch.stack([moments[each][:, each] for each in others])
+    sizes = torch.linalg.det(minors)
+    axis = int(sizes.argmax())
+    if len(points) < 3 or not sizes[axis] > 0:
+        return points.new_full((3,), torch.nan)
+    normal = points.new_ones(3)
+    normal[others[axis]] = -torch.linalg.solve(minors[axis], moments[others[axis], axis])
+    return normal / normal.norm()
+
+
+_errors = partial(of_parts, "Sensor_", sensor_errors, whole=True)
+_angles = {"angle_mean": column("Angle", "mean, deg"), "angle_median": column("Angle", "median, deg")}
+_offsets = {"offset": column("Offset", "mm", 1e3, 2), "RMSE_d": column("RMSE_d", "sensor, mm", 1e3, 2)}
+_dssim = column("DSSIM_v", "sensor, 1/1000", 1e3, 0)
+SENSOR: tuple[Metric, ...] = (
+    *_errors(_scored, {"RMSE_v": column("RMSE_v", "sensor, 1/1000", 1e3, 0)}),
+    Metric("Sensor_DSSIM_v", dssim_v, _scored, _dssim, per_light=True, min_size=SSIM_WINDOW, whole=True),
+    *_errors(_scored, _angles),
+    *_errors(_inner, {"covered": column("Covered", "%", 1e2, higher_is_better=True)}),
+    *_errors(_scored, _offsets),
+)
+_board = partial(of_parts, "Plane_", board_errors)
+_board_covered = {"covered": column("Covered", "plane, %", 1e2, higher_is_better=True)}
+PLANE: tuple[Metric, ...] = (
+    *_board(depth_mask, {"std": column("Std", "plane, mm", 1e3, 2)}, unit="cm"),
+    *_board(depth_mask, {"angle": column("Angle", "plane, central, deg")}, min_size=3),
+    *_board(target_mask, _board_covered, unit="cm", regional=True, whole=True),
+)

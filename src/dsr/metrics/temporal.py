@@ -1,11 +1,9 @@
 """Metrics of depth over time: flicker of what stands still, and whether frames of a moving camera agree.
 
-- :func:`flicker`, :func:`temporal_noise` and :func:`normal_flicker` need a camera that stands still, or the pixels at
-  which nothing moves. Temporal noise is that of Intel's Depth Quality Tool, ``calculate_temporal_noise`` in
-  ``tools/depth-quality/rs-depth-quality.cpp`` of IntelRealSense/librealsense (cacc8e7), there of 39 frames.
-- :func:`opw` needs poses: the optical-flow-based warping metric of Wang et al., *Less Is More: Consistent Video Depth
-  Estimation with Masked Frames Modeling*, ACM MM 2022, and *Neural Video Depth Stabilizer*, ICCV 2023, with the rigid
-  flow of depth and pose; ``smooth_loss.py`` (d7b66e4) and ``infer_NVDS_dpt_bi.py`` (720a979) of RaymondWang987/NVDS.
+- :func:`flicker`, :func:`temporal_noise` and :func:`normal_flicker` need a camera that stands still. Temporal noise is
+  ``calculate_temporal_noise`` in ``tools/depth-quality/rs-depth-quality.cpp`` of IntelRealSense/librealsense (cacc8e7).
+- :func:`opw` needs poses: Wang et al., *Less Is More*, ACM MM 2022, and *Neural Video Depth Stabilizer*, ICCV 2023,
+  with the rigid flow of depth and pose; ``smooth_loss.py`` (d7b66e4) of RaymondWang987/NVDS.
 - :func:`tgm` needs a truth: temporal gradient matching of Chen et al., *Video Depth Anything*, CVPR 2025,
   ``TemporalGradientMatchingLoss`` in ``loss/loss.py`` of DepthAnything/Video-Depth-Anything (4f5ae23), with one stride.
 
@@ -30,8 +28,7 @@ from dsr.utils.compute_device import in_own_precision
 
 Poses = Tensor | np.ndarray | Sequence[np.ndarray]
 _VISIBLE = 50.0  # how fast the weight of a pixel falls with the squared difference of its colours
-# change of the true depth from frame to frame, as a fraction of the frame's range, from which on it is motion
-_MOVING = 0.05
+_MOVING = 0.05  # change of the true depth, as a fraction of the frame's range, from which on it is motion
 
 
 @in_own_precision
@@ -42,16 +39,14 @@ def flicker(depths: Tensor, static: Tensor | None = None) -> Tensor:
     positive. A pixel counts if it has a depth in two frames or more. ``static``, (1, 1, H, W) bool, are the pixels
     where nothing moves. A fraction, (); NaN if no pixel counts.
     """
-    spread, mask = _spread(depths, static)
-    return masked_mean(spread, mask).squeeze()
+    return masked_mean(*_spread(depths, static)).squeeze()
 
 
 @in_own_precision
 def temporal_noise(depths: Tensor, static: Tensor | None = None) -> Tensor:
     """Return the median over the pixels of the deviation over time whose mean is :func:`flicker`.
 
-    Intel's tool counts pixels that never have a depth as 0, so that a map with holes in half of them has no noise. Here
-    they are left out.
+    Pixels that never have a depth are left out; Intel's tool counts them as 0.
     """
     return masked_median(*_spread(depths, static)).squeeze()
 
@@ -85,9 +80,8 @@ def opw(
     """Return the mean difference between the depth of a frame and that of the frame before, warped into its view.
 
     The frame before is warped with a z-buffer, so that what a surface hides does not count, and what appears is a hole.
-    The authors' code normalises each map of disparity by its median and mean deviation, sums weights of three colours
-    from 0 to 255, with which hardly any pixel counts, and takes 10 times the mean over all pixels. Here it is a
-    weighted mean in metres.
+    The authors' code normalises disparity, and its weights of colours from 0 to 255 leave hardly any pixel. Here it is
+    a weighted mean in metres.
 
     Args:
         depths: (T, 1, H, W) orthogonal depth in metres, T at least 2; NaN is a hole.
@@ -107,15 +101,16 @@ def opw(
         raise ValueError(f"poses, photos: expected as many as the {len(depths)} depth maps, got {len(frames)} poses")
     found = []
     for now in range(1, len(depths)):
-        before = now - 1
-        move = torch.from_numpy(relative(frames[before], frames[now]))[None].to(depths.device)
-        warped = warp_depth(depths[before:now], camera, move, camera)
+        move = torch.from_numpy(relative(frames[now - 1], frames[now]))[None].to(depths.device)
+        warped = warp_depth(depths[now - 1 : now], camera, move, camera)
         mask = known[now][None] & warped.isfinite()
         weight = mask.to(depths)
         if photos is not None:
             places = zip(source_pixels(warped, camera, move, camera), photos.shape[:1:-1], strict=True)
             grid = torch.stack([2 * place / (size - 1) - 1 for place, size in places], -1).nan_to_num(0).to(photos)
-            seen = torch.nn.functional.grid_sample(photos[before:now], grid, padding_mode="border", align_corners=True)
+            seen = torch.nn.functional.grid_sample(
+                photos[now - 1 : now], grid, padding_mode="border", align_corners=True
+            )
             apart = (seen - photos[now]).square().sum(dim=1, keepdim=True)
             weight = torch.where(mask, torch.exp(-_VISIBLE * apart), 0)
         error = torch.where(mask, (depths[now] - warped).abs(), 0)
@@ -128,15 +123,15 @@ def tgm(prediction: Tensor, target: Tensor, static: Tensor | None = None) -> Ten
     """Return the mean difference between the changes of predicted and true depth from frame to frame, () in metres.
 
     Depths are (T, 1, H, W) in metres, NaN in holes. Pixels count whose true depth changes by less than 5 % of the range
-    of the later frame's: it is of one surface. The authors' training takes disparity, fitted to the truth by a scale
-    and a shift, and ten times the value.
+    of the later frame's: it is of one surface. The authors' training takes ten times the value, of fitted disparity.
     """
     if prediction.shape != target.shape:
         raise ValueError(f"target: expected shape {tuple(prediction.shape)}, got {tuple(target.shape)}")
     true = _known(target) if static is None else _known(target) & static
     known = true & _known(prediction)
-    highest, lowest = (torch.where(true, target, end).flatten(1) for end in (-torch.inf, torch.inf))
-    limit = _MOVING * (highest.amax(dim=1) - lowest.amin(dim=1))[1:, None, None, None]
+    highest = torch.where(true, target, -torch.inf).amax(dim=(1, 2, 3), keepdim=True)
+    lowest = torch.where(true, target, torch.inf).amin(dim=(1, 2, 3), keepdim=True)
+    limit = _MOVING * (highest - lowest)[1:]
     change = target.diff(dim=0)
     counted = known[1:] & known[:-1] & (change.abs() < limit)
     return torch.where(counted, (prediction.diff(dim=0) - change).abs(), 0).sum() / counted.sum()
@@ -163,7 +158,6 @@ def _spread(depths: Tensor, static: Tensor | None) -> tuple[Tensor, Tensor]:
     values = torch.where(known, depths, 0)
     mean = values.sum(dim=0, keepdim=True) / count.clamp(min=1)
     variance = torch.where(known, (depths - mean).square(), 0).sum(dim=0, keepdim=True) / count.clamp(min=1)
-    of_pixels = (each.flatten(1).T[:, None, None] for each in (values, known))  # (H W, 1, 1, T)
-    median = masked_median(*of_pixels).view_as(mean)
+    pixels, there = values.flatten(1).T[:, None, None], known.flatten(1).T[:, None, None]  # (H W, 1, 1, T)
     counted = _counted(count, static)
-    return torch.where(counted, variance.sqrt() / median, 0), counted
+    return torch.where(counted, variance.sqrt() / masked_median(pixels, there).view_as(mean), 0), counted
