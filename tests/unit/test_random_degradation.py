@@ -10,11 +10,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.degradation import random_noise
-from dsr.degradation.downsampling import Downsampling
-from dsr.degradation.hints import FACTS, KERNELS
-from dsr.degradation.random_degradation import Everything
-from dsr.degradation.random_fields import add_folds, displace
+from dsr.degradation.downsampling import FACTS, KERNELS, Downsampling, encode_facts, local_noise
+from dsr.degradation.noise import NOISES
+from dsr.degradation.random_degradation import Everything, add_folds, displace
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
 from dsr.training.patches import soften
@@ -278,10 +276,33 @@ def test_structured_light_loses_pixels_at_steps_and_on_steep_surfaces() -> None:
     values = torch.where(radius < 1, 1 / (2 - (1 - radius.square()).clamp(min=0).sqrt()), 0.4)[None]
     lost = torch.zeros_like(values)
     for seed in range(60):
-        lost += random_noise.NOISES["structured"](values, torch.ones_like(values), _generator(seed)).isnan()
+        lost += NOISES["structured"](values, torch.ones_like(values), _generator(seed)).isnan()
     rim, rest = (
         (radius > 0.85) & (radius < 0.95),
         (radius > 1.15) & (u > 0) | (radius < 0.3),
     )  # left of it lies its shadow
     assert float(lost[0, rim].mean()) > 3
     assert float(lost[0, rest].mean()) < 1
+
+
+def test_each_fact_has_a_place_of_its_own() -> None:
+    assert not bool(encode_facts().any())
+    reported = [encode_facts(kernel) for kernel in KERNELS]
+    reported += [encode_facts(soft=soft) for soft in (False, True)] + [encode_facts(noise=True)]
+    assert torch.equal(torch.stack(reported), torch.eye(FACTS))
+    assert torch.equal(encode_facts("bicubic", soft=True, noise=True), reported[3] + reported[6] + reported[7])
+    with pytest.raises(ValueError, match=r"kernel: expected one of box, nearest, .*, got sinc"):
+        encode_facts("sinc")
+
+
+def test_local_noise_ignores_holes_and_outliers() -> None:
+    truth = (0.5 + 0.1 * (torch.arange(64, dtype=torch.float64) + 0.5) / 64).expand(1, 1, 48, 64)
+    given = functional.avg_pool2d(truth, 4)
+    error = 0.002 * torch.ones_like(given)
+    error[..., 8:] = 0.02
+    given = given * (1 + error)
+    given[..., 2, 2], given[..., 5, 3] = torch.nan, 5.0
+    noise = local_noise(given, truth)
+    assert bool(noise.isfinite().all())
+    torch.testing.assert_close(noise[..., 0], torch.full_like(noise[..., 0], 0.002), rtol=1e-3, atol=0)
+    torch.testing.assert_close(noise[..., -1], torch.full_like(noise[..., -1], 0.02), rtol=1e-3, atol=0)

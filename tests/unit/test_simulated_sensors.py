@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from dsr.degradation.holes import Shadows, occluded
+from dsr.degradation.noise import NOISES
 from dsr.degradation.random_degradation import Everything
 from dsr.degradation.random_fields import field_of, waves_of
-from dsr.degradation.random_noise import NOISES
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
 

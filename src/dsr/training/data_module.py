@@ -16,7 +16,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset, default_collate
 
 from dsr.data.scene_source import SceneSource, content_key
-from dsr.degradation.hints import encode_facts
+from dsr.degradation.downsampling import encode_facts
 from dsr.degradation.random_degradation import Everything
 from dsr.methods.classical.interpolation import Interpolation
 from dsr.sample import Scene
