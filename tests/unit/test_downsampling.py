@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import replace
 from typing import Any, get_args
@@ -172,11 +171,6 @@ def test_gradient_of_downsampling_is_that_of_its_value(kernel: Kernel, holes: bo
     assert torch.autograd.gradcheck(known_part, values.requires_grad_())
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
-def test_downsampling_keeps_the_precision(kernel: Kernel) -> None:
-    assert Downsampling(kernel)(_values(8, 8).float(), 4).dtype == torch.float32
-
-
 def test_invalid_model_is_refused() -> None:
     with pytest.raises(ValueError, match=r"^kernel: expected one of box, nearest, bilinear, bicubic, gaussian, got"):
         Downsampling("lanczos")  # type: ignore[arg-type]
@@ -189,15 +183,6 @@ def test_invalid_model_is_refused() -> None:
 
 def _points(depth: Tensor, camera: Camera) -> Tensor:
     return depth * camera.rays()
-
-
-@pytest.mark.parametrize("kernel", KERNELS)
-def test_fronto_parallel_plane_is_reproduced(kernel: Kernel) -> None:
-    plane = torch.full((1, 32, 48), 2.5, dtype=torch.float64)
-    types: tuple[RangeType, ...] = ("orthogonal", "disparity")
-    for scale, range_type in itertools.product(SCALES, types):
-        sample = make_sample(_scene(plane, STEREO), scale, Downsampling(kernel), range_type)
-        torch.testing.assert_close(sample.depth_lr, torch.full_like(sample.depth_lr, 2.5), rtol=1e-12, atol=0)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -399,22 +384,6 @@ def _wall(name: str = "hall", dataset: str = "set") -> Scene:
 BOX4: dict[str, Any] = {"scale": 4, "downsampling": Downsampling("box")}
 
 
-@pytest.mark.parametrize("range_type", RANGE_TYPES)
-def test_noise_multiplies_the_low_resolution_values_of_the_methods_range_type(range_type: RangeType) -> None:
-    noise = GaussianMultiplicative(0.02)
-    noisy, clean = (make_sample(_wall(), **BOX4, range_type=range_type, noise=each) for each in (noise, None))
-    one, other = (to_range(each.depth_lr, each.camera_lr, range_type) for each in (noisy, clean))
-    factors = (one / other).flatten()
-    assert float(factors.mean()) == pytest.approx(1, abs=1e-3)
-    assert float(factors.std()) == pytest.approx(0.02, rel=0.03)
-    spread = ((factors - 1) / 0.02).sort().values
-    assert [float(spread[int(len(spread) * share)]) for share in (0.159, 0.5, 0.841)] == pytest.approx(
-        [-1, 0, 1], abs=0.05
-    )
-    assert noisy.depth is not None
-    assert torch.equal(noisy.depth, clean.depth)  # type: ignore[arg-type]
-
-
 @pytest.mark.parametrize("camera", [CAMERA, STEREO])
 @pytest.mark.parametrize(("asked", "method"), ASKED_AND_METHOD)
 def test_noise_is_one_plus_std_times_the_draws_in_the_averaged_range_type(
@@ -461,15 +430,7 @@ def test_own_generator_continues_from_sample_to_sample() -> None:
     assert torch.equal(first.depth_lr, again.depth_lr)
 
 
-def test_measured_map_gets_no_noise() -> None:
-    measured = {4: 1 + torch.rand(1, 8, 12, dtype=torch.float64)}
-    sample = make_sample(_scene(None, measured=measured), 4, Measured(), "disparity", GaussianMultiplicative(0.1))
-    assert torch.equal(sample.depth_lr, measured[4])
-
-
 def test_scene_notes_are_passed_to_its_samples() -> None:
-    known = replace(_scene(_values(32, 48)), notes=("not metric",))
-    assert make_sample(known, 2, Downsampling("box"), "orthogonal").notes == ("not metric",)
     odd = replace(CAMERA, width=50)
     known = replace(_scene(_values(32, 50), odd), notes=("not metric",))
     notes = make_sample(known, 4, Downsampling("box"), "orthogonal").notes

@@ -202,6 +202,7 @@ def test_relief_is_in_the_truth_and_its_means_in_the_map() -> None:
         ({"holes": {"none": -1}}, "holes: expected frequencies of 0 or more"),
         ({"noises": {"none": 0}}, "noises: expected frequencies of 0 or more, one of them positive"),
         ({"soft": 1.5}, "soft: expected a fraction from 0 to 1, got 1.5"),
+        ({"clear": 2}, "clear: expected a fraction from 0 to 1, got 2"),
         ({"scales": {3: 1}}, "scales: expected some of 1, 2, 4, 8, 16, got 3"),
     ],
 )
