@@ -79,8 +79,7 @@ class Shadows:
 def occluded(disparity: Tensor) -> Tensor:
     """Return the mask of the pixels that a nearer one covers in a second image, (..., h, w) bool.
 
-    Beside a step from d1 to d2 it is d1 - d2 pixels wide: on the left where the second camera is to the right. The
-    disparity, (..., h, w) in pixels, is negative if the second camera is to the left.
+    The disparity, (..., h, w) in pixels, is negative if the second camera is to the left.
     """
     if bool((disparity < 0).any()):
         return occluded(-disparity.flip(-1)).flip(-1)

@@ -103,19 +103,19 @@ class PatchData(lightning.LightningDataModule):
         super().__init__()
         check_patches((), settings, degradation.scale)
         self._everything, self._per_step = everything, patches_per_step
-        self._parts, self.patches, self._degradation, self._seed = list(parts), settings, degradation, seed
-        self._training_names: list[list[str]] = []
+        self.patches, self._degradation, self._seed = settings, degradation, seed
+        self._trained: list[tuple[Part, list[str]]] = []
         self._held_out: dict[str, tuple[SceneSource, list[str]]] = {}
         for part in parts:
-            trained_on, kept = _split(part.source, settings)
-            self._training_names.append(trained_on)
+            names, kept = _split(part.source, settings)
+            self._trained.append((part, names))
             if kept:
                 self._held_out[_make_unique(part.source.name, self._held_out)] = (part.source, kept)
         for name, source in (validation or {}).items():
             self._held_out[_make_unique(name, self._held_out)] = (source, source.scenes())
         if not self._held_out:
             raise ValueError("validation_scenes: expected a positive number where there is no other validation")
-        trained = {content_key(source, name) for source, names in self.used_scenes[: len(parts)] for name in names}
+        trained = {content_key(part.source, name) for part, names in self._trained for name in names}
         for kind, (source, names) in self._held_out.items():
             for name in names:
                 if content_key(source, name) in trained:  # under whatever name
@@ -125,8 +125,7 @@ class PatchData(lightning.LightningDataModule):
     @property
     def used_scenes(self) -> list[tuple[SceneSource, list[str]]]:
         """The scenes to train on and to validate with, by data set; those of the parts come first."""
-        trained = [(part.source, names) for part, names in zip(self._parts, self._training_names, strict=True)]
-        return [*trained, *self._held_out.values()]
+        return [*((part.source, names) for part, names in self._trained), *self._held_out.values()]
 
     @property
     def validation_sets(self) -> list[str]:
@@ -136,7 +135,7 @@ class PatchData(lightning.LightningDataModule):
     @property
     def training_count(self) -> int:
         """The number of scenes to train on."""
-        return sum(map(len, self._training_names))
+        return sum(len(names) for _, names in self._trained)
 
     def validation_scenes(self) -> dict[str, tuple[SceneSource, list[str]]]:
         """Return the data set and the names of the scenes of each validation set."""
@@ -147,7 +146,7 @@ class PatchData(lightning.LightningDataModule):
         if self._validation:
             return
         groups: list[list[Scene]] = []
-        for part, names in zip(self._parts, self._training_names, strict=True):
+        for part, names in self._trained:
             scenes = map(part.source.load, names)
             # float32 takes half the memory
             groups.append([derived(s, depth=None if s.depth is None else s.depth.float()) for s in scenes])
@@ -155,7 +154,7 @@ class PatchData(lightning.LightningDataModule):
             groups,
             self.patches,
             self._degradation,
-            shares=[part.share for part in self._parts],
+            shares=[part.share for part, _ in self._trained],
             seed=self._seed,
             everything=self._everything,
             per_step=self._per_step,
