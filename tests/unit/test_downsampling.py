@@ -207,13 +207,6 @@ def test_low_resolution_camera_has_the_points_of_a_tilted_plane(kernel: Kernel, 
         torch.testing.assert_close(offset[inside], torch.full_like(offset[inside], -2.0), rtol=1e-12, atol=0)
 
 
-def test_nearest_keeps_points_of_the_high_resolution_map() -> None:
-    depth = _values(32, 48)
-    sample = make_sample(_scene(depth), 4, Downsampling("nearest"), "perspective")
-    fine = _points(depth, CAMERA)[:, 2::4, 2::4]
-    torch.testing.assert_close(_points(sample.depth_lr, sample.camera_lr), fine, rtol=1e-12, atol=1e-12)
-
-
 @pytest.mark.parametrize("camera", [CAMERA, STEREO])
 @pytest.mark.parametrize(("asked", "method"), ASKED_AND_METHOD)
 def test_average_is_taken_in_the_range_type(camera: Camera, asked: RangeType | None, method: RangeType) -> None:
@@ -234,15 +227,6 @@ def test_average_is_taken_in_the_range_type(camera: Camera, asked: RangeType | N
         "disparity": 1 / mean(1 / z),
     }[asked or method]
     np.testing.assert_allclose(sample.depth_lr[0].numpy(), expected, rtol=1e-12)
-
-
-def test_disparity_of_the_low_resolution_map_is_in_its_own_pixels() -> None:
-    disparity = to_range(_values(32, 48), STEREO, "disparity")
-    depth = STEREO.baseline * 60.0 / (disparity + 1.7)  # type: ignore[operator]
-    sample = make_sample(_scene(depth, STEREO), 4, Downsampling("box"), "disparity")
-    coarse = to_range(sample.depth_lr, sample.camera_lr, "disparity")
-    expected = disparity.numpy().reshape(1, 8, 4, 12, 4).mean(axis=(2, 4)) / 4
-    np.testing.assert_allclose(coarse.numpy(), expected, rtol=1e-12)
 
 
 def test_sample_has_the_scenes_data() -> None:

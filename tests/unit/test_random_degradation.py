@@ -217,6 +217,7 @@ def test_holes_of_the_truth_leave_their_surroundings_alone(kind: str) -> None:
     everything = replace(CLEAN, noises={kind: 1}, kernels={"nearest": 1}, told=0)
     for seed in range(12):
         sample, _ = everything(replace(scene, depth=depth), 2, _generator(seed))
+        assert bool(sample.depth_lr[:, 50:70, 30:90].isnan().all())
         clean, _ = everything(scene, 2, _generator(100))
         truth = Downsampling("nearest")(scene.depth.float(), 2)
         error = (sample.depth_lr.float() / truth - 1).abs()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import functools
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,10 @@ import numpy as np
 import pytest
 import torch
 from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.loggers import TensorBoardLogger
 from small_lpips import random_lpips
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.custom_scalar import layout_pb2
 from torch import Tensor
 from torch.utils.data import DataLoader
 
@@ -31,6 +35,7 @@ from dsr.metrics.classes import visual_metrics
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS
 from dsr.sample import CENTIMETRES, Scene, Unit
+from dsr.training.callbacks import log_layout
 from dsr.training.data_module import WholeScenes, collate_scene
 from dsr.training.degradation import Batch, Degradation, to_tensors
 from dsr.training.module import SuperResolution, WarmupCosine
@@ -491,3 +496,20 @@ def test_checkpoint_holds_the_networks_tensors_alone_and_loads_as_plain_data(tmp
 def test_network_that_leaves_out_pixels_is_refused() -> None:
     with pytest.raises(ValueError, match=r"model: expected a network that covers the whole image"):
         SuperResolution(MSGNet(4, "hui"), DepthObjective())
+
+
+def test_layout_of_tensorboard_begins_with_looks(tmp_path: Path) -> None:
+    logger = TensorBoardLogger(tmp_path, name=None, version="tensorboard")
+    names = ("BadPix_v_5", "RMSE_d", "LPIPS_v", "RMSE_v1", "DSSIM_v", "RMSE_v")
+    log_layout(logger, {name: f"{name}, title" for name in names})
+    logger.finalize("success")
+    events = EventAccumulator(str(tmp_path / "tensorboard"), size_guidance={"tensors": 0}).Reload()
+    layout = layout_pb2.Layout.FromString(events.Tensors("custom_scalars__config__")[0].tensor_proto.string_val[0])
+    charts = {category.title: [chart.title for chart in category.chart] for category in layout.category}
+    assert list(charts) == ["Looks", "Depth and normals", "Training"]
+    assert charts["Looks"] == [f"{name}, title" for name in ("RMSE_v", "RMSE_v1", "DSSIM_v", "LPIPS_v", "BadPix_v_5")]
+    assert charts["Depth and normals"] == ["RMSE_d, title"]
+    [tag] = layout.category[0].chart[0].multiline.tag
+    shown = ("val/RMSE_v", "bicubic/RMSE_v", "val_a/RMSE_v", "bicubic_a/RMSE_v")
+    assert all(re.match(tag, name) for name in shown)
+    assert not any(re.match(tag, name) for name in ("val/RMSE_v1", "bicubic/RMSE_d"))

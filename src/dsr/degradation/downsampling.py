@@ -74,11 +74,10 @@ class Downsampling:
         return camera.downscale(scale)
 
     def __call__(self, values: Tensor, scale: int, *, complete: bool | None = None) -> Tensor:
-        """Downsample (..., H, W) maps with NaN in holes to (..., H / scale, W / scale).
+        """Downsample (..., H, W) maps with NaN in holes; ``complete`` says whether there are none, None if not known.
 
         A low-resolution pixel whose block has no valid pixel is a hole. If less than half of a kernel's weight falls on
-        valid pixels, the result is the mean of the block's valid pixels. ``complete`` says whether there are no holes;
-        None if not known.
+        valid pixels, the result is the mean of the block's valid pixels.
         """
         height, width = values.shape[-2:]
         if height % scale or width % scale:
@@ -224,19 +223,10 @@ def downsample_depth(
     *,
     complete: bool | None = None,
 ) -> tuple[Tensor, Camera]:
-    """Return the low-resolution depth that a model and noise make of high-resolution depth, and its camera.
+    """Return the low-resolution depth that a model makes of depth, (..., H, W) in metres, and its camera.
 
-    Differentiable.
-
-    Args:
-        depth: (..., H, W) orthogonal depth in metres.
-        camera: camera of the high-resolution map.
-        scale: downsampling factor.
-        downsampling: downsampling model.
-        range_type: range type that is averaged, unless the model sets one.
-        noise: noise of the averages and its generator, in the same range type, unless the noise sets one.
-        complete: whether neither map can have holes or values out of range; None if not known.
-
+    Differentiable. Averages and ``noise``, a model and its generator, are of a range type, unless they set another one.
+    ``complete`` says whether neither map can have holes or values out of range; None if not known.
     """
     range_type = downsampling.range_type or range_type
     camera_lr = downsampling.camera(camera, scale)

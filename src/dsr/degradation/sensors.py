@@ -115,15 +115,11 @@ _PARTS = (*_USUAL, 2 / 3, 480 / 1280, 424 / 1280, 0.2)
 
 
 def identify(depth: Tensor, name: str = "auto", device_name: str = "") -> Identified | None:
-    """Return the sensor of a map: the named one, else the one identified by its values and the device's name.
+    """Return the sensor of a map, (1, h, w) in metres, NaN in holes, as it was read; None for an unknown one.
 
-    Where these contradict each other the values count: a device's name may be that of the photo's camera.
-
-    Args:
-        depth: (1, h, w) in metres, NaN in holes, as it was read.
-        name: of one of ``SENSORS`` or of a device; ``auto``, or ``none`` for none.
-        device_name: of the device, as its files state it; empty where they do not.
-
+    ``name`` is that of one of ``SENSORS`` or of a device, or ``none``. With ``auto``, the values and ``device_name``,
+    as the map's files state it, identify a sensor. If they contradict each other the values are decisive: the name may
+    be that of the photo's camera.
     """
     if name == "none":
         return None
@@ -210,17 +206,11 @@ _FINE = 4  # samples of the spectrum for each cycle that fits into the range of 
 def recognise_values(depth: Tensor) -> ValueSteps | None:
     """Return the steps of inverse depth in which a stereo or structured-light camera's map has its values.
 
-    Its values are f B / d for disparities d in whole steps. Where the rounding to millimetres, or tenths of them, does
-    not hide it, inverse depths are therefore multiples of step / (f B), and the sum of exp(2 pi i C / z) over the
-    distinct values has a peak at C = f B / step.
-
-    Args:
-        depth: (1, h, w) in metres, NaN in holes, as it was read: neither resampled nor filtered.
-
-    Returns:
-        None where the values keep to no steps, or too few of them are seen, or they are not rounded as cameras write
-        them: those of a computed plane may keep to steps, too.
-
+    The map, (1, h, w) in metres, is as it was read: neither resampled nor filtered. Its values are f B / d for
+    disparities d in whole steps. Where the rounding to millimetres, or tenths of them, does not hide it, inverse depths
+    are therefore multiples of step / (f B), and the sum of exp(2 pi i C / z) over the distinct values has a peak at
+    C = f B / step. None if the values keep to no steps, too few of them are seen, or they are not rounded as cameras
+    write them: the values of a computed plane may keep to steps, too.
     """
     depth = depth[:, :: max(1, round(depth.numel() / _PIXELS))]
     values, counts = torch.unique(depth[depth.isfinite()].double(), return_counts=True)

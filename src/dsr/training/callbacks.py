@@ -84,11 +84,7 @@ def log_run(
 ) -> None:  # fmt: skip
     """Log a run's configuration before it has values: TensorBoard gets its main settings and a layout of its charts.
 
-    Args:
-        text: the configuration as YAML.
-        table: the main settings.
-        titles: of the validation's metrics, by name.
-
+    ``text`` is the configuration as YAML, ``table`` its main settings; ``titles`` are those of the metrics, by name.
     """
     if isinstance(logger, TensorBoardLogger):
         logger.experiment.add_text("config", f"```yaml\n{text}```")
