@@ -240,7 +240,7 @@ def _structured(values: Tensor, luma: Tensor, generator: torch.Generator) -> Ten
     if chance(0.4, generator):
         lost |= _between(values, 3, generator)
     if chance(0.3, generator):
-        lost |= dark(values, luma, None, generator)
+        lost |= dark(values, luma, generator)
     if chance(0.25, generator):
         lost |= _steep(values, generator)
     return result.masked_fill(lost, torch.nan)
@@ -323,7 +323,7 @@ def _flight(values: Tensor, luma: Tensor, generator: torch.Generator) -> Tensor:
         depth = depth + uniform(0, 0.02, generator) * torch.exp(-luma / 0.1)
     noisy = (depth + torch.minimum(strength, 0.05 * exact) * grain).clamp(min=1e-3).reciprocal()
     if chance(0.2, generator):
-        noisy = noisy.masked_fill(dark(values, luma, None, generator), torch.nan)
+        noisy = noisy.masked_fill(dark(values, luma, generator), torch.nan)
     if chance(0.4, generator):  # cameras leave out what flies
         noisy = noisy.masked_fill(_between(values, 3, generator), torch.nan)
     return noisy
@@ -421,7 +421,7 @@ def _lose(
             disparity = disparity.masked_fill(hidden, torch.nan)
     lost = torch.zeros_like(values, dtype=torch.bool)
     if chance(0.2, generator):
-        lost |= dark(values, luma, None, generator)
+        lost |= dark(values, luma, generator)
     if chance(0.2, generator):  # gloss
         shining = luma > max(0.8, float(luma[:, ::3, ::3].flatten().quantile(uniform(0.9, 0.99, generator))))
         lost |= shining & (field_of(values, 2, generator) > -0.5)

@@ -28,7 +28,7 @@ from torch.nn import functional
 
 from dsr.degradation.downsampling import KERNELS, Downsampling, Hints, encode_facts, local_noise
 from dsr.degradation.glass import add_glass
-from dsr.degradation.holes import HOLES
+from dsr.degradation.holes import HOLES, draw_holes
 from dsr.degradation.noise import NOISES
 from dsr.degradation.random_fields import chance, draw, field_of, normal, power, uniform
 from dsr.geometry.camera import Camera
@@ -137,7 +137,7 @@ class Everything:
             noisy = round_values(noisy, generator)
         holes = draw(self.holes, generator)
         if holes != "none":
-            noisy = noisy.masked_fill(HOLES[holes](noisy, luma, camera_lr, generator), torch.nan)
+            noisy = noisy.masked_fill(draw_holes(holes, noisy, luma, camera_lr, generator), torch.nan)
         noisy = torch.where(noisy > 0, noisy, torch.nan)
         if not bool(noisy.isfinite().any()):
             raise AllHolesError(scene.name)
