@@ -277,30 +277,22 @@ def test_bicubic_undershoot_below_zero_is_a_hole(range_type: RangeType) -> None:
     assert bool((sample.depth_lr[sample.mask_lr] > 0).all())
 
 
-def test_measured_map_is_used_unchanged() -> None:
-    measured = _values(8, 12)
+@pytest.mark.parametrize(("size", "scale", "ratio"), [((8, 12), 4, 4), ((32, 48), "native", 1)])
+def test_measured_map_is_used_unchanged(size: tuple[int, int], scale: Any, ratio: int) -> None:
+    measured = _values(*size)
     measured[0, 1, 1] = torch.nan
-    sample = make_sample(_scene(None, measured={4: measured}), 4, Measured(), "disparity")
+    sample = make_sample(_scene(None, measured={ratio: measured}), scale, Measured(), "disparity")
     assert sample.depth_lr is measured
     assert sample.depth is None
-    assert sample.camera_lr == CAMERA.rescale(12, 8)
+    assert (sample.camera_lr, sample.scale) == (CAMERA.rescale(size[1], size[0]), ratio)
 
 
 @pytest.mark.parametrize("scale", [2.6667, 2.65, "native"])
 def test_measured_map_at_any_ratio_covers_the_whole_photo(scale: Any) -> None:
     camera = Camera(width=16, height=11, fx=9.0, fy=9.0, cx=7.5, cy=5.0)
-    measured = _values(4, 6)
-    sample = make_sample(_scene(None, camera, {16 / 6: measured}), scale, Measured(), "disparity")
-    assert sample.depth_lr is measured
+    sample = make_sample(_scene(None, camera, {16 / 6: _values(4, 6)}), scale, Measured(), "disparity")
     assert (sample.camera, sample.camera_lr, sample.scale) == (camera, camera.rescale(6, 4), 16 / 6)
     assert sample.notes == ()
-
-
-def test_measured_map_at_the_photo_s_own_resolution_has_its_camera() -> None:
-    measured = _values(32, 48)
-    sample = make_sample(_scene(_values(32, 48), measured={1: measured}), "native", Measured(), "disparity")
-    assert (sample.camera_lr, sample.scale) == (CAMERA, 1)
-    assert sample.depth_lr is measured
 
 
 def test_native_scale_needs_exactly_one_measured_map() -> None:

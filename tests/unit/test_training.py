@@ -283,16 +283,6 @@ def _one_batch() -> DataLoader[Batch]:
     return DataLoader(patches, batch_size=2)
 
 
-@pytest.mark.slow
-def test_loss_falls_in_thirty_steps_on_one_batch(tmp_path: Path) -> None:
-    losses, module = _Losses(), _module()
-    before = copy.deepcopy(module.net.state_dict())
-    _trainer(tmp_path, max_epochs=30, callbacks=[losses], gradient_clip_val=1.0).fit(module, _one_batch())
-    assert len(losses.values) == 30
-    assert np.mean(losses.values[-5:]) < 0.6 * losses.values[0]
-    assert all(not torch.equal(before[name], value) for name, value in module.net.state_dict().items())
-
-
 @pytest.mark.parametrize("mixed", [False, True])
 def test_training_loss_is_the_objective_of_the_networks_output_in_full_precision(tmp_path: Path, mixed: bool) -> None:
     losses, module = _Losses(), _module()
