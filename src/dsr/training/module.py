@@ -244,8 +244,8 @@ class SuperResolution(lightning.LightningModule):
         """Store the scores of bicubic interpolation, and of what the module is made, as plain values."""
         checkpoint["bicubic"] = self.bicubic
         makers = {
-            "net": functools.partial(type(self.net), **self.net.arguments()),
-            "objective": functools.partial(type(self.objective), **self.objective.arguments()),
+            "net": functools.partial(self.net.__class__, **self.net.arguments()),
+            "objective": functools.partial(self.objective.__class__, **self.objective.arguments()),
             "optimizer": self._make_optimizer,
             "scheduler": self._make_scheduler,
         }
