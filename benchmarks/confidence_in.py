@@ -22,8 +22,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
-from dsr.degradation.downsampling import Downsampling
-from dsr.degradation.hints import relative_error
+from dsr.degradation.downsampling import Downsampling, relative_error
 from dsr.geometry.camera import Camera, from_range
 from dsr.geometry.surface import depth_to_normals
 from dsr.io.images import read_camera, read_rgb

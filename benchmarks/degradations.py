@@ -30,8 +30,8 @@ from dsr.data.frame_files import read_16bit, read_picture
 from dsr.data.rendered import Procedural
 from dsr.data.rgbdd import RGBDD
 from dsr.degradation.glass import add_glass
+from dsr.degradation.noise import NOISES
 from dsr.degradation.random_degradation import Everything
-from dsr.degradation.random_noise import NOISES
 from dsr.geometry.camera import Camera
 from dsr.pictures.depth_views import rendering
 from dsr.training.patches import soften

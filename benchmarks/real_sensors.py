@@ -62,7 +62,8 @@ from dsr.data.icl import ICL
 from dsr.data.middlebury import Middlebury
 from dsr.data.rendered import Procedural
 from dsr.data.stereo_board import StereoBoard
-from dsr.degradation import random_fields, random_noise
+from dsr.degradation import noise as sensor_noise
+from dsr.degradation import random_fields
 from dsr.degradation.downsampling import scene_generator
 from dsr.degradation.glass import add_glass
 from dsr.degradation.noise import Kinect
@@ -196,7 +197,7 @@ def clear_objects(count: int | None) -> list[Glass]:
         full, seen = add_glass(scene, generator, CLEAR)
         assert full.depth is not None  # noqa: S101 - for the type checker
         rgb = full.rgb.float()
-        inverse = random_noise.NOISES["stereo"](seen.float().reciprocal(), rgb.mean(dim=0, keepdim=True), generator)
+        inverse = sensor_noise.NOISES["stereo"](seen.float().reciprocal(), rgb.mean(dim=0, keepdim=True), generator)
         depth = (1e3 / inverse).round() / 1e3
         sample = without_truth(name, rgb, depth.masked_fill(~(depth > 0) | depth.isinf(), torch.nan), scene.camera)
         found.append(Glass(sample, full.depth, full.depth.ne(torch.as_tensor(scene.depth))))
@@ -360,7 +361,7 @@ def still(scene: Scene, kind: str, draw: int) -> Iterator[DepthSample]:
         def anew(like: Tensor, sigma: float | tuple[float, float], _: object, fresh: torch.Generator = fresh) -> Tensor:
             return field_of(like, sigma, fresh)
 
-        with patch.object(random_fields, "field_of", anew), patch.object(random_noise, "field_of", anew):
+        with patch.object(random_fields, "field_of", anew), patch.object(sensor_noise, "field_of", anew):
             yield simulated(scene, kind, draw=draw)
 
 
@@ -406,7 +407,7 @@ def scores_of_stated(shared: Path, method: Method, count: int | None) -> dict[st
     for name, scenes in sources.items():
         for scale in (1, 4):
             found = rows.setdefault(f"{name}_x{scale}", [])
-            for sample in (simulated(each, kind, scale) for each in scenes[:count] for kind in random_noise.NOISES):
+            for sample in (simulated(each, kind, scale) for each in scenes[:count] for kind in sensor_noise.NOISES):
                 surface = method(sample)
                 if surface.depth_error is None:
                     return {}

@@ -28,7 +28,7 @@ from scipy import ndimage, stats
 
 from dsr.data import sunrgbd
 from dsr.data.rendered import Procedural
-from dsr.degradation.random_noise import NOISES
+from dsr.degradation.noise import NOISES
 from dsr.geometry.camera import Camera
 from dsr.geometry.surface import render_for_viewing
 from dsr.io.depth_files import read_depth_file

@@ -36,8 +36,8 @@ from dsr.degradation import holes as of_holes
 from dsr.degradation import noise as of_noise
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.degradation.holes import HOLES
+from dsr.degradation.noise import NOISES
 from dsr.degradation.random_degradation import Everything
-from dsr.degradation.random_noise import NOISES
 from dsr.geometry.camera import from_range, to_range
 from dsr.geometry.hole_size import distance_to_known, wide_holes
 from dsr.geometry.mesh import triangulate

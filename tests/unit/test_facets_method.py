@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dsr.degradation.hints import FACTS
+from dsr.degradation.downsampling import FACTS
 from dsr.geometry.camera import Camera
 from dsr.methods.networks.facets_method import CAUTION, AnyMap
 from dsr.methods.networks.facets_unet import FacetsUNet

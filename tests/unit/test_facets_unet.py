@@ -10,8 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dsr.degradation.downsampling import Downsampling
-from dsr.degradation.hints import FACTS, KERNELS, encode_facts
+from dsr.degradation.downsampling import FACTS, KERNELS, Downsampling, encode_facts
 from dsr.methods.networks import facets_planes, facets_unet
 from dsr.methods.networks.facets import Facets
 from dsr.methods.networks.facets_layers import enlarge, enlarge_and_join

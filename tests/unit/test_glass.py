@@ -158,8 +158,3 @@ def test_maps_show_what_sensors_see_and_hints_on_noise_leave_it_out() -> None:
         beyond += int(far.sum())
         assert float(noise.max()) < 0.05
     assert beyond > 200
-
-
-def test_the_share_is_a_fraction() -> None:
-    with pytest.raises(ValueError, match="clear: expected a fraction from 0 to 1, got 2"):
-        Everything(clear=2)

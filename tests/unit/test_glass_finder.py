@@ -11,7 +11,7 @@ import torch
 
 from dsr.data.rendered import Procedural
 from dsr.degradation.glass import add_glass
-from dsr.degradation.random_noise import NOISES
+from dsr.degradation.noise import NOISES
 from dsr.geometry.camera import Camera
 from dsr.inference import upsample_surface
 from dsr.methods.glass import FEATURES, GlassFinder, expect_glass, glass_features, probability_of_glass

@@ -19,8 +19,7 @@ from small_scenes import sample_of, step
 from torch import Tensor
 from torch.utils.data import default_collate
 
-from dsr.degradation.downsampling import Downsampling
-from dsr.degradation.hints import encode_facts
+from dsr.degradation.downsampling import Downsampling, encode_facts
 from dsr.methods.dip.upsampler import DeepImagePrior, PriorOptimisation
 from dsr.methods.networks.network import Answer
 from dsr.methods.networks.peers.peer import PEERS

@@ -23,11 +23,12 @@ from dsr.degradation.downsampling import Downsampling, Measured, make_sample
 from dsr.degradation.noise import GaussianMultiplicative, Kinect
 from dsr.degradation.random_degradation import Everything
 from dsr.geometry.camera import Camera
+from dsr.geometry.surface import depth_to_normals, lights, render
 from dsr.methods.images import normalise
 from dsr.sample import CENTIMETRES, Scene, Unit
 from dsr.training.data_module import Part, PatchData, WholeScenes
 from dsr.training.degradation import Batch, Degradation, to_tensors
-from dsr.training.patches import Patches
+from dsr.training.patches import Patches, augment, mirror, rotate90
 from dsr.training.settings import PatchSettings
 
 BOX = Downsampling("box")
@@ -110,12 +111,9 @@ def _equal(first: list[Batch], second: list[Batch]) -> bool:
 
 def test_patch_is_a_pure_function_of_the_seed_and_its_number() -> None:
     scenes, settings = [_scene(i) for i in range(3)], _settings(colour=0.1)
-    whole = Patches([scenes], settings, X4, seed=5, count=12)
-    later = Patches([scenes], settings, X4, seed=5, first=7, count=3)
-    assert all(_same(whole.select(7, 3)[i], later[i]) for i in range(3))
-    assert (len(whole), len(later)) == (12, 3)
-    assert all(_same(later[i], whole[7 + i]) for i in (2, 0, 1))  # whatever was asked for before
-    assert _same(whole[7], whole[7])
+    whole, later = (Patches([scenes], settings, X4, seed=5, count=12) for _ in range(2))
+    assert len(whole) == 12
+    assert all(_same(later[i], whole[i]) for i in (9, 7, 8))  # whatever was asked for before
     assert not any(_same(whole[i], whole[7]) for i in range(12) if i != 7)
     assert not _same(Patches([scenes], settings, X4, seed=6, count=12)[7], whole[7])
 
@@ -173,13 +171,6 @@ def test_devices_share_the_batches_of_a_step() -> None:
     assert _equal(_batches(data, 2, 1, rank=1, world=2), [whole[3], whole[5]])
 
 
-def test_first_patches_can_be_requested() -> None:
-    data = _data()
-    first = _batches(data, 2)
-    for i, patch in enumerate(data.first_patches(4)):
-        assert all(torch.equal(patch[name], first[i // 2][name][i % 2]) for name in patch)
-
-
 def test_held_out_scenes_are_validated_whole_and_never_trained_on() -> None:
     data = _data()
     assert data.training_count == 4
@@ -228,20 +219,13 @@ def test_parts_hold_out_their_last_scenes_under_distinct_names() -> None:
 
 
 def test_other_datasets_validate_whole_and_alone_where_nothing_is_held_out() -> None:
-    bare = Scene("set", "bare", _scene().rgb, CAMERA, None, {4: torch.ones(1, 11, 15)})
-    more: dict[str, SceneSource] = {"mine": _Source([_scene(8), bare, _scene(9)])}
+    more: dict[str, SceneSource] = {"mine": _Source([_scene(8), BARE, _scene(9)])}
     data = PatchData([Part(_Source([_scene(0)]))], _settings(validation_scenes=0), X4, validation=more)
     data.setup()
     assert data.validation_sets == ["mine"]
     assert data.validation_scenes()["mine"][1] == ["scene8", "scene9"]
     with pytest.raises(ValueError, match=r"^validation_scenes: expected a positive number where there is no"):
         _data(validation_scenes=0)
-
-
-def test_training_scene_cannot_validate() -> None:
-    more: dict[str, SceneSource] = {"mine": _Source([_scene(8), _scene(1)])}
-    with pytest.raises(ValueError, match=r"validation.mine: expected scenes that are not trained on, got scene1"):
-        PatchData([Part(_Source([_scene(i) for i in range(6)]))], _settings(), X4, validation=more)
 
 
 def test_training_scene_cannot_validate_under_another_name() -> None:
@@ -255,13 +239,6 @@ def test_training_scene_cannot_validate_under_another_name() -> None:
     assert PatchData(parts, _settings(), X4, validation={"mine": _Copies([_scene(9)])}).validation_sets == [
         "set", "mine",
     ]  # fmt: skip
-
-
-def test_validation_set_without_truth_is_refused() -> None:
-    bare = Scene("set", "bare", _scene().rgb, CAMERA, None, {4: torch.ones(1, 11, 15)})
-    more: dict[str, SceneSource] = {"mine": _Source([bare])}
-    with pytest.raises(ValueError, match=r"validation.mine: expected scenes with a true depth, there is none"):
-        PatchData([Part(_Source([_scene(0)]))], _settings(validation_scenes=0), X4, validation=more).setup()
 
 
 def test_patches_reach_every_row_and_column_of_a_scene() -> None:
@@ -424,13 +401,6 @@ def test_holes_are_kept_and_half_of_a_patch_is_valid_where_possible() -> None:
     assert 0.5 <= min(shares) < 1
 
 
-def test_scenes_that_are_mostly_holes_still_give_patches() -> None:
-    depth = torch.full((1, 44, 60), torch.nan, dtype=torch.float64)
-    depth[0, ::3, ::3] = _tilted(CAMERA)[0, ::3, ::3]
-    patches = _patches([_scene(depth=depth)])
-    assert all(0 < patches[i]["depth"].isfinite().float().mean() < 0.5 for i in range(40))
-
-
 def test_batches_have_the_documented_shapes_and_types() -> None:
     shapes = {
         "rgb": (3, 16, 16),
@@ -450,19 +420,8 @@ def test_batches_have_the_documented_shapes_and_types() -> None:
     assert all(value.dtype == (torch.float32 if name in single else torch.float64) for name, value in whole.items())
 
 
-def test_scene_too_small_for_a_patch_is_refused_by_name_before_training() -> None:
-    small = _scene(1, replace(CAMERA, width=60, height=30))
-    message = "patch: expected at most scene1's 30 x 60, got 32"
-    with pytest.raises(ValueError, match=message):
-        _data([_scene(0), small, _scene(2), _scene(3)], patch=32).setup()
-    with pytest.raises(ValueError, match=message):
-        _patches([_scene(0), small], patch=32)
-
-
-def test_scene_without_truth_is_refused_by_name() -> None:
-    measured = Scene("set", "bare", _scene().rgb, CAMERA, None, {4: torch.ones(1, 11, 15)})
-    with pytest.raises(ValueError, match="bare: expected a true depth to train with, there is none"):
-        _data([measured, *(_scene(i) for i in range(2))], validation_scenes=1).setup()
+SMALL = _scene(1, replace(CAMERA, width=60, height=30))
+BARE = Scene("set", "bare", _scene().rgb, CAMERA, None, {4: torch.ones(1, 11, 15)})
 
 
 def test_measured_map_cannot_be_cropped() -> None:
@@ -486,6 +445,13 @@ REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
     "a patch in 4": (lambda: _data(patch=30), "^patch: expected a size that scale=4 divides"),
     "a patch in 16": (lambda: _data(degradation=Degradation(16, BOX), patch=24), "^patch: .*scale=16 divides, got 24"),
     "factors": (lambda: _degraded([_scene()], Everything(scales={4: 1, 16: 1}), size=24), "16"),
+    "a small scene": (lambda: _patches([_scene(), SMALL], patch=32), "^patch: expected at most scene1's 30 x 60"),
+    "no truth": (lambda: _data([BARE, *map(_scene, range(3))]).setup(), "^bare: expected a true depth to train with"),
+    "no truth to validate with": (
+        lambda: PatchData([Part(_Source([_scene()]))], _settings(validation_scenes=0), X4,
+                          validation={"mine": _Source([BARE])}).setup(),
+        "^validation.mine: expected scenes with a true depth, there is none",
+    ),
     "no part": (lambda: Patches([], _settings(), X4), "expected a scene or more"),
     "an empty part": (lambda: Patches([[_scene()], []], _settings(), X4), "expected a scene or more"),
 }  # fmt: skip
@@ -503,7 +469,7 @@ def test_window_that_noise_leaves_empty_is_replaced_by_another() -> None:
     degradation = Degradation(4, BOX, Kinect(nearest=None, farthest=20.0))
     patches = Patches([[far, _scene()]], _settings(), degradation)
     for index in range(8):
-        assert patches.select(index, 1)[0]["depth"].nanmean() < 20
+        assert patches[index]["depth"].nanmean() < 20
     with pytest.raises(
         ValueError, match="patches: expected low-resolution maps with a known pixel or more; noise makes all"
     ):
@@ -555,3 +521,92 @@ def test_soft_patches_of_scenes_with_holes_of_several_sizes_are_soft() -> None:
         assert float(mixed.double().mean()) > 0.9
     sharp = _degraded(scenes, replace(everything, soft=0))[0]["depth"]
     assert set(sharp[sharp.isfinite()].tolist()) == {1.0, 2.0}
+
+
+# Augmentation: what is turned or mirrored is another view of the same surface, or of its mirror image
+
+WIDE = Camera(width=31, height=23, fx=30.0, fy=27.0, cx=13.3, cy=9.9, baseline=0.1, doffs=0.7)
+
+
+def _waves() -> Scene:
+    random = np.random.default_rng(0)
+    v, u = np.mgrid[:23, :31]
+    depth = torch.from_numpy(2 + 0.03 * u + 0.2 * np.sin(u / 3) * np.cos(v / 4))[None]
+    depth[0, 5, 7] = torch.nan
+    rgb = torch.from_numpy(random.random((3, 23, 31))).float()
+    return Scene("set", "waves", rgb, WIDE, depth, {1: depth})
+
+
+def _normals(scene: Scene) -> Tensor:
+    assert scene.depth is not None
+    return depth_to_normals(scene.depth[None], scene.camera.rays()[None])[0]
+
+
+def _quarter(vectors: Tensor) -> Tensor:
+    """Return vectors turned counterclockwise about the axis, as a picture with y down shows it."""
+    x, y, z = vectors
+    return torch.stack((y, -x, z))
+
+
+def _points(scene: Scene) -> Tensor:
+    assert scene.depth is not None
+    return scene.depth * scene.camera.rays()
+
+
+@pytest.mark.parametrize("turns", [0, 1, 2, 3])
+def test_turned_scene_has_the_turned_points(turns: int) -> None:
+    expected = _points(_waves()).rot90(turns, (-2, -1))
+    for _ in range(turns):
+        expected = _quarter(expected)
+    torch.testing.assert_close(_points(rotate90(_waves(), turns)), expected, rtol=0, atol=1e-12, equal_nan=True)
+
+
+@pytest.mark.parametrize("turns", [0, 1, 2, 3])
+def test_turned_plane_has_the_turned_normal_and_is_lit_by_it(turns: int) -> None:
+    normal = torch.tensor([0.3, -0.4, -1.0], dtype=torch.float64)[:, None, None]
+    depth = -2.0 / (normal * WIDE.rays()).sum(dim=0, keepdim=True)
+    shown = _normals(rotate90(Scene("set", "plane", torch.rand(3, 23, 31), WIDE, depth), turns))
+    expected = normal / normal.norm()
+    for _ in range(turns):
+        expected = _quarter(expected)
+    lit = (lights() @ expected.flatten()).clamp(0, 1)[:, None, None]
+    known = shown[0].isfinite()
+    assert known.float().mean() > 0.8
+    assert float((shown - expected).abs()[:, known].max()) < 1e-9
+    assert float((render(shown[None])[0] - lit).abs()[:, known].max()) < 1e-9
+
+
+def test_four_quarter_turns_and_two_mirrors_restore_the_waves() -> None:
+    scene = _waves()
+    there = rotate90(rotate90(rotate90(rotate90(scene, 1), 1), 1), 1)
+    twice = mirror(mirror(scene, vertical=True), vertical=True)
+    for other in (there, twice):
+        assert torch.equal(other.rgb, scene.rgb)
+        torch.testing.assert_close(_points(other), _points(scene), rtol=0, atol=1e-12, equal_nan=True)
+        assert not other.measured  # which would have to be turned, too
+    assert rotate90(scene, 4) is scene
+    both = mirror(mirror(scene), vertical=True)
+    half = rotate90(scene, 2)
+    assert torch.equal(both.rgb, half.rgb)
+    assert both.camera == half.camera
+
+
+@pytest.mark.parametrize("vertical", [False, True])
+def test_mirrored_scene_has_the_mirrored_points(vertical: bool) -> None:
+    sign = torch.tensor([1.0, -1.0, 1.0] if vertical else [-1.0, 1.0, 1.0], dtype=torch.float64)[:, None, None]
+    expected = sign * _points(_waves()).flip(-2 if vertical else -1)
+    shown = _points(mirror(_waves(), vertical=vertical))
+    torch.testing.assert_close(shown, expected, rtol=0, atol=1e-12, equal_nan=True)
+
+
+def test_factor_of_a_varied_scene_is_that_of_its_depth() -> None:
+    settings = PatchSettings(flip=False, rotate=False, depth_scale=0.5, colour=0.0)
+    random, factors = np.random.default_rng(0), []
+    for _ in range(200):
+        scene, factor = augment(_waves(), settings, random)
+        torch.testing.assert_close(_points(scene), factor * _points(_waves()), rtol=1e-13, atol=0, equal_nan=True)
+        assert scene.camera == WIDE
+        factors.append(np.log(factor))
+    assert -0.5 <= min(factors) < -0.45
+    assert 0.45 < max(factors) <= 0.5
+    assert np.mean(factors) == pytest.approx(0, abs=0.07)

@@ -10,11 +10,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.degradation import random_noise
-from dsr.degradation.downsampling import Downsampling
-from dsr.degradation.hints import FACTS, KERNELS
-from dsr.degradation.random_degradation import Everything
-from dsr.degradation.random_fields import add_folds, displace
+from dsr.degradation.downsampling import FACTS, KERNELS, Downsampling, Kernel, encode_facts, local_noise
+from dsr.degradation.noise import NOISES
+from dsr.degradation.random_degradation import Everything, add_folds, displace
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
 from dsr.training.patches import soften
@@ -29,6 +27,13 @@ def _scene(size: int = 128, step: bool = True) -> Scene:
         depth[:, size // 4 : size // 2, size // 4 : size // 2] = 1.2
     rgb = torch.rand((3, size, size), generator=torch.Generator().manual_seed(0))
     return Scene("test", "slope", rgb, Camera.from_fov(60, size, size), depth)
+
+
+def _averaged(depth: Tensor, depth_lr: Tensor, scale: int, kernel: Kernel = "box") -> str | None:
+    """Return whether a map has averages of inverse depth or, as some have, of depth."""
+    model, fine = Downsampling(kernel), depth.float()
+    means = {"inverse": model(fine.reciprocal(), scale).reciprocal(), "depth": model(fine, scale)}
+    return next((name for name, each in means.items() if torch.allclose(depth_lr, each, rtol=1e-5)), None)
 
 
 def _generator(seed: int = 0) -> torch.Generator:
@@ -57,23 +62,17 @@ def test_a_degradation_is_a_function_of_its_generator(scale: int) -> None:
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_clean_maps_are_those_of_the_kernel_and_hints_name_it(kernel: str) -> None:
+def test_clean_maps_are_those_of_the_kernel_and_hints_name_it(kernel: Kernel) -> None:
     everything = replace(CLEAN, kernels={kernel: 1})
     found = set()
     for seed in range(20):
         sample, hints = everything(_scene(), 4, _generator(seed), soft=seed % 2 == 1)
-        for range_of in (torch.reciprocal, torch.Tensor.clone):  # averages of inverse depth or, at times, of depth
-            expected = range_of(Downsampling(kernel)(range_of(_scene().depth.float()), 4))
-            if torch.allclose(sample.depth_lr, expected, rtol=1e-5):
-                found.add(range_of)
-                break
-        else:
-            raise AssertionError(seed)
+        found.add(_averaged(_scene().true_depth, sample.depth_lr, 4, kernel))
         facts = torch.zeros(FACTS)
         facts[KERNELS.index(kernel)] = facts[len(KERNELS) + seed % 2] = facts[-1] = 1
         assert torch.equal(hints.facts, facts)
         assert float(hints.noise.max()) < 1e-6
-    assert found == {torch.reciprocal, torch.Tensor.clone} or kernel == "nearest"
+    assert found == {"inverse"} | ({"depth"} if kernel != "nearest" else set())
 
 
 def test_there_are_no_hints_where_there_are_to_be_none() -> None:
@@ -184,12 +183,7 @@ def test_relief_is_in_the_truth_and_its_means_in_the_map() -> None:
         change = (sample.depth / scene.depth - 1).abs()
         assert 1e-6 < float(change.mean()) < 0.02
         rough += float(change.mean()) > 1e-4
-        for range_of in (torch.reciprocal, torch.Tensor.clone):
-            expected = range_of(Downsampling("box")(range_of(sample.depth.float()), 4))
-            if torch.allclose(sample.depth_lr, expected, rtol=1e-5):
-                break
-        else:
-            raise AssertionError(seed)
+        assert _averaged(sample.depth, sample.depth_lr, 4), seed
         assert float(hints.noise.max()) < 1e-6, "the map has no noise"
     assert 3 < rough < 20
     same, _ = replace(everything, noises={"white": 1})(scene, 1, _generator())
@@ -204,6 +198,7 @@ def test_relief_is_in_the_truth_and_its_means_in_the_map() -> None:
         ({"holes": {"none": -1}}, "holes: expected frequencies of 0 or more"),
         ({"noises": {"none": 0}}, "noises: expected frequencies of 0 or more, one of them positive"),
         ({"soft": 1.5}, "soft: expected a fraction from 0 to 1, got 1.5"),
+        ({"clear": 2}, "clear: expected a fraction from 0 to 1, got 2"),
         ({"scales": {3: 1}}, "scales: expected some of 1, 2, 4, 8, 16, got 3"),
     ],
 )
@@ -222,6 +217,7 @@ def test_holes_of_the_truth_leave_their_surroundings_alone(kind: str) -> None:
     everything = replace(CLEAN, noises={kind: 1}, kernels={"nearest": 1}, told=0)
     for seed in range(12):
         sample, _ = everything(replace(scene, depth=depth), 2, _generator(seed))
+        assert bool(sample.depth_lr[:, 50:70, 30:90].isnan().all())
         clean, _ = everything(scene, 2, _generator(100))
         truth = Downsampling("nearest")(scene.depth.float(), 2)
         error = (sample.depth_lr.float() / truth - 1).abs()
@@ -248,12 +244,7 @@ def test_folds_are_in_truth_map_and_photo_and_only_in_places() -> None:
         shaded += bool(light.max() > 1e-3)
         near = functional.max_pool2d(change[None], 5, stride=1, padding=2)[0]
         assert not bool(light[near < 1e-6].gt(0.02).any()), "no shade without folds"
-        for range_of in (torch.reciprocal, torch.Tensor.clone):
-            expected = range_of(Downsampling("box")(range_of(sample.depth.float()), 2))
-            if torch.allclose(sample.depth_lr, expected, rtol=1e-5):
-                break
-        else:
-            raise AssertionError(seed)
+        assert _averaged(sample.depth, sample.depth_lr, 2), seed
     assert 5 < shaded < 20, "in some photos they cannot be seen"
     assert min(places) < 0.2
 
@@ -278,10 +269,33 @@ def test_structured_light_loses_pixels_at_steps_and_on_steep_surfaces() -> None:
     values = torch.where(radius < 1, 1 / (2 - (1 - radius.square()).clamp(min=0).sqrt()), 0.4)[None]
     lost = torch.zeros_like(values)
     for seed in range(60):
-        lost += random_noise.NOISES["structured"](values, torch.ones_like(values), _generator(seed)).isnan()
+        lost += NOISES["structured"](values, torch.ones_like(values), _generator(seed)).isnan()
     rim, rest = (
         (radius > 0.85) & (radius < 0.95),
         (radius > 1.15) & (u > 0) | (radius < 0.3),
     )  # left of it lies its shadow
     assert float(lost[0, rim].mean()) > 3
     assert float(lost[0, rest].mean()) < 1
+
+
+def test_each_fact_has_a_place_of_its_own() -> None:
+    assert not bool(encode_facts().any())
+    reported = [encode_facts(kernel) for kernel in KERNELS]
+    reported += [encode_facts(soft=soft) for soft in (False, True)] + [encode_facts(noise=True)]
+    assert torch.equal(torch.stack(reported), torch.eye(FACTS))
+    assert torch.equal(encode_facts("bicubic", soft=True, noise=True), reported[3] + reported[6] + reported[7])
+    with pytest.raises(ValueError, match=r"kernel: expected one of box, nearest, .*, got 'sinc'"):
+        encode_facts("sinc")
+
+
+def test_local_noise_ignores_holes_and_outliers() -> None:
+    truth = (0.5 + 0.1 * (torch.arange(64, dtype=torch.float64) + 0.5) / 64).expand(1, 1, 48, 64)
+    given = functional.avg_pool2d(truth, 4)
+    error = 0.002 * torch.ones_like(given)
+    error[..., 8:] = 0.02
+    given = given * (1 + error)
+    given[..., 2, 2], given[..., 5, 3] = torch.nan, 5.0
+    noise = local_noise(given, truth)
+    assert bool(noise.isfinite().all())
+    torch.testing.assert_close(noise[..., 0], torch.full_like(noise[..., 0], 0.002), rtol=1e-3, atol=0)
+    torch.testing.assert_close(noise[..., -1], torch.full_like(noise[..., -1], 0.02), rtol=1e-3, atol=0)

@@ -8,7 +8,7 @@ pixels only. Kernels for the factor f, in high-resolution pixels from the centre
 - ``bilinear``, ``bicubic`` (a = -0.5): antialiased, their kernels stretched by f, as Pillow resizes.
 - ``gaussian``: standard deviation ``sigma`` * f, truncated at three standard deviations.
 
-At the border, kernels are truncated and normalised.
+At the border, kernels are truncated and normalised. Hints are what a network may be given of a low-resolution map.
 """
 
 from __future__ import annotations
@@ -16,22 +16,27 @@ from __future__ import annotations
 import functools
 import hashlib
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from dsr.degradation.holes import Holes
 from dsr.degradation.noise import Noise
 from dsr.geometry.camera import Camera, RangeType, from_range, to_range
 from dsr.sample import FARTHEST, NEAREST, AllHolesError, DepthSample, Scene
 from dsr.utils.compute_device import known_true
-from dsr.utils.guards import naming, unchecked
+from dsr.utils.guards import expect_one_of, naming, unchecked
 from dsr.utils.ratios import check_scale, match_ratio
 
 Kernel = Literal["box", "nearest", "bilinear", "bicubic", "gaussian"]
+KERNELS: tuple[Kernel, ...] = get_args(Kernel)
+FACTS = len(KERNELS) + 3  # number of the facts of a map
 _LEAST_WEIGHT = 0.5
 _LEAST_SIGMA = 0.1  # as a fraction of the scale: at x2 the nearest pixel centre is 0.25 away, within three sigmas
+_LARGEST = 0.1  # relative errors beyond this are outliers, not noise
+_WINDOW = 9  # low-resolution pixels of the window in which the noise is measured
 
 
 @dataclass(frozen=True)
@@ -54,8 +59,7 @@ class Downsampling:
     def __post_init__(self) -> None:
         """Check the values."""
         for name, kernel in (("kernel", self.kernel), ("assumed", self.assumed or self.kernel)):
-            if kernel not in get_args(Kernel):
-                raise ValueError(f"{name}: expected one of {', '.join(get_args(Kernel))}, got {kernel!r}")
+            expect_one_of(name, kernel, KERNELS)
         if not self.sigma >= _LEAST_SIGMA:
             raise ValueError(f"sigma: expected at least {_LEAST_SIGMA} (of the scale), got {self.sigma}")
 
@@ -70,11 +74,10 @@ class Downsampling:
         return camera.downscale(scale)
 
     def __call__(self, values: Tensor, scale: int, *, complete: bool | None = None) -> Tensor:
-        """Downsample (..., H, W) maps with NaN in holes to (..., H / scale, W / scale).
+        """Downsample (..., H, W) maps with NaN in holes; ``complete`` says whether there are none, None if not known.
 
         A low-resolution pixel whose block has no valid pixel is a hole. If less than half of a kernel's weight falls on
-        valid pixels, the result is the mean of the block's valid pixels. ``complete`` says whether there are no holes;
-        None if not known.
+        valid pixels, the result is the mean of the block's valid pixels.
         """
         height, width = values.shape[-2:]
         if height % scale or width % scale:
@@ -220,19 +223,10 @@ def downsample_depth(
     *,
     complete: bool | None = None,
 ) -> tuple[Tensor, Camera]:
-    """Return the low-resolution depth that a model and noise make of high-resolution depth, and its camera.
+    """Return the low-resolution depth that a model makes of depth, (..., H, W) in metres, and its camera.
 
-    Differentiable.
-
-    Args:
-        depth: (..., H, W) orthogonal depth in metres.
-        camera: camera of the high-resolution map.
-        scale: downsampling factor.
-        downsampling: downsampling model.
-        range_type: range type that is averaged, unless the model sets one.
-        noise: noise of the averages and its generator, in the same range type, unless the noise sets one.
-        complete: whether neither map can have holes or values out of range; None if not known.
-
+    Differentiable. Averages and ``noise``, a model and its generator, are of a range type, unless they set another one.
+    ``complete`` says whether neither map can have holes or values out of range; None if not known.
     """
     range_type = downsampling.range_type or range_type
     camera_lr = downsampling.camera(camera, scale)
@@ -251,3 +245,53 @@ def downsample_depth(
         return depth_lr, camera_lr
     held = (depth_lr >= NEAREST) & (depth_lr <= FARTHEST)  # bicubic may undershoot beside a depth step
     return torch.where(held, depth_lr, torch.nan), camera_lr
+
+
+class Hints(NamedTuple):
+    """What is known of a low-resolution map."""
+
+    noise: Tensor  # (1, h, w), the standard deviation of the logarithm of its inverse depth, 0 where not given
+    facts: Tensor  # (FACTS,), those of encode_facts
+
+
+def encode_facts(kernel: str | None = None, soft: bool | None = None, *, noise: bool = False) -> Tensor:
+    """Encode what is known of a map as (``FACTS``,) numbers: five for the kernel, two for softness, one for noise."""
+    facts = torch.zeros(FACTS)
+    if kernel is not None:
+        expect_one_of("kernel", kernel, KERNELS)
+        facts[KERNELS.index(kernel)] = 1
+    if soft is not None:
+        facts[len(KERNELS) + int(soft)] = 1
+    facts[-1] = noise
+    return facts
+
+
+def known_kernels(facts: Tensor) -> list[str | None]:
+    """Return the kernel in the facts of each map, (B, ``FACTS``); None where there is none."""
+    kernels = facts[:, : len(KERNELS)].tolist()
+    return [KERNELS[each.index(max(each))] if any(each) else None for each in kernels]
+
+
+def relative_error(given: Tensor, result: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the relative difference of maps to block means of results, and a weight, 0 where unknown, (B, 1, h, w).
+
+    ``given`` (B, 1, h, w) and ``result`` (B, 1, H, W) are inverse depth; the difference is 0 in holes and of outliers.
+    """
+    scale = result.shape[-1] // given.shape[-1]
+    error = given / functional.avg_pool2d(result, scale) - 1
+    known = error.isfinite() & (error.abs() < _LARGEST)
+    return torch.where(known, error, 0), known.to(given.dtype)
+
+
+def local_noise(given: Tensor, result: Tensor) -> Tensor:
+    """Return the noise of maps around each pixel, (B, 1, h, w); 0 where nothing around is known.
+
+    It is the root mean square of their relative differences to results; arguments as for :func:`relative_error`.
+    """
+    error, weight = relative_error(given, result)
+    padding = (_WINDOW // 2,) * 4
+    squares, weights = (
+        functional.avg_pool2d(functional.pad(each, padding, mode="replicate"), _WINDOW, stride=1)
+        for each in (error.square(), weight)
+    )
+    return (squares / weights.clamp(min=1e-6)).sqrt()

@@ -168,8 +168,7 @@ class _Room:
     def walls(self, normals: Tensor) -> Tensor:
         """Return the light from the walls that a surface of these normals reflects, (3, h, w)."""
         places = normals[:2].permute(1, 2, 0)[None]
-        found = functional.grid_sample(self._walls, places, padding_mode="border", align_corners=False)
-        return found[0]
+        return functional.grid_sample(self._walls, places, padding_mode="border", align_corners=False)[0]
 
     def lights(self, normals: Tensor) -> Tensor:
         """Return the light from the lights, (3, h, w)."""
@@ -243,9 +242,8 @@ def _seen_through(surface: Tensor, behind: Tensor, cue: Tensor, through: Tensor,
     lean = {"behind": uniform(2, 4, generator), "mixed": uniform(-1, 1.5, generator), "surface": -2.0}
     side = draw(_SIDES, generator)
     size = min(surface.shape[1:])
-    places = (
-        field_of(surface, size * power(-1.5, -0.4, generator), generator) + lean[side] - uniform(0, 4, generator) * cue
-    )
+    field = field_of(surface, size * power(-1.5, -0.4, generator), generator)
+    places = field + lean[side] - uniform(0, 4, generator) * cue
     share = torch.sigmoid(power(-0.3, 1.3, generator) * places)
     pushed = behind + through * uniform(-0.1, 0.6, generator)
     waves = 1 + power(-3, -1.7, generator) * field_of(surface, size * power(-1.5, -0.7, generator), generator)
@@ -296,8 +294,7 @@ def _add_plate(state: _State, focal: float, kind: str, generator: torch.Generato
     mask = whole & ~(surface >= state.depth[window])[0]
     reflected, virtual = _reflect(state, plate, surface, generator)
     if kind == "mirror":
-        painted = reflected * uniform(0.7, 0.97, generator)
-        seen = virtual
+        painted, seen = reflected * uniform(0.7, 0.97, generator), virtual
         if chance(0.3, generator):  # dust shows the surface in places
             seen = torch.where(field_of(surface, power(0.3, 1.2, generator), generator) > 1.3, surface, virtual)
         seen = seen.masked_fill(_missing(surface, torch.zeros_like(surface[0]), generator), torch.nan)
@@ -308,10 +305,8 @@ def _add_plate(state: _State, focal: float, kind: str, generator: torch.Generato
     painted = torch.lerp(painted, torch.tensor(uniform(0, 1, generator)), line)
     shade = 1 + 0.1 * field_of(surface, (0.5, 4), generator)
     colour = uniform(0, 0.8, generator) + 0.25 * torch.rand((3, 1, 1), generator=generator)
-    frame = (colour * shade).clamp(0, 1)
-    painted = torch.where(plate.frame, frame, painted)
-    seen = torch.where(plate.frame, surface, seen)
-    return _put(state, window, mask, painted, surface, seen)
+    painted = torch.where(plate.frame, (colour * shade).clamp(0, 1), painted)
+    return _put(state, window, mask, painted, surface, torch.where(plate.frame, surface, seen))
 
 
 def _reflect(state: _State, plate: Plate, surface: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -326,10 +321,8 @@ def _reflect(state: _State, plate: Plate, surface: Tensor, generator: torch.Gene
     own_v, own_u = (torch.arange(each.start, each.stop) for each in (plate.rows, plate.columns))
     right = u - smaller * plate.right - own_u
     down = v + smaller * plate.down - own_v[:, None]
-    rows = _within(own_v[:, None] + down, height)
-    columns = _within(own_u + right, width)
-    reflected = _sample(state.rgb, plate, right, down)
-    return reflected, surface + state.depth[:, rows, columns]
+    rows, columns = _within(own_v[:, None] + down, height), _within(own_u + right, width)
+    return _sample(state.rgb, plate, right, down), surface + state.depth[:, rows, columns]
 
 
 def _within(places: Tensor, size: int) -> Tensor:

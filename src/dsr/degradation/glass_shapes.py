@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from dsr.degradation.random_fields import chance, draw, normal, uniform
 
@@ -37,7 +38,7 @@ class Body(NamedTuple):
 
 
 _PROFILES = {"tumbler": 0.3, "bottle": 0.35, "goblet": 0.12, "bowl": 0.1, "jar": 0.13}
-_SAMPLES = 256
+_SAMPLES, _REACH = 256, 9  # of a profile, and by how many of them its corners are rounded
 
 
 def draw_vessel(pose: Pose, radius: float, size: tuple[int, int], generator: torch.Generator) -> Body | None:
@@ -45,9 +46,15 @@ def draw_vessel(pose: Pose, radius: float, size: tuple[int, int], generator: tor
     kind = draw(_PROFILES, generator)
     points, aspect = _outline(kind, generator)
     heights, radii = (torch.tensor(each, dtype=torch.float32) for each in zip(*points, strict=True))
-    profile = radius * _smooth(_interpolate(torch.linspace(0, 1, _SAMPLES), heights, radii))
+    places = torch.linspace(0, 1, _SAMPLES)
+    after = torch.searchsorted(heights, places).clamp(1, len(heights) - 1)
+    share = ((places - heights[after - 1]) / (heights[after] - heights[after - 1])).clamp(0, 1)
+    profile = torch.lerp(radii[after - 1], radii[after], share)
+    for _ in range(2):  # round the corners
+        padded = functional.pad(profile[None, None], (_REACH, _REACH), mode="replicate")
+        profile = functional.avg_pool1d(padded, 2 * _REACH + 1, stride=1)[0, 0]
     rings = [uniform(0.8, 0.97, generator) for _ in range(int(torch.randint(3, (1,), generator=generator)))]
-    return _revolve(profile, aspect * radius, [0.0, 1.0, *rings], pose, size)
+    return _revolve(radius * profile, aspect * radius, [0.0, 1.0, *rings], pose, size)
 
 
 def ball(pose: Pose, radius: float, size: tuple[int, int]) -> Body | None:
@@ -83,21 +90,6 @@ def _outline(kind: str, generator: torch.Generator) -> tuple[list[tuple[float, f
         return [(0.0, 0.9), (0.05, 1.0), (0.78, 1.0), (0.86, neck), (1.0, neck)], some(1.6, 3)
     foot = some(0.6, 1)
     return [(0.0, 0.95 * foot), (0.02, foot), (1.0, 1.0)], some(1.4, 3.6)
-
-
-def _interpolate(places: Tensor, known: Tensor, values: Tensor) -> Tensor:
-    """Return values between known ones, linearly."""
-    after = torch.searchsorted(known, places).clamp(1, len(known) - 1)
-    share = ((places - known[after - 1]) / (known[after] - known[after - 1])).clamp(0, 1)
-    return torch.lerp(values[after - 1], values[after], share)
-
-
-def _smooth(profile: Tensor, reach: int = 9) -> Tensor:
-    """Return a profile with its corners rounded."""
-    for _ in range(2):
-        padded = torch.nn.functional.pad(profile[None, None], (reach, reach), mode="replicate")
-        profile = torch.nn.functional.avg_pool1d(padded, 2 * reach + 1, stride=1)[0, 0]
-    return profile
 
 
 def _window(

@@ -6,7 +6,7 @@ A kind of holes is a callable from a low-resolution map, its camera and a genera
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -79,8 +79,7 @@ class Shadows:
 def occluded(disparity: Tensor) -> Tensor:
     """Return the mask of the pixels that a nearer one covers in a second image, (..., h, w) bool.
 
-    Beside a step from d1 to d2 it is d1 - d2 pixels wide: on the left where the second camera is to the right. The
-    disparity, (..., h, w) in pixels, is negative if the second camera is to the left.
+    The disparity, (..., h, w) in pixels, is negative if the second camera is to the left.
     """
     if bool((disparity < 0).any()):
         return occluded(-disparity.flip(-1)).flip(-1)
@@ -94,31 +93,26 @@ def no_holes() -> None:
     return
 
 
-def _blobs(values: Tensor, _: Tensor, camera: object, generator: torch.Generator) -> Tensor:
-    blobs = Blobs(uniform(0.02, 0.25, generator), uniform(2, 12, generator))
-    return blobs(values.reciprocal(), camera, generator)  # type: ignore[arg-type]
+HOLES = ("blobs", "shadows", "steps", "dark", "pixels")
 
 
-def _shadows(values: Tensor, _: Tensor, camera: object, generator: torch.Generator) -> Tensor:
-    side = -1 if chance(0.5, generator) else 1
-    return Shadows(side * uniform(0.03, 0.2, generator))(values.reciprocal(), camera, generator)  # type: ignore[arg-type]
-
-
-def _beside_steps(values: Tensor, _: Tensor, __: object, generator: torch.Generator) -> Tensor:
-    reach = 1 + int(torch.randint(2, (1,), generator=generator))
-    return near_steps(values, reach) & (torch.rand(values.shape, generator=generator) < uniform(0.3, 1, generator))
-
-
-def dark(values: Tensor, luma: Tensor, _: object, generator: torch.Generator) -> Tensor:
-    """Return the mask of the darkest pixels, most of them, (1, h, w)."""
-    limit = float(luma[:, ::3, ::3].flatten().quantile(uniform(0.02, 0.2, generator)))
-    return (luma < limit) & (field_of(values, 1, generator) > -0.3)
-
-
-def _pixels(values: Tensor, _: Tensor, __: object, generator: torch.Generator) -> Tensor:
+def draw_holes(kind: str, values: Tensor, luma: Tensor, camera: Camera, generator: torch.Generator) -> Tensor:
+    """Return a random mask of a kind of ``HOLES``, (1, h, w), for a map of inverse depth and its brightness."""
+    if kind == "blobs":
+        blobs = Blobs(uniform(0.02, 0.25, generator), uniform(2, 12, generator))
+        return blobs(values.reciprocal(), camera, generator)
+    if kind == "shadows":
+        side = -1 if chance(0.5, generator) else 1
+        return Shadows(side * uniform(0.03, 0.2, generator))(values.reciprocal(), camera, generator)
+    if kind == "steps":
+        reach = 1 + int(torch.randint(2, (1,), generator=generator))
+        return near_steps(values, reach) & (torch.rand(values.shape, generator=generator) < uniform(0.3, 1, generator))
+    if kind == "dark":
+        return dark(values, luma, generator)
     return torch.rand(values.shape, generator=generator) < uniform(0.01, 0.4, generator)
 
 
-HOLES: Mapping[str, Callable[[Tensor, Tensor, object, torch.Generator], Tensor]] = {
-    "blobs": _blobs, "shadows": _shadows, "steps": _beside_steps, "dark": dark, "pixels": _pixels,
-}  # fmt: skip
+def dark(values: Tensor, luma: Tensor, generator: torch.Generator) -> Tensor:
+    """Return the mask of the darkest pixels, most of them, (1, h, w)."""
+    limit = float(luma[:, ::3, ::3].flatten().quantile(uniform(0.02, 0.2, generator)))
+    return (luma < limit) & (field_of(values, 1, generator) > -0.3)

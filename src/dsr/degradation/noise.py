@@ -1,12 +1,14 @@
-"""Noise of low-resolution depth maps: multiplicative, and that of two kinds of sensors.
+"""Noise of low-resolution depth maps: models of users' choice, and the noise of cameras drawn at random for training.
 
 A noise model states the range type that it acts on, and maps low-resolution values of that type to noisy ones; see
-:func:`dsr.degradation.downsampling.make_sample`.
+:func:`dsr.degradation.downsampling.make_sample`. ``NOISES`` are functions of inverse depth in 1/m, (1, h, w), of the
+brightness of the photo and of a generator.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
@@ -14,7 +16,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from dsr.degradation.holes import dark, occluded
+from dsr.degradation.random_fields import chance, field_of, near_steps, power, uniform, waves_of
 from dsr.geometry.camera import RangeType
+from dsr.geometry.hole_size import window_maxima
 
 
 class Noise(Protocol):
@@ -57,21 +62,14 @@ class GaussianMultiplicative:
 class TimeOfFlight:
     """Noise that grows with the third power of depth, after Riegler et al., *ATGV-Net*, ECCV 2016.
 
-    They model a time-of-flight camera on Middlebury's disparities v by adding N(0, (strength / v)^2) with a strength of
-    651; their published code takes strength / v as the standard deviation, v in pixels of the full-size photos. Here
+    They add N(0, (strength / v)^2) to Middlebury's disparities v in pixels of the full-size photos. Here
 
         v = stereo_constant / z - doffs,
 
-    which to first order makes the depth's standard deviation strength z^3 / stereo_constant^2 for ``doffs`` = 0. With
-    the defaults it is 1.8 mm at 1 m, 15 mm at 2 m, 49 mm at 3 m, 116 mm at 4 m. It suits rooms: from about 10 m on, the
-    tail of the distribution reaches infinity.
-
-    Their v lacks the pixels by which Middlebury's views of 2005 were shifted (``dmin.txt``), so it is smaller, and
-    their noise larger, than that of the defaults at the same depth. To apply their model to such a scene, set ``doffs``
-    to that shift.
-
-    The noisy Middlebury inputs that are often used with this model, after Park et al., ICCV 2011, do not follow it:
-    they have white noise of five levels everywhere (docs/data.md).
+    which to first order makes the depth's standard deviation strength z^3 / stereo_constant^2 for ``doffs`` = 0: 1.8 mm
+    at 1 m, 15 mm at 2 m, 49 mm at 3 m, 116 mm at 4 m. It suits rooms: from about 10 m on, the tail of the distribution
+    reaches infinity. Their v lacks the shift of Middlebury's views of 2005 (``dmin.txt``), so their noise is larger; to
+    apply their model to such a scene, set ``doffs`` to that shift.
 
     Args:
         strength: the product of v and its standard deviation, in square pixels.
@@ -87,7 +85,7 @@ class TimeOfFlight:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        _check_positive(self, "strength", "stereo_constant")
+        _expect_positive(strength=self.strength, stereo_constant=self.stereo_constant)
         if not 0 <= self.doffs < math.inf:
             raise ValueError(f"doffs: expected 0 or a positive number, got {self.doffs}")
 
@@ -104,17 +102,13 @@ class Kinect:
     """A structured-light sensor: disparity noise and quantisation, dropouts beside depth edges, limits of range.
 
     The sensor counts disparity d = stereo_constant / z in eighths of a pixel (Khoshelham and Oude Elberink, *Accuracy
-    and Resolution of Kinect Depth Data*, Sensors 2012), so depth comes in steps of step z^2 / stereo_constant: 3 mm at
-    1 m, 11 mm at 2 m, 72 mm at 5 m. Their random error is 1.425e-3 z^2 m, half a step. It includes the rounding error,
-    step / sqrt(12). So N(0, std^2) with the default ``std`` of 0.05 px and rounding together give 1.42e-3 z^2 m: 1.4 mm
-    at 1 m, 6 mm at 2 m, 35 mm at 5 m. Nguyen, Izadi and Lovell (3DIMPVT 2012) measured 0.0012 + 0.0019 (z - 0.4)^2 m
-    on surfaces that face the sensor: 1.9, 6 and 41 mm. The noise of neighbouring pixels is independent here; that of a
-    sensor, which matches windows, is not.
-
-    Disparity and its steps are the sensor's, whatever the camera of the map.
+    and Resolution of Kinect Depth Data*, Sensors 2012), so depth comes in steps of step z^2 / stereo_constant. With the
+    defaults, noise and rounding together have their random error, 1.42e-3 z^2 m: 1.4 mm at 1 m, 6 mm at 2 m, 35 mm at
+    5 m. Nguyen, Izadi and Lovell (3DIMPVT 2012) measured 1.9, 6 and 41 mm. The noise of neighbouring pixels is
+    independent here; that of a sensor, which matches windows, is not.
 
     Args:
-        std: standard deviation of the disparity noise, in the sensor's pixels.
+        std: standard deviation of the disparity noise, in the sensor's pixels, whatever the camera of the map.
         step: quantisation step of disparity, in the sensor's pixels.
         stereo_constant: baseline times focal length of the sensor in metre pixels; 0.075 m x 580 px for a Kinect.
         dropout: probability that a pixel beside a depth edge is a hole.
@@ -138,12 +132,13 @@ class Kinect:
         """Check the values."""
         if not 0 <= self.std < math.inf:
             raise ValueError(f"std: expected 0 or a positive number of pixels, got {self.std}")
-        _check_positive(self, "step", "stereo_constant", "jump", "nearest", "farthest")
+        limits = {name: getattr(self, name) for name in ("nearest", "farthest") if getattr(self, name) is not None}
+        _expect_positive(step=self.step, stereo_constant=self.stereo_constant, jump=self.jump, **limits)
         if not 0 <= self.dropout <= 1:
             raise ValueError(f"dropout: expected a number from 0 to 1, got {self.dropout}")
         if self.reach < 1 or not float(self.reach).is_integer():
             raise ValueError(f"reach: expected a positive whole number of low-resolution pixels, got {self.reach}")
-        if self.nearest is not None and self.farthest is not None and self.farthest <= self.nearest:
+        if len(limits) == 2 and limits["farthest"] <= limits["nearest"]:
             raise ValueError(f"farthest: expected more than nearest, {self.nearest}, got {self.farthest}")
 
     def __call__(self, values: Tensor, generator: torch.Generator) -> Tensor:
@@ -174,13 +169,284 @@ def no_noise() -> None:
     return
 
 
-def _check_positive(noise: Noise, *names: str) -> None:
-    for name in names:
-        value = getattr(noise, name)
-        if value is not None and not 0 < value < math.inf:
+def _expect_positive(**values: float) -> None:
+    for name, value in values.items():
+        if not 0 < value < math.inf:
             raise ValueError(f"{name}: expected a positive number, got {value}")
 
 
 def _positive(values: Tensor) -> Tensor:
     """Return the values with those that are not positive replaced by NaN."""
     return torch.where(values > 0, values, torch.nan)
+
+
+def _white(values: Tensor, _: Tensor, generator: torch.Generator) -> Tensor:
+    strongest = chance(0.4, generator)  # as of simulated time of flight: 1 % and more
+    strength = power(-2.2, -1.3, generator) if strongest else power(-3.4, -1.4, generator)
+    return values * (1 + strength * field_of(values, 0, generator))
+
+
+def _correlated(values: Tensor, _: Tensor, generator: torch.Generator) -> Tensor:
+    """Grain of 2 to 8 pixels, and a little white noise."""
+    grain = field_of(values, uniform(0.5, 3.5, generator), generator)
+    mixed = grain + uniform(0, 0.5, generator) * field_of(values, 0, generator)
+    return values * (1 + power(-3.3, -1.8, generator) * mixed)
+
+
+def _waves(values: Tensor, _: Tensor, generator: torch.Generator) -> Tensor:
+    """Waves of 2 to 27 pixels, as far as the map is large enough, of several octaves."""
+    length = min(3.33 * power(-0.22, 0.9, generator), _longest(values))
+    return values * (1 + power(-2.9, -2, generator) * waves_of(values, length, generator))
+
+
+def _longest(values: Tensor) -> float:
+    """Return the longest waves of a map in pixels: longer ones could not be distinguished from its shape.
+
+    With what is added to them, and planes taken off, the longest measure about 45 pixels.
+    """
+    return max(1.0, min(64.0, min(values.shape[-2:]) / 4))
+
+
+def _structured(values: Tensor, luma: Tensor, generator: torch.Generator) -> Tensor:
+    """A projector and a camera that match windows and count disparity in steps.
+
+    The noise is that of Nguyen et al., Modeling Kinect sensor noise, 3DIMPVT 2012: axial 1.2 mm + 1.9 mm (z - 0.4)^2
+    and more at grazing incidence, lateral 0.8 pixels.
+    """
+    focal = uniform(300, 700, generator)
+    stereo_constant = uniform(0.04, 0.12, generator) * focal
+    seen = _fatten(values, 1, generator) if chance(0.5, generator) else values
+    seen = _jitter(seen, uniform(0, 0.8, generator), generator)
+    depth = values.reciprocal()
+    axial = 0.0012 + 0.0019 * (depth - 0.4).square()
+    slope = (
+        values.diff(dim=-1, append=values[..., -1:]).square() + values.diff(dim=-2, append=values[:, -1:]).square()
+    ).sqrt()
+    angle = torch.atan(focal * slope / values)  # between the surface and the view
+    grazing = (angle / (math.pi / 2 - angle)).square().clamp(max=25).nan_to_num(0)
+    axial = axial + 0.0001 / depth.sqrt() * grazing
+    noise = stereo_constant * values.square() * axial * power(-0.4, 0.4, generator)
+    length = min(power(0, 1.1, generator), _longest(values))
+    smooth = chance(0.5, generator)  # a matching window averages: where steps are coarser, plateaus with winding edges
+    grain = field_of(values, length / 3.33, generator) if smooth else waves_of(values, length, generator)
+    if chance(0.4, generator):
+        strength, width = uniform(0.2, 1, generator), values.shape[-1]
+        bands = torch.randn((1, 1, max(2, round(width / power(0.9, 1.9, generator)))), generator=generator)
+        grain = grain + strength * functional.interpolate(bands, width, mode="nearest-exact").expand_as(values)
+    result = _count(stereo_constant * seen, noise.nan_to_num(0) * grain, generator) / stereo_constant
+    lost = (torch.rand(values.shape, generator=generator) < uniform(0, 1, generator)) & near_steps(values, 1)
+    if chance(0.4, generator):  # the projector's light does not get there
+        lost |= occluded(stereo_constant * values)
+    if chance(0.4, generator):
+        lost |= _between(values, 3, generator)
+    if chance(0.3, generator):
+        lost |= dark(values, luma, generator)
+    if chance(0.25, generator):
+        lost |= _steep(values, generator)
+    return result.masked_fill(lost, torch.nan)
+
+
+def _steep(values: Tensor, generator: torch.Generator) -> Tensor:
+    """Return the mask of pixels lost on surfaces at grazing incidence."""
+    steep = near_steps(values, 1, uniform(0.02, 0.06, generator))
+    return steep & (torch.rand(values.shape, generator=generator) < uniform(0.3, 0.9, generator))
+
+
+def _jitter(values: Tensor, strength: float, generator: torch.Generator) -> Tensor:
+    """Return a map whose edges are displaced by normal noise of ``strength`` pixels, alike over few pixels."""
+    height, width = values.shape[-2:]
+    down, across = (
+        (strength * field_of(values, uniform(0.3, 1.2, generator), generator)[0]).round().long() for _ in range(2)
+    )
+    rows = (torch.arange(height)[:, None] + down).clamp(0, height - 1)
+    columns = (torch.arange(width) + across).clamp(0, width - 1)
+    return torch.where(near_steps(values, 2), values[:, rows, columns], values)
+
+
+def _count(disparity: Tensor, noise: Tensor, generator: torch.Generator, *, stereo: bool = False) -> Tensor:
+    """Return disparity in pixels as matching windows finds it: drawn to whole pixels, in steps, and smoothed again.
+
+    Where the noise is weak against the step, a slanted wall becomes a stair.
+    """
+    steps = (0.0, 1 / 64, 1 / 32, 1 / 32) if stereo else (1 / 32, 1 / 16, 1 / 8, 1 / 8)
+    step = steps[int(torch.randint(4, (1,), generator=generator))]
+    if step and chance(0.15 if stereo else 0.4, generator):
+        noise = noise * (uniform(0.1, 0.6, generator) * step / noise.std().clamp(min=1e-9)).clamp(max=1)
+    counted = disparity + noise
+    if chance(0.3, generator):  # fits of a parabola to the costs favour whole pixels (Shimizu, Okutomi, IJCV 2005)
+        counted = counted - uniform(0.02, 0.14, generator) * torch.sin(2 * math.pi * counted)
+    if step:
+        counted = (counted / step).round() * step
+    if chance(0.3, generator):
+        size = 2 * int(torch.randint(1, 3, (1,), generator=generator)) + 1
+        counted = disparity + _means(counted - disparity, torch.ones_like(disparity), size)
+    return counted
+
+
+def _fatten(values: Tensor, reach: int, generator: torch.Generator) -> Tensor:
+    """Return a map in which near objects are ``reach`` pixels wider in random places, as window matching makes them."""
+    wide = window_maxima(values.nan_to_num(0), reach)
+    return torch.where((field_of(values, 3, generator) > 0) & (wide > 0), wide, values)
+
+
+def _flight(values: Tensor, luma: Tensor, generator: torch.Generator) -> Tensor:
+    """Time of flight: noise where little light returns, flying pixels, light by several ways, wiggling by distance."""
+    depth = values.reciprocal()
+    amplitude = (luma + 0.05) * values.square()
+    if chance(0.6, generator):  # flying pixels on both sides of steps: depth, weighted by the light, is averaged
+        size = 3 + 2 * int(torch.randint(5, (1,), generator=generator))
+        mixed = _means(depth, amplitude, size)
+        depth = torch.where(depth.isfinite() & (field_of(depth, 1, generator) > -0.5), mixed, depth)
+    if chance(0.3, generator):  # enlarged by interpolation, or filtered
+        wide = _means(depth, torch.ones_like(depth), 3 + 2 * int(torch.randint(3, (1,), generator=generator)))
+        depth = torch.where(depth.isfinite(), wide, depth)
+    exact = depth
+    strength = power(-3.8, -2.5, generator) * depth ** uniform(1, 3, generator) / (luma + 0.05).sqrt()
+    length = min(uniform(1, 9, generator), _longest(values)) if chance(0.6, generator) else 1
+    grain = waves_of(depth, length, generator)
+    if chance(0.5, generator):  # light that comes by other surfaces
+        height, width = exact.shape[-2:]
+        coarser = power(0.6, 1.3, generator)
+        coarse = max(2, round(height / coarser)), max(2, round(width / coarser))
+        stack = functional.adaptive_avg_pool2d(torch.stack((exact.nan_to_num(0), exact.isfinite().to(exact))), coarse)
+        sums, weights = functional.interpolate(stack, (height, width), mode="bilinear", align_corners=False)
+        rounded = (sums / weights.clamp(min=1e-6) / exact - 1).clamp(min=-0.1)
+        rounded = rounded.clamp(max=0) * torch.exp(-(rounded / 0.04).square())  # inner corners, not steps
+        wide = field_of(depth, min(power(0.8, 1.4, generator), _longest(values)), generator)
+        depth = depth + exact * (uniform(0, 1, generator) * rounded + uniform(0, 0.01, generator) * (wide + 1))
+    if chance(0.4, generator):  # harmonics of the modulation
+        wave = uniform(0.4, 1.5, generator)
+        depth = depth + uniform(0, 0.01, generator) * torch.sin(
+            2 * math.pi * exact / wave + uniform(0, 6.28, generator)
+        )
+    if chance(0.4, generator):  # dark surfaces seem too far
+        depth = depth + uniform(0, 0.02, generator) * torch.exp(-luma / 0.1)
+    noisy = (depth + torch.minimum(strength, 0.05 * exact) * grain).clamp(min=1e-3).reciprocal()
+    if chance(0.2, generator):
+        noisy = noisy.masked_fill(dark(values, luma, generator), torch.nan)
+    if chance(0.4, generator):  # cameras leave out what flies
+        noisy = noisy.masked_fill(_between(values, 3, generator), torch.nan)
+    return noisy
+
+
+def _means(values: Tensor, weights: Tensor, size: int) -> Tensor:
+    """Return weighted means of windows, holes left out, (1, h, w)."""
+    weights = torch.where(values.isfinite(), weights, 0)
+    return _window_means(values.nan_to_num(0) * weights, size) / _window_means(weights, size).clamp(min=1e-9)
+
+
+def _window_means(values: Tensor, size: int) -> Tensor:
+    """Return the means of windows of an odd size, (1, h, w)."""
+    padded = functional.pad(values[None], (size // 2,) * 4, mode="replicate")
+    return functional.avg_pool2d(padded, size, stride=1)[0]
+
+
+def _lidar(values: Tensor, luma: Tensor, generator: torch.Generator) -> Tensor:
+    """A phone's lidar: a grid of dots coarser than the map, interpolated, with blobs of doubtful pixels."""
+    height, width = values.shape[-2:]
+    stride = uniform(1.5, 8, generator)
+    size = max(2, round(height / stride)), max(2, round(width / stride))
+    shift, places = uniform(0, 0.5, generator), []  # each dot is measured up to this part of their distance aside
+    for axis, count in enumerate(size):
+        middles = (torch.arange(count) + 0.5).view((-1, 1) if axis == 0 else (1, -1))
+        aside = shift * (2 * torch.rand(size, generator=generator) - 1)
+        whole = values.shape[axis - 2]
+        places.append(((middles + aside) * (whole / count)).long().clamp(0, whole - 1))
+    dots = values[:, places[0], places[1]]
+    smooth = functional.interpolate(dots[None], (height, width), mode="bilinear", align_corners=False)[0]
+    smooth = torch.where(smooth.isfinite(), smooth, values)  # not beside holes of the truth
+    weight = uniform(0.5, 1, generator)
+    result = weight * smooth + (1 - weight) * values
+    length = min(uniform(3, 9, generator), _longest(values))
+    strength = power(-3.8, -2.6, generator) * (1 + torch.exp(-luma / 0.1))  # twice on dark surfaces
+    doubtful = torch.sigmoid(3 * (field_of(values, min(5.0, _longest(values)), generator) - uniform(1, 3, generator)))
+    result = result * (1 + strength * (1 + 4 * doubtful) * waves_of(values, length, generator).clamp(-3, 3))
+    if chance(0.4, generator):  # 2.9 % at 0.35 m, 1.6 % at 1.1 m, 0.6 % at 3 m; whether near or far is not known
+        result = result * (1 + uniform(-1, 1, generator) * (0.015 * values**0.7).clamp(max=0.03))
+    return result
+
+
+def _stereo(values: Tensor, luma: Tensor, generator: torch.Generator) -> Tensor:
+    """Two cameras of a size of their own, whose map is enlarged to this one by repeating values.
+
+    Matching windows and filters that stop at steps make disparity noise alike over several octaves; what only one
+    camera sees is lost or filled.
+    """
+    length = _longest(values) ** math.sqrt(uniform(0, 1, generator))  # of the waves, in pixels of this map
+    ratio = uniform(1, max(1.0, min(3.4, length / 2)), generator) if chance(0.7, generator) else 1.0
+    rows, columns = (_repeated(size, ratio, generator) for size in values.shape[-2:])
+    seen, shades = (each[:, rows[1]][..., columns[1]] for each in (values, luma))
+    return _match(seen, shades, length / ratio, generator)[:, rows[0]][..., columns[0]]
+
+
+def _repeated(size: int, ratio: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Return which of the sensor's pixels each of a map's repeats, and which of the map's each of the sensor's sees."""
+    shown = ((torch.arange(size) + uniform(0, 1, generator) * (ratio > 1)) / ratio).long()
+    count = int(shown[-1]) + 1
+    return shown, ((torch.arange(count) + 0.5) * (size / count)).long().clamp(max=size - 1)
+
+
+def _match(values: Tensor, luma: Tensor, length: float, generator: torch.Generator) -> Tensor:
+    """Return inverse depth as stereo matching finds it, at the sensor's size, with waves of ``length`` pixels."""
+    middle = values.nanmedian().clamp(min=1e-6)  # of a map of holes, NaN
+    pixels = power(0.7, 1.8, generator)  # disparity at the middle
+    stereo_constant = float(pixels / middle)
+    amplitude = min(max(power(-2.9, -1.8, generator) * pixels, 0.02), 0.4)
+    flat = 0.3 + torch.exp(-(luma - _window_means(luma, 5)).abs() / 0.03)
+    reach = int(torch.randint(5, (1,), generator=generator))  # half the matching window
+    seen = _fatten(values, reach, generator) if reach else values
+    stretch = uniform(1, 1.6, generator)
+    waves = waves_of(values, length, generator, stretch)
+    if length > 3:  # filters stop at steps
+        beside = _beside_steps(values, max(1, int(length / 4)))
+        waves = torch.where(beside, waves_of(values, length / 2.5, generator, stretch), waves)
+    if chance(0.4, generator):  # rows are matched one by one
+        waves = waves + uniform(0, 0.4, generator) * field_of(values, (0.3, max(length / 3, 0.3)), generator)
+    counted = _count(stereo_constant * seen, amplitude * (flat / flat.mean()) * waves, generator, stereo=True)
+    if chance(0.35, generator):  # filters that do not stop at steps
+        counted = _means(counted, torch.ones_like(counted), 2 * int(torch.randint(1, 4, (1,), generator=generator)) + 1)
+    return _lose(counted, values, luma, stereo_constant, generator) / stereo_constant
+
+
+def _lose(
+    disparity: Tensor, values: Tensor, luma: Tensor, stereo_constant: float, generator: torch.Generator
+) -> Tensor:
+    """Return disparity with holes where only one camera sees a surface, or where both see too little."""
+    if chance(0.7, generator):
+        hidden = occluded(stereo_constant * values)
+        if chance(0.25, generator):  # some cameras fill such holes with the value to their left
+            places = torch.where(hidden, 0, torch.arange(hidden.shape[-1])).cummax(dim=-1).values
+            disparity = disparity.gather(-1, places)
+        else:
+            disparity = disparity.masked_fill(hidden, torch.nan)
+    lost = torch.zeros_like(values, dtype=torch.bool)
+    if chance(0.2, generator):
+        lost |= dark(values, luma, generator)
+    if chance(0.2, generator):  # gloss
+        shining = luma > max(0.8, float(luma[:, ::3, ::3].flatten().quantile(uniform(0.9, 0.99, generator))))
+        lost |= shining & (field_of(values, 2, generator) > -0.5)
+    if chance(0.25, generator):  # bare surfaces
+        bare = _window_means((luma - _window_means(luma, 5)).abs(), 5) < 0.01
+        lost |= bare & (field_of(values, 5, generator) > uniform(0.8, 2.5, generator))
+    if chance(0.25, generator):
+        lost |= _steep(values, generator)
+    if chance(0.5, generator):  # windows that see two surfaces
+        lost |= _between(values, 4, generator)
+    return disparity.masked_fill(lost, torch.nan)
+
+
+def _beside_steps(values: Tensor, reach: int) -> Tensor:
+    """Return the mask of the pixels within ``reach`` pixels of a step between neighbours, (1, h, w)."""
+    return window_maxima(near_steps(values, 1).to(values), reach) > 0
+
+
+def _between(values: Tensor, most: int, generator: torch.Generator) -> Tensor:
+    """Return the mask of pixels lost where two surfaces are seen, up to ``most`` pixels from steps, (1, h, w)."""
+    reach = int(torch.randint(1, most + 1, (1,), generator=generator))
+    return _beside_steps(values, reach) & (field_of(values, 1.5, generator) > uniform(-2, 1, generator))
+
+
+NOISES: Mapping[str, Callable[[Tensor, Tensor, torch.Generator], Tensor]] = {
+    "white": _white, "correlated": _correlated, "waves": _waves, "structured": _structured, "flight": _flight,
+    "lidar": _lidar, "stereo": _stereo,
+}  # fmt: skip

@@ -19,33 +19,24 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import cv2
+import numpy as np
 import torch
+from scipy import ndimage
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.degradation.downsampling import Downsampling
+from dsr.degradation.downsampling import KERNELS, Downsampling, Hints, encode_facts, local_noise
 from dsr.degradation.glass import add_glass
-from dsr.degradation.hints import KERNELS, Hints, encode_facts, local_noise
-from dsr.degradation.holes import HOLES
-from dsr.degradation.random_fields import (
-    add_folds,
-    add_relief,
-    chance,
-    displace,
-    draw,
-    normal,
-    print_pattern,
-    round_values,
-    take_another_photo,
-    uniform,
-)
-from dsr.degradation.random_noise import NOISES
+from dsr.degradation.holes import HOLES, draw_holes
+from dsr.degradation.noise import NOISES
+from dsr.degradation.random_fields import chance, draw, field_of, normal, power, uniform
 from dsr.geometry.camera import Camera
 from dsr.sample import CENTIMETRES, AllHolesError, DepthSample, Scene
-from dsr.utils.guards import unchecked
+from dsr.utils.guards import derived, unchecked
 
+# Kinds of noise that stand for a sensor, which does not see glass; the others stand for maps made of a surface
 SENSOR_NOISES = ("waves", "structured", "flight", "lidar", "stereo")
-"""Kinds of noise that stand for a sensor, which does not see glass; the others stand for maps made of a surface."""
 
 
 @dataclass(frozen=True)
@@ -53,24 +44,20 @@ class Everything:
     """The distribution of random degradations.
 
     Args:
-        scales: relative frequency of each factor; None for that of the run.
-        kernels: that of each kernel.
-        noises: that of each kind of noise.
-        holes: that of each kind of holes.
-        folds: fraction of the truths whose surfaces get folds and dents of 2 to 24 pixels in places, as of cloth, which
-            the photo shows, more or less, as light and shade.
-        relief: fraction of the truths that get fine relief, or the steps of a file's levels, before downsampling; none
-            at factor 1, where it could not be distinguished from noise.
+        scales: relative frequency of each factor; None for the run's factor.
+        kernels: relative frequency of each kernel.
+        noises: relative frequency of each kind of noise.
+        holes: relative frequency of each kind of holes.
+        folds: fraction of the truths with folds and dents of 2 to 24 pixels in places, which the photo shades.
+        relief: fraction of the truths with fine relief, or the steps of a file's levels; none at factor 1, where it
+            could not be distinguished from noise.
         displaced: fraction of the noisy maps that are displaced against the photo, by up to one low-resolution pixel.
         rounded: fraction of the maps that are rounded to levels.
-        soft: fraction of the patches whose truth has soft depth steps: blurred, and where the scene is large enough for
-            it, at half its size.
-        photo: fraction of the photos with another exposure, colour balance, blur, noise and compression; half as many
-            of those whose map has no noise.
+        soft: fraction of the patches whose truth has soft depth steps: blurred, large scenes also at half their size.
+        photo: fraction of the photos with another exposure, colours, blur, noise and compression; half for clean maps.
         textured: fraction of the photos on which a pattern is printed, which is no relief.
-        clear: fraction of the sensors' maps, those whose kind of noise is one of ``SENSOR_NOISES``, in which clear,
-            mirroring or glossy objects stand. The truth is their surface, the map what a sensor sees. None if depth
-            steps are soft, as their edges are not.
+        clear: fraction of the maps with one of ``SENSOR_NOISES`` in which clear, mirroring or glossy objects stand. The
+            truth is their surface, the map what a sensor sees. None if depth steps are soft, as their edges are not.
         told: fraction of the maps whose kernel is stated by a hint; likewise, independently, for noise and steps.
 
     """
@@ -139,7 +126,6 @@ class Everything:
         if scale == 1 and kind == "none" and sum(others.values()) > 0:
             kind = draw(others, generator)
         seen = scene.true_depth
-        # at 0, nothing is drawn
         if self.clear and kind in SENSOR_NOISES and not soft and chance(self.clear, generator):
             scene, seen = add_glass(scene, generator)
         clean, camera_lr = self._downsample(seen, scene.camera, scale, kernel, kind, generator)
@@ -151,7 +137,7 @@ class Everything:
             noisy = round_values(noisy, generator)
         holes = draw(self.holes, generator)
         if holes != "none":
-            noisy = noisy.masked_fill(HOLES[holes](noisy, luma, camera_lr, generator), torch.nan)
+            noisy = noisy.masked_fill(draw_holes(holes, noisy, luma, camera_lr, generator), torch.nan)
         noisy = torch.where(noisy > 0, noisy, torch.nan)
         if not bool(noisy.isfinite().any()):
             raise AllHolesError(scene.name)
@@ -177,11 +163,12 @@ class Everything:
         of_depth = kind == "flight" or chance(0.15, generator)
         if scale == 1:
             return values, camera
-        camera = Downsampling("nearest" if kernel == "nearest" else "box").camera(camera, scale)
-        model = Downsampling("gaussian" if kernel == "spread" else kernel)  # type: ignore[arg-type]  # one of them
         if kernel == "spread":
             model = Downsampling("gaussian", sigma=uniform(0.6, 1.1, generator))
-        return (model(values.reciprocal(), scale).reciprocal() if of_depth else model(values, scale)), camera
+        else:
+            model = Downsampling(kernel)  # type: ignore[arg-type]  # one of them
+        low = model(values.reciprocal(), scale).reciprocal() if of_depth else model(values, scale)
+        return low, model.camera(camera, scale)
 
     def _hints(self, clean: Tensor, noisy: Tensor, kernel: str, generator: torch.Generator, *, soft: bool) -> Hints:
         """Return random hints on a map."""
@@ -197,3 +184,79 @@ class Everything:
 def plain() -> None:
     """Return no distribution, for ``degradation=plain``: maps are made by downsampling and noise alone."""
     return
+
+
+def add_relief(scene: Scene, generator: torch.Generator) -> Scene:
+    """Return a scene whose true depth has grain of 1 to 4 pixels, as of a scan, or is rounded, as in a file."""
+    values = scene.true_depth.reciprocal()
+    if chance(0.3, generator):
+        return derived(scene, depth=round_values(values, generator).reciprocal())
+    grain = field_of(values.float(), uniform(0, 1.5, generator) if chance(0.6, generator) else 0, generator)
+    return derived(scene, depth=(values * (1 + power(-4.6, -3, generator) * grain)).reciprocal())
+
+
+def add_folds(scene: Scene, generator: torch.Generator) -> Scene:
+    """Return a scene with smooth folds on parts of its surfaces, shaded by a light from a random side."""
+    like = scene.true_depth.float()
+    sizes = power(0.3, 1.4, generator), power(0.3, 1.4, generator)
+    field = field_of(like, sizes, generator)
+    if chance(0.4, generator):  # creases
+        field = field.abs() - 0.8
+    place = torch.sigmoid(6 * (field_of(like, 20, generator) + uniform(-1, 1, generator)))
+    slope = power(-1.5, -0.2, generator)
+    height = slope * min(sizes) / scene.camera.fx * field * place  # relative to the depth
+    angle, strength = uniform(-math.pi, math.pi, generator), max(0.0, uniform(-0.4, 1.2, generator))
+    down, across = (functional.pad(height.diff(dim=dim), pad) for dim, pad in ((-2, (0, 0, 0, 1)), (-1, (0, 1, 0, 0))))
+    light = 1 + strength * scene.camera.fx * (math.cos(angle) * across + math.sin(angle) * down)
+    rgb = (scene.rgb * light.clamp(0.2, 1.8).to(scene.rgb)).clamp(0, 1)
+    return derived(scene, rgb=rgb, depth=scene.true_depth * (1 + height.clamp(-0.2, 0.2)).to(scene.true_depth))
+
+
+def displace(values: Tensor, scale: int, generator: torch.Generator) -> Tensor:
+    """Return a map (1, H, W) shifted by up to ``scale`` pixels along each axis, half of them also magnified."""
+    for dim in (-2, -1):
+        size = values.shape[dim]
+        shift, growth = uniform(-scale, scale, generator), uniform(-scale, scale, generator)
+        if chance(0.5, generator):
+            growth = 0.0
+        places = torch.arange(size, dtype=torch.float32)
+        moves = (shift + growth * (2 * places / max(size - 1, 1) - 1)).clamp(-scale, scale)
+        values = values.index_select(dim, (places + moves).round().long().clamp(0, size - 1))
+    return values
+
+
+def round_values(values: Tensor, generator: torch.Generator) -> Tensor:
+    """Round to millimetres of depth, or to 8 bits of disparity."""
+    if chance(0.6, generator):
+        step = (0.001, 0.001, 0.002, 0.005)[int(torch.randint(4, (1,), generator=generator))]
+        return ((values.reciprocal() / step).round() * step).clamp(min=step).reciprocal()
+    top = float(values.nan_to_num(0).max()) * uniform(1, 1.3, generator)
+    return ((values / top * 255).round() / 255 * top).clamp(min=top / 255)
+
+
+def print_pattern(rgb: Tensor, generator: torch.Generator) -> Tensor:
+    """Return a photo, (3, H, W), of surfaces on which a pattern is printed; values may exceed 1."""
+    pattern = field_of(rgb[:1], power(0, 1.2, generator), generator)
+    colour = 0.2 * torch.randn((3, 1, 1), generator=generator) + uniform(0.1, 0.5, generator)
+    return rgb * (1 + colour * pattern.clamp(-2, 2)).clamp(min=0)
+
+
+def take_another_photo(rgb: Tensor, generator: torch.Generator) -> Tensor:
+    """Return a photo, (3, H, W), with another exposure, white balance and contrast, and with blur, noise and JPEG.
+
+    One of twelve shows little, down to nothing, as at night or in fog.
+    """
+    gain = math.exp(uniform(-0.7, 0.5, generator)) * (1 + 0.08 * torch.randn((3, 1, 1), generator=generator))
+    rgb = (rgb * gain).clamp(0, 1) ** math.exp(uniform(-0.4, 0.4, generator))
+    if chance(1 / 12, generator):
+        rgb = torch.lerp(rgb.mean(dim=(-2, -1), keepdim=True), rgb, uniform(0, 0.3, generator))
+    if chance(0.5, generator):
+        sigma = uniform(0.3, 1.2, generator)
+        rgb = torch.from_numpy(ndimage.gaussian_filter(rgb.numpy(), (0, sigma, sigma), mode="nearest", truncate=2.5))
+    rgb = (rgb + uniform(0, 0.03, generator) * torch.randn(rgb.shape, generator=generator)).clamp(0, 1)
+    if chance(0.5, generator):
+        pixels = (255 * rgb).round().byte().permute(1, 2, 0).numpy()[..., ::-1]
+        _, code = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, round(uniform(25, 90, generator))])
+        decoded = cv2.cvtColor(np.asarray(cv2.imdecode(code, cv2.IMREAD_COLOR)), cv2.COLOR_BGR2RGB)
+        rgb = torch.from_numpy(decoded).permute(2, 0, 1).float() / 255
+    return rgb

@@ -1,20 +1,15 @@
-"""Random numbers and fields from an explicit generator, and random changes of scenes made of them."""
+"""Random numbers and fields from an explicit generator."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 
-import cv2
-import numpy as np
 import torch
-from scipy import ndimage
 from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.hole_size import window_maxima
-from dsr.sample import Scene
-from dsr.utils.guards import derived
 
 
 def draw(shares: Mapping[str, float], generator: torch.Generator) -> str:
@@ -100,90 +95,8 @@ def _weighted_sums(values: Tensor, taps: Tensor, dim: int) -> Tensor:
     return result
 
 
-def window_means(values: Tensor, size: int) -> Tensor:
-    """Return the means of windows of an odd size, (1, h, w)."""
-    reach = size // 2
-    return functional.avg_pool2d(functional.pad(values[None], (reach,) * 4, mode="replicate"), size, stride=1)[0]
-
-
 def near_steps(values: Tensor, reach: int, jump: float = 0.04) -> Tensor:
     """Return the mask of pixels within ``reach`` pixels of a step, (1, h, w)."""
     high = window_maxima(values.nan_to_num(-math.inf), reach)
     low = -window_maxima((-values).nan_to_num(-math.inf), reach)
     return high > (1 + jump) * low
-
-
-def add_relief(scene: Scene, generator: torch.Generator) -> Scene:
-    """Return a scene whose true depth has grain of 1 to 4 pixels, as of a scan, or is rounded, as in a file."""
-    values = scene.true_depth.reciprocal()
-    if chance(0.3, generator):
-        return derived(scene, depth=round_values(values, generator).reciprocal())
-    grain = field_of(values.float(), uniform(0, 1.5, generator) if chance(0.6, generator) else 0, generator)
-    return derived(scene, depth=(values * (1 + power(-4.6, -3, generator) * grain)).reciprocal())
-
-
-def add_folds(scene: Scene, generator: torch.Generator) -> Scene:
-    """Return a scene with smooth folds on parts of its surfaces, shaded by a light from a random side."""
-    like = scene.true_depth.float()
-    sizes = power(0.3, 1.4, generator), power(0.3, 1.4, generator)
-    field = field_of(like, sizes, generator)
-    if chance(0.4, generator):  # creases
-        field = field.abs() - 0.8
-    place = torch.sigmoid(6 * (field_of(like, 20, generator) + uniform(-1, 1, generator)))
-    slope = power(-1.5, -0.2, generator)
-    height = slope * min(sizes) / scene.camera.fx * field * place  # relative to the depth
-    angle, strength = uniform(-math.pi, math.pi, generator), max(0.0, uniform(-0.4, 1.2, generator))
-    down, across = (functional.pad(height.diff(dim=dim), pad) for dim, pad in ((-2, (0, 0, 0, 1)), (-1, (0, 1, 0, 0))))
-    light = 1 + strength * scene.camera.fx * (math.cos(angle) * across + math.sin(angle) * down)
-    rgb = (scene.rgb * light.clamp(0.2, 1.8).to(scene.rgb)).clamp(0, 1)
-    return derived(scene, rgb=rgb, depth=scene.true_depth * (1 + height.clamp(-0.2, 0.2)).to(scene.true_depth))
-
-
-def displace(values: Tensor, scale: int, generator: torch.Generator) -> Tensor:
-    """Return a map (1, H, W) shifted by up to ``scale`` pixels along each axis, half of them also magnified."""
-    for dim in (-2, -1):
-        size = values.shape[dim]
-        shift, growth = uniform(-scale, scale, generator), uniform(-scale, scale, generator)
-        if chance(0.5, generator):
-            growth = 0.0
-        places = torch.arange(size, dtype=torch.float32)
-        moves = (shift + growth * (2 * places / max(size - 1, 1) - 1)).clamp(-scale, scale)
-        values = values.index_select(dim, (places + moves).round().long().clamp(0, size - 1))
-    return values
-
-
-def round_values(values: Tensor, generator: torch.Generator) -> Tensor:
-    """Round to millimetres of depth, or to 8 bits of disparity."""
-    if chance(0.6, generator):
-        step = (0.001, 0.001, 0.002, 0.005)[int(torch.randint(4, (1,), generator=generator))]
-        return ((values.reciprocal() / step).round() * step).clamp(min=step).reciprocal()
-    top = float(values.nan_to_num(0).max()) * uniform(1, 1.3, generator)
-    return ((values / top * 255).round() / 255 * top).clamp(min=top / 255)
-
-
-def print_pattern(rgb: Tensor, generator: torch.Generator) -> Tensor:
-    """Return a photo, (3, H, W), of surfaces on which a pattern is printed; values may exceed 1."""
-    pattern = field_of(rgb[:1], power(0, 1.2, generator), generator)
-    colour = 0.2 * torch.randn((3, 1, 1), generator=generator) + uniform(0.1, 0.5, generator)
-    return rgb * (1 + colour * pattern.clamp(-2, 2)).clamp(min=0)
-
-
-def take_another_photo(rgb: Tensor, generator: torch.Generator) -> Tensor:
-    """Return a photo, (3, H, W), with another exposure, white balance and contrast, and with blur, noise and JPEG.
-
-    One of twelve shows little, down to nothing, as at night or in fog.
-    """
-    gain = math.exp(uniform(-0.7, 0.5, generator)) * (1 + 0.08 * torch.randn((3, 1, 1), generator=generator))
-    rgb = (rgb * gain).clamp(0, 1) ** math.exp(uniform(-0.4, 0.4, generator))
-    if chance(1 / 12, generator):
-        rgb = torch.lerp(rgb.mean(dim=(-2, -1), keepdim=True), rgb, uniform(0, 0.3, generator))
-    if chance(0.5, generator):
-        sigma = uniform(0.3, 1.2, generator)
-        rgb = torch.from_numpy(ndimage.gaussian_filter(rgb.numpy(), (0, sigma, sigma), mode="nearest", truncate=2.5))
-    rgb = (rgb + uniform(0, 0.03, generator) * torch.randn(rgb.shape, generator=generator)).clamp(0, 1)
-    if chance(0.5, generator):
-        pixels = (255 * rgb).round().byte().permute(1, 2, 0).numpy()[..., ::-1]
-        _, code = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, round(uniform(25, 90, generator))])
-        decoded = cv2.cvtColor(np.asarray(cv2.imdecode(code, cv2.IMREAD_COLOR)), cv2.COLOR_BGR2RGB)
-        rgb = torch.from_numpy(decoded).permute(2, 0, 1).float() / 255
-    return rgb

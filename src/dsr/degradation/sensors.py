@@ -1,264 +1,72 @@
-"""Depth cameras by name: how they measure, how exactly, and where they fail, each figure with its source.
+"""Depth cameras by name and by the values of their maps: how they measure, and how exactly.
 
-What no source at hand confirms is None. Figures hold at a sensor's native width; in maps of another width focal length,
-disparity and noise in pixels scale with it, so that the errors in metres stay. ``docs/sensors.md`` has the table, too.
+Figures that no source confirms are None. They hold at a sensor's native width; in maps of another width focal length,
+disparity and noise in pixels scale with it, so that the errors in metres stay. ``docs/sensors.md`` has the source of
+each figure.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from types import MappingProxyType
+from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-Kind = Literal["stereo", "structured light", "time of flight", "lidar"]
+_ByDistance = tuple[tuple[float, float], ...]  # pairs of a distance and a value in metres, nearest first
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """A depth camera.
+    """A depth camera."""
 
-    Args:
-        name: of the camera or the family.
-        kind: how it measures.
-        width: of its native depth map, in pixels.
-        pattern: of device names, a regular expression without regard to case.
-        stereo_constant: focal length times baseline, in pixels times metres.
-        step: of its disparity, in pixels.
-        noise: standard deviation of its disparity on a textured wall, in pixels.
-        extent: over how many pixels of its map the noise is alike.
-        spread: standard deviation of one frame's depth on a bright wall by distance, pairs of metres, nearest first; it
-            grows linearly between them, and from 0 to the first.
-        offset: limit of the systematic error of depth by distance, likewise, which all pixels of a surface may share;
-            nearer than the first it is that of the first.
-        edges: what it does at depth steps.
-        dark: on dark surfaces.
-        shiny: on glossy and mirroring ones.
-        clear: on transparent ones.
-        sources: of the figures, by their names here.
-
-    """
-
-    name: str
-    kind: Kind
-    width: int
-    pattern: str
-    stereo_constant: float | None = None
-    step: float | None = None
-    noise: float | None = None
-    extent: float | None = None
-    spread: tuple[tuple[float, float], ...] | None = None
-    offset: tuple[tuple[float, float], ...] | None = None
-    edges: str | None = None
-    dark: str | None = None
-    shiny: str | None = None
-    clear: str | None = None
-    sources: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}), hash=False)
+    name: str  # of the camera or the family
+    kind: Literal["stereo", "structured light", "time of flight", "lidar"]
+    width: int  # of its native depth map, in pixels
+    pattern: str  # of device names, a regular expression without regard to case
+    stereo_constant: float | None = None  # focal length times baseline, in pixels times metres
+    step: float | None = None  # of its disparity, in pixels
+    noise: float | None = None  # standard deviation of its disparity on a textured wall, in pixels
+    extent: float | None = None  # pixels of its map over which the noise is correlated
+    spread: _ByDistance | None = None  # standard deviation of one frame's depth on a bright wall; 0 at the camera
+    offset: _ByDistance | None = None  # limit of the systematic error, which all pixels of a surface may share
 
 
-class ValueSteps(NamedTuple):
-    """Steps of inverse depth that a map's values have: multiples of ``1 / constant``."""
-
-    constant: float  # focal length times baseline over the step of disparity, in metres
-    confidence: float  # from 0 to 1, how closely the values keep to them
-
-
-_D400_STEP = "Intel, Subpixel Linearity Improvement for RealSense D400 (dev.intelrealsense.com): 1/32 pixel"
-_D400_NOISE = "A. Grunnet-Jepsen (Intel) in librealsense issue 3904: 0.032 at best, 0.08 as a rule"
-_D400_EXTENT = "measured before a board with a D435: 37 px of a photo of 2.14 times its focal length; the window has 9"
-_GRASP = "Sajjan et al., ClearGrasp, ICRA 2020"
-_L515 = "Intel, L515's product page, in librealsense issue 5808: at 1 m and 9 m on 95 % reflectivity"
-_AZURE_OFFSET = "Microsoft, Azure Kinect DK hardware specifications: typically < 11 mm + 0.1 %, without multipath"
-_AZURE = "Microsoft, Azure Kinect DK depth camera (azure-docs, articles/kinect-dk): random error and invalidation"
-_KURILLO = "Kurillo et al., Evaluating the Accuracy of the Azure Kinect and Kinect v2, Sensors 2022: similar to 2.5 m"
-_FANKHAUSER = "Fankhauser et al., Kinect v2 for Mobile Robot Navigation, ICAR 2015: 1.5 - 0.5 z + 0.3 z^2, mm for m"
-_SARBOLANDI = "Sarbolandi et al., Kinect Range Sensing: Structured-Light versus Time-of-Flight Kinect, CVIU 2015"
-_CORTI = "Corti et al., A metrological characterization of the Kinect V2 time-of-flight camera, RAS 2016"
-_TECHNICAL = "K. Konolige and P. Mihelich, Technical Description of Kinect Calibration (ROS kinect_calibration)"
-_NGUYEN = "Nguyen et al., Modeling Kinect Sensor Noise, 3DIMPVT 2012"
-_MALLICK = "Mallick et al., Characterizations of Noise in Kinect Depth Images, IEEE Sensors Journal 2014"
-_PROMPT = "PromptMoGe (sergmister/PromptMoGe, promptmoge/train/sensor_sim/model.py), against a laser scanner"
-_MULTIPATH = "flying pixels between both sides of a step; concave corners are rounded by multipath"
-
-
-def _stereo(name: str, width: int, pattern: str, constant: float, source: str, of: Sensor) -> Sensor:
-    """Return a stereo camera by f B and its source, with the other figures of its family."""
-    sources = MappingProxyType({**of.sources, "stereo_constant": source})
-    return replace(of, name=name, width=width, pattern=pattern, stereo_constant=constant, sources=sources)
-
-
-def _primesense(name: str, pattern: str, stereo_constant: float, source: str) -> Sensor:
-    """Return a camera with PrimeSense's projector of dots."""
-    noise = 1.9e-3 * 0.075 * 580
-    return Sensor(
-        name,
-        "structured light",
-        640,
-        pattern,
-        stereo_constant,
-        1 / 8,
-        noise,
-        9.0,
-        edges="they jitter along themselves by about 0.8 pixels; a shadow of the projector is missing on one side",
-        dark="missing",
-        shiny="missing",
-        clear="missing, or the depth of what is behind",
-        sources=MappingProxyType(
-            {
-                "stereo_constant": source,
-                "step": _TECHNICAL,
-                "noise": f"{_NGUYEN}: 1.2 mm + 1.9 mm (z - 0.4)^2, z in m, far away",
-                "extent": f"{_TECHNICAL}: windows of 9 x 9 or 9 x 7",
-                "edges": _NGUYEN,
-                **dict.fromkeys(("dark", "shiny", "clear"), _MALLICK),
-            }
-        ),
-    )
-
-
-_OAK = Sensor(
-    "OAK",
-    "stereo",
-    1280,
-    "",
-    step=1 / 8,
-    edges="near surfaces are fattened by about half a matching window; what one camera alone sees is missing",
-    clear="missing, or the depth of what is behind",
-    sources=MappingProxyType(
-        {
-            "step": "Luxonis, DepthAI StereoDepth: 3 fractional bits in subpixel mode unless more are set",
-            "edges": "Scharstein and Szeliski, A Taxonomy of Dense Two-Frame Stereo Correspondence, IJCV 2002",
-            "clear": _GRASP,
-        }
-    ),
-)
-_D400 = replace(
-    _OAK,
-    step=1 / 32,
-    noise=0.08,
-    extent=17.0,
-    sources=MappingProxyType({**_OAK.sources, "step": _D400_STEP, "noise": _D400_NOISE, "extent": _D400_EXTENT}),
-)
+_NGUYEN = 1.9e-3 * 0.075 * 580  # noise of structured light far away, 1.9 mm z^2, as disparity
 _WIDE = r"(?!.*([-_ ]w(?![a-z])|lite|[-_ ]sr|[-_ ]lr|tof))"
+_ARKIT = (
+    r"arkit|record3d|stray scanner|polycam|3d scanner app|scannet\+\+|iphone ?1[2-9] ?pro|ipad.*\bpro|"
+    r"iphone(13,[34]|14,[23]|15,[23]|16,[12]|17,[12])\b"
+)
+_PHONES = r"time.?of.?flight|\btof\b|\bsm-(g977|n97[56]|g98[568])|huawei.*p[34]0 pro|\bvog-"
 
 SENSORS = (  # of several whose pattern fits a name the first is taken
-    _stereo(
-        "RealSense D415",
-        1280,
-        r"\bd41[05]\b",
-        0.0548 * 941,
-        "librealsense issue 1430: a D415's 940.9 px at 1280 x 720; librealsense, doc/depth-from-stereo.md: 54.8 mm",
-        _D400,
-    ),
-    _stereo(
-        "RealSense D435",
-        1280,
-        r"\bd43[05]i?f?\b",
-        0.050 * 640,
-        "librealsense issues 3314 (a D435's 638.0 px at 1280 x 720) and 10575 (50 mm); the values of one's maps: 32.0",
-        _D400,
-    ),
-    _stereo(
-        "RealSense D455",
-        1280,
-        r"\bd45[0-7]f?\b",
-        0.095 * 637,
-        "librealsense issue 8577: a D455's 636.8 px at 1280 x 720; Luxonis, OAK vs RealSense: 95 mm",
-        _D400,
+    Sensor("RealSense D415", "stereo", 1280, r"\bd41[05]\b", 0.0548 * 941, 1 / 32, 0.08, 17.0),
+    Sensor("RealSense D435", "stereo", 1280, r"\bd43[05]i?f?\b", 0.050 * 640, 1 / 32, 0.08, 17.0),
+    Sensor("RealSense D455", "stereo", 1280, r"\bd45[0-7]f?\b", 0.095 * 637, 1 / 32, 0.08, 17.0),
+    Sensor(
+        "RealSense L515", "lidar", 1024, r"\bl515",
+        spread=((1.0, 0.0025), (9.0, 0.0155)), offset=((1.0, 0.005), (9.0, 0.014)),
     ),
     Sensor(
-        "RealSense L515",
-        "lidar",
-        1024,
-        r"\bl515",
-        spread=((1.0, 0.0025), (9.0, 0.0155)),
-        offset=((1.0, 0.005), (9.0, 0.014)),
-        sources=MappingProxyType({"spread": _L515, "offset": _L515}),
+        "Azure Kinect", "time of flight", 640, r"azure|kinect 4|\bk4a|femto.?bolt",
+        spread=((1.0, 0.0013), (2.0, 0.0017), (2.5, 0.0021)), offset=((0.5, 0.0115), (5.5, 0.0165)),
     ),
     Sensor(
-        "Azure Kinect",
-        "time of flight",
-        640,
-        r"azure|kinect 4|\bk4a|femto.?bolt",
-        spread=((1.0, 0.0013), (2.0, 0.0017), (2.5, 0.0021)),
-        offset=((0.5, 0.0115), (5.5, 0.0165)),
-        edges="values between both sides of a step, or missing; so are concave corners",
-        dark="noisier, or missing",
-        shiny="missing where the light saturates",
-        sources=MappingProxyType(
-            {"spread": _KURILLO, "offset": _AZURE_OFFSET, **dict.fromkeys(("edges", "dark", "shiny"), _AZURE)}
-        ),
-    ),
-    Sensor(
-        "Kinect v2",
-        "time of flight",
-        512,
-        r"kinect.*(v2|one|2\.0|\b2\b)|\bkv2\b|xbox nui sensor",
+        "Kinect v2", "time of flight", 512, r"kinect.*(v2|one|2\.0|\b2\b)|\bkv2\b|xbox nui sensor",
         spread=((1.0, 0.0013), (2.0, 0.0017), (3.0, 0.0027), (4.0, 0.0043)),
-        edges=_MULTIPATH,
-        dark="off by a small offset",
-        sources=MappingProxyType({"spread": _FANKHAUSER, "edges": _SARBOLANDI, "dark": _CORTI}),
     ),
-    _primesense(
-        "Kinect v1",
-        r"kinect|\bkv1\b|xbox nui",
-        0.075 * 580,
-        f"{_TECHNICAL}; 43.4 by the slope that OpenKinect's wiki measured (Talk:Imaging Information)",
-    ),
-    _primesense(
-        "Xtion",
-        r"xtion|primesense|carmine",
-        0.075 * 570.3,
-        "SUN RGB-D's Xtion: 570.3 px, and its values agree; ISPRS Archives, part B3: Kinect's chip, about 75 mm",
-    ),
+    Sensor("Kinect v1", "structured light", 640, r"kinect|\bkv1\b|xbox nui", 0.075 * 580, 1 / 8, _NGUYEN, 9.0),
+    Sensor("Xtion", "structured light", 640, r"xtion|primesense|carmine", 0.075 * 570.3, 1 / 8, _NGUYEN, 9.0),
     Sensor("Astra", "structured light", 640, r"\bastra(?!.*(\b2\b|stereo))"),
-    _stereo(
-        "OAK-D Lite",
-        640,
-        r"\boak.?d.?lite",
-        0.075 * 433,
-        "Luxonis, OAK-D-Lite (DM9095): 1.3 mm, pixels of 3 um; Luxonis, OAK vs RealSense: 75 mm",
-        _OAK,
-    ),
-    _stereo(
-        "OAK-D Pro",
-        1280,
-        rf"\boak.?d.?(s2|pro){_WIDE}",
-        0.075 * 783,
-        "Luxonis, OAK-FFC-OV9282 (its camera): 2.35 mm, pixels of 3 um; Luxonis, OAK vs RealSense: 75 mm",
-        _OAK,
-    ),
-    _stereo(
-        "OAK-D",
-        1280,
-        rf"\boak.?d(?![a-z]){_WIDE}",
-        0.075 * 882.5,
-        "Luxonis, FAQ of stereo depth: 7.5 cm, 882.5 px at 1280 x 800",
-        _OAK,
-    ),
-    Sensor(
-        "ARKit lidar",
-        "lidar",
-        256,
-        r"arkit|record3d|stray scanner|polycam|3d scanner app|scannet\+\+|iphone ?1[2-9] ?pro|ipad.*\bpro|"
-        r"iphone(13,[34]|14,[23]|15,[23]|16,[12]|17,[12])\b",
-        extent=6.0,
-        edges="of a step 14 % fall between neighbours and 52 % over three pixels; never a hole",
-        dark="twice as noisy",
-        sources=MappingProxyType(dict.fromkeys(("extent", "edges", "dark"), _PROMPT)),
-    ),
-    Sensor(
-        "phone time of flight",
-        "time of flight",
-        240,
-        r"time.?of.?flight|\btof\b|\bsm-(g977|n97[56]|g98[568])|huawei.*p[34]0 pro|\bvog-",
-    ),
-)
+    Sensor("OAK-D Lite", "stereo", 640, r"\boak.?d.?lite", 0.075 * 433, 1 / 8),
+    Sensor("OAK-D Pro", "stereo", 1280, rf"\boak.?d.?(s2|pro){_WIDE}", 0.075 * 783, 1 / 8),
+    Sensor("OAK-D", "stereo", 1280, rf"\boak.?d(?![a-z]){_WIDE}", 0.075 * 882.5, 1 / 8),
+    Sensor("ARKit lidar", "lidar", 256, _ARKIT, extent=6.0),
+    Sensor("phone time of flight", "time of flight", 240, _PHONES),
+)  # fmt: skip
 
 
 def recognise(device_name: str) -> Sensor | None:
@@ -297,16 +105,21 @@ class Identified(NamedTuple):
         return None if limit is None else _interpolate(depth, limit) / 2
 
 
+# Relative difference up to which steps identify a sensor, and beyond which they contradict one; cameras of a type
+# differ by 2 %
+_NEAR, _ALIKE = 0.02, 0.06
+# Focal lengths of stereo cameras' modes over that of the native width: 848, 640 x 480 (cropped), 640 x 360 and others;
+# disparity is counted in pixels of the mode
+_USUAL = (1.0, 848 / 1280, 0.6, 0.5)
+_PARTS = (*_USUAL, 2 / 3, 480 / 1280, 424 / 1280, 0.2)
+
+
 def identify(depth: Tensor, name: str = "auto", device_name: str = "") -> Identified | None:
-    """Return the sensor of a map: the named one, else the one identified by its values and the device's name.
+    """Return the sensor of a map, (1, h, w) in metres, NaN in holes, as it was read; None for an unknown one.
 
-    Where these contradict each other the values count: a device's name may be that of the photo's camera.
-
-    Args:
-        depth: (1, h, w) in metres, NaN in holes, as it was read.
-        name: of one of ``SENSORS`` or of a device; ``auto``, or ``none`` for none.
-        device_name: of the device, as its files state it; empty where they do not.
-
+    ``name`` is that of one of ``SENSORS`` or of a device, or ``none``. With ``auto``, the values and ``device_name``,
+    as the map's files state it, identify a sensor. If they contradict each other the values are decisive: the name may
+    be that of the photo's camera.
     """
     if name == "none":
         return None
@@ -315,10 +128,9 @@ def identify(depth: Tensor, name: str = "auto", device_name: str = "") -> Identi
     constant = None if steps is None else steps.constant
     if named is not None:
         if constant is not None and _mismatch(named, constant) > _ALIKE:
-            own = _counts(named)
             raise ValueError(
-                f"sensor: expected depth in steps of disparity with f B / step = {own:.0f} m, as of a {named.name}, or "
-                f"of one of its other modes, got {constant:.0f} m"
+                f"sensor: expected depth in steps of disparity with f B / step = {_counts(named):.0f} m, as of a "
+                f"{named.name}, or of one of its other modes, got {constant:.0f} m"
             )
         return Identified(named, "request", constant)
     named = recognise(device_name)
@@ -328,15 +140,6 @@ def identify(depth: Tensor, name: str = "auto", device_name: str = "") -> Identi
         return None
     best = min((each for each in SENSORS if each.step is not None), key=lambda each: _mismatch(each, constant, _USUAL))
     return Identified(best, "values", constant) if _mismatch(best, constant, _USUAL) <= _NEAR else None
-
-
-_NEAR, _ALIKE = 0.02, 0.06
-"""Relative difference up to which steps identify a sensor, and beyond which they contradict one; cameras of a type
-differ by 2 %."""
-_USUAL = (1.0, 848 / 1280, 0.6, 0.5)
-_PARTS = (*_USUAL, 2 / 3, 480 / 1280, 424 / 1280, 0.2)
-"""Focal lengths of stereo cameras' modes over that of the native width: 848, 640 x 480 (cropped), 640 x 360 and others;
-disparity is counted in pixels of the mode."""
 
 
 def _counts(sensor: Sensor) -> float:
@@ -355,10 +158,10 @@ def _mismatch(sensor: Sensor, constant: float, parts: tuple[float, ...] = _PARTS
 
 
 def least_error(sensor: Sensor, depth: Tensor, constant: float | None = None) -> Tensor:
-    """Return the standard deviation in metres of depth of any shape below which a sensor states none; 0 if not known.
+    """Return the least standard deviation of depth that a sensor can have, in metres, of any shape; 0 if not known.
 
-    That of its disparity, z^2 noise / (f B), where no noise is less than the rounding to steps, and its spread at that
-    distance; the larger one. ``constant`` is f B over the step of disparity; None for that of its native width.
+    It is that of its disparity, z^2 noise / (f B), where no noise is less than the rounding to steps, or its spread at
+    that distance, if that is larger. ``constant`` is f B over the step of disparity; None for that of its native width.
     """
     least = torch.zeros_like(depth)
     constant = constant or _counts(sensor)
@@ -370,10 +173,17 @@ def least_error(sensor: Sensor, depth: Tensor, constant: float | None = None) ->
     return least
 
 
-def _interpolate(depth: Tensor, points: tuple[tuple[float, float], ...]) -> Tensor:
+def _interpolate(depth: Tensor, points: _ByDistance) -> Tensor:
     """Return values at distances, linear between points and constant beyond them."""
     distances, values = zip(*points, strict=True)
     return torch.from_numpy(np.interp(depth.detach().double().cpu().numpy(), distances, values)).to(depth)
+
+
+class ValueSteps(NamedTuple):
+    """Steps of inverse depth that a map's values have: multiples of ``1 / constant``."""
+
+    constant: float  # focal length times baseline over the step of disparity, in metres
+    confidence: float  # from 0 to 1, how closely the values keep to them
 
 
 _CONSTANTS = (16.0, 4096.0)  # sought, in metres: 16 pixel metres in whole pixels to 128 in steps of 1/32
@@ -396,17 +206,11 @@ _FINE = 4  # samples of the spectrum for each cycle that fits into the range of 
 def recognise_values(depth: Tensor) -> ValueSteps | None:
     """Return the steps of inverse depth in which a stereo or structured-light camera's map has its values.
 
-    Its values are f B / d for disparities d in whole steps. Where the rounding to millimetres, or tenths of them, does
-    not hide it, inverse depths are therefore multiples of step / (f B), and the sum of exp(2 pi i C / z) over the
-    distinct values has a peak at C = f B / step.
-
-    Args:
-        depth: (1, h, w) in metres, NaN in holes, as it was read: neither resampled nor filtered.
-
-    Returns:
-        None where the values keep to no steps, or too few of them are seen, or they are not rounded as cameras write
-        them: those of a computed plane may keep to steps, too.
-
+    The map, (1, h, w) in metres, is as it was read: neither resampled nor filtered. Its values are f B / d for
+    disparities d in whole steps. Where the rounding to millimetres, or tenths of them, does not hide it, inverse depths
+    are therefore multiples of step / (f B), and the sum of exp(2 pi i C / z) over the distinct values has a peak at
+    C = f B / step. None if the values keep to no steps, too few of them are seen, or they are not rounded as cameras
+    write them: the values of a computed plane may keep to steps, too.
     """
     depth = depth[:, :: max(1, round(depth.numel() / _PIXELS))]
     values, counts = torch.unique(depth[depth.isfinite()].double(), return_counts=True)

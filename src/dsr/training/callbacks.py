@@ -20,18 +20,15 @@ from dsr.utils.runs_table import list_run
 
 
 class Curves(Callback):
-    """Logs the losses and the gradient's norm, means over the steps since the last values, the rate and the speed.
+    """Logs the losses and the gradient's norm, means over steps and devices, the learning rate and the speed.
 
-    Single values of small batches are too noisy to read; these curves need no smoothing. Values that are not finite are
-    left out. The means are those of all devices.
-
-    There is a value every ``log_every_n_steps`` of the trainer, or one after its last step if it has fewer.
+    There is a value every ``log_every_n_steps`` of the trainer, or one after its last step if it has fewer. Values that
+    are not finite are left out.
     """
 
     def __init__(self) -> None:
-        self._start, self._patches = time.perf_counter(), 0
-        self._sums: dict[str, Tensor] = {}
-        self._rate = 0.0
+        self._start, self._patches, self._rate = time.perf_counter(), 0, 0.0
+        self._sums: dict[str, Tensor] = {}  # of the values that are finite, and their number
 
     def state_dict(self) -> dict[str, Any]:
         """Return the sums since the last values, so that a training that goes on logs the same ones."""
@@ -73,7 +70,7 @@ class Curves(Callback):
         self._sums, self._start, self._patches = {}, now, 0
 
     def on_validation_start(self, *_: Any) -> None:
-        """Stop the clock: the time so far counts, that of the validation does not."""
+        """Stop the clock."""
         self._start -= time.perf_counter()
 
     def on_validation_end(self, *_: Any) -> None:
@@ -87,11 +84,7 @@ def log_run(
 ) -> None:  # fmt: skip
     """Log a run's configuration before it has values: TensorBoard gets its main settings and a layout of its charts.
 
-    Args:
-        text: the configuration as YAML.
-        table: the main settings.
-        titles: of the validation's metrics, by name.
-
+    ``text`` is the configuration as YAML, ``table`` its main settings; ``titles`` are those of the metrics, by name.
     """
     if isinstance(logger, TensorBoardLogger):
         logger.experiment.add_text("config", f"```yaml\n{text}```")

@@ -6,7 +6,6 @@ import functools
 import math
 import os
 import signal
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -16,7 +15,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset, default_collate
 
 from dsr.data.scene_source import SceneSource, content_key
-from dsr.degradation.hints import encode_facts
+from dsr.degradation.downsampling import encode_facts
 from dsr.degradation.random_degradation import Everything
 from dsr.methods.classical.interpolation import Interpolation
 from dsr.sample import Scene
@@ -104,28 +103,29 @@ class PatchData(lightning.LightningDataModule):
         super().__init__()
         check_patches((), settings, degradation.scale)
         self._everything, self._per_step = everything, patches_per_step
-        self._parts, self.patches, self._degradation, self._seed = list(parts), settings, degradation, seed
-        self._training_names: list[list[str]] = []
+        self.patches, self._degradation, self._seed = settings, degradation, seed
+        self._trained: list[tuple[Part, list[str]]] = []
         self._held_out: dict[str, tuple[SceneSource, list[str]]] = {}
         for part in parts:
-            self._split(part.source)
+            names, kept = _split(part.source, settings)
+            self._trained.append((part, names))
+            if kept:
+                self._held_out[_make_unique(part.source.name, self._held_out)] = (part.source, kept)
         for name, source in (validation or {}).items():
             self._held_out[_make_unique(name, self._held_out)] = (source, source.scenes())
         if not self._held_out:
             raise ValueError("validation_scenes: expected a positive number where there is no other validation")
-        trained = {content_key(source, name) for source, names in self.used_scenes[: len(parts)] for name in names}
+        trained = {content_key(part.source, name) for part, names in self._trained for name in names}
         for kind, (source, names) in self._held_out.items():
             for name in names:
                 if content_key(source, name) in trained:  # under whatever name
                     raise ValueError(f"validation.{kind}: expected scenes that are not trained on, got {name}")
-        self._cut: Patches | None = None
         self._validation: list[list[Scene]] = []
 
     @property
     def used_scenes(self) -> list[tuple[SceneSource, list[str]]]:
         """The scenes to train on and to validate with, by data set; those of the parts come first."""
-        trained = [(part.source, names) for part, names in zip(self._parts, self._training_names, strict=True)]
-        return [*trained, *self._held_out.values()]
+        return [*((part.source, names) for part, names in self._trained), *self._held_out.values()]
 
     @property
     def validation_sets(self) -> list[str]:
@@ -135,7 +135,7 @@ class PatchData(lightning.LightningDataModule):
     @property
     def training_count(self) -> int:
         """The number of scenes to train on."""
-        return sum(map(len, self._training_names))
+        return sum(len(names) for _, names in self._trained)
 
     def validation_scenes(self) -> dict[str, tuple[SceneSource, list[str]]]:
         """Return the data set and the names of the scenes of each validation set."""
@@ -143,19 +143,18 @@ class PatchData(lightning.LightningDataModule):
 
     def setup(self, stage: str = "fit") -> None:
         """Load the scenes; Lightning's ``stage`` makes no difference."""
-        if self._cut is not None:
+        if self._validation:
             return
         groups: list[list[Scene]] = []
-        for part, names in zip(self._parts, self._training_names, strict=True):
+        for part, names in self._trained:
             scenes = map(part.source.load, names)
             # float32 takes half the memory
             groups.append([derived(s, depth=None if s.depth is None else s.depth.float()) for s in scenes])
-        shares = [part.share for part in self._parts]
         self._cut = Patches(
             groups,
             self.patches,
             self._degradation,
-            shares=shares,
+            shares=[part.share for part, _ in self._trained],
             seed=self._seed,
             everything=self._everything,
             per_step=self._per_step,
@@ -169,8 +168,7 @@ class PatchData(lightning.LightningDataModule):
 
     def first_patches(self, count: int) -> list[Batch]:
         """Return the first ``count`` patches of the run."""
-        patches = self._load_patches().select(0, count)
-        return [patches[index] for index in range(count)]
+        return [self._cut[number] for number in range(count)]
 
     def train_dataloader(self) -> DataLoader[Batch]:
         """Return a loader of an epoch's patches, which begins at the trainer's current step.
@@ -178,16 +176,16 @@ class PatchData(lightning.LightningDataModule):
         An epoch is the whole training or, where the trainer has no number of steps, about 1000 batches. The length is
         that of the whole epoch, as Lightning subtracts the batches that were done before an interruption.
         """
-        numbers = _PatchNumbers(self.trainer, self.patches.batch)
         module: Any = getattr(self.trainer, "lightning_module", None)
         prepare = getattr(getattr(module, "net", None), "prepare", None)
-        workers: dict[str, Any] = {"num_workers": self.patches.workers}
-        if self.patches.workers:
-            workers["worker_init_fn"] = functools.partial(_begin_worker, os.getpid())
-        pin = torch.cuda.is_available()
-        patches = self._load_patches().select(0, sys.maxsize)
-        collate = functools.partial(_collate_prepared, prepare) if prepare else None
-        return _PatchLoader(patches, batch_sampler=numbers, pin_memory=pin, collate_fn=collate, **workers)
+        return _PatchLoader(
+            self._cut,
+            batch_sampler=_PatchNumbers(self.trainer, self.patches.batch),
+            collate_fn=functools.partial(_collate_prepared, prepare) if prepare else None,
+            num_workers=self.patches.workers,
+            worker_init_fn=functools.partial(_begin_worker, os.getpid()),
+            pin_memory=torch.cuda.is_available(),
+        )
 
     def val_dataloader(self) -> list[DataLoader[Batch]]:
         """Return a loader for each validation set, of whole scenes, one at a time.
@@ -203,35 +201,22 @@ class PatchData(lightning.LightningDataModule):
         )
         return [DataLoader(each, batch_size=1, collate_fn=collate_scene) for each in samples]
 
-    def test_dataloader(self) -> list[DataLoader[Batch]]:
-        """Return the loaders of the validation."""
-        return self.val_dataloader()
+    test_dataloader = predict_dataloader = val_dataloader
 
-    def predict_dataloader(self) -> list[DataLoader[Batch]]:
-        """Return the loaders of the validation."""
-        return self.val_dataloader()
 
-    def _load_patches(self) -> Patches:
-        if self._cut is None:
-            self.setup()
-        assert self._cut is not None  # noqa: S101 - for the type checker
-        return self._cut
-
-    def _split(self, source: SceneSource) -> None:
-        """Divide the scenes of a data set into those to train on and those to validate with, the last ones."""
-        if source.evaluation:
-            raise ValueError(
-                f"dataset={source.name}: its scenes are to evaluate on, not to train on; "
-                f"+dataset@validation.{source.name}={source.name} validates with them"
-            )
-        names, count = source.scenes()[: self.patches.scenes], self.patches.validation_scenes
-        if len(names) <= count:
-            raise ValueError(
-                f"validation_scenes: expected fewer than the {len(names)} scenes of {source.name}, got {count}"
-            )
-        self._training_names.append(names[: len(names) - count])
-        if count:
-            self._held_out[_make_unique(source.name, self._held_out)] = (source, names[len(names) - count :])
+def _split(source: SceneSource, settings: PatchSettings) -> tuple[list[str], list[str]]:
+    """Return the scenes of a data set to train on, and the last ones, to validate with."""
+    if source.evaluation:
+        raise ValueError(
+            f"dataset={source.name}: its scenes are to evaluate on, not to train on; "
+            f"+dataset@validation.{source.name}={source.name} validates with them"
+        )
+    names, count = source.scenes()[: settings.scenes], settings.validation_scenes
+    if len(names) <= count:
+        raise ValueError(
+            f"validation_scenes: expected fewer than the {len(names)} scenes of {source.name}, got {count}"
+        )
+    return names[: len(names) - count], names[len(names) - count :]
 
 
 class _PatchNumbers:
@@ -270,7 +255,7 @@ def _collate_prepared(prepare: Callable[[Batch], Batch], samples: list[Batch]) -
 
 
 def _begin_worker(parent: int, _: int) -> None:
-    """Prepare a worker, the number of which is not needed; torch looks after the parent only every five seconds."""
+    """Prepare a worker; torch looks after the parent only every five seconds."""
     interruption.end_with(parent)
     interruption.outlast_group()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import functools
+import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -32,18 +33,11 @@ from dsr.utils.configuration import load_object
 from dsr.utils.guards import refusing
 from dsr.utils.torch_files import read_torch_file
 
+ADAMW = functools.partial(torch.optim.AdamW, lr=1e-3, weight_decay=1e-4)
 _RENDERED_SCENES = 4  # number of scenes of each validation set that are rendered for TensorBoard
 _TRUSTED = ("dsr.", "torch.optim.")
-
-
-_PARTS: dict[str, tuple[type, Callable[..., Any]]] = {
-    "net": (DisparityNetwork, lambda kind, **arguments: kind(**arguments)),
-    "objective": (Objective, lambda kind, **arguments: kind.of(**arguments)),
-    "optimizer": (torch.optim.Optimizer, functools.partial),
-    "scheduler": (LRScheduler, functools.partial),
-}
-"""The parts that a checkpoint names: of what kind they are, and how they are made of a class and its arguments."""
-ADAMW = functools.partial(torch.optim.AdamW, lr=1e-3, weight_decay=1e-4)
+# The kinds of the parts that a checkpoint names
+_PARTS = {"net": DisparityNetwork, "objective": Objective, "optimizer": torch.optim.Optimizer, "scheduler": LRScheduler}
 
 
 class WarmupCosine(LambdaLR):
@@ -67,22 +61,21 @@ class SuperResolution(lightning.LightningModule):
     The averaged weights are what is validated, tested and used. Under ``precision="bf16-mixed"`` the network's
     convolutions run in bfloat16, the loss and the metrics in their own precision.
 
-    Beside the scores of the network, ``val/METRIC``, validations log those of bicubic interpolation of the same maps,
-    ``bicubic/METRIC``, which are computed in the first one.
+    Validations log the scores of the network, ``val/METRIC``, and of bicubic interpolation of the same maps,
+    ``bicubic/METRIC``, which are computed in the first validation.
 
     Args:
         net: the network.
         objective: the loss.
         optimizer: function that makes the optimiser of parameters, such as a ``functools.partial``.
-        scheduler: function that makes the schedule of an optimiser, which is updated after every step; None for none.
-        average: decay of the exponential moving average of the weights; 0 for the weights themselves. The decay is
-            smaller in the first steps.
+        scheduler: function that makes the schedule of an optimiser, which is updated after every step.
+        average: decay of the moving average of the weights, smaller in the first steps; 0 for the weights themselves.
         metrics: function that makes the metrics of a validation set.
         validation_sets: names of the validation sets, in the order of the loaders.
 
     """
 
-    logs_curves = True  # losses and speed, where the trainer has no Curves
+    logs_curves = True  # adds the callback Curves, unless the trainer has one
 
     def __init__(
         self,
@@ -114,10 +107,9 @@ class SuperResolution(lightning.LightningModule):
         self._pictures: dict[str, Tensor] = {}
 
     def configure_callbacks(self) -> list[Callback]:
-        """Return the callback that logs losses and speed, unless the trainer has one; Lightning would replace that."""
+        """Return the callback that logs losses and speed, unless the trainer has one, which Lightning would replace."""
         callbacks: list[Callback] = self.trainer.callbacks  # type: ignore[attr-defined]
-        there = not self.logs_curves or any(isinstance(each, Curves) for each in callbacks)
-        return [] if there else [Curves()]
+        return [Curves()] if self.logs_curves and not any(isinstance(each, Curves) for each in callbacks) else []
 
     def forward(self, batch: Batch) -> Tensor:
         """Return high-resolution depth by the averaged weights, (B, 1, H, W) in metres; NaN where there is none."""
@@ -137,7 +129,7 @@ class SuperResolution(lightning.LightningModule):
             return self.objective(answer, batch)
 
     def _exact(self) -> contextlib.AbstractContextManager[Any]:
-        """Return a context without the mixed precision of the trainer, which losses and metrics are computed in."""
+        """Return a context without the trainer's mixed precision, for losses and metrics."""
         return torch.autocast(self.device.type, enabled=False)
 
     def configure_gradient_clipping(
@@ -192,83 +184,72 @@ class SuperResolution(lightning.LightningModule):
                 picture = comparison(depth, batch["depth"], batch["rays"], batch["rgb"], depth_lr)
                 self._pictures[f"renderings/{self.sets[dataloader_idx]}_{number}"] = picture
 
-    def test_step(self, batch: Batch, index: int, dataloader_idx: int = 0) -> None:
-        """Score a whole scene as a validation does."""
-        self.validation_step(batch, index, dataloader_idx)
-
     def predict_step(self, batch: Batch, *_: Any) -> Tensor | None:
         """Return a scene's depth, as :meth:`forward`; None for an empty batch."""
         return self(batch) if batch else None
 
-    def on_test_epoch_start(self) -> None:
-        """Score bicubic interpolation, too."""
-        self.on_validation_epoch_start()
-
-    def on_test_epoch_end(self) -> None:
-        """Log the mean scores as ``test/METRIC``, in the units of tables."""
-        self._log_scores("test")
-
     def on_validation_epoch_end(self) -> None:
-        """Log the mean scores of all sets and, if there are several, of each, to loggers in the units of tables."""
-        self._log_scores("val")
-
-    def _log_scores(self, stage: str) -> None:
-        """Log the mean scores of all sets and of each, and the pictures; forget them."""
-        if self.trainer.sanity_checking:  # of a few scenes
-            self._forget()
-            return
-        if self.trainer.world_size > 1:
-            all_devices: list[Any] = [None] * self.trainer.world_size
-            torch.distributed.all_gather_object(all_devices, self._pictures)
-            self._pictures = {name: picture for pictures in all_devices for name, picture in pictures.items()}
-        for name in sorted(self._pictures):
-            for logger in self.loggers:
-                log_picture(logger, name, self._pictures[name], self.global_step)
-        named: dict[str, Any] = self._means(stage, self.metrics)
-        if self._bicubic_metrics:
-            means = self._means("bicubic", self._bicubic_metrics)
-            self.bicubic = {kind: {name: float(v) for name, v in each.items()} for kind, each in means.items()}
-        named |= self.bicubic
-        self.validation_scores = {
-            kind: {name: float(value) for name, value in each.items()} for kind, each in named.items()
-        }
-        metrics: Any = {name: metric for each in self.metrics for name, metric in each.items()}  # type: ignore[operator]
-        self.shown_scores = {kind: in_table_units(metrics, raw) for kind, raw in self.validation_scores.items()}
-        shown = _by_tag(self.shown_scores)
-        self.log_dict(_by_tag(self.validation_scores) if self._fits else shown, logger=False if self._fits else None)
-        for logger in self.loggers if self._fits else ():  # Lightning would count steps from 0
-            logger.log_metrics(shown, self.global_step)
-            logger.save()
-        self._forget()
-
-    def _forget(self) -> None:
-        """Forget the scores and the pictures of the scenes so far."""
+        """Log the mean scores as ``val/METRIC`` or ``test/METRIC``, to loggers in the units of tables, and pictures."""
+        if not self.trainer.sanity_checking:  # of a few scenes
+            self._log_pictures()
+            self._log_scores("test" if self.trainer.testing else "val")
         self._pictures, self._bicubic_metrics = {}, []
         for each in self.metrics:
             each.reset()  # type: ignore[operator]
+
+    test_step = validation_step
+    on_test_epoch_start, on_test_epoch_end = on_validation_epoch_start, on_validation_epoch_end
+
+    def _log_pictures(self) -> None:
+        pictures = self._pictures
+        if self.trainer.world_size > 1:
+            all_devices: list[Any] = [None] * self.trainer.world_size
+            torch.distributed.all_gather_object(all_devices, pictures)
+            pictures = {name: picture for each in all_devices for name, picture in each.items()}
+        for name, picture in sorted(pictures.items()):
+            for logger in self.loggers:
+                log_picture(logger, name, picture, self.global_step)
+
+    def _log_scores(self, stage: str) -> None:
+        means = self._means(stage, self.metrics)
+        if self._bicubic_metrics:
+            self.bicubic = self._means("bicubic", self._bicubic_metrics)
+        self.validation_scores = means | self.bicubic
+        metrics: Any = {name: metric for each in self.metrics for name, metric in each.items()}  # type: ignore[operator]
+        self.shown_scores = {kind: in_table_units(metrics, raw) for kind, raw in self.validation_scores.items()}
+        shown = _by_tag(self.shown_scores)
+        if not self._fits:
+            self.log_dict(shown)
+            return
+        self.log_dict(_by_tag(self.validation_scores), logger=False)
+        for logger in self.loggers:  # Lightning would count steps from 0
+            logger.log_metrics(shown, self.global_step)
+            logger.save()
 
     @property
     def _fits(self) -> bool:
         """Whether the validation is one of a training."""
         return self.trainer.state.fn == TrainerFn.FITTING
 
-    def _means(self, kind: str, collections: Any) -> dict[str, dict[str, Tensor]]:
+    def _means(self, kind: str, collections: Any) -> dict[str, dict[str, float]]:
         """Return the mean scores over the scenes, by ``kind`` for all sets and, if there are several, for each."""
         scores = [{name: value.double() for name, value in compute_means(each).items()} for each in collections]
         names = dict.fromkeys(name for each in scores for name in each)
         means = {name: torch.stack([each[name] for each in scores if name in each]).nanmean() for name in names}
         sets = {f"{kind}_{name}": each for name, each in zip(self.sets, scores, strict=True)}
-        return {kind: means} | (sets if len(sets) > 1 else {})
+        found = {kind: means} | (sets if len(sets) > 1 else {})
+        return {each: {name: float(value) for name, value in of.items()} for each, of in found.items()}
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Store the scores of bicubic interpolation, and of what the module is made, as plain values."""
         checkpoint["bicubic"] = self.bicubic
-        nodes = {
-            "net": _node_of(type(self.net), self.net.arguments()),
-            "objective": _node_of(type(self.objective), self.objective.arguments()),
-            "optimizer": _partial_node_of(self._make_optimizer),
-            "scheduler": _partial_node_of(self._make_scheduler) if self._make_scheduler is not None else None,
+        makers = {
+            "net": functools.partial(self.net.__class__, **self.net.arguments()),
+            "objective": functools.partial(self.objective.__class__, **self.objective.arguments()),
+            "optimizer": self._make_optimizer,
+            "scheduler": self._make_scheduler,
         }
+        nodes = {name: _node_of(make) for name, make in makers.items() if make is not None}
         plain = {"average": self.decay, "validation_sets": list(self.sets)}
         checkpoint["hyper_parameters"] = plain | {name: node for name, node in nodes.items() if node is not None}
 
@@ -278,28 +259,16 @@ class SuperResolution(lightning.LightningModule):
     ) -> Self:
         """Return the module of a checkpoint, with its weights and their average.
 
-        Args:
-            checkpoint_path: the file.
-            map_location: as for :func:`torch.load`.
-            **parts: arguments of the constructor in place of those that the checkpoint names, such as a ``net`` that is
-                not dsr's own. The ``metrics`` are not in it.
-
+        ``parts`` are arguments of the constructor in place of those that the checkpoint names, such as a ``net`` that
+        is not dsr's own. The ``metrics`` are not in it.
         """
         stored = read_torch_file(Path(checkpoint_path)).get("hyper_parameters")
         if not isinstance(stored, Mapping):
             raise ValueError(f"{checkpoint_path}: expected a checkpoint of {cls.__name__}, it names no parts")
-        for name, (kind, make) in _PARTS.items():
-            if name in parts:
-                continue
-            if name in stored:
-                found, arguments = _read_node(name, stored[name], kind)
-                try:
-                    if name == "net":
-                        make_network(Path(checkpoint_path), found, arguments)  # is not larger than the file
-                    parts[name] = make(found, **arguments)
-                except TypeError as error:
-                    raise ValueError(f"{checkpoint_path}: {name}: {error}") from error
-            elif name in ("net", "objective"):
+        for name in _PARTS:
+            if name in stored and name not in parts:
+                parts[name] = _read_part(Path(checkpoint_path), name, stored[name])
+            elif name in ("net", "objective") and name not in parts:
                 raise ValueError(f"{checkpoint_path}: expected {name}=, which the checkpoint does not name")
         return super().load_from_checkpoint(checkpoint_path, map_location, weights_only=True, **parts)
 
@@ -324,35 +293,33 @@ def _by_tag(scores: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
     return {f"{kind}/{name}": value for kind, each in scores.items() for name, value in each.items()}
 
 
-def _node_of(kind: Any, arguments: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return a class as ``_target_`` beside arguments; None if it is no class or they are no plain values."""
-    if not isinstance(kind, type) or not _is_plain(arguments):
-        return None
-    return {"_target_": f"{kind.__module__}.{kind.__qualname__}", **arguments}
-
-
-def _partial_node_of(make: Any) -> dict[str, Any] | None:
-    """Return a class, or a partial of one, likewise, with ``_partial_``; None for any other function."""
+def _node_of(make: Any) -> dict[str, Any] | None:
+    """Return a class, or a partial of one, as ``_target_`` beside plain arguments; None for anything else."""
     made = make if isinstance(make, functools.partial) else functools.partial(make)
-    node = _node_of(made.func, made.keywords)
-    return None if node is None or made.args else {**node, "_partial_": True}
+    if made.args or not isinstance(made.func, type):
+        return None
+    try:
+        json.dumps(made.keywords)
+    except (TypeError, ValueError):
+        return None
+    return {"_target_": f"{made.func.__module__}.{made.func.__qualname__}", **made.keywords}
 
 
-def _read_node(name: str, node: Mapping[str, Any], kind: type) -> tuple[Any, dict[str, Any]]:
-    """Return the class, a ``kind``, and the arguments that a node names; the checkpoint may come from somebody else."""
-    path = str(node.get("_target_"))
-    if not path.startswith(_TRUSTED):
-        raise ValueError(f"{name}: the checkpoint names {path}, which is neither dsr's nor torch.optim's; give {name}=")
-    found = load_object(name, path, f"a {kind.__name__}")
-    if not (isinstance(found, type) and issubclass(found, kind)):
-        raise ValueError(f"{name}: expected a {kind.__name__} in the checkpoint, {path} is none")
-    return found, {key: value for key, value in node.items() if key not in ("_target_", "_partial_")}
-
-
-def _is_plain(value: Any) -> bool:
-    """Return whether a value consists of what torch reads without running code."""
-    if isinstance(value, Mapping):
-        return all(isinstance(key, str) and _is_plain(each) for key, each in value.items())
-    if isinstance(value, list | tuple):
-        return all(map(_is_plain, value))
-    return value is None or isinstance(value, str | int | float)
+def _read_part(path: Path, name: str, node: Mapping[str, Any]) -> Any:
+    """Return a part of a module of its class and arguments in a checkpoint, which may come from somebody else."""
+    target, expected = str(node.get("_target_")), _PARTS[name]
+    if not target.startswith(_TRUSTED):
+        raise ValueError(
+            f"{name}: the checkpoint names {target}, which is neither dsr's nor torch.optim's; give {name}="
+        )
+    kind = load_object(name, target, f"a {expected.__name__}")
+    if not (isinstance(kind, type) and issubclass(kind, expected)):
+        raise ValueError(f"{name}: expected a {expected.__name__} in the checkpoint, {target} is none")
+    arguments = {key: value for key, value in node.items() if key not in ("_target_", "_partial_")}
+    try:
+        if issubclass(kind, DisparityNetwork):
+            make_network(path, kind, arguments)  # is not larger than the file
+            return kind(**arguments)
+        return kind.of(**arguments) if issubclass(kind, Objective) else functools.partial(kind, **arguments)
+    except TypeError as error:
+        raise ValueError(f"{path}: {name}: {error}") from error

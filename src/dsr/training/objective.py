@@ -4,8 +4,7 @@ The shading loss is that of DDRNet (Yan et al., ECCV 2018): a photo against the 
 that explains it. A Lambertian surface with albedo R and normals n, under distant light, has the intensity B = R sum
 over b of l_b H_b(n), where the H_b are the nine spherical harmonics up to the second degree (Ramamoorthi and Hanrahan,
 SIGGRAPH 2001). The l_b of a photo are found by least squares with the normals of the reference depth. The albedo comes
-from the photo alone, by Retinex: steep changes of the logarithmic image are changes of the albedo, the others of the
-shading (Grosse et al., ICCV 2009). DDRNet's authors compute it in advance, for which they recommend Retinex.
+from the photo alone, by Retinex (Grosse et al., ICCV 2009), which DDRNet's authors recommend.
 """
 
 from __future__ import annotations
@@ -18,6 +17,7 @@ from typing import Any, Literal, Self
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from dsr.geometry.surface import angle_between
 from dsr.methods.images import compute_min_max, grey, upsample_bicubic
@@ -27,6 +27,7 @@ from dsr.metrics.functional import SurfacePair, masked_mean, mse_v
 from dsr.metrics.losses import MSE_V, VisualLoss, VisualLossName, l1, lap1, make_visual_loss, match_weight, mse
 from dsr.training.degradation import Batch
 from dsr.utils.compute_device import in_own_precision
+from dsr.utils.guards import expect_one_of
 
 DepthLoss = Literal["lap1", "l1", "mse"]
 _TILT = math.asin(5 / 255)  # 1.1 degrees: changes a rendering under grazing light by 5 of 255, as for BadPix_v(5)
@@ -77,8 +78,7 @@ class Objective(abc.ABC):
 class DepthObjective(Objective):
     """The loss: depth_loss + w visual (Voynov et al. 2019, eq. 4: Lap_1 + w MSE_v), and perhaps a shading loss.
 
-    The depth loss compares disparities divided by the range of the low-resolution ones, so that it does not depend on
-    the scale of the scene.
+    The depth loss compares disparities divided by the range of the low-resolution ones.
 
     Args:
         depth_loss: ``lap1``, ``l1`` or ``mse``.
@@ -95,12 +95,11 @@ class DepthObjective(Objective):
 
     def __post_init__(self) -> None:
         """Check the values."""
+        expect_one_of("depth_loss", self.depth_loss, _DEPTH_LOSSES)
         if not 0 <= self.shading < math.inf:
             raise ValueError(f"shading: expected 0 or a positive number, got {self.shading}")
         if self.w != "auto" and not 0 <= self.w < math.inf:
             raise ValueError(f"w: expected auto or a number, 0 or more, got {self.w}")
-        if self.depth_loss not in _DEPTH_LOSSES:
-            raise ValueError(f"depth_loss: expected one of {', '.join(_DEPTH_LOSSES)}, got {self.depth_loss!r}")
 
     @property
     def formula(self) -> str:
@@ -283,9 +282,8 @@ def integrate(along_u: Tensor, along_v: Tensor) -> Tensor:
 
     The normal equations are a Poisson equation with Neumann borders, which the discrete cosine transform diagonalises.
     """
-    zeros_u, zeros_v = torch.zeros_like(along_u[..., :1]), torch.zeros_like(along_v[..., :1, :])
-    divergence = torch.cat((along_u, zeros_u), dim=-1) - torch.cat((zeros_u, along_u), dim=-1)
-    divergence = divergence + torch.cat((along_v, zeros_v), dim=-2) - torch.cat((zeros_v, along_v), dim=-2)
+    divergence = functional.pad(along_u, (0, 1)) - functional.pad(along_u, (1, 0))
+    divergence = divergence + functional.pad(along_v, (0, 0, 0, 1)) - functional.pad(along_v, (0, 0, 1, 0))
     height, width = divergence.shape[-2:]
     eigenvalues = laplacian_eigenvalues(height, width, divergence)
     eigenvalues[0, 0] = torch.inf  # the mean is free

@@ -8,7 +8,6 @@ same on one device and on several.
 from __future__ import annotations
 
 import contextlib
-import copy
 import itertools
 import math
 from collections.abc import Sequence
@@ -35,7 +34,7 @@ _SOFT, _SOFTEST = 0.5, 1.3  # pixels: blur of soft depth steps, from 0 where mea
 
 
 class Patches(Dataset[Batch]):
-    """Random patches ``first`` .. ``first + count - 1`` of a run.
+    """The random patches of a run, by their numbers, without an end; ``count`` is the length.
 
     The scenes of each group have a true depth and are at least as large as a patch; ``shares`` are the frequencies of
     the groups, equal if None. ``everything`` is a distribution of degradations to draw from in place of
@@ -50,7 +49,6 @@ class Patches(Dataset[Batch]):
         *,
         shares: Sequence[float] | None = None,
         seed: int = 0,
-        first: int = 0,
         count: int = 1,
         everything: Everything | None = None,
         per_step: int | None = None,
@@ -68,24 +66,17 @@ class Patches(Dataset[Batch]):
             raise ValueError("shares: expected a positive number among them, all are 0")
         self._groups, self._settings, self._degradation = groups, settings, degradation
         self._limits = np.cumsum(weights / weights.sum())
-        self._seed, self._first, self._count = seed, first, count
+        self._seed, self._count = seed, count
         self._depth_ranges: dict[tuple[int, int], list[float]] = {}  # by group and number of the scene
 
     def __len__(self) -> int:
         return self._count
 
-    def select(self, first: int, count: int) -> Patches:
-        """Return the patches ``first`` .. ``first + count - 1`` of the same run."""
-        other = copy.copy(self)
-        other._first, other._count = first, count
-        return other
-
-    def __getitem__(self, index: int) -> Batch:
-        """Return patch number ``first + index``, at least half of whose depth is valid if ten tries find such a window.
+    def __getitem__(self, number: int) -> Batch:
+        """Return a patch, at least half of whose depth is valid if ten tries find such a window.
 
         Another window is taken where noise makes all of its depth missing, as a sensor's limits of range may.
         """
-        number = self._first + index
         random = np.random.default_rng([self._seed, number])
         for _ in range(_SCENE_TRIES):
             with contextlib.suppress(AllHolesError):

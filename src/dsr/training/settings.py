@@ -28,11 +28,6 @@ class PatchSettings:
         colour: standard deviation of the gain of each colour channel.
         photo: fraction of the patches whose rgb is changed by :func:`dsr.training.patches.simulate_camera`.
 
-    Example:
-        >>> from dsr.training.settings import PatchSettings
-        >>> PatchSettings(patch=64, batch=2).validation_scenes
-        4
-
     """
 
     patch: int = 96
@@ -48,21 +43,16 @@ class PatchSettings:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        if not 0 <= self.depth_scale <= _MAX_DEPTH_SCALE:
-            raise ValueError(f"depth_scale: expected 0 to {_MAX_DEPTH_SCALE:g}, got {self.depth_scale}")
-        if not 0 <= self.colour < math.inf:
-            raise ValueError(f"colour: expected 0 or more, got {self.colour}")
-        if not 0 <= self.photo <= 1:
-            raise ValueError(f"photo: expected a fraction from 0 to 1, got {self.photo}")
-        if self.patch < _MIN_SIZE:
-            raise ValueError(f"patch: expected at least {_MIN_SIZE} pixels, got {self.patch}")
-        if self.batch < 1:
-            raise ValueError(f"batch: expected a positive number, got {self.batch}")
+        ranges = {"depth_scale": (0, _MAX_DEPTH_SCALE), "colour": (0, math.inf), "photo": (0, 1),
+                  "patch": (_MIN_SIZE, math.inf), "batch": (1, math.inf), "workers": (0, math.inf),
+                  "validation_scenes": (0, math.inf)}  # fmt: skip
+        for name, (least, most) in ranges.items():
+            value = getattr(self, name)
+            if not least <= value <= most or value == math.inf:
+                expected = f"{least} or more" if most == math.inf else f"{least} to {most:g}"
+                raise ValueError(f"{name}: expected {expected}, got {value}")
         if self.scenes is not None and self.scenes < 1:
             raise ValueError(f"scenes: expected a positive number, or null for all, got {self.scenes}")
         expect_memory("patch", self.patch, _BYTES * self.patch**2)
         expect_memory("batch", self.batch, _BYTES * self.batch * self.patch**2)
         expect_memory("workers", self.workers, _BYTES_OF_WORKER * self.workers)
-        for name in ("workers", "validation_scenes"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name}: expected 0 or more, got {getattr(self, name)}")

@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.degradation.downsampling import Kernel
-from dsr.degradation.hints import encode_facts, local_noise, relative_error
+from dsr.degradation.downsampling import Kernel, encode_facts, local_noise, relative_error
 from dsr.geometry.hole_size import degrees_per_pixel, distance_to_known
 from dsr.geometry.resampling import pad_inverse_depth, resize_inverse_depth
 from dsr.methods.base import Abilities, Cost, InverseSample, InverseSurface, MapNoise, Method, NoiseLaw, Surface

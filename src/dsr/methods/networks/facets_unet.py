@@ -35,8 +35,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dsr.degradation.downsampling import Downsampling
-from dsr.degradation.hints import FACTS, known_kernels
+from dsr.degradation.downsampling import FACTS, Downsampling, known_kernels
 from dsr.methods.exportable import every, exporting, median_in_graph, quantiles_in_graph
 from dsr.methods.images import inpaint, repeat_blocks, upsample_bicubic
 from dsr.methods.networks.facets import Facets, start_from_another_factor, start_from_facets
