@@ -30,8 +30,8 @@ from dsr.methods.classical.edge_map import (
     predict_edge_map,
     thin,
 )
+from dsr.methods.classical.guided_filter import estimate_slopes
 from dsr.methods.classical.interpolation import Interpolation
-from dsr.methods.classical.photo_guided import estimate_slopes
 from dsr.sample import DepthSample, Scene
 
 
@@ -159,7 +159,7 @@ def test_map_too_small_for_patches_has_no_solution() -> None:
 
 @pytest.mark.parametrize("name", ["radius", "step", "sharp_weight", "smoothness", "sigma_space", "mixed"])
 def test_parameter_that_is_not_positive_is_refused(name: str) -> None:
-    with pytest.raises(ValueError, match=rf"^{name}: expected a positive number for edge-guided upsampling"):
+    with pytest.raises(ValueError, match=rf"^{name}: expected a positive number, got 0"):
         EdgeGuided(**{name: 0.0})
 
 

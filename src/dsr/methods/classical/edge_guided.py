@@ -36,7 +36,7 @@ from dsr.geometry.camera import from_range
 from dsr.methods.base import Abilities, Cost, Method, whole_scale
 from dsr.methods.classical.edge_map import predict_edge_map
 from dsr.methods.classical.finite_differences import box_mean, repeat_blocks, upsample_linear_border
-from dsr.methods.classical.photo_guided import estimate_slopes, expect_positive, expect_window
+from dsr.methods.classical.guided_filter import BEYOND, estimate_slopes, expect_positive, expect_window
 from dsr.methods.inpainting import inpaint
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps, part_of
@@ -44,9 +44,6 @@ from dsr.utils.progress import Steps, part_of
 _CHUNK = 4096  # low-resolution pixels that are flooded at once
 # rows and columns from a pixel to its neighbours, the nearest first
 _BESIDE = ((-1, 0), (0, -1), (0, 1), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
-
-# factor by which a result may be farther than the farthest valid low-resolution pixel, or nearer than the nearest
-_BEYOND = 4.0
 
 
 class _Planes(NamedTuple):
@@ -228,9 +225,9 @@ class EdgeGuided(Method):
         *,
         fill_holes: bool = False,
     ) -> None:
-        expect_positive("edge-guided upsampling", step=step, sharp_weight=sharp_weight, smoothness=smoothness)
-        expect_positive("edge-guided upsampling", sigma_space=sigma_space, mixed=mixed)
-        expect_window("edge-guided upsampling", radius=radius)
+        expect_positive(step=step, sharp_weight=sharp_weight, smoothness=smoothness)
+        expect_positive(sigma_space=sigma_space, mixed=mixed)
+        expect_window(radius=radius)
         for name, value in (("candidates", candidates), ("iterations", iterations), ("radius", radius)):
             if value < 1:
                 raise ValueError(f"{name}: expected at least 1 for edge-guided upsampling, got {value}")
@@ -278,7 +275,7 @@ class EdgeGuided(Method):
                 sharp=number == len(stages) - 1,
             )
         doffs = sample.camera.doffs  # disparity + doffs is inverse depth
-        disparity = disparity.clamp((lowest + doffs) / _BEYOND - doffs, (highest + doffs) * _BEYOND - doffs)
+        disparity = disparity.clamp((lowest + doffs) / BEYOND - doffs, (highest + doffs) * BEYOND - doffs)
         if self._fill_holes:
             disparity = inpaint(disparity[None, None])[0, 0]
         return from_range(disparity[None], sample.camera, "disparity").to(sample.depth_lr)

@@ -46,7 +46,7 @@ from torch.nn import functional
 
 from dsr.methods.base import NoSolutionError
 from dsr.methods.classical.finite_differences import box_mean, extend_linearly, upsample_linear_border
-from dsr.methods.classical.photo_guided import estimate_slopes
+from dsr.methods.classical.guided_filter import estimate_slopes
 from dsr.methods.inpainting import inpaint
 from dsr.utils.progress import Steps
 
@@ -110,7 +110,7 @@ def detect_edges(lr: Tensor, scale: int, step: float) -> Tensor:
     along its direction and above a threshold, or above a lower one and connected with such a pixel. A step of height s
     between low-resolution pixels has a gradient of at least s / 2. A gradient counts only by how much it exceeds the
     slope of the surface (see
-    :func:`dsr.methods.classical.photo_guided.estimate_slopes`) there or at a neighbouring low-resolution pixel. So a
+    :func:`dsr.methods.classical.guided_filter.estimate_slopes`) there or at a neighbouring low-resolution pixel. So a
     plane has no edge, however steep it is, and neither has an inpainted hole.
     """
     hr = upsample_linear_border(inpaint(lr[None, None]), scale)[0, 0]
