@@ -3,13 +3,10 @@
 Xie, Feris, Sun, *Edge-Guided Single Depth Image Super Resolution*, IEEE TIP 25(1), 2016, the self-similar mode, which
 needs no training data. The map itself, downsampled once more, gives pairs of patches: edges found after upsampling, and
 the true ones. The candidates of each patch of edges in the upsampled map are the pairs most similar to it, and a Markov
-random field selects one of them: its data term is the squared distance of the patches' distance
-transforms plus ``sharp_weight``^2 times that of the sharp edges, by the number of pixels, and its smoothness term the
-squared difference of the true patches where two patches overlap. Loopy belief propagation finds the labels
-(:func:`label`). The mean of the chosen patches, where it is above ``KEPT``, is the edge map.
-
-As in the original: patches of 11 x 11 pixels in the self-similar mode, 5 candidates, weight 3, 100 iterations, a mean
-above 0.2, edges of less than 4 pixels dropped, pairs only if both have enough edge pixels and similar numbers of them.
+random field selects one of them: its data term is the squared distance of the patches' distance transforms plus
+``sharp_weight``^2 times that of the sharp edges, by the number of pixels, and its smoothness term the squared
+difference of the true patches where two patches overlap. The mean of the chosen patches, where it is above ``_KEPT``,
+is the edge map.
 
 What differs:
 
@@ -22,25 +19,17 @@ What differs:
 - Each cell of 2 x 2 pixels has at most one patch; the original scans, and skips the neighbours of each patch.
 - The edge map is thinned to lines one pixel wide. The map is extrapolated linearly, so that edges reach the border.
 
-The labels: Pearl, *Probabilistic Reasoning in Intelligent Systems*, 1988; min-sum is max-product in negative
-logarithms, as used by Freeman, Pasztor, Carmichael, *Learning Low-Level Vision*, IJCV 2000. The energy of labels x is
-
-    E(x) = sum over nodes i of unary_i(x_i) + sum over pairs (i, j) of cost_ij(x_i, x_j),
-
-the message from i to j is m_ij(x_j) = min over x_i of unary_i(x_i) + cost_ij(x_i, x_j) + the messages to i from nodes
-other than j, less its minimum. A node's label minimises unary_i plus all messages to it. On trees this is the minimum;
-on other graphs it is an approximation, and the best labels so far are kept. Messages are damped by one half, because
-they may oscillate on loops.
-
-Sums run in the order of the pairs, on any device: equal input gives equal labels. Memory: for each pair, 4 messages of
-K values and K x K costs, with K labels.
+Equal input gives equal labels, on any device. Memory: for each pair of overlapping patches, 4 messages of K values and
+K x K costs, with K candidates.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from scipy import ndimage
 from torch import Tensor
 from torch.nn import functional
 
@@ -48,14 +37,14 @@ from dsr.methods.base import NoSolutionError
 from dsr.methods.classical.finite_differences import box_mean, extend_linearly, upsample_linear_border
 from dsr.methods.classical.guided_filter import estimate_slopes
 from dsr.methods.inpainting import inpaint
-from dsr.utils.progress import Steps
+from dsr.utils.progress import Steps, ignore
 
 PATCH = 11  # rows and columns of a patch, in high-resolution pixels
 _ENTRIES = 2**24  # maximum number of distances between patches in memory
 _BITS = 62  # pixels per 64-bit word, without its sign
 _MOVE = 0.5  # damping factor of messages; 1 would be undamped
-CHECK_EVERY = 5  # iterations between two evaluations of the labels
-KEPT = 0.2  # fraction of the chosen patches from which a pixel is an edge
+_CHECK_EVERY = 5  # iterations between two evaluations of the labels
+_KEPT = 0.2  # fraction of the chosen patches from which a pixel is an edge
 _WEAK = 0.4  # Canny's lower threshold relative to the upper one
 _CELL = 2  # side in pixels of the cells with at most one patch each
 _SMALLEST = 4  # minimum number of edge pixels around an edge pixel, itself included
@@ -72,17 +61,17 @@ def predict_edge_map(
     smoothness: float = 1.0,
     iterations: int = 100,
     progress: Steps | None = None,
-) -> tuple[Tensor, Labelling | None]:
-    """Return the edge map of a map (h, w), NaN in holes, (h * scale, w * scale) bool, and its labelling.
+) -> tuple[Tensor, list[dict[str, float]]]:
+    """Return the edge map of a map (h, w), NaN in holes, (h * scale, w * scale) bool, and :func:`label`'s history.
 
     ``step`` is the minimum height of an edge in the map's unit; the others are as for
-    :class:`dsr.methods.classical.edge_guided.EdgeGuided`. The labelling is None without an edge.
+    :class:`dsr.methods.classical.edge_guided.EdgeGuided`. The history is empty without an edge.
     """
     border = -(-(PATCH // 2 + 1) // scale)
     edges = detect_edges(extend_linearly(lr[None, None], border)[0, 0], scale, step)
     within = (slice(border * scale, -border * scale),) * 2
     if not bool(edges[within].any()):
-        return torch.zeros_like(edges[within]), None
+        return torch.zeros_like(edges[within]), []
     examples = find_recurring(lr, scale, step)
     if len(examples.low) == 0:
         raise NoSolutionError(
@@ -93,25 +82,24 @@ def predict_edge_map(
     distances, indices = find_nearest(extract_patches(edges, places), examples, candidates, sharp_weight)
     patches = examples.high.flatten(1)[indices].float()  # (N, K, PATCH^2)
     pairs, costs = find_overlaps(places, patches)
-    answer = label(distances / PATCH**2, pairs, smoothness * costs, iterations, progress=progress)
-    chosen = patches[torch.arange(len(patches), device=patches.device), answer.labels]
+    labels, history = label(distances / PATCH**2, pairs, smoothness * costs, iterations, progress=progress)
+    chosen = patches[torch.arange(len(patches), device=patches.device), labels]
     total, number = chosen.new_zeros(edges.shape), chosen.new_zeros(edges.shape)  # of the patches that cover a pixel
     for k in range(PATCH**2):  # for one k, all patches touch different pixels
         rows, columns = places[:, 0] + k // PATCH - PATCH // 2, places[:, 1] + k % PATCH - PATCH // 2
         total[rows, columns] += chosen[:, k]
         number[rows, columns] += 1
-    return _drop_small(thin(total / number.clamp(min=1) > KEPT))[within], answer
+    return _drop_small(thin(total / number.clamp(min=1) > _KEPT))[within], history
 
 
 def detect_edges(lr: Tensor, scale: int, step: float) -> Tensor:
     """Return the edges of a map, (h, w), upsampled by ``scale``, (h * scale, w * scale) bool, about one pixel wide.
 
-    Canny, *A Computational Approach to Edge Detection*, PAMI 1986: pixels whose gradient is a maximum
-    along its direction and above a threshold, or above a lower one and connected with such a pixel. A step of height s
-    between low-resolution pixels has a gradient of at least s / 2. A gradient counts only by how much it exceeds the
-    slope of the surface (see
-    :func:`dsr.methods.classical.guided_filter.estimate_slopes`) there or at a neighbouring low-resolution pixel. So a
-    plane has no edge, however steep it is, and neither has an inpainted hole.
+    Canny, *A Computational Approach to Edge Detection*, PAMI 1986: pixels whose gradient is a maximum along its
+    direction and above a threshold, or above a lower one and connected with such a pixel. A step of height s between
+    low-resolution pixels has a gradient of at least s / 2. A gradient counts only by how much it exceeds the slope of
+    the surface there or at a neighbouring low-resolution pixel. So a plane has no edge, however steep it is, and
+    neither has an inpainted hole.
     """
     hr = upsample_linear_border(inpaint(lr[None, None]), scale)[0, 0]
     down, across = (_central_difference(hr, axis) * scale for axis in (0, 1))
@@ -124,12 +112,9 @@ def detect_edges(lr: Tensor, scale: int, step: float) -> Tensor:
     ridge = torch.minimum(strength, most) * (
         (strength > ring.gather(0, turn)[0]) & (strength >= ring.gather(0, turn + 4)[0])
     )
-    weak = ridge > _WEAK * step / 2
-    grown, new = torch.zeros_like(weak), (ridge > step / 2) & weak
-    while not bool((new == grown).all()):  # the weak pixels that are connected with strong ones
-        grown = new
-        new = weak & (functional.max_pool2d(grown[None, None].float(), 3, stride=1, padding=1)[0, 0] > 0)
-    return _drop_small(grown)
+    weak, strong = ((ridge > share * step / 2).cpu().numpy() for share in (_WEAK, 1))
+    connected = ndimage.binary_propagation(strong, np.ones((3, 3)), weak)
+    return _drop_small(torch.from_numpy(connected).to(lr.device))
 
 
 def find_recurring(lr: Tensor, scale: int, step: float) -> Patches:
@@ -189,11 +174,9 @@ def _patch_centres(edges: Tensor) -> Tensor:
     """Return the first edge pixel of each cell whose patch lies inside the map, (N, 2)."""
     half = PATCH // 2
     places = edges[half:-half, half:-half].nonzero() + half
-    number = places[:, 0] // _CELL * edges.shape[1] + places[:, 1] // _CELL
-    order = number.argsort(stable=True)
-    first = torch.ones_like(number, dtype=torch.bool)
-    first[1:] = number[order].diff() != 0
-    return places[order[first].sort().values]
+    cells = places[:, 0] // _CELL * edges.shape[1] + places[:, 1] // _CELL
+    _, first = np.unique(cells.cpu().numpy(), return_index=True)
+    return places[torch.from_numpy(np.sort(first)).to(places.device)]
 
 
 class Patches(NamedTuple):
@@ -282,19 +265,6 @@ def _features(low: Tensor, high: Tensor, weight: float) -> Tensor:
     return torch.cat((edge_distances(low).flatten(1), weight * high.flatten(1).float()), dim=1)
 
 
-class Labelling(NamedTuple):
-    """Labels (N,), their energy, whether the messages converged, and the history.
-
-    Each entry of ``history`` has ``iteration``, ``objective`` (the energy) and ``moved`` (the largest change of a
-    message, relative to the largest cost).
-    """
-
-    labels: Tensor
-    energy: float
-    converged: bool
-    history: list[dict[str, float]]
-
-
 def label(
     unary: Tensor,
     pairs: Tensor,
@@ -302,46 +272,50 @@ def label(
     iterations: int = 100,
     tolerance: float = 1e-3,
     progress: Steps | None = None,
-) -> Labelling:
-    """Return the labels that min-sum belief propagation finds.
+) -> tuple[Tensor, list[dict[str, float]]]:
+    """Return labels, (N,), that have a low :func:`energy`, and the history of min-sum belief propagation.
+
+    Pearl, *Probabilistic Reasoning in Intelligent Systems*, 1988; min-sum is max-product in negative logarithms. The
+    message from i to j is m_ij(x_j) = min over x_i of unary_i(x_i) + cost_ij(x_i, x_j) + the messages to i from nodes
+    other than j, less its minimum. A node's label minimises unary_i plus all messages to it. On trees this is the
+    minimum; on other graphs it is an approximation, and the best labels so far are kept. Messages are damped by one
+    half, because they may oscillate on loops.
 
     The costs of each node's labels are ``unary`` (N, K), and ``costs`` (E, K, K) those of the labels of the first and
     the second node of each pair (E, 2). It stops if no message changes by more than the tolerance, times the largest
-    cost.
+    cost. An entry of the history has ``iteration``, ``objective`` (the energy) and ``moved`` (the largest change of a
+    message, relative to the largest cost).
     """
-    count, labels = unary.shape
-    unit = float(costs.abs().max()) if len(costs) else 0.0
-    unit = unit if unit > 0 else 1.0
+    report = progress or ignore
+    unit = (float(costs.abs().max()) if len(costs) else 0.0) or 1.0
     sources = torch.cat((pairs[:, 0], pairs[:, 1]))
     both = torch.cat((costs, costs.mT))  # (2E, K, K): the source's labels, the target's
-    heard = _incoming(torch.cat((pairs[:, 1], pairs[:, 0])), count)
-    silence = unary.new_zeros(1, labels)
-    messages = unary.new_zeros(2 * len(pairs), labels)
-    best, least, history = unary.argmin(dim=1), torch.inf, []
-    moved = 0.0
+    heard = _incoming(torch.cat((pairs[:, 1], pairs[:, 0])), len(unary))
+    silence = torch.zeros_like(unary[:1])
+    messages = unary.new_zeros(2 * len(pairs), unary.shape[1])
+    beliefs, best, least, history = unary, unary.argmin(dim=1), torch.inf, []
     for done in range(1, iterations + 1):
-        beliefs = unary + torch.cat((messages, silence))[heard].sum(dim=1)
         others = beliefs[sources] - messages.roll(len(pairs), 0)  # less the target's message
         new = (others[:, :, None] + both).amin(dim=1)
         step = (new - new.amin(dim=1, keepdim=True) - messages) * _MOVE
         messages = messages + step
+        beliefs = unary + torch.cat((messages, silence))[heard].sum(dim=1)
         moved = float(step.abs().max()) / unit if len(step) else 0.0
         settled = moved <= tolerance
-        if settled or done % CHECK_EVERY == 0 or done == iterations:
-            found = (unary + torch.cat((messages, silence))[heard].sum(dim=1)).argmin(dim=1)
+        if settled or done % _CHECK_EVERY == 0 or done == iterations:
+            found = beliefs.argmin(dim=1)
             now = energy(found, unary, pairs, costs)
             history.append({"iteration": float(done), "objective": now, "moved": moved})
             if now < least:
                 best, least = found, now
-            if progress is not None:
-                progress(iterations if settled else done, iterations)
+            report(iterations if settled else done, iterations)
         if settled:
             break
-    return Labelling(best, least, moved <= tolerance, history)
+    return best, history
 
 
 def energy(labels: Tensor, unary: Tensor, pairs: Tensor, costs: Tensor) -> float:
-    """Return E of labels (N,)."""
+    """Return the energy of labels, (N,): the sum of their own costs and of those of the pairs."""
     alone = unary.gather(1, labels[:, None]).sum()
     first, second = labels[pairs[:, 0]], labels[pairs[:, 1]]
     return float(alone + costs[torch.arange(len(pairs), device=pairs.device), first, second].sum())
