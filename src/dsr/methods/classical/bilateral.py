@@ -12,7 +12,7 @@ Kopf, Cohen, Lischinski, Uyttendaele, *Joint Bilateral Upsampling*, SIGGRAPH 200
 with Gaussians f of the distance in low-resolution pixels and g of the colour difference, and the sum k_p of the
 weights. What differs: I_q is the mean colour over the low-resolution pixel, as low-resolution depth is a mean. Weights
 of each pixel are scaled so that the largest is 1: a pixel unlike all around it takes the value of its most similar
-neighbours. Time grows as H * W * (2 * radius + 1)^2; memory peaks at about 20 maps of H * W float64 values.
+neighbours.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import RangeType
-from dsr.methods.base import Abilities, Cost
-from dsr.methods.classical.guided_filter import Guided, GuidedMethod, expect_positive, expect_window
+from dsr.methods.base import Abilities, Cost, expect_positive
+from dsr.methods.classical.guided_filter import Guided, GuidedMethod, expect_window
 from dsr.methods.inpainting import inpaint
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps

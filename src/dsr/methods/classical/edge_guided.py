@@ -19,9 +19,7 @@ and k_p the sum of the weights. The colour image is not used. What differs from 
 - The scale is split into prime factors, because more patches recur between neighbouring scales. Pixels on edges take
   sides only in the last stage; after the other stages they count as ``mixed`` and have no slope.
 
-There is no solution for a map with edges that do not recur at half its size, such as one too small for patches: see
-:class:`dsr.methods.base.NoSolutionError`. Memory: about 27 float64 maps of the image's size, at most 2^24 distances of
-4 bytes, and a part that grows with the edge pixels; for a statue before a wall at 512 x 512, 165 maps in total.
+There is no solution for a map with edges that do not recur at half its size, such as one too small for patches.
 """
 
 from __future__ import annotations
@@ -32,10 +30,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.camera import from_range
-from dsr.methods.base import Abilities, Cost, Method, whole_scale
+from dsr.methods.base import Abilities, Cost, Method, expect_positive, whole_scale
 from dsr.methods.classical.edge_map import predict_edge_map
 from dsr.methods.classical.finite_differences import box_mean, repeat_blocks, upsample_linear_border
-from dsr.methods.classical.guided_filter import BEYOND, estimate_slopes, expect_positive, expect_window
+from dsr.methods.classical.guided_filter import BEYOND, estimate_slopes, expect_window
 from dsr.methods.inpainting import inpaint
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps, ignore, part_of
@@ -77,13 +75,11 @@ def bilateral_filter(
 
 
 def find_reachable(barrier: Tensor, scale: int, radius: int) -> Tensor:
-    """Return which low-resolution pixels each high-resolution pixel reaches by a path that crosses no edge.
+    """Return which low-resolution pixels each high-resolution pixel reaches, (2 radius + 1, 2 radius + 1, H, W) bool.
 
-    A path starts in the middle of the low-resolution pixel, runs over 4-connected high-resolution pixels off the edges
-    of the barrier, (H, W) bool, and stays within the low-resolution pixels at most ``radius`` rows and columns away.
-
-    Returns (2 radius + 1, 2 radius + 1, H, W) bool: [radius + a, radius + b] is for the low-resolution pixel a rows
-    below and b columns right of the one that contains the high-resolution pixel.
+    [radius + a, radius + b] is for the low-resolution pixel a rows below and b columns right of the pixel's own. A path
+    starts in its middle, runs over 4-connected high-resolution pixels off the edges of the barrier, (H, W) bool, and
+    stays within the low-resolution pixels at most ``radius`` rows and columns away.
     """
     height, width = barrier.shape[0] // scale, barrier.shape[1] // scale
     side, edge = 2 * radius + 1, radius * scale
@@ -204,12 +200,9 @@ class EdgeGuided(Method):
         *,
         fill_holes: bool = False,
     ) -> None:
-        expect_positive(step=step, sharp_weight=sharp_weight, smoothness=smoothness)
-        expect_positive(sigma_space=sigma_space, mixed=mixed)
+        expect_positive(step=step, candidates=candidates, sharp_weight=sharp_weight, smoothness=smoothness)
+        expect_positive(iterations=iterations, sigma_space=sigma_space, mixed=mixed)
         expect_window(radius=radius)
-        for name, value in (("candidates", candidates), ("iterations", iterations), ("radius", radius)):
-            if value < 1:
-                raise ValueError(f"{name}: expected at least 1, got {value}")
         self._step, self._candidates, self._sharp_weight, self._smoothness = step, candidates, sharp_weight, smoothness
         self._iterations, self._radius, self._sigma_space, self._mixed = iterations, radius, sigma_space, mixed
         self._fill_holes = fill_holes
@@ -220,34 +213,21 @@ class EdgeGuided(Method):
         """Return the high-resolution depth, (1, H, W) in metres in the precision of the low-resolution depth."""
         disparity = disparity_lr = sample.disparity_lr(torch.float64)[0]
         lowest, highest = (float(bound) for bound in disparity_lr[disparity_lr.isfinite()].aminmax())
+        step = self._step * (highest - lowest)
         self.history = []
         stages = prime_factors(whole_scale(sample))
         barrier: Tensor | None = None
         for number, scale in enumerate(stages):
             report = part_of(progress, number * self._iterations, len(stages) * self._iterations) or ignore
-            doubtful = barrier
+            doubtful, last = barrier, number == len(stages) - 1
             barrier, history = predict_edge_map(
-                disparity,
-                scale,
-                self._step * (highest - lowest),
-                self._candidates,
-                self._sharp_weight,
-                self._smoothness,
-                self._iterations,
-                report,
+                disparity, scale, step, self._candidates, self._sharp_weight, self._smoothness, self._iterations, report
             )
             report(self._iterations, self._iterations)
             done = self.history[-1]["iteration"] if self.history else 0.0
             self.history += [{**entry, "iteration": entry["iteration"] + done} for entry in history]
             disparity = bilateral_filter(
-                disparity,
-                barrier,
-                scale,
-                self._radius,
-                self._sigma_space,
-                self._mixed,
-                doubtful=doubtful,
-                sharp=number == len(stages) - 1,
+                disparity, barrier, scale, self._radius, self._sigma_space, self._mixed, doubtful=doubtful, sharp=last
             )
         doffs = sample.camera.doffs  # disparity + doffs is inverse depth
         disparity = disparity.clamp((lowest + doffs) / BEYOND - doffs, (highest + doffs) * BEYOND - doffs)

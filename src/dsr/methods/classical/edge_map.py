@@ -11,21 +11,16 @@ is the edge map.
 What differs:
 
 - Edges are Canny's edges of the bicubic map, whose inflection lines locate a step of block means within a
-  low-resolution pixel. In the original, a map holds single samples, each repeated as a block, and a shock filter makes
-  a second, sharper edge map for the data term. As that filter does not move inflection lines, one map serves for both
-  here.
-- The slope of the surface does not count as a step.
+  low-resolution pixel. In the original, a shock filter makes a second, sharper edge map for the data term; it does not
+  move inflection lines, so one map serves for both here. The slope of the surface does not count as a step.
 - Pairs are used in the 8 exact orientations of the grid, not rotated by multiples of 18 degrees.
 - Each cell of 2 x 2 pixels has at most one patch; the original scans, and skips the neighbours of each patch.
 - The edge map is thinned to lines one pixel wide. The map is extrapolated linearly, so that edges reach the border.
 
-Equal input gives equal labels, on any device. Memory: for each pair of overlapping patches, 4 messages of K values and
-K x K costs, with K candidates.
+Equal input gives equal labels, on any device.
 """
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -73,14 +68,14 @@ def predict_edge_map(
     if not bool(edges[within].any()):
         return torch.zeros_like(edges[within]), []
     examples = find_recurring(lr, scale, step)
-    if len(examples.low) == 0:
+    if len(examples) == 0:
         raise NoSolutionError(
             f"edge-guided upsampling: the edges of a map of {lr.shape[0]} x {lr.shape[1]} pixels do not recur "
             f"at 1/{scale} of its size, so nothing shows how high-resolution ones look"
         )
     places = _patch_centres(edges)
     distances, indices = find_nearest(extract_patches(edges, places), examples, candidates, sharp_weight)
-    patches = examples.high.flatten(1)[indices].float()  # (N, K, PATCH^2)
+    patches = examples[:, 1].flatten(1)[indices].float()  # (N, K, PATCH^2)
     pairs, costs = find_overlaps(places, patches)
     labels, history = label(distances / PATCH**2, pairs, smoothness * costs, iterations, progress=progress)
     chosen = patches[torch.arange(len(patches), device=patches.device), labels]
@@ -117,21 +112,23 @@ def detect_edges(lr: Tensor, scale: int, step: float) -> Tensor:
     return _drop_small(torch.from_numpy(connected).to(lr.device))
 
 
-def find_recurring(lr: Tensor, scale: int, step: float) -> Patches:
-    """Return the pairs of patches of a map, (h, w), downsampled by ``scale``; none if it is too small."""
+def find_recurring(lr: Tensor, scale: int, step: float) -> Tensor:
+    """Return pairs of patches of a map, (h, w), downsampled by ``scale``, (N, 2, PATCH, PATCH) bool.
+
+    The first of a pair has the edges of the upsampled map, the second the true ones. There is none in a map too small.
+    """
     height, width = (n - n % scale for n in lr.shape)
     if min(height, width) < max(PATCH, 2 * scale):
-        none = torch.zeros(0, PATCH, PATCH, dtype=torch.bool, device=lr.device)
-        return Patches(none, none)
+        return torch.zeros(0, 2, PATCH, PATCH, dtype=torch.bool, device=lr.device)
     truth = lr[:height, :width]
     low, high = detect_edges(box_mean(truth[None, None], scale)[0, 0], scale, step), detect_edges(truth, 1, step)
     half = PATCH // 2
     places = low[half : height - half, half : width - half].nonzero() + half
-    lows, highs = extract_patches(low, places), extract_patches(high, places)
-    first, second = lows.sum(dim=(1, 2)), highs.sum(dim=(1, 2))
+    patches = torch.stack((extract_patches(low, places), extract_patches(high, places)), dim=1)
+    first, second = patches.sum(dim=(2, 3)).unbind(1)
     enough = min(2 * scale, PATCH - 3)
     kept = (first > enough) & (second > enough) & ((first - second).abs() < 0.8 * PATCH)
-    return deduplicate(Patches(orient(lows[kept]), orient(highs[kept])))
+    return deduplicate(orient(patches[kept]))
 
 
 def thin(mask: Tensor) -> Tensor:
@@ -179,13 +176,6 @@ def _patch_centres(edges: Tensor) -> Tensor:
     return places[torch.from_numpy(np.sort(first)).to(places.device)]
 
 
-class Patches(NamedTuple):
-    """Edges of an upsampled map, and the true edges at the same positions."""
-
-    low: Tensor
-    high: Tensor
-
-
 def extract_patches(mask: Tensor, places: Tensor) -> Tensor:
     """Return the patches of a mask, (H, W), around positions (N, 2), rows and columns, whose patches lie inside."""
     offsets = torch.arange(PATCH, device=mask.device) - PATCH // 2
@@ -193,20 +183,19 @@ def extract_patches(mask: Tensor, places: Tensor) -> Tensor:
 
 
 def orient(patches: Tensor) -> Tensor:
-    """Return patches under the 8 dihedral transforms, (8 N, PATCH, PATCH)."""
-    quarters = [patches.rot90(k, (1, 2)) for k in range(4)]
+    """Return patches, (N, ..., PATCH, PATCH), under the 8 dihedral transforms, (8 N, ..., PATCH, PATCH)."""
+    quarters = [patches.rot90(k, (-2, -1)) for k in range(4)]
     return torch.cat(quarters + [each.mT for each in quarters])
 
 
-def deduplicate(patches: Patches) -> Patches:
-    """Return the pairs without repetitions, sorted."""
-    pixels = 2 * PATCH**2
-    bits = torch.cat((patches.low.flatten(1), patches.high.flatten(1)), dim=1).long()
+def deduplicate(patches: Tensor) -> Tensor:
+    """Return the pairs of patches, (N, 2, PATCH, PATCH) bool, without repetitions, sorted."""
+    bits = patches.flatten(1).long()
     place = torch.arange(_BITS, device=bits.device)
-    words = (functional.pad(bits, (0, -pixels % _BITS)).unflatten(1, (-1, _BITS)) << place).sum(dim=2)
+    words = (functional.pad(bits, (0, -bits.shape[1] % _BITS)).unflatten(1, (-1, _BITS)) << place).sum(dim=2)
     words = torch.unique(words, dim=0)
-    bits = ((words[:, :, None] >> place) & 1).flatten(1)[:, :pixels]
-    return Patches(*bits.bool().unflatten(1, (2, PATCH, PATCH)).unbind(1))
+    bits = ((words[:, :, None] >> place) & 1).flatten(1)[:, : bits.shape[1]]
+    return bits.bool().unflatten(1, patches.shape[1:])
 
 
 def edge_distances(patches: Tensor) -> Tensor:
@@ -220,21 +209,23 @@ def edge_distances(patches: Tensor) -> Tensor:
     return (along[:, None] + square[:, :, None]).amin(dim=2).sqrt()
 
 
-def find_nearest(query: Tensor, examples: Patches, count: int, weight: float) -> tuple[Tensor, Tensor]:
+def find_nearest(query: Tensor, examples: Tensor, count: int, weight: float) -> tuple[Tensor, Tensor]:
     """Return the examples most similar to patches: squared distances and indices, (N, count) each, the best first.
 
     |D(query) - D(low)|^2 + weight^2 |query - high|^2, D being :func:`edge_distances`.
     """
-    features = _features(examples.low, examples.high, weight)
-    length = features.square().sum(dim=1)
-    distances, indices = [], []
-    for chunk in query.split(max(_ENTRIES // len(features), 1)):
-        query_features = _features(chunk, chunk, weight)
-        square = query_features.square().sum(dim=1, keepdim=True) + length - 2 * query_features @ features.T
-        least = square.clamp_(min=0).topk(min(count, len(features)), dim=1, largest=False)
-        distances.append(least.values)
-        indices.append(least.indices)
-    return torch.cat(distances), torch.cat(indices)
+
+    def features(low: Tensor, high: Tensor) -> Tensor:
+        return torch.cat((edge_distances(low).flatten(1), weight * high.flatten(1).float()), dim=1)
+
+    known = features(examples[:, 0], examples[:, 1])
+    length = known.square().sum(dim=1)
+    found = []
+    for chunk in query.split(max(_ENTRIES // len(known), 1)):
+        asked = features(chunk, chunk)
+        square = asked.square().sum(dim=1, keepdim=True) + length - 2 * asked @ known.T
+        found.append(square.clamp_(min=0).topk(min(count, len(known)), dim=1, largest=False))
+    return torch.cat([each.values for each in found]), torch.cat([each.indices for each in found])
 
 
 def find_overlaps(places: Tensor, patches: Tensor) -> tuple[Tensor, Tensor]:
@@ -259,10 +250,6 @@ def find_overlaps(places: Tensor, patches: Tensor) -> tuple[Tensor, Tensor]:
                 b = images[second][:, :, : PATCH - down, right : PATCH - left].flatten(2)
                 costs.append(a.square().sum(dim=2)[:, :, None] + b.square().sum(dim=2)[:, None] - 2 * a @ b.mT)
     return torch.cat(pairs), torch.cat(costs)
-
-
-def _features(low: Tensor, high: Tensor, weight: float) -> Tensor:
-    return torch.cat((edge_distances(low).flatten(1), weight * high.flatten(1).float()), dim=1)
 
 
 def label(

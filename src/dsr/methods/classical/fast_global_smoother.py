@@ -9,7 +9,7 @@ lambda_t = 3/2 * 4^(T - t) / (4^T - 1) * lambda. Sparse data and their index map
 the paper: the low-resolution map at the centres of its pixels (the four high-resolution pixels around a centre that
 lies between them). What differs: lambda is in units of the squared low-resolution pixel, so that one value fits all
 scales, and far smaller than the paper's, which blurs renderings. Without ``slopes``, as in the paper, renderings show
-a tent at each low-resolution pixel. Memory peaks at about 25 maps of H * W float64 values.
+a tent at each low-resolution pixel.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.methods.classical.guided_filter import Guided, GuidedMethod, expect_positive
+from dsr.methods.base import expect_positive
+from dsr.methods.classical.guided_filter import Guided, GuidedMethod
 
 # minimum smoothed confidence; below it digits are lost, and the result is the nearest low-resolution value
 _LEAST = 1e-200

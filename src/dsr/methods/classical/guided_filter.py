@@ -15,8 +15,7 @@ image, q_i = a_k . I_i + b_k with
 with the mean m_k and the 3 x 3 covariance S_k of the colours I, the input p (the bilinear interpolation of the
 low-resolution map) and the identity U. The result is q_i = mean(a_k) . I_i + mean(b_k) over the windows that contain i.
 What differs: means over a window weight pixels by their confidence, so that holes do not spread, and windows by their
-mean confidence. The radius is in low-resolution pixels. Time grows as H * W * radius * scale; memory peaks at about 50
-maps of H * W float64 values.
+mean confidence. The radius is in low-resolution pixels.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.camera import from_range
-from dsr.methods.base import Abilities, Cost, Method
+from dsr.methods.base import Abilities, Cost, Method, expect_positive
 from dsr.methods.inpainting import inpaint
 from dsr.methods.networks.normalisation import lr_coordinates
 from dsr.sample import DepthSample
@@ -199,17 +198,10 @@ def estimate_slopes(values: Tensor, axis: int) -> Tensor:
     return torch.stack((padded[:-2], slope, padded[2:])).median(dim=0).values.movedim(0, axis)
 
 
-def expect_positive(**values: float) -> None:
-    """Raise a ValueError for the first parameter that is not a positive finite number."""
-    for name, value in values.items():
-        if not 0 < value < float("inf"):
-            raise ValueError(f"{name}: expected a positive number, got {value}")
-
-
-def expect_window(**values: float) -> None:
+def expect_window(**options: float) -> None:
     """Raise a ValueError for the first window that is not positive, or wider than any map needs."""
-    expect_positive(**values)
-    for name, value in values.items():
+    expect_positive(**options)
+    for name, value in options.items():
         if value > _WIDEST:
             raise ValueError(f"{name}: expected at most {_WIDEST} low-resolution pixels, got {value}")
 

@@ -11,7 +11,7 @@ grows to its value in a few levels. Many are fused at once, in disjoint groups, 
 weight. Albedos are exactly constant, and no fusion of two of the resulting regions lowers E.
 
 The best albedo of a region is sum (shading * rgb) / sum shading^2 in each channel, clamped to 0 .. BRIGHTEST, because a
-shading near 0 does not determine it. Memory: about 60 maps of 8 bytes.
+shading near 0 does not determine it.
 """
 
 from __future__ import annotations

@@ -44,9 +44,8 @@ from torch import Tensor
 
 from dsr.geometry.camera import RangeType
 from dsr.geometry.surface import length
-from dsr.methods.base import Abilities, Cost, Method, expect_limits, whole_scale
+from dsr.methods.base import Abilities, Cost, Method, expect_positive, whole_scale
 from dsr.methods.classical.finite_differences import box_mean, repeat_blocks, upsample_linear_border
-from dsr.methods.classical.guided_filter import expect_positive
 from dsr.methods.classical.potts import Regions, boundary_length, fit_albedo, fuse
 from dsr.methods.inpainting import inpaint
 from dsr.sample import DepthSample
@@ -355,9 +354,8 @@ class ShapeFromShading(Method):
         growth: float = 1.3,
         foreground: str | None = None,
     ) -> None:
-        expect_limits(tolerance, iterations=iterations)
-        if not area_weight >= 0:
-            raise ValueError(f"area_weight: expected 0 or more, got {area_weight}")
+        expect_positive(iterations=iterations)
+        expect_positive(or_zero=True, tolerance=tolerance, area_weight=area_weight)
         if not 1 <= growth < float("inf"):
             raise ValueError(f"growth: expected at least 1, got {growth}")
         expect_positive(data_weight=data_weight, boundary_weight=boundary_weight, penalty=penalty)

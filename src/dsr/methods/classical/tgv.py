@@ -34,7 +34,7 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import from_range
-from dsr.methods.base import Abilities, Cost, Method, expect_limits, whole_scale
+from dsr.methods.base import Abilities, Cost, Method, expect_positive, whole_scale
 from dsr.methods.classical.finite_differences import (
     box_mean,
     divergence,
@@ -44,7 +44,6 @@ from dsr.methods.classical.finite_differences import (
     sum_adjacent,
     upsample_linear_border,
 )
-from dsr.methods.classical.guided_filter import expect_positive
 from dsr.methods.inpainting import inpaint
 from dsr.methods.networks.normalisation import normalise
 from dsr.methods.noise_level import estimate_sensor_noise
@@ -111,14 +110,12 @@ class TotalGeneralisedVariation(Method):
         exponent: float = 0.85,
         step_ratio: float = 1e4,
     ) -> None:
-        expect_limits(tolerance, iterations=iterations)
-        expect_positive(first=first, second=second, exponent=exponent, step_ratio=step_ratio)
+        expect_positive(iterations=iterations, first=first, second=second, exponent=exponent, step_ratio=step_ratio)
+        expect_positive(or_zero=True, tolerance=tolerance, sharpness=sharpness)
         if data_weight not in (None, "auto"):
             if isinstance(data_weight, str):
                 raise ValueError(f"data_weight: expected a number, auto or None, got {data_weight!r}")
             expect_positive(data_weight=data_weight)
-        if not sharpness >= 0:
-            raise ValueError(f"sharpness: expected 0 or more, got {sharpness}")
         self.iterations, self.tolerance = iterations, tolerance
         self.alpha1, self.alpha0, self.data_weight = first, second, data_weight
         self.sharpness, self.exponent, self.step_ratio = sharpness, exponent, step_ratio

@@ -32,7 +32,7 @@ from torch.utils.data import DataLoader
 
 from dsr.degradation.downsampling import Downsampling, downsample_depth, scene_generator
 from dsr.geometry.shading import comparison
-from dsr.methods.base import WORKSPACE, Abilities, Cost, Method, whole_scale
+from dsr.methods.base import WORKSPACE, Abilities, Cost, Method, expect_positive, whole_scale
 from dsr.methods.classical.finite_differences import grey
 from dsr.methods.networks.network import DTYPES, Precision
 from dsr.methods.networks.normalisation import compute_min_max, mean3x3
@@ -106,21 +106,16 @@ class DeepImagePrior(Method):
         """Check the options, and load the network of LPIPS."""
         self.device = torch.device(self.device)
         w = 1.0 if self.w == "auto" else self.w
+        expect_positive(steps=self.steps, learning_rate=self.learning_rate)
+        expect_positive(or_zero=True, border=self.border, input_noise=self.input_noise, perturbation=self.perturbation)
+        expect_positive(or_zero=True, w=w, w_intensity=self.w_intensity, validate_every=self.validate_every)
         layers = len(self.widths) == len(self.skips) > 0
         for name, expected, right in (
-            ("steps", "a positive number", self.steps > 0),
-            ("learning_rate", "a positive number", 0 < self.learning_rate < float("inf")),
             ("widths", "a positive number for each level", layers and min(self.widths) > 0),
             ("skips", "a positive number for each level", layers and min(self.skips) > 0),
-            ("border", "0 or a positive number", self.border >= 0),
-            ("input_noise", "0 or a positive number", 0 <= self.input_noise < float("inf")),
-            ("perturbation", "0 or a positive number", 0 <= self.perturbation < float("inf")),
             ("average", "0 or more and less than 1", 0 <= self.average < 1),
             ("data_loss", "lap1 or mse", self.data_loss in DATA_WEIGHTS),
             ("visual", "mse_v where w is 0, as for DIP", bool(w) or self.visual == "mse_v"),
-            ("w", "0 or a positive number", 0 <= w < float("inf")),
-            ("w_intensity", "0 or a positive number", 0 <= self.w_intensity < float("inf")),
-            ("validate_every", "0 or a positive number", self.validate_every >= 0),
             ("validate_every", "a positive number for oracle=true", self.validate_every > 0 or not self.oracle),
             ("precision", f"one of {', '.join(DTYPES)}", self.precision in DTYPES),
         ):  # fmt: skip
@@ -171,7 +166,7 @@ class DeepImagePrior(Method):
                 enable_checkpointing=False,
             )
             fit(trainer, module, _numbers(self.steps), val_dataloaders=_numbers(1))
-        return (module.average if module.best is None else module.best)[0].to(sample.depth_lr)
+        return module.best[0].to(sample.depth_lr)
 
 
 class PriorOptimisation(lightning.LightningModule):
@@ -215,8 +210,7 @@ class PriorOptimisation(lightning.LightningModule):
                 smoothed = SurfacePair(mean3x3(self.depth_lr), self.depth_lr, self.rays_lr)
                 self.w = match_weight(options.visual_loss, [smoothed])
         self.average = torch.zeros_like(self.grey)
-        self.best: Tensor | None = None
-        self.lowest = float("inf")
+        self.best, self.lowest = self.average, float("inf")  # the best one is a copy if the true depth chooses it
         self.metrics = None if options.metrics is None or self.truth is None else options.metrics().to(device)
         self.validation_scores: dict[str, dict[str, float]] = {}
         self.shown_scores: dict[str, dict[str, float]] = {}
