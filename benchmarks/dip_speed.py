@@ -24,7 +24,7 @@ from torch.nn import functional
 
 from dsr.data.rendered import SimGeo
 from dsr.degradation.downsampling import Downsampling, make_sample
-from dsr.methods.dip import skip_net
+from dsr.methods.dip import upsampler
 from dsr.methods.dip.upsampler import DeepImagePrior, PriorOptimisation
 from dsr.metrics.classes import visual_metrics
 from dsr.metrics.functional import SurfacePair
@@ -59,11 +59,11 @@ def module_of(
 def in_plain_layout(module: PriorOptimisation) -> tuple[Tensor, Tensor]:
     """Return what :meth:`PriorOptimisation.forward` does, without a memory layout of its own."""
     draws = torch.randn(module.start.shape, generator=module.generator, device=module.start.device)
-    before, skip_net.upsample_2x = skip_net.upsample_2x, library
+    before, upsampler.upsample_2x = upsampler.upsample_2x, library
     try:
         y = module.net(torch.addcmul(module.start, draws, module.spread).contiguous())
     finally:
-        skip_net.upsample_2x = before
+        upsampler.upsample_2x = before
     return module.near + (module.far - module.near) * y[:, :1].sigmoid(), y[:, 1:].sigmoid()
 
 
@@ -115,7 +115,7 @@ def grouped(net: nn.Module, images: int) -> nn.Module:
 def network_step(images: int, size: int, device: torch.device) -> Callable[[], None]:
     """Return a function that goes forward and back through the network of several images."""
     settings = DeepImagePrior(scale=4, downsampling=BOX)
-    net = grouped(skip_net.SkipNet(35, 2, settings.widths, settings.skips), images)
+    net = grouped(upsampler.SkipNet(35, 2, settings.widths, settings.skips), images)
     net = net.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     x = torch.rand(1, 35 * images, size, size, device=device).to(memory_format=torch.channels_last)
     mixed = fast_precision(device) == "bfloat16"

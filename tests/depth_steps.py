@@ -33,13 +33,6 @@ def holed() -> tuple[Array, Array]:
     return prediction, truth
 
 
-def step_beside_a_photo_edge() -> tuple[torch.Tensor, torch.Tensor]:
-    """Return a photo (3, 48, 64) of two colours, and the disparity (48, 64) of two planes that meet where they do."""
-    columns = torch.arange(64).expand(48, 64)
-    rgb = torch.where(columns < 32, 0.2, 0.8).double().expand(3, 48, 64).contiguous()
-    return rgb, torch.where(columns < 32, 5.0, 9.0).double()
-
-
 def pair_of(prediction: Array, truth: Array, camera: Camera = CAMERA) -> SurfacePair:
     """Return the pair of two maps (H, W), or two batches of them (B, H, W)."""
     maps = (torch.from_numpy(np.asarray(each)).view(-1, 1, *truth.shape[-2:]) for each in (prediction, truth))

@@ -14,8 +14,7 @@ from torch.nn import functional
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.degradation.holes import Blobs
 from dsr.geometry.camera import Camera
-from dsr.methods.dip.skip_net import SkipNet, levels_for, upsample_2x
-from dsr.methods.dip.upsampler import DeepImagePrior, PriorOptimisation
+from dsr.methods.dip.upsampler import DeepImagePrior, PriorOptimisation, SkipNet, levels_for, upsample_2x
 from dsr.methods.images import mean3x3
 from dsr.metrics.classes import visual_metrics
 from dsr.metrics.functional import SurfacePair, dssim_v, mse_v, rmse_v

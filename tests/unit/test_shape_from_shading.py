@@ -1,4 +1,4 @@
-"""Super-resolution from shading: closed forms, a dense reference, and steps that lower the energy."""
+"""Super-resolution from shading: closed forms, dense references, derivatives, and steps that lower the energy."""
 
 from __future__ import annotations
 
@@ -11,16 +11,23 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera, from_range
 from dsr.geometry.surface import depth_to_normals
 from dsr.methods.classical.interpolation import Interpolation
-from dsr.methods.classical.shape_from_shading import ShapeFromShading
-from dsr.methods.classical.srfs_admm import ShadingProblem, ShadingSolver, Slopes, compute_shading
+from dsr.methods.classical.shape_from_shading import (
+    ShadingSolver,
+    ShapeFromShading,
+    compute_shading,
+    compute_surface,
+    conjugate_gradients,
+    fit_lighting,
+)
 from dsr.sample import DepthSample, Scene
 
-LIGHT = ((0.35, -0.3, -0.55, 0.15), (0.3, -0.25, -0.5, 0.2), (0.25, -0.3, -0.5, 0.2))
+LIGHT = torch.tensor([[[0.35, -0.3, -0.55, 0.15], [0.3, -0.25, -0.5, 0.2], [0.25, -0.3, -0.5, 0.2]]]).double()
 
 
 def _camera(height: int, width: int, focal: float | None = None) -> Camera:
@@ -46,7 +53,7 @@ def _lit(depth: Tensor) -> Tensor:
     """Return the photo of a surface of one colour under LIGHT, (3, H, W)."""
     normals = depth_to_normals(depth[None, None], _camera(*depth.shape).rays()[None])
     colour = torch.tensor([0.8, 0.7, 0.6]).double()[:, None, None]
-    return (colour * compute_shading(normals, torch.tensor(LIGHT).double()[None])[0]).clamp(0, 1)
+    return (colour * compute_shading(normals, LIGHT)[0]).clamp(0, 1)
 
 
 def _sphere(size: int) -> Tensor:
@@ -87,7 +94,7 @@ def _solver(*, holes: bool = False, mask: bool = False) -> ShadingSolver:
     if mask:
         v, u = _grid(16, 16)
         inside = ((u - 7) ** 2 + (v - 8) ** 2 < 40)[None, None]
-        solver = ShadingSolver(solver.problem._replace(inside=inside), solver.weights, solver.z, solver.penalty)
+        solver = ShadingSolver(solver.problem._replace(inside=inside), solver.z, solver.penalty)
     rng = np.random.default_rng(1)
     solver.theta = solver.theta + 0.2 * torch.from_numpy(rng.normal(size=(1, 3, 16, 16))) * solver.problem.inside
     solver.missed = 0.1 * torch.from_numpy(rng.normal(size=(1, 3, 16, 16))) * solver.problem.inside
@@ -96,9 +103,9 @@ def _solver(*, holes: bool = False, mask: bool = False) -> ShadingSolver:
     return solver
 
 
-def _dense(operator: Callable[[Tensor], Tensor], count: int, shape: tuple[int, ...]) -> np.ndarray:
+def _dense(operator: Callable[[Tensor], Tensor], shape: tuple[int, ...]) -> np.ndarray:
     """Return an operator's matrix, a column an input."""
-    eye = torch.eye(count).double().reshape(count, 1, *shape)
+    eye = torch.eye(math.prod(shape)).double().unflatten(1, shape)
     return torch.stack([operator(each[None]).flatten() for each in eye], dim=1).numpy()
 
 
@@ -116,16 +123,9 @@ def test_normals_of_a_shaded_surface_are_better_than_those_of_bicubic(
 
 @pytest.mark.parametrize("mask", [False, True])
 def test_slopes_and_their_adjoint_have_transposed_matrices(mask: bool) -> None:
-    problem = _solver(mask=mask).problem
-    slopes = Slopes(problem)
-    forth = _dense(slopes, 256, (16, 16))
-    back = _adjoint(slopes)
-    np.testing.assert_allclose(back, forth.T, atol=1e-14)
-
-
-def _adjoint(slopes: Slopes) -> np.ndarray:
-    eye = torch.eye(768).double().reshape(768, 1, 3, 16, 16)
-    return torch.stack([slopes.adjoint(each).flatten() for each in eye], dim=1).numpy()
+    slopes = _solver(mask=mask).slopes
+    back = _dense(slopes.adjoint, (3, 16, 16))
+    np.testing.assert_allclose(back, _dense(slopes, (1, 16, 16)).T, atol=1e-14)
 
 
 @pytest.mark.parametrize(("holes", "mask"), [(False, False), (True, False), (False, True)])
@@ -138,13 +138,9 @@ def test_depth_step_is_the_least_squares_solution(holes: bool, mask: bool) -> No
     known = np.isfinite(lr)
     weights = np.array([1.0, 1.0, (problem.unit / 4) ** 2]).repeat(256) * np.tile(problem.inside.flatten().numpy(), 3)
     root = np.sqrt(solver.penalty * weights)[:, None]
-    matrix = np.concatenate((np.sqrt(solver.weights.data) * means[known], root * _dense(solver.slopes, 256, (16, 16))))
-    right = np.concatenate(
-        (
-            np.sqrt(solver.weights.data) * lr[known],
-            root[:, 0] * (solver.theta - solver.missed).flatten().numpy(),
-        )
-    )
+    data = np.sqrt(problem.data_weight)
+    matrix = np.concatenate((data * means[known], root * _dense(solver.slopes, (1, 16, 16))))
+    right = np.concatenate((data * lr[known], root[:, 0] * (solver.theta - solver.missed).flatten().numpy()))
     free = problem.inside.flatten().numpy()
     expected = before.copy()
     expected[free] = np.linalg.lstsq(matrix[:, free], right - matrix[:, ~free] @ before[~free], rcond=None)[0]
@@ -155,34 +151,37 @@ def test_depth_step_is_the_least_squares_solution(holes: bool, mask: bool) -> No
 @pytest.mark.parametrize(("holes", "mask"), [(False, False), (True, False), (False, True)])
 def test_augmented_lagrangian_is_raised_by_no_step_in_its_own_variable(holes: bool, mask: bool) -> None:
     solver = _solver(holes=holes, mask=mask)
-    lowered = {}
+    steps = (solver.update_albedo, solver.update_lighting, solver.update_theta, solver.update_depth)
+    lowered = dict.fromkeys(steps, 0.0)
     for turn in range(6):
-        steps = {
-            "albedo": lambda turn=turn: solver.update_albedo(anew=turn % 2 == 0),
-            "lighting": solver.update_lighting,
-            "theta": solver.update_theta,
-            "depth": solver.update_depth,
-        }
-        for name, step in steps.items():
-            before = solver.lagrangian()
-            step()
-            after = solver.lagrangian()
-            assert after <= before + 1e-9 * abs(before), (turn, name)
-            lowered[name] = lowered.get(name, 0.0) + before - after
+        for step in steps:
+            before = _lagrangian(solver)
+            step(**({"anew": turn % 2 == 0} if step == solver.update_albedo else {}))
+            after = _lagrangian(solver)
+            assert after <= before + 1e-9 * abs(before), (turn, step)
+            lowered[step] += before - after
         solver.update_missed(1.3)
     assert min(lowered.values()) > 0
 
 
-def test_theta_step_ends_where_the_gradient_is_small() -> None:
-    solver = _solver()
+def _lagrangian(solver: ShadingSolver) -> float:
+    miss = solver.slopes(solver.z) + solver.missed - solver.theta
+    bound = 0.5 * solver.penalty * float((solver.coupling * (miss.square() - solver.missed.square())).sum())
+    return sum(solver.terms(solver.theta).values()) + bound
+
+
+@pytest.mark.parametrize("mask", [False, True])
+def test_gradient_in_theta_is_that_of_the_energy_and_vanishes_after_some_steps(mask: bool) -> None:
+    solver = _solver(mask=mask)
+    target = solver.slopes(solver.z) + solver.missed
+    first, hessian = solver.expand_energy(solver.theta, target)
+    theta = solver.theta.clone().requires_grad_()
+    torch.testing.assert_close(torch.autograd.grad(solver.pixel_energy(theta, target).sum(), theta)[0], first)
+    assert bool((hessian[:, [0, 3, 5]] >= 0).all())
     for _ in range(20):
         solver.update_theta()
-    target = solver.slopes(solver.z) + solver.missed
-    theta = solver.theta.clone().requires_grad_()
-    (slope,) = torch.autograd.grad(solver._pixel_energy(theta, target).sum(), theta)
-    start = target.clone().requires_grad_()
-    (first,) = torch.autograd.grad(solver._pixel_energy(start, target).sum(), start)
-    assert float(slope.square().mean()) < 1e-3 * float(first.square().mean())
+    last, _ = solver.expand_energy(solver.theta, target)
+    assert float(last.square().mean()) < 1e-3 * float(first.square().mean())
 
 
 def test_level_plane_of_one_colour_is_reproduced_to_a_thousandth_of_its_depth() -> None:
@@ -215,15 +214,8 @@ def test_holes_are_filled_and_have_no_influence() -> None:
 def test_batch_equals_its_problems_one_at_a_time() -> None:
     solvers = [ShapeFromShading().prepare(_sample(*_random(16, 16, seed)))[0] for seed in (0, 1)]
     one, other = (solver.problem for solver in solvers)
-    both = ShadingProblem(
-        torch.cat((one.rgb, other.rgb)),
-        torch.cat((one.lr, other.lr)),
-        one.rays,
-        one.focal,
-        one.unit,
-        torch.cat((one.inside, other.inside)),
-    )
-    together = ShadingSolver(both, solvers[0].weights, torch.cat([solver.z for solver in solvers]), 0.02)
+    joined = {name: torch.cat((getattr(one, name), getattr(other, name))) for name in ("rgb", "lr", "inside")}
+    together = ShadingSolver(one._replace(**joined), torch.cat([solver.z for solver in solvers]), 0.02)
     for solver in (together, *solvers):
         for _ in range(2):
             solver.update_lighting()
@@ -293,3 +285,70 @@ def test_missing_damaged_empty_or_misfitting_mask_is_refused_by_name(tmp_path: P
 def test_value_out_of_range_is_refused_by_name(key: str, value: object) -> None:
     with pytest.raises(ValueError, match=rf"^{key}: expected .* {value}"):
         ShapeFromShading(**{key: value})  # type: ignore[arg-type]
+
+
+def test_rendering_converges_to_that_of_the_geometrys_normals() -> None:
+    errors = []
+    for size in (64, 128):
+        theta, depth, rays = _smooth_theta(size)
+        expected = compute_shading(depth_to_normals(depth, rays), LIGHT)
+        errors.append(float((compute_shading(compute_surface(theta, rays)[0], LIGHT) - expected).abs().max()))
+    assert errors[0] < 0.01
+    assert errors[1] == pytest.approx(errors[0] / 2, rel=0.1)  # of differences taken to one side
+
+
+def test_area_is_that_of_the_back_projected_pixels() -> None:
+    theta, depth, rays = _smooth_theta(256)
+    points, camera = (depth * rays)[0], _camera(256, 256)
+    along_u, along_v = points.diff(dim=2)[:, :-1], points.diff(dim=1)[:, :, :-1]
+    expected = torch.linalg.cross(along_u, along_v, dim=0).norm(dim=0)
+    ours = (depth * compute_surface(theta, rays)[1])[0, 0, :-1, :-1] / (camera.fx * camera.fy)
+    torch.testing.assert_close(ours, expected, rtol=0.02, atol=0)
+    assert float(ours.sum()) == pytest.approx(float(expected.sum()), rel=2e-3)
+
+
+def _smooth_theta(size: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return a smooth surface's slopes and depth, (1, 3, H, W), from forward differences, its depth, and the rays."""
+    camera = _camera(size, size)
+    rays = camera.rays()
+    depth = 2 + 0.3 * torch.sin(3 * rays[0]) * torch.cos(2 * rays[1]) + 0.2 * rays[0]
+    slopes = [
+        focal * torch.cat((depth.diff(dim=dim), depth.diff(dim=dim).narrow(dim, -1, 1)), dim)
+        for dim, focal in ((1, camera.fx), (0, camera.fy))
+    ]
+    return torch.stack((*slopes, depth))[None], depth[None, None], rays[None]
+
+
+def test_light_is_recovered_exactly_from_a_photo_without_noise() -> None:
+    rng = np.random.default_rng(0)
+    normals = functional.normalize(torch.from_numpy(rng.normal(size=(1, 3, 3, 4))), dim=1)
+    albedo = torch.from_numpy(rng.uniform(0.1, 1, (1, 3, 3, 4)))
+    rgb = albedo * compute_shading(normals, LIGHT)
+    inside = torch.ones(1, 1, 3, 4).double()
+    torch.testing.assert_close(fit_lighting(rgb, albedo, normals, inside), LIGHT)
+    rgb[..., 1:3, 2] = 0.7
+    inside[..., 1:3, 2] = 0
+    torch.testing.assert_close(fit_lighting(rgb, albedo, normals, inside), LIGHT)
+
+
+def test_light_on_a_flat_wall_is_the_smallest_that_explains_it() -> None:
+    normals = torch.tensor([0.0, 0.0, -1.0]).double()[:, None, None].expand(1, 3, 4, 5)
+    albedo = torch.ones(1, 1, 4, 5).double()
+    light = fit_lighting(0.6 * albedo, albedo, normals, torch.ones_like(albedo))
+    torch.testing.assert_close(light, torch.tensor([[[0.0, 0.0, -0.3, 0.3]]]).double())
+
+
+def test_conjugate_gradients_solve_each_element_of_a_batch_and_leave_a_solved_one_unchanged() -> None:
+    rng = np.random.default_rng(0)
+    root = torch.from_numpy(rng.normal(size=(3, 12, 12)))
+    matrices, right = root @ root.mT + torch.eye(12).double(), torch.from_numpy(rng.normal(size=(3, 12)))
+    right[0] = 0
+    found = conjugate_gradients(lambda x: (matrices @ x[..., None])[..., 0], right, 100, 1e-12)
+    torch.testing.assert_close(found[1:], torch.linalg.solve(matrices[1:], right[1:]))
+    assert torch.equal(found[0], torch.zeros(12).double())
+
+
+def test_conjugate_gradients_need_at_most_one_step_per_distinct_eigenvalue() -> None:
+    diagonal = torch.tensor([1.0, 1, 4, 4, 9, 9]).double()
+    right = torch.arange(1.0, 7.0).double()[None]
+    torch.testing.assert_close(conjugate_gradients(lambda x: diagonal * x, right, 3, 0.0), right / diagonal)

@@ -301,10 +301,8 @@ def whole_scale(sample: DepthSample) -> int:
     return sample.scale
 
 
-def expect_limits(tolerance: float, **counts: int) -> None:
-    """Check the stopping criteria of an iteration: a change, and maximum numbers of steps by the parameter's name."""
-    for name, count in counts.items():
-        if count < 1:
-            raise ValueError(f"{name}: expected at least 1, got {count}")
-    if not tolerance >= 0:
-        raise ValueError(f"tolerance: expected 0 or more, got {tolerance}")
+def expect_positive(*, or_zero: bool = False, **options: float) -> None:
+    """Raise a ValueError for the first option that is not a positive finite number, nor 0 if that is allowed."""
+    for name, value in options.items():
+        if not (0 < value < float("inf") or (or_zero and value == 0)):
+            raise ValueError(f"{name}: expected {'0 or ' if or_zero else ''}a positive number, got {value}")

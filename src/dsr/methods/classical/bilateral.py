@@ -2,7 +2,7 @@
 
 Tomasi and Manduchi, *Bilateral Filtering for Gray and Color Images*, ICCV 1998: a pixel becomes the mean of a round
 window, weighted by Gaussians of the distance and of the difference of depth. Where the photo has more pixels than the
-map, the filtered map is then interpolated as in :mod:`dsr.methods.classical.photo_guided`. Holes have no weight and
+map, the filtered map is then interpolated as in :mod:`dsr.methods.classical.guided_filter`. Holes have no weight and
 stay holes; with ``fill_holes`` they are inpainted after filtering. OpenCV filters, in float32.
 
 Kopf, Cohen, Lischinski, Uyttendaele, *Joint Bilateral Upsampling*, SIGGRAPH 2007:
@@ -12,7 +12,7 @@ Kopf, Cohen, Lischinski, Uyttendaele, *Joint Bilateral Upsampling*, SIGGRAPH 200
 with Gaussians f of the distance in low-resolution pixels and g of the colour difference, and the sum k_p of the
 weights. What differs: I_q is the mean colour over the low-resolution pixel, as low-resolution depth is a mean. Weights
 of each pixel are scaled so that the largest is 1: a pixel unlike all around it takes the value of its most similar
-neighbours. Time grows as H * W * (2 * radius + 1)^2; memory peaks at about 20 maps of H * W float64 values.
+neighbours.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import RangeType
-from dsr.methods.base import Abilities, Cost
-from dsr.methods.classical.photo_guided import Guided, GuidedMethod, expect_positive, expect_window
+from dsr.methods.base import Abilities, Cost, expect_positive
+from dsr.methods.classical.guided_filter import Guided, GuidedMethod, expect_window
 from dsr.methods.images import inpaint
 from dsr.sample import DepthSample
 from dsr.utils.progress import Steps
@@ -57,8 +57,8 @@ class Bilateral(GuidedMethod):
         self, window: int = 19, sigma_depth: float = 0.03, sigma_space: float = 3.0, *, fill_holes: bool = False
     ) -> None:
         super().__init__(fill_holes=fill_holes, slopes=True)
-        expect_window("the bilateral filter", window=window)
-        expect_positive("the bilateral filter", sigma_depth=sigma_depth, sigma_space=sigma_space)
+        expect_window(window=window)
+        expect_positive(sigma_depth=sigma_depth, sigma_space=sigma_space)
         self._window, self._sigma_depth, self._sigma_space = window, sigma_depth, sigma_space
 
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
@@ -89,7 +89,7 @@ class JointBilateral(GuidedMethod):
         radius: radius of the neighbourhood in low-resolution pixels.
         sigma_space: standard deviation of the distance's Gaussian, in low-resolution pixels.
         sigma_colour: standard deviation of the Gaussian of the Euclidean colour difference, colours in [0, 1].
-        fill_holes, slopes: see :class:`dsr.methods.classical.photo_guided.GuidedMethod`; a hole is filled by this
+        fill_holes, slopes: see :class:`dsr.methods.classical.guided_filter.GuidedMethod`; a hole is filled by this
             filter within the radius, and inpainted beyond it.
 
     """
@@ -106,49 +106,45 @@ class JointBilateral(GuidedMethod):
         slopes: bool = True,
     ) -> None:
         super().__init__(fill_holes=fill_holes, slopes=slopes)
-        expect_window("joint bilateral upsampling", radius=radius)
-        expect_positive("joint bilateral upsampling", sigma_space=sigma_space, sigma_colour=sigma_colour)
+        expect_window(radius=radius)
+        expect_positive(sigma_space=sigma_space, sigma_colour=sigma_colour)
         self._radius, self._sigma_space, self._sigma_colour = radius, sigma_space, sigma_colour
 
     def filter_maps(self, guided: Guided) -> Tensor:
         """Return the weighted means of the low-resolution maps, (N, H, W)."""
-        height, width = guided.valid.shape
         rgb_lr = _block_means(guided)
-        nearest = guided.nearest()
         largest = torch.full_like(guided.rgb[0], -torch.inf)
-        for exponent, _, _ in self._iterate_neighbours(guided, rgb_lr):
+        for exponent, _ in self._iterate_neighbours(guided, rgb_lr):
             torch.maximum(largest, exponent, out=largest)
         found = largest.isfinite()
         largest = torch.where(found, largest, 0)
         weights = torch.zeros_like(largest)
         totals = largest.new_zeros((len(guided.maps), *largest.shape))
-        for exponent, i, j in self._iterate_neighbours(guided, rgb_lr):
+        for exponent, at in self._iterate_neighbours(guided, rgb_lr):
             weight = exponent.sub_(largest).exp_()
             weights += weight
-            rows, columns = i.clamp(0, height - 1)[:, None], j.clamp(0, width - 1)
             for total, values in zip(totals, guided.maps, strict=True):
-                total.addcmul_(weight, values[rows, columns])
-        around = guided.maps[:, nearest[0][:, None], nearest[1]]
-        return torch.where(found, totals / torch.where(found, weights, 1), around)
+                total.addcmul_(weight, values[at])
+        rows, columns = guided.nearest()
+        return torch.where(found, totals / torch.where(found, weights, 1), guided.maps[:, rows[:, None], columns])
 
-    def _iterate_neighbours(self, guided: Guided, rgb_lr: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        """Yield the exponents of the weights, (H, W), the rows, (H,), and the columns, (W,), of each neighbour.
+    def _iterate_neighbours(self, guided: Guided, rgb_lr: Tensor) -> Iterator[tuple[Tensor, tuple[Tensor, Tensor]]]:
+        """Yield the exponents of the weights, (H, W), and the rows, (H, 1), and columns, (W,), of each neighbour.
 
-        The exponent is minus infinity where the neighbour is a hole or lies outside.
+        The exponent is minus infinity where the neighbour is a hole or lies outside; its index is clamped then.
         """
         height, width = guided.valid.shape
         i, j = guided.nearest()
         for down in range(-self._radius, self._radius + 1):
             for across in range(-self._radius, self._radius + 1):
                 rows, columns = i + down, j + across
-                kept_rows, kept_columns = rows.clamp(0, height - 1)[:, None], columns.clamp(0, width - 1)
+                at = rows.clamp(0, height - 1)[:, None], columns.clamp(0, width - 1)
                 squares = (guided.rows - rows).square()[:, None] + (guided.columns - columns).square()
                 exponent = squares / (-2 * self._sigma_space**2)
                 for channel, channel_lr in zip(guided.rgb, rgb_lr, strict=True):
-                    exponent -= (channel - channel_lr[kept_rows, kept_columns]).square() / (2 * self._sigma_colour**2)
-                inside = (rows == rows.clamp(0, height - 1))[:, None] & (columns == columns.clamp(0, width - 1))
-                counts = inside & (guided.valid[kept_rows, kept_columns] > 0)
-                yield exponent.masked_fill_(~counts, -torch.inf), rows, columns
+                    exponent -= (channel - channel_lr[at]).square() / (2 * self._sigma_colour**2)
+                inside = (rows[:, None] == at[0]) & (columns == at[1])
+                yield exponent.masked_fill_(~inside | (guided.valid[at] == 0), -torch.inf), at
 
 
 def _block_means(guided: Guided) -> Tensor:

@@ -19,42 +19,26 @@ and k_p the sum of the weights. The colour image is not used. What differs from 
 - The scale is split into prime factors, because more patches recur between neighbouring scales. Pixels on edges take
   sides only in the last stage; after the other stages they count as ``mixed`` and have no slope.
 
-There is no solution for a map with edges that do not recur at half its size, such as one too small for patches: see
-:class:`dsr.methods.base.NoSolutionError`. Memory: about 27 float64 maps of the image's size, at most 2^24 distances of
-4 bytes, and a part that grows with the edge pixels; for a statue before a wall at 512 x 512, 165 maps in total.
+There is no solution for a map with edges that do not recur at half its size, such as one too small for patches.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
+from scipy import ndimage
 from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.camera import from_range
-from dsr.methods.base import Abilities, Cost, Method, whole_scale
+from dsr.methods.base import Abilities, Cost, Method, expect_positive, whole_scale
 from dsr.methods.classical.edge_map import predict_edge_map
-from dsr.methods.classical.photo_guided import estimate_slopes, expect_positive, expect_window
+from dsr.methods.classical.guided_filter import BEYOND, estimate_slopes, expect_window
 from dsr.methods.images import box_mean, inpaint, repeat_blocks, upsample_linear_border
 from dsr.sample import DepthSample
-from dsr.utils.progress import Steps, part_of
+from dsr.utils.progress import Steps, ignore, part_of
 
-_CHUNK = 4096  # low-resolution pixels that are flooded at once
 # rows and columns from a pixel to its neighbours, the nearest first
 _BESIDE = ((-1, 0), (0, -1), (0, 1), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
-
-# factor by which a result may be farther than the farthest valid low-resolution pixel, or nearer than the nearest
-_BEYOND = 4.0
-
-
-class _Planes(NamedTuple):
-    """Planes of low-resolution pixels, each (h, w): value, slope per row and per column, and weight."""
-
-    values: Tensor
-    down: Tensor
-    across: Tensor
-    trust: Tensor
 
 
 def bilateral_filter(
@@ -79,7 +63,7 @@ def bilateral_filter(
     cut = functional.max_pool2d(barrier[None, None].float(), scale)[0, 0] > 0
     lr_certain = lr.masked_fill(doubtful, torch.nan)
     trust = torch.where(cut | doubtful, mixed, 1.0).to(lr) * valid
-    planes = _Planes(lr_inpainted[0, 0], estimate_slopes(lr_certain, 0), estimate_slopes(lr_certain, 1), trust)
+    planes = torch.stack((lr_inpainted[0, 0], estimate_slopes(lr_certain, 0), estimate_slopes(lr_certain, 1), trust))
     smooth = upsample_linear_border(lr_inpainted, scale)[0, 0]
     reachable = find_reachable(barrier, scale, radius)
     hr = _fill_edges(_filter(planes, reachable, scale, sigma_space, smooth), barrier, lr_inpainted, smooth, scale)
@@ -90,35 +74,35 @@ def bilateral_filter(
 
 
 def find_reachable(barrier: Tensor, scale: int, radius: int) -> Tensor:
-    """Return which low-resolution pixels each high-resolution pixel reaches by a path that crosses no edge.
+    """Return which low-resolution pixels each high-resolution pixel reaches, (2 radius + 1, 2 radius + 1, H, W) bool.
 
-    A path starts in the middle of the low-resolution pixel, runs over 4-connected high-resolution pixels off the edges
-    of the barrier, (H, W) bool, and stays within the low-resolution pixels at most ``radius`` rows and columns away.
-
-    Returns (2 radius + 1, 2 radius + 1, H, W) bool: [radius + a, radius + b] is for the low-resolution pixel a rows
-    below and b columns right of the one that contains the high-resolution pixel.
+    [radius + a, radius + b] is for the low-resolution pixel a rows below and b columns right of the pixel's own. A path
+    starts in its middle, runs over 4-connected high-resolution pixels off the edges of the barrier, (H, W) bool, and
+    stays within the low-resolution pixels at most ``radius`` rows and columns away.
     """
     height, width = barrier.shape[0] // scale, barrier.shape[1] // scale
     side, edge = 2 * radius + 1, radius * scale
     padded = functional.pad(barrier, (edge, edge, edge, edge), value=True)
     windows = padded.unfold(0, side * scale, scale).unfold(1, side * scale, scale).flatten(0, 1)
     ways = torch.ones_like(windows)
-    for chunk in windows.flatten(1).any(dim=1).nonzero()[:, 0].split(_CHUNK):
-        ways[chunk] = _flood(~windows[chunk])
-    ways = ways.view(height, width, side, scale, side, scale)
-    result = barrier.new_zeros(side, side, height, scale, width, scale)
-    for a in range(-radius, radius + 1):
-        rows, from_rows = _shift(a, height)
-        for b in range(-radius, radius + 1):
-            columns, from_columns = _shift(b, width)
-            there = ways[from_rows, from_columns, radius - a, :, radius - b]
-            result[radius + a, radius + b, rows, :, columns] = there.transpose(1, 2)
-    return result.view(side, side, *barrier.shape)
+    cut = windows.flatten(1).any(dim=1)
+    ways[cut] = _flood(~windows[cut])
+    ways = functional.pad(ways.view(height, width, -1), (0, 0, radius, radius, radius, radius))
+    ways = ways.unflatten(2, (side, scale, side, scale))
+    result = []
+    for a in range(side):
+        for b in range(side):
+            there = ways[a : a + height, b : b + width, side - 1 - a, :, side - 1 - b]  # (h, w, scale, scale)
+            result.append(there.transpose(1, 2).reshape(barrier.shape))
+    return torch.stack(result).unflatten(0, (side, side))
 
 
-def _filter(planes: _Planes, reachable: Tensor, scale: int, sigma_space: float, smooth: Tensor) -> Tensor:
-    """Return the weighted means of the planes, (H, W), and the smooth map where all weights are 0."""
-    height, width = planes.values.shape
+def _filter(planes: Tensor, reachable: Tensor, scale: int, sigma_space: float, smooth: Tensor) -> Tensor:
+    """Return the weighted means of planes, (H, W), and the smooth map where all weights are 0.
+
+    ``planes`` (4, h, w) are a value, a slope per row and one per column, and a weight of each low-resolution pixel.
+    """
+    height, width = planes.shape[1:]
     rows, columns = (torch.arange(n, device=smooth.device) for n in smooth.shape)
     y, x = ((n.to(smooth) + 0.5) / scale - 0.5 for n in (rows, columns))
     total, weights = torch.zeros_like(smooth), torch.zeros_like(smooth)
@@ -129,8 +113,9 @@ def _filter(planes: _Planes, reachable: Tensor, scale: int, sigma_space: float, 
             at = i.clamp(0, height - 1)[:, None], j.clamp(0, width - 1)  # nothing beyond the border is reachable
             down, across = (y - i)[:, None], x - j
             weight = torch.exp((down.square() + across.square()) / (-2 * sigma_space**2))
-            weight = weight * planes.trust[at] * reachable[radius + a, radius + b]
-            total += weight * (planes.values[at] + planes.down[at] * down + planes.across[at] * across)
+            value, slope_down, slope_across, trust = planes[:, *at]
+            weight = weight * trust * reachable[radius + a, radius + b]
+            total += weight * (value + slope_down * down + slope_across * across)
             weights += weight
     return torch.where(weights > 0, total / torch.where(weights > 0, weights, 1), smooth)
 
@@ -174,23 +159,10 @@ def _flood(free: Tensor) -> Tensor:
     """Return the pixels of windows, (N, K, K), that are 4-connected with the middle over free pixels."""
     size = free.shape[-1]
     middle = slice((size - 1) // 2, size // 2 + 1)
-    reached = torch.zeros_like(free)
-    reached[:, middle, middle] = free[:, middle, middle]
-    while True:
-        new = reached.clone()
-        new[:, 1:] |= reached[:, :-1]
-        new[:, :-1] |= reached[:, 1:]
-        new[:, :, 1:] |= reached[:, :, :-1]
-        new[:, :, :-1] |= reached[:, :, 1:]
-        new &= free
-        if bool((new == reached).all()):
-            return reached
-        reached = new
-
-
-def _shift(by: int, size: int) -> tuple[slice, slice]:
-    """Return the slice of a line whose pixels have a neighbour ``by`` pixels further on, and that of the neighbours."""
-    return slice(max(-by, 0), size - max(by, 0)), slice(max(by, 0), size - max(-by, 0))
+    start = torch.zeros_like(free)
+    start[:, middle, middle] = free[:, middle, middle]
+    within = ndimage.generate_binary_structure(2, 1)[None]  # a window's neighbours are no other windows
+    return torch.from_numpy(ndimage.binary_propagation(start.cpu().numpy(), within, free.cpu().numpy())).to(free.device)
 
 
 class EdgeGuided(Method):
@@ -227,12 +199,9 @@ class EdgeGuided(Method):
         *,
         fill_holes: bool = False,
     ) -> None:
-        expect_positive("edge-guided upsampling", step=step, sharp_weight=sharp_weight, smoothness=smoothness)
-        expect_positive("edge-guided upsampling", sigma_space=sigma_space, mixed=mixed)
-        expect_window("edge-guided upsampling", radius=radius)
-        for name, value in (("candidates", candidates), ("iterations", iterations), ("radius", radius)):
-            if value < 1:
-                raise ValueError(f"{name}: expected at least 1 for edge-guided upsampling, got {value}")
+        expect_positive(step=step, candidates=candidates, sharp_weight=sharp_weight, smoothness=smoothness)
+        expect_positive(iterations=iterations, sigma_space=sigma_space, mixed=mixed)
+        expect_window(radius=radius)
         self._step, self._candidates, self._sharp_weight, self._smoothness = step, candidates, sharp_weight, smoothness
         self._iterations, self._radius, self._sigma_space, self._mixed = iterations, radius, sigma_space, mixed
         self._fill_holes = fill_holes
@@ -241,43 +210,26 @@ class EdgeGuided(Method):
     @torch.inference_mode()
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
         """Return the high-resolution depth, (1, H, W) in metres in the precision of the low-resolution depth."""
-        disparity_lr = sample.disparity_lr(torch.float64)[0]
-        valid = disparity_lr.isfinite()
-        lowest, highest = (float(bound) for bound in disparity_lr[valid].aminmax())
+        disparity = disparity_lr = sample.disparity_lr(torch.float64)[0]
+        lowest, highest = (float(bound) for bound in disparity_lr[disparity_lr.isfinite()].aminmax())
+        step = self._step * (highest - lowest)
         self.history = []
-        disparity = disparity_lr
         stages = prime_factors(whole_scale(sample))
         barrier: Tensor | None = None
         for number, scale in enumerate(stages):
-            report = part_of(progress, number * self._iterations, len(stages) * self._iterations)
-            doubtful = barrier
-            barrier, answer = predict_edge_map(
-                disparity,
-                scale,
-                self._step * (highest - lowest),
-                self._candidates,
-                self._sharp_weight,
-                self._smoothness,
-                self._iterations,
-                report,
+            report = part_of(progress, number * self._iterations, len(stages) * self._iterations) or ignore
+            doubtful, last = barrier, number == len(stages) - 1
+            barrier, history = predict_edge_map(
+                disparity, scale, step, self._candidates, self._sharp_weight, self._smoothness, self._iterations, report
             )
-            if report is not None:
-                report(self._iterations, self._iterations)
+            report(self._iterations, self._iterations)
             done = self.history[-1]["iteration"] if self.history else 0.0
-            if answer is not None:
-                self.history += [{**entry, "iteration": entry["iteration"] + done} for entry in answer.history]
+            self.history += [{**entry, "iteration": entry["iteration"] + done} for entry in history]
             disparity = bilateral_filter(
-                disparity,
-                barrier,
-                scale,
-                self._radius,
-                self._sigma_space,
-                self._mixed,
-                doubtful=doubtful,
-                sharp=number == len(stages) - 1,
+                disparity, barrier, scale, self._radius, self._sigma_space, self._mixed, doubtful=doubtful, sharp=last
             )
         doffs = sample.camera.doffs  # disparity + doffs is inverse depth
-        disparity = disparity.clamp((lowest + doffs) / _BEYOND - doffs, (highest + doffs) * _BEYOND - doffs)
+        disparity = disparity.clamp((lowest + doffs) / BEYOND - doffs, (highest + doffs) * BEYOND - doffs)
         if self._fill_holes:
             disparity = inpaint(disparity[None, None])[0, 0]
         return from_range(disparity[None], sample.camera, "disparity").to(sample.depth_lr)

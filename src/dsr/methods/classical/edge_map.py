@@ -3,58 +3,42 @@
 Xie, Feris, Sun, *Edge-Guided Single Depth Image Super Resolution*, IEEE TIP 25(1), 2016, the self-similar mode, which
 needs no training data. The map itself, downsampled once more, gives pairs of patches: edges found after upsampling, and
 the true ones. The candidates of each patch of edges in the upsampled map are the pairs most similar to it, and a Markov
-random field selects one of them: its data term is the squared distance of the patches' distance
-transforms plus ``sharp_weight``^2 times that of the sharp edges, by the number of pixels, and its smoothness term the
-squared difference of the true patches where two patches overlap. Loopy belief propagation finds the labels
-(:func:`label`). The mean of the chosen patches, where it is above ``KEPT``, is the edge map.
-
-As in the original: patches of 11 x 11 pixels in the self-similar mode, 5 candidates, weight 3, 100 iterations, a mean
-above 0.2, edges of less than 4 pixels dropped, pairs only if both have enough edge pixels and similar numbers of them.
+random field selects one of them: its data term is the squared distance of the patches' distance transforms plus
+``sharp_weight``^2 times that of the sharp edges, by the number of pixels, and its smoothness term the squared
+difference of the true patches where two patches overlap. The mean of the chosen patches, where it is above ``_KEPT``,
+is the edge map.
 
 What differs:
 
 - Edges are Canny's edges of the bicubic map, whose inflection lines locate a step of block means within a
-  low-resolution pixel. In the original, a map holds single samples, each repeated as a block, and a shock filter makes
-  a second, sharper edge map for the data term. As that filter does not move inflection lines, one map serves for both
-  here.
-- The slope of the surface does not count as a step.
+  low-resolution pixel. In the original, a shock filter makes a second, sharper edge map for the data term; it does not
+  move inflection lines, so one map serves for both here. The slope of the surface does not count as a step.
 - Pairs are used in the 8 exact orientations of the grid, not rotated by multiples of 18 degrees.
 - Each cell of 2 x 2 pixels has at most one patch; the original scans, and skips the neighbours of each patch.
 - The edge map is thinned to lines one pixel wide. The map is extrapolated linearly, so that edges reach the border.
 
-The labels: Pearl, *Probabilistic Reasoning in Intelligent Systems*, 1988; min-sum is max-product in negative
-logarithms, as used by Freeman, Pasztor, Carmichael, *Learning Low-Level Vision*, IJCV 2000. The energy of labels x is
-
-    E(x) = sum over nodes i of unary_i(x_i) + sum over pairs (i, j) of cost_ij(x_i, x_j),
-
-the message from i to j is m_ij(x_j) = min over x_i of unary_i(x_i) + cost_ij(x_i, x_j) + the messages to i from nodes
-other than j, less its minimum. A node's label minimises unary_i plus all messages to it. On trees this is the minimum;
-on other graphs it is an approximation, and the best labels so far are kept. Messages are damped by one half, because
-they may oscillate on loops.
-
-Sums run in the order of the pairs, on any device: equal input gives equal labels. Memory: for each pair, 4 messages of
-K values and K x K costs, with K labels.
+Equal input gives equal labels, on any device.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
+import numpy as np
 import torch
+from scipy import ndimage
 from torch import Tensor
 from torch.nn import functional
 
 from dsr.methods.base import NoSolutionError
-from dsr.methods.classical.photo_guided import estimate_slopes
+from dsr.methods.classical.guided_filter import estimate_slopes
 from dsr.methods.images import box_mean, extend_linearly, inpaint, upsample_linear_border
-from dsr.utils.progress import Steps
+from dsr.utils.progress import Steps, ignore
 
 PATCH = 11  # rows and columns of a patch, in high-resolution pixels
 _ENTRIES = 2**24  # maximum number of distances between patches in memory
 _BITS = 62  # pixels per 64-bit word, without its sign
 _MOVE = 0.5  # damping factor of messages; 1 would be undamped
-CHECK_EVERY = 5  # iterations between two evaluations of the labels
-KEPT = 0.2  # fraction of the chosen patches from which a pixel is an edge
+_CHECK_EVERY = 5  # iterations between two evaluations of the labels
+_KEPT = 0.2  # fraction of the chosen patches from which a pixel is an edge
 _WEAK = 0.4  # Canny's lower threshold relative to the upper one
 _CELL = 2  # side in pixels of the cells with at most one patch each
 _SMALLEST = 4  # minimum number of edge pixels around an edge pixel, itself included
@@ -71,46 +55,45 @@ def predict_edge_map(
     smoothness: float = 1.0,
     iterations: int = 100,
     progress: Steps | None = None,
-) -> tuple[Tensor, Labelling | None]:
-    """Return the edge map of a map (h, w), NaN in holes, (h * scale, w * scale) bool, and its labelling.
+) -> tuple[Tensor, list[dict[str, float]]]:
+    """Return the edge map of a map (h, w), NaN in holes, (h * scale, w * scale) bool, and :func:`label`'s history.
 
     ``step`` is the minimum height of an edge in the map's unit; the others are as for
-    :class:`dsr.methods.classical.edge_guided.EdgeGuided`. The labelling is None without an edge.
+    :class:`dsr.methods.classical.edge_guided.EdgeGuided`. The history is empty without an edge.
     """
     border = -(-(PATCH // 2 + 1) // scale)
     edges = detect_edges(extend_linearly(lr[None, None], border)[0, 0], scale, step)
     within = (slice(border * scale, -border * scale),) * 2
     if not bool(edges[within].any()):
-        return torch.zeros_like(edges[within]), None
+        return torch.zeros_like(edges[within]), []
     examples = find_recurring(lr, scale, step)
-    if len(examples.low) == 0:
+    if len(examples) == 0:
         raise NoSolutionError(
             f"edge-guided upsampling: the edges of a map of {lr.shape[0]} x {lr.shape[1]} pixels do not recur "
             f"at 1/{scale} of its size, so nothing shows how high-resolution ones look"
         )
     places = _patch_centres(edges)
     distances, indices = find_nearest(extract_patches(edges, places), examples, candidates, sharp_weight)
-    patches = examples.high.flatten(1)[indices].float()  # (N, K, PATCH^2)
+    patches = examples[:, 1].flatten(1)[indices].float()  # (N, K, PATCH^2)
     pairs, costs = find_overlaps(places, patches)
-    answer = label(distances / PATCH**2, pairs, smoothness * costs, iterations, progress=progress)
-    chosen = patches[torch.arange(len(patches), device=patches.device), answer.labels]
+    labels, history = label(distances / PATCH**2, pairs, smoothness * costs, iterations, progress=progress)
+    chosen = patches[torch.arange(len(patches), device=patches.device), labels]
     total, number = chosen.new_zeros(edges.shape), chosen.new_zeros(edges.shape)  # of the patches that cover a pixel
     for k in range(PATCH**2):  # for one k, all patches touch different pixels
         rows, columns = places[:, 0] + k // PATCH - PATCH // 2, places[:, 1] + k % PATCH - PATCH // 2
         total[rows, columns] += chosen[:, k]
         number[rows, columns] += 1
-    return _drop_small(thin(total / number.clamp(min=1) > KEPT))[within], answer
+    return _drop_small(thin(total / number.clamp(min=1) > _KEPT))[within], history
 
 
 def detect_edges(lr: Tensor, scale: int, step: float) -> Tensor:
     """Return the edges of a map, (h, w), upsampled by ``scale``, (h * scale, w * scale) bool, about one pixel wide.
 
-    Canny, *A Computational Approach to Edge Detection*, PAMI 1986: pixels whose gradient is a maximum
-    along its direction and above a threshold, or above a lower one and connected with such a pixel. A step of height s
-    between low-resolution pixels has a gradient of at least s / 2. A gradient counts only by how much it exceeds the
-    slope of the surface (see
-    :func:`dsr.methods.classical.photo_guided.estimate_slopes`) there or at a neighbouring low-resolution pixel. So a
-    plane has no edge, however steep it is, and neither has an inpainted hole.
+    Canny, *A Computational Approach to Edge Detection*, PAMI 1986: pixels whose gradient is a maximum along its
+    direction and above a threshold, or above a lower one and connected with such a pixel. A step of height s between
+    low-resolution pixels has a gradient of at least s / 2. A gradient counts only by how much it exceeds the slope of
+    the surface there or at a neighbouring low-resolution pixel. So a plane has no edge, however steep it is, and
+    neither has an inpainted hole.
     """
     hr = upsample_linear_border(inpaint(lr[None, None]), scale)[0, 0]
     down, across = (_central_difference(hr, axis) * scale for axis in (0, 1))
@@ -123,29 +106,28 @@ def detect_edges(lr: Tensor, scale: int, step: float) -> Tensor:
     ridge = torch.minimum(strength, most) * (
         (strength > ring.gather(0, turn)[0]) & (strength >= ring.gather(0, turn + 4)[0])
     )
-    weak = ridge > _WEAK * step / 2
-    grown, new = torch.zeros_like(weak), (ridge > step / 2) & weak
-    while not bool((new == grown).all()):  # the weak pixels that are connected with strong ones
-        grown = new
-        new = weak & (functional.max_pool2d(grown[None, None].float(), 3, stride=1, padding=1)[0, 0] > 0)
-    return _drop_small(grown)
+    weak, strong = ((ridge > share * step / 2).cpu().numpy() for share in (_WEAK, 1))
+    connected = ndimage.binary_propagation(strong, np.ones((3, 3)), weak)
+    return _drop_small(torch.from_numpy(connected).to(lr.device))
 
 
-def find_recurring(lr: Tensor, scale: int, step: float) -> Patches:
-    """Return the pairs of patches of a map, (h, w), downsampled by ``scale``; none if it is too small."""
+def find_recurring(lr: Tensor, scale: int, step: float) -> Tensor:
+    """Return pairs of patches of a map, (h, w), downsampled by ``scale``, (N, 2, PATCH, PATCH) bool.
+
+    The first of a pair has the edges of the upsampled map, the second the true ones. There is none in a map too small.
+    """
     height, width = (n - n % scale for n in lr.shape)
     if min(height, width) < max(PATCH, 2 * scale):
-        none = torch.zeros(0, PATCH, PATCH, dtype=torch.bool, device=lr.device)
-        return Patches(none, none)
+        return torch.zeros(0, 2, PATCH, PATCH, dtype=torch.bool, device=lr.device)
     truth = lr[:height, :width]
     low, high = detect_edges(box_mean(truth[None, None], scale)[0, 0], scale, step), detect_edges(truth, 1, step)
     half = PATCH // 2
     places = low[half : height - half, half : width - half].nonzero() + half
-    lows, highs = extract_patches(low, places), extract_patches(high, places)
-    first, second = lows.sum(dim=(1, 2)), highs.sum(dim=(1, 2))
+    patches = torch.stack((extract_patches(low, places), extract_patches(high, places)), dim=1)
+    first, second = patches.sum(dim=(2, 3)).unbind(1)
     enough = min(2 * scale, PATCH - 3)
     kept = (first > enough) & (second > enough) & ((first - second).abs() < 0.8 * PATCH)
-    return deduplicate(Patches(orient(lows[kept]), orient(highs[kept])))
+    return deduplicate(orient(patches[kept]))
 
 
 def thin(mask: Tensor) -> Tensor:
@@ -188,18 +170,9 @@ def _patch_centres(edges: Tensor) -> Tensor:
     """Return the first edge pixel of each cell whose patch lies inside the map, (N, 2)."""
     half = PATCH // 2
     places = edges[half:-half, half:-half].nonzero() + half
-    number = places[:, 0] // _CELL * edges.shape[1] + places[:, 1] // _CELL
-    order = number.argsort(stable=True)
-    first = torch.ones_like(number, dtype=torch.bool)
-    first[1:] = number[order].diff() != 0
-    return places[order[first].sort().values]
-
-
-class Patches(NamedTuple):
-    """Edges of an upsampled map, and the true edges at the same positions."""
-
-    low: Tensor
-    high: Tensor
+    cells = places[:, 0] // _CELL * edges.shape[1] + places[:, 1] // _CELL
+    _, first = np.unique(cells.cpu().numpy(), return_index=True)
+    return places[torch.from_numpy(np.sort(first)).to(places.device)]
 
 
 def extract_patches(mask: Tensor, places: Tensor) -> Tensor:
@@ -209,20 +182,19 @@ def extract_patches(mask: Tensor, places: Tensor) -> Tensor:
 
 
 def orient(patches: Tensor) -> Tensor:
-    """Return patches under the 8 dihedral transforms, (8 N, PATCH, PATCH)."""
-    quarters = [patches.rot90(k, (1, 2)) for k in range(4)]
+    """Return patches, (N, ..., PATCH, PATCH), under the 8 dihedral transforms, (8 N, ..., PATCH, PATCH)."""
+    quarters = [patches.rot90(k, (-2, -1)) for k in range(4)]
     return torch.cat(quarters + [each.mT for each in quarters])
 
 
-def deduplicate(patches: Patches) -> Patches:
-    """Return the pairs without repetitions, sorted."""
-    pixels = 2 * PATCH**2
-    bits = torch.cat((patches.low.flatten(1), patches.high.flatten(1)), dim=1).long()
+def deduplicate(patches: Tensor) -> Tensor:
+    """Return the pairs of patches, (N, 2, PATCH, PATCH) bool, without repetitions, sorted."""
+    bits = patches.flatten(1).long()
     place = torch.arange(_BITS, device=bits.device)
-    words = (functional.pad(bits, (0, -pixels % _BITS)).unflatten(1, (-1, _BITS)) << place).sum(dim=2)
+    words = (functional.pad(bits, (0, -bits.shape[1] % _BITS)).unflatten(1, (-1, _BITS)) << place).sum(dim=2)
     words = torch.unique(words, dim=0)
-    bits = ((words[:, :, None] >> place) & 1).flatten(1)[:, :pixels]
-    return Patches(*bits.bool().unflatten(1, (2, PATCH, PATCH)).unbind(1))
+    bits = ((words[:, :, None] >> place) & 1).flatten(1)[:, : bits.shape[1]]
+    return bits.bool().unflatten(1, patches.shape[1:])
 
 
 def edge_distances(patches: Tensor) -> Tensor:
@@ -236,21 +208,23 @@ def edge_distances(patches: Tensor) -> Tensor:
     return (along[:, None] + square[:, :, None]).amin(dim=2).sqrt()
 
 
-def find_nearest(query: Tensor, examples: Patches, count: int, weight: float) -> tuple[Tensor, Tensor]:
+def find_nearest(query: Tensor, examples: Tensor, count: int, weight: float) -> tuple[Tensor, Tensor]:
     """Return the examples most similar to patches: squared distances and indices, (N, count) each, the best first.
 
     |D(query) - D(low)|^2 + weight^2 |query - high|^2, D being :func:`edge_distances`.
     """
-    features = _features(examples.low, examples.high, weight)
-    length = features.square().sum(dim=1)
-    distances, indices = [], []
-    for chunk in query.split(max(_ENTRIES // len(features), 1)):
-        query_features = _features(chunk, chunk, weight)
-        square = query_features.square().sum(dim=1, keepdim=True) + length - 2 * query_features @ features.T
-        least = square.clamp_(min=0).topk(min(count, len(features)), dim=1, largest=False)
-        distances.append(least.values)
-        indices.append(least.indices)
-    return torch.cat(distances), torch.cat(indices)
+
+    def features(low: Tensor, high: Tensor) -> Tensor:
+        return torch.cat((edge_distances(low).flatten(1), weight * high.flatten(1).float()), dim=1)
+
+    known = features(examples[:, 0], examples[:, 1])
+    length = known.square().sum(dim=1)
+    found = []
+    for chunk in query.split(max(_ENTRIES // len(known), 1)):
+        asked = features(chunk, chunk)
+        square = asked.square().sum(dim=1, keepdim=True) + length - 2 * asked @ known.T
+        found.append(square.clamp_(min=0).topk(min(count, len(known)), dim=1, largest=False))
+    return torch.cat([each.values for each in found]), torch.cat([each.indices for each in found])
 
 
 def find_overlaps(places: Tensor, patches: Tensor) -> tuple[Tensor, Tensor]:
@@ -277,23 +251,6 @@ def find_overlaps(places: Tensor, patches: Tensor) -> tuple[Tensor, Tensor]:
     return torch.cat(pairs), torch.cat(costs)
 
 
-def _features(low: Tensor, high: Tensor, weight: float) -> Tensor:
-    return torch.cat((edge_distances(low).flatten(1), weight * high.flatten(1).float()), dim=1)
-
-
-class Labelling(NamedTuple):
-    """Labels (N,), their energy, whether the messages converged, and the history.
-
-    Each entry of ``history`` has ``iteration``, ``objective`` (the energy) and ``moved`` (the largest change of a
-    message, relative to the largest cost).
-    """
-
-    labels: Tensor
-    energy: float
-    converged: bool
-    history: list[dict[str, float]]
-
-
 def label(
     unary: Tensor,
     pairs: Tensor,
@@ -301,46 +258,50 @@ def label(
     iterations: int = 100,
     tolerance: float = 1e-3,
     progress: Steps | None = None,
-) -> Labelling:
-    """Return the labels that min-sum belief propagation finds.
+) -> tuple[Tensor, list[dict[str, float]]]:
+    """Return labels, (N,), that have a low :func:`energy`, and the history of min-sum belief propagation.
+
+    Pearl, *Probabilistic Reasoning in Intelligent Systems*, 1988; min-sum is max-product in negative logarithms. The
+    message from i to j is m_ij(x_j) = min over x_i of unary_i(x_i) + cost_ij(x_i, x_j) + the messages to i from nodes
+    other than j, less its minimum. A node's label minimises unary_i plus all messages to it. On trees this is the
+    minimum; on other graphs it is an approximation, and the best labels so far are kept. Messages are damped by one
+    half, because they may oscillate on loops.
 
     The costs of each node's labels are ``unary`` (N, K), and ``costs`` (E, K, K) those of the labels of the first and
     the second node of each pair (E, 2). It stops if no message changes by more than the tolerance, times the largest
-    cost.
+    cost. An entry of the history has ``iteration``, ``objective`` (the energy) and ``moved`` (the largest change of a
+    message, relative to the largest cost).
     """
-    count, labels = unary.shape
-    unit = float(costs.abs().max()) if len(costs) else 0.0
-    unit = unit if unit > 0 else 1.0
+    report = progress or ignore
+    unit = (float(costs.abs().max()) if len(costs) else 0.0) or 1.0
     sources = torch.cat((pairs[:, 0], pairs[:, 1]))
     both = torch.cat((costs, costs.mT))  # (2E, K, K): the source's labels, the target's
-    heard = _incoming(torch.cat((pairs[:, 1], pairs[:, 0])), count)
-    silence = unary.new_zeros(1, labels)
-    messages = unary.new_zeros(2 * len(pairs), labels)
-    best, least, history = unary.argmin(dim=1), torch.inf, []
-    moved = 0.0
+    heard = _incoming(torch.cat((pairs[:, 1], pairs[:, 0])), len(unary))
+    silence = torch.zeros_like(unary[:1])
+    messages = unary.new_zeros(2 * len(pairs), unary.shape[1])
+    beliefs, best, least, history = unary, unary.argmin(dim=1), torch.inf, []
     for done in range(1, iterations + 1):
-        beliefs = unary + torch.cat((messages, silence))[heard].sum(dim=1)
         others = beliefs[sources] - messages.roll(len(pairs), 0)  # less the target's message
         new = (others[:, :, None] + both).amin(dim=1)
         step = (new - new.amin(dim=1, keepdim=True) - messages) * _MOVE
         messages = messages + step
+        beliefs = unary + torch.cat((messages, silence))[heard].sum(dim=1)
         moved = float(step.abs().max()) / unit if len(step) else 0.0
         settled = moved <= tolerance
-        if settled or done % CHECK_EVERY == 0 or done == iterations:
-            found = (unary + torch.cat((messages, silence))[heard].sum(dim=1)).argmin(dim=1)
+        if settled or done % _CHECK_EVERY == 0 or done == iterations:
+            found = beliefs.argmin(dim=1)
             now = energy(found, unary, pairs, costs)
             history.append({"iteration": float(done), "objective": now, "moved": moved})
             if now < least:
                 best, least = found, now
-            if progress is not None:
-                progress(iterations if settled else done, iterations)
+            report(iterations if settled else done, iterations)
         if settled:
             break
-    return Labelling(best, least, moved <= tolerance, history)
+    return best, history
 
 
 def energy(labels: Tensor, unary: Tensor, pairs: Tensor, costs: Tensor) -> float:
-    """Return E of labels (N,)."""
+    """Return the energy of labels, (N,): the sum of their own costs and of those of the pairs."""
     alone = unary.gather(1, labels[:, None]).sum()
     first, second = labels[pairs[:, 0]], labels[pairs[:, 1]]
     return float(alone + costs[torch.arange(len(pairs), device=pairs.device), first, second].sum())

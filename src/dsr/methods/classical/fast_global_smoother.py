@@ -9,15 +9,17 @@ lambda_t = 3/2 * 4^(T - t) / (4^T - 1) * lambda. Sparse data and their index map
 the paper: the low-resolution map at the centres of its pixels (the four high-resolution pixels around a centre that
 lies between them). What differs: lambda is in units of the squared low-resolution pixel, so that one value fits all
 scales, and far smaller than the paper's, which blurs renderings. Without ``slopes``, as in the paper, renderings show
-a tent at each low-resolution pixel. Memory peaks at about 25 maps of H * W float64 values.
+a tent at each low-resolution pixel.
 """
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
-from dsr.methods.classical.photo_guided import Guided, GuidedMethod, expect_positive
+from dsr.methods.base import expect_positive
+from dsr.methods.classical.guided_filter import Guided, GuidedMethod
 
 # minimum smoothed confidence; below it digits are lost, and the result is the nearest low-resolution value
 _LEAST = 1e-200
@@ -31,7 +33,7 @@ class FastGlobalSmoother(GuidedMethod):
         smoothness: lambda, in squared low-resolution pixels; well below 1 the rows without data show as stripes.
         sigma_colour: Euclidean colour difference, colours in [0, 1], at which a neighbour's weight is 1 / e.
         iterations: number of pairs of passes.
-        fill_holes, slopes: see :class:`dsr.methods.classical.photo_guided.GuidedMethod`.
+        fill_holes, slopes: see :class:`dsr.methods.classical.guided_filter.GuidedMethod`.
 
     """
 
@@ -45,9 +47,7 @@ class FastGlobalSmoother(GuidedMethod):
         slopes: bool = True,
     ) -> None:
         super().__init__(fill_holes=fill_holes, slopes=slopes)
-        expect_positive(
-            "the fast global smoother", smoothness=smoothness, sigma_colour=sigma_colour, iterations=iterations
-        )
+        expect_positive(smoothness=smoothness, sigma_colour=sigma_colour, iterations=iterations)
         self._smoothness, self._sigma_colour, self._iterations = smoothness, sigma_colour, iterations
 
     def filter_maps(self, guided: Guided) -> Tensor:
@@ -66,7 +66,7 @@ class FastGlobalSmoother(GuidedMethod):
         return torch.where(enough, both[:-1] / torch.where(enough, both[-1], 1), data)
 
 
-def smooth(guide: Tensor, maps: Tensor, strength: float, sigma_colour: float, iterations: int = 3) -> Tensor:
+def smooth(guide: Tensor, maps: Tensor, strength: float, sigma_colour: float, iterations: int) -> Tensor:
     """Smooth maps, (N, H, W), with the same weights where the guide, (3, H, W), is smooth.
 
     ``strength`` is lambda in squared pixels, ``sigma_colour`` the difference of colours at which a weight is 1 / e.
@@ -89,15 +89,12 @@ def solve_lines(weights: Tensor, right: Tensor) -> Tensor:
     length = right.shape[0]
     solution = right.contiguous().clone()
     upper = torch.zeros_like(right[:, 0]).contiguous()  # the eliminated entries above the diagonal
-    zeros = torch.zeros_like(upper[0])
+    weights = functional.pad(weights, (0, 0, 1, 1))  # 0 before the first pixel, and after the last one
     for k in range(length):
-        before = weights[k - 1] if k else zeros
-        after = weights[k] if k + 1 < length else zeros
-        previous = upper[k - 1] if k else zeros
-        pivot = 1 + after + before * (1 + previous)
+        before, after = weights[k], weights[k + 1]
+        pivot = 1 + after + before * (1 + upper[k - 1])
         upper[k] = -after / pivot
-        if k:
-            solution[k] += before * solution[k - 1]
+        solution[k] += before * solution[k - 1]
         solution[k] /= pivot
     for k in range(length - 2, -1, -1):
         solution[k] -= upper[k] * solution[k + 1]

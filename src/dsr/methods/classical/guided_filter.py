@@ -1,30 +1,127 @@
-"""Guided filter upsampling: in each window, depth is a linear function of the colours.
+"""The base class of guided filters, and the guided filter: in each window, depth is a linear function of the colours.
 
-He, Sun, Tang, *Guided Image Filtering*, TPAMI 2013, with its colour guide. In every window w_k of the high-resolution
+A guided filter is a weighted mean of low-resolution values, u_p = sum of W_pq d_q, with weights that add up to 1. Such
+means flatten slopes at borders, and where the guide makes the weights uneven they copy its texture into the surface.
+With ``slopes``, each low-resolution pixel stands for a plane instead, u_p = sum of W_pq (d_q + s_q . (p - q)), with the
+local slope s_q of the low-resolution disparity and the same weights. A plane in space has a disparity that is linear in
+the pixel, so planes are reproduced exactly under any guide. None of the filters' papers does this: ``slopes=False`` is
+the filter as published. Everything is computed in float64.
+
+He, Sun, Tang, *Guided Image Filtering*, TPAMI 2013, with its colour guide: in every window w_k of the high-resolution
 image, q_i = a_k . I_i + b_k with
 
     a_k = (S_k + eps U)^-1 (mean(I p) - m_k mean(p)),    b_k = mean(p) - a_k . m_k,
 
 with the mean m_k and the 3 x 3 covariance S_k of the colours I, the input p (the bilinear interpolation of the
 low-resolution map) and the identity U. The result is q_i = mean(a_k) . I_i + mean(b_k) over the windows that contain i.
-
-What differs: means over a window weight pixels by their confidence (see :mod:`dsr.methods.classical.photo_guided`), so
-that holes do not spread, and windows by their mean confidence. The radius is in low-resolution pixels. Time grows as
-H * W * radius * scale; memory peaks at about 50 maps of H * W float64 values.
+What differs: means over a window weight pixels by their confidence, so that holes do not spread, and windows by their
+mean confidence. The radius is in low-resolution pixels.
 """
 
 from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.methods.classical.photo_guided import Guided, GuidedMethod, expect_positive, expect_window
+from dsr.geometry.camera import from_range
+from dsr.methods.base import Abilities, Cost, Method, expect_positive
+from dsr.methods.images import inpaint, lr_coordinates
+from dsr.sample import DepthSample
+from dsr.utils.progress import Steps
 
+_WIDEST = 1024  # largest radius or width of a filter, in low-resolution pixels
+# factor by which a result may be farther than the farthest valid low-resolution pixel, or nearer than the nearest
+BEYOND = 4.0
 # the entries of a symmetric 3 x 3 matrix, in the order of storage
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _ROWS = ([0, 1, 2], [1, 3, 4], [2, 4, 5])  # indices of the matrix's rows among these
 _TINY = 1e-30
+
+
+@dataclass(frozen=True)
+class Guided:
+    """Low-resolution maps and the image that guides their upsampling, all float64."""
+
+    rgb: Tensor  # (3, H, W) in [0, 1]
+    maps: Tensor  # (N, h, w), to be upsampled with the same weights; holes are inpainted
+    valid: Tensor  # (h, w), 1 where the maps are valid and 0 in holes
+    rows: Tensor  # (H,) position of each high-resolution pixel in low-resolution pixels
+    columns: Tensor  # (W,)
+
+    @property
+    def scale(self) -> float:
+        """High-resolution pixels per low-resolution one."""
+        return self.rgb.shape[-1] / self.maps.shape[-1]
+
+    def nearest(self) -> tuple[Tensor, Tensor]:
+        """Return the row (H,) and the column (W,) of the low-resolution pixel nearest to each high-resolution pixel."""
+        height, width = self.valid.shape
+        rows, columns = (self.rows + 0.5).floor().long(), (self.columns + 0.5).floor().long()
+        return rows.clamp(0, height - 1), columns.clamp(0, width - 1)
+
+    def interpolate(self) -> tuple[Tensor, Tensor]:
+        """Return the maps, (N, H, W), and their confidence, (H, W), at the high-resolution pixels.
+
+        A value is the bilinear mean of the valid ones among the four low-resolution pixels around it, and its
+        confidence their bilinear weight: 1 away from holes, 0 within them, where the value is inpainted.
+        """
+        height, width = self.valid.shape
+        down, across = _linear_weights(self.rows, height), _linear_weights(self.columns, width)
+        if bool(self.valid.all()):
+            return down @ self.maps @ across.T, torch.ones_like(self.rgb[0])
+        confidence = (down @ self.valid @ across.T).clamp(0, 1)
+        mean = down @ (self.maps * self.valid) @ across.T / torch.where(confidence > 0, confidence, 1)
+        return torch.where(confidence > 0, mean, down @ self.maps @ across.T), confidence
+
+
+class GuidedMethod(Method):
+    """A guided filter of the low-resolution disparity: everything but :meth:`filter_maps`.
+
+    Args:
+        fill_holes: whether holes of the low-resolution map are inpainted; otherwise a high-resolution pixel whose
+            nearest low-resolution pixel is a hole is a hole.
+        slopes: whether each low-resolution pixel stands for a plane, see the module.
+
+    """
+
+    abilities = Abilities(ratios="any", own_size=True, cost=Cost(600, 2))
+
+    def __init__(self, *, fill_holes: bool = False, slopes: bool = True) -> None:
+        self._fill_holes = fill_holes
+        self._slopes = slopes
+
+    @abstractmethod
+    def filter_maps(self, guided: Guided) -> Tensor:
+        """Return the high-resolution maps, (N, H, W) float64, without holes, all with the same weights."""
+
+    def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
+        """Return the high-resolution depth, (1, H, W) in metres in the precision of the low-resolution depth."""
+        device = sample.depth_lr.device
+        rows, columns = lr_coordinates(sample.camera, sample.camera_lr, device)
+        disparity_lr = sample.disparity_lr(torch.float64)[0]
+        valid = disparity_lr.isfinite()
+        maps = disparity_lr[None]
+        if self._slopes:  # the plane's value at row and column 0, and its slopes
+            down, across = estimate_slopes(disparity_lr, 0), estimate_slopes(disparity_lr, 1)
+            i, j = (torch.arange(size).to(disparity_lr) for size in disparity_lr.shape)
+            maps = torch.stack((disparity_lr - down * i[:, None] - across * j, down, across))
+            maps = maps.masked_fill(~valid, torch.nan)
+        guided = Guided(sample.rgb.to(device).double(), inpaint(maps[:, None])[:, 0], valid.double(), rows, columns)
+        answers = self.filter_maps(guided)
+        disparity = answers[0]
+        if self._slopes:
+            disparity = disparity + answers[1] * rows[:, None] + answers[2] * columns
+        doffs = sample.camera.doffs  # disparity + doffs is inverse depth
+        lowest, highest = (float(bound) + doffs for bound in disparity_lr[valid].aminmax())
+        disparity = disparity.clamp(lowest / BEYOND - doffs, highest * BEYOND - doffs)
+        if not (self._fill_holes or bool(valid.all())):
+            row, column = guided.nearest()
+            disparity = disparity.masked_fill(~valid[row[:, None], column], torch.nan)
+        return from_range(disparity[None], sample.camera, "disparity").to(sample.depth_lr)
 
 
 class GuidedFilter(GuidedMethod):
@@ -33,7 +130,7 @@ class GuidedFilter(GuidedMethod):
     Args:
         radius: radius of the windows in low-resolution pixels.
         epsilon: regularisation added to the variances of colours in [0, 1]; smaller variances have no effect.
-        fill_holes, slopes: see :class:`dsr.methods.classical.photo_guided.GuidedMethod`.
+        fill_holes, slopes: see :class:`GuidedMethod`.
 
     """
 
@@ -41,8 +138,8 @@ class GuidedFilter(GuidedMethod):
         self, radius: float = 0.5, epsilon: float = 1e-3, *, fill_holes: bool = False, slopes: bool = True
     ) -> None:
         super().__init__(fill_holes=fill_holes, slopes=slopes)
-        expect_window("the guided filter", radius=radius)
-        expect_positive("the guided filter", epsilon=epsilon)
+        expect_window(radius=radius)
+        expect_positive(epsilon=epsilon)
         self._radius, self._epsilon = radius, epsilon
 
     def filter_maps(self, guided: Guided) -> Tensor:
@@ -52,35 +149,66 @@ class GuidedFilter(GuidedMethod):
         return guided_filter(guided.rgb, maps, radius, self._epsilon, confidence)
 
 
-def guided_filter(guide: Tensor, maps: Tensor, radius: int, epsilon: float, confidence: Tensor | None = None) -> Tensor:
+def guided_filter(guide: Tensor, maps: Tensor, radius: int, epsilon: float, confidence: Tensor) -> Tensor:
     """Filter maps, (N, H, W) finite, with a colour guide, (3, H, W).
 
     Windows have (2 * radius + 1)^2 pixels, truncated at the border, and ``confidence`` weights pixels in [0, 1], (H,
     W). A pixel in no window with a positive confidence keeps its value.
     """
-    weight = torch.ones_like(guide[0]) if confidence is None else confidence
-    mean_weight = _box(weight, radius)
+    mean_weight = _box(confidence, radius)
     divisor = torch.where(mean_weight > 0, mean_weight, 1)
-    mean = _box(weight * guide, radius) / divisor
+    mean = _box(confidence * guide, radius) / divisor
     products = torch.stack([guide[i] * guide[j] for i, j in _PAIRS])
-    variances = _box(weight * products, radius) / divisor - torch.stack([mean[i] * mean[j] for i, j in _PAIRS])
+    variances = _box(confidence * products, radius) / divisor - torch.stack([mean[i] * mean[j] for i, j in _PAIRS])
     del products
     for k in (0, 3, 5):
         variances[k] += epsilon
     inverse = _invert(variances)
-    mean_confidence = mean_weight / _box(torch.ones_like(weight), radius)
+    mean_confidence = mean_weight / _box(torch.ones_like(confidence), radius)
     total = _box(mean_confidence, radius)
 
     filtered = []
     for values in maps:
-        mean_value = _box(weight * values, radius) / divisor
-        cross = _box(weight * guide * values, radius) / divisor - mean * mean_value
+        mean_value = _box(confidence * values, radius) / divisor
+        cross = _box(confidence * guide * values, radius) / divisor - mean * mean_value
         slopes = torch.stack([(inverse[row] * cross).sum(dim=0) for row in _ROWS])
         constant = mean_value - (slopes * mean).sum(dim=0)
         slopes, constant = _box(mean_confidence * slopes, radius), _box(mean_confidence * constant, radius)
         smooth = ((slopes * guide).sum(dim=0) + constant) / total.clamp(min=_TINY)
         filtered.append(torch.where(total > 0, smooth, values))
     return torch.stack(filtered)
+
+
+def estimate_slopes(values: Tensor, axis: int) -> Tensor:
+    """Return the local slope of a map along an axis, in its shape; missing values (NaN) have slope 0.
+
+    The slope is the backward or the forward difference, whichever is closer to 0, or 0 if their signs differ; at a
+    border or a hole it is the one that exists. The median over three pixels then removes the pixel of a depth step that
+    mixes both sides.
+    """
+    values = values.movedim(axis, 0)
+    none = torch.full_like(values[:1], torch.nan)
+    difference = torch.cat((none, values.diff(dim=0), none))
+    before, after = difference[:-1], difference[1:]
+    nearer = torch.where(before.abs() <= after.abs(), before, after)
+    slope = torch.where(before * after < 0, 0, nearer)
+    slope = torch.where(before.isnan(), after, torch.where(after.isnan(), before, slope)).nan_to_num(nan=0.0)
+    padded = torch.cat((slope[:1], slope, slope[-1:]))
+    return torch.stack((padded[:-2], slope, padded[2:])).median(dim=0).values.movedim(0, axis)
+
+
+def expect_window(**options: float) -> None:
+    """Raise a ValueError for the first window that is not positive, or wider than any map needs."""
+    expect_positive(**options)
+    for name, value in options.items():
+        if value > _WIDEST:
+            raise ValueError(f"{name}: expected at most {_WIDEST} low-resolution pixels, got {value}")
+
+
+def _linear_weights(where: Tensor, size: int) -> Tensor:
+    """Return the weights of linear interpolation, (len(where), size); edge pixels are repeated beyond the border."""
+    places = torch.arange(size).to(where)
+    return (1 - (where.clamp(0, size - 1)[:, None] - places).abs()).clamp(min=0)
 
 
 def _box(x: Tensor, radius: int) -> Tensor:

@@ -65,8 +65,7 @@ class Interpolation(Method):
         if not valid.all():
             nearest = ndimage.distance_transform_edt(~valid, return_distances=False, return_indices=True)
             values = values[tuple(nearest)]
-        coordinates = lr_coordinates(camera_hr, camera)
-        grid = torch.stack(torch.meshgrid(*coordinates, indexing="ij")).numpy()
+        grid = torch.stack(torch.meshgrid(*lr_coordinates(camera_hr, camera), indexing="ij")).numpy()
         if self._degree is None:
             range_hr = _clough_tocher(values, grid)
         else:
@@ -92,10 +91,6 @@ class CubicConvolution(Method):
 
     Pixels are matched through the cameras. At the border and beside holes, the kernel is truncated and normalised; a
     high-resolution pixel whose nearest low-resolution pixel is a hole is a hole.
-
-    Args:
-        range_type: range type that is interpolated.
-
     """
 
     abilities = Abilities(ratios="any", own_size=True)
@@ -111,19 +106,14 @@ class CubicConvolution(Method):
         if self.range_type == "disparity":  # in the high-resolution camera's pixels
             values = values * (sample.camera.fx / sample.camera_lr.fx)
         coordinates = lr_coordinates(sample.camera, sample.camera_lr, values.device)
-        rows, columns = (_weights(x, size) for x, size in zip(coordinates, values.shape[-2:], strict=True))
+        matrices, nearest = [], []
+        for where, size in zip(coordinates, values.shape[-2:], strict=True):
+            weights = cubic_kernel((where[:, None] - torch.arange(size).to(where)).abs())
+            matrices.append(weights / weights.sum(dim=1, keepdim=True))
+            nearest.append(where.round().long().clamp(0, size - 1))
+        rows, columns = matrices
         valid = values.isfinite()
-        weight = rows @ valid.double() @ columns.T
-        mean = rows @ torch.where(valid, values, 0).double() @ columns.T / weight
-        nearest = (x.round().long().clamp(0, size - 1) for x, size in zip(coordinates, values.shape[-2:], strict=True))
-        row, column = nearest
-        mean = torch.where(valid[:, row][:, :, column], mean, torch.nan)
+        mean = rows @ torch.where(valid, values, 0).double() @ columns.T / (rows @ valid.double() @ columns.T)
+        mean = mean.masked_fill(~valid[:, nearest[0][:, None], nearest[1]], torch.nan)
         depth = from_range(mean.to(values.dtype), sample.camera, self.range_type)
         return torch.where(depth > 0, depth, torch.nan)  # it may undershoot beside a depth step
-
-
-def _weights(coordinates: Tensor, size: int) -> Tensor:
-    """Return the weights of the pixels 0 .. size - 1 at some coordinates, (coordinates, size); every row sums to 1."""
-    pixels = torch.arange(size, dtype=coordinates.dtype, device=coordinates.device)
-    weights = cubic_kernel((coordinates[:, None] - pixels).abs())
-    return weights / weights.sum(dim=1, keepdim=True)

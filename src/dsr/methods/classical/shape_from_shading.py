@@ -1,32 +1,41 @@
-"""Super-resolution from shading, without training (SRfS).
+"""Super-resolution from shading, without training (SRfS): depth, albedo and light that explain an image.
 
 Haefner, Quéau, Möllenhoff and Cremers, *Fight Ill-Posedness with Ill-Posedness: Single-shot Variational Depth
-Super-Resolution from Shading*, CVPR 2018: the depth z whose block means are the low-resolution map, the piecewise
-constant albedo and the light that explain the image, with minimal surface area. It minimises, by alternating
-directions with a growing penalty over albedo, lighting, theta = (z, grad z), z and the multipliers
-(:mod:`dsr.methods.classical.srfs_admm`, :mod:`dsr.methods.classical.potts`), the energy per pixel
+Super-Resolution from Shading*, CVPR 2018, minimise
 
-    1/2 |albedo * shading - rgb|^2 + area_weight * z |m| + boundary_weight * boundaries
-    + data_weight / (2 scale^2) * (mean z - lr)^2,
+    E = 1/2 sum |albedo * shading - rgb|^2 + data / 2 * sum |mean z - lr|^2
+        + area * sum z |m| + boundary * (length of the albedo's boundaries),
 
-with intensities in [0, 1] and z in pixels (times the focal length f, by the median depth). What differs:
+with z in pixels here (times the focal length, by the median depth), so that slopes have no unit. The image formation
+model is Lambertian shading under first-order spherical harmonics lighting, in each channel
 
-- Weights. Its code has, in these units at x4 with f = 500: data_weight 0.0015, area_weight 1e-7 and boundary_weight
-  0.5. With so weak a data term the result follows the low-resolution map only over hundreds of pixels, and texture that
-  the albedo does not explain becomes relief. Ours were chosen on procedural scenes and on a bumpy surface.
+    shading = l_1 n_x + l_2 n_y + l_3 n_z + l_4,    n = m / |m|,    m = (p, q, -z - x p - y q),
+
+with the slopes p = fx dz/du and q = fy dz/dv, and the ray (x, y, 1) of the pixel. m is the normal that faces the
+camera, and a pixel sees the area z |m| / (fx fy). With a copy theta of (p, q, z) for the nonlinear terms, and the
+scaled multiplier u, the augmented Lagrangian is E with theta in place of (p, q, z) except in the data term, plus
+penalty / 2 * (|(p, q, z) + u - theta|^2 - |u|^2). Alternating steps lower it: the albedo by region fusion
+(:mod:`dsr.methods.classical.potts`), the lighting by least squares, theta by Levenberg and Marquardt's method, z by
+conjugate gradients. What differs:
+
+- Weights. The original has, in these units at x4 with a focal length of 500 pixels: data_weight 0.0015, area_weight
+  1e-7 and boundary_weight 0.5. Then the result follows the low-resolution map only over hundreds of pixels, and texture
+  that the albedo does not explain becomes relief. Ours were chosen on procedural scenes and on a bumpy surface.
 - Each channel has a light of its own. Albedos are between 0 and 2.
 - The penalty of the copy of z is weighted by 1 / scale^2: with 1 a step spreads over a pixel, and blocks have several.
-- theta by Levenberg and Marquardt's method, its 3 x 3 systems solved in closed form, instead of BFGS; z by plain
-  conjugate gradients; it starts from the bicubic map, not smoothed first.
+- Levenberg and Marquardt's 3 x 3 systems are solved in closed form, instead of BFGS; conjugate gradients are plain; it
+  starts from the bicubic map, not smoothed first.
 - Outside the foreground the initial map stays unchanged, including in blocks that cross its border.
 
-The steps of albedo, lighting, theta and z each lower the augmented Lagrangian. The energy itself, logged for z without
-the copy, may rise while the copy still differs. Holes have no data term, and start from inpainted values.
+E itself, logged for z without the copy, may rise while the copy still differs. Holes have no data term, and start from
+inpainted values.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -34,17 +43,276 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import RangeType
-from dsr.methods.base import Abilities, Cost, Method, expect_limits, whole_scale
-from dsr.methods.classical.srfs_admm import ShadingProblem, ShadingSolver, Weights
-from dsr.methods.images import inpaint, upsample_linear_border
+from dsr.geometry.surface import length
+from dsr.methods.base import Abilities, Cost, Method, expect_positive, whole_scale
+from dsr.methods.classical.potts import Regions, boundary_length, fit_albedo, fuse
+from dsr.methods.images import box_mean, inpaint, repeat_blocks, upsample_linear_border
 from dsr.sample import DepthSample
 from dsr.utils.decoding import decode_pixels
 from dsr.utils.guards import MOST_FILE, pixels_beside, read_limited
 from dsr.utils.progress import Steps
 
+_TINY = 1e-12  # minimum length of m, which avoids division by 0
+_RANK = 1e-10  # relative cutoff of singular values, below which a direction of the light is not determined
+_CG_ITERATIONS, _CG_TOLERANCE = 60, 1e-6
+_INNER = 3  # Levenberg-Marquardt steps in an update of theta
+_LESS, _MORE = 0.2, 5.0  # factors of its damping after a step that lowers the energy, and after one that does not
 _RENEW = 10  # iterations between two searches for the regions of the albedo
 _NEARER = 4.0  # factor by which a result may be nearer than the nearest valid low-resolution pixel
 _WHITE = 127  # value of a mask above which a pixel is white
+
+
+def compute_surface(theta: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the normals (B, 3, H, W) and |m| (B, 1, H, W) of theta (B, 3, H, W) and rays (1, 3, H, W)."""
+    p, q, z = theta.split(1, dim=1)
+    m = torch.cat((p, q, -z - rays[:, :1] * p - rays[:, 1:2] * q), dim=1)
+    size = length(m).clamp(min=_TINY)
+    return m / size, size
+
+
+def compute_shading(normals: Tensor, lighting: Tensor) -> Tensor:
+    """Return the shading, (B, C, H, W), of normals (B, 3, H, W) under lighting (B, C, 4)."""
+    return torch.einsum("bck,bkhw->bchw", lighting[..., :3], normals) + lighting[..., 3, None, None]
+
+
+def fit_lighting(rgb: Tensor, albedo: Tensor, normals: Tensor, inside: Tensor) -> Tensor:
+    """Return the lighting with the least squared error in each channel, (B, C, 4) float64.
+
+    If the normals do not determine it, as on a plane, it is the one of minimum norm. ``inside`` weights the pixels.
+    """
+    ones = torch.ones_like(normals[:, :1])
+    design = (torch.cat((normals, ones), dim=1) * inside)[:, None] * albedo[:, :, None]  # (B, C, 4, H, W)
+    columns = design.flatten(3).double()
+    gram = columns @ columns.mT
+    right = columns @ (rgb * inside).flatten(2).double()[..., None]
+    return (torch.linalg.pinv(gram, hermitian=True, rtol=_RANK) @ right)[..., 0]
+
+
+class ShadingProblem(NamedTuple):
+    """The constants of the problem."""
+
+    rgb: Tensor  # (B, C, H, W)
+    lr: Tensor  # (B, 1, h, w) in the unit of z, NaN in holes
+    rays: Tensor  # (1, 3, H, W)
+    focal: tuple[float, float]  # (fx, fy) of the image's camera
+    unit: float  # z of the median depth
+    inside: Tensor  # (B, 1, H, W) bool, the pixels that may change
+    data_weight: float
+    area_weight: float
+    boundary_weight: float
+
+
+class Slopes:
+    """The linear operator z -> (fx dz/du, fy dz/dv, z) / unit, and its adjoint.
+
+    Differences are forward between pixels inside the mask, backward where there is no next pixel, and 0 where there is
+    neither. Without a mask, these are the differences that :func:`dsr.geometry.surface.depth_to_normals` takes.
+    """
+
+    def __init__(self, problem: ShadingProblem) -> None:
+        self._unit = problem.unit
+        self._axes = []
+        for dim, focal in zip((-1, -2), problem.focal, strict=True):
+            ahead = problem.inside & problem.inside.roll(-1, dim)
+            ahead.select(dim, -1).fill_(value=False)  # no pixel follows the last one
+            behind = ahead.roll(1, dim) & ~ahead
+            self._axes.append((dim, focal / problem.unit, ahead.to(problem.rgb), behind.to(problem.rgb)))
+
+    def __call__(self, z: Tensor) -> Tensor:
+        """Return theta of z, (B, 1, H, W) -> (B, 3, H, W)."""
+        found = []
+        for dim, factor, ahead, behind in self._axes:
+            step = z.roll(-1, dim) - z  # where it wraps around the border, both weights are 0
+            found.append(factor * (ahead * step + behind * step.roll(1, dim)))
+        return torch.cat((*found, z / self._unit), dim=1)
+
+    def adjoint(self, theta: Tensor) -> Tensor:
+        """Apply the adjoint, (B, 3, H, W) -> (B, 1, H, W): <theta of z, theta> = <z, what is returned>."""
+        total = theta[:, 2:] / self._unit
+        for (dim, factor, ahead, behind), slope in zip(self._axes, theta[:, :2].split(1, dim=1), strict=True):
+            step = factor * (ahead * slope + (behind * slope).roll(-1, dim))
+            total = total + step.roll(1, dim) - step
+        return total
+
+
+class ShadingSolver:
+    """The variables of a problem, from an initial z (B, 1, H, W), and their updates; ``missed`` is u."""
+
+    def __init__(self, problem: ShadingProblem, first: Tensor, penalty: float) -> None:
+        self.problem, self.penalty = problem, penalty
+        self.scale = problem.rgb.shape[-1] // problem.lr.shape[-1]
+        self.slopes = Slopes(problem)
+        self._weight = problem.inside.to(problem.rgb)
+        self._valid = problem.lr.isfinite()
+        self._lr = torch.where(self._valid, problem.lr, 0)
+        coupling = problem.rgb.new_tensor((1.0, 1.0, (problem.unit / self.scale) ** 2))
+        self.coupling = coupling[:, None, None] * self._weight  # of the penalty, (B, 3, H, W)
+        self.z, self.theta = first, self.slopes(first)
+        self.missed = torch.zeros_like(self.theta)
+        self.albedo = problem.rgb
+        self.lighting = problem.rgb.new_tensor((0.0, 0.0, -1.0, 0.0)).expand(*problem.rgb.shape[:2], 4)
+        self.regions: Regions | None = None
+        self._damping = torch.full_like(first, 1e-3)
+
+    def update_albedo(self, *, anew: bool = True) -> None:
+        """Set the best piecewise constant albedo, in new regions if these are better than the old ones."""
+        problem = self.problem
+        shading = compute_shading(compute_surface(self.theta, problem.rays)[0], self.lighting)
+        found = [] if self.regions is None else [self.regions]
+        if anew or not found:
+            found.append(fuse(problem.rgb, shading, problem.boundary_weight, problem.inside))
+        tried = [(fit_albedo(problem.rgb, shading, regions), regions) for regions in found]
+        energies = [self._shading_energy(albedo, shading) + self._boundaries(regions) for albedo, regions in tried]
+        self.albedo, self.regions = tried[energies.index(min(energies))]
+
+    def update_lighting(self) -> None:
+        """Set the best lighting."""
+        normals, _ = compute_surface(self.theta, self.problem.rays)
+        self.lighting = fit_lighting(self.problem.rgb, self.albedo, normals, self._weight).to(self.problem.rgb)
+
+    def update_theta(self) -> None:
+        """Lower the Lagrangian in theta, pixel by pixel."""
+        target = self.slopes(self.z) + self.missed
+        energy = self.pixel_energy(self.theta, target)
+        for _ in range(_INNER):
+            near = self.theta - _solve(*self.expand_energy(self.theta, target), self._damping)
+            lower = self.pixel_energy(near, target)
+            better = lower < energy
+            self.theta, energy = torch.where(better, near, self.theta), torch.where(better, lower, energy)
+            self._damping = (self._damping * torch.where(better, _LESS, _MORE)).clamp(1e-6, 1e6)
+
+    def update_depth(self) -> None:
+        """Lower the Lagrangian, which is quadratic in z, by conjugate gradients from the current z."""
+        wanted = self.theta - self.missed - self.slopes(self.z)
+        right = self._weight * (
+            self.problem.data_weight * self._block_means_adjoint(self._lr - self._block_means(self.z))
+            + self.penalty * self.slopes.adjoint(self.coupling * wanted)
+        )
+        self.z = self.z + conjugate_gradients(self._normal_operator, right, _CG_ITERATIONS, _CG_TOLERANCE)
+
+    def update_missed(self, growth: float) -> None:
+        """Add (p, q, z) - theta to the multiplier, and multiply the penalty."""
+        self.missed = (self.missed + self.slopes(self.z) - self.theta) / growth
+        self.penalty *= growth
+
+    def terms(self, theta: Tensor) -> dict[str, float]:
+        """Return the terms ``shading``, ``data``, ``area`` and ``boundaries`` of E; of the Lagrangian for the copy."""
+        normals, size = compute_surface(theta, self.problem.rays)
+        miss = self._lr - self._block_means(self.z)
+        area = theta[:, 2:].abs() * size
+        return {
+            "shading": self._shading_energy(self.albedo, compute_shading(normals, self.lighting)),
+            "data": 0.5 * self.problem.data_weight * float(miss.square().sum()),
+            "area": self.problem.area_weight * float((self._weight * area).sum()),
+            "boundaries": 0.0 if self.regions is None else self._boundaries(self.regions),
+        }
+
+    def pixel_energy(self, theta: Tensor, target: Tensor) -> Tensor:
+        """Return the Lagrangian of theta in each pixel, (B, 1, H, W); ``target`` is (p, q, z) + u."""
+        normals, size = compute_surface(theta, self.problem.rays)
+        missed = self.albedo * compute_shading(normals, self.lighting) - self.problem.rgb
+        area = theta[:, 2:].abs() * size
+        own = 0.5 * missed.square().sum(dim=1, keepdim=True) + self.problem.area_weight * area
+        bound = 0.5 * self.penalty * (self.coupling * (theta - target).square()).sum(dim=1, keepdim=True)
+        return self._weight * own + bound
+
+    def expand_energy(self, theta: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+        """Return its gradient (B, 3, H, W) and an approximate Hessian (B, 6, H, W): the upper triangle, row by row."""
+        rays, area_weight, light = self.problem.rays, self.problem.area_weight, self.lighting[..., :3]
+        n, size = compute_surface(theta, rays)
+        directed = torch.einsum("bck,bkhw->bchw", light, n)
+        residual = self.albedo * (directed + self.lighting[..., 3, None, None]) - self.problem.rgb
+        by_m = (light[..., None, None] - directed[:, :, None] * n[:, None]) * (self.albedo / size)[:, :, None]
+        slopes = _chain_to_theta(by_m, rays)  # the derivatives of the residual, (B, C, 3, H, W)
+        stretch = _chain_to_theta(n, rays)  # those of |m|
+
+        depth = theta[:, 2:]
+        gradient = (residual[:, :, None] * slopes).sum(dim=1) + area_weight * depth.abs() * stretch
+        gradient[:, 2:] += area_weight * depth.sign() * size
+        gradient = gradient * self._weight + self.penalty * self.coupling * (theta - target)
+
+        curved = area_weight * depth.abs() / size
+        x, y = rays[:, :1], rays[:, 1:2]
+        along = ((0, 0, 1 + x * x), (0, 1, x * y), (0, 2, x), (1, 1, 1 + y * y), (1, 2, y), (2, 2, 1.0))
+        triangle = []
+        for i, j, product in along:
+            shaded = (slopes[:, :, i] * slopes[:, :, j]).sum(dim=1, keepdim=True)
+            triangle.append(shaded + curved * (product - stretch[:, i : i + 1] * stretch[:, j : j + 1]))
+        hessian = torch.cat(triangle, dim=1) * self._weight
+        hessian[:, [0, 3, 5]] += self.penalty * self.coupling
+        return gradient, hessian
+
+    def _normal_operator(self, z: Tensor) -> Tensor:
+        """Return the second derivative of the Lagrangian in z, times z; 0 outside the mask."""
+        inside = self._weight * z
+        own = self.penalty * self.slopes.adjoint(self.coupling * self.slopes(inside))
+        return self._weight * (own + self.problem.data_weight * self._block_means_adjoint(self._block_means(inside)))
+
+    def _block_means(self, z: Tensor) -> Tensor:
+        return torch.where(self._valid, box_mean(z, self.scale), 0)
+
+    def _block_means_adjoint(self, lr: Tensor) -> Tensor:
+        return repeat_blocks(lr, self.scale) / self.scale**2
+
+    def _shading_energy(self, albedo: Tensor, shading: Tensor) -> float:
+        return 0.5 * float((self._weight * (albedo * shading - self.problem.rgb).square()).sum())
+
+    def _boundaries(self, regions: Regions) -> float:
+        return self.problem.boundary_weight * boundary_length(regions, self.problem.inside)
+
+
+def _chain_to_theta(by_m: Tensor, rays: Tensor) -> Tensor:
+    """Convert derivatives by m to derivatives by theta, (..., 3, H, W)."""
+    along_u, along_v, ahead = by_m.unbind(dim=-3)
+    return torch.stack((along_u - rays[0, 0] * ahead, along_v - rays[0, 1] * ahead, -ahead), dim=-3)
+
+
+def _solve(gradient: Tensor, hessian: Tensor, damping: Tensor) -> Tensor:
+    """Return the inverse of the damped Hessian, its diagonal multiplied by 1 + damping, times the gradient."""
+    a, b, c, d, e, f = hessian.unbind(dim=1)
+    more = 1 + damping[:, 0]
+    a, d, f = (torch.where(each > 0, each * more, 1) for each in (a, d, f))
+    x, y, z = gradient.unbind(dim=1)
+    l21, l31 = b / a, c / a
+    middle = d - l21 * b
+    low = e - l21 * c
+    l32 = low / middle
+    last = f - l31 * c - l32 * low
+    y = y - l21 * x
+    z = (z - l31 * x - l32 * y) / last
+    y = (y - low * z) / middle
+    x = (x - b * y - c * z) / a
+    return torch.stack((x, y, z), dim=1)
+
+
+def conjugate_gradients(
+    operator: Callable[[Tensor], Tensor], right: Tensor, iterations: int, tolerance: float
+) -> Tensor:
+    """Solve A x = b for each element of a batch, (B, ...), from 0, until |b - A x| / |b| is small for all.
+
+    The operator x -> A x is symmetric positive definite for each element, and does not mix elements.
+    """
+
+    def dot(a: Tensor, b: Tensor) -> Tensor:  # (B, 1, ...)
+        return (a * b).sum(dim=tuple(range(1, a.ndim)), keepdim=True)
+
+    def ratio(above: Tensor, below: Tensor) -> Tensor:  # 0 where ``below`` is: a solved element stays
+        return torch.where(below > 0, above / torch.where(below > 0, below, 1), 0)
+
+    x = torch.zeros_like(right)
+    residual = direction = right
+    size = dot(right, right)
+    goal = tolerance**2 * size
+    for _ in range(iterations):
+        if not bool((size > goal).any()):
+            break
+        image = operator(direction)
+        step = ratio(size, dot(direction, image))
+        x = x + step * direction
+        residual = residual - step * image
+        before, size = size, dot(residual, residual)
+        direction = residual + ratio(size, before) * direction
+    return x
 
 
 class ShapeFromShading(Method):
@@ -85,19 +353,15 @@ class ShapeFromShading(Method):
         growth: float = 1.3,
         foreground: str | None = None,
     ) -> None:
-        expect_limits(tolerance, iterations=iterations)
-        if not area_weight >= 0:
-            raise ValueError(f"area_weight: expected 0 or more, got {area_weight}")
+        expect_positive(iterations=iterations)
+        expect_positive(or_zero=True, tolerance=tolerance, area_weight=area_weight)
         if not 1 <= growth < float("inf"):
             raise ValueError(f"growth: expected at least 1, got {growth}")
-        positive = {"data_weight": data_weight, "boundary_weight": boundary_weight, "penalty": penalty}
-        for name, value in positive.items():
-            if not 0 < value < float("inf"):
-                raise ValueError(f"{name}: expected more than 0, got {value}")
+        expect_positive(data_weight=data_weight, boundary_weight=boundary_weight, penalty=penalty)
         if foreground is not None and not Path(foreground).is_dir():
             raise ValueError(f"foreground: expected a folder of masks, there is none at {foreground}")
         self.iterations, self.tolerance = iterations, tolerance
-        self.weights = Weights(data_weight, area_weight, boundary_weight)
+        self.data_weight, self.area_weight, self.boundary_weight = data_weight, area_weight, boundary_weight
         self.penalty, self.growth = penalty, growth
         self.foreground = None if foreground is None else Path(foreground)
         self.history: list[dict[str, float]] = []
@@ -107,27 +371,26 @@ class ShapeFromShading(Method):
         """Return high-resolution depth without holes, (1, H, W) in metres on the sample's device."""
         self.history = []
         solver, metres = self.prepare(sample)
-        objective = float("nan")  # of the iteration before
+        objective = float("nan")
         for done in range(1, self.iterations + 1):
-            before = solver.z
+            before, objective_before = solver.z, objective
             solver.update_albedo(anew=done % _RENEW == 1)
             solver.update_lighting()
             solver.update_theta()
             solver.update_depth()
             solver.update_missed(self.growth)
-            terms = solver.terms()
-            objective_now = sum(terms.values())
-            missed = (solver.slopes(solver.z) - solver.theta)[:, :2]
-            residual = float(missed.square().mean().sqrt())
+            theta = solver.slopes(solver.z)
+            terms = solver.terms(theta)
+            objective = sum(terms.values())
+            residual = float((theta - solver.theta)[:, :2].square().mean().sqrt())
             moved = float((solver.z - before).square().mean().sqrt()) / solver.problem.unit
-            entry = {"iteration": done, "objective": objective_now, **terms, "residual": residual, "moved": moved}
+            entry = {"iteration": done, "objective": objective, **terms, "residual": residual, "moved": moved}
             self.history.append(entry)
             if progress is not None:
                 progress(done, self.iterations)
-            change = abs(objective_now - objective)
-            if change < self.tolerance * abs(objective) and residual < self.tolerance:
+            change = abs(objective - objective_before)
+            if change < self.tolerance * abs(objective_before) and residual < self.tolerance:
                 break
-            objective = objective_now
         if progress is not None:
             progress(self.iterations, self.iterations)
         nearest = float(sample.depth_lr[sample.mask_lr].min()) / _NEARER
@@ -137,7 +400,7 @@ class ShapeFromShading(Method):
         """Return the solver of a sample before its first step, and its unit of depth in metres."""
         lr = sample.depth_lr[None].double()
         camera = sample.camera
-        inside = torch.ones(1, 1, camera.height, camera.width, dtype=torch.bool, device=lr.device)  # that may change
+        inside = torch.ones(1, 1, camera.height, camera.width, dtype=torch.bool, device=lr.device)
         if self.foreground is not None:
             mask = read_foreground(self.foreground / f"{sample.scene}.png", (camera.height, camera.width))
             inside = torch.from_numpy(mask)[None, None].to(lr.device)
@@ -150,23 +413,24 @@ class ShapeFromShading(Method):
             focal=(camera.fx, camera.fy),
             unit=unit,
             inside=inside,
+            data_weight=self.data_weight,
+            area_weight=self.area_weight,
+            boundary_weight=self.boundary_weight,
         )
         first = upsample_linear_border(inpaint(problem.lr), whole_scale(sample))
-        return ShadingSolver(problem, self.weights, first, self.penalty), metres
+        return ShadingSolver(problem, first, self.penalty), metres
 
 
 def read_foreground(path: Path, size: tuple[int, int]) -> np.ndarray:
     """Return a mask, (H, W) bool of the given size, True where the picture is white."""
     if not path.is_file():
         raise ValueError(f"{path}: expected a mask of the foreground, there is no such file")
-    content = read_limited(path, MOST_FILE)
-    levels = decode_pixels(path, content, cv2.IMREAD_GRAYSCALE, pixels_beside(*size))
+    levels = decode_pixels(path, read_limited(path, MOST_FILE), cv2.IMREAD_GRAYSCALE, pixels_beside(*size))
     if levels is None:
         raise ValueError(f"{path}: expected a mask of the foreground, it is no picture or damaged")
     if levels.shape != size:
-        raise ValueError(
-            f"{path}: expected {size[0]} x {size[1]}, as the photo is, got {' x '.join(map(str, levels.shape))}"
-        )
+        shapes = [" x ".join(map(str, each)) for each in (size, levels.shape)]
+        raise ValueError(f"{path}: expected {shapes[0]}, as the photo is, got {shapes[1]}")
     if not (levels > _WHITE).any():
         raise ValueError(f"{path}: expected a foreground in white, got a black mask")
     return levels > _WHITE

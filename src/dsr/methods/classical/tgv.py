@@ -13,9 +13,9 @@ n n^T + t t^T, with n = grad I / |grad I| and t perpendicular to it, is their di
 
 What differs from the original:
 
-- A low-resolution pixel d is the *mean* of u over its block of w pixels; in the original it is the value of a single
-  high-resolution pixel. The proximal map of this data term also has a closed form, and without a finite
-  ``data_weight`` it is a projection: the block means equal the input exactly.
+- A low-resolution pixel d is the *mean* of u over its block of w pixels, not the value of a single high-resolution
+  pixel. The proximal map of this data term has a closed form, too; without a finite ``data_weight`` it is a projection:
+  the block means equal the input exactly.
 - It works on disparity, which is linear on planes, normalised by its range in the image.
 - A difference that would need a pixel beyond the border is left out; the original sets it to 0, which bends planes.
 - It starts from the bicubic map and its gradient, and stops when the map no longer moves. Holes have no data term, as
@@ -34,7 +34,7 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import from_range
-from dsr.methods.base import Abilities, Cost, Method, expect_limits, whole_scale
+from dsr.methods.base import Abilities, Cost, Method, expect_positive, whole_scale
 from dsr.methods.images import (
     box_mean,
     divergence,
@@ -48,7 +48,7 @@ from dsr.methods.images import (
     upsample_linear_border,
 )
 from dsr.sample import DepthSample
-from dsr.utils.progress import Steps
+from dsr.utils.progress import Steps, ignore
 
 _CHECK_EVERY = 50  # iterations between two checks of how far the map has moved
 _RELAXATION = 1.9  # over-relaxation factor; the iteration converges below 2
@@ -70,16 +70,12 @@ class Tensors(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """The minimiser.
+    """The minimiser: u and v are the means of the iterates since the last check, because the iterates oscillate."""
 
-    ``values`` (B, 1, H, W) is u and ``slopes`` (B, 2, H, W) is v, each the mean of the iterates since the last check,
-    because the iterates oscillate; ``iterations`` their number, and ``moved`` the RMS movement of u between two checks.
-    """
-
-    values: Tensor
-    slopes: Tensor
+    values: Tensor  # u, (B, 1, H, W)
+    slopes: Tensor  # v, (B, 2, H, W)
     iterations: int
-    moved: list[float]
+    moved: list[float]  # RMS movement of u between two checks
 
 
 class TotalGeneralisedVariation(Method):
@@ -114,21 +110,12 @@ class TotalGeneralisedVariation(Method):
         exponent: float = 0.85,
         step_ratio: float = 1e4,
     ) -> None:
-        expect_limits(tolerance, iterations=iterations)
-        if isinstance(data_weight, str) and data_weight != "auto":
-            raise ValueError(f"data_weight: expected a number, auto or None, got {data_weight!r}")
-        positive = {
-            "first": first,
-            "second": second,
-            "data_weight": data_weight if isinstance(data_weight, (int, float)) else 1.0,
-            "exponent": exponent,
-            "step_ratio": step_ratio,
-        }
-        for name, value in positive.items():
-            if not value > 0:
-                raise ValueError(f"{name}: expected more than 0, got {value}")
-        if not sharpness >= 0:
-            raise ValueError(f"sharpness: expected 0 or more, got {sharpness}")
+        expect_positive(iterations=iterations, first=first, second=second, exponent=exponent, step_ratio=step_ratio)
+        expect_positive(or_zero=True, tolerance=tolerance, sharpness=sharpness)
+        if data_weight not in (None, "auto"):
+            if isinstance(data_weight, str):
+                raise ValueError(f"data_weight: expected a number, auto or None, got {data_weight!r}")
+            expect_positive(data_weight=data_weight)
         self.iterations, self.tolerance = iterations, tolerance
         self.alpha1, self.alpha0, self.data_weight = first, second, data_weight
         self.sharpness, self.exponent, self.step_ratio = sharpness, exponent, step_ratio
@@ -142,8 +129,7 @@ class TotalGeneralisedVariation(Method):
         """
         lr = sample.disparity_lr(torch.float64)[None]
         scaled = normalise(lr)
-        valid = lr.isfinite()
-        values = torch.where(valid, scaled.values, torch.nan)
+        values = torch.where(lr.isfinite(), scaled.values, torch.nan)
         found = self.minimise(sample.rgb[None].double(), values, whole_scale(sample), progress)
         moved = enumerate(found.moved, start=1)
         self.history = [{"iteration": float(_CHECK_EVERY * check), "moved": value} for check, value in moved]
@@ -155,11 +141,46 @@ class TotalGeneralisedVariation(Method):
 
         At a scale of 1, only holes are inpainted.
         """
-        start = inpaint(lr)
-        if scale > 1 and not bool(lr.isfinite().all()):
+        report = progress or ignore
+        start, valid = inpaint(lr), lr.isfinite()
+        if scale > 1 and not bool(valid.all()):
             start = self.minimise(box_mean(rgb, scale), lr, 1).values
-        first = upsample_linear_border(start, scale)
-        return self._iterate(first, lr, self.diffusion_tensors(rgb), progress)
+        u = upsample_linear_border(start, scale)
+        v = _slopes(u)
+        p, q = torch.zeros_like(v)[:, :, None], torch.zeros_like(gradient(v))
+        g = self.diffusion_tensors(rgb)
+        step_u, step_v, step_p, step_q = self._step_sizes(g)
+
+        # The proximal map moves the pixels of a block by -step_u * weight * (mean - lr). Averaging this over the block
+        # gives an equation for the mean; as the weight goes to infinity, it becomes the projection onto mean = lr.
+        weight, mean_step = self.choose_weight(lr, scale), box_mean(step_u, scale)
+        gain = 1 / mean_step if weight is None else weight / (1 + weight * mean_step)
+        gain = step_u * repeat_blocks(torch.where(valid, gain, 0), scale)
+        target = torch.where(valid, lr, 0)
+
+        mean_u, mean_v = torch.zeros_like(u), torch.zeros_like(v)
+        previous, moved, done = u, [], 0
+        for done in range(1, self.iterations + 1):
+            gp = _zero_border(g.times(p))
+            prox_u = u + step_u * divergence(gp)
+            prox_u = prox_u - gain * repeat_blocks(box_mean(prox_u, scale) - target, scale)
+            prox_v = v + step_v * (gp[:, :, 0] + divergence(q))
+            ahead_u, ahead_v = 2 * prox_u - u, 2 * prox_v - v
+            bent = g.times(_zero_border(gradient(ahead_u) - ahead_v[:, :, None]))
+            prox_p = _project_ball(p + step_p * bent, self.alpha1)
+            prox_q = _project_ball(q + step_q * gradient(ahead_v), self.alpha0)
+            u, v = u.lerp(prox_u, _RELAXATION), v.lerp(prox_v, _RELAXATION)
+            p, q = p.lerp(prox_p, _RELAXATION), q.lerp(prox_q, _RELAXATION)
+            since = (done - 1) % _CHECK_EVERY + 1
+            mean_u, mean_v = mean_u.lerp(prox_u, 1 / since), mean_v.lerp(prox_v, 1 / since)
+            if since == _CHECK_EVERY:
+                moved.append(float((mean_u - previous).square().mean(dim=(-2, -1)).max().sqrt()))
+                previous = mean_u
+                report(done, self.iterations)
+                if moved[-1] < self.tolerance:
+                    break
+        report(self.iterations, self.iterations)
+        return Solution(mean_u, mean_v, done, moved)
 
     def choose_weight(self, lr: Tensor, scale: int) -> float | None:
         """Return the weight of the data term for a normalised map, (B, 1, h, w), NaN in holes.
@@ -183,96 +204,22 @@ class TotalGeneralisedVariation(Method):
         x, y = normal[:, 0], normal[:, 1]
         return Tensors(1 - less * x * x, -less * x * y, 1 - less * y * y)
 
-    def objective(self, values: Tensor, slopes: Tensor, lr: Tensor, tensors: Tensors) -> Tensor:
-        """Return E(u, v), (B,), without the data term if its weight is None."""
-        bent = tensors.times(_zero_border(gradient(values) - slopes[:, :, None]))
-        total = self.alpha1 * _lengths(bent).sum(dim=(1, 2, 3))
-        total = total + self.alpha0 * _lengths(gradient(slopes)).sum(dim=(1, 2, 3))
-        scale = values.shape[-1] // lr.shape[-1]
-        weight = self.choose_weight(lr, scale)
-        if weight is None:
-            return total
-        miss = torch.where(lr.isfinite(), box_mean(values, scale) - lr, 0)
-        return total + weight / 2 * scale**2 * miss.square().sum(dim=(1, 2, 3))
+    def _step_sizes(self, g: Tensors) -> tuple[Tensor, Tensor, Tensor, float]:
+        """Return the step sizes of u (B, 1, H, W), v (B, 2, H, W), p (B, 1, 1, H, W) and q.
 
-    def _iterate(self, first: Tensor, lr: Tensor, g: Tensors, progress: Steps | None) -> Solution:
-        """Iterate from an initial map, (B, 1, H, W)."""
-        steps = _Steps.of(g, self.step_ratio)
-        data = _DataTerm(lr, steps.u, self.choose_weight(lr, first.shape[-1] // lr.shape[-1]))
-        u = first
-        v = slopes(u)
-        p, q = torch.zeros_like(v)[:, :, None], torch.zeros_like(gradient(v))
-        mean_u, mean_v = torch.zeros_like(u), torch.zeros_like(v)
-        previous, moved, done = u, [], 0
-        for done in range(1, self.iterations + 1):
-            gp = _zero_border(g.times(p))
-            prox_u = data.prox(u + steps.u * divergence(gp))
-            prox_v = v + steps.v * (gp[:, :, 0] + divergence(q))
-            ahead_u, ahead_v = 2 * prox_u - u, 2 * prox_v - v
-            prox_p = _project_ball(
-                p + steps.p * g.times(_zero_border(gradient(ahead_u) - ahead_v[:, :, None])), self.alpha1
-            )
-            prox_q = _project_ball(q + steps.q * gradient(ahead_v), self.alpha0)
-            u, v = u.lerp(prox_u, _RELAXATION), v.lerp(prox_v, _RELAXATION)
-            p, q = p.lerp(prox_p, _RELAXATION), q.lerp(prox_q, _RELAXATION)
-            since = (done - 1) % _CHECK_EVERY + 1
-            mean_u, mean_v = mean_u.lerp(prox_u, 1 / since), mean_v.lerp(prox_v, 1 / since)
-            if since == _CHECK_EVERY:
-                moved.append(float((mean_u - previous).square().mean(dim=(-2, -1)).max().sqrt()))
-                previous = mean_u
-                if progress is not None:
-                    progress(done, self.iterations)
-                if moved[-1] < self.tolerance:
-                    break
-        if progress is not None:
-            progress(self.iterations, self.iterations)
-        return Solution(mean_u, mean_v, done, moved)
-
-
-class _Steps(NamedTuple):
-    """Step sizes: of u (B, 1, H, W), v (B, 2, H, W), p (B, 1, 1, H, W) and q."""
-
-    u: Tensor
-    v: Tensor
-    p: Tensor
-    q: float
-
-    @classmethod
-    def of(cls, g: Tensors, ratio: float) -> _Steps:
-        """Return the inverse absolute row and column sums of the operator, scaled by the root of the ratio.
-
-        The operator acts on (u, v / _SLOPE), because slopes are smaller than differences of the map.
+        They are the inverse absolute row and column sums of the operator, scaled by the root of the ratio. The operator
+        acts on (u, v / _SLOPE), because slopes are smaller than differences of the map.
         """
-        root = ratio**0.5
+        root = self.step_ratio**0.5
         along_u, along_v = g.uu + g.uv.abs(), g.vv + g.uv.abs()
         inside = _zero_border(torch.stack((along_u, along_v), dim=1))
-        columns = sum_adjacent(inside)
-        v = _SLOPE / (inside[:, :, 0] + 4)
-        p = 1 / ((2 + _SLOPE) * torch.maximum(along_u, along_v))[:, None]
-        return cls(1 / (root * columns.clamp(min=1e-6)), v / root, p * root, root / (2 * _SLOPE))
+        step_u = 1 / (root * sum_adjacent(inside).clamp(min=1e-6))
+        step_v = _SLOPE / (inside[:, :, 0] + 4) / root
+        step_p = 1 / ((2 + _SLOPE) * torch.maximum(along_u, along_v))[:, None] * root
+        return step_u, step_v, step_p, root / (2 * _SLOPE)
 
 
-class _DataTerm:
-    """The proximal map of data_weight / 2 * sum over blocks of size^2 (mean - lr)^2, with one step size per pixel.
-
-    With step sizes t, the pixels of a block move by -t * data_weight * (mean - lr). Averaging this over the block gives
-    an equation for the mean. As data_weight goes to infinity, it becomes the projection onto mean = lr.
-    """
-
-    def __init__(self, lr: Tensor, steps: Tensor, weight: float | None) -> None:
-        self.scale = steps.shape[-1] // lr.shape[-1]
-        valid = lr.isfinite()
-        self.lr = torch.where(valid, lr, 0)
-        mean = box_mean(steps, self.scale)
-        gain = 1 / mean if weight is None else weight / (1 + weight * mean)
-        self.gain = steps * repeat_blocks(torch.where(valid, gain, 0), self.scale)
-
-    def prox(self, u: Tensor) -> Tensor:
-        """Return the proximal map of u, (B, 1, H, W)."""
-        return u - self.gain * repeat_blocks(box_mean(u, self.scale) - self.lr, self.scale)
-
-
-def slopes(u: Tensor) -> Tensor:
+def _slopes(u: Tensor) -> Tensor:
     """Return the gradient of (B, 1, H, W) maps, (B, 2, H, W); the last column and row repeat the one before."""
     v = gradient(u)[:, :, 0]
     if u.shape[-1] > 1:
@@ -289,11 +236,7 @@ def _zero_border(p: Tensor) -> Tensor:
     return p
 
 
-def _lengths(p: Tensor) -> Tensor:
-    """Return the length of each pixel's vector or matrix, (B, 2, C, H, W) -> (B, 1, H, W)."""
-    return p.square().sum(dim=(1, 2), keepdim=True)[:, 0].sqrt()
-
-
 def _project_ball(p: Tensor, radius: float) -> Tensor:
     """Project each pixel's vector or matrix of (B, 2, C, H, W) onto the ball of a radius."""
-    return p / (_lengths(p)[:, None] / radius).clamp(min=1)
+    lengths = p.square().sum(dim=(1, 2), keepdim=True).sqrt()
+    return p / (lengths / radius).clamp(min=1)

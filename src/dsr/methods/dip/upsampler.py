@@ -8,6 +8,9 @@ low-resolution version D d is compared with the input d_LR, and the intensity of
 
 with the range r of the input, and c = 10 for MSE, 1 for Lap_1. Holes of the input have no data term; the network fills
 them. The result is a moving average of the depth maps of all steps.
+
+The network is the hourglass of Ulyanov et al., supplementary material. What differs: convolutions are padded with
+zeros, the last one always computes in float32, and the widths may differ between levels.
 """
 
 from __future__ import annotations
@@ -23,14 +26,13 @@ import torch
 import torchmetrics
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import TensorBoardLogger
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 from torch.utils.data import DataLoader
 
 from dsr.degradation.downsampling import Downsampling, downsample_depth, scene_generator
-from dsr.geometry.surface import comparison, depth_to_normals
-from dsr.methods.base import WORKSPACE, Abilities, Cost, Method, whole_scale
-from dsr.methods.dip.skip_net import SkipNet, levels_for
+from dsr.geometry.surface import comparison
+from dsr.methods.base import WORKSPACE, Abilities, Cost, Method, expect_positive, whole_scale
 from dsr.methods.images import compute_min_max, estimate_noise, grey, mean3x3, normal_noise_deg
 from dsr.methods.networks.network import DTYPES, Precision
 from dsr.metrics.classes import compute_means, in_table_units
@@ -102,21 +104,16 @@ class DeepImagePrior(Method):
         """Check the options, and load the network of LPIPS."""
         self.device = torch.device(self.device)
         w = 1.0 if self.w == "auto" else self.w
+        expect_positive(steps=self.steps, learning_rate=self.learning_rate)
+        expect_positive(or_zero=True, border=self.border, input_noise=self.input_noise, perturbation=self.perturbation)
+        expect_positive(or_zero=True, w=w, w_intensity=self.w_intensity, validate_every=self.validate_every)
         layers = len(self.widths) == len(self.skips) > 0
         for name, expected, right in (
-            ("steps", "a positive number", self.steps > 0),
-            ("learning_rate", "a positive number", 0 < self.learning_rate < float("inf")),
             ("widths", "a positive number for each level", layers and min(self.widths) > 0),
             ("skips", "a positive number for each level", layers and min(self.skips) > 0),
-            ("border", "0 or a positive number", self.border >= 0),
-            ("input_noise", "0 or a positive number", 0 <= self.input_noise < float("inf")),
-            ("perturbation", "0 or a positive number", 0 <= self.perturbation < float("inf")),
             ("average", "0 or more and less than 1", 0 <= self.average < 1),
             ("data_loss", "lap1 or mse", self.data_loss in DATA_WEIGHTS),
             ("visual", "mse_v where w is 0, as for DIP", bool(w) or self.visual == "mse_v"),
-            ("w", "0 or a positive number", 0 <= w < float("inf")),
-            ("w_intensity", "0 or a positive number", 0 <= self.w_intensity < float("inf")),
-            ("validate_every", "0 or a positive number", self.validate_every >= 0),
             ("validate_every", "a positive number for oracle=true", self.validate_every > 0 or not self.oracle),
             ("precision", f"one of {', '.join(DTYPES)}", self.precision in DTYPES),
         ):  # fmt: skip
@@ -132,13 +129,7 @@ class DeepImagePrior(Method):
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
         """Return the high-resolution orthogonal depth, (1, H, W) in metres on the sample's device; valid everywhere.
 
-        Args:
-            sample: the low-resolution map and the photo.
-            progress: called with the number of steps done and their total, unless there is a display.
-
-        Raises:
-            ValueError: the optimisation diverged.
-
+        ``progress`` is not called if there is a display. A ValueError tells that the optimisation diverged.
         """
         display = self.display or StepsProgress(progress)
         with torch.inference_mode(mode=False), torch.enable_grad():
@@ -173,7 +164,7 @@ class DeepImagePrior(Method):
                 enable_checkpointing=False,
             )
             fit(trainer, module, _numbers(self.steps), val_dataloaders=_numbers(1))
-        return (module.average if module.best is None else module.best)[0].to(sample.depth_lr)
+        return module.best[0].to(sample.depth_lr)
 
 
 class PriorOptimisation(lightning.LightningModule):
@@ -211,15 +202,13 @@ class PriorOptimisation(lightning.LightningModule):
         self.spread[_NOISE_CHANNELS:] = _PHOTO_PERTURBATION
 
         self.w = (1.0 if options.w == "auto" else options.w) if visual else 0.0
-        self.normals_lr = depth_to_normals(self.depth_lr, self.rays_lr) if self.w and self.complete else None
         if self.w:
             options.visual_loss.check_size(*self.depth_lr.shape[-2:])
             if options.w == "auto" and options.visual != "mse_v":
                 smoothed = SurfacePair(mean3x3(self.depth_lr), self.depth_lr, self.rays_lr)
                 self.w = match_weight(options.visual_loss, [smoothed])
         self.average = torch.zeros_like(self.grey)
-        self.best: Tensor | None = None
-        self.lowest = float("inf")
+        self.best, self.lowest = self.average, float("inf")  # the best one is a copy if the true depth chooses it
         self.metrics = None if options.metrics is None or self.truth is None else options.metrics().to(device)
         self.validation_scores: dict[str, dict[str, float]] = {}
         self.shown_scores: dict[str, dict[str, float]] = {}
@@ -249,8 +238,6 @@ class PriorOptimisation(lightning.LightningModule):
         loss = DATA_WEIGHTS[options.data_loss] * data
         if self.w:
             surfaces = SurfacePair(depth_lr, self.depth_lr, self.rays_lr)
-            if surfaces.complete and self.normals_lr is not None:
-                surfaces.normals = depth_to_normals(depth_lr, self.rays_lr), self.normals_lr
             visual = options.visual_loss(surfaces).squeeze()
             terms[options.visual] = visual if surfaces.complete else visual.nansum()  # there may be none between holes
             loss = loss + self.w * terms[options.visual]
@@ -308,3 +295,107 @@ def _numbers(count: int) -> Any:
     """Return a loader of numbers, one for each step, that does not use the global random generator."""
     numbers: Any = range(count)
     return DataLoader(numbers, batch_size=None, generator=torch.Generator())
+
+
+class SkipNet(nn.Module):
+    """An hourglass with narrow skip connections, of given channels at each level, full resolution first.
+
+    In the encoder, each level halves the resolution by a strided 3 x 3 convolution, followed by another one. In the
+    decoder, each level doubles it bilinearly, concatenates the skip connection and applies a 3 x 3 and a 1 x 1
+    convolution. Batch normalisation over the image and a leaky ReLU follow every convolution.
+    """
+
+    def __init__(self, inputs: int, outputs: int, widths: Sequence[int], skips: Sequence[int]) -> None:
+        super().__init__()
+        above = [inputs, *widths[:-1]]
+        below = [*widths[1:], widths[-1]]
+        self.skip = nn.ModuleList(_block(i, s, 1) for i, s in zip(above, skips, strict=True))
+        self.down = nn.ModuleList(
+            nn.Sequential(_block(i, w, 3, 2), _block(w, w, 3)) for i, w in zip(above, widths, strict=True)
+        )
+        self.norm = nn.ModuleList(_Norm(s + b) for s, b in zip(skips, below, strict=True))
+        self.up = nn.ModuleList(
+            nn.Sequential(_block(s + b, w, 3), _block(w, w, 1)) for s, b, w in zip(skips, below, widths, strict=True)
+        )
+        self.last = nn.Conv2d(widths[0], outputs, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map (B, inputs, H, W) to (B, outputs, H, W), at least in float32."""
+        sides: list[Tensor] = []
+        for skip, down in zip(self.skip, self.down, strict=True):
+            sides.append(skip(x))
+            x = down(x)
+        for side, norm, up in zip(reversed(sides), reversed(self.norm), reversed(self.up), strict=True):
+            x = upsample_2x(x)[..., : side.shape[-2], : side.shape[-1]]  # the side may be odd
+            x = up(norm(torch.cat((side, x), dim=1)))
+        with torch.autocast(x.device.type, enabled=False):  # bfloat16 would round depth to 256 steps
+            return self.last(x.to(self.last.weight.dtype))
+
+
+def levels_for(height: int, width: int, most: int) -> int:
+    """Return the number of levels of a SkipNet for an image size, between 1 and ``most``.
+
+    The smallest has at least 2 x 2 pixels, for batch normalisation.
+    """
+    return max(1, min(most, (min(height, width) - 1).bit_length() - 1))
+
+
+def upsample_2x(x: Tensor) -> Tensor:
+    """Upsample (B, C, h, w) bilinearly to (B, C, 2 h, 2 w), with pixels as areas and border pixels repeated."""
+    result: Tensor = _Upsample2x.apply(x)
+    return result
+
+
+class _Upsample2x(torch.autograd.Function):
+    """Bilinear upsampling by slices, whose backward pass is several times as fast as the library's on a CPU."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        """Mix the two nearest pixels with weights 1/4 and 3/4 along each axis."""
+        channels_last = x.is_contiguous(memory_format=torch.channels_last)
+        layout = torch.channels_last if channels_last else torch.contiguous_format
+        with torch.autocast(x.device.type, enabled=False):  # which pads in float32
+            x = functional.pad(x, (1, 1, 1, 1), mode="replicate")
+        for axis in (2, 3):
+            size, shape = x.shape[axis] - 2, list(x.shape)
+            shape[axis] = 2 * size
+            out = torch.empty(shape, dtype=x.dtype, device=x.device, memory_format=layout)
+            even, odd = out.unflatten(axis, (size, 2)).unbind(axis + 1)
+            here = x.narrow(axis, 1, size)
+            torch.lerp(here, x.narrow(axis, 0, size), 0.25, out=even)
+            torch.lerp(here, x.narrow(axis, 2, size), 0.25, out=odd)
+            x = out
+        return x
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        """Apply the transpose."""
+        for axis in (3, 2):
+            size = gradient.shape[axis] // 2
+            even, odd = gradient.unflatten(axis, (size, 2)).unbind(axis + 1)
+            out = (even + odd).mul_(0.75)
+            out.narrow(axis, 0, size - 1).add_(even.narrow(axis, 1, size - 1), alpha=0.25)
+            out.narrow(axis, 1, size - 1).add_(odd.narrow(axis, 0, size - 1), alpha=0.25)
+            ends = gradient.transpose(0, axis)[:: 2 * size - 1].transpose(0, axis)  # the first and the last
+            if size == 1:
+                ends = ends.sum(axis, keepdim=True)
+            out.transpose(0, axis)[:: max(size - 1, 1)].transpose(0, axis).add_(ends, alpha=0.25)
+            gradient = out
+        return gradient
+
+
+class _Norm(nn.BatchNorm2d):
+    """A batch normalisation that always uses the statistics of the current image."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__(channels, track_running_stats=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Normalise (B, C, H, W) without the buffer that nn.BatchNorm2d's own call allocates."""
+        return torch.native_batch_norm(x, self.weight, self.bias, None, None, True, 0.1, self.eps)[0]
+
+
+def _block(inputs: int, outputs: int, kernel: int, stride: int = 1) -> nn.Sequential:
+    """Return a convolution, normalisation and activation."""
+    convolution = nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2)
+    return nn.Sequential(convolution, _Norm(outputs), nn.LeakyReLU(0.2, inplace=True))

@@ -1,0 +1,308 @@
+"""Photo-guided filters: planes, offsets, holes and sizes for all, and each against its definition."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from dsr.degradation.downsampling import Downsampling, Kernel, make_sample
+from dsr.geometry.camera import Camera, from_range, to_range
+from dsr.methods.classical.bilateral import Bilateral, JointBilateral
+from dsr.methods.classical.fast_global_smoother import FastGlobalSmoother, smooth, solve_lines
+from dsr.methods.classical.guided_filter import GuidedFilter, GuidedMethod, estimate_slopes, guided_filter
+from dsr.methods.classical.interpolation import Interpolation
+from dsr.sample import DepthSample, Scene
+from dsr.utils.ratios import SCALES
+
+METHODS = (GuidedFilter, JointBilateral, FastGlobalSmoother)
+every_method = pytest.mark.parametrize("method", METHODS, ids=lambda method: method.__name__)
+Build = Callable[..., GuidedMethod]
+
+
+def _noise(*shape: int, seed: int = 0) -> Tensor:
+    return torch.from_numpy(np.random.default_rng(seed).uniform(size=shape))
+
+
+def _sample(disparity: Tensor, kernel: Kernel = "box", scale: int = 4, rgb: Tensor | None = None) -> DepthSample:
+    """Return the problem of a scene with these disparities, (H, W)."""
+    height, width = disparity.shape
+    camera = Camera(width, height, 60.0, 55.0, 21.3, 17.9)
+    depth = from_range(disparity[None], camera, "disparity")
+    scene = Scene("set", "hall", _noise(3, height, width, seed=1) if rgb is None else rgb, camera, depth)
+    return make_sample(scene, scale, Downsampling(kernel), "disparity")
+
+
+def _result(method: GuidedMethod, sample: DepthSample) -> Tensor:
+    """Return the high-resolution disparity, (H, W)."""
+    fine = method(sample)
+    assert fine.shape == (1, sample.camera.height, sample.camera.width)
+    return to_range(fine, sample.camera, "disparity")[0]
+
+
+def _plane(height: int = 32, width: int = 48) -> Tensor:
+    v, u = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
+    return 8 + 0.05 * u - 0.03 * v
+
+
+def _random() -> Tensor:
+    return 5 + 4 * _noise(32, 48, seed=2)
+
+
+@every_method
+@pytest.mark.parametrize("kernel", ["box", "nearest"])
+def test_plane_is_reproduced_exactly_under_a_photo_of_noise(method: Build, kernel: Kernel) -> None:
+    plane = _plane()
+    for scale in SCALES:
+        torch.testing.assert_close(_result(method(), _sample(plane, kernel, scale)), plane, rtol=0, atol=1e-10)
+
+
+@every_method
+def test_plane_without_slopes_is_reproduced_to_a_low_resolution_pixels_rise_away_from_the_border(method: Build) -> None:
+    plane = _plane(64, 64)
+    error = (_result(method(slopes=False), _sample(plane)) - plane).abs()[16:-16, 16:-16]
+    assert 1e-3 < float(error.max()) < 4 * (0.05 + 0.03)
+
+
+@every_method
+def test_hole_in_a_plane_is_filled_with_the_plane(method: Build) -> None:
+    holed = _plane()
+    holed[8:24, 12:32] = torch.nan
+    torch.testing.assert_close(_result(method(fill_holes=True), _sample(holed)), _plane(), rtol=0, atol=1e-10)
+
+
+@every_method
+@pytest.mark.parametrize("slopes", [True, False])
+def test_methods_are_equivariant_to_scale_and_offset_of_disparity(method: Build, slopes: bool) -> None:
+    fine = _result(method(slopes=slopes), _sample(_random()))
+    moved = _result(method(slopes=slopes), _sample(2 * _random() + 7))
+    torch.testing.assert_close(moved, 2 * fine + 7, rtol=0, atol=1e-10)
+
+
+@every_method
+@pytest.mark.parametrize("fill", [True, False])
+def test_holes_are_where_the_nearest_low_resolution_pixel_is_missing_unless_filled(method: Build, fill: bool) -> None:
+    holed = _random()
+    holed[4:12, 8:16] = torch.nan
+    holed[28:, :4] = torch.nan
+    sample = _sample(holed)
+    expected = np.kron(sample.mask_lr[0].numpy(), np.ones((4, 4), dtype=bool))
+    assert (~expected).sum() == 80
+    np.testing.assert_array_equal(_result(method(fill_holes=fill), sample).isfinite().numpy(), expected | fill)
+
+
+@every_method
+def test_result_without_slopes_lies_between_the_valid_values(method: Build) -> None:
+    """A hole that counted as 0 would pull its surroundings below 5."""
+    flat = torch.full((32, 48), 5.0).double()
+    flat[8:20, 12:32] = torch.nan
+    for slopes in (True, False):
+        fine = _result(method(fill_holes=True, slopes=slopes), _sample(flat))
+        torch.testing.assert_close(fine, torch.full_like(fine, 5.0), rtol=0, atol=1e-10)
+
+
+@every_method
+def test_single_valid_low_resolution_pixel_is_enough(method: Build) -> None:
+    lonely = torch.full((32, 48), torch.nan).double()
+    lonely[8:12, 8:12] = 5.0
+    fine = _result(method(fill_holes=True), _sample(lonely))
+    torch.testing.assert_close(fine, torch.full_like(fine, 5.0), rtol=0, atol=1e-10)
+
+
+@every_method
+def test_result_is_positive_depth_even_where_far_and_near_meet(method: Build) -> None:
+    disparity = torch.where(torch.arange(48) % 16 < 8, 0.01, 40.0).double().expand(32, 48)
+    sample = _sample(disparity)
+    fine = method()(sample)
+    assert bool((fine > 0).all())
+    assert float(fine.max()) <= 4 * float(sample.depth_lr.max()) + 1e-9
+
+
+def test_slope_is_the_smaller_difference_without_the_pixel_that_mixes_a_step() -> None:
+    values = torch.tensor([[0.0, 1.0, 2.0, 6.0, 10.0, 11.0, 12.0, 11.0, 10.0]]).double()
+    expected = torch.tensor([[1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0, -1.0, -1.0]]).double()
+    torch.testing.assert_close(estimate_slopes(values, 1), expected)
+    torch.testing.assert_close(estimate_slopes(values.T, 0), expected.T)
+
+
+def test_slope_beside_a_hole_is_the_remaining_difference() -> None:
+    values = torch.tensor([0.0, 2.0, 4.0, torch.nan, 9.0, 12.0, 15.0]).double()
+    torch.testing.assert_close(estimate_slopes(values, 0), torch.tensor([2.0, 2.0, 2.0, 2.0, 3.0, 3.0, 3.0]).double())
+
+
+def _by_regression(guide: Tensor, values: Tensor, radius: int, epsilon: float, weight: Tensor) -> np.ndarray:
+    """Fit each window by weighted ridge regression (numpy's lstsq), then average the fits."""
+    colours, p, w = guide.numpy(), values.numpy(), weight.numpy()
+    height, width = p.shape
+    total, counted = np.zeros((height, width)), np.zeros((height, width))
+    for i in range(height):
+        for j in range(width):
+            rows, columns = slice(max(i - radius, 0), i + radius + 1), slice(max(j - radius, 0), j + radius + 1)
+            share, target = w[rows, columns].ravel(), p[rows, columns].ravel()
+            samples = colours[:, rows, columns].reshape(3, -1).T
+            if share.sum() == 0:
+                continue
+            root = np.sqrt(share)[:, None]
+            ridge = np.sqrt(epsilon * share.sum()) * np.eye(3, 4)
+            design = np.vstack((root * np.column_stack((samples, np.ones(len(share)))), ridge))
+            fit = np.linalg.lstsq(design, np.concatenate((root[:, 0] * target, np.zeros(3))), rcond=None)[0]
+            answer = np.tensordot(fit[:3], colours[:, rows, columns], 1) + fit[3]
+            total[rows, columns] += share.mean() * answer
+            counted[rows, columns] += share.mean()
+    return np.where(counted > 0, total / np.where(counted > 0, counted, 1), p)
+
+
+@pytest.mark.parametrize("radius", [1, 3])
+@pytest.mark.parametrize("holes", [False, True])
+def test_guided_filter_is_the_mean_of_each_windows_ridge_regression(radius: int, holes: bool) -> None:
+    guide, values, weight = _noise(3, 16, 16), _noise(16, 16, seed=1), torch.ones(16, 16).double()
+    if holes:
+        weight = _noise(16, 16, seed=2)
+        weight[3:12, 4:14] = 0
+    result = guided_filter(guide, values[None], radius, 1e-3, weight)[0]
+    np.testing.assert_allclose(result, _by_regression(guide, values, radius, 1e-3, weight), rtol=0, atol=1e-9)
+
+
+def test_guided_filter_under_a_constant_photo_is_the_box_filter_twice() -> None:
+    impulse = torch.zeros(1, 15, 15).double()
+    impulse[0, 7, 7] = 1
+    tent = torch.tensor([1.0, 2.0, 3.0, 2.0, 1.0]).double() / 9
+    result = guided_filter(torch.full((3, 15, 15), 0.4).double(), impulse, 1, 1e-3, torch.ones(15, 15).double())[0]
+    torch.testing.assert_close(result[5:10, 5:10], tent[:, None] * tent, rtol=0, atol=1e-15)
+
+
+def test_blurred_step_along_a_photo_edge_becomes_sharp() -> None:
+    """Half of it, as the windows that straddle the edge disagree."""
+    columns = torch.arange(64).double().expand(64, 64)
+    rgb = torch.where(columns < 32, 0.2, 0.8).expand(3, 64, 64).contiguous()
+    blurred = ((columns - 27.5) / 8).clamp(0, 1)
+    sharp = guided_filter(rgb, blurred[None], 8, 1e-4, torch.ones_like(blurred))[0]
+    before, after = ((each[:, 32] - each[:, 31]) for each in (blurred, sharp))
+    torch.testing.assert_close(before, torch.full_like(before, 1 / 8))
+    assert float(after.min()) > 0.5
+
+
+@pytest.mark.parametrize("method", [JointBilateral, FastGlobalSmoother])
+@pytest.mark.parametrize("slopes", [True, False])
+def test_step_along_a_photo_edge_stays_sharp_within_a_low_resolution_pixel(method: Build, slopes: bool) -> None:
+    columns = torch.arange(64).expand(48, 64)
+    rgb = torch.where(columns < 32, 0.2, 0.8).double().expand(3, 48, 64).contiguous()
+    truth = torch.where(columns < 32, 5.0, 9.0).double()
+    sample = _sample(truth, rgb=rgb)
+    assert float((_result(method(slopes=slopes), sample) - truth).abs().max()) < 1e-6
+    bilinear = to_range(Interpolation("bilinear")(sample), sample.camera, "disparity")[0]
+    assert float((bilinear - truth).abs().max()) > 1
+
+
+def _by_neighbours(sample: DepthSample, radius: int, sigma_space: float, sigma_colour: float) -> np.ndarray:
+    """Sum over the neighbours of each HR pixel, LR pixel (i, j) lying at its block's centre."""
+    coarse = to_range(sample.depth_lr, sample.camera_lr, "disparity")[0].numpy() * 4
+    rgb = sample.rgb.numpy()
+    height, width = rgb.shape[1:]
+    means = rgb.reshape(3, height // 4, 4, width // 4, 4).mean(axis=(2, 4))
+    result = np.full((height, width), np.nan)
+    for v in range(height):
+        for u in range(width):
+            total = weights = 0.0
+            for i in range(max(v // 4 - radius, 0), min(v // 4 + radius + 1, height // 4)):
+                for j in range(max(u // 4 - radius, 0), min(u // 4 + radius + 1, width // 4)):
+                    if math.isnan(coarse[i, j]):
+                        continue
+                    distance = math.hypot((v - 1.5) / 4 - i, (u - 1.5) / 4 - j)
+                    unlike = np.linalg.norm(rgb[:, v, u] - means[:, i, j])
+                    weight = math.exp(-0.5 * (distance / sigma_space) ** 2 - 0.5 * (unlike / sigma_colour) ** 2)
+                    total, weights = total + weight * coarse[i, j], weights + weight
+            result[v, u] = total / weights if weights else np.nan
+    return result
+
+
+@pytest.mark.parametrize(("radius", "sigma_space", "sigma_colour"), [(1, 0.5, 0.1), (2, 1.0, 0.3)])
+@pytest.mark.parametrize("holes", [False, True])
+def test_joint_bilateral_is_the_mean_weighted_by_distance_and_colour(
+    radius: int, sigma_space: float, sigma_colour: float, holes: bool
+) -> None:
+    disparity = 5 + 4 * _noise(16, 16)
+    if holes:
+        disparity[4:8, 8:12] = torch.nan
+        disparity[:4, :4] = torch.nan
+    sample = _sample(disparity)
+    method = JointBilateral(radius, sigma_space, sigma_colour, fill_holes=True, slopes=False)
+    expected = _by_neighbours(sample, radius, sigma_space, sigma_colour)
+    np.testing.assert_allclose(_result(method, sample), expected, rtol=1e-10)
+
+
+def _line(colours: np.ndarray, values: np.ndarray, strength: float, sigma: float) -> np.ndarray:
+    """Solve one line, colours (3, L), as a dense system."""
+    system = np.eye(len(values))
+    for k in range(len(values) - 1):
+        w = strength * np.exp(-np.linalg.norm(colours[:, k] - colours[:, k + 1]) / sigma)
+        system[k : k + 2, k : k + 2] += w * np.array([[1, -1], [-1, 1]])
+    return np.linalg.solve(system, values)
+
+
+def _by_dense_systems(guide: Tensor, values: Tensor, strength: float, sigma: float) -> np.ndarray:
+    colours, u = guide.numpy(), values.numpy().copy()
+    for share in (24 / 63, 6 / 63, 1.5 / 63):  # 3/2 * 4^(3 - t) / (4^3 - 1)
+        for i in range(u.shape[0]):
+            u[i] = _line(colours[:, i], u[i], share * strength, sigma)
+        for j in range(u.shape[1]):
+            u[:, j] = _line(colours[:, :, j], u[:, j], share * strength, sigma)
+    return u
+
+
+def test_smoother_solves_rows_then_columns_three_times_with_the_papers_lambdas() -> None:
+    guide, values = _noise(3, 16, 13), _noise(16, 13, seed=1)
+    result = smooth(guide, values[None], 30.0, 0.3, 3)[0]
+    np.testing.assert_allclose(result, _by_dense_systems(guide, values, 30.0, 0.3), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("length", [1, 2, 9])
+def test_smoother_solves_lines_of_any_length(length: int) -> None:
+    weights, right = _noise(length - 1, 4), _noise(length, 2, 4, seed=1)
+    result = solve_lines(weights, right)
+    for m in range(4):
+        system = np.eye(length)
+        for k in range(length - 1):
+            system[k : k + 2, k : k + 2] += float(weights[k, m]) * np.array([[1, -1], [-1, 1]])
+        np.testing.assert_allclose(result[:, :, m], np.linalg.solve(system, right[:, :, m].numpy()), atol=1e-13)
+
+
+@pytest.mark.parametrize("kernel", ["box", "nearest"])
+def test_result_is_the_smoothed_data_divided_by_the_smoothed_index_map(kernel: Kernel) -> None:
+    disparity = 5 + 4 * _noise(16, 16, seed=3)
+    disparity[4:8, 8:12] = torch.nan
+    rgb = _noise(3, 16, 16)
+    sample = _sample(disparity, kernel, rgb=rgb)
+    coarse = to_range(sample.depth_lr, sample.camera_lr, "disparity")[0].numpy() * 4
+    data, index = np.zeros((16, 16)), np.zeros((16, 16))
+    for i, j in np.argwhere(np.isfinite(coarse)):
+        first, last = (1, 3) if kernel == "box" else (2, 3)  # the centre lies between four pixels, or on one
+        block = (slice(4 * i + first, 4 * i + last), slice(4 * j + first, 4 * j + last))
+        data[block], index[block] = coarse[i, j], 1
+    total, weight = (_by_dense_systems(rgb, torch.from_numpy(each), 0.7 * 16, 0.3) for each in (data, index))
+    method = FastGlobalSmoother(0.7, 0.3, fill_holes=True, slopes=False)
+    np.testing.assert_allclose(_result(method, sample), total / weight, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("method", "name"),
+    [
+        (Bilateral, "window"), (Bilateral, "sigma_depth"), (Bilateral, "sigma_space"),
+        (GuidedFilter, "radius"), (GuidedFilter, "epsilon"),
+        (JointBilateral, "radius"), (JointBilateral, "sigma_space"), (JointBilateral, "sigma_colour"),
+        (FastGlobalSmoother, "smoothness"), (FastGlobalSmoother, "sigma_colour"), (FastGlobalSmoother, "iterations"),
+    ],
+)  # fmt: skip
+def test_parameter_that_is_not_positive_is_refused(method: Build, name: str) -> None:
+    with pytest.raises(ValueError, match=rf"^{name}: expected a positive number, got 0"):
+        method(**{name: 0})
+
+
+@pytest.mark.parametrize(("method", "name"), [(Bilateral, "window"), (GuidedFilter, "radius")])
+def test_window_that_no_map_needs_is_refused(method: Build, name: str) -> None:
+    with pytest.raises(ValueError, match=rf"^{name}: expected at most 1024 low-resolution pixels, got 2000"):
+        method(**{name: 2000})
