@@ -11,8 +11,7 @@ from torch import Tensor
 from dsr.geometry.camera import Camera, from_range
 from dsr.methods.networks.facets import Facets
 from dsr.methods.networks.msg_net import MSGNet
-from dsr.methods.networks.network import DisparityNetwork, NetworkUpsampler
-from dsr.methods.tiling import blend_tiles, split_axis
+from dsr.methods.networks.network import DisparityNetwork, NetworkUpsampler, blend_tiles, split_axis
 from dsr.sample import DepthSample
 
 NETS: dict[str, Callable[[], DisparityNetwork]] = {

@@ -35,7 +35,6 @@ from dsr.utils.configuration import ConfigError, Node, build, config_directories
 from dsr.utils.ratios import SCALES
 
 _NETWORK = "network"  # key of a method's node: the dotted path of the network's class, for weights of a training
-OF_RUN = ("weights", "scale", "downsampling")  # keys of a method's node that a run gives in another way
 _ALONE: Mapping[str, Any] = {"scale": 4, "seed": 0, "downsampling": None}  # what a node may refer to without a run
 
 
@@ -49,19 +48,15 @@ class Known(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """Settings of a run for its method, which gets those that the signature of its class names.
-
-    ``known`` is for arguments that the method's node leaves open, by null or ``auto``. ``alignment`` is that of the
-    predictions to the ground truth before scores. The last five are those of
-    :class:`~dsr.methods.dip.upsampler.DeepImagePrior`.
-    """
+    """Settings of a run for its method, which gets those that the signature of its class names."""
 
     device: torch.device | str = "cpu"
     precision: str = "float32"
     seed: int = 0
     downsampling: Downsampling = field(default_factory=lambda: Downsampling("box"))
-    known: Known = field(default_factory=Known)
-    alignment: str = "none"
+    known: Known = field(default_factory=Known)  # for arguments that the method's node leaves open, by null or ``auto``
+    alignment: str = "none"  # of the predictions to the ground truth before scores
+    # the rest is of :class:`~dsr.methods.dip.upsampler.DeepImagePrior`
     metrics: Any = None
     workspace: Path | None = None
     display: Any = None
@@ -131,7 +126,7 @@ class Recipe:
     @functools.cached_property
     def of_run(self) -> tuple[str, ...]:
         """Keys of the node that a run gives in another way, of weights only to a method that needs a file."""
-        return OF_RUN if self.abilities.needs else OF_RUN[1:]
+        return ("weights", "scale", "downsampling") if self.abilities.needs else ("scale", "downsampling")
 
     @property
     def computed_at(self) -> tuple[float, ...]:
@@ -155,20 +150,20 @@ class Recipe:
     def build(self, factor: float, run: Run | None = None, **decided: Any) -> Method:
         """Build the method for a factor.
 
-        Args:
-            run: what the run gives; None for what :class:`Run` has.
-            **decided: arguments that the caller decides in place of the method's file, if the class names them.
-
+        ``run`` is what the run gives, None for what :class:`Run` has; ``decided`` are arguments that the caller decides
+        in place of the method's file, if the class names them.
         """
         given = {**vars(run or Run()), "scale": factor}
-        node = {key: value for key, value in self.at(factor).items() if key not in decided or key in self.settings}
-        for key, value in given.pop("known")._asdict().items():
+        known = given.pop("known")._asdict()
+        if self.abilities.needs is not None:
+            given |= {"weights": self.weights(factor), "networks": self._networks}
+        node = dict(self.at(factor))
+        for key, value in known.items():
             if value is not None and node.get(key) in (None, "auto"):
                 node.pop(key, None)
                 given[key] = value
-        if self.abilities.needs is not None:
-            given |= {"weights": self.weights(factor), "networks": self._networks}
-        node = {key: value for key, value in node.items() if key not in (*self.of_run, _NETWORK)}
+        for key in (*self.of_run, _NETWORK, *(decided.keys() - self.settings)):
+            node.pop(key, None)
         method: Method = build("method", node, {**given, **decided}, self.name)
         return method
 
