@@ -183,13 +183,11 @@ def fit_to_map(values: Tensor, sample: DepthSample, quantity: str, fit: str, pla
 
     The sample's truth is not looked at; ``place`` is the file that the values are of, for messages.
     """
-    target = from_depth(sample.depth_lr.to("cpu", torch.float64), sample, quantity)
     values = values.to(torch.float64)
-    reduced = _reduce(values, target)
-    known = reduced.isfinite() & target.isfinite()
-    if int(known.sum()) < 2:
+    own, theirs = _both_known(values, from_depth(sample.depth_lr.to("cpu", torch.float64), sample, quantity))
+    if own.numel() < 2:
         raise ValueError(f"{place}: expected pixels that the low-resolution map knows, too; there are none")
-    gain, shift = fit_line(reduced[known], target[known], shift=fit == "affine")
+    gain, shift = fit_line(own, theirs, shift=fit == "affine")
     if not gain > 0:
         what = quantity if quantity == "disparity" else f"{quantity} depth"
         raise ValueError(f"{place}: expected values that rise with the low-resolution map's {what}, they do not")
@@ -238,19 +236,18 @@ def from_depth(depth_lr: Tensor, sample: DepthSample, quantity: str) -> Tensor:
     return to_range(depth_lr, sample.camera_lr, cast(RangeType, quantity))
 
 
-def _reduce(values: Tensor, smaller: Tensor) -> Tensor:
-    """Return the means of the known values within the pixels of a smaller map, NaN where less than half are known."""
+def _both_known(values: Tensor, smaller: Tensor) -> tuple[Tensor, Tensor]:
+    """Return means of values within the pixels of a smaller map, if half of one are known, and its values there."""
     known, size = values.isfinite(), (smaller.shape[-2], smaller.shape[-1])
     share = adaptive_avg_pool2d(known.to(values.dtype), size)
-    return torch.where(share >= 0.5, adaptive_avg_pool2d(torch.where(known, values, 0), size) / share, torch.nan)
+    reduced = adaptive_avg_pool2d(torch.where(known, values, 0), size) / share
+    both = (share >= 0.5) & reduced.isfinite() & smaller.isfinite()
+    return reduced[both], smaller[both]
 
 
 def _expect_likeness(path: Path, depth: Tensor, sample: DepthSample, *, metric: bool) -> None:
     """Raise a ValueError if a map, perhaps metric, cannot be of the sample's scene."""
-    coarse = 1 / sample.depth_lr.to("cpu", torch.float64)
-    reduced = _reduce(1 / depth, coarse)
-    known = reduced.isfinite() & coarse.isfinite()
-    own, theirs = reduced[known], coarse[known]
+    own, theirs = _both_known(1 / depth, 1 / sample.depth_lr.to("cpu", torch.float64))
     if own.numel() < 2:
         return
     off = float(theirs.median() / own.median())

@@ -23,14 +23,7 @@ from dsr.degradation.downsampling import Downsampling
 from dsr.methods.base import Abilities, Method
 from dsr.methods.networks.network import DisparityNetwork
 from dsr.methods.networks.trained import NETWORKS, load_msg_weights
-from dsr.methods.networks.weight_files import (
-    find_weights,
-    has_weights,
-    is_dsr_weights,
-    load_network,
-    network_name,
-    read_header,
-)
+from dsr.methods.networks.weight_files import find_weights, has_weights, is_dsr_weights, load_network, network_name
 from dsr.utils.configuration import ConfigError, Node, build, config_directories, list_choices, load_target
 from dsr.utils.ratios import SCALES
 
@@ -66,24 +59,14 @@ class Run:
 
 @dataclass(frozen=True, eq=False)
 class Recipe:
-    """A method before the factor is known.
-
-    Args:
-        name: the method's.
-        node: its content, in which ``${scale}`` is not resolved.
-        directories: the user's configuration directories.
-        others: values that the node may refer to, the run's ``scale`` among them.
-        settings: keys that the caller has set.
-        label: its name in tables; None for ``name``.
-
-    """
+    """A method before the factor is known."""
 
     name: str
-    node: DictConfig
-    directories: tuple[Path, ...] = ()
-    others: Mapping[str, Any] = field(default_factory=lambda: _ALONE)
-    settings: frozenset[str] = frozenset()
-    label: str | None = None
+    node: DictConfig  # its content, in which ``${scale}`` is not resolved
+    directories: tuple[Path, ...] = ()  # of the user's configuration
+    others: Mapping[str, Any] = field(default_factory=lambda: _ALONE)  # that the node may refer to, such as ``scale``
+    settings: frozenset[str] = frozenset()  # keys that the caller has set
+    label: str | None = None  # name in tables; None for ``name``
     _resolved: dict[float | None, dict[str, Any]] = field(default_factory=dict, init=False, repr=False)
 
     def at(self, factor: float | None = None) -> Node:
@@ -177,10 +160,7 @@ class Recipe:
         path, variant = find_weights(node.get("weights"), factor, self.name), node.get("variant")
         if variant is not None and not is_dsr_weights(path):
             return load_msg_weights(path, factor, variant)
-        header = read_header(path)
-        trained, kind = header["arguments"].get("scale"), self._networks.get(header["network"])
-        serves = kind is not None and trained is not None and kind.serves(trained, factor)
-        return load_network(path, self._networks, None if serves else factor, str(node["model"]))
+        return load_network(path, self._networks, factor, str(node["model"]))
 
     def targets(self) -> Iterator[str]:
         """Yield the dotted paths of the method's class and of its network's class."""

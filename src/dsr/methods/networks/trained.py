@@ -27,7 +27,7 @@ from dsr.methods.networks.sparse_to_dense import SparseToDense
 from dsr.methods.networks.weight_files import is_dsr_weights, load_network, load_parameters
 from dsr.utils.guards import MOST_FILE, read_limited, refusing
 from dsr.utils.ratios import SCALES
-from dsr.utils.torch_files import read_torch_file
+from dsr.utils.torch_files import read_tensors
 
 _KINDS: tuple[type[DisparityNetwork], ...] = (
     MSGNet, Facets, FacetsUNet, PrimalDualNetwork, DynamicGuidance, SparseToDense, DDRNet,
@@ -102,14 +102,9 @@ def load_msg_weights(path: Path, scale: int, variant: VariantName | None = None)
 
 def _from_torch(path: Path) -> tuple[int, dict[str, Tensor]]:
     """Return the number of levels and the tensors by their names of a file with the key ``model_state_dict``."""
-    content = read_torch_file(path)
-    found = content.get("model_state_dict") if isinstance(content, dict) else None
-    if not isinstance(found, dict) or not all(isinstance(value, Tensor) for value in found.values()):
-        keys = ", ".join(map(str, list(content)[:4])) if isinstance(content, dict) else type(content).__name__
-        raise ValueError(f"{path}: expected tensors under the key model_state_dict, got {keys}")
-    indices = re.findall(r"^upsampling_X\.(\d{1,3})\.", "\n".join(map(str, found)), re.MULTILINE)
-    levels = max(map(int, indices), default=0) // 3  # 3 layers per level, then 2
-    return levels, {str(name): value for name, value in found.items()}
+    found = read_tensors(path, "model_state_dict")
+    indices = re.findall(r"^upsampling_X\.(\d{1,3})\.", "\n".join(found), re.MULTILINE)
+    return max(map(int, indices), default=0) // 3, found  # 3 layers per level, then 2
 
 
 def _from_caffe(path: Path, data: bytes) -> tuple[int, dict[str, Tensor]]:

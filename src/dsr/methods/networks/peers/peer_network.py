@@ -28,9 +28,9 @@ from dsr.methods.networks.network import DTYPES, Precision, blend_tiles, split_i
 from dsr.methods.networks.normalisation import compute_min_max, normalise, resize_bicubic
 from dsr.methods.networks.weight_files import load_parameters
 from dsr.sample import DepthSample
+from dsr.utils import torch_files
 from dsr.utils.guards import expect_one_of
 from dsr.utils.progress import Steps
-from dsr.utils.torch_files import read_torch_file
 
 Range = Literal["measured", "truth"]
 SWAPPED_LUMA = LUMA[::-1]  # weights of red, green and blue, as some authors' code applies the luma's to RGB
@@ -49,11 +49,7 @@ def load_peer(path: Path, network: type[PeerNetwork], scale: float) -> PeerNetwo
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
     """Read the tensors of an authors' file by name, without the prefix of networks trained on several GPUs."""
-    content = read_torch_file(path)
-    if not isinstance(content, dict) or not all(isinstance(value, Tensor) for value in content.values()):
-        keys = ", ".join(map(str, list(content)[:4])) if isinstance(content, dict) else type(content).__name__
-        raise ValueError(f"{path}: expected a network's tensors by name, got {keys}")
-    return {str(name).removeprefix("module."): value for name, value in content.items()}
+    return {name.removeprefix("module."): value for name, value in torch_files.read_tensors(path).items()}
 
 
 def rename(tensors: Mapping[str, Tensor], names: Mapping[str, str]) -> dict[str, Tensor]:
