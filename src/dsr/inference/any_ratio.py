@@ -42,10 +42,9 @@ from dsr.utils.compute_device import fast_precision, pick_device
 from dsr.utils.configuration import ConfigError
 from dsr.utils.progress import Steps
 
+# arguments of methods that are set here: holes are restored afterwards, and validation has no ground truth
 _DECIDED = MappingProxyType({"fill_holes": True, "validate_every": 0})
-"""Arguments of methods that are set here: holes are restored afterwards, and validation has no ground truth."""
-_LARGEST_RATIO = 16
-"""Largest ratio of the sizes that a smaller working size may lead to: there are no weights for larger ones."""
+_LARGEST_RATIO = 16  # of the sizes that a smaller working size may lead to: there are no weights for larger ones
 
 
 class AnyRatio(Method):
@@ -72,9 +71,6 @@ class AnyRatio(Method):
             choose it by the map's noise, see :mod:`dsr.inference.working_size`.
         precision: dtype of the convolutions; None for the device's fast one where that costs no accuracy.
         seed: of random numbers.
-
-    Raises:
-        ValueError: an option is not as above.
 
     """
 
@@ -105,20 +101,13 @@ class AnyRatio(Method):
     def first(self) -> Method:
         """Return the method for its smallest factor, which checks the settings.
 
-        Raises:
-            ValueError: a setting is unknown, of another type, or the method rejects it: the message begins with its
-                name and a colon; or the method's own file has such a value: it begins with ``method=NAME:``.
-
+        The message of a ValueError begins with the name of a setting, or for one of the method's own file with
+        ``method=NAME:``.
         """
         return self._method(min((step for steps in self._steps.values() for step in steps), default=USUAL_SCALE))
 
     def check_working_size(self) -> None:
-        """Check that a working size other than the map's own has an effect.
-
-        Raises:
-            ValueError: it has none with this method and scale.
-
-        """
+        """Check that a working size other than the map's own has an effect with this method and scale."""
         size = self._working_size
         if size not in (None, 1) and not self._may_reduce:
             raise ValueError(
@@ -338,19 +327,10 @@ def upsampler(
     max_hole: float = WIDEST,
     working_size: int | None = None,
 ) -> AnyRatio:
-    """Return a method for depth maps of any size, which loads its weights once.
+    """Return a method of ``conf/method`` for depth maps of any size, which loads its weights once.
 
-    Args:
-        method: the name of one in ``conf/method``.
-        scale: see :class:`AnyRatio`, also for ``fill``, ``max_hole`` and ``working_size``.
-        settings: arguments of the method that differ from its file, by name.
-        device: ``auto`` for a GPU if there is one, or a device as torch names it.
-        fill: see there.
-        max_hole: see there.
-        working_size: see there.
-
-    Raises:
-        ValueError: there is no such method or device, or an option is not as described.
+    ``settings`` are arguments of the method that differ from its file, by name; ``device`` is ``auto`` for a GPU if
+    there is one, or a device as torch names it. The others are as of :class:`AnyRatio`.
 
     Example:
         >>> import torch

@@ -14,8 +14,7 @@ from dsr.geometry.resampling import resize_inverse_depth
 from dsr.methods.base import InverseSample, InverseSurface, Method, NoiseLaw
 from dsr.utils.progress import Steps, part_of
 
-Size = tuple[int, int]
-"""Height and width."""
+Size = tuple[int, int]  # height and width
 
 
 def at_ratio(
@@ -26,15 +25,7 @@ def at_ratio(
     progress: Steps | None,
     noise: NoiseLaw | None = None,
 ) -> InverseSurface:
-    """Run a method of any ratio.
-
-    Args:
-        rgb: (3, H, W) the photo.
-        inverse: (1, h, w) the map.
-        camera: the photo's.
-        noise: of the map, where it is known.
-
-    """
+    """Run a method of any ratio on a photo, (3, H, W), its camera, and a map, (1, h, w), whose noise may be known."""
     height, width = size_of(inverse)
     down, across = camera.height / height, camera.width / width
     ratio = down if across.is_integer() else across  # whole only if both are
@@ -47,12 +38,7 @@ def at_factors(
 ) -> InverseSurface:
     """Run methods in turn, each at its factor and on the result of the one before, and resize the last one's result.
 
-    Args:
-        stages: factors and methods.
-        rgb: (3, H, W) the photo.
-        inverse: (1, h, w) the map.
-        camera: the photo's.
-
+    The photo is (3, H, W), the camera is the photo's, and the map is (1, h, w).
     """
     size = size_of(rgb)
     sizes = [size_of(inverse)]  # of the low-resolution map of each stage

@@ -103,8 +103,9 @@ class Surface(NamedTuple):
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Surface:
         """Return the surface with a function applied to each of its maps."""
-        maps = {key: value for key, value in self._asdict().items() if isinstance(value, Tensor)}
-        return self._replace(**{key: function(value) for key, value in maps.items()})
+        others = (self.depth_error, self.angle_error, self.filled)
+        depth_error, angle_error, filled = (None if each is None else function(each) for each in others)
+        return Surface(function(self.depth), depth_error, angle_error, self.noise, self.outliers, filled, self.glass)
 
     def without_dubious(self, limit: float) -> Surface:
         """Return the surface with holes where the depth is expected to be off by more than this share of it."""
