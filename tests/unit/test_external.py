@@ -78,6 +78,8 @@ def quantity(sample: DepthSample, name: str) -> Tensor:
 def test_quantity_is_converted(sample: DepthSample, tmp_path: Path, name: str) -> None:
     write(tmp_path, "hall.npy", quantity(sample, name)[0].numpy())
     torch.testing.assert_close(External(str(tmp_path), range_type=name)(sample), sample.depth)
+    write(tmp_path, "hall.npy", 10 * truth(sample))  # unlikely, but wanted
+    torch.testing.assert_close(External(str(tmp_path), check=False)(sample), 10 * full(sample))
 
 
 @pytest.mark.parametrize(("name", "gain", "shift"), [("inverse", 7.0, -0.5), ("disparity", 0.01, 2.0)])
@@ -160,11 +162,6 @@ def test_map_that_cannot_be_right_is_refused_by_name(
     write(tmp_path, "hall.npy", change(truth(sample)))  # type: ignore[operator]
     with pytest.raises(ValueError, match=message):
         External(str(tmp_path), **settings)(sample)  # type: ignore[arg-type]
-
-
-def test_unlikely_map_is_taken_when_asked(sample: DepthSample, tmp_path: Path) -> None:
-    write(tmp_path, "hall.npy", 10 * truth(sample))
-    torch.testing.assert_close(External(str(tmp_path), check=False)(sample), 10 * full(sample))
 
 
 @pytest.mark.parametrize(

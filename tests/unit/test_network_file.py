@@ -6,7 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from small_scenes import plane, random_scene, sample_of
@@ -169,38 +168,24 @@ def test_photo_is_resized_for_a_network_that_sees_it_alone(tmp_path: Path) -> No
 
 def test_content_follows_weights_that_lie_beside_the_graph(tmp_path: Path) -> None:
     onnx = pytest.importorskip("onnx")
-    helper, kind = onnx.helper, onnx.TensorProto.FLOAT
-    found = []
-    for value in (1.0, 0.5):
-        shape = ["n", 1, "h", "w"]
-        maps = [helper.make_tensor_value_info(name, kind, shape) for name in ("depth", "out")]
-        weight = helper.make_tensor("w", kind, [256], np.full(256, value, "<f4").tobytes(), raw=True)
-        nodes = [
-            helper.make_node("ReduceMean", ["w"], ["m"], keepdims=0),
-            helper.make_node("Mul", ["depth", "m"], ["out"]),
-        ]
-        model = helper.make_model(
-            helper.make_graph(nodes, "g", maps[:1], maps[1:], [weight]),
-            opset_imports=[helper.make_opsetid("", 18)], ir_version=9,
-        )  # fmt: skip
-        beside = {"save_as_external_data": True, "location": "net.data", "size_threshold": 0}
-        (tmp_path / "net.data").unlink(missing_ok=True)
-        onnx.save_model(model, str(tmp_path / "net.onnx"), **beside)
-        found.append((
-            (tmp_path / "net.onnx").read_bytes(),
-            NetworkFile(str(tmp_path / "net.onnx"), {"depth": "up"}).content("set", "hall", 4),
-        ))  # fmt: skip
+    path, beside = tmp_path / "net.onnx", tmp_path / "net.data"
+    inputs, found = {"photo": "image", "inverse_depth": "lr", "valid": "valid"}, []
+    for seed in range(2):
+        torch.manual_seed(seed)
+        write_onnx(tmp_path / "whole.onnx", OnnxGraph(MSGNet(2), 2), {})
+        beside.unlink(missing_ok=True)
+        onnx.save_model(
+            onnx.load(tmp_path / "whole.onnx"), path, save_as_external_data=True, location=beside.name, size_threshold=0
+        )
+        found.append((path.read_bytes(), NetworkFile(str(path), inputs).content("set", "hall", 4)))
     assert found[0][0] == found[1][0]
     assert found[0][1] != found[1][1]
-    (tmp_path / "net.data").unlink()
+    beside.unlink()
     with pytest.raises(ValueError, match=r"net.onnx: expected its weights in .*net.data"):
-        NetworkFile(str(tmp_path / "net.onnx"), {"depth": "up"})
-
-
-def test_damaged_file_is_named(tmp_path: Path) -> None:
-    (tmp_path / "bad.onnx").write_bytes(b"PK\x03\x04 no network")
-    with pytest.raises(ValueError, match=r"bad.onnx: expected an ONNX file"):
-        NetworkFile(str(tmp_path / "bad.onnx"), {"rgb": "image"})
+        NetworkFile(str(path), inputs)
+    path.write_bytes(b"PK\x03\x04 no network")
+    with pytest.raises(ValueError, match=r"net.onnx: expected an ONNX file"):
+        NetworkFile(str(path), inputs)
 
 
 def test_network_that_returns_no_map_or_fails_is_named(sample: DepthSample, tmp_path: Path) -> None:

@@ -30,31 +30,18 @@ BUILDERS: MappingProxyType[str, Callable[[int], DisparityNetwork]] = MappingProx
 )
 
 
-def _disturb(net: DisparityNetwork) -> None:
-    """Change the weights of a network to some that are far from those that it starts with."""
-    torch.manual_seed(net.scale)
+def _build(name: str, scale: int = 4) -> DisparityNetwork:
+    """Return a small network whose weights are far from those that it starts with."""
+    net = BUILDERS[name](scale)
+    torch.manual_seed(scale)
     for parameter in net.eval().requires_grad_(False).parameters():
         parameter.add_(0.1 * torch.randn_like(parameter))
+    return net
 
 
 @pytest.fixture(params=BUILDERS)
 def net(request: pytest.FixtureRequest) -> DisparityNetwork:
-    """Return a small network of scale 4."""
-    net = BUILDERS[request.param](4)
-    _disturb(net)
-    return net
-
-
-@pytest.fixture(params=WINDOWED)
-def build_windowed(request: pytest.FixtureRequest) -> Callable[..., DisparityNetwork]:
-    """Return what builds a small network that processes windows."""
-
-    def built(scale: int = 4) -> DisparityNetwork:
-        net = WINDOWED[request.param](scale)
-        _disturb(net)
-        return net
-
-    return built
+    return _build(request.param)
 
 
 def test_networks_are_equivariant_to_scale_and_offset_of_disparity(net: DisparityNetwork) -> None:
@@ -98,8 +85,10 @@ def test_maps_of_any_size_keep_their_dtype(net: DisparityNetwork) -> None:
             assert bool(result.isfinite().all())
 
 
-def test_hole_is_filled_locally_within_the_receptive_field(build_windowed: Callable[..., DisparityNetwork]) -> None:
-    net = build_windowed()
+@pytest.mark.parametrize("name", WINDOWED)
+def test_hole_is_filled_locally_within_the_receptive_field(name: str) -> None:
+    net = _build(name)
+    assert net.receptive_field_radius is not None
     columns = 2 * net.receptive_field_radius + 6
     rgb, coarse = photos(32, 4 * columns), maps(8, columns)
     coarse[..., 0, 0], coarse[..., 0, 1] = 20, 29  # the range, which normalises
@@ -117,8 +106,10 @@ def test_image_without_a_valid_pixel_becomes_nan(net: DisparityNetwork) -> None:
 
 
 @pytest.mark.parametrize("scale", [2, 4])
-def test_tiles_equal_the_whole_image(build_windowed: Callable[..., DisparityNetwork], scale: int) -> None:
-    net = build_windowed(scale)
+@pytest.mark.parametrize("name", WINDOWED)
+def test_tiles_equal_the_whole_image(name: str, scale: int) -> None:
+    net = _build(name, scale)
+    assert net.receptive_field_radius is not None
     rows, columns = net.receptive_field_radius + 9, 2 * net.receptive_field_radius + 10
     rgb, coarse = photos(scale * rows, scale * columns).double(), maps(rows, columns).double()
     tiled, whole = NetworkUpsampler(net, tile=4 * scale), NetworkUpsampler(net)

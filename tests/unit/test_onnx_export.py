@@ -135,20 +135,16 @@ def test_command_refuses_in_one_line_and_writes_nothing(arguments, text, tmp_pat
     assert list(tmp_path.iterdir()) == []
 
 
-def test_folder_in_place_of_the_file_is_refused(tmp_path):
+def test_folder_and_factor_that_the_network_does_not_serve_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"^path: expected a file .*, got a folder: "):
         ExportRequest(path=tmp_path, method="dg")
+    with pytest.raises(ValueError, match=r"^scale: expected 4, the network's, got 2"):
+        OnnxGraph(random_network("dg")[0], 2)
 
 
 @pytest.mark.parametrize("library", ["onnx", "onnxruntime"])
 def test_missing_library_is_named_with_its_extra(library, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, library, None)
-    net, scale = random_network("dg")
     with pytest.raises(ValueError, match=rf"^--onnx: expected the library {library}; pip install .*\[onnx\]'"):
-        write_onnx(tmp_path / "net.onnx", OnnxGraph(net, scale), {})
+        write_onnx(tmp_path / "net.onnx", OnnxGraph(*random_network("dg")), {})
     assert list(tmp_path.iterdir()) == []
-
-
-def test_factor_that_the_network_does_not_serve_is_refused():
-    with pytest.raises(ValueError, match=r"^scale: expected 4, the network's, got 2"):
-        OnnxGraph(random_network("dg")[0], 2)

@@ -105,7 +105,7 @@ def test_constant_map_stays_constant(folder: Path) -> None:
 def test_recipe_takes_a_folder_and_knows_its_content(folder: Path) -> None:
     method = read_recipe("prompt_da", {"weights": str(folder), "size": 56}).build(4)
     assert isinstance(method, PromptDA)
-    assert len(method.content("set", "hall", 4)) == 64
+    assert method.content("set", "hall", 4).count(", ") == 1
     with pytest.raises(ConfigError, match=r"method.size: expected 14 or more, got 3"):
         read_recipe("prompt_da", {"weights": str(folder), "size": 3}).build(4)
 

@@ -107,7 +107,9 @@ def test_caffe_model_round_trips_its_parameters(tmp_path: Path, scale: int, pack
 
 def test_torch_file_round_trips_its_parameters(tmp_path: Path) -> None:
     net = MSGNet(4)
-    loaded = load_msg_weights(_save(tmp_path / "net.pth", {"model_state_dict": _author_state(net)}), 4, "voynov")
+    path, before = _save(tmp_path / "net.pth", {"model_state_dict": _author_state(net)}), torch.get_rng_state()
+    loaded = load_msg_weights(path, 4, "voynov")
+    assert torch.equal(torch.get_rng_state(), before)
     assert loaded.variant == "voynov"
     torch.testing.assert_close(dict(loaded.state_dict()), dict(net.state_dict()), rtol=0, atol=0)
 
@@ -116,13 +118,6 @@ def test_published_networks_default_to_their_published_settings(tmp_path: Path) 
     path = _save(tmp_path / "net.pth", {"model_state_dict": _author_state(MSGNet(4))})
     assert TrainedNetwork(path, 4, "msg_v", "voynov").ensemble == 1
     assert TrainedNetwork(path, 4, "msg_v", "voynov", ensemble=8).ensemble == 8
-
-
-def test_loading_draws_nothing_from_the_random_generator(tmp_path: Path) -> None:
-    path = _save(tmp_path / "net.pth", {"model_state_dict": _author_state(MSGNet(4))})
-    before = torch.get_rng_state()
-    load_msg_weights(path, 4)
-    assert torch.equal(torch.get_rng_state(), before)
 
 
 def _refusal(path: Path, scale: int = 4, variant: str | None = None) -> str:
@@ -135,29 +130,19 @@ def _refusal(path: Path, scale: int = 4, variant: str | None = None) -> str:
     return message
 
 
-def test_missing_file_is_refused_as_missing(tmp_path: Path) -> None:
+def test_missing_file_and_weights_of_another_scale_are_refused(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"nowhere\.pth: no such weights file"):
         load_msg_weights(tmp_path / "nowhere.pth", 4)
-
-
-def test_weights_of_another_scale_are_refused(tmp_path: Path) -> None:
     caffe = _write(tmp_path / "net.caffemodel", _caffemodel(_caffe_layers(MSGNet(8, "hui"))))
     assert "weights are for scale 8, the run is at scale 4" in _refusal(caffe, 4)
-    assert "weights are for scale 4, the run is at scale 2" in _refusal(
-        _save(tmp_path / "net.pth", {"model_state_dict": _author_state(MSGNet(4))}), 2
-    )
+    path = _save(tmp_path / "net.pth", {"model_state_dict": _author_state(MSGNet(4))})
+    assert "weights are for scale 4, the run is at scale 2" in _refusal(path, 2)
 
 
-@pytest.mark.parametrize("protocol", [0, 2, 4])
-def test_pickled_code_is_not_run(tmp_path: Path, protocol: int) -> None:
+def test_code_in_a_file_is_not_run(tmp_path: Path) -> None:
     mark = tmp_path / "trapped"
-    path = _write(tmp_path / "net.pth", pickle.dumps({"model_state_dict": Trap(mark)}, protocol))
-    _refusal(path)
-    assert not mark.exists()
-
-
-def test_code_in_a_torch_file_is_not_run(tmp_path: Path) -> None:
-    mark = tmp_path / "trapped"
+    for protocol in (0, 2, 4):
+        _refusal(_write(tmp_path / "net.pth", pickle.dumps({"model_state_dict": Trap(mark)}, protocol)))
     message = _refusal(_save(tmp_path / "net.pth", {"model_state_dict": _author_state(MSGNet(4)), "x": Trap(mark)}))
     assert "which are never loaded" in message
     assert not mark.exists()
@@ -169,13 +154,9 @@ def test_damaged_and_foreign_files_are_refused(tmp_path: Path) -> None:
     foreign = (b"", noise, b"\x80" + noise, b"PK\x03\x04" + noise, b"\x89PNG\r\n\x1a\n")
     for content in (whole[:5000], whole[:-30], *foreign):
         assert "expected a torch" in _refusal(_write(tmp_path / "net.pth", content))
-
-
-def test_caffe_model_truncated_anywhere_is_refused(tmp_path: Path) -> None:
     whole = _caffemodel(_caffe_layers(MSGNet(2, "hui")))
     for length in np.random.default_rng(0).integers(1, len(whole), 40).tolist():
-        message = _refusal(_write(tmp_path / "net.caffemodel", whole[:length]), 2)
-        assert "expected" in message
+        assert "expected" in _refusal(_write(tmp_path / "net.caffemodel", whole[:length]), 2)
 
 
 @pytest.mark.parametrize(

@@ -54,13 +54,14 @@ def test_unknown_method_is_refused_with_those_that_there_are(tmp_path: Path) -> 
         ("defaults: [bad]", "expected a readable file bad.yaml"),
         ("defaults: 5", "bad.yaml: expected keys and values, with a list of names as defaults"),
         ("name: ${nowhere}", "method=bad: Interpolation key 'nowhere' not found"),
+        ("_target_: dsr.geometry.camera.Camera", r"method\._target_: expected a class that derives from .*Method"),
     ],
 )
 def test_damaged_file_of_a_method_is_refused(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "method").mkdir()
     (tmp_path / "method" / "bad.yaml").write_text(text)
     with pytest.raises(ConfigError, match=message) as caught:
-        read_recipe("bad", directories=[tmp_path])
+        read_recipe("bad", directories=[tmp_path]).build(4)
     assert "\n" not in str(caught.value)
 
 

@@ -324,7 +324,7 @@ def upsampler(
     max_hole: float = WIDEST,
     working_size: int | None = None,
 ) -> AnyRatio:
-    """Return a method for depth maps of any size, which loads its weights once.
+    """Return a method of ``conf/method`` for depth maps of any size, which loads its weights once.
 
     Args:
         method: the name of one in ``conf/method``.

@@ -17,73 +17,45 @@ from dsr.methods.networks.weight_files import SLACK, nearest_scale
 from dsr.methods.recipe import Recipe
 from dsr.utils.progress import duration
 
-LARGEST_OPTIMISED = 2**20
-"""Pixels; optimising a network for a larger picture takes hours."""
-OWN_SIZE = 1.25
-"""A depth map whose sides differ from the photo's by no more than this factor is treated as having the photo's size."""
+LARGEST_OPTIMISED = 2**20  # pixels; optimising a network for a larger picture takes hours
+OWN_SIZE = 1.25  # a depth map whose sides differ from the photo's by no more than this factor has the photo's size
 _ASPECT = 0.02
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How a depth map is upsampled.
-
-    Args:
-        method: the method.
-        scale: the approximate upsampling factor.
-        steps: the networks' factors, one after the other; empty for interpolation.
-        coarsened: the factor by which depth of the photo's own size is downsampled first; 1 for low-resolution depth.
-        way: the sizes and the method in one line.
-        text: the same, and the memory and time that it takes.
-        seconds: the time on two CPU cores; None where it is not known.
-
-    """
+    """How a depth map is upsampled."""
 
     method: str
-    scale: int
-    steps: tuple[int, ...]
-    coarsened: int
-    way: str
-    text: str
-    seconds: float | None
+    scale: int  # the approximate upsampling factor
+    steps: tuple[int, ...]  # the networks' factors, one after the other; empty for interpolation
+    coarsened: int  # the factor by which depth of the photo's own size is downsampled first; 1 for low-resolution depth
+    way: str  # the sizes and the method in one line
+    text: str  # the same, and the memory and time that it takes
+    seconds: float | None  # the time on two CPU cores; None where it is not known
 
 
 def steps_of(recipe: Recipe) -> Mapping[int, tuple[int, ...]]:
     """Return, for each factor, those of the calls that give it; nothing for a method of any ratio.
 
-    Raises:
-        ValueError: a method of fixed factors has no weights for any.
-
+    A ValueError if a method of fixed factors has no weights for any. A network reaches further ones by a second step.
     """
     if recipe.abilities.at_ratio:
         return {}
     steps: dict[int, tuple[int, ...]] = {factor: (factor,) for factor in recipe.factors}
-    return _with_second_step(steps) if recipe.abilities.repeats else steps
-
-
-def _with_second_step(steps: dict[int, tuple[int, ...]]) -> dict[int, tuple[int, ...]]:
-    """Return a network's steps with those of the factors that it reaches by a second step of 4."""
-    if 4 not in steps:
-        return steps
-    second = {16: (8, 4), 32: (8, 4)} if 8 in steps else {16: (4, 4)}
-    return second | steps if 16 not in steps else steps
+    if recipe.abilities.repeats and 4 in steps and 16 not in steps:
+        steps = {16: (8, 4), 32: (8, 4), **steps} if 8 in steps else {16: (4, 4), **steps}
+    return steps
 
 
 def plan_for(
     recipe: Recipe, photo_size: tuple[int, int], depth_size: tuple[int, int], scale: int | None = None
 ) -> Plan:
-    """Plan what :class:`dsr.inference.AnyRatio` does.
+    """Plan what :class:`dsr.inference.AnyRatio` does for a photo and a depth map of these heights and widths.
 
-    This plan does not apply to a depth map of the photo's size that was enlarged by repeating pixels: it is upsampled
-    from the low-resolution map that it was before.
-
-    Args:
-        photo_size: height and width.
-        depth_size: height and width.
-        scale: the factor; None to choose it by the sizes, 4 if they are equal.
-
-    Raises:
-        ValueError: a scale that the method has no weights for, or sizes that do not fit together.
+    ``scale`` is the factor; None to choose it by the sizes, 4 if they are equal. A ValueError if the method has no
+    weights for it, or the sizes do not fit together. This plan does not apply to a depth map of the photo's size that
+    was enlarged by repeating pixels: it is upsampled from the low-resolution map that it was before.
 
     Example:
         >>> from dsr.inference import plan_for
@@ -104,27 +76,28 @@ def plan_for(
             f"method={method}: expected a photo of up to {LARGEST_OPTIMISED} pixels, as it is optimised for each "
             f"picture, got {photo_size[0]} x {photo_size[1]}; method={DEFAULT} takes any"
         )
-    coarsened = chosen if own else 1
-    before = f"averaged over {chosen} x {chosen} pixels, " if own else ""
-    what = f"{method} x{chosen}" + (
-        f" in two steps ({', '.join(f'x{step}' for step in steps)})" if len(steps) > 1 else ""
-    )
-    computed = _computed(photo_size, depth_size, steps, coarsened)
+    computed = pixels  # of the largest picture that is computed
     if recipe.computed_at and not as_it_is:
         computed = round(math.prod(depth_size) * nearest_scale(recipe.computed_at, chosen) ** 2)
-    way = f"{depth_size[0]} x {depth_size[1]} depth {before}to {photo_size[0]} x {photo_size[1]} by {what}"
+    elif steps and not own:
+        first = math.prod(depth_size) * steps[0] ** 2
+        computed = first if len(steps) == 1 else max(first, pixels)
+    before = f"averaged over {chosen} x {chosen} pixels, " if own else ""
+    way = f"{depth_size[0]} x {depth_size[1]} depth {before}to {photo_size[0]} x {photo_size[1]} by {method} x{chosen}"
+    if len(steps) > 1:
+        way += f" in two steps ({', '.join(f'x{step}' for step in steps)})"
     text = f"{way}, in about {abilities.cost.bytes_for(pixels, computed) / 2**30:.1f} GB of memory"
     seconds = None if abilities.cost.seconds is None else abilities.cost.seconds * computed / 1e6
     if seconds is not None:
         text += f" and about {duration(max(seconds, 1))} on two CPU cores"
-    return Plan(method, chosen, steps, coarsened, way, text, seconds)
+    return Plan(method, chosen, steps, chosen if own else 1, way, text, seconds)
 
 
 def _ratio(photo_size: tuple[int, int], depth_size: tuple[int, int]) -> float:
     """Return how much larger the photo is than the depth map."""
     if min(*photo_size, *depth_size) < 1:
         raise ValueError(f"sizes: expected positive ones, got a photo of {photo_size} and depth of {depth_size}")
-    down, across = (photo / depth for photo, depth in zip(photo_size, depth_size, strict=True))
+    down, across = photo_size[0] / depth_size[0], photo_size[1] / depth_size[1]
     sizes = f"{depth_size[0]} x {depth_size[1]} for a photo of {photo_size[0]} x {photo_size[1]} (height x width)"
     if abs(down / across - 1) > max(_ASPECT, 1 / min(depth_size)):
         raise ValueError(f"depth: expected the photo's field of view and aspect within {_ASPECT:.0%}, got {sizes}")
@@ -148,11 +121,3 @@ def _scale(requested: int | None, ratio: float, method: str, factors: Mapping[in
             f"depth: expected at least 1/{max(factors)} of the photo's size for {method}, got 1/{ratio:.3g}"
         )
     return requested or enough[0]
-
-
-def _computed(photo_size: tuple[int, int], depth_size: tuple[int, int], steps: tuple[int, ...], coarsened: int) -> int:
-    """Return the number of pixels of the largest picture that a network computes."""
-    if not steps or coarsened > 1:
-        return math.prod(photo_size)
-    first = math.prod(depth_size) * steps[0] ** 2
-    return max(first, math.prod(photo_size)) if len(steps) > 1 else first

@@ -19,26 +19,14 @@ from dsr.utils.configuration import ConfigError
 
 @dataclass(frozen=True)
 class Selection:
-    """A method for one scale.
+    """A method for one scale."""
 
-    Args:
-        recipe: the method, with its weights.
-        scale: ratio of the photo's width to the depth map's.
-        direct: whether it is run at this scale itself; else as in ``dsr upsample``, which may resize photo and map.
-
-    """
-
-    recipe: Recipe
-    scale: float
-    direct: bool
+    recipe: Recipe  # with its weights
+    scale: float  # ratio of the photo's width to the depth map's
+    direct: bool  # run at this scale itself; else as in ``dsr upsample``, which may resize photo and map
 
     def files(self) -> list[Path]:
-        """Return the files of weights that it may use.
-
-        Raises:
-            ConfigError: one is missing.
-
-        """
+        """Return the files of weights that it may use; a ConfigError if one is missing."""
         factors: set[float] = {self.scale}
         if not self.direct:
             steps = steps_of(self.recipe).values()
@@ -47,12 +35,7 @@ class Selection:
         return list(dict.fromkeys(file for file in found if file is not None))
 
     def build(self, run: Run) -> Method:
-        """Build the method.
-
-        Raises:
-            ConfigError: it rejects a setting, or has no weights.
-
-        """
+        """Build the method; a ConfigError if it rejects a setting, or has no weights."""
         if self.direct:
             return self.recipe.build(self.scale, run)
         try:
@@ -68,15 +51,12 @@ class Selection:
 
 
 def select(recipe: Recipe, scale: float, weights: Path | None = None, *, measured: bool = False) -> Selection:
-    """Select how to run a method at a scale.
+    """Select how to run a method at a scale, the ratio of the photo's width to the depth map's.
 
-    Args:
-        scale: ratio of the photo's width to the depth map's.
-        weights: a file of weights, or a directory with published ones; None for those that the method names.
-        measured: whether the maps are a sensor's own. A method that can choose its working size by the map's noise does
-            so; of one without packaged weights for their ratio, those for another one are taken. Of a model of
-            downsampling, the error says that it needs weights.
-
+    ``weights`` are a file of weights, or a directory with published ones; None for those that the method names. With
+    ``measured`` maps, a sensor's own, a method that can choose its working size by the map's noise does so; of one
+    without packaged weights for their ratio, those for another one are taken. Of a model of downsampling, the error
+    says that it needs weights.
     """
     node = recipe.at().get("weights")  # with the scale as the run names it
     packaged = node.get("packaged") if isinstance(node, Mapping) else None

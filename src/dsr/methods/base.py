@@ -12,13 +12,19 @@ from torch import Tensor
 
 from dsr.geometry.camera import Camera, RangeType
 from dsr.methods.images import inpaint
-from dsr.methods.tiling import TILE, UNTILED
 from dsr.sample import DepthSample
 from dsr.utils.configuration import Node
 from dsr.utils.progress import Steps
 from dsr.utils.ratios import SCALES, round_ratio
 
+TILE = 1024  # side in high-resolution pixels of the tiles in which networks compute large images
+UNTILED = 2**21  # number of high-resolution pixels up to which an image is computed without tiles
+WORKSPACE = "optimisation"  # folder in which a method that optimises keeps what it needs after an interruption
 _HALF = float(np.finfo(np.float16).max)  # largest number of half precision
+# Ratios of the photo's size to the map's: 2, 4, 8 and 16; these and any whole one from 1; any from 1. At 1 the map has
+# the photo's size: a filter smooths it, and a method that reproduces block means only fills its holes.
+Ratios = Literal["factors", "whole", "any"]
+NoiseLaw = tuple[float, float]  # deviation of a map in metres at 1 m, and the power of the distance with which it grows
 
 
 class NoSolutionError(ValueError):
@@ -41,36 +47,18 @@ class Cost:
         return self.program + self.photo * photo + self.memory * computed + self.tile * window
 
 
-Ratios = Literal["factors", "whole", "any"]
-"""Ratios of the photo's size to the map's: 2, 4, 8 and 16; these and any whole one from 1; any from 1. At 1 the map has
-the photo's size: a filter smooths it, and a method that reproduces block means only fills its holes."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class Abilities:
-    """What a method can do; its class states it as ``abilities``.
+    """What a method can do; its class states it as ``abilities``."""
 
-    Args:
-        ratios: of the samples that it takes.
-        own_size: whether it takes a map of the photo's own size as it is.
-        repeats: whether its result may be its input once more, for larger factors.
-        needs: a file of ``weights``, or one of weights from which dsr loads a ``network``.
-        optimises: whether it optimises a network for each picture.
-        tolerant: whether convolutions in bfloat16 change its scores in the fourth digit only.
-        assumes_downsampling: whether it takes the model of the downsampling, as its argument ``downsampling``.
-        fast_on: where ``device=auto`` runs it; ``cpu`` for a method that a GPU slows down.
-        cost: its rough cost.
-
-    """
-
-    ratios: Ratios = "factors"
-    own_size: bool = False
-    repeats: bool = False
-    needs: Literal["weights", "network"] | None = None
-    optimises: bool = False
-    tolerant: bool = False
-    assumes_downsampling: bool = False
-    fast_on: Literal["any", "cpu"] = "any"
+    ratios: Ratios = "factors"  # of the samples that it takes
+    own_size: bool = False  # whether it takes a map of the photo's own size as it is
+    repeats: bool = False  # whether its result may be its input once more, for larger factors
+    needs: Literal["weights", "network"] | None = None  # a file of weights, or one from which dsr loads a network
+    optimises: bool = False  # whether it optimises a network for each picture
+    tolerant: bool = False  # whether convolutions in bfloat16 change its scores in the fourth digit only
+    assumes_downsampling: bool = False  # whether it takes the downsampling model, as its argument ``downsampling``
+    fast_on: Literal["any", "cpu"] = "any"  # where ``device=auto`` runs it; ``cpu`` if a GPU slows it down
     cost: Cost = Cost(1000)
 
     @property
@@ -117,8 +105,7 @@ class Surface(NamedTuple):
         """Return the surface with a function applied to each of its maps."""
         others = (self.depth_error, self.angle_error, self.filled)
         depth_error, angle_error, filled = (None if each is None else function(each) for each in others)
-        depth = function(self.depth)
-        return self._replace(depth=depth, depth_error=depth_error, angle_error=angle_error, filled=filled)
+        return Surface(function(self.depth), depth_error, angle_error, self.noise, self.outliers, filled, self.glass)
 
     def without_dubious(self, limit: float) -> Surface:
         """Return the surface with holes where the depth is expected to be off by more than this share of it."""
@@ -137,42 +124,31 @@ class Surface(NamedTuple):
         """
         known = self.depth.isfinite()
         filled = known & self.filled if self.filled is not None else known & False
-        found = {"measured": known & ~filled, "filled": filled, "open": ~known}
+        masks = {"measured": known & ~filled, "filled": filled, "open": ~known}
         if self.depth_error is not None:
-            found["dubious"] = known & (self.depth_error > limit * self.depth)
-        glass = {} if self.glass is None else {"glass": self.glass}
-        return {name: float(mask.double().mean()) for name, mask in found.items()} | glass
+            masks["dubious"] = known & (self.depth_error > limit * self.depth)
+        found = {name: float(mask.double().mean()) for name, mask in masks.items()}
+        return found if self.glass is None else {**found, "glass": self.glass}
 
     def error_arrays(self) -> dict[str, np.ndarray]:
-        """Return the expected errors by name, (H, W), as they are stored; empty without them.
-
-        They are in half precision, which holds up to 65 km, or in single precision if one is larger.
-        """
-        named = {"depth_error": self.depth_error, "angle_error": self.angle_error}
-        found = {name: each[0].cpu().numpy() for name, each in named.items() if each is not None}
-        return {
-            name: values.astype(np.float16 if np.nanmax(values, initial=0) <= _HALF else np.float32)
-            for name, values in found.items()
-        }
-
-
-NoiseLaw = tuple[float, float]
-"""Standard deviation of a map's noise in metres at 1 m, and the power of the distance with which it grows."""
+        """Return the expected errors by name, (H, W), in half precision, or single if one is beyond 65 km."""
+        found = {}
+        for name, error in (("depth_error", self.depth_error), ("angle_error", self.angle_error)):
+            if error is not None:
+                values = error[0].cpu().numpy()
+                found[name] = values.astype(np.float16 if np.nanmax(values, initial=0) <= _HALF else np.float32)
+        return found
 
 
 class InverseSample(NamedTuple):
-    """A problem in inverse depth, whose values are not checked: they may be a method's own.
+    """A problem in inverse depth, whose values are not checked: they may be a method's own."""
 
-    ``rgb`` (3, H, W) in [0, 1]; ``inverse`` (1, h, w) in 1/m, NaN in holes; the cameras of both; ``ratio`` of their
-    sizes; the map's ``noise``, where it is known.
-    """
-
-    rgb: Tensor
-    inverse: Tensor
+    rgb: Tensor  # (3, H, W) in [0, 1]
+    inverse: Tensor  # (1, h, w) in 1/m, NaN in holes
     camera: Camera
     camera_lr: Camera
     ratio: float
-    noise: NoiseLaw | None = None
+    noise: NoiseLaw | None = None  # of the map, if it is known
 
     def in_depth(self) -> DepthSample:
         """Return the same as a sample."""
@@ -181,16 +157,12 @@ class InverseSample(NamedTuple):
 
 
 class InverseSurface(NamedTuple):
-    """A result in inverse depth: (1, H, W) in 1/m, NaN where a method leaves a hole.
+    """A result in inverse depth, (1, H, W) each; the errors are None for a method that does not predict them."""
 
-    ``spread``, ``angle`` (1, H, W): the expected relative error of the depth and that of the normal in degrees; None
-    for a method that does not say. ``noise``: of the low-resolution map, if the method estimates it.
-    """
-
-    inverse: Tensor
-    spread: Tensor | None = None
-    angle: Tensor | None = None
-    noise: MapNoise | None = None
+    inverse: Tensor  # in 1/m, NaN where a method leaves a hole
+    spread: Tensor | None = None  # expected relative error of the depth
+    angle: Tensor | None = None  # expected error of the normal in degrees
+    noise: MapNoise | None = None  # of the low-resolution map, if the method estimates it
 
     @classmethod
     def of(cls, surface: Surface) -> InverseSurface:
@@ -216,24 +188,6 @@ class Method(abc.ABC):
         history: of the last call of a method that iterates, one entry per recorded iteration: ``iteration`` first, then
             the method's own quantities, such as ``objective`` and ``moved``, in an order of its own. None for others.
         name: in scores and tables, of a method that takes it from its input; None for that of its file of ``conf``.
-
-    Example:
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.degradation.downsampling import Downsampling, make_sample
-        >>> from dsr.methods.base import Method
-        >>> from dsr.methods.classical.interpolation import Interpolation
-        >>> from dsr.sample import Scene
-        >>> class Nearer(Method):
-        ...     range_type = "orthogonal"
-        ...
-        ...     def __call__(self, sample, progress=None):
-        ...         return 0.5 * Interpolation("bicubic")(sample)
-        >>> camera, wall = dsr.Camera.from_fov(60, width=32, height=24), torch.full((1, 24, 32), 2.0)
-        >>> method, scene = Nearer(), Scene("mine", "wall", torch.rand(3, 24, 32), camera, wall)
-        >>> sample = make_sample(scene, 4, Downsampling("box"), method.range_type)
-        >>> bool((method(sample) - 1).abs().max() < 0.05)
-        True
 
     """
 
@@ -283,9 +237,6 @@ class Method(abc.ABC):
     def count_steps(self, height: int, width: int) -> int:
         """Return the total that ``progress`` receives for a photo of height x width pixels, if it is known before."""
         return 1
-
-
-WORKSPACE = "optimisation"  # folder in which a method that optimises keeps what it needs after an interruption
 
 
 def expect_some_depth(depth: Tensor, name: str) -> None:

@@ -7,18 +7,13 @@ those that need one of them.
 
 from __future__ import annotations
 
-import functools
 import sys
-from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any, ParamSpec, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn import functional
-
-P = ParamSpec("P")
-T = TypeVar("T")
 
 
 def exporting() -> bool:
@@ -26,19 +21,7 @@ def exporting() -> bool:
     return "torch.onnx" in sys.modules and bool(torch.onnx.is_in_onnx_export())
 
 
-def _scripted(function: Callable[P, T]) -> Callable[P, T]:
-    """Return a function with loops that a graph keeps; it is compiled at its first call, which takes a while."""
-    compiled: Callable[[], Callable[P, T]] = functools.cache(lambda: torch.jit.script(function))
-
-    @functools.wraps(function)
-    def call(*arguments: P.args, **named: P.kwargs) -> T:
-        return compiled()(*arguments, **named)
-
-    return call
-
-
-@_scripted
-def fill_in_graph(values: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+def _fill(values: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Fill the holes of maps as :func:`dsr.methods.images.inpaint` does, as a loop in the graph.
 
     Both are (B, 1, h, w), 0 in holes; ``weight`` is 1 elsewhere, and in the result 0 in an image without a known value.
@@ -58,17 +41,15 @@ def neighbours_of(x: Tensor) -> Tensor:
     """Return the eight neighbours of each pixel, row by row, (B, C, h, w) to (B, 8, C, h, w); 0 beyond the border."""
     height, width = x.shape[-2], x.shape[-1]
     padded = functional.pad(x, [1, 1, 1, 1])
-    rows = [padded[:, :, :height], padded[:, :, 1 : height + 1], padded[:, :, 2 : height + 2]]
-    around = [
-        rows[0][..., :width], rows[0][..., 1 : width + 1], rows[0][..., 2 : width + 2],
-        rows[1][..., :width], rows[1][..., 2 : width + 2],
-        rows[2][..., :width], rows[2][..., 1 : width + 1], rows[2][..., 2 : width + 2],
-    ]  # fmt: skip
+    around = []
+    for down in range(3):
+        for across in range(3):
+            if down != 1 or across != 1:
+                around.append(padded[:, :, down : down + height, across : across + width])
     return torch.stack(around, dim=1)
 
 
-@_scripted
-def fill_by_colour_in_graph(x: Tensor, affinity: Tensor, alike: float) -> Tensor:
+def _fill_by_colour(x: Tensor, affinity: Tensor, alike: float) -> Tensor:
     """Fill the holes of a map as :func:`dsr.methods.images.inpaint` does with a photo.
 
     ``x`` (1, 1, h, w) is NaN in holes, ``affinity`` (1, 8, h, w) that of each pixel and its neighbours; pixels of an
@@ -89,6 +70,11 @@ def fill_by_colour_in_graph(x: Tensor, affinity: Tensor, alike: float) -> Tensor
         values = torch.where(first, mean / torch.where(total > 0, total, torch.ones_like(total)), values)
         known = torch.where(first, torch.ones_like(known), known)
     return torch.where(known > 0, values, torch.full_like(values, float("nan")))
+
+
+# scripted, so that a graph keeps their loops
+fill_in_graph = torch.jit.script_if_tracing(_fill)
+fill_by_colour_in_graph = torch.jit.script_if_tracing(_fill_by_colour)
 
 
 def apply(function: type[torch.autograd.Function], *arguments: Any) -> Any:

@@ -12,13 +12,14 @@ import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, cast, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d, interpolate
 
-from dsr.geometry.camera import RANGE_TYPES, Camera, from_range, to_range
+from dsr.geometry.camera import RANGE_TYPES, Camera, RangeType, from_range, to_range
 from dsr.io.depth_files import DEPTH_SUFFIXES, read_depth_file
 from dsr.io.encoding import expect_known, find_holes
 from dsr.io.reading import parse_unit
@@ -49,8 +50,7 @@ class External(Method):
         path: directory of the predictions; its name is the method's in scores and tables.
         file: name of a scene's file, with or without a suffix; ``{scene}``, ``{dataset}`` and ``{scale}`` stand for the
             sample's. Without a suffix, it is any of the formats of :data:`dsr.io.depth_files.DEPTH_SUFFIXES`.
-        range_type: what the values measure: ``orthogonal``, ``perspective``, ``disparity`` in pixels of the photo's
-            camera, or ``inverse``.
+        range_type: what the values measure; ``disparity`` in pixels of the photo's camera.
         unit: m, cm, mm or metres per value (of disparities and inverse depths: pixels or 1/m per value). None for 1 of
             floats; whole numbers need one.
         hole_value: a value that marks a hole, beside those of :func:`dsr.io.encoding.find_holes`.
@@ -79,14 +79,10 @@ class External(Method):
         check: bool = True,
         alignment: str = "none",
     ) -> None:
-        for key, value, known in (
-            ("range_type", range_type, QUANTITIES),
-            ("fit", fit, (None, *get_args(Fit))),
-            ("resize", resize, (None, *get_args(Resize))),
-        ):
-            expect_one_of(key, value, known)
-        unknown = set(_FIELD.findall(file)) - set(_FIELDS)
-        if unknown or not file:
+        expect_one_of("range_type", range_type, QUANTITIES)
+        expect_one_of("fit", fit, (None, *get_args(Fit)))
+        expect_one_of("resize", resize, (None, *get_args(Resize)))
+        if not file or set(_FIELD.findall(file)) - set(_FIELDS):
             raise ValueError(f"file: expected a name with {', '.join(f'{{{each}}}' for each in _FIELDS)}, got {file!r}")
         self.folder = Path(path).expanduser()
         if not self.folder.is_dir():
@@ -98,13 +94,11 @@ class External(Method):
             self._unit = None if unit is None else parse_unit(str(unit))
         except ValueError as error:
             raise ValueError(f"unit: {error}") from None
-        self._fit: Fit | None = fit  # type: ignore[assignment]  # it has been checked
-        self._resize, self._check, self._metric = resize, check, alignment == "none"
+        self._fit, self._resize, self._check, self._metric = fit, resize, check, alignment == "none"
 
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
         """Return the map of the sample's scene, (1, H, W) orthogonal depth in metres, NaN in holes."""
-        name = self._name(sample.dataset, sample.scene, sample.scale)
-        found = self._found(name)
+        name, found = self._find(sample.dataset, sample.scene, sample.scale)
         if not found:
             raise ValueError(f"{self.folder / name}: expected a map as {', '.join(DEPTH_SUFFIXES)}, there is none")
         if len(found) > 1:
@@ -122,17 +116,18 @@ class External(Method):
 
     def describe(self, sample: DepthSample) -> str:
         """Return a note on the scene's map if its format costs precision, or if it was changed."""
-        found = self._found(self._name(sample.dataset, sample.scene, sample.scale))
-        stored = ""
+        notes = [describe_fit(self._fit)] if self._fit else []
+        _, found = self._find(sample.dataset, sample.scene, sample.scale)
         if len(found) == 1:
-            kind = read_depth_file(found[0], pixels_beside(sample.camera.height, sample.camera.width)).dtype
-            stored = f"predictions come as whole numbers of {self._unit or 1:g} m" if kind.kind in "iu" else ""
-            stored = stored if self._quantity in ("orthogonal", "perspective") else stored.removesuffix(" m")
-        return "; ".join(filter(None, (stored, describe_fit(self._fit))))
+            stored = read_depth_file(found[0], pixels_beside(sample.camera.height, sample.camera.width))
+            if stored.dtype.kind in "iu":
+                metres = " m" if self._quantity in ("orthogonal", "perspective") else ""
+                notes.insert(0, f"predictions come as whole numbers of {self._unit or 1:g}{metres}")
+        return "; ".join(notes)
 
     def remarks(self, dataset: str, scenes: Sequence[str], scale: float) -> list[str]:
         """Return lines on files that are of no scene."""
-        used = {path for scene in scenes for path in self._found(self._name(dataset, scene, scale))}
+        used = {path for scene in scenes for path in self._find(dataset, scene, scale)[1]}
         files = {path for path in self.folder.rglob("*") if path.suffix.lower() in DEPTH_SUFFIXES and path.is_file()}
         others = sorted((os.fspath(path.relative_to(self.folder)) for path in files - used), key=natural_key)
         if not others:
@@ -142,28 +137,26 @@ class External(Method):
 
     def content(self, dataset: str, scene: str, scale: float) -> str | None:
         """Return the SHA-256 of a scene's file; None without one."""
-        return ", ".join(map(hash_once, self._found(self._name(dataset, scene, scale)))) or None
+        return ", ".join(map(hash_once, self._find(dataset, scene, scale)[1])) or None
 
-    def _name(self, dataset: str, scene: str, scale: float) -> str:
-        """Return the file's name of a scene."""
+    def _find(self, dataset: str, scene: str, scale: float) -> tuple[str, list[Path]]:
+        """Return the name of a scene's file, and the files of this name."""
         values = {"dataset": dataset, "scene": scene, "scale": str(round_ratio(scale))}
-        return _FIELD.sub(lambda match: values[match[1]], self._file)
-
-    def _found(self, name: str) -> list[Path]:
-        """Return the files of a name."""
+        name = _FIELD.sub(lambda match: values[match[1]], self._file)
         suffixes = ("",) if name.lower().endswith(DEPTH_SUFFIXES) else DEPTH_SUFFIXES
-        return [path for suffix in suffixes if (path := self.folder / f"{name}{suffix}").is_file()]
+        return name, [path for suffix in suffixes if (path := self.folder / f"{name}{suffix}").is_file()]
 
     def _read(self, path: Path, camera: Camera) -> Tensor:
         """Return the values of a file, (1, H, W) float64 in their quantity's unit, NaN in holes."""
         stored = read_depth_file(path, pixels_beside(camera.height, camera.width))
-        whole = stored.dtype.kind in "iu"
-        free = self._fit is not None and self._quantity in (INVERSE, "disparity")  # 0 may be the farthest point
-        if whole and self._unit is None and self._fit is None and self._metric:
+        if stored.dtype.kind in "iu" and self._unit is None and self._fit is None and self._metric:
             raise ValueError(f"{path}: expected method.unit=mm, or another one, for {stored.dtype} values, got none")
-        holes = ~np.isfinite(stored) if free else find_holes(stored, self._hole_value, above=math.inf)[0]
-        if free and self._hole_value is not None:
-            holes |= stored == self._hole_value
+        if self._fit is not None and self._quantity in (INVERSE, "disparity"):  # 0 may be the farthest point
+            holes = ~np.isfinite(stored)
+            if self._hole_value is not None:
+                holes |= stored == self._hole_value
+        else:
+            holes = find_holes(stored, self._hole_value, above=math.inf)[0]
         expect_known(path, stored, holes)
         values = torch.from_numpy(np.where(holes, np.nan, stored.astype(np.float64)))[None] * (self._unit or 1.0)
         size = (camera.height, camera.width)
@@ -176,9 +169,8 @@ class External(Method):
                 "method.resize=nearest or bilinear resizes it"
             )
         factor = size[1] / values.shape[-1] if self._quantity == "disparity" else 1.0  # in pixels of the photo
-        corners = {} if self._resize == "nearest" else {"align_corners": False}
         mode = "nearest-exact" if self._resize == "nearest" else self._resize
-        return torch.nn.functional.interpolate(values[None], size, mode=mode, **corners)[0] * factor
+        return interpolate(values[None], size, mode=mode)[0] * factor
 
 
 def describe_fit(fit: str | None) -> str:
@@ -186,18 +178,16 @@ def describe_fit(fit: str | None) -> str:
     return f"{fit} fitted to the low-resolution map" if fit else ""
 
 
-def fit_to_map(values: Tensor, sample: DepthSample, quantity: str, fit: Fit, place: Path) -> Tensor:
+def fit_to_map(values: Tensor, sample: DepthSample, quantity: str, fit: str, place: Path) -> Tensor:
     """Return values of a quantity, (1, H, W) on the CPU in any unit, NaN in holes, fitted to the low-resolution map.
 
     The sample's truth is not looked at; ``place`` is the file that the values are of, for messages.
     """
-    target = from_depth(sample.depth_lr.to("cpu", torch.float64), sample, quantity)
     values = values.to(torch.float64)
-    reduced = _reduce(values, target)
-    known = reduced.isfinite() & target.isfinite()
-    if int(known.sum()) < 2:
+    own, theirs = _both_known(values, from_depth(sample.depth_lr.to("cpu", torch.float64), sample, quantity))
+    if own.numel() < 2:
         raise ValueError(f"{place}: expected pixels that the low-resolution map knows, too; there are none")
-    gain, shift = fit_line(reduced[known], target[known], shift=fit == "affine")
+    gain, shift = fit_line(own, theirs, shift=fit == "affine")
     if not gain > 0:
         what = quantity if quantity == "disparity" else f"{quantity} depth"
         raise ValueError(f"{place}: expected values that rise with the low-resolution map's {what}, they do not")
@@ -211,9 +201,10 @@ def fit_line(values: Tensor, target: Tensor, *, shift: bool = True) -> tuple[flo
     """
     weight, line = torch.ones_like(values), torch.zeros(2, dtype=values.dtype)
     floor = 1e-6 * float(target.abs().median()) + torch.finfo(values.dtype).tiny
+    mean = middle = values.new_zeros(())
     for _ in range(_STEPS):
-        sums = ((weight * each).sum() / weight.sum() if shift else each.new_zeros(()) for each in (values, target))
-        mean, middle = sums
+        if shift:
+            mean, middle = (weight * values).sum() / weight.sum(), (weight * target).sum() / weight.sum()
         centred = values - mean
         gain = (weight * centred * (target - middle)).sum() / (weight * centred.square()).sum()
         before, line = line, torch.stack((gain, middle - gain * mean))
@@ -227,7 +218,7 @@ def to_depth(values: Tensor, camera: Camera, quantity: str) -> Tensor:
     """Return values of a quantity as orthogonal depth; NaN where there is none."""
     if quantity == INVERSE:
         return torch.where(values > 0, 1 / values, torch.nan)
-    depth = from_range(values, camera, quantity)  # type: ignore[arg-type]  # it is a range type
+    depth = from_range(values, camera, cast(RangeType, quantity))
     return torch.where(depth > 0, depth, torch.nan)
 
 
@@ -242,23 +233,21 @@ def from_depth(depth_lr: Tensor, sample: DepthSample, quantity: str) -> Tensor:
         return 1 / depth_lr
     if quantity == "disparity":
         return sample.disparity_lr(torch.float64).cpu()
-    return to_range(depth_lr, sample.camera_lr, quantity)  # type: ignore[arg-type]  # it is a range type
+    return to_range(depth_lr, sample.camera_lr, cast(RangeType, quantity))
 
 
-def _reduce(values: Tensor, smaller: Tensor) -> Tensor:
-    """Return the means of the known values within the pixels of a smaller map, NaN where less than half are known."""
+def _both_known(values: Tensor, smaller: Tensor) -> tuple[Tensor, Tensor]:
+    """Return means of values within the pixels of a smaller map, if half of one are known, and its values there."""
     known, size = values.isfinite(), (smaller.shape[-2], smaller.shape[-1])
-    pool = torch.nn.functional.adaptive_avg_pool2d
-    share = pool(known.to(values.dtype), size)
-    return torch.where(share >= 0.5, pool(torch.where(known, values, 0), size) / share, torch.nan)
+    share = adaptive_avg_pool2d(known.to(values.dtype), size)
+    reduced = adaptive_avg_pool2d(torch.where(known, values, 0), size) / share
+    both = (share >= 0.5) & reduced.isfinite() & smaller.isfinite()
+    return reduced[both], smaller[both]
 
 
 def _expect_likeness(path: Path, depth: Tensor, sample: DepthSample, *, metric: bool) -> None:
     """Raise a ValueError if a map, perhaps metric, cannot be of the sample's scene."""
-    coarse = 1 / sample.depth_lr.to("cpu", torch.float64)
-    reduced = _reduce(1 / depth, coarse)
-    known = reduced.isfinite() & coarse.isfinite()
-    own, theirs = reduced[known], coarse[known]
+    own, theirs = _both_known(1 / depth, 1 / sample.depth_lr.to("cpu", torch.float64))
     if own.numel() < 2:
         return
     off = float(theirs.median() / own.median())

@@ -23,19 +23,11 @@ from dsr.degradation.downsampling import Downsampling
 from dsr.methods.base import Abilities, Method
 from dsr.methods.networks.network import DisparityNetwork
 from dsr.methods.networks.trained import NETWORKS, load_msg_weights
-from dsr.methods.networks.weight_files import (
-    find_weights,
-    has_weights,
-    is_dsr_weights,
-    load_network,
-    network_name,
-    read_header,
-)
+from dsr.methods.networks.weight_files import find_weights, has_weights, is_dsr_weights, load_network, network_name
 from dsr.utils.configuration import ConfigError, Node, build, config_directories, list_choices, load_target
 from dsr.utils.ratios import SCALES
 
 _NETWORK = "network"  # key of a method's node: the dotted path of the network's class, for weights of a training
-OF_RUN = ("weights", "scale", "downsampling")  # keys of a method's node that a run gives in another way
 _ALONE: Mapping[str, Any] = {"scale": 4, "seed": 0, "downsampling": None}  # what a node may refer to without a run
 
 
@@ -49,19 +41,15 @@ class Known(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """Settings of a run for its method, which gets those that the signature of its class names.
-
-    ``known`` is for arguments that the method's node leaves open, by null or ``auto``. ``alignment`` is that of the
-    predictions to the ground truth before scores. The last five are those of
-    :class:`~dsr.methods.dip.upsampler.DeepImagePrior`.
-    """
+    """Settings of a run for its method, which gets those that the signature of its class names."""
 
     device: torch.device | str = "cpu"
     precision: str = "float32"
     seed: int = 0
     downsampling: Downsampling = field(default_factory=lambda: Downsampling("box"))
-    known: Known = field(default_factory=Known)
-    alignment: str = "none"
+    known: Known = field(default_factory=Known)  # for arguments that the method's node leaves open, by null or ``auto``
+    alignment: str = "none"  # of the predictions to the ground truth before scores
+    # the rest is of :class:`~dsr.methods.dip.upsampler.DeepImagePrior`
     metrics: Any = None
     workspace: Path | None = None
     display: Any = None
@@ -71,24 +59,14 @@ class Run:
 
 @dataclass(frozen=True, eq=False)
 class Recipe:
-    """A method before the factor is known.
-
-    Args:
-        name: the method's.
-        node: its content, in which ``${scale}`` is not resolved.
-        directories: the user's configuration directories.
-        others: values that the node may refer to, the run's ``scale`` among them.
-        settings: keys that the caller has set.
-        label: its name in tables; None for ``name``.
-
-    """
+    """A method before the factor is known."""
 
     name: str
-    node: DictConfig
-    directories: tuple[Path, ...] = ()
-    others: Mapping[str, Any] = field(default_factory=lambda: _ALONE)
-    settings: frozenset[str] = frozenset()
-    label: str | None = None
+    node: DictConfig  # its content, in which ``${scale}`` is not resolved
+    directories: tuple[Path, ...] = ()  # of the user's configuration
+    others: Mapping[str, Any] = field(default_factory=lambda: _ALONE)  # that the node may refer to, such as ``scale``
+    settings: frozenset[str] = frozenset()  # keys that the caller has set
+    label: str | None = None  # name in tables; None for ``name``
     _resolved: dict[float | None, dict[str, Any]] = field(default_factory=dict, init=False, repr=False)
 
     def at(self, factor: float | None = None) -> Node:
@@ -131,7 +109,7 @@ class Recipe:
     @functools.cached_property
     def of_run(self) -> tuple[str, ...]:
         """Keys of the node that a run gives in another way, of weights only to a method that needs a file."""
-        return OF_RUN if self.abilities.needs else OF_RUN[1:]
+        return ("weights", "scale", "downsampling") if self.abilities.needs else ("scale", "downsampling")
 
     @property
     def computed_at(self) -> tuple[float, ...]:
@@ -155,20 +133,20 @@ class Recipe:
     def build(self, factor: float, run: Run | None = None, **decided: Any) -> Method:
         """Build the method for a factor.
 
-        Args:
-            run: what the run gives; None for what :class:`Run` has.
-            **decided: arguments that the caller decides in place of the method's file, if the class names them.
-
+        ``run`` is what the run gives, None for what :class:`Run` has; ``decided`` are arguments that the caller decides
+        in place of the method's file, if the class names them.
         """
         given = {**vars(run or Run()), "scale": factor}
-        node = {key: value for key, value in self.at(factor).items() if key not in decided or key in self.settings}
-        for key, value in given.pop("known")._asdict().items():
+        known = given.pop("known")._asdict()
+        if self.abilities.needs is not None:
+            given |= {"weights": self.weights(factor), "networks": self._networks}
+        node = dict(self.at(factor))
+        for key, value in known.items():
             if value is not None and node.get(key) in (None, "auto"):
                 node.pop(key, None)
                 given[key] = value
-        if self.abilities.needs is not None:
-            given |= {"weights": self.weights(factor), "networks": self._networks}
-        node = {key: value for key, value in node.items() if key not in (*self.of_run, _NETWORK)}
+        for key in (*self.of_run, _NETWORK, *(decided.keys() - self.settings)):
+            node.pop(key, None)
         method: Method = build("method", node, {**given, **decided}, self.name)
         return method
 
@@ -182,10 +160,7 @@ class Recipe:
         path, variant = find_weights(node.get("weights"), factor, self.name), node.get("variant")
         if variant is not None and not is_dsr_weights(path):
             return load_msg_weights(path, factor, variant)
-        header = read_header(path)
-        trained, kind = header["arguments"].get("scale"), self._networks.get(header["network"])
-        serves = kind is not None and trained is not None and kind.serves(trained, factor)
-        return load_network(path, self._networks, None if serves else factor, str(node["model"]))
+        return load_network(path, self._networks, factor, str(node["model"]))
 
     def targets(self) -> Iterator[str]:
         """Yield the dotted paths of the method's class and of its network's class."""

@@ -32,6 +32,17 @@ def read_torch_file(path: Path) -> Any:
     return content
 
 
+def read_tensors(path: Path, key: str | None = None) -> dict[str, Tensor]:
+    """Return the tensors of a torch file by name, or those that it has under a key."""
+    content = read_torch_file(path)
+    found = content.get(key) if isinstance(content, dict) and key is not None else content
+    if not isinstance(found, dict) or not all(isinstance(value, Tensor) for value in found.values()):
+        keys = ", ".join(map(str, list(content)[:4])) if isinstance(content, dict) else type(content).__name__
+        place = "" if key is None else f" under the key {key}"
+        raise ValueError(f"{path}: expected a network's tensors by name{place}, got {keys}")
+    return {str(name): value for name, value in found.items()}
+
+
 def _expect_plain_tensors(path: Path, content: Any) -> None:
     """Refuse a file with a tensor without values of its own.
 

@@ -1,4 +1,10 @@
-"""The networks, which map low-resolution disparity and an RGB image to high-resolution disparity, and their method."""
+"""The networks, which map low-resolution disparity and an RGB image to high-resolution disparity, and their method.
+
+Large images are computed in tiles of low-resolution pixels, which bounds the memory. The output of a tile is computed
+from a window that contains the tile, half of the overlap with its neighbours, and a margin of the receptive-field
+radius. Neighbouring outputs therefore agree where they overlap. They are blended there with linear ramps whose weights
+add up to 1. Values of the whole image, such as the range of the disparity, are computed before.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +13,7 @@ import copy
 import inspect
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal
@@ -17,11 +23,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.geometry.camera import from_range, to_range
-from dsr.methods.base import Abilities, Cost, InverseSample, InverseSurface, Method
+from dsr.methods.base import TILE, UNTILED, Abilities, Cost, InverseSample, InverseSurface, Method
 from dsr.methods.images import compute_min_max, inpaint
-from dsr.methods.tiling import TILE, UNTILED, AxisTile, blend_tiles, split_axis
 from dsr.sample import DepthSample
 from dsr.utils.compute_device import widened
+from dsr.utils.guards import expect_one_of
 from dsr.utils.progress import Steps
 
 Precision = Literal["float32", "bfloat16"]
@@ -45,24 +51,16 @@ class Answer:
 
 
 class DisparityNetwork(nn.Module, abc.ABC):
-    """A network that upsamples disparity, guided by an RGB image.
-
-    Attributes:
-        scale: upsampling factor.
-        receptive_field_radius: in low-resolution pixels, of a network whose outputs depend on a neighbourhood and a few
-            global values only; large images are then processed in tiles. None for any other network.
-        of_inverse_depth: whether it takes inverse depth in place of disparity, which may have an offset.
-        states_errors: whether its answers have expected errors, and it is given what is known of the maps.
-        covers: whether the output covers the whole image; some published networks leave out a row and a column.
-        method: target and arguments of the method that runs it as validations do: one pass, with what is known of maps.
-
-    """
+    """A network that upsamples disparity, guided by an RGB image."""
 
     scale: int
+    # Low-resolution pixels around its own that an output depends on, beside a few values of the whole image; large
+    # images are then computed in tiles. None for a network that needs the whole image.
     receptive_field_radius: int | None = None
-    covers: bool = True
-    of_inverse_depth: bool = False
-    states_errors: bool = False
+    covers: bool = True  # the whole image; some published networks leave out a row and a column
+    of_inverse_depth: bool = False  # takes inverse depth in place of disparity, which may have an offset
+    states_errors: bool = False  # its answers have expected errors, and it is given what is known of the maps
+    # target and arguments of the method that runs it as validations do: one pass, with what is known of maps
     method: ClassVar[Mapping[str, Any]] = MappingProxyType(
         {"_target_": "dsr.methods.networks.trained.TrainedNetwork", "ensemble": 1}
     )
@@ -183,20 +181,18 @@ def expect_rgb_size(rgb: Tensor, values_lr: Tensor, scale: int) -> None:
 class NetworkUpsampler(Method):
     """A method that is a trained network.
 
-    Images of more than ``UNTILED`` pixels are processed in tiles, see :mod:`dsr.methods.tiling`. This bounds the memory
-    to about 40 bytes per pixel of the image, and 700 to 1300 bytes per pixel of a window (a tile and the network's
-    receptive-field radius on each side), depending on the network and the depth's precision. Global values, such as
-    the range of the disparity, are computed from the whole image, so tiles change the result by rounding errors only.
+    Images of more than ``UNTILED`` pixels are computed in tiles, which changes the result by rounding errors only. The
+    memory is about 40 bytes per pixel of the image, and 700 to 1300 bytes per pixel of a tile's window, depending on
+    the network and the depth's precision.
 
     Args:
         net: the network; it is copied.
         precision: dtype of the convolutions; all other computations use the depth's dtype.
         device: device of the computations.
         ensemble: number of test-time augmentations: 1 for none, 4 for the rotations by multiples of 90 degrees, 8 for
-            these and their mirror images. Each transformed image is upsampled, the results are transformed back and
-            averaged, which takes 4 or 8 times as long. Errors that depend on the orientation partly cancel. This is the
-            geometric self-ensemble of Timofte, Rothe, Van Gool, *Seven Ways to Improve Example-Based Single Image
-            Super Resolution*, CVPR 2016, section 3.6.
+            these and their mirror images. The results are transformed back and averaged, so that errors that depend on
+            the orientation partly cancel, which takes 4 or 8 times as long. This is the geometric self-ensemble of
+            Timofte, Rothe, Van Gool, *Seven Ways to Improve Example-Based Single Image Super Resolution*, CVPR 2016.
         tile: side of a tile in high-resolution pixels; None for ``TILE``, and no tiles up to ``UNTILED`` pixels.
 
     """
@@ -211,8 +207,7 @@ class NetworkUpsampler(Method):
         ensemble: int = 1,
         tile: int | None = None,
     ) -> None:
-        if precision not in DTYPES:
-            raise ValueError(f"precision: expected one of {', '.join(DTYPES)}, got {precision!r}")
+        expect_one_of("precision", precision, tuple(DTYPES))
         if ensemble not in ENSEMBLES:
             raise ValueError(f"ensemble: expected one of {', '.join(map(str, ENSEMBLES))}, got {ensemble!r}")
         if ensemble > 1 and not net.covers:
@@ -236,13 +231,12 @@ class NetworkUpsampler(Method):
         rgb = sample.rgb.to(self.device)[None]
         disparity = self.upsample_disparity(rgb, disparity_lr.to(self.device)[None], progress)[0] - offset
         missing = (sample.camera.width - disparity.shape[-1], sample.camera.height - disparity.shape[-2])
-        if any(missing):
-            disparity = functional.pad(disparity, (0, missing[0], 0, missing[1]), value=torch.nan)
+        disparity = functional.pad(disparity, (0, missing[0], 0, missing[1]), value=torch.nan)
         return from_range(disparity, sample.camera, "disparity").to(sample.depth_lr.device)
 
     def upsample_inverse(self, problem: InverseSample, progress: Steps | None = None) -> InverseSurface:
         """Return the network's upsampled inverse depth."""
-        rgb, inverse = (each.to(self.device)[None] for each in (problem.rgb, problem.inverse))
+        rgb, inverse = problem.rgb.to(self.device)[None], problem.inverse.to(self.device)[None]
         return InverseSurface(self.upsample_disparity(rgb, inverse, progress)[0])
 
     def upsample_disparity(self, rgb: Tensor, disparity_lr: Tensor, progress: Steps | None = None) -> Tensor:
@@ -279,13 +273,7 @@ class NetworkUpsampler(Method):
         return len(rows) * len(columns) * self.ensemble
 
     def _tiles(self, height: int, width: int) -> tuple[list[AxisTile], list[AxisTile]]:
-        """Return the tiles along both axes of an image, of which there may be one alone."""
-        scale, radius = self.net.scale, self.net.receptive_field_radius
-        sizes = height // scale, width // scale
-        whole = radius is None or (self.tile is None and height * width <= UNTILED)
-        tile = max(sizes) if whole else (self.tile or TILE) // scale
-        rows, columns = (split_axis(size, tile, radius or 0, _OVERLAP) for size in sizes)
-        return rows, columns
+        return split_image((height, width), self.net.scale, self.net.receptive_field_radius, self.tile, _OVERLAP)
 
 
 def apply_dihedral(x: Tensor, index: int) -> Tensor:
@@ -297,3 +285,81 @@ def undo_dihedral(x: Tensor, index: int) -> Tensor:
     """Undo :func:`apply_dihedral`."""
     x = torch.rot90(x, -(index % 4), (-2, -1))
     return x.flip(-1) if index >= 4 else x
+
+
+@dataclass(frozen=True)
+class AxisTile:
+    """A tile along one axis, in low-resolution pixels."""
+
+    read: slice  # the window that the output is computed from
+    kept: slice  # the part of the output that is used
+    ramps: tuple[int, int]  # pixels that are blended with the previous and with the next tile, 0 at a border
+
+    def weights(self, scale: int) -> Tensor:
+        """Return the weight of each used high-resolution pixel, (scale * kept,) float32: 1, with ramps at the ends."""
+        weights = torch.ones(scale * (self.kept.stop - self.kept.start))
+        rising, falling = ((torch.arange(scale * ramp) + 0.5) / max(scale * ramp, 1) for ramp in self.ramps)
+        weights[: len(rising)] = rising
+        weights[len(weights) - len(falling) :] = 1 - falling
+        return weights
+
+
+def split_image(
+    size: tuple[int, int], scale: int, radius: int | None, tile: int | None, overlap: int
+) -> tuple[list[AxisTile], list[AxisTile]]:
+    """Return the tiles along both axes of an image of high-resolution pixels; one if it is small or needed whole.
+
+    The ``radius`` of the receptive field and the ``overlap`` are low-resolution pixels, the ``tile`` as of
+    :class:`NetworkUpsampler`.
+    """
+    height, width = (n // scale for n in size)
+    whole = radius is None or (tile is None and math.prod(size) <= UNTILED)
+    longest = max(height, width) if whole else (tile or TILE) // scale
+    return split_axis(height, longest, radius or 0, overlap), split_axis(width, longest, radius or 0, overlap)
+
+
+def split_axis(size: int, tile: int, radius: int, overlap: int) -> list[AxisTile]:
+    """Split an axis of low-resolution pixels into tiles whose sizes differ by one pixel at most.
+
+    ``tile`` is the maximum size of a tile without its overlaps, ``radius`` that of the receptive field,
+    ``overlap`` that of neighbouring tiles, even; no tile is smaller.
+    """
+    count = max(1, min(math.ceil(size / tile), size // max(overlap, 1)))
+    edges, half, found = [round(i * size / count) for i in range(count + 1)], overlap // 2, []
+    for i in range(count):
+        before, after = (half if i else 0), (half if i + 1 < count else 0)
+        first, last = edges[i] - before, edges[i + 1] + after
+        read = slice(max(first - radius, 0), min(last + radius, size))
+        found.append(AxisTile(read, slice(first, last), (2 * before, 2 * after)))
+    return found
+
+
+def blend_tiles(
+    compute: Callable[[slice, slice], Tensor],
+    rows: list[AxisTile],
+    columns: list[AxisTile],
+    scale: int,
+    progress: Steps | None = None,
+) -> Tensor:
+    """Compute an image, (B, C, scale * h, scale * w), tile by tile and blend the tiles.
+
+    ``compute`` maps rows and columns of low-resolution pixels to their high-resolution pixels. It may leave out the
+    last high-resolution row and column, which the result then lacks.
+    """
+    total = torch.empty(0)
+    for done, (row, column) in enumerate(itertools.product(rows, columns), 1):
+        output = compute(row.read, column.read)
+        if done == 1:
+            lost_y = scale * (row.read.stop - row.read.start) - output.shape[-2]
+            lost_x = scale * (column.read.stop - column.read.start) - output.shape[-1]
+            size = (scale * rows[-1].kept.stop - lost_y, scale * columns[-1].kept.stop - lost_x)
+            total = output.new_zeros((*output.shape[:-2], *size))
+        top, left = scale * row.kept.start, scale * column.kept.start
+        target = total[..., top : scale * row.kept.stop, left : scale * column.kept.stop]
+        height, width = target.shape[-2:]
+        y, x = top - scale * row.read.start, left - scale * column.read.start
+        part = output[..., y : y + height, x : x + width] * row.weights(scale)[:height, None].to(total)
+        target += part.mul_(column.weights(scale)[:width].to(total))
+        if progress is not None:
+            progress(done, len(rows) * len(columns))
+    return total

@@ -54,15 +54,13 @@ class NetworkFile(Method):
         inputs: what each input gets, by its name, (1, C, H, W) float32: ``image``, the photo in 0..1; ``image255``;
             ``imagenet``, normalised as for ImageNet; ``grey``, its luma; ``lr``, the low-resolution map; ``up``, that
             map enlarged by Keys' cubic kernel to the photo's size; ``valid``, where the map is known (bool).
-        range_type: what the depth inputs measure, and the type that the low-resolution map is averaged in:
-            ``orthogonal``, ``perspective``, ``disparity`` in pixels of the photo's camera, or ``inverse`` in 1/m, which
-            is averaged as disparity.
+        range_type: what the depth inputs measure, and the type that the low-resolution map is averaged in;
+            ``disparity`` in pixels of the photo's camera, ``inverse`` in 1/m, which is averaged as disparity.
         range: what becomes 0..1 in the depth inputs: ``measured`` for the low-resolution map's minimum and maximum, two
             numbers in the quantity's unit, or None for values as they are.
         output: what the network returns, (1, 1, H, W): ``same`` as its depth inputs, in the same range; ``residual``,
             to be added to the enlarged map; or a quantity as it is, of :data:`dsr.methods.external.QUANTITIES`.
-        fit: of the result to the low-resolution map, in the quantity that it measures: ``scale``, ``affine``, or None
-            for a network that is metric. See :func:`dsr.methods.external.fit_to_map`.
+        fit: of the result to the low-resolution map, as of :class:`~dsr.methods.external.External`.
         result: name of the output; None for the first.
         size: height and width that photos are resized to by Keys' cubic kernel, and the result bilinearly back, for a
             network that sees the photo alone; None for the photo's.
@@ -88,15 +86,12 @@ class NetworkFile(Method):
         self._path = Path(path).expanduser()
         if self._path.suffix.lower() != ".onnx" or not self._path.is_file():
             raise ValueError(f"path: expected an existing file *.onnx, got {path}")
-        for key, value, known in (
-            ("range_type", range_type, QUANTITIES),
-            ("output", output, OUTPUTS),
-            ("fit", fit, (None, *get_args(Fit))),
-            *((f"inputs.{name}", content, CONTENTS) for name, content in inputs.items()),
-        ):
-            expect_one_of(key, value, known)
-        self._inputs = dict(inputs)
-        self._limits = None
+        expect_one_of("range_type", range_type, QUANTITIES)
+        expect_one_of("output", output, OUTPUTS)
+        expect_one_of("fit", fit, (None, *get_args(Fit)))
+        for name, content in inputs.items():
+            expect_one_of(f"inputs.{name}", content, CONTENTS)
+        self._inputs, self._limits = dict(inputs), None
         if range not in (None, MEASURED):
             if isinstance(range, str) or len(range) != 2 or not range[0] < range[1]:
                 raise ValueError(f"range: expected {MEASURED}, null or two numbers that rise, got {range!r}")
@@ -109,10 +104,9 @@ class NetworkFile(Method):
         self._size = None if size is None else (int(size[0]), int(size[1]))
         self.name = self._path.stem
         self.range_type = range_type if range_type in RANGE_TYPES else "disparity"
-        self._quantity, self._scaled, self._output = range_type, range is not None, output
-        self._fit: Fit | None = fit  # type: ignore[assignment]  # it has been checked
+        self._quantity, self._scaled, self._output, self._fit = range_type, range is not None, output, fit
         self._result, self._multiple, self.device = result, multiple, torch.device(device)
-        self._weights = self._files_of_weights()
+        self._files = [self._path, *self._weights()]
         self._sessions: dict[int, Any] = {}  # by process: a worker has one of its own
         self._session(threads=1)  # its errors, before anything is computed
 
@@ -121,32 +115,30 @@ class NetworkFile(Method):
         """Return the high-resolution orthogonal depth, (1, H, W) in metres on the sample's device."""
         photo_size = sample.camera.height, sample.camera.width
         size = self._size or photo_size
-        known = sample.mask_lr[None].to(self.device)
-        values_lr = inpaint(from_depth(sample.depth_lr, sample, self._quantity)[None]).to(self.device)
-        scaled = normalise(values_lr, self._limits)
-        lowest, span = (scaled.minimum, scaled.value_range) if self._scaled else (0.0, 1.0)
-        low = (scaled.values if self._scaled else values_lr).float()
-        enlarged = resize_bicubic(low, photo_size)
-        pictures = {"lr": low, "up": enlarged, "valid": known}
         rgb = sample.rgb.to(self.device, torch.float32)[None]
         if size != photo_size:
             rgb = resize_bicubic(rgb, size).clamp(0, 1)
-        given = {
-            name: self._padded(_IMAGES[content](rgb) if content in _IMAGES else pictures[content], size)
-            for name, content in self._inputs.items()
-        }
+        values_lr = inpaint(from_depth(sample.depth_lr, sample, self._quantity)[None]).to(self.device)
+        low, lowest, span = normalise(values_lr, self._limits) if self._scaled else (values_lr, 0.0, 1.0)
+        enlarged = resize_bicubic(low.float(), photo_size)
+        maps = {"lr": low.float(), "up": enlarged, "valid": sample.mask_lr[None].to(self.device)}
+        inputs = {}
+        for name, content in self._inputs.items():
+            picture = maps[content] if content in maps else _IMAGES[content](rgb)
+            inputs[name] = self._padded(picture, size).cpu().numpy()
         if os.getpid() not in self._sessions:
             self._sessions[os.getpid()] = self._session(torch.get_num_threads())
+        session = self._sessions[os.getpid()]
         with refusing(f"{self._path}: expected a network for {size[0]} x {size[1]} pixels, it failed", Exception):
-            session, inputs = self._sessions[os.getpid()], {name: each.cpu().numpy() for name, each in given.items()}
             found = torch.from_numpy(session.run([self._result or session.get_outputs()[0].name], inputs)[0])
         found = found.reshape(1, 1, *found.shape[-2:]) if found.numel() == found.shape[-2:].numel() else found
         if found.dim() != 4 or found.shape[:2] != (1, 1) or found.shape[-2] < size[0] or found.shape[-1] < size[1]:
             raise ValueError(f"{self._path}: expected a map of {size[0]} x {size[1]}, got {tuple(found.shape)}")
-        values = found[..., : size[0], : size[1]].to(values_lr)
+        values, quantity = found[..., : size[0], : size[1]].to(values_lr), self._output
+        if self._output == RESIDUAL:
+            values = values + enlarged
         if self._output in (SAME, RESIDUAL):
-            values = (values + enlarged if self._output == RESIDUAL else values) * span + lowest
-        quantity = self._quantity if self._output in (SAME, RESIDUAL) else self._output
+            values, quantity = values * span + lowest, self._quantity
         if size != photo_size:
             factor = photo_size[1] / size[1] if quantity == "disparity" else 1.0  # in pixels of the photo
             values = functional.interpolate(values, photo_size, mode="bilinear", align_corners=False) * factor
@@ -163,9 +155,9 @@ class NetworkFile(Method):
 
     def content(self, dataset: str, scene: str, scale: float) -> str:
         """Return the SHA-256 of the network's file, and of those that hold its weights."""
-        return ", ".join(hash_once(file) for file in (self._path, *self._weights))
+        return ", ".join(map(hash_once, self._files))
 
-    def _files_of_weights(self) -> list[Path]:
+    def _weights(self) -> list[Path]:
         """Return the files beside an ONNX file that hold its weights, as those of more than 2 GB do."""
         onnx = import_library("onnx", f"method.path={self._path}")
         with refusing(f"{self._path}: expected an ONNX file, got a damaged or foreign one", Exception):
@@ -179,15 +171,11 @@ class NetworkFile(Method):
 
     def _padded(self, picture: Tensor, size: tuple[int, int]) -> Tensor:
         """Return a picture continued to as many pixels as make the photo's size a multiple."""
-        more = [-each % self._multiple for each in size]
-        if not any(more):
-            return picture
         ratio = size[0] / picture.shape[-2]
-        steps = [each / ratio for each in more]
-        if any(step != int(step) for step in steps):
+        down, across = (-each % self._multiple / ratio for each in size)
+        if not down.is_integer() or not across.is_integer():
             raise ValueError(f"multiple: expected one that x{round_ratio(ratio)} divides, got {self._multiple}")
-        padding = (0, int(steps[1]), 0, int(steps[0]))
-        return functional.pad(picture.float(), padding, mode="replicate").to(picture.dtype)
+        return functional.pad(picture.float(), (0, int(across), 0, int(down)), mode="replicate").to(picture.dtype)
 
     def _session(self, threads: int) -> Any:
         """Return a session of onnxruntime, whose inputs and outputs are those that are declared."""

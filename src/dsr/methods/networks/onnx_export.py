@@ -17,7 +17,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -44,12 +43,8 @@ class OnnxGraph(nn.Module):
         if scale != net.scale and not net.serves(net.scale, scale):
             raise ValueError(f"scale: expected {net.scale}, the network's, got {scale}")
         self.net, self.scale = net.requires_grad_(False), scale
+        self.outputs = (RESULT, *ERRORS) if isinstance(net, FacetsUNet) else (RESULT,)
         self.eval()
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        """Names of the results."""
-        return (RESULT, *ERRORS) if isinstance(self.net, FacetsUNet) else (RESULT,)
 
     def forward(self, photo: Tensor, inverse_depth: Tensor, valid: Tensor) -> tuple[Tensor, ...]:
         """Return high-resolution inverse depth, (1, 1, H, W) in the unit of the input, and the expected errors.
@@ -63,17 +58,18 @@ class OnnxGraph(nn.Module):
         if not isinstance(self.net, FacetsUNet):
             return (self.net.upsample(photo, values),)
         if self.scale == 1:  # its pixels are averaged in pairs
-            photo, values = (pad_to_multiple(each, 2) for each in (photo, values))
+            photo, values = pad_to_multiple(photo, 2), pad_to_multiple(values, 2)
         answer = self.net.answer(photo, values)
         results = (answer.disparity, answer.spread, answer.angle * (180 / math.pi))
         return tuple(each[..., :height, :width] for each in results)
 
 
+@torch.no_grad()
 def write_onnx(path: Path, graph: OnnxGraph, facts: Mapping[str, Any]) -> float:
     """Write a network as an ONNX file with facts as metadata, atomically, after comparing its results.
 
-    Return the largest difference, over the range of the result; a ValueError if they differ, or if `onnx` or
-    `onnxruntime` is not installed.
+    Return the largest difference for a size that it was not traced with, over the range of the result; a ValueError if
+    they differ, or if `onnx` or `onnxruntime` is not installed.
     """
     onnx, runtime = import_library("onnx", "--onnx"), import_library("onnxruntime", "--onnx")
     with replacing(path) as temporary:
@@ -82,7 +78,13 @@ def write_onnx(path: Path, graph: OnnxGraph, facts: Mapping[str, Any]) -> float:
         onnx.helper.set_model_props(model, {key: str(value) for key, value in facts.items()})
         onnx.save(model, str(temporary))
         session = runtime.InferenceSession(str(temporary), providers=["CPUExecutionProvider"])
-        difference = _compare(session, graph)
+        inputs = example_inputs(_CHECKED, graph.scale)
+        found = session.run(None, {name: each.numpy() for name, each in zip(INPUTS, inputs, strict=True)})
+        differences = []
+        for mine, theirs in zip(found, graph(*inputs), strict=True):
+            value_range = float(theirs.max() - theirs.min()) or 1
+            differences.append((torch.from_numpy(mine) - theirs).abs().max() / value_range)
+        difference = float(torch.stack(differences).max())
         if not difference <= _TOLERANCE:
             raise ValueError(
                 f"{path}: expected the network's results to {_TOLERANCE:g} of the range, got a difference of "
@@ -105,12 +107,10 @@ def example_inputs(size_lr: tuple[int, int], scale: int) -> tuple[Tensor, Tensor
     return photo, inverse[None, None], valid[None, None]
 
 
-@torch.no_grad()
 def _trace(path: Path, graph: OnnxGraph) -> None:
     """Write the graph of a network, with the operators that the exporter lacks."""
     low = {2: "h", 3: "w"}
     high = low if graph.scale == 1 else {2: "H", 3: "W"}
-    axes = {"photo": high, "inverse_depth": low, "valid": low, **dict.fromkeys(graph.outputs, high)}
     added: dict[str, Callable[..., Any]] = {
         "aten::asinh": lambda context, x: context.op("Asinh", x),
         "aten::_upsample_bicubic2d_aa": _bicubic,
@@ -126,7 +126,7 @@ def _trace(path: Path, graph: OnnxGraph) -> None:
                 str(path),
                 input_names=list(INPUTS),
                 output_names=list(graph.outputs),
-                dynamic_axes=axes,
+                dynamic_axes={"photo": high, "inverse_depth": low, "valid": low, **dict.fromkeys(graph.outputs, high)},
                 opset_version=_OPSET,
                 dynamo=False,
             )
@@ -142,29 +142,8 @@ def _bicubic(context: Any, x: Any, size: Any, _align: Any, *_scales: Any) -> Any
     lead = context.op("Slice", context.op("Shape", x), start, end)
     sizes = context.op("Concat", lead, context.op("Cast", size, to_i=7), axis_i=0)  # 7: int64
     empty = context.op("Constant", value_t=torch.tensor([], dtype=torch.float32))
-    return context.op(
-        "Resize",
-        x,
-        empty,
-        empty,
-        sizes,
-        mode_s="cubic",
-        cubic_coeff_a_f=-0.5,
-        exclude_outside_i=1,
-        coordinate_transformation_mode_s="half_pixel",
-    )
-
-
-@torch.no_grad()
-def _compare(session: Any, graph: OnnxGraph) -> float:
-    """Return the largest difference between what a graph and its network compute for a size it was not traced with."""
-    inputs = example_inputs(_CHECKED, graph.scale)
-    found = session.run(None, {name: each.numpy() for name, each in zip(INPUTS, inputs, strict=True)})
-    differences = []
-    for mine, theirs in zip(found, graph(*inputs), strict=True):
-        value_range = float(theirs.max() - theirs.min())
-        differences.append(float(np.abs(mine - theirs.numpy()).max()) / (value_range or 1))
-    return max(differences)
+    keys = {"mode_s": "cubic", "cubic_coeff_a_f": -0.5, "exclude_outside_i": 1}
+    return context.op("Resize", x, empty, empty, sizes, coordinate_transformation_mode_s="half_pixel", **keys)
 
 
 def import_library(name: str, wanted_by: str) -> Any:

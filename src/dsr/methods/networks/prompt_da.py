@@ -2,18 +2,16 @@
 
 Lin, Peng, Chen, Peng, Sun, Liu, Bao, Feng, Zhou, Kang, *Prompting Depth Anything for 4K Resolution Accurate Metric
 Depth Estimation*, CVPR 2025. The network is that of Hugging Face's ``transformers``
-(PromptDepthAnythingForDepthEstimation, ``pip install -e '.[transformers]'``), the weights are its authors'. What its
-image processor does is done here in torch, as in transformers' models/prompt_depth_anything: the photo is resized by
-Pillow's bicubic kernel to multiples of the patches and normalised as for ImageNet, the result by a bicubic kernel with
-a = -0.75 to the photo's size. The processor resizes photos of 8 bits and rounds, this does not.
-
-The network itself brings the prompt's minimum and maximum to 0 and 1, its result back, and the prompt, of any size, to
-those of its features. It was trained on the 256 x 192 pixels of ARKit's lidar.
+(PromptDepthAnythingForDepthEstimation, ``pip install -e '.[transformers]'``), the weights are its authors'. As in its
+image processor, but without rounding to 8 bits, the photo is resized by Pillow's bicubic kernel to multiples of the
+patches and normalised as for ImageNet, the result by a bicubic kernel with a = -0.75 to the photo's size. The network
+itself brings the prompt's minimum and maximum to 0 and 1. It was trained on the 256 x 192 pixels of ARKit's lidar.
 """
 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -70,8 +68,8 @@ class PromptDA(Method):
         expect_library("weights", "transformers", "transformers")
         self._folder = _find(str(weights))
         self._size, self.device = size, torch.device(device)
-        self.net, self._patch = _load(self._folder)
-        self.net = self.net.to(self.device)
+        net, self._patch = _load(self._folder)
+        self.net = net.to(self.device)
         if size < self._patch:
             raise ValueError(f"size: expected {self._patch} or more, got {size}")
 
@@ -87,7 +85,9 @@ class PromptDA(Method):
     def predict(self, rgb: Tensor, prompt: Tensor) -> Tensor:
         """Return depth in metres, (B, 1, H, W), of photos (B, 3, H, W) in 0..1 and depth (B, 1, h, w) without holes."""
         size = (rgb.shape[-2], rgb.shape[-1])
-        photo = resize_bicubic(rgb.to(torch.float64), self._size_within(size)).clamp(0, 1)  # as exact as Pillow's
+        factor = min((self._size / n for n in size), key=lambda each: abs(1 - each))
+        height, width = (max(1, round(factor * n / self._patch)) * self._patch for n in size)
+        photo = resize_bicubic(rgb.to(torch.float64), (height, width)).clamp(0, 1)  # as exact as Pillow's
         flat = prompt.amax(dim=(-2, -1), keepdim=True) == prompt.amin(dim=(-2, -1), keepdim=True)
         corner = torch.zeros_like(prompt)
         corner[..., 0, 0] = 1e-6  # gives a constant map a range, which the network divides by
@@ -100,36 +100,26 @@ class PromptDA(Method):
         """Return the SHA-256 of the network's files."""
         return ", ".join(hash_once(self._folder / name) for name in (CONFIG, WEIGHTS))
 
-    def _size_within(self, size: tuple[int, int]) -> tuple[int, int]:
-        """Return the height and width that the network gets of a photo."""
-        factor = min((self._size / n for n in size), key=lambda each: abs(1 - each))
-        height, width = (max(1, round(factor * n / self._patch)) * self._patch for n in size)
-        return height, width
-
 
 def _find(weights: str) -> Path:
-    """Return the folder with the files of a network."""
+    """Return the folder with the files of a network: a name of the hub is taken from its cache, or fetched."""
     folder = Path(weights).expanduser()
     if not folder.is_dir() and _HUB_NAME.fullmatch(weights):
-        folder = _fetched(weights)
+        import huggingface_hub  # noqa: PLC0415 - it comes with an extra
+
+        arguments: dict[str, Any] = {"repo_id": weights, "allow_patterns": [CONFIG, WEIGHTS]}
+        with contextlib.suppress(Exception):
+            folder = Path(huggingface_hub.snapshot_download(local_files_only=True, **arguments))
+        if not all((folder / name).is_file() for name in (CONFIG, WEIGHTS)):
+            message = (
+                f"weights: expected a folder, or a name of the Hugging Face hub that can be reached, got {weights}"
+            )
+            with refusing(message, Exception):
+                folder = Path(huggingface_hub.snapshot_download(**arguments))
     missing = [name for name in (CONFIG, WEIGHTS) if not (folder / name).is_file()]
     if missing:
         raise ValueError(f"weights: expected a folder with {CONFIG} and {WEIGHTS}, got {weights} (no {missing[0]})")
     return folder
-
-
-def _fetched(name: str) -> Path:
-    """Return the folder with the files of a name of the hub: in its cache, or fetched if they are not there."""
-    import huggingface_hub  # noqa: PLC0415 - it comes with an extra
-
-    arguments: dict[str, Any] = {"allow_patterns": [CONFIG, WEIGHTS]}
-    with contextlib.suppress(Exception):
-        cached = Path(huggingface_hub.snapshot_download(name, local_files_only=True, **arguments))
-        if all((cached / file).is_file() for file in (CONFIG, WEIGHTS)):
-            return cached
-    message = f"weights: expected a folder, or a name of the Hugging Face hub that can be reached, got {name}"
-    with refusing(message, Exception):
-        return Path(huggingface_hub.snapshot_download(name, **arguments))
 
 
 def _load(folder: Path) -> tuple[nn.Module, int]:
@@ -172,15 +162,15 @@ def _read_config(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     kind = backbone.get("model_type") if isinstance(backbone, Mapping) else None
     if kind != "dinov2":
         raise ValueError(f"{path}: expected a backbone_config of model_type dinov2, got {kind!r}")
-    found = [
-        {key: part[key] for key in keys if key in part} for part, keys in ((content, _NETWORK), (backbone, _BACKBONE))
-    ]
-    numbers = [n for part in found for value in part.values() for n in (value if isinstance(value, list) else [value])]
-    if any(isinstance(n, int) and abs(n) > _LARGEST for n in numbers) or not isinstance(
-        content.get("patch_size", 14), int
-    ):
+    network = {key: content[key] for key in _NETWORK if key in content}
+    backbone = {key: backbone[key] for key in _BACKBONE if key in backbone}
+    numbers = itertools.chain.from_iterable(
+        value if isinstance(value, list) else [value] for value in (*network.values(), *backbone.values())
+    )
+    too_large = any(isinstance(n, int) and abs(n) > _LARGEST for n in numbers)
+    if too_large or not isinstance(content.get("patch_size", 14), int):
         raise ValueError(f"{path}: expected sizes of a network of at most {_LARGEST}")
-    return found[0], found[1]
+    return network, backbone
 
 
 @contextlib.contextmanager

@@ -25,9 +25,9 @@ from dsr.methods.networks.network import DisparityNetwork, NetworkUpsampler, Pre
 from dsr.methods.networks.pdn import PrimalDualNetwork
 from dsr.methods.networks.sparse_to_dense import SparseToDense
 from dsr.methods.networks.weight_files import is_dsr_weights, load_network, load_parameters
-from dsr.utils.guards import MOST_FILE, read_limited
+from dsr.utils.guards import MOST_FILE, read_limited, refusing
 from dsr.utils.ratios import SCALES
-from dsr.utils.torch_files import read_torch_file
+from dsr.utils.torch_files import read_tensors
 
 _KINDS: tuple[type[DisparityNetwork], ...] = (
     MSGNet, Facets, FacetsUNet, PrimalDualNetwork, DynamicGuidance, SparseToDense, DDRNet,
@@ -78,66 +78,48 @@ def load_msg_weights(path: Path, scale: int, variant: VariantName | None = None)
     data = read_limited(path, MOST_FILE)
     is_torch = data.startswith((b"PK\x03\x04", b"\x80"))
     found: VariantName = "voynov" if is_torch else "hui"
-    levels, tensors = _from_torch(path) if is_torch else _from_caffe(path, data)
+    levels, values = _from_torch(path) if is_torch else _from_caffe(path, data)
+    if levels < 1 or 2**levels not in SCALES:
+        raise ValueError(f"{path}: expected MSG-Net for a scale of {SCALES}, got {levels} upsampling levels")
     if variant is not None and found != variant:
         raise ValueError(f"{path}: expected weights of variant {variant}, got those of variant {found}")
     if 2**levels != scale:
         raise ValueError(f"{path}: weights are for scale {2**levels}, the run is at scale {scale}")
     with torch.device("meta"):  # without memory and random numbers
         net = MSGNet(scale, found)
+    own = list(net.state_dict())
+    if is_torch:
+        guidance = [f"feature_extraction_Y.{max(i, 2 * i - 2)}" for i in range(levels + 1)]  # which also count poolings
+        theirs = [*guidance, "feature_extraction_X", *(f"upsampling_X.{i}" for i in range(3 * levels + 2))]
+        layers = [name.removesuffix(".conv.weight") for name in own if name.endswith(".conv.weight")]
+        names = {f"{old}.{part}": f"{new}.{part}" for old, new in zip(theirs, layers, strict=True) for part in _PARTS}
+    else:  # both are in the order of the data flow
+        names = dict(zip(values, own, strict=False))
+    tensors = {names.get(name, name): value for name, value in values.items()}
     load_parameters(net, tensors, path, f"MSG-Net ({found}) at scale {scale}")
     return net
 
 
-def _layer_names(path: Path, levels: int) -> list[str]:
-    """Return the names of dsr's layers in the order of the data flow."""
-    if levels < 1 or 2**levels not in SCALES:
-        raise ValueError(f"{path}: expected MSG-Net for a scale of {SCALES}, got {levels} upsampling levels")
-    guidance = [f"guidance.{i}" for i in range(levels + 1)]
-    depth = [f"levels.{level}.{part}" for level in range(levels) for part in ("up", "fuse", "refine")]
-    return [*guidance, "stem", *depth, "smooth", "reconstruct"]
-
-
 def _from_torch(path: Path) -> tuple[int, dict[str, Tensor]]:
-    """Return the number of levels and the tensors by dsr's names of a file with the key ``model_state_dict``."""
-    content = read_torch_file(path)
-    found = content.get("model_state_dict") if isinstance(content, dict) else None
-    if not isinstance(found, dict) or not all(isinstance(value, Tensor) for value in found.values()):
-        keys = ", ".join(map(str, list(content)[:4])) if isinstance(content, dict) else type(content).__name__
-        raise ValueError(f"{path}: expected tensors under the key model_state_dict, got {keys}")
-    indices = re.findall(r"^upsampling_X\.(\d{1,3})\.", "\n".join(map(str, found)), re.MULTILINE)
-    levels = max(map(int, indices), default=0) // 3  # 3 layers per level, then 2
-    names = _layer_names(path, levels)
-    guidance = [f"feature_extraction_Y.{max(i, 2 * i - 2)}" for i in range(levels + 1)]  # which also count poolings
-    theirs = [*guidance, "feature_extraction_X", *(f"upsampling_X.{i}" for i in range(3 * levels + 2))]
-    ours = {f"{old}.{part}": f"{new}.{part}" for old, new in zip(theirs, names, strict=True) for part in _PARTS}
-    return levels, {ours.get(name, str(name)): value for name, value in found.items()}
+    """Return the number of levels and the tensors by their names of a file with the key ``model_state_dict``."""
+    found = read_tensors(path, "model_state_dict")
+    indices = re.findall(r"^upsampling_X\.(\d{1,3})\.", "\n".join(found), re.MULTILINE)
+    return max(map(int, indices), default=0) // 3, found  # 3 layers per level, then 2
 
 
 def _from_caffe(path: Path, data: bytes) -> tuple[int, dict[str, Tensor]]:
-    """Return the same of a NetParameter; its layers are identified by their order, which is that of the data flow."""
-    try:
-        layers = []
-        for message in _fields(memoryview(data)).get(100, []):
-            layer = _fields(message)
-            name, kind = (bytes(layer.get(number, [b""])[0]).decode("utf-8", "replace") for number in (1, 2))
-            if blobs := [_read_blob(blob) for blob in layer.get(7, [])]:
-                layers.append((name, kind, blobs))
-    except (ValueError, TypeError, IndexError, KeyError) as error:
-        raise ValueError(f"{path}: expected a torch or Caffe model, got a damaged one or neither ({error})") from error
-    if not layers:
+    """Return the same of a NetParameter, in the order of its layers."""
+    levels, blobs = 0, {}
+    message = f"{path}: expected a torch or Caffe model, got a damaged one or neither"
+    with refusing(message, ValueError, TypeError, IndexError, KeyError):
+        for number, content in enumerate(_fields(memoryview(data)).get(100, [])):
+            layer = _fields(content)
+            levels += bytes(layer.get(2, [b""])[0]) == b"Deconvolution" and 7 in layer
+            for i, blob in enumerate(layer.get(7, [])):
+                blobs[f"layer {number} blob {i}"] = _read_blob(blob)
+    if not blobs:
         raise ValueError(f"{path}: expected a torch or Caffe model, got {len(data)} bytes without a Caffe layer")
-    levels = sum(kind == "Deconvolution" for _, kind, _ in layers)
-    names, ours = iter(_layer_names(path, levels)), ""
-    tensors: dict[str, Tensor] = {}
-    for name, kind, blobs in layers:
-        is_activation = kind == "PReLU"  # it follows the layer that it belongs to
-        ours = ours if is_activation else next(names, name)
-        keys = [f"{ours}.{part}" for part in (_PARTS[2:] if is_activation else _PARTS[:2])]
-        for i, blob in enumerate(blobs):
-            fits = i < len(keys) and keys[i] not in tensors
-            tensors[keys[i] if fits else f"{name} blob {i}"] = blob
-    return levels, tensors
+    return levels, blobs
 
 
 def _read_blob(message: memoryview) -> Tensor:

@@ -30,6 +30,7 @@ _NODE = ("file", "files", "packaged", "path", "source")
 FORMAT = "dsr-network-1"
 _KEY, _SHARED = "dsr", "shared"
 _DAMAGED = "expected a safetensors file, got a damaged one"
+_NO_NETWORK = (KeyError, TypeError, ValueError)  # of names and arguments that make none
 _LARGEST_ARGUMENT = 4096  # largest whole number among the arguments of a network in a file of weights
 LINKS: Mapping[str, str] = MappingProxyType(
     {
@@ -43,38 +44,40 @@ LINKS: Mapping[str, str] = MappingProxyType(
 def find_weights(node: Any, scale: float, method: str) -> Path:
     """Return the file of weights for a factor, else raise a ConfigError; ``method`` is its name, for messages."""
     node = node if isinstance(node, Mapping) else {"path": node}
-    unknown = next((key for key in node if key not in _NODE), None)
-    if unknown is not None:
-        raise ConfigError(f"weights.{unknown}: unknown key; expected {', '.join(_NODE)}")
-    given = None if node.get("path") is None else Path(str(node["path"])).expanduser()
+    if unknown := [key for key in node if key not in _NODE]:
+        raise ConfigError(f"weights.{unknown[0]}: unknown key; expected {', '.join(_NODE)}")
     published = [node["file"]] if node.get("file") else []
     if files := node.get("files"):
         trained = nearest_scale(files.values(), scale)
         published = [str(file) for file, factor in files.items() if factor == trained]
-    if given is not None and given.is_dir() and published:
-        given = next((given / file for file in published if (given / file).is_file()), given / published[0])
-    if given is not None and not given.is_dir():
-        if not given.is_file():
-            raise ConfigError(f"weights: method={method}: expected a file of weights, got {given} (no such file)")
-        return given
+    if node.get("path") is not None:
+        given = Path(str(node["path"])).expanduser()
+        candidates = [given / file for file in published] if given.is_dir() else [given]
+        for path in candidates:
+            if path.is_file():
+                return path
+        if candidates:
+            first = candidates[0]
+            raise ConfigError(f"weights: method={method}: expected a file of weights, got {first} (no such file)")
     packaged = node.get("packaged")
-    if isinstance(packaged, Mapping):
-        there = {str(name): factor for name, factor in packaged.items() if packaged_weights(str(name)) is not None}
-        nearest = nearest_scale(there.values(), scale / SLACK) if there else None
-        found = next((packaged_weights(name) for name, factor in there.items() if factor == nearest), None)
-    else:
-        found = None if packaged is None else packaged_weights(packaged)
-    if found is not None:
-        return found
-    from_authors = f", or a directory with {published[0]} (from {node.get('source')})" if published else ""
-    needs = f"scale {round_ratio(scale)} needs weights=FILE{from_authors}"
+    factors = packaged if isinstance(packaged, Mapping) else {packaged: 1} if packaged else {}
+    there = {path: factor for name, factor in factors.items() if (path := packaged_weights(str(name))) is not None}
+    if there:
+        nearest = nearest_scale(there.values(), scale / SLACK)
+        return next(path for path, factor in there.items() if factor == nearest)
+    raise ConfigError(f"weights: method={method}: {_where_to_get(node, scale, published)}")
+
+
+def _where_to_get(node: Mapping[str, Any], scale: float, published: list[str]) -> str:
+    """Return where to get the weights of a node."""
+    packaged, needs = node.get("packaged"), f"scale {round_ratio(scale)} needs weights=FILE"
+    if published:
+        needs += f", or a directory with {published[0]} (from {node.get('source')})"
     if published and packaged is None:
-        text = f"{needs}; its authors publish them, dsr does not come with them"
-    elif isinstance(packaged, str) and packaged in left_out():
-        text = f"{packaged} does not come with this installation; `dsr data get weights`, or weights=FILE"
-    else:
-        text = f"dsr comes with {', '.join(packaged_names())}; {needs}"
-    raise ConfigError(f"weights: method={method}: {text}")
+        return f"{needs}; its authors publish them, dsr does not come with them"
+    if isinstance(packaged, str) and packaged in left_out():
+        return f"{packaged} does not come with this installation; `dsr data get weights`, or weights=FILE"
+    return f"dsr comes with {', '.join(packaged_names())}; {needs}"
 
 
 def has_weights(node: Any, scale: float) -> bool:
@@ -109,10 +112,10 @@ def save_network(
     half: bool = False,
     links: Mapping[str, Path] = MappingProxyType({}),
 ) -> None:
-    """Write a network's weights; equal networks and facts give equal bytes.
+    """Write a network's weights, not atomically; equal networks and facts give equal bytes.
 
     Args:
-        path: path of the file; the write is not atomic.
+        path: path of the file.
         model: name of the model in ``conf/model/``, such as ``msg_v``.
         facts: further plain values for readers of the file, such as data, steps and scores.
         half: whether to store the kernels of convolutions in half precision; biases and normalisations are not.
@@ -128,14 +131,13 @@ def save_network(
         "facts": dict(facts or {}),
         **{key: other.name for key, other in links.items()},
     }
-    tensors = {
-        name: value.detach().to("cpu", torch.float16 if half and value.dim() > 1 else value.dtype).contiguous()
-        for name, value in net.state_dict().items()
-    }
-    there = _read_tensors(links[_SHARED]) if _SHARED in links else {}
-    for name, value in there.items():
-        if name in tensors and tensors[name].dtype == value.dtype and torch.equal(tensors[name], value):
-            del tensors[name]
+    shared = _read_tensors(links[_SHARED]) if _SHARED in links else {}
+    tensors = {}
+    for name, value in net.state_dict().items():
+        dtype = torch.float16 if half and value.dim() > 1 else value.dtype
+        tensor, there = value.detach().to("cpu", dtype).contiguous(), shared.get(name)
+        if there is None or there.dtype != dtype or not torch.equal(there, tensor):
+            tensors[name] = tensor
     safetensors.torch.save_file(tensors, path, {_KEY: json.dumps(header, sort_keys=True)})
 
 
@@ -178,23 +180,17 @@ def load_network(
     if model is not None and header["model"] != model:
         raise ValueError(f"{path}: expected weights of model {model}, got those of {header['model']}")
     shared = _beside(path, header, _SHARED)
-    try:
+    came = f"{header['network']} of {header['arguments']}"
+    with refusing(f"{path}: expected one of the networks {', '.join(networks)}, got {came}", *_NO_NETWORK):
         kind, arguments = networks[header["network"]], dict(header["arguments"])
         if scale is not None and kind.serves(arguments["scale"], scale):
             arguments["scale"] = scale
         net = make_network(path, kind, arguments, shared)
-    except (KeyError, TypeError, ValueError) as error:
-        names = ", ".join(networks)
-        raise ValueError(
-            f"{path}: expected one of the networks {names}, got {header['network']} of {header['arguments']}"
-        ) from error
     if scale is not None and net.scale != scale:
         raise ValueError(f"{path}: weights are for scale {net.scale}, the run is at scale {scale}")
-    tensors = _read_tensors(path)
-    if shared is not None:
-        needed = net.state_dict().keys()
-        tensors = {name: value for name, value in _read_tensors(shared).items() if name in needed} | tensors
-    load_parameters(net, tensors, path, f"{header['network']} at scale {net.scale}")
+    needed = net.state_dict().keys()
+    tensors = {} if shared is None else {name: each for name, each in _read_tensors(shared).items() if name in needed}
+    load_parameters(net, {**tensors, **_read_tensors(path)}, path, f"{header['network']} at scale {net.scale}")
     return net
 
 
@@ -207,12 +203,12 @@ def files_of_weights(path: Path) -> list[Path]:
     """Return a file of weights and those beside it that it needs; one that is not dsr's is alone."""
     if not is_dsr_weights(path):
         return [path]
-    header, found = read_header(path), {path: None}
+    header, found = read_header(path), [path]
     for other in (_beside(path, header, key) for key in LINKS):
         if other is not None:
             shared = _beside(other, read_header(other), _SHARED)
-            found |= dict.fromkeys(each for each in (other, shared) if each is not None)
-    return list(found)
+            found += [other] if shared is None else [other, shared]
+    return list(dict.fromkeys(found))
 
 
 def _beside(path: Path, header: Mapping[str, Any], key: str) -> Path | None:
@@ -250,17 +246,14 @@ def _read_tensors(path: Path) -> dict[str, Tensor]:
 
 
 def load_parameters(net: nn.Module, tensors: Mapping[str, Tensor], path: Path, expected: str) -> None:
-    """Check the tensors of a file and load them into a network.
-
-    A ValueError names one that is missing, unexpected, of another shape or dtype, or not finite; ``expected`` describes
-    the network.
-    """
-    shapes = {name: tuple(value.shape) for name, value in net.state_dict().items()}
-    problems = [f"{name} is missing" for name in shapes if name not in tensors]
-    problems += [f"{name!r} is unexpected" for name in tensors if name not in shapes]
-    for name, value in ((name, tensors[name]) for name in shapes if name in tensors):
-        if tuple(value.shape) != shapes[name]:
-            problems.append(f"{name} has shape {tuple(value.shape)} instead of {shapes[name]}")
+    """Load the tensors of a file into a network that ``expected`` describes; a ValueError names one that is wrong."""
+    own = net.state_dict()
+    problems = [f"{name} is missing" for name in own if name not in tensors]
+    problems += [f"{name!r} is unexpected" for name in tensors if name not in own]
+    for name in (name for name in own if name in tensors):
+        value, shape = tensors[name], tuple(own[name].shape)
+        if tuple(value.shape) != shape:
+            problems.append(f"{name} has shape {tuple(value.shape)} instead of {shape}")
         elif not value.is_floating_point() or not bool(value.isfinite().all()):
             problems.append(f"{name} holds values other than finite real numbers")
     if problems:

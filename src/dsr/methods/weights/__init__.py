@@ -15,8 +15,7 @@ from dsr.utils.files import data_root
 from dsr.utils.versions import hash_once
 
 _HERE = Path(__file__).parent
-FOLDER = "weights"
-"""Where those that are fetched are, below the directory of the data sets."""
+FOLDER = "weights"  # of those that are fetched, below the directory of the data sets
 
 
 @functools.cache
@@ -32,10 +31,7 @@ def version() -> str:
 
 
 def packaged_weights(name: str) -> Path | None:
-    """Return the file of weights ``name.safetensors``; None if it neither comes with this installation nor was fetched.
-
-    What lies where files are fetched to has to be what is known.
-    """
+    """Return the file of weights of a name, which if it was fetched has to be what is known; None if it is not here."""
     path, fetched = _HERE / f"{name}.safetensors", data_root() / FOLDER / f"{name}.safetensors"
     if path.is_file():
         return path

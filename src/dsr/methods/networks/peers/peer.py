@@ -37,8 +37,7 @@ class Peer(PeerUpsampler):
         weights: the file.
         scale: the upsampling factor of the run.
         weights_files: the trained factors of the authors' files by their names.
-        range_type: see :class:`~dsr.methods.networks.peers.peer_network.PeerUpsampler`.
-        range: its ``value_range``.
+        range: the ``value_range`` of :class:`~dsr.methods.networks.peers.peer_network.PeerUpsampler`.
 
     """
 

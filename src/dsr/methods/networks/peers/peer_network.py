@@ -22,13 +22,12 @@ from torch.nn import functional
 from dsr.geometry.camera import RANGE_TYPES, RangeType, from_range, to_range
 from dsr.methods.base import Abilities, Cost, Method
 from dsr.methods.images import LUMA, compute_min_max, inpaint, normalise, resize_bicubic
-from dsr.methods.networks.network import DTYPES, Precision
+from dsr.methods.networks.network import DTYPES, Precision, blend_tiles, split_image
 from dsr.methods.networks.weight_files import load_parameters
-from dsr.methods.tiling import TILE, UNTILED, blend_tiles, split_axis
 from dsr.sample import DepthSample
+from dsr.utils import torch_files
 from dsr.utils.guards import expect_one_of
 from dsr.utils.progress import Steps
-from dsr.utils.torch_files import read_torch_file
 
 Range = Literal["measured", "truth"]
 SWAPPED_LUMA = LUMA[::-1]  # weights of red, green and blue, as some authors' code applies the luma's to RGB
@@ -47,11 +46,7 @@ def load_peer(path: Path, network: type[PeerNetwork], scale: float) -> PeerNetwo
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
     """Read the tensors of an authors' file by name, without the prefix of networks trained on several GPUs."""
-    content = read_torch_file(path)
-    if not isinstance(content, dict) or not all(isinstance(value, Tensor) for value in content.values()):
-        keys = ", ".join(map(str, list(content)[:4])) if isinstance(content, dict) else type(content).__name__
-        raise ValueError(f"{path}: expected a network's tensors by name, got {keys}")
-    return {str(name).removeprefix("module."): value for name, value in content.items()}
+    return {name.removeprefix("module."): value for name, value in torch_files.read_tensors(path).items()}
 
 
 def fold_batch_norm(tensors: dict[str, Tensor], conv: str, norm: str, eps: float = 1e-5) -> None:
@@ -59,14 +54,13 @@ def fold_batch_norm(tensors: dict[str, Tensor], conv: str, norm: str, eps: float
 
     Nothing happens if a tensor is missing or of another shape.
     """
-    weight, bias = (tensors.get(f"{conv}.{part}") for part in ("weight", "bias"))
-    parts = [tensors.get(f"{norm}.{part}") for part in _NORM_PARTS]
-    if weight is None or bias is None or weight.dim() != 4:
+    names = [f"{conv}.weight", f"{conv}.bias", *(f"{norm}.{part}" for part in _NORM_PARTS)]
+    if any(name not in tensors for name in names):
         return
-    known = [part for part in parts if part is not None and part.shape == bias.shape == weight.shape[:1]]
-    if len(known) < len(_NORM_PARTS):
+    weight, bias, *parts = (tensors[name] for name in names)
+    if weight.dim() != 4 or any(part.shape != weight.shape[:1] for part in (bias, *parts)):
         return
-    gain, shift, mean, variance = (part.double() for part in known)
+    gain, shift, mean, variance = (part.double() for part in parts)
     factor = gain / (variance + eps).sqrt()
     tensors[f"{conv}.weight"] = (weight * factor[:, None, None, None]).float()
     tensors[f"{conv}.bias"] = ((bias - mean) * factor + shift).float()
@@ -75,24 +69,13 @@ def fold_batch_norm(tensors: dict[str, Tensor], conv: str, norm: str, eps: float
 
 
 class PeerNetwork(nn.Module, abc.ABC):
-    """A published network that refines an enlarged depth map, guided by a photo; ``scale`` is that of its weights.
+    """A published network that refines an enlarged depth map, guided by a photo; ``scale`` is that of its weights."""
 
-    Attributes:
-        title: the name in messages.
-        checksums: the factors of its authors' files by the first 16 digits of their SHA-256.
-        multiple: the number that divides the sizes of its images.
-        receptive_field_radius: in pixels of the photo; None where an output depends on the whole image. Large images
-            are processed in tiles if there is one.
-        depth_range: orthogonal depth in metres that became 0 and 1 in the training; None if each map's own range did.
-        cost: the rough cost.
-
-    """
-
-    title: ClassVar[str]
-    checksums: ClassVar[Mapping[str, float]]
-    multiple: ClassVar[int] = 1
-    receptive_field_radius: ClassVar[int | None] = None
-    depth_range: tuple[float, float] | None = None
+    title: ClassVar[str]  # in messages
+    checksums: ClassVar[Mapping[str, float]]  # factors of its authors' files by the first 16 digits of their SHA-256
+    multiple: ClassVar[int] = 1  # divides the sizes of its images
+    receptive_field_radius: ClassVar[int | None] = None  # in pixels of the photo; None if it needs the whole image
+    depth_range: tuple[float, float] | None = None  # in metres, that became 0..1 in the training; None: each map's own
     cost: ClassVar[Cost]
 
     def __init__(self, scale: float) -> None:
@@ -117,10 +100,7 @@ class PeerNetwork(nn.Module, abc.ABC):
 
 
 class PeerUpsampler(Method):
-    """A method that is a published network.
-
-    It takes a low-resolution map of any ratio, as the network works at the photo's size. Images of more than
-    ``UNTILED`` pixels are processed in tiles where the network's receptive field is limited.
+    """A method that is a published network; it takes maps of any ratio, as the network works at the photo's size.
 
     Args:
         net: the network; it is copied.
@@ -131,7 +111,7 @@ class PeerUpsampler(Method):
             with a ``depth_range`` of their own get orthogonal depth, normalised by it.
         precision: dtype of the convolutions.
         device: device of the computations.
-        tile: side of a tile in pixels; None for ``TILE``, and no tiles up to ``UNTILED`` pixels.
+        tile: as of :class:`~dsr.methods.networks.network.NetworkUpsampler`.
 
     """
 
@@ -200,11 +180,9 @@ class PeerUpsampler(Method):
         padding = (0, -width % multiple, 0, -height % multiple)
         enlarged = self.net.enlarge(values_lr.float(), (height, width))
         rgb, enlarged = (functional.pad(each.float(), padding, mode="replicate") for each in (rgb, enlarged))
-        sizes = [n // multiple for n in rgb.shape[-2:]]
-        whole = radius is None or (self._tile is None and rgb.shape[-2] * rgb.shape[-1] <= UNTILED)
-        tile = max(sizes) if whole else (self._tile or TILE) // multiple
-        margin, overlap = -(-(radius or 0) // multiple), max(_OVERLAP // multiple, 2)
-        rows, columns = (split_axis(n, tile, margin, overlap) for n in sizes)
+        margin = None if radius is None else math.ceil(radius / multiple)
+        size, overlap = (rgb.shape[-2], rgb.shape[-1]), max(_OVERLAP // multiple, 2)
+        rows, columns = split_image(size, multiple, margin, self._tile, overlap)
 
         def compute(row: slice, column: slice) -> Tensor:
             down, across = (slice(multiple * each.start, multiple * each.stop) for each in (row, column))

@@ -1,18 +1,27 @@
-"""Tiles, and that networks answer in them as they answer the whole image."""
+"""The method that runs a network: tiles give what the whole image gives, and the average over augmentations."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
+from torch.nn import functional
 
-from dsr.geometry.camera import Camera, from_range
+from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.methods.networks.facets import Facets
 from dsr.methods.networks.msg_net import MSGNet
-from dsr.methods.networks.network import DisparityNetwork, NetworkUpsampler
-from dsr.methods.tiling import blend_tiles, split_axis
+from dsr.methods.networks.network import (
+    ENSEMBLES,
+    DisparityNetwork,
+    NetworkUpsampler,
+    apply_dihedral,
+    blend_tiles,
+    split_axis,
+    undo_dihedral,
+)
 from dsr.sample import DepthSample
 
 NETS: dict[str, Callable[[], DisparityNetwork]] = {
@@ -23,7 +32,21 @@ NETS: dict[str, Callable[[], DisparityNetwork]] = {
 }
 
 
-def _method(name: str, *, ensemble: int = 1, tile: int | None = None) -> NetworkUpsampler:
+class _Leaning(DisparityNetwork):
+    """Repeats the low-resolution pixels and adds a ramp to the right and an arc from top to bottom."""
+
+    scale = 2
+
+    def arguments(self) -> dict[str, Any]:
+        return {}
+
+    def upsample(self, rgb: Tensor, disparity: Tensor, min_max: Tensor | None = None) -> Tensor:
+        ramp = torch.linspace(-1, 1, rgb.shape[-1], dtype=disparity.dtype)
+        arc = torch.linspace(-1, 1, rgb.shape[-2], dtype=disparity.dtype)[:, None] ** 2
+        return functional.interpolate(disparity, scale_factor=2, mode="nearest") + ramp + arc
+
+
+def _method(name: str, *, ensemble: int = 1) -> NetworkUpsampler:
     """Return a network whose answer is far from smooth, so that whatever a window misses shows."""
     torch.manual_seed(0)
     net = NETS[name]()
@@ -31,7 +54,7 @@ def _method(name: str, *, ensemble: int = 1, tile: int | None = None) -> Network
         for parameter in net.parameters():
             if parameter.dim() > 1:
                 parameter.mul_(1.5)
-    return NetworkUpsampler(net.double(), ensemble=ensemble, tile=tile)
+    return NetworkUpsampler(net.double(), ensemble=ensemble)
 
 
 def _pair(scale: int, height: int, width: int) -> tuple[Tensor, Tensor]:
@@ -39,6 +62,14 @@ def _pair(scale: int, height: int, width: int) -> tuple[Tensor, Tensor]:
     rgb = torch.rand((1, 3, scale * height, scale * width), generator=generator)
     coarse = 20 + 5 * torch.rand((1, 1, height, width), generator=generator)
     return rgb, coarse
+
+
+def _sample(scale: int, height: int, width: int) -> DepthSample:
+    rgb, coarse = _pair(scale, height, width)
+    camera = Camera(scale * width, scale * height, 600.0, 600.0, 3.0, 4.0, baseline=0.2)
+    low = camera.rescale(width, height)
+    depth = from_range(coarse[0].double() / scale, low, "disparity")
+    return DepthSample("test", "scene", rgb[0], depth, camera, low, scale)
 
 
 @pytest.mark.parametrize(("size", "tile", "overlap"), [(100, 30, 4), (31, 30, 4), (30, 30, 4), (7, 1, 2), (1, 5, 0)])
@@ -65,9 +96,9 @@ def test_results_that_differ_by_a_constant_are_joined_by_a_ramp() -> None:
     torch.testing.assert_close(line, expected)
 
 
-@pytest.mark.parametrize("name", NETS)
-def test_tiled_result_equals_the_whole_image(name: str) -> None:
-    method = _method(name)
+@pytest.mark.parametrize(("name", "ensemble"), [*((name, 1) for name in NETS), ("facets", 8)])
+def test_tiled_result_equals_the_whole_image(name: str, ensemble: int) -> None:
+    method, steps = _method(name, ensemble=ensemble), []
     scale = method.net.scale
     rgb, coarse = _pair(scale, 14, 48)
     coarse[..., 3:9, 4:20] = torch.nan  # a hole that is larger than a tile
@@ -76,23 +107,12 @@ def test_tiled_result_equals_the_whole_image(name: str) -> None:
     with torch.inference_mode():
         whole = method.upsample_disparity(rgb, coarse)
         method.tile = 12 * scale
-        tiled = method.upsample_disparity(rgb, coarse)
+        tiled = method.upsample_disparity(rgb, coarse, lambda done, total: steps.append((done, total)))
     assert tiled.shape == whole.shape
-    assert method.count_steps(*rgb.shape[-2:]) == 8
+    count = 8 * ensemble
+    assert method.count_steps(*rgb.shape[-2:]) == count
+    assert steps == [(i + 1, count) for i in range(count)]
     assert float((tiled - whole).abs().max() / (whole.max() - whole.min())) < 1e-5
-
-
-@pytest.mark.slow
-def test_tiled_augmentation_equals_the_whole_image() -> None:
-    method = _method("facets", ensemble=8)
-    rgb, coarse = _pair(4, 12, 36)
-    parts: list[tuple[int, int]] = []
-    with torch.inference_mode():
-        whole = method.upsample_disparity(rgb, coarse)
-        method.tile = 24
-        tiled = method.upsample_disparity(rgb, coarse, lambda done, total: parts.append((done, total)))
-    assert float((tiled - whole).abs().max() / (whole.max() - whole.min())) < 1e-5
-    assert parts == [(i + 1, method.count_steps(48, 144)) for i in range(8 * 2 * 6)]
 
 
 @pytest.mark.parametrize("name", NETS)
@@ -114,15 +134,36 @@ def test_pixels_beyond_the_receptive_field_do_not_matter(name: str) -> None:
 
 
 def test_large_photo_is_tiled_automatically(monkeypatch: pytest.MonkeyPatch) -> None:
-    method = _method("facets")
-    rgb, coarse = _pair(4, 12, 12)
-    camera = Camera(48, 48, 50.0, 50.0, 24.0, 24.0)
-    low = camera.rescale(12, 12)
-    sample = DepthSample("test", "scene", rgb[0], from_range(coarse[0] / 4, low, "disparity"), camera, low, 4)
-    parts: list[int] = []
+    method, sample, parts = _method("facets"), _sample(4, 12, 12), []
     whole = method(sample, lambda done, total: parts.append(total))
     monkeypatch.setattr("dsr.methods.networks.network.UNTILED", 1000)
     monkeypatch.setattr("dsr.methods.networks.network.TILE", 24)
     tiled = method(sample, lambda done, total: parts.append(total))
     assert parts == [1, *[4] * 4]
     torch.testing.assert_close(tiled, whole, rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("index", range(8))
+def test_dihedral_transforms_are_distinct_and_invertible(index: int) -> None:
+    x = torch.rand(2, 3, 5, 5)
+    turned = apply_dihedral(x, index)
+    assert torch.equal(undo_dihedral(turned, index), x)
+    assert not any(torch.equal(turned, apply_dihedral(x, other)) for other in range(8) if other != index)
+
+
+def test_augmentation_averages_what_depends_on_the_orientation() -> None:
+    sample = _sample(2, 6, 8)
+    plain = functional.interpolate(sample.disparity_lr()[None], scale_factor=2, mode="nearest")[0]
+    down, right = (torch.linspace(-1, 1, n, dtype=torch.float64) for n in plain.shape[-2:])
+    leaning = plain + right + down[:, None] ** 2
+    even = plain + (right**2 + down[:, None] ** 2) / 2  # the ramps cancel out, the arcs turn
+    for ensemble, expected in zip(ENSEMBLES, (leaning, even, even), strict=True):
+        depth = NetworkUpsampler(_Leaning(), ensemble=ensemble)(sample)
+        torch.testing.assert_close(to_range(depth, sample.camera, "disparity"), expected)
+
+
+def test_invalid_augmentation_is_refused() -> None:
+    with pytest.raises(ValueError, match="ensemble: expected one of 1, 4, 8, got 2"):
+        NetworkUpsampler(MSGNet(2, "dsr"), ensemble=2)
+    with pytest.raises(ValueError, match="ensemble: expected 1 for a network that leaves out pixels, got 4"):
+        NetworkUpsampler(MSGNet(2, "hui"), ensemble=4)
