@@ -41,8 +41,8 @@ def measured_errors(prediction: Tensor, target: Tensor, rays: Tensor) -> tuple[T
 def error_ratios(expected: Tensor, measured: Tensor, parts: int = 10) -> Tensor:
     """Return the mean measured error over the mean expected error for equal parts of the pixels, (parts,).
 
-    The pixels are sorted by expected error, those of equal expected error as they come. 1 is as expected, more means
-    larger errors than expected. NaN for a part without pixels, infinite for one whose expected errors are all 0.
+    The pixels are sorted by expected error, those of equal expected error as they come. More than 1 means larger errors
+    than expected. NaN for a part without pixels, infinite for one whose expected errors are all 0.
     """
     expected, measured = _ordered(expected, measured)
     pairs = zip(expected.tensor_split(parts), measured.tensor_split(parts), strict=True)
@@ -76,8 +76,7 @@ def ence(expected: Tensor, measured: Tensor, parts: int = 10) -> Tensor:
 def sparsification(expected: Tensor, measured: Tensor, steps: int = STEPS) -> Tensor:
     """Return the mean error of the pixels left when those with the largest expected errors are removed, (steps + 1,).
 
-    Step t removes t / steps of the pixels. Of pixels of equal expected error, each part that is left has their mean
-    error.
+    Step t removes t / steps of the pixels. Pixels of equal expected error all have their mean error.
     """
     expected, measured = _ordered(expected, measured)
     count = len(measured)
@@ -90,10 +89,10 @@ def sparsification(expected: Tensor, measured: Tensor, steps: int = STEPS) -> Te
 
 
 def ause(expected: Tensor, measured: Tensor, steps: int = STEPS) -> Tensor:
-    """Return the area under the sparsification error, relative to the mean error.
+    """Return the area under the sparsification error, relative to the mean error; it depends on the number of steps.
 
     The sparsification error is the curve of :func:`sparsification` less that of an oracle, which expects the measured
-    errors; the area is by trapezoids. It depends on the number of steps: by a sixth from 20 to 100.
+    errors.
     """
     measured = measured.masked_fill(~expected.isfinite(), torch.nan)
     curve, oracle = sparsification(expected, measured, steps), sparsification(measured, measured, steps)
@@ -101,10 +100,9 @@ def ause(expected: Tensor, measured: Tensor, steps: int = STEPS) -> Tensor:
 
 
 def off_auc(expected: Tensor, measured: Tensor, threshold: float = OFF) -> Tensor:
-    """Return how well expected errors separate pixels with large errors from the others: the area under the ROC curve.
+    """Return the area under the ROC curve of expected errors that separate pixels with large errors from the others.
 
-    It is the probability that a pixel whose measured error exceeds the threshold has a larger expected error than one
-    whose measured error does not; equal expected errors count half.
+    It is the probability that the former have larger expected errors; equal expected errors count half.
     """
     expected, measured = _ordered(expected, measured)
     of, sizes = expected.unique_consecutive(return_inverse=True, return_counts=True)[1:]

@@ -32,7 +32,7 @@ _VISUAL = {"mse_v": ("MSE_v", 2), "dssim": ("DSSIM_v", SSIM_WINDOW), "lpips": ("
 def l1(prediction: Tensor, target: Tensor, *, complete: bool | None = None) -> Tensor:
     """Return the mean absolute difference over valid pixels of (B, 1, H, W) maps, (B,); NaN if none is valid.
 
-    ``complete`` says whether neither has a hole (NaN); None if not known.
+    ``complete`` says whether neither has a hole, NaN; None if not known.
     """
     difference, valid = _difference(prediction, target, complete)
     return _mean(difference.abs(), valid)

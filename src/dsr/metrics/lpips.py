@@ -11,7 +11,6 @@ import importlib.metadata
 import socket
 import warnings
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -44,7 +43,7 @@ class LPIPS(nn.Module):
     mean: Tensor
     std: Tensor
 
-    def __init__(self, trunk: dict[str, Any]) -> None:
+    def __init__(self, trunk: dict[str, Tensor]) -> None:
         super().__init__()
         self.convolutions = nn.ModuleDict(
             {str(i): skip_init(nn.Conv2d, a, b, k, stride=s, padding=p) for i, (a, b, k, s, p) in _CONVOLUTIONS.items()}
@@ -53,7 +52,7 @@ class LPIPS(nn.Module):
             for name, parameter in layer.named_parameters():
                 value = trunk.get(f"features.{index}.{name}")
                 shape, came = tuple(parameter.shape), tuple(value.shape) if isinstance(value, Tensor) else "nothing"
-                if came != shape:
+                if value is None or came != shape:
                     raise ValueError(f"features.{index}.{name}: expected a tensor of shape {shape}, got {came}")
                 parameter.data.copy_(value)
         for level, head in enumerate(_linear_heads()):

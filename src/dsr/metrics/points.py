@@ -1,22 +1,15 @@
 """Metrics of the points that a depth map is back-projected to, against those of the true map: P = z r, in metres.
 
-The predicted cloud has the pixels with both depths, the true one all pixels with a true depth. Distances are Euclidean,
-each to the nearest point of the other cloud; nothing is thinned out.
+The predicted cloud has the pixels with both depths, the true one all pixels with a true depth; nothing is thinned out.
 
 - *Chamfer distance*: the mean of the mean distances of either cloud to the other. ``chamfer_dist`` in
   ``unidepth/utils/evaluation_depth.py`` of lpiccinelli-eth/UniDepth (8d8cfe4).
 - *F-score*: the harmonic mean of precision and recall, the fractions of the two clouds that are less than a threshold
-  from the other one. Knapitsch et al., *Tanks and Temples*, SIGGRAPH 2017; at 5 cm as for ScanNet, ``eval_mesh`` in
-  ``atlas/evaluation.py`` of magicleap/Atlas (bee3ddb), which thins both clouds out to 2 cm first; and at 1 cm.
-- *Flying pixels*: predicted points in the void between two surfaces (Sabov and Krueger, SCCG 2008). A point flies if
-
-  1. an occlusion edge of the truth is within 16 pixels along rows and columns, as far as one low-resolution pixel
-     reaches at x16: two neighbours whose depths have a ratio of more than 1.05, as in Depth Pro's contours;
-  2. along the ray it lies behind the nearest front and before the farthest back of these edges; and
-  3. it is more than 1 % of its depth away from every true point.
-
-A hole of a prediction does not fly and adds nothing to a precision, but the true points there are far from the
-predicted cloud, and ``Points_covered`` stands beside these metrics.
+  from the other one (Knapitsch et al., *Tanks and Temples*, SIGGRAPH 2017). ``eval_mesh`` in ``atlas/evaluation.py`` of
+  magicleap/Atlas (bee3ddb) takes 5 cm, as for ScanNet, and thins both clouds out to 2 cm first.
+- *Flying pixels*: predicted points in the void between two surfaces (Sabov and Krueger, SCCG 2008). A point flies if it
+  lies between the front and the back of true depth discontinuities within 16 pixels along rows and columns, as far as
+  one low-resolution pixel reaches at x16, and more than 1 % of its depth away from every true point.
 """
 
 from __future__ import annotations
@@ -31,8 +24,8 @@ from dsr.geometry.hole_size import window_maxima
 from dsr.metrics.formats import Metric, column, depth_mask, of_parts, target_mask
 from dsr.metrics.functional import SurfacePair, masked_mean, once_per_pair
 
-EDGE_RATIO = 1.05
-EDGE_RADIUS = 16
+EDGE_RATIO = 1.05  # of the depths of two neighbours at a discontinuity, as in Depth Pro's contours
+EDGE_RADIUS = 16  # pixels
 FLYING = 0.01  # distance of a flying pixel from every true point, as a fraction of its depth
 
 
