@@ -102,21 +102,6 @@ def test_batch_of_two_equals_two_single_images(variant: VariantName) -> None:
     torch.testing.assert_close(together, alone, rtol=0, atol=1e-4)  # of a range of 15
 
 
-def test_gradients_of_pre_and_postprocessing_equal_finite_differences() -> None:
-    rgb, disparity = _scene(2, 3, 4)
-    disparity[0, 0, 1, 2] = torch.nan
-    known = disparity.isfinite()
-
-    def around_an_absent_network(rgb: Tensor, values: Tensor) -> Tensor:
-        inpaint = torch.full_like(disparity, torch.nan).masked_scatter(known, values)
-        low, minimum, span = normalise(inpaint)
-        outside = upsample_bicubic(mean3x3(low), 2) * guidance_map(rgb, "voynov")
-        return outside * span + minimum
-
-    inputs = (rgb.double().requires_grad_(), disparity[known].requires_grad_())
-    assert torch.autograd.gradcheck(around_an_absent_network, inputs)
-
-
 def test_training_reaches_every_parameter_around_holes_too() -> None:
     net, (rgb, disparity) = _net(4).train(), _scene(4, 16, 16)
     disparity[0, 0, 2, 2] = torch.nan
