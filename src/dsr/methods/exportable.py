@@ -37,23 +37,6 @@ def _scripted(function: Callable[P, T]) -> Callable[P, T]:
     return call
 
 
-@_scripted
-def fill_in_graph(values: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Fill the holes of maps as :func:`dsr.methods.images.inpaint` does, as a loop in the graph.
-
-    Both are (B, 1, h, w), 0 in holes; ``weight`` is 1 elsewhere, and in the result 0 in an image without a known value.
-    """
-    before = torch.zeros_like(weight.sum())
-    while bool(weight.sum() != before):
-        before = weight.sum()
-        total = functional.avg_pool2d(values, [3, 3], [1, 1], [1, 1])
-        fraction = functional.avg_pool2d(weight, [3, 3], [1, 1], [1, 1])
-        new = (weight == 0) & (fraction > 0)
-        values = torch.where(new, total / torch.where(fraction > 0, fraction, torch.ones_like(fraction)), values)
-        weight = torch.where(new, torch.ones_like(weight), weight)
-    return values, weight
-
-
 def neighbours_of(x: Tensor) -> Tensor:
     """Return the eight neighbours of each pixel, row by row, (B, C, h, w) to (B, 8, C, h, w); 0 beyond the border."""
     height, width = x.shape[-2], x.shape[-1]
