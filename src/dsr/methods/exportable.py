@@ -21,22 +21,6 @@ def exporting() -> bool:
     return "torch.onnx" in sys.modules and bool(torch.onnx.is_in_onnx_export())
 
 
-def _fill(values: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Fill the holes of maps as :func:`dsr.methods.images.inpaint` does, as a loop in the graph.
-
-    Both are (B, 1, h, w), 0 in holes; ``weight`` is 1 elsewhere, and in the result 0 in an image without a known value.
-    """
-    before = torch.zeros_like(weight.sum())
-    while bool(weight.sum() != before):
-        before = weight.sum()
-        total = functional.avg_pool2d(values, [3, 3], [1, 1], [1, 1])
-        fraction = functional.avg_pool2d(weight, [3, 3], [1, 1], [1, 1])
-        new = (weight == 0) & (fraction > 0)
-        values = torch.where(new, total / torch.where(fraction > 0, fraction, torch.ones_like(fraction)), values)
-        weight = torch.where(new, torch.ones_like(weight), weight)
-    return values, weight
-
-
 def neighbours_of(x: Tensor) -> Tensor:
     """Return the eight neighbours of each pixel, row by row, (B, C, h, w) to (B, 8, C, h, w); 0 beyond the border."""
     height, width = x.shape[-2], x.shape[-1]
@@ -49,7 +33,8 @@ def neighbours_of(x: Tensor) -> Tensor:
     return torch.stack(around, dim=1)
 
 
-def _fill_by_colour(x: Tensor, affinity: Tensor, alike: float) -> Tensor:
+@torch.jit.script_if_tracing  # so that a graph keeps its loop
+def fill_by_colour_in_graph(x: Tensor, affinity: Tensor, alike: float) -> Tensor:
     """Fill the holes of a map as :func:`dsr.methods.images.inpaint` does with a photo.
 
     ``x`` (1, 1, h, w) is NaN in holes, ``affinity`` (1, 8, h, w) that of each pixel and its neighbours; pixels of an
@@ -70,11 +55,6 @@ def _fill_by_colour(x: Tensor, affinity: Tensor, alike: float) -> Tensor:
         values = torch.where(first, mean / torch.where(total > 0, total, torch.ones_like(total)), values)
         known = torch.where(first, torch.ones_like(known), known)
     return torch.where(known > 0, values, torch.full_like(values, float("nan")))
-
-
-# scripted, so that a graph keeps their loops
-fill_in_graph = torch.jit.script_if_tracing(_fill)
-fill_by_colour_in_graph = torch.jit.script_if_tracing(_fill_by_colour)
 
 
 def apply(function: type[torch.autograd.Function], *arguments: Any) -> Any:

@@ -19,9 +19,6 @@ _REACH = 2  # half width of Keys' kernel in low-resolution pixels
 _CONTRAST = 0.02  # standard deviation of the difference of the colours of a surface's neighbouring pixels in [0, 1]
 _ALIKE = 0.3  # affinity from which two pixels count as of one surface
 _LEAST = 1e-4  # affinity of pixels of different surfaces
-_FRACTION, _QUANTILE = 0.1, 0.12566  # a tenth of a normal variable's absolute values are below so many deviations
-_QUARTER, _QUARTILE = 0.25, 0.31864  # a quarter of them are below so many
-_STRIDES = (1, 2)  # distances of compared pixels: noise that neighbours share shows at a distance of two pixels
 
 
 def grey(rgb: Tensor, weights: Sequence[float] = LUMA) -> Tensor:
@@ -233,7 +230,8 @@ def estimate_noise(depth_lr: Tensor) -> float:
 
     ``depth_lr`` is (1, 1, h, w) in metres, NaN in holes; the result is 0 without a valid 3 x 3 window.
     """
-    return _low_quantile(depth_lr.double().log(), 1, _FRACTION) / _QUANTILE / 6
+    # a tenth of a normal variable's absolute values are below 0.12566 standard deviations
+    return _low_quantile(depth_lr.double().log(), 1, 0.1) / 0.12566 / 6
 
 
 def estimate_sensor_noise(values: Tensor) -> float:
@@ -246,7 +244,8 @@ def estimate_sensor_noise(values: Tensor) -> float:
     ``values`` (1, 1, h, w), NaN in holes, are in a unit in which planes are linear and noise is alike everywhere, such
     as disparity; the result is in it, and 0 without a valid window.
     """
-    return max(_low_quantile(values.double(), stride, _QUARTER) for stride in _STRIDES) / _QUARTILE / 6
+    # a quarter of a normal variable's absolute values are below 0.31864 standard deviations
+    return max(_low_quantile(values.double(), stride, 0.25) for stride in (1, 2)) / 0.31864 / 6
 
 
 def _low_quantile(values: Tensor, stride: int, fraction: float) -> float:
