@@ -70,6 +70,7 @@ def test_scenes_vary_in_depth_focal_length_and_brightness():
     assert middle.max() > 2.5 * middle.min()
     assert light.std() > 8
     assert len({s.camera.cx for s in scenes()}) == len(scenes())
+    assert render_random_scene(4, 0, 48).camera.fx != scenes()[0].camera.fx  # the seed counts, too
 
 
 @pytest.mark.slow

@@ -68,22 +68,19 @@ def find_scenes(folder: Path) -> Iterator[tuple[str, Loader]]:
     """Yield the name and the loader of each scene in a directory, or of the scene that the directory is."""
     if not folder.is_dir():
         raise ValueError(f"{folder}: expected a directory, there is none")
-    for place in (folder, *_subfolders(folder)):
-        yield from _own_layout(place)
+    below = (path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+    for place in (folder, *sorted(below, key=natural_key)):
+        if (place / "camera.json").is_file():
+            yield place.name, functools.partial(load_scene, place, "folder")
         yield from _stereo(place, itself=place == folder)
-        yield from _labelled(place)
-    yield from _frames(folder)
-
-
-def _subfolders(folder: Path) -> list[Path]:
-    folders = (path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
-    return sorted(folders, key=natural_key)
-
-
-def _own_layout(place: Path) -> Iterator[tuple[str, Loader]]:
-    """Yield the scene of a folder that has a camera file."""
-    if (place / "camera.json").is_file():
-        yield place.name, functools.partial(load_scene, place, "folder")
+        labelled = place / "nyu_depth_v2_labeled.mat"
+        if labelled.is_file():
+            for name, arguments in itertools.islice(nyu.find_frames(labelled).items(), 0, None, 100):
+                yield name, functools.partial(nyu.load_frame, *arguments, "nyu", name)
+    for find, load, dataset in _FRAMES:
+        for name, arguments in find(folder).items():
+            if not any((path.parent / "camera.json").is_file() for path in arguments if isinstance(path, Path)):
+                yield name, functools.partial(load, *arguments, dataset, name)
 
 
 def _stereo(place: Path, *, itself: bool) -> Iterator[tuple[str, Loader]]:
@@ -102,19 +99,3 @@ def _stereo(place: Path, *, itself: bool) -> Iterator[tuple[str, Loader]]:
 def _levels(name: str, files: middlebury.Files) -> Loader:
     year = _YEARS.get(files.photo.name, 2005)
     return functools.partial(middlebury.load_levels, files, f"middlebury{year}", name, year)
-
-
-def _labelled(place: Path) -> Iterator[tuple[str, Loader]]:
-    """Yield every hundredth frame of NYU's labelled file."""
-    path = place / "nyu_depth_v2_labeled.mat"
-    if path.is_file():
-        for name, arguments in itertools.islice(nyu.find_frames(path).items(), 0, None, 100):
-            yield name, functools.partial(nyu.load_frame, *arguments, "nyu", name)
-
-
-def _frames(folder: Path) -> Iterator[tuple[str, Loader]]:
-    """Yield the frames of other data sets in a folder and its subfolders."""
-    for find, load, dataset in _FRAMES:
-        for name, arguments in find(folder).items():
-            if not any((path.parent / "camera.json").is_file() for path in arguments if isinstance(path, Path)):
-                yield name, functools.partial(load, *arguments, dataset, name)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dsr.synthetic.procedural import paints as p
-from dsr.synthetic.procedural.paints import PAINTS, Paint, Palette, palette
+from dsr.synthetic.procedural.paints import PAINTS, Paint, palette
 from dsr.synthetic.procedural.photo import Body
 from dsr.synthetic.procedural.reliefs import spectrum
 from dsr.synthetic.procedural.shape import Shape, random_rotation
@@ -22,7 +22,7 @@ _FONTS = (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_TRIPLEX, cv2.FONT_HERSHEY_C
 _LETTERS = list("abcdefghijklmnoprstuvwyz      ")
 
 
-def _colour(rng: np.random.Generator, colours: Palette) -> tuple[float, ...]:
+def _colour(rng: np.random.Generator, colours: Array) -> tuple[float, ...]:
     return _ink(colours[rng.integers(len(colours))])
 
 
@@ -41,7 +41,7 @@ def _random_pixels(rng: np.random.Generator, low: float, high: float) -> int:
     return int(rng.uniform(low, high) * _SIDE)
 
 
-def poster(rng: np.random.Generator, colours: Palette) -> Image:
+def poster(rng: np.random.Generator, colours: Array) -> Image:
     """Return rectangles, discs, lines and a title."""
     image = _sheet(_colour(rng, colours))
     for _ in range(rng.integers(3, 16)):
@@ -67,7 +67,7 @@ def _word(rng: np.random.Generator, image: Image, at: tuple[int, int], size: flo
     cv2.putText(image, text, at, face, size, colour, max(1, round(1.5 * size)), cv2.LINE_AA)
 
 
-def page(rng: np.random.Generator, colours: Palette) -> Image:
+def page(rng: np.random.Generator, colours: Array) -> Image:
     """Return lines of text, some of them with a figure, dark on light."""
     image = _sheet(_ink(rng.uniform(0.5, 0.85) * rng.uniform([0.9, 0.88, 0.75], 1.0)))
     size, ink = rng.uniform(0.3, 0.9), _ink(np.array([0.03, 0.03, 0.04]))
@@ -85,7 +85,7 @@ def page(rng: np.random.Generator, colours: Palette) -> Image:
     return image
 
 
-def facade(rng: np.random.Generator, colours: Palette) -> Image:
+def facade(rng: np.random.Generator, colours: Array) -> Image:
     """Return painted boxes with lit and dark sides and cast shadows, which are not geometry."""
     image = _sheet(_colour(rng, colours))
     image = (image * np.linspace(0.7, 1.0, _SIDE)[:, None, None]).astype(np.uint8)
@@ -108,7 +108,7 @@ def facade(rng: np.random.Generator, colours: Palette) -> Image:
     return image
 
 
-def photograph(rng: np.random.Generator, colours: Palette) -> Image:
+def photograph(rng: np.random.Generator, colours: Array) -> Image:
     """Return coloured noise with the spectrum of photographs and a few occluding outlines."""
     image = np.zeros((_SIDE, _SIDE, 3))
     for _ in range(rng.integers(1, 5)):
@@ -120,7 +120,7 @@ def photograph(rng: np.random.Generator, colours: Palette) -> Image:
     return np.rint(255 * np.sqrt(np.clip(image, 0, 1))).astype(np.uint8)
 
 
-def scribble(rng: np.random.Generator, colours: Palette) -> Image:
+def scribble(rng: np.random.Generator, colours: Array) -> Image:
     """Return curves and outlines drawn on paper."""
     image = _sheet(_colour(rng, colours))
     s = np.linspace(0, 1, 200)[:, None]
@@ -154,13 +154,10 @@ def tile_picture(image: Image, size: float, *, turn: float = 0.0) -> Paint:
     return paint
 
 
-PICTURES = (poster, page, facade, photograph, scribble)
-
-
 def picture_paint(rng: np.random.Generator, family: str, scale: float) -> Paint:
     """Return a random picture as paint, repeated one to three times over ``scale`` metres."""
     colours = palette(rng, family, 6)
-    image = PICTURES[rng.choice(5, p=[0.3, 0.15, 0.15, 0.25, 0.15])](rng, colours)
+    image = (poster, page, facade, photograph, scribble)[rng.choice(5, p=[0.3, 0.15, 0.15, 0.25, 0.15])](rng, colours)
     return tile_picture(image, scale * rng.uniform(0.3, 1.1), turn=rng.choice([0.0, rng.uniform(0, 6.28)]))
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from skimage.measure import marching_cubes
 
-from dsr.synthetic.procedural.shape import Shape, merge, rotation_about, surface, tube, unit
+from dsr.synthetic.procedural.shape import Shape, grid, merge, rotation_about, surface, tube, unit
 from dsr.synthetic.procedural.solids import place_on_ground
 from dsr.synthetic.raycast import Array
 
@@ -29,10 +29,10 @@ class Blobs:
         bells = [np.exp(-(((a - self.centres[:, i, None]) / self.radii[:, i, None]) ** 2)) for i, a in enumerate(axes)]
         turns = [np.exp(1j * self.waves[:, i, None] * a) for i, a in enumerate(axes)]
         turns[0] = turns[0] * (self.heights * np.exp(1j * self.phases))[:, None]
-        flat = (self.weights[:, None] * bells[0]).T @ (bells[1][:, :, None] * bells[2][:, None, :]).reshape(
-            len(self.centres), -1
-        )
-        swing = (turns[0].T @ (turns[1][:, :, None] * turns[2][:, None, :]).reshape(len(self.heights), -1)).imag
+        plane = (bells[1][:, :, None] * bells[2][:, None, :]).reshape(len(self.centres), -1)
+        flat = (self.weights[:, None] * bells[0]).T @ plane
+        plane = (turns[1][:, :, None] * turns[2][:, None, :]).reshape(len(self.heights), -1)
+        swing = (turns[0].T @ plane).imag
         return (flat - 0.5 + self._shape_ripples(swing)[0]).reshape([len(a) for a in axes])
 
     def _shape_ripples(self, swing: Array) -> tuple[Array, Array]:
@@ -189,10 +189,8 @@ def leaf(rng: np.random.Generator, length: float, wide: float) -> Shape:
     droop, fold, roll = rng.uniform(0.2, 1.6), rng.uniform(0.0, 0.5), rng.uniform(-0.6, 0.6)
     angle = droop * s
     x, z = np.cumsum(np.cos(angle)) * length / 13, -np.cumsum(np.sin(angle)) * length / 13
-    points = np.empty((13, 7, 3))
-    points[..., 0], points[..., 1] = x[:, None], half[:, None] * t
-    points[..., 2] = z[:, None] + half[:, None] * (fold * np.abs(t) + roll * t)
-    return surface(points, tone=np.broadcast_to(np.abs(t), (13, 7)))
+    rise = z[:, None] + half[:, None] * (fold * np.abs(t) + roll * t)
+    return surface(grid(x[:, None], half[:, None] * t, rise), tone=np.abs(t))
 
 
 def plant(rng: np.random.Generator) -> list[Shape]:

@@ -15,7 +15,6 @@ from dsr.synthetic.procedural.shape import random_rotation
 from dsr.synthetic.raycast import TILT, Array, mix, noise
 
 Paint = Callable[[Array, Array], Array]
-Palette = Array
 _FAMILIES = {
     "wood": ((0.40, 0.22, 0.10), (0.16, 0.07, 0.03), (0.60, 0.42, 0.24), (0.30, 0.15, 0.07)),
     "stone": ((0.55, 0.52, 0.47), (0.33, 0.31, 0.29), (0.70, 0.66, 0.58), (0.20, 0.19, 0.19)),
@@ -28,7 +27,7 @@ _FAMILIES = {
 }
 
 
-def palette(rng: np.random.Generator, family: str, count: int = 4) -> Palette:
+def palette(rng: np.random.Generator, family: str, count: int = 4) -> Array:
     """Return ``count`` linear RGB colours (count, 3) of a material, or of any colour for "any"."""
     if family in _FAMILIES:
         table = np.array(_FAMILIES[family])

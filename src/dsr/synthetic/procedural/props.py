@@ -10,7 +10,7 @@ from dsr.synthetic.procedural import furniture as f
 from dsr.synthetic.procedural.materials import SceneBuilder
 from dsr.synthetic.procedural.organic import branches, creature, figure, pebble, plant
 from dsr.synthetic.procedural.reliefs import RELIEFS, blanket, curtain, relief
-from dsr.synthetic.procedural.shape import Shape, box, merge, quad, surface
+from dsr.synthetic.procedural.shape import Shape, box, grid, merge, quad, surface
 from dsr.synthetic.procedural.solids import bowl, letter, random_solid, vase
 from dsr.synthetic.raycast import Array
 
@@ -234,8 +234,8 @@ def backdrop(rng: np.random.Generator, scene: SceneBuilder, back: float, floor: 
         slope = np.concatenate(([0], s, [np.pi / 2]))[:, None]
         scene.add(
             surface(
-                _grid(np.linspace(-12, 12, 3), y[:, None], z[:, None]),
-                _grid(np.zeros(3), -np.sin(slope), np.cos(slope)),
+                grid(np.linspace(-12, 12, 3), y[:, None], z[:, None]),
+                grid(np.zeros(3), -np.sin(slope), np.cos(slope)),
             ),
             "wall",
             0.8,
@@ -243,15 +243,10 @@ def backdrop(rng: np.random.Generator, scene: SceneBuilder, back: float, floor: 
     elif kind == 2:  # a bent wall
         angle, radius = np.linspace(-np.pi, 0, 121) + np.pi / 2, rng.uniform(2.2, 6.0)
         x, y = radius * np.sin(angle), back - radius + radius * np.cos(angle)
-        scene.add(surface(_grid(x, y, np.array([[-14.0], [14.0]]))), "wall", 0.8)
+        scene.add(surface(grid(x, y, np.array([[-14.0], [14.0]]))), "wall", 0.8)
     elif kind == 3:
         sheet = curtain(rng, 5.0, 4.0).scale([1, float(rng.uniform(0.5, 2.5)), 1])
         scene.add(sheet.translate(-2.5, back, floor), "cloth", 0.5)
     else:
         wall = relief(rng, RELIEFS[rng.integers(len(RELIEFS))], 5.0, 340).turn(0, 90)
         scene.add(wall.translate(0, back, 1.0), "brick", 0.8)
-
-
-def _grid(*coordinates: Array) -> Array:
-    """Return the grid of points (R, C, 3) of three coordinates that broadcast to (R, C)."""
-    return np.stack(np.broadcast_arrays(*coordinates), axis=-1)

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
-from dsr.synthetic.procedural.shape import Shape, surface
+from dsr.synthetic.procedural.shape import Shape, grid, surface
 from dsr.synthetic.raycast import Array
 
 Heights = tuple[Array, Array, float]
@@ -23,11 +23,8 @@ def spectrum(rng: np.random.Generator, count: int, slope: float, squeeze: float 
     """Return a periodic random surface (count, count) whose amplitudes fall with frequency**-slope, from 0 to 1."""
     fy, fx = np.meshgrid(np.fft.fftfreq(count), np.fft.rfftfreq(count) * squeeze, indexing="ij")
     frequency = np.hypot(fx, fy) * count
-    waves = (
-        np.fft.rfft2(rng.normal(size=(count, count)))
-        * np.maximum(frequency, 1.0) ** -slope
-        * np.exp(-((frequency / 90) ** 2))
-    )
+    fall = np.maximum(frequency, 1.0) ** -slope
+    waves = np.fft.rfft2(rng.normal(size=(count, count))) * fall * np.exp(-((frequency / 90) ** 2))
     waves[0, 0] = 0
     out = np.fft.irfft2(waves, s=(count, count))
     return np.asarray((out - out.min()) / np.ptp(out))
@@ -48,8 +45,7 @@ def ground(rng: np.random.Generator, count: int) -> Heights:
     """Return hills, dunes or rough ground."""
     height = spectrum(rng, count, rng.uniform(1.6, 2.5), rng.choice([1.0, 1.0, 0.4]))
     if rng.random() < 0.3:  # ridges
-        height = 1 - np.abs(2 * height - 1)
-        height = gaussian_filter(height, 1.0)
+        height = gaussian_filter(1 - np.abs(2 * height - 1), 1.0)
     return height, height, rng.uniform(0.02, 0.13)
 
 
@@ -176,7 +172,7 @@ def relief(rng: np.random.Generator, maker: Maker, side: float, count: int = 300
     height, tone, amplitude = maker(rng, count)
     u, v = _grid(count)
     z = side * (amplitude * height + bend * (1 - (2 * u - 1) ** 2))
-    return surface(np.stack((side * (u - 0.5), side * (v - 0.5), z), axis=-1), tone=tone)
+    return surface(grid(side * (u - 0.5), side * (v - 0.5), z), tone=tone)
 
 
 def blanket(rng: np.random.Generator, size: Array, thick: float, count: int = 150) -> Shape:
@@ -185,7 +181,7 @@ def blanket(rng: np.random.Generator, size: Array, thick: float, count: int = 15
     pillow = ((1 - (2 * u - 1) ** 6) * (1 - (2 * v - 1) ** 6)) ** 0.5
     height, tone, _ = (folds, crumple, quilt, ground)[rng.integers(4)](rng, count)
     z = thick * pillow * (0.75 + 0.35 * height)
-    return surface(np.stack((size[0] * (u - 0.5), size[1] * (v - 0.5), z), axis=-1), tone=tone)
+    return surface(grid(size[0] * (u - 0.5), size[1] * (v - 0.5), z), tone=tone)
 
 
 def curtain(rng: np.random.Generator, width: float, height: float) -> Shape:
@@ -198,4 +194,4 @@ def curtain(rng: np.random.Generator, width: float, height: float) -> Shape:
     deep = rng.uniform(0.15, 0.4) * width / waves
     y = deep * (np.sin(phase) + 0.25 * np.sin(2 * phase + 3 * drift)) * (0.7 + 0.6 * (1 - v) * rng.uniform(0, 1))
     x = width * u + 0.3 * deep * np.cos(phase)
-    return surface(np.stack((x, y, height * v), axis=-1), tone=0.5 + 0.5 * np.sin(phase))
+    return surface(grid(x, y, height * v), tone=0.5 + 0.5 * np.sin(phase))

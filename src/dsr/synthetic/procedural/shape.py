@@ -72,7 +72,7 @@ def merge(shapes: Sequence[Shape]) -> Shape:
 def surface(points: Array, normals: Array | None = None, tone: Array | None = None) -> Shape:
     """Return the surface through a grid of points, (R, C, 3); the last column may repeat the first, which closes it.
 
-    Without ``normals`` they are taken from the grid; ``tone`` (R, C) is the chart's third coordinate.
+    Without ``normals`` they are taken from the grid; ``tone``, (R, C) or (C,), is the chart's third coordinate.
     """
     rows, columns = points.shape[:2]
     if normals is None:  # by central differences, across the seam where the grid is closed
@@ -93,6 +93,11 @@ def surface(points: Array, normals: Array | None = None, tone: Array | None = No
     if tone is not None:
         chart[..., 2] = tone
     return Shape(flat, np.concatenate((first, second)), unit(normals.reshape(-1, 3)), chart.reshape(-1, 3), flat)
+
+
+def grid(*coordinates: Array) -> Array:
+    """Return the points (R, C, 3) of three coordinates that broadcast to (R, C)."""
+    return np.stack(np.broadcast_arrays(*coordinates), axis=-1)
 
 
 def lathe(sections: Sequence[Array], segments: int = 80) -> Shape:

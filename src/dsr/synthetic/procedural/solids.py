@@ -13,6 +13,7 @@ from dsr.synthetic.procedural.shape import (
     Shape,
     box,
     extrusion,
+    grid,
     lathe,
     merge,
     quad,
@@ -45,19 +46,11 @@ def rounded_box(size: Array, radius: float, steps: int = 8) -> Shape:
     half = np.asarray(size) / 2 - radius
     quarter = np.linspace(0, np.pi / 2, steps + 1)
     theta = np.concatenate([k * np.pi / 2 + quarter for k in range(4)])
-    theta, phi = np.append(theta, 0.0), np.concatenate((quarter - np.pi / 2, quarter))
+    theta, phi = np.append(theta, 0.0), np.concatenate((quarter - np.pi / 2, quarter))[:, None]
     side = np.repeat([[1, 1], [-1, 1], [-1, -1], [1, -1], [1, 1]], [*[steps + 1] * 4, 1], axis=0)
-    lift = np.repeat([-1.0, 1.0], steps + 1)
-    normal = np.stack(
-        [
-            np.cos(phi)[:, None] * np.cos(theta),
-            np.cos(phi)[:, None] * np.sin(theta),
-            np.broadcast_to(np.sin(phi)[:, None], (len(phi), len(theta))),
-        ],
-        axis=-1,
-    )
-    centre = np.empty_like(normal)
-    centre[..., :2], centre[..., 2] = side * half[:2], lift[:, None] * half[2]
+    lift = np.repeat([-1.0, 1.0], steps + 1)[:, None]
+    normal = grid(np.cos(phi) * np.cos(theta), np.cos(phi) * np.sin(theta), np.sin(phi))
+    centre = grid(side[:, 0] * half[0], side[:, 1] * half[1], lift * half[2])
     span = 2 * half
     lids = [quad([-half[0], -half[1], z], [span[0], 0, 0], [0, span[1], 0]) for z in (-size[2] / 2, size[2] / 2)]
     return merge([surface(centre + radius * normal, normal), *lids]).translate(0, 0, size[2] / 2)
@@ -74,13 +67,12 @@ def ellipsoid(size: Array, power: Array, steps: int = 48) -> Shape:
     """Return the superquadric of half axes ``size`` (3,) and exponents ``power`` (2,), 1 for an ellipsoid."""
     phi, theta = np.linspace(-np.pi / 2, np.pi / 2, steps + 1)[:, None], np.linspace(-np.pi, np.pi, 2 * steps + 1)
 
-    def ball(e: Array) -> Array:
-        def signed(value: Array, exponent: float) -> Array:
-            return np.sign(value) * np.abs(value) ** exponent
+    def signed(value: Array, exponent: float) -> Array:
+        return np.sign(value) * np.abs(value) ** exponent
 
-        across = signed(np.cos(phi), e[0])
-        top = np.broadcast_to(signed(np.sin(phi), e[0]), (steps + 1, 2 * steps + 1))
-        return np.stack((across * signed(np.cos(theta), e[1]), across * signed(np.sin(theta), e[1]), top), axis=-1)
+    def ball(e: Array) -> Array:
+        across, top = signed(np.cos(phi), e[0]), signed(np.sin(phi), e[0])
+        return grid(across * signed(np.cos(theta), e[1]), across * signed(np.sin(theta), e[1]), top)
 
     return surface(ball(power) * size, unit(ball(2 - power) / size))
 
