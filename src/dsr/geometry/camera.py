@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.utils.data._utils.collate import default_collate_fn_map
 
-from dsr.geometry.range_type import RANGE_TYPES, RangeType
+from dsr.geometry import RANGE_TYPES, RangeType
 from dsr.utils.guards import derived, expect_one_of, is_number, naming
 
 # baseline in metres of the virtual stereo pair of a camera without a second one (Voynov et al. 2019)

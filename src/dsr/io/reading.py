@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from dsr.geometry.range_type import RangeType
+from dsr.geometry import RangeType
 from dsr.utils.options import Options, Rule, group, option, positive
 
 _UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "sunrgbd": 1e-3}
