@@ -199,7 +199,7 @@ def estimate_slopes(values: Tensor, axis: int) -> Tensor:
 
 def expect_window(**options: float) -> None:
     """Raise a ValueError for the first window that is not positive, or wider than any map needs."""
-    expect_positive(**options)
+    expect_positive(or_zero=False, **options)
     for name, value in options.items():
         if value > _WIDEST:
             raise ValueError(f"{name}: expected at most {_WIDEST} low-resolution pixels, got {value}")
