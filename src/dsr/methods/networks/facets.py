@@ -267,7 +267,7 @@ def start_from_facets(net: Any, first: Facets, levels: int) -> None:
     ``levels`` is the number of smoothed copies of the map, whose values and slopes it offers beside the map's own.
     """
     theirs = first.state_dict()
-    taken = {}
+    taken: dict[str, Tensor] = {}
     for name, value in theirs.items():
         kind, number, *rest = name.split(".")
         if kind == "trunk":
