@@ -12,8 +12,7 @@ from torch.nn import functional
 
 from dsr.degradation.downsampling import FACTS, KERNELS, Downsampling, encode_facts
 from dsr.methods.networks import facets_planes, facets_unet
-from dsr.methods.networks.facets import Facets
-from dsr.methods.networks.facets_layers import enlarge, enlarge_and_join
+from dsr.methods.networks.facets import Facets, enlarge_and_join
 from dsr.methods.networks.facets_planes import NEIGHBOURS, average_planes, mix_planes
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.network import Answer
@@ -86,12 +85,9 @@ def test_bands_change_nothing(scale: int, monkeypatch: pytest.MonkeyPatch) -> No
 def test_holes_are_filled(scale: int) -> None:
     rgb, values = _inputs(scale)
     values[..., 3:7, 2:6] = torch.nan
-    answer = _net(scale).answer(rgb, values)
-    for each in _maps(answer):
+    for each in _maps(_net(scale).answer(rgb, values)):
         assert each.shape == (1, 1, *rgb.shape[-2:])
-        assert bool(each.isfinite().all())
-    assert bool((answer.spread > 0).all())
-    assert bool((answer.angle > 0).all())
+        assert bool((each > 0).all())
 
 
 def test_hints_and_noise_change_the_result() -> None:
@@ -221,22 +217,6 @@ def test_gradients_of_mixed_planes_are_those_of_differences(monkeypatch: pytest.
     torch.testing.assert_close(mix_planes(planes, found, 2)[1], found[:, NEIGHBOURS:])
 
 
-@pytest.mark.parametrize("width", [0, 5])
-def test_results_of_a_convolution_are_shuffled_before_features(width: int) -> None:
-    generator = torch.Generator().manual_seed(width)
-    conv = nn.Conv2d(3, 12, 1).double().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    x = torch.randn((2, 3, 4, 5), generator=generator, dtype=torch.float64, requires_grad=True)
-    features = [torch.randn((2, width, 8, 10), generator=generator, dtype=torch.float64, requires_grad=True)][:width]
-    expected = torch.cat((functional.pixel_shuffle(conv(x), 2), *features), dim=1)
-    found = enlarge(conv, x, *features)
-    torch.testing.assert_close(found, expected)
-    factors = torch.randn(found.shape, generator=generator, dtype=torch.float64)
-    inputs = [x, conv.weight, conv.bias, *features]
-    gradients = [torch.autograd.grad((each * factors).sum(), inputs) for each in (found, expected)]
-    torch.testing.assert_close(*gradients)
-    assert gradients[0][1].stride() == conv.weight.stride()  # which several devices expect
-
-
 def test_two_convolutions_and_the_shuffle_between_them_are_one() -> None:
     generator = torch.Generator().manual_seed(1)
     up, join = nn.Conv2d(3, 12, 1), nn.Conv2d(3 + 2, 4, 3, padding=1)
@@ -249,10 +229,13 @@ def test_two_convolutions_and_the_shuffle_between_them_are_one() -> None:
     found = enlarge_and_join(up, join, x, features)
     torch.testing.assert_close(found, expected)
     factors = torch.randn(found.shape, generator=generator, dtype=torch.float64)
-    parameters = [*up.parameters(), *join.parameters()]
-    gradients = [torch.autograd.grad((each * factors).sum(), [x, features, *parameters]) for each in (found, expected)]
-    torch.testing.assert_close(*gradients)
-    assert [each.stride() for each in gradients[0][2:]] == [each.stride() for each in parameters]
+    inputs = [x, features, *up.parameters(), *join.parameters()]
+    expected_gradients = torch.autograd.grad((expected * factors).sum(), inputs)
+    (found * factors).sum().backward()
+    for each, gradient in zip(inputs, expected_gradients, strict=True):
+        torch.testing.assert_close(each.grad, gradient)
+        assert each.grad is not None
+        assert each.grad.stride() == each.stride()  # which several devices expect
 
 
 @pytest.mark.parametrize("width", [1, 4])
@@ -291,13 +274,13 @@ def test_mixed_planes_are_planes_at_each_pixel_weighted_by_a_softmax() -> None:
         assert float(found[0, 0, row, column]) == pytest.approx(expected, abs=1e-12)
 
 
-def test_sizes_are_checked() -> None:
-    with pytest.raises(ValueError, match="scale: expected 1, 2, 4, 8 or 16, got 3"):
-        FacetsUNet(3)
-    with pytest.raises(ValueError, match=r"model: expected positive sizes.*got width 0"):
-        FacetsUNet(4, 0)
-    with pytest.raises(ValueError, match=r"blocks of at least 3, got .* blocks 2"):
-        FacetsUNet(4, blocks=2)
+@pytest.mark.parametrize(
+    ("sizes", "message"),
+    [((3,), "scale: expected 1, 2, 4, 8 or 16, got 3"), ((4, 0), "got width 0"), ((4, 8, 8, 2), "got .* blocks 2")],
+)
+def test_sizes_are_checked(sizes: tuple[int, ...], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        FacetsUNet(*sizes)
 
 
 def test_prepared_patches_have_the_answer_of_the_maps_and_the_hints() -> None:
@@ -335,7 +318,7 @@ def test_photos_of_another_size_and_other_networks_are_refused() -> None:
     with pytest.raises(ValueError, match="rgb: expected"):
         _net(8).answer(rgb, values)
     for first in (FacetsUNet(4, 12, 12, 4), Facets(4, width=8, blocks=5)):
-        with pytest.raises(ValueError, match=r"expected weights of FacetsUNet or Facets with {'width': 8, 'blocks': 4"):
+        with pytest.raises(ValueError, match=r"expected weights of Facets or FacetsUNet with {'width': 8, 'blocks': 4"):
             _net().start_from(first)
 
 

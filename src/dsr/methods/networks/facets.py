@@ -1,40 +1,32 @@
 """Facets: guided super-resolution by a mixture of planes, dsr's own network.
 
-Renderings are most sensitive to errors of normals on smooth surfaces, where convolutions that predict disparity pixel
-by pixel leave a faint texture. The disparity of a plane is linear in the pixel, so this network predicts planes
-instead. Each low-resolution pixel proposes a few planes ("facets"), built from the differences to its neighbours. Each
-high-resolution pixel mixes the planes of the 3 x 3 low-resolution pixels around it, extended to its position, with
-weights predicted from the colour image; at an edge the network switches from one plane to another. Three properties
-hold for any weights: planes are reproduced exactly, the network commutes with an affine map of the disparity, and the
-result does not overshoot the extended planes.
+Convolutions that predict disparity pixel by pixel leave a faint texture on smooth surfaces. The disparity of a plane
+is linear in the pixel, so this network predicts planes. Each low-resolution pixel proposes a few ("facets"), built
+from the differences to its neighbours. Each high-resolution pixel mixes the planes of the 3 x 3 low-resolution pixels
+around it, extended to its position, with weights predicted from the colour image. Whatever the weights are, planes are
+reproduced exactly, the network commutes with an affine map of the disparity, and the result does not overshoot the
+extended planes, which differ from the differences by at most a multiple of the local *bend*, the largest second
+difference around a pixel.
 
-The planes of a low-resolution pixel differ from the differences that they are built from by at most a multiple of the
-local *bend* (the largest second difference around it). The bend is 0 on planes, and large beside a depth step, where
-the low-resolution value mixes both sides.
-
-A network of planes takes over what it can from a trained one: from Facets, or from itself for another factor.
+Below it are the layers that it shares with :mod:`dsr.methods.networks.facets_unet`, which can start from its weights.
 """
 
 from __future__ import annotations
+
+import itertools
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.degradation.downsampling import check_scale
-from dsr.methods.networks.facets_layers import (
-    HEAD,
-    Residual,
-    enlarge_and_join,
-    make_pyramid,
-    mean_colour,
-    photo_input,
-    scale_down,
-    silence,
-)
+from dsr.methods.exportable import exporting, pad_to_multiple
 from dsr.methods.networks.facets_planes import NEIGHBOURS, Stencil, mix_planes, stencil
-from dsr.methods.networks.network import DisparityNetwork, NormalisedNetwork
+from dsr.methods.networks.network import NormalisedNetwork
 
+FULL, HALF = 16, 32  # channels of the photo's features at the full and at half the resolution
+HEAD = 24  # channels of the layers that choose the planes, at the full resolution
 # differences of normalised disparity that become about 1 in the network's compressed and linear inputs
 _FAINT, _STRONG = 1e-3, 0.25
 _RARE = -5.0  # logit of what is added to the choices of Facets
@@ -80,14 +72,10 @@ class Facets(NormalisedNetwork):
         """Return normalised disparity; ``mean`` is the mean colour of the image that ``rgb`` is a window of."""
         around = stencil(values)
         dtype = self.photo.weight.dtype
-        pyramid = [functional.relu(self.photo(photo_input(rgb, mean).to(dtype)), inplace=True)]
-        for layer in self.down:
-            pyramid.append(functional.relu(layer(pyramid[-1]), inplace=True))
+        pyramid = look(self, photo_input(rgb, mean).to(dtype))
         x = self.trunk(functional.relu(pyramid[-1] + self.coarse(_lr_input(around).to(dtype))))
         planes = self._propose_planes(self.planes(x), around)
-        for up, join, features in zip(self.up, self.join, reversed(pyramid[:-1]), strict=True):
-            x = functional.relu(enlarge_and_join(up, join, x, features), inplace=True)
-        return mix_planes(planes, self.choice(x), self.scale)[0]
+        return mix_planes(planes, self.choice(rise(self, x, pyramid)), self.scale)[0]
 
     def _propose_planes(self, output: Tensor, around: Stencil) -> Tensor:
         """Return the planes of each low-resolution pixel, (B, facets, 3, h, w): value at its centre and slopes."""
@@ -104,32 +92,192 @@ class Facets(NormalisedNetwork):
 
 
 def _lr_input(around: Stencil) -> Tensor:
-    """Return (B, 10, h, w): differences compressed so that small ones count, linear differences, and directions."""
+    """Return (B, 10, h, w): compressed differences, so that small ones count, linear ones, and directions."""
     differences = torch.cat((around.value - around.mean, around.slopes[:, :, 1], around.bend), dim=1).float()
     turns = around.turns.float() / around.bend.float().clamp(min=torch.finfo(torch.float32).tiny)
     return torch.cat((torch.asinh(differences / _FAINT) / 3, differences / _STRONG, turns), dim=1)
 
 
-def start_from_facets(net: DisparityNetwork, first: Facets, levels: int) -> None:
-    """Take over the weights of Facets for the same or another factor; both sets of a block's weights start as its own.
+def make_pyramid(
+    levels: int, width: int, inputs: int = 4
+) -> tuple[nn.Conv2d, nn.ModuleList, nn.ModuleList, nn.ModuleList]:
+    """Return the layers that halve the photo's resolution ``levels`` times, down to ``width`` channels, and back.
 
-    ``net`` is a :class:`~dsr.methods.networks.facets_unet.FacetsUNet`, changed in place, ``levels`` the number of
-    smoothed copies of the map, whose values and slopes it offers beside the map's own.
+    They are ``photo`` and ``down`` of a network, and ``up`` and ``join``.
     """
-    theirs = dict(first.state_dict())
-    planes = {name: theirs.pop(name) for name in ("planes.weight", "planes.bias")}
-    finer = _levels(net) - _levels(first)
-    taken = []
+    channels = [*[FULL, HALF, width, width][:levels], width]
+    outputs = [HEAD, *channels[1:-1]]
+    return (
+        nn.Conv2d(inputs, channels[0], 5, padding=2),
+        nn.ModuleList(nn.Conv2d(a, b, 4, stride=2, padding=1) for a, b in itertools.pairwise(channels)),
+        nn.ModuleList(nn.Conv2d(channels[i + 1], 4 * outputs[i], 1) for i in reversed(range(levels))),
+        nn.ModuleList(nn.Conv2d(outputs[i] + channels[i], outputs[i], 3, padding=1) for i in reversed(range(levels))),
+    )
+
+
+def look(net: Any, photo: Tensor) -> list[Tensor]:
+    """Return a photo's features in a network that has a pyramid, from the full to the low resolution."""
+    pyramid = [functional.relu(net.photo(photo), inplace=True)]
+    for layer in net.down:
+        pyramid.append(functional.relu(layer(pyramid[-1]), inplace=True))
+    return pyramid
+
+
+def rise(net: Any, x: Tensor, pyramid: list[Tensor]) -> Tensor:
+    """Return features at the full resolution of those at the low resolution and of the photo's."""
+    for up, join, features in zip(net.up, net.join, reversed(pyramid[:-1]), strict=True):
+        x = functional.relu(enlarge_and_join(up, join, x, features), inplace=True)
+    return x
+
+
+def enlarge_and_join(up: nn.Conv2d, join: nn.Conv2d, x: Tensor, features: Tensor) -> Tensor:
+    """Return a 3 x 3 convolution of the sub-pixel shuffle of a 1 x 1 convolution's results, with features behind them.
+
+    Both convolutions are linear: in float32 and above, their effect on ``x`` is computed as one transposed convolution,
+    without the arrays between them. The bias of the first becomes the weight of a channel of ones, which, like all
+    others, has no effect beyond the border. In lower precisions, whose matrix products prefer even numbers of channels,
+    that would be slower and less exact.
+    """
+    if exporting() or x.dtype.itemsize < torch.float32.itemsize:  # a graph has to know the weights of a convolution
+        enlarged: Tensor = functional.pixel_shuffle(up(x), 2)
+        return functional.conv2d(torch.cat((enlarged, features), dim=1), join.weight, join.bias, padding=1)
+    own, others = join.weight.split((up.out_channels // 4, features.shape[1]), dim=1)
+    first = torch.cat((up.weight.flatten(1), up.get_parameter("bias")[:, None]), dim=1)  # (4 C, channels + 1)
+    shuffled = first.T.unflatten(1, (-1, 2, 2))  # (channels + 1, C, 2, 2)
+    whole = functional.conv2d(shuffled, own, padding=2)  # (channels + 1, D, 4, 4)
+    extended = torch.cat((x, torch.ones_like(x[:, :1])), dim=1)
+    enlarged = functional.conv_transpose2d(extended, whole, stride=2, padding=1)
+    return functional.conv2d(features, others, join.bias, padding=1).add_(enlarged)
+
+
+class Residual(nn.Module):
+    """x + conv(relu(conv(x))), initialised close to the identity."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(width, width, 3, padding=1)
+        self.second = nn.Conv2d(width, width, 3, padding=1)
+        with torch.no_grad():
+            self.second.weight.mul_(0.3)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map (B, C, h, w) to the same shape."""
+        found: Tensor = self.second(functional.relu(self.first(x), inplace=True)).add_(x)
+        return found
+
+
+class MixedResidual(nn.Module):
+    """A residual block whose weights are a mixture of two sets, scaled and shifted; another one for each image."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.width = width
+        self.ways = nn.ModuleList(Residual(width) for _ in range(2))
+        self.ways[1].load_state_dict(self.ways[0].state_dict())
+
+    def forward(self, x: Tensor, shares: Tensor, gains: Tensor, shifts: Tensor) -> Tensor:
+        """Map (B, C, h, w) to the same shape; ``shares`` (B,) are those of the second set.
+
+        The features after the first convolution are multiplied by 1 + ``gains`` (B, C), and ``shifts`` (B, C) are
+        added. On a GPU, which is slow at convolutions of many groups, results are mixed instead of weights.
+        """
+        first, second = cast(list[Residual], self.ways)
+        if x.is_cuda and len(x) > 1:
+            share, gain, shift = (each[..., None, None] for each in (shares[:, None], 1 + gains, shifts))
+            hidden = torch.lerp(one := first.first(x), second.first(x), share.to(one))
+            hidden = functional.relu(torch.addcmul(shift.to(one), hidden, gain.to(one)), inplace=True)
+            return torch.lerp(one := first.second(hidden), second.second(hidden), share.to(one)).add_(x)
+        batch = 1 if exporting() else len(x)  # a graph has to know the shapes of its weights
+        width, square = self.width, (batch, self.width, 3, 3, self.width)
+        gain, shift = (1 + gains.float()).reshape(batch, width), shifts.reshape(batch, width).float()
+        mixed = torch.lerp(_in_a_row(first), _in_a_row(second), shares.reshape(batch, 1).float())
+        weight, bias, last, last_bias = mixed.split((9 * width**2, width) * 2, dim=1)
+        weight = weight.view(square) * gain[..., None, None, None]
+        bias = torch.addcmul(shift, bias, gain)
+        weight, last = (each.to(x.dtype).flatten(0, 1).permute(0, 3, 1, 2) for each in (weight, last.view(square)))
+        bias, last_bias = (each.to(x.dtype).flatten() for each in (bias, last_bias))
+        images = x.reshape(1, -1, *x.shape[-2:]) if batch > 1 else x  # each image is a group of channels
+        hidden = functional.relu(functional.conv2d(images, weight, bias, padding=1, groups=batch), inplace=True)
+        return functional.conv2d(hidden, last, last_bias, padding=1, groups=batch).add_(images).view(x.shape)
+
+
+def _in_a_row(block: Residual) -> Tensor:
+    """Return the weights of a block, (n,) in float32, with the channels of an input pixel side by side."""
+    parameters = (each.permute(0, 2, 3, 1) if each.dim() > 1 else each for each in block.parameters())
+    return torch.cat([each.flatten() for each in parameters]).float()
+
+
+class Context(nn.Module):
+    """What a U-net adds to the trunk, nothing at first; its coarsest level is an eighth, and knows its mean."""
+
+    def __init__(self, width: int, deep: int) -> None:
+        super().__init__()
+        widths = (width, deep, deep, deep)
+        self.shrink = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in itertools.pairwise(widths))
+        self.encoder = nn.ModuleList(nn.Sequential(Residual(deep), Residual(deep)) for _ in widths[1:])
+        self.overall = silence(nn.Linear(deep, deep))
+        self.grow = nn.ModuleList(nn.Conv2d(deep, 4 * a, 1) for a in widths[:-1])
+        self.decoder = nn.ModuleList(Residual(deep) for _ in widths[1:-1])
+        silence(self.grow[0])
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map (B, C, h, w) to the same shape; the sizes are padded to multiples of eight."""
+        height, width = x.shape[-2:]
+        x = pad_to_multiple(x, 8)
+        kept = []
+        for shrink, encode in zip(self.shrink, self.encoder, strict=True):
+            x = encode(functional.relu(shrink(x), inplace=True))
+            kept.append(x)
+        x = x + self.overall(x.mean(dim=(-2, -1)))[..., None, None]
+        for i in (2, 1):
+            grown = functional.pixel_shuffle(self.grow[i](x), 2)
+            x = self.decoder[i - 1](functional.relu(kept[i - 1] + grown, inplace=True))
+        return functional.pixel_shuffle(self.grow[0](x), 2)[..., :height, :width]
+
+
+def scale_down(conv: nn.Conv2d) -> nn.Conv2d:
+    """Return the convolution with small initial weights."""
+    with torch.no_grad():
+        conv.weight.mul_(0.1)
+    nn.init.zeros_(conv.get_parameter("bias"))
+    return conv
+
+
+def silence(layer: nn.Module) -> Any:
+    """Return a layer whose results are 0 at first."""
+    for parameter in layer.parameters():
+        nn.init.zeros_(parameter)
+    return layer
+
+
+def mean_colour(rgb: Tensor) -> Tensor:
+    """Return the mean colour of images, (B, 3, 1, 1)."""
+    return rgb.mean(dim=(-2, -1), keepdim=True)
+
+
+def photo_input(rgb: Tensor, mean: Tensor | None = None) -> Tensor:
+    """Return (B, 4, H, W): the colours, and the brightness relative to the image's mean."""
+    brightness = (rgb - (mean_colour(rgb) if mean is None else mean)).mean(dim=1, keepdim=True)
+    return torch.cat((rgb - 0.5, 2 * brightness), dim=1)
+
+
+def start_from_facets(net: Any, first: Facets, levels: int) -> None:
+    """Let a FacetsUNet take over the weights of Facets for the same or another factor, in both sets of a block.
+
+    ``levels`` is the number of smoothed copies of the map, whose values and slopes it offers beside the map's own.
+    """
+    theirs = first.state_dict()
+    taken: dict[str, Tensor] = {}
     for name, value in theirs.items():
-        if name.startswith("trunk."):
-            number, rest = name.removeprefix("trunk.").split(".", 1)
-            taken += [(f"trunk.{number}.ways.{way}.{rest}", value) for way in range(2)]
-        else:
-            taken.append((_shift(name, finer), value))
-    _copy(net, taken)
+        kind, number, *rest = name.split(".")
+        if kind == "trunk":
+            taken |= {".".join((kind, number, "ways", way, *rest)): value for way in "01"}
+        elif kind != "planes":
+            taken[name] = value
+    _copy(net, first, taken)
     own = net.state_dict()
-    for name, value in planes.items():
-        moves, picks = value.split((3 * first.facets, 6))
+    for name in ("planes.weight", "planes.bias"):
+        moves, picks = theirs[name].split((3 * first.facets, 6))
         new = own[name].unflatten(0, (first.facets, -1)).zero_()
         new[:, -3:] = moves.unflatten(0, (first.facets, 3))
         slopes = new[:, 1 + levels : -3].unflatten(1, (2, -1))
@@ -139,50 +287,39 @@ def start_from_facets(net: DisparityNetwork, first: Facets, levels: int) -> None
             slopes[:, :, 3:] = _RARE
 
 
-def start_from_another_factor(net: DisparityNetwork, first: DisparityNetwork) -> None:
-    """Take over the weights for a factor: layers between resolutions that it has not begin as means and repetitions.
-
-    Both are a :class:`~dsr.methods.networks.facets_unet.FacetsUNet` with the same width, blocks and facets.
-    """
-    theirs, finer = first.state_dict(), _levels(net) - _levels(first)
-    own = net.state_dict()  # the channels of the U-net, ``wide``, may differ
+def start_from_another_factor(net: Any, first: Any) -> None:
+    """Take over a FacetsUNet's weights: layers between resolutions that it lacks begin as means and repetitions."""
+    theirs, own = first.state_dict(), net.state_dict()
+    # the channels of the U-net, ``wide``, may differ
     whole = all(own[name].shape == value.shape for name, value in theirs.items() if name.startswith("wide."))
-    taken = {name: value for name, value in theirs.items() if whole or not name.startswith("wide.")}
-    _copy(net, [(_shift(name, finer), value) for name, value in taken.items()])
-    layers = {name: list(net.get_submodule(name).children()) for name in ("down", "up", "join")}
-    for level in range(finer):
-        weight: Tensor = silence(layers["down"][-1 - level]).get_parameter("weight")
+    _copy(net, first, {name: value for name, value in theirs.items() if whole or not name.startswith("wide.")})
+    for level in range(len(net.up) - len(first.up)):
+        weight = silence(net.down[-1 - level]).weight
         for channel in range(min(weight.shape[:2])):  # means of 2 x 2 pixels
             weight[channel, channel, 1:3, 1:3] = 0.25
-        weight = silence(layers["up"][level]).get_parameter("weight")
+        weight = silence(net.up[level]).weight
         for channel in range(min(weight.shape[0] // 4, weight.shape[1])):  # each pixel four times
             weight[4 * channel : 4 * channel + 4, channel] = 1
-        join = layers["join"][level]
-        for parameter in join.parameters():
-            parameter.mul_(0.1)
-        weight = join.get_parameter("weight")
-        for channel in range(min(weight.shape[:2])):  # and little else
-            weight[channel, channel, 1, 1] += 1
+        join = net.join[level]
+        join.weight.mul_(0.1)
+        join.bias.mul_(0.1)
+        for channel in range(min(join.weight.shape[:2])):  # and little else
+            join.weight[channel, channel, 1, 1] += 1
 
 
-def _copy(net: DisparityNetwork, named: list[tuple[str, Tensor]]) -> None:
-    """Copy weights of the same shape, and into layers that have more inputs, which count nothing at first."""
+def _copy(net: Any, first: Any, named: dict[str, Tensor]) -> None:
+    """Copy weights of the same shape, and into layers that have more inputs, which count nothing at first.
+
+    The layers towards the full resolution have other numbers at another factor.
+    """
     own = net.state_dict()
-    for name, value in named:
+    for theirs, value in named.items():
+        kind, number, *rest = theirs.split(".")
+        numbered = kind in ("up", "join")
+        name = ".".join((kind, str(int(number) + len(net.up) - len(first.up)), *rest)) if numbered else theirs
         if name not in own:
             continue
         if own[name].shape == value.shape:
             own[name].copy_(value)
         elif name in _WIDENED and own[name].shape[1] > value.shape[1]:
             own[name].zero_()[:, : value.shape[1]] = value
-
-
-def _levels(net: DisparityNetwork) -> int:
-    """Return how many times the photo's resolution is halved."""
-    return len(list(net.get_submodule("up").children()))
-
-
-def _shift(name: str, steps: int) -> str:
-    """Return a parameter's name at another factor, where the layers towards the full resolution have other numbers."""
-    kind, number, *rest = name.split(".")
-    return ".".join((kind, str(int(number) + steps), *rest)) if kind in ("up", "join") else name

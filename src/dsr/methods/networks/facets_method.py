@@ -54,7 +54,7 @@ class AnyMap(Method):
         weights: file that ``train.py model=facets`` wrote, or a network, which is used as it is.
         noise: standard deviation of the map's depth in metres, at 1 m if it grows; None if it is not known.
         noise_growth: the noise grows with this power of the distance: 0 where it is the same everywhere, 2 for stereo.
-        smooth: 0 takes the map for free of noise, 2 its noise for twice as large as estimated; 1 is neutral.
+        smooth: the map's noise, given or estimated, is multiplied by this, 0 to 2.
         edges: whether the result's depth steps are to be ``sharp`` or ``soft``, a pixel's value then being a mean over
             its area; ``auto``: as the map shows.
         kernel: of the downsampling that made the map, if it is known.
@@ -86,24 +86,29 @@ class AnyMap(Method):
         cleanly = noise is None and clean and smooth == 1
         if cleanly:
             noise = 0.0
-        if edges not in get_args(Edges):
-            raise ValueError(f"edges: expected one of {', '.join(get_args(Edges))}, got {edges}")
-        if not 0 <= smooth <= 2:
-            raise ValueError(f"smooth: expected a number from 0 to 2, got {smooth}")
-        if noise is not None and not 0 <= noise < 1:
-            raise ValueError(f"noise: expected metres, 0 or more and less than 1, got {noise}")
-        if not 0 <= noise_growth <= 4:
-            raise ValueError(f"noise_growth: expected a power of the distance from 0 to 4, got {noise_growth}")
-        if noise_growth and noise is None:
-            raise ValueError(f"noise_growth: expected noise with it, got {noise_growth} and no noise")
-        if max_error is not None and not max_error > 0:
-            raise ValueError(f"max_error: expected a positive share of the depth, got {max_error}")
+        kinds = get_args(Edges)
+        for fits, message in (
+            (edges in kinds, f"edges: expected one of {', '.join(kinds)}, got {edges}"),
+            (0 <= smooth <= 2, f"smooth: expected a number from 0 to 2, got {smooth}"),
+            (noise is None or 0 <= noise < 1, f"noise: expected metres, 0 or more and less than 1, got {noise}"),
+            (0 <= noise_growth <= 4, f"noise_growth: expected a power of distance from 0 to 4, got {noise_growth}"),
+            (noise is not None or not noise_growth, f"noise_growth: expected noise with it, got {noise_growth} alone"),
+            (max_error is None or max_error > 0, f"max_error: expected a positive share of the depth, got {max_error}"),
+        ):
+            if not fits:
+                raise ValueError(message)
         self._caution = CAUTION
         if isinstance(weights, str | Path):
+            path = Path(weights)
             kind, caution = SPECIAL.get((kernel, edges), (None, CAUTION)) if cleanly else (None, CAUTION)
-            if kind is not None and (special := special_weights(Path(weights), kind)) is not None:
-                weights, self._caution = special, caution
-            weights = _load(Path(weights), model, networks).to(DTYPES[precision])
+            if kind is not None and (special := special_weights(path, kind)) is not None:
+                path, self._caution = special, caution
+            net = load_network(path, networks, None, model)
+            if not isinstance(net, FacetsUNet):
+                raise ValueError(
+                    f"{path}: expected weights of {FacetsUNet.__name__}, got those of {type(net).__name__}"
+                )
+            weights = net.eval().requires_grad_(False).to(DTYPES[precision])
         self._max_error = max_error
         self._net = weights.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs
         self._device, self._smooth = torch.device(device), smooth
@@ -127,50 +132,41 @@ class AnyMap(Method):
     def _upsample(self, sample: DepthSample, noise: NoiseLaw | None, progress: Steps | None) -> Surface:
         """Return the result for a map of this noise; None for one that is not known."""
         inverse = sample.depth_lr.to(self._device).reciprocal()[None]
-        size = sample.rgb.shape[-2:]
+        height, width = sample.rgb.shape[-2:]
+        rows, columns = inverse.shape[-2:]
         own_size = self._net.serves(self._net.scale, 1) and sample.scale <= 1 + _TOLERANCE
         factor = 1 if own_size else self._net.scale
-        rows, columns = inverse.shape[-2:]
         rgb = _resize(sample.rgb.to(self._device).float()[None], (factor * rows, factor * columns)).clamp(0, 1)
         padded = inverse
         if factor == 1:  # in pairs
             rgb = functional.pad(rgb, (0, columns % 2, 0, rows % 2), mode="replicate")
             padded = pad_inverse_depth(inverse, 2)
         level = None if noise is None else (noise[0] * padded ** (1 - noise[1])).nan_to_num(0)
-        passes = 1
-        if self._smooth != 1:
-            if level is None:
-                passes = 2
-                level = local_noise(padded, self._answer(rgb, padded, None, _half(progress, 0)).disparity)
-            level = self._smooth * level
-        answer = self._answer(rgb, padded, level, progress if passes == 1 else _half(progress, 1))
-        found = _describe_noise(padded, answer)
+        if level is None and self._smooth != 1:
+            first = self._answer(rgb, padded, None, _half(progress, 0))
+            level, progress = local_noise(padded, first.disparity), _half(progress, 1)
+        answer = self._answer(rgb, padded, None if level is None else self._smooth * level, progress)
         inside = (..., slice(factor * rows), slice(factor * columns))
-        result = resize_inverse_depth(answer.disparity[inside][0], (size[0], size[1]))
+        result = resize_inverse_depth(answer.disparity[inside][0], (height, width))
         depth = torch.where(result > 0, result, torch.nan).reciprocal().to(sample.depth_lr.device)
-        errors = (_resize(each[inside], (size[0], size[1]))[0].to(depth) for each in (answer.spread, answer.angle))
-        spread, angle = (self._caution * each for each in errors)
+
+        def fit(error: Tensor) -> Tensor:
+            return _resize(error, (height, width))[0].to(depth)
+
         focal = sample.camera_lr.fx
-        more = (each.to(depth) for each in (*_rounding(inverse, focal), _guessing(inverse, focal)))
-        rounding, tilt, guessing = (_resize(each, (size[0], size[1]))[0] for each in more)
-        spread, angle = torch.maximum(spread, rounding) + guessing, torch.maximum(angle, tilt)
+        rounding, tilt, guessing = (each.to(depth) for each in (*_rounding(inverse, focal), _guessing(inverse, focal)))
+        spread = torch.maximum(self._caution * fit(answer.spread[inside]), fit(rounding)) + fit(guessing)
+        angle = torch.maximum(self._caution * fit(answer.angle[inside]), fit(tilt))
         depth_error = spread * depth
         if self._max_error is not None:
             depth = depth.masked_fill(spread > self._max_error, torch.nan)
-        return Surface(depth, depth_error, torch.rad2deg(angle), found)
+        return Surface(depth, depth_error, torch.rad2deg(angle), _describe_noise(padded, answer))
 
     def _answer(self, rgb: Tensor, inverse: Tensor, noise: Tensor | None, progress: Steps | None) -> Answer:
         """Return the network's answer, with the noise if it is given."""
         facts = self._facts.to(self._device).clone()
         facts[0, -1] = noise is not None
         return self._net.answer(rgb, inverse, None if noise is None else noise.float(), facts, progress)
-
-
-def _load(path: Path, model: str, networks: Mapping[str, type[DisparityNetwork]]) -> FacetsUNet:
-    net = load_network(path, networks, None, model)
-    if not isinstance(net, FacetsUNet):
-        raise ValueError(f"{path}: expected weights of {FacetsUNet.__name__}, got those of {type(net).__name__}")
-    return net.eval().requires_grad_(False)
 
 
 def _half(progress: Steps | None, before: int) -> Steps | None:
@@ -208,29 +204,28 @@ def _rounding(inverse: Tensor, focal: float) -> tuple[Tensor, Tensor]:
     are (B, 1, h, w), and 0 where the values around a pixel differ, from which the truth can be determined more exactly.
     A rounded slope is a staircase; its largest relative step, twice, limits those of single levels.
     """
-    known = inverse.isfinite()
+    nothing, known = torch.zeros_like(inverse), inverse.isfinite()
     values = inverse[known].unique()
     if values.numel() < 2 or values.numel() * _ROUNDED >= known.sum():
-        return torch.zeros_like(inverse), torch.zeros_like(inverse)
+        return nothing, nothing
     gaps = values.diff()
-    step = torch.cat((gaps[:1], torch.minimum(gaps[:-1], gaps[1:]), gaps[-1:]))
+    smaller, larger = torch.minimum(gaps[:-1], gaps[1:]), torch.maximum(gaps[:-1], gaps[1:])
     level = torch.searchsorted(values, torch.where(known, inverse, values[0]))
     above, borders = torch.zeros_like(values), torch.zeros_like(values)  # with the next level, and all, by level
     for dim in (2, 3):
-        ends = torch.stack([level.narrow(dim, start, level.shape[dim] - 1) for start in (0, 1)])
-        both = known.narrow(dim, 0, ends.shape[dim + 1]) & known.narrow(dim, 1, ends.shape[dim + 1])
-        low, high = ends.amin(0)[both], ends.amax(0)[both]
+        count = inverse.shape[dim] - 1
+        both = known.narrow(dim, 0, count) & known.narrow(dim, 1, count)
+        ends = torch.stack((level.narrow(dim, 0, count)[both], level.narrow(dim, 1, count)[both]))
+        low, high = ends.amin(dim=0), ends.amax(dim=0)
         above += torch.bincount(low[high - low == 1], minlength=len(values))
-        borders += torch.bincount(torch.cat((low, high))[(low < high).repeat(2)], minlength=len(values))
-    even = torch.maximum(gaps[1:], gaps[:-1]) <= _EVEN * torch.minimum(gaps[1:], gaps[:-1])
-    stairs = even & (torch.minimum(above[1:-1], above[:-2]) > _STAIR * borders[1:-1])
+        borders += torch.bincount(ends[:, low < high].flatten(), minlength=len(values))
+    stairs = (larger <= _EVEN * smaller) & (torch.minimum(above[1:-1], above[:-2]) > _STAIR * borders[1:-1])
     if stairs.sum() < _STAIRS:
-        return torch.zeros_like(inverse), torch.zeros_like(inverse)
-    relative = ((step / values).clamp(max=_EXCESS * (step / values)[1:-1][stairs].max()) / 4)[level]
-    low, high = (
-        -functional.max_pool2d(-torch.where(known, inverse, torch.inf), 3, stride=1, padding=1),
-        functional.max_pool2d(torch.where(known, inverse, -torch.inf), 3, stride=1, padding=1),
-    )
+        return nothing, nothing
+    step = torch.cat((gaps[:1], smaller, gaps[-1:])) / values
+    relative = (step.clamp(max=_EXCESS * step[1:-1][stairs].max()) / 4)[level]
+    low = -functional.max_pool2d(-torch.where(known, inverse, torch.inf), 3, stride=1, padding=1)
+    high = functional.max_pool2d(torch.where(known, inverse, -torch.inf), 3, stride=1, padding=1)
     flat = known & (low == high)
     away = torch.stack([distance_to_known(each) for each in ~flat])
     return torch.where(flat, relative, 0), torch.where(flat, torch.atan(focal * relative / (away + 1)), 0)

@@ -1,35 +1,22 @@
 """Facets with context: a network for low-resolution maps of any kernel and noise, which predicts its expected errors.
 
-It is :mod:`dsr.methods.networks.facets`, where low-resolution pixels propose planes and high-resolution pixels mix the
-planes of the 3 x 3 low-resolution pixels around them, and can start from its weights. What is new:
-
-- **Context.** Within the trunk, a U-net sees the low-resolution grid down to an eighth of its size (Ronneberger,
-  Fischer, Brox, *U-Net*, MICCAI 2015), and the mean of that.
-- **Noise.** The value and the slopes of a plane are a choice among those of the map itself and of three smoothed copies
-  of it. Then planes are averaged with those around them, extended to the pixel, with weights that the network chooses,
-  in five steps of 1 to 16 pixels: a wall may become one plane over 60 pixels, and an edge stays where the weights end.
-  How rough the whole map is, at four resolutions, is an input, as are the hints: both scale and shift the features of
-  each block (Perez et al., *FiLM*, AAAI 2018), and mix its weights from two sets, so that noisy maps do not cost clean
-  ones their weights (Yang et al., *CondConv*, NeurIPS 2019).
-- **Hints.** The network may be given what is known of the map: the noise of each pixel (Zhang et al., *FFDNet*, TIP
-  2018), the kernel that made it, and whether depth steps are sharp. Each hint may be missing.
-- **Exact means.** Where the kernel is known, its residual is added to the result twice (back-projection: Irani, Peleg,
-  *Improving Resolution by Image Registration*, CVGIP 1991), multiplied by a factor that the network chooses per pixel.
-- **Maps of the photo's own size.** They are averaged over 2 x 2 pixels for the trunk, and seen at full resolution by
-  the layers that choose the planes. The weights are those of factor 2.
-- **Confidence.** Two more outputs are the expected error of the logarithm of disparity and that of the normal.
-
-The layers at the low resolution are alike for all factors, so that they can be taken from a training for another one.
-
-Disparity is divided by its median, so that the result does not depend on the unit; planes are reproduced exactly.
+It extends :mod:`dsr.methods.networks.facets`, as docs/facets.md describes. A U-net (Ronneberger et al., MICCAI 2015)
+sees the low-resolution grid down to an eighth of its size. Planes choose among the map and three smoothed copies of
+it, and are averaged with those around them in five steps of 1 to 16 pixels. The roughness of the map and the hints
+scale and shift the features of each block (Perez et al., *FiLM*, AAAI 2018), and mix its weights from two sets (Yang
+et al., *CondConv*, NeurIPS 2019). Where the kernel is known, the residual is added back twice (Irani, Peleg, CVGIP
+1991). Maps of the photo's own size are averaged over 2 x 2 pixels for the trunk, and have the weights of factor 2. Two
+more outputs are the expected errors of the logarithm of disparity and of the normal. The layers at the low resolution
+are alike for all factors. Disparity is divided by its median, so that the result does not depend on the unit.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -38,19 +25,19 @@ from torch.nn import functional
 from dsr.degradation.downsampling import FACTS, Downsampling, known_kernels
 from dsr.methods.exportable import every, exporting, median_in_graph, quantiles_in_graph
 from dsr.methods.images import inpaint, repeat_blocks, upsample_bicubic
-from dsr.methods.networks.facets import Facets, start_from_another_factor, start_from_facets
-from dsr.methods.networks.facets_layers import (
+from dsr.methods.networks.facets import (
     HEAD,
     Context,
+    Facets,
     MixedResidual,
-    concatenate,
-    constant,
-    convolve_together,
-    enlarge_and_join,
+    look,
     make_pyramid,
     photo_input,
+    rise,
     scale_down,
     silence,
+    start_from_another_factor,
+    start_from_facets,
 )
 from dsr.methods.networks.facets_planes import NEIGHBOURS, Stencil, average_planes, mix_planes, smooth, stencil
 from dsr.methods.networks.network import Answer, DisparityNetwork, expect_rgb_size
@@ -75,13 +62,6 @@ _ROUGHNESS = len(_QUANTILES) * (1 + _LEVELS)
 _SAMPLES = 2**16  # about how many low-resolution pixels the roughness of a map is measured at
 _BAND = 2**20  # pixels of the photo that are processed at a time, beside the trunk, which sees the whole map
 _MARGIN = 4  # low-resolution rows beyond a band that its result depends on
-
-
-class _Band(NamedTuple):
-    """Low-resolution rows: ``rows`` with their margins, and where among them those are that are kept, ``inner``."""
-
-    rows: slice
-    inner: slice
 
 
 class FacetsUNet(DisparityNetwork):
@@ -140,13 +120,7 @@ class FacetsUNet(DisparityNetwork):
 
         From Facets for the same factor, the results for clean maps are nearly the same.
         """
-        sizes = {key: self.arguments()[key] for key in ("width", "blocks", "facets")}
-        theirs = {key: first.arguments().get(key) for key in sizes}
-        if not isinstance(first, Facets | FacetsUNet) or theirs != sizes:
-            raise ValueError(
-                f"expected weights of FacetsUNet or Facets with {sizes}, got those of {type(first).__name__} "
-                f"{first.arguments()}"
-            )
+        self._expect(first, (Facets, FacetsUNet), ("width", "blocks", "facets"))
         if isinstance(first, Facets):
             start_from_facets(self, first, _LEVELS)
         else:
@@ -155,16 +129,20 @@ class FacetsUNet(DisparityNetwork):
     @torch.no_grad()
     def share(self, first: DisparityNetwork) -> None:
         """Take over the layers at the low resolution from a network for another factor, and do not train them."""
-        own = {**self.arguments(), "scale": None}
-        if not isinstance(first, FacetsUNet) or {**first.arguments(), "scale": None} != own:
-            raise ValueError(
-                f"expected weights of FacetsUNet with {own}, got those of {type(first).__name__} {first.arguments()}"
-            )
+        self._expect(first, (FacetsUNet,), ("width", "deep", "blocks", "facets"))
         theirs = first.state_dict()
         for name, parameter in self.named_parameters():
             if name.split(".")[0] in _SHARED:
                 parameter.copy_(theirs[name])
                 parameter.requires_grad_(False)
+
+    def _expect(self, first: DisparityNetwork, kinds: tuple[type, ...], sizes: Sequence[str]) -> None:
+        """Raise a ValueError for a network of another kind or of other sizes."""
+        own, theirs = ({key: net.arguments().get(key) for key in sizes} for net in (self, first))
+        if not isinstance(first, kinds) or own != theirs:
+            names = " or ".join(kind.__name__ for kind in kinds)
+            name, came = type(first).__name__, first.arguments()
+            raise ValueError(f"expected weights of {names} with {own}, got those of {name} {came}")
 
     def upsample(self, rgb: Tensor, disparity: Tensor, min_max: Tensor | None = None) -> Tensor:
         """Return high-resolution disparity; see :meth:`~dsr.methods.networks.network.DisparityNetwork.upsample`."""
@@ -247,14 +225,14 @@ class FacetsUNet(DisparityNetwork):
             elif scale == 2:
                 parts.append(torch.zeros_like(rgb[:, :3]))
             levels = torch.cat((values, *smooth(values, weight, _LEVELS)))
-            around = Stencil(*(torch.stack(each.chunk(1 + _LEVELS)) for each in stencil(levels)))  # (levels, B, ...)
+            around = Stencil(*(each.view(1 + _LEVELS, -1, *each.shape[1:]) for each in stencil(levels)))
             lr_input = _lr_input(around, weight, noise, hints)
             cues = torch.cat((hints.float(), _roughness(around.bend, weight)), dim=1)
-        photo, bands = torch.cat(parts, dim=1), self._split(values.shape[-2], rgb.shape)
-        kept = [self._see(photo, scale, bands[0])] if len(bands) == 1 else None
-        seen = kept or (self._see(photo, scale, band) for band in bands)
-        features = [pyramid[-1][..., band.inner, :] for pyramid, band in zip(seen, bands, strict=True)]
-        x = functional.relu(self.coarse(lr_input.to(dtype)).add_(concatenate(features, dim=-2)), inplace=True)
+        photo, bands = torch.cat(parts, dim=1).to(dtype), self._split(values.shape[-2], rgb.shape)
+        windows = [photo[..., scale * rows.start : scale * rows.stop, :] for rows, _ in bands]
+        kept = look(self, photo) if len(bands) == 1 else None
+        features = [(kept or look(self, window))[-1][..., i, :] for window, (_, i) in zip(windows, bands, strict=True)]
+        x = functional.relu(self.coarse(lr_input.to(dtype)).add_(_join(features)), inplace=True)
         kind, shares = functional.relu(self.hints(cues.to(dtype))), self.shares(cues.to(dtype)).sigmoid()
         for number, (block, modulate) in enumerate(zip(self.trunk, self.modulation, strict=True)):
             if number == _BEFORE:
@@ -262,43 +240,34 @@ class FacetsUNet(DisparityNetwork):
             x = block(x, shares[:, number], *modulate(kind).chunk(2, dim=1))
         planes = self._blend_planes(self._propose_planes(self.planes(x), around), self.blend(x))
         bits = []
-        for number, band in enumerate(bands, 1):
-            pyramid = kept[0] if kept else self._see(photo, scale, band)
-            found = self._choose(x[..., band.rows, :], planes[..., band.rows, :], pyramid, scale)
-            rows = slice(scale * band.inner.start, scale * band.inner.stop)
-            bits.append([each[..., rows, :] for each in found])
+        for number, (window, (rows, inner)) in enumerate(zip(windows, bands, strict=True), 1):
+            high = rise(self, x[..., rows, :], kept or look(self, window))
+            found = self._choose(high, planes[..., rows, :], scale)
+            inside = slice(scale * inner.start, scale * inner.stop)
+            bits.append([each[..., inside, :] for each in found])
             if progress is not None:
                 progress(number, len(bands))
-        result, errors, gate = (concatenate(each, dim=-2) for each in zip(*bits, strict=True))
+        result, errors, gate = (_join(each) for each in zip(*bits, strict=True))
         if given.shape == values.shape:  # not for a map of the photo's own size
             with torch.autocast(rgb.device.type, enabled=False):
                 result = _project(result, given, known, gate, kernels)
         return result, errors
 
-    def _split(self, height: int, shape: torch.Size) -> list[_Band]:
-        """Return the bands of low-resolution rows that are processed one after another; all rows in a training."""
+    def _split(self, height: int, shape: torch.Size) -> list[tuple[slice, slice]]:
+        """Return bands of low-resolution rows with their margins, and the rows of each that are kept."""
         if exporting() or self.training:
-            return [_Band(slice(0, height), slice(0, height))]
-        rows, bands = max(1, height * _BAND // (shape[0] * shape[-2] * shape[-1])), []
-        for first in range(0, height, rows):
-            above, end = max(0, first - _MARGIN), min(first + rows, height)
-            bands.append(_Band(slice(above, min(end + _MARGIN, height)), slice(first - above, end - above)))
+            return [(slice(0, height), slice(0, height))]
+        count, bands = max(1, height * _BAND // (shape[0] * shape[-2] * shape[-1])), []
+        for first in range(0, height, count):
+            above, end = max(0, first - _MARGIN), min(first + count, height)
+            bands.append((slice(above, min(end + _MARGIN, height)), slice(first - above, end - above)))
         return bands
 
-    def _see(self, photo: Tensor, scale: int, band: _Band) -> list[Tensor]:
-        """Return the photo's features in a band with its margins, from the full to the low resolution."""
-        window = photo[..., scale * band.rows.start : scale * band.rows.stop, :]
-        pyramid = [functional.relu(self.photo(window.to(self.photo.weight.dtype)), inplace=True)]
-        for layer in self.down:
-            pyramid.append(functional.relu(layer(pyramid[-1]), inplace=True))
-        return pyramid
-
-    def _choose(self, x: Tensor, planes: Tensor, pyramid: list[Tensor], scale: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the mixture of planes, the logarithms of the expected errors, (B, 2, H, W), and residuals' factors."""
-        for up, join, features in zip(self.up, self.join, reversed(pyramid[:-1]), strict=True):
-            x = functional.relu(enlarge_and_join(up, join, x, features), inplace=True)
-        found = convolve_together((self.choice, self.errors, self.gate), x)
-        mixed, others = mix_planes(planes, found, scale)
+    def _choose(self, x: Tensor, planes: Tensor, scale: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the mixture of planes, logarithms of the expected errors, (B, 2, H, W), and the residual's factor."""
+        layers = (self.choice, self.errors, self.gate)
+        weight, bias = (torch.cat([each.get_parameter(name) for each in layers]) for name in ("weight", "bias"))
+        mixed, others = mix_planes(planes, functional.conv2d(x, weight, bias, padding=1), scale)
         errors, gate = others.float().split((2, 1), dim=1)
         return mixed, errors - 5, torch.sigmoid(gate + _CLOSED)
 
@@ -324,10 +293,22 @@ class FacetsUNet(DisparityNetwork):
         return planes
 
 
+@functools.lru_cache(64)
+@torch.inference_mode(mode=False)  # so that gradients can be computed with it
+def _constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Return numbers as a tensor, (n,), which is made once, so that no step waits for its copy to a GPU."""
+    return torch.tensor(values, dtype=dtype, device=device)
+
+
+def _join(bands: Sequence[Tensor]) -> Tensor:
+    """Return bands of rows as one map; a single one as it is."""
+    return bands[0] if len(bands) == 1 else torch.cat(list(bands), dim=-2)
+
+
 def _favour(logits: Tensor, index: int) -> Tensor:
     """Return logits of (B, facets, ..., n, h, w) with 2 added to one of the n."""
     added = tuple(2.0 * (i == index) for i in range(logits.shape[-3]))
-    return logits + constant(added, logits.dtype, logits.device)[:, None, None]
+    return logits + _constant(added, logits.dtype, logits.device)[:, None, None]
 
 
 def _pair_up(values: Tensor, weight: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -348,15 +329,8 @@ def _lr_input(around: Stencil, weight: Tensor, noise: Tensor, hints: Tensor) -> 
     wide = torch.cat((value[0] - value[1:], central[1:], bend[1:]), dim=2).transpose(0, 1).flatten(1, 2).float()
     noise_known = hints[:, -1:, None, None].float().expand_as(weight)
     level = torch.where(noise_known > 0, torch.log10(noise.float().clamp(min=1e-5) / 1e-3), 0)
-    parts = (
-        torch.asinh(differences / _FAINT) / 3,
-        differences / _STRONG,
-        turns,
-        torch.asinh(wide / _FAINT) / 3,
-        weight.float() - 0.5,
-        noise_known,
-        level,
-    )
+    compressed, coarser = (torch.asinh(each / _FAINT) / 3 for each in (differences, wide))
+    parts = (compressed, differences / _STRONG, turns, coarser, weight.float() - 0.5, noise_known, level)
     return torch.cat(parts, dim=1)
 
 
@@ -365,28 +339,29 @@ def _project(result: Tensor, values: Tensor, known: Tensor, gate: Tensor, kernel
     scale = result.shape[-1] // values.shape[-1]
     for kernel in dict.fromkeys(filter(None, kernels)):
         places = [i for i, each in enumerate(kernels) if each == kernel]
-        index = None if len(places) == len(kernels) else constant(tuple(places), torch.int64, result.device)
+        index = None if len(places) == len(kernels) else _constant(tuple(places), torch.int64, result.device)
         x, given, valid, factor = (each if index is None else each[index] for each in (result, values, known, gate))
+        model = Downsampling(kernel)  # type: ignore[arg-type]
         for _ in range(_PROJECTIONS):
-            residual = torch.where(valid, given - Downsampling(kernel)(x, scale), 0)  # type: ignore[arg-type]
+            residual = torch.where(valid, given - model(x, scale, complete=True), 0)
             x = x + factor.to(x.dtype) * upsample_bicubic(residual, scale)
         result = x if index is None else result.index_copy(0, index, x)
     return result
 
 
 def _roughness(bend: Tensor, weight: Tensor) -> Tensor:
-    """Return how rough maps are, (B, channels): logarithms of quantiles of the bend, (levels, B, 1, h, w), if known."""
-    fractions = constant(_QUANTILES, torch.float32, bend.device)
+    """Return logarithms of quantiles of the bend, (levels, B, 1, h, w), where it is known, (B, channels)."""
+    known = weight > 0.5
     if exporting():
         step = (torch.ones_like(weight[0, 0]).sum() / _SAMPLES).sqrt().floor().clamp(min=1)
-        known = ((weight > 0.5) & every(step, weight)).flatten(1)
-        found = [quantiles_in_graph(level.float().flatten(1), known, fractions) for level in bend]
-        quantiles = torch.cat(found, dim=1)
+        known = known & every(step, weight)
     else:
-        every_nth = max(1, math.isqrt(weight.shape[-2] * weight.shape[-1] // _SAMPLES))
-        known = weight[..., ::every_nth, ::every_nth].flatten(1) > 0.5
-        bends = bend[..., ::every_nth, ::every_nth].flatten(2).float().masked_fill(~known, torch.nan)
-        quantiles = torch.nanquantile(bends, fractions, dim=2).permute(2, 1, 0).flatten(1)  # (B, levels * quantiles)
+        nth = max(1, math.isqrt(weight.shape[-2] * weight.shape[-1] // _SAMPLES))
+        bend, known = bend[..., ::nth, ::nth], known[..., ::nth, ::nth]
+    rows = bend.float().flatten(2).flatten(0, 1)  # of pixels, one of each image and level
+    fractions = _constant(_QUANTILES, torch.float32, bend.device)
+    quantiles = quantiles_in_graph(rows, known.flatten(1).repeat(1 + _LEVELS, 1), fractions)
+    quantiles = quantiles.unflatten(0, (1 + _LEVELS, -1)).transpose(0, 1).flatten(1)  # (B, levels * quantiles)
     return (torch.log10(quantiles.nan_to_num(0) + 1e-6) + 4) / 2
 
 
