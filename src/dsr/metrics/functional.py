@@ -152,7 +152,7 @@ class SurfacePair:
     @cached_property
     def normal_mask(self) -> Tensor:
         """(B, 1, H, W) bool: where both normals are valid."""
-        return normal_mask(self.depth_mask)
+        return self.depth_mask if self.complete else normal_mask(self.depth_mask)
 
     @cached_property
     def shadings(self) -> tuple[Tensor, Tensor]:

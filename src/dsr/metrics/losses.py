@@ -54,13 +54,13 @@ def lap1(prediction: Tensor, target: Tensor, *, levels: int = 3, complete: bool 
     """
     difference, valid = _difference(prediction, target, complete)
     weight = None if valid is None else valid.to(difference.dtype)
-    total = difference.new_zeros(len(difference))
+    terms = []
     for _ in range(levels - 1):
         lower, size = _reduce(difference), difference.shape[-2:]
-        detail = difference - _blur(lower, size) / _blur(torch.ones_like(lower[:1]), size)
-        total = total + _mean(detail.abs(), weight)
+        detail = difference - _blur(lower, size) / _blurred_ones(lower.shape[-2:], size, lower.dtype, lower.device)
+        terms.append(_mean(detail.abs(), weight))
         difference, weight = lower, None if weight is None else _reduce(weight)
-    return total + _mean(difference.abs(), weight)
+    return functools.reduce(torch.add, [*terms, _mean(difference.abs(), weight)])
 
 
 def _difference(prediction: Tensor, target: Tensor, complete: bool | None) -> tuple[Tensor, Tensor | None]:
@@ -94,8 +94,15 @@ def _blur(level: Tensor, size: Sequence[int]) -> Tensor:
     return functional.conv_transpose2d(level, kernel, stride=2, padding=2, output_padding=extra)
 
 
+@functools.lru_cache(maxsize=64)
+@torch.inference_mode(mode=False)  # so that gradients can be computed with them
+def _blurred_ones(size: Sequence[int], larger: Sequence[int], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Return what normalises :func:`_blur`, (1, 1, *larger)."""
+    return _blur(torch.ones(1, 1, *size, dtype=dtype, device=device), larger)
+
+
 @functools.cache
-@torch.inference_mode(mode=False)  # so that gradients can be computed with it
+@torch.inference_mode(mode=False)
 def _kernel(dtype: torch.dtype, device: torch.device) -> Tensor:
     """Return the binomial kernel, (1, 1, 5, 5)."""
     taps = torch.tensor((1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16), dtype=dtype, device=device)

@@ -31,7 +31,7 @@ from torch.nn import functional
 from torch.utils.data import DataLoader
 
 from dsr.degradation.downsampling import Downsampling, downsample_depth, scene_generator
-from dsr.geometry.surface import comparison
+from dsr.geometry.surface import comparison, depth_to_normals
 from dsr.methods.base import WORKSPACE, Abilities, Cost, Method, expect_positive, whole_scale
 from dsr.methods.images import compute_min_max, estimate_noise, grey, mean3x3, normal_noise_deg
 from dsr.methods.networks.network import DTYPES, Precision
@@ -202,6 +202,7 @@ class PriorOptimisation(lightning.LightningModule):
         self.spread[_NOISE_CHANNELS:] = _PHOTO_PERTURBATION
 
         self.w = (1.0 if options.w == "auto" else options.w) if visual else 0.0
+        self.normals_lr = depth_to_normals(self.depth_lr, self.rays_lr) if self.w and self.complete else None
         if self.w:
             options.visual_loss.check_size(*self.depth_lr.shape[-2:])
             if options.w == "auto" and options.visual != "mse_v":
@@ -238,6 +239,8 @@ class PriorOptimisation(lightning.LightningModule):
         loss = DATA_WEIGHTS[options.data_loss] * data
         if self.w:
             surfaces = SurfacePair(depth_lr, self.depth_lr, self.rays_lr)
+            if surfaces.complete and self.normals_lr is not None:
+                surfaces.normals = depth_to_normals(depth_lr, self.rays_lr), self.normals_lr
             visual = options.visual_loss(surfaces).squeeze()
             terms[options.visual] = visual if surfaces.complete else visual.nansum()  # there may be none between holes
             loss = loss + self.w * terms[options.visual]
