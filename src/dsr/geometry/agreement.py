@@ -75,11 +75,11 @@ class Agreement(NamedTuple):
 class Verdict(NamedTuple):
     """Evidence from edges on whether a photo and a depth map belong together."""
 
-    kind: Literal["turned", "apart", "other", "fits", "unclear"]
+    kind: Literal["turned", "apart", "other", "fits", "unclear"]  # turned: or of another field of view
     statement: str
     figures: str
     code: str  # of the warning, one of LIMITS; empty without one
-    value: float  # what the warning's limit was compared with
+    value: float  # what the warning's limit was compared with; without a warning the significance
     as_given: Agreement
     margin: float  # by how much more significant the agreement of the best mirroring, rotation or zoom is
     contours: bool  # whether the depth map has enough of them

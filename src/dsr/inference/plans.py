@@ -38,7 +38,7 @@ class Plan:
 def steps_of(recipe: Recipe) -> Mapping[int, tuple[int, ...]]:
     """Return, for each factor, those of the calls that give it; nothing for a method of any ratio.
 
-    A ValueError if a method of fixed factors has no weights for any. A network reaches further ones by a second step.
+    A network reaches further factors by a second step. A method of fixed factors without weights is a ValueError.
     """
     if recipe.abilities.at_ratio:
         return {}

@@ -40,10 +40,14 @@ def align(prediction: Tensor, target: Tensor, mask: Tensor | None, how: str) -> 
     """
     if how not in ALIGNMENTS:
         raise ValueError(f"alignment: expected one of {', '.join(ALIGNMENTS)}, got {how!r}")
+    if prediction.shape != target.shape:
+        came = f"{tuple(prediction.shape)} and {tuple(target.shape)}"
+        raise ValueError(f"prediction, target: expected two depth maps of shape (B, 1, H, W), got {came}")
     if how == "none":
         return prediction
     known = prediction.isfinite() & (prediction > 0)
-    valid = known & target.isfinite() & (target > 0) & (True if mask is None else mask)
+    valid = known & target.isfinite() & (target > 0)
+    valid = valid if mask is None else valid & mask
     z = torch.where(known, prediction, 1).double()
     truth = torch.where(valid, target, 1).double()
     if how == "scale":

@@ -24,7 +24,7 @@ from torch import Tensor
 from dsr.geometry.surface import length
 from dsr.metrics.boundaries import depth_pro_scores
 from dsr.metrics.depth import covered
-from dsr.metrics.formats import column, of_parts, target_mask
+from dsr.metrics.formats import Metric, column, of_parts, target_mask
 from dsr.metrics.functional import SurfacePair, once_per_pair
 from dsr.utils.compute_device import in_own_precision
 
@@ -141,7 +141,7 @@ def evalmde_errors(pair: SurfacePair) -> dict[str, Tensor]:
         "boundary": 1 - depth_pro_scores(pair)["F1"],
     }
     weighted = [weight * parts[name].double() for name, weight in WEIGHTS.items()]
-    return {"SAWA_H": torch.stack(weighted).sum(dim=0), **parts, "covered": covered(pair)}
+    return {"SAWA_H": torch.stack(weighted).sum(dim=0), **parts}
 
 
 def _taken(values: Tensor, source: Tensor) -> Tensor:
@@ -202,6 +202,9 @@ _formats = {
     "beyond_disparity": column("Beyond", "1.028 x, disparity fitted, %", 1e2),
     "beyond_depth": column("Beyond", "1.028 x, depth fitted, %", 1e2),
     "boundary": column("1 - F1", "Depth Pro, %", 1e2),
-    "covered": column("Covered", "%", 1e2, higher_is_better=True),
 }
-METRICS = tuple(of_parts("EvalMDE_", evalmde_errors, target_mask, _formats, min_size=MIN_SIZE, whole=True))
+_covered = column("Covered", "%", 1e2, higher_is_better=True)
+METRICS: tuple[Metric, ...] = (
+    *of_parts("EvalMDE_", evalmde_errors, target_mask, _formats, min_size=MIN_SIZE, whole=True),
+    Metric("EvalMDE_covered", covered, target_mask, _covered, min_size=MIN_SIZE, whole=True),
+)

@@ -47,9 +47,10 @@ def mse(prediction: Tensor, target: Tensor, *, complete: bool | None = None) -> 
 
 @in_own_precision
 def lap1(prediction: Tensor, target: Tensor, *, levels: int = 3, complete: bool | None = None) -> Tensor:
-    """Return the Laplacian pyramid loss Lap_1 per pixel, (B,), as :func:`l1`: eq. 2, the sum of the levels' means.
+    """Return the Laplacian pyramid loss Lap_1 per pixel, (B,), as :func:`l1`: the sum of the levels' means.
 
-    The pyramid is linear, so it is built of the difference, which is 0 in holes; each level weights a pixel by the
+    This is eq. 2 per pixel: its weight of a level, 2^(2 j), cancels with the number of pixels that the level has. The
+    pyramid is linear, so it is built of the difference, which is 0 in holes; each level weights a pixel by the
     valid fraction of its area. The shorter side has at least 3 * 2^(levels - 1) pixels.
     """
     difference, valid = _difference(prediction, target, complete)

@@ -79,6 +79,9 @@ class LPIPS(nn.Module):
 
         With a mask, (B, 1, H, W) bool, each feature is weighted by the fraction of its pixels that is set.
         """
+        if min(first.shape[-2:]) < MIN_SIZE:
+            came = tuple(first.shape[-2:])
+            raise ValueError(f"LPIPS: expected images of at least {MIN_SIZE} x {MIN_SIZE} pixels, got {came}")
         total = first.new_zeros(len(first))
         images = torch.cat((first, second)).contiguous(memory_format=torch.channels_last)
         for level, features in enumerate(self.features(images)):

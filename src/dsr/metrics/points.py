@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from dsr.geometry.hole_size import window_maxima
+from dsr.metrics.depth import covered
 from dsr.metrics.formats import Metric, column, depth_mask, of_parts, target_mask
 from dsr.metrics.functional import SurfacePair, masked_mean, once_per_pair
 
@@ -39,7 +40,6 @@ def point_errors(pair: SurfacePair) -> dict[str, Tensor]:
     found = {
         "flying": masked_mean(flying, pair.depth_mask),
         "chamfer": (masked_mean(to_truth, pair.depth_mask) + masked_mean(to_prediction, pair.target_mask)) / 2,
-        "covered": masked_mean(pair.depth_mask, pair.target_mask),
     }
     for name, threshold in (("F_1cm", 0.01), ("F_5cm", 0.05)):
         precision = masked_mean(to_truth < threshold, pair.depth_mask)
@@ -92,7 +92,9 @@ METRICS: tuple[Metric, ...] = (
             "chamfer": column("Chamfer", "mm", 1e3, 2),
             "F_1cm": _fraction("F at 1 cm", "%", digits=2),
             "F_5cm": _fraction("F at 5 cm", "%", digits=2),
-            "covered": _fraction("Covered", "points, %"),
         },
+    ),
+    Metric(
+        "Points_covered", covered, target_mask, _fraction("Covered", "points, %"), min_size=1, unit="cm", whole=True
     ),
 )
