@@ -31,7 +31,7 @@ def version() -> str:
 
 
 def packaged_weights(name: str) -> Path | None:
-    """Return the file of weights of a name, which if it was fetched has to be what is known; None if it is not here."""
+    """Return the file of weights of a name, None if it is not here; of a fetched one the checksum has to be right."""
     path, fetched = _HERE / f"{name}.safetensors", data_root() / FOLDER / f"{name}.safetensors"
     if path.is_file():
         return path
