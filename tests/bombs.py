@@ -14,8 +14,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-LARGE = 600 << 20
-"""Bytes, more than a refusal may take."""
+LARGE = 600 << 20  # Bytes, more than a refusal may take
 CHUNK = 1 << 24
 
 

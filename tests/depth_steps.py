@@ -13,8 +13,7 @@ from dsr.metrics.functional import SurfacePair
 
 Array = npt.NDArray[Any]
 CAMERA = Camera(width=160, height=120, fx=150.0, fy=151.0, cx=79.5, cy=59.5)
-UNKNOWN = np.s_[50:62, 40:70]
-"""A rectangle of unknown truth."""
+UNKNOWN = np.s_[50:62, 40:70]  # A rectangle of unknown truth
 
 
 def steps(seed: int = 0) -> tuple[Array, Array]:

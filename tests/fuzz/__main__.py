@@ -15,8 +15,7 @@ from pathlib import Path
 
 from fuzz.pool import Pool
 
-_EVERY = 20.0
-"""Seconds between lines about the progress."""
+_EVERY = 20.0  # Seconds between lines about the progress
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

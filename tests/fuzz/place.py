@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-MARK = "dsr_fuzz_canary"
-"""A word in everything that a file could execute."""
+MARK = "dsr_fuzz_canary"  # A word in everything that a file could execute
 
 
 @dataclass(frozen=True)

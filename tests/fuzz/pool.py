@@ -14,8 +14,7 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
-_HANGS = 100.0
-"""Seconds after which a worker is killed whose case did not end by itself."""
+_HANGS = 100.0  # Seconds after which a worker is killed whose case did not end by itself
 _CHUNK = 50
 _ADDRESSES = 6 << 30
 """Bytes of addresses that a case may take beyond those of an idle worker, so that the machine is left alone."""

@@ -58,8 +58,7 @@ def evaluation_arguments(folder: Path, run: Path) -> list[str]:
     ]  # fmt: skip
 
 
-_STEPS = 2
-"""Steps of a training."""
+_STEPS = 2  # Steps of a training
 
 
 @functools.cache

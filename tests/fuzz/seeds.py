@@ -377,9 +377,8 @@ def heic(folder: Path) -> None:
 
 def ros2_alone(folder: Path) -> None:
     """Write a file of ROS 2 without the folder that it is of."""
-    from rosbags.rosbag2 import StoragePlugin  # noqa: PLC0415 - an extra
 
-    whole = captures.ros(folder.parent / "whole", 2, storage_plugin=StoragePlugin.MCAP)
+    whole = captures.ros(folder.parent / "whole", 2, plugin="MCAP")
     (whole / "whole.mcap").rename(folder / "scan.mcap")
     shutil.rmtree(whole)
 

@@ -1,7 +1,5 @@
 """The programs of ``examples/``."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess
@@ -50,8 +48,7 @@ class Any:  # what is configured needs no answer
 v, u = np.mgrid[:24, :32]
 PHOTOS = [np.stack([8 * u % 255, v * 10, 0 * u + 90 * k], -1).astype(np.uint8) for k in (1, 2)]
 STORED = [(1500 + 300 * k + 4 * u).astype(np.uint16) * (v > 1) for k in (1, 2)]
-"""
-"""Two frames, their first rows without depth, of stand-ins for the packages of cameras."""
+"""  # Two frames, their first rows without depth, of stand-ins for the packages of cameras
 
 STAND_INS = {
     "pyrealsense2": """
