@@ -1,7 +1,5 @@
 """Small files that unpack to gigabytes, or whose headers say so."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -1,7 +1,5 @@
 """A made pair of depth maps with steps, on which other projects' code was run once for the figures that tests have."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -6,8 +6,6 @@ standard deviations of 6 x 6 blocks are kept. Whether they are right is for othe
 that :data:`dsr.utils.versions.RESULTS` and :data:`~dsr.utils.versions.SCENES` stand for.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 import os

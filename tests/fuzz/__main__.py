@@ -1,7 +1,5 @@
 """Run cases of the fuzzer in worker processes, and count how they end: ``make fuzz ARGS="--cases 10000 --seed 0"``."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Mutations of arrays and archives that keep the file whole but lie in its headers."""
 
-from __future__ import annotations
-
 import io
 import struct
 import tarfile

@@ -1,7 +1,5 @@
 """What happens to valid files in a case: their bytes, what they hold, and what lies in their place."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import os

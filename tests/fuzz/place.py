@@ -1,7 +1,5 @@
 """Where a case of the fuzzer happens: the folder of its files, and what must not be touched."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Worker processes that run cases; the one that starts them notices those that hang or die."""
 
-from __future__ import annotations
-
 import contextlib
 import multiprocessing
 import os

@@ -1,7 +1,5 @@
 """Valid directories of runs, results of ``dsr upsample``, studies and configurations, from which cases are made."""
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import functools

@@ -1,7 +1,5 @@
 """Valid files of every kind, small and made here, from which cases are made."""
 
-from __future__ import annotations
-
 import functools
 import importlib.util
 import json

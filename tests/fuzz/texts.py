@@ -1,7 +1,5 @@
 """Mutations of text, JSON, YAML and tables."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable

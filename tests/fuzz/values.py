@@ -1,7 +1,5 @@
 """Values that a file may hold where it should hold another: of wrong types, out of range, huge, deep, malicious."""
 
-from __future__ import annotations
-
 import os
 import pickle
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The benchmarks run: small, for what they print, not for how fast."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

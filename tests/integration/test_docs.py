@@ -1,7 +1,5 @@
 """The README, the documentation's pages and CITATION.cff: sizes, links, and commands that parse."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import re

@@ -1,7 +1,5 @@
 """``dsr report``: what it writes, what it replaces, and what it refuses."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Situations that people reported of programs like this one, each with the values that must come out."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

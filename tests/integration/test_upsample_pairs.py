@@ -1,7 +1,5 @@
 """Photos and depth maps that do not belong together get a warning of ``dsr upsample``, and right ones do not."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -17,7 +17,6 @@ LABELS = {"msg_v": "MSG-V", "bicubic": "Bicubic", "dip": "DIP"}
 SCENES = ("cube", "statue", "<img src=x onerror=alert(1)>")
 QUESTIONS = len(SCENES) + 1
 PHONE = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True, "device_scale_factor": 2}
-LANDSCAPE = PHONE | {"viewport": {"width": 844, "height": 390}}
 
 
 @pytest.fixture(scope="module")
