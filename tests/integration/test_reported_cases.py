@@ -1248,7 +1248,7 @@ def warnings_of(out: Path):
     return {each["code"]: each["message"] for each in json.loads((out / "info.json").read_text())["warnings"]}
 
 
-@pytest.mark.parametrize("by", [2, 4])
+@pytest.mark.parametrize("by", [pytest.param(2, marks=pytest.mark.nightly), 4])
 @pytest.mark.parametrize("ratio", [0.7, 0.85, 1.0, 1.3, 1.5])
 def test_another_field_of_view_is_reported(tmp_path, ratio, by):
     depth, photo = scene()
