@@ -1,7 +1,5 @@
 """Small files that unpack to gigabytes, or whose headers say so."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
@@ -14,8 +12,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-LARGE = 600 << 20
-"""Bytes, more than a refusal may take."""
+LARGE = 600 << 20  # Bytes, more than a refusal may take
 CHUNK = 1 << 24
 
 

@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 SIZE, SIZE_LR = (48, 64), (12, 16)
 INTRINSICS = (50.0, 51.0, 31.0, 24.0)
 FRAMES = 3
-FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-"""From ARKit's and OpenGL's axes of the camera to dsr's, and back."""
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # From ARKit's and OpenGL's axes of the camera to dsr's, and back
 
 
 def photo(number=0):
@@ -205,105 +204,108 @@ def rvl(values):
     return struct.pack("<II", values.shape[1], values.shape[0]) + struct.pack(f"<{len(words)}I", *words)
 
 
-def ros(
-    path,
-    version,
-    *,
-    floats=False,
-    compressed=False,
-    photos=photo,
-    image_name="image_raw",
-    rvl_depth=False,
-    storage_plugin=None,
-    packed=False,
-    **of_info,
-):
+class RosWriter:
+    """Messages of ROS 1 or 2, all of second 100 and 33 ms apart, and what writes them."""
+
+    def __init__(self, version):
+        from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415 - an extra
+
+        self.version = version
+        self.store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
+
+    def make(self, kind, *values, **named):
+        """Return a message of a kind, such as ``sensor_msgs/Image``."""
+        return self.store.types[kind.replace("/", "/msg/")](*values, **named)
+
+    def header(self, frame="camera", number=0, late=0):
+        stamp = self.make("builtin_interfaces/Time", 100, int(33e6 * number + late))
+        return self.make(
+            "std_msgs/Header", stamp=stamp, frame_id=frame, **({"seq": number} if self.version == 1 else {})
+        )
+
+    def image(self, header, values, encoding):
+        data = np.frombuffer(values.tobytes(), np.uint8)
+        size = {"height": values.shape[0], "width": values.shape[1], "step": values[0].nbytes}
+        return self.make("sensor_msgs/Image", header=header, encoding=encoding, is_bigendian=0, data=data, **size)
+
+    def compressed(self, header, content, layout):
+        data = np.frombuffer(content, np.uint8)
+        return self.make("sensor_msgs/CompressedImage", header=header, format=layout, data=data)
+
+    def info(self, header, size, camera, roi=(0, 0, 0, 0), **changes):
+        """CameraInfo of a size (height, width) and fx, fy, cx, cy; ``roi`` is x, y, width, height."""
+        fx, fy, cx, cy = camera
+        arrays = {"d": np.zeros(5), "k": np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1.0]), "r": np.eye(3).ravel(),
+                  "p": np.zeros(12)}  # fmt: skip
+        arrays |= {name: np.array(changes.pop(name), float) for name in arrays.keys() & changes.keys()}
+        if self.version == 1:
+            arrays = {name.upper(): value for name, value in arrays.items()}
+        x, y, width, height = roi
+        window = self.make("sensor_msgs/RegionOfInterest", x, y, height, width, False)
+        plain = {"height": size[0], "width": size[1], "distortion_model": "plumb_bob", "binning_x": 0, "binning_y": 0}
+        return self.make("sensor_msgs/CameraInfo", header=header, roi=window, **{**plain, **changes}, **arrays)
+
+    def write(self, path, topics, plugin="SQLITE3", packed=False):
+        """Write the messages of each topic; ``packed``: the file of ROS 2 is compressed as a whole."""
+        from rosbags import rosbag1, rosbag2  # noqa: PLC0415
+
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if self.version == 1:
+            writer = rosbag1.Writer(path)
+        else:
+            writer = rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin[plugin])
+        if packed:
+            writer.set_compression(rosbag2.CompressionMode.FILE, rosbag2.CompressionFormat.ZSTD)
+        serialize = self.store.serialize_ros1 if self.version == 1 else self.store.serialize_cdr
+        with writer:
+            for topic, messages in topics.items():
+                kind = messages[0].__msgtype__
+                connection = writer.add_connection(topic, kind, typestore=self.store)
+                for number, message in enumerate(messages):
+                    writer.write(connection, int(100e9 + 33e6 * number), bytes(serialize(message, kind)))
+        return path
+
+
+def ros(path, version, *, floats=False, compressed=False, photos=photo, image_name="image_raw", rvl_depth=False,
+        plugin="SQLITE3", packed=False, **of_info):  # fmt: skip
     """Write a recording of ROS 1 or 2 with colour, depth aligned to it, raw depth and infrared.
 
     Args:
-        path: of the file, or of the folder of ROS 2.
-        version: of ROS.
         floats: whether depth is in metres.
         compressed: whether photos are JPEG.
         photos: makes the photo of a number.
-        image_name: of the photos' topic.
         rvl_depth: whether depth is compressedDepth of millimetres as RVL.
-        storage_plugin: of rosbags' writer of ROS 2.
-        packed: whether the file of ROS 2 is packed whole.
-        of_info: entries of CameraInfo that are not as for a plain picture; ``d``, ``k`` and ``p`` are lists, ``roi`` x,
-            y, width and height.
+        of_info: entries of CameraInfo that are not as for a plain picture.
 
     """
-    from rosbags.rosbag1 import Writer as Writer1  # noqa: PLC0415 - an extra
-    from rosbags.rosbag2 import CompressionFormat, CompressionMode  # noqa: PLC0415
-    from rosbags.rosbag2 import Writer as Writer2  # noqa: PLC0415
-    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
+    writer = RosWriter(version)
 
-    store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
-    types = store.types
+    def colour(number):
+        if not compressed:
+            return writer.image(writer.header(number=number), photos(number)[..., ::-1], "bgr8")
+        content = cv2.imencode(".jpg", photos(number)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 98])[1]
+        return writer.compressed(writer.header(number=number), content.tobytes(), "rgb8; jpeg compressed bgr8")
 
-    def header(number, late=0):
-        time = types["builtin_interfaces/msg/Time"](100, int(33e6 * number + late))
-        own = {"seq": number} if version == 1 else {}
-        return types["std_msgs/msg/Header"](stamp=time, frame_id="camera", **own)
+    def aligned(number):
+        header = writer.header(number=number, late=5e6)
+        if rvl_depth:
+            content = struct.pack("<iff", 0, 0, 0) + rvl(millimetres(number))
+            return writer.compressed(header, content, "16UC1; compressedDepth rvl")
+        if floats:
+            return writer.image(header, depth(number).astype(np.float32), "32FC1")
+        return writer.image(header, millimetres(number), "16UC1")
 
-    def image(number, values, encoding, late=0):
-        return types["sensor_msgs/msg/Image"](
-            header=header(number, late), height=values.shape[0], width=values.shape[1], encoding=encoding,
-            is_bigendian=0, step=values[0].nbytes, data=np.frombuffer(values.tobytes(), np.uint8),
-        )  # fmt: skip
-
-    def jpeg(number):
-        data = cv2.imencode(".jpg", photos(number)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 98])[1]
-        kind = types["sensor_msgs/msg/CompressedImage"]
-        return kind(header=header(number), format="rgb8; jpeg compressed bgr8", data=data.reshape(-1))
-
-    def in_rvl(number):
-        data = np.frombuffer(struct.pack("<iff", 0, 0, 0) + rvl(millimetres(number)), np.uint8)
-        kind = types["sensor_msgs/msg/CompressedImage"]
-        return kind(header=header(number, 5e6), format="16UC1; compressedDepth rvl", data=data)
-
-    def info(number):
-        fx, fy, cx, cy = INTRINSICS
-        k = np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1.0])
-        arrays = {"d": np.zeros(5), "k": k, "r": np.eye(3).reshape(-1), "p": np.zeros(12)}
-        arrays |= {name: np.array(of_info[name], float) for name in arrays.keys() & of_info.keys()}
-        if version == 1:
-            arrays = {name.upper(): value for name, value in arrays.items()}
-        x, y, width, height = of_info.get("roi", (0, 0, 0, 0))
-        roi = types["sensor_msgs/msg/RegionOfInterest"](x, y, height, width, False)
-        plain = {"height": SIZE[0], "width": SIZE[1], "distortion_model": "plumb_bob", "binning_x": 0, "binning_y": 0}
-        plain |= {name: of_info[name] for name in plain.keys() & of_info.keys()}
-        return types["sensor_msgs/msg/CameraInfo"](header=header(number), roi=roi, **plain, **arrays)
-
-    name = f"/camera/color/{image_name}"
-    topics = {
-        name + "/compressed" if compressed else name:
-            jpeg if compressed else lambda number: image(number, photos(number)[..., ::-1], "bgr8"),
-        "/camera/color/camera_info": info,
-        "/camera/depth/image_rect_raw": lambda number: image(number, 2 * millimetres(number), "16UC1"),
-        "/camera/aligned_depth_to_color/image_raw" + "/compressedDepth" * rvl_depth:
-            in_rvl if rvl_depth else lambda number: image(
-                number, depth(number).astype(np.float32) if floats else millimetres(number),
-                "32FC1" if floats else "16UC1", late=5e6,
-            ),
-        "/camera/infra1/image_rect_raw": lambda number: image(number, levels(), "mono8"),
+    makers = {
+        f"/camera/color/{image_name}" + "/compressed" * compressed: colour,
+        "/camera/color/camera_info":
+            lambda number: writer.info(writer.header(number=number), SIZE, INTRINSICS, **of_info),
+        "/camera/depth/image_rect_raw":
+            lambda number: writer.image(writer.header(number=number), 2 * millimetres(number), "16UC1"),
+        "/camera/aligned_depth_to_color/image_raw" + "/compressedDepth" * rvl_depth: aligned,
+        "/camera/infra1/image_rect_raw": lambda number: writer.image(writer.header(number=number), levels(), "mono8"),
     }  # fmt: skip
-    make = (
-        Writer1(path)
-        if version == 1
-        else Writer2(path, version=9, **({"storage_plugin": storage_plugin} if storage_plugin else {}))
-    )
-    if packed:
-        make.set_compression(CompressionMode.FILE, CompressionFormat.ZSTD)
-    with make as writer:
-        for topic, message in topics.items():
-            kind = message(0).__msgtype__
-            connection = writer.add_connection(topic, kind, typestore=store)
-            for number in range(FRAMES):
-                raw = store.serialize_ros1 if version == 1 else store.serialize_cdr
-                writer.write(connection, int(100e9 + 33e6 * number), bytes(raw(message(number), kind)))
-    return path
+    topics = {name: [make(number) for number in range(FRAMES)] for name, make in makers.items()}
+    return writer.write(path, topics, plugin, packed)
 
 
 def write_matrix(path, matrix):

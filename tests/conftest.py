@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -173,10 +174,30 @@ def webgl_browser(browser: Any) -> Iterator[Any]:
 
 
 @pytest.fixture
-def line_per_report(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make commands print a line for each report of progress, as if seconds lay between them."""
-    monkeypatch.setattr("dsr.utils.console._FIRST_LINE", 0.0)
-    monkeypatch.setattr("dsr.utils.console._NEXT_LINE", 0.0)
+def in_process(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> Callable[..., tuple[int, str, list[str]]]:
+    """Return a runner of ``eval.py`` and ``train.py`` in this process: exit code, output, lines of errors."""
+    from dsr.app.entry import run_command  # noqa: PLC0415 - takes seconds, as the next ones
+    from dsr.app.evaluate import evaluate  # noqa: PLC0415
+    from dsr.app.train import train  # noqa: PLC0415
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("DSR_LPIPS_TRUNK", raising=False)
+    for name, value in (("HYDRA_FULL_ERROR", "1"), ("PL_GLOBAL_SEED", "0"), ("PL_SEED_WORKERS", "1")):
+        monkeypatch.setenv(name, value)  # and so put back afterwards
+
+    def call(name: str, *arguments: str) -> tuple[int, str, list[str]]:
+        monkeypatch.setattr(sys, "argv", [f"{name}.py", *arguments])
+        code = 0
+        try:
+            run_command(name, {"train": train, "eval": evaluate}[name])
+        except SystemExit as ended:
+            code = int(ended.code or 0)
+        captured = capfd.readouterr()
+        return code, captured.out, captured.err.splitlines()
+
+    return call
 
 
 @pytest.fixture(scope="session")

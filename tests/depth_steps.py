@@ -1,7 +1,5 @@
 """A made pair of depth maps with steps, on which other projects' code was run once for the figures that tests have."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -13,8 +11,7 @@ from dsr.metrics.functional import SurfacePair
 
 Array = npt.NDArray[Any]
 CAMERA = Camera(width=160, height=120, fx=150.0, fy=151.0, cx=79.5, cy=59.5)
-UNKNOWN = np.s_[50:62, 40:70]
-"""A rectangle of unknown truth."""
+UNKNOWN = np.s_[50:62, 40:70]  # A rectangle of unknown truth
 
 
 def steps(seed: int = 0) -> tuple[Array, Array]:

@@ -11,6 +11,5 @@ def _is_open(name: str) -> bool:
     return "???" in read_recipe(name).at(4).values() or (name not in PEERS and "packaged" not in weights)
 
 
-OPEN = [name for name in list_methods() if _is_open(name)]
-"""Those that a user names files for."""
+OPEN = [name for name in list_methods() if _is_open(name)]  # Those that a user names files for
 AT_HAND = [name for name in list_methods() if name not in (*PEERS, *OPEN)]

@@ -34,8 +34,7 @@ _INDEXED = ("index", "index_put", "index_put_", "_index_put_impl_", "_unsafe_ind
 _JOINED = ("cat", "stack")
 _MOVES = ("to", "cpu", "cuda")
 _READS = ("tolist", "numpy", "__array__")
-_EMPTY: list[bool] = []
-"""Not empty while a tensor is made that is meant to be on ``meta``, without values."""
+_EMPTY: list[bool] = []  # Not empty while a tensor is made that is meant to be on ``meta``, without values
 
 
 class CudaTensor(Tensor):

@@ -10,13 +10,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 COLOR = (64, 48, 50.0, 51.0, 31.0, 24.0)
-DEPTH = (64, 48, 60.0, 60.0, 30.5, 23.0)
-"""Width, height, fx, fy, cx, cy."""
+DEPTH = (64, 48, 60.0, 60.0, 30.5, 23.0)  # Width, height, fx, fy, cx, cy
 NO_LENS = ("Brown Conrady", (0.0,) * 5)
 TURN, SHIFT = Rotation.from_euler("xyz", (1, -2, 0.5), degrees=True), (0.02, -0.005, 0.001)
 """From the depth camera to the colour camera, metres."""
-NORMAL, DISTANCE = np.array([0.2, -0.1, 1.0]), 1.5
-"""Of the plane NORMAL . x = DISTANCE in the depth camera's frame."""
+NORMAL, DISTANCE = np.array([0.2, -0.1, 1.0]), 1.5  # Of the plane NORMAL . x = DISTANCE in the depth camera's frame
 
 
 def rays(camera):

@@ -6,8 +6,6 @@ standard deviations of 6 x 6 blocks are kept. Whether they are right is for othe
 that :data:`dsr.utils.versions.RESULTS` and :data:`~dsr.utils.versions.SCENES` stand for.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 import os
@@ -65,8 +63,7 @@ from dsr.utils import compute_device
 from dsr.utils.versions import RESULTS, SCENES, file_hash
 
 FILE = Path(__file__).resolve().parent / "golden" / "results.npz"
-TOLERANCE = 1e-4
-"""Relative: processors round differently."""
+TOLERANCE = 1e-4  # Relative: processors round differently
 _LOOSE = {"dip": 0.1, "srfs": 0.01, "pdn": 1e-3, "random": 1e-3, "facets": 5e-4, "bicubic 2": 5e-4, "loss mse": 5e-4}
 """Tolerances by how names begin, where iterations, levels of a photo or errors' own errors make more of roundings."""
 SIZES = {"1": 64, "1.07": 60, "1.23": 52, "1.4": 46, "2": 32, "2.06": 31, "2.67": 24, "4": 16, "8": 8, "16": 4}

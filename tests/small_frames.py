@@ -1,7 +1,5 @@
 """Folders of a few small frames for ``dsr upsample``, and its results as values to compare."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -4,8 +4,6 @@ Everything is computed by NumPy, SciPy and scikit-image, nothing by the package:
 traced in closed form, their block means, the spline through these, and the metrics of :mod:`reference_metrics`.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

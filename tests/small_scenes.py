@@ -1,7 +1,5 @@
 """Small scenes and maps of closed form, for the tests of many methods."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch import Tensor

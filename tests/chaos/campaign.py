@@ -12,8 +12,7 @@ from chaos.processes import Command, Ended
 from chaos.scenarios import ALL, REPOSITORY, Scenario
 from chaos.trees import differences
 
-_LIMIT = 300.0
-"""Seconds that an undisturbed command may take."""
+_LIMIT = 300.0  # Seconds that an undisturbed command may take
 
 
 @dataclass(frozen=True)

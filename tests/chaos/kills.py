@@ -16,8 +16,7 @@ from chaos.scenarios import STRUCK, Scenario
 from chaos.trees import damaged
 
 _CODES = {signal.SIGKILL: -signal.SIGKILL, signal.SIGINT: 130, signal.SIGTERM: 143}
-_AT_THE_END = 1.0
-"""Seconds of computing that a command may take to its end by itself when a signal comes too late."""
+_AT_THE_END = 1.0  # Seconds of computing that a command may take to its end by itself when a signal comes too late
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,7 @@ from pathlib import Path
 
 _POLL = 0.02
 _TICK = os.sysconf("SC_CLK_TCK")
-_UNREADY = 0.6
-"""Seconds of computing after which a process counts as ready to be struck even if it catches no SIGTERM."""
+_UNREADY = 0.6  # Seconds of computing after which a process counts as ready to be struck even if it catches no SIGTERM
 
 
 @dataclass(frozen=True)

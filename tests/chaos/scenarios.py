@@ -135,8 +135,7 @@ STRUCK = {
 }  # fmt: skip
 """What is struck by signals."""
 
-PREPARING = {each.name: each for each in (Scenario("eval_bicubic", (_BICUBIC,)),)}
-"""What others start from."""
+PREPARING = {each.name: each for each in (Scenario("eval_bicubic", (_BICUBIC,)),)}  # What others start from
 
 AT_ONCE = {
     each.name: each

@@ -11,8 +11,6 @@ went on:
 - hidden temporary files, which a command that is killed may leave.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import json

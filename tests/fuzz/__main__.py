@@ -1,7 +1,5 @@
 """Run cases of the fuzzer in worker processes, and count how they end: ``make fuzz ARGS="--cases 10000 --seed 0"``."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import shutil
@@ -15,8 +13,7 @@ from pathlib import Path
 
 from fuzz.pool import Pool
 
-_EVERY = 20.0
-"""Seconds between lines about the progress."""
+_EVERY = 20.0  # Seconds between lines about the progress
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

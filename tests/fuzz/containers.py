@@ -1,7 +1,5 @@
 """Mutations of arrays and archives that keep the file whole but lie in its headers."""
 
-from __future__ import annotations
-
 import io
 import struct
 import tarfile
@@ -31,8 +29,7 @@ _KINDS = (
 )  # fmt: skip
 """Of the members of a tar archive."""
 _BLOCK = 1 << 24
-_MOST = 1 << 26
-"""Bytes in an archive, unpacked, that may be changed once more."""
+_MOST = 1 << 26  # Bytes in an archive, unpacked, that may be changed once more
 
 
 def npy_header(descr: str, shape: str, order: str = "False", extra: str = "", version: int = 1) -> bytes:

@@ -23,13 +23,10 @@ from dsr.utils.console import one_line, printable
 from fuzz.guard import watching
 from fuzz.place import Place
 
-SECONDS, MEGABYTES = 20.0, 2000.0
-"""Limits of a case: seconds of computing, and memory."""
-_WAITING = 60.0
-"""Seconds that a case may take on a machine that does much else."""
+SECONDS, MEGABYTES = 20.0, 2000.0  # Limits of a case: seconds of computing, and memory
+_WAITING = 60.0  # Seconds that a case may take on a machine that does much else
 _LONGEST_LINE = 1000
-_SHORTEST_NAME = 3
-"""Names of fewer letters are found in any message."""
+_SHORTEST_NAME = 3  # Names of fewer letters are found in any message
 _SILENT = (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning)
 """Warnings that Python does not show to users."""
 

@@ -1,7 +1,5 @@
 """What happens to valid files in a case: their bytes, what they hold, and what lies in their place."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import os
@@ -21,8 +19,7 @@ _KINDS = (
 )  # fmt: skip
 """Of what happens to bytes."""
 _INTEGERS = (0, 1, 2, 0x7F, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 0xFFFFFFFE, 100000)
-_SPARSE = 2200 << 20
-"""Size in bytes of files that take no room on the disk."""
+_SPARSE = 2200 << 20  # Size in bytes of files that take no room on the disk
 _ANOTHER = ("../../etc/passwd", "/etc/passwd", "/dev/zero", "/dev/stdin", "/proc/self/mem", ".", "nowhere")
 _NAMES = (
     b"\xff\xfe%s", b"-%s", b" %s", b"%s\n", b"a" * 200 + b"%s", b"\x1b[31m%s", b"%s.txt", b"=%s", b"'%s'", b"..%s",

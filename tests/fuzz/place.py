@@ -1,12 +1,9 @@
 """Where a case of the fuzzer happens: the folder of its files, and what must not be touched."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
-MARK = "dsr_fuzz_canary"
-"""A word in everything that a file could execute."""
+MARK = "dsr_fuzz_canary"  # A word in everything that a file could execute
 
 
 @dataclass(frozen=True)

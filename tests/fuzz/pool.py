@@ -1,7 +1,5 @@
 """Worker processes that run cases; the one that starts them notices those that hang or die."""
 
-from __future__ import annotations
-
 import contextlib
 import multiprocessing
 import os
@@ -14,8 +12,7 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
-_HANGS = 100.0
-"""Seconds after which a worker is killed whose case did not end by itself."""
+_HANGS = 100.0  # Seconds after which a worker is killed whose case did not end by itself
 _CHUNK = 50
 _ADDRESSES = 6 << 30
 """Bytes of addresses that a case may take beyond those of an idle worker, so that the machine is left alone."""

@@ -21,8 +21,7 @@ from fuzz.judging import EscapedError, RefusedError
 from fuzz.place import Place
 
 _SUFFIXES = (".png", ".jpg", ".heic", ".tiff", ".npy", ".npz", ".pfm", ".exr", ".depth", ".json", ".txt")
-_LIBRARY = (ValueError, OSError)
-"""What the commands turn into a line."""
+_LIBRARY = (ValueError, OSError)  # What the commands turn into a line
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,5 @@
 """Valid directories of runs, results of ``dsr upsample``, studies and configurations, from which cases are made."""
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import functools
@@ -58,8 +56,7 @@ def evaluation_arguments(folder: Path, run: Path) -> list[str]:
     ]  # fmt: skip
 
 
-_STEPS = 2
-"""Steps of a training."""
+_STEPS = 2  # Steps of a training
 
 
 @functools.cache

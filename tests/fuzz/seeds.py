@@ -1,7 +1,5 @@
 """Valid files of every kind, small and made here, from which cases are made."""
 
-from __future__ import annotations
-
 import functools
 import importlib.util
 import json
@@ -377,9 +375,8 @@ def heic(folder: Path) -> None:
 
 def ros2_alone(folder: Path) -> None:
     """Write a file of ROS 2 without the folder that it is of."""
-    from rosbags.rosbag2 import StoragePlugin  # noqa: PLC0415 - an extra
 
-    whole = captures.ros(folder.parent / "whole", 2, storage_plugin=StoragePlugin.MCAP)
+    whole = captures.ros(folder.parent / "whole", 2, plugin="MCAP")
     (whole / "whole.mcap").rename(folder / "scan.mcap")
     shutil.rmtree(whole)
 

@@ -12,7 +12,6 @@ import pytest
 
 from fuzz import judging, values
 from fuzz.judging import RefusedError, judge
-from fuzz.mutations import mutate
 from fuzz.place import MARK, Place
 
 
@@ -81,24 +80,3 @@ def test_case_in_which_a_reader_does_what_it_must_not_is_unclean(place, monkeypa
     outcome = judge(read, place, (ValueError, OSError))
     assert outcome.kind == "unclean"
     assert text in outcome.text
-
-
-def content_of(folder):
-    return {
-        str(path.relative_to(folder)): path.read_bytes()[:10_000]
-        if path.is_file() and path.stat().st_size < 1e8
-        else None
-        for path in sorted(folder.rglob("*"))
-    }
-
-
-def test_case_is_the_same_each_time_and_differs_from_others(tmp_path):
-    seen = []
-    for number in (0, 0, 1):
-        place = Place(tmp_path / str(len(seen)))
-        place.input.mkdir(parents=True)
-        np.save(place.input / "depth.npy", np.arange(600.0).reshape(20, 30))
-        (place.input / "camera.json").write_text('{"width": 30, "height": 20, "fx": 50.0}')
-        random = Random(f"7-{number}")
-        seen.append(([mutate(random, place, lambda: b"other") for _ in range(9)], content_of(place.input)))
-    assert seen[0] == seen[1] != seen[2]

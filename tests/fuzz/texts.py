@@ -1,7 +1,5 @@
 """Mutations of text, JSON, YAML and tables."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable
@@ -13,8 +11,7 @@ import yaml
 
 from fuzz import values
 
-_LONGEST = 16 << 20
-"""Characters of a line that is made longer, and of all lines that are added."""
+_LONGEST = 16 << 20  # Characters of a line that is made longer, and of all lines that are added
 _HOLE = "\ue000hole\ue000"
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?")
 _YAML = (

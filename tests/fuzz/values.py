@@ -1,7 +1,5 @@
 """Values that a file may hold where it should hold another: of wrong types, out of range, huge, deep, malicious."""
 
-from __future__ import annotations
-
 import os
 import pickle
 from pathlib import Path
@@ -10,8 +8,7 @@ from typing import Any
 
 from fuzz.place import MARK
 
-DEEP = 10_000
-"""Levels of nested lists."""
+DEEP = 10_000  # Levels of nested lists
 _PLAIN: tuple[Any, ...] = (
     None, True, False, "", -1, 0, 1, 2, 0.5, -0.0, 1e-320, 1e19, 1e308, -1e308, 2**31, 2**63, -(2**63), 2**64, 10**30,
     [], {}, [[]], {"": {}}, [1, 2, 3], [1e6] * 100, {"a": 1}, "nan", "None", "0", "1/0", "abc", " ", "\n", "\0",

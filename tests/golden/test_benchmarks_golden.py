@@ -39,8 +39,7 @@ IMAGES = {
     "Middlebury": ("Middlebury_01", "Middlebury_18"),
     "Lu": ("RGBD_03",),
     "RGBDD": ("20200509112638", "20200720133636"),
-}
-"""A few images of each benchmark; ``experiment=field_benchmarks`` evaluates all."""
+}  # A few images of each benchmark; ``experiment=field_benchmarks`` evaluates all
 
 
 @pytest.mark.parametrize("frame", FRAMES)

@@ -1,14 +1,10 @@
 """The benchmarks run: small, for what they print, not for how fast."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 from commands import run_python
 
@@ -17,8 +13,7 @@ SMALL = {
     "train_speed.py": (("--patch", "32", "--batch", "2", "--steps", "1"), 3),
     "prepare_speed.py": (("--scenes", "2", "--height", "160", "--width", "240"), 2),
     "dip_speed.py": (("--size", "64", "--steps", "1", "--quality-steps", "2"), 4),
-}
-"""Arguments, and how many ratios are printed."""
+}  # Arguments, and how many ratios are printed
 
 pytestmark = pytest.mark.nightly
 
@@ -43,38 +38,6 @@ def run_benchmark(name: str, *arguments: str) -> str:
     done = run_python(str(BENCHMARKS / name), *arguments, cwd=BENCHMARKS.parent)
     assert done.returncode == 0, done.stderr
     return done.stdout
-
-
-@pytest.fixture
-def wall(tmp_path: Path) -> Path:
-    """A folder like the shared one, whose cameras all saw a wall at 1 m, one of them with noise of 2 mm."""
-    noise = np.random.default_rng(0).normal(0, 2, (480, 640))
-    photo, exact = np.full((480, 640, 3), 128, np.uint8), np.full((480, 640), 1000, np.uint16)
-    camera, ddrnet = tmp_path / "real" / "depth_camera" / "0", tmp_path / "real" / "ddrnet"
-    pictures = {
-        camera / "rgb.png": photo,
-        camera / "raw_depth.png": (exact + noise).round().astype(np.uint16),
-        ddrnet / "color_map" / "frame_000001.png": photo,
-        ddrnet / "depth_map" / "frame_000001.png": exact,
-        ddrnet / "high_quality_depth" / "frame_000001.png": exact,
-    }
-    for path, pixels in pictures.items():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        assert cv2.imwrite(str(path), pixels)
-    (camera / "intrinsics.txt").write_text("460 0 319.5\n0 460 239.5\n0 0 1\n")
-    return tmp_path
-
-
-def test_crops_have_one_panel_for_each_method(wall: Path, tmp_path: Path) -> None:
-    arguments = ("--only", "depth_camera_0", "--methods", "bilateral", "--output", str(tmp_path / "crops"))
-    printed = run_benchmark("crops.py", "--shared", str(wall), *arguments)
-    path = tmp_path / "crops" / "depth_camera_0.jpg"
-    assert printed.splitlines() == ["depth_camera_0", "  Bilateral", str(path)]
-    picture = cv2.imread(str(path))
-    assert picture.shape[1] == 4 * 384 + 3 * 8 + 2 * 10
-    panels = [picture[100:200, 10 + column * 392 :][:, 100:284].std() for column in range(4)]
-    assert panels[0] < 1 < panels[2] < panels[1] / 2, "the photo is grey, the input has noise, the result less of it"
-    assert panels[3] == 0, "there is no fourth panel"
 
 
 def test_flatness_is_the_published_one(shared: Path) -> None:
@@ -120,15 +83,3 @@ def test_pairs_have_their_published_rows(shared: Path, tmp_path: Path) -> None:
     rows = ("ddrnet raw", "iphone_lidar", "books raw")
     assert {name: measured[name] for name in rows} == {name: expected[name] for name in rows}
     assert measured["rendered"][0] == "8"
-
-
-def test_real_sensors_have_a_row_of_creases_for_each_method(shared: Path) -> None:
-    arguments = ("--only", "creases", "--frames", "1", "--methods", "nearest")
-    printed = run_benchmark("real_sensors.py", "--shared", str(shared), *arguments).splitlines()
-    assert [line.split()[:2] for line in printed] == [["creases", "input"], ["creases", "nearest"]]
-    raw, result = (
-        {name: float(value) for name, value in re.findall(r"  (\w+) ([\d.]+)", line[24:])} for line in printed
-    )
-    shares = ("ddrnet_share", "icl_share")
-    assert all(3 < raw[name] < 10 and raw[name] == result[name] for name in shares)
-    assert all(0 < result[name] < 90 for name in result)

@@ -9,18 +9,14 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from commands import Program, run_python
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-from dsr.app.entry import run_command
-from dsr.app.evaluate import evaluate
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 QUICK = (
@@ -37,24 +33,15 @@ def _command(*arguments: str) -> list[str]:
 
 
 @pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Iterator[Run]:
-    """Return a runner of the command in this process: the exit code, the output and the errors."""
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # as in the processes that results are compared with
+def run(in_process: Run, monkeypatch: pytest.MonkeyPatch, one_thread: None) -> Run:
+    """Return a runner of the command in this process, with one thread as in those that results are compared with."""
 
     def call(folder: Path, *arguments: str, quick: Sequence[str] = QUICK) -> tuple[int, str, str]:
         monkeypatch.chdir(folder)
-        monkeypatch.setattr(sys, "argv", ["eval.py", *quick, *arguments])
-        code = 0
-        try:
-            run_command("eval", evaluate)
-        except SystemExit as ended:
-            code = int(ended.code or 0)
-        return code, *capfd.readouterr()
+        code, output, errors = in_process("eval", *quick, *arguments)
+        return code, output, "\n".join(errors)
 
-    yield call
-    torch.set_num_threads(threads)
+    return call
 
 
 def _depth(home: Path, scene: str) -> Any:
@@ -87,18 +74,6 @@ def test_scores_of_each_validation_are_printed_and_the_run_ends_in_a_table(
         assert re.search(rf"^evaluate {scene}: \d of 2, ", done.stdout, re.M)
     assert "DIP-V on simgeo, x4, box downsampling" in done.stdout
     assert {row["method"] for row in _rows(home)} == {"dip_v"}
-
-
-@pytest.mark.usefixtures("line_per_report")
-def test_steps_have_lines_with_named_times_off_a_terminal(tmp_path: Path, run: Run) -> None:
-    code, output, errors = run(
-        tmp_path, "method=dip", "dataset.scenes=[statue]", "method.steps=4", "method.validate_every=0"
-    )
-    assert (code, errors) == (0, "")
-    times = r"elapsed \d:\d\d:\d\d, remaining \d:\d\d:\d\d"
-    outer = r"evaluate statue \(0 of 1(?:, remaining \d:\d\d:\d\d)?\)"
-    steps = rf"^{outer}: steps: (\d) of 4, {times}(?:, loss \d+\.\d{{4}})?$"
-    assert list(dict.fromkeys(re.findall(steps, output, re.MULTILINE))) == ["1", "2", "3"]
 
 
 def test_log_has_the_losses_all_scores_and_renderings(

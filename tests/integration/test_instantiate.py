@@ -1,7 +1,5 @@
 """What a Hydra user expects: every node of the configuration is one for ``hydra.utils.instantiate``."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 from typing import Any

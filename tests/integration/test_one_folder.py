@@ -1,7 +1,5 @@
 """Commands in one folder: of the same settings they share the work, others are refused while one is at work there."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

@@ -1,7 +1,5 @@
 """A method and a network from outside the package: one module, and a YAML file of each."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path
@@ -116,13 +114,6 @@ def home(tmp_path_factory, dsr_cache):
     done = evaluate(folder, "method=constant", "output_dir=runs/constant")
     assert (done.returncode, done.stderr) == (0, "")
     return folder
-
-
-def test_report_shows_a_method_from_outside(home):
-    done = run(home, "-m", "dsr.cli", "report", "runs", "-o", "report")
-    assert (done.returncode, done.stderr) == (0, "")
-    tables = "".join(path.read_text() for path in (home / "report").rglob("*.md"))
-    assert "Constant" in tables
 
 
 def test_changed_code_of_a_method_from_outside_makes_another_run(home):

@@ -1,7 +1,5 @@
 """``dsr report``: what it writes, what it replaces, and what it refuses."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable
@@ -110,19 +108,6 @@ def test_report_without_truth_has_pictures_and_no_tables(
     assert "no scene has a ground truth to score against" in capsys.readouterr().out
     assert sorted(path.name for path in (tmp_path / "report").iterdir()) == ["index.html", "report.json"]
     assert "Bicubic" in (tmp_path / "report" / "index.html").read_text(encoding="utf-8")
-
-
-def test_user_study_joins_the_tables(runs: Path, tmp_path: Path) -> None:
-    shares = {"user_first": 75.0, "user_second": 25.0, "user_top2": 100.0}
-    ends = {f"{name}_{end}": value for name in shares for end, value in (("low", 40.0), ("high", 99.0))}
-    place = {"dataset": "simgeo", "scene": "statue", "scale": 4, "downsampling": "box"}
-    row = {**place, "method": "msg-v", "label": "MSG-V", **shares, "n": 20, **ends}
-    pd.DataFrame([row]).to_csv(tmp_path / "study.csv", index=False)
-    arguments = ["report", str(runs), "-o", str(tmp_path / "report"), "--only", "tables"]
-    assert main([*arguments, "--study", str(tmp_path / "study.csv")]) == 0
-    text = (tmp_path / "report" / "tables" / "simgeo_x4_box.md").read_text(encoding="utf-8")
-    assert "User 1st" in text
-    assert "75" in text
 
 
 @pytest.mark.parametrize(

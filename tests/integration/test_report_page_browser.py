@@ -202,19 +202,6 @@ def test_hovering_a_method_shows_and_reads_out_its_errors(opened, results):
         assert float(text.split("off by ")[1].split("°")[0]) == pytest.approx(degrees, abs=0.6)
 
 
-def test_error_map_is_red_where_the_result_is_farther_and_blue_where_it_is_nearer(opened, results):
-    page = opened()
-    choose(page, "left", "Bicubic")
-    page.click("[data-view=error]")
-    settle(page)
-    drawn = pixels(page, ".pane-left canvas").astype(int)
-    error = (depth_of(results, "Bicubic") - depth_of(results, "truth"))[0].numpy()
-    large = np.percentile(np.abs(error), 90)
-    assert (drawn[..., 0] > drawn[..., 2])[error > large].all()
-    assert (drawn[..., 0] < drawn[..., 2])[error < -large].all()
-    assert "cm" in page.inner_text(".stage-scale") or "mm" in page.inner_text(".stage-scale")
-
-
 @pytest.fixture
 def sure(make_run, tmp_path):
     """Return a run with expected errors, one without, and the address of the page about them."""
@@ -297,18 +284,3 @@ def test_names_in_the_files_of_a_run_are_shown_and_not_run(opened, make_run, tmp
     assert SPITEFUL in page.inner_text("#tables")
     assert name in page.inner_text("body")
     assert page.locator("img").count() == 0
-
-
-def test_method_of_the_leaderboard_is_shown_at_a_click(make_run, tmp_path, opened):
-    for label in ("Bicubic", "MSG-V"):
-        make_run(tmp_path / label, method=label.lower(), label=label, scenes=SCENES, size=SIZE)
-    results = load_results([tmp_path])
-    save_page(tmp_path / "index.html", results, leaderboard=True)
-    page = opened((tmp_path / "index.html").as_uri())
-    choose(page, "left", "input")
-    assert set(column(page, 0, 1)) == {"Bicubic", "MSG-V"}
-    page.locator("#tables table").first.get_by_role("button", name="Bicubic").click()
-    settle(page)
-    shown = page.evaluate("['left', 'right'].map((side) => document.querySelector(`#scenes select.${side}`)"
-                          ".selectedOptions[0].label)")  # fmt: skip
-    assert "Bicubic" in shown

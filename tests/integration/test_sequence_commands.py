@@ -3,7 +3,6 @@
 import json
 import re
 
-import captures
 import cv2
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ import torch
 import trimesh
 from PIL import Image
 from scipy.spatial.transform import Rotation
-from small_frames import in_text, room, walk, write_recording
+from small_frames import in_text, walk, write_recording
 from upsampling import info, refused_line, upsample
 
 from dsr.cli import main
@@ -94,22 +93,6 @@ def test_rig_gives_depth_in_the_photos_view(rig, capsys):
     assert {"depth_camera", "extrinsics"} <= info(rig / "out")["inputs"].keys()
 
 
-@pytest.mark.parametrize(
-    ("matrix", "message"),
-    [
-        (1.1 * np.eye(4)[:3], "move.txt: expected a rigid transform"),
-        (np.full((3, 4), np.nan), "move.txt: expected finite numbers"),
-        (np.eye(3), "move.txt: expected a matrix of 3 x 4 or 4 x 4 numbers"),
-        (pose(-90.0), "move.txt: expected a translation in metres"),
-        (pose(-9.0), "--extrinsics: expected the transform from the depth camera's frame"),
-    ],
-)
-def test_bad_extrinsics_end_in_one_line(rig, capsys, matrix, message):
-    (rig / "move.txt").write_text(text(matrix))
-    assert message in refused_line(capsys, with_rig(rig))
-    assert not (rig / "out").exists()
-
-
 # registration
 
 
@@ -157,17 +140,6 @@ def test_displaced_pair_is_warned_of_and_register_cures_it(apart, capsys):
     assert info(folder / "cured")["settings"]["register"] is True
 
 
-def test_register_leaves_an_aligned_pair_alone(apart, capsys):
-    folder, depth = apart
-    np.save(folder / "depth.npy", depth)
-    files = ("--rgb", folder / "photo.png", "--depth", folder / "depth.npy", "--fov", "60", *DEPTH_ONLY)
-    assert upsample(*files, "--register", "-o", folder / "out") == 0
-    assert "no displacement is certain, the depth map stays where it is" in " ".join(capsys.readouterr().out.split())
-    assert upsample(*files, "-o", folder / "other") == 0
-    assert "warning" not in capsys.readouterr().out
-    assert np.array_equal(np.load(folder / "out" / "depth.npy"), np.load(folder / "other" / "depth.npy"))
-
-
 # sequences
 
 
@@ -176,8 +148,6 @@ def test_neighbours_lower_the_noise_and_keep_the_pose(capture, capsys):
     assert upsample(capture, *poses, *DEPTH_ONLY, "-o", capture.parent / "one") == 0
     assert upsample(capture, *poses, "--neighbours", "4", *DEPTH_ONLY, "-o", capture.parent / "five") == 0
     assert "4 neighbouring frames vote on the depth" in capsys.readouterr().out
-    assert upsample(capture, *poses, "--neighbours", "1", *DEPTH_ONLY, "-o", capture.parent / "two") == 0
-    assert "1 neighbouring frame votes on the depth" in capsys.readouterr().out
     truth = world(CAMERA, 0.08)[1]
     noise = {
         name: np.std((read_depth_file(capture.parent / name / "002" / "depth_metres.tiff") - truth)[5:15, 20:-20])
@@ -203,36 +173,6 @@ def test_same_command_again_is_complete_and_a_changed_neighbour_is_not(capture, 
     outcome = capsys.readouterr()
     assert all(f"{name}: holds a result of other inputs" in outcome.err for name in ("000", "001"))
     assert "3 complete already" in outcome.out  # the others do not depend on frame 000
-
-
-def test_broken_neighbour_does_not_stop_the_others(capture, capsys):
-    (capture / "depth" / "003.png").write_bytes(b"\x89PNG broken")
-    code = upsample(
-        capture, "--poses", capture.parent / "poses.txt", "--neighbours", "2", *DEPTH_ONLY, "-o", capture.parent / "out"
-    )
-    assert "003" in refused_line(capsys, code)
-    assert sorted(path.parent.name for path in (capture.parent / "out").glob("*/depth.png")) == [
-        "000",
-        "001",
-        "002",
-        "004",
-    ]
-
-
-@pytest.mark.parametrize(
-    ("poses", "message"),
-    [
-        ("", "poses.txt: expected lines of 8 numbers"),
-        (text(np.diag([1.0, 1.0, 1.5, 1.0])), "poses.txt: pose 1: expected a rigid transform"),
-        (text(pose(np.nan)), "poses.txt: expected poses of finite numbers"),
-        (text(pose(0.0)), "poses.txt: expected a pose for each of the 5 frames"),
-    ],
-)
-def test_bad_poses_end_in_one_line(capture, capsys, poses, message):
-    (capture.parent / "poses.txt").write_text(poses)
-    code = upsample(capture, "--poses", capture.parent / "poses.txt", "--neighbours", "2", "-o", capture.parent / "out")
-    assert message in refused_line(capsys, code)
-    assert not (capture.parent / "out").exists()
 
 
 def test_neighbours_without_poses_are_refused(capture, capsys):
@@ -347,27 +287,6 @@ def test_poses_that_are_read_wrongly_are_reported_once_and_in_every_info(walked,
         (warning,) = info(out / f"{number:03}")["warnings"]
         assert warning["code"] == "poses"
         assert warning["value"] > warning["threshold"]
-
-
-def test_strict_refuses_wrong_poses_and_writes_no_result(walked, capsys):
-    out = walked.parent / "out"
-    assert upsample(walked, *poses_of(walked, np.linalg.inv), *DEPTH_ONLY, "--strict", "-o", out) == 2
-    assert "the poses are probably from world to camera" in capsys.readouterr().err
-    assert not list(out.rglob("info.json"))
-
-
-@pytest.mark.parametrize(("change", "codes"), [(np.array, []), (np.linalg.inv, ["poses"])])
-def test_poses_of_a_capture_are_compared_with_its_depth(tmp_path, monkeypatch, change, codes):
-    poses = walk(6, 0.12, 8.0)
-    size = Camera(captures.SIZE[1], captures.SIZE[0], *captures.INTRINSICS).rescale(*captures.SIZE_LR[::-1])
-    monkeypatch.setattr(captures, "FRAMES", len(poses))
-    monkeypatch.setattr(captures, "depth", lambda number=0: room(size, poses[number]))
-    monkeypatch.setattr(captures, "pose", lambda number=0: change(poses[number]))
-    captures.stray(tmp_path / "scan", video=False, own_intrinsics=False)
-    assert upsample(tmp_path / "scan", *DEPTH_ONLY, "-o", tmp_path / "out") == 0
-    about = [info(path.parent) for path in sorted((tmp_path / "out").rglob("info.json"))]
-    assert len(about) == len(poses)
-    assert all([each["code"] for each in one["warnings"] if each["code"].startswith("poses")] == codes for one in about)
 
 
 def test_frames_without_a_pose_are_reported_and_strict_refuses_them(walked, capsys):

@@ -7,7 +7,6 @@ import os
 import re
 import shutil
 import signal
-import sys
 import time
 from pathlib import Path
 
@@ -19,9 +18,6 @@ from safetensors.torch import load_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
-import dsr.app.train as command
-from dsr.app.entry import run_command
-from dsr.app.evaluate import evaluate
 from dsr.training.module import SuperResolution
 from dsr.utils.runs_table import COLUMNS
 
@@ -62,24 +58,9 @@ def whole(tmp_path_factory, environment):
 
 
 @pytest.fixture
-def within(monkeypatch, tmp_path, capfd):
-    """Return a runner of the commands within this process: the exit code, the output and the error lines."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("DSR_LPIPS_TRUNK", raising=False)
-    for name, value in (("HYDRA_FULL_ERROR", "1"), ("PL_GLOBAL_SEED", "0"), ("PL_SEED_WORKERS", "1")):
-        monkeypatch.setenv(name, value)  # and so put back afterwards
-
-    def call(*arguments, name="train"):
-        monkeypatch.setattr(sys, "argv", [f"{name}.py", *arguments])
-        code = 0
-        try:
-            run_command(name, {"train": command.train, "eval": evaluate}[name])
-        except SystemExit as ended:
-            code = ended.code
-        captured = capfd.readouterr()
-        return code, captured.out, captured.err.splitlines()
-
-    return call
+def within(in_process):
+    """Return a runner of the commands within this process, see there."""
+    return lambda *arguments, name="train": in_process(name, *arguments)
 
 
 @pytest.fixture
@@ -508,6 +489,7 @@ def test_network_that_fits_any_scale_starts_from_weights_of_another(smoke, tmp_p
     assert errors[0].endswith("weights are for scale 4, the run is at scale 8, where MSGNet has other parameters")
 
 
+@pytest.mark.nightly
 def test_facets_share_layers_with_weights_of_another_scale_and_some_are_frozen(tmp_path, within):
     small = ("model=facets", "degradation=everything", "model.net.width=8", "model.net.deep=8", "model.net.blocks=3")
     code, output, errors = within(*SMOKE, *small, "output_dir=out")
@@ -526,6 +508,7 @@ def test_facets_share_layers_with_weights_of_another_scale_and_some_are_frozen(t
     assert not torch.equal(first["errors.weight"], larger["errors.weight"])
 
 
+@pytest.mark.nightly
 def test_losses_and_scores_of_two_devices_are_those_of_one_with_the_same_patches(tmp_path, environment):
     apart = {key: value for key, value in environment.items() if not key.startswith("SLURM_")}
     given = (*SMOKE, "precision=float32", "patches.validation_scenes=3", "trainer.val_check_interval=2")

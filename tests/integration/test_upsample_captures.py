@@ -1,11 +1,9 @@
 """``dsr upsample`` on captures: what is printed, what info.json keeps, confidence, units of folders, refusals."""
 
-import json
-
 import captures
 import numpy as np
 import pytest
-from captures import FRAMES, INTRINSICS, SIZE, SIZE_LR
+from captures import FRAMES, INTRINSICS, SIZE_LR
 from PIL import Image
 from upsampling import info, refused_line, upsample
 
@@ -139,14 +137,3 @@ def test_resumed_folder_of_millimetre_floats_keeps_its_unit(tmp_path, monkeypatc
             np.testing.assert_allclose(read_depth_file(place / str(number) / "depth_metres.tiff"), metres, rtol=0.03)
         reported = [{**info(place / str(number)), "seconds": None} for place in (tmp_path / "whole", out)]
         assert reported[0] == reported[1]
-
-
-def test_broken_frame_of_a_capture_does_not_stop_the_others(tmp_path, capsys):
-    folder, out = captures.polycam(tmp_path / "scan"), tmp_path / "out"
-    path = folder / "keyframes" / "corrected_cameras" / "1001.json"
-    path.write_text(json.dumps(captures.polycam_camera(1, fx=float("nan"))))
-    assert upsample(folder, "-o", out, *DEPTH_ONLY) == 2
-    reported = capsys.readouterr()
-    assert reported.err == f"error: 1001: {path}: camera fx: expected a finite number, got nan\n"
-    assert f"{FRAMES} pictures: {FRAMES - 1} done, 1 failed" in reported.out
-    assert tuple(info(out / "1002")["photo_size"]) == SIZE[::-1]

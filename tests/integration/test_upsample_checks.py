@@ -14,8 +14,7 @@ from dsr.cli import main
 from dsr.geometry.camera import Camera
 from dsr.io.depth_files import read_depth_file
 
-SMALL = Camera.from_fov(60, 128, 96)
-"""Of the depth maps; the default of 60 degrees, so that no camera need be given."""
+SMALL = Camera.from_fov(60, 128, 96)  # Of the depth maps; the default of 60 degrees, so that no camera need be given
 DEPTH = room(SMALL, 17.0)[0]
 MILLIMETRES = np.round(DEPTH * 1000).astype(np.uint16)
 BASELINE = 0.1

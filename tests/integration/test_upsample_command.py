@@ -11,7 +11,6 @@ import trimesh
 from PIL import Image
 from upsampling import info, refused_line, upsample
 
-from dsr.cli import main
 from dsr.geometry.camera import Camera
 from dsr.io.depth_files import read_depth_file, write_depth_file
 from dsr.synthetic.simgeo import render_scene
@@ -127,25 +126,6 @@ def test_wide_holes_stay_holes_and_it_is_said(pair, tmp_path, capsys):
     assert message == "--max-hole: expected a positive number of degrees, got -1"
 
 
-def test_outliers_are_holes_and_it_is_said(pair, tmp_path, capsys):
-    clean, out = tmp_path / "clean", tmp_path / "out"
-    assert of(pair, clean, *DEPTH_ONLY) == 0
-    assert "treated as holes" not in capsys.readouterr().out
-    values = pair[2].copy()
-    values[10, 9], values[3, 12] = 25, 64000  # mm
-    Image.fromarray(values).save(pair[1])
-    assert of(pair, out, *DEPTH_ONLY) == 0
-    said = capsys.readouterr().out
-    assert said.count("treated as holes") == 1
-    assert "pixels: 2, patches: 2" in said
-    counted = {"pixels": 2, "patches": 2}
-    assert (info(clean)["outliers"], info(out)["outliers"]) == ({"pixels": 0, "patches": 0}, counted)
-    before, after = (read_depth_file(folder / "depth_metres.tiff") for folder in (clean, out))
-    np.testing.assert_allclose(after, before, rtol=0.1)
-    assert of(pair, out, *BICUBIC, "--only", "depth,normals") == 0
-    assert info(out)["outliers"] == counted
-
-
 def test_glass_is_said_and_a_robot_gets_no_depth_there(pair, tmp_path, capsys, monkeypatch):
     def half(photo, _):
         glass = torch.zeros(1, *photo.shape[-2:])
@@ -245,15 +225,6 @@ def test_result_for_a_robot_has_millimetres_of_certain_measured_depth_alone(pair
         assert error.count("\n") == 0
         assert f"--for robot: expected {more[0]}" in error
         assert not (tmp_path / "no").exists()
-
-
-def test_mask_makes_holes(pair, tmp_path):
-    mask = np.full((16, 16), 255, np.uint8)
-    mask[:, 10:] = 0
-    Image.fromarray(mask).save(tmp_path / "mask.png")
-    assert of(pair, tmp_path / "out", *DEPTH_ONLY, "--fill", "none", "--mask", tmp_path / "mask.png") == 0
-    assert (np.asarray(Image.open(tmp_path / "out" / "depth.png"))[:, 44:] == 0).all()
-    assert set(info(tmp_path / "out")["inputs"]) == {"rgb", "depth", "mask"}
 
 
 def test_disparity_becomes_disparity_of_the_high_resolution_pixels(pair, cube, tmp_path):
@@ -400,33 +371,16 @@ def test_sensor_is_recognised_by_the_depth_values_and_must_not_contradict_them(t
         (("--baseline", "0"), "--baseline: expected a positive number of metres, got 0"),
         (("--fov", "200"), "--fov: expected degrees from 1 to below 180, got 200"),
         (("--range-type", "disparity"), "depth.png: disparities need the distance between the two cameras"),
+        (("--method", "facets", "--noise", "-1"), "--noise: expected metres, 0 or more and less than 1, got -1.0"),
+        (("--method", "facets", "--smooth", "3"), "--smooth: expected a number from 0 to 2, got 3.0"),
+        (("--noise", "0.1", "--method", "tgv"), "--noise: unknown key; method=tgv takes"),
+        (("--max-error", "0"), "--max-error: expected a positive percentage of the depth, got 0"),
         (("some_folder",), "expected --rgb and --depth, or folders that hold both"),
     ],
 )
 def test_invalid_arguments_are_refused_in_one_line(pair, tmp_path, capsys, arguments, message):
     assert message in refused_line(capsys, of(pair, tmp_path / "out", *BICUBIC, *arguments))
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(
-    ("first", "second", "given"),
-    [
-        ("color", "depth", "--rgb color --depth depth"),
-        ("color/0.png", "depth/0.png", "--rgb color/0.png --depth depth/0.png"),
-        ("color", "nothing/depth", None),
-        ("color", "other/0.png", None),
-    ],
-)
-def test_photos_and_depth_maps_in_two_arguments_are_refused_with_the_options_for_them(
-    pair, tmp_path, capsys, monkeypatch, first, second, given
-):
-    names = ("color/0.png", "depth/0.png", "files/photo.png", "files/my_depth.png", "other/0.png")
-    for number, name in enumerate(names):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        shutil.copy(pair[number % 2], tmp_path / name)
-    monkeypatch.chdir(tmp_path)
-    message = refused_line(capsys, main(["upsample", first, second, "-o", "out", "--dry-run"]))
-    assert message.endswith(given) if given else "--rgb" not in message
 
 
 def test_pictures_that_do_not_fit_each_other_are_refused_in_one_line(pair, tmp_path, capsys):
@@ -478,20 +432,6 @@ def test_noise_is_estimated_and_may_be_given(cube, tmp_path, capsys):
         assert not np.array_equal(results[name], results[other])
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (("--noise", "-1"), "--noise: expected metres, 0 or more and less than 1, got -1.0"),
-        (("--smooth", "3"), "--smooth: expected a number from 0 to 2, got 3.0"),
-        (("--noise", "0.1", "--method", "tgv"), "--noise: unknown key; method=tgv takes"),
-        (("--max-error", "0"), "--max-error: expected a positive percentage of the depth, got 0"),
-    ],
-)
-def test_a_wrong_noise_is_refused(pair, tmp_path, capsys, options, message):
-    assert message in refused_line(capsys, of(pair, tmp_path / "out", *options))
-    assert not (tmp_path / "out").exists()
-
-
 def test_what_is_likely_to_be_wrong_is_left_out_of_the_mesh(pair, tmp_path, capsys):
     assert of(pair, tmp_path / "all", "--only", "mesh,depth", "--max-error", "1000") == 0
     assert "left out of cloud and mesh" not in capsys.readouterr().out
@@ -529,54 +469,16 @@ def test_dry_run_reads_one_frame_of_each_kind_and_sums_up_the_time(tmp_path, cap
     assert "2_depth.png: expected a picture" in capsys.readouterr().err
 
 
-@pytest.fixture(scope="module")
-def vga(tmp_path_factory):
-    """A textured photo of 640 x 480 of a curved wall and boxes, and its depth with the noise of a depth camera."""
-    folder, rng = tmp_path_factory.mktemp("vga"), np.random.default_rng(0)
-    rows, columns = np.mgrid[:480, :640]
-    depth = 2.5 + 0.4 * np.sin(columns / 90) + 0.001 * rows
-    for number in range(6):
-        y, x = rng.integers(0, 380), rng.integers(0, 500)
-        depth[y : y + 100, x : x + 140] = 1.2 + 0.2 * number
-    noisy = np.round(1000 * (depth + 0.002 * depth**2 * rng.standard_normal(depth.shape)))
-    noisy[rng.random(noisy.shape) < 0.01] = 0
-    texture = (
-        128
-        + 50 * np.sin(rows / 3) * np.cos(columns / 5)
-        + 40 * np.cos(7 * depth)
-        + 6 * rng.standard_normal(depth.shape)
-    )
-    photo = np.repeat(texture.clip(0, 255).astype(np.uint8)[..., None], 3, axis=2)
-    Image.fromarray(photo).save(folder / "photo.png")
-    Image.fromarray(noisy.astype(np.uint16)).save(folder / "depth.png")
-    return folder / "photo.png", folder / "depth.png", folder / "out"
-
-
-def test_default_results_of_a_vga_frame_are_small_and_complete(vga, capsys):
-    *pair, out = vga
-    assert of(pair, out, "--fov", 60, "--dry-run") == 0
-    [said] = re.findall(r"about ([\d.]+) MB", capsys.readouterr().out)
-    assert of(pair, out, "--fov", 60) == 0
-    sizes = {str(path.relative_to(out)): path.stat().st_size for path in out.rglob("*") if path.is_file()}
-    assert set(sizes) == {name for part in PARTS.values() for name in part} | {"info.json"}
-    assert sum(sizes.values()) < 6e6
-    assert 0.5 < sum(sizes.values()) / 1e6 / float(said) < 2
-    assert f"{sum(sizes.values()) / 1e6:.1f} MB -> {out}" in capsys.readouterr().out
-    took = info(out)["seconds"]
-    assert list(took) == ["reading", "upsampling", "writing", "total"]
-    assert took["total"] == pytest.approx(took["reading"] + took["upsampling"] + took["writing"], abs=1e-6)
-    shape = info(out)["mesh"]
-    assert shape["after"] < 0.4 * shape["before"]
-
-
-def test_parts_that_are_added_later_are_those_of_a_single_run(vga, tmp_path):
+def test_parts_that_are_added_later_are_those_of_a_single_run(pair, tmp_path):
     """Depth and expected errors are read back to the bit."""
-    *pair, first = vga
-    parts = ("mesh.glb", "depth_metres.tiff", "confidence.npz", "normals.png")
-    assert of(pair, tmp_path, "--fov", 60, "--only", "depth,confidence") == 0
-    assert of(pair, tmp_path, "--fov", 60, "--only", "mesh,normals") == 0
-    for name in parts:
-        assert (tmp_path / name).read_bytes() == (first / name).read_bytes(), name
+    whole, later = tmp_path / "whole", tmp_path / "later"
+    assert of(pair, whole, "--only", "depth,confidence,mesh,normals") == 0
+    took = info(whole)["seconds"]
+    assert took["total"] == pytest.approx(took["reading"] + took["upsampling"] + took["writing"], abs=1e-6)
+    assert of(pair, later, "--only", "depth,confidence") == 0
+    assert of(pair, later, "--only", "mesh,normals") == 0
+    for name in ("mesh.glb", "depth_metres.tiff", "confidence.npz", "normals.png"):
+        assert (later / name).read_bytes() == (whole / name).read_bytes(), name
 
 
 def test_keep_all_writes_every_pixel_and_the_files_of_other_programs(pair, tmp_path):

@@ -1,7 +1,5 @@
 """``dsr upsample --shard``: shards together give what one command gives, and each knows its own."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -4,8 +4,6 @@
 With ``DSR_SHARED`` the frames are those of all data sets and sensors there, otherwise rendered ones.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

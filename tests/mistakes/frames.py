@@ -23,14 +23,10 @@ DATA_SETS = (
     *(f"real/{name}" for name in ("ddrnet", "icl_nuim", "middlebury2005", "middlebury2006", "middlebury2014")),
     *(f"real/{name}" for name in ("rgbdd_real", "sunrgbd", "tartanair")),
     *("scenes", "modern/Lu", "modern/Middlebury", "modern/NYU", "modern/RGBDD"),
-)
-"""Folders that dsr finds scenes in by itself."""
-LIDAR_FOCAL = 1440.0
-"""Pixels of a phone's photo of 1920 x 1440, which comes without a camera."""
-RENDERED, SIZE = 24, 256
-"""Rendered frames to draw from, and their size in pixels."""
-LENGTH, STEP = 5, 0.03
-"""Frames of a sequence, and distance of their places as a fraction of that to what they look at."""
+)  # Folders that dsr finds scenes in by itself
+LIDAR_FOCAL = 1440.0  # Pixels of a phone's photo of 1920 x 1440, which comes without a camera
+RENDERED, SIZE = 24, 256  # Rendered frames to draw from, and their size in pixels
+LENGTH, STEP = 5, 0.03  # Frames of a sequence, and distance of their places as a fraction of that to what they look at
 
 
 @dataclass(frozen=True)

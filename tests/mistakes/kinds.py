@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 from mistakes.frames import Frame
 
 RIGHT = "right"
-ANSWERS = ("read rightly", "warned", "refused", "silent")
-"""What may be said of a case."""
+ANSWERS = ("read rightly", "warned", "refused", "silent")  # What may be said of a case
 CENTIMETRES, SHIFT, MILLIMETRES = 1e2, 0.05, 1e3
 """Values of a metre; and the shift of a photo as a fraction of its width."""
 

@@ -1,7 +1,5 @@
 """Cameras and range types, against the pinhole model written out in numpy."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

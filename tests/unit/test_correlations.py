@@ -10,7 +10,7 @@ from scipy import stats
 
 from dsr.evaluation.results import Results, Run
 from dsr.report import correlation_figure
-from dsr.report.correlation_figure import density_of, save_scatter_matrix
+from dsr.report.correlation_figure import save_scatter_matrix
 from dsr.report.correlations import correlate, metric_matrix, pairs, with_reference, write_correlations
 from dsr.report.paper import published
 
@@ -128,13 +128,3 @@ def test_missing_lpips_leaves_the_rest_and_one_line_says_so(tmp_path, monkeypatc
     save_scatter_matrix(tmp_path, results)
     assert list(drawn) == ["scatter_matrix.pdf", "scatter_matrix.png"]
     assert "no LPIPS_v in these results" in drawn["scatter_matrix.pdf"].texts[0].get_text()
-
-
-def test_densities_equal_scipy_and_integrate_to_one():
-    values = np.random.default_rng(2).normal(3, 1, 50)
-    grid = np.linspace(-5, 11, 4001)
-    density = density_of(values, grid)
-    assert np.trapezoid(density, grid) == pytest.approx(1, abs=1e-4)
-    width = values.std(ddof=1) * 50 ** (-1 / 5)  # Scott's rule in one dimension
-    at = np.exp(-0.5 * ((grid[2000] - values) / width) ** 2).sum() / (50 * width * math.sqrt(2 * math.pi))
-    assert density[2000] == pytest.approx(at)

@@ -1,7 +1,5 @@
 """Damaged, wrong and hostile files end with one line that names the file: a table of readers and damages."""
 
-from __future__ import annotations
-
 import io
 import json
 import math

@@ -8,8 +8,6 @@ import pytest
 from omegaconf import OmegaConf
 
 from dsr.app.schema import EvalConfig, MetricsConfig, TrainConfig
-from dsr.methods.dip.upsampler import DeepImagePrior
-from dsr.methods.recipe import read_recipe
 from dsr.training.module import SuperResolution
 from dsr.training.settings import PatchSettings
 from dsr.utils.configuration import load_target
@@ -27,8 +25,7 @@ DIFFERENT = {
     "model/msg": {"variant"},  # trained by the project; the class's is the published MSG-V
     "model/msg_v": {"variant"},
     "dataset/simgeo": {"root"},  # on the command line the folder of data is looked at for Lucy
-}
-"""Files whose keys are what tells one choice from another of the same class, by the keys."""
+}  # Files whose keys are what tells one choice from another of the same class, by the keys
 PRESET = OmegaConf.to_container(OmegaConf.load(CONF / "trainer" / "default.yaml"))
 
 
@@ -64,24 +61,6 @@ def test_value_in_conf_is_the_default_of_the_target(name):
     assert differences(node, defaults_of(load_target(name, node))) == DIFFERENT.get(name, set())
 
 
-def test_every_setting_of_deep_image_priors_is_in_conf():
-    own = {
-        "precision",
-        "seed",
-        "device",
-        "metrics",
-        "workspace",
-        "display",
-        "lpips_trunk",
-        "about",
-    }  # of the run, not of the method
-    assert defaults_of(DeepImagePrior).keys() - own == read_recipe("dip").at().keys() - {
-        "_target_",
-        "scale",
-        "downsampling",
-    }
-
-
 def test_patches_in_conf_have_the_defaults_of_their_class():
     defaults = defaults_of(PatchSettings)
     assert defaults.keys() == PRESET["patches"].keys() - {"_target_"}
@@ -108,7 +87,3 @@ def test_command_in_conf_has_the_defaults_of_the_schema(command, schema):
     assert {
         key: vars(value) if key in ("loss", "start") else value for key, value in values.items() if key in own
     } == own
-
-
-def test_difference_is_noticed():
-    assert differences({"a": 1, "b": 2, "c": 3}, {"a": 1, "b": 3, "d": 4}) == {"b"}

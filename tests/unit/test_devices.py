@@ -3,8 +3,6 @@
 The results have to be those of the CPU. ``DSR_DEVICE=cuda`` runs the same tests on a real GPU.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from functools import partial

@@ -1,6 +1,5 @@
 """The doctor: a check finds the one fault that the test put in, with its number, and none finds any in sound scenes."""
 
-import json
 import math
 import re
 from dataclasses import replace
@@ -15,7 +14,6 @@ from dsr.doctor.depth_checks import find_rounding
 from dsr.doctor.examine import CHECKS, examine, examine_directory
 from dsr.doctor.finding import with_depth
 from dsr.geometry.camera import Camera, from_range, to_range
-from dsr.geometry.planes import range_votes
 from dsr.io.images import read_map, read_rgb
 from dsr.sample import Scene
 from dsr.synthetic.simgeo import render_scene
@@ -315,13 +313,6 @@ def test_distance_along_the_ray_is_distinguished_from_orthogonal_depth(straight,
         assert advice == 'set "range_type": "orthogonal" in camera.json'
 
 
-@pytest.mark.parametrize(("exponent", "verdict"), [(0, "orthogonal"), (1, "ray"), (-1, "reverse")])
-def test_exponent_of_planes_is_measured(sound, exponent, verdict):
-    votes = range_votes(sound.depth[0].numpy() * CAMERA.ray_lengths().numpy() ** exponent, CAMERA)
-    assert votes.windows > 50
-    assert votes.verdict == verdict
-
-
 def test_planes_are_recognised_through_noise_and_holes(sound):
     noise = 1 + 0.002 * np.random.default_rng(6).standard_normal((SIZE, SIZE))
     holes = np.where(scattered(0.002), np.nan, 1)
@@ -413,35 +404,6 @@ def test_middlebury_2006_has_terraces_of_a_third_of_a_pixel(shared, name):
 
 
 # the report
-
-
-def write(folder, scene, **entries):
-    """Write a scene in the folder layout."""
-    folder.mkdir(parents=True)
-    camera = scene.camera
-    names = ("width", "height", "fx", "fy", "cx", "cy")
-    (folder / "camera.json").write_text(json.dumps({name: getattr(camera, name) for name in names} | entries))
-    photo = scene.rgb.permute(1, 2, 0).numpy()[:, :, ::-1] * 255
-    cv2.imwrite(str(folder / "rgb.png"), photo.round().astype(np.uint8))
-    np.save(folder / "depth.npy", scene.depth[0].numpy())
-
-
-def test_report_of_a_directory_ends_in_a_summary(tmp_path, capsys, sound):
-    write(tmp_path / "a_sound", sound)
-    write(tmp_path / "b_unit", changed(sound, lambda z: z * 1000))
-    write(tmp_path / "c_rounded", changed(sound, lambda z: np.round(z, 3)))
-    write(tmp_path / "d_[broken]", sound)
-    (tmp_path / "d_[broken]" / "depth.npy").write_bytes(b"none")
-    assert examine_directory(tmp_path) == 1
-    out, err = capsys.readouterr()
-    assert err == ""
-    assert "a_sound: fine\n" in out
-    assert "b_unit: 1 problem\n" in out
-    assert "c_rounded: 1 warning\n" in out
-    assert "d_[broken]: 1 problem\n" in out
-    assert re.search(r"problem +files +cannot be read: ", out)
-    assert re.search(r"-> +x 0\.001", out)
-    assert out.splitlines()[-1] == "4 scenes: 1 fine, 1 with warnings, 2 with problems"
 
 
 @pytest.mark.parametrize("kind", ["missing", "file", "empty"])

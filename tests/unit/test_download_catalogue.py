@@ -5,9 +5,7 @@ from collections import Counter
 from pathlib import PurePosixPath
 from urllib.parse import urlsplit
 
-import pytest
-
-from dsr.data.download.collections import CATALOGUE, EVALUATION_2014, find
+from dsr.data.download.collections import CATALOGUE, EVALUATION_2014
 from dsr.data.middlebury import EVALUATION_2014 as EVALUATED
 from dsr.data.middlebury import SCENES
 
@@ -71,9 +69,3 @@ def test_catalogue_scenes_are_those_that_the_readers_expect():
     for year, scenes in SCENES.items():
         folders = {item.path.split("/")[1].lower() for item in CATALOGUE[f"middlebury{year}"].items}
         assert folders == set(scenes)
-
-
-def test_unknown_name_is_refused_with_the_known_ones():
-    with pytest.raises(ValueError, match=r"^middelbury: unknown data set; expected some of middlebury, ") as caught:
-        find(["nyu", "middelbury"], CATALOGUE)
-    assert "\n" not in str(caught.value)

@@ -1,7 +1,5 @@
 """Dynamic guidance: its stages against plain loops and the energy's gradient, and what holds whatever its weights."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

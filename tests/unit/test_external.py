@@ -1,7 +1,5 @@
 """Maps of another program as a method: read in every format and quantity, fitted without the truth, and refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -133,25 +133,6 @@ def test_strongest_window_equals_an_exhaustive_search(seed):
     assert strongest_window(values, 3, 4, [first])[:2] == max(clear, key=clear.get)
 
 
-def test_details_and_their_frames_are_the_same_for_all_methods(results, drawn, tmp_path):
-    save_grids(tmp_path, results, "renderings")
-    [figure] = drawn.values()
-    boxes = [patch.get_bbox() for patch in figure.axes[0].patches if patch.get_label() == "one: frame"]
-    frames = []
-    for image, both in zip(panels(figure, "one"), zip(boxes[::2], boxes[1::2], strict=True), strict=True):
-        left, right, bottom, top = image.get_extent()
-        pixels = np.array(image.get_array().shape[:2][::-1]) / (right - left, top - bottom)
-        frames.append([np.array([(box.x0 - left, top - box.y1), (box.width, box.height)]) * pixels for box in both])
-    shapes = [image.get_array().shape[0] for image in panels(figure, "one")]
-    for frame, shape in zip(frames, shapes, strict=True):  # that of the input has fewer pixels
-        np.testing.assert_allclose(np.array(frame) * shapes[-1] / shape, frames[-1], atol=1e-6)
-    insets = [image.get_array() for image in panels(figure, "one", "detail")]
-    assert len(insets) == 12
-    (left, top), (width, height) = frames[-1][0].round().astype(int)
-    whole = panels(figure, "one")[-1].get_array()
-    np.testing.assert_array_equal(insets[-2], whole[top : top + height, left : left + width])
-
-
 def test_scores_are_in_thousandths_and_the_best_is_bold(results, drawn, tmp_path):
     save_grids(tmp_path, results, "renderings")
     [figure] = drawn.values()

@@ -21,8 +21,7 @@ from dsr.data.cleargrasp import (
 )
 
 ROWS, COLUMNS = np.mgrid[0:36, 0:64]
-TWIN = 0.5 + ROWS / 128 + COLUMNS / 256
-"""Metres that 16-bit floats hold exactly, not symmetric under any flip."""
+TWIN = 0.5 + ROWS / 128 + COLUMNS / 256  # Metres that 16-bit floats hold exactly, not symmetric under any flip
 MASK = 255 * ((ROWS >= 10) & (ROWS < 30) & (COLUMNS >= 20) & (COLUMNS < 50)).astype(np.uint8)
 CAMERA = b"""# Camera Intrinsic Parameters
 camera_name: 'D435'

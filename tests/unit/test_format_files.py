@@ -12,8 +12,7 @@ from small_files import png_by_its_specification as png
 
 from dsr.io.images import read_camera, read_map, read_mask, read_rgb
 
-VALUES = np.array([[1.0, 2.5, 3.25], [4.5, 5.0, 60000.0]])
-"""Not symmetric under any flip, exact in float32."""
+VALUES = np.array([[1.0, 2.5, 3.25], [4.5, 5.0, 60000.0]])  # Not symmetric under any flip, exact in float32
 WHOLE = np.array([[1, 256, 3], [40000, 5, 65535]])
 INTRINSICS = {"width": 3, "height": 2, "fx": 3.0, "fy": 3.0, "cx": 1.0, "cy": 0.5}
 

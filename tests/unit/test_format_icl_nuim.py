@@ -10,8 +10,7 @@ from small_files import written
 from dsr.data.icl import CAMERA, find_frames, load_frame, read_depth
 
 ROWS, COLUMNS = np.mgrid[0:480, 0:640]
-DISTANCES = 100.0 + ROWS + COLUMNS / 1000
-"""Centimetres; not symmetric under any flip."""
+DISTANCES = 100.0 + ROWS + COLUMNS / 1000  # Centimetres; not symmetric under any flip
 
 
 def text(values):

@@ -10,8 +10,7 @@ from small_files import written
 
 from dsr.data.sintel import SEQUENCES, find_frames, load_frame, read_camera, read_depth
 
-VALUES = np.array([[1.5, 2.25, 0.125], [40.0, 999.0, 1e10]])
-"""Metres, exact in float32; the last is sky."""
+VALUES = np.array([[1.5, 2.25, 0.125], [40.0, 999.0, 1e10]])  # Metres, exact in float32; the last is sky
 INTRINSICS = [1120.0, 0.0, 511.5, 0.0, 1120.0, 217.5, 0.0, 0.0, 1.0]
 SIZE = (436, 1024)
 

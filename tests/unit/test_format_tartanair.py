@@ -11,8 +11,7 @@ from small_files import written
 from dsr.data.tartanair import CAMERA, find_frames, load_frame, read_depth
 
 ROWS, COLUMNS = np.mgrid[0:480, 0:640]
-VALUES = 1.0 + ROWS + COLUMNS / 1024
-"""Metres, exact in float32, not symmetric under any flip."""
+VALUES = 1.0 + ROWS + COLUMNS / 1024  # Metres, exact in float32, not symmetric under any flip
 
 
 def npy(values=VALUES, descr="<f4", shape=None, order=False):

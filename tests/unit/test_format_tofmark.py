@@ -17,8 +17,7 @@ from dsr.data.tofmark import block_means, find_frames, load_frame, read_matrices
 INTRINSICS = (40.0, 40.0, 19.5, 9.5)
 SIZE = (22, 40)
 ROWS, COLUMNS = np.mgrid[0 : SIZE[0], 0 : SIZE[1]]
-TRUTH = 0.75 + ROWS / 64 + COLUMNS / 1024
-"""Metres; not symmetric under any flip."""
+TRUTH = 0.75 + ROWS / 64 + COLUMNS / 1024  # Metres; not symmetric under any flip
 SPARSE = np.where((ROWS % 6 == 1) & (COLUMNS % 6 == 2), TRUTH, 0)
 GREY = ((ROWS * 7 + COLUMNS) % 256).astype(np.uint8)
 

@@ -1,7 +1,5 @@
 """The table of formats, and the command that prints it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

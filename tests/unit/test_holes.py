@@ -1,7 +1,5 @@
 """Holes of low-resolution maps."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

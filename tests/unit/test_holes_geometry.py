@@ -1,7 +1,5 @@
 """Distances to known pixels, and wide holes."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

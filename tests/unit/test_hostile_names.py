@@ -1,7 +1,5 @@
 """Names that are commands or code come out of every file as the texts that they are."""
 
-from __future__ import annotations
-
 import dataclasses
 import io
 import json

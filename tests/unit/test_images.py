@@ -1,7 +1,5 @@
 """Operations on images and maps that methods share: values, sizes, holes and noise."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

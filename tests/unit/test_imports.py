@@ -19,12 +19,9 @@ MORE_FORBIDDEN = {
         "dsr.inference",
         "dsr.degradation",
     ),
-}
-"""Beyond the layers: data sets and methods know no metric, and a report reads files alone."""
-ONLY_APP = ("hydra", "omegaconf")
-"""Libraries for the configuration of commands."""
-MAY_TOO = {"omegaconf": "dsr.methods.recipe"}
-"""A method's file is read there without Hydra."""
+}  # Beyond the layers: data sets and methods know no metric, and a report reads files alone
+ONLY_APP = ("hydra", "omegaconf")  # Libraries for the configuration of commands
+MAY_TOO = {"omegaconf": "dsr.methods.recipe"}  # A method's file is read there without Hydra
 
 
 def place_of(name):

@@ -22,7 +22,6 @@ from dsr.io.captures.ros_images import decode_message
 from dsr.io.inputs import FolderUnits, read_picture
 from dsr.io.layouts import find_pairs_of_folder
 from dsr.io.reading import Reading
-from dsr.io.trajectories import check_pose
 
 BROKEN_POSE = "expected a rigid pose"
 
@@ -407,10 +406,3 @@ def test_odometry_of_another_app_is_refused(folder):
     (folder / "odometry.csv").write_text("time,lat,lon\n1,2,3\n")
     with pytest.raises(ValueError, match=r"odometry.csv: expected Stray Scanner's columns, there is no frame, x, y, z"):
         find_pairs_of_folder(folder)
-
-
-def test_pose_that_is_not_finite_or_not_rigid_is_refused():
-    np.testing.assert_array_equal(check_pose("x", np.eye(4)), np.eye(4))
-    for wrong in (np.full((4, 4), np.nan), 2 * np.eye(4), np.diag([1.0, 1.0, -1.0, 1.0]), np.ones((4, 4))):
-        with pytest.raises(ValueError, match=rf"^x: {BROKEN_POSE}"):
-            check_pose("x", wrong)

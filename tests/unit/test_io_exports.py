@@ -12,11 +12,8 @@ import trimesh
 from dsr.geometry.camera import Camera
 from dsr.geometry.mesh import triangulate, vertex_normals
 from dsr.geometry.surface import depth_to_normals, render
-from dsr.io import exports
 from dsr.io.exports import Written, write_cloud, write_mesh, write_normals, write_renderings
 from dsr.io.glb import write_glb
-from dsr.pictures import before_after
-from dsr.pictures.before_after import write_before_after
 
 CAMERA = Camera(24, 18, 30, 30, 11.5, 8.5)
 NORMAL_OF_A_WALL = [128, 128, 255]
@@ -54,17 +51,6 @@ def test_renderings_are_those_of_the_protocol_in_eight_bits(tmp_path):
     for path, shades in zip(paths, expected, strict=True):
         assert read(path).shape == (18, 24)
         np.testing.assert_allclose(read(path), 255 * shades.numpy(), atol=0.51)
-
-
-@pytest.mark.parametrize("strip", [1, 24 * 5, 24 * 17])
-def test_strips_leave_no_seam(tmp_path, monkeypatch, strip):
-    write_renderings(tmp_path / "whole", bumpy(), CAMERA)
-    write_normals(tmp_path / "whole" / "normals.png", bumpy(), CAMERA)
-    monkeypatch.setattr(exports, "_STRIP", strip)
-    write_renderings(tmp_path / "strips", bumpy(), CAMERA)
-    write_normals(tmp_path / "strips" / "normals.png", bumpy(), CAMERA)
-    for path in (tmp_path / "whole").iterdir():
-        np.testing.assert_array_equal(read(path), read(tmp_path / "strips" / path.name))
 
 
 def test_holes_are_transparent(tmp_path):
@@ -218,30 +204,3 @@ def test_map_without_two_neighbours_is_refused_and_an_older_file_is_kept(tmp_pat
     assert (tmp_path / "m.glb").read_text() == "old"
     triangulate(depth, CAMERA, isolated=True)
     assert write_cloud(tmp_path / "c.ply", photo(), depth, CAMERA) == Written(1, 1)
-
-
-@pytest.fixture
-def drawn(monkeypatch):
-    """What would have been written, with its dots per inch."""
-    figures = []
-    monkeypatch.setattr(before_after, "write_figure", lambda _, figure, dpi: figures.append((figure, dpi)))
-    return figures
-
-
-def test_detail_of_a_before_after_picture_is_where_the_surface_changed(tmp_path, drawn):
-    depth = wall()
-    depth[0, 10:13, 15:19] += 0.05 * torch.rand(3, 4, generator=torch.Generator().manual_seed(1))
-    write_before_after(tmp_path / "b.png", photo(), wall(), depth, CAMERA, "t")
-    [(figure, _)] = drawn
-    pictures = figure.axes[0].images
-    frames = figure.axes[0].patches[::2]
-    assert len(frames) == 3
-    for frame, picture in zip(frames, pictures[:6:2], strict=True):
-        x0, x1, y0, y1 = picture.get_extent()
-        left, right = (24 * (at - x0) / (x1 - x0) for at in (frame.get_x(), frame.get_x() + frame.get_width()))
-        bottom, top = (18 * (y1 - at) / (y1 - y0) for at in (frame.get_y(), frame.get_y() + frame.get_height()))
-        assert left <= 14 + 1e-9
-        assert top <= 9 + 1e-9
-        assert right >= 19 - 1e-9
-        assert bottom >= 13 - 1e-9
-    assert len({picture.get_clim() for picture in pictures if picture.cmap.name == "viridis"}) == 1

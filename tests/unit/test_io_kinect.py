@@ -18,8 +18,7 @@ from dsr.io.reading import CameraChoice, Reading, RigFiles
 pytest.importorskip("av")
 
 SIZE, SIZE_LR = (480, 640), captures.KINECT_DEPTH
-NORMAL, DISTANCE = np.array([0.15, -0.25, 1.0]), 1.3
-"""A plane before the depth camera: NORMAL X = DISTANCE."""
+NORMAL, DISTANCE = np.array([0.15, -0.25, 1.0]), 1.3  # A plane before the depth camera: NORMAL X = DISTANCE
 
 
 def opencv(lens):

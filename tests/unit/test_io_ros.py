@@ -106,10 +106,7 @@ def test_camera_info_that_is_none_is_one_line(tmp_path, of_info, said):
 
 @pytest.mark.parametrize("suffix", [".db3", ".mcap"])
 def test_file_of_ros_2_is_read_without_its_folder(tmp_path, suffix):
-    from rosbags.rosbag2 import StoragePlugin  # noqa: PLC0415 - an extra
-
-    plugin = StoragePlugin.MCAP if suffix == ".mcap" else StoragePlugin.SQLITE3
-    folder = captures.ros(tmp_path / "whole", 2, storage_plugin=plugin)
+    folder = captures.ros(tmp_path / "whole", 2, plugin="MCAP" if suffix == ".mcap" else "SQLITE3")
     alone = tmp_path / "alone" / f"scan{suffix}"
     alone.parent.mkdir()
     (folder / f"whole{suffix}").rename(alone)
@@ -175,9 +172,7 @@ def test_rvl_that_is_damaged_or_declares_more_than_it_can_hold_is_refused_before
 
 @pytest.mark.parametrize("plugin", ["SQLITE3", "MCAP"])
 def test_recording_whose_files_are_packed_whole_is_read_and_leaves_nothing(tmp_path, monkeypatch, plugin):
-    from rosbags.rosbag2 import StoragePlugin  # noqa: PLC0415 - an extra
-
-    path = captures.ros(tmp_path / "scan", 2, storage_plugin=StoragePlugin[plugin], packed=True)
+    path = captures.ros(tmp_path / "scan", 2, plugin=plugin, packed=True)
     assert [file.suffix for file in path.iterdir() if file.stem != "metadata"] == [".zstd"]
     (tmp_path / "temporary").mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
@@ -227,9 +222,3 @@ def test_packed_messages_and_files_are_not_unpacked_to_any_size(tmp_path, mode, 
     path = packed(tmp_path / "scan", mode)
     with pytest.raises(ValueError, match=f"^{path}: expected a recording of ROS, got a damaged one .{said}"):
         find_pairs_of_folder(path)
-
-
-def zstd():
-    from rosbags.rosbag2 import storage_mcap  # noqa: PLC0415 - an extra
-
-    return storage_mcap.zstd

@@ -1,7 +1,5 @@
 """The standings: ranks within families and settings, over the scenes that all methods have."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

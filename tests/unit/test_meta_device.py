@@ -4,8 +4,6 @@ On the device ``meta`` a value that is read (``item``, ``bool``, ``tolist``, an 
 a tensor that was left on the CPU.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator
 from typing import Any

@@ -26,8 +26,7 @@ NAMES = {
     "two numbers": "v2_{0}_{late}",
     "some zeros": "{0:02}",
     "times": "{time:.3f}",
-}
-"""Names of frames 0 to 11; as texts they sort otherwise, but for those with enough zeros."""
+}  # Names of frames 0 to 11; as texts they sort otherwise, but for those with enough zeros
 
 
 def named(style, number):

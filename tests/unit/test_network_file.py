@@ -1,7 +1,5 @@
 """Networks of ONNX files: each declaration gives what it says, and what does not fit is refused."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The method that runs a network: tiles give what the whole image gives, and the average over augmentations."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

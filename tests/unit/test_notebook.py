@@ -1,7 +1,5 @@
 """Trainings without Hydra: the lines of docs/python.md, stock loggers, and checkpoints that say what they are of."""
 
-from __future__ import annotations
-
 import csv
 import functools
 import re

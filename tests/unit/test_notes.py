@@ -1,7 +1,5 @@
 """Warnings of input, and their limits."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -192,12 +192,3 @@ def test_recorded_are_the_options_that_results_depend_on():
     entries = recorded(_parse("--fov", "60", "--pose", "p", "--rig-camera", "c", "--workers", "3"))
     assert {"camera", "workers"} & set(entries) == set()
     assert (entries["fov"], entries["rig_camera"], entries["only"]) == (60.0, Path("c"), ["a", "b"])
-
-
-def test_help_says_what_the_fields_say(capsys):
-    parser = ArgumentParser("demo")
-    add_options(parser, Request)
-    text = parser.format_help()
-    assert "the camera:" in text
-    assert "-o OUTPUT, --output OUTPUT" in text
-    assert "--intrinsics FX FY CX CY" in text

@@ -13,8 +13,7 @@ from dsr.sample import DepthSample
 pytestmark = pytest.mark.slow  # drawing takes a second
 
 SCORES = {"RMSE_d": 0.07, "DSSIM_v": 0.3}
-WIDTH = 2656
-"""Pixels: five panels of 3.2 inches and 0.6 inches of margin at 160 dpi."""
+WIDTH = 2656  # Pixels: five panels of 3.2 inches and 0.6 inches of margin at 160 dpi
 
 
 def toy_sample(height=32, width=32, *, truth=True, name="toy", scale=4):

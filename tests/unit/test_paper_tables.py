@@ -141,8 +141,7 @@ RECREATED = {
     "sphere_cylinder_high_freq": "Sphere and cylinder, high-frequency texture",
     "sphere_cylinder_low_freq": "Sphere and cylinder, low-frequency texture",
     "sphere_cylinder_no_texture": "Sphere and cylinder, no texture",
-}
-"""The embedded SimGeo scenes, and those of the paper that they are like."""
+}  # The embedded SimGeo scenes, and those of the paper that they are like
 
 
 def test_published_averages_are_over_the_same_scenes_as_ours():
@@ -238,14 +237,6 @@ def test_other_data_degradations_sizes_scales_and_methods_have_no_published_valu
     found = tables(run("Mine", {scene: 1.0}, **given)).values()
     assert not any(table.has_published for table in found)
     assert "method" in settings or not any(group.paper_only for table in found for group in table.groups)
-
-
-def test_methods_that_the_paper_ran_with_other_programs_are_named_below_its_values():
-    note = "EG, PDN: dsr's own implementation, not the one that the paper ran."
-    runs = [run(label, {"lucy": 1.0, "statue": 2.0}) for label in ("MSG-V", "PDN", "EG")]
-    found = tables(*runs, run("DG", {"statue": 1.0}))
-    assert note in found["simgeo_x4_box"].notes
-    assert not any("dsr's own" in text for text in found["summary_x4_box"].notes)  # no value of the paper there
 
 
 def study_of(*rows):

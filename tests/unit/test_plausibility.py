@@ -13,8 +13,7 @@ HEIGHT, WIDTH = 96, 640
 FRAMES = {
     "ddrnet": ("ddrnet/color_map/frame_000001.png", "ddrnet/depth_map/frame_000001.png", 90, 200),
     "camera": ("depth_camera/0/rgb.png", "depth_camera/0/raw_depth.png", 230, 300),
-}
-"""Photo, depth in mm, and the upper left corner of a window."""
+}  # Photo, depth in mm, and the upper left corner of a window
 WINDOW = 208
 
 

@@ -1,7 +1,5 @@
 """Prompt Depth Anything: what transformers' own processor and network give, files of others, and the hub."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The readers of the authors' weight files: what they take, and what they refuse without running it."""
 
-from __future__ import annotations
-
 import pickle
 from collections.abc import Iterable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``dsr.upsample``, ``dsr.Upsampler`` and ``dsr.Surface``: what is taken, what is given back, and what is refused."""
 
-from __future__ import annotations
-
 import json
 import pickle
 import re

@@ -1,7 +1,5 @@
 """``dsr.read``, ``dsr.read_depth`` and the cameras of matrices, angles and files, against what the command reads."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The methods of the configuration, read without Hydra."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -26,8 +26,6 @@ from dsr.report.page.value_pictures import (
     mask_picture,
 )
 
-SPITEFUL = "<img src=x onerror=alert(1)>\"'&</script><script>alert(2)</script>"
-
 
 def blocks(path):
     """Return the page's blocks of data by name."""
@@ -229,14 +227,6 @@ def test_page_has_mean_and_standard_deviation_of_several_seeds(make_run, tmp_pat
     assert [surface["text"] for surface in scene["surfaces"] if surface["kind"] == "method"] == ["seed 0"]
 
 
-def test_mean_over_the_scenes_in_common_is_labelled_with_their_number(make_run, tmp_path):
-    make_run(tmp_path / "runs" / "all", scenes=("a", "b"))
-    make_run(tmp_path / "runs" / "part", method="mine", label="Mine", scenes=("a",))
-    _, data, _ = saved(tmp_path, load_results([tmp_path / "runs"]))
-    counts = {row["method"]: row["counts"] for row in data["problems"][0]["means"]}
-    assert counts["Bicubic"]["RMSE_d"] == counts["Mine"]["RMSE_d"] == 1
-
-
 def test_published_values_stand_with_the_papers_own_scenes_alone(make_run, tmp_path):
     make_run(tmp_path / "runs" / "a", scenes=("lucy", "cube_no_texture"), size=512)
     make_run(tmp_path / "runs" / "b", scenes=("lucy",), downsampling="nearest", size=512)
@@ -278,31 +268,3 @@ def test_scene_without_truth_has_renderings_and_no_errors(make_run, tmp_path):
     assert [surface["kind"] for surface in scene["surfaces"]] == ["input", "method"]
     assert "error" not in scene
     assert "error" not in scene["surfaces"][1]
-
-
-def test_names_with_tags_are_escaped(make_run, tmp_path):
-    [run] = load_results([make_run(tmp_path / "run")]).runs
-    spiteful = dataclasses.replace(run, label=SPITEFUL, dataset=SPITEFUL)
-    path = tmp_path / "index.html"
-    save_page(path, Results((spiteful,), (SPITEFUL,)), title=SPITEFUL)
-    text = path.read_text(encoding="utf-8")
-    assert "<img" not in text
-    assert "alert(2)</script>" not in text
-    assert json.loads(blocks(path)["data"])["methods"] == [SPITEFUL]
-
-
-def test_progress_is_reported_and_an_interrupted_page_leaves_the_old_one(make_run, tmp_path):
-    results = load_results([make_run(tmp_path / "run", scenes=("a", "b", "c"))])
-    seen = []
-    path = tmp_path / "report" / "index.html"
-    save_page(path, results, progress=lambda done, total: seen.append((done, total)))
-    assert seen == [(1, 3), (2, 3), (3, 3)]
-    before = path.read_bytes()
-
-    def interrupt(_done, _total):
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        save_page(path, results, progress=interrupt)
-    assert path.read_bytes() == before
-    assert [file.name for file in path.parent.iterdir()] == ["index.html"]

@@ -1,7 +1,5 @@
 """The records' checks: each says whose value is wrong, what was expected and what came."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

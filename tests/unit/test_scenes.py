@@ -160,13 +160,6 @@ def test_scores_are_those_of_the_stored_prediction(tmp_path):
     assert table == pytest.approx(expected, rel=1e-12)
 
 
-def test_rmse_d_is_the_root_mean_square_of_perspective_depth_in_metres(tmp_path):
-    run(toy_study(tmp_path, ToySource(a=toy_scene("a")), ToyMethod(a=RAMP + 0.03)))
-    [value] = [float(row["value"]) for row in rows(tmp_path) if row["metric"] == "RMSE_d"]
-    lengths = [math.hypot((u - 7.5) / 20, (v - 7.5) / 20, 1) for u in range(SIZE) for v in range(SIZE)]
-    assert value == pytest.approx(0.03 * math.sqrt(sum(x * x for x in lengths) / len(lengths)), rel=1e-9)
-
-
 def test_valid_share_reflects_a_hole_in_the_truth(tmp_path):
     holed = RAMP.clone()
     holed[0, :4] = torch.nan

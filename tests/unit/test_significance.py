@@ -1,7 +1,5 @@
 """Intervals of means over scenes, and the paired test between two methods."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import bootstrap, permutation_test

@@ -1,7 +1,5 @@
 """Sparse-to-Dense: the parts against plain computations and the published sizes, and images of any size."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Files of our own networks' weights: what they give back, and what is refused."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A configuration in a run's directory runs no code but dsr's own, unless the person at the keyboard allows it."""
 
-from __future__ import annotations
-
 import copy
 import sys
 

@@ -32,21 +32,6 @@ def test_parts_are_those_asked_for_and_what_they_are_made_of(options, of_frame, 
     assert [part.name for part in wanted.of_all] == of_all
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"only": ("nosuch",)}, "got 'nosuch'"),
-        ({"without": ("nosuch",)}, "got 'nosuch'"),
-        ({"only": ()}, "something to be left"),
-        ({"format": "gif"}, "format: expected one of png"),
-        ({"max_points": 99}, "max_points: expected at least 100, got 99"),
-    ],
-)
-def test_wrong_results_are_refused(options, message):
-    with pytest.raises(ValueError, match=message):
-        results(**options)
-
-
 def test_settings_are_all_options_that_a_result_depends_on():
     request = UpsampleRequest(
         frames=FrameChoice(folders=(Path("in"),), workers=3),

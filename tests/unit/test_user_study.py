@@ -1,6 +1,5 @@
 """The perceptual study: its page, what is taken of the answers, and the percentages."""
 
-import argparse
 import base64
 import copy
 import io
@@ -16,7 +15,7 @@ import torch
 from PIL import Image
 from scipy.stats import binomtest
 
-from dsr.cli.study import STUDY
+from dsr.cli import main
 from dsr.evaluation.run_files import load_results
 from dsr.geometry.camera import Camera
 from dsr.pictures.depth_views import rendering
@@ -26,7 +25,6 @@ from dsr.report.study.intervals import agreement, average_fraction, bootstrap_of
 from dsr.report.study.key import Candidate, Key, Trial, read_key, write_key
 from dsr.report.study.percentages import ALL, AVERAGE, COLUMNS, collect, remarks
 from dsr.report.study.questionnaire import build_study, grey_png
-from dsr.utils.console import open_console
 
 CANDIDATES = {
     "aa": Candidate("MSG-V", "msg_v", "runs/1"),
@@ -396,24 +394,13 @@ def test_missing_truth_is_hidden_in_every_picture_alike():
     assert np.argwhere(~known).tolist() == [[1, 3], [2, 2], [2, 3]]
 
 
-class Commands:
-    """What the command line adds its commands to."""
-
-    def __init__(self):
-        self.parser = argparse.ArgumentParser()
-        STUDY.add(self.parser.add_subparsers())
-
-    def __call__(self, *arguments):
-        options = self.parser.parse_args(["study", *map(str, arguments)])
-        return options.run(options, open_console(), None)
-
-
 def test_command_collects_valid_answers_and_reports_the_others(tmp_path, capsys):
     write_key(tmp_path / "key.json", KEY)
     folder = tmp_path / "answers"
     folder.mkdir()
     written(folder, *FOUR, "{")
-    assert Commands()("collect", tmp_path, folder, "-o", tmp_path / "table.csv") == []
+    arguments = ("study", "collect", tmp_path, folder, "-o", tmp_path / "table.csv")
+    assert main([*map(str, arguments)]) == 0
     said = capsys.readouterr()
     assert said.err.startswith(f"left out: {folder / '4.json'}: ")
     assert "4 of 5 files count, see above" in said.out
