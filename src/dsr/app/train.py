@@ -361,8 +361,8 @@ def _train(plain: Config, settings: TrainConfig, prepared: _Prepared, processes:
     prepared.progress.say(f"loss   {module.objective.formula}")
     if not first:
         return _fit(plain, settings, prepared, first=False)
-    with rundir.at_work(folder, plain, prepared.identity, alone=True):
-        for key in rundir.claim(folder, plain, prepared.identity, prepared.tolerated):
+    with rundir.at_work(folder, plain, prepared.identity, prepared.tolerated, alone=True) as changed:
+        for key in changed:
             prepared.progress.say(f"note: the run began with another {key}")
         if settings.overwrite:  # so that nothing of the earlier training is taken for this one's if it is interrupted
             (folder / WEIGHTS).unlink(missing_ok=True)
