@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from dsr.utils.console import ConsoleProgress
-from dsr.utils.progress import SILENT, clock, duration, megabytes, part_of, show_length
+from dsr.utils.progress import clock, duration, megabytes, part_of, show_length
 
 
 class Clock:
@@ -114,14 +114,6 @@ def test_next_pass_is_shown_after_an_error(now: Clock, *, terminal: bool) -> Non
         with pytest.raises(ValueError, match="broken"):
             fail()
     assert list(progress.track(["c"], "score")) == ["c"]
-
-
-def test_silent_progress_shows_nothing_and_passes_items_on(capsys: pytest.CaptureFixture[str]) -> None:
-    assert list(SILENT.track("ab", "predict")) == ["a", "b"]
-    with SILENT.task("steps") as task:
-        task(1, 2, "loss 0.1")
-    SILENT.say("a line")
-    assert capsys.readouterr().out == ""
 
 
 def test_part_of_counts_the_steps_of_earlier_stages() -> None:
