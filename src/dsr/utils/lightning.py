@@ -113,7 +113,7 @@ class StepProgress(Callback):
         if bicubic and not trainer.global_step:
             self._progress.say(f"             bicubic:    {bicubic}")
 
-    def on_train_end(self, *_: Any) -> None:
+    def on_train_end(self, *_: Any, **__: Any) -> None:
         """Stop showing anything."""
         self._validation.close()
         self._stack.close()
