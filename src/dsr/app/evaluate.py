@@ -273,7 +273,6 @@ def _run(prepared: _Prepared, method: Method, progress: ConsoleProgress) -> pd.D
 
     settings, folder, source = prepared.settings, prepared.folder, prepared.source
     with rundir.at_work(folder, prepared.plain, prepared.identity):
-        rundir.claim(folder, prepared.plain, prepared.identity)
         if settings.overwrite:
             shutil.rmtree(folder / WORKSPACE, ignore_errors=True)
         _seed(settings.seed)

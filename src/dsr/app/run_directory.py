@@ -160,39 +160,32 @@ def expect_free(folder: Path, config: Config, identity: Identity, tolerated: Seq
 
 
 @contextlib.contextmanager
-def at_work(folder: Path, config: Config, identity: Identity, *, alone: bool = False) -> Iterator[None]:
-    """Within this context ``folder`` is that of commands with these settings; if ``alone``, of this command only."""
-    settings = (
-        f"{socket.gethostname()} {os.getpid()}" if alone else _hash_of({**identity, "metrics": config["metrics"]})
-    )
+def at_work(
+    folder: Path, config: Config, identity: Identity, tolerated: Sequence[str] = (), *, alone: bool = False
+) -> Iterator[list[str]]:
+    """Within this context ``folder`` is that of commands with these settings; if ``alone``, of this command only.
+
+    ``config.yaml`` and ``versions.json`` are written to it. Yields the ``tolerated`` keys in which the run differs.
+    """
+    shared = _hash_of({**identity, "metrics": config["metrics"]})
+    settings = f"{socket.gethostname()} {os.getpid()}" if alone else shared
+    record = {**versions(), "hash": _hash_of(identity), "identity": dict(identity)}
     with contextlib.ExitStack() as stack:
         try:
             stack.enter_context(locks.at_work(folder, settings))
+            different = expect_free(folder, config, identity, tolerated)
+            write_text(folder / _RECORD, json.dumps(record, indent=1) + "\n")
+            write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(dict(config))))
         except locks.InUseError as error:
-            shared = "" if alone else " with other settings"
+            settings = "" if alone else " with other settings"
             raise ConfigError(
-                f"output_dir: {error.owner} is at work in {folder}{shared}; wait for its end, or take another"
+                f"output_dir: {error.owner} is at work in {folder}{settings}; wait for its end, or take another"
             ) from error
         except OSError as error:
-            raise _unwritable(folder, error) from error
-        yield
-
-
-def _unwritable(folder: Path, error: OSError) -> ConfigError:
-    """Return the error of a directory that cannot be written."""
-    return ConfigError(f"output_dir: expected a directory to write to, got {folder} ({error.strerror})")
-
-
-def claim(folder: Path, config: Config, identity: Identity, tolerated: Sequence[str] = ()) -> list[str]:
-    """Write ``config.yaml`` and ``versions.json`` of this run into ``folder``, checked by :func:`expect_free`."""
-    different = expect_free(folder, config, identity, tolerated)
-    record = {**versions(), "hash": _hash_of(identity), "identity": dict(identity)}
-    try:
-        write_text(folder / _RECORD, json.dumps(record, indent=1) + "\n")
-        write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(dict(config))))
-    except OSError as error:
-        raise _unwritable(folder, error) from error
-    return different
+            raise ConfigError(
+                f"output_dir: expected a directory to write to, got {folder} ({error.strerror})"
+            ) from error
+        yield different
 
 
 def _changes(before: Config, now: Config, prefix: str = "") -> list[str]:

@@ -114,7 +114,7 @@ class Processes:
     @contextlib.contextmanager
     def running(self) -> Iterator[None]:
         """Join the processes within this context; those that Lightning has started end with the first one."""
-        before = {name: os.environ.get(name) for name in _OF_PROCESSES}
+        before = {name: os.environ[name] for name in _OF_PROCESSES if name in os.environ}
         rank_zero_only.rank = self.rank  # type: ignore[attr-defined]
         if self.rank and isinstance(self.environment, LightningEnvironment):
             interruption.end_with(os.getppid())
@@ -123,10 +123,9 @@ class Processes:
         finally:
             if self.count > 1 and torch.distributed.is_initialized():
                 torch.distributed.destroy_process_group()
-            for name, value in before.items():  # the next job of a multirun starts processes of its own
+            for name in _OF_PROCESSES:  # the next job of a multirun starts processes of its own
                 os.environ.pop(name, None)
-                if value is not None:
-                    os.environ[name] = value
+            os.environ.update(before)
 
 
 def find_processes(device: torch.device, devices: int | Literal["auto"]) -> Processes:
@@ -229,11 +228,8 @@ def _prepare(plain: Config, settings: TrainConfig, device: torch.device, process
                 )
         with without_chatter():
             loggers.append(build(f"logger.{name}", {"save_dir": str(folder), **node}))
-    node = {  # the limit of gradients is only checked here
-        key: value
-        for key, value in settings.trainer.items()
-        if key not in READ_OF_TRAINER or key == "gradient_clip_val"
-    }
+    ours = READ_OF_TRAINER.keys() - {"gradient_clip_val"}  # the limit of gradients is only checked here
+    node = {key: value for key, value in settings.trainer.items() if key not in ours}
     unused = "_find_unused_parameters_true" if settings.degradation.get("scales") else ""  # layers of one factor
     trainer = make_trainer(
         device,
@@ -361,8 +357,8 @@ def _train(plain: Config, settings: TrainConfig, prepared: _Prepared, processes:
     prepared.progress.say(f"loss   {module.objective.formula}")
     if not first:
         return _fit(plain, settings, prepared, first=False)
-    with rundir.at_work(folder, plain, prepared.identity, alone=True):
-        for key in rundir.claim(folder, plain, prepared.identity, prepared.tolerated):
+    with rundir.at_work(folder, plain, prepared.identity, prepared.tolerated, alone=True) as changed:
+        for key in changed:
             prepared.progress.say(f"note: the run began with another {key}")
         if settings.overwrite:  # so that nothing of the earlier training is taken for this one's if it is interrupted
             (folder / WEIGHTS).unlink(missing_ok=True)

@@ -9,19 +9,22 @@ from pathlib import Path
 from typing import Any
 
 from dsr.app.schema import Config, TrainConfig, user_directories
-from dsr.app.trust import Trust, expect_trusted, read_plain_yaml
+from dsr.app.trust import allowed_targets, expect_trusted, read_plain_yaml
 from dsr.data.scene_source import SceneSource, SceneSubset
 from dsr.degradation.downsampling import Downsampling
 from dsr.methods.networks.network import DisparityNetwork
 from dsr.training.data_module import Part, PatchData
 from dsr.training.degradation import Degradation
 from dsr.training.settings import PatchSettings
-from dsr.utils.configuration import ConfigError, build, load_target, with_key
+from dsr.utils.configuration import ConfigError, build, load_target
 from dsr.utils.guards import is_number
 
 WEIGHTS = "weights.safetensors"
 _FROM_RUN = ("scale", "downsampling", "noise", "seed", "dataset")
 _NOT_WITH_RUN = ("method", "scale", "weights")
+# The nodes of the arguments that errors of a training's parts begin with.
+_NODES = dict.fromkeys((each.name for each in dataclasses.fields(PatchSettings)), "patches")
+_NODES |= {"depth_loss": "model.objective", "shading": "model.objective", "visual": "loss"}
 
 
 def read_config(folder: Path, trust: Any = None) -> dict[str, Any]:
@@ -41,7 +44,7 @@ def read_config(folder: Path, trust: Any = None) -> dict[str, Any]:
             raise ConfigError("model.net._target_: missing")
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
-    expect_trusted(path, config, Trust.of(trust, user_directories()))
+    expect_trusted(path, config, allowed_targets(trust, user_directories()))
     return config
 
 
@@ -109,12 +112,11 @@ def training_data(settings: TrainConfig, devices: int = 1) -> PatchData:
 @contextlib.contextmanager
 def keyed() -> Iterator[None]:
     """Turn an error of a training's parts into a ConfigError that names the configuration key."""
-    names = [field.name for field in dataclasses.fields(PatchSettings)]
     try:
         yield
     except (ValueError, OSError) as error:
-        message = with_key(with_key(str(error), "patches", names), "model.objective", ["depth_loss", "shading"])
-        raise ConfigError(with_key(message, "loss", ["visual"])) from error
+        node = _NODES.get(str(error).partition(":")[0])
+        raise ConfigError(f"{node}.{error}" if node else str(error)) from error
 
 
 def _parts(settings: TrainConfig) -> list[Part]:

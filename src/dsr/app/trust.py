@@ -11,7 +11,6 @@ import functools
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,21 +30,17 @@ _LIGHTNING = ("logger", "callbacks", "trainer")  # nodes of Lightning's classes,
 _PLACES = ("save_dir", "dir", "root_dir", "tracking_uri")  # of loggers; dsr gives them the run's directory
 
 
-@dataclass(frozen=True)
-class Trust:
-    """Which targets besides dsr's the person who runs the command allows: all, or those named, each with its group."""
+def allowed_targets(trust: Any, directories: Sequence[Path] = ()) -> frozenset[tuple[str, str]] | None:
+    """Return the targets besides dsr's, with their groups, that a person's own directories and ``trust`` allow.
 
-    anything: bool = False
-    targets: frozenset[tuple[str, str]] = frozenset()
-
-    @classmethod
-    def of(cls, value: Any, directories: Sequence[Path] = ()) -> Trust:
-        """Return what the key ``trust`` (null, false, true, a target or a list of them) and own directories allow."""
-        named = [value] if isinstance(value, str) else value or []
-        if not isinstance(value, bool) and not (isinstance(named, list) and all(isinstance(e, str) for e in named)):
-            raise ConfigError(f"trust: expected true, false, or targets such as module.Name, got {value!r}")
-        own = frozenset().union(*map(_targets_in, directories))
-        return cls(value is True, own if isinstance(value, bool) else own | {("", each) for each in named})
+    ``trust`` is null, false, true, for which None is returned, a target or a list of them, which any group may have.
+    """
+    if trust is True:
+        return None
+    named = [trust] if isinstance(trust, str) else trust or []
+    if not (isinstance(named, list) and all(isinstance(each, str) for each in named)):
+        raise ConfigError(f"trust: expected true, false, or targets such as module.Name, got {trust!r}")
+    return frozenset({("", each) for each in named}).union(*map(_targets_in, directories))
 
 
 def read_plain_yaml(path: Path) -> dict[str, Any]:
@@ -68,11 +63,14 @@ def read_plain_yaml(path: Path) -> dict[str, Any]:
     return {str(key): value for key, value in content.items()}
 
 
-def expect_trusted(path: Path, config: Config, trust: Trust) -> None:
-    """Check the configuration of a run, which may be a stranger's: what it imports, and which files it names."""
-    if trust.anything:
+def expect_trusted(path: Path, config: Config, trusted: frozenset[tuple[str, str]] | None) -> None:
+    """Check the configuration of a run, which may be a stranger's: what it imports, and which files it names.
+
+    ``trusted`` are the targets besides dsr's that may be imported, each with its group; None for all.
+    """
+    if trusted is None:
         return
-    allowed = _targets_in(config_directories()[0]) | trust.targets
+    allowed = _targets_in(config_directories()[0]) | trusted
     for key, target in imported(config):
         group = key[1] if key[1] in ("optimizer", "scheduler") else _GROUP_OF.get(key[0], key[0])
         of_metrics = group == "metrics" and target.startswith("dsr.metrics.")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import attrgetter
@@ -221,3 +221,9 @@ def complete_formats(names: Iterable[str], *defined: Formats) -> dict[str, Metri
 def main_first(names: Iterable[str]) -> list[str]:
     """Return the names of metrics with those of :data:`LOOKS` first; the others keep their order."""
     return sorted(names, key=lambda name: LOOKS.index(name) if name in LOOKS else len(LOOKS))
+
+
+def looks_and_depth(names: Collection[str]) -> dict[str, list[str]]:
+    """Return the names of metrics by the heading of their charts, with those of :data:`LOOKS` first."""
+    looks = main_first(name for name in names if "_v" in name)
+    return {"Looks": looks, "Depth and normals": [name for name in names if name not in looks]}

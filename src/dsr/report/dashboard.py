@@ -18,7 +18,7 @@ from dsr.evaluation.results import Run, formats_of, method_settings
 from dsr.geometry.lights import LIGHT_NAMES
 from dsr.geometry.surface import render
 from dsr.metrics.catalogue import KNOWN_FORMATS
-from dsr.metrics.formats import HEADLINES, LOOKS, MetricFormat, main_first
+from dsr.metrics.formats import HEADLINES, LOOKS, looks_and_depth, main_first
 from dsr.pictures.canvas import colours
 from dsr.pictures.depth_views import normals_seen_by, reduced
 from dsr.sample import DepthSample
@@ -26,8 +26,7 @@ from dsr.utils.files import temporary_folder
 from dsr.utils.runs_table import list_run
 
 _EVENTS = "events.out.tfevents.*"
-_PANEL = 320
-"""Maximum longer side of a rendering in a picture, pixels."""
+_PANEL = 320  # pixels of the longer side of a rendering in a picture
 
 
 def save_dashboard(run: Run) -> None:
@@ -56,8 +55,8 @@ def _write_scores(writer: SummaryWriter, run: Run) -> None:
     """Write scalars, their layout, and the run's row in the table of runs."""
     scored = list(run.scores["scene"].unique())
     means: dict[str, float] = {}
-    formats = _shown_formats(run)
-    looks = main_first(name for name in formats if "_v" in name)
+    more = {name: KNOWN_FORMATS[name] for name in LOOKS if (run.scores["metric"] == name).any()}
+    formats = formats_of([run]) | more
     by_light: list[str] = []
     for name, each in formats.items():
         rows = run.scores[run.scores["metric"] == name]
@@ -72,12 +71,11 @@ def _write_scores(writer: SummaryWriter, run: Run) -> None:
             light = LIGHT_NAMES.index(row.variant) + 1
             writer.add_scalar(f"light/{name}/{row.scene}", row.value * each.factor, light)
     titles = {name: each.chart_title(by_light=name in by_light) for name, each in formats.items()}
-    depth = [name for name in formats if name not in looks]
     layout = {
         f"{title}, {run.dataset}": {
             titles[name]: ["Multiline", [f"scene/{name}/{re.escape(run.dataset)}$"]] for name in names
         }
-        for title, names in (("Looks", looks), ("Depth and normals", depth))
+        for title, names in looks_and_depth(formats).items()
     }
     layout[f"By light, {LIGHT_NAMES[0]} to {LIGHT_NAMES[-1]}, {run.dataset}"] = {
         formats[name].title: ["Multiline", [f"light/{name}/.*"]] for name in main_first(by_light)
@@ -89,12 +87,6 @@ def _write_scores(writer: SummaryWriter, run: Run) -> None:
         **{name: getattr(run, name) for name in ("scale", "dataset", "seed")},
     }
     list_run(writer, "evaluation", {**settings, "method": run.label, "degradation": run.downsampling}, means)
-
-
-def _shown_formats(run: Run) -> dict[str, MetricFormat]:
-    """Return the formats of the metrics of tables, and of others by which results are compared first."""
-    more = {name: KNOWN_FORMATS[name] for name in LOOKS if (run.scores["metric"] == name).any()}
-    return formats_of([run]) | more
 
 
 def _write_pictures(

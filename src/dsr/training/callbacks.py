@@ -13,7 +13,7 @@ from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import Logger, MLFlowLogger, TensorBoardLogger, WandbLogger
 from torch import Tensor
 
-from dsr.metrics.formats import main_first
+from dsr.metrics.formats import looks_and_depth
 from dsr.training.degradation import Batch
 from dsr.utils.checkpoints import ends_step
 from dsr.utils.runs_table import list_run
@@ -102,11 +102,9 @@ def log_layout(logger: TensorBoardLogger, titles: Mapping[str, str]) -> None:
     A chart has a metric's mean over all validation sets and, if there are several, the means of each, of the network
     and of bicubic interpolation.
     """
-    looks = main_first(name for name in titles if "_v" in name)
-    depth = [name for name in titles if name not in looks]
     groups = {
         **{title: {titles[name]: rf"(val|bicubic)(_[^/]*)?/{re.escape(name)}$" for name in names}
-           for title, names in (("Looks", looks), ("Depth and normals", depth))},
+           for title, names in looks_and_depth(titles).items()},
         "Training": {name: f"train/{name}$" for name in ("loss", "gradient_norm")},
     }  # fmt: skip
     layout = {title: {name: ["Multiline", [tag]] for name, tag in charts.items()} for title, charts in groups.items()}

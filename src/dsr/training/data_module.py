@@ -257,7 +257,7 @@ def _collate_prepared(prepare: Callable[[Batch], Batch], samples: list[Batch]) -
 def _begin_worker(parent: int, _: int) -> None:
     """Prepare a worker; torch looks after the parent only every five seconds."""
     interruption.end_with(parent)
-    interruption.outlast_group()
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # to the whole group: the parent may need it to complete a step
 
 
 def _make_unique(name: str, names: Mapping[str, Any]) -> str:

@@ -38,11 +38,7 @@ class Divergence(Callback):
     """Ends a training whose losses, weights or predictions are not finite, before a checkpoint is written.
 
     The numbers are read every 100 steps, after validations and before checkpoints. Callbacks that keep something of a
-    validation come after this one.
-
-    Args:
-        patience: steps in a row without a finite loss and gradient that end it.
-
+    validation come after this one. ``patience`` steps in a row without a finite loss and gradient end the training.
     """
 
     def __init__(self, patience: int = 10) -> None:

@@ -15,7 +15,7 @@ import importlib.util
 import inspect
 import json
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -66,9 +66,11 @@ def _make(group: str, node: Node, given: Mapping[str, Any], name: str | None = N
         if not isinstance(error, ValueError | OSError) and not target.__module__.startswith("lightning."):
             raise
         message = " ".join(str(error).split())
-        keyed = with_key(message, group, inspect.signature(target).parameters)
-        foreign = keyed == message and not target.__module__.startswith("dsr.")
-        raise ConfigError(f"{group}: {message}" if foreign else keyed) from error
+        if message.partition(":")[0] in inspect.signature(target).parameters:
+            message = f"{group}.{message}"
+        elif not target.__module__.startswith("dsr."):
+            message = f"{group}: {message}"
+        raise ConfigError(message) from error
 
 
 def _checked(group: str, node: Node, given: Mapping[str, Any], name: str | None) -> tuple[Any, dict[str, Any]]:
@@ -109,11 +111,6 @@ def _built(key: str, value: Any) -> Any:
     if _TARGET in value:
         return _make(key, value, {})
     return {name: _built(f"{key}.{name}", each) for name, each in value.items()}
-
-
-def with_key(message: str, group: str, parameters: Collection[str]) -> str:
-    """Return an error message with the key that sets the argument which it begins with."""
-    return f"{group}.{message}" if message.partition(":")[0] in parameters else message
 
 
 def load_target(group: str, node: Node) -> Any:

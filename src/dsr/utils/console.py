@@ -95,20 +95,16 @@ class ConsoleProgress(Progress):
     """Shows progress with named times: bars on a terminal, elsewhere plain lines.
 
     If the output is not a terminal, each finished item gets a line, and running work gets one every ten seconds. In a
-    process that is forked from the one that made it, only lines of text are shown.
-
-    Args:
-        console: where it is shown.
-        now: returns the time in seconds.
-
+    process that is forked from the one that made it, only lines of text are shown. ``now`` returns the time in seconds.
     """
 
     def __init__(self, console: Console, now: Callable[[], float] = time.monotonic) -> None:
         self._console, self._now, self._process, self._next_line = console, now, os.getpid(), 0.0
+        self._state = _State()
         self._bars = Bars(
             TextColumn("{task.description:<8}", markup=False),
             BarColumn(24),
-            _State(),
+            self._state,
             console=console,
             transient=True,
             get_time=now,
@@ -128,27 +124,23 @@ class ConsoleProgress(Progress):
         if not self._bars.tasks:
             self._bars.start()
             self._next_line = self._now() + _FIRST_LINE
-        since = self._now()
         number = self._bars.add_task(
-            name, total=total, completed=done, visible=total is not None, unit=unit, remark="", measured=(since, done),
-            speed=0.0,
-        )  # fmt: skip
+            name, total=total, completed=done, visible=total is not None, unit=unit, remark="", before=done
+        )
         bar, counted = next(each for each in self._bars.tasks if each.id == number), unit == "items"
 
         def report(done: int, total: int | None = None, remark: str | None = None) -> None:
             nonlocal counted
-            now = self._now()
             if not counted or done < bar.completed:  # a download first reports the bytes that were there before
-                bar.fields["measured"], counted = (now, done), True
-            since, before = bar.fields["measured"]
-            bar.fields["speed"] = (done - before) / (now - since) if now > since else 0.0
+                bar.fields["before"], counted = done, True
             bar.fields["remark"] = bar.fields["remark"] if remark is None else remark
             bar.total, bar.completed, bar.visible = bar.total if total is None else total, done, True
+            now = self._now()
             if not self._console.is_terminal and done != bar.total and now >= self._next_line:
                 self._next_line = now + _NEXT_LINE
                 bars = [each for each in self._bars.tasks if each.visible]
                 outer = (f"{_name_of(each)} ({_amount_of(each)})" for each in bars[: bars.index(bar)])
-                self.say(": ".join((*outer, f"{name}: {_state_of(bar)}")))
+                self.say(": ".join((*outer, f"{name}: {self._state.render(bar).plain}")))
 
         try:
             yield report
@@ -168,33 +160,35 @@ class ConsoleProgress(Progress):
         lines: bool = True,
     ) -> Iterator[Item]:
         """Yield items, and show how many are done; see :class:`dsr.utils.progress.Progress`."""
+        if os.getpid() != self._process:
+            yield from items
+            return
         if total is None:
             items = list(items)
             total = len(items)
         with self.task(name, total, done=done) as task:
-            bar = self._bars.tasks[-1] if os.getpid() == self._process else None
-            before = self._now()
+            bar, before = self._bars.tasks[-1], self._now()
             for number, item in enumerate(items, done):
                 task(number, remark=label(item))
                 yield item
                 now = self._now()
                 worthwhile = total <= _MANY or number + 1 == total or now - before >= _LONG
-                told = lines and not self._console.is_terminal and worthwhile and bar is not None
+                told = lines and not self._console.is_terminal and worthwhile
                 self._next_line = now + _NEXT_LINE if told else self._next_line
                 task(number + 1)
-                if told and bar is not None:
-                    amount, *times = _facts_of(bar)
-                    self.say(f"{_name_of(bar)}: {', '.join((amount, f'{now - before:.1f} s', *times))}")
+                if told:
+                    times = (f"{now - before:.1f} s", *_times_of(bar))
+                    self.say(f"{_name_of(bar)}: {', '.join((_amount_of(bar), *times))}")
                 before = now
-        if lines and self._console.is_terminal and bar is not None and (bar.elapsed or 0) >= _LONG:
-            self.say(f"{name}: {', '.join(_facts_of(bar)[:2])}")
+        if lines and self._console.is_terminal and (bar.elapsed or 0) >= _LONG:
+            self.say(f"{name}: {_amount_of(bar)}, {_times_of(bar)[0]}")
 
 
 class _State(ProgressColumn):
     """The amount, the named times and the remark of a task."""
 
     def render(self, task: Bar) -> Text:
-        return Text(_state_of(task), no_wrap=True)
+        return Text(", ".join(filter(None, (_amount_of(task), *_times_of(task), task.fields["remark"]))), no_wrap=True)
 
 
 def _name_of(bar: Bar) -> str:
@@ -202,22 +196,22 @@ def _name_of(bar: Bar) -> str:
     return f"{bar.description} {bar.fields['remark']}".rstrip()
 
 
+def _speed_of(bar: Bar) -> float:
+    """Return the amount of a second, 0 if it is not known."""
+    return (bar.completed - bar.fields["before"]) / bar.elapsed if bar.elapsed else 0.0
+
+
 def _amount_of(bar: Bar) -> str:
-    """Return the amount done and the total."""
-    done, total = int(bar.completed), bar.total
+    """Return the amount done, the total and, of bytes, the speed."""
+    done, total, speed = int(bar.completed), bar.total, _speed_of(bar)
     if bar.fields["unit"] == "items":
         return f"{done}" if total is None else f"{done} of {int(total)}"
-    speed = f", {megabytes(bar.fields['speed'])}/s" if bar.fields["speed"] else ""
-    return megabytes(done) + ("" if total is None else f" of {megabytes(total)}") + speed
+    of_total = "" if total is None else f" of {megabytes(total)}"
+    return megabytes(done) + of_total + (f", {megabytes(speed)}/s" if speed else "")
 
 
-def _facts_of(bar: Bar) -> list[str]:
-    """Return the amount, and the elapsed and, if it is known, the remaining time."""
-    left, speed = bar.remaining, bar.fields["speed"]
+def _times_of(bar: Bar) -> list[str]:
+    """Return the elapsed and, if it is known, the remaining time."""
+    left, speed = bar.remaining, _speed_of(bar)
     remaining = [f"remaining {clock(left / speed)}"] if left is not None and speed else []
-    return [_amount_of(bar), f"elapsed {clock(bar.elapsed or 0.0)}", *remaining]
-
-
-def _state_of(bar: Bar) -> str:
-    """Return a task's state in one line."""
-    return ", ".join(filter(None, (*_facts_of(bar), bar.fields["remark"])))
+    return [f"elapsed {clock(bar.elapsed or 0.0)}", *remaining]

@@ -32,7 +32,12 @@ def start(module: str, function: str) -> NoReturn:
     for number in (signal.SIGINT, signal.SIGTERM):
         if signal.getsignal(number) != signal.SIG_IGN:  # as in a shell's background job
             signal.signal(number, _interrupt)
-    _leave_working_directory()
+    # No code is loaded from the working directory, which may hold a stranger's files, here or in worker processes.
+    os.environ["PYTHONSAFEPATH"] = "1"  # of worker processes, which are started with -c
+    os.environ["LD_LIBRARY_PATH"] = os.environ.get("LD_LIBRARY_PATH") or str(Path(__file__).parent)
+    # OpenCV puts a colon before it, and the working directory would stand for an empty entry
+    if getattr(sys.modules["__main__"], "__spec__", None) is not None and sys.path[:1] == [os.getcwd()]:  # noqa: PTH109
+        del sys.path[0]  # where ``python -m`` puts it
     ignore_warnings_of_numbers()
     try:
         code = getattr(importlib.import_module(module), function)()
@@ -47,15 +52,6 @@ def start(module: str, function: str) -> NoReturn:
             with contextlib.suppress(AttributeError):  # joblib's have no kill, and end by themselves
                 worker.kill()
     sys.exit(code)
-
-
-def _leave_working_directory() -> None:
-    """Load no code from the working directory, which may hold a stranger's files, in this process and its workers."""
-    os.environ["PYTHONSAFEPATH"] = "1"  # of worker processes, which are started with -c
-    os.environ["LD_LIBRARY_PATH"] = os.environ.get("LD_LIBRARY_PATH") or str(Path(__file__).parent)
-    # OpenCV puts a colon before it, and the working directory would stand for an empty entry
-    if getattr(sys.modules["__main__"], "__spec__", None) is not None and sys.path[:1] == [os.getcwd()]:  # noqa: PTH109
-        del sys.path[0]  # where ``python -m`` puts it
 
 
 def _interrupt(number: int, _: FrameType | None) -> None:
@@ -142,8 +138,3 @@ def end_with(parent: int) -> None:
     ignore_warnings_of_numbers()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=watch, daemon=True).start()
-
-
-def outlast_group() -> None:
-    """Ignore a SIGTERM to all processes in this one, a worker: its parent may need it to complete a step."""
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)

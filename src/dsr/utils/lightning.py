@@ -36,11 +36,7 @@ class ScoreTables(Callback):
 
     The file has the raw values to the last digit: step, set, metric and value. The module's ``validation_scores`` are
     in metres and fractions, ``shown_scores``, which are logged, in the units of tables; both by set and by metric.
-
-    Args:
-        path: of the file.
-        best: what finds the best validation, before it has seen the one at hand; without it the last one is listed.
-
+    ``best`` has not yet seen the validation at hand; without it the last one is listed.
     """
 
     def __init__(self, path: Path, best: ModelCheckpoint | None = None) -> None:
@@ -55,10 +51,10 @@ class ScoreTables(Callback):
         if self._path.is_file():
             with self._path.open(newline="", encoding="utf-8") as before:
                 kept = [row for row in list(csv.reader(before))[1:] if int(row[0]) < step]
-        rows = [[str(step), kind, name, repr(value)]
-                for kind, each in scored.validation_scores.items() for name, value in each.items()]  # fmt: skip
+        for kind, scores in scored.validation_scores.items():
+            kept += [[str(step), kind, name, repr(value)] for name, value in scores.items()]
         with replacing(self._path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-            csv.writer(file, lineterminator="\n").writerows([("step", "set", "metric", "value"), *kept, *rows])
+            csv.writer(file, lineterminator="\n").writerows([("step", "set", "metric", "value"), *kept])
         best = None if self._best is None else self._best.best_model_score
         if best is not None and trainer.callback_metrics[str(self._best.monitor)] >= best:  # type: ignore[union-attr]
             return
@@ -117,14 +113,12 @@ class StepProgress(Callback):
         if bicubic and not trainer.global_step:
             self._progress.say(f"             bicubic:    {bicubic}")
 
-    def on_train_end(self, *_: Any) -> None:
+    def on_train_end(self, *_: Any, **__: Any) -> None:
         """Stop showing anything."""
         self._validation.close()
         self._stack.close()
 
-    def on_exception(self, *_: Any) -> None:
-        """Stop showing anything."""
-        self.on_train_end()
+    on_exception = on_train_end
 
 
 class LastValidation(Callback):

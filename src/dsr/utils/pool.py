@@ -64,40 +64,31 @@ class Pool:
     ) -> Generator[tuple[_Item, _Value]]:
         """Begin to work on items, and return each with its value, as they come or in their order.
 
-        If workers are killed twice, a ChildProcessError is raised instead of what is left.
+        What a killed worker has left is begun again. If workers are killed twice, a ChildProcessError is raised.
         """
-        return self._results(function, items, *self._submit(function, items), ordered=ordered)
+        left, executor = self._submit(function, items)
 
-    def _results(
-        self,
-        function: Callable[[_Item], _Value],
-        items: Sequence[_Item],
-        futures: list[Future[_Value]],
-        executor: ProcessPoolExecutor,
-        *,
-        ordered: bool,
-    ) -> Generator[tuple[_Item, _Value]]:
-        """Yield each item with its value; what a killed worker has left is submitted again."""
-        left = dict(zip(futures, items, strict=True))
-        while left:
-            try:
-                for future in list(left) if ordered else as_completed(left):
-                    value = future.result()
-                    yield left.pop(future), value
-            except BrokenProcessPool:
-                self._replace(executor)
-                items = list(left.values())
-                futures, executor = self._submit(function, items)
-                left = dict(zip(futures, items, strict=True))
+        def values() -> Generator[tuple[_Item, _Value]]:
+            nonlocal left, executor
+            while left:
+                try:
+                    for future in list(left) if ordered else as_completed(left):
+                        value = future.result()
+                        yield left.pop(future), value
+                except BrokenProcessPool:
+                    self._replace(executor)
+                    left, executor = self._submit(function, list(left.values()))
+
+        return values()
 
     def _submit(
         self, function: Callable[[_Item], _Value], items: Sequence[_Item]
-    ) -> tuple[list[Future[_Value]], ProcessPoolExecutor]:
+    ) -> tuple[dict[Future[_Value], _Item], ProcessPoolExecutor]:
         while True:
             executor = self._executors[-1]
             try:
                 with interruption.starting_workers():
-                    return [executor.submit(_call, function, item) for item in items], executor
+                    return {executor.submit(_call, function, item): item for item in items}, executor
             except BrokenProcessPool:
                 self._replace(executor)
 
