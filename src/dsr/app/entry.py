@@ -12,13 +12,15 @@ import re
 import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor
+from pathlib import Path
 from typing import Any, NoReturn
 
 import hydra
+from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
@@ -79,13 +81,11 @@ def run_command(name: str, command: Callable[[DictConfig], Any], arguments: Sequ
     except KeyboardInterrupt as interrupted:
         sys.exit(interruption.stop(str(interrupted)))
     except (HydraException, OmegaConfBaseException) as error:
-        fail(explain(error))
-    except UnicodeDecodeError as error:
-        fail(f"--config-dir: expected files in UTF-8, got one that is not: {error}")
+        fail(_damaged_file() or explain(error))
     except (OSError, FullDiskError, ValueError, YAMLError, RecursionError, BrokenExecutor) as error:
         if begun and isinstance(error, ValueError | RecursionError) and not isinstance(error, ConfigError):
             raise  # a defect of the command's
-        fail(one_line(error))
+        fail(_damaged_file() or one_line(error))
     finally:
         sys.argv = process
 
@@ -122,6 +122,21 @@ def fail(message: str) -> NoReturn:
     """Print one line on stderr and exit with 2."""
     print_error(message)
     sys.exit(USAGE_ERROR)
+
+
+def _damaged_file() -> str:
+    """Return why the user's configuration files cannot be read, one line; empty if they can."""
+    folder = get_args_parser().parse_known_args(sys.argv[1:])[0].config_dir
+    try:
+        own = config_directories([] if folder is None else [Path(folder)])[1:]
+    except ConfigError as error:
+        return str(error)
+    for path in sorted(path for place in own for path in place.glob("*/*.yaml")):
+        try:
+            OmegaConf.load(path)
+        except Exception as error:  # damaged YAML raises many types
+            return f"{path}: expected a readable YAML file, got {type(error).__name__}"
+    return ""
 
 
 def explain(error: Exception) -> str:
