@@ -110,12 +110,18 @@ def test_missing_key_is_refused_with_how_to_set_it():
         ("names", "a", ".*, got 'a'"), ("names", [1], ".*, got \\[1\\]"),
         ("share", "x", "number, got 'x'"), ("share", True, "number, got True"),
         ("count", 1.5, "integer, got 1.5"), ("count", True, "integer, got True"),
-        ("order", "mid", ".*, got 'mid'"), ("flag", "yes", "boolean, got 'yes'"),
-        ("flag", 1, "boolean, got 1"), ("file", 1, ".*, got 1"),
+        ("order", "mid", ".*, got 'mid'"), ("flag", "yes", "true or false, got 'yes'"),
+        ("flag", 1, "true or false, got 1"), ("file", 1, ".*, got 1"),
     ],
 )  # fmt: skip
 def test_value_of_the_wrong_type_is_refused_with_the_expected_type(key, value, expected):
     assert re.match(rf"dataset\.{key}: expected {expected}", refusal(node(**{"root": "r", key: value})))
+
+
+def test_text_in_place_of_a_node_is_refused():
+    objective = {"_target_": "dsr.training.objective.DepthObjective", "visual": "mse_v"}
+    with pytest.raises(ConfigError, match=r"^model\.objective\.visual: expected a node with _target_, got 'mse_v'"):
+        build("model.objective", objective)
 
 
 @pytest.mark.parametrize(("key", "value"), [("share", 1), ("names", None), ("names", []), ("file", None)])

@@ -140,7 +140,7 @@ def test_method_is_built_from_a_file_and_values_are_checked(tmp_path: Path) -> N
     depth = AnyMap(tmp_path / "weights")(_sample((12, 18), 8 / 3))
     assert depth.shape == (1, 32, 48)
     for key, value in (("smooth", 3), ("noise", -1), ("kernel", "sinc"), ("edges", "round"), ("max_error", 0)):
-        with pytest.raises(ValueError, match=f"^{key}: expected .*, got {value}$"):
+        with pytest.raises(ValueError, match=f"^{key}: expected .*, got '?{value}'?$"):
             AnyMap(tmp_path / "weights", **{key: value})  # type: ignore[arg-type]
 
 

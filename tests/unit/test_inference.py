@@ -266,7 +266,7 @@ def test_settings_change_the_result_and_are_checked() -> None:
     assert float((exact - loose).abs().max()) > 1e-3
     for settings, message in (
         ({"data_wieght": 3}, "data_wieght: unknown key; method=tgv takes iterations, .*data_weight"),
-        ({"data_weight": "x"}, "data_weight: expected number or 'auto', got 'x'"),
+        ({"data_weight": "x"}, "data_weight: expected number or 'auto' or null, got 'x'"),
         ({"data_weight": -3}, "data_weight: expected a positive number, got -3"),
         ({"fill_holes": False}, "fill_holes: unknown key"),
     ):

@@ -36,7 +36,7 @@ _NOT_IDENTITY = ("output_dir", "overwrite", "metrics", "weights", "resume", "run
                  "logger")  # fmt: skip
 # Overrides that a name does not list: what is in it anyway, and what changes no result.
 _IN_NAME = (*NAMED, "names.dataset", "scale", "seed")
-_NOT_NAMED = {*_NOT_IDENTITY, "device"} - {"weights", "run"}
+_NOT_NAMED = {*_NOT_IDENTITY, "device"} - {"run"}
 _LONGEST, _LONGEST_VALUE = 100, 60
 
 
@@ -62,8 +62,8 @@ def identity_of(
 def default_directory(kind: str, config: Config, identity: Identity, overrides: Sequence[str] = ()) -> Path:
     """Return outputs/KIND/NAME for a run with these overrides of the command line.
 
-    The first eight digits of the identity's hash follow where the name does not say everything, or where the directory
-    of that name holds a run of another identity. The same identity gives the same directory.
+    The first eight digits of the identity's hash follow where an override is too long to be shown, or where the
+    directory of that name holds a run of another identity. Weights that were given are named by their hash.
     """
     head = "method" if kind == "eval" else "model"
     listed: Any = OmegaConf.load(config_directories()[0] / f"{kind}.yaml")
@@ -72,8 +72,10 @@ def default_directory(kind: str, config: Config, identity: Identity, overrides: 
     for group, name in config["names"].items():
         if group in usual and group != head and (name != usual[group] or (kind, group) == ("eval", "dataset")):
             parts.append(name)
+    if config.get("weights") is not None and config.get("run") is None and identity["weights_sha256"] is not None:
+        parts.append(f"weights-{str(identity['weights_sha256'])[:8]}")
     complete = True
-    for key, _, value in sorted(each.lstrip("+~").partition("=") for each in overrides):
+    for key, _, value in sorted(each.lstrip("+").partition("=") for each in overrides):
         if key not in _IN_NAME and (key == "metrics.alignment" or key.partition(".")[0] not in _NOT_NAMED):
             setting, whole = _setting(key, value)
             parts.append(setting)
@@ -89,8 +91,8 @@ def _setting(key: str, value: str) -> tuple[str, bool]:
     """Return an override in short, and whether that is all of it."""
     text = value.strip("[]\"'").replace(",", "+")
     short = re.sub(r"[^\w.+-]+", "-", "-".join(Path(text).parts[-2:]))[:_LONGEST_VALUE].strip("-")
-    name = "" if key == "experiment" else key.rpartition(".")[2]
-    joint = "-" if name and short and not short[0].isdigit() else ""
+    name = f"no-{key[1:]}" if key.startswith("~") else key.rpartition(".")[2]
+    joint = "-" if short and not re.match(r"[\d.]", short) else ""
     return f"{name}{joint}{short}", short == text
 
 

@@ -245,7 +245,7 @@ def _prepare(plain: Config, settings: TrainConfig, device: torch.device, process
         default_root_dir=folder,
         make=lambda **given: build("trainer", node, {key: value for key, value in given.items() if key not in node}),
     )
-    tolerated = ("results_version", "scenes_version", "device") if "resume" in given_keys() else ()
+    tolerated = ("results_version", "scenes_version", "outside_code", "device") if "resume" in given_keys() else ()
     resume = folder / _LAST if (folder / _LAST).is_file() and not settings.overwrite else None
     return _Prepared(data, module, trainer, best, progress, identity, folder, resume, tolerated)
 

@@ -97,7 +97,7 @@ def load_scene(folder: Path, dataset: str, *, offset: bool = True) -> Scene:
     camera = description.camera
     rgb_path = _first(folder, _RGB_NAMES)
     rgb = read_rgb(rgb_path)
-    expect_size(rgb_path, rgb[..., 0], (camera.height, camera.width))
+    expect_size(rgb_path, rgb[..., 0], (camera.height, camera.width), ", from camera.json")
     measured: dict[float, Tensor] = {}
     for path in sorted(folder.iterdir()):
         match = _MEASURED.fullmatch(path.stem)
@@ -154,7 +154,7 @@ def _read_depth(
 ) -> Tensor:
     """Return a map as orthogonal depth, (1, H, W) in metres, NaN in holes."""
     values = read_map(path, pixels_beside(camera.height, camera.width))
-    expect_size(path, values, (camera.height, camera.width))
+    expect_size(path, values, (camera.height, camera.width), ", from camera.json")
     unit = 1.0 if quantity == "disparity" else _depth_unit(path, description)
     values[np.isinf(values)] = np.nan  # infinity stands for an unknown disparity at Middlebury
     if description.hole_value is not None:

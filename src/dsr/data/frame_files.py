@@ -71,12 +71,12 @@ def to_depth(path: Path, values: np.ndarray, farthest: float = math.inf) -> Tens
     return torch.from_numpy(np.where(known, values, np.nan))[None]
 
 
-def expect_size(path: Path, image: Tensor | np.ndarray, expected: Sequence[int]) -> None:
-    """Refuse an image, (..., H, W), that is not ``expected`` = (height, width)."""
+def expect_size(path: Path, image: Tensor | np.ndarray, expected: Sequence[int], source: str = "") -> None:
+    """Refuse an image, (..., H, W), that is not ``expected`` = (height, width), perhaps of another file."""
     height, width = image.shape[-2:]
     if (height, width) != tuple(expected):
         raise ValueError(
-            f"{path}: expected {expected[0]} x {expected[1]} pixels (height x width), got {height} x {width}"
+            f"{path}: expected {expected[0]} x {expected[1]} pixels (height x width{source}), got {height} x {width}"
         )
 
 

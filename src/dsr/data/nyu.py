@@ -168,8 +168,8 @@ class NYU(PreparedDataset):
         if split not in SPLITS:
             raise ValueError(f"split: expected one of {', '.join(SPLITS)}, or null, got {split}")
         named = [f"{number:04d}" for number in SPLITS[split]]
-        files = make_records(list_frames(find_files, root), load_files, "nyu")
-        found = _records(root, filled=True, crop=False) or files
+        found = _records(root, filled=True, crop=False)
+        found = found or make_records(list_frames(find_files, root), load_files, "nyu")
         found = {name: found[name] for name in named if name in found}
         super().__init__("nyu", root, found, named, scenes, Preparation(None))
         self.evaluation = split == "test"

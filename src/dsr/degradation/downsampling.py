@@ -31,7 +31,7 @@ from dsr.utils.guards import expect_one_of, naming, unchecked
 from dsr.utils.ratios import check_scale, match_ratio
 
 Kernel = Literal["box", "nearest", "bilinear", "bicubic", "gaussian"]
-KERNELS: tuple[Kernel, ...] = get_args(Kernel)
+KERNELS: tuple[Kernel, ...] = get_args(Kernel)  # in the order that stored weights know them by
 FACTS = len(KERNELS) + 3  # number of the facts of a map
 _LEAST_WEIGHT = 0.5
 _LEAST_SIGMA = 0.1  # as a fraction of the scale: at x2 the nearest pixel centre is 0.25 away, within three sigmas

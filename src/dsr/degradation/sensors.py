@@ -1,8 +1,8 @@
 """Depth cameras by name and by the values of their maps: how they measure, and how exactly.
 
-Figures that no source confirms are None. They hold at a sensor's native width; in maps of another width focal length,
-disparity and noise in pixels scale with it, so that the errors in metres stay. ``docs/sensors.md`` has the source of
-each figure.
+Figures that no source confirms are None. The others hold at a sensor's native width; in maps of another width focal
+length, disparity and noise in pixels scale with it, so that the errors in metres stay. ``docs/sensors.md`` has the
+source of each figure.
 """
 
 from __future__ import annotations

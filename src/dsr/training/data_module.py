@@ -168,6 +168,7 @@ class PatchData(lightning.LightningDataModule):
 
     def first_patches(self, count: int) -> list[Batch]:
         """Return the first ``count`` patches of the run."""
+        self.setup()
         return [self._cut[number] for number in range(count)]
 
     def train_dataloader(self) -> DataLoader[Batch]:
@@ -176,6 +177,7 @@ class PatchData(lightning.LightningDataModule):
         An epoch is the whole training or, where the trainer has no number of steps, about 1000 batches. The length is
         that of the whole epoch, as Lightning subtracts the batches that were done before an interruption.
         """
+        self.setup()
         module: Any = getattr(self.trainer, "lightning_module", None)
         prepare = getattr(getattr(module, "net", None), "prepare", None)
         return _PatchLoader(

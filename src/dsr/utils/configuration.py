@@ -9,6 +9,7 @@ shown with the key that sets it (``method.sharpness: expected ...``).
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import importlib
 import importlib.util
@@ -17,7 +18,7 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 from dsr.utils.guards import did_you_mean
 from dsr.utils.versions import how_to_install
@@ -25,6 +26,11 @@ from dsr.utils.versions import how_to_install
 Node = Mapping[str, Any]  # ``_target_``, perhaps ``_partial_``, and arguments of the target
 _MISSING = "???"
 _TARGET, _PARTIAL = "_target_", "_partial_"
+_NODE = f"a node with {_TARGET}"
+# What pydantic's types of errors mean to the writer of a configuration, where its text is about JSON.
+_EXPECTED = {"bool_type": "true or false", "list_type": "a list", "tuple_type": "a list", "dict_type": "keys",
+             "missing": "more values", "too_long": "fewer values", "needs_python_object": _NODE,
+             "callable_type": _NODE}  # fmt: skip
 _PACKAGE = Path(__file__).resolve().parents[1]
 _PLACES = (_PACKAGE / "conf", _PACKAGE.parents[1] / "conf")  # of an installed package, and of a checkout
 
@@ -139,14 +145,17 @@ def _expect_type(key: str, value: Any, hint: Any) -> None:
     """Check that a configuration value, which is JSON's, is of an annotated type; a whole number is a number, too."""
     from pydantic import TypeAdapter, ValidationError  # noqa: PLC0415 - a refused command line needs none
 
+    if dataclasses.is_dataclass(hint):
+        raise ConfigError(f"{key}: expected {_NODE}, got {value!r:.60}")
     kind: TypeAdapter[Any] = TypeAdapter(hint, config={"strict": True, "arbitrary_types_allowed": True})
     try:
         kind.validate_json(json.dumps(value))
     except ValidationError as error:
-        reasons = []
-        for each in error.errors():
-            of_node = each["type"] in ("needs_python_object", "callable_type")
-            reasons.append("a node" if of_node else re.sub(r"^\w+ should (be|have) (a valid )?", "", each["msg"]))
+        reasons = [
+            _EXPECTED.get(each["type"]) or re.sub(r"^\w+ should (be|have) (a valid )?", "", each["msg"])
+            for each in error.errors()
+        ]
+        reasons += ["null"] if type(None) in get_args(hint) else []
         raise ConfigError(f"{key}: expected {' or '.join(dict.fromkeys(reasons))}, got {value!r:.60}") from error
 
 

@@ -94,7 +94,8 @@ def solve_lines(weights: Tensor, right: Tensor) -> Tensor:
         before, after = weights[k], weights[k + 1]
         pivot = 1 + after + before * (1 + upper[k - 1])
         upper[k] = -after / pivot
-        solution[k] += before * solution[k - 1]
+        if k:
+            solution[k] += before * solution[k - 1]
         solution[k] /= pivot
     for k in range(length - 2, -1, -1):
         solution[k] -= upper[k] * solution[k + 1]

@@ -138,7 +138,8 @@ def save_network(
         tensor, there = value.detach().to("cpu", dtype).contiguous(), shared.get(name)
         if there is None or there.dtype != dtype or not torch.equal(there, tensor):
             tensors[name] = tensor
-    safetensors.torch.save_file(tensors, path, {_KEY: json.dumps(header, sort_keys=True)})
+    # save_file would make a file that nobody else can read
+    path.write_bytes(safetensors.torch.save(tensors, {_KEY: json.dumps(header, sort_keys=True)}))
 
 
 def network_name(network: type[DisparityNetwork]) -> str:
