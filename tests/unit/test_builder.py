@@ -3,7 +3,7 @@
 import re
 import sys
 import types
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -32,7 +32,9 @@ class Toy:
         *,
         flag: bool = False,
         file: Path | None = None,
+        parts: Collection[str] | None = None,
     ) -> None:
+        self.parts = parts
         self.values = (root, names, share, count, order, flag, file)
         self.scale = scale
         if root == "missing":
@@ -124,7 +126,9 @@ def test_text_in_place_of_a_node_is_refused():
         build("model.objective", objective)
 
 
-@pytest.mark.parametrize(("key", "value"), [("share", 1), ("names", None), ("names", []), ("file", None)])
+@pytest.mark.parametrize(
+    ("key", "value"), [("share", 1), ("names", None), ("names", []), ("file", None), ("parts", ["a"])]
+)
 def test_value_of_a_compatible_type_is_accepted(key, value):
     build("dataset", node(**{"root": "r", key: value}))
 

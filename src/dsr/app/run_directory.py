@@ -169,8 +169,9 @@ def at_work(
 
     ``config.yaml`` and ``versions.json`` are written to it. Yields the ``tolerated`` keys in which the run differs.
     """
-    shared = _hash_of({**identity, "metrics": config["metrics"]})
-    settings = f"{socket.gethostname()} {os.getpid()}" if alone else shared
+    settings = (
+        f"{socket.gethostname()} {os.getpid()}" if alone else _hash_of({**identity, "metrics": config["metrics"]})
+    )
     record = {**versions(), "hash": _hash_of(identity), "identity": dict(identity)}
     with contextlib.ExitStack() as stack:
         try:
@@ -179,9 +180,9 @@ def at_work(
             write_text(folder / _RECORD, json.dumps(record, indent=1) + "\n")
             write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(dict(config))))
         except locks.InUseError as error:
-            settings = "" if alone else " with other settings"
+            others = "" if alone else " with other settings"
             raise ConfigError(
-                f"output_dir: {error.owner} is at work in {folder}{settings}; wait for its end, or take another"
+                f"output_dir: {error.owner} is at work in {folder}{others}; wait for its end, or take another"
             ) from error
         except OSError as error:
             raise ConfigError(
