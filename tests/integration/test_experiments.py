@@ -22,9 +22,7 @@ def test_paper_tables_in_small_are_evaluated_and_reported(tmp_path, capfd):
     run_eval(["-m", "+experiment=paper_tables", "method=bicubic,eg", *small])
     runs = sorted((tmp_path / "outputs" / "eval").iterdir())
     assert [run.name for run in runs] == [
-        f"{method}_x{scale}_simgeo_scenes-statue_size64_experiment-paper_tables_seed0"
-        for method in ("bicubic", "eg")
-        for scale in (4, 8)
+        f"{method}_x{scale}_simgeo_scenes-statue_size64_seed0" for method in ("bicubic", "eg") for scale in (4, 8)
     ]
     assert "note: left out, as not in" in capfd.readouterr().err
     assert main(["report", "outputs/eval", "-o", "report", "--only", "tables"]) == 0

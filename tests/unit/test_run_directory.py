@@ -72,6 +72,8 @@ def name_of(kind, *overrides):
          "msg_v_x4_smoke_w0_max_steps4_seed0"),
         ("train", "noise=tof patches.scenes=5", "msg_v_x4_tof_scenes5_seed0"),
         ("eval", "method=bicubic", "bicubic_x4_simgeo_seed0"),
+        ("eval", "method=bicubic +experiment=paper_tables", "bicubic_x4_simgeo_seed0"),
+        ("eval", "method=bicubic +experiment=noise", "bicubic_x4_simgeo_experiment-noise_seed0"),
         ("eval", "method=dip_v scale=8 dataset=icl method.w=2 method.oracle=true",
          "dip_v_x8_icl_oracle-true_w2_seed0"),
         ("eval", "downsampling=nearest noise=gaussian_multiplicative noise.std=0.01 dataset.scenes=[lucy,plant]",

@@ -19,7 +19,7 @@ from typing import Any
 import torch
 from omegaconf import OmegaConf
 
-from dsr.app.schema import NAMED, Config, Identity
+from dsr.app.schema import NAMED, Config, Identity, user_directories
 from dsr.app.trust import imported
 from dsr.utils import locks
 from dsr.utils.configuration import ConfigError, config_directories
@@ -76,7 +76,8 @@ def default_directory(kind: str, config: Config, identity: Identity, overrides: 
         parts.append(f"weights-{str(identity['weights_sha256'])[:8]}")
     complete = True
     for key, _, value in sorted(each.lstrip("+").partition("=") for each in overrides):
-        if key not in _IN_NAME and (key == "metrics.alignment" or key.partition(".")[0] not in _NOT_NAMED):
+        named = key == "metrics.alignment" or key.partition(".")[0] not in _NOT_NAMED
+        if named and key not in _IN_NAME and not (key == "experiment" and _only_sweeps(value)):
             setting, whole = _setting(key, value)
             parts.append(setting)
             complete = complete and whole
@@ -85,6 +86,12 @@ def default_directory(kind: str, config: Config, identity: Identity, overrides: 
     marked = plain.with_name(f"{plain.name}-{_hash_of(identity)[:8]}")
     free = not marked.is_dir() and _changes_in(plain, identity) == []
     return plain if complete and len(name) <= _LONGEST and free else marked
+
+
+def _only_sweeps(experiment: str) -> bool:
+    """Return whether a file of ``conf/experiment`` lists jobs and choices alone, which their names have themselves."""
+    files = (place / "experiment" / f"{experiment}.yaml" for place in config_directories(user_directories()))
+    return any(file.is_file() and set(OmegaConf.load(file)) <= {"hydra", "defaults"} for file in files)
 
 
 def _setting(key: str, value: str) -> tuple[str, bool]:
