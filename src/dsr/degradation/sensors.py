@@ -43,9 +43,9 @@ _ARKIT = (
 _PHONES = r"time.?of.?flight|\btof\b|\bsm-(g977|n97[56]|g98[568])|huawei.*p[34]0 pro|\bvog-"
 
 SENSORS = (  # of several whose pattern fits a name the first is taken
-    Sensor("RealSense D415", "stereo", 1280, r"\bd41[05]\b", 0.0548 * 941, 1 / 32, 0.08, 17.0),
-    Sensor("RealSense D435", "stereo", 1280, r"\bd43[05]i?f?\b", 0.050 * 640, 1 / 32, 0.08, 17.0),
-    Sensor("RealSense D455", "stereo", 1280, r"\bd45[0-7]f?\b", 0.095 * 637, 1 / 32, 0.08, 17.0),
+    Sensor("RealSense D415", "stereo", 1280, r"\bd41[05]\b", 0.0548 * 941, step=1 / 32, noise=0.08, extent=17.0),
+    Sensor("RealSense D435", "stereo", 1280, r"\bd43[05]i?f?\b", 0.050 * 640, step=1 / 32, noise=0.08, extent=17.0),
+    Sensor("RealSense D455", "stereo", 1280, r"\bd45[0-7]f?\b", 0.095 * 637, step=1 / 32, noise=0.08, extent=17.0),
     Sensor(
         "RealSense L515", "lidar", 1024, r"\bl515",
         spread=((1.0, 0.0025), (9.0, 0.0155)), offset=((1.0, 0.005), (9.0, 0.014)),
@@ -58,12 +58,18 @@ SENSORS = (  # of several whose pattern fits a name the first is taken
         "Kinect v2", "time of flight", 512, r"kinect.*(v2|one|2\.0|\b2\b)|\bkv2\b|xbox nui sensor",
         spread=((1.0, 0.0013), (2.0, 0.0017), (3.0, 0.0027), (4.0, 0.0043)),
     ),
-    Sensor("Kinect v1", "structured light", 640, r"kinect|\bkv1\b|xbox nui", 0.075 * 580, 1 / 8, _NGUYEN, 9.0),
-    Sensor("Xtion", "structured light", 640, r"xtion|primesense|carmine", 0.075 * 570.3, 1 / 8, _NGUYEN, 9.0),
+    Sensor(
+        "Kinect v1", "structured light", 640, r"kinect|\bkv1\b|xbox nui", 0.075 * 580,
+        step=1 / 8, noise=_NGUYEN, extent=9.0,
+    ),
+    Sensor(
+        "Xtion", "structured light", 640, r"xtion|primesense|carmine", 0.075 * 570.3,
+        step=1 / 8, noise=_NGUYEN, extent=9.0,
+    ),
     Sensor("Astra", "structured light", 640, r"\bastra(?!.*(\b2\b|stereo))"),
-    Sensor("OAK-D Lite", "stereo", 640, r"\boak.?d.?lite", 0.075 * 433, 1 / 8),
-    Sensor("OAK-D Pro", "stereo", 1280, rf"\boak.?d.?(s2|pro){_WIDE}", 0.075 * 783, 1 / 8),
-    Sensor("OAK-D", "stereo", 1280, rf"\boak.?d(?![a-z]){_WIDE}", 0.075 * 882.5, 1 / 8),
+    Sensor("OAK-D Lite", "stereo", 640, r"\boak.?d.?lite", 0.075 * 433, step=1 / 8),
+    Sensor("OAK-D Pro", "stereo", 1280, rf"\boak.?d.?(s2|pro){_WIDE}", 0.075 * 783, step=1 / 8),
+    Sensor("OAK-D", "stereo", 1280, rf"\boak.?d(?![a-z]){_WIDE}", 0.075 * 882.5, step=1 / 8),
     Sensor("ARKit lidar", "lidar", 256, _ARKIT, extent=6.0),
     Sensor("phone time of flight", "time of flight", 240, _PHONES),
 )  # fmt: skip
@@ -192,8 +198,8 @@ _SEEN = 2.0  # smallest step of depth that shows, over what values are rounded t
 _COMMON = 4  # pixels that a value must have; rarer ones come from resampling
 _BAND = 1.2  # ratio of the constants that are looked for in the same values, those far enough to show them
 _FEWEST, _CYCLES = 12, 8  # distinct values, and steps between the smallest and the largest, that are needed
+# Least confidence; and least N confidence^2 for N values, minus the logarithm of the chance that random ones have
 _CONFIDENT, _SIGNIFICANT = 0.6, 25.0
-"""Least confidence; and least N confidence^2 for N values, minus the logarithm of the chance that random ones have."""
 _NEAREST = 0.1  # metres; nearer values are left out
 _PIXELS = 2**20  # about how many pixels are looked at; of larger maps some rows
 _MOST = 400  # values that are looked at, drawn at random

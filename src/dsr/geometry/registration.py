@@ -133,9 +133,9 @@ def find_displacement(depth_lr: Tensor, rgb: Tensor) -> Displacement | None:
     gradients = _edge_gradients(photo.double().numpy())
     comparison = _Comparison(Edges(right, below), tiles, gradients, size, factor, radius)
     down, across, scale = best = _search(comparison)
+    sums = comparison.sums(*best)
     for simpler in ((0.0, 0.0, 1.0), (0.0, across, scale), (down, 0.0, scale)):
-        gains = comparison.sums(*best) - comparison.sums(*simpler)
-        if simpler != best and _standard_errors(gains) < _WEAK:
+        if simpler != best and _standard_errors(sums - comparison.sums(*simpler)) < _WEAK:
             best = simpler
             break
     certain, corner = _judge(comparison, best)

@@ -98,14 +98,17 @@ def catalogue(
     metrics = (*(metric for name in dict.fromkeys(protocols) for metric in PROTOCOLS[name]), *extra)
     of_regions = [each for each in metrics if each.in_regions]
     metrics = (*metrics, *(each.within(region) for region in regions for each in of_regions))
-    found: dict[str, Metric] = {}
+    names: set[str] = set()
+    found: list[Metric] = []
     for metric in metrics:
-        if metric.name in found:
+        if metric.name in names:
             raise ValueError(f"{metric.name}: expected metrics of different names, got two of this one")
-        found[metric.name] = metric
-        if metric.perceptual:
-            found[metric.name] = replace(metric, function=partial(metric.function, network=network))
-    return tuple(metric for metric in found.values() if network is not None or not metric.perceptual)
+        names.add(metric.name)
+        if not metric.perceptual:
+            found.append(metric)
+        elif network is not None:
+            found.append(replace(metric, function=partial(metric.function, network=network)))
+    return tuple(found)
 
 
 class Score(NamedTuple):

@@ -24,7 +24,7 @@ from torch import Tensor
 from dsr.geometry.surface import length
 from dsr.metrics.boundaries import depth_pro_scores
 from dsr.metrics.depth import covered
-from dsr.metrics.formats import Metric, column, of_parts, target_mask
+from dsr.metrics.formats import Metric, column, target_mask
 from dsr.metrics.functional import SurfacePair, once_per_pair
 from dsr.utils.compute_device import in_own_precision
 
@@ -36,9 +36,9 @@ STEEPEST = 1e-5  # sine of the angle between the two edges of a triangle below w
 RATIO = 1.25**0.125
 NEAREST = 1e-4  # lower limit of aligned depth in metres and of aligned disparity in 1/m
 MIN_SIZE = 2 * SCALES[-1] + 1  # of a map with a normal at the coarsest scale
-WEIGHTS = {"WKDR": 3.65, "beyond_disparity": 0.18, "beyond_depth": 0.01, "boundary": 0.20, "RelNormal": 1.94}
 
 
+@once_per_pair
 def rel_normal(pair: SurfacePair) -> Tensor:
     """Return RelNormal, (B,) in radians, the mean error of the angle between two normals; lower is better.
 
@@ -102,6 +102,7 @@ def sobol_pairs(height: int, width: int, device: torch.device) -> list[Tensor]:
     return found
 
 
+@once_per_pair
 def wkdr(pair: SurfacePair) -> Tensor:
     """Return the fraction of ordered pairs (i, j) of true pixels that the prediction has in another order, (B,).
 
@@ -127,21 +128,28 @@ def wkdr(pair: SurfacePair) -> Tensor:
 
 
 @once_per_pair
-def evalmde_errors(pair: SurfacePair) -> dict[str, Tensor]:
-    """Return SAWA-H and its parts by name, (B,) each; lower is better.
+def beyond_disparity(pair: SurfacePair) -> Tensor:
+    """Return the fraction of pixels with a ratio to the true depth of 1.25^.125 or more, (B,), disparity fitted."""
+    return _beyond(pair, 1 / _aligned(pair, 1 / pair.prediction, 1 / pair.target))
 
-    The parts ``beyond`` are the fractions of pixels with a ratio to the true depth of 1.25^.125 or more, after a fit.
-    """
-    z, t = pair.prediction, pair.target
-    parts = {
-        "RelNormal": rel_normal(pair),
-        "WKDR": wkdr(pair),
-        "beyond_disparity": _beyond(pair, 1 / _aligned(pair, 1 / z, 1 / t)),
-        "beyond_depth": _beyond(pair, _aligned(pair, z, t)),
-        "boundary": 1 - depth_pro_scores(pair)["F1"],
-    }
-    weighted = [weight * parts[name].double() for name, weight in WEIGHTS.items()]
-    return {"SAWA_H": torch.stack(weighted).sum(dim=0), **parts}
+
+@once_per_pair
+def beyond_depth(pair: SurfacePair) -> Tensor:
+    """Return the same as :func:`beyond_disparity`, (B,), with depth fitted."""
+    return _beyond(pair, _aligned(pair, pair.prediction, pair.target))
+
+
+def boundary_error(pair: SurfacePair) -> Tensor:
+    """Return 1 less the boundary F1 of Depth Pro, (B,)."""
+    return 1 - depth_pro_scores(pair)["F1"]
+
+
+WEIGHTS = {wkdr: 3.65, beyond_disparity: 0.18, beyond_depth: 0.01, boundary_error: 0.20, rel_normal: 1.94}
+
+
+def sawa_h(pair: SurfacePair) -> Tensor:
+    """Return SAWA-H, (B,), the sum of its parts by :data:`WEIGHTS`; lower is better."""
+    return torch.stack([weight * part(pair).double() for part, weight in WEIGHTS.items()]).sum(dim=0)
 
 
 def _taken(values: Tensor, source: Tensor) -> Tensor:
@@ -195,16 +203,15 @@ def _beyond(pair: SurfacePair, aligned: Tensor) -> Tensor:
     return 1 - within.double() / pair.target_mask.sum(dim=(1, 2, 3))
 
 
-_formats = {
-    "SAWA_H": column("SAWA-H", "", digits=3),
-    "RelNormal": column("RelNormal", "rad", digits=3),
-    "WKDR": column("WKDR", "%", 1e2, 2),
-    "beyond_disparity": column("Beyond", "1.028 x, disparity fitted, %", 1e2),
-    "beyond_depth": column("Beyond", "1.028 x, depth fitted, %", 1e2),
-    "boundary": column("1 - F1", "Depth Pro, %", 1e2),
-}
-_covered = column("Covered", "%", 1e2, higher_is_better=True)
-METRICS: tuple[Metric, ...] = (
-    *of_parts("EvalMDE_", evalmde_errors, target_mask, _formats, min_size=MIN_SIZE, whole=True),
-    Metric("EvalMDE_covered", covered, target_mask, _covered, min_size=MIN_SIZE, whole=True),
+METRICS: tuple[Metric, ...] = tuple(
+    Metric(f"EvalMDE_{name}", function, target_mask, shown, min_size=MIN_SIZE, whole=True)
+    for name, function, shown in (
+        ("SAWA_H", sawa_h, column("SAWA-H", "", digits=3)),
+        ("RelNormal", rel_normal, column("RelNormal", "rad", digits=3)),
+        ("WKDR", wkdr, column("WKDR", "%", 1e2, 2)),
+        ("beyond_disparity", beyond_disparity, column("Beyond", "1.028 x, disparity fitted, %", 1e2)),
+        ("beyond_depth", beyond_depth, column("Beyond", "1.028 x, depth fitted, %", 1e2)),
+        ("boundary", boundary_error, column("1 - F1", "Depth Pro, %", 1e2)),
+        ("covered", covered, column("Covered", "%", 1e2, higher_is_better=True)),
+    )
 )

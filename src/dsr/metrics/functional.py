@@ -168,6 +168,12 @@ class SurfacePair:
         return first.clamp(0, 1), second.clamp(0, 1)
 
     @cached_property
+    def rendering_error(self) -> Tensor:
+        """(B, 4, H, W) absolute difference of the renderings; 0 where invalid."""
+        first, second = self.renderings
+        return (first - second).abs()
+
+    @cached_property
     def ray_lengths(self) -> Tensor:
         """(B or 1, 1, H, W): the perspective depth of a point with orthogonal depth 1."""
         return length(self.rays)
@@ -186,6 +192,8 @@ class SurfacePair:
     @cached_property
     def bumpiness_mask(self) -> Tensor:
         """(B, 1, H, W) bool: where the 5 x 5 pixels of a second derivative are valid or outside the map."""
+        if self.complete:
+            return self.depth_mask
         missing = (~self.depth_mask).to(self.target.dtype)
         return torch.nn.functional.max_pool2d(missing, 5, stride=1, padding=2) == 0
 
@@ -226,8 +234,7 @@ def rmse_v1(pair: SurfacePair) -> Tensor:
 
 def bad_pix_v(pair: SurfacePair, threshold: float) -> Tensor:
     """Return the fraction of pixels whose renderings differ by more than ``threshold`` / 255, per light, (B, 4)."""
-    first, second = pair.renderings
-    return masked_mean((first - second).abs() > threshold / 255, pair.normal_mask)
+    return masked_mean(pair.rendering_error > threshold / 255, pair.normal_mask)
 
 
 def dssim_v(pair: SurfacePair, mask: Tensor | None = None) -> Tensor:
