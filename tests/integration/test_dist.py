@@ -3,6 +3,7 @@
 import importlib.util
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -48,6 +49,25 @@ def test_versions_that_differ_are_refused(dist, monkeypatch, tmp_path):
     (tmp_path / "CITATION.cff").write_text("version: 9.9.9\n")
     with pytest.raises(dist.ReleaseError, match=rf"CITATION.cff: expected version: {version}"):
         dist.check_versions(draft=True)
+
+
+def test_damaged_weights_are_refused(dist, monkeypatch, tmp_path):
+    (tmp_path / "msg_x4.safetensors").write_bytes(b"damaged")
+    monkeypatch.setattr(dist, "_WEIGHTS", tmp_path)
+    with pytest.raises(dist.ReleaseError, match=r"msg_x4.*: not as in known\.sha256"):
+        dist.check_weights()
+
+
+def test_wheels_that_are_too_large_or_lack_weights_are_refused(dist, tmp_path):
+    wheel = tmp_path / "dsr.whl"
+    with zipfile.ZipFile(wheel, "w") as packed:
+        packed.writestr("dsr/methods/weights/msg_x4.safetensors", b"x")
+    with pytest.raises(dist.ReleaseError, match="expected the weights"):
+        dist.check_wheel(wheel)
+    with wheel.open("ab") as file:
+        file.truncate(61_000_000)
+    with pytest.raises(dist.ReleaseError, match="expected at most 60 MB, got 61"):
+        dist.check_wheel(wheel)
 
 
 def test_a_folder_of_something_else_is_not_emptied(dist, tmp_path):

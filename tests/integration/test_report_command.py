@@ -94,6 +94,17 @@ def test_directory_with_foreign_files_is_refused_and_kept(
     assert (tmp_path / "mine" / "thesis.tex").read_text() == "years of work"
 
 
+def test_user_study_joins_the_tables(runs: Path, tmp_path: Path) -> None:
+    shares, table = {"user_first": 75.0, "user_second": 25.0, "user_top2": 100.0}, tmp_path / "study.csv"
+    ends = {f"{name}_{end}": value for name in shares for end, value in (("low", 40.0), ("high", 99.0))}
+    row = {"dataset": "simgeo", "scene": "statue", "scale": 4, "downsampling": "box", "method": "msg-v"}
+    pd.DataFrame([{**row, "label": "MSG-V", **shares, "n": 20, **ends}]).to_csv(table, index=False)
+    assert main(["report", str(runs), "-o", f"{tmp_path}/out", "--only", "tables", "--study", str(table)]) == 0
+    text = (tmp_path / "out/tables/simgeo_x4_box.md").read_text(encoding="utf-8")
+    assert "User 1st" in text
+    assert "75" in text
+
+
 def test_report_without_truth_has_pictures_and_no_tables(
     runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -93,6 +93,22 @@ def test_rig_gives_depth_in_the_photos_view(rig, capsys):
     assert {"depth_camera", "extrinsics"} <= info(rig / "out")["inputs"].keys()
 
 
+@pytest.mark.parametrize(
+    ("matrix", "message"),
+    [
+        (1.1 * np.eye(4)[:3], "move.txt: expected a rigid transform"),
+        (np.full((3, 4), np.nan), "move.txt: expected finite numbers"),
+        (np.eye(3), "move.txt: expected a matrix of 3 x 4 or 4 x 4 numbers"),
+        (pose(-90.0), "move.txt: expected a translation in metres"),
+        (pose(-9.0), "--extrinsics: expected the transform from the depth camera's frame"),
+    ],
+)
+def test_bad_extrinsics_end_in_one_line(rig, capsys, matrix, message):
+    (rig / "move.txt").write_text(text(matrix))
+    assert message in refused_line(capsys, with_rig(rig))
+    assert not (rig / "out").exists()
+
+
 # registration
 
 
@@ -114,18 +130,8 @@ def apart(tmp_path):
 
 def test_displaced_pair_is_warned_of_and_register_cures_it(apart, capsys):
     folder, depth = apart
-    files = (
-        "--rgb",
-        folder / "photo.png",
-        "--depth",
-        folder / "depth.npy",
-        "--fov",
-        "60",
-        *DEPTH_ONLY,
-        "--fill",
-        "none",
-    )
-    files = (*files, "--method", "bilateral")
+    files = ("--rgb", folder / "photo.png", "--depth", folder / "depth.npy", "--fov", "60", *DEPTH_ONLY)
+    files = (*files, "--fill", "none", "--method", "bilateral")
     assert upsample(*files, "-o", folder / "out") == 0
     out = " ".join(capsys.readouterr().out.split())
     assert "the photo's edges lie beside the depth edges (6.0 px to the right, 4.0 px above" in out
@@ -138,6 +144,12 @@ def test_displaced_pair_is_warned_of_and_register_cures_it(apart, capsys):
     inner = (slice(8, -8), slice(8, -8))
     assert (np.abs(result - depth)[inner] < 0.05).mean() > 0.97
     assert info(folder / "cured")["settings"]["register"] is True
+    np.save(folder / "depth.npy", depth)  # which is beside nothing
+    assert upsample(*files, "--register", "-o", folder / "same") == 0
+    assert "no displacement is certain, the depth map stays where it is" in " ".join(capsys.readouterr().out.split())
+    assert upsample(*files, "-o", folder / "plain") == 0
+    assert "warning" not in capsys.readouterr().out
+    assert np.array_equal(np.load(folder / "same" / "depth.npy"), np.load(folder / "plain" / "depth.npy"))
 
 
 # sequences
@@ -173,6 +185,14 @@ def test_same_command_again_is_complete_and_a_changed_neighbour_is_not(capture, 
     outcome = capsys.readouterr()
     assert all(f"{name}: holds a result of other inputs" in outcome.err for name in ("000", "001"))
     assert "3 complete already" in outcome.out  # the others do not depend on frame 000
+
+
+def test_broken_neighbour_does_not_stop_the_others(capture, capsys):
+    (capture / "depth" / "003.png").write_bytes(b"\x89PNG broken")
+    options = ("--poses", capture.parent / "poses.txt", "--neighbours", "2", *DEPTH_ONLY)
+    assert "003" in refused_line(capsys, upsample(capture, *options, "-o", capture.parent / "out"))
+    done = sorted(path.parent.name for path in (capture.parent / "out").glob("*/depth.png"))
+    assert done == ["000", "001", "002", "004"]
 
 
 def test_neighbours_without_poses_are_refused(capture, capsys):
@@ -287,6 +307,13 @@ def test_poses_that_are_read_wrongly_are_reported_once_and_in_every_info(walked,
         (warning,) = info(out / f"{number:03}")["warnings"]
         assert warning["code"] == "poses"
         assert warning["value"] > warning["threshold"]
+
+
+def test_strict_refuses_wrong_poses_and_writes_no_result(walked, capsys):
+    out = walked.parent / "out"
+    assert upsample(walked, *poses_of(walked, np.linalg.inv), *DEPTH_ONLY, "--strict", "-o", out) == 2
+    assert "the poses are probably from world to camera" in capsys.readouterr().err
+    assert not list(out.rglob("info.json"))
 
 
 def test_frames_without_a_pose_are_reported_and_strict_refuses_them(walked, capsys):

@@ -69,19 +69,11 @@ def test_two_files_are_enough_and_all_assumptions_are_printed(pair, cube, tmp_pa
     assert stored.dtype == np.uint16
     np.testing.assert_array_equal(stored, np.round(metres.astype(float) * 1000))
     reported = info(out)
-    assert (reported["complete"], reported["scale"], reported["method"], reported["settings"]["method"]) == (
-        True,
-        4,
-        "facets",
-        "facets",
-    )
+    assert (reported["complete"], reported["scale"]) == (True, 4)
+    assert reported["method"] == reported["settings"]["method"] == "facets"
     assert reported["depth_file"] == {
-        "suffix": ".png",
-        "dtype": "uint16",
-        "unit": 0.001,
-        "hole": 0,
-        "range_type": "orthogonal",
-    }
+        "suffix": ".png", "dtype": "uint16", "unit": 0.001, "hole": 0, "range_type": "orthogonal",
+    }  # fmt: skip
     assert reported["photo_size"] == [64, 64]
     assert Camera(**reported["camera"]).fx == pytest.approx(32 / np.tan(np.pi / 6))
     assert "noise of the depth map (about " in said
@@ -124,6 +116,24 @@ def test_wide_holes_stay_holes_and_it_is_said(pair, tmp_path, capsys):
         assert "stay holes" not in capsys.readouterr().out
     message = refused_line(capsys, of(pair, tmp_path / "wrong", *options, "--max-hole", "-1"))
     assert message == "--max-hole: expected a positive number of degrees, got -1"
+
+
+def test_outliers_are_holes_and_it_is_said(pair, tmp_path, capsys):
+    clean, out, counted = tmp_path / "clean", tmp_path / "out", {"pixels": 2, "patches": 2}
+    assert of(pair, clean, *DEPTH_ONLY) == 0
+    assert "treated as holes" not in capsys.readouterr().out
+    values = pair[2].copy()
+    values[10, 9], values[3, 12] = 25, 64000  # mm
+    Image.fromarray(values).save(pair[1])
+    assert of(pair, out, *DEPTH_ONLY) == 0
+    said = capsys.readouterr().out
+    assert said.count("treated as holes") == 1
+    assert "pixels: 2, patches: 2" in said
+    assert (info(clean)["outliers"], info(out)["outliers"]) == ({"pixels": 0, "patches": 0}, counted)
+    before, after = (read_depth_file(folder / "depth_metres.tiff") for folder in (clean, out))
+    np.testing.assert_allclose(after, before, rtol=0.1)
+    assert of(pair, out, *BICUBIC, "--only", "depth,normals") == 0
+    assert info(out)["outliers"] == counted
 
 
 def test_glass_is_said_and_a_robot_gets_no_depth_there(pair, tmp_path, capsys, monkeypatch):
@@ -375,12 +385,25 @@ def test_sensor_is_recognised_by_the_depth_values_and_must_not_contradict_them(t
         (("--method", "facets", "--smooth", "3"), "--smooth: expected a number from 0 to 2, got 3.0"),
         (("--noise", "0.1", "--method", "tgv"), "--noise: unknown key; method=tgv takes"),
         (("--max-error", "0"), "--max-error: expected a positive percentage of the depth, got 0"),
+        (("--workers", "0"), "--workers: expected 1 or more, got 0"),
         (("some_folder",), "expected --rgb and --depth, or folders that hold both"),
     ],
 )
 def test_invalid_arguments_are_refused_in_one_line(pair, tmp_path, capsys, arguments, message):
     assert message in refused_line(capsys, of(pair, tmp_path / "out", *BICUBIC, *arguments))
     assert not (tmp_path / "out").exists()
+
+
+def test_photos_and_depth_maps_in_two_arguments_are_refused_with_the_options_for_them(
+    pair, tmp_path, capsys, monkeypatch
+):
+    for number, name in enumerate(("color/0.png", "depth/0.png", "other/0.png")):
+        (tmp_path / name).parent.mkdir()
+        shutil.copy(pair[number % 2], tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    message = refused_line(capsys, upsample("color", "depth", "-o", "out", "--dry-run"))
+    assert message.endswith("--rgb color --depth depth")
+    assert "--rgb" not in refused_line(capsys, upsample("color", "other/0.png", "-o", "out", "--dry-run"))
 
 
 def test_pictures_that_do_not_fit_each_other_are_refused_in_one_line(pair, tmp_path, capsys):

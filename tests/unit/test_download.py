@@ -20,7 +20,7 @@ import pytest
 
 from dsr.cli import main
 from dsr.data.download import fetching
-from dsr.data.download.collections import Collection, Item
+from dsr.data.download.collections import CATALOGUE, Collection, Item
 from dsr.data.download.fetching import Checksums, Server, get, lock_directory, state, verify
 from dsr.utils.progress import Progress
 
@@ -556,6 +556,23 @@ def test_password_of_a_mirror_is_sent_but_neither_shown_nor_stored(server, tmp_p
     stored = "".join(path.read_text(errors="replace") for path in tmp_path.rglob("*") if path.is_file())
     for text in (captured.out, captured.err, stored, *map(str, tmp_path.rglob("*"))):
         assert not any(secret in text for secret in (SECRET, "sécr@t", "name:"))
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("data", "get", "nyu", "--mirror", f"ftp://name:{SECRET}@host/x"), ("data", "get", f"https://name:{SECRET}@host/x"),
+        ("data", "get", "nyu", "--miror", f"https://name:{SECRET}@host/x"), ("eval", f"https://name:{SECRET}@host/x"),
+    ],
+)  # fmt: skip
+def test_password_in_arguments_that_are_refused_is_not_repeated(tmp_path, monkeypatch, capfd, arguments):
+    monkeypatch.setenv("DSR_DATA", str(tmp_path))
+    monkeypatch.setattr(fetching, "RETRIES", 0)
+    with contextlib.suppress(SystemExit):
+        assert main(arguments, {**CATALOGUE, "nyu": replace(CATALOGUE["nyu"], items=(Item("nyu/a.png", ()),))}) == 2
+    captured = capfd.readouterr()
+    assert captured.err
+    assert SECRET not in captured.out + captured.err
 
 
 def test_list_shows_which_checksums_are_pinned_noted_and_unknown(server, tmp_path, monkeypatch, capsys):

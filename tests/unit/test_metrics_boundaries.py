@@ -125,11 +125,15 @@ def _planarity(prediction: Array, truth: Array, planes: Array, camera: Camera = 
     return found["flatness"].item(), found["orientation"].item()
 
 
-def test_flatness_is_that_of_the_authors_code() -> None:
+def test_planarity_is_that_of_the_authors_code() -> None:
     """Executed: the same file's ``compute_planarity_error``, of a large plane; another is too small."""
     planes = np.ones((120, 160), np.uint8)
     planes[:10], planes[:4] = 0, 2
     assert _planarity(*holed(), planes)[0] == pytest.approx(0.3394655151, rel=1e-5)
+    pair, given = pair_of(*holed()), np.array((0.1, -0.97, -0.2))  # the normal that theirs was given, in our axes
+    _, normal = boundaries._fit_plane(pair.prediction * pair.rays, _mask(planes == 1) & pair.depth_mask)
+    angle = np.degrees(np.arccos(abs(normal[0].numpy() @ given) / np.linalg.norm(given)))
+    assert angle == pytest.approx(77.97643416, rel=1e-5)
 
 
 def test_planarity_of_planes_is_exact() -> None:

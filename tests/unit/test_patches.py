@@ -151,6 +151,13 @@ def test_workers_outlast_a_signal_to_the_whole_group_until_the_trainer_has_ended
     assert not any(worker.is_alive() for worker in workers)
 
 
+def test_first_patches_can_be_requested() -> None:
+    data = _data()
+    first = _batches(data, 2)
+    for i, patch in enumerate(data.first_patches(4)):
+        assert all(torch.equal(patch[name], first[i // 2][name][i % 2]) for name in patch)
+
+
 def test_loader_begins_at_the_trainers_step_and_has_the_length_of_the_training() -> None:
     data = _data(colour=0.1)
     whole = _batches(data, 6)

@@ -173,6 +173,13 @@ def test_sample_is_read_with_the_same_bits(tmp_path: Path, dtype: torch.dtype, l
         assert stored["rgb"].dtype == {255: np.uint8, 65535: np.uint16}.get(levels or 0, str(dtype)[6:])
 
 
+def test_sample_at_a_ratio_that_is_not_whole_is_read_as_it_was_written(tmp_path: Path) -> None:
+    camera = Camera(width=16, height=11, fx=9.0, fy=9.0, cx=7.5, cy=5.0)
+    maps = {"rgb": torch.zeros(3, 11, 16), "depth": None, "depth_lr": torch.ones(1, 4, 6)}
+    _sample(**maps, camera=camera, camera_lr=camera.rescale(6, 4), scale=16 / 6).save(tmp_path / "hall.npz")
+    assert DepthSample.load(tmp_path / "hall.npz").scale == 16 / 6
+
+
 def test_sample_without_truth_is_read_without_truth(tmp_path: Path) -> None:
     _sample(depth=None).save(tmp_path / "hall.npz")
     assert DepthSample.load(tmp_path / "hall.npz").depth is None

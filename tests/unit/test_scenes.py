@@ -8,6 +8,7 @@ import math
 import time
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
@@ -266,6 +267,23 @@ def test_scene_at_which_the_method_fails_is_not_written_and_the_others_are(tmp_p
     assert message in results["a"].failure
     assert not (tmp_path / "predictions" / "a.npz").exists()
     assert set(scores["scene"]) == {"b"}
+
+
+def test_depths_that_are_not_finite_and_positive_count_as_holes(tmp_path):
+    wrong, holes = RAMP.clone(), RAMP.clone()
+    wrong[0, 0, :3] = torch.tensor([math.inf, 0.0, -1.0])
+    holes[0, 0, :3] = math.nan
+    scores = [run(toy_study(tmp_path / name, method=ToyMethod(a=depth)))[1]
+              for name, depth in (("wrong", wrong), ("holes", holes))]  # fmt: skip
+    pd.testing.assert_frame_equal(*scores)
+
+
+def test_valid_share_reflects_a_hole_in_the_truth(tmp_path):
+    holed = RAMP.clone()
+    holed[0, :4] = torch.nan
+    run(toy_study(tmp_path, ToySource(a=toy_scene("a", holed)), ToyMethod(a=RAMP)))
+    [row] = [row for row in rows(tmp_path) if row["metric"] == "RMSE_d"]
+    assert (float(row["valid_share"]), float(row["value"])) == (0.75, 0)
 
 
 def test_picture_that_cannot_be_drawn_fails_its_scene_and_keeps_its_scores(tmp_path):

@@ -159,6 +159,7 @@ def test_validation_set_that_leads_out_of_a_folder_is_refused(tmp_path):
         ("logger__csv__save_dir", "/tmp/elsewhere"),
         ("logger__csv__save_dir", "stolen"),
         ("callbacks__best__dirpath", "$HOME/x"),
+        ("callbacks__best__dirpath", "~/x"),
         ("logger__tensorboard__version", "../../up"),
         ("logger__mlflow__tracking_uri", "http://elsewhere"),
     ],
