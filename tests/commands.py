@@ -4,8 +4,6 @@ A process per worker of the tests imports them once, and each program runs in a 
 environment, arguments, output and an exit code of its own. Tests of how commands start use :mod:`subprocess` itself.
 """
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import functools

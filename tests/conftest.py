@@ -1,7 +1,5 @@
 """Fixtures that every kind of test uses."""
 
-from __future__ import annotations
-
 import gc
 import json
 import os

@@ -1,7 +1,5 @@
 """The metrics of the protocol in plain NumPy and scikit-image, independent of the package."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

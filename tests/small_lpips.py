@@ -1,7 +1,5 @@
 """LPIPS with a random trunk."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

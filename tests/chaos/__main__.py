@@ -3,8 +3,6 @@
 ``make chaos ARGS="--kills 100 --seed 0"``, on Linux. Files and output of cases that are not clean are kept.
 """
 
-from __future__ import annotations
-
 import argparse
 import shutil
 import signal

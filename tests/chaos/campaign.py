@@ -1,7 +1,5 @@
 """The folder of a campaign: undisturbed results to compare with, and the cases that are not clean."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Commands struck by signals at random moments."""
 
-from __future__ import annotations
-
 import json
 import random
 import signal

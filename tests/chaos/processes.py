@@ -1,7 +1,5 @@
 """Processes to be struck by signals: their sessions, computing time, and what is left of them."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

@@ -1,7 +1,5 @@
 """Two commands at once on the same files."""
 
-from __future__ import annotations
-
 import random
 import time
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Cases: a number and a seed are a reader, its files with something changed, and how reading them ends."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import tempfile

@@ -4,8 +4,6 @@ Python tells an audit hook of such things (https://docs.python.org/3/library/aud
 removed, so there is one for the process, which looks only while a case runs.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import sys

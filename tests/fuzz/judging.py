@@ -1,7 +1,5 @@
 """One case: a reader on its files, and whether it ended as it must."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import io

@@ -1,7 +1,5 @@
 """The readers of other people's files: what makes valid files, and what reads them as the commands do."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

@@ -3,8 +3,6 @@
 ``expected/real_sensor.json`` and ``expected/peers.csv`` were computed by other code than ours.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 from collections.abc import Iterator

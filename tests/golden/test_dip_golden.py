@@ -1,7 +1,5 @@
 """DIP-V on a part of the paper's Lucy, in few steps."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 ``expected/metrics.json`` was computed by other code than ours, from the same protocol.
 """
 
-from __future__ import annotations
-
 import json
 from functools import cache
 from pathlib import Path

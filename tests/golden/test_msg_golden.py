@@ -1,7 +1,5 @@
 """MSG and MSG-V with their authors' weights, against the disparity maps that the published networks give."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

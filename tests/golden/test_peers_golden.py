@@ -1,7 +1,5 @@
 """Published networks of the field with their authors' weights, against maps and scores of the authors' own code."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Results are those that the versions in the code stand for, see ``results_golden.py``."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Downsampling, interpolation and all metrics on a small scene of the project, against independent files."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

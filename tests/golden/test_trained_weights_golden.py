@@ -1,7 +1,5 @@
 """The weights that come with dsr, on scenes that they were neither trained on nor chosen with."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """``python eval.py method=dip_v``: what it says, writes, logs, and how it goes on."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

@@ -158,6 +158,33 @@ def test_nothing_is_said_where_nothing_can_be_known(rendered, case, tmp_path):
     assert not any(reported(path.parent) for path in (tmp_path / "out").rglob("info.json"))
 
 
+REAL = {
+    "kinect-like": ("real/ddrnet/color_map/frame_000001.png", "real/ddrnet/depth_map/frame_000001.png"),
+    "stereo": ("real/depth_camera/1/rgb.jpg", "real/depth_camera/1/raw_depth.png"),
+    "time of flight": ("real/rgbdd_real/RGB/20200509112638_RGB.jpg",
+                       "real/rgbdd_real/DepthLR/20200509112638_LR_fill_depth.png"),
+    "phone": ("real/iphone_lidar/image.jpg", "real/iphone_lidar/arkit_depth.png"),
+}  # fmt: skip
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", REAL)
+def test_real_sensors_frames_are_judged(shared, name, tmp_path, capsys):
+    photo, depth = (cv2.imread(str(shared / file), cv2.IMREAD_UNCHANGED) for file in REAL[name])
+    photo = (
+        cv2.resize(photo, (4 * photo.shape[1] // 8, 4 * photo.shape[0] // 8))[..., ::-1]
+        if name == "phone"
+        else photo[..., ::-1]
+    )
+    assert upsample(write(tmp_path / "right", [(photo, depth)]), tmp_path / "out") == 0
+    assert not {"photo-turned", "photo-other", "photo-order"} & set(reported(tmp_path / "out"))
+    for turn in ("mirrored left to right", "turned by 180 degrees"):
+        options = write(tmp_path / "wrong", [(TURNS[turn](photo), depth)])
+        assert upsample(options, tmp_path / turn) == 0
+        assert "photo-turned" in reported(tmp_path / turn)
+    expect_refused(options, tmp_path / "strict", capsys)
+
+
 @pytest.mark.nightly
 def test_real_lists_in_another_order_are_reported(shared, tmp_path):
     names = sorted(path.name.split("_")[0] for path in (shared / "modern/RGBDD/RGB").iterdir())[:14]

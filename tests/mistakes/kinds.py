@@ -1,7 +1,5 @@
 """The mistakes: each writes what a person would have given, in a folder, and returns the arguments of the command."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """The bilateral filter of a sensor's map, against its definition, one pixel at a time."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

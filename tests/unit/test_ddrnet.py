@@ -1,7 +1,5 @@
 """DDRNet: its sizes against the published ones, its two stages, and what it starts from."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from small_scenes import maps, photos

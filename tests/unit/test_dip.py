@@ -1,7 +1,5 @@
 """Deep image priors: the method, its loss and its network."""
 
-from __future__ import annotations
-
 import functools
 import re
 from typing import Any

@@ -1,7 +1,5 @@
 """Downsampling models, against numpy, Pillow and weights written out in the test; samples, against closed forms."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any, get_args

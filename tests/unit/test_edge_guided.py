@@ -1,7 +1,5 @@
 """Edge-guided upsampling: planes, straight steps, holes, and the filter against a plain loop."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections import deque

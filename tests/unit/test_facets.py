@@ -1,7 +1,5 @@
 """Facets: what holds whatever its weights are, and that it can learn."""
 
-from __future__ import annotations
-
 import copy
 
 import pytest

@@ -1,7 +1,5 @@
 """The method for maps of any ratio: sizes, units, the estimate of the noise, and its settings."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Facets with context: planes at every factor, units, holes, hints, confidence, and what it starts from."""
 
-from __future__ import annotations
-
 import itertools
 from pathlib import Path
 

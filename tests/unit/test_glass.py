@@ -1,7 +1,5 @@
 """Clear, mirroring and glossy objects: nothing changes beside them, the truth is theirs, and sensors see it wrongly."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

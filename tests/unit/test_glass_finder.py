@@ -1,7 +1,5 @@
 """What finds glass: features that do not depend on units, and probabilities on simulated objects."""
 
-from __future__ import annotations
-
 import importlib.util
 from pathlib import Path
 

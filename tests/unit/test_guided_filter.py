@@ -1,7 +1,5 @@
 """Photo-guided filters: planes, offsets, holes and sizes for all, and each against its definition."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Upsampling anybody's picture: any size, any ratio, holes; arrays and tensors."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

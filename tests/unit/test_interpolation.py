@@ -1,7 +1,5 @@
 """Interpolation, against scipy's zoom, repetition and closed forms of perspective depth."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -92,6 +92,18 @@ def test_job_of_a_scheduler_saves_before_it_is_requeued() -> None:
         signal.signal(signal.SIGUSR2, before)
 
 
+def test_processes_started_as_workers_do_not_get_ctrl_c_but_their_parent_does() -> None:
+    code = "import os, signal; os.kill(os.getpid(), signal.SIGINT); print('alive')"
+
+    def start() -> None:
+        with interruption.starting_workers():
+            assert subprocess.check_output([sys.executable, "-c", code], text=True) == "alive\n"
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        start()
+
+
 def test_worker_ends_with_its_parent() -> None:
     worker = "import os, time; from dsr.utils.interruption import end_with; end_with(os.getppid()); time.sleep(60)"
     parent = (

@@ -1,7 +1,5 @@
 """Training losses, against a pyramid in plain numpy, closed forms, finite differences and the metrics' kernels."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from pathlib import Path

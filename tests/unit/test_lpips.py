@@ -1,7 +1,5 @@
 """LPIPS, against its own example pair and against AlexNet written out here, with random weights."""
 
-from __future__ import annotations
-
 import hashlib
 import http.client
 import io

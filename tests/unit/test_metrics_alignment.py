@@ -1,7 +1,5 @@
 """Alignment to the truth, against its authors' codes, numpy's least squares and scipy's linear programming."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Boundary F1, boundary errors and planes: the values of their authors' code, closed forms, holes."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

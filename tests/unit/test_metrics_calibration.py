@@ -1,7 +1,5 @@
 """Expected errors against measured ones: closed forms of known distributions, numpy, and planes of known normals."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

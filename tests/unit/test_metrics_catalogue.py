@@ -1,7 +1,5 @@
 """All scores of one image: their names, their values, and the share of pixels that each rests on."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The torchmetrics classes: means over images of the pure functions' values, and nothing of LPIPS in checkpoints."""
 
-from __future__ import annotations
-
 import copy
 import math
 import pickle

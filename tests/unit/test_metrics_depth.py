@@ -1,7 +1,5 @@
 """The errors of depth and normals that papers print, against their authors' codes, numpy and closed forms."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """RelNormal and SAWA-H: the values that EvalMDE's own code gives, closed forms, and that no hole pays."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from pathlib import Path

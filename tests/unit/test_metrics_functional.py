@@ -1,7 +1,5 @@
 """Every metric, against plain numpy and scikit-image code written from the protocol's table."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 

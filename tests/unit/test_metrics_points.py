@@ -1,7 +1,5 @@
 """Flying pixels, Chamfer distance and F-score, against all pairs of points, and closed forms."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

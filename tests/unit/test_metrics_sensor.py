@@ -1,7 +1,5 @@
 """The metrics of real sensors, against numpy, scipy and scikit-image, and of a board, against closed forms."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Metrics over time: closed forms, numpy, scipy's interpolation of moved points, the code of Video Depth Anything."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """MSG-Net and its pre- and post-processing, against SciPy, Pillow and its own slow ways."""
 
-from __future__ import annotations
-
 import copy
 from typing import get_args
 

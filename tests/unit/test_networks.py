@@ -1,7 +1,5 @@
 """What holds of every network of ours that works on the disparity's range, whatever its weights are."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from types import MappingProxyType
 

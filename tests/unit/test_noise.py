@@ -3,8 +3,6 @@
 The noise of cameras drawn at random has the stated amplitudes, lengths, steps, bands and edges.
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Training patches: pure functions of the seed and their number, true to geometry, cut from training scenes alone."""
 
-from __future__ import annotations
-
 import itertools
 import multiprocessing
 import os

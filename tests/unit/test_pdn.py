@@ -1,7 +1,5 @@
 """PDN: its unrolled stage against a plain loop and another optimiser, and what holds for the whole network."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

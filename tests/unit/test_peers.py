@@ -1,7 +1,5 @@
 """What all published networks of the field share: how they are fed, and how their authors' files are read."""
 
-from __future__ import annotations
-
 import pickle
 from pathlib import Path
 from typing import ClassVar

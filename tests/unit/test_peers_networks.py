@@ -1,7 +1,5 @@
 """The published networks of the field, part by part, against plain loops, OpenCV, SciPy and torch's own layers."""
 
-from __future__ import annotations
-
 import math
 
 import cv2

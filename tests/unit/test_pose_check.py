@@ -1,7 +1,5 @@
 """Poses that are read wrongly are noticed by the depth maps, and nothing is said where these cannot show it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The Potts problem: closed forms, and all partitions of small pictures tried."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Progress on the console: bars on a terminal, lines off it, with named times."""
 
-from __future__ import annotations
-
 import io
 
 import pytest

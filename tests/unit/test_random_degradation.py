@@ -1,7 +1,5 @@
 """Random degradations: reproducible, of the stated size and shape, and described truly by the hints."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

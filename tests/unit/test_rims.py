@@ -1,7 +1,5 @@
 """Holes between two surfaces."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

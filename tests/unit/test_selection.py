@@ -1,7 +1,5 @@
 """Methods of fixed factors at other scales: what ``dsr.upsample`` gives, and a note."""
 
-from __future__ import annotations
-
 import itertools
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The shading loss: light and albedo against least squares of numpy and scipy, and its zero at the truth."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Super-resolution from shading: closed forms, dense references, derivatives, and steps that lower the energy."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from pathlib import Path

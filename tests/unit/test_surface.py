@@ -1,7 +1,5 @@
 """Normals and renderings, against closed forms, cross products of differences, and the protocol's literal values."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

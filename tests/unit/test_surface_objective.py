@@ -1,7 +1,5 @@
 """The loss of networks that say how sure they are, and what the module feeds them."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """TGV upsampling, against another algorithm for the same minimum, and closed forms."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The objective, the schedule and the Lightning module, against numbers worked out by hand."""
 
-from __future__ import annotations
-
 import copy
 import functools
 import math

@@ -1,7 +1,5 @@
 """The noise of a sensor's map is distinguished from shape, and the map is worked on at the size that it suggests."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 from typing import Any
