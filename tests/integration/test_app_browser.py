@@ -221,3 +221,23 @@ def test_wrong_and_large_files_are_refused_before_they_are_sent_and_work_can_be_
     page.click(".cancel")
     assert finished(page)[0] == "Cancelled."
     assert page.is_enabled(".compute")
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(
+    ("photo", "depth", "size"),
+    [
+        ("iphone_lidar/image.jpg", "iphone_lidar/arkit_depth.png", "1920 x 1440"),
+        ("depth_camera/0/rgb.png", "depth_camera/0/raw_depth.png", "640 x 480"),
+    ],
+)
+def test_real_pairs_of_a_phone_and_of_a_depth_camera(page, shared, photo, depth, size):
+    page.set_input_files("#photo", shared / "real" / photo)
+    page.set_input_files("#depth", shared / "real" / depth)
+    page.select_option("#method", "bicubic")
+    computed(page)
+    assert size in page.inner_text(".facts")
+    assert page.locator(".job-notes li").count() > 0
+    seen = panels(page)
+    assert middle(seen["after"]).mean() > 30
+    assert seen["after"].std() > 5
