@@ -155,7 +155,7 @@ def read_depth(path: Path, *, smooth: bool = False) -> Tensor:
 def read_regions(path: Path, size: Sequence[int]) -> dict[str, Tensor]:
     """Return the regions that a mask of ``size`` = (height, width) gives, (1, H, W) uint8."""
     mask = read_mask(path).astype(np.uint8)
-    expect_size(path, mask, tuple(size))
+    expect_size(path, mask, size)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * EDGE + 1, 2 * EDGE + 1))
     edges = cv2.dilate(mask, disc) - cv2.erode(mask, disc)
     regions = {"glass": mask, "outside": 1 - mask, "edges": edges}

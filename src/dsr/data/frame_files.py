@@ -19,8 +19,8 @@ from dsr.io.images import read_pixels
 from dsr.sample import Scene
 from dsr.utils.guards import MOST_FILE, natural_key, read_limited
 
+# Note of scenes whose camera is that of Camera.from_fov
 NO_CAMERA = f"no camera is published: {ASSUMED_FOV:g} degrees of horizontal view are assumed"
-"""Note of scenes whose camera is :meth:`dsr.geometry.camera.Camera.from_fov`."""
 Found = TypeVar("Found")
 
 

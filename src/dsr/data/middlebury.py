@@ -201,7 +201,12 @@ def _names(folders: Sequence[str]) -> tuple[str, ...]:
 
 
 EVALUATION_2014, TRAINING_2014 = _names(collections.EVALUATION_2014), _names(collections.TRAINING_2014)
-SCENES = {year: _names(getattr(collections, f"SCENES_{year}")) for year in YEARS}
+SCENES = {
+    2001: _names(collections.SCENES_2001),
+    2003: _names(collections.SCENES_2003),
+    2005: _names(collections.SCENES_2005),
+    2006: _names(collections.SCENES_2006),
+}
 TRAINING = {2001: SCENES[2001], 2006: SCENES[2006], 2014: TRAINING_2014}  # scenes to train on by year
 _FILES_2014 = ("im0.png", "calib.txt", "disp0.pfm", "disp0GT.pfm")
 

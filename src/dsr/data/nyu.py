@@ -37,11 +37,9 @@ from dsr.sample import Scene
 from dsr.utils.guards import refusing
 
 CAMERA = Camera(640, 480, 518.85790117450188, 519.46961112127485, 325.58244941119034 - 1, 253.73616633400465 - 1)
-BORDER = (44, 40, 427, 561)
-"""First row and column, from 0, height and width of the window that the projected depth covers."""
+BORDER = (44, 40, 427, 561)  # of the window that the projected depth covers: first row and column, height, width
 Split = Literal["train", "test"]
-SPLITS = MappingProxyType({"train": range(1, 1001), "test": range(1001, 1450)})
-"""Numbers of the frames by what guided depth super-resolution uses them for."""
+SPLITS = MappingProxyType({"train": range(1, 1001), "test": range(1001, 1450)})  # numbers of the frames
 _PHOTO = re.compile(r"(\d{1,4})\.jpg")
 _FRAME = MappingProxyType({
     "images": ((3, 640, 480), np.dtype(np.uint8)),

@@ -21,7 +21,7 @@ import torch
 from dsr.data.reference_depth import fit, inpaint_depth
 from dsr.data.scene_source import SceneSelection, select_scenes
 from dsr.sample import Scene
-from dsr.synthetic.rendering import Rendering, cache_directory, expect_size, load_or_render
+from dsr.synthetic.rendering import Rendering, cache_directory, expect_room_for, load_or_render
 from dsr.utils.progress import SILENT
 from dsr.utils.versions import SCENES, file_hash
 
@@ -111,7 +111,7 @@ class Preparation:
         """Check the values."""
         if self.size is not None and self.size < _MIN_SIZE:
             raise ValueError(f"size: expected at least {_MIN_SIZE} pixels, or null, got {self.size}")
-        expect_size(self.size or _MIN_SIZE)
+        expect_room_for(self.size or _MIN_SIZE)
         if self.crop is not None and not 0 <= self.crop <= 1:
             raise ValueError(f"crop: expected a number from 0 to 1, or null, got {self.crop}")
 

@@ -15,7 +15,7 @@ from dsr.data.folder import Folder
 from dsr.data.scene_source import SceneSelection, select_scenes
 from dsr.sample import Scene
 from dsr.synthetic.procedural.random_scene import PROCEDURAL_VERSION, render_random_scene
-from dsr.synthetic.rendering import cache_directory, expect_size, load_or_render
+from dsr.synthetic.rendering import cache_directory, expect_room_for, load_or_render
 from dsr.synthetic.simgeo import SCENES, SCENES_VERSION, render_scene
 from dsr.utils.pool import Pool
 from dsr.utils.progress import SILENT
@@ -41,7 +41,7 @@ class Procedural:
             raise ValueError(
                 f"dataset: expected count at least 1, size at least 32, seed at least 0; got {count}, {size}, {seed}"
             )
-        expect_size(size)
+        expect_room_for(size)
         self._count, self._size, self._seed = count, size, seed
 
     def scenes(self) -> list[str]:
@@ -106,7 +106,7 @@ class SimGeo:
     def __init__(self, root: str | None = None, scenes: SceneSelection = None, size: int = 512) -> None:
         if size < 32:
             raise ValueError(f"size: expected at least 32 pixels, got {size}")
-        expect_size(size)
+        expect_room_for(size)
         self._size = size
         self._lucy: Folder | None = None
         available = list(SCENES)

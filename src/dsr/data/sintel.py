@@ -30,13 +30,13 @@ from dsr.geometry.camera import Camera
 from dsr.sample import Scene
 from dsr.utils.guards import natural_key
 
+# Numbers of frames of the training sequences, 1064 in all
 SEQUENCES = MappingProxyType({
     "alley_1": 50, "alley_2": 50, "ambush_2": 21, "ambush_4": 33, "ambush_5": 50, "ambush_6": 20, "ambush_7": 50,
     "bamboo_1": 50, "bamboo_2": 50, "bandage_1": 50, "bandage_2": 50, "cave_2": 50, "cave_4": 50, "market_2": 50,
     "market_5": 50, "market_6": 40, "mountain_1": 50, "shaman_2": 50, "shaman_3": 50, "sleeping_1": 50,
     "sleeping_2": 50, "temple_2": 50, "temple_3": 50,
 })  # fmt: skip
-"""Frames of each training sequence, 1064 in all."""
 FARTHEST = 1000.0  # largest depth in metres; the sky has a larger one
 _TAG = struct.pack("<f", 202021.25)
 _DPT_HEADER = struct.Struct("<4sii")

@@ -10,8 +10,8 @@ github.com/alr-internship/self-supervised-depth-denoising:
     depth/8.png    the camera's depth, registered to the photo, 16 bits, mm, 0 = hole
 
 likewise 14, 19, 25 and 31. A ChArUco board is in view. Its corners gave what this module has in :data:`CAMERA`,
-:data:`LENS` and :data:`BOARDS` (root mean square of 0.30 pixels when projected), and so the depth of every pixel on the
-board: that of the plane where the pixel's ray, bent by the lens, meets it. Elsewhere nothing is known. The scene's
+:data:`LENS` and :data:`BOARDS` (root mean square reprojection error 0.30 pixels), and so the depth of every pixel on
+the board: that of the plane where the pixel's ray, bent by the lens, meets it. Elsewhere nothing is known. The scene's
 camera has no lens, so that planes are bent in it by up to 4.5 mm, the truth's and the map's alike.
 """
 
@@ -67,8 +67,8 @@ BOARDS = MappingProxyType(
         ),
     }
 )
+# Pixels inside the outline up to which its own error of a pixel or two counts, and up to which the border reaches
 INSIDE, BORDER = 12, 36
-"""Pixels inside the outline up to which its own error of a pixel or two counts, and up to which the border reaches."""
 _PHOTO = re.compile(r"(\d+)\.(?:png|jpg)")
 
 

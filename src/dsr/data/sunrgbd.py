@@ -102,6 +102,7 @@ def _only(folder: Path) -> Path:
     return found[0]
 
 
+# Folders of the scenes; where several scenes lie below one, its first is used
 FRAMES = MappingProxyType(
     {
         "kinect1_1": "kv1/NYUdata/NYU0001",
@@ -118,7 +119,6 @@ FRAMES = MappingProxyType(
         "xtion_3": "xtion/sun3ddata/brown_bm_2/brown_bm_2",
     }
 )
-"""Folders of the scenes; where several scenes lie below one, its first is used."""
 
 
 class SunRGBD(PreparedDataset):

@@ -9,7 +9,7 @@ all of 610 x 810 pixels. No names of variables are published for the ``.mat`` fi
 their names and sizes, or named by the caller. Depths are orthogonal, in millimetres where their median exceeds 50, else
 in metres. In ``*_depth.bmp`` 255 is the farthest sample, and levels are linear in depth; what depth a level stands for
 is the caller's to give. No file holds a camera: :data:`ESTIMATED` fits 72 correspondences with the scene Books, which
-the paper's authors published with a camera, up to 0.95 pixels (root mean square).
+the paper's authors published with a camera, to a root mean square error of 0.95 pixels.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ FACTORS = (4, 8)  # of the measured maps: about 40 % of the 4 x 4 blocks have a 
 _MILLIMETRES = 50.0
 _SMALLEST = 16
 _SPARSE = 0.2
+# What the names of variables hold, in small letters and digits alone, by what they are; the first counts most
 _ROLES: Mapping[str, tuple[str, ...]] = {
     "intensity": ("intensity", "gr[ae]y", "rgb|colou?r", "im(g|age)?$", "^i$"),
     "depth": ("truth|gt", "hr|highres", "depth"),
     "samples": ("tof", "sparse|projected", "lr|mr|lowres", "depth"),
 }
-"""What the names of variables hold, in small letters and digits alone, by what they are; the first counts most."""
 _OTHERS = {
     "intensity": re.compile("weight|mask|conf|amplitude|depth|tof|disp"),
     "depth": re.compile("weight|mask|conf|amplitude"),

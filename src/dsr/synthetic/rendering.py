@@ -65,7 +65,7 @@ def load_or_render(path: Path, make: Callable[[], Rendering]) -> Rendering:
     return rendering
 
 
-def expect_size(size: int) -> None:
+def expect_room_for(size: int) -> None:
     """Refuse a height and width of scenes that this machine has too little memory to make."""
     expect_memory("size", size, _BYTES * size**2)
 
