@@ -11,8 +11,15 @@ from small_scenes import disparity_of, plane, random_scene, sample_of, step
 from torch import Tensor
 
 from dsr.geometry.camera import to_range
-from dsr.methods.classical.tgv import Solution, Tensors, TotalGeneralisedVariation
-from dsr.methods.images import divergence, extend_linearly, gradient, sum_adjacent, upsample_linear_border
+from dsr.methods.classical.tgv import (
+    Solution,
+    Tensors,
+    TotalGeneralisedVariation,
+    divergence,
+    gradient,
+    sum_adjacent,
+)
+from dsr.methods.images import extend_linearly, upsample_linear_border
 
 
 def _normals(*shape: int, seed: int = 0) -> Tensor:

@@ -1,4 +1,4 @@
-"""Operations on images and maps that methods share: values, sizes, differences, holes and noise."""
+"""Operations on images and maps that methods share: values, sizes, holes and noise."""
 
 from __future__ import annotations
 
@@ -119,36 +119,6 @@ def lr_coordinates(camera: Camera, camera_lr: Camera, device: torch.device | str
         (rows - camera.cy) / camera.fy * camera_lr.fy + camera_lr.cy,
         (columns - camera.cx) / camera.fx * camera_lr.fx + camera_lr.cx,
     )
-
-
-def gradient(x: Tensor) -> Tensor:
-    """Return forward differences along u and v, (B, C, H, W) -> (B, 2, C, H, W); 0 in the last column and row."""
-    along_u, along_v = functional.pad(x.diff(dim=-1), (0, 1)), functional.pad(x.diff(dim=-2), (0, 0, 0, 1))
-    return torch.stack((along_u, along_v), dim=1)
-
-
-def divergence(p: Tensor) -> Tensor:
-    """Return minus the adjoint of :func:`gradient`, (B, 2, C, H, W) -> (B, C, H, W).
-
-    The last column of p along u and its last row along v are ignored.
-    """
-    return _collect(p, -1)
-
-
-def sum_adjacent(p: Tensor) -> Tensor:
-    """Return the sum of the values at the differences that use each pixel, (B, 2, C, H, W) -> (B, C, H, W)."""
-    return _collect(p, 1)
-
-
-def _collect(p: Tensor, sign: int) -> Tensor:
-    """Add the values of differences, (B, 2, C, H, W), to their first pixels and, with a sign, to their second ones."""
-    total = torch.zeros_like(p[:, 0])
-    for direction, dim in ((0, -1), (1, -2)):
-        count = p.shape[dim] - 1
-        values = p[:, direction].narrow(dim, 0, count)
-        total.narrow(dim, 0, count).add_(values)
-        total.narrow(dim, 1, count).add_(values, alpha=sign)
-    return total
 
 
 def inpaint(x: Tensor, photo: Tensor | None = None) -> Tensor:

@@ -32,19 +32,17 @@ from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from dsr.geometry.camera import from_range
 from dsr.methods.base import Abilities, Cost, Method, expect_positive, whole_scale
 from dsr.methods.images import (
     box_mean,
-    divergence,
     estimate_sensor_noise,
-    gradient,
     grey,
     inpaint,
     normalise,
     repeat_blocks,
-    sum_adjacent,
     upsample_linear_border,
 )
 from dsr.sample import DepthSample
@@ -217,6 +215,36 @@ class TotalGeneralisedVariation(Method):
         step_v = _SLOPE / (inside[:, :, 0] + 4) / root
         step_p = 1 / ((2 + _SLOPE) * torch.maximum(along_u, along_v))[:, None] * root
         return step_u, step_v, step_p, root / (2 * _SLOPE)
+
+
+def gradient(x: Tensor) -> Tensor:
+    """Return forward differences along u and v, (B, C, H, W) -> (B, 2, C, H, W); 0 in the last column and row."""
+    along_u, along_v = functional.pad(x.diff(dim=-1), (0, 1)), functional.pad(x.diff(dim=-2), (0, 0, 0, 1))
+    return torch.stack((along_u, along_v), dim=1)
+
+
+def divergence(p: Tensor) -> Tensor:
+    """Return minus the adjoint of :func:`gradient`, (B, 2, C, H, W) -> (B, C, H, W).
+
+    The last column of p along u and its last row along v are ignored.
+    """
+    return _collect(p, -1)
+
+
+def sum_adjacent(p: Tensor) -> Tensor:
+    """Return the sum of the values at the differences that use each pixel, (B, 2, C, H, W) -> (B, C, H, W)."""
+    return _collect(p, 1)
+
+
+def _collect(p: Tensor, sign: int) -> Tensor:
+    """Add the values of differences, (B, 2, C, H, W), to their first pixels and, with a sign, to their second ones."""
+    total = torch.zeros_like(p[:, 0])
+    for direction, dim in ((0, -1), (1, -2)):
+        count = p.shape[dim] - 1
+        values = p[:, direction].narrow(dim, 0, count)
+        total.narrow(dim, 0, count).add_(values)
+        total.narrow(dim, 1, count).add_(values, alpha=sign)
+    return total
 
 
 def _slopes(u: Tensor) -> Tensor:

@@ -18,7 +18,13 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.methods.base import Cost
-from dsr.methods.networks.peers.peer_network import PeerNetwork, fold_batch_norm
+from dsr.methods.networks.peers.peer_network import (
+    ChannelAttention,
+    PeerNetwork,
+    ResidualGroup,
+    conv3x3,
+    fold_batch_norm,
+)
 
 _CHUNK = 2**20  # values that are read at once, so that they stay in the processor's cache
 
@@ -57,39 +63,6 @@ def _sampling_grid(offsets: Tensor, top: int, height: int) -> Tensor:
     y = (offsets[:, ::2] + y) * (2 / height) + (1 / height - 1)  # (B, 9, rows, W)
     x = (offsets[:, 1::2] + x) * (2 / width) + (1 / width - 1)
     return torch.stack((x, y), dim=-1).flatten(1, 2)
-
-
-class ChannelAttention(nn.Module):
-    """A residual block whose features are weighted by factors of the whole image (Zhang et al., *RCAN*, ECCV 2018)."""
-
-    def __init__(self, width: int, inner: int, slope: float) -> None:
-        super().__init__()
-        factors = nn.Sequential(nn.Conv2d(width, inner, 1), nn.ReLU(), nn.Conv2d(inner, width, 1), nn.Sigmoid())
-        self.body = nn.Sequential(
-            conv3x3(width, width),
-            nn.LeakyReLU(slope, inplace=True),
-            conv3x3(width, width),
-            nn.ModuleDict({"conv_du": factors}),
-        )
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Map (B, C, H, W) to the same shape."""
-        y = self.body[:3](x)
-        factors = self.body.get_submodule("3.conv_du")(y.mean(dim=(-2, -1), keepdim=True))
-        return torch.addcmul(x, y, factors)
-
-
-class ResidualGroup(nn.Module):
-    """Two blocks with channel attention, a convolution, and a connection around all."""
-
-    def __init__(self, width: int, inner: int, slope: float, bias: bool = True) -> None:
-        super().__init__()
-        blocks = [ChannelAttention(width, inner, slope) for _ in range(2)]
-        self.body = nn.Sequential(*blocks, conv3x3(width, width, bias))
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Map (B, C, H, W) to the same shape."""
-        return self.body(x).add_(x)
 
 
 class EncoderBlock(nn.Module):
@@ -228,8 +201,3 @@ class DORNet(PeerNetwork):
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
         """Refine an enlarged map; see :meth:`PeerNetwork.forward`."""
         return self.R(rgb, values, *self.Enc(values))
-
-
-def conv3x3(before: int, after: int, bias: bool = True) -> nn.Conv2d:
-    """Make a 3 x 3 convolution that keeps the size."""
-    return nn.Conv2d(before, after, 3, padding=1, bias=bias)

@@ -99,6 +99,44 @@ class PeerNetwork(nn.Module, abc.ABC):
         return tensors
 
 
+def conv3x3(before: int, after: int, bias: bool = True) -> nn.Conv2d:
+    """Make a 3 x 3 convolution that keeps the size."""
+    return nn.Conv2d(before, after, 3, padding=1, bias=bias)
+
+
+class ChannelAttention(nn.Module):
+    """A residual block whose features are weighted by factors of the whole image (Zhang et al., *RCAN*, ECCV 2018)."""
+
+    def __init__(self, width: int, inner: int, slope: float) -> None:
+        super().__init__()
+        factors = nn.Sequential(nn.Conv2d(width, inner, 1), nn.ReLU(), nn.Conv2d(inner, width, 1), nn.Sigmoid())
+        self.body = nn.Sequential(
+            conv3x3(width, width),
+            nn.LeakyReLU(slope, inplace=True),
+            conv3x3(width, width),
+            nn.ModuleDict({"conv_du": factors}),
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map (B, C, H, W) to the same shape."""
+        y = self.body[:3](x)
+        factors = self.body.get_submodule("3.conv_du")(y.mean(dim=(-2, -1), keepdim=True))
+        return torch.addcmul(x, y, factors)
+
+
+class ResidualGroup(nn.Module):
+    """Two blocks with channel attention, a convolution, and a connection around all."""
+
+    def __init__(self, width: int, inner: int, slope: float, bias: bool = True) -> None:
+        super().__init__()
+        blocks = [ChannelAttention(width, inner, slope) for _ in range(2)]
+        self.body = nn.Sequential(*blocks, conv3x3(width, width, bias))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map (B, C, H, W) to the same shape."""
+        return self.body(x).add_(x)
+
+
 class PeerUpsampler(Method):
     """A method that is a published network; it takes maps of any ratio, as the network works at the photo's size.
 
