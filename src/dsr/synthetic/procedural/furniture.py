@@ -83,10 +83,10 @@ def sofa(rng: np.random.Generator) -> Parts:
     return [merge(body), merge(soft)]
 
 
-def shelf(rng: np.random.Generator, *, low: bool = False) -> Parts:
+def shelf(rng: np.random.Generator) -> Parts:
     """Return [boards, and one shape for each group of things] of a bookcase with its back at the largest y."""
     wide, deep = rng.uniform(0.6, 1.6), rng.uniform(0.25, 0.4)
-    rows = int(rng.integers(2, 4) if low else rng.integers(3, 6))
+    rows = int(rng.integers(3, 6))
     pitch, thick = rng.uniform(0.28, 0.4), rng.uniform(0.015, 0.035)
     boards = [box([wide - thick, deep - 0.005, thick]).translate(0, 0, k * pitch) for k in range(rows + 1)]
     side = box([thick, deep, rows * pitch + thick])
@@ -187,7 +187,7 @@ def window(rng: np.random.Generator, width: float, height: float) -> Parts:
         for j in range(rows):
             low, high = np.array([i * w, j * h]) + rim, np.array([(i + 1) * w, (j + 1) * h])
             holes.append(np.array([low, [low[0], high[1]], high, [high[0], low[1]]]))
-    frame = extrusion([outer, *holes], out).turn(0, 90).translate(0, 0, 0)
+    frame = extrusion([outer, *holes], out).turn(0, 90)
     pane = box([width - rim, 0.004, height - rim]).translate(width / 2, 0, rim / 2)
     return [pane, frame]
 

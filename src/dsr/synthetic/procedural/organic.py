@@ -13,8 +13,8 @@ from dsr.synthetic.raycast import Array
 
 
 @dataclass(frozen=True, eq=False)
-class Blobs:
-    """A field, the sum of B Gaussian blobs - 0.5 + ripples, positive inside, with a gradient in closed form."""
+class _Field:
+    """The sum of B Gaussian blobs - 0.5 + ripples, positive inside, with a gradient in closed form."""
 
     centres: Array  # (B, 3)
     radii: Array  # (B, 3) along the coordinate axes
@@ -56,8 +56,12 @@ class Blobs:
         return total + swing, gradient + slope[:, None] * ((np.cos(phase) * self.heights) @ self.waves)
 
 
-def polygonise(field: Blobs, cells: int) -> Shape:
-    """Return the zero set of the field with exact vertices and normals, from ``cells`` cells along the longest side."""
+def polygonise(rng: np.random.Generator, blobs: Array, ripples: tuple[Array, Array, Array], cells: int) -> Shape:
+    """Return the body of ``blobs`` (B, 7), centres, radii and weights, with ``ripples``: waves, phases and heights.
+
+    Vertices and normals are exact. It has ``cells`` cells along the longest side and stands on z = 0.
+    """
+    field = _Field(blobs[:, :3], blobs[:, 3:6], blobs[:, 6], *ripples, ridged=bool(rng.random() < 0.5))
     low = (field.centres - 1.9 * field.radii).min(0)
     high = (field.centres + 1.9 * field.radii).max(0)
     step = (high - low).max() / cells
@@ -74,7 +78,7 @@ def polygonise(field: Blobs, cells: int) -> Shape:
     _, gradient = field.value(points)
     tone = np.clip(0.5 + np.sin(points @ field.waves.T + field.phases) @ field.heights / 0.15, 0, 1)
     chart = np.column_stack((points[:, 0] + 0.3 * points[:, 1], points[:, 2], tone))
-    return Shape(points, faces.astype(np.intp), unit(gradient), chart, points)
+    return place_on_ground(Shape(points, faces.astype(np.intp), unit(gradient), chart, points))
 
 
 def _ripples(rng: np.random.Generator, cells: int) -> tuple[Array, Array, Array]:
@@ -99,11 +103,8 @@ def creature(rng: np.random.Generator, cells: int = 96) -> Shape:
             radii.append(thick[k] * rng.uniform(0.85, 1.2, 3))
             heading = unit((heading + 0.45 * rng.normal(size=3))[None])[0]
             start = start + 0.75 * thick[k] * heading
-    waves, phases, heights = _ripples(rng, cells)
-    field = Blobs(
-        np.array(centres), np.array(radii), np.ones(len(radii)), waves, phases, heights, bool(rng.random() < 0.5)
-    )
-    return place_on_ground(polygonise(field, cells))
+    blobs = np.column_stack((centres, radii, np.ones(len(radii))))
+    return polygonise(rng, blobs, _ripples(rng, cells), cells)
 
 
 _FACE = np.array(
@@ -166,8 +167,7 @@ def figure(rng: np.random.Generator, cells: int = 120) -> Shape:
         blobs = np.concatenate((head, _body(rng)))
         waves, heights = rng.normal(size=(count, 3)) * [60, 40, 9], rng.uniform(0.005, 0.03, count)
     phases = rng.uniform(0, 6.28, count)
-    field = Blobs(blobs[:, :3], blobs[:, 3:6], blobs[:, 6], waves, phases, heights, bool(rng.random() < 0.5))
-    shape = place_on_ground(polygonise(field, cells))
+    shape = polygonise(rng, blobs, (waves, phases, heights), cells)
     return shape.scale(1 / float(shape.vertices[:, 2].max()))
 
 
@@ -176,10 +176,8 @@ def pebble(rng: np.random.Generator, cells: int = 56) -> Shape:
     size = rng.uniform(0.3, 0.5, 3)
     rough = rng.uniform(0.0, 0.25) ** 1.3
     waves, phases, heights = _ripples(rng, cells)
-    field = Blobs(
-        np.zeros((1, 3)), size[None] * 1.2, np.ones(1), waves, phases, heights * rough * 4, bool(rng.random() < 0.5)
-    )
-    return place_on_ground(polygonise(field, cells))
+    blob = np.concatenate((np.zeros(3), size * 1.2, np.ones(1)))
+    return polygonise(rng, blob[None], (waves, phases, heights * rough * 4), cells)
 
 
 def leaf(rng: np.random.Generator, length: float, wide: float) -> Shape:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -36,35 +36,7 @@ def shell(rng: np.random.Generator, scene: SceneBuilder, size: Array) -> None:
 
 def fill_room(rng: np.random.Generator, scene: SceneBuilder, size: Array) -> None:
     """Add furniture along the back and side walls and in the middle, and what hangs on the walls."""
-    for turn, length, out in ((0, size[0], size[1] / 2), (90, size[1], size[0] / 2), (-90, size[1], size[0] / 2)):
-        x = -length / 2 + rng.uniform(0.1, 0.8)
-        while x < length / 2 - 0.6:
-            parts, families = _wall_piece(rng)
-            low, high = _extent(parts)
-            if x + high[0] - low[0] < length / 2 - 0.05:
-                y = out - high[1] - rng.uniform(0.025, 0.1)
-                _place(scene, parts, families, (x - low[0], y, 0.0), turn)
-            x += high[0] - low[0] + rng.uniform(0.05, 1.0)
-        _hang(rng, scene, turn, length, out, size[2])
-    _fill_middle(rng, scene, size)
-
-
-def _extent(parts: Sequence[Shape]) -> tuple[Array, Array]:
-    """Return the corners of the box around the shapes."""
-    points = np.concatenate([s.vertices for s in parts])
-    return points.min(0), points.max(0)
-
-
-def _place(
-    scene: SceneBuilder, parts: Sequence[Shape], families: Sequence[str], at: Sequence[float], turn: float = 0
-) -> None:
-    """Add the parts, shifted to ``at`` and then rotated by ``turn`` degrees, each in a material of its family."""
-    scene.add_all([part.translate(*at).turn(2, turn) for part in parts], families, 0.6)
-
-
-def _wall_piece(rng: np.random.Generator) -> tuple[list[Shape], list[str]]:
-    """Return a piece of furniture whose front faces -y, and the families of its materials."""
-    pieces: tuple[tuple[Callable[[], list[Shape]], list[str]], ...] = (
+    pieces = (
         (lambda: f.shelf(rng), ["wood", "any", "print", "cloth", "any"]),
         (lambda: f.cabinet(rng), ["wood", "metal"]),
         (lambda: f.sofa(rng), ["cloth", "cloth"]),
@@ -75,8 +47,26 @@ def _wall_piece(rng: np.random.Generator) -> tuple[list[Shape], list[str]]:
         (lambda: f.bed(rng), ["wood", "cloth"]),
         (lambda: _boxes(rng), ["any", "print"]),
     )
-    make, families = pieces[rng.integers(len(pieces))]
-    return make(), families
+    for turn, length, out in ((0, size[0], size[1] / 2), (90, size[1], size[0] / 2), (-90, size[1], size[0] / 2)):
+        x = -length / 2 + rng.uniform(0.1, 0.8)
+        while x < length / 2 - 0.6:
+            make, families = pieces[rng.integers(len(pieces))]
+            parts = make()
+            points = np.concatenate([part.vertices for part in parts])
+            low, high = points.min(0), points.max(0)
+            if x + high[0] - low[0] < length / 2 - 0.05:
+                y = out - high[1] - rng.uniform(0.025, 0.1)
+                _place(scene, parts, families, (x - low[0], y, 0.0), turn)
+            x += high[0] - low[0] + rng.uniform(0.05, 1.0)
+        _hang(rng, scene, turn, length, out, size[2])
+    _fill_middle(rng, scene, size)
+
+
+def _place(
+    scene: SceneBuilder, parts: Sequence[Shape], families: Sequence[str], at: Sequence[float], turn: float = 0
+) -> None:
+    """Add the parts, shifted to ``at`` and then rotated by ``turn`` degrees, each in a material of its family."""
+    scene.add_all([part.translate(*at).turn(2, turn) for part in parts], families, 0.6)
 
 
 def _boxes(rng: np.random.Generator) -> list[Shape]:
@@ -88,7 +78,7 @@ def _boxes(rng: np.random.Generator) -> list[Shape]:
 def _set_table(rng: np.random.Generator) -> list[Shape]:
     """Return [top, legs, objects...] of a table with objects on it."""
     parts = f.table(rng)
-    low, high = _extent(parts[:1])
+    low, high = parts[0].vertices.min(0), parts[0].vertices.max(0)
     for spot in scatter(rng, high[:2] - low[:2] - 0.2, int(rng.integers(1, 6)), 0.28):
         size = rng.uniform(0.12, 0.4)
         things = f.lamp(rng, 0.5) if rng.random() < 0.15 else [random_solid(rng).scale(size)]
@@ -193,7 +183,7 @@ def _books(rng: np.random.Generator, large: float) -> Shape:
 def random_object(rng: np.random.Generator) -> tuple[list[Shape], list[str]]:
     """Return an object of 0.1 to 0.6 metres that stands on z = 0: its shapes and the families of their materials."""
     size = rng.uniform(0.12, 0.6)
-    things: tuple[tuple[float, Callable[[], list[Shape]], list[str]], ...] = (
+    things = (
         (0.50, lambda: [random_solid(rng).scale(size)], ["any"]),
         (0.08, lambda: [s.scale(1.3 * size) for s in plant(rng)], ["plant", "plant"]),
         (0.10, lambda: [branches(rng).scale(1.6 * size)], ["wood"]),
@@ -208,38 +198,24 @@ def random_object(rng: np.random.Generator) -> tuple[list[Shape], list[str]]:
     return make(), families
 
 
-def random_positions(rng: np.random.Generator, count: int) -> list[Array]:
-    """Return ``count`` random positions (3,) around the origin for large shapes."""
-    if count == 1:
-        return [rng.uniform(-0.1, 0.1, 3)]
-    spots = scatter(rng, np.full(2, 1.5), count, 0.45)
-    return [np.array([x, rng.uniform(-0.4, 0.4), z]) for x, z in spots]
-
-
 def backdrop(rng: np.random.Generator, scene: SceneBuilder, back: float, floor: float) -> None:
     """Add a background that fills the view: wall and floor, a sweep, a curved wall, a curtain or a relief."""
     kind = rng.integers(5)
-    ground = scene.sample(box([30, 30, 0.1]).translate(0, 0, floor - 0.101), "wood", 1.0)
-    if kind != 1:
-        scene.bodies.append(ground)
+    scene.add(box([30, 30, 0.1]).translate(0, 0, floor - 0.101), "wood", 1.0)
+    if kind == 1:  # the sweep is the floor too
+        scene.bodies.pop()
     scene.add(quad([-25, back + 6, -10], [50, 0, 0], [0, 0, 40]), "wall", 2.0)
     if kind == 0:
         wall = box([24, 0.1, 24]).translate(0, 0.05, -12).turn(2, rng.uniform(-25, 25))
         scene.add(wall.translate(0, back, 0), "wall", 0.8)
-    elif kind == 1:  # a photographer's sweep, which is the floor too
+    elif kind == 1:  # a photographer's sweep
         s = np.linspace(0, np.pi / 2, 24)
         radius = rng.uniform(0.3, 1.2)
         y = np.concatenate(([-14], back - radius + radius * np.sin(s), [back]))
         z = floor + np.concatenate(([0], radius * (1 - np.cos(s)), [16]))
         slope = np.concatenate(([0], s, [np.pi / 2]))[:, None]
-        scene.add(
-            surface(
-                grid(np.linspace(-12, 12, 3), y[:, None], z[:, None]),
-                grid(np.zeros(3), -np.sin(slope), np.cos(slope)),
-            ),
-            "wall",
-            0.8,
-        )
+        points = grid(np.linspace(-12, 12, 3), y[:, None], z[:, None])
+        scene.add(surface(points, grid(np.zeros(3), -np.sin(slope), np.cos(slope))), "wall", 0.8)
     elif kind == 2:  # a bent wall
         angle, radius = np.linspace(-np.pi, 0, 121) + np.pi / 2, rng.uniform(2.2, 6.0)
         x, y = radius * np.sin(angle), back - radius + radius * np.cos(angle)

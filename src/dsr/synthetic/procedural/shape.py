@@ -1,6 +1,6 @@
 """Triangle meshes with normals and paint coordinates, and general functions that make them.
 
-A shape stands for the curved surface that its vertex normals define (see :mod:`dsr.synthetic.procedural.lighting`), so
+A shape stands for the curved surface that its vertex normals define (see :mod:`dsr.synthetic.procedural.photo`), so
 the vertices of sharp edges occur twice, with different normals. Local frames have z up; lengths are in metres.
 """
 
@@ -100,12 +100,12 @@ def grid(*coordinates: Array) -> Array:
     return np.stack(np.broadcast_arrays(*coordinates), axis=-1)
 
 
-def lathe(sections: Sequence[Array], segments: int = 80) -> Shape:
+def lathe(sections: Sequence[Array]) -> Shape:
     """Return the surface of revolution about the z axis of a profile.
 
     Its sections, (K, 2) each, are radius and height along smooth pieces; edges between pieces are sharp.
     """
-    angle = np.linspace(0, 2 * np.pi, segments + 1)
+    angle = np.linspace(0, 2 * np.pi, 81)
     out, up = np.stack((np.cos(angle), np.sin(angle), 0 * angle), axis=1), np.array([0.0, 0.0, 1.0])
     parts = []
     for section in sections:
@@ -115,12 +115,27 @@ def lathe(sections: Sequence[Array], segments: int = 80) -> Shape:
     return merge(parts)
 
 
-def extrusion(outlines: Sequence[Array], height: float, crease: float = 32.0) -> Shape:
+def extrusion(outlines: Sequence[Array], height: float) -> Shape:
     """Return a prism from z = 0 to ``height`` over closed polygons (K, 2): the outer one, then holes.
 
-    Corners of the outline below the ``crease`` angle in degrees get smooth normals.
+    Corners of the outline below 32 degrees get smooth normals.
     """
-    parts = [_side(outline, height, crease) for outline in outlines]
+    parts = []
+    for outline in outlines:  # the walls
+        after = np.roll(outline, -1, axis=0)
+        edge = after - outline
+        normal = unit(np.column_stack((edge[:, 1], -edge[:, 0], 0 * edge[:, 0])))
+        before, behind = np.roll(normal, 1, axis=0), np.roll(normal, -1, axis=0)
+        smooth = ((normal * before).sum(1) > np.cos(np.deg2rad(32.0)))[:, None]
+        start = np.where(smooth, unit(normal + before), normal)
+        end = np.where(np.roll(smooth, -1), unit(normal + behind), normal)
+        arc = np.concatenate(([0.0], np.cumsum(np.linalg.norm(edge, axis=1))))
+        foot, along = np.concatenate((outline, after)), np.concatenate((arc[:-1], arc[1:]))
+        points = np.concatenate([_at_height(foot, z) for z in (0.0, height)])
+        chart = np.concatenate([np.column_stack((along, np.full(len(along), z), 0 * along)) for z in (0.0, height)])
+        a, b, c, d = np.arange(4 * len(outline)).reshape(4, -1)
+        faces = np.concatenate((np.stack((a, b, c), 1), np.stack((b, d, c), 1)))
+        parts.append(Shape(points, faces, np.concatenate((start, end, start, end)), chart, points))
     flat = np.concatenate(outlines)
     ends = np.cumsum([len(o) for o in outlines]).astype(np.uint32)
     faces = mapbox_earcut.triangulate_float64(np.ascontiguousarray(flat), ends).reshape(-1, 3).astype(np.intp)
@@ -134,25 +149,6 @@ def extrusion(outlines: Sequence[Array], height: float, crease: float = 32.0) ->
 def _at_height(flat: Array, z: float) -> Array:
     """Return the points (K, 3) at height ``z`` over points (K, 2)."""
     return np.column_stack((flat, np.full(len(flat), z)))
-
-
-def _side(outline: Array, height: float, crease: float) -> Shape:
-    """Return the wall over a closed outline (K, 2)."""
-    after = np.roll(outline, -1, axis=0)
-    edge = after - outline
-    normal = unit(np.column_stack((edge[:, 1], -edge[:, 0], 0 * edge[:, 0])))
-    smooth = (normal * np.roll(normal, 1, axis=0)).sum(1) > np.cos(np.deg2rad(crease))
-    start = np.where(smooth[:, None], unit(normal + np.roll(normal, 1, axis=0)), normal)
-    end = np.where(np.roll(smooth, -1)[:, None], unit(normal + np.roll(normal, -1, axis=0)), normal)
-    arc = np.concatenate(([0.0], np.cumsum(np.linalg.norm(edge, axis=1))))
-    foot, along = np.concatenate((outline, after)), np.concatenate((arc[:-1], arc[1:]))
-    points = np.concatenate([_at_height(foot, z) for z in (0.0, height)])
-    chart = np.concatenate([np.column_stack((along, np.full(len(along), z), 0 * along)) for z in (0.0, height)])
-    normals = np.concatenate((start, end, start, end))
-    k = np.arange(len(outline))
-    a, b, c, d = k, k + len(k), k + 2 * len(k), k + 3 * len(k)
-    faces = np.concatenate((np.stack((a, b, c), 1), np.stack((b, d, c), 1)))
-    return Shape(points, faces, normals, chart, points)
 
 
 def tube(path: Array, radius: Array | float, segments: int = 20) -> Shape:
