@@ -9,8 +9,19 @@ from dsr.synthetic.procedural.materials import PAINTS, picture_paint
 from dsr.synthetic.procedural.photo import Tracer, Viewpoint
 from dsr.synthetic.procedural.random_scene import LAYOUTS, make_camera, random_scene, render, render_random_scene
 from dsr.synthetic.procedural.reliefs import RELIEFS, relief
-from dsr.synthetic.procedural.shape import box, extrusion, merge, quad, rotation_about, surface
-from dsr.synthetic.procedural.solids import SOLIDS, ellipsoid, frustum, random_solid, rounded_box
+from dsr.synthetic.procedural.shape import (
+    SOLIDS,
+    box,
+    ellipsoid,
+    extrusion,
+    frustum,
+    merge,
+    quad,
+    random_solid,
+    rotation_about,
+    rounded_box,
+    surface,
+)
 
 SIZE = 96
 ORIGIN = np.zeros(3)

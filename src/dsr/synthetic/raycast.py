@@ -24,7 +24,6 @@ Field = Callable[[Array], Array]
 
 _CHUNK = 1 << 16  # rays at a time: temporaries stay in the cache
 _LIFT = 1e-4  # metres that a shadow ray starts above its surface
-_SUBPIXELS = [((i % 3 - 1) / 3, (i // 3 - 1) / 3) for i in range(9)]
 _CELL = 0.0125  # metres between the samples of an implicit surface's lattice
 
 
@@ -90,24 +89,14 @@ class Convex(Surface):
         """Return ``points`` (3, N) in the body's own frame."""
         return self.axes.T @ (points - self.centre[:, None])
 
+    @abstractmethod
     def interval(self, origin: Array, direction: Array) -> tuple[Array, Array]:
-        """Return the parameters at which rays enter and leave the body; enter > leave on a miss."""
-        return self._interval(self.to_local(origin), self.axes.T @ direction)
+        """Return the parameters (N,) at which rays enter and leave the body; enter > leave on a miss."""
 
     def intersect(self, origin: Array, direction: Array) -> Array:
         """Return where the rays enter the body."""
         enter, leave = self.interval(origin, direction)
         return np.where((enter <= leave) & (enter > 0), enter, np.inf)
-
-    def normal(self, points: Array) -> Array:
-        """Return the outward unit normals (3, N)."""
-        return self.axes @ self._normal(self.to_local(points))
-
-    @abstractmethod
-    def _interval(self, origin: Array, direction: Array) -> tuple[Array, Array]: ...  # in the body's own frame
-
-    @abstractmethod
-    def _normal(self, points: Array) -> Array: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,11 +105,14 @@ class Sphere(Convex):
 
     radius: float
 
-    def _interval(self, origin: Array, direction: Array) -> tuple[Array, Array]:
-        return _intersect_round(origin, direction, self.radius)
+    def interval(self, origin: Array, direction: Array) -> tuple[Array, Array]:
+        """Return where the rays enter and leave the sphere."""
+        return _intersect_round(self.to_local(origin), self.axes.T @ direction, self.radius)
 
-    def _normal(self, points: Array) -> Array:
-        return points / np.sqrt((points**2).sum(0))
+    def normal(self, points: Array) -> Array:
+        """Return the directions from the centre."""
+        away = self.to_local(points)
+        return self.axes @ (away / np.sqrt((away**2).sum(0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,13 +121,17 @@ class Box(Convex):
 
     half: Array
 
-    def _interval(self, origin: Array, direction: Array) -> tuple[Array, Array]:
-        slabs = [_intersect_slab(origin[i], direction[i], self.half[i]) for i in range(3)]
+    def interval(self, origin: Array, direction: Array) -> tuple[Array, Array]:
+        """Return where the rays are between the faces of all three pairs."""
+        start, way = self.to_local(origin), self.axes.T @ direction
+        slabs = [_intersect_slab(start[i], way[i], self.half[i]) for i in range(3)]
         return np.maximum.reduce([s[0] for s in slabs]), np.minimum.reduce([s[1] for s in slabs])
 
-    def _normal(self, points: Array) -> Array:
-        face = np.argmax(np.abs(points) - self.half[:, None], axis=0)  # the nearest
-        return np.where(np.arange(3)[:, None] == face, np.sign(points), 0.0)
+    def normal(self, points: Array) -> Array:
+        """Return the normals of the nearest faces."""
+        away = self.to_local(points)
+        face = np.argmax(np.abs(away) - self.half[:, None], axis=0)
+        return self.axes @ np.where(np.arange(3)[:, None] == face, np.sign(away), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,16 +141,20 @@ class Cylinder(Convex):
     radius: float
     half: float
 
-    def _interval(self, origin: Array, direction: Array) -> tuple[Array, Array]:
-        side = _intersect_round(origin[::2], direction[::2], self.radius)
-        caps = _intersect_slab(origin[1], direction[1], self.half)
+    def interval(self, origin: Array, direction: Array) -> tuple[Array, Array]:
+        """Return where the rays are within the side and between the caps."""
+        start, way = self.to_local(origin), self.axes.T @ direction
+        side = _intersect_round(start[::2], way[::2], self.radius)
+        caps = _intersect_slab(start[1], way[1], self.half)
         return np.maximum(side[0], caps[0]), np.minimum(side[1], caps[1])
 
-    def _normal(self, points: Array) -> Array:
-        across = np.maximum(np.hypot(points[0], points[2]), 1e-300)
-        cap = np.abs(points[1]) - self.half > across - self.radius
-        side = np.stack((points[0] / across, np.zeros_like(across), points[2] / across))
-        return np.where(cap, np.sign(points[1]) * np.array([[0.0], [1.0], [0.0]]), side)
+    def normal(self, points: Array) -> Array:
+        """Return the normals of the caps or the side, whichever is nearer."""
+        x, y, z = self.to_local(points)
+        across = np.maximum(np.hypot(x, z), 1e-300)
+        cap = np.abs(y) - self.half > across - self.radius
+        side = np.stack((x / across, np.zeros_like(across), z / across))
+        return self.axes @ np.where(cap, np.sign(y) * np.array([[0.0], [1.0], [0.0]]), side)
 
 
 def _intersect_slab(origin: Array, direction: Array, half: float) -> tuple[Array, Array]:
@@ -355,22 +355,15 @@ def render(scene: World, camera: Camera) -> tuple[NDArray[np.uint8], Array]:
         part = slice(start, start + _CHUNK)
         colour[:, part] = shade(scene, depth[part] * rays[:, part], index[part], scene.lights)
     rough = np.flatnonzero(local_contrast(encode(colour).reshape(3, *shape)) > 0.04)
+    offsets = np.array([((i % 3 - 1) / 3 / camera.fx, (i // 3 - 1) / 3 / camera.fy, 0.0) for i in range(9)])
     for start in range(0, rough.size, _CHUNK):
         pixels = rough[start : start + _CHUNK]
-        colour[:, pixels] = _supersample(scene, camera, rays[:, pixels])
+        moved = rays[:, None, pixels] + offsets.T[..., None]  # (3, 9, N); each of the nine uses a ninth of the light
+        fine, which = (hit.reshape(9, -1) for hit in cast(scene, moved.reshape(3, -1)))
+        parts = (shade(scene, fine[k] * moved[:, k], which[k], scene.lights[:, k::9]) for k in range(9))
+        colour[:, pixels] = sum(parts) / 9
     rgb = np.rint(255 * encode(colour)).astype(np.uint8)
     return np.ascontiguousarray(rgb.T).reshape(*shape, 3), depth.reshape(shape)
-
-
-def _supersample(scene: World, camera: Camera, rays: Array) -> Array:
-    """Return the mean linear RGB (3, N) of 3 x 3 rays around each of ``rays``; each uses a ninth of the light."""
-    offsets = np.array([(du / camera.fx, dv / camera.fy, 0.0) for du, dv in _SUBPIXELS])
-    moved = rays[:, None] + offsets.T[..., None]  # (3, 9, N)
-    depth, index = (hit.reshape(9, -1) for hit in cast(scene, moved.reshape(3, -1)))
-    total = np.zeros_like(rays)
-    for k in range(9):
-        total += shade(scene, depth[k] * moved[:, k], index[k], scene.lights[:, k::9])
-    return total / 9
 
 
 def encode(linear: Array) -> Array:

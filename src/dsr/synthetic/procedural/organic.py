@@ -2,83 +2,62 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from skimage.measure import marching_cubes
 
-from dsr.synthetic.procedural.shape import Shape, grid, merge, rotation_about, surface, tube, unit
-from dsr.synthetic.procedural.solids import place_on_ground
+from dsr.synthetic.procedural.shape import Shape, grid, merge, place_on_ground, rotation_about, surface, tube, unit
 from dsr.synthetic.raycast import Array
 
 
-@dataclass(frozen=True, eq=False)
-class _Field:
-    """The sum of B Gaussian blobs - 0.5 + ripples, positive inside, with a gradient in closed form."""
+def polygonise(rng: np.random.Generator, blobs: Array, ripples: tuple[Array, Array, Array], cells: int) -> Shape:
+    """Return the zero set of a field, the sum of Gaussian ``blobs`` - 0.5 + ``ripples``, on z = 0.
 
-    centres: Array  # (B, 3)
-    radii: Array  # (B, 3) along the coordinate axes
-    weights: Array  # (B,) 1 for a blob, below 0 for a hollow
-    waves: Array  # (K, 3) wave vectors of the ripples
-    phases: Array  # (K,)
-    heights: Array  # (K,)
-    ridged: bool  # whether ripples are folds with sharp valleys instead of hills
+    Blobs are rows (B, 7): a centre, radii along the axes, and a weight, which is below 0 for a hollow. Ripples are wave
+    vectors (K, 3), phases and heights (K,); they are hills or, in half of the bodies, folds with sharp valleys.
+    Vertices and normals are exact. There are ``cells`` cells along the longest side.
+    """
+    centres, radii, weights = blobs[:, :3], blobs[:, 3:6], blobs[:, 6]
+    waves, phases, heights = ripples
+    ridged, soft = rng.random() < 0.5, 0.25 * np.abs(heights).sum() + 1e-9
 
-    def lattice(self, axes: list[Array]) -> Array:
-        """Return the field on the lattice of the three coordinate ``axes``."""
-        bells = [np.exp(-(((a - self.centres[:, i, None]) / self.radii[:, i, None]) ** 2)) for i, a in enumerate(axes)]
-        turns = [np.exp(1j * self.waves[:, i, None] * a) for i, a in enumerate(axes)]
-        turns[0] = turns[0] * (self.heights * np.exp(1j * self.phases))[:, None]
-        plane = (bells[1][:, :, None] * bells[2][:, None, :]).reshape(len(self.centres), -1)
-        flat = (self.weights[:, None] * bells[0]).T @ plane
-        plane = (turns[1][:, :, None] * turns[2][:, None, :]).reshape(len(self.heights), -1)
-        swing = (turns[0].T @ plane).imag
-        return (flat - 0.5 + self._shape_ripples(swing)[0]).reshape([len(a) for a in axes])
-
-    def _shape_ripples(self, swing: Array) -> tuple[Array, Array]:
+    def shape_ripples(swing: Array) -> tuple[Array, Array]:
         """Return the ripples and their derivative for sums of waves."""
-        if not self.ridged:
-            return swing, np.ones_like(swing)
-        soft = 0.25 * np.abs(self.heights).sum() + 1e-9
         root = np.sqrt(swing**2 + soft**2)
-        return root, swing / root
+        return (root, swing / root) if ridged else (swing, np.ones_like(swing))
 
-    def value(self, points: Array) -> tuple[Array, Array]:
+    def evaluate(points: Array) -> tuple[Array, Array]:
         """Return the field (N,) and its gradient (N, 3) at ``points`` (N, 3)."""
         total, gradient = np.full(len(points), -0.5), np.zeros(points.shape)
-        for centre, radius, weight in zip(self.centres, self.radii, self.weights, strict=True):
+        for centre, radius, weight in zip(centres, radii, weights, strict=True):
             off = (points - centre) / radius
             bell = weight * np.exp(-(off**2).sum(1))
             total += bell
             gradient -= 2 * bell[:, None] * off / radius
-        phase = points @ self.waves.T + self.phases
-        swing, slope = self._shape_ripples(np.sin(phase) @ self.heights)
-        return total + swing, gradient + slope[:, None] * ((np.cos(phase) * self.heights) @ self.waves)
+        phase = points @ waves.T + phases
+        swing, slope = shape_ripples(np.sin(phase) @ heights)
+        return total + swing, gradient + slope[:, None] * ((np.cos(phase) * heights) @ waves)
 
-
-def polygonise(rng: np.random.Generator, blobs: Array, ripples: tuple[Array, Array, Array], cells: int) -> Shape:
-    """Return the body of ``blobs`` (B, 7), centres, radii and weights, with ``ripples``: waves, phases and heights.
-
-    Vertices and normals are exact. It has ``cells`` cells along the longest side and stands on z = 0.
-    """
-    field = _Field(blobs[:, :3], blobs[:, 3:6], blobs[:, 6], *ripples, ridged=bool(rng.random() < 0.5))
-    low = (field.centres - 1.9 * field.radii).min(0)
-    high = (field.centres + 1.9 * field.radii).max(0)
+    low, high = (centres - 1.9 * radii).min(0), (centres + 1.9 * radii).max(0)
     step = (high - low).max() / cells
     axes = [np.arange(low[i], high[i] + step, step) for i in range(3)]
-    values = field.lattice(axes)
-    for axis in range(3):  # closed at the border
-        np.moveaxis(values, axis, 0)[[0, -1]] = -0.1
+    # on a lattice, blobs and waves are products of functions of one coordinate
+    bells = [np.exp(-(((axis - centres[:, i, None]) / radii[:, i, None]) ** 2)) for i, axis in enumerate(axes)]
+    turns = [np.exp(1j * waves[:, i, None] * axis) for i, axis in enumerate(axes)]
+    turns[0] = turns[0] * (heights * np.exp(1j * phases))[:, None]
+    flat = (weights[:, None] * bells[0]).T @ (bells[1][:, :, None] * bells[2][:, None, :]).reshape(len(blobs), -1)
+    swing = turns[0].T @ (turns[1][:, :, None] * turns[2][:, None, :]).reshape(len(heights), -1)
+    values = (flat - 0.5 + shape_ripples(swing.imag)[0]).reshape([len(axis) for axis in axes])
+    for i in range(3):  # closed at the border
+        np.moveaxis(values, i, 0)[[0, -1]] = -0.1
     vertices, faces, _, _ = marching_cubes(values, 0.0)
     points = low + step * vertices.astype(np.float64)
     for _ in range(3):
-        value, gradient = field.value(points)
+        value, gradient = evaluate(points)
         move = value / np.maximum((gradient**2).sum(1), 1e-9)
         points -= np.clip(move[:, None] * gradient, -step, step)
-    _, gradient = field.value(points)
-    tone = np.clip(0.5 + np.sin(points @ field.waves.T + field.phases) @ field.heights / 0.15, 0, 1)
+    tone = np.clip(0.5 + np.sin(points @ waves.T + phases) @ heights / 0.15, 0, 1)
     chart = np.column_stack((points[:, 0] + 0.3 * points[:, 1], points[:, 2], tone))
-    return place_on_ground(Shape(points, faces.astype(np.intp), unit(gradient), chart, points))
+    return place_on_ground(Shape(points, faces.astype(np.intp), unit(evaluate(points)[1]), chart, points))
 
 
 def _ripples(rng: np.random.Generator, cells: int) -> tuple[Array, Array, Array]:

@@ -10,8 +10,7 @@ from dsr.synthetic.procedural import furniture as f
 from dsr.synthetic.procedural.materials import SceneBuilder
 from dsr.synthetic.procedural.organic import branches, creature, figure, pebble, plant
 from dsr.synthetic.procedural.reliefs import RELIEFS, blanket, curtain, relief
-from dsr.synthetic.procedural.shape import Shape, box, grid, merge, quad, surface
-from dsr.synthetic.procedural.solids import bowl, letter, random_solid, vase
+from dsr.synthetic.procedural.shape import Shape, bowl, box, grid, letter, merge, quad, random_solid, surface, vase
 from dsr.synthetic.raycast import Array
 
 

@@ -12,11 +12,10 @@ from typing import NamedTuple
 import numpy as np
 
 from dsr.geometry.camera import Camera
-from dsr.synthetic.procedural.furniture import blinds, shelf, table
+from dsr.synthetic.procedural.furniture import arched_wall, blinds, column, shelf, table
 from dsr.synthetic.procedural.materials import Body, SceneBuilder
 from dsr.synthetic.procedural.organic import branches, creature, figure, pebble, plant
 from dsr.synthetic.procedural.photo import (
-    Hits,
     Lighting,
     Tracer,
     Viewpoint,
@@ -27,8 +26,15 @@ from dsr.synthetic.procedural.photo import (
 )
 from dsr.synthetic.procedural.props import backdrop, fill_room, random_object, scatter, shell, tableware
 from dsr.synthetic.procedural.reliefs import RELIEFS, blanket, crumple, curtain, folds, ground, relief
-from dsr.synthetic.procedural.shape import Shape, box, extrusion, merge, random_rotation
-from dsr.synthetic.procedural.solids import frustum, hollow, place_on_ground, prism, random_solid, ring
+from dsr.synthetic.procedural.shape import (
+    box,
+    frustum,
+    merge,
+    place_on_ground,
+    prism,
+    random_rotation,
+    random_solid,
+)
 from dsr.synthetic.raycast import rotation_about
 from dsr.synthetic.rendering import Rendering
 
@@ -47,40 +53,6 @@ class SceneLayout(NamedTuple):
 
 
 Layout = Callable[[np.random.Generator, SceneBuilder], SceneLayout]
-
-
-def column(rng: np.random.Generator, high: float) -> Shape:
-    """Return a round, fluted or square column with base and capital, ``high`` metres tall."""
-    radius = rng.uniform(0.16, 0.32)
-    kind = rng.integers(3)
-    if kind == 0:
-        shaft = hollow(radius * np.array([1.0, 1.03, 0.98, 0.85]), high - 0.4, 0.02)
-    elif kind == 1:
-        angle = np.arange(192) * 2 * np.pi / 192
-        flutes = radius * (1 - 0.07 * np.abs(np.sin(angle * 10)))
-        shaft = extrusion([ring(flutes, 192)], high - 0.4)
-    else:
-        shaft = box([1.7 * radius, 1.7 * radius, high - 0.4])
-    plate = box([2.8 * radius, 2.8 * radius, 0.12])
-    foot = frustum(1.3 * radius, 1.05 * radius, 0.1).translate(0, 0, 0.12)
-    neck = frustum(radius, 1.35 * radius, 0.15).translate(0, 0, high - 0.27)
-    return merge([shaft.translate(0, 0, 0.2), plate, plate.translate(0, 0, high - 0.121), foot, neck])
-
-
-def arched_wall(rng: np.random.Generator, wide: float, high: float, back: float) -> list[Shape]:
-    """Return a wall with a row of arched openings at y = ``back``, and the wall behind it."""
-    count, thick = int(rng.integers(1, 6)), rng.uniform(0.15, 0.6)
-    pitch = wide / count
-    half, rise = pitch * rng.uniform(0.15, 0.36), rng.uniform(1.2, 2.4)
-    bow = np.linspace(0, np.pi, 25)
-    holes = []
-    for k in range(count):
-        x, sill = (k + 0.5) * pitch - wide / 2, 0.001 if rng.random() < 0.5 else 0.8
-        arc = np.column_stack((x + half * np.cos(bow), rise + half * np.sin(bow) * rng.choice([1.0, 0.3])))
-        holes.append(np.concatenate((arc, [[x - half, sill], [x + half, sill]]))[::-1])
-    outline = np.array([[-wide, -1], [wide, -1], [wide, high], [-wide, high]], dtype=np.float64)
-    wall = extrusion([outline, *holes], thick).turn(0, 90).translate(0, back, 0)
-    return [wall, box([2 * wide, 0.05, high + 1]).translate(0, back + 0.05, -1)]
 
 
 def room(rng: np.random.Generator, scene: SceneBuilder) -> SceneLayout:
@@ -337,23 +309,18 @@ def random_scene(rng: np.random.Generator, layout_name: str | None = None) -> Ra
         for _ in range(_CAMERA_TRIES):
             viewpoint = layout.views(rng)
             seen = tracer.trace(viewpoint.eye, viewpoint.rays(make_camera(viewpoint, _PREVIEW_SIZE)))
-            if _is_usable(seen):
+            if not np.isfinite(seen.depth).all():  # the preview has a gap
+                continue
+            low, middle, high = np.quantile(seen.depth, [0.02, 0.5, 0.98])
+            fractions = np.bincount(seen.body) / seen.body.size
+            varied = fractions.max() < 0.985 and np.sum(fractions > 0.004) >= 2
+            if seen.depth.min() > 0.17 * middle and high < 6.2 * low and varied:
                 lighting = random_lighting(rng, tracer, seen, layout.low, layout.high)
                 scale = min(np.exp(rng.normal(0, 0.3)), _MAX_MEDIAN_DEPTH / float(np.median(seen.depth)))
                 metres = float(max(scale, 1.5 * _MIN_DEPTH / float(seen.depth.min())))  # per unit, within the limits
                 seed = int(rng.integers(1 << 31))
                 return RandomScene(builder.bodies, tracer, viewpoint, lighting, metres, seed)
     raise RuntimeError("no view of the scene was usable")  # pragma: no cover
-
-
-def _is_usable(seen: Hits) -> bool:
-    """Return whether a preview has no gap, is neither too near nor too deep, and shows more than one object."""
-    if not np.isfinite(seen.depth).all():
-        return False
-    low, middle, high = np.quantile(seen.depth, [0.02, 0.5, 0.98])
-    fractions = np.bincount(seen.body) / seen.body.size
-    near = seen.depth.min() > 0.17 * middle
-    return bool(near and high < 6.2 * low and fractions.max() < 0.985 and np.sum(fractions > 0.004) >= 2)
 
 
 def make_camera(viewpoint: Viewpoint, size: int) -> Camera:
