@@ -381,10 +381,7 @@ TILT = rotation(37.0, 31.0, 29.0)  # so that the lattice of noise is not paralle
 
 
 def noise(points: Array, cell: float, seed: int, order: int = 1) -> Array:
-    """Return noise in [0, 1] at ``points`` (3, N), with one value per ``cell`` metres, shape (N,).
-
-    Order 1 interpolates between the values; order 3 is a B-spline, which is smoother and weaker.
-    """
+    """Return noise (N,) in [0, 1] at ``points`` (3, N), one value per ``cell`` metres; order 3 is a B-spline."""
     place = points / cell
     if order == 1:
         part = place - np.floor(place)

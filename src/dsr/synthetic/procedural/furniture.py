@@ -169,9 +169,8 @@ def pot_plant(rng: np.random.Generator, height: float) -> Parts:
     wide = rng.uniform(0.1, 0.2)
     pot = hollow(wide * np.array([0.7, 0.85, 1.0, 1.05]), 0.28, 0.015)
     earth = frustum(0.85 * wide, 0.85 * wide, 0.02).translate(0, 0, 0.2)
-    return [
-        s.scale(height / 1.2) for s in (leaves.translate(0, 0, 0.2), merge([stems.translate(0, 0, 0.2), earth]), pot)
-    ]
+    parts = leaves.translate(0, 0, 0.2), merge([stems.translate(0, 0, 0.2), earth]), pot
+    return [part.scale(height / 1.2) for part in parts]
 
 
 def blinds(rng: np.random.Generator, width: float, height: float) -> Parts:
@@ -217,15 +216,12 @@ def picture(rng: np.random.Generator) -> Parts:
 def bed(rng: np.random.Generator) -> Parts:
     """Return [frame, bedding] of a bed whose head is at the largest y."""
     wide, long, high = rng.uniform([0.9, 1.9, 0.3], [1.6, 2.1, 0.5])
-    frame = [
-        box([wide, long, 0.6 * high]).translate(0, 0, 0.05),
-        box([wide, 0.05, high + 0.5]).translate(0, long / 2, 0),
-    ]
+    base, head = box([wide, long, 0.6 * high]), box([wide, 0.05, high + 0.5])
     bedding = [rounded_box(np.array([wide, long - 0.05, 0.2]), 0.06).translate(0, -0.02, high - 0.18)]
     bedding.append(blanket(rng, np.array([wide + 0.1, 1.3]), 0.14, 200).translate(0, -0.3, high - 0.03))
     for s in (-1, 1) if wide > 1.2 else (0,):
         bedding.append(blanket(rng, np.array([0.6, 0.4]), 0.16, 80).translate(s * wide / 4, long / 2 - 0.3, high))
-    return [merge(frame), merge(bedding)]
+    return [merge([base.translate(0, 0, 0.05), head.translate(0, long / 2, 0)]), merge(bedding)]
 
 
 def column(rng: np.random.Generator, high: float) -> Shape:

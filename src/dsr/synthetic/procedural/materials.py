@@ -313,13 +313,10 @@ def scribble(rng: np.random.Generator, colours: Array) -> Image:
     image = np.full((_SIDE, _SIDE, 3), _colour(rng, colours), dtype=np.uint8)
     s = np.linspace(0, 1, 200)[:, None]
     for _ in range(rng.integers(4, 20)):
-        curve = sum(
-            rng.normal(size=(1, 2)) / (k + 1) * np.sin(np.pi * (k + 1) * s + rng.uniform(0, 6)) for k in range(4)
-        )
-        points = ((0.25 * curve + rng.random(2)) * _SIDE).astype(np.int32)
-        cv2.polylines(
-            image, [points], bool(rng.random() < 0.2), _colour(rng, colours), int(rng.integers(1, 9)), cv2.LINE_AA
-        )
+        waves = (rng.normal(size=2) / k * np.sin(np.pi * k * s + rng.uniform(0, 6)) for k in range(1, 5))
+        points = ((0.25 * sum(waves) + rng.random(2)) * _SIDE).astype(np.int32)
+        closed, colour, width = bool(rng.random() < 0.2), _colour(rng, colours), int(rng.integers(1, 9))
+        cv2.polylines(image, [points], closed, colour, width, cv2.LINE_AA)
     return image
 
 

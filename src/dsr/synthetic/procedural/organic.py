@@ -75,12 +75,12 @@ def creature(rng: np.random.Generator, cells: int = 96) -> Shape:
     centres, radii = [], []
     for _ in range(rng.integers(2, 6)):
         steps = int(rng.integers(3, 7))
-        start, heading = rng.uniform([-0.2, -0.2, 0.1], [0.2, 0.2, 0.9]), unit(rng.normal(size=(1, 3)))[0]
+        start, heading = rng.uniform([-0.2, -0.2, 0.1], [0.2, 0.2, 0.9]), unit(rng.normal(size=3))
         thick = rng.uniform(0.09, 0.24) * np.linspace(1, rng.uniform(0.5, 1.1), steps)
         for k in range(steps):
             centres.append(start)
             radii.append(thick[k] * rng.uniform(0.85, 1.2, 3))
-            heading = unit((heading + 0.45 * rng.normal(size=3))[None])[0]
+            heading = unit(heading + 0.45 * rng.normal(size=3))
             start = start + 0.75 * thick[k] * heading
     blobs = np.column_stack((centres, radii, np.ones(len(radii))))
     return polygonise(rng, blobs, _ripples(rng, cells), cells)
@@ -201,6 +201,6 @@ def branches(rng: np.random.Generator) -> Shape:
         parts.append(tube(path, radius * np.linspace(1, 0.7, 9), 10))
         if length > 0.07:
             for _ in range(2 + int(rng.random() < 0.3)):
-                heading = unit((way + spread * rng.normal(size=3))[None])[0]
+                heading = unit(way + spread * rng.normal(size=3))
                 tips.append((path[-1], heading, length * rng.uniform(0.55, 0.9), 0.7 * radius))
     return merge(parts)

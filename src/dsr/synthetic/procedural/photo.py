@@ -130,7 +130,7 @@ def random_lighting(
     extent = float(np.median(seen.depth))
     best, position = -1.0, middle
     for _ in range(8):
-        way = unit(rng.normal(size=(1, 3)) * [1, 1, 0.6] + [0, -0.5, 0.7])[0]
+        way = unit(rng.normal(size=3) * [1, 1, 0.6] + [0, -0.5, 0.7])
         spot = np.clip(middle + extent * rng.uniform(0.5, 2.5) * way, low, high)
         toward = spot[:, None] - seen.points
         slope = (toward * seen.normals).sum(0) / np.sqrt((toward**2).sum(0))
@@ -214,8 +214,8 @@ class Viewpoint:
 
     def axes(self) -> Array:
         """Return the camera's right, down and forward axes as rows (3, 3)."""
-        forward = unit((self.target - self.eye)[None])[0]
-        right = unit(np.cross(forward, [0.0, 0.0, 1.0])[None])[0]
+        forward = unit(self.target - self.eye)
+        right = unit(np.cross(forward, [0.0, 0.0, 1.0]))
         down = np.cross(forward, right)
         c, s = np.cos(np.deg2rad(self.roll)), np.sin(np.deg2rad(self.roll))
         return np.stack((c * right + s * down, c * down - s * right, forward))

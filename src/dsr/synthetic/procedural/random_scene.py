@@ -15,26 +15,10 @@ from dsr.geometry.camera import Camera
 from dsr.synthetic.procedural.furniture import arched_wall, blinds, column, shelf, table
 from dsr.synthetic.procedural.materials import Body, SceneBuilder
 from dsr.synthetic.procedural.organic import branches, creature, figure, pebble, plant
-from dsr.synthetic.procedural.photo import (
-    Lighting,
-    Tracer,
-    Viewpoint,
-    aim_camera,
-    develop,
-    radiance,
-    random_lighting,
-)
+from dsr.synthetic.procedural.photo import Lighting, Tracer, Viewpoint, aim_camera, develop, radiance, random_lighting
 from dsr.synthetic.procedural.props import backdrop, fill_room, random_object, scatter, shell, tableware
 from dsr.synthetic.procedural.reliefs import RELIEFS, blanket, crumple, curtain, folds, ground, relief
-from dsr.synthetic.procedural.shape import (
-    box,
-    frustum,
-    merge,
-    place_on_ground,
-    prism,
-    random_rotation,
-    random_solid,
-)
+from dsr.synthetic.procedural.shape import box, frustum, merge, place_on_ground, prism, random_rotation, random_solid
 from dsr.synthetic.raycast import rotation_about
 from dsr.synthetic.rendering import Rendering
 
@@ -50,9 +34,6 @@ class SceneLayout(NamedTuple):
     views: Callable[[np.random.Generator], Viewpoint]
     low: Sequence[float]  # (3,) corners of the box in which lamps may hang, in metres
     high: Sequence[float]
-
-
-Layout = Callable[[np.random.Generator, SceneBuilder], SceneLayout]
 
 
 def room(rng: np.random.Generator, scene: SceneBuilder) -> SceneLayout:
@@ -263,7 +244,7 @@ def shelves(rng: np.random.Generator, scene: SceneBuilder) -> SceneLayout:
     return SceneLayout(views, [-2, -3, 0.4], [2, -0.5, 2.6])
 
 
-LAYOUTS: dict[str, tuple[Layout, float]] = {
+LAYOUTS = {
     "room": (room, 0.25),
     "tabletop": (tabletop, 0.17),
     "clutter": (clutter, 0.09),

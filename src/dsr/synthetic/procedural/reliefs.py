@@ -153,10 +153,7 @@ RELIEFS: tuple[Maker, ...] = (masonry, cobbles, ornament, panels, folds, crumple
 
 
 def relief(rng: np.random.Generator, maker: Maker, side: float, count: int = 300, bend: float = 0.0) -> Shape:
-    """Return a square relief of ``side`` metres: (x, y) in the middle of the origin, heights along z.
-
-    ``bend`` is the height of the middle above the edges along x as a fraction of the side.
-    """
+    """Return a square relief of ``side`` metres around the origin, its middle ``bend`` sides above the edges in x."""
     u, v = np.meshgrid(np.linspace(0, 1, count), np.linspace(0, 1, count))
     height, tone, amplitude = maker(rng, u, v)
     z = side * (amplitude * height + bend * (1 - (2 * u - 1) ** 2))

@@ -60,9 +60,9 @@ def unit(vectors: Array) -> Array:
 
 def random_rotation(rng: np.random.Generator) -> Array:
     """Return a uniformly distributed random rotation matrix (3, 3)."""
-    q = unit(rng.normal(size=(1, 3)))[0]
+    q = unit(rng.normal(size=3))
     spin = rotation_about(2, rng.uniform(0, 360))
-    other = unit(np.cross(q, [0.3, 0.5, 0.81])[None])[0]
+    other = unit(np.cross(q, [0.3, 0.5, 0.81]))
     return np.asarray(np.stack((other, np.cross(q, other), q), axis=1) @ spin)
 
 
@@ -106,10 +106,7 @@ def grid(*coordinates: Array) -> Array:
 
 
 def lathe(sections: Sequence[Array]) -> Shape:
-    """Return the surface of revolution about the z axis of a profile.
-
-    Its sections, (K, 2) each, are radius and height along smooth pieces; edges between pieces are sharp.
-    """
+    """Return the surface of revolution of smooth sections (K, 2), radius and height, with sharp edges between them."""
     angle = np.linspace(0, 2 * np.pi, 81)
     out, up = np.stack((np.cos(angle), np.sin(angle), 0 * angle), axis=1), np.array([0.0, 0.0, 1.0])
     parts = []
@@ -121,17 +118,14 @@ def lathe(sections: Sequence[Array]) -> Shape:
 
 
 def extrusion(outlines: Sequence[Array], height: float) -> Shape:
-    """Return a prism from z = 0 to ``height`` over closed polygons (K, 2): the outer one, then holes.
-
-    Corners of the outline below 32 degrees get smooth normals.
-    """
+    """Return a prism from z = 0 to ``height`` over closed polygons (K, 2): the outer one, then holes."""
     parts = []
     for outline in outlines:  # the walls
         after = np.roll(outline, -1, axis=0)
         edge = after - outline
         normal = unit(np.column_stack((edge[:, 1], -edge[:, 0], 0 * edge[:, 0])))
         before, behind = np.roll(normal, 1, axis=0), np.roll(normal, -1, axis=0)
-        smooth = ((normal * before).sum(1) > np.cos(np.deg2rad(32.0)))[:, None]
+        smooth = ((normal * before).sum(1) > np.cos(np.deg2rad(32.0)))[:, None]  # at corners below 32 degrees
         start = np.where(smooth, unit(normal + before), normal)
         end = np.where(np.roll(smooth, -1), unit(normal + behind), normal)
         arc = np.concatenate(([0.0], np.cumsum(np.linalg.norm(edge, axis=1))))
@@ -179,7 +173,7 @@ def quad(corner: Sequence[float] | Array, side: Sequence[float] | Array, up: Seq
     """Return the flat parallelogram from ``corner`` along ``side`` and ``up``, all (3,)."""
     origin, a, b = (np.asarray(x, dtype=np.float64) for x in (corner, side, up))
     points = np.array([[origin, origin + a], [origin + b, origin + a + b]])
-    return surface(points, np.broadcast_to(unit(np.cross(a, b)[None])[0], points.shape))
+    return surface(points, np.broadcast_to(unit(np.cross(a, b)), points.shape))
 
 
 def box(size: Sequence[float] | Array) -> Shape:
@@ -261,9 +255,8 @@ def torus(rng: np.random.Generator) -> Shape:
     angle = np.linspace(0, 2 * np.pi, 49)
     thick = rng.uniform(0.12, 0.42) * outer
     shape = lathe([np.column_stack((outer + thick * np.cos(angle), thick * np.sin(angle) * rng.uniform(0.6, 1.3)))])
-    return place_on_ground(
-        shape.rotate(rotation_about(2, rng.uniform(0, 360)) @ rotation_about(0, rng.choice([0.0, 20.0, 65.0, 90.0])))
-    )
+    turn = rotation_about(2, rng.uniform(0, 360)) @ rotation_about(0, rng.choice([0.0, 20.0, 65.0, 90.0]))
+    return place_on_ground(shape.rotate(turn))
 
 
 def vase(rng: np.random.Generator) -> Shape:
@@ -297,10 +290,8 @@ def hollow(radii: Array, height: float, wall: float, *, smooth: bool = True) -> 
     turn = np.linspace(0, np.pi, 9)
     rim = np.column_stack((r[-1] - wall + wall * np.cos(turn), height + wall * np.sin(turn)))
     inner = np.column_stack((np.maximum(r - 2 * wall, 0.01), z + wall))[::-1]
-    floor = np.array([[inner[-1, 0], inner[-1, 1]], [0.0, wall]])
-    return lathe(
-        [np.array([[0.0, 0.0], [r[0], 0.0]]), np.column_stack((r, z)), rim, inner[inner[:, 1] <= height], floor]
-    )
+    foot, floor = np.array([[0.0, 0.0], [r[0], 0.0]]), np.array([inner[-1], [0.0, wall]])
+    return lathe([foot, np.column_stack((r, z)), rim, inner[inner[:, 1] <= height], floor])
 
 
 def prism(rng: np.random.Generator) -> Shape:
