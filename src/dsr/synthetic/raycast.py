@@ -380,7 +380,7 @@ def local_contrast(image: NDArray[np.floating]) -> NDArray[np.floating]:
 TILT = rotation(37.0, 31.0, 29.0)  # so that the lattice of noise is not parallel to edges
 
 
-def noise(points: Array, cell: float, seed: int, order: int = 1) -> Array:
+def noise(points: Array, cell: float, seed: int | np.int64, order: int = 1) -> Array:
     """Return noise (N,) in [0, 1] at ``points`` (3, N), one value per ``cell`` metres; order 3 is a B-spline."""
     place = points / cell
     if order == 1:
@@ -390,7 +390,7 @@ def noise(points: Array, cell: float, seed: int, order: int = 1) -> Array:
 
 
 @lru_cache(maxsize=32)
-def random_table(seed: int) -> Array:
+def random_table(seed: int | np.int64) -> Array:
     """Return 32 x 32 x 32 values in [0, 1)."""
     return np.random.default_rng(seed).random((32, 32, 32))
 

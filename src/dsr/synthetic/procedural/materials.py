@@ -44,7 +44,7 @@ def palette(rng: np.random.Generator, family: str, count: int = 4) -> Array:
     return np.clip(light[:, None] * (grey * tint / tint.max(1, keepdims=True) + 1 - grey), 0.012, 0.9)
 
 
-def fractal(points: Array, cell: float, seed: int, octaves: int = 3) -> Array:
+def fractal(points: Array, cell: float, seed: int | np.int64, octaves: int = 3) -> Array:
     """Return noise in about [0, 1] of several scales, the coarsest ``cell`` metres, shape (N,)."""
     place = TILT @ points
     total = sum(0.5**k * noise(place + 0.37 * k * cell, cell * 0.47**k, seed + k) for k in range(octaves))
