@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.degradation.downsampling import check_scale
-from dsr.methods.exportable import exporting, pad_to_multiple
+from dsr.methods.images import exporting, pad_to_multiple
 from dsr.methods.networks.facets_planes import NEIGHBOURS, Stencil, mix_planes, stencil
 from dsr.methods.networks.network import NormalisedNetwork
 

@@ -16,8 +16,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
-from dsr.methods.exportable import exporting
-from dsr.methods.images import extend_linearly
+from dsr.methods.images import exporting, extend_linearly
 
 NEIGHBOURS = 9  # low-resolution pixels whose planes are mixed or averaged: 3 x 3
 _CHUNK = 2**17  # values that a processor's cache holds several of

@@ -20,7 +20,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from dsr.methods.exportable import pad_to_multiple
+from dsr.methods.images import pad_to_multiple
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.network import DisparityNetwork
 from dsr.utils.files import replacing

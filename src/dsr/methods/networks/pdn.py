@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -27,8 +28,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from dsr.degradation.downsampling import check_scale
-from dsr.methods.exportable import apply
-from dsr.methods.images import extend_linearly, upsample_linear_border
+from dsr.methods.images import exporting, extend_linearly, upsample_linear_border
 from dsr.methods.networks.facets_planes import stencil
 from dsr.methods.networks.network import NormalisedNetwork
 
@@ -120,6 +120,13 @@ class _DualStep(torch.autograd.Function):
         return within, within * sigma, of_sigma, -keep.square() * sigma * numerator, of_w
 
 
+def _apply(function: type[torch.autograd.Function], *arguments: Any) -> Tensor:
+    """Apply a function that has a derivative of its own; a graph gets its operations, without the derivative."""
+    if exporting():
+        return function.forward(SimpleNamespace(save_for_backward=lambda *_: None), *arguments)
+    return function.apply(*arguments)
+
+
 class UnrolledHuber(nn.Module):
     """A fixed number of iterations with learned parameters, stored as logarithms so that they are positive.
 
@@ -152,9 +159,9 @@ class UnrolledHuber(nn.Module):
         moved = ahead = slopes.new_zeros(weights.shape[0], 1, *weights.shape[-2:])
         for k, step in enumerate(self.log_steps.to(dtype).exp().unbind()):
             sigma, tau, theta = step.unbind()
-            now = slopes if k == 0 else slopes + apply(_Differences, ahead, self.window)
-            p = apply(_DualStep, p, now, sigma, huber, most)
-            before, moved = moved, (moved - tau * apply(_Sums, p, self.window)) / (1 + tau * data)
+            now = slopes if k == 0 else slopes + _apply(_Differences, ahead, self.window)
+            p = _apply(_DualStep, p, now, sigma, huber, most)
+            before, moved = moved, (moved - tau * _apply(_Sums, p, self.window)) / (1 + tau * data)
             ahead = moved + theta * (moved - before)
         return moved
 

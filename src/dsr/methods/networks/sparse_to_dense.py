@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dsr.methods.exportable import pad_to_multiple
+from dsr.methods.images import pad_to_multiple
 from dsr.methods.networks.network import NormalisedNetwork
 from dsr.utils.ratios import check_scale
 
