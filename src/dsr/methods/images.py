@@ -164,10 +164,7 @@ def inpaint(x: Tensor, photo: Tensor | None = None) -> Tensor:
 
 @torch.jit.script_if_tracing
 def _fill_evenly(values: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Fill maps, (B, 1, h, w) with 0 in holes, with plain means; a graph keeps the loop.
-
-    ``weight`` is 0 in holes and 1 elsewhere; the result has 0 in an image without a known value.
-    """
+    """Fill maps, (B, 1, h, w) with 0 where ``weight`` is 0, there with plain means; a graph keeps the loop."""
     more = True
     while more:
         total = functional.avg_pool2d(values, [3, 3], [1, 1], [1, 1])
@@ -212,11 +209,7 @@ def _fill_by_colour(x: Tensor, colours: Tensor) -> Tensor:
 
 @torch.jit.script_if_tracing  # so that a graph keeps its loop
 def _fill_by_colour_in_graph(x: Tensor, affinity: Tensor, alike: float) -> Tensor:
-    """Fill the holes of a map as :func:`dsr.methods.images.inpaint` does with a photo.
-
-    ``x`` (1, 1, h, w) is NaN in holes, ``affinity`` (1, 8, h, w) that of each pixel and its neighbours; pixels of an
-    affinity of ``alike`` are filled before others. An image without a known value stays NaN.
-    """
+    """Fill a map, (1, 1, h, w), as :func:`inpaint` does with a photo; ``affinity`` (1, 8, h, w) is of neighbours."""
     known = torch.isfinite(x).to(affinity.dtype)
     values = torch.where(known > 0, x, torch.zeros_like(x))
     before = torch.zeros_like(known.sum()) - 1
@@ -247,13 +240,11 @@ def _neighbours_of(x: Tensor) -> Tensor:
 
 
 def estimate_noise(depth_lr: Tensor) -> float:
-    """Return the standard deviation of a depth map's relative noise, estimated from the map alone.
+    """Return the standard deviation of the relative noise of a depth map, (1, 1, h, w) in metres, NaN in holes.
 
     Immerkaer, *Fast Noise Variance Estimation*, CVIU 1996: the difference of two Laplacians, which is 0 on planes and
     on straight edges; here of the logarithm of depth, with the 10th percentile instead of the mean: noise is
-    everywhere, while steps and curves of the surface are not.
-
-    ``depth_lr`` is (1, 1, h, w) in metres, NaN in holes; the result is 0 without a valid 3 x 3 window.
+    everywhere, while steps and curves of the surface are not. It is 0 without a valid 3 x 3 window.
     """
     # a tenth of a normal variable's absolute values are below 0.12566 standard deviations
     return _low_quantile(depth_lr.double().log(), 1, 0.1) / 0.12566 / 6
@@ -262,12 +253,9 @@ def estimate_noise(depth_lr: Tensor) -> float:
 def estimate_sensor_noise(values: Tensor) -> float:
     """Return the standard deviation of a map's noise, also where a sensor rounds its values or neighbours share noise.
 
-    As :func:`estimate_noise`, with two differences: a quarter of the responses instead of a tenth, because rounding
-    makes many of them 0, and the larger of the estimates from neighbouring pixels and from every second one, because
-    the first misses noise that is correlated between neighbours.
-
-    ``values`` (1, 1, h, w), NaN in holes, are in a unit in which planes are linear and noise is alike everywhere, such
-    as disparity; the result is in it, and 0 without a valid window.
+    As :func:`estimate_noise`, with a quarter of the responses instead of a tenth, because rounding makes many of them
+    0, and the larger of the estimates from neighbouring pixels and from every second one, because the first misses
+    correlated noise. ``values`` (1, 1, h, w) are in a unit in which planes are linear and noise is alike everywhere.
     """
     # a quarter of a normal variable's absolute values are below 0.31864 standard deviations
     return max(_low_quantile(values.double(), stride, 0.25) for stride in (1, 2)) / 0.31864 / 6
@@ -286,9 +274,5 @@ def _low_quantile(values: Tensor, stride: int, fraction: float) -> float:
 
 
 def normal_noise_deg(noise: float, camera: Camera) -> float:
-    """Return the standard deviation, in degrees, by which relative depth noise tilts the normals of a frontal surface.
-
-    Two neighbouring pixels at depth z are z / f metres apart; noise of standard deviation s z in each makes a slope of
-    standard deviation sqrt(2) s f, for the low-resolution map's camera.
-    """
+    """Return by how many degrees relative depth noise s tilts frontal normals: a slope of sqrt(2) s f."""
     return math.degrees(math.atan(math.sqrt(2) * noise * camera.fx))

@@ -178,11 +178,7 @@ def mix_planes(planes: Tensor, found: Tensor, scale: int) -> tuple[Tensor, Tenso
 @functools.lru_cache(64)
 @torch.inference_mode(mode=False)  # so that gradients can be computed with them
 def _mixing_constants(scale: int, facets: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Return factors of the value and the slopes at high-resolution pixels, (s s, 3), and logits, (9 f, s s, 1).
-
-    The logits are logarithms of the quadratic B-spline's weights, to which a small constant is added, so that no
-    neighbour is excluded.
-    """
+    """Return factors of value and slopes at high-resolution pixels, (s s, 3), and B-spline logits, (9 f, s s, 1)."""
     # from the centre of the low-resolution pixel, in low-resolution pixels
     offsets = (torch.arange(scale, dtype=dtype, device=device) + 0.5) / scale - 0.5
     ones = torch.ones(scale, scale, dtype=dtype, device=device)

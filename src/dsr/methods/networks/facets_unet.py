@@ -26,9 +26,9 @@ from dsr.degradation.downsampling import FACTS, Downsampling, known_kernels
 from dsr.methods.images import exporting, inpaint, repeat_blocks, upsample_bicubic
 from dsr.methods.networks.facets import (
     HEAD,
-    Context,
     Facets,
     MixedResidual,
+    UNet,
     look,
     make_pyramid,
     photo_input,
@@ -100,7 +100,7 @@ class FacetsUNet(DisparityNetwork):
             self.shares.weight[:, FACTS] = _SLOPE
             self.shares.bias.fill_(-_SLOPE * _ROUGH)
         self.trunk = nn.ModuleList(MixedResidual(width) for _ in range(blocks))
-        self.wide = Context(width, deep)
+        self.wide = UNet(width, deep)
         self.planes = scale_down(nn.Conv2d(width, (1 + _LEVELS + 2 * (3 + _LEVELS) + 3) * facets, 3, padding=1))
         self.up, self.join = up, join
         self.choice = scale_down(nn.Conv2d(HEAD, NEIGHBOURS * facets, 3, padding=1))
@@ -115,10 +115,7 @@ class FacetsUNet(DisparityNetwork):
 
     @torch.no_grad()
     def start_from(self, first: DisparityNetwork) -> None:
-        """Take over the weights of a trained network for the same or another factor, or of Facets.
-
-        From Facets for the same factor, the results for clean maps are nearly the same.
-        """
+        """Take over the weights of a trained network for the same or another factor, or of Facets."""
         self._expect(first, (Facets, FacetsUNet), ("width", "blocks", "facets"))
         if isinstance(first, Facets):
             start_from_facets(self, first, _LEVELS)
@@ -229,8 +226,10 @@ class FacetsUNet(DisparityNetwork):
             cues = torch.cat((hints.float(), _roughness(around.bend, weight)), dim=1)
         photo, bands = torch.cat(parts, dim=1).to(dtype), self._split(values.shape[-2], rgb.shape)
         windows = [photo[..., scale * rows.start : scale * rows.stop, :] for rows, _ in bands]
-        kept = look(self, photo) if len(bands) == 1 else None
-        features = [(kept or look(self, window))[-1][..., i, :] for window, (_, i) in zip(windows, bands, strict=True)]
+        kept = look(self.photo, self.down, photo) if len(bands) == 1 else None
+        features = []
+        for window, (_, inner) in zip(windows, bands, strict=True):
+            features.append((kept or look(self.photo, self.down, window))[-1][..., inner, :])
         x = functional.relu(self.coarse(lr_input.to(dtype)).add_(_join(features)), inplace=True)
         kind, shares = functional.relu(self.hints(cues.to(dtype))), self.shares(cues.to(dtype)).sigmoid()
         for number, (block, modulate) in enumerate(zip(self.trunk, self.modulation, strict=True)):
@@ -240,7 +239,7 @@ class FacetsUNet(DisparityNetwork):
         planes = self._blend_planes(self._propose_planes(self.planes(x), around), self.blend(x))
         bits = []
         for number, (window, (rows, inner)) in enumerate(zip(windows, bands, strict=True), 1):
-            high = rise(self, x[..., rows, :], kept or look(self, window))
+            high = rise(self.up, self.join, x[..., rows, :], kept or look(self.photo, self.down, window))
             found = self._choose(high, planes[..., rows, :], scale)
             inside = slice(scale * inner.start, scale * inner.stop)
             bits.append([each[..., inside, :] for each in found])
