@@ -355,8 +355,8 @@ def _roughness(bend: Tensor, weight: Tensor) -> Tensor:
         rows, columns = (torch.arange(n, device=bend.device, dtype=torch.float32) for n in weight.shape[-2:])
         known = known & (torch.fmod(rows, nth) == 0)[:, None] & (torch.fmod(columns, nth) == 0)
     else:
-        nth = max(1, math.isqrt(weight.shape[-2] * weight.shape[-1] // _SAMPLES))
-        bend, known = bend[..., ::nth, ::nth], known[..., ::nth, ::nth]
+        step = max(1, math.isqrt(weight.shape[-2] * weight.shape[-1] // _SAMPLES))
+        bend, known = bend[..., ::step, ::step], known[..., ::step, ::step]
     values = bend.float().flatten(2).flatten(0, 1)  # of pixels, a row for each level and image
     known = known.flatten(1).repeat(1 + _LEVELS, 1)
     ordered, count = torch.where(known, values, torch.inf).sort(dim=1).values, known.sum(dim=1, keepdim=True)
