@@ -28,7 +28,8 @@ import torch
 from torch import Tensor, nn
 
 from dsr.methods.images import normalise_imagenet
-from dsr.methods.networks.peers.peer_network import PeerUpsampler, read_tensors
+from dsr.methods.networks.peers.peer import Peer
+from dsr.methods.networks.peers.peer_network import read_tensors
 from dsr.methods.recipe import Run, read_recipe
 
 TRAINING_ONLY = (
@@ -116,7 +117,7 @@ def ways(name: str, checkouts: Path, weights: Path, size: int, device: torch.dev
     scale = SCALES.get(name, 4)
     recipe = read_recipe(name).with_weights(weights)
     upsampler = recipe.build(scale, Run(device=device))
-    if not isinstance(upsampler, PeerUpsampler):
+    if not isinstance(upsampler, Peer):
         raise TypeError(f"method={name}: expected a published network of the field")
     theirs, call = AUTHORS[name](checkouts)
     theirs.load_state_dict(read_tensors(recipe.weights(scale)))

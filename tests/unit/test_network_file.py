@@ -15,8 +15,7 @@ from dsr.methods.base import Method
 from dsr.methods.images import resize_bicubic
 from dsr.methods.networks.msg_net import MSGNet
 from dsr.methods.networks.network import NetworkUpsampler
-from dsr.methods.networks.network_file import NetworkFile
-from dsr.methods.networks.onnx_export import OnnxGraph, write_onnx
+from dsr.methods.networks.network_file import NetworkFile, OnnxGraph, write_onnx
 from dsr.sample import DepthSample
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # of the exporter

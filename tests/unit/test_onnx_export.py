@@ -14,7 +14,7 @@ from dsr.methods.networks.dynamic_guidance import DynamicGuidance
 from dsr.methods.networks.facets import Facets
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.msg_net import MSGNet
-from dsr.methods.networks.onnx_export import INPUTS, OnnxGraph, example_inputs, write_onnx
+from dsr.methods.networks.network_file import INPUTS, OnnxGraph, example_inputs, write_onnx
 from dsr.methods.networks.pdn import PrimalDualNetwork
 from dsr.methods.networks.sparse_to_dense import SparseToDense
 from dsr.methods.networks.trained import NETWORKS

@@ -16,7 +16,7 @@ from dsr.methods.base import Cost
 from dsr.methods.images import inpaint, resize_bicubic
 from dsr.methods.networks.peers.local_filters import SVLRM
 from dsr.methods.networks.peers.peer import PEERS, Peer
-from dsr.methods.networks.peers.peer_network import PeerNetwork, PeerUpsampler, fold_batch_norm, load_peer
+from dsr.methods.networks.peers.peer_network import PeerNetwork, fold_batch_norm, load_peer
 from dsr.methods.networks.weight_files import has_weights, nearest_scale
 from dsr.methods.recipe import read_recipe
 from dsr.sample import DepthSample
@@ -85,7 +85,7 @@ def _pillow(values: Tensor, size: tuple[int, int]) -> Tensor:
 @pytest.mark.parametrize("range_type", ["disparity", "orthogonal"])
 def test_map_of_any_ratio_is_fed_in_its_range_type(size_lr, scale, range_type) -> None:
     sample = _sample(size_lr, scale, doffs=3.0)
-    depth = PeerUpsampler(Enlarged(), range_type)(sample)
+    depth = Peer(Enlarged(), range_type=range_type)(sample)
     size = (sample.camera.height, sample.camera.width)
     values_lr = sample.disparity_lr() if range_type == "disparity" else sample.depth_lr
     expected = from_range(_pillow(values_lr[0], size)[None], sample.camera, range_type)
@@ -94,7 +94,7 @@ def test_map_of_any_ratio_is_fed_in_its_range_type(size_lr, scale, range_type) -
 
 
 def test_range_is_that_of_the_low_resolution_map() -> None:
-    upsampler, sample = PeerUpsampler(Enlarged()), _sample(scale=1)
+    upsampler, sample = Peer(Enlarged()), _sample(scale=1)
     upsampler(sample)
     [values] = upsampler.net.seen
     assert (float(values.min()), float(values.max())) == pytest.approx((0, 1), abs=1e-6)
@@ -105,32 +105,32 @@ def test_weights_trained_on_a_range_of_depth_get_depth_normalised_by_it() -> Non
     class Metric(Enlarged):
         depth_range = (1.0, 9.0)
 
-    upsampler, sample = PeerUpsampler(Metric(), "disparity"), _sample(scale=1)
+    upsampler, sample = Peer(Metric(), range_type="disparity"), _sample(scale=1)
     depth = upsampler(sample)
     assert upsampler.range_type == "orthogonal"
     torch.testing.assert_close(upsampler.net.seen[0][0, :, :6, :9].double(), (sample.depth_lr - 1) / 8)
     torch.testing.assert_close(depth, sample.depth_lr, rtol=1e-5, atol=0)
     message = "range: expected measured for weights trained on depth of 1 to 9 m, got truth"
     with pytest.raises(ValueError, match=message):
-        PeerUpsampler(Metric(), value_range="truth")
+        Peer(Metric(), range="truth")
 
 
 def test_other_factor_than_that_of_the_weights_is_noted() -> None:
-    upsampler = PeerUpsampler(Enlarged(8))
+    upsampler = Peer(Enlarged(8))
     assert upsampler.describe(_sample(scale=8)) == ""
     assert upsampler.describe(_sample(scale=4)) == "weights trained for x8"
-    assert PeerUpsampler(Enlarged(8 / 3)).describe(_sample(scale=4)) == "weights trained for x2.67"
+    assert Peer(Enlarged(8 / 3)).describe(_sample(scale=4)) == "weights trained for x2.67"
 
 
 def test_true_range_is_flagged_and_needs_the_truth() -> None:
-    upsampler, sample = PeerUpsampler(Enlarged(), value_range="truth"), _sample(scale=1)
+    upsampler, sample = Peer(Enlarged(), range="truth"), _sample(scale=1)
     depth = upsampler(sample)
     assert upsampler.flag == "true-range"
     expected = (sample.disparity_lr() - 10) / 30
     torch.testing.assert_close(upsampler.net.seen[0][0, :, :6, :9].double(), expected, rtol=0, atol=1e-6)
     torch.testing.assert_close(depth, sample.depth_lr, rtol=1e-5, atol=0)
     unknown = DepthSample("test", "scene", sample.rgb, sample.depth_lr, sample.camera, sample.camera_lr, 1)
-    measured = PeerUpsampler(Enlarged())
+    measured = Peer(Enlarged())
     assert torch.equal(measured(sample), measured(unknown))  # does not read the truth
     with pytest.raises(ValueError, match="scene: range=truth expects a scene with a true depth map, there is none"):
         upsampler(unknown)
@@ -141,7 +141,7 @@ def test_holes_are_inpainted_before_the_range_is_taken() -> None:
     holes = sample.depth_lr.clone()
     holes[0, 2:4, 3:6] = torch.nan
     pierced = DepthSample("test", "scene", sample.rgb, holes, sample.camera, sample.camera_lr, 1)
-    depth = PeerUpsampler(Enlarged())(pierced)
+    depth = Peer(Enlarged())(pierced)
     expected = from_range(inpaint(pierced.disparity_lr()[None])[0], sample.camera, "disparity")
     torch.testing.assert_close(depth, expected, rtol=1e-5, atol=0)
 
@@ -149,20 +149,20 @@ def test_holes_are_inpainted_before_the_range_is_taken() -> None:
 def test_constant_map_stays_constant() -> None:
     sample = _sample()
     flat = torch.full_like(sample.depth_lr, 2.5)
-    depth = PeerUpsampler(Enlarged())(DepthSample("t", "s", sample.rgb, flat, sample.camera, sample.camera_lr, 4))
+    depth = Peer(Enlarged())(DepthSample("t", "s", sample.rgb, flat, sample.camera, sample.camera_lr, 4))
     torch.testing.assert_close(depth, torch.full_like(depth, 2.5))
 
 
 def test_tiles_change_rounding_errors_only() -> None:
     sample, steps = _sample((17, 23), 4), []
-    whole = PeerUpsampler(Smoothed())(sample)
-    tiled = PeerUpsampler(Smoothed(), tile=24)(sample, lambda *step: steps.append(step))
+    whole = Peer(Smoothed())(sample)
+    tiled = Peer(Smoothed(), tile=24)(sample, lambda *step: steps.append(step))
     torch.testing.assert_close(tiled, whole, rtol=1e-5, atol=0)
     assert steps == [(i + 1, 12) for i in range(12)]
 
 
 def test_bfloat16_changes_the_result_a_little() -> None:
-    exact, rounded = (PeerUpsampler(Smoothed(), precision=each)(_sample()) for each in ("float32", "bfloat16"))
+    exact, rounded = (Peer(Smoothed(), precision=each)(_sample()) for each in ("float32", "bfloat16"))
     assert 1e-7 < float((rounded / exact - 1).abs().max()) < 0.02
 
 
@@ -170,13 +170,13 @@ def test_bfloat16_changes_the_result_a_little() -> None:
     ("arguments", "message"),
     [
         ({"range_type": "depth"}, "range_type: expected one of orthogonal, perspective, disparity, got 'depth'"),
-        ({"value_range": "full"}, "range: expected one of measured, truth, got 'full'"),
+        ({"range": "full"}, "range: expected one of measured, truth, got 'full'"),
         ({"precision": "float16"}, "precision: expected one of float32, bfloat16, got 'float16'"),
     ],
 )
 def test_unsupported_value_is_refused(arguments: dict[str, str], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        PeerUpsampler(Enlarged(), **arguments)
+        Peer(Enlarged(), **arguments)
 
 
 def test_folded_batch_normalisation_gives_the_same_result() -> None:
@@ -214,7 +214,7 @@ def _state(prefix: str = "") -> dict[str, Tensor]:
     return {prefix + name: value for name, value in SVLRM(4).state_dict().items()}
 
 
-def _build(path: Path, scale: float = 4) -> PeerUpsampler:
+def _build(path: Path, scale: float = 4) -> Peer:
     return Peer("svlrm", path, scale, FILES)
 
 

@@ -6,7 +6,7 @@ from rich.console import Console
 
 import dsr
 from dsr.app.requests import ExportRequest
-from dsr.methods.networks.onnx_export import OnnxGraph, write_onnx
+from dsr.methods.networks.network_file import OnnxGraph, write_onnx
 from dsr.methods.recipe import read_recipe
 from dsr.utils.console import show
 from dsr.utils.progress import megabytes

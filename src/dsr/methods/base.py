@@ -118,9 +118,8 @@ class Surface(NamedTuple):
     def shares(self, limit: float) -> dict[str, float]:
         """Return the shares of the pixels that are ``measured``, ``filled`` and ``open``, which have no depth.
 
-        With expected errors also the share of those that have depth and are ``dubious``: expected to be off by more
-        than ``limit`` of it; and of those that are probably ``glass``. Without knowing what was filled, what has depth
-        counts as measured.
+        If ``filled`` is None, all depth is measured. With expected errors also the share of ``dubious`` depth, which is
+        expected to be off by more than ``limit`` of it, and of ``glass``, if it was looked for.
         """
         known = self.depth.isfinite()
         filled = known & self.filled if self.filled is not None else known & False

@@ -162,10 +162,7 @@ def _grid_size(height: int, width: int, longer: int) -> tuple[int, int]:
 
 
 def _holes(known: Tensor, size: tuple[int, int], wide: float | None) -> Tensor:
-    """Return which part of each pixel of the grid is a hole that counts, (1, g, g'); ``known`` is (1, h, w) bool.
-
-    Holes wider than ``wide`` do not count, nor those thinner than three pixels of the map; all count if it is None.
-    """
+    """Return the share of holes of each grid pixel, (1, g, g'), without wide and thin ones if ``wide`` is given."""
     missing = (~known).float()
     if wide is not None and min(known.shape[-2:]) > 2:
         missing = window_maxima(-window_maxima(-missing, 1), 1)

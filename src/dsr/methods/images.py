@@ -1,8 +1,13 @@
-"""Operations on images and maps that methods share: values, sizes, holes and noise."""
+"""Operations on images and maps that methods share: values, sizes, holes and noise.
+
+While a network is exported to ONNX, some of them do the same in another way: in a graph no size of a tensor depends on
+values, and a loop that ends when nothing is missing has to be written as one.
+"""
 
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -11,7 +16,6 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.camera import Camera
-from dsr.methods.exportable import exporting, fill_by_colour_in_graph, neighbours_of
 
 LUMA = (0.299, 0.587, 0.114)  # weights of red, green and blue in the luma (ITU-R BT.601)
 _IMAGENET_MEAN, _IMAGENET_DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -19,6 +23,11 @@ _REACH = 2  # half width of Keys' kernel in low-resolution pixels
 _CONTRAST = 0.02  # standard deviation of the difference of the colours of a surface's neighbouring pixels in [0, 1]
 _ALIKE = 0.3  # affinity from which two pixels count as of one surface
 _LEAST = 1e-4  # affinity of pixels of different surfaces
+
+
+def exporting() -> bool:
+    """Return whether a network is being exported, without importing the exporter, which takes a while."""
+    return "torch.onnx" in sys.modules and bool(torch.onnx.is_in_onnx_export())
 
 
 def grey(rgb: Tensor, weights: Sequence[float] = LUMA) -> Tensor:
@@ -111,6 +120,16 @@ def extend_linearly(x: Tensor, border: int) -> Tensor:
     return x
 
 
+def pad_to_multiple(x: Tensor, factor: int) -> Tensor:
+    """Repeat the last row and column of (B, C, h, w) so that both sizes become multiples of ``factor``."""
+    height, width = x.shape[-2:]
+    if not exporting():
+        return functional.pad(x, (0, -width % factor, 0, -height % factor), mode="replicate")
+    more = functional.pad(x, (0, factor - 1, 0, factor - 1), mode="replicate")
+    rows, columns = (factor * ((n + factor - 1) // factor) for n in (height, width))
+    return more[..., :rows, :columns]
+
+
 def lr_coordinates(camera: Camera, camera_lr: Camera, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor]:
     """Return the low-resolution row of each high-resolution row, (H,), and likewise the columns, (W,), in float64."""
     rows = torch.arange(camera.height, dtype=torch.float64, device=device)
@@ -136,19 +155,16 @@ def inpaint(x: Tensor, photo: Tensor | None = None) -> Tensor:
         return torch.where(weight > 0, values, torch.nan)
     if exporting():  # one factor for both axes
         colours = mean3x3(functional.avg_pool2d(photo.to(x.dtype), int(photo.shape[-1] // x.shape[-1])))
-        difference = (neighbours_of(colours) - colours[:, None]).square().sum(dim=2)  # (B, 8, h, w)
+        difference = (_neighbours_of(colours) - colours[:, None]).square().sum(dim=2)  # (B, 8, h, w)
         affinity = (difference / (-2 * _CONTRAST**2)).exp().clamp(min=_LEAST)
-        return fill_by_colour_in_graph(x, affinity, _ALIKE)
+        return _fill_by_colour_in_graph(x, affinity, _ALIKE)
     colours = mean3x3(functional.adaptive_avg_pool2d(photo.to(x.dtype), (x.shape[-2], x.shape[-1])))
     return torch.stack([_fill_by_colour(each[0], colour) for each, colour in zip(x, colours, strict=True)])[:, None]
 
 
 @torch.jit.script_if_tracing
 def _fill_evenly(values: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Fill maps, (B, 1, h, w) with 0 in holes, with plain means; a graph keeps the loop.
-
-    ``weight`` is 0 in holes and 1 elsewhere; the result has 0 in an image without a known value.
-    """
+    """Fill maps, (B, 1, h, w) with 0 where ``weight`` is 0, there with plain means; a graph keeps the loop."""
     more = True
     while more:
         total = functional.avg_pool2d(values, [3, 3], [1, 1], [1, 1])
@@ -191,14 +207,44 @@ def _fill_by_colour(x: Tensor, colours: Tensor) -> Tensor:
     return values.view(height + 2, width + 2)[1:-1, 1:-1]
 
 
+@torch.jit.script_if_tracing  # so that a graph keeps its loop
+def _fill_by_colour_in_graph(x: Tensor, affinity: Tensor, alike: float) -> Tensor:
+    """Fill a map, (1, 1, h, w), as :func:`inpaint` does with a photo; ``affinity`` (1, 8, h, w) is of neighbours."""
+    known = torch.isfinite(x).to(affinity.dtype)
+    values = torch.where(known > 0, x, torch.zeros_like(x))
+    before = torch.zeros_like(known.sum()) - 1
+    while bool(known.sum() != before):
+        before = known.sum()
+        weights = affinity * _neighbours_of(known)[:, :, 0]
+        nearest = weights.amax(dim=1, keepdim=True)
+        front = (known == 0) & (nearest > 0)
+        likely = front & (nearest >= alike)
+        first = likely | (front & ~likely.any())
+        total = weights.sum(dim=1, keepdim=True)
+        mean = (weights * _neighbours_of(values)[:, :, 0]).sum(dim=1, keepdim=True)
+        values = torch.where(first, mean / torch.where(total > 0, total, torch.ones_like(total)), values)
+        known = torch.where(first, torch.ones_like(known), known)
+    return torch.where(known > 0, values, torch.full_like(values, float("nan")))
+
+
+def _neighbours_of(x: Tensor) -> Tensor:
+    """Return the eight neighbours of each pixel, row by row, (B, C, h, w) to (B, 8, C, h, w); 0 beyond the border."""
+    height, width = x.shape[-2], x.shape[-1]
+    padded = functional.pad(x, [1, 1, 1, 1])
+    around = []
+    for down in range(3):
+        for across in range(3):
+            if down != 1 or across != 1:
+                around.append(padded[:, :, down : down + height, across : across + width])
+    return torch.stack(around, dim=1)
+
+
 def estimate_noise(depth_lr: Tensor) -> float:
-    """Return the standard deviation of a depth map's relative noise, estimated from the map alone.
+    """Return the standard deviation of the relative noise of a depth map, (1, 1, h, w) in metres, NaN in holes.
 
     Immerkaer, *Fast Noise Variance Estimation*, CVIU 1996: the difference of two Laplacians, which is 0 on planes and
     on straight edges; here of the logarithm of depth, with the 10th percentile instead of the mean: noise is
-    everywhere, while steps and curves of the surface are not.
-
-    ``depth_lr`` is (1, 1, h, w) in metres, NaN in holes; the result is 0 without a valid 3 x 3 window.
+    everywhere, while steps and curves of the surface are not. It is 0 without a valid 3 x 3 window.
     """
     # a tenth of a normal variable's absolute values are below 0.12566 standard deviations
     return _low_quantile(depth_lr.double().log(), 1, 0.1) / 0.12566 / 6
@@ -207,12 +253,9 @@ def estimate_noise(depth_lr: Tensor) -> float:
 def estimate_sensor_noise(values: Tensor) -> float:
     """Return the standard deviation of a map's noise, also where a sensor rounds its values or neighbours share noise.
 
-    As :func:`estimate_noise`, with two differences: a quarter of the responses instead of a tenth, because rounding
-    makes many of them 0, and the larger of the estimates from neighbouring pixels and from every second one, because
-    the first misses noise that is correlated between neighbours.
-
-    ``values`` (1, 1, h, w), NaN in holes, are in a unit in which planes are linear and noise is alike everywhere, such
-    as disparity; the result is in it, and 0 without a valid window.
+    As :func:`estimate_noise`, with a quarter of the responses instead of a tenth, because rounding makes many of them
+    0, and the larger of the estimates from neighbouring pixels and from every second one, because the first misses
+    correlated noise. ``values`` (1, 1, h, w) are in a unit in which planes are linear and noise is alike everywhere.
     """
     # a quarter of a normal variable's absolute values are below 0.31864 standard deviations
     return max(_low_quantile(values.double(), stride, 0.25) for stride in (1, 2)) / 0.31864 / 6
@@ -231,9 +274,5 @@ def _low_quantile(values: Tensor, stride: int, fraction: float) -> float:
 
 
 def normal_noise_deg(noise: float, camera: Camera) -> float:
-    """Return the standard deviation, in degrees, by which relative depth noise tilts the normals of a frontal surface.
-
-    Two neighbouring pixels at depth z are z / f metres apart; noise of standard deviation s z in each makes a slope of
-    standard deviation sqrt(2) s f, for the low-resolution map's camera.
-    """
+    """Return by how many degrees relative depth noise s tilts frontal normals: a slope of sqrt(2) s f."""
     return math.degrees(math.atan(math.sqrt(2) * noise * camera.fx))

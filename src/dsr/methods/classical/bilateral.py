@@ -1,9 +1,7 @@
 """Bilateral filters: of a sensor's own depth map without the photo, and joint bilateral upsampling with it.
 
-Tomasi and Manduchi, *Bilateral Filtering for Gray and Color Images*, ICCV 1998: a pixel becomes the mean of a round
-window, weighted by Gaussians of the distance and of the difference of depth. Where the photo has more pixels than the
-map, the filtered map is then interpolated as in :mod:`dsr.methods.classical.guided_filter`. Holes have no weight and
-stay holes; with ``fill_holes`` they are inpainted after filtering. OpenCV filters, in float32.
+Tomasi and Manduchi, *Bilateral Filtering for Gray and Color Images*, ICCV 1998, by OpenCV in float32: a pixel becomes
+the mean of a round window, weighted by Gaussians of the distance and of the difference of depth. Holes have no weight.
 
 Kopf, Cohen, Lischinski, Uyttendaele, *Joint Bilateral Upsampling*, SIGGRAPH 2007:
 
@@ -11,8 +9,7 @@ Kopf, Cohen, Lischinski, Uyttendaele, *Joint Bilateral Upsampling*, SIGGRAPH 200
 
 with Gaussians f of the distance in low-resolution pixels and g of the colour difference, and the sum k_p of the
 weights. What differs: I_q is the mean colour over the low-resolution pixel, as low-resolution depth is a mean. Weights
-of each pixel are scaled so that the largest is 1: a pixel unlike all around it takes the value of its most similar
-neighbours.
+of each pixel are scaled so that the largest is 1: a pixel unlike all around it takes the most similar values.
 """
 
 from __future__ import annotations
@@ -112,7 +109,11 @@ class JointBilateral(GuidedMethod):
 
     def filter_maps(self, guided: Guided) -> Tensor:
         """Return the weighted means of the low-resolution maps, (N, H, W)."""
-        rgb_lr = _block_means(guided)
+        matrices = []  # of the means over the high-resolution pixels nearest to each low-resolution one
+        for nearest, size in zip(guided.nearest(), guided.valid.shape, strict=True):
+            belongs = (nearest == torch.arange(size, device=nearest.device)[:, None]).double()
+            matrices.append(belongs / belongs.sum(dim=1, keepdim=True).clamp(min=1))
+        rgb_lr = matrices[0] @ guided.rgb @ matrices[1].T
         largest = torch.full_like(guided.rgb[0], -torch.inf)
         for exponent, _ in self._iterate_neighbours(guided, rgb_lr):
             torch.maximum(largest, exponent, out=largest)
@@ -129,10 +130,7 @@ class JointBilateral(GuidedMethod):
         return torch.where(found, totals / torch.where(found, weights, 1), guided.maps[:, rows[:, None], columns])
 
     def _iterate_neighbours(self, guided: Guided, rgb_lr: Tensor) -> Iterator[tuple[Tensor, tuple[Tensor, Tensor]]]:
-        """Yield the exponents of the weights, (H, W), and the rows, (H, 1), and columns, (W,), of each neighbour.
-
-        The exponent is minus infinity where the neighbour is a hole or lies outside; its index is clamped then.
-        """
+        """Yield each neighbour's exponents, (H, W), -inf in holes and outside, its rows, (H, 1), and columns, (W,)."""
         height, width = guided.valid.shape
         i, j = guided.nearest()
         for down in range(-self._radius, self._radius + 1):
@@ -145,12 +143,3 @@ class JointBilateral(GuidedMethod):
                     exponent -= (channel - channel_lr[at]).square() / (2 * self._sigma_colour**2)
                 inside = (rows[:, None] == at[0]) & (columns == at[1])
                 yield exponent.masked_fill_(~inside | (guided.valid[at] == 0), -torch.inf), at
-
-
-def _block_means(guided: Guided) -> Tensor:
-    """Return the mean colour over the high-resolution pixels nearest to each low-resolution one, (3, h, w)."""
-    matrices = []
-    for nearest, size in zip(guided.nearest(), guided.valid.shape, strict=True):
-        belongs = (nearest == torch.arange(size, device=nearest.device)[:, None]).double()
-        matrices.append(belongs / belongs.sum(dim=1, keepdim=True).clamp(min=1))
-    return matrices[0] @ guided.rgb @ matrices[1].T

@@ -5,21 +5,14 @@ Xie, Feris, Sun, *Edge-Guided Single Depth Image Super Resolution*, IEEE TIP 25(
 
     S_p = 1 / k_p * sum over low-resolution pixels q of S_q f(|p - q|) r(p, q),
 
-with f a Gaussian of the distance in low-resolution pixels, r = 1 if a path from p to q crosses no edge and 0 otherwise,
-and k_p the sum of the weights. The colour image is not used. What differs from the original, besides the edge map:
+with f a Gaussian of the distance in low-resolution pixels, r = 1 if a 4-connected path from p to q within the
+neighbourhood touches no edge and 0 otherwise, and k_p the sum of the weights.
 
-- It works on disparity, and each low-resolution pixel stands for a plane, so that planes are reproduced exactly.
-- A low-resolution pixel is a mean over its block. One with an edge through it mixes both sides, so its weight is
-  multiplied by ``mixed``: it counts only if there is no other pixel on the side of p.
-- A path is 4-connected, within the neighbourhood of the low-resolution pixel, and does not touch edges.
-- Pixels on edges get the value that makes the mean of their block equal to the low-resolution value, starting from the
-  bicubic map and staying between the two sides: so an edge is placed with subpixel accuracy. Then each takes the
-  reachable pixels of its most similar neighbour off the edge. In the original, they reach both sides.
-- Where no pixel is reachable, the result is the bicubic map, not the nearest sample.
-- The scale is split into prime factors, because more patches recur between neighbouring scales. Pixels on edges take
-  sides only in the last stage; after the other stages they count as ``mixed`` and have no slope.
-
-There is no solution for a map with edges that do not recur at half its size, such as one too small for patches.
+What differs, besides the edge map and what docs/methods.md says: a low-resolution pixel with an edge through it mixes
+both sides, so its weight is multiplied by ``mixed``. Pixels on edges get the value that makes the mean of their block
+equal to the low-resolution value, starting from the bicubic map and staying between the two sides, which places an edge
+with subpixel accuracy; then each takes the reachable pixels of its most similar neighbour off the edge, only in the
+last stage. In the original they reach both sides. Where no pixel is reachable, the result is the bicubic map.
 """
 
 from __future__ import annotations
@@ -86,7 +79,13 @@ def find_reachable(barrier: Tensor, scale: int, radius: int) -> Tensor:
     windows = padded.unfold(0, side * scale, scale).unfold(1, side * scale, scale).flatten(0, 1)
     ways = torch.ones_like(windows)
     cut = windows.flatten(1).any(dim=1)
-    ways[cut] = _flood(~windows[cut])
+    free = ~windows[cut]
+    middle = slice((side * scale - 1) // 2, side * scale // 2 + 1)
+    start = torch.zeros_like(free)
+    start[:, middle, middle] = free[:, middle, middle]
+    within = ndimage.generate_binary_structure(2, 1)[None]  # a window's neighbours are no other windows
+    flooded = ndimage.binary_propagation(start.cpu().numpy(), within, free.cpu().numpy())
+    ways[cut] = torch.from_numpy(flooded).to(free.device)
     ways = functional.pad(ways.view(height, width, -1), (0, 0, radius, radius, radius, radius))
     ways = ways.unflatten(2, (side, scale, side, scale))
     result = []
@@ -98,10 +97,7 @@ def find_reachable(barrier: Tensor, scale: int, radius: int) -> Tensor:
 
 
 def _filter(planes: Tensor, reachable: Tensor, scale: int, sigma_space: float, smooth: Tensor) -> Tensor:
-    """Return the weighted means of planes, (H, W), and the smooth map where all weights are 0.
-
-    ``planes`` (4, h, w) are a value, a slope per row and one per column, and a weight of each low-resolution pixel.
-    """
+    """Return means of planes, (4, h, w): value, slopes along rows and columns, weight; ``smooth`` where all weigh 0."""
     height, width = planes.shape[1:]
     rows, columns = (torch.arange(n, device=smooth.device) for n in smooth.shape)
     y, x = ((n.to(smooth) + 0.5) / scale - 0.5 for n in (rows, columns))
@@ -121,10 +117,7 @@ def _filter(planes: Tensor, reachable: Tensor, scale: int, sigma_space: float, s
 
 
 def _fill_edges(hr: Tensor, barrier: Tensor, lr: Tensor, smooth: Tensor, scale: int) -> Tensor:
-    """Return the high-resolution map with new values on edges: the smooth map, shifted to preserve block means.
-
-    The values stay between the minimum and the maximum of the neighbours off the edge.
-    """
+    """Return the map with the smooth map's values on edges, shifted to preserve block means, within those beside."""
     start = torch.where(barrier, smooth, hr)[None, None]
     fraction = box_mean(barrier[None, None].to(hr), scale)
     missing = repeat_blocks((lr - box_mean(start, scale)) / torch.where(fraction > 0, fraction, 1), scale)
@@ -135,10 +128,7 @@ def _fill_edges(hr: Tensor, barrier: Tensor, lr: Tensor, smooth: Tensor, scale: 
 
 
 def _take_sides(reachable: Tensor, barrier: Tensor, hr: Tensor, scale: int) -> None:
-    """Copy to each edge pixel, in place, the reachable pixels of its most similar neighbour off the edge.
-
-    An edge pixel without a neighbour off the edge reaches nothing.
-    """
+    """Copy to each edge pixel, in place, what its most similar neighbour off the edge reaches, if there is one."""
     places = barrier.nonzero()
     beside = places[:, None] + places.new_tensor(_BESIDE)  # (N, 8, 2)
     inside = ((beside >= 0) & (beside < places.new_tensor(barrier.shape))).all(dim=2)
@@ -155,16 +145,6 @@ def _take_sides(reachable: Tensor, barrier: Tensor, hr: Tensor, scale: int) -> N
     reachable[:, :, places[:, 0], places[:, 1]] = seen & within[:, None, :, 0] & within[None, :, :, 1]
 
 
-def _flood(free: Tensor) -> Tensor:
-    """Return the pixels of windows, (N, K, K), that are 4-connected with the middle over free pixels."""
-    size = free.shape[-1]
-    middle = slice((size - 1) // 2, size // 2 + 1)
-    start = torch.zeros_like(free)
-    start[:, middle, middle] = free[:, middle, middle]
-    within = ndimage.generate_binary_structure(2, 1)[None]  # a window's neighbours are no other windows
-    return torch.from_numpy(ndimage.binary_propagation(start.cpu().numpy(), within, free.cpu().numpy())).to(free.device)
-
-
 class EdgeGuided(Method):
     """Edge-guided upsampling of the low-resolution disparity.
 
@@ -178,9 +158,6 @@ class EdgeGuided(Method):
         sigma_space: standard deviation of the distance's Gaussian, in low-resolution pixels of the stage.
         mixed: weight of a low-resolution pixel with an edge through it, relative to others.
         fill_holes: whether holes of the low-resolution map are inpainted; otherwise they stay.
-
-    Attributes:
-        history: of the last call: iterations (over all stages), energy of the labels, largest change of a message.
 
     """
 

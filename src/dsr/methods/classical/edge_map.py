@@ -6,18 +6,12 @@ the true ones. The candidates of each patch of edges in the upsampled map are th
 random field selects one of them: its data term is the squared distance of the patches' distance transforms plus
 ``sharp_weight``^2 times that of the sharp edges, by the number of pixels, and its smoothness term the squared
 difference of the true patches where two patches overlap. The mean of the chosen patches, where it is above ``_KEPT``,
-is the edge map.
+and thinned to lines, is the edge map. Equal input gives equal labels, on any device.
 
-What differs:
-
-- Edges are Canny's edges of the bicubic map, whose inflection lines locate a step of block means within a
-  low-resolution pixel. In the original, a shock filter makes a second, sharper edge map for the data term; it does not
-  move inflection lines, so one map serves for both here. The slope of the surface does not count as a step.
-- Pairs are used in the 8 exact orientations of the grid, not rotated by multiples of 18 degrees.
-- Each cell of 2 x 2 pixels has at most one patch; the original scans, and skips the neighbours of each patch.
-- The edge map is thinned to lines one pixel wide. The map is extrapolated linearly, so that edges reach the border.
-
-Equal input gives equal labels, on any device.
+What differs: edges are Canny's edges of the bicubic map, and the surface's slope does not count; the original's shock
+filter does not move the inflection lines, which locate a step of block means within a low-resolution pixel. Pairs are
+used in the 8 orientations of the grid, not rotated by multiples of 18 degrees. Each cell of 2 x 2 pixels has at most
+one patch; the original scans, and skips each patch's neighbours. The map is extrapolated, so edges reach the border.
 """
 
 from __future__ import annotations
@@ -89,11 +83,9 @@ def predict_edge_map(
 def detect_edges(lr: Tensor, scale: int, step: float) -> Tensor:
     """Return the edges of a map, (h, w), upsampled by ``scale``, (h * scale, w * scale) bool, about one pixel wide.
 
-    Canny, *A Computational Approach to Edge Detection*, PAMI 1986: pixels whose gradient is a maximum along its
-    direction and above a threshold, or above a lower one and connected with such a pixel. A step of height s between
-    low-resolution pixels has a gradient of at least s / 2. A gradient counts only by how much it exceeds the slope of
-    the surface there or at a neighbouring low-resolution pixel. So a plane has no edge, however steep it is, and
-    neither has an inpainted hole.
+    Canny, *A Computational Approach to Edge Detection*, PAMI 1986. A step of height s between low-resolution pixels has
+    a gradient of at least s / 2. A gradient counts only by how much it exceeds the slope of the surface there or at a
+    neighbouring low-resolution pixel, so that neither planes nor inpainted holes have edges.
     """
     hr = upsample_linear_border(inpaint(lr[None, None]), scale)[0, 0]
     down, across = (_central_difference(hr, axis) * scale for axis in (0, 1))
@@ -261,16 +253,12 @@ def label(
 ) -> tuple[Tensor, list[dict[str, float]]]:
     """Return labels, (N,), that have a low :func:`energy`, and the history of min-sum belief propagation.
 
-    Pearl, *Probabilistic Reasoning in Intelligent Systems*, 1988; min-sum is max-product in negative logarithms. The
-    message from i to j is m_ij(x_j) = min over x_i of unary_i(x_i) + cost_ij(x_i, x_j) + the messages to i from nodes
-    other than j, less its minimum. A node's label minimises unary_i plus all messages to it. On trees this is the
-    minimum; on other graphs it is an approximation, and the best labels so far are kept. Messages are damped by one
-    half, because they may oscillate on loops.
-
-    The costs of each node's labels are ``unary`` (N, K), and ``costs`` (E, K, K) those of the labels of the first and
-    the second node of each pair (E, 2). It stops if no message changes by more than the tolerance, times the largest
-    cost. An entry of the history has ``iteration``, ``objective`` (the energy) and ``moved`` (the largest change of a
-    message, relative to the largest cost).
+    Pearl, *Probabilistic Reasoning in Intelligent Systems*, 1988. The message from i to j is m_ij(x_j) = min over x_i
+    of unary_i(x_i) + cost_ij(x_i, x_j) + the messages to i from nodes other than j, less its minimum. Messages are
+    damped by one half, because they may oscillate on loops. A node's label minimises unary_i plus all messages to it;
+    the best labels so far are kept. ``unary`` is (N, K), ``costs`` (E, K, K) are those of the labels of the nodes of
+    each pair (E, 2). It stops if no message changes by more than the tolerance, times the largest cost. The history has
+    the ``objective``, the energy, and ``moved``, the largest change of a message, relative to the largest cost.
     """
     report = progress or ignore
     unit = (float(costs.abs().max()) if len(costs) else 0.0) or 1.0

@@ -8,8 +8,7 @@ is approximated by solving the tridiagonal systems of all rows, then of all colu
 lambda_t = 3/2 * 4^(T - t) / (4^T - 1) * lambda. Sparse data and their index map are both smoothed and divided, as in
 the paper: the low-resolution map at the centres of its pixels (the four high-resolution pixels around a centre that
 lies between them). What differs: lambda is in units of the squared low-resolution pixel, so that one value fits all
-scales, and far smaller than the paper's, which blurs renderings. Without ``slopes``, as in the paper, renderings show
-a tent at each low-resolution pixel.
+scales, and far smaller than the paper's, which blurs renderings.
 """
 
 from __future__ import annotations

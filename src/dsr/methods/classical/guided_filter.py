@@ -1,11 +1,9 @@
 """The base class of guided filters, and the guided filter: in each window, depth is a linear function of the colours.
 
-A guided filter is a weighted mean of low-resolution values, u_p = sum of W_pq d_q, with weights that add up to 1. Such
-means flatten slopes at borders, and where the guide makes the weights uneven they copy its texture into the surface.
-With ``slopes``, each low-resolution pixel stands for a plane instead, u_p = sum of W_pq (d_q + s_q . (p - q)), with the
-local slope s_q of the low-resolution disparity and the same weights. A plane in space has a disparity that is linear in
-the pixel, so planes are reproduced exactly under any guide. None of the filters' papers does this: ``slopes=False`` is
-the filter as published. Everything is computed in float64.
+A guided filter is a weighted mean of low-resolution values, u_p = sum of W_pq d_q, with weights that add up to 1. With
+``slopes``, each low-resolution pixel stands for a plane instead, u_p = sum of W_pq (d_q + s_q . (p - q)), with the
+local slope s_q of the low-resolution disparity, so that planes are reproduced exactly under any guide; ``slopes=False``
+is the filter as published. Everything is computed in float64.
 
 He, Sun, Tang, *Guided Image Filtering*, TPAMI 2013, with its colour guide: in every window w_k of the high-resolution
 image, q_i = a_k . I_i + b_k with
@@ -13,9 +11,8 @@ image, q_i = a_k . I_i + b_k with
     a_k = (S_k + eps U)^-1 (mean(I p) - m_k mean(p)),    b_k = mean(p) - a_k . m_k,
 
 with the mean m_k and the 3 x 3 covariance S_k of the colours I, the input p (the bilinear interpolation of the
-low-resolution map) and the identity U. The result is q_i = mean(a_k) . I_i + mean(b_k) over the windows that contain i.
-What differs: means over a window weight pixels by their confidence, so that holes do not spread, and windows by their
-mean confidence. The radius is in low-resolution pixels.
+low-resolution map) and the identity U. The result is the mean over the windows that contain i. What differs: means over
+a window weight pixels by their confidence, so that holes do not spread, and windows by their mean confidence.
 """
 
 from __future__ import annotations
@@ -220,10 +217,7 @@ def _box(x: Tensor, radius: int) -> Tensor:
 
 
 def _invert(matrix: Tensor) -> Tensor:
-    """Return the inverses of symmetric 3 x 3 matrices, (6, H, W) both, by cofactors.
-
-    Covariances plus epsilon have determinants of at least epsilon cubed.
-    """
+    """Return the inverses of symmetric 3 x 3 matrices, (6, H, W) both, by cofactors; epsilon bounds determinants."""
     a, b, c, d, e, f = matrix
     aa, bb, cc = d * f - e * e, c * e - b * f, b * e - c * d
     dd, ee, ff = a * f - c * c, b * c - a * e, a * d - b * b

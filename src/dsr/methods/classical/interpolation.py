@@ -19,6 +19,7 @@ from dsr.geometry.camera import RANGE_TYPES, Camera, RangeType, from_range, to_r
 from dsr.methods.base import Abilities, Cost, InverseSample, InverseSurface, Method
 from dsr.methods.images import lr_coordinates
 from dsr.sample import DepthSample
+from dsr.utils.guards import expect_one_of
 from dsr.utils.progress import Steps
 
 Order = Literal["nearest", "bilinear", "bicubic", "clough_tocher"]
@@ -43,8 +44,7 @@ class Interpolation(Method):
     range_type: RangeType = "perspective"
 
     def __init__(self, order: Order = "bicubic", *, fill_holes: bool = False) -> None:
-        if order not in get_args(Order):
-            raise ValueError(f"order: expected one of {', '.join(get_args(Order))}, got {order!r}")
+        expect_one_of("order", order, get_args(Order))
         self._degree = {"nearest": 0, "bilinear": 1, "bicubic": 3, "clough_tocher": None}[order]
         self._fill_holes = fill_holes
 
@@ -66,24 +66,19 @@ class Interpolation(Method):
             nearest = ndimage.distance_transform_edt(~valid, return_distances=False, return_indices=True)
             values = values[tuple(nearest)]
         grid = torch.stack(torch.meshgrid(*lr_coordinates(camera_hr, camera), indexing="ij")).numpy()
-        if self._degree is None:
-            range_hr = _clough_tocher(values, grid)
+        if self._degree is None:  # over a triangulation of the pixels, the border repeated once
+            from scipy.interpolate import CloughTocher2DInterpolator  # noqa: PLC0415 - only this order needs it
+
+            padded = np.pad(values, 1, mode="edge")
+            pixels = np.indices(padded.shape).reshape(2, -1).T - 1
+            rows, columns = (np.clip(each, -1, size) for each, size in zip(grid, values.shape, strict=True))
+            range_hr = CloughTocher2DInterpolator(pixels, padded.ravel())(rows, columns)
         else:
             range_hr = ndimage.map_coordinates(values, grid, order=self._degree, mode="nearest")
         if not (valid.all() or self._fill_holes):
             range_hr[ndimage.map_coordinates(valid.astype(np.uint8), grid, order=0, mode="nearest") == 0] = np.nan
         range_hr[range_hr <= 0] = np.nan  # a spline may overshoot beside a depth step
         return from_range(torch.from_numpy(range_hr).to(range_lr)[None], camera_hr, "perspective")
-
-
-def _clough_tocher(values: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """Interpolate (h, w) at rows and columns (2, H, W) over a triangulation of the pixels, the border repeated once."""
-    from scipy.interpolate import CloughTocher2DInterpolator  # noqa: PLC0415 - only this order needs it
-
-    padded = np.pad(values, 1, mode="edge")
-    pixels = np.indices(padded.shape).reshape(2, -1).T - 1
-    rows, columns = (np.clip(each, -1, size) for each, size in zip(grid, values.shape, strict=True))
-    return CloughTocher2DInterpolator(pixels, padded.ravel())(rows, columns)
 
 
 class CubicConvolution(Method):
@@ -96,8 +91,7 @@ class CubicConvolution(Method):
     abilities = Abilities(ratios="any", own_size=True)
 
     def __init__(self, range_type: RangeType = "disparity") -> None:
-        if range_type not in get_args(RangeType):
-            raise ValueError(f"range_type: expected one of {', '.join(RANGE_TYPES)}, got {range_type!r}")
+        expect_one_of("range_type", range_type, RANGE_TYPES)
         self.range_type = range_type
 
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:

@@ -4,14 +4,12 @@ Of all piecewise constant albedos, it finds one with a low
 
     E = 1/2 sum (rgb - albedo * shading)^2 + weight * (number of pairs of neighbours in different regions),
 
-the Potts prior on the albedo of Haefner et al. (CVPR 2018), who minimise it with a primal-dual iteration. Here regions
-are fused, as in Nguyen and Brown (*Fast and Effective L0 Gradient Minimization by Region Fusion*, ICCV 2015): it starts
-with one region per pixel, and fuses two neighbours if this costs less than the boundary between them, whose weight
-grows to its value in a few levels. Many are fused at once, in disjoint groups, and only if this lowers E at the current
-weight. Albedos are exactly constant, and no fusion of two of the resulting regions lowers E.
-
-The best albedo of a region is sum (shading * rgb) / sum shading^2 in each channel, clamped to 0 .. BRIGHTEST, because a
-shading near 0 does not determine it.
+the Potts prior of Haefner et al. (CVPR 2018), who minimise it with a primal-dual iteration. Here regions are fused, as
+in Nguyen and Brown (*Fast and Effective L0 Gradient Minimization by Region Fusion*, ICCV 2015): it starts with one
+region per pixel, and fuses two neighbours if this costs less than the boundary between them, whose weight grows to its
+value in a few levels. Many are fused at once, in disjoint groups, and only if this lowers E at the current weight. No
+fusion of two of the resulting regions lowers E. A region's best albedo is sum (shading * rgb) / sum shading^2 in each
+channel, clamped to 0 .. BRIGHTEST, because a shading near 0 does not determine it.
 """
 
 from __future__ import annotations
@@ -108,12 +106,7 @@ def _find_borders(labels: Tensor, inside: Tensor) -> _Borders:
 
 
 def _choose_fusions(squares: Tensor, products: Tensor, borders: _Borders, price: float, turn: int) -> Tensor | None:
-    """Return the region that each region is fused into, (count,), or None if no fusion of two lowers E.
-
-    The best neighbour of a region has the lowest cost of fusing per unit of boundary saved. A hash splits regions into
-    centres and those that may join their best neighbour, if it is a centre. If all fusions of a centre together cost
-    more than the boundaries between them, it only takes its best neighbour.
-    """
+    """Return the region that each region is fused into, (count,), or None if no fusion of two lowers E."""
     one, other, length = borders
     worth, count = _worth(squares, products), len(squares)
     cost = (worth[one] + worth[other] - _worth(squares[one] + squares[other], products[one] + products[other])) / length
@@ -122,6 +115,7 @@ def _choose_fusions(squares: Tensor, products: Tensor, borders: _Borders, price:
         return None
     leaf, centre = torch.cat((one, other))[cheap.repeat(2)], torch.cat((other, one))[cheap.repeat(2)]
     length, cost = length[cheap].repeat(2), cost[cheap].repeat(2)
+    # a hash splits regions into centres and those that may join their best neighbour, if it is a centre
     joining = (_hash(torch.arange(count, device=one.device) + turn * count) & 1).bool()
     kept = ~joining[leaf] & joining[centre]
     leaf, centre, length, cost = leaf[kept], centre[kept], length[kept], cost[kept]
@@ -130,6 +124,7 @@ def _choose_fusions(squares: Tensor, products: Tensor, borders: _Borders, price:
     union = squares.index_add(0, centre, squares[leaf]), products.index_add(0, centre, products[leaf])
     lost = worth.index_add(0, centre, worth[leaf]) - _worth(*union)
     saved = torch.zeros_like(worth).index_add_(0, centre, price * length.to(worth))
+    # if all fusions of a centre together cost more than the boundaries, it only takes its best neighbour
     joins = (lost < saved)[centre] | _is_cheapest(centre, cost, count)
     parent = torch.arange(count, device=one.device)
     parent[leaf[joins]] = centre[joins]

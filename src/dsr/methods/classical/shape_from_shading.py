@@ -5,30 +5,18 @@ Super-Resolution from Shading*, CVPR 2018, minimise
 
     E = 1/2 sum |albedo * shading - rgb|^2 + data / 2 * sum |mean z - lr|^2
         + area * sum z |m| + boundary * (length of the albedo's boundaries),
-
-with z in pixels here (times the focal length, by the median depth), so that slopes have no unit. The image formation
-model is Lambertian shading under first-order spherical harmonics lighting, in each channel
-
     shading = l_1 n_x + l_2 n_y + l_3 n_z + l_4,    n = m / |m|,    m = (p, q, -z - x p - y q),
 
-with the slopes p = fx dz/du and q = fy dz/dv, and the ray (x, y, 1) of the pixel. m is the normal that faces the
-camera, and a pixel sees the area z |m| / (fx fy). With a copy theta of (p, q, z) for the nonlinear terms, and the
-scaled multiplier u, the augmented Lagrangian is E with theta in place of (p, q, z) except in the data term, plus
-penalty / 2 * (|(p, q, z) + u - theta|^2 - |u|^2). Alternating steps lower it: the albedo by region fusion
-(:mod:`dsr.methods.classical.potts`), the lighting by least squares, theta by Levenberg and Marquardt's method, z by
-conjugate gradients. What differs:
+with z in pixels here (times the focal length, by the median depth), the slopes p = fx dz/du and q = fy dz/dv, and the
+ray (x, y, 1) of the pixel. The augmented Lagrangian is E with a copy theta of (p, q, z) in the nonlinear terms, plus
+penalty / 2 * (|(p, q, z) + u - theta|^2 - |u|^2) with the scaled multiplier u. Alternating steps lower it: the albedo
+by region fusion (:mod:`dsr.methods.classical.potts`), the lighting by least squares, theta by Levenberg and Marquardt's
+method, z by conjugate gradients.
 
-- Weights. The original has, in these units at x4 with a focal length of 500 pixels: data_weight 0.0015, area_weight
-  1e-7 and boundary_weight 0.5. Then the result follows the low-resolution map only over hundreds of pixels, and texture
-  that the albedo does not explain becomes relief. Ours were chosen on procedural scenes and on a bumpy surface.
-- Each channel has a light of its own. Albedos are between 0 and 2.
-- The penalty of the copy of z is weighted by 1 / scale^2: with 1 a step spreads over a pixel, and blocks have several.
-- Levenberg and Marquardt's 3 x 3 systems are solved in closed form, instead of BFGS; conjugate gradients are plain; it
-  starts from the bicubic map, not smoothed first.
-- Outside the foreground the initial map stays unchanged, including in blocks that cross its border.
-
-E itself, logged for z without the copy, may rise while the copy still differs. Holes have no data term, and start from
-inpainted values.
+What differs, beside the weights (the original's: data 0.0015, area 1e-7, boundary 0.5 at x4 with a focal length of 500
+pixels): each channel has its own light; the penalty of the copy of z is weighted by 1 / scale^2, because with 1 a step
+spreads over a pixel, and blocks have several; theta's 3 x 3 systems are solved in closed form, not by BFGS; it starts
+from the bicubic map, not smoothed first, which stays unchanged outside the foreground. Holes have no data term.
 """
 
 from __future__ import annotations
@@ -288,10 +276,7 @@ def _solve(gradient: Tensor, hessian: Tensor, damping: Tensor) -> Tensor:
 def conjugate_gradients(
     operator: Callable[[Tensor], Tensor], right: Tensor, iterations: int, tolerance: float
 ) -> Tensor:
-    """Solve A x = b for each element of a batch, (B, ...), from 0, until |b - A x| / |b| is small for all.
-
-    The operator x -> A x is symmetric positive definite for each element, and does not mix elements.
-    """
+    """Solve A x = b, A positive definite, for each element of a batch, (B, ...), until |b - A x| / |b| is small."""
 
     def dot(a: Tensor, b: Tensor) -> Tensor:  # (B, 1, ...)
         return (a * b).sum(dim=tuple(range(1, a.ndim)), keepdim=True)
@@ -333,9 +318,8 @@ class ShapeFromShading(Method):
         foreground: folder of masks SCENE.png of the image's size, white at the object; None for the whole image.
 
     Attributes:
-        history: of the last call, each iteration's ``objective``, its terms ``shading``, ``data``, ``area`` and
-            ``boundaries``, the ``residual`` (RMS difference of theta and the slopes) and the movement of z, ``moved``
-            (RMS, relative to the median depth).
+        history: of the last call: the ``objective``, its terms, the ``residual``, which is the RMS difference of theta
+            and the slopes, and the RMS movement of z relative to the median depth, ``moved``.
 
     """
 

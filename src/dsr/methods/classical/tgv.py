@@ -1,28 +1,21 @@
 """Upsampling by anisotropic total generalised variation, without training.
 
 Ferstl, Reinbacher, Ranftl, Rüther and Bischof, *Image Guided Depth Upsampling using Anisotropic Total Generalized
-Variation*, ICCV 2013: of all high-resolution maps u and vector fields v, the pair that minimises
+Variation*, ICCV 2013: of all high-resolution maps u and slopes v, the pair that minimises
 
     E(u, v) = alpha_1 * sum |G (grad u - v)| + alpha_0 * sum |grad v| + data_weight / 2 * sum w (mean u - d)^2,
+    G = exp(-sharpness |grad I|^exponent) n n^T + t t^T,    n = grad I / |grad I|,    t perpendicular to n,
 
-their eq. 6. v is the slope of the map where it is smooth, so planes have no cost. G = exp(-sharpness |grad I|^exponent)
-n n^T + t t^T, with n = grad I / |grad I| and t perpendicular to it, is their diffusion tensor of the grey image I
-(eq. 5): the map may jump across edges of I. E is minimised by the primal-dual method of Chambolle and Pock
-(2011), with the diagonal step sizes of Pock and Chambolle (ICCV 2011, eq. 10 with alpha = 1), over-relaxed (Condat
-2013, algorithm 3.1).
+their eq. 6 and 5, with the grey image I, across whose edges the map may jump. E is minimised by the primal-dual method
+of Chambolle and Pock (2011), with the diagonal step sizes of Pock and Chambolle (ICCV 2011, eq. 10 with alpha = 1),
+over-relaxed (Condat 2013, algorithm 3.1).
 
-What differs from the original:
-
-- A low-resolution pixel d is the *mean* of u over its block of w pixels, not the value of a single high-resolution
-  pixel. The proximal map of this data term has a closed form, too; without a finite ``data_weight`` it is a projection:
-  the block means equal the input exactly.
-- It works on disparity, which is linear on planes, normalised by its range in the image.
-- A difference that would need a pixel beyond the border is left out; the original sets it to 0, which bends planes.
-- It starts from the bicubic map and its gradient, and stops when the map no longer moves. Holes have no data term, as
-  in the original; a map with holes starts from its own solution at the low resolution, because a hole is filled only
-  one pixel per iteration.
-- alpha_0 (``second``) is 2.4 instead of 17: on procedural scenes, renderings are better by a quarter, and convergence
-  is faster. The last iterations gain little: 1000 come close to the minimum of E, and walls may keep ripples.
+What differs: a low-resolution pixel d is the mean of u over its block of w pixels, not the value of one high-resolution
+pixel; without a finite ``data_weight`` its proximal map is a projection, and block means equal the input exactly. It
+works on disparity, normalised by its range. Differences beyond the border are left out; the original sets them to 0,
+which bends planes. It starts from the bicubic map and its gradient, one with holes from its own solution at the low
+resolution, because a hole is filled one pixel per iteration. alpha_0 is 2.4 instead of 17: on procedural scenes,
+renderings are better by a quarter, and convergence is faster.
 """
 
 from __future__ import annotations
@@ -121,10 +114,7 @@ class TotalGeneralisedVariation(Method):
 
     @torch.inference_mode()
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
-        """Return high-resolution depth without holes, (1, H, W) in metres on the sample's device.
-
-        A disparity at or beyond infinity becomes NaN.
-        """
+        """Return high-resolution depth without holes, (1, H, W) in metres; NaN where it is at or beyond infinity."""
         lr = sample.disparity_lr(torch.float64)[None]
         scaled = normalise(lr)
         values = torch.where(lr.isfinite(), scaled.values, torch.nan)
@@ -135,10 +125,7 @@ class TotalGeneralisedVariation(Method):
         return from_range(hr[0], sample.camera, "disparity").to(sample.depth_lr.dtype)
 
     def minimise(self, rgb: Tensor, lr: Tensor, scale: int, progress: Steps | None = None) -> Solution:
-        """Return the minimiser of E for normalised maps, (B, 1, h, w) in [0, 1], NaN in holes, of images in [0, 1].
-
-        At a scale of 1, only holes are inpainted.
-        """
+        """Return the minimiser of E for normalised maps, (B, 1, h, w), NaN in holes; scale 1 only inpaints these."""
         report = progress or ignore
         start, valid = inpaint(lr), lr.isfinite()
         if scale > 1 and not bool(valid.all()):
@@ -203,11 +190,7 @@ class TotalGeneralisedVariation(Method):
         return Tensors(1 - less * x * x, -less * x * y, 1 - less * y * y)
 
     def _step_sizes(self, g: Tensors) -> tuple[Tensor, Tensor, Tensor, float]:
-        """Return the step sizes of u (B, 1, H, W), v (B, 2, H, W), p (B, 1, 1, H, W) and q.
-
-        They are the inverse absolute row and column sums of the operator, scaled by the root of the ratio. The operator
-        acts on (u, v / _SLOPE), because slopes are smaller than differences of the map.
-        """
+        """Return step sizes of u (B, 1, H, W), v (B, 2, H, W), p (B, 1, 1, H, W), q: inverse sums of the operator."""
         root = self.step_ratio**0.5
         along_u, along_v = g.uu + g.uv.abs(), g.vv + g.uv.abs()
         inside = _zero_border(torch.stack((along_u, along_v), dim=1))
@@ -224,20 +207,15 @@ def gradient(x: Tensor) -> Tensor:
 
 
 def divergence(p: Tensor) -> Tensor:
-    """Return minus the adjoint of :func:`gradient`, (B, 2, C, H, W) -> (B, C, H, W).
+    """Return minus the adjoint of :func:`gradient`, (B, 2, C, H, W) -> (B, C, H, W)."""
+    return sum_adjacent(p, -1)
 
-    The last column of p along u and its last row along v are ignored.
+
+def sum_adjacent(p: Tensor, sign: int = 1) -> Tensor:
+    """Return the sum of the values at the differences that use each pixel, (B, 2, C, H, W) -> (B, C, H, W).
+
+    At its second pixel, a value has the sign. The last column of p along u and its last row along v are ignored.
     """
-    return _collect(p, -1)
-
-
-def sum_adjacent(p: Tensor) -> Tensor:
-    """Return the sum of the values at the differences that use each pixel, (B, 2, C, H, W) -> (B, C, H, W)."""
-    return _collect(p, 1)
-
-
-def _collect(p: Tensor, sign: int) -> Tensor:
-    """Add the values of differences, (B, 2, C, H, W), to their first pixels and, with a sign, to their second ones."""
     total = torch.zeros_like(p[:, 0])
     for direction, dim in ((0, -1), (1, -2)):
         count = p.shape[dim] - 1

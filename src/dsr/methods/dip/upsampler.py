@@ -59,11 +59,8 @@ class DeepImagePrior(Method):
     scale only, not on other images.
 
     Args:
-        scale: upsampling factor.
         downsampling: assumed downsampling model of the low-resolution map.
         precision: dtype of the convolutions.
-        seed: seed of all random numbers.
-        device: device of the computations.
         metrics: function that returns the metrics of a validation pass; None for none.
         workspace: directory for logs; None for no logs.
         display: display of the progress.
@@ -336,10 +333,7 @@ class SkipNet(nn.Module):
 
 
 def levels_for(height: int, width: int, most: int) -> int:
-    """Return the number of levels of a SkipNet for an image size, between 1 and ``most``.
-
-    The smallest has at least 2 x 2 pixels, for batch normalisation.
-    """
+    """Return the number of levels of a SkipNet, 1 to ``most``: the smallest has 2 x 2 pixels or more, for its norm."""
     return max(1, min(most, (min(height, width) - 1).bit_length() - 1))
 
 

@@ -47,10 +47,7 @@ def idct2(coefficients: Tensor) -> Tensor:
 
 
 def laplacian_eigenvalues(height: int, width: int, like: Tensor) -> Tensor:
-    """Return the eigenvalues of the Laplacian of four neighbours in the basis of :func:`dct2`, (height, width).
-
-    The border is mirrored. None is positive; dtype and device are those of ``like``.
-    """
+    """Return the eigenvalues, none positive, of the four neighbours' Laplacian in the basis of :func:`dct2`."""
     rows, columns = (
         torch.cos(math.pi / size * torch.arange(size, dtype=torch.float64, device=like.device))
         for size in (height, width)

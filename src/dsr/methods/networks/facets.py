@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.degradation.downsampling import check_scale
-from dsr.methods.exportable import exporting, pad_to_multiple
+from dsr.methods.images import exporting, pad_to_multiple
 from dsr.methods.networks.facets_planes import NEIGHBOURS, Stencil, mix_planes, stencil
 from dsr.methods.networks.network import NormalisedNetwork
 
@@ -66,16 +66,16 @@ class Facets(NormalisedNetwork):
 
     def context(self, rgb: Tensor, disparity: Tensor) -> tuple[Tensor | None, ...]:
         """Return the range and the mean colour of the image, (B, 3, 1, 1)."""
-        return (*super().context(rgb, disparity), mean_colour(rgb))
+        return (*super().context(rgb, disparity), rgb.mean(dim=(-2, -1), keepdim=True))
 
     def forward(self, rgb: Tensor, values: Tensor, mean: Tensor | None = None) -> Tensor:
         """Return normalised disparity; ``mean`` is the mean colour of the image that ``rgb`` is a window of."""
         around = stencil(values)
         dtype = self.photo.weight.dtype
-        pyramid = look(self, photo_input(rgb, mean).to(dtype))
+        pyramid = look(self.photo, self.down, photo_input(rgb, mean).to(dtype))
         x = self.trunk(functional.relu(pyramid[-1] + self.coarse(_lr_input(around).to(dtype))))
         planes = self._propose_planes(self.planes(x), around)
-        return mix_planes(planes, self.choice(rise(self, x, pyramid)), self.scale)[0]
+        return mix_planes(planes, self.choice(rise(self.up, self.join, x, pyramid)), self.scale)[0]
 
     def _propose_planes(self, output: Tensor, around: Stencil) -> Tensor:
         """Return the planes of each low-resolution pixel, (B, facets, 3, h, w): value at its centre and slopes."""
@@ -101,10 +101,7 @@ def _lr_input(around: Stencil) -> Tensor:
 def make_pyramid(
     levels: int, width: int, inputs: int = 4
 ) -> tuple[nn.Conv2d, nn.ModuleList, nn.ModuleList, nn.ModuleList]:
-    """Return the layers that halve the photo's resolution ``levels`` times, down to ``width`` channels, and back.
-
-    They are ``photo`` and ``down`` of a network, and ``up`` and ``join``.
-    """
+    """Return layers that halve a resolution ``levels`` times, and back: ``photo``, ``down``, ``up`` and ``join``."""
     channels = [*[FULL, HALF, width, width][:levels], width]
     outputs = [HEAD, *channels[1:-1]]
     return (
@@ -115,18 +112,19 @@ def make_pyramid(
     )
 
 
-def look(net: Any, photo: Tensor) -> list[Tensor]:
-    """Return a photo's features in a network that has a pyramid, from the full to the low resolution."""
-    pyramid = [functional.relu(net.photo(photo), inplace=True)]
-    for layer in net.down:
+def look(first: nn.Conv2d, down: nn.ModuleList, photo: Tensor) -> list[Tensor]:
+    """Return a photo's features by layers of :func:`make_pyramid`, from the full to the low resolution."""
+    pyramid = [functional.relu(first(photo), inplace=True)]
+    for layer in down:
         pyramid.append(functional.relu(layer(pyramid[-1]), inplace=True))
     return pyramid
 
 
-def rise(net: Any, x: Tensor, pyramid: list[Tensor]) -> Tensor:
+def rise(up: nn.ModuleList, join: nn.ModuleList, x: Tensor, pyramid: list[Tensor]) -> Tensor:
     """Return features at the full resolution of those at the low resolution and of the photo's."""
-    for up, join, features in zip(net.up, net.join, reversed(pyramid[:-1]), strict=True):
-        x = functional.relu(enlarge_and_join(up, join, x, features), inplace=True)
+    layers = cast(list[nn.Conv2d], up), cast(list[nn.Conv2d], join)
+    for grow, merge, features in zip(*layers, reversed(pyramid[:-1]), strict=True):
+        x = functional.relu(enlarge_and_join(grow, merge, x, features), inplace=True)
     return x
 
 
@@ -207,8 +205,8 @@ def _in_a_row(block: Residual) -> Tensor:
     return torch.cat([each.flatten() for each in parameters]).float()
 
 
-class Context(nn.Module):
-    """What a U-net adds to the trunk, nothing at first; its coarsest level is an eighth, and knows its mean."""
+class UNet(nn.Module):
+    """A U-net below the low resolution, which adds nothing at first; its coarsest level, an eighth, knows its mean."""
 
     def __init__(self, width: int, deep: int) -> None:
         super().__init__()
@@ -250,22 +248,15 @@ def silence(layer: nn.Module) -> Any:
     return layer
 
 
-def mean_colour(rgb: Tensor) -> Tensor:
-    """Return the mean colour of images, (B, 3, 1, 1)."""
-    return rgb.mean(dim=(-2, -1), keepdim=True)
-
-
 def photo_input(rgb: Tensor, mean: Tensor | None = None) -> Tensor:
-    """Return (B, 4, H, W): the colours, and the brightness relative to the image's mean."""
-    brightness = (rgb - (mean_colour(rgb) if mean is None else mean)).mean(dim=1, keepdim=True)
+    """Return (B, 4, H, W): the colours, and the brightness relative to the image's mean colour, (B, 3, 1, 1)."""
+    mean = rgb.mean(dim=(-2, -1), keepdim=True) if mean is None else mean
+    brightness = (rgb - mean).mean(dim=1, keepdim=True)
     return torch.cat((rgb - 0.5, 2 * brightness), dim=1)
 
 
 def start_from_facets(net: Any, first: Facets, levels: int) -> None:
-    """Let a FacetsUNet take over the weights of Facets for the same or another factor, in both sets of a block.
-
-    ``levels`` is the number of smoothed copies of the map, whose values and slopes it offers beside the map's own.
-    """
+    """Let a FacetsUNet of ``levels`` smoothed maps take over the weights of Facets, in both sets of a block."""
     theirs = first.state_dict()
     taken: dict[str, Tensor] = {}
     for name, value in theirs.items():
@@ -308,14 +299,11 @@ def start_from_another_factor(net: Any, first: Any) -> None:
 
 
 def _copy(net: Any, first: Any, named: dict[str, Tensor]) -> None:
-    """Copy weights of the same shape, and into layers that have more inputs, which count nothing at first.
-
-    The layers towards the full resolution have other numbers at another factor.
-    """
+    """Copy weights of the same shape, and into layers that have more inputs, which count nothing at first."""
     own = net.state_dict()
     for theirs, value in named.items():
         kind, number, *rest = theirs.split(".")
-        numbered = kind in ("up", "join")
+        numbered = kind in ("up", "join")  # by resolution, of which there are others at another factor
         name = ".".join((kind, str(int(number) + len(net.up) - len(first.up)), *rest)) if numbered else theirs
         if name not in own:
             continue

@@ -22,8 +22,9 @@ from dsr.methods.base import Abilities, Cost, InverseSample, InverseSurface, Map
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.network import DTYPES, Answer, DisparityNetwork, Precision
 from dsr.methods.networks.trained import NETWORKS
-from dsr.methods.networks.weight_files import load_network, special_weights
+from dsr.methods.networks.weight_files import linked_weights, load_network
 from dsr.sample import DepthSample
+from dsr.utils.guards import expect_one_of
 from dsr.utils.progress import Steps
 
 Edges = Literal["auto", "sharp", "soft"]
@@ -86,9 +87,8 @@ class AnyMap(Method):
         cleanly = noise is None and clean and smooth == 1
         if cleanly:
             noise = 0.0
-        kinds = get_args(Edges)
+        expect_one_of("edges", edges, get_args(Edges))
         for fits, message in (
-            (edges in kinds, f"edges: expected one of {', '.join(kinds)}, got {edges}"),
             (0 <= smooth <= 2, f"smooth: expected a number from 0 to 2, got {smooth}"),
             (noise is None or 0 <= noise < 1, f"noise: expected metres, 0 or more and less than 1, got {noise}"),
             (0 <= noise_growth <= 4, f"noise_growth: expected a power of distance from 0 to 4, got {noise_growth}"),
@@ -101,7 +101,7 @@ class AnyMap(Method):
         if isinstance(weights, str | Path):
             path = Path(weights)
             kind, caution = SPECIAL.get((kernel, edges), (None, CAUTION)) if cleanly else (None, CAUTION)
-            if kind is not None and (special := special_weights(path, kind)) is not None:
+            if kind is not None and (special := linked_weights(path, kind)) is not None:
                 path, self._caution = special, caution
             net = load_network(path, networks, None, model)
             if not isinstance(net, FacetsUNet):
@@ -197,12 +197,11 @@ def _guessing(inverse: Tensor, focal: float) -> Tensor:
 
 
 def _rounding(inverse: Tensor, focal: float) -> tuple[Tensor, Tensor]:
-    """Return the expected errors of maps that are rounded to few values, where there is one value around a pixel.
+    """Return the expected errors of maps rounded to few values, (B, 1, h, w), 0 where the values around a pixel differ.
 
     That of depth is relative: a quarter of the step to the next value, the mean of errors that are equally likely up to
-    half a step. That of the normal, in radians, is the tilt of a surface that gains it up to the next other value. Both
-    are (B, 1, h, w), and 0 where the values around a pixel differ, from which the truth can be determined more exactly.
-    A rounded slope is a staircase; its largest relative step, twice, limits those of single levels.
+    half a step. That of the normal, in radians, is the tilt of a surface that gains it up to the next other value. A
+    rounded slope is a staircase; its largest relative step, twice, limits those of single levels.
     """
     nothing, known = torch.zeros_like(inverse), inverse.isfinite()
     values = inverse[known].unique()

@@ -16,8 +16,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
-from dsr.methods.exportable import exporting
-from dsr.methods.images import extend_linearly
+from dsr.methods.images import exporting, extend_linearly
 
 NEIGHBOURS = 9  # low-resolution pixels whose planes are mixed or averaged: 3 x 3
 _CHUNK = 2**17  # values that a processor's cache holds several of
@@ -179,11 +178,7 @@ def mix_planes(planes: Tensor, found: Tensor, scale: int) -> tuple[Tensor, Tenso
 @functools.lru_cache(64)
 @torch.inference_mode(mode=False)  # so that gradients can be computed with them
 def _mixing_constants(scale: int, facets: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Return factors of the value and the slopes at high-resolution pixels, (s s, 3), and logits, (9 f, s s, 1).
-
-    The logits are logarithms of the quadratic B-spline's weights, to which a small constant is added, so that no
-    neighbour is excluded.
-    """
+    """Return factors of value and slopes at high-resolution pixels, (s s, 3), and B-spline logits, (9 f, s s, 1)."""
     # from the centre of the low-resolution pixel, in low-resolution pixels
     offsets = (torch.arange(scale, dtype=dtype, device=device) + 0.5) / scale - 0.5
     ones = torch.ones(scale, scale, dtype=dtype, device=device)

@@ -23,13 +23,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.degradation.downsampling import FACTS, Downsampling, known_kernels
-from dsr.methods.exportable import every, exporting, median_in_graph, quantiles_in_graph
-from dsr.methods.images import inpaint, repeat_blocks, upsample_bicubic
+from dsr.methods.images import exporting, inpaint, repeat_blocks, upsample_bicubic
 from dsr.methods.networks.facets import (
     HEAD,
-    Context,
     Facets,
     MixedResidual,
+    UNet,
     look,
     make_pyramid,
     photo_input,
@@ -101,7 +100,7 @@ class FacetsUNet(DisparityNetwork):
             self.shares.weight[:, FACTS] = _SLOPE
             self.shares.bias.fill_(-_SLOPE * _ROUGH)
         self.trunk = nn.ModuleList(MixedResidual(width) for _ in range(blocks))
-        self.wide = Context(width, deep)
+        self.wide = UNet(width, deep)
         self.planes = scale_down(nn.Conv2d(width, (1 + _LEVELS + 2 * (3 + _LEVELS) + 3) * facets, 3, padding=1))
         self.up, self.join = up, join
         self.choice = scale_down(nn.Conv2d(HEAD, NEIGHBOURS * facets, 3, padding=1))
@@ -116,10 +115,7 @@ class FacetsUNet(DisparityNetwork):
 
     @torch.no_grad()
     def start_from(self, first: DisparityNetwork) -> None:
-        """Take over the weights of a trained network for the same or another factor, or of Facets.
-
-        From Facets for the same factor, the results for clean maps are nearly the same.
-        """
+        """Take over the weights of a trained network for the same or another factor, or of Facets."""
         self._expect(first, (Facets, FacetsUNet), ("width", "blocks", "facets"))
         if isinstance(first, Facets):
             start_from_facets(self, first, _LEVELS)
@@ -230,8 +226,10 @@ class FacetsUNet(DisparityNetwork):
             cues = torch.cat((hints.float(), _roughness(around.bend, weight)), dim=1)
         photo, bands = torch.cat(parts, dim=1).to(dtype), self._split(values.shape[-2], rgb.shape)
         windows = [photo[..., scale * rows.start : scale * rows.stop, :] for rows, _ in bands]
-        kept = look(self, photo) if len(bands) == 1 else None
-        features = [(kept or look(self, window))[-1][..., i, :] for window, (_, i) in zip(windows, bands, strict=True)]
+        kept = look(self.photo, self.down, photo) if len(bands) == 1 else None
+        features = []
+        for window, (_, inner) in zip(windows, bands, strict=True):
+            features.append((kept or look(self.photo, self.down, window))[-1][..., inner, :])
         x = functional.relu(self.coarse(lr_input.to(dtype)).add_(_join(features)), inplace=True)
         kind, shares = functional.relu(self.hints(cues.to(dtype))), self.shares(cues.to(dtype)).sigmoid()
         for number, (block, modulate) in enumerate(zip(self.trunk, self.modulation, strict=True)):
@@ -241,7 +239,7 @@ class FacetsUNet(DisparityNetwork):
         planes = self._blend_planes(self._propose_planes(self.planes(x), around), self.blend(x))
         bits = []
         for number, (window, (rows, inner)) in enumerate(zip(windows, bands, strict=True), 1):
-            high = rise(self, x[..., rows, :], kept or look(self, window))
+            high = rise(self.up, self.join, x[..., rows, :], kept or look(self.photo, self.down, window))
             found = self._choose(high, planes[..., rows, :], scale)
             inside = slice(scale * inner.start, scale * inner.stop)
             bits.append([each[..., inside, :] for each in found])
@@ -352,21 +350,28 @@ def _project(result: Tensor, values: Tensor, known: Tensor, gate: Tensor, kernel
 def _roughness(bend: Tensor, weight: Tensor) -> Tensor:
     """Return logarithms of quantiles of the bend, (levels, B, 1, h, w), where it is known, (B, channels)."""
     known = weight > 0.5
-    if exporting():
-        step = (torch.ones_like(weight[0, 0]).sum() / _SAMPLES).sqrt().floor().clamp(min=1)
-        known = known & every(step, weight)
+    if exporting():  # no size of a graph depends on values
+        nth = (torch.ones_like(weight[0, 0]).sum() / _SAMPLES).sqrt().floor().clamp(min=1)
+        rows, columns = (torch.arange(n, device=bend.device, dtype=torch.float32) for n in weight.shape[-2:])
+        known = known & (torch.fmod(rows, nth) == 0)[:, None] & (torch.fmod(columns, nth) == 0)
     else:
-        nth = max(1, math.isqrt(weight.shape[-2] * weight.shape[-1] // _SAMPLES))
-        bend, known = bend[..., ::nth, ::nth], known[..., ::nth, ::nth]
-    rows = bend.float().flatten(2).flatten(0, 1)  # of pixels, one of each image and level
-    fractions = _constant(_QUANTILES, torch.float32, bend.device)
-    quantiles = quantiles_in_graph(rows, known.flatten(1).repeat(1 + _LEVELS, 1), fractions)
+        step = max(1, math.isqrt(weight.shape[-2] * weight.shape[-1] // _SAMPLES))
+        bend, known = bend[..., ::step, ::step], known[..., ::step, ::step]
+    values = bend.float().flatten(2).flatten(0, 1)  # of pixels, a row for each level and image
+    known = known.flatten(1).repeat(1 + _LEVELS, 1)
+    ordered, count = torch.where(known, values, torch.inf).sort(dim=1).values, known.sum(dim=1, keepdim=True)
+    place = _constant(_QUANTILES, torch.float32, bend.device) * (count - 1).clamp(min=0).to(values.dtype)
+    below, above = place.floor().long(), place.ceil().long()
+    quantiles = torch.lerp(ordered.gather(1, below), ordered.gather(1, above), place - below.to(values.dtype))
+    quantiles = torch.where(count > 0, quantiles, torch.nan)
     quantiles = quantiles.unflatten(0, (1 + _LEVELS, -1)).transpose(0, 1).flatten(1)  # (B, levels * quantiles)
     return (torch.log10(quantiles.nan_to_num(0) + 1e-6) + 4) / 2
 
 
 def _median(values: Tensor, known: Tensor) -> Tensor:
     """Return the lower median of the known values of maps, (B, 1, h, w) to (B, 1, 1, 1)."""
-    if exporting():
-        return median_in_graph(values.flatten(1), known.flatten(1))[..., None, None]
-    return values.masked_fill(~known, torch.nan).flatten(1).nanmedian(dim=1).values.view(-1, 1, 1, 1)
+    if not exporting():
+        return values.masked_fill(~known, torch.nan).flatten(1).nanmedian(dim=1).values.view(-1, 1, 1, 1)
+    ordered = torch.where(known, values, torch.inf).flatten(1).sort(dim=1).values
+    middle = (known.flatten(1).sum(dim=1, keepdim=True) - 1).clamp(min=0) // 2
+    return ordered.gather(1, middle)[..., None, None]

@@ -39,10 +39,7 @@ _DEPTH_GAIN, _RESIDUAL_GAIN = 10.0, 0.05
 
 
 class ConvLayer(nn.Module):
-    """A convolution that keeps the size, or a transposed one that doubles it, followed by a PReLU.
-
-    The PReLU has one slope, one per channel, or there is none.
-    """
+    """A convolution, transposed if it doubles the size, and a PReLU of one slope, one for each channel, or none."""
 
     def __init__(self, conv: nn.Conv2d | nn.ConvTranspose2d, slopes: int) -> None:
         super().__init__()
@@ -155,8 +152,8 @@ class MSGNet(DisparityNetwork):
     def forward(self, guidance: Tensor, depth: Tensor) -> Tensor:
         """Map normalised inputs to the high-resolution residual, (B, 1, H, W), in units of the disparity's range.
 
-        ``guidance`` (B, 1, H, W) is that of :func:`guidance_map` in the size of :meth:`output_size`, ``depth``
-        (B, 1, h, w) normalised disparity minus its mean.
+        ``guidance`` (B, 1, H, W) is that of :func:`guidance_map`, ``depth`` (B, 1, h, w) normalised disparity minus its
+        mean.
         """
         pyramid = [self.guidance[1](self.guidance[0](guidance))]  # (B, 32, H, W), (B, 32, H / 2, W / 2), ...
         for layer in self.guidance[2:]:
@@ -184,7 +181,7 @@ class MSGNet(DisparityNetwork):
         if self.variant == "dsr":
             values = inpaint(torch.where(disparity.isfinite(), values, torch.nan))
         low_pass = mean3x3(values)
-        height, width = self.output_size(values)
+        height, width = (self.scale * n - (0 if self.covers else 1) for n in values.shape[-2:])
         guidance = guidance_map(rgb, self.variant, intensity_range, detail_range)[..., :height, :width]
         output = self.residual(guidance, values - low_pass)
         if self.variant == "voynov":
@@ -218,9 +215,8 @@ class MSGNet(DisparityNetwork):
         """Return the constant offset of the output of a ``voynov`` network, (B, 1, 1, 1).
 
         The first quarter of rows and columns of the normalised disparity, (B, 1, h, w), is set to 0.5. The output is
-        averaged over rows h // 16 .. h // 4 - h // 16 and the corresponding columns, where the indices count
-        high-resolution pixels, as in the released code. The network runs only on the inputs that these pixels depend
-        on. The offset is 0 where there are none.
+        averaged over rows h // 16 .. h // 4 - h // 16 and the corresponding columns of high-resolution pixels, as in
+        the released code. The network runs only on the inputs that these depend on. Without any, the offset is 0.
         """
         height, width = values.shape[-2:]
         rows, columns = (slice(n // 16, n // 4 - n // 16) for n in (height, width))
@@ -233,17 +229,11 @@ class MSGNet(DisparityNetwork):
         output = self.residual(guidance[..., : self.scale * height, : self.scale * width], probe[..., :height, :width])
         return output[..., rows, columns].mean((-2, -1), keepdim=True)
 
-    def output_size(self, depth: Tensor) -> torch.Size:
-        """Return the output's size (H, W) for depth of (..., h, w)."""
-        lost = 0 if self.covers else 1
-        return torch.Size(self.scale * n - lost for n in depth.shape[-2:])
-
     def rows_seen(self, rows: int) -> int:
         """Return how many low-resolution rows (times scale, guidance rows) the outputs 0 .. ``rows`` - 1 depend on.
 
-        The same holds for columns. It is computed backwards along the depth branch with the ``voynov`` variant's
-        padding: a 5 x 5 convolution needs 2 more rows, and output o of a transposed convolution reads inputs up to
-        (o + 2) // 2. The guidance branch needs no more than that at any scale.
+        Computed backwards along the depth branch with the ``voynov`` variant's padding: a 5 x 5 convolution needs 2
+        more rows, and output o of a transposed convolution reads inputs up to (o + 2) // 2. Guidance needs no more.
         """
         seen = rows + 4  # reconstruction, smoothing
         for _ in self.levels:
@@ -252,11 +242,7 @@ class MSGNet(DisparityNetwork):
 
     @torch.no_grad()
     def _start_smooth(self) -> None:
-        """Initialise with interpolating kernels, zero biases and a small residual, for a smooth initial output.
-
-        A random transposed convolution treats even and odd pixels differently. This causes a checkerboard on smooth
-        surfaces, which training removes only slowly. A bilinear kernel treats them alike.
-        """
+        """Initialise with interpolating kernels and a small residual: random ones leave a checkerboard."""
         line = torch.tensor([0.0, 0.5, 1.0, 0.5, 0.0])
         slope = 0.25  # of a new PReLU
         for layer in self.modules():

@@ -1,9 +1,9 @@
 """The networks, which map low-resolution disparity and an RGB image to high-resolution disparity, and their method.
 
-Large images are computed in tiles of low-resolution pixels, which bounds the memory. The output of a tile is computed
-from a window that contains the tile, half of the overlap with its neighbours, and a margin of the receptive-field
-radius. Neighbouring outputs therefore agree where they overlap. They are blended there with linear ramps whose weights
-add up to 1. Values of the whole image, such as the range of the disparity, are computed before.
+Large images are computed in tiles of low-resolution pixels, which bounds the memory. A tile is computed from a window
+with half of the overlap with its neighbours and a margin of the receptive-field radius, so that neighbours agree where
+they overlap; they are blended there with linear ramps. Values of the whole image, such as the range of the disparity,
+are computed before.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from dsr.methods.base import TILE, UNTILED, Abilities, Cost, InverseSample, Inve
 from dsr.methods.images import compute_min_max, inpaint
 from dsr.sample import DepthSample
 from dsr.utils.compute_device import widened
-from dsr.utils.guards import expect_one_of
+from dsr.utils.guards import expect_one_of, refusing
 from dsr.utils.progress import Steps
 
 Precision = Literal["float32", "bfloat16"]
@@ -77,13 +77,9 @@ class DisparityNetwork(nn.Module, abc.ABC):
                 f"expected weights of {type(self).__name__} {self.arguments()}, got those of {type(first).__name__} "
                 f"{first.arguments()}"
             )
-        shapes = [{name: value.shape for name, value in net.state_dict().items()} for net in (self, first)]
-        if shapes[0] != shapes[1]:
-            raise ValueError(
-                f"weights are for scale {first.scale}, the run is at scale {self.scale}, where {type(self).__name__} "
-                "has other parameters"
-            )
-        self.load_state_dict(first.state_dict())
+        scales = f"weights are for scale {first.scale}, the run is at scale {self.scale}"
+        with refusing(f"{scales}, where {type(self).__name__} has other parameters", RuntimeError):
+            self.load_state_dict(first.state_dict())
 
     def share(self, first: DisparityNetwork) -> None:
         """Take over layers that do not depend on the factor from a trained network, and do not train them."""
@@ -117,10 +113,7 @@ class DisparityNetwork(nn.Module, abc.ABC):
         return dict(batch)
 
     def answer_patches(self, batch: Mapping[str, Any]) -> Answer:
-        """Return what a training compares with the truth, in float32, for perhaps prepared patches.
-
-        The patches are as of :func:`dsr.training.degradation.to_tensors`, with a batch axis.
-        """
+        """Return what a training compares with the truth, in float32, for a batch of patches, which may be prepared."""
         return Answer(self.upsample(batch["rgb"], batch["disparity_lr"], batch["min_max"]).float())
 
     def answer_scene(self, batch: Mapping[str, Tensor]) -> Tensor:
@@ -181,17 +174,13 @@ def expect_rgb_size(rgb: Tensor, values_lr: Tensor, scale: int) -> None:
 class NetworkUpsampler(Method):
     """A method that is a trained network.
 
-    Images of more than ``UNTILED`` pixels are computed in tiles, which changes the result by rounding errors only. The
-    memory is about 40 bytes per pixel of the image, and 700 to 1300 bytes per pixel of a tile's window, depending on
-    the network and the depth's precision.
+    The memory is about 40 bytes per pixel of the image, and 700 to 1300 bytes per pixel of a tile's window.
 
     Args:
         net: the network; it is copied.
         precision: dtype of the convolutions; all other computations use the depth's dtype.
-        device: device of the computations.
         ensemble: number of test-time augmentations: 1 for none, 4 for the rotations by multiples of 90 degrees, 8 for
-            these and their mirror images. The results are transformed back and averaged, so that errors that depend on
-            the orientation partly cancel, which takes 4 or 8 times as long. This is the geometric self-ensemble of
+            these and their mirror images. The results are transformed back and averaged: the geometric self-ensemble of
             Timofte, Rothe, Van Gool, *Seven Ways to Improve Example-Based Single Image Super Resolution*, CVPR 2016.
         tile: side of a tile in high-resolution pixels; None for ``TILE``, and no tiles up to ``UNTILED`` pixels.
 
@@ -218,11 +207,7 @@ class NetworkUpsampler(Method):
 
     @torch.inference_mode()
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
-        """Return the high-resolution orthogonal depth, (1, H, W) in metres on the sample's device.
-
-        It is NaN where the disparity corresponds to a depth at or beyond infinity, and in the last row and column if
-        the network does not cover them.
-        """
+        """Return the depth, (1, H, W) in metres, NaN beyond infinity and where the network has no pixels."""
         if sample.scale != self.net.scale:
             raise ValueError(f"{sample.scene}: expected scale {self.net.scale}, the network's, got {sample.scale}")
         # in pixels of sample.camera
@@ -240,10 +225,7 @@ class NetworkUpsampler(Method):
         return InverseSurface(self.upsample_disparity(rgb, inverse, progress)[0])
 
     def upsample_disparity(self, rgb: Tensor, disparity_lr: Tensor, progress: Steps | None = None) -> Tensor:
-        """Return high-resolution disparity, averaged over the test-time augmentations, (B, 1, H, W).
-
-        ``progress`` is called after each augmentation of the image or of each tile.
-        """
+        """Return high-resolution disparity, (B, 1, H, W); ``progress`` is called after each augmentation of a tile."""
         net, scale = self.net, self.net.scale
         rows, columns = self._tiles(*rgb.shape[-2:])
         count = len(rows) * len(columns)
@@ -307,11 +289,7 @@ class AxisTile:
 def split_image(
     size: tuple[int, int], scale: int, radius: int | None, tile: int | None, overlap: int
 ) -> tuple[list[AxisTile], list[AxisTile]]:
-    """Return the tiles along both axes of an image of high-resolution pixels; one if it is small or needed whole.
-
-    The ``radius`` of the receptive field and the ``overlap`` are low-resolution pixels, the ``tile`` as of
-    :class:`NetworkUpsampler`.
-    """
+    """Return the tiles along both axes of an image; one if it is small or needed whole; see :func:`split_axis`."""
     height, width = (n // scale for n in size)
     whole = radius is None or (tile is None and math.prod(size) <= UNTILED)
     longest = max(height, width) if whole else (tile or TILE) // scale
@@ -321,8 +299,7 @@ def split_image(
 def split_axis(size: int, tile: int, radius: int, overlap: int) -> list[AxisTile]:
     """Split an axis of low-resolution pixels into tiles whose sizes differ by one pixel at most.
 
-    ``tile`` is the maximum size of a tile without its overlaps, ``radius`` that of the receptive field,
-    ``overlap`` that of neighbouring tiles, even; no tile is smaller.
+    ``tile`` is their maximum size without the overlaps, which are even, and ``radius`` that of the receptive field.
     """
     count = max(1, min(math.ceil(size / tile), size // max(overlap, 1)))
     edges, half, found = [round(i * size / count) for i in range(count + 1)], overlap // 2, []

@@ -7,18 +7,15 @@ the upsampled map becomes f, and weights w. A fixed number of steps of Chambolle
     E(u) = sum over pairs (i, i + d) of h(u[i + d] - u[i], w[i, d]) + data / 2 * sum (u - f)^2,
 
 with d half of the offsets of a square window and h(x, w) = x^2 / (2 huber) where |x| <= huber w, else
-w |x| - huber / 2 w^2.
-
-What differs: it works on disparity, upsampled exactly on planes; the convolutions see differences and slopes, faint
-ones enlarged, and the colours; the residual is in multiples of the low-resolution map's *bend*, the largest second
-difference around (:mod:`dsr.methods.networks.facets_planes`), which is 0 on planes; beyond the border, f is
-extrapolated and fixed, so that planes are not bent; each step has its own sizes; the window is 5 x 5 instead of 7 x 7.
+w |x| - huber / 2 w^2. What differs is in docs/methods.md; the *bend*, the unit of the residual, is the largest second
+difference of the low-resolution map around a pixel (:mod:`dsr.methods.networks.facets_planes`), which is 0 on planes.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -27,8 +24,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from dsr.degradation.downsampling import check_scale
-from dsr.methods.exportable import apply
-from dsr.methods.images import extend_linearly, upsample_linear_border
+from dsr.methods.images import exporting, extend_linearly, upsample_linear_border
 from dsr.methods.networks.facets_planes import stencil
 from dsr.methods.networks.network import NormalisedNetwork
 
@@ -120,6 +116,13 @@ class _DualStep(torch.autograd.Function):
         return within, within * sigma, of_sigma, -keep.square() * sigma * numerator, of_w
 
 
+def _apply(function: type[torch.autograd.Function], *arguments: Any) -> Tensor:
+    """Apply a function that has a derivative of its own; a graph gets its operations, without the derivative."""
+    if exporting():
+        return function.forward(SimpleNamespace(save_for_backward=lambda *_: None), *arguments)
+    return function.apply(*arguments)
+
+
 class UnrolledHuber(nn.Module):
     """A fixed number of iterations with learned parameters, stored as logarithms so that they are positive.
 
@@ -152,9 +155,9 @@ class UnrolledHuber(nn.Module):
         moved = ahead = slopes.new_zeros(weights.shape[0], 1, *weights.shape[-2:])
         for k, step in enumerate(self.log_steps.to(dtype).exp().unbind()):
             sigma, tau, theta = step.unbind()
-            now = slopes if k == 0 else slopes + apply(_Differences, ahead, self.window)
-            p = apply(_DualStep, p, now, sigma, huber, most)
-            before, moved = moved, (moved - tau * apply(_Sums, p, self.window)) / (1 + tau * data)
+            now = slopes if k == 0 else slopes + _apply(_Differences, ahead, self.window)
+            p = _apply(_DualStep, p, now, sigma, huber, most)
+            before, moved = moved, (moved - tau * _apply(_Sums, p, self.window)) / (1 + tau * data)
             ahead = moved + theta * (moved - before)
         return moved
 
@@ -211,12 +214,7 @@ class PrimalDualNetwork(NormalisedNetwork):
             return hr + residual + moved.to(hr.dtype)
 
     def _inputs(self, rgb: Tensor, values: Tensor, hr: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the input of the convolutions, (B, 9, H, W), and the bend, the unit of their residual.
-
-        The channels are the 3 colours; the slopes of the low-resolution map along u and v, its difference from the mean
-        of 3 x 3 pixels, the difference of the high-resolution map from the same means, and the bend, all compressed so
-        that small values count; and the second difference divided by the bend.
-        """
+        """Return the convolutions' input, (B, 9, H, W), whose small values are enlarged, and the bend."""
         around = stencil(values)
         slopes_lr = torch.cat((around.slopes[:, :, 1], around.value - around.mean), dim=1)
         size = tuple(hr.shape[-2:])

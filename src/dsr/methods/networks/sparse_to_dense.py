@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dsr.methods.exportable import pad_to_multiple
+from dsr.methods.images import pad_to_multiple
 from dsr.methods.networks.network import NormalisedNetwork
 from dsr.utils.ratios import check_scale
 
@@ -104,10 +104,9 @@ class ResidualBlock(nn.Module):
 
 
 class UpProjection(nn.Module):
-    """An up-projection, which doubles the size and halves the channels.
+    """An up-projection to the double size and half the channels: a 5 x 5 and a 3 x 3, and a 5 x 5 convolution alone.
 
-    Zeros are inserted between the pixels. A 5 x 5 and a 3 x 3 convolution, and a 5 x 5 convolution alone, are added.
-    Zeros and a 5 x 5 convolution are one transposed convolution, which takes a quarter of the time.
+    Zeros between the pixels and a 5 x 5 convolution are one transposed convolution, which takes a quarter of the time.
     """
 
     def __init__(self, before: int) -> None:

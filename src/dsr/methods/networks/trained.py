@@ -78,7 +78,12 @@ def load_msg_weights(path: Path, scale: int, variant: VariantName | None = None)
     data = read_limited(path, MOST_FILE)
     is_torch = data.startswith((b"PK\x03\x04", b"\x80"))
     found: VariantName = "voynov" if is_torch else "hui"
-    levels, values = _from_torch(path) if is_torch else _from_caffe(path, data)
+    if is_torch:
+        values = read_tensors(path, "model_state_dict")
+        indices = re.findall(r"^upsampling_X\.(\d{1,3})\.", "\n".join(values), re.MULTILINE)
+        levels = max(map(int, indices), default=0) // 3  # 3 layers per level, then 2
+    else:
+        levels, values = _from_caffe(path, data)
     if levels < 1 or 2**levels not in SCALES:
         raise ValueError(f"{path}: expected MSG-Net for a scale of {SCALES}, got {levels} upsampling levels")
     if variant is not None and found != variant:
@@ -98,13 +103,6 @@ def load_msg_weights(path: Path, scale: int, variant: VariantName | None = None)
     tensors = {names.get(name, name): value for name, value in values.items()}
     load_parameters(net, tensors, path, f"MSG-Net ({found}) at scale {scale}")
     return net
-
-
-def _from_torch(path: Path) -> tuple[int, dict[str, Tensor]]:
-    """Return the number of levels and the tensors by their names of a file with the key ``model_state_dict``."""
-    found = read_tensors(path, "model_state_dict")
-    indices = re.findall(r"^upsampling_X\.(\d{1,3})\.", "\n".join(found), re.MULTILINE)
-    return max(map(int, indices), default=0) // 3, found  # 3 layers per level, then 2
 
 
 def _from_caffe(path: Path, data: bytes) -> tuple[int, dict[str, Tensor]]:

@@ -12,7 +12,7 @@ import json
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any
 
 import safetensors
 import safetensors.torch
@@ -30,7 +30,6 @@ _NODE = ("file", "files", "packaged", "path", "source")
 FORMAT = "dsr-network-1"
 _KEY, _SHARED = "dsr", "shared"
 _DAMAGED = "expected a safetensors file, got a damaged one"
-_NO_NETWORK = (KeyError, TypeError, ValueError)  # of names and arguments that make none
 _LARGEST_ARGUMENT = 4096  # largest whole number among the arguments of a network in a file of weights
 LINKS: Mapping[str, str] = MappingProxyType(
     {
@@ -114,14 +113,9 @@ def save_network(
 ) -> None:
     """Write a network's weights, not atomically; equal networks and facts give equal bytes.
 
-    Args:
-        path: path of the file.
-        model: name of the model in ``conf/model/``, such as ``msg_v``.
-        facts: further plain values for readers of the file, such as data, steps and scores.
-        half: whether to store the kernels of convolutions in half precision; biases and normalisations are not.
-        links: other files of weights, of the same folder, by keys of ``LINKS``. Tensors that the ``shared`` one has,
-            too, are not written again; the others are for maps of some kind, see :func:`special_weights`.
-
+    ``model`` is its name in ``conf/model``, ``facts`` are further plain values for readers of the file, ``half`` stores
+    the kernels of convolutions in half precision, and ``links`` are other files of weights in the same folder by keys
+    of ``LINKS``: tensors that the ``shared`` one has, too, are not written again.
     """
     header = {
         "format": FORMAT,
@@ -172,17 +166,15 @@ def read_header(path: Path) -> dict[str, Any]:
 def load_network(
     path: Path, networks: Mapping[str, type[DisparityNetwork]], scale: int | None = None, model: str | None = None
 ) -> DisparityNetwork:
-    """Load the network of a dsr weights file, in float32 on the CPU.
-
-    ``networks`` are the classes by name, ``scale`` and ``model`` those that the run requires, None for any.
-    """
+    """Load the network of a dsr weights file on the CPU; it has to be of the scale and model that are given."""
     path = Path(path)
     header = read_header(path)
     if model is not None and header["model"] != model:
         raise ValueError(f"{path}: expected weights of model {model}, got those of {header['model']}")
-    shared = _beside(path, header, _SHARED)
+    shared = linked_weights(path, _SHARED)
     came = f"{header['network']} of {header['arguments']}"
-    with refusing(f"{path}: expected one of the networks {', '.join(networks)}, got {came}", *_NO_NETWORK):
+    message = f"{path}: expected one of the networks {', '.join(networks)}, got {came}"
+    with refusing(message, KeyError, TypeError, ValueError):
         kind, arguments = networks[header["network"]], dict(header["arguments"])
         if scale is not None and kind.serves(arguments["scale"], scale):
             arguments["scale"] = scale
@@ -195,28 +187,24 @@ def load_network(
     return net
 
 
-def special_weights(path: Path, kind: Literal["clean", "soft"]) -> Path | None:
-    """Return the file of weights for maps of a kind, see ``LINKS``, if the file names one beside it."""
-    return _beside(path, read_header(path), kind)
-
-
 def files_of_weights(path: Path) -> list[Path]:
     """Return a file of weights and those beside it that it needs; one that is not dsr's is alone."""
     if not is_dsr_weights(path):
         return [path]
-    header, found = read_header(path), [path]
-    for other in (_beside(path, header, key) for key in LINKS):
+    found: list[Path | None] = [path]
+    for key in LINKS:
+        other = linked_weights(path, key)
         if other is not None:
-            shared = _beside(other, read_header(other), _SHARED)
-            found += [other] if shared is None else [other, shared]
-    return list(dict.fromkeys(found))
+            found += [other, linked_weights(other, _SHARED)]
+    return [file for file in dict.fromkeys(found) if file is not None]
 
 
-def _beside(path: Path, header: Mapping[str, Any], key: str) -> Path | None:
-    """Return the file that a header names, in the folder of ``path``."""
-    if header.get(key) is None:
+def linked_weights(path: Path, key: str) -> Path | None:
+    """Return the file that a file of weights names by a key of ``LINKS``, if any, in its own folder."""
+    name = read_header(path).get(key)
+    if name is None:
         return None
-    other = path.with_name(Path(str(header[key])).name)
+    other = path.with_name(Path(str(name)).name)
     if not other.is_file():
         raise FileNotFoundError(f"{path}: expected {other.name} beside it, {LINKS[key]}; there is none")
     return other

@@ -39,10 +39,10 @@ def packaged_weights(name: str) -> Path | None:
 
 
 def packaged_names() -> list[str]:
-    """Return the names of the weights that come with this installation."""
+    """Return the sorted names of the weights that come with this installation."""
     return sorted(path.stem for path in _HERE.glob("*.safetensors"))
 
 
 def left_out() -> list[str]:
-    """Return the names of the weights that do not."""
+    """Return the sorted names of the weights that this installation lacks."""
     return sorted(known().keys() - set(packaged_names()))

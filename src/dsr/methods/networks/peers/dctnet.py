@@ -11,9 +11,7 @@ the left-hand side the eigenvalues of the Laplacian of four neighbours. Layers h
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
 from types import MappingProxyType
-from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -85,11 +83,11 @@ class DCTNet(PeerNetwork):
     of memory per pixel.
     """
 
-    title: ClassVar[str] = "DCTNet"
-    checksums: ClassVar[Mapping[str, float]] = MappingProxyType(
+    title = "DCTNet"
+    checksums = MappingProxyType(
         {"383745e7223d0b2c": 4, "2526a628d307b79c": 8, "b9a75d3c1404c01d": 16, "87dee6a437887894": 8 / 3}
     )
-    cost: ClassVar[Cost] = Cost(memory=1600, seconds=8)
+    cost = Cost(memory=1600, seconds=8)
 
     def __init__(self, scale: float) -> None:
         super().__init__(scale)

@@ -9,9 +9,7 @@ needed for training only and left out. Layers have the names of the authors' fil
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from types import MappingProxyType
-from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -43,26 +41,20 @@ def deformable_conv3x3(x: Tensor, offsets: Tensor, mask: Tensor, weight: Tensor)
     kernels = weight.flatten(2)  # (B, D, C * 9)
     features = x.contiguous()
     count = max(1, _CHUNK // (batch * channels * 9 * width))
+    taps = torch.arange(-1, 2, device=x.device)
+    down, across = taps.repeat_interleave(3)[:, None, None], taps.repeat(3)[:, None, None]
     results = []
     for top in range(0, height, count):
         rows = slice(top, min(top + count, height))
-        grid = _sampling_grid(offsets[:, :, rows], top, height)  # (B, 9 * rows, W, 2)
+        v = offsets[:, ::2, rows] + (torch.arange(rows.start, rows.stop, device=x.device)[:, None] + down)
+        u = offsets[:, 1::2, rows] + (torch.arange(width, device=x.device) + across)  # (B, 9, rows, W)
+        places = u * (2 / width) + (1 / width - 1), v * (2 / height) + (1 / height - 1)
+        grid = torch.stack(places, dim=-1).flatten(1, 2)  # (B, 9 * rows, W, 2)
         values = functional.grid_sample(features, grid, align_corners=False).view(batch, channels, 9, -1, width)
         values = values * mask[:, None, :, rows]
         result = (kernels @ values.flatten(3).flatten(1, 2)).unflatten(2, (-1, width))  # (B, D, rows, W)
         results.append(result.contiguous(memory_format=torch.channels_last))
     return torch.cat(results, dim=2)
-
-
-def _sampling_grid(offsets: Tensor, top: int, height: int) -> Tensor:
-    """Return the positions that the taps of some rows read, as ``grid_sample`` expects them."""
-    rows, width = offsets.shape[-2:]
-    taps = torch.arange(-1, 2, device=offsets.device)
-    y = torch.arange(top, top + rows, device=offsets.device)[:, None] + taps.repeat_interleave(3)[:, None, None]
-    x = torch.arange(width, device=offsets.device) + taps.repeat(3)[:, None, None]
-    y = (offsets[:, ::2] + y) * (2 / height) + (1 / height - 1)  # (B, 9, rows, W)
-    x = (offsets[:, 1::2] + x) * (2 / width) + (1 / width - 1)
-    return torch.stack((x, y), dim=-1).flatten(1, 2)
 
 
 class EncoderBlock(nn.Module):
@@ -173,11 +165,9 @@ class DORNet(PeerNetwork):
     Averages over the whole image steer it, so there are no tiles: large images need about 2 kB of memory per pixel.
     """
 
-    title: ClassVar[str] = "DORNet-T"
-    checksums: ClassVar[Mapping[str, float]] = MappingProxyType(
-        {"f91a4b6387036348": 4, "6cbd299ec3a589c2": 8, "38bd20f150d138e3": _SENSOR_RATIO}
-    )
-    cost: ClassVar[Cost] = Cost(memory=2000, seconds=10)
+    title = "DORNet-T"
+    checksums = MappingProxyType({"f91a4b6387036348": 4, "6cbd299ec3a589c2": 8, "38bd20f150d138e3": _SENSOR_RATIO})
+    cost = Cost(memory=2000, seconds=10)
 
     def __init__(self, scale: float) -> None:
         super().__init__(scale)

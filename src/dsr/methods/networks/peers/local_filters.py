@@ -11,10 +11,8 @@ it and their weights, from the enlarged map and the photo, and adds the weighted
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from itertools import pairwise
 from types import MappingProxyType
-from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -33,14 +31,12 @@ _WIDTHS = (16, 32, 32, 64, 64, 128, 128)
 
 
 class SVLRM(PeerNetwork):
-    """The network of :mod:`dsr.methods.networks.peers.local_filters`."""
+    """SVLRM with its authors' sizes: twelve layers of 64 features, 0.37 million parameters."""
 
-    title: ClassVar[str] = "SVLRM"
-    checksums: ClassVar[Mapping[str, float]] = MappingProxyType(
-        {"d0b47c00e5a8e074": 4, "a23c7cda0bccb284": 8, "77f6b973783a722d": 16}
-    )
-    receptive_field_radius: ClassVar[int | None] = _DEPTH + 2
-    cost: ClassVar[Cost] = Cost(800, 5)
+    title = "SVLRM"
+    checksums = MappingProxyType({"d0b47c00e5a8e074": 4, "a23c7cda0bccb284": 8, "77f6b973783a722d": 16})
+    receptive_field_radius = _DEPTH + 2
+    cost = Cost(800, 5)
 
     def __init__(self, scale: float) -> None:
         super().__init__(scale)
@@ -78,13 +74,13 @@ def _cubic_interpolation(old: int, new: int, shift: float) -> Tensor:
 
 
 class FDKN(PeerNetwork):
-    """The network of :mod:`dsr.methods.networks.peers.local_filters`."""
+    """FDKN with its authors' sizes: nine positions in a window of 15 x 15 pixels, 0.69 million parameters."""
 
-    title: ClassVar[str] = "FDKN"
-    checksums: ClassVar[Mapping[str, float]] = MappingProxyType({"036ec8f27eec624c": 8})
-    multiple: ClassVar[int] = _FACTOR
-    receptive_field_radius: ClassVar[int | None] = _FACTOR * len(_WIDTHS)
-    cost: ClassVar[Cost] = Cost(420, 1)
+    title = "FDKN"
+    checksums = MappingProxyType({"036ec8f27eec624c": 8})
+    multiple = _FACTOR
+    receptive_field_radius = _FACTOR * len(_WIDTHS)
+    cost = Cost(420, 1)
 
     def __init__(self, scale: float) -> None:
         super().__init__(scale)
@@ -125,10 +121,7 @@ class _Kernel(nn.Module):
 
 
 def _sample(values: Tensor, weights: Tensor, offsets: Tensor) -> Tensor:
-    """Return the weighted sum of a map at nine positions around each pixel.
-
-    Each pixel sees a window of 15 x 15 pixels, interpolated bilinearly; outside of it and of the map, values are 0.
-    """
+    """Return the weighted sum of a map at nine positions within 15 x 15 pixels around each pixel; 0 outside."""
     height, width = values.shape[-2:]
     rows = torch.arange(height, device=values.device, dtype=values.dtype)[:, None]
     columns = torch.arange(width, device=values.device, dtype=values.dtype)

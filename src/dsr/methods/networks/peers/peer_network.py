@@ -1,38 +1,22 @@
-"""The base of the field's published networks, and how their authors' weights are read, from which no code is executed.
-
-Such a network maps a photo and an enlarged map in 0..1 to a refined map in 0..1. Its authors trained it on depth or on
-disparity of one data set, normalised; most of them normalise by the minimum and the maximum of the *true* map, which no
-method can know. :class:`PeerUpsampler` takes those of the low-resolution map, and the true ones only on request, to
-reproduce the authors' figures.
-"""
+"""The base of the field's published networks, and how their weights are read, from which no code is executed."""
 
 from __future__ import annotations
 
 import abc
-import copy
-import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import ClassVar, Literal, get_args
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
-from dsr.geometry.camera import RANGE_TYPES, RangeType, from_range, to_range
-from dsr.methods.base import Abilities, Cost, Method
-from dsr.methods.images import LUMA, compute_min_max, inpaint, normalise, resize_bicubic
-from dsr.methods.networks.network import DTYPES, Precision, blend_tiles, split_image
+from dsr.methods.base import Cost
+from dsr.methods.images import LUMA, resize_bicubic
 from dsr.methods.networks.weight_files import load_parameters
-from dsr.sample import DepthSample
 from dsr.utils import torch_files
-from dsr.utils.guards import expect_one_of
-from dsr.utils.progress import Steps
 
-Range = Literal["measured", "truth"]
 SWAPPED_LUMA = LUMA[::-1]  # weights of red, green and blue, as some authors' code applies the luma's to RGB
 _NORM_PARTS = ("weight", "bias", "running_mean", "running_var")
-_OVERLAP = 16  # of neighbouring tiles in pixels
 
 
 def load_peer(path: Path, network: type[PeerNetwork], scale: float) -> PeerNetwork:
@@ -135,96 +119,3 @@ class ResidualGroup(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Map (B, C, H, W) to the same shape."""
         return self.body(x).add_(x)
-
-
-class PeerUpsampler(Method):
-    """A method that is a published network; it takes maps of any ratio, as the network works at the photo's size.
-
-    Args:
-        net: the network; it is copied.
-        range_type: the range type of the map that the network gets.
-        value_range: the minimum and maximum that map to 0 and 1: ``measured`` for those of the low-resolution map,
-            ``truth`` for those of the true one, which is how the authors get their figures. It is the one case besides
-            the oracle of deep image priors in which a method reads ``sample.depth``; ``flag`` marks its scores. Weights
-            with a ``depth_range`` of their own get orthogonal depth, normalised by it.
-        precision: dtype of the convolutions.
-        device: device of the computations.
-        tile: as of :class:`~dsr.methods.networks.network.NetworkUpsampler`.
-
-    """
-
-    abilities = Abilities(ratios="any", needs="weights")
-
-    def __init__(
-        self,
-        net: PeerNetwork,
-        range_type: RangeType = "disparity",
-        value_range: Range = "measured",
-        precision: Precision = "float32",
-        device: torch.device | str = "cpu",
-        tile: int | None = None,
-    ) -> None:
-        expect_one_of("range_type", range_type, RANGE_TYPES)
-        expect_one_of("range", value_range, get_args(Range))
-        expect_one_of("precision", precision, tuple(DTYPES))
-        if net.depth_range is not None and value_range == "truth":
-            low, high = net.depth_range
-            raise ValueError(
-                f"range: expected measured for weights trained on depth of {low:g} to {high:g} m, got truth"
-            )
-        self.range_type = range_type if net.depth_range is None else "orthogonal"
-        self.device, self._dtype, self._tile = torch.device(device), DTYPES[precision], tile
-        self._uses_truth = value_range == "truth"
-        net = copy.deepcopy(net).eval().requires_grad_(False).to(self.device)
-        self.net: PeerNetwork = net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs
-
-    @property
-    def flag(self) -> str:
-        """Mark for scores: ``true-range`` if the true map's minimum and maximum were used, else empty."""
-        return "true-range" if self._uses_truth else ""
-
-    def describe(self, sample: DepthSample) -> str:
-        """Return a note for the scores where the weights were trained for another factor, else an empty text."""
-        trained = self.net.scale
-        return "" if math.isclose(trained, sample.scale, rel_tol=0.01) else f"weights trained for x{trained:.3g}"
-
-    @torch.inference_mode()
-    def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
-        """Return the high-resolution orthogonal depth, (1, H, W) in metres on the sample's device.
-
-        It is NaN where the disparity corresponds to a depth at or beyond infinity. A ValueError if the truth's range is
-        needed, and there is no truth.
-        """
-        if self.range_type == "disparity":
-            values_lr = sample.disparity_lr()
-        else:
-            values_lr = to_range(sample.depth_lr, sample.camera_lr, self.range_type)
-        min_max = None  # the low-resolution map's own
-        if self.net.depth_range is not None:
-            min_max = torch.tensor(self.net.depth_range).view(1, 2, 1, 1)
-        elif self._uses_truth:
-            if sample.depth is None:
-                raise ValueError(f"{sample.scene}: range=truth expects a scene with a true depth map, there is none")
-            min_max = compute_min_max(to_range(sample.depth, sample.camera, self.range_type)[None])
-        values_lr, rgb = values_lr.to(self.device)[None], sample.rgb.to(self.device)[None]
-        values, minimum, value_range = normalise(inpaint(values_lr), min_max)
-        refined = self._refine(rgb, values, progress).to(values_lr.dtype) * value_range + minimum
-        return from_range(refined[0], sample.camera, self.range_type).to(sample.depth_lr.device)
-
-    def _refine(self, rgb: Tensor, values_lr: Tensor, progress: Steps | None) -> Tensor:
-        """Return a map in 0..1, (B, 1, h, w), enlarged to the photo's size and refined, in tiles if that is large."""
-        multiple, radius = self.net.multiple, self.net.receptive_field_radius
-        height, width = rgb.shape[-2:]
-        padding = (0, -width % multiple, 0, -height % multiple)
-        enlarged = self.net.enlarge(values_lr.float(), (height, width))
-        rgb, enlarged = (functional.pad(each.float(), padding, mode="replicate") for each in (rgb, enlarged))
-        margin = None if radius is None else math.ceil(radius / multiple)
-        size, overlap = (rgb.shape[-2], rgb.shape[-1]), max(_OVERLAP // multiple, 2)
-        rows, columns = split_image(size, multiple, margin, self._tile, overlap)
-
-        def compute(row: slice, column: slice) -> Tensor:
-            down, across = (slice(multiple * each.start, multiple * each.stop) for each in (row, column))
-            with torch.autocast(self.device.type, self._dtype, enabled=self._dtype != torch.float32):
-                return self.net(rgb[..., down, across], enlarged[..., down, across]).float()
-
-        return blend_tiles(compute, rows, columns, multiple, progress)[..., :height, :width]

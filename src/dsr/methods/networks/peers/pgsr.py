@@ -10,9 +10,7 @@ the photo's resolution. Layers have the names of the authors' files. Weights: gi
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from types import MappingProxyType
-from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -34,18 +32,16 @@ _UNUSED = re.compile(r"^(PAI_\d\.(upconv\d|fusion2Depth)|conv_(depth|rgb)_mappin
 
 
 class PGSR(PeerNetwork):
-    """The network of :mod:`dsr.methods.networks.peers.pgsr`.
+    """PGSR with its authors' sizes: 32 features, 0.73 million parameters.
 
     Its attention averages over the whole image, and its offsets are fractions of the image's size, so large images are
     not processed in tiles. Only the last layers, which need most of the memory, are computed in strips.
     """
 
-    title: ClassVar[str] = "PGSR"
-    checksums: ClassVar[Mapping[str, float]] = MappingProxyType(
-        {"4e652c04c6523058": 4, "0774dd5c80ddc29a": 8, "ea327e3050228fb5": 16}
-    )
-    multiple: ClassVar[int] = _FACTOR
-    cost: ClassVar[Cost] = Cost(320, 1.5)
+    title = "PGSR"
+    checksums = MappingProxyType({"4e652c04c6523058": 4, "0774dd5c80ddc29a": 8, "ea327e3050228fb5": 16})
+    multiple = _FACTOR
+    cost = Cost(320, 1.5)
 
     def __init__(self, scale: float) -> None:
         super().__init__(scale)
@@ -104,7 +100,9 @@ class _Interaction(nn.Module):
         """Map (B, 32, h, w) and (B, 32, h, w) to (B, 16, h, w)."""
         confidence, offset = self.conv_offset(depth).float().split((1, 2), dim=1)
         confidence, offset = confidence.sigmoid(), offset.tanh() * _LARGEST_OFFSET
-        places = _pixel_grid(offset)
+        # -1 and 1 at the centres of the border pixels
+        down, across = (torch.linspace(-1, 1, n, dtype=offset.dtype, device=offset.device) for n in offset.shape[-2:])
+        places = torch.stack(torch.meshgrid(across, down, indexing="xy"), dim=-1)[None]  # (1, h, w, 2)
         for _ in range(_STEPS):
             offset = offset + functional.grid_sample(offset, _move(places, offset), align_corners=True)
         planes = _normalise(self.conv_parameterized_depth(photo))
@@ -165,12 +163,6 @@ def _apply(layer: nn.Module, *inputs: Tensor) -> Tensor:
     return functional.leaky_relu_(layer(torch.cat(inputs, dim=1)), _SLOPE)
 
 
-def _pixel_grid(like: Tensor) -> Tensor:
-    """Return the pixels' positions, (1, h, w, 2): across and down, -1 and 1 at the centres of the border pixels."""
-    down, across = (torch.linspace(-1, 1, n, dtype=like.dtype, device=like.device) for n in like.shape[-2:])
-    return torch.stack(torch.meshgrid(across, down, indexing="xy"), dim=-1)[None]
-
-
 def _move(places: Tensor, offset: Tensor) -> Tensor:
     """Return positions, (1, h, w, 2), moved by (B, 2, h, w)."""
     return (places + offset.movedim(1, -1)).clamp(-1, 1)
@@ -185,12 +177,10 @@ def _normalise(planes: Tensor) -> Tensor:
 
 def _evaluate(planes: Tensor) -> Tensor:
     """Return the depth, (B, 1, h, w), of each pixel's plane; at most 1."""
-    across, down = (_plane_coordinates(n, max(planes.shape[-2:]), planes) for n in (planes.shape[-1], planes.shape[-2]))
+    coordinates = []  # nearly constant, as the authors' code has them
+    for size in planes.shape[-2:]:
+        centred = torch.arange(size, dtype=planes.dtype, device=planes.device) - (size - 1) / 2
+        coordinates.append(2 * (centred / (max(planes.shape[-2:]) * max(size - 1, 1)) - 0.5))
+    down, across = coordinates
     p, q, r, s = planes.split(1, dim=1)
     return ((p * across + q * down[:, None] + r) * s).clamp(min=1).reciprocal()
-
-
-def _plane_coordinates(size: int, longest: int, like: Tensor) -> Tensor:
-    """Return the coordinates of pixels along an axis, as the authors' code has them: nearly constant."""
-    centred = torch.arange(size, dtype=like.dtype, device=like.device) - (size - 1) / 2
-    return 2 * (centred / (longest * max(size - 1, 1)) - 0.5)
