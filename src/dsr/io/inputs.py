@@ -16,7 +16,7 @@ from torch import Tensor
 from dsr.geometry.agreement import judge
 from dsr.geometry.camera import ASSUMED_FOV, Camera, Lens, RangeType, undistort
 from dsr.geometry.plausible import expect_possible
-from dsr.geometry.warping import registered_camera, warp_depth
+from dsr.geometry.resampling import registered_camera, warp_depth
 from dsr.io.cameras import (
     camera_only,
     find_camera,

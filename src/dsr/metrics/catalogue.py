@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dsr.metrics import boundaries, calibration, depth, evalmde, functional, points, sensor
+from dsr.metrics import boundaries, calibration, depth, evalmde, functional, sensor
 from dsr.metrics.formats import Metric, MetricFormat, depth_mask, normal_mask
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS, MIN_SIZE, lpips_v
@@ -74,7 +74,7 @@ PROTOCOLS: Mapping[str, tuple[Metric, ...]] = {
     "sensor": sensor.SENSOR,
     "depth": _family("depth", depth.DEPTH),
     "normals": _family("normals", depth.NORMALS),
-    "points": _family("points", points.METRICS),
+    "points": _family("points", depth.POINTS),
     "evalmde": _family("evalmde", evalmde.METRICS),
     "boundaries": _family("boundaries", boundaries.METRICS),
     "calibration": _family("calibration", calibration.METRICS),
