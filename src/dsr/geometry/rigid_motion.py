@@ -80,14 +80,6 @@ def rotation_of_quaternion(quaternion: Sequence[float]) -> Matrix:
     return turn
 
 
-def rotation_of_vector(vector: Sequence[float] | np.ndarray) -> Matrix:
-    """Return the 3 x 3 rotation about a vector (3,) by its length in radians."""
-    from scipy.spatial.transform import Rotation  # noqa: PLC0415
-
-    turn: Matrix = Rotation.from_rotvec(vector).as_matrix()
-    return turn
-
-
 def quaternion_of(rotation: Matrix) -> np.ndarray:
     """Return the unit quaternion (x, y, z, w) with w >= 0 of a 3 x 3 rotation."""
     from scipy.spatial.transform import Rotation  # noqa: PLC0415
