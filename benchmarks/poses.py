@@ -25,9 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from dsr.degradation.noise import Kinect
 from dsr.geometry.camera import Camera
-from dsr.geometry.pose_check import READINGS, compare, find_fault, prepare, sample
-from dsr.geometry.rigid_motion import Matrix, as_rigid, invert
-from dsr.geometry.tsdf import PosedMap
+from dsr.geometry.poses import READINGS, Matrix, PosedMap, as_rigid, compare, find_fault, invert, prepare, sample
 from dsr.synthetic.procedural.random_scene import make_camera, random_scene
 
 _FORWARD_DOWN = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])

@@ -32,8 +32,8 @@ from dsr.data.ddrnet_frames import DDRNetFrames
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.degradation.noise import Kinect, Noise, TimeOfFlight
 from dsr.geometry.camera import Camera
+from dsr.geometry.poses import Matrix, relative
 from dsr.geometry.resampling import warp_depth
-from dsr.geometry.rigid_motion import Matrix, relative
 from dsr.geometry.surface import depth_to_normals
 from dsr.geometry.surface import render as render_lights
 from dsr.inference import upsample_surface

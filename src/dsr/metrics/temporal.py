@@ -20,8 +20,8 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
+from dsr.geometry.poses import as_rigid, relative
 from dsr.geometry.resampling import source_pixels, warp_depth
-from dsr.geometry.rigid_motion import as_rigid, relative
 from dsr.geometry.surface import angle_between, depth_to_normals, length
 from dsr.metrics.functional import masked_mean, masked_median
 from dsr.utils.compute_device import in_own_precision
