@@ -168,20 +168,9 @@ class SurfacePair:
         return first.clamp(0, 1), second.clamp(0, 1)
 
     @cached_property
-    def rendering_error(self) -> Tensor:
-        """(B, 4, H, W) absolute difference of the renderings; 0 where invalid."""
-        first, second = self.renderings
-        return (first - second).abs()
-
-    @cached_property
-    def ray_lengths(self) -> Tensor:
-        """(B or 1, 1, H, W): the perspective depth of a point with orthogonal depth 1."""
-        return length(self.rays)
-
-    @cached_property
     def perspective_error(self) -> Tensor:
         """(B, 1, H, W) absolute difference of the perspective depths in metres; 0 where invalid."""
-        return (self.prediction - self.target).abs() * self.ray_lengths
+        return (self.prediction - self.target).abs() * length(self.rays)
 
     @cached_property
     def ssim_mask(self) -> Tensor:
@@ -208,7 +197,7 @@ def bad_pix_d(pair: SurfacePair, threshold: float, *, relative: bool = False) ->
 
     The threshold is in metres, or a fraction of the target if ``relative``.
     """
-    limit = pair.target * pair.ray_lengths * threshold if relative else threshold
+    limit = pair.target * length(pair.rays) * threshold if relative else threshold
     return masked_mean(pair.perspective_error > limit, pair.depth_mask).squeeze(1)
 
 
@@ -234,7 +223,8 @@ def rmse_v1(pair: SurfacePair) -> Tensor:
 
 def bad_pix_v(pair: SurfacePair, threshold: float) -> Tensor:
     """Return the fraction of pixels whose renderings differ by more than ``threshold`` / 255, per light, (B, 4)."""
-    return masked_mean(pair.rendering_error > threshold / 255, pair.normal_mask)
+    first, second = pair.renderings
+    return masked_mean((first - second).abs() > threshold / 255, pair.normal_mask)
 
 
 def dssim_v(pair: SurfacePair, mask: Tensor | None = None) -> Tensor:
