@@ -176,14 +176,6 @@ _ALIKE = 0.7  # share of the pixels in which frames that look alike agree withou
 _STILL = 1.2  # times as many pixels have to disagree under the poses as without any motion
 
 
-class Agreement(NamedTuple):
-    """How far pairs of frames agree under each of :data:`READINGS` and, last, without motion, (pairs, readings + 1)."""
-
-    overlap: np.ndarray  # share of a frame's points that lie in the other's view
-    agreed: np.ndarray  # share of these whose depths agree
-    moved: np.ndarray  # distance of the two places as given, over the median depth, (pairs,)
-
-
 def sample(count: int) -> list[tuple[int, ...]]:
     """Return which frames of a sequence to compare with each other, as groups of their places."""
     last = max(count - 1, 0)
@@ -197,20 +189,10 @@ def check_poses(count: int, load: Callable[[int], PosedMap | None]) -> Assumptio
 
     ``load`` returns the frame of a number; None for one that cannot be read, or has no pose.
     """
-    groups = ([prepare(each) for number in group if (each := load(number)) is not None] for group in sample(count))
-    return find_fault(compare(groups))
+    return find_fault(filter(None, map(load, group)) for group in sample(count))
 
 
-def compare(groups: Iterable[Sequence[Reduced]]) -> Agreement:
-    """Return how far the frames of each group agree with each other; see :func:`prepare`."""
-    pairs = [pair for group in groups for pair in itertools.combinations(group, 2)]
-    shares = np.reshape([_compare(*pair) for pair in pairs], (len(pairs), 2, len(READINGS) + 1))
-    with np.errstate(over="ignore", invalid="ignore"):
-        moved = [np.linalg.norm(one.poses[0, :3, 3] - other.poses[0, :3, 3]) / one.middle for one, other in pairs]
-    return Agreement(shares[:, 0], shares[:, 1], np.array(moved))
-
-
-class Reduced(NamedTuple):
+class _Reduced(NamedTuple):
     """A reduced map, its camera, some points with their median depth, and the poses by all readings."""
 
     depth: np.ndarray
@@ -220,7 +202,7 @@ class Reduced(NamedTuple):
     poses: np.ndarray  # (readings + 1, 4, 4)
 
 
-def prepare(each: PosedMap) -> Reduced:
+def _prepare(each: PosedMap) -> _Reduced:
     """Return a frame to compare."""
     step = min(-(-each.camera.width // _WIDEST), each.camera.height)
     camera = each.camera.decimate(step, step // 2)
@@ -232,10 +214,10 @@ def prepare(each: PosedMap) -> Reduced:
     middle = float(np.median(points[2])) if points.size else np.nan
     with np.errstate(over="ignore", invalid="ignore"):  # of numbers that no pose has
         poses = np.stack([*(_read(each.pose, *reading) for reading in READINGS.values()), np.eye(4)])
-    return Reduced(depth, camera, points, middle, poses)
+    return _Reduced(depth, camera, points, middle, poses)
 
 
-def _compare(frame: Reduced, other: Reduced) -> tuple[np.ndarray, np.ndarray]:
+def _compare(frame: _Reduced, other: _Reduced) -> tuple[np.ndarray, np.ndarray]:
     """Return overlap and agreement of another frame's points with a frame, (readings + 1,) each."""
     camera, back = frame.camera, frame.poses[:, :3, :3].transpose(0, 2, 1)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -250,12 +232,17 @@ def _compare(frame: Reduced, other: Reduced) -> tuple[np.ndarray, np.ndarray]:
     return count / max(z.shape[1], 1), agreeing.sum(1) / np.maximum(count, 1)
 
 
-def find_fault(agreement: Agreement) -> Assumption | None:
-    """Return a warning where frames disagree under the poses as given; None where they agree, or show too little.
+def find_fault(groups: Iterable[Iterable[PosedMap]]) -> Assumption | None:
+    """Return a warning where frames of a group disagree under the poses as given.
 
-    A pair of frames counts as much as they disagree without motion.
+    None where they agree, or show too little. A pair of frames counts as much as they disagree without motion.
     """
-    seen, agreed = agreement.overlap >= _OVERLAP, agreement.agreed
+    pairs = [pair for group in groups for pair in itertools.combinations(map(_prepare, group), 2)]
+    # (pairs, readings + 1) each: under all readings and, last, without motion
+    overlap, agreed = np.reshape([_compare(*pair) for pair in pairs], (len(pairs), 2, len(READINGS) + 1)).swapaxes(0, 1)
+    with np.errstate(over="ignore", invalid="ignore"):  # distances of the two places as given, over the median depth
+        moved = [np.linalg.norm(one.poses[0, :3, 3] - other.poses[0, :3, 3]) / one.middle for one, other in pairs]
+    seen = overlap >= _OVERLAP
     without = agreed[:, -1:]
     given = np.where(seen[:, :1], agreed[:, :1], without)
     weight = seen * (1 - without)  # (pairs, readings + 1)
@@ -275,9 +262,8 @@ def find_fault(agreement: Agreement) -> Assumption | None:
             "poses",
             round(float(gain[best]), 3),
         )
-    alike = agreement.moved.size > 0 and float(np.median(without)) >= _ALIKE
-    if alike and agreement.moved.min() >= LIMITS["poses-far"]:
-        nearest = float(agreement.moved.min())
+    nearest = float(np.min(moved, initial=np.inf))
+    if pairs and float(np.median(without)) >= _ALIKE and nearest >= LIMITS["poses-far"]:
         return Assumption(
             "under the poses the camera is far away in the next frame, which looks similar: are they in millimetres?",
             f"{nearest:.3g} times as far as what it sees; {float(np.median(without)):.0%} of the pixels are unchanged",
