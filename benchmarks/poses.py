@@ -25,9 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from dsr.degradation.noise import Kinect
 from dsr.geometry.camera import Camera
-from dsr.geometry.pose_check import READINGS, compare, find_fault, prepare, sample
-from dsr.geometry.rigid_motion import Matrix, as_rigid, invert
-from dsr.geometry.tsdf import PosedMap
+from dsr.geometry.poses import READINGS, Matrix, PosedMap, as_rigid, find_fault, invert, sample
 from dsr.synthetic.procedural.random_scene import make_camera, random_scene
 
 _FORWARD_DOWN = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
@@ -188,10 +186,8 @@ def outcome(recording: Recording, groups: Sequence[Sequence[int]], maps: dict[in
     """Return what is said of poses that are wrong in a way."""
     change = WRONG[wrong]
     found = find_fault(
-        compare(
-            [prepare(PosedMap(maps[number], recording.camera, change(recording.poses[number]))) for number in group]
-            for group in groups
-        )
+        [PosedMap(maps[number], recording.camera, change(recording.poses[number])) for number in group]
+        for group in groups
     )
     if found is None:
         return "silent"

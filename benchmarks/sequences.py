@@ -32,10 +32,10 @@ from dsr.data.ddrnet_frames import DDRNetFrames
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.degradation.noise import Kinect, Noise, TimeOfFlight
 from dsr.geometry.camera import Camera
-from dsr.geometry.rigid_motion import Matrix, relative
+from dsr.geometry.poses import Matrix, relative
+from dsr.geometry.resampling import warp_depth
 from dsr.geometry.surface import depth_to_normals
 from dsr.geometry.surface import render as render_lights
-from dsr.geometry.warping import warp_depth
 from dsr.inference import upsample_surface
 from dsr.inference.sequences import View, fuse_views
 from dsr.methods.base import Surface

@@ -40,9 +40,8 @@ from dsr.geometry.camera import from_range, to_range
 from dsr.geometry.hole_size import distance_to_known, wide_holes
 from dsr.geometry.mesh import triangulate
 from dsr.geometry.registration import find_displacement, find_edges, undo
-from dsr.geometry.resampling import pad_inverse_depth, resize_inverse_depth
+from dsr.geometry.resampling import pad_inverse_depth, resize_inverse_depth, warp_depth
 from dsr.geometry.surface import depth_to_normals, render, render_for_viewing
-from dsr.geometry.warping import warp_depth
 from dsr.inference.any_ratio import upsample_surface
 from dsr.inference.plausibility import find_outliers, within_measured
 from dsr.inference.sequences import View, fuse_views

@@ -14,7 +14,7 @@ import yaml
 
 from dsr.data.detection import find_scenes
 from dsr.geometry.camera import Camera
-from dsr.geometry.rigid_motion import Matrix
+from dsr.geometry.poses import Matrix
 from dsr.io.depth_files import read_depth_file
 from dsr.sample import Scene
 from dsr.synthetic.procedural.random_scene import RandomScene, make_camera, random_scene, render

@@ -11,8 +11,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from dsr.cli import main
-from dsr.geometry.camera import Camera
-from dsr.geometry.lens import Lens
+from dsr.geometry.camera import Camera, Lens
 from dsr.io.captures.colmap import add_model, model_file
 from dsr.io.inputs import read_picture
 from dsr.io.layouts import find_pairs_of_folder

@@ -192,7 +192,6 @@ def test_meshes_are_cut_at_steps(tmp_path):
     depth = wall()
     depth[0, :, 12:] = 3
     assert write_mesh(tmp_path / "m.ply", photo(), depth, CAMERA).after == 2 * 17 * 22
-    assert write_mesh(tmp_path / "m.ply", photo(), depth, CAMERA, largest_step=0.6).after == 2 * 17 * 23
 
 
 def test_map_without_two_neighbours_is_refused_and_an_older_file_is_kept(tmp_path):

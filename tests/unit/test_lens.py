@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from dsr.geometry.camera import Camera
-from dsr.geometry.lens import Lens, undistort
+from dsr.geometry.camera import Camera, Lens, undistort
 from dsr.io.frames import CaptureFrame, Geometry, Rig
 from dsr.io.inputs import read_picture
 from dsr.io.pairs import Pair

@@ -59,8 +59,8 @@ def test_wall_mesh_has_two_triangles_per_square_and_the_area_of_the_wall():
 
 
 def test_vertices_are_the_back_projected_pixels():
-    depth = wall() + 0.01 * torch.arange(1200).view(1, 30, 40)
-    mesh = triangulate(depth, CAMERA, largest_step=9)
+    depth = wall() + 2e-4 * torch.arange(1200).view(1, 30, 40)
+    mesh = triangulate(depth, CAMERA)
     points = (CAMERA.rays() * depth).flatten(1).T.numpy()
     np.testing.assert_allclose(mesh.vertices, points[mesh.pixels], rtol=1e-6)
 
@@ -69,7 +69,7 @@ def test_vertices_are_the_back_projected_pixels():
 def test_faces_and_vertex_normals_face_the_camera(seed):
     depth = 2 + 0.02 * torch.rand(1, 30, 40, generator=torch.Generator().manual_seed(seed))
     depth[0, 5:8, 5:8] = torch.nan
-    mesh = triangulate(depth, CAMERA, largest_step=0.5)
+    mesh = triangulate(depth, CAMERA)
     normals, centres = face_normals(mesh)
     assert ((normals * centres).sum(axis=1) < 0).all()
     assert ((vertex_normals(mesh) * mesh.vertices).sum(axis=1) < 0).all()
@@ -160,10 +160,10 @@ def test_three_valid_pixels_of_a_square_make_a_triangle():
 
 
 def test_diagonal_follows_the_smaller_change_of_depth():
-    depth = torch.tensor([[[2.0, 2.5], [2.2, 2.0]]])
-    mesh = triangulate(depth, Camera(2, 2, 5, 5, 0.5, 0.5), largest_step=9)
+    depth = torch.tensor([[[2.0, 2.03], [2.01, 2.0]]])
+    mesh = triangulate(depth, Camera(2, 2, 5, 5, 0.5, 0.5))
     assert all({0, 3} <= set(face) for face in mesh.faces.tolist())
-    mesh = triangulate(depth.flip(-1), Camera(2, 2, 5, 5, 0.5, 0.5), largest_step=9)
+    mesh = triangulate(depth.flip(-1), Camera(2, 2, 5, 5, 0.5, 0.5))
     assert all({1, 2} <= set(face) for face in mesh.faces.tolist())
 
 
@@ -176,11 +176,11 @@ def test_stride_takes_every_which_row_and_column(stride):
 
 
 def test_strips_of_rows_and_triangles_leave_no_seam(monkeypatch):
-    depth = wall() + torch.rand(1, 30, 40, generator=torch.Generator().manual_seed(0))
-    whole = triangulate(depth, CAMERA, largest_step=0.2)
+    depth = wall() + 0.1 * torch.rand(1, 30, 40, generator=torch.Generator().manual_seed(0))
+    whole = triangulate(depth, CAMERA)
     normals = vertex_normals(whole)
     monkeypatch.setattr(mesh_module, "_STRIP", 70)
-    strips = triangulate(depth, CAMERA, largest_step=0.2)
+    strips = triangulate(depth, CAMERA)
     np.testing.assert_array_equal(strips.faces, whole.faces)
     np.testing.assert_allclose(vertex_normals(strips), normals, atol=1e-6)
 
@@ -308,7 +308,7 @@ def test_simplify_keeps_the_surface_and_its_outline():
 
 @pytest.mark.parametrize(("most", "stride"), [(1200, 2), (TRIANGLES - 1, 2), (300, 3), (100, 5)])
 def test_thin_takes_the_smallest_stride(most, stride):
-    mesh, found = thin(wavy(), SMALL, most, 0.5)
+    mesh, found = thin(1.6 + wavy() / 5, SMALL, most)  # without steps
     assert found == stride
     rows, columns = len(range(0, 30, stride)), len(range(0, 40, stride))
     assert len(mesh.faces) == 2 * (rows - 1) * (columns - 1) <= most

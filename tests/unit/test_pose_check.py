@@ -8,9 +8,7 @@ from scipy.spatial.transform import Rotation
 from small_frames import room, walk
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.pose_check import check, sample
-from dsr.geometry.rigid_motion import Matrix, invert
-from dsr.geometry.tsdf import PosedMap
+from dsr.geometry.poses import Matrix, PosedMap, check_poses, invert, sample
 from dsr.notes import Assumption
 
 CAMERA = Camera.centred(64, 48, 52.0)
@@ -62,7 +60,7 @@ def checked(
         draws = np.random.default_rng(number).standard_normal((CAMERA.height, CAMERA.width))
         return PosedMap(depth(CAMERA, poses[number]) * (1 + 0.005 * draws), CAMERA, change(poses[number]))
 
-    return check(len(poses), load)
+    return check_poses(len(poses), load)
 
 
 def wall(camera: Camera, pose: Matrix) -> np.ndarray:
@@ -118,8 +116,8 @@ def test_poses_that_no_reading_explains_disagree() -> None:
 
 def test_frames_that_cannot_be_read_are_left_out() -> None:
     poses = walk(8)
-    assert check(8, lambda number: None) is None
-    some = check(8, lambda n: None if n == 1 else PosedMap(room(CAMERA, poses[n]), CAMERA, invert(poses[n])))
+    assert check_poses(8, lambda number: None) is None
+    some = check_poses(8, lambda n: None if n == 1 else PosedMap(room(CAMERA, poses[n]), CAMERA, invert(poses[n])))
     assert some is not None
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.rigid_motion import as_rigid
+from dsr.geometry.poses import as_rigid
 from dsr.inference.sequences import View, fuse_views
 from dsr.synthetic.raycast import rotation
 

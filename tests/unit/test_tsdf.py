@@ -5,7 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.tsdf import PosedMap, fuse_maps
+from dsr.geometry.poses import PosedMap
+from dsr.geometry.tsdf import fuse_maps
 
 CAMERA = Camera.centred(96, 80, 110.0)
 CENTRE, RADIUS = np.array([0.1, -0.2, 2.0]), 0.5

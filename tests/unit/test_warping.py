@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.rigid_motion import as_rigid, from_quaternion, invert, relative
-from dsr.geometry.warping import registered_camera, source_pixels, warp_depth
+from dsr.geometry.poses import as_rigid, from_quaternion, invert, relative
+from dsr.geometry.resampling import registered_camera, source_pixels, warp_depth
 from dsr.synthetic.raycast import rotation
 
 SENSOR = Camera(96, 72, 90.0, 88.0, 46.0, 36.5)

@@ -16,9 +16,8 @@ from dsr.app.requests import FuseRequest
 from dsr.app.upsample.outputs import INFO
 from dsr.app.upsample.parts import ERRORS
 from dsr.app.upsample.stored import read_camera, read_depth, read_errors, read_info, read_up
-from dsr.geometry.pose_check import check
-from dsr.geometry.rigid_motion import as_rigid
-from dsr.geometry.tsdf import PosedMap, fuse_maps, suggest_voxel
+from dsr.geometry.poses import PosedMap, as_rigid, check_poses
+from dsr.geometry.tsdf import fuse_maps, suggest_voxel
 from dsr.io.exports import INPUT, read_input, world_comment, write_ply
 from dsr.io.images import read_pixels
 from dsr.io.scene_files import RGBD
@@ -165,7 +164,7 @@ def _faults(frames: Sequence[Path], max_error: float) -> list[Assumption]:
         recordings.setdefault(frame.parent, []).append(frame)
 
     def fault(recording: Sequence[Path]) -> Assumption | None:
-        return check(len(recording), lambda number: _load(recording[number], max_error))
+        return check_poses(len(recording), lambda number: _load(recording[number], max_error))
 
     return list(dict.fromkeys(each for each in map(fault, recordings.values()) if each is not None))
 

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from dsr.cli.parser import Parser
 from dsr.data.download.collections import CATALOGUE
-from dsr.geometry.lights import LIGHT_NAMES
+from dsr.geometry import LIGHT_NAMES
 from dsr.utils.configuration import config_directories, list_choices, list_groups
 from dsr.utils.options import Options, one_of, option
 

@@ -30,8 +30,7 @@ import torch
 from dsr.data.frame_files import find_beside, in_natural_order, read_frame
 from dsr.data.preparation import Preparation, PreparedDataset, list_frames, make_records
 from dsr.data.scene_source import SceneSelection
-from dsr.geometry.camera import Camera
-from dsr.geometry.lens import Lens
+from dsr.geometry.camera import Camera, Lens
 from dsr.sample import Scene
 
 

@@ -18,7 +18,9 @@ def distance_to_known(known: Tensor) -> Tensor:
     """Return each pixel's distance to the nearest known one in pixels, (1, h, w); 0 there, infinite without any."""
     if not bool(known.any()):
         return torch.full(known.shape, math.inf, device=known.device)
-    return _distance(~known)
+    unknown = (~known)[0].cpu().numpy().astype(np.uint8)
+    found = cv2.distanceTransform(unknown, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return torch.from_numpy(found)[None].to(known.device)
 
 
 def degrees_per_pixel(focal: float) -> float:
@@ -34,9 +36,7 @@ def wide_holes(known: Tensor, width: float) -> Tensor:
     """
     radius = max(width / 2, _NARROW)
     core = distance_to_known(known) - 0.5 > radius  # from the known pixel's edge
-    if not bool(core.any()):
-        return torch.zeros_like(known)
-    return ~known & (_distance(~core) <= radius + 0.5)
+    return ~known & (distance_to_known(core) <= radius + 0.5)
 
 
 def is_scattered(known: Tensor) -> bool:
@@ -57,9 +57,3 @@ def window_maxima(values: Tensor, reach: int) -> Tensor:
             result = torch.maximum(result.narrow(dim, 0, rest), result.narrow(dim, shift, rest))
             size += shift
     return result
-
-
-def _distance(mask: Tensor) -> Tensor:
-    """Return the distance to the nearest pixel outside of a mask, (1, h, w), some of which there must be."""
-    found = cv2.distanceTransform(mask[0].cpu().numpy().astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return torch.from_numpy(found)[None].to(mask.device)

@@ -21,9 +21,9 @@ from torch import Tensor
 
 from dsr.geometry.camera import Camera
 
-LARGEST_STEP = 0.02  # maximum relative deviation of a neighbour's depth from the slope of the surface
+LARGEST_STEP = 0.02  # relative change of a neighbour's depth, beyond what the slopes on both sides predict, that is cut
 _HALF_WIDTHS = (1, 2, 3)  # half widths of the windows in pixels
-_OWN_FRACTION = 0.25  # fraction of largest_step by which a pair within a wider window must itself change to be cut
+_OWN_FRACTION = 0.25  # fraction of LARGEST_STEP by which a pair within a wider window must itself change to be cut
 _LEVELS = 6  # the largest triangles have two sides of 2 to this power pixels
 _STRIP = 1 << 21  # pixels whose steps are found, and triangles whose normals are summed, at a time
 
@@ -45,7 +45,6 @@ def triangulate(
     depth: Tensor,
     camera: Camera,
     *,
-    largest_step: float = LARGEST_STEP,
     stride: int = 1,
     isolated: bool = False,
     tolerance: Tensor | None = None,
@@ -55,20 +54,17 @@ def triangulate(
     The diagonal of a square is the one with the smaller change of depth. A square with one missing pixel gives one
     triangle. Memory: about 110 bytes per pixel, and 80 bytes for :func:`vertex_normals`.
 
-    Depth is (1, H, W) in metres, NaN in holes. A pair is cut from the relative change ``largest_step`` on, beyond what
-    the slopes on both sides predict. ``isolated`` keeps vertices without a triangle. ``tolerance``, (1, H, W), is the
-    largest deviation of most pixels from the mesh in metres (a few deviate by about twice as much), so that flat parts
-    get large triangles; None for a mesh of all pixels.
+    Depth is (1, H, W) in metres, NaN in holes. ``isolated`` keeps vertices without a triangle. ``tolerance``,
+    (1, H, W), is the largest deviation of most pixels from the mesh in metres (a few deviate by about twice as much),
+    so that flat parts get large triangles; None for a mesh of all pixels.
     """
     if tuple(depth.shape) != (1, camera.height, camera.width):
         raise ValueError(f"depth: expected shape {(1, camera.height, camera.width)}, got {tuple(depth.shape)}")
-    if not largest_step > 0 or stride < 1:
-        raise ValueError(f"mesh: expected a positive step and stride, got {largest_step} and {stride}")
     strided = depth[0, ::stride, ::stride].detach().cpu().double().numpy()
     allowed = None
     if tolerance is not None:
         allowed = tolerance[0, ::stride, ::stride].detach().cpu().double().numpy() / strided**2
-    faces, dense = _faces(1 / strided, largest_step, allowed)
+    faces, dense = _faces(1 / strided, allowed)
     kept = np.isfinite(strided).ravel() if isolated else np.zeros(strided.size, bool)
     kept[faces.ravel()] = True
     vertex_of = np.cumsum(kept, dtype=np.int32) - 1
@@ -96,10 +92,10 @@ def vertex_normals(mesh: Mesh) -> np.ndarray:
     return np.where(lengths > 0, total / np.where(lengths > 0, lengths, 1), towards).astype(np.float32)
 
 
-def _faces(inverse: np.ndarray, largest_step: float, allowed: np.ndarray | None) -> tuple[np.ndarray, int]:
+def _faces(inverse: np.ndarray, allowed: np.ndarray | None) -> tuple[np.ndarray, int]:
     """Return the triangles of a map of inverse depth, (H, W), as (M, 3) indices, and how many there are of all."""
     height, width = inverse.shape
-    across, down = find_connections(inverse, largest_step)
+    across, down = find_connections(inverse)
     top, bottom, left, right = across[:-1], across[1:], down[:, :-1], down[:, 1:]
     falling = np.abs(inverse[:-1, :-1] - inverse[1:, 1:])  # from the upper left pixel to the lower right one
     rising = np.abs(inverse[1:, :-1] - inverse[:-1, 1:])
@@ -203,15 +199,15 @@ def _leaves(needed: np.ndarray, rows: int, columns: int) -> tuple[np.ndarray, np
     return np.concatenate(done, axis=1).T, corners.T
 
 
-def find_connections(inverse: np.ndarray, largest_step: float = LARGEST_STEP) -> tuple[np.ndarray, np.ndarray]:
+def find_connections(inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return which neighbouring pixels of inverse depth, (H, W) in 1/m, lie on one surface, those that a mesh joins.
 
     These are whether each pixel and its right neighbour do, (H, W - 1) bool, and each pixel and the one below.
     """
-    return _connected(inverse, largest_step), _connected(inverse.T, largest_step).T
+    return _connected(inverse), _connected(inverse.T).T
 
 
-def _connected(inverse: np.ndarray, largest_step: float) -> np.ndarray:
+def _connected(inverse: np.ndarray) -> np.ndarray:
     """Return whether each pixel and its right neighbour lie on one surface, (H, W - 1) bool; False beside holes."""
     width, widest = inverse.shape[1], 2 * max(_HALF_WIDTHS)
     rows, found = max(1, _STRIP // width), []
@@ -219,7 +215,7 @@ def _connected(inverse: np.ndarray, largest_step: float) -> np.ndarray:
         strip = inverse[start : start + rows]
         padded = np.pad(strip, ((0, 0), (widest, widest)), constant_values=np.nan)
         change = np.diff(strip, axis=1)
-        scale = largest_step * np.minimum(strip[:, :-1], strip[:, 1:])
+        scale = LARGEST_STEP * np.minimum(strip[:, :-1], strip[:, 1:])
         step = np.zeros(change.shape, dtype=bool)
         for half_width in _HALF_WIDTHS:
             far, near, beyond, before = (
@@ -253,10 +249,10 @@ def simplify(mesh: Mesh, most: int, camera: Camera) -> Mesh:
     return Mesh(vertices, place_of[faces], places[:, 1] * camera.width + places[:, 0])
 
 
-def thin(depth: Tensor, camera: Camera, most: int, largest_step: float) -> tuple[Mesh, int]:
+def thin(depth: Tensor, camera: Camera, most: int) -> tuple[Mesh, int]:
     """Return a mesh of at most ``most`` triangles, of every second, third, ... row and column, and that stride."""
     stride = max(2, math.isqrt(2 * int(depth.isfinite().sum()) // most))
-    while len((mesh := triangulate(depth, camera, largest_step=largest_step, stride=stride)).faces) > most:
+    while len((mesh := triangulate(depth, camera, stride=stride)).faces) > most:
         stride += 1
     return mesh, stride
 

@@ -32,7 +32,8 @@ def judge_camera(camera: Camera, size_lr: tuple[int, int] | None = None) -> list
     ``size_lr`` is the (height, width) of a depth map that another camera may have taken.
     """
     found = []
-    view, (low, high) = view_of(camera), _USUAL_VIEW
+    view, offset, (low, high) = view_of(camera), offset_of(camera), _USUAL_VIEW
+    ratio = max(camera.fx, camera.fy) / min(camera.fx, camera.fy)
     if not low <= view <= high:
         text = f"fx {camera.fx:.4g} px gives a horizontal field of view of {view:.3g} degrees"
         remark = ("hardly any camera has this field of view", f"{text}; {low:g} to {high:g} are usual")
@@ -42,12 +43,12 @@ def judge_camera(camera: Camera, size_lr: tuple[int, int] | None = None) -> list
             degrees = f"60 degrees correspond to {0.866 * camera.width:.0f} px"
             advice = f"give fx and fy in pixels of this image, not in mm; {degrees}"
             found.append(Remark("warning", *remark, advice, "view-narrow" if view < low else "view-wide", view))
-    other = _other_picture(camera, size_lr)
-    if other is not None:
-        return [*found, Remark("problem", *other, "other-picture", offset_of(camera))]
-    offset, ratio = offset_of(camera), _ratio(camera)
+    if offset > LIMITS["other-picture"] or ratio > LIMITS["focal-ratio"]:
+        other = _other_picture(camera, size_lr)
+        if other is not None:
+            return [*found, Remark("problem", *other, "other-picture", offset)]
     if offset > LIMITS["other-picture"]:
-        right, below = _from_middle(camera.cx, camera.cy, camera.width, camera.height)
+        right, below = (camera.cx + 0.5) / camera.width - 0.5, (camera.cy + 0.5) / camera.height - 0.5
         message = (
             f"principal point ({camera.cx:.4g}, {camera.cy:.4g}) px is {abs(right):.0%} of the width "
             f"{'right' if right > 0 else 'left'} of the centre and {abs(below):.0%} of the height "
@@ -99,28 +100,16 @@ def view_of(camera: Camera) -> float:
 
 def offset_of(camera: Camera) -> float:
     """Return how far the principal point is off the centre, as a fraction of the width or height, the larger one."""
-    return max(map(abs, _from_middle(camera.cx, camera.cy, camera.width, camera.height)))
+    return max(abs((camera.cx + 0.5) / camera.width - 0.5), abs((camera.cy + 0.5) / camera.height - 0.5))
 
 
 def may_be_of(cx: float, cy: float, width: int, height: int) -> bool:
     """Return whether a principal point may be that of a picture of this size."""
-    return max(map(abs, _from_middle(cx, cy, width, height))) <= LIMITS["off-centre"]
-
-
-def _from_middle(cx: float, cy: float, width: int, height: int) -> tuple[float, float]:
-    """Return the offset of a pixel from the middle, as fractions of the width and height."""
-    return (cx + 0.5) / width - 0.5, (cy + 0.5) / height - 0.5
-
-
-def _ratio(camera: Camera) -> float:
-    """Return the ratio of the focal lengths, at least 1."""
-    return max(camera.fx, camera.fy) / min(camera.fx, camera.fy)
+    return max(abs((cx + 0.5) / width - 0.5), abs((cy + 0.5) / height - 0.5)) <= LIMITS["off-centre"]
 
 
 def _other_picture(camera: Camera, size_lr: tuple[int, int] | None) -> tuple[str, str, str] | None:
     """Return kind, message and advice if the numbers fit better in another order, or to an image of another size."""
-    if offset_of(camera) <= LIMITS["other-picture"] and _ratio(camera) <= LIMITS["focal-ratio"]:
-        return None
     text = f"fx {camera.fx:.4g}, fy {camera.fy:.4g}, cx {camera.cx:.4g}, cy {camera.cy:.4g} px"
     order = _better_order(camera)
     if order is not None:
@@ -136,7 +125,7 @@ def _other_picture(camera: Camera, size_lr: tuple[int, int] | None) -> tuple[str
             of_map, of_photo = f"{width} x {height}", f"{camera.width} x {camera.height}"
             message = f"{text} fit the depth map of {of_map}, not the photo of {of_photo}"
             return kind, message, "give the intrinsics of the photo's camera, in pixels of the photo"
-    for scale in (*_SCALES, *(1 / scale for scale in _SCALES)):
+    for scale in (*_SCALES, *(1 / each for each in _SCALES)):
         if abs(across / scale - 1) < _FITTING and abs(down / scale - 1) < _FITTING:
             size = f"{camera.height * scale:.0f} x {camera.width * scale:.0f}"
             message = f"{text} fit an image {scale:.3g} times as large ({size})"
@@ -146,16 +135,15 @@ def _other_picture(camera: Camera, size_lr: tuple[int, int] | None) -> tuple[str
 
 def _better_order(camera: Camera) -> list[tuple[str, str]] | None:
     """Return the numbers to exchange for a good fit, as (name, name under which its number is given), or None."""
-    values = [getattr(camera, name) for name in _NUMBERS]
     best = None
-    for order in itertools.permutations(range(4)):
-        fx, fy, cx, cy = (values[index] for index in order)
+    for order in itertools.permutations(_NUMBERS):
+        fx, fy, cx, cy = (getattr(camera, name) for name in order)
         if min(fx, fy) <= 0:
             continue
         other = Camera(camera.width, camera.height, fx, fy, cx, cy)
         usual = _USUAL_VIEW[0] <= view_of(other) <= _USUAL_VIEW[1]
-        moved = [(_NUMBERS[place], _NUMBERS[index]) for place, index in enumerate(order) if place != index]
-        fits = offset_of(other) < _FITTING and _ratio(other) < 1.03 and usual
+        moved = [(name, given) for name, given in zip(_NUMBERS, order, strict=True) if name != given]
+        fits = offset_of(other) < _FITTING and max(fx, fy) / min(fx, fy) < 1.03 and usual
         if fits and (best is None or len(moved) < len(best)):
             best = moved
     return best

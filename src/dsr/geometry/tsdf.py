@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.measure import marching_cubes
 
-from dsr.geometry.camera import Camera
-from dsr.geometry.rigid_motion import Matrix, invert
+from dsr.geometry.poses import PosedMap, invert
 
 # largest change of the distance within a cell, in units of the truncation; at a surface it is at most 0.43
 _STEEPEST = 0.9
@@ -27,15 +26,6 @@ MOST_BLOCKS = 120_000  # blocks that are stored, 8 KiB each
 # largest extent of the surfaces in blocks of one layer, 2.3 KiB each, whether they are stored or not
 _LARGEST_LAYER = 65_536
 _AT_ONCE = 2048  # blocks that are updated at a time
-
-
-class PosedMap(NamedTuple):
-    """A depth map with its camera's place."""
-
-    depth: np.ndarray  # (H, W) in metres, NaN in holes
-    camera: Camera
-    pose: Matrix  # camera to world
-    deviation: np.ndarray | None = None  # (H, W) expected error in metres; None to weight all pixels alike
 
 
 class FusedMesh(NamedTuple):

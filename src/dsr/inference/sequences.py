@@ -19,8 +19,8 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.rigid_motion import Matrix, as_rigid, relative
-from dsr.geometry.warping import source_pixels, warp_depth
+from dsr.geometry.poses import Matrix, as_rigid, relative
+from dsr.geometry.resampling import source_pixels, warp_depth
 from dsr.inference.working_size import find_noise
 from dsr.methods.images import estimate_sensor_noise
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dsr.geometry.camera import ASSUMED_FOV, Camera, expect_intrinsics
 from dsr.geometry.plausible import may_be_of
-from dsr.geometry.warping import registered_camera, warp_depth
+from dsr.geometry.resampling import registered_camera, warp_depth
 from dsr.io.frames import Rig
 from dsr.io.images import CameraFile, Pixels, pixels_in_header, read_camera
 from dsr.io.photos import Size, focal_in_exif, orientation_of, same_aspect

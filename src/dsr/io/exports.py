@@ -18,10 +18,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dsr.geometry import LIGHT_NAMES
 from dsr.geometry.camera import Camera
-from dsr.geometry.lights import LIGHT_NAMES
 from dsr.geometry.mesh import (
-    LARGEST_STEP,
     QUADRIC,
     Mesh,
     project,
@@ -213,7 +212,6 @@ def write_mesh(
     depth: Tensor,
     camera: Camera,
     *,
-    largest_step: float = LARGEST_STEP,
     most: int = MOST_FACES,
     tolerance: Tensor | None = None,
     filled: Tensor | None = None,
@@ -228,7 +226,6 @@ def write_mesh(
         rgb: (3, H, W) in [0, 1].
         depth: (1, H, W) orthogonal depth in metres, NaN in holes.
         camera: of these pixels.
-        largest_step: see :func:`dsr.geometry.mesh.triangulate`.
         most: triangles; a larger mesh is simplified, see :mod:`dsr.geometry.mesh`.
         tolerance: see :func:`dsr.geometry.mesh.triangulate`.
         filled: (1, H, W) bool, where depth was not measured; a GLB file has it as the attribute ``_FILLED``.
@@ -244,12 +241,12 @@ def write_mesh(
     for path in paths:  # before anything is written
         if path.suffix.lower() not in (".ply", ".glb"):
             raise ValueError(f"{path}: expected a mesh file, .ply or .glb, got {path.suffix or 'no suffix'}")
-    mesh = triangulate(depth, camera, largest_step=largest_step, tolerance=tolerance)
+    mesh = triangulate(depth, camera, tolerance=tolerance)
     if not len(mesh.faces):
         raise ValueError(f"{paths[0]}: expected neighbours of known depth to make a surface of, got none")
     before, how = mesh.dense, FLAT if len(mesh.faces) < mesh.dense else ""
     if len(mesh.faces) > most:
-        mesh, how = _reduce(mesh, depth, camera, most, largest_step)
+        mesh, how = _reduce(mesh, depth, camera, most)
     normals, missing = vertex_normals(mesh), _at(filled, mesh.pixels)
     for path in paths:
         if path.suffix.lower() == ".ply":
@@ -260,12 +257,12 @@ def write_mesh(
     return Written(before, len(mesh.faces), how)
 
 
-def _reduce(mesh: Mesh, depth: Tensor, camera: Camera, most: int, largest_step: float) -> tuple[Mesh, str]:
+def _reduce(mesh: Mesh, depth: Tensor, camera: Camera, most: int) -> tuple[Mesh, str]:
     """Return a mesh of fewer triangles, and what made them fewer."""
     try:
         return simplify(mesh, most, camera), QUADRIC
     except ImportError:
-        thinned, stride = thin(depth, camera, most, largest_step)
+        thinned, stride = thin(depth, camera, most)
         return thinned, f"a stride of {stride} pixels; {how_to_install('mesh')} simplifies and keeps more detail"
 
 

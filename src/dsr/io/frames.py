@@ -11,9 +11,8 @@ from typing import NamedTuple, Protocol
 import cv2
 import numpy as np
 
-from dsr.geometry.camera import Camera
-from dsr.geometry.lens import Lens
-from dsr.geometry.rigid_motion import Matrix
+from dsr.geometry.camera import Camera, Lens
+from dsr.geometry.poses import Matrix
 from dsr.io.depth_files import DEPTH_SUFFIXES, read_array_file
 from dsr.io.images import read_pixels
 from dsr.notes import Assumption

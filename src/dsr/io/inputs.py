@@ -14,10 +14,9 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.agreement import judge
-from dsr.geometry.camera import ASSUMED_FOV, Camera, RangeType
-from dsr.geometry.lens import Lens, undistort
+from dsr.geometry.camera import ASSUMED_FOV, Camera, Lens, RangeType, undistort
 from dsr.geometry.plausible import expect_possible
-from dsr.geometry.warping import registered_camera, warp_depth
+from dsr.geometry.resampling import registered_camera, warp_depth
 from dsr.io.cameras import (
     camera_only,
     find_camera,

@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from dsr.geometry.rigid_motion import Matrix
+from dsr.geometry.poses import Matrix
 from dsr.io.cameras import read_any_camera
 from dsr.io.captures.archive import unpack
 from dsr.io.captures.arkit import find_arkitscenes, find_polycam, find_scanner_app

@@ -44,7 +44,7 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.rigid_motion import is_rotation, quaternion_of
+from dsr.geometry.poses import is_rotation, quaternion_of
 from dsr.io.depth_files import read_depth_file
 from dsr.io.exports import world_comment, write_ply
 from dsr.io.images import read_pixels

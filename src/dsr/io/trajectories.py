@@ -12,7 +12,7 @@ import numpy as np
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.plausible import may_be_of
-from dsr.geometry.rigid_motion import Matrix, as_rigid, from_quaternion, is_rotation
+from dsr.geometry.poses import Matrix, as_rigid, from_quaternion, is_rotation
 from dsr.io.pairs import Pair
 from dsr.notes import Assumption
 from dsr.utils.guards import naming, numbers_in, parse_json, read_text, refusing, split_numbers

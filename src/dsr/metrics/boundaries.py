@@ -202,16 +202,9 @@ def _fit_plane(points: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
     return values[:, 0].clamp(min=0).sqrt(), vectors[..., 0]
 
 
-_F1 = partial(MetricFormat, "F1", factor=1e2, digits=1, higher_is_better=True)
-_depth_pro = {
-    "F1": _F1("Depth Pro, %", position=BEFORE_THE_PAPER),
-    "ceiling": _F1("of the truth, %", position=BEFORE_THE_PAPER),
-}
-_moge = {
-    "1": _F1("MoGe, 1 px, %", position=BEFORE_THE_PAPER),
-    "2": _F1("MoGe, 2 px, %", position=None),
-    "3": _F1("MoGe, 3 px, %", position=None),
-}
+_F1 = partial(MetricFormat, "F1", factor=1e2, digits=1, higher_is_better=True, position=BEFORE_THE_PAPER)
+_depth_pro = {"F1": _F1("Depth Pro, %"), "ceiling": _F1("of the truth, %")}
+_moge = {"1": _F1("MoGe, 1 px, %"), "2": _F1("MoGe, 2 px, %", position=None), "3": _F1("MoGe, 3 px, %", position=None)}
 _coverage = partial(column, factor=1e2, higher_is_better=True)
 _whole, _parts = partial(Metric, whole=True), partial(of_parts, whole=True)
 _boundary = {name: column("DBE", f"{name}, px") for name in ("accuracy", "completeness")}

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dsr.metrics import boundaries, calibration, depth, evalmde, functional, points, sensor
+from dsr.metrics import boundaries, calibration, depth, evalmde, functional, sensor
 from dsr.metrics.formats import Metric, MetricFormat, depth_mask, normal_mask
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS, MIN_SIZE, lpips_v
@@ -74,7 +74,7 @@ PROTOCOLS: Mapping[str, tuple[Metric, ...]] = {
     "sensor": sensor.SENSOR,
     "depth": _family("depth", depth.DEPTH),
     "normals": _family("normals", depth.NORMALS),
-    "points": _family("points", points.METRICS),
+    "points": _family("points", depth.POINTS),
     "evalmde": _family("evalmde", evalmde.METRICS),
     "boundaries": _family("boundaries", boundaries.METRICS),
     "calibration": _family("calibration", calibration.METRICS),
@@ -95,20 +95,15 @@ def catalogue(
     """
     if not protocols or not set(protocols) <= set(PROTOCOLS):
         raise ValueError(f"protocols: expected some of {', '.join(PROTOCOLS)}, got {', '.join(protocols) or 'none'}")
-    metrics = (*(metric for name in dict.fromkeys(protocols) for metric in PROTOCOLS[name]), *extra)
-    of_regions = [each for each in metrics if each.in_regions]
-    metrics = (*metrics, *(each.within(region) for region in regions for each in of_regions))
-    names: set[str] = set()
-    found: list[Metric] = []
+    metrics = [*(metric for name in dict.fromkeys(protocols) for metric in PROTOCOLS[name]), *extra]
+    metrics += [each.within(region) for region in regions for each in metrics if each.in_regions]
+    found: dict[str, Metric] = {}
     for metric in metrics:
-        if metric.name in names:
+        if metric.name in found:
             raise ValueError(f"{metric.name}: expected metrics of different names, got two of this one")
-        names.add(metric.name)
-        if not metric.perceptual:
-            found.append(metric)
-        elif network is not None:
-            found.append(replace(metric, function=partial(metric.function, network=network)))
-    return tuple(found)
+        bound = partial(metric.function, network=network) if metric.perceptual else metric.function
+        found[metric.name] = replace(metric, function=bound)
+    return tuple(metric for metric in found.values() if network is not None or not metric.perceptual)
 
 
 class Score(NamedTuple):
@@ -141,24 +136,20 @@ def score_image(
     units, absent regions or absent errors are left out.
     """
 
-    def pair_of(rows: slice, columns: slice) -> SurfacePair:
-        parts = [values[None, :, rows, columns] for values in (prediction, target, rays, *(errors or ()))]
-        return SurfacePair(
-            *parts[:3],
-            unit=unit,
-            regions={name: region[None, :, rows, columns] for name, region in (regions or {}).items()},
-            depth_error=parts[3] if errors else None,
-            angle_error=parts[4] if errors else None,
-            image_dtype=torch.float32,
-        )
+    def pair_of(*window: slice) -> SurfacePair:
+        at = (None, slice(None), *window)
+        parts = [values[at] for values in (prediction, target, rays)]
+        inside = {name: region[at] for name, region in (regions or {}).items()}
+        stated = {"depth_error": errors[0][at], "angle_error": errors[1][at]} if errors else {}
+        return SurfacePair(*parts, unit=unit, regions=inside, image_dtype=torch.float32, **stated)
 
-    whole = inner = pair_of(slice(None), slice(None))
+    whole = inner = pair_of()
     valid = prediction.isfinite()[0]
     if valid.any():
         v, u = valid.nonzero().unbind(1)
-        rows, columns = slice(int(v.min()), int(v.max()) + 1), slice(int(u.min()), int(u.max()) + 1)
-        if valid[rows, columns].shape != valid.shape:
-            inner = pair_of(rows, columns)
+        window = slice(int(v.min()), int(v.max()) + 1), slice(int(u.min()), int(u.max()) + 1)
+        if valid[window].shape != valid.shape:
+            inner = pair_of(*window)
     for metric in metrics:
         pair = whole if metric.whole else inner
         if not metric.applies(pair):

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dsr.geometry.lights import LIGHT_NAMES
+from dsr.geometry import LIGHT_NAMES
 from dsr.metrics.functional import SurfacePair
 from dsr.utils.compute_device import in_own_precision
 
@@ -33,29 +33,17 @@ HEADLINES = ("", WORST, "min")
 
 @dataclass(frozen=True)
 class MetricFormat:
-    """How tables and figures show a metric.
+    """How tables and figures show a metric."""
 
-    Args:
-        heading: short name for readers.
-        unit: of the shown values; may be empty.
-        factor: from raw values, as in ``scores.csv``, to shown ones.
-        digits: number of digits after the decimal point.
-        higher_is_better: direction of the ranking.
-        family: metrics of one family share a table; those of other families and of regions have one of their own.
-        position: place among the columns of a table, from the left; None for a metric that is only in ``scores.csv``.
-
-    """
-
-    heading: str
-    unit: str = ""
-    factor: float = 1.0
-    digits: int = 3
+    heading: str  # short name for readers
+    unit: str = ""  # of the shown values
+    factor: float = 1.0  # from raw values, as in ``scores.csv``, to shown ones
+    digits: int = 3  # after the decimal point
     higher_is_better: bool = False
-    position: int | None = AFTER_THE_PAPER
-    family: str = PAPER
+    position: int | None = AFTER_THE_PAPER  # among the columns of a table; None for a metric only in ``scores.csv``
+    family: str = PAPER  # metrics of one family share a table; those of other families and of regions have their own
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if not 0 < self.factor < math.inf:
             raise ValueError(f"{self.heading}: factor: expected a positive number, got {self.factor}")
         if not 0 <= self.digits <= _MOST_DIGITS:
@@ -89,36 +77,21 @@ normal_mask = attrgetter("normal_mask")  # the pixels with a normal in both maps
 
 @dataclass(frozen=True)
 class Metric:
-    """A metric: how it is computed and how it is shown.
+    """A metric: how it is computed and how it is shown."""
 
-    Args:
-        name: as in ``scores.csv``.
-        function: from a pair to (B,), or to (B, 4) if ``per_light``.
-        mask: from a pair to the (B, 1, H', W') pixels that the metric uses.
-        format: how tables and figures show it.
-        per_light: whether there is a value for each of the lights e1..e4.
-        min_size: smallest height and width in pixels that it is defined for.
-        perceptual: whether the function takes an LPIPS ``network``; :func:`dsr.metrics.catalogue.catalogue` binds it.
-        unit: name of the benchmarks' unit that it is for, see :class:`dsr.sample.Unit`; None for all of them.
-        region: the part of the image that it is of, see :class:`dsr.sample.Scene`. Scenes without it are skipped.
-        regional: whether tables of regions have it; None for means over the pixels with both depths or both normals.
-        whole: whether it is computed of the whole image even where a method left out rows or columns at the border.
-        stated: the expected errors that it compares, ``depth_error`` or ``angle_error``; methods without are skipped.
-
-    """
-
-    name: str
-    function: Callable[..., Tensor]
-    mask: Callable[[SurfacePair], Tensor]
+    name: str  # as in ``scores.csv``
+    function: Callable[..., Tensor]  # from a pair to (B,), or to (B, 4) if ``per_light``
+    mask: Callable[[SurfacePair], Tensor]  # from a pair to the (B, 1, H', W') pixels that the metric uses
     format: MetricFormat
-    per_light: bool = False
-    min_size: int = 2
-    perceptual: bool = False
-    unit: str | None = None
-    region: str | None = None
+    per_light: bool = False  # whether there is a value for each of the lights e1..e4
+    min_size: int = 2  # smallest height and width in pixels that it is defined for
+    perceptual: bool = False  # whether the function takes an LPIPS ``network``, which the catalogue binds
+    unit: str | None = None  # name of the benchmarks' unit that it is for, see :class:`dsr.sample.Unit`; None for all
+    region: str | None = None  # the part of the image that it is of; scenes without it are skipped
+    # whether tables of regions have it; None for means over the pixels with both depths or both normals
     regional: bool | None = None
-    whole: bool = False
-    stated: str | None = None
+    whole: bool = False  # whether it is of the whole image even where a method left out rows or columns at the border
+    stated: str | None = None  # the expected errors, ``depth_error`` or ``angle_error``; methods without are skipped
 
     def applies(self, pair: SurfacePair) -> bool:
         """Return whether the metric is for the pair's benchmark, and the pair has its region and expected errors."""

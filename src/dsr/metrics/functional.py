@@ -47,18 +47,13 @@ def once_per_pair(function: Callable[[SurfacePair], _Derived]) -> Callable[[Surf
 class SurfacePair:
     """Two depth maps of the same pixels, and the quantities that metrics derive from them.
 
-    Args:
-        prediction, target: (B, 1, H, W) orthogonal depth in metres; NaN is a hole, and so is a depth that is not
-            positive, which no camera sees. float16 and bfloat16 become float32.
-        rays: (B or 1, 3, H, W) rays with z = 1, see :meth:`dsr.geometry.camera.Camera.rays`.
-        mask: (B, 1, H, W) bool, the pixels to compare; None for all.
-        unit: unit of the metrics that are in the benchmark's own.
-        regions: parts of the images by name, (B, 1, H, W) uint8, 0 outside, see :class:`dsr.sample.Scene`.
-        depth_error, angle_error: (B, 1, H, W) expected absolute errors of the predicted depth in metres and of its
-            normals in degrees, NaN where there is none; None from a method that states none.
-        image_dtype: of normals and renderings, None for the depth's. float32 halves their computing time and changes
-            scores by about 1e-7; depths and their differences keep their own dtype.
-
+    Prediction and target are (B, 1, H, W) orthogonal depth in metres; NaN is a hole, and so is a depth that is not
+    positive, which no camera sees. float16 and bfloat16 become float32. The rays, (B or 1, 3, H, W), have z = 1, see
+    :meth:`dsr.geometry.camera.Camera.rays`; ``mask``, (B, 1, H, W) bool, are the pixels to compare. ``regions`` are
+    parts of the images by name, (B, 1, H, W) uint8, 0 outside. ``depth_error`` and ``angle_error`` are the expected
+    absolute errors of the predicted depth in metres and of its normals in degrees, (B, 1, H, W), NaN where there is
+    none. ``image_dtype`` is that of normals and renderings, None for the depth's: float32 halves their computing time
+    and changes scores by about 1e-7; depths and their differences keep their own dtype.
     """
 
     def __init__(
@@ -168,20 +163,9 @@ class SurfacePair:
         return first.clamp(0, 1), second.clamp(0, 1)
 
     @cached_property
-    def rendering_error(self) -> Tensor:
-        """(B, 4, H, W) absolute difference of the renderings; 0 where invalid."""
-        first, second = self.renderings
-        return (first - second).abs()
-
-    @cached_property
-    def ray_lengths(self) -> Tensor:
-        """(B or 1, 1, H, W): the perspective depth of a point with orthogonal depth 1."""
-        return length(self.rays)
-
-    @cached_property
     def perspective_error(self) -> Tensor:
         """(B, 1, H, W) absolute difference of the perspective depths in metres; 0 where invalid."""
-        return (self.prediction - self.target).abs() * self.ray_lengths
+        return (self.prediction - self.target).abs() * length(self.rays)
 
     @cached_property
     def ssim_mask(self) -> Tensor:
@@ -208,7 +192,7 @@ def bad_pix_d(pair: SurfacePair, threshold: float, *, relative: bool = False) ->
 
     The threshold is in metres, or a fraction of the target if ``relative``.
     """
-    limit = pair.target * pair.ray_lengths * threshold if relative else threshold
+    limit = pair.target * length(pair.rays) * threshold if relative else threshold
     return masked_mean(pair.perspective_error > limit, pair.depth_mask).squeeze(1)
 
 
@@ -234,7 +218,8 @@ def rmse_v1(pair: SurfacePair) -> Tensor:
 
 def bad_pix_v(pair: SurfacePair, threshold: float) -> Tensor:
     """Return the fraction of pixels whose renderings differ by more than ``threshold`` / 255, per light, (B, 4)."""
-    return masked_mean(pair.rendering_error > threshold / 255, pair.normal_mask)
+    first, second = pair.renderings
+    return masked_mean((first - second).abs() > threshold / 255, pair.normal_mask)
 
 
 def dssim_v(pair: SurfacePair, mask: Tensor | None = None) -> Tensor:

@@ -118,7 +118,6 @@ class VisualLoss:
     network: LPIPS | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if self.name not in _VISUAL:
             raise ValueError(f"visual: expected one of {', '.join(_VISUAL)}, got {self.name!r}")
         if self.name == "lpips" and self.network is None:
@@ -147,13 +146,7 @@ MSE_V = VisualLoss()
 
 
 def make_visual_loss(name: VisualLossName, trunk: str | Path | None = None) -> VisualLoss:
-    """Return a loss, with the network that ``lpips`` needs.
-
-    Args:
-        name: ``mse_v``, ``dssim`` or ``lpips``.
-        trunk: file of AlexNet's weights; None to use torch's hub cache.
-
-    """
+    """Return a loss; ``trunk`` is the file of AlexNet's weights for ``lpips``, None to use torch's hub cache."""
     if name != "lpips":
         return VisualLoss(name)
     try:

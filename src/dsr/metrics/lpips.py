@@ -55,8 +55,11 @@ class LPIPS(nn.Module):
                 if value is None or came != shape:
                     raise ValueError(f"features.{index}.{name}: expected a tensor of shape {shape}, got {came}")
                 parameter.data.copy_(value)
-        for level, head in enumerate(_linear_heads()):
-            self.register_buffer(f"head{level}", head)
+        wheel = importlib.metadata.distribution("torchmetrics")  # importing it takes two seconds
+        file = wheel.locate_file("torchmetrics/functional/image/lpips_models/alex.pth")
+        heads = torch.load(str(file), map_location="cpu", weights_only=True)
+        for level in range(len(_CONVOLUTIONS)):
+            self.register_buffer(f"head{level}", heads[f"lin{level}.model.1.weight"])  # (1, C, 1, 1)
         self.register_buffer("mean", torch.tensor((-0.030, -0.088, -0.188)).view(1, 3, 1, 1))
         self.register_buffer("std", torch.tensor((0.458, 0.448, 0.450)).view(1, 3, 1, 1))
         self.requires_grad_(requires_grad=False)
@@ -143,11 +146,3 @@ def load_lpips(configured: Path | None = None) -> LPIPS:
     except Exception as error:  # torch.load raises many types for a damaged file
         reason = str(error) if isinstance(error, ValueError) else "not a file of plain tensors"
         raise ValueError(f"{path}: expected the weights of torchvision's AlexNet: {reason}") from error
-
-
-def _linear_heads() -> list[Tensor]:
-    """Return the five linear heads of LPIPS v0.1, each (1, C, 1, 1), from the torchmetrics wheel."""
-    wheel = importlib.metadata.distribution("torchmetrics")  # importing it takes two seconds
-    file = wheel.locate_file("torchmetrics/functional/image/lpips_models/alex.pth")
-    state = torch.load(str(file), map_location="cpu", weights_only=True)
-    return [state[f"lin{level}.model.1.weight"] for level in range(len(_CONVOLUTIONS))]

@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.pose_check import check
-from dsr.geometry.tsdf import PosedMap
+from dsr.geometry.poses import PosedMap, check_poses
 from dsr.inference.sequences import View, fuse_views
 from dsr.io.inputs import Picture
 from dsr.io.pairs import Pair
@@ -100,7 +99,7 @@ class FrameSequence:
                 return None
             return None if view is None else PosedMap(view.depth[0].double().numpy(), view.camera, view.pose)
 
-        return check(len(frames), load)
+        return check_poses(len(frames), load)
 
     def fuse(self, pair: Pair, picture: Picture) -> Picture:
         """Return a frame with its pose, its depth fused with that of its neighbours."""

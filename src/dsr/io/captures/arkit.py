@@ -41,7 +41,6 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, Field
 
-from dsr.geometry.rigid_motion import rotation_of_vector
 from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry
 from dsr.io.images import Pixels, read_numbers
 from dsr.io.pairs import Pair, PairingResult, has_name, numbered_files
@@ -143,8 +142,10 @@ def _geometry(place: str, intrinsics: Path | None, motion: _Motion | None, _: tu
     elif not np.isfinite(motion).all():
         raise ValueError(f"{place}: expected a rigid pose, got {' '.join(f'{value:g}' for value in motion)}")
     else:
+        from scipy.spatial.transform import Rotation  # noqa: PLC0415 - a third of a second that frames without poses save
+
         to_camera = np.eye(4)
-        to_camera[:3, :3] = rotation_of_vector(motion[:3])
+        to_camera[:3, :3] = Rotation.from_rotvec(motion[:3]).as_matrix()
         to_camera[:3, 3] = motion[3:]
         pose = check_pose(place, np.linalg.inv(to_camera))
     return Geometry(camera, pose, tuple(notes), up="z")

@@ -29,8 +29,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dsr.geometry.lens import Lens
-from dsr.geometry.rigid_motion import from_quaternion, invert
+from dsr.geometry.camera import Lens
+from dsr.geometry.poses import from_quaternion, invert
 from dsr.io.frames import CaptureFrame, Geometry, Record, file_state
 from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult
 from dsr.io.trajectories import intrinsics_camera

@@ -42,7 +42,7 @@ from pathlib import Path
 import numpy as np
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.rigid_motion import Matrix, as_rigid
+from dsr.geometry.poses import Matrix, as_rigid
 from dsr.io.frames import CaptureFrame, Geometry
 from dsr.io.images import read_camera, read_numbers
 from dsr.io.pairs import (

@@ -29,9 +29,8 @@ import cv2
 import numpy as np
 from pydantic import BaseModel, Field
 
-from dsr.geometry.camera import Camera
-from dsr.geometry.lens import Lens
-from dsr.geometry.rigid_motion import Matrix, as_rigid, invert
+from dsr.geometry.camera import Camera, Lens
+from dsr.geometry.poses import Matrix, as_rigid, invert
 from dsr.io.captures.archive import PHOTO_LIMIT, decode_photo
 from dsr.io.frames import CaptureFrame, Geometry, Record, Rig, file_state
 from dsr.io.pairs import Pair, PairingResult, join, match_times

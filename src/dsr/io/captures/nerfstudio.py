@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from dsr.geometry.lens import Lens
+from dsr.geometry.camera import Lens
 from dsr.io.frames import CaptureFrame, Geometry
 from dsr.io.pairs import Pair, PairingResult
 from dsr.io.trajectories import check_pose, intrinsics_camera

@@ -24,9 +24,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dsr.geometry.camera import Camera
-from dsr.geometry.lens import Lens
-from dsr.geometry.rigid_motion import Matrix, as_rigid, from_quaternion, invert
+from dsr.geometry.camera import Camera, Lens
+from dsr.geometry.poses import Matrix, as_rigid, from_quaternion, invert
 from dsr.io.captures.bags import Message, NamedErrors, connections_of, deserialize, first_message
 from dsr.io.frames import CaptureFrame, Geometry, Rig
 from dsr.io.pairs import Pair, PairingResult, match_times

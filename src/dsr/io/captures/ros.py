@@ -27,8 +27,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dsr.geometry.lens import Lens
-from dsr.geometry.rigid_motion import Matrix, as_rigid, from_quaternion, invert
+from dsr.geometry.camera import Lens
+from dsr.geometry.poses import Matrix, as_rigid, from_quaternion, invert
 from dsr.io.captures import realsense
 from dsr.io.captures.bags import COMPRESSED, IMAGE, Message, NamedErrors, connections_of, first_message, open_recording
 from dsr.io.captures.ros_images import COLOURS, DEPTHS

@@ -37,7 +37,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
-from dsr.geometry.rigid_motion import as_rigid
+from dsr.geometry.poses import as_rigid
 from dsr.io.captures.archive import PHOTO_LIMIT, Section, decode_photo, inflate
 from dsr.io.captures.stray import VideoFrame, check_count
 from dsr.io.frames import CaptureFrame, Geometry

@@ -1,22 +1,122 @@
-"""Check whether the poses of frames fit their depth maps, or would under another convention or unit.
+"""Poses of cameras: rigid transforms, and whether those of frames fit their depth maps.
 
-The points of one depth map are moved into the view of another: where they see the same surfaces, the depths agree. That
-is measured under the poses as given, under each of :data:`READINGS`, and without any motion, which shows how
-informative the frames are: before a wall, or of a camera that stands still, all readings agree.
+A pose is the transform from a camera's frame (x right, y down, z forward) to the world's, a 4 x 4 matrix in metres.
+:func:`check_poses` moves the points of one depth map into the view of another: where they see the same surfaces, the
+depths agree. That is measured under the poses as given, under each of :data:`READINGS`, other conventions and units,
+and without any motion, which shows how informative the frames are: before a wall, or of a camera that stands still, all
+readings agree.
 """
 
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.rigid_motion import Matrix, invert, quaternion_of, rotation_of_quaternion
-from dsr.geometry.tsdf import PosedMap
 from dsr.notes import LIMITS, Assumption
+
+Matrix = NDArray[np.float64]
+
+# largest deviation of the product of a rotation with its transpose from the identity: matrices of few decimals
+_TOLERANCE = 5e-3
+
+
+def as_rigid(values: Sequence[Sequence[float]] | np.ndarray, name: str) -> Matrix:
+    """Return a 3 x 4 or 4 x 4 transform as a 4 x 4 matrix whose rotation is orthonormal to rounding.
+
+    Errors begin with ``name``, such as the file that the numbers are from.
+    """
+    expected = f"{name}: expected a matrix of 3 x 4 or 4 x 4 numbers, got"
+    try:
+        if not isinstance(values, np.ndarray) and any(isinstance(each, bool | str) for row in values for each in row):
+            raise TypeError
+        matrix = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{expected} something else") from None
+    if matrix.shape not in ((3, 4), (4, 4)):
+        raise ValueError(f"{expected} {' x '.join(map(str, matrix.shape))}")
+    if not np.isfinite(matrix).all():
+        raise ValueError(f"{name}: expected finite numbers, got {matrix[~np.isfinite(matrix)][0]}")
+    if matrix.shape == (4, 4) and not np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6):
+        columns = np.allclose(matrix[:, 3], (0, 0, 0, 1), atol=1e-6)
+        hint = "; are rows and columns exchanged?" if columns else ""
+        row = " ".join(f"{value:.4g}" for value in matrix[3])
+        raise ValueError(f"{name}: expected 0 0 0 1 as the last row, got {row}{hint}")
+    turn = matrix[:3, :3]
+    if not orthonormal_error(turn) <= _TOLERANCE:  # NaN is none either
+        lengths = " ".join(f"{math.hypot(*row):.4g}" for row in turn)
+        raise ValueError(f"{name}: expected a rigid transform, got rows of length {lengths} that do not form one")
+    if np.linalg.det(turn) < 0:
+        raise ValueError(f"{name}: expected a rigid transform, got one that mirrors")
+    left, _, right = np.linalg.svd(turn)
+    rigid = np.eye(4)
+    rigid[:3, :3], rigid[:3, 3] = left @ right, matrix[:3, 3]
+    return rigid
+
+
+def orthonormal_error(turn: np.ndarray) -> float:
+    """Return how far the rows of a matrix R, (3, 3), are from orthonormal: the largest magnitude in R R' - 1.
+
+    It is infinite or NaN where the numbers are too large for that.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        return float(np.abs(turn @ turn.T - np.eye(3)).max())
+
+
+def is_rotation(turn: np.ndarray, tolerance: float) -> bool:
+    """Return whether a matrix, (3, 3), is a rotation to within a tolerance of :func:`orthonormal_error`."""
+    return orthonormal_error(turn) <= tolerance and float(np.linalg.det(turn)) > 0
+
+
+def from_quaternion(translation: Sequence[float], quaternion: Sequence[float], name: str) -> Matrix:
+    """Return the transform of a translation in metres and a unit quaternion (x, y, z, w)."""
+    length = math.hypot(*quaternion)
+    if not abs(length - 1) <= 0.01:
+        raise ValueError(f"{name}: expected a quaternion of length 1, got {length:g}")
+    return as_rigid(np.column_stack((rotation_of_quaternion(quaternion), translation)), name)
+
+
+def rotation_of_quaternion(quaternion: Sequence[float]) -> Matrix:
+    """Return the 3 x 3 rotation of a quaternion (x, y, z, w) of any length but 0."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - a third of a second that frames without poses save
+
+    turn: Matrix = Rotation.from_quat(quaternion).as_matrix()
+    return turn
+
+
+def quaternion_of(rotation: Matrix) -> np.ndarray:
+    """Return the unit quaternion (x, y, z, w) with w >= 0 of a 3 x 3 rotation."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415
+
+    return np.asarray(Rotation.from_matrix(rotation).as_quat(canonical=True))
+
+
+def invert(transform: Matrix) -> Matrix:
+    """Return the inverse of a rigid transform."""
+    turn, shift = transform[:3, :3], transform[:3, 3]
+    inverse = np.eye(4)
+    inverse[:3, :3], inverse[:3, 3] = turn.T, -turn.T @ shift
+    return inverse
+
+
+def relative(pose: Matrix, to: Matrix) -> Matrix:
+    """Return the transform from the frame of the camera at ``pose`` to that of the camera at ``to``."""
+    return invert(to) @ pose
+
+
+class PosedMap(NamedTuple):
+    """A depth map with its camera's place."""
+
+    depth: np.ndarray  # (H, W) in metres, NaN in holes
+    camera: Camera
+    pose: Matrix  # camera to world
+    deviation: np.ndarray | None = None  # (H, W) expected error in metres; None to weight all pixels alike
+
 
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _FORWARD_DOWN = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
@@ -39,7 +139,7 @@ _LENGTHS = {
 
 
 def _read(pose: Matrix, direction: str, turn: str, axes: str, length: str) -> Matrix:
-    """Return a pose of a convention in that of :mod:`dsr.geometry.rigid_motion`."""
+    """Return a pose of a convention in that of this module."""
     rotation = pose[:3, :3]
     if turn == "with rotations by columns":
         rotation = rotation.T
@@ -76,14 +176,6 @@ _ALIKE = 0.7  # share of the pixels in which frames that look alike agree withou
 _STILL = 1.2  # times as many pixels have to disagree under the poses as without any motion
 
 
-class Agreement(NamedTuple):
-    """How far pairs of frames agree under each of :data:`READINGS` and, last, without motion, (pairs, readings + 1)."""
-
-    overlap: np.ndarray  # share of a frame's points that lie in the other's view
-    agreed: np.ndarray  # share of these whose depths agree
-    moved: np.ndarray  # distance of the two places as given, over the median depth, (pairs,)
-
-
 def sample(count: int) -> list[tuple[int, ...]]:
     """Return which frames of a sequence to compare with each other, as groups of their places."""
     last = max(count - 1, 0)
@@ -92,25 +184,15 @@ def sample(count: int) -> list[tuple[int, ...]]:
     return sorted(group for group in groups if len(group) > 1)
 
 
-def check(count: int, load: Callable[[int], PosedMap | None]) -> Assumption | None:
+def check_poses(count: int, load: Callable[[int], PosedMap | None]) -> Assumption | None:
     """Compare some frames of a sequence with each other; see :func:`find_fault`.
 
     ``load`` returns the frame of a number; None for one that cannot be read, or has no pose.
     """
-    groups = ([prepare(each) for number in group if (each := load(number)) is not None] for group in sample(count))
-    return find_fault(compare(groups))
+    return find_fault(filter(None, map(load, group)) for group in sample(count))
 
 
-def compare(groups: Iterable[Sequence[Reduced]]) -> Agreement:
-    """Return how far the frames of each group agree with each other; see :func:`prepare`."""
-    pairs = [pair for group in groups for pair in itertools.combinations(group, 2)]
-    shares = np.reshape([_compare(*pair) for pair in pairs], (len(pairs), 2, len(READINGS) + 1))
-    with np.errstate(over="ignore", invalid="ignore"):
-        moved = [np.linalg.norm(one.poses[0, :3, 3] - other.poses[0, :3, 3]) / one.middle for one, other in pairs]
-    return Agreement(shares[:, 0], shares[:, 1], np.array(moved))
-
-
-class Reduced(NamedTuple):
+class _Reduced(NamedTuple):
     """A reduced map, its camera, some points with their median depth, and the poses by all readings."""
 
     depth: np.ndarray
@@ -120,7 +202,7 @@ class Reduced(NamedTuple):
     poses: np.ndarray  # (readings + 1, 4, 4)
 
 
-def prepare(each: PosedMap) -> Reduced:
+def _prepare(each: PosedMap) -> _Reduced:
     """Return a frame to compare."""
     step = min(-(-each.camera.width // _WIDEST), each.camera.height)
     camera = each.camera.decimate(step, step // 2)
@@ -132,10 +214,10 @@ def prepare(each: PosedMap) -> Reduced:
     middle = float(np.median(points[2])) if points.size else np.nan
     with np.errstate(over="ignore", invalid="ignore"):  # of numbers that no pose has
         poses = np.stack([*(_read(each.pose, *reading) for reading in READINGS.values()), np.eye(4)])
-    return Reduced(depth, camera, points, middle, poses)
+    return _Reduced(depth, camera, points, middle, poses)
 
 
-def _compare(frame: Reduced, other: Reduced) -> tuple[np.ndarray, np.ndarray]:
+def _compare(frame: _Reduced, other: _Reduced) -> tuple[np.ndarray, np.ndarray]:
     """Return overlap and agreement of another frame's points with a frame, (readings + 1,) each."""
     camera, back = frame.camera, frame.poses[:, :3, :3].transpose(0, 2, 1)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -150,12 +232,17 @@ def _compare(frame: Reduced, other: Reduced) -> tuple[np.ndarray, np.ndarray]:
     return count / max(z.shape[1], 1), agreeing.sum(1) / np.maximum(count, 1)
 
 
-def find_fault(agreement: Agreement) -> Assumption | None:
-    """Return a warning where frames disagree under the poses as given; None where they agree, or show too little.
+def find_fault(groups: Iterable[Iterable[PosedMap]]) -> Assumption | None:
+    """Return a warning where frames of a group disagree under the poses as given.
 
-    A pair of frames counts as much as they disagree without motion.
+    None where they agree, or show too little. A pair of frames counts as much as they disagree without motion.
     """
-    seen, agreed = agreement.overlap >= _OVERLAP, agreement.agreed
+    pairs = [pair for group in groups for pair in itertools.combinations(map(_prepare, group), 2)]
+    # (pairs, readings + 1) each: under all readings and, last, without motion
+    overlap, agreed = np.reshape([_compare(*pair) for pair in pairs], (len(pairs), 2, len(READINGS) + 1)).swapaxes(0, 1)
+    with np.errstate(over="ignore", invalid="ignore"):  # distances of the two places as given, over the median depth
+        moved = [np.linalg.norm(one.poses[0, :3, 3] - other.poses[0, :3, 3]) / one.middle for one, other in pairs]
+    seen = overlap >= _OVERLAP
     without = agreed[:, -1:]
     given = np.where(seen[:, :1], agreed[:, :1], without)
     weight = seen * (1 - without)  # (pairs, readings + 1)
@@ -175,9 +262,8 @@ def find_fault(agreement: Agreement) -> Assumption | None:
             "poses",
             round(float(gain[best]), 3),
         )
-    alike = agreement.moved.size > 0 and float(np.median(without)) >= _ALIKE
-    if alike and agreement.moved.min() >= LIMITS["poses-far"]:
-        nearest = float(agreement.moved.min())
+    nearest = float(np.min(moved, initial=np.inf))
+    if pairs and float(np.median(without)) >= _ALIKE and nearest >= LIMITS["poses-far"]:
         return Assumption(
             "under the poses the camera is far away in the next frame, which looks similar: are they in millimetres?",
             f"{nearest:.3g} times as far as what it sees; {float(np.median(without)):.0%} of the pixels are unchanged",
