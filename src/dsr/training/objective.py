@@ -306,22 +306,22 @@ def balance_weight(patches: Sequence[Batch], visual: VisualLoss = MSE_V) -> floa
     """
     if not patches:
         raise ValueError("patches: expected one or more to compute w from, got none")
-    ratios = []
-    for patch in patches:
-        x = patch["rays"][0, 0].double()
+    ratios, batches = [], [{name: value[None] for name, value in patch.items()} for patch in patches]
+    for batch in batches:
+        x = batch["rays"][0, 0, 0].double()
         focal = (x.numel() - 1) / float(x[-1] - x[0])
-        depth = float(patch["depth"][patch["depth"].isfinite()].median())
-        extent = float(_range(patch["disparity_lr"][None]))
-        ratios.append(float(patch["bf"]) * math.tan(_TILT) / (focal * depth * extent))
+        depth = float(batch["depth"][batch["depth"].isfinite()].median())
+        extent = float(_range(batch["disparity_lr"]))
+        ratios.append(float(batch["bf"]) * math.tan(_TILT) / (focal * depth * extent))
     w = float(torch.tensor(ratios, dtype=torch.float64).median()) / ((2 - 2 * math.cos(_TILT)) / 3)
-    return w if visual.name == "mse_v" else w * match_weight(visual, map(_interpolated, patches))
-
-
-def _interpolated(patch: Batch) -> SurfacePair:
-    """Return the bicubic interpolation of a patch's low-resolution disparity, and the patch."""
-    batch = {name: value[None] for name, value in patch.items()}
-    scale = batch["depth"].shape[-1] // batch["disparity_lr"].shape[-1]
-    return SurfacePair(to_depth(upsample_bicubic(batch["disparity_lr"], scale), batch), batch["depth"], batch["rays"])
+    if visual.name == "mse_v":
+        return w
+    pairs = []
+    for batch in batches:
+        scale = batch["depth"].shape[-1] // batch["disparity_lr"].shape[-1]
+        interpolated = to_depth(upsample_bicubic(batch["disparity_lr"], scale), batch)
+        pairs.append(SurfacePair(interpolated, batch["depth"], batch["rays"]))
+    return w * match_weight(visual, pairs)
 
 
 def _range(disparity: Tensor) -> Tensor:
