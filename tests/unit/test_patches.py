@@ -21,7 +21,6 @@ from dsr.degradation.downsampling import Downsampling, Measured, make_sample
 from dsr.degradation.noise import GaussianMultiplicative, Kinect
 from dsr.degradation.random_degradation import Everything
 from dsr.geometry.camera import Camera
-from dsr.geometry.surface import depth_to_normals, lights, render
 from dsr.methods.images import normalise
 from dsr.sample import CENTIMETRES, Scene, Unit
 from dsr.training.data_module import Part, PatchData, WholeScenes
@@ -539,11 +538,6 @@ def _waves() -> Scene:
     return Scene("set", "waves", rgb, WIDE, depth, {1: depth})
 
 
-def _normals(scene: Scene) -> Tensor:
-    assert scene.depth is not None
-    return depth_to_normals(scene.depth[None], scene.camera.rays()[None])[0]
-
-
 def _quarter(vectors: Tensor) -> Tensor:
     """Return vectors turned counterclockwise about the axis, as a picture with y down shows it."""
     x, y, z = vectors
@@ -561,21 +555,6 @@ def test_turned_scene_has_the_turned_points(turns: int) -> None:
     for _ in range(turns):
         expected = _quarter(expected)
     torch.testing.assert_close(_points(rotate90(_waves(), turns)), expected, rtol=0, atol=1e-12, equal_nan=True)
-
-
-@pytest.mark.parametrize("turns", [0, 1, 2, 3])
-def test_turned_plane_has_the_turned_normal_and_is_lit_by_it(turns: int) -> None:
-    normal = torch.tensor([0.3, -0.4, -1.0], dtype=torch.float64)[:, None, None]
-    depth = -2.0 / (normal * WIDE.rays()).sum(dim=0, keepdim=True)
-    shown = _normals(rotate90(Scene("set", "plane", torch.rand(3, 23, 31), WIDE, depth), turns))
-    expected = normal / normal.norm()
-    for _ in range(turns):
-        expected = _quarter(expected)
-    lit = (lights() @ expected.flatten()).clamp(0, 1)[:, None, None]
-    known = shown[0].isfinite()
-    assert known.float().mean() > 0.8
-    assert float((shown - expected).abs()[:, known].max()) < 1e-9
-    assert float((render(shown[None])[0] - lit).abs()[:, known].max()) < 1e-9
 
 
 def test_four_quarter_turns_and_two_mirrors_restore_the_waves() -> None:

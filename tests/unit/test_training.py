@@ -152,13 +152,6 @@ def test_setting_of_the_loss_out_of_range_is_refused(wrong: dict[str, Any], mess
         DepthObjective(**wrong)
 
 
-@pytest.mark.parametrize("doffs", [0.0, 1.0, -2.5])
-def test_disparity_is_converted_back_to_its_depth(doffs: float) -> None:
-    depth = torch.from_numpy(np.random.default_rng(0).uniform(1, 3, (1, 12, 13)))
-    batch = {**_batch(depth, STEREO, (3.0, 5.0)), "doffs": _four(doffs)}
-    torch.testing.assert_close(to_depth(0.5 * 20 / depth[None] - doffs, batch), depth[None], rtol=1e-13, atol=0)
-
-
 def test_disparity_at_or_beyond_infinity_has_no_depth() -> None:
     disparity = torch.tensor([[[[-1.5, -1.0, -0.5]]]], dtype=torch.float64)
     assert to_depth(disparity, _wall())[0, 0, 0].isnan().tolist() == [True, True, False]

@@ -24,7 +24,7 @@ from dsr.training.settings import PatchSettings
 from dsr.utils import interruption
 from dsr.utils.guards import derived
 
-_EPOCH = 1000  # about how many batches an epoch has where the trainer has no number of steps
+_EPOCH = 1000
 
 
 @dataclass(frozen=True)
@@ -142,11 +142,7 @@ class PatchData(lightning.LightningDataModule):
         return [self._cut[number] for number in range(count)]
 
     def train_dataloader(self) -> DataLoader[Batch]:
-        """Return a loader of an epoch's patches, which begins at the trainer's current step.
-
-        An epoch is the whole training or, where the trainer has no number of steps, about 1000 batches. The length is
-        that of the whole epoch, as Lightning subtracts the batches that were done before an interruption.
-        """
+        """Return a loader of an epoch's patches, which begins at the trainer's current step."""
         self.setup()
         module: Any = getattr(self.trainer, "lightning_module", None)
         prepare = getattr(getattr(module, "net", None), "prepare", None)
@@ -160,15 +156,11 @@ class PatchData(lightning.LightningDataModule):
         )
 
     def val_dataloader(self) -> list[DataLoader[Batch]]:
-        """Return a loader for each validation set, of whole scenes, one at a time.
-
-        Each device has a part of the scenes; one without a scene has an empty batch, as Lightning would not let it take
-        part in the validation.
-        """
+        """Return a loader for each validation set, of whole scenes, one at a time; each device has a part of them."""
         rank, devices = (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)
         parts = (scenes[rank::devices] for scenes in self._validation)
         hinted = self._everything is not None
-        batches: Any = (
+        batches: Any = (  # an empty one where a device has no scene: Lightning would leave it out of the validation
             WholeScenes(part, self._degradation, self._seed, hinted=hinted) if part else [{}] for part in parts
         )
         return [DataLoader(each, batch_size=None) for each in batches]
@@ -192,7 +184,11 @@ def _split(source: SceneSource, settings: PatchSettings) -> tuple[list[str], lis
 
 
 class _PatchNumbers:
-    """The patch numbers of one device's batches in an epoch, from the trainer's current step on."""
+    """The patch numbers of one device's batches in an epoch, from the trainer's current step on.
+
+    An epoch is the whole training or, where the trainer has no number of steps, about 1000 batches. The length is that
+    of the whole epoch, as Lightning subtracts the batches that were done before an interruption.
+    """
 
     def __init__(self, trainer: lightning.Trainer | None, batch: int) -> None:
         self._trainer, self._batch = trainer, batch

@@ -254,11 +254,7 @@ class SuperResolution(lightning.LightningModule):
     def load_from_checkpoint(  # type: ignore[override]  # Lightning's has arguments for another file of arguments
         cls, checkpoint_path: str | Path, map_location: Any = None, **parts: Any
     ) -> Self:
-        """Return the module of a checkpoint, with its weights and their average.
-
-        ``parts`` are arguments of the constructor in place of those that the checkpoint names, such as a ``net`` that
-        is not dsr's own. The ``metrics`` are not in it.
-        """
+        """Return the module of a checkpoint; ``parts`` replace what it names, such as a ``net`` that is not dsr's."""
         stored = read_torch_file(Path(checkpoint_path)).get("hyper_parameters")
         if not isinstance(stored, Mapping):
             raise ValueError(f"{checkpoint_path}: expected a checkpoint of {cls.__name__}, it names no parts")

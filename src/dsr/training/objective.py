@@ -260,11 +260,7 @@ def estimate_light(normals: Tensor, intensity: Tensor, albedo: Tensor, valid: Te
 
 
 def estimate_albedo(rgb: Tensor) -> Tensor:
-    """Return the albedo of photos by the Retinex algorithm, (B, 1, H, W), with a mean of 1 before it is clipped to 2.
-
-    Its logarithm has the gradient of the photo's logarithm where that is an edge of intensity or of colour, and else
-    none, as well as least squares allow (a Poisson equation with free borders).
-    """
+    """Return the albedo of photos by Retinex, (B, 1, H, W), whose logarithm has the photo's edges, but no slopes."""
     log_rgb = rgb.clamp(min=_DARKEST).log()
     log_grey = grey(rgb).clamp(min=_DARKEST).log()
     colour = log_rgb - log_rgb.mean(dim=1, keepdim=True)
@@ -278,10 +274,8 @@ def estimate_albedo(rgb: Tensor) -> Tensor:
 
 
 def integrate(along_u: Tensor, along_v: Tensor) -> Tensor:
-    """Return the maps (B, 1, H, W) with a mean of 0 whose differences (B, 1, H, W - 1), (B, 1, H - 1, W) are nearest.
-
-    The normal equations are a Poisson equation with Neumann borders, which the discrete cosine transform diagonalises.
-    """
+    """Return the maps (B, 1, H, W) of mean 0 whose differences are nearest to (B, 1, H, W - 1) and (B, 1, H - 1, W)."""
+    # A Poisson equation with Neumann borders, which the discrete cosine transform diagonalises
     divergence = functional.pad(along_u, (0, 1)) - functional.pad(along_u, (1, 0))
     divergence = divergence + functional.pad(along_v, (0, 0, 0, 1)) - functional.pad(along_v, (0, 0, 1, 0))
     height, width = divergence.shape[-2:]

@@ -51,11 +51,9 @@ class Patches(Dataset[Batch]):
         everything: Everything | None = None,
         per_step: int | None = None,
     ) -> None:
-        scales = [degradation.scale]
-        if everything is not None and everything.scales is not None:
-            scales = [int(scale) for scale in everything.scales]
-        for group, scale in itertools.product(groups, scales):
-            check_patches(group, settings, scale)
+        drawn = everything and everything.scales
+        for group, scale in itertools.product(groups, drawn or (degradation.scale,)):
+            check_patches(group, settings, int(scale))
         self._everything, self._per_step = everything, per_step or settings.batch
         weights = np.array([1.0] * len(groups) if shares is None else shares, dtype=np.float64)
         if not groups or not all(groups):
@@ -117,11 +115,9 @@ class Patches(Dataset[Batch]):
         return {**to_tensors(sample), **hints._asdict(), "soft": torch.tensor(float(soft))}
 
     def _window(self, group: int, random: np.random.Generator, size: int) -> tuple[int, int, int]:
-        """Return a random window of a group: the number of the scene, the top and the left.
-
-        The first window of a random scene with enough valid depth is taken, else the best of ten. Another scene is
-        taken only where all ten have no valid depth, so that scenes with many holes are not trained on less often.
-        """
+        """Return a random window of a group: the number of the scene, the top and the left."""
+        # The first with enough valid depth of ten of a random scene, else the best. Another scene only if none has any,
+        # so that scenes with many holes are not trained on less often.
         scenes = self._groups[group]
         for _ in range(_SCENE_TRIES):
             number, best, highest = int(random.integers(len(scenes))), None, 0.0
