@@ -51,7 +51,7 @@ class Patches(Dataset[Batch]):
         everything: Everything | None = None,
         per_step: int | None = None,
     ) -> None:
-        drawn = everything and everything.scales
+        drawn = None if everything is None else everything.scales
         for group, scale in itertools.product(groups, drawn or (degradation.scale,)):
             check_patches(group, settings, int(scale))
         self._everything, self._per_step = everything, per_step or settings.batch
