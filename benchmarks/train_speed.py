@@ -183,7 +183,7 @@ def main() -> None:
     source = SimGeo(size=2 * arguments.patch)
     scenes = [source.load(name) for name in source.scenes()]
     settings = PatchSettings(patch=arguments.patch, batch=arguments.batch)
-    patches = Patches([scenes], settings, Degradation(SCALE, Downsampling("box")), count=arguments.batch)
+    patches = Patches([scenes], settings, Degradation(SCALE, Downsampling("box")))
     start = time.perf_counter()
     batch = torch.utils.data.default_collate([patches[i] for i in range(arguments.batch)])
     batch = {name: values.to(arguments.device) for name, values in batch.items()}

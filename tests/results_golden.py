@@ -249,13 +249,13 @@ def training() -> Iterator[tuple[str, Job]]:
     """Yield training patches, losses and the sizes of their gradients."""
     settings = PatchSettings(patch=48, batch=2)
     degradation = Degradation(4, Downsampling("box"))
-    plain = Patches([[_large_scene()]], settings, degradation, count=4)
-    drawn = Patches([[_large_scene()]], settings, degradation, count=4, everything=Everything())
+    plain = Patches([[_large_scene()]], settings, degradation)
+    drawn = Patches([[_large_scene()]], settings, degradation, everything=Everything())
     keys = ("depth", "disparity_lr", "rgb")
     for number in range(4):
         for name, patches in (("patch", plain), ("drawn patch", drawn)):
             yield f"{name} {number}", lambda p=patches, n=number: [p[n][key] for key in keys]
-    many = Patches([[_large_scene()]], settings, degradation, count=48, everything=Everything(soft=1))
+    many = Patches([[_large_scene()]], settings, degradation, everything=Everything(soft=1))
     yield "many drawn patches", lambda: torch.stack([many[n]["disparity_lr"].nanmean() for n in range(48)])
     flat = replace(_scene(), depth=torch.full((1, 64, 64), 2.0, dtype=torch.float64))
     yield "range of a flat map", to_tensors(degradation.sample(flat))["min_max"].flatten

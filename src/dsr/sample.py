@@ -9,6 +9,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, Self
 
@@ -102,14 +103,13 @@ class Scene:
         window = (slice(None), slice(top, top + height), slice(left, left + width))
         measured = {}
         for ratio, depth_lr in self.measured.items():
-            (rows, columns), (rows_lr, columns_lr) = (ratio, ratio), (1, 1)
+            down = across = Fraction(ratio)
             if not isinstance(ratio, int):
-                rows, columns = self.camera.height, self.camera.width
-                rows_lr, columns_lr = depth_lr.shape[-2:]
-            places = [(row * rows_lr, rows) for row in (top, top + height)]
-            places += [(column * columns_lr, columns) for column in (left, left + width)]
-            if all(place % side == 0 for place, side in places):
-                first_row, end_row, first_column, end_column = (int(place // side) for place, side in places)
+                rows, columns = depth_lr.shape[-2:]
+                down, across = Fraction(self.camera.height, rows), Fraction(self.camera.width, columns)
+            ends = top / down, (top + height) / down, left / across, (left + width) / across
+            if all(end.denominator == 1 for end in ends):
+                first_row, end_row, first_column, end_column = map(int, ends)
                 measured[ratio] = depth_lr[:, first_row:end_row, first_column:end_column]
         depth = None if self.depth is None else self.depth[window]
         if depth is None and not measured:

@@ -17,7 +17,7 @@ from pretend_cuda import pretend_cuda
 from small_lpips import random_lpips
 from small_scenes import sample_of
 from torch import Tensor, nn
-from torch.utils.data import DataLoader
+from torch.utils.data import default_collate
 
 from dsr.degradation.downsampling import Downsampling, Holes, make_sample
 from dsr.degradation.holes import Blobs, Shadows
@@ -109,8 +109,8 @@ def test_training_step_on_a_gpu_is_that_of_the_cpu(model: str, gpu: torch.device
     degradation = Degradation(4, Downsampling("box"), noise)
     sample = _sample()
     scene = Scene("set", "hall", sample.rgb, sample.camera, sample.depth)
-    patches = Patches([[scene]], settings, degradation, count=2, everything=everything)
-    batch = next(iter(DataLoader(patches, batch_size=2)))
+    patches = Patches([[scene]], settings, degradation, everything=everything)
+    batch = default_collate([patches[0], patches[1]])
     found = []
     for device in (CPU, gpu):
         torch.manual_seed(0)

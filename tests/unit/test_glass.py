@@ -6,8 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dsr.degradation.glass import KINDS, add_glass
-from dsr.degradation.glass_shapes import Pose, ball
+from dsr.degradation.glass import KINDS, Pose, add_glass, ball
 from dsr.degradation.random_degradation import SENSOR_NOISES, Everything
 from dsr.geometry.camera import Camera
 from dsr.sample import AllHolesError, DepthSample, Scene

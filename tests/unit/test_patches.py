@@ -21,7 +21,6 @@ from dsr.degradation.downsampling import Downsampling, Measured, make_sample
 from dsr.degradation.noise import GaussianMultiplicative, Kinect
 from dsr.degradation.random_degradation import Everything
 from dsr.geometry.camera import Camera
-from dsr.geometry.surface import depth_to_normals, lights, render
 from dsr.methods.images import normalise
 from dsr.sample import CENTIMETRES, Scene, Unit
 from dsr.training.data_module import Part, PatchData, WholeScenes
@@ -53,8 +52,8 @@ def _settings(**changes: Any) -> PatchSettings:
     return PatchSettings(**{**plain, "rotate": False, "depth_scale": 0.0, "colour": 0.0, "photo": 0.0, **changes})
 
 
-def _patches(scenes: list[Scene] | None = None, count: int = 40, **changes: Any) -> Patches:
-    return Patches([scenes or [_scene()]], _settings(**changes), X4, count=count)
+def _patches(scenes: list[Scene] | None = None, **changes: Any) -> Patches:
+    return Patches([scenes or [_scene()]], _settings(**changes), X4)
 
 
 def _places(patch: Batch) -> tuple[np.ndarray, np.ndarray, int]:
@@ -109,11 +108,10 @@ def _equal(first: list[Batch], second: list[Batch]) -> bool:
 
 def test_patch_is_a_pure_function_of_the_seed_and_its_number() -> None:
     scenes, settings = [_scene(i) for i in range(3)], _settings(colour=0.1)
-    whole, later = (Patches([scenes], settings, X4, seed=5, count=12) for _ in range(2))
-    assert len(whole) == 12
+    whole, later = (Patches([scenes], settings, X4, seed=5) for _ in range(2))
     assert all(_same(later[i], whole[i]) for i in (9, 7, 8))  # whatever was asked for before
     assert not any(_same(whole[i], whole[7]) for i in range(12) if i != 7)
-    assert not _same(Patches([scenes], settings, X4, seed=6, count=12)[7], whole[7])
+    assert not _same(Patches([scenes], settings, X4, seed=6)[7], whole[7])
 
 
 def test_patches_neither_use_nor_change_the_global_random_states() -> None:
@@ -178,8 +176,8 @@ def test_devices_share_the_batches_of_a_step() -> None:
 
 def test_held_out_scenes_are_validated_whole_and_never_trained_on() -> None:
     data = _data()
-    assert data.training_count == 4
-    assert {kind: names for kind, (_, names) in data.validation_scenes().items()} == {"set": ["scene4", "scene5"]}
+    assert sum(len(names) for _, names in data.trained) == 4
+    assert {kind: names for kind, (_, names) in data.held_out.items()} == {"set": ["scene4", "scene5"]}
     seen = {int((255 * rgb[2, 0, 0]).round()) for batch in _batches(data, 60) for rgb in batch["rgb"]}
     assert seen == {0, 1, 2, 3}
     [loader] = data.val_dataloader()
@@ -193,13 +191,13 @@ def test_held_out_scenes_are_validated_whole_and_never_trained_on() -> None:
 def test_dataset_can_be_limited_to_its_first_scenes() -> None:
     sources = [Part(_Source([_scene(i) for i in range(6)]))]
     data = PatchData(sources, _settings(scenes=3, validation_scenes=1), X4)
-    assert data.used_scenes[0][1] == ["scene0", "scene1"]
-    assert data.validation_scenes()["set"][1] == ["scene2"]
+    assert data.trained[0][1] == ["scene0", "scene1"]
+    assert data.held_out["set"][1] == ["scene2"]
 
 
 def test_parts_give_patches_by_their_fractions() -> None:
     parts = [_scene(0)], [_scene(1), _scene(2)], [_scene(3)]
-    patches = Patches(parts, _settings(), X4, shares=[1, 3, 0], count=400)
+    patches = Patches(parts, _settings(), X4, shares=[1, 3, 0])
     seen = np.array([_places(patches[i])[2] for i in range(400)])
     assert np.bincount(seen, minlength=4) / 400 == pytest.approx([0.25, 0.375, 0.375, 0], abs=0.07)
 
@@ -207,7 +205,7 @@ def test_parts_give_patches_by_their_fractions() -> None:
 def test_part_keeps_its_fraction_and_a_scene_its_turn_with_sparse_depth() -> None:
     sparse = torch.full((1, 44, 60), torch.nan, dtype=torch.float64)
     sparse[0, ::3, ::3] = 2.0
-    patches = Patches([[_scene(0)], [_scene(1), _scene(2, depth=sparse)]], _settings(), X4, shares=[2, 2], count=400)
+    patches = Patches([[_scene(0)], [_scene(1), _scene(2, depth=sparse)]], _settings(), X4, shares=[2, 2])
     seen = np.array([_places(patches[i])[2] for i in range(400)])
     assert np.bincount(seen) / 400 == pytest.approx([0.5, 0.25, 0.25], abs=0.07)
 
@@ -215,10 +213,8 @@ def test_part_keeps_its_fraction_and_a_scene_its_turn_with_sparse_depth() -> Non
 def test_parts_hold_out_their_last_scenes_under_distinct_names() -> None:
     sources = [_Source([_scene(i) for i in numbers]) for numbers in ((0, 1, 2), (3, 4))]
     data = PatchData([Part(source) for source in sources], _settings(validation_scenes=1), X4)
-    assert data.validation_sets == ["set", "set_2"]
-    assert data.training_count == 3
-    assert [source for source, _ in data.used_scenes] == [*sources, *sources]
-    assert [names for _, names in data.used_scenes] == [["scene0", "scene1"], ["scene3"], ["scene2"], ["scene4"]]
+    assert data.trained == [(sources[0], ["scene0", "scene1"]), (sources[1], ["scene3"])]
+    assert data.held_out == {"set": (sources[0], ["scene2"]), "set_2": (sources[1], ["scene4"])}
     data.setup()
     assert [next(iter(loader))["rgb"][0, 2, 0, 0] * 255 for loader in data.val_dataloader()] == pytest.approx([2, 4])
 
@@ -227,8 +223,7 @@ def test_other_datasets_validate_whole_and_alone_where_nothing_is_held_out() -> 
     more: dict[str, SceneSource] = {"mine": _Source([_scene(8), BARE, _scene(9)])}
     data = PatchData([Part(_Source([_scene(0)]))], _settings(validation_scenes=0), X4, validation=more)
     data.setup()
-    assert data.validation_sets == ["mine"]
-    assert data.validation_scenes()["mine"][1] == ["scene8", "scene9"]
+    assert {name: scenes for name, (_, scenes) in data.held_out.items()} == {"mine": ["scene8", "scene9"]}
     with pytest.raises(ValueError, match=r"^validation_scenes: expected a positive number where there is no"):
         _data(validation_scenes=0)
 
@@ -241,13 +236,12 @@ def test_training_scene_cannot_validate_under_another_name() -> None:
     parts = [Part(_Copies([_scene(i) for i in range(6)]))]
     with pytest.raises(ValueError, match=r"validation.mine: expected scenes that are not trained on, got scene8"):
         PatchData(parts, _settings(), X4, validation={"mine": _Copies([_scene(8)])})
-    assert PatchData(parts, _settings(), X4, validation={"mine": _Copies([_scene(9)])}).validation_sets == [
-        "set", "mine",
-    ]  # fmt: skip
+    other = PatchData(parts, _settings(), X4, validation={"mine": _Copies([_scene(9)])})
+    assert list(other.held_out) == ["set", "mine"]
 
 
 def test_patches_reach_every_row_and_column_of_a_scene() -> None:
-    patches = _patches(count=400)
+    patches = _patches()
     seen: tuple[set[int], set[int]] = (set(), set())
     for i in range(400):
         for places, reached in zip(_places(patches[i])[:2], seen, strict=True):
@@ -259,7 +253,7 @@ def test_patches_reach_every_row_and_column_of_a_scene() -> None:
 def test_patch_has_the_points_of_its_pixels_in_the_scene_up_to_the_mirror(camera: Camera) -> None:
     bumps = torch.from_numpy(np.random.default_rng(0).uniform(1, 3, (1, 44, 60)))
     full = (bumps * camera.rays()).numpy()
-    patches, mirrors = _patches([_scene(camera=camera, depth=bumps)], count=60), set()
+    patches, mirrors = _patches([_scene(camera=camera, depth=bumps)]), set()
     for i in range(60):
         patch = patches[i]
         rows, columns, _ = _places(patch)
@@ -301,7 +295,7 @@ def test_network_input_depends_on_the_low_resolution_map_alone() -> None:
 @pytest.mark.parametrize("camera", [CAMERA, STEREO])
 def test_min_max_lies_between_the_patchs_and_the_scenes_and_half_are_the_scenes(camera: Camera) -> None:
     """The scene's, as the patch's camera counts it: turned, and nearer or farther."""
-    patches = _patches([_scene(camera=camera)], count=200, rotate=True, depth_scale=0.5)
+    patches = _patches([_scene(camera=camera)], rotate=True, depth_scale=0.5)
     coarse = 1 / (1 / _tilted(camera)).reshape(11, 4, 15, 4).mean(dim=(1, 3)).numpy()
     shares = []
     for i in range(200):
@@ -323,7 +317,7 @@ def test_min_max_lies_between_the_patchs_and_the_scenes_and_half_are_the_scenes(
 
 
 def test_min_max_of_a_noisy_patch_contains_its_low_resolution_map_or_is_the_clean_scenes() -> None:
-    patches = Patches([[_scene()]], _settings(), Degradation(4, BOX, GaussianMultiplicative(0.005)), count=60)
+    patches = Patches([[_scene()]], _settings(), Degradation(4, BOX, GaussianMultiplicative(0.005)))
     coarse = 10 * (1 / _tilted(CAMERA)).reshape(11, 4, 15, 4).mean(dim=(1, 3))
     clean = 0
     for i in range(60):
@@ -349,7 +343,7 @@ def test_min_max_of_a_whole_scene_is_its_low_resolution_maps_and_that_of_a_wall_
 def test_noise_is_new_in_every_patch_and_the_same_in_every_run() -> None:
     noisy = Degradation(4, BOX, GaussianMultiplicative(0.01))
     wall = _scene(depth=torch.full((1, 44, 60), 2.0, dtype=torch.float64))
-    first, again = (Patches([[wall]], _settings(), noisy, count=50) for _ in range(2))
+    first, again = (Patches([[wall]], _settings(), noisy) for _ in range(2))
     assert _same(first[7], again[7])
     values = np.stack([first[i]["disparity_lr"].numpy() / 5 - 1 for i in range(50)])
     assert values.std() == pytest.approx(0.01, rel=0.1)
@@ -362,7 +356,7 @@ def test_noise_is_new_in_every_patch_and_the_same_in_every_run() -> None:
 
 def test_colour_is_a_gain_per_channel_of_the_given_spread() -> None:
     grey = replace(_scene(), rgb=torch.full((3, 44, 60), 0.4))
-    patches = _patches([grey], count=300, colour=0.1)
+    patches = _patches([grey], colour=0.1)
     gains = np.stack([patches[i]["rgb"].numpy() / 0.4 for i in range(300)])
     assert np.ptp(gains, axis=(2, 3)).max() < 1e-6
     gains = gains[:, :, 0, 0]
@@ -380,7 +374,7 @@ def test_colour_stays_within_its_range_and_is_unchanged_when_off() -> None:
 
 def test_given_fraction_of_the_photos_gets_another_gamma_blur_and_noise() -> None:
     step = replace(_scene(), rgb=(0.2 + 0.6 * (torch.arange(60.0) >= 30)).expand(3, 44, 60).contiguous())
-    patches = _patches([step], count=400, photo=0.5, flip=False)
+    patches = _patches([step], photo=0.5, flip=False)
     changed = [patch["rgb"] for patch in (patches[i] for i in range(400)) if len(patch["rgb"].unique()) > 2]
     assert len(changed) / 400 == pytest.approx(0.5, abs=0.08)
     left = torch.stack([photo[..., :3].mean() for photo in changed if photo[..., :8].max() < 0.55])
@@ -395,7 +389,7 @@ def test_given_fraction_of_the_photos_gets_another_gamma_blur_and_noise() -> Non
 def test_holes_are_kept_and_half_of_a_patch_is_valid_where_possible() -> None:
     depth = _tilted(CAMERA)
     depth[:, :, :30] = torch.nan
-    patches, shares = _patches([_scene(depth=depth)], count=60), []
+    patches, shares = _patches([_scene(depth=depth)]), []
     for i in range(60):
         patch = patches[i]
         _, columns, _ = _places(patch)
@@ -442,16 +436,18 @@ REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
                            ("depth_scale", -0.1), ("colour", -0.1), ("colour", float("nan")), ("scenes", 0))
     },
     **{
-        f"share={value}": (lambda value=value: Part(_Source([_scene()]), value), "^share: expected ")
-        for value in (-1.0, float("nan"), float("inf"))
+        f"shares={shares}": (
+            lambda shares=shares: Patches(len(shares) * [[_scene()]], _settings(), X4, shares=shares),
+            "^shares: expected numbers of 0 or more, one of them positive, got ",
+        )
+        for shares in ([0.0], [2.0, -1.0], [2.0, float("nan")], [2.0, float("inf")])
     },
-    "shares of 0": (lambda: Patches([[_scene()]], _settings(), X4, shares=[0]), "^shares: expected a positive number"),
     "too few scenes": (lambda: _data(validation_scenes=6), "^validation_scenes: expected fewer than the 6 scenes"),
     "a patch in 4": (lambda: _data(patch=30), "^patch: expected a size that scale=4 divides"),
     "a patch in 16": (lambda: _data(degradation=Degradation(16, BOX), patch=24), "^patch: .*scale=16 divides, got 24"),
     "factors": (lambda: _degraded([_scene()], Everything(scales={4: 1, 16: 1}), size=24), "16"),
     "a small scene": (lambda: _patches([_scene(), SMALL], patch=32), "^patch: expected at most scene1's 30 x 60"),
-    "no truth": (lambda: _data([BARE, *map(_scene, range(3))]).setup(), "^bare: expected a true depth to train with"),
+    "no truth": (lambda: _data([BARE, *map(_scene, range(3))]).setup(), "^bare: expected a true depth, there is none"),
     "no truth to validate with": (
         lambda: PatchData([Part(_Source([_scene()]))], _settings(validation_scenes=0), X4,
                           validation={"mine": _Source([BARE])}).setup(),
@@ -482,7 +478,7 @@ def test_window_that_noise_leaves_empty_is_replaced_by_another() -> None:
 
 
 def _degraded(scenes: list[Scene], everything: Everything, batch: int = 2, size: int = SIZE, **changes: Any) -> Patches:
-    return Patches([scenes], _settings(patch=size, batch=batch, **changes), X4, count=36, everything=everything)
+    return Patches([scenes], _settings(patch=size, batch=batch, **changes), X4, everything=everything)
 
 
 def test_degraded_patches_are_pure_functions_of_their_number_and_describe_themselves() -> None:
@@ -542,11 +538,6 @@ def _waves() -> Scene:
     return Scene("set", "waves", rgb, WIDE, depth, {1: depth})
 
 
-def _normals(scene: Scene) -> Tensor:
-    assert scene.depth is not None
-    return depth_to_normals(scene.depth[None], scene.camera.rays()[None])[0]
-
-
 def _quarter(vectors: Tensor) -> Tensor:
     """Return vectors turned counterclockwise about the axis, as a picture with y down shows it."""
     x, y, z = vectors
@@ -564,21 +555,6 @@ def test_turned_scene_has_the_turned_points(turns: int) -> None:
     for _ in range(turns):
         expected = _quarter(expected)
     torch.testing.assert_close(_points(rotate90(_waves(), turns)), expected, rtol=0, atol=1e-12, equal_nan=True)
-
-
-@pytest.mark.parametrize("turns", [0, 1, 2, 3])
-def test_turned_plane_has_the_turned_normal_and_is_lit_by_it(turns: int) -> None:
-    normal = torch.tensor([0.3, -0.4, -1.0], dtype=torch.float64)[:, None, None]
-    depth = -2.0 / (normal * WIDE.rays()).sum(dim=0, keepdim=True)
-    shown = _normals(rotate90(Scene("set", "plane", torch.rand(3, 23, 31), WIDE, depth), turns))
-    expected = normal / normal.norm()
-    for _ in range(turns):
-        expected = _quarter(expected)
-    lit = (lights() @ expected.flatten()).clamp(0, 1)[:, None, None]
-    known = shown[0].isfinite()
-    assert known.float().mean() > 0.8
-    assert float((shown - expected).abs()[:, known].max()) < 1e-9
-    assert float((render(shown[None])[0] - lit).abs()[:, known].max()) < 1e-9
 
 
 def test_four_quarter_turns_and_two_mirrors_restore_the_waves() -> None:

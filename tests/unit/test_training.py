@@ -34,7 +34,7 @@ from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS
 from dsr.sample import CENTIMETRES, Scene, Unit
 from dsr.training.callbacks import log_layout
-from dsr.training.data_module import WholeScenes, collate_scene
+from dsr.training.data_module import WholeScenes
 from dsr.training.degradation import Batch, Degradation, to_tensors
 from dsr.training.module import SuperResolution, WarmupCosine
 from dsr.training.objective import DepthObjective, SurfaceObjective, balance_weight, shading_loss, to_depth
@@ -150,13 +150,6 @@ def test_holes_of_the_low_resolution_map_do_not_widen_its_range() -> None:
 def test_setting_of_the_loss_out_of_range_is_refused(wrong: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=f"^{message}"):
         DepthObjective(**wrong)
-
-
-@pytest.mark.parametrize("doffs", [0.0, 1.0, -2.5])
-def test_disparity_is_converted_back_to_its_depth(doffs: float) -> None:
-    depth = torch.from_numpy(np.random.default_rng(0).uniform(1, 3, (1, 12, 13)))
-    batch = {**_batch(depth, STEREO, (3.0, 5.0)), "doffs": _four(doffs)}
-    torch.testing.assert_close(to_depth(0.5 * 20 / depth[None] - doffs, batch), depth[None], rtol=1e-13, atol=0)
 
 
 def test_disparity_at_or_beyond_infinity_has_no_depth() -> None:
@@ -277,8 +270,8 @@ class _Losses(Callback):
 
 
 def _one_batch() -> DataLoader[Batch]:
-    patches = Patches([[_scene(0), _scene(1)]], PatchSettings(patch=32, batch=2), X2, count=2)
-    return DataLoader(patches, batch_size=2)
+    patches = Patches([[_scene(0), _scene(1)]], PatchSettings(patch=32, batch=2), X2)
+    return DataLoader([patches[0], patches[1]], batch_size=2)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("mixed", [False, True])
@@ -380,7 +373,7 @@ def test_invalid_average_is_refused(average: float) -> None:
 
 
 def _loader(scenes: WholeScenes) -> DataLoader[Batch]:
-    return DataLoader(scenes, collate_fn=collate_scene)
+    return DataLoader(scenes, batch_size=None)
 
 
 def test_validation_is_in_the_unit_of_its_benchmark(tmp_path: Path) -> None:
@@ -407,7 +400,7 @@ def test_validation_logs_the_mean_over_the_scenes_in_the_units_of_tables(tmp_pat
     factors = {"RMSE_d": 1000, "RMSE_v": 1000, "RMSE_v1": 1000, "DSSIM_v": 1000, "BadPix_v_5": 100, "Bumpiness_d": 1}
     values: dict[str, list[float]] = {name: [] for name in factors}
     for i in range(3):
-        batch = collate_scene([scenes[i]])
+        batch = scenes[i]
         with torch.no_grad():
             disparity = module.average.upsample(batch["rgb"], batch["disparity_lr"])
         assert bool((disparity > 0).all())

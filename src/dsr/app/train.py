@@ -289,7 +289,7 @@ def _module(settings: TrainConfig, net: DisparityNetwork, data: PatchData) -> Su
             what = "a loss of its own" if w is None else "no visual loss, which model.objective.w=auto adds"
             raise ConfigError(f"loss.{key}: model={names['model']} has {what}; leave it out")
     metrics = functools.partial(metric_collection, settings.metrics)
-    given = {"net": net, "metrics": metrics, "validation_sets": data.validation_sets}
+    given = {"net": net, "metrics": metrics, "validation_sets": list(data.held_out)}
     with keyed():
         module = build("model", {key: value for key, value in node.items() if key not in given}, given, names["model"])
         module.logs_curves = False  # a callback of the configuration does
@@ -336,20 +336,20 @@ def _train(plain: Config, settings: TrainConfig, prepared: _Prepared, processes:
         rundir.expect_free(folder, plain, prepared.identity, prepared.tolerated)
         if (folder / WEIGHTS).exists() and not settings.overwrite:
             raise ConfigError(f"output_dir: {folder / WEIGHTS} is trained already; overwrite=true trains it again")
-    held_out = ", ".join(f"{len(names)} of {kind}" for kind, (_, names) in data.validation_scenes().items())
-    parameters = sum(each.numel() for each in module.net.parameters())
+    held_out = ", ".join(f"{len(names)} of {kind}" for kind, (_, names) in data.held_out.items())
+    count, parameters = sum(len(names) for _, names in data.trained), sum(p.numel() for p in module.net.parameters())
     patch, several = data.patches.patch, f" x {settings.accumulate} batches" if settings.accumulate > 1 else ""
     several += f" x {processes.count} devices" if processes.count > 1 else ""
     logs = (f"tensorboard --logdir {folder}" if name == "tensorboard" else name for name in settings.logger)
     for line in (
         f"model  {settings.names['model']} x{settings.scale}, {parameters:,} parameters, {settings.precision}",
-        f"data   {data.training_count} scenes of {settings.names['dataset']} to train on, {held_out} to validate with",
+        f"data   {count} scenes of {settings.names['dataset']} to train on, {held_out} to validate with",
         f"steps  {settings.steps} of {data.patches.batch} patches of {patch} x {patch}{several}"
         f"{', resumed' if prepared.resume else ''}",
         f"log    {', '.join(logs)}",
     ):
         prepared.progress.say(line)
-    for source, names in data.used_scenes:
+    for source, names in (*data.trained, *data.held_out.values()):
         prepare_scenes(source, names, prepared.progress)
     with keyed():
         data.setup()

@@ -79,8 +79,8 @@ def studies_of_run(plain: Config, given: Sequence[str]) -> Iterator[tuple[dict[s
         yield base, None
         return
     data = training_data(TrainConfig.of(run))
-    for kind, (source, scenes) in data.validation_scenes().items():
-        several = len(data.validation_sets) > 1 and base["output_dir"] is not None
+    for kind, (source, scenes) in data.held_out.items():
+        several = len(data.held_out) > 1 and base["output_dir"] is not None
         place = {"output_dir": str(Path(base["output_dir"]) / kind)} if several else {}
         there = {"names": {**names, "dataset": kind}, "dataset": {"validation_of": str(folder)}}
         yield {**base, **place, **there}, SceneSubset(source, scenes)

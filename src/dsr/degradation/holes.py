@@ -90,7 +90,6 @@ def occluded(disparity: Tensor) -> Tensor:
 
 def no_holes() -> None:
     """Return no holes, for ``holes=none``."""
-    return
 
 
 HOLES = ("blobs", "shadows", "steps", "dark", "pixels")

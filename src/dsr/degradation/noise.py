@@ -157,16 +157,12 @@ class Kinect:
         planes = edge.reshape(-1, 1, *edge.shape[-2:]).float()
         beside = functional.max_pool2d(planes, 2 * self.reach - 1, stride=1, padding=self.reach - 1).view_as(edge) > 0
         lost = (chances < self.dropout) & beside
-        if self.nearest is not None:
-            lost |= depth < self.nearest
-        if self.farthest is not None:
-            lost |= depth > self.farthest
+        lost |= (depth < (self.nearest or 0)) | (depth > (self.farthest or math.inf))
         return depth.masked_fill(lost, torch.nan).to(values.dtype)
 
 
 def no_noise() -> None:
     """Return no noise, for ``noise=none``."""
-    return
 
 
 def _expect_positive(**values: float) -> None:
@@ -200,23 +196,17 @@ def _waves(values: Tensor, _: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def _longest(values: Tensor) -> float:
-    """Return the longest waves of a map in pixels: longer ones could not be distinguished from its shape.
-
-    With what is added to them, and planes taken off, the longest measure about 45 pixels.
-    """
+    """Return the longest waves of a map in pixels: longer ones could not be distinguished from its shape."""
     return max(1.0, min(64.0, min(values.shape[-2:]) / 4))
 
 
 def _structured(values: Tensor, luma: Tensor, generator: torch.Generator) -> Tensor:
-    """A projector and a camera that match windows and count disparity in steps.
-
-    The noise is that of Nguyen et al., Modeling Kinect sensor noise, 3DIMPVT 2012: axial 1.2 mm + 1.9 mm (z - 0.4)^2
-    and more at grazing incidence, lateral 0.8 pixels.
-    """
+    """A projector and a camera that match windows and count disparity in steps, with axial and lateral noise."""
     focal = uniform(300, 700, generator)
     stereo_constant = uniform(0.04, 0.12, generator) * focal
     seen = _fatten(values, 1, generator) if chance(0.5, generator) else values
     seen = _jitter(seen, uniform(0, 0.8, generator), generator)
+    # The noise of Nguyen et al., Modeling Kinect sensor noise, 3DIMPVT 2012, up to 0.8 pixels laterally
     depth = values.reciprocal()
     axial = 0.0012 + 0.0019 * (depth - 0.4).square()
     slope = (
@@ -264,13 +254,10 @@ def _jitter(values: Tensor, strength: float, generator: torch.Generator) -> Tens
 
 
 def _count(disparity: Tensor, noise: Tensor, generator: torch.Generator, *, stereo: bool = False) -> Tensor:
-    """Return disparity in pixels as matching windows finds it: drawn to whole pixels, in steps, and smoothed again.
-
-    Where the noise is weak against the step, a slanted wall becomes a stair.
-    """
+    """Return disparity in pixels as matching windows finds it: drawn to whole pixels, in steps, and smoothed again."""
     steps = (0.0, 1 / 64, 1 / 32, 1 / 32) if stereo else (1 / 32, 1 / 16, 1 / 8, 1 / 8)
     step = steps[int(torch.randint(4, (1,), generator=generator))]
-    if step and chance(0.15 if stereo else 0.4, generator):
+    if step and chance(0.15 if stereo else 0.4, generator):  # noise so weak that a slanted wall becomes a stair
         noise = noise * (uniform(0.1, 0.6, generator) * step / noise.std().clamp(min=1e-9)).clamp(max=1)
     counted = disparity + noise
     if chance(0.3, generator):  # fits of a parabola to the costs favour whole pixels (Shimizu, Okutomi, IJCV 2005)
@@ -367,11 +354,7 @@ def _lidar(values: Tensor, luma: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def _stereo(values: Tensor, luma: Tensor, generator: torch.Generator) -> Tensor:
-    """Two cameras of a size of their own, whose map is enlarged to this one by repeating values.
-
-    Matching windows and filters that stop at steps make disparity noise alike over several octaves; what only one
-    camera sees is lost or filled.
-    """
+    """Two cameras of a size of their own, whose map is enlarged to this one by repeating values."""
     length = _longest(values) ** math.sqrt(uniform(0, 1, generator))  # of the waves, in pixels of this map
     ratio = uniform(1, max(1.0, min(3.4, length / 2)), generator) if chance(0.7, generator) else 1.0
     rows, columns = (_repeated(size, ratio, generator) for size in values.shape[-2:])

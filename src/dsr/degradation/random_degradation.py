@@ -112,10 +112,7 @@ class Everything:
     def __call__(
         self, scene: Scene, scale: int, generator: torch.Generator, *, soft: bool = False
     ) -> tuple[DepthSample, Hints]:
-        """Return a scene or a patch with a true depth with a low-resolution map, and hints.
-
-        The factor ``scale`` divides its size; at 1 a map has noise, if any kind is to be drawn.
-        """
+        """Return a scene with a low-resolution map, and hints; at factor 1 it has noise, if any kind is to be drawn."""
         if chance(self.folds, generator):
             scene = add_folds(scene, generator)
         if scale > 1 and chance(self.relief, generator):
@@ -183,7 +180,6 @@ class Everything:
 
 def plain() -> None:
     """Return no distribution, for ``degradation=plain``: maps are made by downsampling and noise alone."""
-    return
 
 
 def add_relief(scene: Scene, generator: torch.Generator) -> Scene:
@@ -242,13 +238,10 @@ def print_pattern(rgb: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def take_another_photo(rgb: Tensor, generator: torch.Generator) -> Tensor:
-    """Return a photo, (3, H, W), with another exposure, white balance and contrast, and with blur, noise and JPEG.
-
-    One of twelve shows little, down to nothing, as at night or in fog.
-    """
+    """Return a photo, (3, H, W), with another exposure, white balance and contrast, and with blur, noise and JPEG."""
     gain = math.exp(uniform(-0.7, 0.5, generator)) * (1 + 0.08 * torch.randn((3, 1, 1), generator=generator))
     rgb = (rgb * gain).clamp(0, 1) ** math.exp(uniform(-0.4, 0.4, generator))
-    if chance(1 / 12, generator):
+    if chance(1 / 12, generator):  # shows little, down to nothing, as at night or in fog
         rgb = torch.lerp(rgb.mean(dim=(-2, -1), keepdim=True), rgb, uniform(0, 0.3, generator))
     if chance(0.5, generator):
         sigma = uniform(0.3, 1.2, generator)

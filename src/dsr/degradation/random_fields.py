@@ -39,21 +39,22 @@ def normal(generator: torch.Generator) -> float:
 
 
 def field_of(like: Tensor, sigma: float | tuple[float, float], generator: torch.Generator) -> Tensor:
-    """Return normal noise with a variance of 1, (1, h, w), blurred by a Gaussian of ``sigma`` pixels, or of two (v, u).
-
-    Wide Gaussians are drawn on a coarse grid and enlarged, which costs little.
-    """
+    """Return normal noise with a variance of 1, (1, h, w), blurred by a Gaussian of ``sigma`` pixels, or of (v, u)."""
     if sigma == 0:
         return torch.randn(like.shape, generator=generator)
     sigmas = sigma if isinstance(sigma, tuple) else (sigma, sigma)
-    factors = [max(int(each / 1.25), 1) for each in sigmas]
+    factors = [max(int(each / 1.25), 1) for each in sigmas]  # wide Gaussians are drawn on a coarse grid and enlarged
     height, width = like.shape[-2:]
-    down, across = (_normalised_taps(each / factor) for each, factor in zip(sigmas, factors, strict=True))
     rows, columns = (
         -(-size // factor) + 2 * (factor > 1) for size, factor in zip((height, width), factors, strict=True)
     )
-    draws = torch.randn((1, 1, rows + len(down) - 1, columns + len(across) - 1), generator=generator)
-    field = _weighted_sums(_weighted_sums(draws, down, -2), across, -1)
+    taps = []  # the values of Gaussians whose squares add up to 1
+    for each, factor in zip(sigmas, factors, strict=True):
+        radius = max(math.ceil(3.5 * (each / factor)), 1)
+        values = torch.exp(-0.5 * (torch.arange(-radius, radius + 1) / (each / factor)).square())
+        taps.append(values / values.norm())
+    draws = torch.randn((1, 1, rows + len(taps[0]) - 1, columns + len(taps[1]) - 1), generator=generator)
+    field = _weighted_sums(_weighted_sums(draws, taps[0], -2), taps[1], -1)
     if max(factors) == 1:
         return field[0]
     size = rows * factors[0], columns * factors[1]
@@ -77,13 +78,6 @@ def waves_of(like: Tensor, length: float, generator: torch.Generator, stretch: f
         field += ratio**octave * field_of(like, (size / stretch, size * stretch), generator)
         variance += ratio ** (2 * octave)
     return field / math.sqrt(variance)
-
-
-def _normalised_taps(sigma: float) -> Tensor:
-    """Return the values of a Gaussian whose squares add up to 1."""
-    radius = max(math.ceil(3.5 * sigma), 1)
-    taps = torch.exp(-0.5 * (torch.arange(-radius, radius + 1) / sigma).square())
-    return taps / taps.norm()
 
 
 def _weighted_sums(values: Tensor, taps: Tensor, dim: int) -> Tensor:

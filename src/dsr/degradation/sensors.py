@@ -129,19 +129,19 @@ def identify(depth: Tensor, name: str = "auto", device_name: str = "") -> Identi
     """
     if name == "none":
         return None
-    named = None if name == "auto" else sensor_named(name)
     steps = recognise_values(depth)
     constant = None if steps is None else steps.constant
-    if named is not None:
+    if name != "auto":
+        named = sensor_named(name)
         if constant is not None and _mismatch(named, constant) > _ALIKE:
             raise ValueError(
                 f"sensor: expected depth in steps of disparity with f B / step = {_counts(named):.0f} m, as of a "
                 f"{named.name}, or of one of its other modes, got {constant:.0f} m"
             )
         return Identified(named, "request", constant)
-    named = recognise(device_name)
-    if named is not None and _has_figures(named) and (constant is None or _mismatch(named, constant) <= _ALIKE):
-        return Identified(named, "file", constant)
+    stated = recognise(device_name)
+    if stated is not None and _has_figures(stated) and (constant is None or _mismatch(stated, constant) <= _ALIKE):
+        return Identified(stated, "file", constant)
     if constant is None:
         return None
     best = min((each for each in SENSORS if each.step is not None), key=lambda each: _mismatch(each, constant, _USUAL))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
 import os
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -25,7 +24,7 @@ from dsr.training.settings import PatchSettings
 from dsr.utils import interruption
 from dsr.utils.guards import derived
 
-_EPOCH = 1000  # about how many batches an epoch has where the trainer has no number of steps
+_EPOCH = 1000
 
 
 @dataclass(frozen=True)
@@ -35,14 +34,9 @@ class Part:
     source: SceneSource
     share: float = 1.0
 
-    def __post_init__(self) -> None:
-        """Check the share."""
-        if not 0 <= self.share < math.inf:
-            raise ValueError(f"share: expected 0 or a positive number, got {self.share}")
-
 
 class WholeScenes(Dataset[Batch]):
-    """Samples of whole scenes in float64, in which evaluation scores them; ``hinted`` adds the hints of ``eval.py``."""
+    """Batches of one whole scene in float64, as evaluation scores it; ``hinted`` adds the hints of ``eval.py``."""
 
     def __init__(
         self, scenes: Sequence[Scene], degradation: Degradation, seed: int = 0, *, hinted: bool = False
@@ -50,29 +44,19 @@ class WholeScenes(Dataset[Batch]):
         self._samples = [degradation.sample(scene, seed) for scene in scenes]
         self._facts = None
         if hinted:
-            kernel = degradation.downsampling.assumed_model().kernel
-            self._facts = encode_facts(kernel, soft=False, noise=degradation.noise is None)
+            self._facts = encode_facts(degradation.downsampling.kernel, soft=False, noise=degradation.noise is None)
 
     def __len__(self) -> int:
         return len(self._samples)
 
     def __getitem__(self, index: int) -> Batch:
-        """Return a sample's tensors, its ``unit``, hints if there are any, and ``bicubic``, (1, H, W) in metres."""
+        """Return a scene's tensors, its ``unit``, hints if there are any, and ``bicubic``, (1, 1, H, W) in metres."""
         sample = self._samples[index]
         tensors = to_tensors(sample, torch.float64)
         tensors["bicubic"] = Interpolation("bicubic")(sample).double()
         if self._facts is not None:
             tensors |= {"noise": torch.zeros_like(tensors["disparity_lr"]).float(), "facts": self._facts}
-        return {**tensors, "unit": asdict(sample.unit)}
-
-
-def collate_scene(samples: Sequence[Batch]) -> Batch:
-    """Return a batch of one whole scene, empty as its sample."""
-    (sample,) = samples
-    if not sample:
-        return {}
-    tensors = {name: value for name, value in sample.items() if name != "unit"}
-    return {**default_collate([tensors]), "unit": sample["unit"]}
+        return {**{name: value[None] for name, value in tensors.items()}, "unit": asdict(sample.unit)}
 
 
 class PatchData(lightning.LightningDataModule):
@@ -104,66 +88,52 @@ class PatchData(lightning.LightningDataModule):
         check_patches((), settings, degradation.scale)
         self._everything, self._per_step = everything, patches_per_step
         self.patches, self._degradation, self._seed = settings, degradation, seed
-        self._trained: list[tuple[Part, list[str]]] = []
-        self._held_out: dict[str, tuple[SceneSource, list[str]]] = {}
+        self._shares = [part.share for part in parts]
+        self.trained: list[tuple[SceneSource, list[str]]] = []  # data sets and names of their scenes to train on
+        self.held_out: dict[str, tuple[SceneSource, list[str]]] = {}  # likewise to validate with, by validation set
+        held_out: list[tuple[str, SceneSource, list[str]]] = []
         for part in parts:
             names, kept = _split(part.source, settings)
-            self._trained.append((part, names))
+            self.trained.append((part.source, names))
             if kept:
-                self._held_out[_make_unique(part.source.name, self._held_out)] = (part.source, kept)
-        for name, source in (validation or {}).items():
-            self._held_out[_make_unique(name, self._held_out)] = (source, source.scenes())
-        if not self._held_out:
+                held_out.append((part.source.name, part.source, kept))
+        held_out += [(name, source, source.scenes()) for name, source in (validation or {}).items()]
+        if not held_out:
             raise ValueError("validation_scenes: expected a positive number where there is no other validation")
-        trained = {content_key(part.source, name) for part, names in self._trained for name in names}
-        for kind, (source, names) in self._held_out.items():
-            for name in names:
-                if content_key(source, name) in trained:  # under whatever name
-                    raise ValueError(f"validation.{kind}: expected scenes that are not trained on, got {name}")
+        trained = {content_key(source, name) for source, names in self.trained for name in names}
+        for name, source, scenes in held_out:
+            kind, number = name, 1
+            while kind in self.held_out:
+                number += 1
+                kind = f"{name}_{number}"
+            self.held_out[kind] = (source, scenes)
+            for scene in scenes:
+                if content_key(source, scene) in trained:  # under whatever name
+                    raise ValueError(f"validation.{kind}: expected scenes that are not trained on, got {scene}")
         self._validation: list[list[Scene]] = []
-
-    @property
-    def used_scenes(self) -> list[tuple[SceneSource, list[str]]]:
-        """The scenes to train on and to validate with, by data set; those of the parts come first."""
-        return [*((part.source, names) for part, names in self._trained), *self._held_out.values()]
-
-    @property
-    def validation_sets(self) -> list[str]:
-        """The names of the validation sets, in the order of the loaders."""
-        return list(self._held_out)
-
-    @property
-    def training_count(self) -> int:
-        """The number of scenes to train on."""
-        return sum(len(names) for _, names in self._trained)
-
-    def validation_scenes(self) -> dict[str, tuple[SceneSource, list[str]]]:
-        """Return the data set and the names of the scenes of each validation set."""
-        return dict(self._held_out)
 
     def setup(self, stage: str = "fit") -> None:
         """Load the scenes; Lightning's ``stage`` makes no difference."""
         if self._validation:
             return
-        groups: list[list[Scene]] = []
-        for part, names in self._trained:
-            scenes = map(part.source.load, names)
-            # float32 takes half the memory
-            groups.append([derived(s, depth=None if s.depth is None else s.depth.float()) for s in scenes])
+        groups = [  # of float32, which takes half the memory
+            [derived(scene, depth=scene.true_depth.float()) for scene in map(source.load, names)]
+            for source, names in self.trained
+        ]
         self._cut = Patches(
             groups,
             self.patches,
             self._degradation,
-            shares=[part.share for part, _ in self._trained],
+            shares=self._shares,
             seed=self._seed,
             everything=self._everything,
             per_step=self._per_step,
         )
-        for kind, (source, names) in self._held_out.items():
+        for kind, (source, names) in self.held_out.items():
             known = [scene for scene in map(source.load, names) if scene.depth is not None]
             if not known:
                 raise ValueError(f"validation.{kind}: expected scenes with a true depth, there is none")
-            self._held_out[kind] = (source, [scene.name for scene in known])
+            self.held_out[kind] = (source, [scene.name for scene in known])
             self._validation.append(known)
 
     def first_patches(self, count: int) -> list[Batch]:
@@ -172,11 +142,7 @@ class PatchData(lightning.LightningDataModule):
         return [self._cut[number] for number in range(count)]
 
     def train_dataloader(self) -> DataLoader[Batch]:
-        """Return a loader of an epoch's patches, which begins at the trainer's current step.
-
-        An epoch is the whole training or, where the trainer has no number of steps, about 1000 batches. The length is
-        that of the whole epoch, as Lightning subtracts the batches that were done before an interruption.
-        """
+        """Return a loader of an epoch's patches, which begins at the trainer's current step."""
         self.setup()
         module: Any = getattr(self.trainer, "lightning_module", None)
         prepare = getattr(getattr(module, "net", None), "prepare", None)
@@ -190,18 +156,14 @@ class PatchData(lightning.LightningDataModule):
         )
 
     def val_dataloader(self) -> list[DataLoader[Batch]]:
-        """Return a loader for each validation set, of whole scenes, one at a time.
-
-        Each device has a part of the scenes; one without a scene has an empty batch, as Lightning would not let it take
-        part in the validation.
-        """
+        """Return a loader for each validation set, of whole scenes, one at a time; each device has a part of them."""
         rank, devices = (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)
         parts = (scenes[rank::devices] for scenes in self._validation)
         hinted = self._everything is not None
-        samples: Any = (
+        batches: Any = (  # an empty one where a device has no scene: Lightning would leave it out of the validation
             WholeScenes(part, self._degradation, self._seed, hinted=hinted) if part else [{}] for part in parts
         )
-        return [DataLoader(each, batch_size=1, collate_fn=collate_scene) for each in samples]
+        return [DataLoader(each, batch_size=None) for each in batches]
 
     test_dataloader = predict_dataloader = val_dataloader
 
@@ -222,7 +184,11 @@ def _split(source: SceneSource, settings: PatchSettings) -> tuple[list[str], lis
 
 
 class _PatchNumbers:
-    """The patch numbers of one device's batches in an epoch, from the trainer's current step on."""
+    """The patch numbers of one device's batches in an epoch, from the trainer's current step on.
+
+    An epoch is the whole training or, where the trainer has no number of steps, about 1000 batches. The length is that
+    of the whole epoch, as Lightning subtracts the batches that were done before an interruption.
+    """
 
     def __init__(self, trainer: lightning.Trainer | None, batch: int) -> None:
         self._trainer, self._batch = trainer, batch
@@ -260,12 +226,3 @@ def _begin_worker(parent: int, _: int) -> None:
     """Prepare a worker; torch looks after the parent only every five seconds."""
     interruption.end_with(parent)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # to the whole group: the parent may need it to complete a step
-
-
-def _make_unique(name: str, names: Mapping[str, Any]) -> str:
-    """Return the name, with a number behind it where ``names`` has it already."""
-    candidate, number = name, 1
-    while candidate in names:
-        number += 1
-        candidate = f"{name}_{number}"
-    return candidate

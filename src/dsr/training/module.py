@@ -113,7 +113,7 @@ class SuperResolution(lightning.LightningModule):
 
     def forward(self, batch: Batch) -> Tensor:
         """Return high-resolution depth by the averaged weights, (B, 1, H, W) in metres; NaN where there is none."""
-        with self._exact():
+        with torch.autocast(self.device.type, enabled=False):
             return to_depth(self.average.answer_scene(batch).to(batch["disparity_lr"].dtype), batch)
 
     def training_step(self, batch: Batch, _: int = 0) -> Tensor:
@@ -125,12 +125,8 @@ class SuperResolution(lightning.LightningModule):
     def loss_terms(self, batch: Batch) -> dict[str, Tensor]:
         """Return ``loss`` and its terms."""
         answer = self.net.answer_patches(batch)
-        with self._exact():
+        with torch.autocast(self.device.type, enabled=False):
             return self.objective(answer, batch)
-
-    def _exact(self) -> contextlib.AbstractContextManager[Any]:
-        """Return a context without the trainer's mixed precision, for losses and metrics."""
-        return torch.autocast(self.device.type, enabled=False)
 
     def configure_gradient_clipping(
         self,
@@ -160,14 +156,14 @@ class SuperResolution(lightning.LightningModule):
 
     def on_validation_epoch_start(self) -> None:
         """Score bicubic interpolation, too, unless its scores are known from the training's first validation."""
-        known = self.bicubic and self._fits
+        known = self.bicubic and self.trainer.state.fn == TrainerFn.FITTING
         self._bicubic_metrics = [] if known else [self._make_metrics().to(self.device) for _ in self.sets]
 
     def validation_step(self, batch: Batch, index: int, dataloader_idx: int = 0) -> None:
         """Score a whole scene, if the batch has one; render the first few for the loggers."""
         if not batch:
             return
-        with self._exact():
+        with torch.autocast(self.device.type, enabled=False):
             depth = self(batch)
             scored = [(self.metrics[dataloader_idx], depth)]
             if self._bicubic_metrics:
@@ -218,18 +214,13 @@ class SuperResolution(lightning.LightningModule):
         metrics: Any = {name: metric for each in self.metrics for name, metric in each.items()}  # type: ignore[operator]
         self.shown_scores = {kind: in_table_units(metrics, raw) for kind, raw in self.validation_scores.items()}
         shown = _by_tag(self.shown_scores)
-        if not self._fits:
+        if self.trainer.state.fn != TrainerFn.FITTING:
             self.log_dict(shown)
             return
         self.log_dict(_by_tag(self.validation_scores), logger=False)
         for logger in self.loggers:  # Lightning would count steps from 0
             logger.log_metrics(shown, self.global_step)
             logger.save()
-
-    @property
-    def _fits(self) -> bool:
-        """Whether the validation is one of a training."""
-        return self.trainer.state.fn == TrainerFn.FITTING
 
     def _means(self, kind: str, collections: Any) -> dict[str, dict[str, float]]:
         """Return the mean scores over the scenes, by ``kind`` for all sets and, if there are several, for each."""
@@ -243,25 +234,27 @@ class SuperResolution(lightning.LightningModule):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Store the scores of bicubic interpolation, and of what the module is made, as plain values."""
         checkpoint["bicubic"] = self.bicubic
-        makers = {
+        makers: dict[str, Any] = {
             "net": functools.partial(self.net.__class__, **self.net.arguments()),
             "objective": functools.partial(self.objective.__class__, **self.objective.arguments()),
             "optimizer": self._make_optimizer,
-            "scheduler": self._make_scheduler,
         }
-        nodes = {name: _node_of(make) for name, make in makers.items() if make is not None}
-        plain = {"average": self.decay, "validation_sets": list(self.sets)}
-        checkpoint["hyper_parameters"] = plain | {name: node for name, node in nodes.items() if node is not None}
+        if self._make_scheduler is not None:
+            makers["scheduler"] = self._make_scheduler
+        stored: dict[str, Any] = {"average": self.decay, "validation_sets": list(self.sets)}
+        for name, make in makers.items():  # a class or a partial of one is stored, if its arguments are plain
+            made = functools.partial(make)
+            if isinstance(made.func, type) and not made.args:
+                with contextlib.suppress(TypeError, ValueError):
+                    json.dumps(made.keywords)
+                    stored[name] = {"_target_": f"{made.func.__module__}.{made.func.__qualname__}", **made.keywords}
+        checkpoint["hyper_parameters"] = stored
 
     @classmethod
     def load_from_checkpoint(  # type: ignore[override]  # Lightning's has arguments for another file of arguments
         cls, checkpoint_path: str | Path, map_location: Any = None, **parts: Any
     ) -> Self:
-        """Return the module of a checkpoint, with its weights and their average.
-
-        ``parts`` are arguments of the constructor in place of those that the checkpoint names, such as a ``net`` that
-        is not dsr's own. The ``metrics`` are not in it.
-        """
+        """Return the module of a checkpoint; ``parts`` replace what it names, such as a ``net`` that is not dsr's."""
         stored = read_torch_file(Path(checkpoint_path)).get("hyper_parameters")
         if not isinstance(stored, Mapping):
             raise ValueError(f"{checkpoint_path}: expected a checkpoint of {cls.__name__}, it names no parts")
@@ -291,18 +284,6 @@ class SuperResolution(lightning.LightningModule):
 def _by_tag(scores: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
     """Return the scores of sets by the names that they are logged by."""
     return {f"{kind}/{name}": value for kind, each in scores.items() for name, value in each.items()}
-
-
-def _node_of(make: Any) -> dict[str, Any] | None:
-    """Return a class, or a partial of one, as ``_target_`` beside plain arguments; None for anything else."""
-    made = make if isinstance(make, functools.partial) else functools.partial(make)
-    if made.args or not isinstance(made.func, type):
-        return None
-    try:
-        json.dumps(made.keywords)
-    except (TypeError, ValueError):
-        return None
-    return {"_target_": f"{made.func.__module__}.{made.func.__qualname__}", **made.keywords}
 
 
 def _read_part(path: Path, name: str, node: Mapping[str, Any]) -> Any:

@@ -260,11 +260,7 @@ def estimate_light(normals: Tensor, intensity: Tensor, albedo: Tensor, valid: Te
 
 
 def estimate_albedo(rgb: Tensor) -> Tensor:
-    """Return the albedo of photos by the Retinex algorithm, (B, 1, H, W), with a mean of 1 before it is clipped to 2.
-
-    Its logarithm has the gradient of the photo's logarithm where that is an edge of intensity or of colour, and else
-    none, as well as least squares allow (a Poisson equation with free borders).
-    """
+    """Return the albedo of photos by Retinex, (B, 1, H, W), whose logarithm has the photo's edges, but no slopes."""
     log_rgb = rgb.clamp(min=_DARKEST).log()
     log_grey = grey(rgb).clamp(min=_DARKEST).log()
     colour = log_rgb - log_rgb.mean(dim=1, keepdim=True)
@@ -278,10 +274,8 @@ def estimate_albedo(rgb: Tensor) -> Tensor:
 
 
 def integrate(along_u: Tensor, along_v: Tensor) -> Tensor:
-    """Return the maps (B, 1, H, W) with a mean of 0 whose differences (B, 1, H, W - 1), (B, 1, H - 1, W) are nearest.
-
-    The normal equations are a Poisson equation with Neumann borders, which the discrete cosine transform diagonalises.
-    """
+    """Return the maps (B, 1, H, W) of mean 0 whose differences are nearest to (B, 1, H, W - 1) and (B, 1, H - 1, W)."""
+    # A Poisson equation with Neumann borders, which the discrete cosine transform diagonalises
     divergence = functional.pad(along_u, (0, 1)) - functional.pad(along_u, (1, 0))
     divergence = divergence + functional.pad(along_v, (0, 0, 0, 1)) - functional.pad(along_v, (0, 0, 1, 0))
     height, width = divergence.shape[-2:]
@@ -306,22 +300,22 @@ def balance_weight(patches: Sequence[Batch], visual: VisualLoss = MSE_V) -> floa
     """
     if not patches:
         raise ValueError("patches: expected one or more to compute w from, got none")
-    ratios = []
-    for patch in patches:
-        x = patch["rays"][0, 0].double()
+    ratios, batches = [], [{name: value[None] for name, value in patch.items()} for patch in patches]
+    for batch in batches:
+        x = batch["rays"][0, 0, 0].double()
         focal = (x.numel() - 1) / float(x[-1] - x[0])
-        depth = float(patch["depth"][patch["depth"].isfinite()].median())
-        extent = float(_range(patch["disparity_lr"][None]))
-        ratios.append(float(patch["bf"]) * math.tan(_TILT) / (focal * depth * extent))
+        depth = float(batch["depth"][batch["depth"].isfinite()].median())
+        extent = float(_range(batch["disparity_lr"]))
+        ratios.append(float(batch["bf"]) * math.tan(_TILT) / (focal * depth * extent))
     w = float(torch.tensor(ratios, dtype=torch.float64).median()) / ((2 - 2 * math.cos(_TILT)) / 3)
-    return w if visual.name == "mse_v" else w * match_weight(visual, map(_interpolated, patches))
-
-
-def _interpolated(patch: Batch) -> SurfacePair:
-    """Return the bicubic interpolation of a patch's low-resolution disparity, and the patch."""
-    batch = {name: value[None] for name, value in patch.items()}
-    scale = batch["depth"].shape[-1] // batch["disparity_lr"].shape[-1]
-    return SurfacePair(to_depth(upsample_bicubic(batch["disparity_lr"], scale), batch), batch["depth"], batch["rays"])
+    if visual.name == "mse_v":
+        return w
+    pairs = []
+    for batch in batches:
+        scale = batch["depth"].shape[-1] // batch["disparity_lr"].shape[-1]
+        interpolated = to_depth(upsample_bicubic(batch["disparity_lr"], scale), batch)
+        pairs.append(SurfacePair(interpolated, batch["depth"], batch["rays"]))
+    return w * match_weight(visual, pairs)
 
 
 def _range(disparity: Tensor) -> Tensor:

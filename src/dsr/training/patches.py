@@ -15,7 +15,6 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from scipy import ndimage
-from torch import Tensor
 from torch.nn import functional
 from torch.utils.data import Dataset
 
@@ -34,7 +33,7 @@ _SOFT, _SOFTEST = 0.5, 1.3  # pixels: blur of soft depth steps, from 0 where mea
 
 
 class Patches(Dataset[Batch]):
-    """The random patches of a run, by their numbers, without an end; ``count`` is the length.
+    """The random patches of a run, by their numbers, without an end.
 
     The scenes of each group have a true depth and are at least as large as a patch; ``shares`` are the frequencies of
     the groups, equal if None. ``everything`` is a distribution of degradations to draw from in place of
@@ -49,28 +48,22 @@ class Patches(Dataset[Batch]):
         *,
         shares: Sequence[float] | None = None,
         seed: int = 0,
-        count: int = 1,
         everything: Everything | None = None,
         per_step: int | None = None,
     ) -> None:
-        scales = [degradation.scale]
-        if everything is not None and everything.scales is not None:
-            scales = [int(scale) for scale in everything.scales]
-        for group, scale in itertools.product(groups, scales):
-            check_patches(group, settings, scale)
+        drawn = None if everything is None else everything.scales
+        for group, scale in itertools.product(groups, drawn or (degradation.scale,)):
+            check_patches(group, settings, int(scale))
         self._everything, self._per_step = everything, per_step or settings.batch
         weights = np.array([1.0] * len(groups) if shares is None else shares, dtype=np.float64)
         if not groups or not all(groups):
             raise ValueError("patches: expected a scene or more to train on")
-        if not weights.sum() > 0:
-            raise ValueError("shares: expected a positive number among them, all are 0")
+        if not (weights >= 0).all() or not 0 < weights.sum() < math.inf:
+            raise ValueError(f"shares: expected numbers of 0 or more, one of them positive, got {weights.tolist()}")
         self._groups, self._settings, self._degradation = groups, settings, degradation
         self._limits = np.cumsum(weights / weights.sum())
-        self._seed, self._count = seed, count
+        self._seed = seed
         self._depth_ranges: dict[tuple[int, int], list[float]] = {}  # by group and number of the scene
-
-    def __len__(self) -> int:
-        return self._count
 
     def __getitem__(self, number: int) -> Batch:
         """Return a patch, at least half of whose depth is valid if ten tries find such a window.
@@ -122,11 +115,9 @@ class Patches(Dataset[Batch]):
         return {**to_tensors(sample), **hints._asdict(), "soft": torch.tensor(float(soft))}
 
     def _window(self, group: int, random: np.random.Generator, size: int) -> tuple[int, int, int]:
-        """Return a random window of a group: the number of the scene, the top and the left.
-
-        The first window of a random scene with enough valid depth is taken, else the best of ten. Another scene is
-        taken only where all ten have no valid depth, so that scenes with many holes are not trained on less often.
-        """
+        """Return a random window of a group: the number of the scene, the top and the left."""
+        # The first with enough valid depth of ten of a random scene, else the best. Another scene only if none has any,
+        # so that scenes with many holes are not trained on less often.
         scenes = self._groups[group]
         for _ in range(_SCENE_TRIES):
             number, best, highest = int(random.integers(len(scenes))), None, 0.0
@@ -150,7 +141,11 @@ def augment(scene: Scene, settings: PatchSettings, random: np.random.Generator) 
         gain = torch.from_numpy(1 + settings.colour * random.standard_normal((3, 1, 1))).float()
         rgb = (rgb * gain).clamp(0, 1)
     if random.random() < settings.photo:
-        rgb = simulate_camera(rgb, random)
+        pixels = rgb.clamp(min=0).numpy() ** math.exp(random.uniform(-0.5, 0.5))
+        sigma = random.uniform(0, 1.0)
+        pixels = ndimage.gaussian_filter(pixels, (0, sigma, sigma), mode="nearest")
+        pixels = pixels + random.uniform(0, 0.03) * random.standard_normal(pixels.shape)
+        rgb = torch.from_numpy(pixels.astype(np.float32)).clamp(0, 1)
     scene = derived(scene, rgb=rgb)
     if settings.flip:
         for vertical in (False, True):
@@ -160,15 +155,6 @@ def augment(scene: Scene, settings: PatchSettings, random: np.random.Generator) 
         scene = rotate90(scene, int(random.integers(4)))
     factor = math.exp(random.uniform(-settings.depth_scale, settings.depth_scale)) if settings.depth_scale else 1.0
     return derived(scene, depth=scene.true_depth * factor), factor
-
-
-def simulate_camera(rgb: Tensor, random: np.random.Generator) -> Tensor:
-    """Return an rgb image (3, H, W) with another gamma, exp(U(-0.5, 0.5)), and Gaussian blur and noise, up to 0.03."""
-    pixels = rgb.clamp(min=0).numpy() ** math.exp(random.uniform(-0.5, 0.5))
-    sigma = random.uniform(0, 1.0)
-    pixels = ndimage.gaussian_filter(pixels, (0, sigma, sigma), mode="nearest")
-    pixels = pixels + random.uniform(0, 0.03) * random.standard_normal(pixels.shape)
-    return torch.from_numpy(pixels.astype(np.float32)).clamp(0, 1)
 
 
 def soften(scene: Scene, sigma: float = 0.0, *, halve: bool = True) -> Scene:
@@ -196,10 +182,9 @@ def mirror(scene: Scene, *, vertical: bool = False) -> Scene:
     """Return the mirror image of a scene and its camera, left to right or, with ``vertical``, top to bottom."""
     camera = scene.camera
     if vertical:
-        camera = derived(camera, cy=camera.height - 1 - camera.cy)
+        axis, camera = -2, derived(camera, cy=camera.height - 1 - camera.cy)
     else:
-        camera = derived(camera, cx=camera.width - 1 - camera.cx)
-    axis = -2 if vertical else -1
+        axis, camera = -1, derived(camera, cx=camera.width - 1 - camera.cx)
     return derived(scene, rgb=scene.rgb.flip(axis), depth=scene.true_depth.flip(axis), camera=camera, measured={})
 
 
@@ -216,8 +201,6 @@ def check_patches(scenes: Sequence[Scene], settings: PatchSettings, scale: int) 
     if settings.patch % scale:
         raise ValueError(f"patch: expected a size that scale={scale} divides, got {settings.patch}")
     for scene in scenes:
-        if scene.depth is None:
-            raise ValueError(f"{scene.name}: expected a true depth to train with, there is none")
         height, width = scene.rgb.shape[-2:]
         if min(height, width) < settings.patch:
             raise ValueError(f"patch: expected at most {scene.name}'s {height} x {width}, got {settings.patch}")

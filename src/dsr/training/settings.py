@@ -26,7 +26,7 @@ class PatchSettings:
         rotate: whether scenes are rotated by random quarter turns, the camera included.
         depth_scale: s, where depth is multiplied by exp(U(-s, s)).
         colour: standard deviation of the gain of each colour channel.
-        photo: fraction of the patches whose rgb is changed by :func:`dsr.training.patches.simulate_camera`.
+        photo: fraction of the patches whose rgb gets another gamma, exp(U(-0.5, 0.5)), blur, and noise of up to 0.03.
 
     """
 
