@@ -9,13 +9,14 @@ longer multiples, but along a slope they are still exactly equal for some pixels
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
+from torch.nn import functional
 
-from dsr.doctor.finding import Array, Finding, Level, metres
 from dsr.geometry.camera import baseline_times_focal
 from dsr.geometry.plausible import implausible_distance, plausible_baseline
 from dsr.notes import LIMITS
@@ -72,6 +73,53 @@ _TILT, _STEEP = 3.0, 20.0
 _LEAST = 100
 """Minimum number of pixels."""
 _REPEATED = (8, 6, 5, 4, 3, 2)
+Level = Literal["ok", "note", "warning", "problem"]
+LEVELS: tuple[Level, ...] = get_args(Level)
+"""From the best to the worst; ``warning`` and ``problem`` mean that the scene is probably wrong."""
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A finding of one check.
+
+    Args:
+        check: name of the check.
+        level: severity.
+        message: measured values, with units.
+        advice: recommended action; empty for none.
+
+    """
+
+    check: str
+    level: Level
+    message: str
+    advice: str = ""
+
+
+def worst(findings: list[Finding]) -> Level:
+    """Return the worst level; ``ok`` without findings."""
+    return max((finding.level for finding in findings), key=LEVELS.index, default="ok")
+
+
+def with_depth(scene: Scene) -> Scene:
+    """Return the scene at the resolution of its high-resolution depth, else of its largest measured map."""
+    if scene.depth is not None:
+        return scene
+    depth = scene.measured[min(scene.measured)]
+    height, width = depth.shape[-2:]
+    camera, ratio = scene.camera.reduce(width, height), scene.camera.ratio_to(width, height)
+    rgb = scene.rgb[:, : camera.height * ratio, : camera.width * ratio] if isinstance(ratio, int) else scene.rgb
+    rgb = functional.interpolate(rgb[None], (height, width), mode="area")[0]
+    return replace(scene, rgb=rgb.clamp(0, 1), camera=camera, depth=depth, measured={})
+
+
+def metres(scene: Scene) -> Array:
+    """Return a scene's high-resolution depth, (H, W) float64 in metres, NaN in holes."""
+    if scene.depth is None:
+        raise ValueError(f"{scene.name}: expected high-resolution depth, there is none; see with_depth")
+    depth: Array = scene.depth[0].double().numpy()
+    return depth
 
 
 def check_units(scene: Scene) -> list[Finding]:

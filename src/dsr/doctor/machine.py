@@ -17,8 +17,8 @@ from rich.text import Text
 
 from dsr.data.download.collections import CATALOGUE
 from dsr.doctor.about import Extra, extras, graphics_cards, lack, processor, requirements, version_lines
+from dsr.doctor.depth_checks import Finding, Level
 from dsr.doctor.examine import FINE, show_findings
-from dsr.doctor.finding import Finding, Level
 from dsr.methods import weights
 from dsr.synthetic.rendering import cache_directory
 from dsr.utils.compute_device import fast_precision, pick_device

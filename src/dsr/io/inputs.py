@@ -20,6 +20,8 @@ from dsr.geometry.plausible import expect_possible
 from dsr.geometry.warping import registered_camera, warp_depth
 from dsr.io.cameras import (
     camera_only,
+    doubt_camera,
+    doubt_depth,
     find_camera,
     read_any_camera,
     read_rig,
@@ -28,7 +30,6 @@ from dsr.io.cameras import (
     to_photo,
 )
 from dsr.io.depth_files import ICL_CAMERA, ICL_SUFFIX, read_depth_file
-from dsr.io.doubts import doubt_camera, doubt_depth
 from dsr.io.encoding import Encoding, decode, expect_known, find_holes, turn_back_bits
 from dsr.io.frames import SLACK, Geometry, Rig
 from dsr.io.images import CameraFile, pixels_in_header, read_mask

@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from dsr.app.upsample.alignment import align
-from dsr.app.upsample.checks import check_together
+from dsr.app.upsample.checks import align, check_together
 from dsr.app.upsample.frames import Frames
 from dsr.app.upsample.outputs import (
     PreviousRun,

@@ -19,7 +19,7 @@ from torch import Tensor
 from dsr.app.upsample.frame import Times, write_result
 from dsr.app.upsample.outputs import begin, expect_free, output_encoding, read_previous_run
 from dsr.app.upsample.parts import Result, Results
-from dsr.app.upsample.scene import write_scene
+from dsr.app.upsample.stored import write_scene
 from dsr.geometry.camera import Camera
 from dsr.geometry.lights import FIGURE_LIGHT, Direction, direction_of
 from dsr.geometry.mesh import Mesh, triangulate, vertex_normals
@@ -32,7 +32,7 @@ from dsr.io.photos import data_url
 from dsr.methods import base
 from dsr.methods.base import MapNoise, Outliers
 from dsr.notes import warn
-from dsr.pictures.inline import encode_row
+from dsr.pictures.canvas import encode_row
 from dsr.utils.progress import SILENT
 
 Array = TypeVar("Array", np.ndarray, Tensor)

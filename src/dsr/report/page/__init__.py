@@ -16,8 +16,7 @@ from dsr.evaluation.results import BenchmarkSetting, Results
 from dsr.geometry.lights import BASIS, LIGHTS, VIEWING_LIGHT
 from dsr.pictures.canvas import HOLE_COLOUR
 from dsr.report.html_page import asset, block, fill, json_text, palette
-from dsr.report.leaderboard import standings
-from dsr.report.page.content import links, metrics_data, problem_data, run_data
+from dsr.report.page.content import links, metrics_data, problem_data, run_data, standings
 from dsr.report.page.scene_content import View, calibration_data, scene_data, views_of
 from dsr.report.page.value_pictures import LEVELS, Level, PictureStore, megabytes
 from dsr.report.worker_pool import WorkerPool

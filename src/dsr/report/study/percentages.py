@@ -18,8 +18,8 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
+from dsr.report.significance import agreement, average_fraction, bootstrap_of_average, wilson
 from dsr.report.study.answers import Answer, Answers
-from dsr.report.study.intervals import agreement, average_fraction, bootstrap_of_average, wilson
 from dsr.report.study.key import Candidate, Key, Trial
 from dsr.report.study.study_table import ALL, AVERAGE, COLUMNS, PERCENTAGES, PLACE
 from dsr.utils.ratios import as_ratio

@@ -19,7 +19,7 @@ from torch import Tensor
 from dsr.evaluation.results import BenchmarkSetting, Results, Run, one_per_method
 from dsr.pictures.depth_views import rendering
 from dsr.report.html_page import asset, fill, json_text, policy
-from dsr.report.study.choice import Choice
+from dsr.report.study import Choice
 from dsr.report.study.key import KEY_NAME, PAGE_VERSION, Candidate, Key, Trial, read_key, write_key
 from dsr.utils.files import expect_targets, write_text
 from dsr.utils.progress import SILENT, Progress
