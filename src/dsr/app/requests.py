@@ -132,11 +132,6 @@ class BrowserRequest(Options):
         None, "memory of a computation (default: what is free)", "GB", rule=positive("number of gigabytes")
     )
 
-    @property
-    def memory(self) -> int | None:
-        """Memory limit of a computation in bytes; None for all that is free."""
-        return None if self.max_memory is None else int(1e9 * self.max_memory)
-
 
 @dataclass(frozen=True, kw_only=True)
 class ExportRequest(Options):

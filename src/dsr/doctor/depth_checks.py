@@ -210,7 +210,9 @@ def check_holes(scene: Scene) -> list[Finding]:
 def _marks(scene: Scene, depth: Array) -> list[Finding]:
     """Return the extreme values that look like marks, of the depth or else of the distance along the ray."""
     for values in (depth, depth * scene.camera.ray_lengths().numpy()):
-        rounded = _round(values)
+        with np.errstate(invalid="ignore"):
+            power = 10.0 ** (_DIGITS - 1 - np.floor(np.log10(values)))
+            rounded = np.round(values * power) / power
         levels, counts = np.unique(rounded[np.isfinite(rounded)], return_counts=True)
         if levels.size == 1 and counts[0] > 1:
             message = f"all valid pixels have the same value, {levels[0]:g} m"
@@ -224,14 +226,6 @@ def _marks(scene: Scene, depth: Array) -> list[Finding]:
     return []
 
 
-def _round(values: Array) -> Array:
-    """Round values to six significant digits."""
-    with np.errstate(invalid="ignore"):
-        power = 10.0 ** (_DIGITS - 1 - np.floor(np.log10(values)))
-        rounded: Array = np.round(values * power) / power
-    return rounded
-
-
 def _judge(where: np.ndarray, value: float, beside: float, fraction: float) -> list[Finding]:
     """Return a finding if an extreme value that many pixels have is, or may be, a mark."""
     smallest = value < beside
@@ -241,19 +235,15 @@ def _judge(where: np.ndarray, value: float, beside: float, fraction: float) -> l
         return []
     name = "smallest" if smallest else "largest"
     message = f"{fraction:.1%} of the valid pixels have exactly the {name} value, {value:g} m"
-    if mark or _is_scattered(where):
+    labels, regions = ndimage.label(where)
+    scattered = regions > 20 and np.bincount(labels.ravel())[1:].max() < 0.5 * where.sum()  # holes are, a wall is not
+    if mark or scattered:
         advice = 'if it marks holes, set "hole_value" in camera.json, in the unit of the file, or add a mask.png'
         return [Finding("holes", "warning", f"{message}, which looks like a mark of missing depth", advice)]
     message += f"; the next value is {beside:g} m"
     return [
         Finding("holes", "note", message, 'correct for a flat wall; if it marks holes, set "hole_value" in camera.json')
     ]
-
-
-def _is_scattered(where: np.ndarray) -> bool:
-    """Return whether pixels form many separate regions, which is typical of holes but not of a wall."""
-    labels, count = ndimage.label(where)
-    return count > 20 and np.bincount(labels.ravel())[1:].max() < 0.5 * where.sum()
 
 
 @dataclass(frozen=True)

@@ -189,7 +189,10 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     if given and geometry.lens is not None and geometry.lens.bends:
         text = "the lens distortion that the capture states is not undone: the camera is given"
         camera_assumptions = [*camera_assumptions, Assumption(text, str(geometry.lens))]
-    pixels, undone = _undistort_photo(pixels, described.camera, lens)
+    undone = []
+    if lens is not None and lens.bends:
+        pixels = undistort(pixels, described.camera, lens)
+        undone = [Assumption("the lens distortion of the photo is undone", str(lens))]
     pixels, crop_assumptions = _crop_to_multiple(pixels, pair.factor, size_lr)
     size: Size = (pixels.shape[0], pixels.shape[1])
     rig = _rig(pair, reading, geometry, size_lr)
@@ -459,13 +462,6 @@ def _to_photo(
                 detail = f"{better.figures}; expected the transform from the depth camera's frame to the photo camera's"
                 doubts.append(Assumption(text, detail, "extrinsics-inverse", gain))
     return warped, [*doubts, note]
-
-
-def _undistort_photo(pixels: np.ndarray, camera: Camera, lens: Lens | None) -> tuple[np.ndarray, list[Assumption]]:
-    """Return a photo without its lens distortion, and a note if it had any."""
-    if lens is None or not lens.bends:
-        return pixels, []
-    return undistort(pixels, camera, lens), [Assumption("the lens distortion of the photo is undone", str(lens))]
 
 
 def _undistort_depth(

@@ -59,7 +59,7 @@ def decode_pixels(place: str | Path, content: bytes, flags: int, most: int | Non
     if content[:2] in (b"II", b"MM"):
         content, no_data = _only_page(place, content, flags)
     try:
-        with _QUIET_STDERR:
+        with QUIET_DECODERS:
             pixels = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     except cv2.error:
         return None
@@ -122,12 +122,8 @@ class _QuietStderr:
                 os.close(self._kept)
 
 
-_QUIET_STDERR = _QuietStderr()
-
-
-def quiet_decoders() -> _QuietStderr:
-    """Return a context in which messages of decoders about damaged files are not shown."""
-    return _QUIET_STDERR
+QUIET_DECODERS = _QuietStderr()
+"""A context in which messages of decoders about damaged files are not shown."""
 
 
 @dataclass(frozen=True)

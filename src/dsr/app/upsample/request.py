@@ -258,21 +258,17 @@ class UpsampleRequest(Options):
     @functools.cached_property
     def settings(self) -> Mapping[str, Any]:
         """The settings that a result depends on, as values for JSON; the method's files are read for them."""
+        from dsr.methods.recipe import read_recipe  # noqa: PLC0415 - it imports torch
+
+        recipe = read_recipe(self.upsampling.method, None, self.upsampling.directories)
         return {
             **recorded(self),
             "max_error": self.results.max_error / 100,
             **({"certain": True} if self.results.certain else {}),
             "registered_by": None if self.reading.rig is None else "extrinsics",
             "set": self.upsampling.arguments,
-            "code": hash_outside_code(_targets(self.upsampling)),
+            "code": hash_outside_code(list(recipe.targets())),
         }
-
-
-def _targets(how: Upsampling) -> list[str]:
-    """Return the dotted paths of the code that the method's file names."""
-    from dsr.methods.recipe import read_recipe  # noqa: PLC0415 - it imports torch
-
-    return list(read_recipe(how.method, None, how.directories).targets())
 
 
 def files_of(pair: Pair, reading: Reading) -> dict[str, Path]:

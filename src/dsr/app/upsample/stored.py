@@ -84,6 +84,8 @@ def read_result(folder: Path, name: str) -> ViewedResult:
         photo, depth_lr = read_input(folder / INPUT)
     except FileNotFoundError:
         notes.append(f"without {INPUT} there is neither the photo nor the input; the same `dsr upsample` again adds it")
+    settings = info.get("settings")
+    limit = settings.get("max_error") if isinstance(settings, dict) else None
     filled = None if depth_lr is None else find_filled(*(torch.from_numpy(each)[None] for each in (depth, depth_lr)))
     return ViewedResult(
         name=name,
@@ -94,7 +96,7 @@ def read_result(folder: Path, name: str) -> ViewedResult:
         depth_error=None if errors is None else errors[0],
         angle_error=None if errors is None else errors[1],
         filled=None if filled is None else filled[0].numpy(),
-        max_error=_max_error(info.get("settings")),
+        max_error=float(limit) if is_number(limit) and 0 < limit < 1e9 else Results.max_error / 100,
         facts=_facts(info, depth),
         notes=notes,
     )
@@ -139,12 +141,6 @@ def read_camera(path: Path, info: Mapping[str, Any]) -> Camera:
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         came = f"{info.get('camera')!r:.200}"
         raise ValueError(f"{path}: expected the photo's camera under `camera`, got {came}") from error
-
-
-def _max_error(settings: Any) -> float:
-    """Return the expected error from which pixels are left out, as a fraction of the depth."""
-    limit = settings.get("max_error") if isinstance(settings, dict) else None
-    return float(limit) if is_number(limit) and 0 < limit < 1e9 else Results.max_error / 100
 
 
 def read_depth(folder: Path, camera: Camera) -> np.ndarray:

@@ -211,7 +211,9 @@ class Surface(Generic[Array]):
     def _save(self, wanted: Results) -> list[Path]:
         """Write results."""
         folder = wanted.output
-        earlier, inputs = read_previous_run(folder), self._identity
+        earlier = read_previous_run(folder)
+        content = hashlib.sha256(self._found.depth.numpy().tobytes() + _bytes(self._picture.rgb).tobytes())
+        inputs = {"surface": {"sha256": content.hexdigest()}}  # which a folder of results has for its inputs
         settings = {"max_error": wanted.max_error / 100}
         same = earlier is not None and earlier.complete and (earlier.inputs, earlier.settings) == (inputs, settings)
         if earlier is not None and not same and not wanted.overwrite:
@@ -234,12 +236,6 @@ class Surface(Generic[Array]):
         if scene.problems:
             raise ValueError(scene.problems[0])
         return files + list(scene.files.values())
-
-    @functools.cached_property
-    def _identity(self) -> dict[str, dict[str, str]]:
-        """What a folder of results has for its inputs: a hash of the surface."""
-        content = hashlib.sha256(self._found.depth.numpy().tobytes() + _bytes(self._picture.rgb).tobytes())
-        return {"surface": {"sha256": content.hexdigest()}}
 
     def __repr__(self) -> str:
         return f"Surface({self._size(self._found.depth)}, {self._range}, {self._plan.method} x{self._plan.scale})"
