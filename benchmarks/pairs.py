@@ -28,7 +28,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.app.upsample.alignment import align
+from dsr.app.upsample.checks import align
 from dsr.data.cleargrasp import read_depth
 from dsr.data.detection import find_scenes
 from dsr.data.frame_files import read_picture

@@ -100,7 +100,7 @@ def jobs(scenes: Path, folder: Path) -> Iterator[tuple[str, list[str]]]:
     photo, depth = pictures(scenes / "plant", folder)
     for method in ("facets", "msg_v", "bicubic"):
         name = f"upsample {method}"
-        command = [sys.executable, "-m", "dsr.cli", "upsample", "--rgb", str(photo), "--depth", str(depth)]
+        command = [sys.executable, "-m", "dsr", "upsample", "--rgb", str(photo), "--depth", str(depth)]
         yield name, [*command, "--method", method, "-o", str(folder / name)]
 
 

@@ -71,7 +71,7 @@ def upsample(arguments: list[str], cores: set[int]) -> Cost:
     """Run the command on some cores with one thread each, and return what it took."""
     started = time.perf_counter()
     process = subprocess.Popen(  # noqa: S603 - this project's command
-        [sys.executable, "-m", "dsr.cli", "upsample", *arguments],
+        [sys.executable, "-m", "dsr", "upsample", *arguments],
         env={**os.environ, "OMP_NUM_THREADS": "1"},
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,

@@ -25,7 +25,7 @@ def upsample(arguments: list[str], cores: set[int]) -> float:
     environment = {**os.environ, **({"OMP_NUM_THREADS": "1"} if len(cores) == 1 else {})}
     started = time.perf_counter()
     subprocess.run(  # noqa: S603 - this project's command
-        [sys.executable, "-m", "dsr.cli", "upsample", *arguments, "--without", "mesh"],
+        [sys.executable, "-m", "dsr", "upsample", *arguments, "--without", "mesh"],
         check=True,
         env=environment,
         stdout=subprocess.DEVNULL,

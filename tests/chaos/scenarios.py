@@ -15,7 +15,7 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 _PROGRAMS = {
     "eval": (sys.executable, str(REPOSITORY / "eval.py")),
     "train": (sys.executable, str(REPOSITORY / "train.py")),
-    "dsr": (sys.executable, "-m", "dsr.cli"),
+    "dsr": (sys.executable, "-m", "dsr"),
     "python": (sys.executable,),
 }
 

@@ -69,7 +69,7 @@ def root(tmp_path, monkeypatch):
 
 
 def command(*arguments):
-    return [sys.executable, "-m", "dsr.cli", *arguments]
+    return [sys.executable, "-m", "dsr", *arguments]
 
 
 def run(*arguments):

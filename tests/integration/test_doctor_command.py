@@ -13,7 +13,7 @@ from dsr.synthetic.simgeo import render_scene
 
 def doctor(folder):
     """Run the command in a process of its own."""
-    return run_python("-m", "dsr.cli", "doctor", str(folder), cwd=folder.parent)
+    return run_python("-m", "dsr", "doctor", str(folder), cwd=folder.parent)
 
 
 @pytest.fixture(scope="module")

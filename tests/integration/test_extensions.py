@@ -89,7 +89,7 @@ def home(tmp_path_factory, dsr_cache):
         )  # fmt: skip
         assert (done.returncode, done.stderr) == (0, "")
         (folder / f"{method}.txt").write_text(done.stdout)
-    done = run(folder, "-m", "dsr.cli", "report", "runs", "-o", "report", outside=False)
+    done = run(folder, "-m", "dsr", "report", "runs", "-o", "report", outside=False)
     assert (done.returncode, done.stderr) == (0, "")
     return folder
 

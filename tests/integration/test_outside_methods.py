@@ -99,7 +99,7 @@ def evaluate(folder, *arguments):
 def upsample(folder, *arguments):
     """Run ``dsr upsample`` on a small picture."""
     files = ("--rgb", "photo.png", "--depth", "depth.png", "--fov", "60", "--only", "depth")
-    return run(folder, "-m", "dsr.cli", "upsample", *files, "--config-dir", "conf", *arguments)
+    return run(folder, "-m", "dsr", "upsample", *files, "--config-dir", "conf", *arguments)
 
 
 @pytest.fixture(scope="module")

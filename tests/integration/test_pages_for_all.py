@@ -6,7 +6,7 @@ from small_results import waves, write_result
 from dsr.cli import main
 from dsr.evaluation.run_files import load_results
 from dsr.report.page import save_page
-from dsr.report.study.choice import Choice
+from dsr.report.study import Choice
 from dsr.report.study.questionnaire import build_study
 
 PAGES = ("report", "leaderboard", "view", "study", "trial")

@@ -33,7 +33,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
 
 
 def test_report_has_tables_figures_the_metric_study_and_a_page(runs: Path, tmp_path: Path) -> None:
-    done = run_python("-m", "dsr.cli", "report", str(runs), "-o", "report", "--title", "Ours", cwd=tmp_path)
+    done = run_python("-m", "dsr", "report", str(runs), "-o", "report", "--title", "Ours", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     folder = tmp_path / "report"
     for name in (
@@ -57,7 +57,7 @@ def test_workers_make_the_same_files_and_notes_as_the_command_alone(runs: Path, 
         file.write_bytes(b"damaged")
     files, notes = [], []
     for workers in ("1", "2"):
-        done = run_python("-m", "dsr.cli", "report", str(runs), "-o", workers, "--workers", workers, cwd=tmp_path)
+        done = run_python("-m", "dsr", "report", str(runs), "-o", workers, "--workers", workers, cwd=tmp_path)
         assert (done.returncode, done.stderr) == (0, "")
         folder = tmp_path / workers
         files.append({path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()})

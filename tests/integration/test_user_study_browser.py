@@ -9,7 +9,7 @@ import pytest
 
 from dsr.cli import main
 from dsr.evaluation.run_files import load_results
-from dsr.report.study.choice import Choice
+from dsr.report.study import Choice
 from dsr.report.study.key import read_key
 from dsr.report.study.questionnaire import build_study
 

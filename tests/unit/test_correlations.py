@@ -125,6 +125,6 @@ def test_missing_lpips_leaves_the_rest_and_one_line_says_so(tmp_path, monkeypatc
     assert "There is no LPIPS_v in these 5 results" in text
     drawn = {}
     monkeypatch.setattr(correlation_figure, "write_figure", lambda path, figure, *_: drawn.update({path.name: figure}))
-    save_scatter_matrix(tmp_path, results)
+    save_scatter_matrix(results, tmp_path)
     assert list(drawn) == ["scatter_matrix.pdf", "scatter_matrix.png"]
     assert "no LPIPS_v in these results" in drawn["scatter_matrix.pdf"].texts[0].get_text()

@@ -26,8 +26,7 @@ from dsr.app.entry import run_command
 from dsr.app.training_runs import read_config
 from dsr.app.trust import read_plain_yaml
 from dsr.app.upsample.outputs import kept_surface, read_previous_run
-from dsr.app.upsample.scene import _read_record
-from dsr.app.upsample.stored import read_result
+from dsr.app.upsample.stored import _read_record, read_result
 from dsr.data.download.fetching import Checksums, unpack
 from dsr.data.folder import Folder, load_scene
 from dsr.data.matlab import read_variables

@@ -10,9 +10,8 @@ import pytest
 import torch
 from small_scenes import room
 
-from dsr.doctor.depth_checks import find_rounding
+from dsr.doctor.depth_checks import find_rounding, with_depth
 from dsr.doctor.examine import CHECKS, examine, examine_directory
-from dsr.doctor.finding import with_depth
 from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.io.images import read_map, read_rgb
 from dsr.sample import Scene

@@ -82,7 +82,7 @@ def test_no_name_is_a_command_of_latex_or_markdown(name):
 def test_figures_show_names_that_look_like_formulas_of_tex(results, tmp_path):
     more = dataclasses.replace(results.runs[0], label="$\\frac$ $x", folder=results.runs[0].folder)
     both = dataclasses.replace(results, runs=(results.runs[0], more))
-    assert all(path.stat().st_size > 1000 for path in save_scatter_matrix(tmp_path / "figures", both))
+    assert all(path.stat().st_size > 1000 for path in save_scatter_matrix(both, tmp_path / "figures"))
 
 
 def test_study_is_read_with_its_names(tmp_path):

@@ -20,7 +20,7 @@ sys.argv = {argv!r}
 {start}
 """
 SCRIPT = "runpy.run_path(sys.argv[0], run_name='__main__')"
-MODULE = "runpy.run_module('dsr.cli', run_name='__main__')"
+MODULE = "runpy.run_module('dsr', run_name='__main__')"
 COMMANDS = {
     "dsr --help": 0, "dsr --version": 0, "dsr completion bash": 0, "dsr fuse out --outptu mesh.ply": 2,
     "dsr upsample --help": 0, "dsr upsample --rgb a --depth b -o out --mehtod x": 2,

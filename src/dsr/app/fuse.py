@@ -73,7 +73,8 @@ def fuse(request: FuseRequest, console: Console) -> list[str]:
     comment = world_comment(ups.pop() if len(ups) == 1 else "")
     write_ply(request.output, mesh.vertices, colours, mesh.normals, mesh.faces, frame=comment)
     size = f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles, voxels of {show_length(voxel)}"
-    show(console, f"{_count(frames)} -> {request.output}: {size}; in the world's frame of the poses")
+    count = "1 result" if len(frames) == 1 else f"{len(frames)} results"
+    show(console, f"{count} -> {request.output}: {size}; in the world's frame of the poses")
     if request.score:
         show(console, f"successive results differ by {_difference(frames, max_error)} (OPW)")
     return problems
@@ -167,8 +168,3 @@ def _faults(frames: Sequence[Path], max_error: float) -> list[Assumption]:
         return check_poses(len(recording), lambda number: _load(recording[number], max_error))
 
     return list(dict.fromkeys(each for each in map(fault, recordings.values()) if each is not None))
-
-
-def _count(frames: Sequence[Path]) -> str:
-    """Return how many results there are."""
-    return "1 result" if len(frames) == 1 else f"{len(frames)} results"

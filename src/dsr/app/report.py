@@ -8,10 +8,10 @@ from pathlib import Path
 import pandas as pd
 from rich.console import Console
 
-from dsr.app.requests import LeaderboardRequest, ReportRequest
+from dsr.app.requests import REPORT_PARTS, LeaderboardRequest, ReportRequest
 from dsr.evaluation.run_files import load_results
 from dsr.notes import expect_no_warning
-from dsr.report.correlation_figure import draw_study
+from dsr.report.correlation_figure import save_scatter_matrix
 from dsr.report.correlations import write_correlations
 from dsr.report.figures import Figures
 from dsr.report.page import Pictures, save_page
@@ -44,7 +44,8 @@ def make_report(request: ReportRequest, console: Console) -> list[str]:
 
     """
     output = request.output
-    _check(output)
+    if output.exists() and not (output.is_dir() and ((output / _MARK).is_file() or not any(output.iterdir()))):
+        raise ValueError(f"{output}: expected a new directory or an earlier report, it holds something else")
     results = load_results(request.runs)
     results = results.only(request.methods, request.datasets, tuple(map(as_ratio, request.scales)))
     if request.strict:
@@ -77,12 +78,6 @@ def make_leaderboard(request: LeaderboardRequest, console: Console) -> list[str]
     return make_report(ReportRequest(**vars(request), leaderboard=True, intervals=True, parts=parts), console)
 
 
-def _check(output: Path) -> None:
-    """Check the directory, before anything is read."""
-    if output.exists() and not (output.is_dir() and ((output / _MARK).is_file() or not any(output.iterdir()))):
-        raise ValueError(f"{output}: expected a new directory or an earlier report, it holds something else")
-
-
 def _write(
     folder: Path, pool: WorkerPool, study: pd.DataFrame | None, request: ReportRequest, progress: Progress
 ) -> list[str]:
@@ -93,27 +88,27 @@ def _write(
     results = pool.results
     notes: list[str] = []
     scored = any(not run.scores.empty for run in results.runs)
-    scatter = pool.map(draw_study, [folder / "metrics"] if "metrics" in request.parts and scored else [])
+    scatter = pool.map(save_scatter_matrix, [folder / "metrics"] if "metrics" in request.parts and scored else [])
     drawn = Figures(folder / "figures", pool, request.light) if "figures" in request.parts else None
     pictures = Pictures(pool) if "page" in request.parts else None
 
-    def tables() -> None:
-        write_tables(folder / "tables", results, study, intervals=request.intervals)
-
-    def metrics() -> None:
-        write_correlations(folder / "metrics", results)
-        list(scatter)
-
-    def figures() -> None:
-        if drawn is not None:
+    todo = [part for part in REPORT_PARTS if part in request.parts]
+    if not scored:
+        notes.append("no scene has a ground truth to score against, so there are no tables and no metric study")
+        todo = [part for part in todo if part not in ("tables", "metrics")]
+    for part in progress.track(todo, "report"):
+        if part == "tables":
+            write_tables(folder / "tables", results, study, intervals=request.intervals)
+        elif part == "metrics":
+            write_correlations(folder / "metrics", results)
+            list(scatter)
+        elif drawn is not None and part == "figures":
             with progress.task("figures") as task:
                 drawn.save(task)
             notes.extend(drawn.notes)
-
-    def page() -> None:  # last, as it links to the other parts' files
-        with progress.task("scenes") as task:
-            notes.extend(
-                save_page(
+        else:  # the page, which is last, as it links to the other parts' files
+            with progress.task("scenes") as task:
+                notes += save_page(
                     folder / "index.html",
                     results,
                     title=request.title,
@@ -122,13 +117,4 @@ def _write(
                     pictures=pictures,
                     leaderboard=request.leaderboard,
                 )
-            )
-
-    parts = {"tables": tables, "metrics": metrics, "figures": figures, "page": page}
-    todo = [part for part in parts if part in request.parts]
-    if not scored:
-        notes.append("no scene has a ground truth to score against, so there are no tables and no metric study")
-        todo = [part for part in todo if part not in ("tables", "metrics")]
-    for part in progress.track(todo, "report"):
-        parts[part]()
     return notes

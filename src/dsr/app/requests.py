@@ -7,7 +7,7 @@ from pathlib import Path
 
 from dsr.app.upsample.parts import EXPECTED_ERROR
 from dsr.geometry import FIGURE_LIGHT, LIGHT_CHOICES, LIGHT_NAMES
-from dsr.report.study.choice import Choice
+from dsr.report.study import Choice
 from dsr.utils.configuration import config_directories, list_choices
 from dsr.utils.options import Options, Rule, at_least, group, one_of, option, positive, some_of
 
@@ -131,11 +131,6 @@ class BrowserRequest(Options):
     max_memory: float | None = option(
         None, "memory of a computation (default: what is free)", "GB", rule=positive("number of gigabytes")
     )
-
-    @property
-    def memory(self) -> int | None:
-        """Memory limit of a computation in bytes; None for all that is free."""
-        return None if self.max_memory is None else int(1e9 * self.max_memory)
 
 
 @dataclass(frozen=True, kw_only=True)

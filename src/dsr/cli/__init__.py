@@ -6,7 +6,6 @@ import argparse
 from collections.abc import Mapping, Sequence
 from typing import NoReturn
 
-from dsr.app.downloads import downloads
 from dsr.cli.commands import (
     APP,
     DOCTOR,
@@ -21,8 +20,7 @@ from dsr.cli.commands import (
     add_data_command,
     add_hydra_commands,
 )
-from dsr.cli.completion import ABOUT, EPILOG, CompletionRequest, complete
-from dsr.cli.parser import Parser
+from dsr.cli.parser import ABOUT, EPILOG, CompletionRequest, Parser, complete
 from dsr.cli.study import STUDY
 from dsr.data.download.collections import Collection
 from dsr.doctor.about import version_lines
@@ -63,14 +61,14 @@ def main(arguments: Sequence[str] | None = None, catalogue: Mapping[str, Collect
     """Run the command, and return its exit code: 0, 2 after an error, 130 or 143 when interrupted.
 
     Args:
-        catalogue: the data sets to offer; None for :func:`dsr.app.downloads.downloads`.
+        catalogue: the data sets to offer; None for :func:`dsr.cli.data_tasks.downloads`.
 
     """
     options = make_parser().parse_args(arguments)
     console = open_console()
     try:
         with refusing_excess():
-            problems = options.run(options, console, downloads() if catalogue is None else catalogue)
+            problems = options.run(options, console, catalogue)
     except KeyboardInterrupt as interrupted:
         return interruption.stop(str(interrupted))
     except (ValueError, OSError, FullDiskError) as error:

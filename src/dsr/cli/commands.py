@@ -364,8 +364,8 @@ def add_data_command(commands: Any) -> None:
         )
 
 
-def _run_data_task(options: argparse.Namespace, *context: Any) -> list[str]:
-    """Run a task."""
-    from dsr.cli.data_tasks import TASKS  # noqa: PLC0415 - it imports what downloads need
+def _run_data_task(options: argparse.Namespace, console: Console, catalogue: Any) -> list[str]:
+    """Run a task on the data sets of a catalogue, None for all that are known."""
+    from dsr.cli.data_tasks import TASKS, downloads  # noqa: PLC0415 - it imports what downloads need
 
-    return TASKS[options.task](options, *context)
+    return TASKS[options.task](options, console, downloads() if catalogue is None else catalogue)

@@ -6,15 +6,53 @@ import argparse
 import sys
 import textwrap
 from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, metadata
 
 from rich.console import Console
 from rich.table import Table
 
-from dsr.data.download.collections import Collection, find
+from dsr.data.download.collections import CATALOGUE, Collection, Item, find
 from dsr.data.download.fetching import Server, absent, checksums_of, get, state, verify
+from dsr.methods import weights
 from dsr.utils.console import ConsoleProgress, show
 from dsr.utils.files import data_root
 from dsr.utils.progress import megabytes
+from dsr.utils.versions import DISTRIBUTION
+
+_URL = "Weights"  # the label of the release's files in ``project.urls`` of pyproject.toml
+
+
+def downloads() -> Mapping[str, Collection]:
+    """Return the data sets, and the weights that this installation does not come with, by their names."""
+    absent = weights.left_out()
+    return {**CATALOGUE, weights.FOLDER: _weights(absent)} if absent else CATALOGUE
+
+
+def _weights(names: list[str]) -> Collection:
+    """Return weights to fetch from the release, or from a mirror."""
+    try:
+        stated = metadata(DISTRIBUTION).get_all("Project-URL") or []
+    except PackageNotFoundError:
+        stated = []
+    address = dict(each.split(", ", 1) for each in stated).get(_URL, "").rstrip("/")
+    items = (
+        Item(
+            f"{weights.FOLDER}/{name}.safetensors",
+            (f"{address}/{name}.safetensors",) if address else (),
+            sha256=weights.known()[name],
+        )
+        for name in names
+    )
+    return Collection(
+        weights.FOLDER,
+        "weights of networks for comparison, which a wheel leaves out",
+        address or "a checkout has them in src/dsr/methods/weights",
+        "Apache-2.0, as dsr.",
+        "As of dsr, see docs/citation.md.",
+        (weights.FOLDER,),
+        None,
+        tuple(items),
+    )
 
 
 def list_data_sets(_: argparse.Namespace, console: Console, catalogue: Mapping[str, Collection]) -> list[str]:

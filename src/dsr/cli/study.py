@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from rich.console import Console
 
 from dsr.app.requests import AnswersRequest, StudyRequest
 from dsr.cli.commands import Command, CommandGroup
 from dsr.notes import expect_no_warning
 from dsr.utils.console import ConsoleProgress, show
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 _EXAMPLES = """\
 examples:
@@ -62,7 +57,7 @@ def _collect(request: AnswersRequest, console: Console, _: object) -> list[str]:
     """Read answers, print and write the table."""
     from dsr.report.study.answers import files_of, read_all  # noqa: PLC0415
     from dsr.report.study.key import KEY_NAME, read_key  # noqa: PLC0415
-    from dsr.report.study.percentages import collect, remarks  # noqa: PLC0415
+    from dsr.report.study.percentages import collect, remarks, tables_of  # noqa: PLC0415
     from dsr.utils.files import expect_target, write_text  # noqa: PLC0415 - pandas takes a second to import
 
     path = request.output or request.study / "study.csv"
@@ -76,20 +71,13 @@ def _collect(request: AnswersRequest, console: Console, _: object) -> list[str]:
     if not answers:
         raise ValueError(f"{request.study}: expected answers that count, got none in {len(files)} files")
     table = collect(answers, key)
-    _print(console, table)
+    for each in tables_of(table):
+        console.print(each)
     for line in remarks(answers, key):
         show(console, line)
     write_text(path, table.to_csv(index=False, float_format="%.6g"))
     show(console, f"{path}  {len(answers)} of {len(files)} files count{', see above' if left_out else ''}")
     return []
-
-
-def _print(console: Console, table: pd.DataFrame) -> None:
-    """Print one table for each data set, scale and degradation."""
-    from dsr.report.study.percentages import tables_of  # noqa: PLC0415
-
-    for each in tables_of(table):
-        console.print(each)
 
 
 STUDY = CommandGroup(

@@ -6,6 +6,7 @@ a change of any of them prepares the scene again.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import json
@@ -201,7 +202,12 @@ class PreparedDataset:
 
     def unprepared(self, scenes: Sequence[str]) -> list[str]:
         """Return those of some scenes that are not in the cache."""
-        return [scene for scene in scenes if not self._is_ready(scene)]
+        missing = []
+        for scene in scenes if self._preparation.size is not None else ():
+            with contextlib.suppress(OSError, ValueError):  # loading the scene raises it again
+                if not (cache_directory() / self._path(scene)).is_file():
+                    missing.append(scene)
+        return missing
 
     def prepare(self, scenes: Sequence[str], _: Callable[[str], None] = SILENT.say) -> Iterator[str]:
         """Prepare scenes that are not in the cache, several at a time, and yield the name of each that is ready.
@@ -218,12 +224,6 @@ class PreparedDataset:
             except BaseException:
                 pool.shutdown(cancel_futures=True)
                 raise
-
-    def _is_ready(self, scene: str) -> bool:
-        try:
-            return self._preparation.size is None or (cache_directory() / self._path(scene)).is_file()
-        except (OSError, ValueError):  # loading the scene raises it again
-            return True
 
     def _path(self, scene: str) -> Path:
         key = hashlib.sha256(f"{self.fingerprint(scene)}{SCENES}".encode()).hexdigest()[:16]

@@ -166,7 +166,9 @@ def _solve_laplace(values: np.ndarray, hole: np.ndarray, rim: np.ndarray) -> np.
     for step in _SIDES:
         there = np.roll(number, step, (0, 1))
         known, beside = np.roll(rim, step, (0, 1)), np.roll(values, step, (0, 1))
-        _clear_wrapped(step, there, known)
+        across = slice(None)  # what a roll moved in from the opposite side is cleared
+        edge = (across, 0 if step[1] > 0 else -1) if step[1] else (0 if step[0] > 0 else -1, across)
+        there[edge], known[edge] = -1, False
         inner = hole & (there >= 0)
         rows.append(number[inner])
         columns.append(there[inner])
@@ -177,12 +179,6 @@ def _solve_laplace(values: np.ndarray, hole: np.ndarray, rim: np.ndarray) -> np.
     )
     solution: np.ndarray = linalg.spsolve((sparse.diags(count) + coupling).tocsc(), right)
     return solution
-
-
-def _clear_wrapped(step: tuple[int, int], number: np.ndarray, known: np.ndarray) -> None:
-    """Clear the row or column that a roll moved in from the opposite side."""
-    edge = (slice(None), 0 if step[1] > 0 else -1) if step[1] else (0 if step[0] > 0 else -1, slice(None))
-    number[edge], known[edge] = -1, False
 
 
 def smooth_levels(levels: np.ndarray, largest_step: int = 2) -> np.ndarray:

@@ -6,8 +6,7 @@ import math
 
 import torch
 
-from dsr.doctor.depth_checks import find_rounding
-from dsr.doctor.finding import Finding, metres
+from dsr.doctor.depth_checks import Finding, find_rounding, metres
 from dsr.geometry.agreement import judge
 from dsr.geometry.planes import range_votes
 from dsr.geometry.plausible import judge_camera, offset_of, view_of

@@ -9,13 +9,14 @@ longer multiples, but along a slope they are still exactly equal for some pixels
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
+from torch.nn import functional
 
-from dsr.doctor.finding import Array, Finding, Level, metres
 from dsr.geometry.camera import baseline_times_focal
 from dsr.geometry.plausible import implausible_distance, plausible_baseline
 from dsr.notes import LIMITS
@@ -72,6 +73,53 @@ _TILT, _STEEP = 3.0, 20.0
 _LEAST = 100
 """Minimum number of pixels."""
 _REPEATED = (8, 6, 5, 4, 3, 2)
+Level = Literal["ok", "note", "warning", "problem"]
+LEVELS: tuple[Level, ...] = get_args(Level)
+"""From the best to the worst; ``warning`` and ``problem`` mean that the scene is probably wrong."""
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A finding of one check.
+
+    Args:
+        check: name of the check.
+        level: severity.
+        message: measured values, with units.
+        advice: recommended action; empty for none.
+
+    """
+
+    check: str
+    level: Level
+    message: str
+    advice: str = ""
+
+
+def worst(findings: list[Finding]) -> Level:
+    """Return the worst level; ``ok`` without findings."""
+    return max((finding.level for finding in findings), key=LEVELS.index, default="ok")
+
+
+def with_depth(scene: Scene) -> Scene:
+    """Return the scene at the resolution of its high-resolution depth, else of its largest measured map."""
+    if scene.depth is not None:
+        return scene
+    depth = scene.measured[min(scene.measured)]
+    height, width = depth.shape[-2:]
+    camera, ratio = scene.camera.reduce(width, height), scene.camera.ratio_to(width, height)
+    rgb = scene.rgb[:, : camera.height * ratio, : camera.width * ratio] if isinstance(ratio, int) else scene.rgb
+    rgb = functional.interpolate(rgb[None], (height, width), mode="area")[0]
+    return replace(scene, rgb=rgb.clamp(0, 1), camera=camera, depth=depth, measured={})
+
+
+def metres(scene: Scene) -> Array:
+    """Return a scene's high-resolution depth, (H, W) float64 in metres, NaN in holes."""
+    if scene.depth is None:
+        raise ValueError(f"{scene.name}: expected high-resolution depth, there is none; see with_depth")
+    depth: Array = scene.depth[0].double().numpy()
+    return depth
 
 
 def check_units(scene: Scene) -> list[Finding]:
@@ -162,7 +210,9 @@ def check_holes(scene: Scene) -> list[Finding]:
 def _marks(scene: Scene, depth: Array) -> list[Finding]:
     """Return the extreme values that look like marks, of the depth or else of the distance along the ray."""
     for values in (depth, depth * scene.camera.ray_lengths().numpy()):
-        rounded = _round(values)
+        with np.errstate(invalid="ignore"):
+            power = 10.0 ** (_DIGITS - 1 - np.floor(np.log10(values)))
+            rounded = np.round(values * power) / power
         levels, counts = np.unique(rounded[np.isfinite(rounded)], return_counts=True)
         if levels.size == 1 and counts[0] > 1:
             message = f"all valid pixels have the same value, {levels[0]:g} m"
@@ -176,14 +226,6 @@ def _marks(scene: Scene, depth: Array) -> list[Finding]:
     return []
 
 
-def _round(values: Array) -> Array:
-    """Round values to six significant digits."""
-    with np.errstate(invalid="ignore"):
-        power = 10.0 ** (_DIGITS - 1 - np.floor(np.log10(values)))
-        rounded: Array = np.round(values * power) / power
-    return rounded
-
-
 def _judge(where: np.ndarray, value: float, beside: float, fraction: float) -> list[Finding]:
     """Return a finding if an extreme value that many pixels have is, or may be, a mark."""
     smallest = value < beside
@@ -193,19 +235,15 @@ def _judge(where: np.ndarray, value: float, beside: float, fraction: float) -> l
         return []
     name = "smallest" if smallest else "largest"
     message = f"{fraction:.1%} of the valid pixels have exactly the {name} value, {value:g} m"
-    if mark or _is_scattered(where):
+    labels, regions = ndimage.label(where)
+    scattered = regions > 20 and np.bincount(labels.ravel())[1:].max() < 0.5 * where.sum()  # holes are, a wall is not
+    if mark or scattered:
         advice = 'if it marks holes, set "hole_value" in camera.json, in the unit of the file, or add a mask.png'
         return [Finding("holes", "warning", f"{message}, which looks like a mark of missing depth", advice)]
     message += f"; the next value is {beside:g} m"
     return [
         Finding("holes", "note", message, 'correct for a flat wall; if it marks holes, set "hole_value" in camera.json')
     ]
-
-
-def _is_scattered(where: np.ndarray) -> bool:
-    """Return whether pixels form many separate regions, which is typical of holes but not of a wall."""
-    labels, count = ndimage.label(where)
-    return count > 20 and np.bincount(labels.ravel())[1:].max() < 0.5 * where.sum()
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,7 @@ from rich.text import Text
 
 from dsr.data.detection import find_scenes
 from dsr.doctor.camera_checks import check_intrinsics, check_planes, check_registration, check_size
-from dsr.doctor.depth_checks import check_holes, check_precision, check_units
-from dsr.doctor.finding import LEVELS, Finding, Level, with_depth, worst
+from dsr.doctor.depth_checks import LEVELS, Finding, Level, check_holes, check_precision, check_units, with_depth, worst
 from dsr.sample import Scene
 from dsr.utils.console import USAGE_ERROR, ConsoleProgress, one_line, open_console, print_error
 from dsr.utils.ratios import round_ratio

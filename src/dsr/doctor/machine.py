@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import platform
 import shutil
@@ -16,9 +17,9 @@ from packaging.specifiers import SpecifierSet
 from rich.text import Text
 
 from dsr.data.download.collections import CATALOGUE
-from dsr.doctor.about import Extra, extras, graphics_cards, lack, processor, requirements, version_lines
+from dsr.doctor.about import extras, graphics_cards, lack, processor, requirements, version_lines
+from dsr.doctor.depth_checks import Finding, Level
 from dsr.doctor.examine import FINE, show_findings
-from dsr.doctor.finding import Finding, Level
 from dsr.methods import weights
 from dsr.synthetic.rendering import cache_directory
 from dsr.utils.compute_device import fast_precision, pick_device
@@ -39,7 +40,7 @@ def examine_machine() -> int:
         Exit status: 0 if everything that ``dsr upsample`` needs is there, else 2.
 
     """
-    console, findings = open_console(), check_machine()
+    console, findings = open_console(), [finding for check in CHECKS for finding in check()]
     show_findings(console, "this machine", findings, brief=False)
     missing = [each for each in findings if each.level == "problem"]
     if not missing:
@@ -163,19 +164,16 @@ def check_browser() -> list[Finding]:
 
 def check_extras() -> list[Finding]:
     """List the extras: which are there, and how to get the others."""
-    try:
-        found = extras()
-    except PackageNotFoundError:
-        return []
-    return [_extra(each) for each in found]
-
-
-def _extra(extra: Extra) -> Finding:
-    """Return whether an extra is there, and how to get it."""
-    if not extra.missing:
-        return Finding("extra", "ok", f"{extra.name}: {extra.purpose}")
-    message = f"{extra.name}: {extra.purpose} ({', '.join(extra.missing)})"
-    return Finding("extra", "note", message, how_to_install(extra.name))
+    findings = []
+    with contextlib.suppress(PackageNotFoundError):
+        for extra in extras():
+            text = f"{extra.name}: {extra.purpose}"
+            if extra.missing:
+                advice = how_to_install(extra.name)
+                findings.append(Finding("extra", "note", f"{text} ({', '.join(extra.missing)})", advice))
+            else:
+                findings.append(Finding("extra", "ok", text))
+    return findings
 
 
 CHECKS: tuple[Callable[[], list[Finding]], ...] = (

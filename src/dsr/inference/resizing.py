@@ -66,7 +66,9 @@ def padded(
 ) -> InverseSurface:
     """Apply ``run`` to the photo padded to ``ratio`` times the size of the map, and crop the result."""
     height, width = (max(round(ratio * n), m) for n, m in zip(size_of(inverse), size_of(rgb), strict=True))
-    found = run(_pad_photo(rgb, (height, width)), Camera(width, height, camera.fx, camera.fy, camera.cx, camera.cy))
+    padding = (0, width - rgb.shape[-1], 0, height - rgb.shape[-2])  # at the right and the bottom
+    photo = functional.pad(rgb[None], padding, mode="replicate")[0] if any(padding) else rgb
+    found = run(photo, Camera(width, height, camera.fx, camera.fy, camera.cx, camera.cy))
     return found.map(lambda values: values[..., : camera.height, : camera.width])
 
 
@@ -96,9 +98,3 @@ def size_of(values: Tensor) -> Size:
 def _resize(values: Tensor, size: Size) -> Tensor:
     """Return (1, *size), bilinear."""
     return functional.interpolate(values[None], size, mode="bilinear", align_corners=False, antialias=True)[0]
-
-
-def _pad_photo(rgb: Tensor, size: Size) -> Tensor:
-    """Pad a photo at the right and the bottom to a size, by repeating its border pixels."""
-    padding = (0, size[1] - rgb.shape[-1], 0, size[0] - rgb.shape[-2])
-    return functional.pad(rgb[None], padding, mode="replicate")[0] if any(padding) else rgb

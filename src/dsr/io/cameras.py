@@ -1,4 +1,7 @@
-"""The cameras of a photo, and of a depth map of another camera: from files, numbers or EXIF data, or assumed."""
+"""The cameras of a photo, and of a depth map of another camera: from files, numbers or EXIF data, or assumed.
+
+A camera, a baseline or distances that are implausible by the rules of ``dsr doctor`` are warned of.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +16,8 @@ import torch
 from pydantic import BaseModel, Field
 from torch import Tensor
 
-from dsr.geometry.camera import ASSUMED_FOV, Camera, expect_intrinsics
-from dsr.geometry.plausible import may_be_of
+from dsr.geometry.camera import ASSUMED_FOV, Camera, RangeType, expect_intrinsics
+from dsr.geometry.plausible import implausible_distance, judge_camera, may_be_of, plausible_baseline
 from dsr.geometry.resampling import registered_camera, warp_depth
 from dsr.io.frames import Rig
 from dsr.io.images import CameraFile, Pixels, pixels_in_header, read_camera
@@ -23,12 +26,15 @@ from dsr.io.reading import CameraChoice, RigFiles
 from dsr.io.trajectories import intrinsics_camera, read_transform
 from dsr.notes import Assumption
 from dsr.utils.guards import naming, numbers_in, parse_json, read_text, refusing, split_numbers
+from dsr.utils.progress import show_length
 from dsr.utils.validation import parse_model
 
 _FOCAL_OF_ONE = 20
 """Focal length in widths of the picture, which no lens of a photo with depth has."""
 _FILM_DIAGONAL = math.hypot(36, 24)
 """Diagonal of 35 mm film in millimetres, to which equivalent focal lengths refer (CIPA DCG-001)."""
+_SAMPLE = 100_000
+"""Largest number of pixels that percentiles are taken of."""
 
 
 def find_camera(choice: CameraChoice, photo: Path, size: Size, size_lr: Size) -> tuple[CameraFile, list[Assumption]]:
@@ -273,3 +279,44 @@ def to_photo(depth_lr: Tensor, rig: Rig, photo: Camera, place: str) -> tuple[Ten
         )
     holes = f"{target.width} x {target.height}, {float(warped.isnan().float().mean()):.1%} holes"
     return warped, Assumption("the depth map is warped into the photo's view", holes)
+
+
+def doubt_camera(camera: Camera, whose: str, size_lr: tuple[int, int] | None = None) -> list[Assumption]:
+    """Return warnings of a camera.
+
+    Args:
+        camera: the camera.
+        whose: what it is, such as ``camera``.
+        size_lr: (height, width) of the depth map, whose intrinsics may have been given for the photo's.
+
+    """
+    found = (each for each in judge_camera(camera, size_lr) if each.level != "note")
+    return [
+        Assumption(f"{whose}: {each.kind}", f"{each.message}; {each.advice}", each.code, each.value) for each in found
+    ]
+
+
+def doubt_depth(depth_lr: Tensor, camera: Camera, range_type: RangeType) -> list[Assumption]:
+    """Return warnings of distances that no room or table has, and of a baseline that no two cameras have.
+
+    Args:
+        depth_lr: (1, h, w) orthogonal depth in metres, NaN in holes.
+        camera: that of its pixels.
+        range_type: what it was read as; a strange baseline is right if disparities become plausible depth with it.
+
+    """
+    known = depth_lr[depth_lr.isfinite()]
+    known = known[:: -(-known.numel() // _SAMPLE)]
+    low, high = np.percentile(known.numpy(), (1, 99)).tolist()
+    code, doubts = implausible_distance(low, high), []
+    baseline = camera.baseline
+    if baseline is not None and not plausible_baseline(baseline) and (range_type != "disparity" or code is not None):
+        text = f"the baseline is {show_length(baseline)}: --baseline is in metres, between the two cameras of a pair"
+        doubts.append(Assumption(text, "", "baseline-short" if baseline < 1 else "baseline-long", baseline))
+    if code is not None:
+        cure = "--baseline, --depth-unit and the camera set it" if range_type == "disparity" else "--depth-unit sets it"
+        text = f"the depth is {'nearer' if code == 'depth-near' else 'farther'} than any depth camera measures; {cure}"
+        doubts.append(
+            Assumption(text, f"{show_length(low)} to {show_length(high)}", code, high if code == "depth-near" else low)
+        )
+    return doubts

@@ -17,7 +17,7 @@ import numpy as np
 from dsr.geometry.camera import Camera
 from dsr.io.images import expect_depth_values, read_array, read_numbers
 from dsr.utils.arrays import array_headers, read_arrays
-from dsr.utils.decoding import quiet_decoders
+from dsr.utils.decoding import QUIET_DECODERS
 from dsr.utils.files import replacing
 from dsr.utils.guards import MOST_PIXELS, bytes_of_archive, expect_bytes, expect_pixels, refusing
 
@@ -57,7 +57,11 @@ def read_depth_file(path: Path, most: int | None = None) -> np.ndarray:
         raise ValueError(f"{path}: expected a depth map as {', '.join(READ_SUFFIXES)}, got {suffix or 'no suffix'}")
     if not path.is_file():
         raise ValueError(f"{path}: expected a depth map, there is no such file")
-    values = _read_icl(path) if suffix == ICL_SUFFIX else expect_depth_values(path, read_array_file(path, most))
+    if suffix == ICL_SUFFIX:
+        size = ICL_CAMERA.height, ICL_CAMERA.width
+        values = read_numbers(path, size[0] * size[1]).reshape(size)
+    else:
+        values = expect_depth_values(path, read_array_file(path, most))
     if values.size == 0:
         raise ValueError(f"{path}: expected a depth map, got one of {values.shape[0]} x {values.shape[1]} pixels")
     return np.ascontiguousarray(values, values.dtype.newbyteorder("="))
@@ -123,11 +127,6 @@ def _format(suffix: str) -> str:
     return ".tiff" if suffix == ".tif" else suffix
 
 
-def _read_icl(path: Path) -> np.ndarray:
-    """Return the numbers of a file of ICL-NUIM, (480, 640) float64."""
-    return read_numbers(path, ICL_CAMERA.height * ICL_CAMERA.width).reshape(ICL_CAMERA.height, ICL_CAMERA.width)
-
-
 def _read_npz(path: Path, most: int | None) -> np.ndarray:
     """Return the array named depth, or the only one."""
     names = sorted(array_headers(path))
@@ -145,7 +144,7 @@ def _read_exr(path: Path, most: int | None) -> np.ndarray:
         # damaged files raise RuntimeError, ValueError, MemoryError, ..., and print on both streams
         with refusing(f"{path}: expected an OpenEXR file, got a damaged or foreign one", Exception):
             quiet = contextlib.redirect_stdout(io.StringIO())
-            with quiet_decoders(), quiet, OpenEXR.File(str(path), separate_channels=True, header_only=header) as file:
+            with QUIET_DECODERS, quiet, OpenEXR.File(str(path), separate_channels=True, header_only=header) as file:
                 if header:
                     return [_exr_windows(part.header) for part in file.parts]
                 return [

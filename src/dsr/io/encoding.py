@@ -187,10 +187,6 @@ def encode(depth: Tensor, encoding: Encoding, camera: Camera) -> tuple[np.ndarra
     dtype, known = np.dtype(encoding.dtype), np.isfinite(values)
     if dtype.kind in "iu":
         values = np.round(values)
-    held = known & (values >= (1 if dtype.kind in "iu" else 0)) & (values <= _largest(dtype))
+    least, largest = (1, np.iinfo(dtype).max - 1) if dtype.kind in "iu" else (0, float(np.finfo(dtype).max))
+    held = known & (values >= least) & (values <= largest)
     return np.where(held, values, encoding.hole).astype(dtype), int((known & ~held).sum())
-
-
-def _largest(dtype: np.dtype) -> float:
-    """Return the largest value of a type that is not a hole."""
-    return np.iinfo(dtype).max - 1 if dtype.kind in "iu" else float(np.finfo(dtype).max)

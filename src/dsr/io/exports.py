@@ -315,12 +315,7 @@ def read_input(path: Path) -> tuple[np.ndarray, np.ndarray]:
     arrays = read_arrays(path)
     depth = arrays["depth_lr"]
     expect_distances(str(path), torch.from_numpy(depth[np.isfinite(depth)]))
-    return _decode(path, arrays["photo"]), np.where(np.isfinite(depth), depth, np.float32(np.nan))
-
-
-def _decode(path: Path, content: np.ndarray) -> np.ndarray:
-    """Decode the photo."""
-    picture = decode_pixels(path, content.tobytes(), cv2.IMREAD_COLOR, LONGEST**2)
-    if picture is None:
+    photo = decode_pixels(path, arrays["photo"].tobytes(), cv2.IMREAD_COLOR, LONGEST**2)
+    if photo is None:
         raise ValueError(f"{path}: expected the bytes of a JPEG as photo, got something else")
-    return picture[..., ::-1]
+    return photo[..., ::-1], np.where(np.isfinite(depth), depth, np.float32(np.nan))

@@ -1,7 +1,7 @@
 """Table of the captures and layouts that dsr reads, a row per device, program or data set, as in docs/captures.md.
 
 A row also lists the files by which a reader in :mod:`dsr.io.captures` or :mod:`dsr.io.layouts` recognises the layout;
-for a folder that has only some of them, :mod:`dsr.io.captures.known` names those that are missing.
+for a folder that has only some of them, :func:`dsr.io.layouts.lacking` names those that are missing.
 """
 
 from __future__ import annotations

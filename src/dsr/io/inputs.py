@@ -19,6 +19,8 @@ from dsr.geometry.plausible import expect_possible
 from dsr.geometry.resampling import registered_camera, warp_depth
 from dsr.io.cameras import (
     camera_only,
+    doubt_camera,
+    doubt_depth,
     find_camera,
     read_any_camera,
     read_rig,
@@ -27,7 +29,6 @@ from dsr.io.cameras import (
     to_photo,
 )
 from dsr.io.depth_files import ICL_CAMERA, ICL_SUFFIX, read_depth_file
-from dsr.io.doubts import doubt_camera, doubt_depth
 from dsr.io.encoding import Encoding, decode, expect_known, find_holes, turn_back_bits
 from dsr.io.frames import SLACK, Geometry, Rig
 from dsr.io.images import CameraFile, pixels_in_header, read_mask
@@ -187,7 +188,10 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     if given and geometry.lens is not None and geometry.lens.bends:
         text = "the lens distortion that the capture states is not undone: the camera is given"
         camera_assumptions = [*camera_assumptions, Assumption(text, str(geometry.lens))]
-    pixels, undone = _undistort_photo(pixels, described.camera, lens)
+    undone = []
+    if lens is not None and lens.bends:
+        pixels = undistort(pixels, described.camera, lens)
+        undone = [Assumption("the lens distortion of the photo is undone", str(lens))]
     pixels, crop_assumptions = _crop_to_multiple(pixels, pair.factor, size_lr)
     size: Size = (pixels.shape[0], pixels.shape[1])
     rig = _rig(pair, reading, geometry, size_lr)
@@ -457,13 +461,6 @@ def _to_photo(
                 detail = f"{better.figures}; expected the transform from the depth camera's frame to the photo camera's"
                 doubts.append(Assumption(text, detail, "extrinsics-inverse", gain))
     return warped, [*doubts, note]
-
-
-def _undistort_photo(pixels: np.ndarray, camera: Camera, lens: Lens | None) -> tuple[np.ndarray, list[Assumption]]:
-    """Return a photo without its lens distortion, and a note if it had any."""
-    if lens is None or not lens.bends:
-        return pixels, []
-    return undistort(pixels, camera, lens), [Assumption("the lens distortion of the photo is undone", str(lens))]
 
 
 def _undistort_depth(

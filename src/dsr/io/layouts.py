@@ -6,7 +6,9 @@ Which app made a capture, by what lies in its folder.
 from __future__ import annotations
 
 import contextlib
+import os
 import re
+from collections import Counter
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -22,7 +24,6 @@ from dsr.io.captures.colmap import add_model, find_colmap, model_file
 from dsr.io.captures.data_sets import find_replica, find_scannet, find_seven_scenes, find_sunrgbd
 from dsr.io.captures.heic import find_heic
 from dsr.io.captures.kinect import find_kinect
-from dsr.io.captures.known import describe_content, lacking
 from dsr.io.captures.nerfstudio import add_transforms
 from dsr.io.captures.record3d import find_record3d
 from dsr.io.captures.ros import find_ros
@@ -30,6 +31,7 @@ from dsr.io.captures.scannet import find_scannetpp, find_sens
 from dsr.io.captures.stray import find_stray
 from dsr.io.captures.zed import find_zed
 from dsr.io.depth_files import DEPTH_SUFFIXES
+from dsr.io.formats import FORMATS
 from dsr.io.frames import CaptureFrame, Geometry
 from dsr.io.images import read_pixels
 from dsr.io.open3d import add_trajectory
@@ -38,6 +40,7 @@ from dsr.io.pairs import (
     PairingResult,
     find_camera_file,
     find_pairs_of_two_folders,
+    has_name,
     has_pictures,
     is_registered,
     list_pictures,
@@ -69,6 +72,10 @@ _LAYOUTS = (
     find_sunrgbd, find_replica, find_zed, *_FILES,
 )  # fmt: skip
 """A video of ScanNet++ is asked before those of a Kinect."""
+_MOST_FILES = 100_000
+"""Largest number of files that are counted."""
+_KINDS = 6
+"""Largest number of kinds of files that are named."""
 
 
 class NoPairError(ValueError):
@@ -300,3 +307,48 @@ def find_capture(place: Path) -> PairingResult | None:
     """
     layouts = _FILES if place.is_file() else _LAYOUTS
     return next((found for layout in layouts if (found := layout(place)) is not None), None)
+
+
+def lacking(folder: Path) -> list[str]:
+    """Return the layouts that a folder resembles, each with its missing files: ``like ScanNet, without depth/``."""
+    return [
+        f"like {each.name}, without {', '.join(missing)}"
+        for each in FORMATS
+        if _has(folder, each.marks)
+        and (missing := [name for name, patterns in each.needs.items() if not _has(folder, patterns)])
+    ]
+
+
+def _has(folder: Path, patterns: tuple[str, ...]) -> bool:
+    """Return whether a folder has a file or folder of one of several patterns."""
+    for pattern in patterns:
+        parent, name = folder / Path(pattern).parent, Path(pattern).name
+        if (parent / name).exists() or ("*" in name and parent.is_dir() and has_name(parent, *name.split("*"))):
+            return True
+    return False
+
+
+def describe_content(folder: Path, deep: int) -> str:
+    """Describe a folder in one line: the numbers of its files by kind, and the layouts that it nearly matches.
+
+    Args:
+        folder: the folder.
+        deep: levels of subfolders that are looked at.
+
+    """
+    kinds, near, count = Counter[str](), list[str](), 0
+    for place, below, names in os.walk(folder):
+        below[:] = sorted((name for name in below if not name.startswith(".")), key=natural_key)
+        level = len(Path(place).relative_to(folder).parts)
+        if level >= deep:
+            below.clear()
+        kinds.update(Path(name).suffix.lower() or "no suffix" for name in names if not name.startswith("."))
+        near += [f"{text} in {Path(place).relative_to(folder)}" if level else text for text in lacking(Path(place))]
+        count += len(names)
+        if count > _MOST_FILES:
+            break
+    found = [f"{number} {kind}" for kind, number in kinds.most_common(_KINDS)]
+    more = len(kinds) - len(found)
+    text = f"the folder has {', '.join(found)}" + (f" and {more} more kinds" if more > 0 else "")
+    near = list(dict.fromkeys(near))[:2]
+    return (text if kinds else "the folder is empty") + "".join(f"; it looks {each}" for each in near)

@@ -33,7 +33,8 @@ from torch import Tensor
 from dsr.geometry.camera import Camera
 from dsr.io.frames import CaptureFrame, Geometry
 from dsr.io.pairs import Pair, PairingResult
-from dsr.io.scene_files import RGBD, Frame, one_camera, to_millimetres, write_colour, write_sixteen_bits
+from dsr.io.photos import write_png
+from dsr.io.scene_files import RGBD, Frame, one_camera, to_millimetres
 from dsr.io.trajectories import check_pose, order_of
 from dsr.notes import Assumption
 from dsr.utils.files import replacing, write_text
@@ -98,8 +99,9 @@ def write_rgbd(folder: Path, rgb: Tensor, depth: Tensor, camera: Camera) -> list
 
     """
     millimetres, lost = to_millimetres(depth[0].cpu().numpy())
-    write_colour(folder / RGBD[0], (rgb * 255).round().clamp(0, 255).byte().permute(1, 2, 0).cpu().numpy())
-    write_sixteen_bits(folder / RGBD[1], millimetres)
+    pixels = (rgb * 255).round().clamp(0, 255).byte().permute(1, 2, 0).cpu().numpy()
+    write_png(folder / RGBD[0], np.ascontiguousarray(pixels[..., ::-1]))
+    write_png(folder / RGBD[1], millimetres)
     _write_intrinsics(folder / RGBD[2], camera)
     if not lost:
         return []
@@ -125,7 +127,7 @@ def write_open3d(folder: Path, frames: Sequence[Frame]) -> list[Path]:
         files += [folder / "color" / f"{frame.stem}.png", folder / "depth" / f"{frame.stem}.png"]
         with replacing(files[-2]) as temporary:
             shutil.copyfile(frame.colour, temporary)
-        write_sixteen_bits(files[-1], to_millimetres(frame.read_depth())[0])
+        write_png(files[-1], to_millimetres(frame.read_depth())[0])
     camera = one_camera(frames)
     named = {frame.stem: frame.camera for frame in frames} if camera is None else {}
     intrinsics = {folder / "intrinsics" / f"{stem}.json": each for stem, each in named.items()}
@@ -136,15 +138,13 @@ def write_open3d(folder: Path, frames: Sequence[Frame]) -> list[Path]:
     files += intrinsics
     if all(frame.pose is not None for frame in frames):
         files.append(folder / "trajectory.log")
-        write_text(files[-1], "".join(_log_entry(number, frame) for number, frame in enumerate(frames)))
+        lines = []
+        for number, frame in enumerate(frames):
+            rows = [] if frame.pose is None else frame.pose.tolist()
+            lines.append(f"{number} {number} {number + 1}\n")
+            lines += (" ".join(f"{value:.12g}" for value in row) + "\n" for row in rows)
+        write_text(files[-1], "".join(lines))
     return files
-
-
-def _log_entry(number: int, frame: Frame) -> str:
-    """Return a frame's lines of ``trajectory.log``."""
-    rows = [] if frame.pose is None else frame.pose.tolist()
-    lines = [f"{number} {number} {number + 1}", *(" ".join(f"{value:.12g}" for value in row) for row in rows)]
-    return "\n".join(lines) + "\n"
 
 
 def _write_intrinsics(path: Path, camera: Camera) -> None:

@@ -83,11 +83,6 @@ def key_of(path: Path) -> tuple[str, ...]:
     return tuple(word for word in words if word not in _RGB_WORDS | _DEPTH_WORDS | _FILLERS)
 
 
-def confidence_key(path: Path) -> tuple[str, ...]:
-    """Return the key of the depth map that a confidence map belongs to, see :func:`key_of`."""
-    return tuple(word for word in key_of(path) if word not in _CONFIDENCE_WORDS)
-
-
 def time_of(path: Path) -> float | None:
     """Return the time in seconds in a name such as 1305031102.175304; None if there is none."""
     numbers = re.findall(r"\d+(?:\.\d+)?", path.stem)
@@ -330,9 +325,10 @@ def add_confidence(pairs: Sequence[Pair], given: Sequence[Path]) -> tuple[Pair, 
 
 def _match_confidence(pairs: Sequence[Pair], folder: Path) -> list[Path]:
     """Return the maps of a folder that have the names of the pairs' depth maps or photos."""
-    maps = {
-        confidence_key(path): path for path in sorted(folder.iterdir()) if path.suffix.lower() in CONFIDENCE_SUFFIXES
-    }
+    maps = {}
+    for path in sorted(folder.iterdir()):
+        if path.suffix.lower() in CONFIDENCE_SUFFIXES:
+            maps[tuple(word for word in key_of(path) if word not in _CONFIDENCE_WORDS)] = path
     found = [maps.get(key_of(pair.depth)) or maps.get(key_of(pair.rgb)) for pair in pairs]
     missing = [pair.name for pair, path in zip(pairs, found, strict=True) if path is None]
     if missing:

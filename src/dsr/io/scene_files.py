@@ -162,16 +162,6 @@ def common_up(frames: Sequence[Frame]) -> str:
     return ups.pop() if len(ups) == 1 else ""
 
 
-def write_colour(path: Path, rgb: np.ndarray) -> None:
-    """Write (H, W, 3) uint8, red first, as a PNG, atomically."""
-    write_png(path, np.ascontiguousarray(rgb[..., ::-1]))
-
-
-def write_sixteen_bits(path: Path, values: np.ndarray) -> None:
-    """Write (H, W) uint16 as a PNG, atomically."""
-    write_png(path, values)
-
-
 def to_millimetres(depth: np.ndarray) -> tuple[np.ndarray, int]:
     """Return depth in metres as whole millimetres, (H, W) uint16 with 0 in holes, and how many pixels are too far.
 
@@ -202,7 +192,7 @@ def write_transforms(path: Path, frames: Sequence[Frame]) -> list[Path]:
     for frame, photo, depth in zip(frames, files[::2], files[1::2], strict=True):
         with replacing(photo) as temporary:
             shutil.copyfile(frame.colour, temporary)
-        write_sixteen_bits(depth, to_millimetres(frame.read_depth())[0])
+        write_png(depth, to_millimetres(frame.read_depth())[0])
     files.append(folder / "points.ply")
     write_ply(files[-1], *_sparse(frames), frame=world_comment(common_up(frames)))
     entries: dict[str, Any] = {"camera_model": "OPENCV", **({} if camera is None else _intrinsics(camera))}
@@ -210,15 +200,17 @@ def write_transforms(path: Path, frames: Sequence[Frame]) -> list[Path]:
     entries["applied_transform"] = np.eye(4)[:3].tolist()
     names = [file.relative_to(path.parent).as_posix() for file in files]
     entries["ply_file_path"] = names[-1]
-    entries["frames"] = [
-        {
-            "file_path": photo_name,
-            "depth_file_path": depth_name,
-            **({} if camera is not None else _intrinsics(frame.camera)),
-            "transform_matrix": _to_opengl(frame),
-        }
-        for frame, photo_name, depth_name in zip(frames, names[:-1:2], names[1:-1:2], strict=True)
-    ]
+    entries["frames"] = []
+    for frame, photo_name, depth_name in zip(frames, names[:-1:2], names[1:-1:2], strict=True):
+        pose = torch.eye(4, dtype=torch.float64) if frame.pose is None else frame.pose
+        entries["frames"].append(
+            {
+                "file_path": photo_name,
+                "depth_file_path": depth_name,
+                **({} if camera is not None else _intrinsics(frame.camera)),
+                "transform_matrix": (pose * pose.new_tensor([1, -1, -1, 1])).tolist(),  # of OpenGL's camera frame
+            }
+        )
     write_text(path, json.dumps(entries, indent=2) + "\n")
     return [path, *files]
 
@@ -240,13 +232,6 @@ def expect_poses(part: str, known: Mapping[str, bool]) -> None:
             f"{part}: expected a pose of each frame, got none for {len(missing)} of {len(known)}, such as "
             f"{missing[0]}; --poses gives them"
         )
-
-
-def _to_opengl(frame: Frame) -> list[list[float]]:
-    """Return the transform from OpenGL's camera frame to the world."""
-    pose = torch.eye(4, dtype=torch.float64) if frame.pose is None else frame.pose
-    matrix: list[list[float]] = (pose * pose.new_tensor([1, -1, -1, 1])).tolist()
-    return matrix
 
 
 def _intrinsics(camera: Camera) -> dict[str, float]:
@@ -279,7 +264,8 @@ def write_splatting(folder: Path, frames: Sequence[Frame]) -> list[Path]:
 
     """
     expect_poses("gaussian", {frame.name: frame.pose is not None for frame in frames})
-    nearest = min((_nearest(frame) for frame in frames), default=np.inf)
+    depths = (frame.read_depth() for frame in frames)
+    nearest = min((float(depth[np.isfinite(depth)].min(initial=np.inf)) for depth in depths), default=np.inf)
     if not np.isfinite(nearest):
         raise ValueError("gaussian: expected some depth, got holes alone")
     scale = _DIVISOR / _LARGEST / nearest
@@ -289,25 +275,15 @@ def write_splatting(folder: Path, frames: Sequence[Frame]) -> list[Path]:
         with replacing(files[-2]) as temporary:
             shutil.copyfile(frame.colour, temporary)
         inverse = _DIVISOR / (scale * frame.read_depth().astype(np.float64))
-        write_sixteen_bits(files[-1], np.nan_to_num(np.rint(inverse), nan=0, posinf=0).astype(np.uint16))
+        write_png(files[-1], np.nan_to_num(np.rint(inverse), nan=0, posinf=0).astype(np.uint16))
     sparse = folder / "sparse" / "0"
-    texts = {"depth_params.json": _parameters(frames, scale)}
+    parameters = {frame.stem: {"scale": scale, "offset": 0.0} for frame in frames}
+    texts = {"depth_params.json": json.dumps(parameters, indent=2) + "\n"}
     if all(frame.pose is not None for frame in frames):
         texts |= {"cameras.txt": _cameras(frames), "images.txt": _images(frames), "points3D.txt": _points(frames)}
     for name, text in texts.items():
         write_text(sparse / name, text)
     return [*files, *(sparse / name for name in texts)]
-
-
-def _nearest(frame: Frame) -> float:
-    """Return a frame's smallest depth in metres, infinity if it has none."""
-    depth = frame.read_depth()
-    return float(depth[np.isfinite(depth)].min(initial=np.inf))
-
-
-def _parameters(frames: Sequence[Frame], scale: float) -> str:
-    """Return ``depth_params.json``."""
-    return json.dumps({frame.stem: {"scale": scale, "offset": 0.0} for frame in frames}, indent=2) + "\n"
 
 
 def _cameras(frames: Sequence[Frame]) -> str:

@@ -118,11 +118,6 @@ class _Clues:
         return float(self.values[~self.holes].max())
 
     @functools.cached_property
-    def lowest(self) -> float:
-        """The smallest known value."""
-        return float(self.values[~self.holes].min())
-
-    @functools.cached_property
     def conclusive(self) -> bool:
         """Whether there are enough different values."""
         return np.unique(self.known).size >= _FEWEST_LEVELS
@@ -176,7 +171,8 @@ class _Clues:
 
 def _interpret_whole(clues: _Clues) -> Meaning:
     """Return what whole numbers mean."""
-    if clues.lowest < clues.highest < _LEVELS and not (clues.conclusive and clues.may_fall and clues.votes.verdict):
+    lowest = float(clues.values[~clues.holes].min())
+    if lowest < clues.highest < _LEVELS and not (clues.conclusive and clues.may_fall and clues.votes.verdict):
         raise ValueError(
             f"{clues.name}: expected --depth-unit cm (median {clues.metres(1e-2)}), or --range-type disparity with "
             f"--baseline METRES: whole numbers up to {clues.highest:g} are too small for millimetres"

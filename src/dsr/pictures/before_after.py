@@ -74,9 +74,10 @@ def write_before_after(path: Path, rgb: Tensor, depth_lr: Tensor, depth: Tensor,
     sheet = _Sheet(camera.height / camera.width, title)
     pictures = ((rgb.float(), f"photo, {size}"), (before, f"before, {size_lr}"), (after, f"after, {size}"))
     for column, (picture, heading) in enumerate(pictures):
-        sheet.heading(column, heading)
+        place = sheet.place(0, column)
+        sheet.text((place.x0 + place.x1) / 2, place.y1 + 0.08, heading, fontsize=13, ha="center")
         sheet.panel(0, column, reduced(picture, _LONGEST))
-        sheet.frame(_part_of(sheet.place(0, column), part), facecolor="none", edgecolor=_FRAME, linewidth=1.8)
+        sheet.frame(_part_of(place, part), facecolor="none", edgecolor=_FRAME, linewidth=1.8)
         sheet.panel(1, column, picture, part)
         sheet.frame(sheet.place(1, column), facecolor="none", edgecolor=_FRAME, linewidth=2.5)
     sheet.panel(2, 0, (1 + torch.tensor([1, -1, -1])[:, None, None] * reduced(normals, _LONGEST)) / 2)
@@ -132,11 +133,6 @@ class _Sheet(Canvas):
         top = self.figure.get_figheight() - _HEADING - row * (height + _BETWEEN)
         return Bbox.from_bounds(left, top - height, width, height)
 
-    def heading(self, column: int, text: str) -> None:
-        """Write the heading of a column."""
-        place = self.place(0, column)
-        self.text((place.x0 + place.x1) / 2, place.y1 + 0.08, text, fontsize=13, ha="center")
-
     def panel(
         self, row: int, column: int, values: Tensor, part: _Part = _WHOLE, depth: tuple[float, float] | None = None
     ) -> AxesImage:
@@ -145,7 +141,8 @@ class _Sheet(Canvas):
         place = self.place(row, column)
         picture = _with_holes(shown) if len(shown) == 3 else shown[0].numpy()
         colour_map = "gray" if depth is None else "viridis"
-        whole = _whole_of(place, part)
+        width, height = place.width / (part.right - part.left), place.height / (part.bottom - part.top)
+        whole = Bbox.from_bounds(place.x0 - part.left * width, place.y1 + (part.top - 1) * height, width, height)
         return self.show(
             _part_of(whole, covered), picture, colour_map=colour_map, limits=depth or (0.0, 1.0), within=place
         )
@@ -171,12 +168,6 @@ def _part_of(place: Bbox, part: _Part) -> Bbox:
     x0, x1 = (place.x0 + at * place.width for at in (part.left, part.right))
     y1, y0 = (place.y1 - at * place.height for at in (part.top, part.bottom))
     return Bbox.from_extents(x0, y0, x1, y1)
-
-
-def _whole_of(place: Bbox, part: _Part) -> Bbox:
-    """Return where a picture would be of which a part is at a place."""
-    width, height = place.width / (part.right - part.left), place.height / (part.bottom - part.top)
-    return Bbox.from_bounds(place.x0 - part.left * width, place.y1 + (part.top - 1) * height, width, height)
 
 
 def _with_holes(picture: Tensor) -> np.ndarray:

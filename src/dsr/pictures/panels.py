@@ -54,7 +54,9 @@ def save_picture(
         page.angles(1, 4, depth, truth)
         page.scores(2, 4, scores, formats)
     holes = "" if all(bool(values.isfinite().all()) for values, _ in maps) else " (pink: holes)"
-    page.heading(f"{sample.dataset} / {sample.scene}, {label} x{round_ratio(sample.scale)}{holes}")
+    heading = f"{sample.dataset} / {sample.scene}, {label} x{round_ratio(sample.scale)}{holes}"
+    across, up = page.figure.get_size_inches()
+    page.text(across / 2, up - 0.12, heading, fontsize=16, ha="center", va="top")
     write_figure(path, page.figure, _DPI)
 
 
@@ -108,11 +110,6 @@ class _Page(Canvas):
         panel = self._panel(row, column)
         top = panel.y1 - 0.05 * panel.height
         self.text(panel.x0, top, text, family="monospace", fontsize=11, va="top", linespacing=1.6)
-
-    def heading(self, text: str) -> None:
-        """Write the heading."""
-        width, height = self.figure.get_size_inches()
-        self.text(width / 2, height - 0.12, text, fontsize=16, ha="center", va="top")
 
     def _panel(self, row: int, column: int) -> Bbox:
         """Return the space of a panel."""

@@ -157,7 +157,8 @@ def _reduced(values: Tensor) -> Tensor:
 
 def _save_page(path: Path, rows: list[_Row], title: str) -> None:
     """Draw a page and write it."""
-    sizes = [_panel_size(*row.shape) for row in rows]
+    sides = [[_PANEL * side / max(row.shape) for side in row.shape] for row in rows]
+    sizes = [(max(width, _LEAST_PANEL), max(height, _LEAST_PANEL)) for height, width in sides]  # inches
     heights = [max(size[1] + _BELOW, (row.text.count("\n") + 2) * _LINE) for row, size in zip(rows, sizes, strict=True)]
     total = _ABOVE + sum(heights)
     figure = Figure(figsize=(_MARGIN + _TEXT + 4 * (_PANEL + _GAP), total))
@@ -165,31 +166,19 @@ def _save_page(path: Path, rows: list[_Row], title: str) -> None:
     figure.suptitle(f"{title} (pink: holes)", x=_MARGIN / figure.get_figwidth(), y=1 - 0.12 / total, ha="left",
                     fontsize=14, parse_math=False)  # fmt: skip
     top = total - _ABOVE
-    for number, (row, size, height) in enumerate(zip(rows, sizes, heights, strict=True)):
+    for row, size, height in zip(rows, sizes, heights, strict=True):
         _draw_row(figure, row, top, size)
-        if number == 0:
-            _head_columns(figure, top)
         top -= height
+    headings = ("photo", "depth, m", "holes", f"under {LIGHT_NAMES[0]} to {LIGHT_NAMES[-1]}")
+    for column, heading in enumerate(headings):
+        x, y = (_left(column) + _PANEL / 2) / figure.get_figwidth(), (total - _ABOVE + 0.08) / total
+        figure.text(x, y, heading, ha="center", fontsize=11)
     write_figure(path, figure, _DPI)
-
-
-def _panel_size(height: int, width: int) -> tuple[float, float]:
-    """Return a panel's width and height in inches."""
-    longest = max(height, width)
-    return max(_PANEL * width / longest, _LEAST_PANEL), max(_PANEL * height / longest, _LEAST_PANEL)
 
 
 def _left(column: int) -> float:
     """Return the left edge of a column of panels, in inches."""
     return _MARGIN + _TEXT + column * (_PANEL + _GAP)
-
-
-def _head_columns(figure: Figure, top: float) -> None:
-    """Write the headings of the columns."""
-    width, height = figure.get_size_inches()
-    headings = ("photo", "depth, m", "holes", f"under {LIGHT_NAMES[0]} to {LIGHT_NAMES[-1]}")
-    for column, heading in enumerate(headings):
-        figure.text((_left(column) + _PANEL / 2) / width, (top + 0.08) / height, heading, ha="center", fontsize=11)
 
 
 def _draw_row(figure: Figure, row: _Row, top: float, size: tuple[float, float]) -> None:
@@ -200,7 +189,8 @@ def _draw_row(figure: Figure, row: _Row, top: float, size: tuple[float, float]) 
     for text, below, weight in ((name, 0.0, "bold"), (rest, 0.05 + _LINE * lines, "normal")):
         figure.text(_MARGIN / width, (top - below) / height, text, va="top", fontsize=9, weight=weight,
                     linespacing=1.25, parse_math=False)  # fmt: skip
-    photo, depth, holes = (_panel(figure, column, top, size) for column in range(3))
+    lefts = (_left(column) + (_PANEL - size[0]) / 2 for column in range(3))
+    photo, depth, holes = (_axes(figure, left, top - size[1], *size, frame=False) for left in lefts)
     photo.imshow(row.photo, aspect="auto")
     low, high = row.limits
     high = max(high, 1.01 * low)  # so that the ticks of a constant depth differ
@@ -209,7 +199,8 @@ def _draw_row(figure: Figure, row: _Row, top: float, size: tuple[float, float]) 
     bar = figure.colorbar(image, cax=_axes(figure, *place), orientation="horizontal", ticks=MaxNLocator(4),
                           format=ScalarFormatter(useOffset=False))  # fmt: skip
     bar.ax.tick_params(labelsize=8, pad=1.5, length=2)
-    holes.imshow(_blend_missing(row.missing), aspect="auto")
+    known, hole = (np.array(to_rgb(colour)) for colour in (_VALID_COLOUR, HOLE_COLOUR))
+    holes.imshow(known + row.missing[..., None] * (hole - known), aspect="auto")
     caption = f"{_percent(row.missing_fraction)} missing" if row.missing_fraction else "complete"
     holes.text(0.5, -0.06 / size[1], caption, transform=holes.transAxes, ha="center", va="top", fontsize=9)
     _draw_renderings(figure, row.renderings, top, size)
@@ -228,11 +219,6 @@ def _draw_renderings(figure: Figure, renderings: np.ndarray, top: float, size: t
             axes.text(0.05 / width, 0.05 / height, name, transform=axes.transAxes, fontsize=7, bbox=_LABEL)
 
 
-def _panel(figure: Figure, column: int, top: float, size: tuple[float, float]) -> Axes:
-    """Add the axes of a panel, centred in its column."""
-    return _axes(figure, _left(column) + (_PANEL - size[0]) / 2, top - size[1], *size, frame=False)
-
-
 def _axes(figure: Figure, left: float, bottom: float, width: float, height: float, *, frame: bool = True) -> Axes:
     """Add axes at a position given in inches."""
     page_width, page_height = figure.get_size_inches()
@@ -240,9 +226,3 @@ def _axes(figure: Figure, left: float, bottom: float, width: float, height: floa
     if not frame:
         axes.set_axis_off()
     return axes
-
-
-def _blend_missing(missing_fraction: np.ndarray) -> np.ndarray:
-    """Blend the colours of valid and missing pixels by the fraction missing, (H, W), as (H, W, 3)."""
-    valid, hole = (np.array(to_rgb(colour)) for colour in (_VALID_COLOUR, HOLE_COLOUR))
-    return valid + missing_fraction[..., None] * (hole - valid)

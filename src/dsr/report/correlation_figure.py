@@ -48,12 +48,7 @@ _FREE = ("#999933", "#c9a0dc", "#004d40", "#f5a3b5", "#7fb800", "#0072b2", "#5c4
 _GOLDEN = 0.618033988749895
 
 
-def draw_study(results: Results, folder: Path) -> list[Path]:
-    """Call :func:`save_scatter_matrix` with the arguments in the order of a pool of workers."""
-    return save_scatter_matrix(folder, results)
-
-
-def save_scatter_matrix(folder: Path, results: Results) -> list[Path]:
+def save_scatter_matrix(results: Results, folder: Path) -> list[Path]:
     """Draw the scatter matrix of the paper's metrics, and the correlations of all versions with LPIPS_v.
 
     Args:
@@ -130,16 +125,12 @@ def method_colours(labels: Sequence[str]) -> dict[str, str]:
     colours in order.
     """
     others = [label for label in dict.fromkeys(labels) if label not in FIXED]
-    free = {
-        label: _FREE[number] if number < len(_FREE) else _generate_colour(number) for number, label in enumerate(others)
-    }
+    free = dict(zip(others, _FREE, strict=False))
+    for number, label in enumerate(others[len(_FREE) :], len(_FREE)):
+        # Successive hues are a golden section apart, in three alternating lightnesses.
+        rgb = colorsys.hls_to_rgb(number * _GOLDEN % 1, (0.38, 0.55, 0.72)[number % 3], 0.6)
+        free[label] = "#" + "".join(f"{round(255 * each):02x}" for each in rgb)
     return {label: FIXED.get(label) or free[label] for label in labels}
-
-
-def _generate_colour(number: int) -> str:
-    """Generate a colour: successive hues are a golden section apart, in three alternating lightnesses."""
-    red, green, blue = colorsys.hls_to_rgb(number * _GOLDEN % 1, (0.38, 0.55, 0.72)[number % 3], 0.6)
-    return f"#{round(255 * red):02x}{round(255 * green):02x}{round(255 * blue):02x}"
 
 
 def _limits(values: pd.Series) -> tuple[float, float]:

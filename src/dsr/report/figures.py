@@ -153,7 +153,8 @@ def save_page(folder: Path, results: Results, page: Page, notes: list[str]) -> l
         return []
     columns = (*kind.before, *first_runs(results, page.problem), *kind.after)
     title = f"{page.problem.dataset}, x{page.problem.scale}, {page.problem.downsampling}"
-    holes = "; pink: holes" if any(_has_holes(row) for row in rows) else ""
+    pictures = (cell.picture for row in rows for cell in row.cells if cell.picture is not None)
+    holes = "; pink: holes" if any(not np.isfinite(picture).all() for picture in pictures) else ""
     below = kind.below.format(light=page.light) + holes
     return save_both(folder, page.name, draw_grid(columns, rows, (title, below)))
 
@@ -167,11 +168,6 @@ def _names(problems: list[BenchmarkSetting]) -> list[str]:
             name += "_"
         names.append(name)
     return names
-
-
-def _has_holes(row: Row) -> bool:
-    """Return whether a picture of the row has holes."""
-    return any(cell.picture is not None and not np.isfinite(cell.picture).all() for cell in row.cells)
 
 
 def rendering_row(shown: Shown, light: str) -> Row:
@@ -220,7 +216,9 @@ def error_row(shown: Shown, _: str) -> Row | None:
     pooled = np.concatenate(valid)
     limit = max(float(np.percentile(pooled, 98)) if pooled.size else 0.0, _LEAST_ERROR)
     factor, unit = (100, "cm") if limit >= _CENTIMETRE_LIMIT else (1000, "mm")
-    style, scores = _Style(_diverging(), (-factor * limit, factor * limit)), _captions(shown, "RMSE_d")
+    # From blue over white to red, without the nearly black ends
+    colour_map = ListedColormap(mpl.colormaps["RdBu_r"](np.linspace(0.1, 0.9, 255)), "errors")
+    style, scores = _Style(colour_map, (-factor * limit, factor * limit)), _captions(shown, "RMSE_d")
     cells = [_photo(shown)]
     for label, error in errors.items():
         cells.append(_panel(None if error is None else factor * error[0].numpy(), scores[label], style=style))
@@ -290,11 +288,6 @@ def _enlarge(picture: np.ndarray, size: tuple[int, int]) -> np.ndarray:
         ((np.arange(new) + 0.5) * old / new).astype(int) for old, new in zip(picture.shape, size, strict=True)
     )
     return picture[rows[:, None], columns]
-
-
-def _diverging() -> Colormap:
-    """Return a colour map from blue over white to red, without its nearly black ends."""
-    return ListedColormap(mpl.colormaps["RdBu_r"](np.linspace(0.1, 0.9, 255)), "errors")
 
 
 def _label(shown: Shown) -> str:

@@ -1,9 +1,9 @@
-"""Confidence intervals of means over scenes, and significance of the differences between methods.
+"""Confidence intervals of means over scenes and of the answers of a study, and significance of differences.
 
-The interval is the percentile interval of the bootstrap, expanded for few scenes (Efron, Tibshirani, *An Introduction
-to the Bootstrap*, 1993, chapter 13; Hesterberg, *What Teachers Should Know About the Bootstrap*, The American
-Statistician 2015, section 4.2). The test is the permutation test of paired values, whose signs are as likely under the
-hypothesis: exact up to :data:`_EXACT` scenes. With five, no difference is significant.
+The interval of a mean is the percentile interval of the bootstrap, expanded for few scenes (Efron, Tibshirani, *An
+Introduction to the Bootstrap*, 1993, chapter 13; Hesterberg, *What Teachers Should Know About the Bootstrap*, The
+American Statistician 2015, section 4.2). The test is the permutation test of paired values, whose signs are as likely
+under the hypothesis: exact up to :data:`_EXACT` scenes. With five, no difference is significant.
 """
 
 from __future__ import annotations
@@ -22,6 +22,10 @@ LEVEL = 0.05
 _DRAWS = 10_000
 _EXACT = 13
 _ROUNDING = 1e-9
+CONFIDENCE = 0.95
+_Z = 1.959963984540054
+"""The 97.5th percentile of the normal distribution."""
+_RESAMPLES = 2000
 
 
 def interval_of_mean(values: Sequence[float]) -> tuple[float, float] | None:
@@ -68,3 +72,79 @@ def _signs(count: int) -> np.ndarray:
     random = np.random.default_rng(0).choice((1, -1), (_DRAWS, count))
     random[0] = 1
     return random
+
+
+def wilson(count: float, n: int) -> tuple[float, float]:
+    """Compute the 95 % score interval of a fraction (Wilson 1927, "Probable inference", JASA 22).
+
+    Args:
+        count: number of positive answers, 0 to ``n``.
+        n: number of answers.
+
+    Returns:
+        Lower and upper bound in [0, 1]; (NaN, NaN) without answers.
+
+    """
+    if n == 0:
+        return math.nan, math.nan
+    fraction = count / n
+    centre = fraction + _Z**2 / (2 * n)
+    half = _Z * math.sqrt(fraction * (1 - fraction) / n + _Z**2 / (4 * n**2))
+    scale = 1 + _Z**2 / n
+    return max((centre - half) / scale, 0.0), min((centre + half) / scale, 1.0)
+
+
+def bootstrap_of_average(chosen: np.ndarray, asked: np.ndarray, seed: int = 0) -> tuple[float, float]:
+    """Compute the 95 % interval of a fraction averaged over scenes by resampling participants.
+
+    The answers of one participant to several scenes are not independent, so participants are resampled (cluster
+    percentile bootstrap: Davison and Hinkley 1997, "Bootstrap Methods and their Application", ch. 2-3). If all
+    resamples agree, for example because all or no participants chose a method, the Wilson interval with one answer per
+    participant is returned.
+
+    Args:
+        chosen: (people, scenes) 1 where the participant chose the method, else 0.
+        asked: (people, scenes) 1 where the participant saw the method, else 0.
+        seed: seed of the resampling.
+
+    Returns:
+        Lower and upper bound in [0, 1].
+
+    """
+    people = len(asked)
+    weights = np.random.default_rng(seed).multinomial(people, np.full(people, 1 / people), size=_RESAMPLES)
+    fractions = average_fraction(weights @ chosen, weights @ asked)
+    fractions = fractions[np.isfinite(fractions)]
+    low, high = np.quantile(fractions, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    if high - low > 1e-12:
+        return float(low), float(high)
+    return wilson(float(average_fraction(chosen.sum(0), asked.sum(0))) * people, people)
+
+
+def average_fraction(chosen: np.ndarray, asked: np.ndarray) -> np.ndarray:
+    """Average chosen / asked over the scenes (last axis) with answers; NaN without any."""
+    counted = asked > 0
+    fractions = np.where(counted, chosen / np.maximum(asked, 1), 0.0)
+    scenes = counted.sum(-1)
+    return np.where(scenes > 0, fractions.sum(-1) / np.maximum(scenes, 1), np.nan)
+
+
+def agreement(counts: np.ndarray) -> tuple[float, float]:
+    """Compute the agreement of pairs of participants, and Fleiss' kappa (Fleiss 1971, Psychological Bulletin 76).
+
+    Args:
+        counts: (scenes, methods) number of first choices. Scenes with fewer than two answers are left out.
+
+    Returns:
+        The fraction of pairs of participants that agree, averaged over scenes, and kappa: 1 for full agreement, 0 for
+        agreement by chance given the overall frequency of each method. Both are NaN without pairs; kappa is also NaN if
+        all participants always chose the same method.
+
+    """
+    counts = counts[counts.sum(1) >= 2]
+    if not len(counts):
+        return math.nan, math.nan
+    people = counts.sum(1)
+    observed = float((((counts**2).sum(1) - people) / (people * (people - 1))).mean())
+    expected = float(((counts.sum(0) / counts.sum()) ** 2).sum())
+    return observed, (observed - expected) / (1 - expected) if expected < 1 else math.nan

@@ -134,7 +134,8 @@ def pack_grid(grid: Grid) -> tuple[dict[str, Any], str]:
     span = max(high - low, 1e-6 * high)
     steps = np.where(valid, np.nan_to_num((inverse - low) / span), 0)
     levels = np.where(valid, 1 + np.rint(steps * (LEVELS - 1)), 0).astype(np.int64)
-    rest = _unpredicted(levels)
+    padded = np.pad(levels, ((1, 0), (1, 0)))  # beyond the border, neighbours are 0
+    rest = (levels - padded[1:, :-1] - padded[:-1, 1:] + padded[:-1, :-1]) & LEVELS
     planes = [(rest >> shift & 255).astype(np.uint8) for shift in (16, 8, 0)]
     planes += [_flags(grid), *grid.errors.values()]
     data = zlib.compress(b"".join(plane.tobytes() for plane in planes), 9)
@@ -155,12 +156,6 @@ def _blocks(values: np.ndarray, factor: int) -> np.ndarray:
     height, width = values.shape[0] // factor, values.shape[1] // factor
     cut = values[: height * factor, : width * factor].reshape(height, factor, width, factor)
     return cut.transpose(0, 2, 1, 3).reshape(height, width, factor * factor)
-
-
-def _unpredicted(levels: np.ndarray) -> np.ndarray:
-    """Return the deviation from the plane through three neighbours modulo 2**24; those beyond the border are 0."""
-    padded = np.pad(levels, ((1, 0), (1, 0)))
-    return (levels - padded[1:, :-1] - padded[:-1, 1:] + padded[:-1, :-1]) & LEVELS
 
 
 def _flags(grid: Grid) -> np.ndarray:

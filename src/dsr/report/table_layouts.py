@@ -137,15 +137,16 @@ def to_markdown(table: PaperTable) -> str:
         for group in table.groups
         for number, row in enumerate(group.rows)
     ]
+    head = [*(fact.name for fact in facts), *(escaped(each.title) for each in table.columns.values())]
     parts = [
         f"## {escaped(table.title)}",
-        aligned([*(fact.name for fact in facts), *map(_heading, table.columns.values())], rows, len(words)),
+        aligned(head, rows, len(words)),
         "\n".join(f"- {escaped(note)}" for note in table.notes),
     ]
     if table.has_published:
         columns = table.published_columns()
         rows = [row for group in table.groups for row in _compared(words, columns, group)]
-        head = [*(fact.name for fact in words), "", *map(_heading, columns.values())]
+        head = [*(fact.name for fact in words), "", *(escaped(each.title) for each in columns.values())]
         parts += [f"### {escaped(table.title)}, beside the paper", aligned(head, rows, len(words) + 1)]
         parts += ["- Difference: ours - paper. Ratio: ours / paper."]
     return "\n\n".join(parts) + "\n"
@@ -225,8 +226,12 @@ def escaped(text: str) -> str:
 
 def latex_text(text: str) -> str:
     r"""Escape a text for LaTeX, on one line; letters missing from the fonts become code points such as U+65E5."""
-    composed = unicodedata.normalize("NFC", " ".join(text.split()))
-    return "".join(map(_letter, composed))
+    letters = []
+    for letter in unicodedata.normalize("NFC", " ".join(text.split())):
+        plain = letter.isascii() and letter.isprintable()
+        known = plain or (letter.isalpha() and ord(letter) <= _LAST_LETTER)
+        letters.append(_LATEX_SPECIAL.get(letter, letter if known else f"[U+{ord(letter):04X}]"))
+    return "".join(letters)
 
 
 def score_tables(run: Run, formats: Formats) -> list[Table]:
@@ -271,15 +276,16 @@ def _score_table(run: Run, formats: Formats) -> Table:
         table.add_column(escape(f"{column.heading}\n{column.unit}"), justify="right", no_wrap=True)
     scenes = [str(scene) for scene in ours.index]
     papers = [paper_row(scene, [run], [scene]) for scene in scenes]
-    for scene, (_, values), paper in zip(scenes, ours.iterrows(), papers, strict=True):
-        table.add_row(escape(scene), "dsr", *_cells(values, columns))
-        if paper is not None and _has_any(paper, columns):
-            table.add_row("", "paper", *_cells(paper, columns), style="dim")
+    rows = [(escape(scene), values) for scene, (_, values) in zip(scenes, ours.iterrows(), strict=True)]
+    beside = list(papers)
     if len(ours) > 1:
-        table.add_section()
-        table.add_row("mean", "dsr", *_cells(ours.mean(), columns), style="bold")
-        paper = paper_row(average_of(run.dataset, scenes), [run], scenes)
-        if paper is not None and _has_any(paper, columns):
+        rows.append(("mean", ours.mean()))
+        beside.append(paper_row(average_of(run.dataset, scenes), [run], scenes))
+    for number, ((name, values), paper) in enumerate(zip(rows, beside, strict=True)):
+        if number == len(scenes):
+            table.add_section()
+        table.add_row(name, "dsr", *_cells(values, columns), style="bold" if number == len(scenes) else None)
+        if paper is not None and paper.reindex(list(columns)).notna().any():
             table.add_row("", "paper", *_cells(paper, columns), style="dim")
     notes = [alignment_note([run])]
     if any(paper is not None for paper in papers):
@@ -313,16 +319,16 @@ def _of_paper(row: Row) -> Row:
     return replace(row, label=f"{row.label} (paper)")
 
 
-def _heading(column: MetricFormat) -> str:
-    return escaped(column.title)
-
-
 def _compared(facts: Sequence[Fact], columns: Formats, group: Group) -> Iterator[list[str]]:
     """Yield our value, the paper's, difference and ratio of each method in the paper, then its other methods."""
     rows = [row for row in group.rows if row.published]
     for number, row in enumerate(rows):
         both = [_against(key, column, row) for key, column in columns.items()]
-        ours = [_plain(column, row.cells.get(key)) for key, column in columns.items()]
+        ours = []
+        for key, column in columns.items():
+            cell = row.cells.get(key)
+            text = shown(column, cell.mean) if cell is not None and cell.scenes else MISSING
+            ours.append(text if cell is None or cell.complete else f"{text} ({cell.scenes} of {cell.of})")
         yield [*_MARKDOWN.facts(row, facts, first=number == 0), "ours", *ours]
         blank = [""] * len(facts)
         yield [*blank, "paper", *_MARKDOWN.paper(columns, row.published)]
@@ -330,12 +336,6 @@ def _compared(facts: Sequence[Fact], columns: Formats, group: Group) -> Iterator
         yield [*blank, "ratio", *(ratio for _, ratio in both)]
     for number, row in enumerate(group.paper_only, len(rows)):
         yield [*_MARKDOWN.facts(row, facts, first=number == 0), "paper", *_MARKDOWN.paper(columns, row.published)]
-
-
-def _plain(column: MetricFormat, cell: Cell | None) -> str:
-    """Format a mean, with the number of scenes if some are missing."""
-    text = shown(column, cell.mean) if cell is not None and cell.scenes else MISSING
-    return text if cell is None or cell.complete else f"{text} ({cell.scenes} of {cell.of})"
 
 
 def _against(key: str, column: MetricFormat, row: Row) -> tuple[str, str]:
@@ -346,19 +346,6 @@ def _against(key: str, column: MetricFormat, row: Row) -> tuple[str, str]:
         return MISSING, MISSING
     text = shown(column, difference)
     return text if text.startswith("-") else f"+{text}", MISSING if ratio is None else f"{ratio:.2f}"
-
-
-def _letter(letter: str) -> str:
-    if letter in _LATEX_SPECIAL:
-        return _LATEX_SPECIAL[letter]
-    plain = letter.isascii() and letter.isprintable()
-    return letter if plain or (letter.isalpha() and ord(letter) <= _LAST_LETTER) else f"[U+{ord(letter):04X}]"
-
-
-def _latex_heading(column: MetricFormat) -> str:
-    """Format the name of a metric with the part after the underscore as a subscript."""
-    name, _, index = column.heading.partition("_")
-    return latex_text(name) + (f"$_{{{latex_text(index)}}}$" if index else "")
 
 
 def _pages(groups: Sequence[list[str]], most: int) -> Iterator[list[list[str]]]:
@@ -388,7 +375,10 @@ def _page(table: PaperTable, groups: Sequence[Sequence[str]], number: int, publi
     title = table.title + (", beside the paper's values (in parentheses)" if published else "")
     caption = f"{title}. {' '.join(table.notes)}" if number == 0 else f"{title}, continued."
     kinds = "".join("r" if fact.number else "l" for fact in facts) + "r" * len(columns)
-    head = [*(fact.name.capitalize() for fact in facts), *map(_latex_heading, columns.values())]
+    head = [fact.name.capitalize() for fact in facts]
+    for column in columns.values():
+        name, _, index = column.heading.partition("_")
+        head.append(latex_text(name) + (f"$_{{{latex_text(index)}}}$" if index else ""))
     units = [*("" for _ in facts), *(latex_text(column.unit) for column in columns.values())]
     body = "\n\\midrule\n".join("\n".join(rows) for rows in groups)
     return rf"""\begin{{table}}[htbp]
@@ -450,16 +440,6 @@ def _width(table: PaperTable, *, published: bool) -> int:
     return wide
 
 
-def _number(text: str) -> str:
-    """Format a number with a proper minus sign."""
-    return f"${text}$" if text.startswith("-") else text
-
-
-def _has_any(values: pd.Series, columns: Formats) -> bool:
-    """Return whether a row has a value for one of the columns."""
-    return bool(values.reindex(list(columns)).notna().any())
-
-
 def _cells(values: pd.Series, columns: Formats) -> list[str]:
     """Format the values of a row with the digits of each column; "-" for missing values."""
     return [each.text(values[name]) if pd.notna(values.get(name)) else "-" for name, each in columns.items()]
@@ -475,5 +455,5 @@ _LATEX = Style(
     "$\\pm$",
     "$n = {}$",
     "$^*$",
-    _number,
+    lambda text: f"${text}$" if text.startswith("-") else text,  # with a proper minus sign
 )

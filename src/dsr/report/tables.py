@@ -307,7 +307,10 @@ class _Maker:
         cells = {key: cells_of(self.values, labels, about.places, key) for key in self.formats}
         for label in labels:
             runs = [run for run in here if run.label == label]
-            valid = {key: of[label] for key, of in cells.items() if label in of} | self._study_cells(about, label)
+            valid = {key: of[label] for key, of in cells.items() if label in of}
+            found = study_cells(self.study, about.places, self.scale, self.downsampling, label)
+            for key, (mean, count, interval) in found.items():
+                valid[key] = Cell(mean, None, 0, count, len(about.places), interval)
             row = paper_row(about.published, runs, scenes) if valid else None
             seeds = max([1, *(cell.seeds for cell in valid.values())])
             rows.append(Row(label, *degradation, seeds, runs, valid, self._columns_of(row)))
@@ -324,11 +327,6 @@ class _Maker:
     def _columns_of(self, row: pd.Series | None) -> dict[str, float]:
         """Return the paper's values by column."""
         return {} if row is None else {key: float(row[key]) for key in self.columns if pd.notna(row.get(key))}
-
-    def _study_cells(self, about: SceneSet, label: str) -> dict[str, Cell]:
-        """Return the study's cells of a method."""
-        found = study_cells(self.study, about.places, self.scale, self.downsampling, label)
-        return {key: Cell(mean, None, 0, count, len(about.places), ci) for key, (mean, count, ci) in found.items()}
 
 
 def values_of(runs: Sequence[Run], formats: Formats) -> Values:

@@ -97,17 +97,6 @@ _HEADERS = {
 }
 
 
-def browse(request: BrowserRequest, console: Console) -> list[str]:
-    """Serve the page until the process is interrupted.
-
-    Raises:
-        ValueError: the port is taken, or the address is not one of this machine.
-
-    """
-    with _ending_by_signal():
-        return _serve(request, console)
-
-
 @contextlib.contextmanager
 def _ending_by_signal() -> Iterator[None]:
     """Within this context a closed terminal is a SIGTERM, and an interruption says that the files are deleted."""
@@ -126,13 +115,20 @@ def _ending_by_signal() -> Iterator[None]:
             signal.signal(hangup, before or signal.SIG_DFL)
 
 
-def _serve(request: BrowserRequest, console: Console) -> list[str]:
-    """Serve the page until the process is interrupted."""
+@_ending_by_signal()
+def browse(request: BrowserRequest, console: Console) -> list[str]:
+    """Serve the page until the process is interrupted.
+
+    Raises:
+        ValueError: the port is taken, or the address is not one of this machine.
+
+    """
     listening = _listen(request.host, request.port)
     address = listening.getsockname()
     name = f"[{address[0]}]" if ":" in address[0] else address[0]
     url, token, once = f"http://{name}:{address[1]}/?token=", secrets.token_urlsafe(24), secrets.token_urlsafe(24)
-    desk = Desk(int(request.max_upload * 1e6), request.max_seconds, request.memory)
+    memory = None if request.max_memory is None else int(1e9 * request.max_memory)
+    desk = Desk(int(request.max_upload * 1e6), request.max_seconds, memory)
     try:
         app = make_app(desk, request.host, token, once if request.open_page else "")
         config = uvicorn.Config(

@@ -61,12 +61,6 @@ def send(**facts: Any) -> None:
     _OUTPUT[-1].flush()
 
 
-def _keep_output() -> None:
-    """Leave the standard output to :func:`send` alone: what libraries print goes where errors go."""
-    _OUTPUT.append(os.fdopen(os.dup(1), "w", encoding="ascii"))
-    os.dup2(2, 1)
-
-
 class _Sender(Reporter):
     """Sends notes to the server; what else is said is about the command's files."""
 
@@ -108,7 +102,8 @@ class _Parser(ArgumentParser):
 def main() -> int:
     """Run one job; the arguments: its kind, its folder, the memory limit in bytes, and those of ``dsr upsample``."""
     what, folder, memory, *arguments = sys.argv[1:]
-    _keep_output()
+    _OUTPUT.append(os.fdopen(os.dup(1), "w", encoding="ascii"))
+    os.dup2(2, 1)  # leaves the standard output to :func:`send`: what libraries print goes where errors go
     _limit(int(memory))
     threading.Thread(target=_end_with_parent, daemon=True).start()
     try:

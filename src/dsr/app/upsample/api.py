@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.app.upsample.alignment import align
 from dsr.app.upsample.arrays import Given, doubts_of, is_batch, picture_of, pictures_of
+from dsr.app.upsample.checks import align
 from dsr.app.upsample.frame import prepare, without_repeats
 from dsr.app.upsample.parts import as_stored
 from dsr.app.upsample.sequence import camera_lr, nearest, vote

@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from dsr.app.upsample.alignment import align
-from dsr.app.upsample.checks import check_together
+from dsr.app.upsample.checks import align, check_together
 from dsr.app.upsample.frames import Frames
 from dsr.app.upsample.outputs import (
     PreviousRun,
@@ -34,7 +33,7 @@ from dsr.inference import AnyRatio, Plan, enlarged_by, find_filled, find_sensor
 from dsr.io.exports import FLAT
 from dsr.io.inputs import Picture, read_picture
 from dsr.io.pairs import Pair
-from dsr.methods.base import MapNoise, Outliers, Surface
+from dsr.methods.base import MapNoise, Surface
 from dsr.methods.glass import NOTED
 from dsr.notes import CHECKS, Assumption, expect_no_warning
 from dsr.utils.guards import readable, refusing_excess
@@ -147,14 +146,11 @@ class FrameWork:
         surface = kept_surface(target, picture.camera, errors=errors) if job.reusable else None
         times.begin("upsampling")
         if surface is not None and job.earlier is not None:
-            times.keep(job.earlier.seconds)
+            times.kept = job.earlier.seconds
             surface = surface._replace(filled=find_filled(surface.depth, picture.depth_lr))
         else:
             surface = as_stored(self._upsample(picture, identified, progress))
-            reporter.facts(_describe(surface.noise, given="noise" in how.arguments))
-            reporter.facts(
-                [*_describe_outliers(surface.outliers), *_describe_glass(surface.glass), *_describe_holes(surface, how)]
-            )
+            reporter.facts(_describe(surface, how))
             if wanted.certain:
                 surface = surface.without_dubious(wanted.max_error / 100)
         times.begin("writing")
@@ -166,7 +162,7 @@ class FrameWork:
             target, result, planned, times, job.inputs, job.settings, job.earlier, kept
         )
         reporter.facts(facts)
-        brief = [*_noise_in_brief(surface.noise), *_shares_in_brief(result.shares)]
+        brief = _in_brief(surface.noise, result.shares)
         brief += [f"{seconds['total']:.1f} s", megabytes(self.bytes)]
         reporter.say(f"{pair.name}: {', '.join([f'{planned.method} x{planned.scale}', *brief])} -> {target}")
         return "done"
@@ -191,11 +187,17 @@ class FrameWork:
 
 
 class Times:
-    """Measures the seconds of each stage of a picture and shows which one begins; some may be known beforehand."""
+    """Measures the seconds of each stage of a picture and shows which one begins; some may be known beforehand.
+
+    Attributes:
+        kept: the seconds of an earlier run whose result is kept, which :meth:`together` counts, too.
+
+    """
 
     def __init__(self, progress: Progress, **seconds: float) -> None:
         self._progress, self._seconds = progress, {stage: round(each, 3) for stage, each in seconds.items()}
-        self._stage, self._since, self._kept = "", 0.0, {}  # type: str, float, Mapping[str, float]
+        self._stage, self._since = "", 0.0
+        self.kept: Mapping[str, float] = {}
 
     def begin(self, stage: str) -> None:
         """Begin reading, upsampling or writing."""
@@ -209,14 +211,10 @@ class Times:
             self._seconds[self._stage] = round(time.perf_counter() - self._since, 3)
         return _with_total(self._seconds)
 
-    def keep(self, seconds: Mapping[str, float]) -> None:
-        """Count the seconds of an earlier run, whose result is kept, in :meth:`together`."""
-        self._kept = seconds
-
     def together(self, seconds: Mapping[str, float]) -> dict[str, float]:
-        """Return the seconds from :meth:`read` plus those of an earlier run whose result is kept, if any."""
-        stages = dict.fromkeys((*self._kept, *seconds))
-        return _with_total({name: self._kept.get(name, 0.0) + seconds.get(name, 0.0) for name in stages})
+        """Return the seconds from :meth:`read` plus :attr:`kept`."""
+        stages = dict.fromkeys((*self.kept, *seconds))
+        return _with_total({name: self.kept.get(name, 0.0) + seconds.get(name, 0.0) for name in stages})
 
 
 def _with_total(seconds: Mapping[str, float]) -> dict[str, float]:
@@ -327,60 +325,45 @@ def _with_sensor(picture: Picture, identified: Identified | None) -> Picture:
     return replace(picture, assumptions=(*picture.assumptions, fact))
 
 
-def _describe(noise: MapNoise | None, *, given: bool) -> list[Assumption]:
-    """Return a note on the noise of the input, if it was estimated and not given."""
-    if noise is None or given:
-        return []
-    extent = f", correlated over {noise.extent:.0f} pixels" if noise.extent > _WHITE else ""
-    text = f"about {show_length(noise.deviation, 2)}{extent}"
-    if noise.reduced > 1:
-        text += f": worked on at 1/{noise.reduced}"
-    option = "--noise" if noise.reduced == 1 else "--working-size"
-    return [Assumption("noise of the depth map", f"{text}; {option} overrides it")]
-
-
-def _noise_in_brief(noise: MapNoise | None) -> list[str]:
-    """Return the noise of the input, and the size that it was worked on at because of that, in a few words each."""
-    if noise is None:
-        return []
-    reduced = [f"worked on at 1/{noise.reduced}"] if noise.reduced > 1 else []
-    return [f"noise {show_length(noise.deviation, 2)}", *reduced]
-
-
-def _shares_in_brief(shares: Mapping[str, float]) -> list[str]:
-    """Return the shares of the pixels in a few words each, less those that there are none of."""
-    words = {"open": "left open", "glass": "like glass"}
-    return [f"{words.get(name, name)} {_percent(share)}" for name, share in shares.items() if share]
-
-
-def _percent(share: float) -> str:
-    """Return a share in percent, which is 0 or 100 only if it is exactly that."""
-    return f"{min(max(round(100 * share, 1), 0.1), 99.9):g}%" if 0 < share < 1 else f"{share:.0%}"
-
-
-def _describe_outliers(outliers: Outliers | None) -> list[Assumption]:
-    """Return a note on depth that was treated as holes, if there is any."""
-    if outliers is None or not outliers.pixels:
-        return []
-    text = "depth far from everything around it, or nearer than 5 cm, is treated as holes"
-    return [Assumption(text, f"pixels: {outliers.pixels}, patches: {outliers.patches}")]
-
-
-def _describe_glass(share: float | None) -> list[Assumption]:
-    """Return a note on what looks like glass, if there is enough of it."""
-    if share is None or share < _GLASS:
-        return []
-    text = "photo and depth disagree as they do on glass, mirrors and gloss; do not trust the depth there"
-    return [Assumption(text, f"{share:.1%} of the pixels, expected to be off by more than {NOTED:.0%}")]
-
-
-def _describe_holes(surface: Surface, how: Upsampling) -> list[Assumption]:
-    """Return a note on wide holes, if there are any."""
+def _describe(surface: Surface, how: Upsampling) -> list[Assumption]:
+    """Return notes on an estimated noise of the input, on outliers, on what looks like glass, and on wide holes."""
+    notes, noise = [], surface.noise
+    if noise is not None and "noise" not in how.arguments:
+        text = f"about {show_length(noise.deviation, 2)}"
+        text += f", correlated over {noise.extent:.0f} pixels" if noise.extent > _WHITE else ""
+        text += f": worked on at 1/{noise.reduced}" if noise.reduced > 1 else ""
+        option = "--noise" if noise.reduced == 1 else "--working-size"
+        notes.append(Assumption("noise of the depth map", f"{text}; {option} overrides it"))
+    if surface.outliers is not None and surface.outliers.pixels:
+        text = "depth far from everything around it, or nearer than 5 cm, is treated as holes"
+        notes.append(Assumption(text, f"pixels: {surface.outliers.pixels}, patches: {surface.outliers.patches}"))
+    if surface.glass is not None and surface.glass >= _GLASS:
+        text = "photo and depth disagree as they do on glass, mirrors and gloss; do not trust the depth there"
+        of_pixels = f"{surface.glass:.1%} of the pixels, expected to be off by more than {NOTED:.0%}"
+        notes.append(Assumption(text, of_pixels))
     share = float(surface.depth.isnan().float().mean())
-    if how.fill != "small" or not share:
-        return []
-    text = f"holes wider than {how.max_hole:g} degrees stay holes"
-    return [Assumption(text, f"{share:.1%} of the pixels; --fill all fills them, too")]
+    if how.fill == "small" and share:
+        text = f"holes wider than {how.max_hole:g} degrees stay holes"
+        notes.append(Assumption(text, f"{share:.1%} of the pixels; --fill all fills them, too"))
+    return notes
+
+
+def _in_brief(noise: MapNoise | None, shares: Mapping[str, float]) -> list[str]:
+    """Return the noise of the input, the size that it was worked on at, and the shares of the pixels that are not 0.
+
+    A share is 0 % or 100 % only if it is exactly that.
+    """
+    brief = []
+    if noise is not None:
+        brief.append(f"noise {show_length(noise.deviation, 2)}")
+        if noise.reduced > 1:
+            brief.append(f"worked on at 1/{noise.reduced}")
+    words = {"open": "left open", "glass": "like glass"}
+    for name, share in shares.items():
+        if share:
+            percent = f"{min(max(round(100 * share, 1), 0.1), 99.9):g}%" if share < 1 else f"{share:.0%}"
+            brief.append(f"{words.get(name, name)} {percent}")
+    return brief
 
 
 def write_result(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any
 
 from rich.console import Console
 
@@ -13,18 +13,6 @@ from dsr.utils.console import show
 
 _SHOWN = 5
 """Number of names that a line lists; further ones are only counted."""
-
-
-class Messages(Protocol):
-    """What takes lines and notes: a :class:`Reporter`, or a :class:`Record` for one."""
-
-    def say(self, line: str) -> None:
-        """Take a line."""
-        ...
-
-    def facts(self, facts: Sequence[Assumption]) -> None:
-        """Take notes."""
-        ...
 
 
 class Record:
@@ -81,6 +69,9 @@ class Reporter:
         for text, count in self._counts.items():
             if count < pictures:
                 self.say(f"  {count} of {pictures} pictures: {text}")
+
+
+Messages = Reporter | Record  # takes lines and notes
 
 
 def listed(names: Sequence[str]) -> str:

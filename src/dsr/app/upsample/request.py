@@ -25,10 +25,21 @@ SHORTCUTS = ("noise", "smooth")
 
 
 def _parse_settings(texts: list[str]) -> tuple[tuple[str, Any], ...]:
-    """Return the arguments of a method."""
-    from dsr.app.upsample.settings import parse_settings  # noqa: PLC0415 - few commands need OmegaConf
+    """Return arguments of a method, of which each text is ``KEY=VALUE``, with values read as YAML."""
+    from omegaconf import OmegaConf  # noqa: PLC0415 - few commands need OmegaConf
+    from omegaconf.errors import OmegaConfBaseException  # noqa: PLC0415
+    from yaml import YAMLError  # noqa: PLC0415
 
-    return tuple(parse_settings(texts).items())
+    settings: dict[str, Any] = {}
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if not equals or not key.isidentifier():
+            raise OptionError(text, "expected KEY=VALUE")
+        try:
+            settings |= OmegaConf.to_container(OmegaConf.from_dotlist([f"{key}={value}"]), resolve=True)  # type: ignore[arg-type]
+        except (YAMLError, OmegaConfBaseException) as error:
+            raise OptionError(key, f"expected a value as in a YAML file, got {value!r}") from error
+    return tuple(settings.items())
 
 
 def _parse_poses(text: str) -> Path:
@@ -247,21 +258,17 @@ class UpsampleRequest(Options):
     @functools.cached_property
     def settings(self) -> Mapping[str, Any]:
         """The settings that a result depends on, as values for JSON; the method's files are read for them."""
+        from dsr.methods.recipe import read_recipe  # noqa: PLC0415 - it imports torch
+
+        recipe = read_recipe(self.upsampling.method, None, self.upsampling.directories)
         return {
             **recorded(self),
             "max_error": self.results.max_error / 100,
             **({"certain": True} if self.results.certain else {}),
             "registered_by": None if self.reading.rig is None else "extrinsics",
             "set": self.upsampling.arguments,
-            "code": hash_outside_code(_targets(self.upsampling)),
+            "code": hash_outside_code(list(recipe.targets())),
         }
-
-
-def _targets(how: Upsampling) -> list[str]:
-    """Return the dotted paths of the code that the method's file names."""
-    from dsr.methods.recipe import read_recipe  # noqa: PLC0415 - it imports torch
-
-    return list(read_recipe(how.method, None, how.directories).targets())
 
 
 def files_of(pair: Pair, reading: Reading) -> dict[str, Path]:

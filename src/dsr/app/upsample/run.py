@@ -13,12 +13,10 @@ from rich.console import Console
 
 from dsr.app.upsample.frames import Frames, find_frames
 from dsr.app.upsample.outputs import INFO
-from dsr.app.upsample.preview import preview
 from dsr.app.upsample.reporting import Reporter, listed
 from dsr.app.upsample.request import UpsampleRequest
-from dsr.app.upsample.scene import EXPORTS, write_scene
-from dsr.app.upsample.stored import read_info
-from dsr.app.upsample.workers import work_through
+from dsr.app.upsample.stored import EXPORTS, read_info, write_scene
+from dsr.app.upsample.workers import preview, work_through
 from dsr.io.images import pixels_in_header
 from dsr.io.inputs import read_geometry
 from dsr.io.pairs import Pair

@@ -29,6 +29,7 @@ class FrameSequence:
 
     Attributes:
         recordings: the frames of each folder of depth maps.
+        given: whether the poses are those of a file.
 
     Raises:
         ValueError: the file is damaged, or does not fit the frames.
@@ -40,6 +41,7 @@ class FrameSequence:
     ) -> None:
         self._read, self._count, self._file = read, neighbours, poses
         self._poses: Mapping[str, np.ndarray] | None = None
+        self.given = poses is not None
         self._matched: list[Assumption] = []
         if poses is not None:
             trajectory = read_poses(poses)
@@ -82,11 +84,6 @@ class FrameSequence:
                 Assumption(f"{self._file.name} has no pose of this frame", detail, "poses-missing", self._without)
             )
         return replace(picture, assumptions=(*picture.assumptions, *notes)) if notes else picture
-
-    @property
-    def given(self) -> bool:
-        """Whether the poses are those of a file."""
-        return self._poses is not None
 
     def fault(self, recording: Sequence[Pair]) -> Assumption | None:
         """Return a warning if the poses of a recording do not fit a sample of its frames."""

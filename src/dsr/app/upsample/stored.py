@@ -1,10 +1,12 @@
-"""Readers of the result folders of ``dsr upsample``, for ``dsr view``, ``dsr fuse`` and exports."""
+"""Results of ``dsr upsample`` read back, for ``dsr view``, ``dsr fuse`` and exports of all frames."""
 
 from __future__ import annotations
 
+import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,16 +14,18 @@ import numpy as np
 import torch
 
 from dsr.app.upsample.outputs import INFO
-from dsr.app.upsample.parts import ERRORS, METRES, Results
+from dsr.app.upsample.parts import ERRORS, METRES, Part, Results
 from dsr.evaluation.store import load_errors
 from dsr.geometry.camera import Camera
 from dsr.inference import find_filled
 from dsr.io.depth_files import read_depth_file
 from dsr.io.exports import INPUT, read_input
 from dsr.io.frames import UPS
+from dsr.io.scene_files import RGBD, Frame, parse_pose
 from dsr.sample import expect_distances
 from dsr.utils.arrays import array_headers
-from dsr.utils.guards import TooLargeError, is_number, natural_key, parse_json, pixels_beside, read_limited
+from dsr.utils.files import write_text
+from dsr.utils.guards import TooLargeError, is_number, natural_key, parse_json, path_within, pixels_beside, read_limited
 from dsr.utils.progress import show_length
 
 if TYPE_CHECKING:
@@ -30,6 +34,8 @@ if TYPE_CHECKING:
 _DEEPEST = 6
 """Folders below the given one in which results are looked for."""
 _LARGEST_INFO = 16 << 20
+EXPORTS = "exports.json"
+"""The record of exports, in the folder of the results."""
 
 
 def find_results(folder: Path) -> list[Path]:
@@ -78,6 +84,8 @@ def read_result(folder: Path, name: str) -> ViewedResult:
         photo, depth_lr = read_input(folder / INPUT)
     except FileNotFoundError:
         notes.append(f"without {INPUT} there is neither the photo nor the input; the same `dsr upsample` again adds it")
+    settings = info.get("settings")
+    limit = settings.get("max_error") if isinstance(settings, dict) else None
     filled = None if depth_lr is None else find_filled(*(torch.from_numpy(each)[None] for each in (depth, depth_lr)))
     return ViewedResult(
         name=name,
@@ -88,7 +96,7 @@ def read_result(folder: Path, name: str) -> ViewedResult:
         depth_error=None if errors is None else errors[0],
         angle_error=None if errors is None else errors[1],
         filled=None if filled is None else filled[0].numpy(),
-        max_error=_max_error(info.get("settings")),
+        max_error=float(limit) if is_number(limit) and 0 < limit < 1e9 else Results.max_error / 100,
         facts=_facts(info, depth),
         notes=notes,
     )
@@ -133,12 +141,6 @@ def read_camera(path: Path, info: Mapping[str, Any]) -> Camera:
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         came = f"{info.get('camera')!r:.200}"
         raise ValueError(f"{path}: expected the photo's camera under `camera`, got {came}") from error
-
-
-def _max_error(settings: Any) -> float:
-    """Return the expected error from which pixels are left out, as a fraction of the depth."""
-    limit = settings.get("max_error") if isinstance(settings, dict) else None
-    return float(limit) if is_number(limit) and 0 < limit < 1e9 else Results.max_error / 100
 
 
 def read_depth(folder: Path, camera: Camera) -> np.ndarray:
@@ -205,3 +207,105 @@ def _facts(info: Mapping[str, Any], depth: np.ndarray) -> dict[str, str]:
 def _size(size: Any) -> str:
     """Return a size as text."""
     return f"{size[0]} x {size[1]}" if isinstance(size, list) and len(size) == 2 else "unknown"
+
+
+@dataclass
+class SceneResult:
+    """What was written, by part, and the problems, one line each."""
+
+    files: dict[str, Path] = field(default_factory=dict)
+    problems: list[str] = field(default_factory=list)
+
+
+def write_scene(output: Path, folders: Mapping[str, Path], parts: Sequence[Part], *, overwrite: bool) -> SceneResult:
+    """Write exports of frames that are complete, and record them in ``exports.json``.
+
+    A problem with one export does not stop the others.
+
+    Args:
+        output: the folder of the results.
+        folders: the folder of each frame, by its name.
+        parts: parts of all frames together.
+        overwrite: whether to replace what is there and not recorded.
+
+    """
+    result = SceneResult()
+    try:
+        frames = [read_frame(name, folder) for name, folder in folders.items()]
+        expect_distinct(frames)
+        recorded = _read_record(output)
+    except (ValueError, OSError) as error:
+        result.problems.append(str(error))
+        return result
+    for part in parts:
+        assert part.write_all is not None  # noqa: S101 - they are of all frames
+        name = part.files[0]
+        path = output / name
+        there = [output / each for each in part.files if (output / each).exists()]
+        if there and name not in recorded and not overwrite:
+            result.problems.append(f"{there[0]}: is there already and not of an earlier run; --overwrite replaces it")
+            continue
+        try:
+            files = part.write_all(path, frames)
+        except (ValueError, OSError) as error:
+            result.problems.append(str(error))
+            continue
+        stale = set(recorded.get(name, ())) - {file.relative_to(output).as_posix() for file in files}
+        for old in stale:  # of frames that are no longer there
+            if old.split("/")[0] in part.files:
+                (output / old).unlink(missing_ok=True)
+        recorded[name] = sorted(file.relative_to(output).as_posix() for file in files)
+        write_text(output / EXPORTS, json.dumps({"exports": recorded}, indent=2) + "\n")
+        result.files[part.name] = path
+    return result
+
+
+def read_frame(name: str, folder: Path) -> Frame:
+    """Return the frame whose results are in a folder.
+
+    Its pose is the entry ``pose`` of ``info.json``: a camera-to-world matrix of four lists of four numbers, in metres.
+
+    Raises:
+        ValueError: the folder is not complete, or the pose is none.
+
+    """
+    path = folder / INFO
+    info = read_info(path)
+    depth, colour = folder / METRES, folder / "rgbd" / RGBD[0]
+    if not (depth.is_file() and colour.is_file()):
+        raise ValueError(f"{folder}: expected {METRES} and rgbd/{RGBD[0]} of this run, one is missing")
+    pose, time = parse_pose(f"{path}: pose", info.get("pose")), info.get("time")
+    time = time if is_number(time) else None
+    return Frame(name, read_camera(path, info), pose, colour, depth, read_up(info), time)
+
+
+def expect_distinct(frames: Sequence[Frame]) -> None:
+    """Check that frames have different names as files.
+
+    Raises:
+        ValueError: two have the same.
+
+    """
+    seen: dict[str, str] = {}
+    for frame in frames:
+        if frame.stem in seen:
+            raise ValueError(f"expected frames of different names as files, got {seen[frame.stem]} and {frame.name}")
+        seen[frame.stem] = frame.name
+
+
+def _read_record(output: Path) -> dict[str, list[str]]:
+    """Return the exports of earlier runs, with their files."""
+    path = output / EXPORTS
+    if not path.is_file():
+        return {}
+    try:
+        exports = dict(parse_json(read_limited(path))["exports"])
+        lists = [files if isinstance(files, list) else [None] for files in exports.values()]
+        if not all(isinstance(file, str) for files in lists for file in files):
+            raise TypeError
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path}: expected a file of `dsr upsample`, got something else") from error
+    for name, files in exports.items():
+        for file in files:
+            path_within(output, file, f"{path}: exports.{name}")
+    return exports

@@ -19,7 +19,7 @@ from torch import Tensor
 from dsr.app.upsample.frame import Times, write_result
 from dsr.app.upsample.outputs import begin, expect_free, output_encoding, read_previous_run
 from dsr.app.upsample.parts import Result, Results
-from dsr.app.upsample.scene import write_scene
+from dsr.app.upsample.stored import write_scene
 from dsr.geometry import FIGURE_LIGHT, Direction, direction_of
 from dsr.geometry.camera import Camera
 from dsr.geometry.mesh import Mesh, triangulate, vertex_normals
@@ -32,7 +32,7 @@ from dsr.io.photos import data_url
 from dsr.methods import base
 from dsr.methods.base import MapNoise, Outliers
 from dsr.notes import warn
-from dsr.pictures.inline import encode_row
+from dsr.pictures.canvas import encode_row
 from dsr.utils.progress import SILENT
 
 Array = TypeVar("Array", np.ndarray, Tensor)
@@ -211,7 +211,9 @@ class Surface(Generic[Array]):
     def _save(self, wanted: Results) -> list[Path]:
         """Write results."""
         folder = wanted.output
-        earlier, inputs = read_previous_run(folder), self._identity
+        earlier = read_previous_run(folder)
+        content = hashlib.sha256(self._found.depth.numpy().tobytes() + _bytes(self._picture.rgb).tobytes())
+        inputs = {"surface": {"sha256": content.hexdigest()}}  # which a folder of results has for its inputs
         settings = {"max_error": wanted.max_error / 100}
         same = earlier is not None and earlier.complete and (earlier.inputs, earlier.settings) == (inputs, settings)
         if earlier is not None and not same and not wanted.overwrite:
@@ -234,12 +236,6 @@ class Surface(Generic[Array]):
         if scene.problems:
             raise ValueError(scene.problems[0])
         return files + list(scene.files.values())
-
-    @functools.cached_property
-    def _identity(self) -> dict[str, dict[str, str]]:
-        """What a folder of results has for its inputs: a hash of the surface."""
-        content = hashlib.sha256(self._found.depth.numpy().tobytes() + _bytes(self._picture.rgb).tobytes())
-        return {"surface": {"sha256": content.hexdigest()}}
 
     def __repr__(self) -> str:
         return f"Surface({self._size(self._found.depth)}, {self._range}, {self._plan.method} x{self._plan.scale})"

@@ -62,10 +62,6 @@ class Collection:
     manual: str | None = None  # how to get it by hand, with {folder} for its directory
     patterns: tuple[str, ...] = ()  # of the files that the user puts into the first of the folders
 
-    def instruction(self, root: Path) -> str:
-        """Return how to get it by hand."""
-        return (self.manual or "").format(folder=root / self.folders[0])
-
 
 # SHA-256 of files that never change, by their paths: those of a commit of git, whose number vouches for their content
 _PINNED = {

@@ -183,11 +183,11 @@ def find_polycam(folder: Path) -> PairingResult | None:
     photos = {kind: {path.stem: path for path in (frames / kind).glob("*.jpg")} for kind in cameras}
     pairs, unpaired = [], []
     for depth in sorted((frames / "depth").glob("*.png"), key=natural_key):
-        kind = next((kind for kind in cameras if depth.stem in photos[kind] and _camera_of(frames, kind, depth)), None)
-        if kind is None:
+        files = {kind: frames / _CAMERAS[kind] / f"{depth.stem}.json" for kind in cameras if depth.stem in photos[kind]}
+        kind, path = next(((kind, file) for kind, file in files.items() if file.is_file()), (None, None))
+        if kind is None or path is None:
             unpaired.append(depth)
             continue
-        path = frames / _CAMERAS[kind] / f"{depth.stem}.json"
         frame = CaptureFrame(
             _POLYCAM, functools.partial(_polycam_geometry, path), path, read_limited(path, _LARGEST_JSON)
         )
@@ -199,11 +199,6 @@ def find_polycam(folder: Path) -> PairingResult | None:
     if corrected:
         notes.append(Assumption("photos and cameras are the corrected ones", f"{corrected} of {len(pairs)}"))
     return PairingResult(tuple(pairs), tuple(notes), tuple(unpaired))
-
-
-def _camera_of(frames: Path, kind: str, depth: Path) -> bool:
-    """Return whether a frame has a camera for a kind of photo."""
-    return (frames / _CAMERAS[kind] / f"{depth.stem}.json").is_file()
 
 
 def _polycam_geometry(path: Path, _: tuple[int, int]) -> Geometry:

@@ -46,22 +46,19 @@ class Message:
 
     def read(self) -> np.ndarray:
         """Return (H, W, 3) uint8 RGB of a photo, (h, w) of a depth map as it is stored."""
-        return decode_message(f"{self.file}{self.topic}", self._message())
+        kind, raw = self._raw()
+        with naming_recording(self.file):
+            message = deserialize(open_recording(self.file), raw, kind)
+        return decode_message(f"{self.file}{self.topic}", message)
 
     def record(self) -> Record:
         """Return the topic and a hash of the message."""
         _, raw = self._raw()
         return {"file": f"{self.file.name}{self.topic}", "sha256": hashlib.sha256(raw).hexdigest()}
 
-    def _message(self) -> Any:
-        """Return the message."""
-        kind, raw = self._raw()
-        with NamedErrors(self.file):
-            return deserialize(open_recording(self.file), raw, kind)
-
     def _raw(self) -> tuple[str, bytes]:
         """Return the message's type and bytes."""
-        with NamedErrors(self.file):
+        with naming_recording(self.file):
             reader = open_recording(self.file)
             found = list(reader.messages(connections_of(reader, self.topic), start=self.time, stop=self.time + 1))
             connection, _, raw = found[self.order]
@@ -91,22 +88,17 @@ def deserialize(reader: Any, raw: bytes, kind: str) -> Any:
     return reader.deserialize(raw, kind)
 
 
-class NamedErrors:
-    """A context in which rosbags' errors become one that names the recording."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
-        if error is None or not isinstance(error, Exception):
-            return
-        named = isinstance(error, ValueError) and str(error).startswith(str(self._path))
-        if named or isinstance(error, FullDiskError):
-            return
-        raise ValueError(f"{self._path}: expected a recording of ROS, got a damaged one ({error!s:.120})") from error
+@contextlib.contextmanager
+def naming_recording(path: Path) -> Iterator[None]:
+    """Within this context rosbags' errors become one that names the recording."""
+    try:
+        yield
+    except FullDiskError:
+        raise
+    except Exception as error:
+        if isinstance(error, ValueError) and str(error).startswith(str(path)):
+            raise
+        raise ValueError(f"{path}: expected a recording of ROS, got a damaged one ({error!s:.120})") from error
 
 
 def state_of(path: Path) -> tuple[int, ...]:

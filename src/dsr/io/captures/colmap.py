@@ -165,17 +165,15 @@ def add_model(found: PairingResult, file: Path) -> PairingResult:
             continue
         count += 1
         frame = model.frame(image)
-        pairs.append(replace(pair, capture=frame if pair.capture is None else _within(frame, pair.capture)))
+        if pair.capture is not None:  # which has pictures, the depth camera and the time
+            geometry = functools.partial(_joined, frame.geometry, pair.capture.geometry)
+            content = frame.content + pair.capture.content
+            frame = replace(pair.capture, geometry=geometry, description=frame.description, content=content)
+        pairs.append(replace(pair, capture=frame))
     if not count:
         text = f"no poses: {file.name} of {_APP} has {len(names)} images, none of these names"
         return replace(found, assumptions=(*found.assumptions, Assumption(text)))
     return replace(found, pairs=tuple(pairs), assumptions=(*found.assumptions, _note(count, len(pairs), file)))
-
-
-def _within(frame: CaptureFrame, capture: CaptureFrame) -> CaptureFrame:
-    """Return what a model says of a frame of a capture, which has its pictures, its depth camera and its time."""
-    geometry = functools.partial(_joined, frame.geometry, capture.geometry)
-    return replace(capture, geometry=geometry, description=frame.description, content=frame.content + capture.content)
 
 
 def _joined(
@@ -299,11 +297,13 @@ def _pose(place: str, quaternion: Sequence[float], translation: Sequence[float])
     return from_quaternion(translation, (x, y, z, w), place)
 
 
+@dataclass
 class _Bytes:
-    """A binary file, read from its beginning."""
+    """A binary file, read from its beginning; ``place`` is how far."""
 
-    def __init__(self, path: Path, content: bytes) -> None:
-        self.path, self.content, self.place = path, content, 0
+    path: Path
+    content: bytes
+    place: int = 0
 
     def read(self, layout: str) -> tuple[float, ...]:
         """Return the next numbers of a layout of :mod:`struct`."""

@@ -63,9 +63,12 @@ class HeicImage:
 
     def read(self) -> np.ndarray:
         """Return (H, W, 3) uint8 RGB, or (h, w) float32 depth in metres, NaN where there is none."""
-        if self.role == "depth":
-            return _read_depth(self.file, _first_map(self.file, open_heic(self.file)))
-        return read_heic(self.file)
+        if self.role == "photo":
+            return read_heic(self.file)
+        maps = [each for each in open_heic(self.file).info.get("depth_images", ()) if each is not None]
+        if not maps:
+            raise ValueError(f"{self.file}: expected a depth map of the photo, there is none that can be read")
+        return _read_depth(self.file, maps[0])
 
     def record(self) -> Record:
         """Return the file's name and hash."""
@@ -104,14 +107,6 @@ def _has_depth(path: Path) -> bool:
         return False
     with opened(path) as file:
         return _MARK.search(file.read(_HEAD)) is not None
-
-
-def _first_map(path: Path, image: Any) -> Any:
-    """Return the depth map that belongs to a photo."""
-    maps = [each for each in image.info.get("depth_images", ()) if each is not None]
-    if not maps:
-        raise ValueError(f"{path}: expected a depth map of the photo, there is none that can be read")
-    return maps[0]
 
 
 def _read_depth(path: Path, stored: Any) -> np.ndarray:

@@ -30,7 +30,7 @@ import numpy as np
 from pydantic import BaseModel, Field
 
 from dsr.geometry.camera import Camera, Lens
-from dsr.geometry.poses import Matrix, as_rigid, invert
+from dsr.geometry.poses import as_rigid, invert
 from dsr.io.captures.archive import PHOTO_LIMIT, decode_photo
 from dsr.io.frames import CaptureFrame, Geometry, Record, Rig, file_state
 from dsr.io.pairs import Pair, PairingResult, join, match_times
@@ -67,10 +67,6 @@ class _Motion(BaseModel):
 
     Rotation: Annotated[list[Number], Field(min_length=9, max_length=9)]
     Translation: Annotated[list[Number], Field(min_length=3, max_length=3)]
-
-    def matrix(self, place: str) -> Matrix:
-        """Return the motion from the rig's frame to the camera's, (4, 4), metres."""
-        return as_rigid(np.column_stack((np.reshape(self.Rotation, (3, 3)), self.Translation)), place)
 
 
 class _Intrinsics(BaseModel):
@@ -266,7 +262,10 @@ def _geometry(
     camera = _scale(place, numbers, whole, (0, (whole[0] - size[0]) / 2), size)
     side, left, top = _DEPTH_MODES[size_lr]
     own = _scale(place, depth.Intrinsics.ModelParameters, (side, side), (left, top), size_lr)
-    motions = [each.Rt.matrix(f"{place}: Rt of {each.Location}") for each in (depth, photo)]
+    motions = []  # from the rig's frame to the cameras', (4, 4), metres
+    for each in (depth, photo):
+        motion = np.column_stack((np.reshape(each.Rt.Rotation, (3, 3)), each.Rt.Translation))
+        motions.append(as_rigid(motion, f"{place}: Rt of {each.Location}"))
     transform = motions[1] @ invert(motions[0])
     return Geometry(camera, lens=_lens(place, photo), rig=Rig(own, transform, _lens(place, depth)))
 

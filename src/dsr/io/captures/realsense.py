@@ -26,7 +26,7 @@ import numpy as np
 
 from dsr.geometry.camera import Camera, Lens
 from dsr.geometry.poses import Matrix, as_rigid, from_quaternion, invert
-from dsr.io.captures.bags import Message, NamedErrors, connections_of, deserialize, first_message
+from dsr.io.captures.bags import Message, connections_of, deserialize, first_message, naming_recording
 from dsr.io.frames import CaptureFrame, Geometry, Rig
 from dsr.io.pairs import Pair, PairingResult, match_times
 from dsr.io.trajectories import describe_capture, intrinsics_camera
@@ -34,7 +34,7 @@ from dsr.notes import Assumption
 from dsr.utils.guards import naming, numbers_in
 from dsr.utils.progress import show_length
 
-_VERSION = "/file_version"
+VERSION = "/file_version"
 _OLDEST = 2
 _IMAGES = re.compile(
     r"(?P<stream>(?P<sensor>/device_\d+/sensor_\d+)/(?P<kind>\w+)_\d+)/image/data(/compressed(Depth)?)?"
@@ -61,11 +61,6 @@ class _Stream(NamedTuple):
     notes: tuple[Assumption, ...]
 
 
-def is_recording(reader: Any) -> bool:
-    """Return whether an open recording is one of RealSense's SDK."""
-    return bool(connections_of(reader, _VERSION))
-
-
 def read(reader: Any, path: Path, prefix: str) -> PairingResult:
     """Return the frames of a recording.
 
@@ -78,14 +73,14 @@ def read(reader: Any, path: Path, prefix: str) -> PairingResult:
         ValueError: it has no colour or no depth, or what describes them is missing or damaged.
 
     """
-    version = int(first_message(reader, _VERSION).data)
+    version = int(first_message(reader, VERSION).data)
     if version < _OLDEST:
         raise ValueError(f"{path}: expected file_version {_OLDEST} or later of RealSense's SDK, got {version}")
     color_topic, depth_topic = (_choose(reader, path, kind) for kind in ("Color", "Depth"))
     unit, notes = _unit(reader, path, depth_topic)
     streams, registered, damage = None, list[Assumption](), ""
     try:
-        with NamedErrors(path):
+        with naming_recording(path):
             streams = _stream(reader, path, color_topic), _stream(reader, path, depth_topic)
             geometry, registered = _geometry(*streams)
     except ValueError as error:  # which does not matter where cameras are given

@@ -30,7 +30,15 @@ import numpy as np
 from dsr.geometry.camera import Lens
 from dsr.geometry.poses import Matrix, as_rigid, from_quaternion, invert
 from dsr.io.captures import realsense
-from dsr.io.captures.bags import COMPRESSED, IMAGE, Message, NamedErrors, connections_of, first_message, open_recording
+from dsr.io.captures.bags import (
+    COMPRESSED,
+    IMAGE,
+    Message,
+    connections_of,
+    first_message,
+    naming_recording,
+    open_recording,
+)
 from dsr.io.captures.ros_images import COLOURS, DEPTHS
 from dsr.io.frames import CaptureFrame, Geometry, Rig
 from dsr.io.pairs import Pair, PairingResult, is_registered, join, match_times
@@ -79,9 +87,9 @@ def find_ros(folder: Path) -> PairingResult | None:
 
 def _read(path: Path, prefix: str = "") -> PairingResult:
     """Return the frames of a recording."""
-    with NamedErrors(path):
+    with naming_recording(path):
         reader = open_recording(path)
-        if realsense.is_recording(reader):
+        if connections_of(reader, realsense.VERSION):
             return realsense.read(reader, path, prefix)
         topics = _topics(reader)
         photo_topic, depth_topic = _choose(path, topics)

@@ -35,7 +35,7 @@ from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry, 
 from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult, numbered_files
 from dsr.io.trajectories import USUAL_SIZE, describe_capture, fitting_camera, pose_from_quaternion
 from dsr.notes import Assumption
-from dsr.utils.decoding import quiet_decoders
+from dsr.utils.decoding import QUIET_DECODERS
 from dsr.utils.guards import expect_pixels, numbers_in, read_text
 from dsr.utils.versions import hash_once
 
@@ -219,7 +219,7 @@ class _Player:
         if index < self._next:
             self._capture.release()
             self._capture, self._next = self._open(), 0
-        with quiet_decoders():
+        with QUIET_DECODERS:
             while self._next <= index:
                 if not self._capture.grab():
                     end = f"the video is damaged or ends after {self._next} frames"
@@ -235,7 +235,7 @@ class _Player:
         if not self._path.is_file():
             raise ValueError(f"{self._path}: expected a video, there is none")
         os.environ.setdefault(_LOG_LEVEL, _SILENT)  # read once; its threads may print messages later
-        with quiet_decoders(), _environment(_OPTIONS, _ALL_FRAMES):
+        with QUIET_DECODERS, _environment(_OPTIONS, _ALL_FRAMES):
             capture = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG)
         width, height = (capture.get(key) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         if not capture.isOpened() or not width * height > 0:

@@ -16,8 +16,7 @@ from dsr.evaluation.results import BenchmarkSetting, Results
 from dsr.geometry import BASIS, LIGHTS, VIEWING_LIGHT
 from dsr.pictures.canvas import HOLE_COLOUR
 from dsr.report.html_page import asset, block, fill, json_text, palette
-from dsr.report.leaderboard import standings
-from dsr.report.page.content import links, metrics_data, problem_data, run_data
+from dsr.report.page.content import links, metrics_data, problem_data, run_data, standings
 from dsr.report.page.scene_content import View, calibration_data, scene_data, views_of
 from dsr.report.page.value_pictures import LEVELS, Level, PictureStore, megabytes
 from dsr.report.worker_pool import WorkerPool
@@ -57,6 +56,9 @@ class Pictures:
     Args:
         workers: runs, and what encodes their pictures.
 
+    Attributes:
+        calibration: yields the result of :func:`dsr.report.page.scene_content.calibration_data` of each setting.
+
     """
 
     def __init__(self, workers: WorkerPool) -> None:
@@ -64,7 +66,7 @@ class Pictures:
         self.views = views_of(workers.results)
         self._workers = workers
         self._first = self._encode(LEVELS[0])
-        self._calibration = workers.map(_calibrate, workers.results.problems())
+        self.calibration = workers.map(calibration_data, workers.results.problems())
 
     def stored(self, budget: float, progress: Steps) -> _Stored:
         """Encode the pictures at the best level within the budget in bytes, otherwise at the last level."""
@@ -75,10 +77,6 @@ class Pictures:
             except _TooLargeError:
                 encoded.close()
         return _at_level(self._encode(LEVELS[-1]), LEVELS[-1], len(self.views), math.inf, progress)
-
-    def calibration(self) -> list[list[dict[str, Any]]]:
-        """Return the result of :func:`dsr.report.page.scene_content.calibration_data` of each setting."""
-        return list(self._calibration)
 
     def _encode(self, level: Level) -> Generator[_Encoded]:
         """Return the encoded scenes in the order of :func:`_spread`."""
@@ -97,11 +95,6 @@ def _encode_scene(level: Level, results: Results, scene: _Scene) -> _Encoded:
     pool, notes = PictureStore(level), list[str]()
     view = View(scene.problem, scene.name, tuple(results.runs[number] for number in scene.runs))
     return scene_data(view, pool, notes), pool, notes
-
-
-def _calibrate(results: Results, problem: BenchmarkSetting) -> list[dict[str, Any]]:
-    """Compare the expected errors of a setting with the measured ones."""
-    return calibration_data(views_of(results, problem))
 
 
 def save_page(
@@ -149,7 +142,7 @@ def save_page(
         notes = [f"pictures: {stored.pool.level.text(stored.pool.reduced)}; {megabytes(stored.pool.size)}", *notes]
     problems = results.problems()
     data = {
-        **_data(path, results, pictures.calibration(), tables, title),
+        **_data(path, results, list(pictures.calibration), tables, title),
         "notes": [*results.remarks, *notes],
         "standings": standings(results) if leaderboard else [],
         "scenes": [

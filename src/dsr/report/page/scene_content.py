@@ -91,12 +91,13 @@ def scene_data(view: View, pool: PictureStore, notes: list[str]) -> dict[str, An
     predictions = results_of(view, stored, notes)
     reference = stored.depth if stored.depth is not None else (predictions[0].depth if predictions else stored.depth_lr)
     low, high = limits_of(reference)
+    photo, _ = pool.fit(stored.rgb.permute(1, 2, 0).double().numpy())
     data: dict[str, Any] = {
         "scene": view.scene,
         "size": [stored.camera.width, stored.camera.height],
         "notes": list(stored.notes),
         "depth": [low, high],
-        "photo": _photo(stored.rgb, pool),
+        "photo": pool.add(np.rint(255 * np.clip(photo, 0, 1)).astype(np.uint8)),
     }
     expected = [each.errors for each in predictions if each.errors is not None]
     largest = None
@@ -163,12 +164,6 @@ def results_of(view: View, stored: DepthSample, notes: list[str]) -> list[Result
     return found
 
 
-def _photo(rgb: Tensor, pool: PictureStore) -> str:
-    """Store a photo, (3, H, W) in [0, 1]."""
-    values, _ = pool.fit(rgb.permute(1, 2, 0).double().numpy())
-    return pool.add(np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8))
-
-
 def _surface(depth: Tensor, camera: Camera, data: dict[str, Any], pool: PictureStore) -> dict[str, Any]:
     """Store the normals and depth of a map, (1, H, W) in metres."""
     basis = torch.tensor(BASIS, dtype=torch.float64)
@@ -233,11 +228,12 @@ def _sizes(errors: Sequence[Tensor]) -> list[np.ndarray]:
     return [values for values in sizes if values.size]
 
 
-def calibration_data(views: Sequence[View]) -> list[dict[str, Any]]:
+def calibration_data(results: Results, problem: BenchmarkSetting) -> list[dict[str, Any]]:
     """Return how the expected errors of each method that has them agree with the measured ones.
 
     Args:
-        views: the scenes of one setting. Those without ground truth are left out.
+        results: all runs.
+        problem: the setting. Its scenes without ground truth are left out.
 
     Returns:
         A row per method: ``method``; ``scenes``, the number of scenes that all of them have; ``depth`` and ``angle``,
@@ -246,7 +242,7 @@ def calibration_data(views: Sequence[View]) -> list[dict[str, Any]]:
 
     """
     found: dict[str, dict[str, Tensor]] = {}
-    step = 0
+    step, views = 0, views_of(results, problem)
     for view in views:
         confident = replace(view, runs=tuple(run for run in view.runs if _is_confident(run, view.scene)))
         stored = stored_sample(confident, []) if confident.runs else None

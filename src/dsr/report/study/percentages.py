@@ -18,8 +18,8 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
+from dsr.report.significance import agreement, average_fraction, bootstrap_of_average, wilson
 from dsr.report.study.answers import Answer, Answers
-from dsr.report.study.intervals import agreement, average_fraction, bootstrap_of_average, wilson
 from dsr.report.study.key import Candidate, Key, Trial
 from dsr.report.study.study_table import ALL, AVERAGE, COLUMNS, PERCENTAGES, PLACE
 from dsr.utils.ratios import as_ratio
@@ -186,15 +186,12 @@ def _terminal_table(rows: pd.DataFrame, where: str) -> Table:
     for scene, of_scene in rows.groupby("scene", sort=False):
         table.add_section()
         for number, (_, row) in enumerate(of_scene.iterrows()):
-            cells = [_cell(row, column, bold=row[column] == of_scene[column].max() > 0) for column in PERCENTAGES]
+            cells = []
+            for column in PERCENTAGES:
+                value, low, high = row[column], row[f"{column}_low"], row[f"{column}_high"]
+                shown = f"[bold]{value:.1f}[/]" if value == of_scene[column].max() > 0 else f"{value:.1f}"
+                cells.append(f"{shown} [dim]({low:.0f}-{high:.0f})[/]")
             name = escape(str(scene)) if number == 0 else ""
             heading = f"[bold]{name}[/]" if name and scene == AVERAGE else name
             table.add_row(heading, escape(row["label"]), *cells, str(row["n"]))
     return table
-
-
-def _cell(row: pd.Series, column: str, *, bold: bool) -> str:
-    """Format a percentage and its interval."""
-    value = f"{row[column]:.1f}"
-    interval = f"{row[f'{column}_low']:.0f}-{row[f'{column}_high']:.0f}"
-    return f"{f'[bold]{value}[/]' if bold else value} [dim]({interval})[/]"

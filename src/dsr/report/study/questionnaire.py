@@ -14,12 +14,11 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
-from torch import Tensor
 
 from dsr.evaluation.results import BenchmarkSetting, Results, Run, one_per_method
 from dsr.pictures.depth_views import rendering
 from dsr.report.html_page import asset, fill, json_text, policy
-from dsr.report.study.choice import Choice
+from dsr.report.study import Choice
 from dsr.report.study.key import KEY_NAME, PAGE_VERSION, Candidate, Key, Trial, read_key, write_key
 from dsr.utils.files import expect_targets, write_text
 from dsr.utils.progress import SILENT, Progress
@@ -109,9 +108,12 @@ def build_study(
     asked: dict[str, Any] = {"perPerson": per_person, "repeat": repeat, "scenes": scenes}
     study = hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()[:_DIGITS]
     key = Key(study, choice.light, per_person, repeat, trials)
-    _expect_free(folder / KEY_NAME, study, overwrite=overwrite)
+    path = folder / KEY_NAME
+    if not overwrite and path.exists() and read_key(path).study != study:
+        where = "take another directory or --overwrite"
+        raise ValueError(f"{path}: expected no other study, whose answers need this key, got one; {where}")
     content = {"study": study, "page": PAGE_VERSION, **asked}
-    write_key(folder / KEY_NAME, key)
+    write_key(path, key)
     write_text(folder / PAGE_NAME, _page_of(content, choice))
     return Built(folder / PAGE_NAME, key, tuple(notes))
 
@@ -196,7 +198,11 @@ def _draw(question: Question, light: str) -> _Drawn:
     shown = []
     for run in question.runs:
         depth = run.prediction(question.scene)
-        _expect_size(run, question.scene, depth, scene.depth)
+        if depth.shape != scene.depth.shape:
+            sizes = [" x ".join(map(str, reversed(each.shape[-2:]))) for each in (scene.depth, depth)]
+            raise ValueError(
+                f"{run.folder}: prediction of {question.scene}: expected {sizes[0]} pixels, got {sizes[1]}"
+            )
         picture = grey_png(rendering(depth, scene.camera, light), valid)
         if pictures.setdefault(picture, run.label) != run.label:
             notes.append(f"{place}: {pictures[picture]} and {run.label} look exactly the same")
@@ -216,13 +222,6 @@ def grey_png(shades: np.ndarray, valid: np.ndarray) -> bytes:
     content = io.BytesIO()
     Image.fromarray(levels.astype(np.uint8)).save(content, "PNG", transparency=0, compress_level=9)
     return content.getvalue()
-
-
-def _expect_size(run: Run, scene: str, depth: Tensor, truth: Tensor) -> None:
-    """Check that a prediction has the size of the ground truth."""
-    if depth.shape != truth.shape:
-        sizes = [" x ".join(map(str, reversed(each.shape[-2:]))) for each in (truth, depth)]
-        raise ValueError(f"{run.folder}: prediction of {scene}: expected {sizes[0]} pixels, got {sizes[1]}")
 
 
 def _with_ids(drawn: Sequence[_Drawn]) -> tuple[list[dict[str, Any]], dict[str, Trial]]:
@@ -282,10 +281,3 @@ def _within(what: str, value: int | None, low: int, high: int, default: int) -> 
     if not low <= value <= high:
         raise ValueError(f"{what}: expected {low} to {high}, got {value}")
     return value
-
-
-def _expect_free(path: Path, study: str, *, overwrite: bool) -> None:
-    """Check that no key of another study is overwritten; its answers need that key."""
-    if not overwrite and path.exists() and read_key(path).study != study:
-        where = "take another directory or --overwrite"
-        raise ValueError(f"{path}: expected no other study, whose answers need this key, got one; {where}")

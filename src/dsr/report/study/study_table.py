@@ -99,10 +99,11 @@ def study_cells(
     for key in PERCENTAGES:
         values = rows.loc[here, key].dropna()
         if len(values):
+            mean, interval = values.mean(), None
             own_average = _own_average(rows, places) if len(values) == len(places) else None
-            mean, interval = (
-                (values.mean(), None) if own_average is None else (own_average[key], _interval(own_average, key))
-            )
+            if own_average is not None:
+                mean, low, high = own_average[key], own_average.get(f"{key}_low"), own_average.get(f"{key}_high")
+                interval = None if pd.isna(low) or pd.isna(high) else (float(low), float(high))
             found[key] = Share(float(mean), len(values), interval)
     return found
 
@@ -121,9 +122,3 @@ def _own_average(rows: pd.DataFrame, places: Sequence[tuple[str, str]]) -> pd.Se
     else:
         return None
     return rows.loc[own] if own in rows.index else None
-
-
-def _interval(row: pd.Series, key: str) -> tuple[float, float] | None:
-    """Return the 95 % confidence interval of a percentage."""
-    low, high = row.get(f"{key}_low"), row.get(f"{key}_high")
-    return None if pd.isna(low) or pd.isna(high) else (float(low), float(high))
