@@ -27,7 +27,7 @@ from dsr.utils.compute_device import pick_device
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 UNIT_TESTS = REPOSITORY / "tests" / "unit"
-NIGHTLY = tuple(REPOSITORY / "tests" / name for name in ("chaos", "fuzz", "mistakes"))
+NIGHTLY = tuple(REPOSITORY / "tests" / name for name in ("chaos", "fuzz"))
 CHROMIUMS = ("chromium", "chromium-browser", "google-chrome")
 CHROMIUM_ARGUMENTS = (
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
