@@ -66,7 +66,10 @@ def test_visual_loss_shows_on_simgeo(shared: Path, scale: int, name: str) -> Non
     assert max(gain.values()) < 1.0, gain
 
 
-@pytest.mark.parametrize("name", ["sparse_to_dense_x4", "sparse_to_dense_x8", "ddrnet_x4", "ddrnet_x8"])
+@pytest.mark.parametrize(
+    "name",
+    ["sparse_to_dense_x4", "sparse_to_dense_x8", "ddrnet_x4", pytest.param("ddrnet_x8", marks=pytest.mark.nightly)],
+)
 def test_scores_on_lucy_are_those_that_the_recipe_expects(shared: Path, name: str) -> None:
     header = (REPOSITORY / "conf" / "experiment" / f"{name}.yaml").read_text(encoding="utf-8")
     found = re.search(r"Expected: .*Lucy (\d+) / (\d+) / (\d+),", header)
