@@ -8,6 +8,7 @@ from pathlib import Path
 import captures
 import pytest
 
+pytestmark = pytest.mark.slow
 SCRIPT = "from dsr.__main__ import main\nif __name__ == '__main__':\n    main()\n"
 MODULES = ("cv2", "json", "matplotlib", "multiprocessing", "numpy", "pickle", "pydantic", "rich", "sitecustomize",
            "torch", "usercustomize", "yaml", "zlib")  # fmt: skip
