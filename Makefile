@@ -50,7 +50,7 @@ chaos: $(VENV)/installed-dev
 	PYTHONPATH=tests $(BIN)/python -m chaos $(ARGS)
 
 mistakes: $(VENV)/installed-dev
-	OMP_NUM_THREADS=1 PYTHONPATH=tests $(BIN)/python -m mistakes $(ARGS)
+	OMP_NUM_THREADS=1 PYTHONPATH=tests:benchmarks $(BIN)/python -m mistakes $(ARGS)
 
 benchmark: $(VENV)/installed-dev
 	for name in dip metrics msg peers prepare train; do $(BIN)/python benchmarks/$${name}_speed.py || exit 1; done

@@ -2,15 +2,15 @@
 
     python benchmarks/depth_encodings.py [--shared DIR] [--frames N] [--reduce 1] [--only NAME]
 
-Every frame of ``DIR``, or each of some rendered ones, is stored in each encoding as the mistakes of ``tests/mistakes``
-are, and read as the command reads it, without any option but the camera. *Read rightly* means that unit and range type
-are, *refused* that a line asks for what cannot be decided, *silent* that one of the two is wrong, and no line says so.
+Every frame of ``DIR``, or each of some rendered ones, is stored in each encoding as the mistakes of
+``benchmarks/mistakes`` are, and read as the command reads it, without any option but the camera. *Read rightly* means
+that unit and range type are, *refused* that a line asks for what cannot be decided, *silent* that one of the two is
+wrong, and no line says so.
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
@@ -20,17 +20,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from mistakes.frames import Frame, all_frames
+from mistakes.kinds import ANSWERS, KINDS, RIGHT, Maker, Material, judged, valued, whole
 
 from dsr.app.upsample.checks import check_planes
 from dsr.app.upsample.frames import find_frames
 from dsr.app.upsample.request import UpsampleRequest
 from dsr.io.inputs import read_picture
 from dsr.utils.options import add_options, build
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-
-from mistakes.frames import Frame, all_frames
-from mistakes.kinds import ANSWERS, KINDS, RIGHT, Maker, Material, judged, valued, whole
 
 ENCODINGS: dict[str, Maker] = {
     **{name: KINDS[RIGHT][name] for name in ("millimetres, 16 bits", "float metres")},

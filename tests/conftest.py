@@ -27,7 +27,7 @@ from dsr.utils.compute_device import pick_device
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 UNIT_TESTS = REPOSITORY / "tests" / "unit"
-NIGHTLY = tuple(REPOSITORY / "tests" / name for name in ("chaos", "fuzz", "mistakes"))
+NIGHTLY = tuple(REPOSITORY / "tests" / name for name in ("chaos", "fuzz"))
 CHROMIUMS = ("chromium", "chromium-browser", "google-chrome")
 CHROMIUM_ARGUMENTS = (
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
@@ -59,7 +59,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker("nightly")
         if not any(item.get_closest_marker(tier) for tier in ("shared", "browser", "slow")):
             item.add_marker("unit")
-    items.sort(key=lambda item: UNIT_TESTS in item.path.parents)  # so that at the end no worker has a long file alone
+    long = {item.path for item in items if not item.get_closest_marker("unit")}
+    # Long files first, so that at the end no worker has one alone
+    items.sort(key=lambda item: (UNIT_TESTS in item.path.parents, item.path not in long))
 
 
 def pytest_collection_finish() -> None:

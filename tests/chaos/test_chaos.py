@@ -4,6 +4,7 @@ import json
 import signal
 import sys
 
+import numpy as np
 import pytest
 
 from chaos import kills, together
@@ -11,6 +12,7 @@ from chaos.campaign import Campaign
 from chaos.kills import KillCase, Strike
 from chaos.scenarios import STRUCK, Scenario, make_answers
 from chaos.together import PairCase
+from chaos.trees import differences
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 
@@ -58,6 +60,27 @@ def test_sigterm_while_torch_is_imported_ends_an_evaluation_in_one_line(campaign
 
 def test_two_commands_at_once_do_not_disturb_each_other(campaign):
     assert together.run_case(campaign, PairCase("pair", COLLECT, 0.0)) == []
+
+
+def test_results_that_differ_in_more_than_their_times_are_found(tmp_path):
+    one, two = tmp_path / "one", tmp_path / "two"
+    for folder, seconds in ((one, 1.0), (two, 2.0)):
+        folder.mkdir()
+        np.savez(folder / "depth.npz", depth=np.zeros(3), seconds=seconds)
+        (folder / "info.json").write_text(json.dumps({"unit": "m", "seconds": seconds}))
+        (folder / "scores.csv").write_text("scene,value\nhall,1\n")
+    (two / ".half.npz").write_bytes(b"PK")
+    assert differences(one, two) == []
+    np.savez(two / "depth.npz", depth=np.ones(3), seconds=2.0)
+    (two / "info.json").write_text(json.dumps({"unit": "mm", "seconds": 2.0}))
+    (two / "scores.csv").unlink()
+    (two / "mine.txt").write_text("")
+    assert differences(one, two) == [
+        "depth.npz: /depth.npy differs",
+        "info.json: /unit: expected 'm', got 'mm'",
+        "mine.txt: not in the reference",
+        "scores.csv: missing",
+    ]
 
 
 STUBBORN = "import signal, time\nfor n in (2, 15): signal.signal(n, lambda *_: None)\n"

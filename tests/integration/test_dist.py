@@ -20,6 +20,7 @@ def dist():
     return module
 
 
+@pytest.mark.nightly  # test_installed.py builds a wheel and runs it
 @pytest.mark.skipif(importlib.util.find_spec("build") is None, reason="needs the package build")
 def test_release_is_built_and_runs_alone(tmp_path):
     command = [sys.executable, str(SCRIPT), "--offline", "--draft", "--output", str(tmp_path / "dist")]

@@ -74,8 +74,9 @@ def test_killed_command_keeps_nobody_out(case, tmp_path, environment):
 @pytest.mark.parametrize(
     ("first", "second"),
     [
-        ((*UPSAMPLE, "--shard", "1/2"), (*UPSAMPLE, "--shard", "2/2", "--workers", "2")),
-        (EVALUATE, (*EVALUATE, "workers=2", "threads=1")),
+        ((*UPSAMPLE, "--shard", "1/2"), (*UPSAMPLE, "--shard", "2/2")),
+        (EVALUATE, EVALUATE),
+        pytest.param(EVALUATE, (*EVALUATE, "workers=2", "threads=1"), marks=pytest.mark.nightly),
     ],
 )
 def test_commands_of_the_same_settings_work_together(first, second, tmp_path, environment):

@@ -56,8 +56,9 @@ def test_workers_make_the_same_files_and_notes_as_the_command_alone(runs: Path, 
     for file in runs.rglob("scenes/statue.npz"):
         file.write_bytes(b"damaged")
     files, notes = [], []
+    command = ("-m", "dsr", "report", str(runs), "--only", "figures,page")
     for workers in ("1", "2"):
-        done = run_python("-m", "dsr", "report", str(runs), "-o", workers, "--workers", workers, cwd=tmp_path)
+        done = run_python(*command, "-o", workers, "--workers", workers, cwd=tmp_path)
         assert (done.returncode, done.stderr) == (0, "")
         folder = tmp_path / workers
         files.append({path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()})

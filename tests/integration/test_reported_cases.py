@@ -1150,8 +1150,8 @@ def test_argument_leads_to_the_one_that_is_meant(command, arguments, meant):
     ("alignment", "make", "given"),
     [
         ("affine_disparity", lambda depth: 17 * (1 / depth - 0.2), ["method.range_type=inverse"]),
-        ("affine", lambda depth: 40 * depth + 3, []),
-        ("scale", lambda depth: 9 * depth, []),
+        pytest.param("affine", lambda depth: 40 * depth + 3, [], marks=pytest.mark.nightly),
+        pytest.param("scale", lambda depth: 9 * depth, [], marks=pytest.mark.nightly),
         ("robust", lambda depth: np.round(1000 * depth).astype(np.uint16), []),
     ],
 )

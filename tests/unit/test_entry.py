@@ -138,7 +138,7 @@ def test_multirun_runs_every_combination_and_a_failing_job_keeps_the_others(comm
 
 
 def test_value_of_the_command_line_replaces_the_sweep_of_an_experiment(command):
-    code, _, seen = command("-m", "+experiment=noise", "method=bicubic,nearest", "scale=8", "dataset.size=64")
+    code, _, seen = command("-m", "+experiment=noise", "noise=kinect", "method=bicubic,nearest", "scale=8")
     assert code == 0
     assert {(config.label, config.scale) for config in seen} == {("Bicubic", 8), ("Nearest", 8)}
 

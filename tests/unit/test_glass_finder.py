@@ -138,7 +138,7 @@ def test_training_script_writes_weights_that_fit(tmp_path: Path, monkeypatch: py
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    small = ["--scenes", "6", "--rendered", "2", "--steps", "3", "--workers", "0", "-o", "glass.safetensors"]
+    small = ["--scenes", "2", "--rendered", "1", "--steps", "2", "--workers", "0", "-o", "glass.safetensors"]
     monkeypatch.setattr("sys.argv", ["train_glass.py", *small])
     module.main()
     state = safetensors.torch.load_file("glass.safetensors")

@@ -158,6 +158,9 @@ def test_values_of_time_of_flight_give_none(shared, file):
     assert recognise_values(torch.from_numpy(stored.astype(np.float32))[None] / 1000) is None
 
 
+QUARTER = (slice(None), slice(240), slice(320))  # of a map of 640 x 480 pixels
+
+
 def counted(constant, unit=1e-4, noise=0.0):
     """Return a map of a slanted wall in steps of disparity, whose noise is correlated over 9 pixels."""
     inverse = slanted(1.0, 6.0)
@@ -196,17 +199,17 @@ def test_sensor_that_is_unknown_or_contradicts_the_values_is_refused():
 def test_computed_disparity_is_no_camera():
     assert find_sensor(counted(1024)) is None
     assert find_sensor(counted(1024, noise=0.004)).sensor is BY_NAME["RealSense D435"]
-    camera, rgb = Camera.centred(640, 480, 600.0), torch.full((3, 480, 640), 0.5)
-    depth = counted(1024)
+    camera, rgb = Camera.centred(320, 240, 600.0), torch.full((3, 240, 320), 0.5)
+    depth = counted(1024)[QUARTER]
     auto, none = (upsample_surface(rgb, depth, camera, sensor=name) for name in ("auto", "none"))
     assert torch.equal(auto.depth, none.depth)
     assert torch.equal(auto.depth_error, none.depth_error)
 
 
 def test_stated_error_is_never_less_than_the_disparity_allows():
-    camera, rgb = Camera.centred(640, 480, 600.0), torch.full((3, 480, 640), 0.5)
+    camera, rgb = Camera.centred(320, 240, 600.0), torch.full((3, 240, 320), 0.5)
     for part in (1.0, 0.5):
-        depth = counted(1024 * part)
+        depth = counted(1024 * part)[QUARTER]
         found = {
             name: upsample_surface(rgb, depth, camera, method="bicubic", scale=4, sensor=name)
             for name in ("none", "D435")
@@ -232,8 +235,8 @@ def test_systematic_error_of_a_known_sensor_is_added_to_the_stated_one():
 
 
 def test_correlated_noise_of_a_stereo_camera_is_given_as_it_grows():
-    depth = counted(1024, 1e-3, noise=0.004)
-    camera, rgb = Camera.centred(640, 480, 600.0), torch.full((3, 480, 640), 0.5)
+    depth = counted(1024, 1e-3, noise=0.004)[QUARTER]
+    camera, rgb = Camera.centred(320, 240, 600.0), torch.full((3, 240, 320), 0.5)
     found = find_noise(depth)
     assert found.extent == pytest.approx(9, rel=0.2)
     assert found.deviation == pytest.approx(0.004 * found.distance**2, rel=0.2)
@@ -250,8 +253,8 @@ def test_correlated_noise_of_a_stereo_camera_is_given_as_it_grows():
 
 def test_noise_that_is_not_correlated_is_left_to_the_network():
     inverse = slanted(1.0, 6.0) + 0.004 * np.random.default_rng(0).standard_normal((480, 640))
-    depth = as_stored(1 / inverse, 1e-3)
-    camera, rgb = Camera.centred(640, 480, 600.0), torch.full((3, 480, 640), 0.5)
+    depth = as_stored(1 / inverse, 1e-3)[QUARTER]
+    camera, rgb = Camera.centred(320, 240, 600.0), torch.full((3, 240, 320), 0.5)
     named, none = (upsample_surface(rgb, depth, camera, sensor=name).depth for name in ("D435", "none"))
     assert torch.equal(named, none)
 
