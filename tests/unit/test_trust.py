@@ -6,8 +6,7 @@ import sys
 import pytest
 import yaml
 
-from dsr.app.training_runs import read_config, studies_of_run
-from dsr.app.trust import allowed_targets, expect_trusted
+from dsr.app.training_runs import expect_trusted, read_config, studies_of_run
 from dsr.utils.configuration import ConfigError
 
 CONFIG = {
@@ -105,19 +104,19 @@ def test_person_at_the_keyboard_decides(tmp_path, trust, allowed):
 
 
 @pytest.mark.parametrize("value", [5, {"a": 1}, [3]])
-def test_trust_of_another_type_is_refused(value):
+def test_trust_of_another_type_is_refused(tmp_path, value):
     with pytest.raises(ConfigError, match="trust: expected true, false, or targets"):
-        allowed_targets(value)
+        read_config(write(tmp_path / "run"), value)
 
 
 def test_target_in_the_persons_own_configuration_directory_is_allowed(tmp_path):
     own = tmp_path / "conf" / "model"
     own.mkdir(parents=True)
     (own / "mine.yaml").write_text("net:\n  _target_: mine.Net\n")
-    trust = allowed_targets(None, [tmp_path / "conf"])
-    expect_trusted(tmp_path / "config.yaml", {"model": {"net": {"_target_": "mine.Net"}}}, trust)
+    path, places = tmp_path / "config.yaml", [tmp_path / "conf"]
+    expect_trusted(path, {"model": {"net": {"_target_": "mine.Net"}}}, None, places)
     with pytest.raises(ConfigError, match=r"mine\.Other"):
-        expect_trusted(tmp_path / "config.yaml", {"model": {"net": {"_target_": "mine.Other"}}}, trust)
+        expect_trusted(path, {"model": {"net": {"_target_": "mine.Other"}}}, None, places)
 
 
 @pytest.mark.parametrize(
