@@ -124,12 +124,12 @@ class Interruption(Checkpoint):
 
     def __init__(self, path: Path, seconds: float = 600.0) -> None:
         self._path, self._seconds, self._saved = path, seconds, time.monotonic()
-        self._stack, self.signal = contextlib.ExitStack(), interruption.Deferred()
+        self._stack, self.signals = contextlib.ExitStack(), list[int]()
         self.started = False  # and so what was to be restored is restored
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Only note signals from now on."""
-        self.started, self.signal = True, self._stack.enter_context(interruption.deferred())
+        self.started, self.signals = True, self._stack.enter_context(interruption.deferred())
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
         """Act once a step is complete that no validation follows; Lightning would skip that after an interruption."""
@@ -145,7 +145,7 @@ class Interruption(Checkpoint):
 
     def on_train_end(self, *_: Any) -> None:
         """Stop, if this was requested after the last step."""
-        if self.signal.number:
+        if self.signals:
             raise KeyboardInterrupt
 
     def teardown(self, *_: Any, **__: Any) -> None:
@@ -157,7 +157,7 @@ class Interruption(Checkpoint):
     def _act(self, trainer: lightning.Trainer, *, due: bool) -> None:
         """Save if it is time or if any process was asked to end, and in that case end."""
         agree = trainer.strategy.reduce_boolean_decision
-        ends = agree(self.signal.number != 0, all=False)
+        ends = agree(bool(self.signals), all=False)
         if (ends or agree(due, all=False)) and not trainer.fast_dev_run:  # type: ignore[attr-defined]
             trainer.save_checkpoint(self._path)
             self._saved = time.monotonic()

@@ -150,10 +150,9 @@ def make_trainer(
     The arguments of a ``node`` of the configuration go before those that are given here. Without an ``environment``
     Lightning starts the processes of several devices, whatever Slurm or MPI say.
     """
-    index: int | None = device.index  # torch's stubs say int
     given = {
         "accelerator": "gpu" if device.type == "cuda" else device.type,
-        "devices": devices if index is None or devices > 1 else [index],
+        "devices": devices if device == torch.device(device.type) else [device.index],
         "max_steps": steps,
         "accumulate_grad_batches": accumulate,
         "val_check_interval": interval * accumulate,
@@ -203,7 +202,7 @@ def fit(
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGINT, before)  # which Lightning ignores after an interruption
     if trainer.interrupted:
-        number = (saving and saving.signal.number) or signal.SIGINT
+        number = saving.signals[0] if saving is not None and saving.signals else signal.SIGINT
         if saving is not None and callable(signal.getsignal(number)):
             signal.raise_signal(number)  # to who else waits for it, such as submitit
         raise KeyboardInterrupt
