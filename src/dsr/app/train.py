@@ -176,7 +176,6 @@ class _Prepared:
 
     plain: Config
     settings: TrainConfig
-    processes: Processes
     data: PatchData
     module: SuperResolution
     trainer: lightning.Trainer
@@ -242,9 +241,7 @@ def _prepare(plain: Config, settings: TrainConfig, device: torch.device, process
     )
     tolerated = ("results_version", "scenes_version", "outside_code", "device") if "resume" in given_keys() else ()
     resume = folder / _LAST if (folder / _LAST).is_file() and not settings.overwrite else None
-    return _Prepared(
-        plain, settings, processes, data, module, trainer, best, progress, identity, folder, resume, tolerated
-    )
+    return _Prepared(plain, settings, data, module, trainer, best, progress, identity, folder, resume, tolerated)
 
 
 def _network(settings: TrainConfig) -> DisparityNetwork:
@@ -324,16 +321,16 @@ def _own_callbacks(settings: TrainConfig, module: SuperResolution) -> list[Callb
 
 def _train(prepared: _Prepared) -> float:
     """Train in one of the processes, the first of which has the directory for itself, and return the best score."""
-    plain, settings, processes, folder = prepared.plain, prepared.settings, prepared.processes, prepared.folder
-    data, module, first = prepared.data, prepared.module, processes.rank == 0
-    if first:
+    plain, settings, folder = prepared.plain, prepared.settings, prepared.folder
+    data, module, trainer = prepared.data, prepared.module, prepared.trainer
+    if trainer.is_global_zero:
         rundir.expect_free(folder, plain, prepared.identity, prepared.tolerated)
         if (folder / WEIGHTS).exists() and not settings.overwrite:
             raise ConfigError(f"output_dir: {folder / WEIGHTS} is trained already; overwrite=true trains it again")
     held_out = ", ".join(f"{len(names)} of {kind}" for kind, (_, names) in data.validation_scenes().items())
     parameters = sum(each.numel() for each in module.net.parameters())
     patch, several = data.patches.patch, f" x {settings.accumulate} batches" if settings.accumulate > 1 else ""
-    several += f" x {processes.count} devices" if processes.count > 1 else ""
+    several += f" x {trainer.world_size} devices" if trainer.world_size > 1 else ""
     logs = (f"tensorboard --logdir {folder}" if name == "tensorboard" else name for name in settings.logger)
     for line in (
         f"model  {settings.names['model']} x{settings.scale}, {parameters:,} parameters, {settings.precision}",
@@ -349,7 +346,7 @@ def _train(prepared: _Prepared) -> float:
         data.setup()
         module.objective = module.objective.balanced(data.first_patches)  # its weights may depend on the scenes
     prepared.progress.say(f"loss   {module.objective.formula}")
-    if not first:
+    if not trainer.is_global_zero:
         return _fit(prepared)
     with rundir.at_work(folder, plain, prepared.identity, prepared.tolerated, alone=True) as changed:
         for key in changed:
@@ -363,7 +360,7 @@ def _train(prepared: _Prepared) -> float:
 
 def _fit(prepared: _Prepared) -> float:
     """Train in the directory of the run; return the score of the weights that are kept."""
-    plain, settings, folder, first = prepared.plain, prepared.settings, prepared.folder, prepared.processes.rank == 0
+    plain, settings, folder = prepared.plain, prepared.settings, prepared.folder
     data, module, trainer = prepared.data, prepared.module, prepared.trainer
     groups = ("model", "dataset", "downsampling", "noise", "degradation", "trainer")
     facts = {
@@ -374,7 +371,7 @@ def _fit(prepared: _Prepared) -> float:
         **{key: getattr(data.patches, key) for key in ("batch", "patch")},
         **module.objective.facts,
     }
-    if first:
+    if trainer.is_global_zero:
         _log_settings(prepared, facts)
     try:
         fit(trainer, module, data, prepared.resume)
@@ -394,7 +391,7 @@ def _fit(prepared: _Prepared) -> float:
             client.finish()  # so that the next job of a multirun has a run of its own
     if trainer.fast_dev_run:  # type: ignore[attr-defined]
         return math.nan
-    if first:
+    if trainer.is_global_zero:
         kept = folder / _LAST.with_name(f"{settings.keep}.ckpt")
         checkpoint = read_torch_file(kept)
         state, prefix = checkpoint["state_dict"], "average."
@@ -408,7 +405,8 @@ def _fit(prepared: _Prepared) -> float:
 
 def _log_settings(prepared: _Prepared, facts: Mapping[str, Any]) -> None:
     """Log a run's configuration before it has values: TensorBoard gets its main settings and a layout of its charts."""
-    plain, metrics = prepared.plain, prepared.module.metrics[0]
+    plain = prepared.plain
+    metrics: Any = prepared.module.metrics[0]
     table = {**facts, "method": facts["model"], "degradation": rundir.degradation_of(plain)}
     for logger in prepared.trainer.loggers:
         if isinstance(logger, TensorBoardLogger):
