@@ -208,7 +208,6 @@ def test_diverged_training_writes_no_weights_of_it(tmp_path, within):
 
 USAGE_ERRORS = {
     "a weight that is none": (["loss.w=abc"], "loss.w: "),
-    "a mistyped model": (["model=foo"], "model=foo: "),
     "a mistyped loss": (["model.objective.depth_loss=l3"], "model.objective.depth_loss: "),
     "a patch the scale does not divide": (["patches.patch=30"], "patches.patch: "),
     "no step": (["trainer.max_steps=0"], "trainer.max_steps: "),
@@ -369,9 +368,7 @@ REFUSED = {
     "files elsewhere": lambda checkpoint: state_of_best(checkpoint).update(
         best_k_models={f"{state_of_best(checkpoint)['dirpath']}/../../mine": torch.ones(())}
     ),
-    "no callbacks": lambda checkpoint: checkpoint.pop("callbacks"),
     "no weights": lambda checkpoint: checkpoint.update(state_dict={}),
-    "no loops": lambda checkpoint: checkpoint.update(loops={}),
 }
 
 

@@ -50,10 +50,8 @@ def evil(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("key", "target"),
     [
-        ("model__net___target_", "os.system"),
         ("model__net___target_", "evil_targets.Net"),
         ("dataset___target_", "dsr.app.entry.os.system"),
-        ("dataset___target_", "dsr.cli.main"),
         ("dataset__parts__mine___target_", "evil_targets.Net"),
         ("validation__own___target_", "evil_targets.Net"),
         ("model__network", "evil_targets.Net"),
@@ -62,7 +60,6 @@ def evil(tmp_path, monkeypatch):
         ("logger__mine___target_", "evil_targets.Net"),
         ("model__net___target_", "dsr.data.rendered.Procedural"),
         ("dataset__parts__logger___target_", "lightning.pytorch.loggers.WandbLogger"),
-        ("trainer___target_", "os.system"),
         ("trainer__profiler___target_", "evil_targets.Net"),
     ],
 )
@@ -77,10 +74,9 @@ def test_target_that_is_not_dsrs_is_refused_before_it_is_imported(evil, key, tar
     assert "\n" not in message
 
 
-@pytest.mark.parametrize("value", [["evil_targets.METRIC"], ["dsr.cli.main.x"]])
-def test_metrics_from_outside_are_refused(evil, value):
+def test_metrics_from_outside_are_refused(evil):
     with pytest.raises(ConfigError, match=r"config\.yaml: metrics\.extra\.0: expected a target of"):
-        read_config(write(evil / "run", metrics__extra=value))
+        read_config(write(evil / "run", metrics__extra=["evil_targets.METRIC"]))
 
 
 def test_trust_in_the_file_itself_counts_for_nothing(evil):
@@ -141,15 +137,10 @@ def test_configuration_of_anything_but_plain_values_is_refused(evil, text):
 
 
 @pytest.mark.parametrize("name", ["../../up", "/etc/x", "a\\b", "..", "", "a\nb", "x" * 200])
-@pytest.mark.parametrize("key", ["names__model", "names__dataset"])
-def test_name_that_leads_out_of_a_folder_is_refused(tmp_path, key, name):
-    with pytest.raises(ConfigError, match="expected a name without folders"):
-        read_config(write(tmp_path / "run", **{key: name}))
-
-
-def test_validation_set_that_leads_out_of_a_folder_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match="expected a name without folders"):
-        read_config(write(tmp_path / "run", validation={"../up": CONFIG["dataset"]}))
+def test_name_that_leads_out_of_a_folder_is_refused(tmp_path, name):
+    for changes in ({"names__model": name}, {"names__dataset": name}, {"validation": {name: CONFIG["dataset"]}}):
+        with pytest.raises(ConfigError, match="expected a name without folders"):
+            read_config(write(tmp_path / "run", **changes))
 
 
 @pytest.mark.parametrize(

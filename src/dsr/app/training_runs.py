@@ -106,8 +106,6 @@ def expect_trusted(path: Path, config: Config, trust: Any, directories: Sequence
                 f"run; if you trust it, trust={target} allows it, trust=true allows all"
             )
     for key, value in entries_of(config):
-        if key[0] == "names" and key[1:]:
-            expect_name(f"{path}: {'.'.join(key)}", str(value))
         if key[:-1] in (("validation",), ("dataset", "parts")):
             expect_name(f"{path}: {'.'.join(key)}", key[-1])
         if key[0] in _LIGHTNING and isinstance(value, str):
