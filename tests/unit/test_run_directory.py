@@ -34,13 +34,9 @@ def config(**changes):
     }
 
 
-def claim(folder, plain, identity):
-    with at_work(folder, plain, identity):
+def claim(folder, plain, weights="abc"):
+    with at_work(folder, plain, identity_of(plain, weights, CPU)):
         pass
-
-
-def claimed(folder, plain, weights="abc"):
-    claim(folder, plain, identity_of(plain, weights, CPU))
 
 
 @pytest.fixture(autouse=True)
@@ -91,9 +87,8 @@ def test_what_a_name_cannot_say_is_distinguished_by_a_hash():
 def test_run_takes_the_directory_of_no_other_run_and_finds_its_own():
     plain, folders = composed("eval"), []
     for weights in ("abc", "abd"):
-        identity = identity_of(plain, weights, CPU)
-        folders.append(default_directory("eval", plain, identity))
-        claim(folders[-1], plain, identity)
+        folders.append(default_directory("eval", plain, identity_of(plain, weights, CPU)))
+        claim(folders[-1], plain, weights)
     assert folders[0].name == "msg_v_x4_simgeo_seed0"
     assert re.fullmatch(r"msg_v_x4_simgeo_seed0-[0-9a-f]{8}", folders[1].name)
     record = json.loads((folders[1] / "versions.json").read_text())
@@ -129,7 +124,7 @@ def test_identity_has_the_weights_the_kind_of_device_and_the_versions(monkeypatc
 
 
 def test_claimed_directory_has_the_config_and_the_versions(tmp_path):
-    claimed(tmp_path / "new" / "run", config())
+    claim(tmp_path / "new" / "run", config())
     assert sorted(path.name for path in (tmp_path / "new" / "run").iterdir()) == ["config.yaml", "versions.json"]
     assert OmegaConf.to_container(OmegaConf.load(tmp_path / "new" / "run" / "config.yaml")) == config()
     record = json.loads((tmp_path / "new" / "run" / "versions.json").read_text())
@@ -142,33 +137,28 @@ def test_claimed_directory_has_the_config_and_the_versions(tmp_path):
     assert record["identity"]["device"] == "cpu"
 
 
-def test_check_before_the_claim_refuses_the_same_and_writes_nothing(tmp_path):
-    plain = config()
-    identity = identity_of(plain, "abc", CPU)
-    assert expect_free(tmp_path / "new", plain, identity) == []
+def test_directory_of_another_run_is_refused_with_the_changed_keys_before_the_claim_and_then(tmp_path):
+    plain, other = config(), config(scale=8, dataset={"root": "other", "scenes": None})
+    assert expect_free(tmp_path / "new", plain, identity_of(plain, "abc", CPU)) == []
     assert list(tmp_path.iterdir()) == []
-    claim(tmp_path / "run", plain, identity)
-    other = identity_of(config(scale=8), "abc", CPU)
-    with pytest.raises(ConfigError, match="holds a run with another scale; "):
-        expect_free(tmp_path / "run", plain, other)
-    assert expect_free(tmp_path / "run", plain, other, ["scale"]) == ["scale"]
+    claim(tmp_path / "run", plain)
+    before = (tmp_path / "run" / "config.yaml").read_bytes()
+    keys = ["dataset.root", "scale", "weights_sha256"]
+    identity, message = (
+        identity_of(other, "abd", CPU),
+        f"run holds a run with another {', '.join(keys)}; .* overwrite=t",
+    )
+    with pytest.raises(ConfigError, match=message):
+        expect_free(tmp_path / "run", plain, identity)
+    with pytest.raises(ConfigError, match=message):
+        claim(tmp_path / "run", other, "abd")
+    assert (tmp_path / "run" / "config.yaml").read_bytes() == before
+    assert expect_free(tmp_path / "run", plain, identity, keys) == keys
 
 
-def test_directory_of_another_run_is_refused_with_the_changed_keys(tmp_path):
-    claimed(tmp_path, config())
-    before = (tmp_path / "config.yaml").read_bytes()
-    other = config(scale=8, dataset={"root": "other", "scenes": None})
-    with pytest.raises(ConfigError) as caught:
-        claimed(tmp_path, other, "abd")
-    message = str(caught.value)
-    assert message.startswith(f"output_dir: {tmp_path} holds a run with another dataset.root, scale, weights_sha256; ")
-    assert "overwrite=true" in message
-    assert (tmp_path / "config.yaml").read_bytes() == before
-
-
-def test_directory_in_which_another_run_begins_can_be_claimed(tmp_path):
+def test_directory_in_which_another_run_begins_can_be_claim(tmp_path):
     (tmp_path / ".versions-8f3k.json").touch()  # what replacing() writes before the record is there
-    claimed(tmp_path, config())
+    claim(tmp_path, config())
     assert (tmp_path / "versions.json").is_file()
 
 
@@ -179,13 +169,13 @@ def test_directory_with_foreign_files_is_refused_and_unchanged(tmp_path, content
         (tmp_path / "versions.json").write_text(content)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     with pytest.raises(ConfigError, match=r"^output_dir: .* holds files of something else"):
-        claimed(tmp_path, config())
+        claim(tmp_path, config())
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 def test_overwrite_claims_the_directory_of_another_run(tmp_path):
-    claimed(tmp_path, config())
-    claimed(tmp_path, config(scale=8, overwrite=True))
+    claim(tmp_path, config())
+    claim(tmp_path, config(scale=8, overwrite=True))
     assert OmegaConf.load(tmp_path / "config.yaml").scale == 8
     assert json.loads((tmp_path / "versions.json").read_text())["identity"]["scale"] == 8
 
@@ -195,4 +185,4 @@ def test_file_in_place_of_the_directory_or_of_one_above_it_is_refused(tmp_path):
     with pytest.raises(ConfigError, match=r"^output_dir: .*file: expected a folder .*, got a file"):
         expect_free(tmp_path / "file", config(), {})
     with pytest.raises(ConfigError, match=r"^output_dir: expected a directory to write to, got .*run \(Not a dir"):
-        claimed(tmp_path / "file" / "run", config())
+        claim(tmp_path / "file" / "run", config())

@@ -18,7 +18,6 @@ import lightning
 import torch
 from lightning.pytorch.callbacks import (
     Callback,
-    DeviceStatsMonitor,
     GradientAccumulationScheduler,
     LearningRateMonitor,
     ModelCheckpoint,
@@ -306,7 +305,7 @@ def _own_callbacks(settings: TrainConfig, module: SuperResolution) -> list[Callb
             raise ConfigError(
                 f"callbacks.{name}.monitor: expected one of {', '.join(known[: len(scored)])}, got {monitor}{near}"
             )
-        if isinstance(each, LearningRateMonitor | DeviceStatsMonitor) and not settings.logger:
+        if isinstance(each, LearningRateMonitor) and not settings.logger:
             raise ConfigError(f"callbacks.{name}: expected a logger to write to, such as logger=csv, got none")
         if isinstance(each, ProgressBar | GradientAccumulationScheduler):
             raise ConfigError(
