@@ -14,7 +14,7 @@ Item = TypeVar("Item")
 class Task(Protocol):
     """A piece of work under way; it is cheap to call in a loop."""
 
-    def __call__(self, done: int, total: int | None = None, remark: str | None = None) -> object:
+    def __call__(self, done: int, total: int | None = None, remark: str | None = None) -> None:
         """Report how much is done, of how much, and a short text shown beside the numbers; None if unchanged."""
         ...
 
@@ -70,7 +70,11 @@ class StepsProgress(Progress):
         if steps is None or name != "steps":
             yield ignore
             return
-        yield lambda done, total=None, remark=None: steps(done, total or all_steps)
+
+        def report(done: int, total: int | None = None, remark: str | None = None) -> None:
+            steps(done, total or all_steps)
+
+        yield report
         steps(all_steps, all_steps)
 
 
