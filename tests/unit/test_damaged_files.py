@@ -24,8 +24,7 @@ from omegaconf import OmegaConf
 from small_results import write_result
 
 from dsr.app.entry import run_command
-from dsr.app.training_runs import read_config
-from dsr.app.trust import read_plain_yaml
+from dsr.app.training_runs import read_config, read_plain_yaml
 from dsr.app.upsample.outputs import kept_surface, read_previous_run
 from dsr.app.upsample.stored import _read_record, read_result
 from dsr.data.download.fetching import Checksums, unpack

@@ -16,8 +16,8 @@ READY = "print('ready', flush=True)"
 WORK = f"{READY}\ntime.sleep(60)"
 STEP = (
     f"with deferred() as noted:\n    {READY}\n    until = time.monotonic() + SECONDS\n"
-    "    while not noted.number and time.monotonic() < until: time.sleep(0.01)\n"
-    "    time.sleep(0.3)\n    print('saved', file=sys.stderr)\nsignal.raise_signal(noted.number)"
+    "    while not noted and time.monotonic() < until: time.sleep(0.01)\n"
+    "    time.sleep(0.3)\n    print('saved', file=sys.stderr)\nsignal.raise_signal(noted[0])"
 )
 
 
@@ -71,9 +71,9 @@ def test_output_that_nobody_reads_ends_the_command_without_a_word(tmp_path: Path
 def test_signals_of_the_host_process_are_its_own_again_after_a_deferral() -> None:
     before = signal.getsignal(signal.SIGTERM)
     with interruption.deferred() as noted:
-        assert not noted.number
+        assert not noted
         signal.raise_signal(signal.SIGTERM)
-        assert noted.number
+        assert noted == [signal.SIGTERM]
     assert signal.getsignal(signal.SIGTERM) is before
 
 
@@ -83,10 +83,10 @@ def test_job_of_a_scheduler_saves_before_it_is_requeued() -> None:
     try:
         with interruption.deferred() as noted:
             signal.raise_signal(signal.SIGTERM)  # as some clusters do before
-            assert not noted.number
+            assert not noted
             signal.raise_signal(signal.SIGUSR2)
-            assert (noted.number, requeues) == (signal.SIGUSR2, [])
-        signal.raise_signal(noted.number)
+            assert (noted, requeues) == ([signal.SIGUSR2], [])
+        signal.raise_signal(noted[0])
         assert requeues == [signal.SIGUSR2]
     finally:
         signal.signal(signal.SIGUSR2, before)

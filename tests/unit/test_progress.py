@@ -12,8 +12,7 @@ from dsr.utils.progress import clock, duration, megabytes, part_of, show_length
 class Clock:
     """A clock that is set by hand."""
 
-    def __init__(self) -> None:
-        self.seconds = 100.0
+    seconds = 100.0
 
     def __call__(self) -> float:
         return self.seconds
@@ -132,11 +131,9 @@ def test_times_and_sizes_are_written_for_readers() -> None:
 @pytest.mark.parametrize(
     ("metres", "digits", "text"),
     [
-        (150, 2, "150 m"),
         (0.0996, 2, "0.1 m"),
         (0.0994, 2, "99 mm"),
         (999.9, 3, "1 km"),
-        (998.6, 3, "999 m"),
         (123_456, 2, "120 km"),
         (0.00123, 2, "1.2 mm"),
         (0, 3, "0 mm"),

@@ -13,7 +13,6 @@ from dsr.app.composition import compose
 from dsr.app.run_directory import at_work, default_directory, expect_free, identity_of
 from dsr.app.schema import plain_config
 from dsr.utils.configuration import ConfigError, config_directories
-from dsr.utils.versions import versions
 
 CPU = torch.device("cpu")
 
@@ -35,17 +34,9 @@ def config(**changes):
     }
 
 
-def directory(plain, weights="abc", device=CPU):
-    return default_directory("eval", plain, identity_of(plain, weights, device))
-
-
-def claim(folder, plain, identity):
-    with at_work(folder, plain, identity):
+def claim(folder, plain, weights="abc"):
+    with at_work(folder, plain, identity_of(plain, weights, CPU)):
         pass
-
-
-def claimed(folder, plain, weights="abc"):
-    claim(folder, plain, identity_of(plain, weights, CPU))
 
 
 @pytest.fixture(autouse=True)
@@ -96,9 +87,8 @@ def test_what_a_name_cannot_say_is_distinguished_by_a_hash():
 def test_run_takes_the_directory_of_no_other_run_and_finds_its_own():
     plain, folders = composed("eval"), []
     for weights in ("abc", "abd"):
-        identity = identity_of(plain, weights, CPU)
-        folders.append(default_directory("eval", plain, identity))
-        claim(folders[-1], plain, identity)
+        folders.append(default_directory("eval", plain, identity_of(plain, weights, CPU)))
+        claim(folders[-1], plain, weights)
     assert folders[0].name == "msg_v_x4_simgeo_seed0"
     assert re.fullmatch(r"msg_v_x4_simgeo_seed0-[0-9a-f]{8}", folders[1].name)
     record = json.loads((folders[1] / "versions.json").read_text())
@@ -111,79 +101,64 @@ def test_run_takes_the_directory_of_no_other_run_and_finds_its_own():
 
 
 @pytest.mark.parametrize(
-    "changes",
+    ("changes", "same"),
     [
-        {"scale": 8}, {"seed": 1}, {"precision": "bfloat16"}, {"dataset": {"root": "other"}},
-        {"downsampling": {"kernel": "gaussian"}}, {"method": {"variant": "x"}},
+        ({"scale": 8}, False), ({"seed": 1}, False), ({"precision": "bfloat16"}, False),
+        ({"dataset": {"root": "other"}}, False), ({"downsampling": {"kernel": "gaussian"}}, False),
+        ({"method": {"variant": "x"}}, False), ({"weights": "elsewhere.pth"}, True), ({"output_dir": "x"}, True),
+        ({"overwrite": True}, True), ({"metrics": {"lpips": False}}, True),
     ],
 )  # fmt: skip
-def test_other_configuration_gives_another_directory(changes):
-    claimed(directory(config()), config())
-    assert directory(config(**changes)) != directory(config())
+def test_identity_has_the_settings_that_predictions_depend_on(changes, same):
+    assert (identity_of(config(**changes), "abc", CPU) == identity_of(config(), "abc", CPU)) is same
 
 
-def test_other_weights_or_kind_of_device_give_another_directory():
-    folders = []
-    for weights, device in (("abc", CPU), ("abd", CPU), (None, CPU), ("abc", torch.device("cuda"))):
-        folders.append(directory(config(), weights, device))
-        claim(folders[-1], config(), identity_of(config(), weights, device))
-    assert len(set(folders)) == 4
-    assert directory(config(), "abc", torch.device("cuda", 1)) == folders[3]
-
-
-@pytest.mark.parametrize(
-    "changes", [{"weights": "elsewhere.pth"}, {"output_dir": "x"}, {"overwrite": True}, {"metrics": {"lpips": False}}]
-)
-def test_settings_without_influence_on_predictions_keep_the_directory(changes):
-    assert directory(config(**changes)) == directory(config())
-
-
-@pytest.mark.parametrize("name", ["RESULTS", "SCENES"])
-def test_other_version_gives_another_directory(monkeypatch, name):
-    before = directory(config())
-    claimed(before, config())
-    monkeypatch.setattr(rundir, name, 0)
-    assert directory(config()) != before
+def test_identity_has_the_weights_the_kind_of_device_and_the_versions(monkeypatch):
+    cuda = torch.device("cuda")
+    found = [identity_of(config(), *each) for each in (("abc", CPU), ("abd", CPU), (None, CPU), ("abc", cuda))]
+    assert identity_of(config(), "abc", torch.device("cuda", 1)) == found[3]
+    for name in ("RESULTS", "SCENES"):
+        monkeypatch.setattr(rundir, name, 0)
+        found.append(identity_of(config(), "abc", CPU))
+    assert all(found.count(each) == 1 for each in found)
 
 
 def test_claimed_directory_has_the_config_and_the_versions(tmp_path):
-    claimed(tmp_path / "new" / "run", config())
+    claim(tmp_path / "new" / "run", config())
     assert sorted(path.name for path in (tmp_path / "new" / "run").iterdir()) == ["config.yaml", "versions.json"]
     assert OmegaConf.to_container(OmegaConf.load(tmp_path / "new" / "run" / "config.yaml")) == config()
     record = json.loads((tmp_path / "new" / "run" / "versions.json").read_text())
     assert record["packages"]["torch"] == importlib.metadata.version("torch")
-    assert record["packages"]["numpy"] == importlib.metadata.version("numpy")
+    assert {"dsr", "numpy", "hydra-core"} <= record["packages"].keys()
+    assert record["accelerator"] == (torch.cuda.get_device_name() if torch.cuda.is_available() else None)
+    assert record["git_commit"] is None or len(record["git_commit"]) == 40
+    assert isinstance(record["git_dirty"], bool)
     assert record["identity"]["weights_sha256"] == "abc"
     assert record["identity"]["device"] == "cpu"
 
 
-def test_check_before_the_claim_refuses_the_same_and_writes_nothing(tmp_path):
-    plain = config()
-    identity = identity_of(plain, "abc", CPU)
-    assert expect_free(tmp_path / "new", plain, identity) == []
+def test_directory_of_another_run_is_refused_with_the_changed_keys_before_the_claim_and_then(tmp_path):
+    plain, other = config(), config(scale=8, dataset={"root": "other", "scenes": None})
+    assert expect_free(tmp_path / "new", plain, identity_of(plain, "abc", CPU)) == []
     assert list(tmp_path.iterdir()) == []
-    claim(tmp_path / "run", plain, identity)
-    other = identity_of(config(scale=8), "abc", CPU)
-    with pytest.raises(ConfigError, match="holds a run with another scale; "):
-        expect_free(tmp_path / "run", plain, other)
-    assert expect_free(tmp_path / "run", plain, other, ["scale"]) == ["scale"]
+    claim(tmp_path / "run", plain)
+    before = (tmp_path / "run" / "config.yaml").read_bytes()
+    keys = ["dataset.root", "scale", "weights_sha256"]
+    identity, message = (
+        identity_of(other, "abd", CPU),
+        f"run holds a run with another {', '.join(keys)}; .* overwrite=t",
+    )
+    with pytest.raises(ConfigError, match=message):
+        expect_free(tmp_path / "run", plain, identity)
+    with pytest.raises(ConfigError, match=message):
+        claim(tmp_path / "run", other, "abd")
+    assert (tmp_path / "run" / "config.yaml").read_bytes() == before
+    assert expect_free(tmp_path / "run", plain, identity, keys) == keys
 
 
-def test_directory_of_another_run_is_refused_with_the_changed_keys(tmp_path):
-    claimed(tmp_path, config())
-    before = (tmp_path / "config.yaml").read_bytes()
-    other = config(scale=8, dataset={"root": "other", "scenes": None})
-    with pytest.raises(ConfigError) as caught:
-        claimed(tmp_path, other, "abd")
-    message = str(caught.value)
-    assert message.startswith(f"output_dir: {tmp_path} holds a run with another dataset.root, scale, weights_sha256; ")
-    assert "overwrite=true" in message
-    assert (tmp_path / "config.yaml").read_bytes() == before
-
-
-def test_directory_in_which_another_run_begins_can_be_claimed(tmp_path):
+def test_directory_in_which_another_run_begins_can_be_claim(tmp_path):
     (tmp_path / ".versions-8f3k.json").touch()  # what replacing() writes before the record is there
-    claimed(tmp_path, config())
+    claim(tmp_path, config())
     assert (tmp_path / "versions.json").is_file()
 
 
@@ -194,32 +169,20 @@ def test_directory_with_foreign_files_is_refused_and_unchanged(tmp_path, content
         (tmp_path / "versions.json").write_text(content)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     with pytest.raises(ConfigError, match=r"^output_dir: .* holds files of something else"):
-        claimed(tmp_path, config())
+        claim(tmp_path, config())
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 def test_overwrite_claims_the_directory_of_another_run(tmp_path):
-    claimed(tmp_path, config())
-    claimed(tmp_path, config(scale=8, overwrite=True))
+    claim(tmp_path, config())
+    claim(tmp_path, config(scale=8, overwrite=True))
     assert OmegaConf.load(tmp_path / "config.yaml").scale == 8
     assert json.loads((tmp_path / "versions.json").read_text())["identity"]["scale"] == 8
 
 
-def test_file_in_place_of_the_directory_is_refused(tmp_path):
+def test_file_in_place_of_the_directory_or_of_one_above_it_is_refused(tmp_path):
     (tmp_path / "file").write_text("x")
     with pytest.raises(ConfigError, match=r"^output_dir: .*file: expected a folder .*, got a file"):
         expect_free(tmp_path / "file", config(), {})
-
-
-def test_directory_that_cannot_be_made_is_refused_in_one_line(tmp_path):
-    (tmp_path / "file").write_text("x")
     with pytest.raises(ConfigError, match=r"^output_dir: expected a directory to write to, got .*run \(Not a dir"):
-        claimed(tmp_path / "file" / "run", config())
-
-
-def test_versions_have_packages_commit_and_accelerator():
-    record = json.loads(json.dumps(versions()))
-    assert {"dsr", "torch", "numpy", "hydra-core"} <= record["packages"].keys()
-    assert record["accelerator"] == (torch.cuda.get_device_name() if torch.cuda.is_available() else None)
-    assert record["git_commit"] is None or len(record["git_commit"]) == 40
-    assert isinstance(record["git_dirty"], bool)
+        claim(tmp_path / "file" / "run", config())

@@ -20,7 +20,6 @@ import torch
 from omegaconf import OmegaConf
 
 from dsr.app.schema import NAMED, Config, Identity, user_directories
-from dsr.app.trust import imported
 from dsr.utils import locks
 from dsr.utils.configuration import ConfigError, config_directories
 from dsr.utils.files import TargetError, expect_own, expect_target, write_text
@@ -28,6 +27,7 @@ from dsr.utils.guards import parse_json, read_limited
 from dsr.utils.ratios import round_ratio
 from dsr.utils.versions import RESULTS, SCENES, hash_outside_code, versions
 
+IMPORTED = ("_target_", "network")  # keys whose value is imported
 _RECORD = "versions.json"
 # Arguments of a trainer that change no result.
 _NO_BITS = ("log_every_n_steps", "profiler", "detect_anomaly", "enable_progress_bar", "enable_model_summary")
@@ -57,6 +57,23 @@ def identity_of(
     if (alignment := config.get("metrics", {}).get("alignment", "none")) != "none":
         more["alignment"] = alignment
     return {**kept, "device": device.type, "weights_sha256": weights_hash, **code, **more}
+
+
+def imported(config: Config) -> Iterator[tuple[tuple[str, ...], str]]:
+    """Yield the key and the value of all entries that are imported, those of ``metrics.extra`` included."""
+    for key, value in entries_of(config):
+        metric = key[:2] == ("metrics", "extra") and not isinstance(value, list)
+        if value is not None and (key[-1] in IMPORTED or metric):
+            yield key, str(value)
+
+
+def entries_of(node: Any, above: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Yield the key and the value of all entries of a configuration."""
+    entries = node.items() if isinstance(node, Mapping) else enumerate(node) if isinstance(node, list) else ()
+    for name, value in entries:
+        key = (*above, str(name))
+        yield key, value
+        yield from entries_of(value, key)
 
 
 def default_directory(kind: str, config: Config, identity: Identity, overrides: Sequence[str] = ()) -> Path:

@@ -9,28 +9,22 @@ import math
 import os
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
-from zipfile import BadZipFile
 
 import lightning
 import torch
 from lightning.pytorch.callbacks import (
     Callback,
-    DeviceStatsMonitor,
     GradientAccumulationScheduler,
     LearningRateMonitor,
     ModelCheckpoint,
     ProgressBar,
 )
-from lightning.pytorch.plugins.environments import (
-    ClusterEnvironment,
-    LightningEnvironment,
-    SLURMEnvironment,
-    TorchElasticEnvironment,
-)
+from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.plugins import environments
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig, OmegaConf
@@ -54,7 +48,7 @@ from dsr.data.scene_source import prepare_scenes
 from dsr.methods.networks.network import DisparityNetwork
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, network_name, save_network
-from dsr.training.callbacks import log_run
+from dsr.training.callbacks import log_layout
 from dsr.training.data_module import PatchData
 from dsr.training.module import SuperResolution
 from dsr.utils import interruption
@@ -66,7 +60,8 @@ from dsr.utils.files import replacing
 from dsr.utils.guards import did_you_mean
 from dsr.utils.lightning import ScoreTables, StepProgress, fit, make_trainer, without_chatter
 from dsr.utils.progress import Progress
-from dsr.utils.torch_files import expect_stored, read_torch_file
+from dsr.utils.runs_table import list_run
+from dsr.utils.torch_files import read_torch_file
 
 MONITOR = "val/RMSE_v"
 _LARGEST_SEED = 2**32 - 1
@@ -84,12 +79,7 @@ def train(config: DictConfig) -> float:
     plain, settings, device = _read(config)
     processes = find_processes(device, settings.trainer["devices"])
     with processes.running():
-        try:
-            return _train(plain, settings, _prepare(plain, settings, device, processes), processes)
-        except (ConfigError, KeyboardInterrupt) as error:
-            if processes.rank == 0:
-                raise
-            sys.exit(USAGE_ERROR if isinstance(error, ConfigError) else interruption.exit_code())
+        return _train(_prepare(plain, settings, device, processes))
 
 
 def plan(config: DictConfig) -> list[Plan]:
@@ -109,17 +99,24 @@ class Processes:
 
     count: int
     rank: int  # of this one; 0 writes files and prints
-    environment: ClusterEnvironment  # what Lightning learns of the processes from
+    environment: environments.ClusterEnvironment  # what Lightning learns of the processes from
 
     @contextlib.contextmanager
     def running(self) -> Iterator[None]:
-        """Join the processes within this context; those that Lightning has started end with the first one."""
+        """Join the processes within this context; those that Lightning has started end with the first one.
+
+        The first one alone reports a mistake or an interruption.
+        """
         before = {name: os.environ[name] for name in _OF_PROCESSES if name in os.environ}
         rank_zero_only.rank = self.rank  # type: ignore[attr-defined]
-        if self.rank and isinstance(self.environment, LightningEnvironment):
+        if self.rank and isinstance(self.environment, environments.LightningEnvironment):
             interruption.end_with(os.getppid())
         try:
             yield
+        except (ConfigError, KeyboardInterrupt) as error:
+            if self.rank == 0:
+                raise
+            sys.exit(USAGE_ERROR if isinstance(error, ConfigError) else interruption.exit_code())
         finally:
             if self.count > 1 and torch.distributed.is_initialized():
                 torch.distributed.destroy_process_group()
@@ -134,19 +131,18 @@ def find_processes(device: torch.device, devices: int | Literal["auto"]) -> Proc
     A step of Slurm with one task is a process as any other: Lightning must neither expect that Slurm starts those of
     further devices, nor answer the signals by which submitit or the user wants a job to be requeued.
     """
-    index: int | None = device.index  # torch's stubs say int
-    there = torch.cuda.device_count() if device.type == "cuda" and index is None else 1
+    there = torch.cuda.device_count() if device == torch.device("cuda") else 1
     count = there if devices == "auto" else devices
     if device.type != "cpu" and count > there:
         raise ConfigError(f"trainer.devices: expected at most {there} for device={device}, got {count}")
-    environment: ClusterEnvironment = LightningEnvironment()
+    environment: environments.ClusterEnvironment = environments.LightningEnvironment()
     tasks = os.environ.get("SLURM_STEP_NUM_TASKS", "")
     started = None
-    if TorchElasticEnvironment.detect():
-        environment, started = TorchElasticEnvironment(), int(os.environ["WORLD_SIZE"])
+    if environments.TorchElasticEnvironment.detect():
+        environment, started = environments.TorchElasticEnvironment(), int(os.environ["WORLD_SIZE"])
     elif tasks.isdecimal() and int(tasks) > 1:  # not in a job's script, which no srun has started
         os.environ.setdefault("SLURM_NTASKS_PER_NODE", tasks)  # Lightning asks for it
-        environment, started = SLURMEnvironment(auto_requeue=False), int(tasks)
+        environment, started = environments.SLURMEnvironment(auto_requeue=False), int(tasks)
     if started not in (None, count):
         raise ConfigError(f"trainer.devices: expected {started}, the number of processes of this job, got {count}")
     rank = environment.global_rank() if started else environment.local_rank()
@@ -164,10 +160,6 @@ def _read(config: DictConfig, *, here: bool = True) -> tuple[dict[str, Any], Tra
                 f"resume: continues with the run's own configuration; {', '.join(others)} cannot be changed"
             )
         before = read_config(folder, plain["trust"])
-        try:
-            expect_stored(folder / _LAST)
-        except (ValueError, OSError, BadZipFile) as error:
-            raise ConfigError(f"resume: {error}") from error
         device = {"device": plain["device"]} if "device" in given_keys() else {}
         plain = {**before, **device, "resume": None, "output_dir": str(folder), "overwrite": False, "trust": None}
     settings = TrainConfig.of(plain)
@@ -181,6 +173,8 @@ def _read(config: DictConfig, *, here: bool = True) -> tuple[dict[str, Any], Tra
 class _Prepared:
     """A training that can be run, in the directory of its run, of which nothing is written yet."""
 
+    plain: Config
+    settings: TrainConfig
     data: PatchData
     module: SuperResolution
     trainer: lightning.Trainer
@@ -229,13 +223,13 @@ def _prepare(plain: Config, settings: TrainConfig, device: torch.device, process
         with without_chatter():
             loggers.append(build(f"logger.{name}", {"save_dir": str(folder), **node}))
     ours = READ_OF_TRAINER.keys() - {"gradient_clip_val"}  # the limit of gradients is only checked here
-    node = {key: value for key, value in settings.trainer.items() if key not in ours}
     unused = "_find_unused_parameters_true" if settings.degradation.get("scales") else ""  # layers of one factor
     trainer = make_trainer(
         device,
         settings.steps,
         settings.interval,
         callbacks=callbacks,
+        node={key: value for key, value in settings.trainer.items() if key not in ours},
         logger=loggers,
         devices=processes.count,
         accumulate=settings.accumulate,
@@ -243,11 +237,10 @@ def _prepare(plain: Config, settings: TrainConfig, device: torch.device, process
         strategy=f"ddp{unused}" if processes.count > 1 else "auto",
         precision="bf16-mixed" if settings.precision == "bfloat16" else "32-true",
         default_root_dir=folder,
-        make=lambda **given: build("trainer", node, {key: value for key, value in given.items() if key not in node}),
     )
     tolerated = ("results_version", "scenes_version", "outside_code", "device") if "resume" in given_keys() else ()
     resume = folder / _LAST if (folder / _LAST).is_file() and not settings.overwrite else None
-    return _Prepared(data, module, trainer, best, progress, identity, folder, resume, tolerated)
+    return _Prepared(plain, settings, data, module, trainer, best, progress, identity, folder, resume, tolerated)
 
 
 def _network(settings: TrainConfig) -> DisparityNetwork:
@@ -258,13 +251,9 @@ def _network(settings: TrainConfig) -> DisparityNetwork:
         if given is None:
             continue
         try:
-            first = load_network(Path(given).expanduser(), {**NETWORKS, network_name(type(net)): type(net)})
+            take(load_network(Path(given).expanduser(), {**NETWORKS, network_name(type(net)): type(net)}))
         except (ValueError, OSError) as error:
             raise ConfigError(f"start.{key}: {error}") from error
-        try:
-            take(first)
-        except ValueError as error:
-            raise ConfigError(f"start.{key}: {given}: {error}") from error
     for scale in settings.degradation.get("scales") or ():
         if not net.serves(settings.scale, int(scale)):
             raise ConfigError(
@@ -316,7 +305,7 @@ def _own_callbacks(settings: TrainConfig, module: SuperResolution) -> list[Callb
             raise ConfigError(
                 f"callbacks.{name}.monitor: expected one of {', '.join(known[: len(scored)])}, got {monitor}{near}"
             )
-        if isinstance(each, LearningRateMonitor | DeviceStatsMonitor) and not settings.logger:
+        if isinstance(each, LearningRateMonitor) and not settings.logger:
             raise ConfigError(f"callbacks.{name}: expected a logger to write to, such as logger=csv, got none")
         if isinstance(each, ProgressBar | GradientAccumulationScheduler):
             raise ConfigError(
@@ -329,17 +318,18 @@ def _own_callbacks(settings: TrainConfig, module: SuperResolution) -> list[Callb
     return own
 
 
-def _train(plain: Config, settings: TrainConfig, prepared: _Prepared, processes: Processes) -> float:
+def _train(prepared: _Prepared) -> float:
     """Train in one of the processes, the first of which has the directory for itself, and return the best score."""
-    folder, first, data, module = prepared.folder, processes.rank == 0, prepared.data, prepared.module
-    if first:
+    plain, settings, folder = prepared.plain, prepared.settings, prepared.folder
+    data, module, trainer = prepared.data, prepared.module, prepared.trainer
+    if trainer.is_global_zero:
         rundir.expect_free(folder, plain, prepared.identity, prepared.tolerated)
         if (folder / WEIGHTS).exists() and not settings.overwrite:
             raise ConfigError(f"output_dir: {folder / WEIGHTS} is trained already; overwrite=true trains it again")
     held_out = ", ".join(f"{len(names)} of {kind}" for kind, (_, names) in data.held_out.items())
     count, parameters = sum(len(names) for _, names in data.trained), sum(p.numel() for p in module.net.parameters())
     patch, several = data.patches.patch, f" x {settings.accumulate} batches" if settings.accumulate > 1 else ""
-    several += f" x {processes.count} devices" if processes.count > 1 else ""
+    several += f" x {trainer.world_size} devices" if trainer.world_size > 1 else ""
     logs = (f"tensorboard --logdir {folder}" if name == "tensorboard" else name for name in settings.logger)
     for line in (
         f"model  {settings.names['model']} x{settings.scale}, {parameters:,} parameters, {settings.precision}",
@@ -355,8 +345,8 @@ def _train(plain: Config, settings: TrainConfig, prepared: _Prepared, processes:
         data.setup()
         module.objective = module.objective.balanced(data.first_patches)  # its weights may depend on the scenes
     prepared.progress.say(f"loss   {module.objective.formula}")
-    if not first:
-        return _fit(plain, settings, prepared, first=False)
+    if not trainer.is_global_zero:
+        return _fit(prepared)
     with rundir.at_work(folder, plain, prepared.identity, prepared.tolerated, alone=True) as changed:
         for key in changed:
             prepared.progress.say(f"note: the run began with another {key}")
@@ -364,12 +354,13 @@ def _train(plain: Config, settings: TrainConfig, prepared: _Prepared, processes:
             (folder / WEIGHTS).unlink(missing_ok=True)
             for name in ("checkpoints", "tensorboard", "csv", "wandb"):
                 shutil.rmtree(folder / name, ignore_errors=True)
-        return _fit(plain, settings, prepared, first=True)
+        return _fit(prepared)
 
 
-def _fit(plain: Config, settings: TrainConfig, prepared: _Prepared, *, first: bool) -> float:
+def _fit(prepared: _Prepared) -> float:
     """Train in the directory of the run; return the score of the weights that are kept."""
-    data, module, trainer, folder = prepared.data, prepared.module, prepared.trainer, prepared.folder
+    plain, settings, folder = prepared.plain, prepared.settings, prepared.folder
+    data, module, trainer = prepared.data, prepared.module, prepared.trainer
     groups = ("model", "dataset", "downsampling", "noise", "degradation", "trainer")
     facts = {
         **{group: plain["names"][group] for group in groups},
@@ -379,14 +370,8 @@ def _fit(plain: Config, settings: TrainConfig, prepared: _Prepared, *, first: bo
         **{key: getattr(data.patches, key) for key in ("batch", "patch")},
         **module.objective.facts,
     }
-    if first:
-        listed = {**facts, "method": facts["model"], "degradation": rundir.degradation_of(plain)}
-        loss = {**plain["loss"], "w": facts["w"]} if "w" in facts else {}
-        collection: Any = module.metrics[0]
-        titles = {name: metric.chart_title for name, metric in collection.items()}
-        text, resumed = OmegaConf.to_yaml(OmegaConf.create(dict(plain))), prepared.resume is not None
-        for logger in trainer.loggers:
-            log_run(logger, text, listed, {**plain, "loss": loss}, titles, resumed=resumed)
+    if trainer.is_global_zero:
+        _log_settings(prepared, facts)
     try:
         fit(trainer, module, data, prepared.resume)
     except DivergenceError as error:
@@ -405,7 +390,7 @@ def _fit(plain: Config, settings: TrainConfig, prepared: _Prepared, *, first: bo
             client.finish()  # so that the next job of a multirun has a run of its own
     if trainer.fast_dev_run:  # type: ignore[attr-defined]
         return math.nan
-    if first:
+    if trainer.is_global_zero:
         kept = folder / _LAST.with_name(f"{settings.keep}.ckpt")
         checkpoint = read_torch_file(kept)
         state, prefix = checkpoint["state_dict"], "average."
@@ -415,3 +400,20 @@ def _fit(plain: Config, settings: TrainConfig, prepared: _Prepared, *, first: bo
     prepared.progress.say(f"weights: {folder / WEIGHTS}")
     score = prepared.best.best_model_score if settings.keep == "best" else trainer.callback_metrics.get(MONITOR)
     return math.nan if score is None else float(score)
+
+
+def _log_settings(prepared: _Prepared, facts: Mapping[str, Any]) -> None:
+    """Log a run's configuration before it has values: TensorBoard gets its main settings and a layout of its charts."""
+    plain = prepared.plain
+    metrics: Any = prepared.module.metrics[0]
+    table = {**facts, "method": facts["model"], "degradation": rundir.degradation_of(plain)}
+    for logger in prepared.trainer.loggers:
+        if isinstance(logger, TensorBoardLogger):
+            logger.experiment.add_text("config", f"```yaml\n{OmegaConf.to_yaml(OmegaConf.create(dict(plain)))}```")
+            logger.experiment.flush()
+            log_layout(logger, {name: metric.chart_title for name, metric in metrics.items()})
+            logger.log_hyperparams(table)
+            list_run(logger.experiment, "training", table, {})
+        elif prepared.resume is None:  # MLflow refuses another device, say
+            loss = {**plain["loss"], "w": facts["w"]} if "w" in facts else {}
+            logger.log_hyperparams({**plain, "loss": loss})

@@ -1,23 +1,35 @@
-"""Read the directory of a training: its configuration, its data, and how to evaluate its network."""
+"""Read the directory of a training: its configuration, its data, and how to evaluate its network.
+
+The directory may come from somebody else. A ``_target_`` is imported and called with the arguments beside it. A person
+who types one, or keeps it in a directory of their own (``--config-dir``), decides that; a run's ``config.yaml`` does
+not. In each group it may name the targets that the group's files in dsr's own ``conf`` name. Others need ``trust``.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
+import os
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from dsr.app.schema import Config, TrainConfig, user_directories
-from dsr.app.trust import allowed_targets, expect_trusted, read_plain_yaml
+import yaml
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from dsr.app.run_directory import IMPORTED, entries_of, imported
+from dsr.app.schema import Config, TrainConfig, expect_name, user_directories
 from dsr.data.scene_source import SceneSource, SceneSubset
 from dsr.degradation.downsampling import Downsampling
 from dsr.methods.networks.network import DisparityNetwork
 from dsr.training.data_module import Part, PatchData
 from dsr.training.degradation import Degradation
 from dsr.training.settings import PatchSettings
-from dsr.utils.configuration import ConfigError, build, load_target
-from dsr.utils.guards import is_number
+from dsr.utils.configuration import ConfigError, build, config_directories, load_target
+from dsr.utils.guards import is_number, read_limited
 
 WEIGHTS = "weights.safetensors"
 _FROM_RUN = ("scale", "downsampling", "noise", "seed", "dataset")
@@ -25,16 +37,20 @@ _NOT_WITH_RUN = ("method", "scale", "weights")
 # The nodes of the arguments that errors of a training's parts begin with.
 _NODES = dict.fromkeys((each.name for each in dataclasses.fields(PatchSettings)), "patches")
 _NODES |= {"depth_loss": "model.objective", "shading": "model.objective", "visual": "loss"}
+_LARGEST = 1 << 18  # bytes of a run's configuration
+_DEEPEST = 30  # nested keys and lists
+_GROUP_OF = {"validation": "dataset", "patches": "trainer"}  # whose files name the targets of a key
+_LIGHTNING = ("logger", "callbacks", "trainer")  # nodes of Lightning's classes, which write files
+_PLACES = ("save_dir", "dir", "root_dir", "tracking_uri")  # of loggers; dsr gives them the run's directory
 
 
 def read_config(folder: Path, trust: Any = None) -> dict[str, Any]:
     """Read the configuration of a training, which may come from somebody else, from its run's directory."""
     path = folder / "config.yaml"
-    if not path.is_file():
-        raise ConfigError(f"{folder}: expected the directory of a training, it has no readable config.yaml")
-    config = read_plain_yaml(path)
+    config = read_plain_yaml(path) if path.is_file() else {}
     if "model" not in config:
-        raise ConfigError(f"{folder}: expected the directory of a training, its config.yaml names no model")
+        what = "its config.yaml names no model" if config else "it has no readable config.yaml"
+        raise ConfigError(f"{folder}: expected the directory of a training, {what}")
     try:
         TrainConfig.of(config)
         for key in ("model", "dataset", "downsampling", "noise"):
@@ -44,8 +60,78 @@ def read_config(folder: Path, trust: Any = None) -> dict[str, Any]:
             raise ConfigError("model.net._target_: missing")
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
-    expect_trusted(path, config, allowed_targets(trust, user_directories()))
+    expect_trusted(path, config, trust, user_directories())
     return config
+
+
+def read_plain_yaml(path: Path) -> dict[str, Any]:
+    """Return the keys of a YAML file; aliases, which a bomb is made of, and interpolations are refused."""
+    depth = 0
+    try:
+        text = read_limited(path, _LARGEST).decode()
+        for event in yaml.parse(text, Loader=yaml.SafeLoader):
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if isinstance(event, yaml.AliasEvent) or depth > _DEEPEST or "${" in getattr(event, "value", ""):
+                line = event.start_mark.line + 1
+                raise ConfigError(f"{path}: line {line}: expected plain values, got an alias, ${{...}} or nested ones")
+        content = OmegaConf.to_container(OmegaConf.create(text))
+    except ConfigError:
+        raise
+    except (OSError, ValueError, yaml.YAMLError, OmegaConfBaseException) as error:
+        raise ConfigError(f"{path}: expected YAML of keys and plain values, got {type(error).__name__}") from error
+    if not isinstance(content, dict):
+        raise ConfigError(f"{path}: expected keys and values")
+    return {str(key): value for key, value in content.items()}
+
+
+def expect_trusted(path: Path, config: Config, trust: Any, directories: Sequence[Path] = ()) -> None:
+    """Check the configuration of a run, which may be a stranger's: what it imports, and which files it names.
+
+    Besides dsr's own, the targets that files in ``directories`` name, in their groups, and those of ``trust`` may be
+    imported: null, false, a target or a list of them; true for all that there are.
+    """
+    if trust is True:
+        return
+    named = [trust] if isinstance(trust, str) else trust or []
+    if not (isinstance(named, list) and all(isinstance(each, str) for each in named)):
+        raise ConfigError(f"trust: expected true, false, or targets such as module.Name, got {trust!r}")
+    places = (config_directories()[0], *directories)
+    allowed = {("", each) for each in named}.union(*map(_targets_in, places))
+    for key, target in imported(config):
+        group = key[1] if key[1] in ("optimizer", "scheduler") else _GROUP_OF.get(key[0], key[0])
+        of_metrics = group == "metrics" and target.startswith("dsr.metrics.")
+        if not of_metrics and allowed.isdisjoint({("", target), (group, target)}):
+            raise ConfigError(
+                f"{path}: {'.'.join(key)}: expected a target of dsr's own {group}, got {target!r}, whose code would "
+                f"run; if you trust it, trust={target} allows it, trust=true allows all"
+            )
+    for key, value in entries_of(config):
+        if key[:-1] in (("validation",), ("dataset", "parts")):
+            expect_name(f"{path}: {'.'.join(key)}", key[-1])
+        if key[0] in _LIGHTNING and isinstance(value, str):
+            leads = re.match(r"\s*[/\\~]|\w+:", value) or "$" in value or ".." in re.split(r"[/\\]", value)
+            leads = leads or (key[0] == "logger" and key[-1] in _PLACES and value != "mlruns")
+            if leads and value != os.environ.get("MLFLOW_TRACKING_URI"):
+                raise ConfigError(
+                    f"{path}: {'.'.join(key)}: expected nothing outside of the run, got {value!r:.60}; "
+                    "if you trust it, trust=true allows it"
+                )
+
+
+@functools.cache
+def _targets_in(directory: Path) -> frozenset[tuple[str, str]]:
+    """Return the group and the target of all that a directory's files name; files outside of groups have the group "".
+
+    Methods' files are left out: a training's configuration has no method.
+    """
+    pattern = re.compile(rf"\b(?:{'|'.join(IMPORTED)}): *([\w.]+)")
+    found: set[tuple[str, str]] = set()
+    for path in directory.rglob("*.yaml"):
+        *groups, _ = path.relative_to(directory).parts
+        if groups != ["method"]:
+            group = groups[0] if groups and groups != ["experiment"] else ""
+            found |= {(group, target) for target in pattern.findall(path.read_text(encoding="utf-8"))}
+    return frozenset(found)
 
 
 def studies_of_run(plain: Config, given: Sequence[str]) -> Iterator[tuple[dict[str, Any], SceneSource | None]]:

@@ -10,13 +10,12 @@ from typing import Any
 import lightning
 import torch
 from lightning.pytorch.callbacks import Callback
-from lightning.pytorch.loggers import Logger, MLFlowLogger, TensorBoardLogger, WandbLogger
+from lightning.pytorch.loggers import MLFlowLogger, TensorBoardLogger, WandbLogger
 from torch import Tensor
 
 from dsr.metrics.formats import looks_and_depth
 from dsr.training.degradation import Batch
 from dsr.utils.checkpoints import ends_step
-from dsr.utils.runs_table import list_run
 
 
 class Curves(Callback):
@@ -76,24 +75,6 @@ class Curves(Callback):
     def on_validation_end(self, *_: Any) -> None:
         """Start the clock again."""
         self._start += time.perf_counter()
-
-
-def log_run(
-    logger: Logger, text: str, table: Mapping[str, Any], config: Mapping[str, Any], titles: Mapping[str, str], *,
-    resumed: bool,
-) -> None:  # fmt: skip
-    """Log a run's configuration before it has values: TensorBoard gets its main settings and a layout of its charts.
-
-    ``text`` is the configuration as YAML, ``table`` its main settings; ``titles`` are those of the metrics, by name.
-    """
-    if isinstance(logger, TensorBoardLogger):
-        logger.experiment.add_text("config", f"```yaml\n{text}```")
-        logger.experiment.flush()
-        log_layout(logger, titles)
-        logger.log_hyperparams(dict(table))
-        list_run(logger.experiment, "training", table, {})
-    elif not resumed:  # MLflow refuses another device, say
-        logger.log_hyperparams(dict(config))
 
 
 def log_layout(logger: TensorBoardLogger, titles: Mapping[str, str]) -> None:

@@ -7,7 +7,6 @@ step out is not lost, so a few of them in a row are tolerated. Weights that are 
 from __future__ import annotations
 
 import contextlib
-import math
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -63,7 +62,7 @@ class Divergence(Callback):
         self._expect_finite_steps(trainer)
         score = trainer.callback_metrics.get(_SCORE)
         if score is not None and not bool(score.isfinite()):
-            raise _error(trainer, trainer.global_step, f"the validation's RMSE_d is {float(score):g}")
+            raise _error(trainer, f"the validation's RMSE_d is {float(score):g}")
 
     def on_save_checkpoint(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, checkpoint: dict[str, Any]
@@ -72,22 +71,20 @@ class Divergence(Callback):
         self._expect_finite_steps(trainer)
         for name, value in checkpoint["state_dict"].items():
             if isinstance(value, Tensor) and not bool(value.isfinite().all()):
-                raise _error(trainer, trainer.global_step, f"the weights {name} are not finite")
+                raise _error(trainer, f"the weights {name} are not finite")
 
     def _expect_finite_steps(self, trainer: lightning.Trainer) -> None:
         """Raise DivergenceError if there were too many steps without a finite loss and gradient on any device."""
         row: Any = trainer.strategy.reduce(self._row, reduce_op="max")
         steps = int(row) // trainer.accumulate_grad_batches
         if steps >= self._patience:
-            raise _error(
-                trainer, trainer.global_step - steps + 1, "the loss or its gradient is not finite from there on"
-            )
+            raise _error(trainer, "the loss or its gradient is not finite from there on", steps - 1)
 
 
-def _error(trainer: lightning.Trainer, step: int, what: str) -> DivergenceError:
-    """Return the error of a step."""
-    rate = trainer.optimizers[0].param_groups[0]["lr"] if trainer.optimizers else math.nan
-    return DivergenceError(f"diverged at step {step}: {what}, at a learning rate of {rate:.3g}")
+def _error(trainer: lightning.Trainer, what: str, ago: int = 0) -> DivergenceError:
+    """Return the error of the latest step, or of one some steps ago."""
+    rate = trainer.optimizers[0].param_groups[0]["lr"]
+    return DivergenceError(f"diverged at step {trainer.global_step - ago}: {what}, at a learning rate of {rate:.3g}")
 
 
 class BestCheckpoint(ModelCheckpoint):
@@ -98,32 +95,24 @@ class BestCheckpoint(ModelCheckpoint):
 
     def __init__(self, folder: Path, monitor: str) -> None:
         super().__init__(folder, "best", monitor=monitor, enable_version_counter=False, save_on_train_epoch_end=False)
-        self._best = str(Path(str(self.dirpath), "best.ckpt"))  # which is absolute
+        self._last_global_step_saved = -1  # else Lightning keeps no weights of step 0
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Validate the initial weights without any effect on the steps; they may be the best ones."""
         super().on_train_start(trainer, pl_module)
-        if trainer.global_step:
-            return
-        with isolate_rng():
-            trainer.validating = True
-            trainer.fit_loop.epoch_loop.val_loop.run()
-            trainer.training = True
-        score = trainer.callback_metrics[str(self.monitor)].clone()
-        if score.isfinite() and not trainer.fast_dev_run:  # type: ignore[attr-defined]
-            trainer.save_checkpoint(self._best)
-            self._keep(score)
+        if not trainer.global_step:
+            with isolate_rng():
+                trainer.validating = True
+                trainer.fit_loop.epoch_loop.val_loop.run()
+                trainer.training = True
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore the score; the file is the run's own, whatever a checkpoint says."""
-        if state_dict["best_model_score"] is not None:
-            self._keep(state_dict["best_model_score"])
-
-    def _keep(self, score: Tensor) -> None:
-        """Note the score of the best checkpoint."""
-        self.best_model_path = self.kth_best_model_path = self._best
-        self.best_model_score = self.kth_value = score
-        self.best_k_models = {self._best: score}
+        score = state_dict["best_model_score"]
+        if score is not None:
+            self.best_model_path = self.kth_best_model_path = self.format_checkpoint_name({})
+            self.best_model_score = self.kth_value = score
+            self.best_k_models = {self.best_model_path: score}
 
 
 class Interruption(Checkpoint):
@@ -135,11 +124,12 @@ class Interruption(Checkpoint):
 
     def __init__(self, path: Path, seconds: float = 600.0) -> None:
         self._path, self._seconds, self._saved = path, seconds, time.monotonic()
-        self._stack, self.signal = contextlib.ExitStack(), interruption.Deferred()
+        self._stack, self.signals = contextlib.ExitStack(), list[int]()
+        self.started = False  # and so what was to be restored is restored
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Only note signals from now on."""
-        self.signal = self._stack.enter_context(interruption.deferred())
+        self.started, self.signals = True, self._stack.enter_context(interruption.deferred())
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
         """Act once a step is complete that no validation follows; Lightning would skip that after an interruption."""
@@ -155,7 +145,7 @@ class Interruption(Checkpoint):
 
     def on_train_end(self, *_: Any) -> None:
         """Stop, if this was requested after the last step."""
-        if self.signal.number:
+        if self.signals:
             raise KeyboardInterrupt
 
     def teardown(self, *_: Any, **__: Any) -> None:
@@ -167,7 +157,7 @@ class Interruption(Checkpoint):
     def _act(self, trainer: lightning.Trainer, *, due: bool) -> None:
         """Save if it is time or if any process was asked to end, and in that case end."""
         agree = trainer.strategy.reduce_boolean_decision
-        ends = agree(self.signal.number != 0, all=False)
+        ends = agree(bool(self.signals), all=False)
         if (ends or agree(due, all=False)) and not trainer.fast_dev_run:  # type: ignore[attr-defined]
             trainer.save_checkpoint(self._path)
             self._saved = time.monotonic()

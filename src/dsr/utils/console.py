@@ -6,7 +6,6 @@ import contextlib
 import errno
 import functools
 import io
-import os
 import re
 import sys
 import time
@@ -19,7 +18,7 @@ from rich.progress import Progress as Bars
 from rich.progress import Task as Bar
 from rich.text import Text
 
-from dsr.utils.progress import Item, Progress, Task, Unit, clock, ignore, megabytes
+from dsr.utils.progress import Item, Progress, Task, Unit, clock, megabytes
 
 USAGE_ERROR = 2
 _OUTPUT = {errno.ENOSPC, errno.EPIPE}  # errors without a file's name that are those of printing
@@ -94,12 +93,12 @@ def one_line(error: BaseException) -> str:
 class ConsoleProgress(Progress):
     """Shows progress with named times: bars on a terminal, elsewhere plain lines.
 
-    If the output is not a terminal, each finished item gets a line, and running work gets one every ten seconds. In a
-    process that is forked from the one that made it, only lines of text are shown. ``now`` returns the time in seconds.
+    If the output is not a terminal, each finished item gets a line, and running work gets one every ten seconds.
+    ``now`` returns the time in seconds.
     """
 
     def __init__(self, console: Console, now: Callable[[], float] = time.monotonic) -> None:
-        self._console, self._now, self._process, self._next_line = console, now, os.getpid(), 0.0
+        self._console, self._now, self._next_line = console, now, 0.0
         self._state = _State()
         self._bars = Bars(
             TextColumn("{task.description:<8}", markup=False),
@@ -113,21 +112,18 @@ class ConsoleProgress(Progress):
 
     def say(self, line: str) -> None:
         """Show a line of text, above the bars if there are any."""
-        show(self._console if os.getpid() == self._process else open_console(), line)
+        show(self._console, line)
 
     @contextlib.contextmanager
     def task(self, name: str, total: int | None = None, *, done: int = 0, unit: Unit = "items") -> Iterator[Task]:
         """Return a context in which a piece of work is shown; see :class:`dsr.utils.progress.Progress`."""
-        if os.getpid() != self._process:
-            yield ignore
-            return
         if not self._bars.tasks:
             self._bars.start()
             self._next_line = self._now() + _FIRST_LINE
-        number = self._bars.add_task(
+        self._bars.add_task(
             name, total=total, completed=done, visible=total is not None, unit=unit, remark="", before=done
         )
-        bar, counted = next(each for each in self._bars.tasks if each.id == number), unit == "items"
+        bar, counted = self._bars.tasks[-1], unit == "items"
 
         def report(done: int, total: int | None = None, remark: str | None = None) -> None:
             nonlocal counted
@@ -139,13 +135,13 @@ class ConsoleProgress(Progress):
             if not self._console.is_terminal and done != bar.total and now >= self._next_line:
                 self._next_line = now + _NEXT_LINE
                 bars = [each for each in self._bars.tasks if each.visible]
-                outer = (f"{_name_of(each)} ({_amount_of(each)})" for each in bars[: bars.index(bar)])
-                self.say(": ".join((*outer, f"{name}: {self._state.render(bar).plain}")))
+                outer = (f"{_name_of(each)} ({_amount_and_times(each)[0]}): " for each in bars[: bars.index(bar)])
+                self.say(f"{''.join(outer)}{name}: {self._state.render(bar).plain}")
 
         try:
             yield report
         finally:
-            self._bars.remove_task(number)
+            self._bars.remove_task(bar.id)
             if not self._bars.tasks:
                 self._bars.stop()
 
@@ -160,9 +156,6 @@ class ConsoleProgress(Progress):
         lines: bool = True,
     ) -> Iterator[Item]:
         """Yield items, and show how many are done; see :class:`dsr.utils.progress.Progress`."""
-        if os.getpid() != self._process:
-            yield from items
-            return
         if total is None:
             items = list(items)
             total = len(items)
@@ -177,18 +170,20 @@ class ConsoleProgress(Progress):
                 self._next_line = now + _NEXT_LINE if told else self._next_line
                 task(number + 1)
                 if told:
-                    times = (f"{now - before:.1f} s", *_times_of(bar))
-                    self.say(f"{_name_of(bar)}: {', '.join((_amount_of(bar), *times))}")
+                    amount, times = _amount_and_times(bar)
+                    self.say(f"{_name_of(bar)}: {', '.join((amount, f'{now - before:.1f} s', *times))}")
                 before = now
         if lines and self._console.is_terminal and (bar.elapsed or 0) >= _LONG:
-            self.say(f"{name}: {_amount_of(bar)}, {_times_of(bar)[0]}")
+            amount, times = _amount_and_times(bar)
+            self.say(f"{name}: {amount}, {times[0]}")
 
 
 class _State(ProgressColumn):
     """The amount, the named times and the remark of a task."""
 
     def render(self, task: Bar) -> Text:
-        return Text(", ".join(filter(None, (_amount_of(task), *_times_of(task), task.fields["remark"]))), no_wrap=True)
+        amount, times = _amount_and_times(task)
+        return Text(", ".join(filter(None, (amount, *times, task.fields["remark"]))), no_wrap=True)
 
 
 def _name_of(bar: Bar) -> str:
@@ -196,22 +191,14 @@ def _name_of(bar: Bar) -> str:
     return f"{bar.description} {bar.fields['remark']}".rstrip()
 
 
-def _speed_of(bar: Bar) -> float:
-    """Return the amount of a second, 0 if it is not known."""
-    return (bar.completed - bar.fields["before"]) / bar.elapsed if bar.elapsed else 0.0
-
-
-def _amount_of(bar: Bar) -> str:
-    """Return the amount done, the total and, of bytes, the speed."""
-    done, total, speed = int(bar.completed), bar.total, _speed_of(bar)
-    if bar.fields["unit"] == "items":
-        return f"{done}" if total is None else f"{done} of {int(total)}"
-    of_total = "" if total is None else f" of {megabytes(total)}"
-    return megabytes(done) + of_total + (f", {megabytes(speed)}/s" if speed else "")
-
-
-def _times_of(bar: Bar) -> list[str]:
-    """Return the elapsed and, if it is known, the remaining time."""
-    left, speed = bar.remaining, _speed_of(bar)
+def _amount_and_times(bar: Bar) -> tuple[str, list[str]]:
+    """Return the amount done, of bytes with the speed, and the elapsed and, if it is known, the remaining time."""
+    elapsed, left, of_bytes = bar.elapsed or 0.0, bar.remaining, bar.fields["unit"] == "bytes"
+    speed = (bar.completed - bar.fields["before"]) / elapsed if elapsed else 0.0
+    amount = " of ".join(
+        megabytes(size) if of_bytes else f"{size:.0f}" for size in (bar.completed, bar.total) if size is not None
+    )
+    if of_bytes and speed:
+        amount += f", {megabytes(speed)}/s"
     remaining = [f"remaining {clock(left / speed)}"] if left is not None and speed else []
-    return [f"elapsed {clock(bar.elapsed or 0.0)}", *remaining]
+    return amount, [f"elapsed {clock(elapsed)}", *remaining]

@@ -17,7 +17,6 @@ import threading
 import time
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
@@ -72,24 +71,17 @@ def exit_code() -> int:
     return 128 + (_came[0] if _came else signal.SIGINT)
 
 
-@dataclass
-class Deferred:
-    """The number of the signal that has come meanwhile, 0 for none."""
-
-    number: int = 0
-
-
 @contextlib.contextmanager
-def deferred() -> Iterator[Deferred]:
-    """Within this context the first signal is only noted; a second one kills the process.
+def deferred() -> Iterator[list[int]]:
+    """Within this context the first signal is only noted, in the list that is yielded; a second one kills the process.
 
     SIGUSR2 is noted, too, if there is a handler for it: submitit's, which requeues the job. SIGTERM then has no effect,
     as under submitit. The caller passes the signal on to its handler with :func:`signal.raise_signal`.
     """
-    noted = Deferred()
+    noted: list[int] = []
 
     def note(number: int, _: FrameType | None) -> None:
-        noted.number = number
+        noted.append(number)
         signal.signal(number, signal.SIG_DFL)
         if number == signal.SIGINT:
             os.write(2, b"stopping after this step (Ctrl-C again stops at once)\n")

@@ -9,7 +9,7 @@ import signal
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +20,10 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.plugins.environments import ClusterEnvironment, LightningEnvironment
 
 from dsr.utils.checkpoints import AtomicCheckpoints, Interruption
-from dsr.utils.configuration import ConfigError
+from dsr.utils.configuration import ConfigError, Node, build
 from dsr.utils.console import one_line
 from dsr.utils.files import FullDiskError, replacing, space_for
-from dsr.utils.progress import Progress, Task
+from dsr.utils.progress import Progress, Task, ignore
 from dsr.utils.runs_table import SCORES, list_scores
 
 LOG_EVERY = 10  # steps between two values of a training in its log
@@ -73,8 +73,8 @@ class StepProgress(Callback):
     def __init__(self, progress: Progress, name: str, subject: str = "") -> None:
         self._progress, self._name, self._subject = progress, name, f"{subject}: " if subject else ""
         self._stack, self._validation = contextlib.ExitStack(), contextlib.ExitStack()
-        self._steps: Task = lambda *_, **__: None
-        self._scenes: Task = lambda *_, **__: None
+        self._steps: Task = ignore
+        self._scenes: Task = ignore
         self._fetched, self._validated = 0.0, 0
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
@@ -126,11 +126,6 @@ class LastValidation(Callback):
 
     def __init__(self, interval: int) -> None:
         self._interval = interval
-        self.started = False  # and so what was to be restored is restored
-
-    def on_train_start(self, *_: Any) -> None:
-        """Note that the training starts."""
-        self.started = True
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
         """Let Lightning stop, which runs a validation."""
@@ -144,34 +139,37 @@ def make_trainer(
     interval: int,
     *,
     callbacks: Sequence[Callback],
+    node: Node | None = None,
     devices: int = 1,
     accumulate: int = 1,
     environment: ClusterEnvironment | None = None,
-    make: Callable[..., lightning.Trainer] | None = None,
     **named: Any,
 ) -> lightning.Trainer:
-    """Return a trainer that ``make`` makes, for a number of steps, with a validation after every ``interval`` of them.
+    """Return a trainer for a number of steps, with a validation after every ``interval`` of them.
 
-    Without an ``environment`` Lightning starts the processes of several devices, whatever Slurm or MPI say.
+    The arguments of a ``node`` of the configuration go before those that are given here. Without an ``environment``
+    Lightning starts the processes of several devices, whatever Slurm or MPI say.
     """
-    index: int | None = device.index  # torch's stubs say int
+    given = {
+        "accelerator": "gpu" if device.type == "cuda" else device.type,
+        "devices": devices if device == torch.device(device.type) else [device.index],
+        "max_steps": steps,
+        "accumulate_grad_batches": accumulate,
+        "val_check_interval": interval * accumulate,
+        "check_val_every_n_epoch": None,
+        "callbacks": [LastValidation(interval), *callbacks],
+        "plugins": [AtomicCheckpoints(), environment or LightningEnvironment()],
+        "use_distributed_sampler": False,
+        "log_every_n_steps": min(LOG_EVERY, interval),
+        "enable_progress_bar": False,
+        "enable_model_summary": False,
+        "num_sanity_val_steps": 0,
+        **named,
+    }
     with without_chatter():
-        return (make or lightning.Trainer)(
-            accelerator="gpu" if device.type == "cuda" else device.type,
-            devices=devices if index is None or devices > 1 else [index],
-            max_steps=steps,
-            accumulate_grad_batches=accumulate,
-            val_check_interval=interval * accumulate,
-            check_val_every_n_epoch=None,
-            callbacks=[LastValidation(interval), *callbacks],
-            plugins=[AtomicCheckpoints(), environment or LightningEnvironment()],
-            use_distributed_sampler=False,
-            log_every_n_steps=min(LOG_EVERY, interval),
-            enable_progress_bar=False,
-            enable_model_summary=False,
-            num_sanity_val_steps=0,
-            **named,
-        )
+        if node is None:
+            return lightning.Trainer(**given)
+        return build("trainer", node, {key: value for key, value in given.items() if key not in node})
 
 
 def fit(
@@ -182,7 +180,7 @@ def fit(
     **named: Any,
 ) -> None:
     """Train; KeyboardInterrupt if it is interrupted, ConfigError if the checkpoint to go on from is none of it."""
-    callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
+    saving = next((each for each in trainer.checkpoint_callbacks if isinstance(each, Interruption)), None)
     before = signal.getsignal(signal.SIGINT)
     try:
         with without_chatter(), space_for(Path(trainer.log_dir or trainer.default_root_dir)):
@@ -193,7 +191,7 @@ def fit(
     except (OSError, FullDiskError, MemoryError, torch.OutOfMemoryError):
         raise
     except Exception as error:
-        if resume is None or any(isinstance(each, LastValidation) and each.started for each in callbacks):
+        if resume is None or (saving is not None and saving.started):
             raise
         what = one_line(error).removeprefix(f"{resume}: ")
         raise ConfigError(
@@ -204,9 +202,9 @@ def fit(
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGINT, before)  # which Lightning ignores after an interruption
     if trainer.interrupted:
-        for each in callbacks:
-            if isinstance(each, Interruption) and callable(signal.getsignal(each.signal.number or signal.SIGINT)):
-                signal.raise_signal(each.signal.number or signal.SIGINT)  # to who else waits for it, such as submitit
+        number = saving.signals[0] if saving is not None and saving.signals else signal.SIGINT
+        if saving is not None and callable(signal.getsignal(number)):
+            signal.raise_signal(number)  # to who else waits for it, such as submitit
         raise KeyboardInterrupt
 
 

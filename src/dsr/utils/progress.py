@@ -58,32 +58,23 @@ SILENT = Progress()
 
 
 class StepsProgress(Progress):
-    """Reports only the steps of the outermost task, to a function.
-
-    Args:
-        steps: is called with the number of steps done and their total, at the end with both equal; None for no report.
-
-    """
+    """Reports only the task ``steps``, to a function, at its end with all steps done; None for no report."""
 
     def __init__(self, steps: Steps | None) -> None:
-        self._steps, self._busy = steps, False
+        self._steps = steps
 
     @contextlib.contextmanager
     def task(self, name: str, total: int | None = None, *, done: int = 0, unit: Unit = "items") -> Iterator[Task]:
-        """Return a context in which the steps of a task are reported, unless it is part of another."""
+        """Return a context in which the steps of a task are reported."""
         steps, all_steps = self._steps, total or 0
-        if steps is None or self._busy:
+        if steps is None or name != "steps":
             yield ignore
             return
 
         def report(done: int, total: int | None = None, remark: str | None = None) -> None:
             steps(done, total or all_steps)
 
-        self._busy = True
-        try:
-            yield report
-        finally:
-            self._busy = False
+        yield report
         steps(all_steps, all_steps)
 
 
