@@ -74,14 +74,16 @@ _BETWEEN_ROUNDS = 0.3  # seconds, where other commands work on all scenes that a
 _WORTH_WORKERS = 30.0  # seconds of work from which workers are started, which take some to begin
 
 
-def evaluate(config: DictConfig) -> pd.DataFrame:
-    """Evaluate one method on one data set: write predictions, scores and pictures, print a table, return the scores.
+def evaluate(config: DictConfig) -> float:
+    """Evaluate one method on one data set: write predictions, scores and pictures, and print a table.
 
-    ``run=RUN_DIR`` evaluates the network of a training, on its own validation scenes unless a data set is given; of
-    several data sets the tables are concatenated. If a scene fails, the others' results are written before the error.
+    ``run=RUN_DIR`` evaluates the network of a training, on its own validation scenes unless a data set is given. If a
+    scene fails, the others' results are written before the error. Returns the mean over all scenes of RMSE_v, or of the
+    first metric without it, for sweepers.
     """
     scores = [_run(*_prepare(*study)) for study in _studies(config)]
-    return pd.concat(scores, ignore_index=True)
+    means = headline_means(pd.concat(scores, ignore_index=True))
+    return means.get(_OBJECTIVE, next(iter(means.values()), math.nan))
 
 
 def plan(config: DictConfig) -> list[Plan]:
@@ -94,12 +96,6 @@ def plan(config: DictConfig) -> list[Plan]:
         done = 0 if prepared.settings.overwrite else there
         plans.append(Plan(prepared.folder, prepared.identity, "scene", len(scenes) - done, done))
     return plans
-
-
-def objective(scores: pd.DataFrame) -> float:
-    """Return the objective of sweepers: the mean over the scenes of RMSE_v, or of the first metric without it."""
-    means = headline_means(scores)
-    return means.get(_OBJECTIVE, next(iter(means.values()), math.nan))
 
 
 def _studies(config: DictConfig) -> Iterator[tuple[dict[str, Any], Any, SceneSource | None]]:
