@@ -40,17 +40,16 @@ from dsr.degradation.downsampling import Downsampling, Measured
 from dsr.degradation.holes import Holes
 from dsr.degradation.noise import Noise
 from dsr.evaluation.results import Run as StoredRun
+from dsr.evaluation.results import load_errors, prediction_path
 from dsr.evaluation.run_files import read_run
 from dsr.evaluation.scenes import (
     Evaluation,
     SceneResult,
-    StalePredictionError,
     evaluate_scene,
     failure_line,
     headline_means,
     write_tables,
 )
-from dsr.evaluation.store import load_errors, prediction_path
 from dsr.inference.selection import Selection, select
 from dsr.methods.base import WORKSPACE, Method
 from dsr.methods.networks.weight_files import files_of_weights
@@ -276,10 +275,7 @@ def _run(prepared: _Prepared, method: Method, progress: ConsoleProgress) -> pd.D
         study = _study(prepared, method)
         for remark in method.remarks(source.name, source.scenes(), study.scale):
             note_once(remark)
-        try:
-            results = _evaluate_scenes(prepared, study, progress)
-        except StalePredictionError as error:
-            raise ConfigError(str(error)) from error
+        results = _evaluate_scenes(prepared, study, progress)
         scores = write_tables(study, results)
         run = read_run(folder)
         save_dashboard(run)

@@ -14,7 +14,7 @@ from matplotlib.colors import Normalize
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
-from dsr.evaluation.results import Run, formats_of, method_settings
+from dsr.evaluation.results import Results, Run, method_settings
 from dsr.geometry.lights import LIGHT_NAMES
 from dsr.geometry.surface import render
 from dsr.metrics.catalogue import KNOWN_FORMATS
@@ -56,7 +56,7 @@ def _write_scores(writer: SummaryWriter, run: Run) -> None:
     scored = list(run.scores["scene"].unique())
     means: dict[str, float] = {}
     more = {name: KNOWN_FORMATS[name] for name in LOOKS if (run.scores["metric"] == name).any()}
-    formats = formats_of([run]) | more
+    formats = Results((run,)).formats | more
     by_light: list[str] = []
     for name, each in formats.items():
         rows = run.scores[run.scores["metric"] == name]
