@@ -61,8 +61,7 @@ from dsr.utils.compute_device import fast_precision, pick_device
 from dsr.utils.configuration import ConfigError
 from dsr.utils.console import ConsoleProgress, note_once, open_console, print_error, show
 from dsr.utils.guards import free_memory
-from dsr.utils.locks import free_first
-from dsr.utils.pool import LOST, Pool, computing_threads
+from dsr.utils.processes import LOST, Pool, computing_threads, free_first
 from dsr.utils.progress import SILENT, Progress
 from dsr.utils.ratios import NATIVE, match_ratio
 from dsr.utils.versions import hash_once
