@@ -68,9 +68,9 @@ def _is_count(value: object, most: float = math.inf) -> bool:
 class RunConfig:
     """The configuration that all commands have.
 
-    The groups (dataset, downsampling, noise, method, model) are nodes for ``hydra.utils.instantiate``, which
-    :func:`dsr.utils.configuration.build` makes, too; it checks their keys against what the class or function that they
-    name takes. ``names`` has the choices of the groups.
+    The groups (dataset, downsampling, noise, method, model) are nodes, whose keys
+    :func:`dsr.utils.configuration.build` checks against what the class or function that they name takes. ``names`` has
+    the choices of the groups.
     """
 
     names: dict[str, Any] = field(default_factory=lambda: {"dataset": None})
@@ -281,10 +281,8 @@ def plain_config(config: DictConfig) -> dict[str, Any]:
                 all_of_them = f", metrics.protocols={value} computes all of them" if group == "metrics" else ""
                 raise ConfigError(f"{group}: expected one choice, got a list; -m runs each of several{all_of_them}")
         named |= {group: name for group, name in choices.items() if group in NAMED}
-    plain["names"] = named | {
-        group: str(name) for group, name in (plain.get("names") or {}).items() if name is not None
-    }
-    return plain
+    given = {group: str(name) for group, name in (plain.get("names") or {}).items() if name is not None}
+    return {**plain, "names": named | given}
 
 
 def register() -> None:
