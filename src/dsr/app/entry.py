@@ -30,7 +30,6 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from dsr.app.composition import register_resolvers
 from dsr.app.schema import (
     EvalConfig,
     Identity,
@@ -73,7 +72,6 @@ def run_command(name: str, command: Callable[[DictConfig], Any], arguments: Sequ
     a multirun fails, the others of its batch go on. Sweepers minimise the number that the command returns.
     """
     register()
-    register_resolvers()
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra then raises exceptions instead of printing them
     begun: list[DictConfig] = []
     process = sys.argv
@@ -100,7 +98,7 @@ def _job(command: Callable[[DictConfig], Any], argv: list[str], begun: list[Dict
 
     def job(config: DictConfig) -> Any:
         if os.getpid() != pid:
-            register_resolvers()
+            register()
             if os.getppid() == pid:  # of a launcher on this machine
                 interruption.end_with(pid)
         begun.append(config)

@@ -14,6 +14,8 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from dsr.utils.configuration import ConfigError, build
+from dsr.utils.console import note_once
+from dsr.utils.files import data_root
 from dsr.utils.guards import did_you_mean, is_number
 from dsr.utils.ratios import NATIVE, SCALES
 
@@ -286,9 +288,21 @@ def plain_config(config: DictConfig) -> dict[str, Any]:
 
 
 def register() -> None:
-    """Register the schemas with Hydra."""
+    """Register the schemas with Hydra, and ``${present:NAME,NAME}``: those data sets that are on this machine."""
     ConfigStore.instance().store(name="eval_schema", node=EvalConfig)
     ConfigStore.instance().store(name="train_schema", node=TrainConfig)
+    OmegaConf.register_new_resolver("present", _present, replace=True)
+
+
+def _present(*names: str) -> str:
+    """Return the data sets that are on this machine or embedded, separated by commas; print a note on the others."""
+    from dsr.data.download.collections import CATALOGUE  # noqa: PLC0415 - only a few experiments ask for it
+
+    folders = {name: CATALOGUE[name].folders if name in CATALOGUE else () for name in names}
+    absent = [name for name in names if not all((data_root() / folder).is_dir() for folder in folders[name])]
+    if absent:
+        note_once(f"left out, as not in {data_root()}: {', '.join(absent)}; `dsr data get NAME` gets one")
+    return ",".join(name for name in names if name not in absent)
 
 
 @dataclass(frozen=True)

@@ -51,12 +51,7 @@ def sample_path(folder: Path, scene: str, source: str = "") -> Path:
 def load_errors(path: Path) -> tuple[Tensor, Tensor] | None:
     """Return the expected errors of a prediction, (1, H, W): depth in metres, normal in degrees; None without them."""
     maps = _read_maps(path, _ERRORS)
-    if "depth_error" not in maps:
-        return None
-    if len(maps) < len(_ERRORS):
-        raise ValueError(_DAMAGED.format(path))
-    depth, angle = (maps[name].float() for name in _ERRORS)
-    return depth, angle
+    return (maps["depth_error"].float(), maps["angle_error"].float()) if len(maps) == len(_ERRORS) else None
 
 
 def load_prediction(path: Path) -> Tensor:

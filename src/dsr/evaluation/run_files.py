@@ -254,15 +254,13 @@ def _identity_of_method(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 def _distinguishing_suffixes(names: Sequence[Any], settings: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return a suffix for each name, such as " (ensemble=1)": the settings in which equal names differ."""
-    added = []
-    namesakes: dict[Any, list[Mapping[str, Any]]] = {}
+    suffixes = []
     for name, own in zip(names, settings, strict=True):
-        namesakes.setdefault(name, []).append(own)
-    for name, own in zip(names, settings, strict=True):
-        keys = [key for key in own if any(other.get(key) != own[key] for other in namesakes[name])]
+        others = [other for same, other in zip(names, settings, strict=True) if same == name]
+        keys = [key for key in own if any(other.get(key) != own[key] for other in others)]
         text = ", ".join(f"{key}={own[key]}" for key in keys if own[key] is not None)
-        added.append(f" ({text})" if text else "")
-    return added
+        suffixes.append(f" ({text})" if text else "")
+    return suffixes
 
 
 def _newest(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:

@@ -97,7 +97,9 @@ def _write_pictures(
     if scene.depth is not None:
         shades.append(render(normals_seen_by(scene.camera, scene.depth))[0])
     rows = [torch.cat(list(reduced(each, _PANEL)), dim=-1) for each in shades]
-    writer.add_image(f"renderings/{scene.scene}", _grey(torch.cat(rows, dim=-2)), number, dataformats="HWC")
+    grey = colours("gray")(np.ma.masked_invalid(torch.cat(rows, dim=-2).numpy()))  # with holes in their colour
+    picture = (grey[..., :3] * 255).round().astype(np.uint8)
+    writer.add_image(f"renderings/{scene.scene}", picture, number, dataformats="HWC")
     reference = depth if scene.depth is None else scene.depth
     if scene.depth is not None:
         picture = _error(depth - scene.depth, reference)
@@ -105,11 +107,6 @@ def _write_pictures(
     if errors is not None:
         picture = _error(torch.where(depth.isfinite(), errors[0], torch.nan), reference)
         writer.add_image(f"expected_error/{scene.scene}", picture, number, dataformats="HWC")
-
-
-def _grey(values: Tensor) -> np.ndarray:
-    """Convert (H, W) in [0, 1] to grey levels with holes in the hole colour, (H, W, 3) uint8."""
-    return (colours("gray")(np.ma.masked_invalid(values.numpy()))[..., :3] * 255).round().astype(np.uint8)
 
 
 def _error(error: Tensor, reference: Tensor) -> np.ndarray:
