@@ -18,8 +18,8 @@ import pytest
 import torch
 
 from dsr.degradation.downsampling import Downsampling, make_sample
+from dsr.evaluation.results import prediction_path, sample_path
 from dsr.evaluation.scenes import SCORE_COLUMNS
-from dsr.evaluation.store import prediction_path, sample_path
 from dsr.geometry.camera import Camera
 from dsr.metrics.catalogue import catalogue, score_image
 from dsr.sample import Scene

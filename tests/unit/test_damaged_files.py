@@ -30,8 +30,8 @@ from dsr.app.upsample.stored import _read_record, read_result
 from dsr.data.download.fetching import Checksums, unpack
 from dsr.data.folder import Folder, load_scene
 from dsr.data.matlab import read_variables
+from dsr.evaluation.results import load_errors, load_prediction, prediction_path, sample_path
 from dsr.evaluation.run_files import load_results, read_run
-from dsr.evaluation.store import load_errors, load_prediction, prediction_path, sample_path
 from dsr.geometry.camera import Camera
 from dsr.io.cameras import read_any_camera
 from dsr.io.captures.arkit import find_arkitscenes, find_polycam

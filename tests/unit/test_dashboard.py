@@ -9,8 +9,8 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams import plugin_data_pb2
 
+from dsr.evaluation.results import sample_path
 from dsr.evaluation.run_files import load_results, read_run
-from dsr.evaluation.store import sample_path
 from dsr.geometry.surface import render
 from dsr.pictures.depth_views import normals_seen_by
 from dsr.report.dashboard import save_dashboard

@@ -42,7 +42,7 @@ USAGE_ERRORS = {
     "dataset.rot=x": r"dataset.rot: unknown key; expected .* root, .*; \+dataset.rot=.*; did you mean root\?",
     "seed=four": "seed: ",
     "overwrite=maybe": "overwrite: ",
-    "method=null": "",
+    "method=null": "method=null: ",
     "method=": "method=: ",
     "scale": "scale: expected KEY=VALUE",
     "output_dir=a=b": "output_dir=a=b: expected KEY=VALUE",

@@ -7,8 +7,8 @@ from itertools import product
 import pytest
 from omegaconf import OmegaConf
 
-from dsr.app.composition import compose, register_resolvers
-from dsr.app.schema import EvalConfig, TrainConfig, plain_config
+from dsr.app.composition import compose
+from dsr.app.schema import EvalConfig, TrainConfig, plain_config, register
 from dsr.app.training_runs import training_data
 from dsr.methods.base import Method
 from dsr.methods.weights import packaged_names
@@ -27,7 +27,7 @@ def experiment(name, command, *overrides):
 
 def sweep_of(name):
     """Return the overrides of each job of an experiment."""
-    register_resolvers()
+    register()
     params = OmegaConf.load(FOLDER / f"{name}.yaml").hydra.sweeper.params
     keys = [(str(key), str(value).split(",")) for key, value in params.items()]
     return [[f"{key}={value}" for (key, _), value in zip(keys, values, strict=True)]

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from dsr.cli import main
+from dsr.evaluation.results import prediction_path, sample_path
 from dsr.evaluation.run_files import load_results
-from dsr.evaluation.store import iterations_path, prediction_path, sample_path
 from dsr.sample import DepthSample
 from dsr.utils.guards import OutsideError, path_within
 
@@ -133,7 +133,7 @@ def test_run_whose_scenes_are_links_to_outside_is_refused(make_run, tmp_path, pl
         load_results([run])
 
 
-@pytest.mark.parametrize("path", [iterations_path, prediction_path, sample_path])
+@pytest.mark.parametrize("path", [prediction_path, sample_path])
 def test_files_of_a_scene_that_leads_outside_have_no_path(folder, path):
     with pytest.raises(OutsideError, match=r"scene: expected a name within"):
         path(folder, UP)

@@ -6,9 +6,8 @@ import os
 import pytest
 import torch
 
-from dsr.evaluation.results import BenchmarkSetting
+from dsr.evaluation.results import BenchmarkSetting, sample_path
 from dsr.evaluation.run_files import load_results
-from dsr.evaluation.store import sample_path
 from dsr.sample import DepthSample
 
 

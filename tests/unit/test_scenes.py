@@ -14,8 +14,8 @@ import torch
 
 from dsr.degradation.downsampling import Downsampling, Measured, make_sample
 from dsr.degradation.noise import GaussianMultiplicative
+from dsr.evaluation.results import load_prediction
 from dsr.evaluation.scenes import SCORE_COLUMNS, Evaluation, StalePredictionError, evaluate_scene, write_tables
-from dsr.evaluation.store import load_prediction
 from dsr.geometry.camera import Camera
 from dsr.methods.base import Method, NoSolutionError
 from dsr.metrics.catalogue import catalogue, score_image

@@ -12,8 +12,7 @@ import torch
 
 from dsr.report.worker_pool import WorkerPool
 from dsr.utils.files import replacing
-from dsr.utils.locks import LOCKS, InUseError, at_work, free_first, scene_lock
-from dsr.utils.pool import Pool
+from dsr.utils.processes import LOCKS, InUseError, Pool, at_work, free_first, scene_lock
 
 SPAWN = multiprocessing.get_context("spawn")
 

@@ -1,11 +1,13 @@
 """``train.py`` and ``eval.py`` as Hydra's commands: a mistake of the user is one line on stderr and exit code 2.
 
 torch and Lightning take seconds to import. A command's module is therefore imported only after its configuration has
-been composed and checked, so that a mistyped argument is reported immediately.
+been composed and checked, so that a mistyped argument is reported immediately. A multirun is refused before its first
+job begins if one of its jobs cannot be run, with a line for each of these.
 """
 
 from __future__ import annotations
 
+import copy
 import importlib
 import os
 import re
@@ -16,17 +18,22 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import hydra
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra._internal.utils import get_args_parser
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from hydra.experimental.callback import Callback
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from dsr.app.composition import register_resolvers
 from dsr.app.schema import (
     EvalConfig,
+    Identity,
+    Plan,
     TrainConfig,
     explain_value,
     given_overrides,
@@ -36,19 +43,14 @@ from dsr.app.schema import (
 )
 from dsr.utils import interruption
 from dsr.utils.configuration import ConfigError, config_directories
-from dsr.utils.console import USAGE_ERROR, one_line, print_error
+from dsr.utils.console import USAGE_ERROR, one_line, open_console, print_error, show
 from dsr.utils.files import FullDiskError
 from dsr.utils.guards import OutOfMemoryError, did_you_mean, refusing_excess
 
 
 def run_eval(arguments: Sequence[str] | None = None) -> None:
     """Run ``eval.py``, which is ``dsr eval``, with the given arguments or those of the process."""
-
-    def command(config: DictConfig) -> Any:
-        module = module_of("eval", config)
-        return module.objective(module.evaluate(config))
-
-    run_command("eval", command, arguments)
+    run_command("eval", lambda config: module_of("eval", config).evaluate(config), arguments)
 
 
 def run_train(arguments: Sequence[str] | None = None) -> None:
@@ -70,7 +72,6 @@ def run_command(name: str, command: Callable[[DictConfig], Any], arguments: Sequ
     a multirun fails, the others of its batch go on. Sweepers minimise the number that the command returns.
     """
     register()
-    register_resolvers()
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra then raises exceptions instead of printing them
     begun: list[DictConfig] = []
     process = sys.argv
@@ -85,7 +86,8 @@ def run_command(name: str, command: Callable[[DictConfig], Any], arguments: Sequ
     except (OSError, FullDiskError, ValueError, YAMLError, RecursionError, BrokenExecutor) as error:
         if begun and isinstance(error, ValueError | RecursionError) and not isinstance(error, ConfigError):
             raise  # a defect of the command's
-        fail(_damaged_file() or one_line(error))
+        of_hydra = isinstance(error, ValueError) and not isinstance(error, ConfigError)  # which names no key
+        fail(_damaged_file() or (f"{' '.join(sys.argv[1:])}: {one_line(error)}" if of_hydra else one_line(error)))
     finally:
         sys.argv = process
 
@@ -96,7 +98,7 @@ def _job(command: Callable[[DictConfig], Any], argv: list[str], begun: list[Dict
 
     def job(config: DictConfig) -> Any:
         if os.getpid() != pid:
-            register_resolvers()
+            register()
             if os.getppid() == pid:  # of a launcher on this machine
                 interruption.end_with(pid)
         begun.append(config)
@@ -158,3 +160,49 @@ def explain(error: Exception) -> str:
     if "No match in the defaults list" in str(error):
         return f"{key}: expected a choice that the command has; +{key}=... adds one"
     return explain_value(cause, key) if isinstance(cause, OmegaConfBaseException) else one_line(error)
+
+
+class CheckJobs(Callback):
+    """Hydra's callback that plans each job of a multirun of Hydra's own sweeper, and prints how much there is to do."""
+
+    def on_multirun_start(self, config: DictConfig, config_name: str | None = None, **_: Any) -> None:
+        """Exit with 2 if a job cannot be run."""
+        if not str(config.hydra.sweeper._target_).endswith(".BasicSweeper"):
+            return  # its jobs are not known beforehand
+        loader: Any = GlobalHydra.instance().config_loader()
+        given = [f"{key}={value}" for key, value in (config.hydra.sweeper.params or {}).items()]
+        given += OmegaConf.to_container(config.hydra.overrides.task)  # type: ignore[arg-type]
+        try:
+            overrides = OverridesParser.create(loader).parse_overrides(given)
+            [jobs] = BasicSweeper.split_arguments(overrides, None)
+            composed = [(job, loader.load_sweep_config(config, job)) for job in jobs]
+        except HydraException as error:
+            fail(explain(error))
+        plans: list[Plan] = []
+        problems: list[str] = []
+        owners: dict[Path, Identity] = {}
+        before = HydraConfig.instance().cfg
+        for job, whole in composed:
+            HydraConfig.instance().set_config(whole)
+            own = copy.deepcopy(whole)
+            with read_write(own), open_dict(own):
+                del own["hydra"]
+            try:
+                for plan in module_of(str(config_name), own).plan(own):
+                    plans.append(plan)
+                    if owners.setdefault(plan.folder.resolve(), plan.identity) != plan.identity:
+                        raise ConfigError(
+                            f"output_dir: expected a directory for each job, got {plan.folder} for several"
+                        )
+            except (ConfigError, OSError, OmegaConfBaseException) as error:
+                problems.append(f"{' '.join(job)}: {one_line(error)}")
+        HydraConfig.instance().cfg = before
+        if problems:
+            print_error(f"{len(problems)} of the jobs cannot be run, so none is begun")
+            for problem in problems:
+                print_error(problem)
+            sys.exit(USAGE_ERROR)
+        left, done = sum(plan.left for plan in plans), sum(plan.done for plan in plans)
+        more = f" ({done} more are complete)" if done else ""
+        for unit in {plan.unit for plan in plans}:
+            show(open_console(), f"{len(plans)} runs, {unit}s to do: {left}{more}")

@@ -11,7 +11,7 @@ import random
 import shutil
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal
@@ -40,17 +40,16 @@ from dsr.degradation.downsampling import Downsampling, Measured
 from dsr.degradation.holes import Holes
 from dsr.degradation.noise import Noise
 from dsr.evaluation.results import Run as StoredRun
+from dsr.evaluation.results import load_errors, prediction_path
 from dsr.evaluation.run_files import read_run
 from dsr.evaluation.scenes import (
     Evaluation,
     SceneResult,
-    StalePredictionError,
     evaluate_scene,
     failure_line,
     headline_means,
     write_tables,
 )
-from dsr.evaluation.store import load_errors, prediction_path
 from dsr.inference.selection import Selection, select
 from dsr.methods.base import WORKSPACE, Method
 from dsr.methods.networks.weight_files import files_of_weights
@@ -62,33 +61,32 @@ from dsr.utils.compute_device import fast_precision, pick_device
 from dsr.utils.configuration import ConfigError
 from dsr.utils.console import ConsoleProgress, note_once, open_console, print_error, show
 from dsr.utils.guards import free_memory
-from dsr.utils.locks import free_first
-from dsr.utils.pool import LOST, Pool, computing_threads
+from dsr.utils.processes import Pool, computing_threads, free_first
 from dsr.utils.progress import SILENT, Progress
 from dsr.utils.ratios import NATIVE, match_ratio
 from dsr.utils.versions import hash_once
 
 _OBJECTIVE = "RMSE_v"
 _MEMORY = 1 << 30  # bytes of free memory that the automatic number of workers leaves to each
-_BETWEEN_ROUNDS = 0.3  # seconds, where other commands work on all scenes that are left
 _WORTH_WORKERS = 30.0  # seconds of work from which workers are started, which take some to begin
 
 
-def evaluate(config: DictConfig) -> pd.DataFrame:
-    """Evaluate one method on one data set: write predictions, scores and pictures, print a table, return the scores.
+def evaluate(config: DictConfig) -> float:
+    """Evaluate one method on one data set: write predictions, scores and pictures, and print a table.
 
-    ``run=RUN_DIR`` evaluates the network of a training, on its own validation scenes unless a data set is given; of
-    several data sets the tables are concatenated. If a scene fails, the others' results are written before the error.
+    ``run=RUN_DIR`` evaluates the network of a training, on its own validation scenes unless a data set is given. If a
+    scene fails, the others' results are written before the error. Returns the mean over all scenes of RMSE_v, or of the
+    first metric without it, for sweepers.
     """
-    scores = [_run(*_prepare(*study)) for study in _studies(config)]
-    return pd.concat(scores, ignore_index=True)
+    scores = [_run(*study) for study in _studies(config)]
+    means = headline_means(pd.concat(scores, ignore_index=True))
+    return means.get(_OBJECTIVE, next(iter(means.values()), math.nan))
 
 
 def plan(config: DictConfig) -> list[Plan]:
     """Check what :func:`evaluate` would run as a job of a multirun; nothing is computed or written."""
     plans = []
-    for each in _studies(config):
-        prepared, _, _ = _prepare(*each, here=runs_here())
+    for prepared, _, _ in _studies(config, here=runs_here()):
         scenes = prepared.source.scenes()
         there = sum(prediction_path(prepared.folder, scene).is_file() for scene in scenes)
         done = 0 if prepared.settings.overwrite else there
@@ -96,23 +94,17 @@ def plan(config: DictConfig) -> list[Plan]:
     return plans
 
 
-def objective(scores: pd.DataFrame) -> float:
-    """Return the objective of sweepers: the mean over the scenes of RMSE_v, or of the first metric without it."""
-    means = headline_means(scores)
-    return means.get(_OBJECTIVE, next(iter(means.values()), math.nan))
-
-
-def _studies(config: DictConfig) -> Iterator[tuple[dict[str, Any], Any, SceneSource | None]]:
-    """Yield what to evaluate: configurations, their methods' nodes, data sets (None for the configuration's own)."""
+def _studies(config: DictConfig, *, here: bool = True) -> Iterator[tuple[_Prepared, Method, ConsoleProgress]]:
+    """Prepare what to evaluate: one method on one data set, or a training's network on its validation scenes."""
     plain = plain_config(config)
     if plain["run"] is None:
         raw: Any = OmegaConf.to_container(config, resolve=False)  # for scales other than the run's
-        yield plain, raw["method"], None
+        yield _prepare(plain, raw["method"], None, here=here)
         return
     from dsr.app.training_runs import studies_of_run  # noqa: PLC0415 - it imports Lightning, which takes seconds
 
     for study, source in studies_of_run(plain, given_keys()):
-        yield study, study["method"], source
+        yield _prepare(study, study["method"], source, here=here)
 
 
 @dataclass(frozen=True)
@@ -133,9 +125,9 @@ class _Prepared:
 
 
 def _prepare(
-    plain: Config, node: Any, source: SceneSource | None, *, here: bool = True
+    plain: Config, node: Any, source: SceneSource | None, *, here: bool
 ) -> tuple[_Prepared, Method, ConsoleProgress]:
-    """Check all that an evaluation needs, and write nothing."""
+    """Check all that an evaluation needs, and write nothing; without a data set, it is that of the configuration."""
     settings = EvalConfig.of(plain)
     if source is None:
         if "parts" in settings.dataset:
@@ -152,7 +144,7 @@ def _prepare(
         precision = fast_precision(device) if recipe.abilities.optimises else "float32"
     own = {key: value for key, value in plain["method"].items() if key not in recipe.of_run}
     plain = {**plain, "method": own, "precision": precision, "scale": scale}
-    settings = EvalConfig.of(plain)
+    settings = replace(settings, method=own, precision=precision, scale=scale)
     weights = None if settings.weights is None else Path(settings.weights).expanduser()
     if weights is not None and recipe.abilities.needs is None:
         if not weights.is_dir():  # a directory serves all methods of a multirun
@@ -280,10 +272,7 @@ def _run(prepared: _Prepared, method: Method, progress: ConsoleProgress) -> pd.D
         study = _study(prepared, method)
         for remark in method.remarks(source.name, source.scenes(), study.scale):
             note_once(remark)
-        try:
-            results = _evaluate_scenes(prepared, study, progress)
-        except StalePredictionError as error:
-            raise ConfigError(str(error)) from error
+        results = _evaluate_scenes(prepared, study, progress)
         scores = write_tables(study, results)
         run = read_run(folder)
         save_dashboard(run)
@@ -311,26 +300,22 @@ def _evaluate_scenes(prepared: _Prepared, study: Evaluation, progress: Progress)
                     break
     if left:
         with Pool(min(workers, len(left)), _begin, (prepared, since), threads, progress.say) as pool:
-            results = _rounds(pool, list(left))
+            results = _in_workers(pool, left)
             for scene, result in progress.track(results, "evaluate", len(scenes), done=len(found), label=itemgetter(0)):
                 found[scene] = result
     return {scene: found[scene] for scene in scenes}
 
 
-def _rounds(pool: Pool, left: list[str]) -> Iterator[tuple[str, SceneResult]]:
-    """Yield the scenes with their results; those that another command works on are tried again."""
-    while left:
-        before = len(left)
-        try:
-            for scene, result in pool.results(_in_worker, tuple(left)):
+def _in_workers(pool: Pool, left: list[str]) -> Iterator[tuple[str, SceneResult]]:
+    """Yield the scenes with their results; those that other commands work on come last."""
+    try:
+        for wait in (False, True):
+            for scene, result in pool.results(functools.partial(_in_worker, wait), tuple(left)):
                 if result is not None:
                     left.remove(scene)
                     yield scene, result
-        except ChildProcessError:
-            yield from ((scene, SceneResult(failure=f"{scene}: {LOST}")) for scene in left)
-            return
-        if len(left) == before:
-            time.sleep(_BETWEEN_ROUNDS)
+    except ChildProcessError as error:
+        yield from ((scene, SceneResult(failure=f"{scene}: {error}")) for scene in left)
 
 
 _worker: tuple[Evaluation, float] | None = None  # of this process, if it is a worker
@@ -344,11 +329,11 @@ def _begin(prepared: _Prepared, since: float) -> None:
         _worker = _study(prepared, _method(prepared, SILENT)), since
 
 
-def _in_worker(scene: str) -> SceneResult | None:
-    """Evaluate a scene in a worker; None if another process works on it."""
+def _in_worker(wait: bool, scene: str) -> SceneResult | None:
+    """Evaluate a scene in a worker; None if another process works on it, unless its end is waited for."""
     assert _worker is not None  # noqa: S101 - workers begin with _begin
     study, since = _worker
-    for _ in free_first(study.folder, [scene], wait=False):
+    for _ in free_first(study.folder, [scene], wait=wait):
         return evaluate_scene(study, scene, since)
     return None
 

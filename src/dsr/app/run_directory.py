@@ -20,7 +20,7 @@ import torch
 from omegaconf import OmegaConf
 
 from dsr.app.schema import NAMED, Config, Identity, user_directories
-from dsr.utils import locks
+from dsr.utils import processes
 from dsr.utils.configuration import ConfigError, config_directories
 from dsr.utils.files import TargetError, expect_own, expect_target, write_text
 from dsr.utils.guards import parse_json, read_limited
@@ -129,7 +129,7 @@ def _changes_in(folder: Path, identity: Identity) -> list[str] | None:
     """Return the keys in which the run in a directory differs; None if the directory holds something else."""
     if not folder.is_dir():
         return None if folder.exists() else []
-    ours = (f".{Path(_RECORD).stem}-", locks.LOCKS)  # locks, and a record that another run is writing right now
+    ours = (f".{Path(_RECORD).stem}-", processes.LOCKS)  # locks, and a record that another run is writing right now
     if all(path.name.startswith(ours) for path in folder.iterdir()):
         return []
     try:
@@ -199,11 +199,11 @@ def at_work(
     record = {**versions(), "hash": _hash_of(identity), "identity": dict(identity)}
     with contextlib.ExitStack() as stack:
         try:
-            stack.enter_context(locks.at_work(folder, settings))
+            stack.enter_context(processes.at_work(folder, settings))
             different = expect_free(folder, config, identity, tolerated)
             write_text(folder / _RECORD, json.dumps(record, indent=1) + "\n")
             write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(dict(config))))
-        except locks.InUseError as error:
+        except processes.InUseError as error:
             others = "" if alone else " with other settings"
             raise ConfigError(
                 f"output_dir: {error.owner} is at work in {folder}{others}; wait for its end, or take another"

@@ -14,6 +14,8 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from dsr.utils.configuration import ConfigError, build
+from dsr.utils.console import note_once
+from dsr.utils.files import data_root
 from dsr.utils.guards import did_you_mean, is_number
 from dsr.utils.ratios import NATIVE, SCALES
 
@@ -68,9 +70,9 @@ def _is_count(value: object, most: float = math.inf) -> bool:
 class RunConfig:
     """The configuration that all commands have.
 
-    The groups (dataset, downsampling, noise, method, model) are nodes for ``hydra.utils.instantiate``, which
-    :func:`dsr.utils.configuration.build` makes, too; it checks their keys against what the class or function that they
-    name takes. ``names`` has the choices of the groups.
+    The groups (dataset, downsampling, noise, method, model) are nodes, whose keys
+    :func:`dsr.utils.configuration.build` checks against what the class or function that they name takes. ``names`` has
+    the choices of the groups.
     """
 
     names: dict[str, Any] = field(default_factory=lambda: {"dataset": None})
@@ -281,16 +283,26 @@ def plain_config(config: DictConfig) -> dict[str, Any]:
                 all_of_them = f", metrics.protocols={value} computes all of them" if group == "metrics" else ""
                 raise ConfigError(f"{group}: expected one choice, got a list; -m runs each of several{all_of_them}")
         named |= {group: name for group, name in choices.items() if group in NAMED}
-    plain["names"] = named | {
-        group: str(name) for group, name in (plain.get("names") or {}).items() if name is not None
-    }
-    return plain
+    given = {group: str(name) for group, name in (plain.get("names") or {}).items() if name is not None}
+    return {**plain, "names": named | given}
 
 
 def register() -> None:
-    """Register the schemas with Hydra."""
+    """Register the schemas with Hydra, and ``${present:NAME,NAME}``: those data sets that are on this machine."""
     ConfigStore.instance().store(name="eval_schema", node=EvalConfig)
     ConfigStore.instance().store(name="train_schema", node=TrainConfig)
+    OmegaConf.register_new_resolver("present", _present, replace=True)
+
+
+def _present(*names: str) -> str:
+    """Return the data sets that are on this machine or embedded, separated by commas; print a note on the others."""
+    from dsr.data.download.collections import CATALOGUE  # noqa: PLC0415 - only a few experiments ask for it
+
+    folders = {name: CATALOGUE[name].folders if name in CATALOGUE else () for name in names}
+    absent = [name for name in names if not all((data_root() / folder).is_dir() for folder in folders[name])]
+    if absent:
+        note_once(f"left out, as not in {data_root()}: {', '.join(absent)}; `dsr data get NAME` gets one")
+    return ",".join(name for name in names if name not in absent)
 
 
 @dataclass(frozen=True)

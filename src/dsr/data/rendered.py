@@ -17,7 +17,7 @@ from dsr.sample import Scene
 from dsr.synthetic.procedural.random_scene import PROCEDURAL_VERSION, render_random_scene
 from dsr.synthetic.rendering import cache_directory, expect_room_for, load_or_render
 from dsr.synthetic.simgeo import SCENES, SCENES_VERSION, render_scene
-from dsr.utils.pool import Pool
+from dsr.utils.processes import Pool
 from dsr.utils.progress import SILENT
 
 _WORTH_WORKERS = 5.0  # seconds of rendering from which worker processes are used; they take some seconds to start

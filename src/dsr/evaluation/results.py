@@ -1,4 +1,10 @@
-"""Runs of evaluations, for tables, figures and pages; :mod:`dsr.evaluation.run_files` reads them from files."""
+"""Runs of evaluations, for tables, figures and pages, and the files of their scenes.
+
+``scenes/SCENE.npz`` is the sample that the method was given. ``predictions/SCENE.npz``, see
+:mod:`dsr.evaluation.scenes`, is written with it, so that scoring and drawing need only the directory.
+``iterations/SCENE.csv`` is the history of a method that iterates. A name that leads out of the run is an OutsideError.
+:mod:`dsr.evaluation.run_files` reads runs from their directories.
+"""
 
 from __future__ import annotations
 
@@ -6,18 +12,21 @@ import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import pandas as pd
+import torch
 from torch import Tensor
 
-from dsr.evaluation.store import load_errors, load_prediction, prediction_path, sample_path
 from dsr.metrics.alignment import ALIGNMENTS, align_map
 from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.metrics.formats import HEADLINES, MetricFormat, complete_formats, in_tables
 from dsr.notes import LIMITS, Assumption
 from dsr.sample import DepthSample
-from dsr.utils.arrays import array_headers
+from dsr.utils.arrays import array_headers, read_arrays
+from dsr.utils.guards import TooLargeError, path_within
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 METHOD_ORDER = (
     "Nearest", "Bilinear", "Bicubic", "Bilateral", "GF", "JBU", "FGS", "Diffusion", "TGV",
@@ -25,6 +34,45 @@ METHOD_ORDER = (
 )  # fmt: skip
 """Order of the methods: simple ones, then those of the paper in the order of its tables; others follow."""
 _DATASET_ORDER = ("simgeo", "icl", "middlebury", "sunrgbd", "tofmark")
+_ERRORS = ("depth_error", "angle_error")
+_DAMAGED = "{}: expected a prediction, got a missing or damaged file"
+
+
+def prediction_path(folder: Path, scene: str, source: str = "") -> Path:
+    """Return where a run keeps the prediction of a scene, whose name is perhaps from a source to blame."""
+    return path_within(folder, scene, source or f"{folder}: scene", "predictions/{}.npz")
+
+
+def sample_path(folder: Path, scene: str, source: str = "") -> Path:
+    """Return where a run keeps the sample of a scene."""
+    return path_within(folder, scene, source or f"{folder}: scene", "scenes/{}.npz")
+
+
+def load_errors(path: Path) -> tuple[Tensor, Tensor] | None:
+    """Return the expected errors of a prediction, (1, H, W): depth in metres, normal in degrees; None without them."""
+    maps = _read_maps(path, _ERRORS)
+    return (maps["depth_error"].float(), maps["angle_error"].float()) if len(maps) == len(_ERRORS) else None
+
+
+def load_prediction(path: Path) -> Tensor:
+    """Return a predicted depth map, (1, H, W) in metres."""
+    maps = _read_maps(path, ("depth",))
+    if not maps:
+        raise ValueError(_DAMAGED.format(path))
+    return maps["depth"]
+
+
+def _read_maps(path: Path, names: tuple[str, ...]) -> dict[str, Tensor]:
+    """Return those of some maps of a prediction that there are, (1, H, W)."""
+    try:
+        arrays = read_arrays(path, names)
+    except TooLargeError:
+        raise
+    except (OSError, ValueError) as error:
+        raise ValueError(_DAMAGED.format(path)) from error
+    if any(array.ndim != 2 or array.dtype.kind != "f" for array in arrays.values()):
+        raise ValueError(_DAMAGED.format(path))
+    return {name: torch.from_numpy(array)[None] for name, array in arrays.items()}
 
 
 class BenchmarkSetting(NamedTuple):
@@ -37,44 +85,25 @@ class BenchmarkSetting(NamedTuple):
 
 @dataclass(frozen=True)
 class Run:
-    """One run of ``eval.py``: one method on one data set, at one scale, under one degradation, with one seed.
-
-    Args:
-        folder: directory of the run.
-        dataset, scale, downsampling, seed, method: as in ``scores.csv``; ``downsampling`` includes noise and holes.
-        label: displayed name of the method. Runs of a method with different settings have different labels; runs
-            that differ only in the seed have the same label.
-        scores: rows of ``scores.csv`` for the scenes in ``scenes``, in raw units.
-        seconds: computing time by scene.
-        settings: the resolved configuration.
-        versions: versions of packages, Python and the project.
-        scenes: scenes with a prediction.
-        unsolved: reason by scene why the method has no solution.
-        formats: formats of its metrics that the run stores.
-        notes: remarks on the scores of a scene, by its name.
-        truths: identifies its ground truths, by scene.
-        truth: identifies its ground truth where other runs have a different one for the same scenes, as in
-            ``dataset``; empty otherwise.
-
-    """
+    """One run of ``eval.py``: one method on one data set, at one scale, under one degradation, with one seed."""
 
     folder: Path
-    dataset: str
+    dataset: str  # this one and the next four are as in ``scores.csv``
     scale: float
-    downsampling: str
+    downsampling: str  # noise and holes included
     seed: int
     method: str
-    label: str
-    scores: pd.DataFrame
-    seconds: Mapping[str, float]
-    settings: Mapping[str, Any]
-    versions: Mapping[str, Any]
-    scenes: tuple[str, ...]
-    unsolved: Mapping[str, str] = field(default_factory=dict)
-    formats: Mapping[str, MetricFormat] = field(default_factory=dict)
-    notes: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    truths: Mapping[str, str] = field(default_factory=dict)
-    truth: str = ""
+    label: str  # name in tables; it differs between runs whose settings differ, but for the seed
+    scores: pd.DataFrame  # rows of ``scores.csv`` for the scenes in ``scenes``, in raw units
+    seconds: Mapping[str, float]  # by scene
+    settings: Mapping[str, Any]  # the resolved configuration
+    versions: Mapping[str, Any]  # of packages, Python and the project
+    scenes: tuple[str, ...]  # with a prediction
+    unsolved: Mapping[str, str] = field(default_factory=dict)  # why the method has no solution, by scene
+    formats: Mapping[str, MetricFormat] = field(default_factory=dict)  # of its metrics, that the run stores
+    notes: Mapping[str, Sequence[str]] = field(default_factory=dict)  # on the scores of a scene
+    truths: Mapping[str, str] = field(default_factory=dict)  # identify the ground truths, by scene
+    truth: str = ""  # identifies the ground truths if other runs have different ones, as in ``dataset``
 
     @property
     def problem(self) -> BenchmarkSetting:
@@ -122,16 +151,10 @@ class Run:
 
 @dataclass(frozen=True)
 class Results:
-    """Any number of runs.
-
-    Args:
-        runs: ordered by data set, scale, degradation, and then by method as in the paper's tables, and seed.
-        notes: omitted data and reasons.
-
-    """
+    """Any number of runs, ordered by data set, scale, degradation, method as in the paper's tables, and seed."""
 
     runs: tuple[Run, ...]
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # omitted data and reasons
 
     @property
     def warnings(self) -> tuple[Assumption, ...]:
@@ -164,13 +187,19 @@ class Results:
     @property
     def scores(self) -> pd.DataFrame:
         """All scores in one table, with the columns ``label`` and ``run`` besides those of ``scores.csv``."""
+        import pandas as pd  # noqa: PLC0415 - dsr upsample, which reads expected errors, needs none
+
         parts = [run.scores.assign(label=run.label, run=str(run.folder)) for run in self.runs]
         return pd.concat(parts, ignore_index=True)
 
     @property
     def formats(self) -> dict[str, MetricFormat]:
-        """See :func:`formats_of`."""
-        return formats_of(self.runs)
+        """The formats of the metrics that tables show, in the order of the columns.
+
+        Metrics that neither this installation nor a run describes show their raw values under their own names.
+        """
+        names = dict.fromkeys(str(name) for run in self.runs for name in run.scores["metric"].unique())
+        return in_tables(complete_formats(names, KNOWN_FORMATS, *(run.formats for run in self.runs)))
 
     def methods(self) -> list[str]:
         """Return the labels of the methods, in order."""
@@ -205,15 +234,6 @@ class Results:
         if not runs:
             raise ValueError("methods, datasets, scales: expected a run that fits all of them, there is none")
         return Results(runs, self.notes)
-
-
-def formats_of(runs: Sequence[Run]) -> dict[str, MetricFormat]:
-    """Return the formats of the metrics that tables of some runs show, in the order of the columns.
-
-    Metrics that neither this installation nor a run describes show their raw values under their own names.
-    """
-    names = dict.fromkeys(str(name) for run in runs for name in run.scores["metric"].unique())
-    return in_tables(complete_formats(names, KNOWN_FORMATS, *(run.formats for run in runs)))
 
 
 def alignment_note(runs: Sequence[Run]) -> str:

@@ -10,16 +10,15 @@ import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import pandas as pd
 from pydantic import BaseModel, Field
 
-from dsr.evaluation.results import Results, Run, method_key, method_settings, problem_key
-from dsr.evaluation.store import expect_scene, prediction_path, sample_path
+from dsr.evaluation.results import Results, Run, method_key, method_settings, prediction_path, problem_key, sample_path
 from dsr.metrics.formats import MetricFormat
 from dsr.utils.arrays import array_headers
-from dsr.utils.guards import MOST_TABLE, OutsideError, TooLargeError, natural_key, read_limited
+from dsr.utils.guards import MOST_TABLE, OutsideError, natural_key, read_limited, refusing
 from dsr.utils.ratios import as_ratio
 from dsr.utils.validation import Number, Whole, parse_model
 
@@ -27,11 +26,8 @@ _SCORES, _SUMMARY, _VERSIONS = "scores.csv", "summary.json", "versions.json"
 _TEXT_COLUMNS = ("dataset", "scene", "downsampling", "method", "metric", "variant")
 _NUMBER_COLUMNS = ("scale", "seed", "value", "valid_share")
 _LARGEST_SCALE = 1e6
-_LARGEST_SCORE = 1e100
-"""Whose squares can be added; an infinite score is one of its own."""
-_DIGEST = 8
-"""Number of displayed digits of a hash."""
-_Content = TypeVar("_Content", bound=BaseModel)
+_LARGEST_SCORE = 1e100  # whose squares can be added; an infinite score is one of its own
+_DIGEST = 8  # displayed digits of a hash
 
 
 def load_results(paths: Sequence[Path]) -> Results:
@@ -111,14 +107,16 @@ def _folders(paths: Sequence[Path]) -> Iterator[Path]:
 
 def read_run(folder: Path) -> Run:
     """Return one run, with the label that it has by itself."""
-    summary, versions = _read(_Summary, folder / _SUMMARY), _read(_Versions, folder / _VERSIONS)
+    summary = parse_model(_Summary, read_limited(folder / _SUMMARY), folder / _SUMMARY)
+    versions = parse_model(_Versions, read_limited(folder / _VERSIONS), folder / _VERSIONS)
     settings = versions.identity.model_dump(exclude_unset=True)
     scores = _read_scores(folder / _SCORES)
     names = [(f"{folder / _SUMMARY}: seconds", scene) for scene in summary.seconds]
     first = scores["scene"].drop_duplicates()
     names += [(f"{folder / _SCORES}: line {row + 2}", scene) for row, scene in first.items()]
     for source, scene in names:
-        expect_scene(folder, scene, source)
+        prediction_path(folder, scene, source)
+        sample_path(folder, scene, source)
     dataset = str(scores["dataset"].iloc[0]) if len(scores) else summary.dataset
     scenes = tuple(scene for scene in summary.seconds if prediction_path(folder, scene).is_file())
     scores = scores[scores["scene"].isin(scenes)]
@@ -172,25 +170,17 @@ class _Versions(BaseModel, extra="allow"):
     identity: _Identity = _Identity()
 
 
-def _read(kind: type[_Content], path: Path) -> _Content:
-    """Read and check a JSON file of a run."""
-    try:
-        content = read_limited(path)
-    except OSError as error:
-        raise ValueError(f"{path}: expected a run's JSON, got {error.strerror or error}") from error
-    return parse_model(kind, content, path)
-
-
 def _read_scores(path: Path) -> pd.DataFrame:
     """Return a run's ``scores.csv``; an empty variant is ""."""
-    try:
-        missing = {name: [""] for name in _NUMBER_COLUMNS}
+    content = io.BytesIO(read_limited(path, MOST_TABLE))
+    expected = f"{path}: expected a run's scores, got a damaged or foreign file"
+    with refusing(expected, ValueError, KeyError, OverflowError, pd.errors.ParserError):
         scores = pd.read_csv(
-            io.BytesIO(read_limited(path, MOST_TABLE)),
+            content,
             usecols=[*_TEXT_COLUMNS, *_NUMBER_COLUMNS],
             dtype=dict.fromkeys(_TEXT_COLUMNS, str),
             keep_default_na=False,
-            na_values=missing,
+            na_values={name: [""] for name in _NUMBER_COLUMNS},
         )
         scores = scores[[*_TEXT_COLUMNS, *_NUMBER_COLUMNS]]
         if any(scores[name].dtype == bool for name in _NUMBER_COLUMNS):
@@ -199,11 +189,7 @@ def _read_scores(path: Path) -> pd.DataFrame:
         scores["scale"] = pd.to_numeric(scores["scale"])
         if not scores["scale"].between(1, _LARGEST_SCALE).all() or not scores["seed"].between(0, 2**63 - 1).all():
             raise ValueError("a scale or seed is none")
-        unlike = scores["value"][scores["value"].abs().between(_LARGEST_SCORE, math.inf, inclusive="neither")]
-    except TooLargeError:
-        raise
-    except (OSError, ValueError, KeyError, OverflowError, pd.errors.ParserError) as error:
-        raise ValueError(f"{path}: expected a run's scores, got a damaged or foreign file") from error
+    unlike = scores["value"][scores["value"].abs().between(_LARGEST_SCORE, math.inf, inclusive="neither")]
     if len(unlike):
         where, came = unlike.index[0] + 2, unlike.iloc[0]
         raise ValueError(f"{path}: line {where}: value: expected at most {_LARGEST_SCORE:g}, got {came:g}")
@@ -268,15 +254,13 @@ def _identity_of_method(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 def _distinguishing_suffixes(names: Sequence[Any], settings: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return a suffix for each name, such as " (ensemble=1)": the settings in which equal names differ."""
-    added = []
-    namesakes: dict[Any, list[Mapping[str, Any]]] = {}
+    suffixes = []
     for name, own in zip(names, settings, strict=True):
-        namesakes.setdefault(name, []).append(own)
-    for name, own in zip(names, settings, strict=True):
-        keys = [key for key in own if any(other.get(key) != own[key] for other in namesakes[name])]
+        others = [other for same, other in zip(names, settings, strict=True) if same == name]
+        keys = [key for key in own if any(other.get(key) != own[key] for other in others)]
         text = ", ".join(f"{key}={own[key]}" for key in keys if own[key] is not None)
-        added.append(f" ({text})" if text else "")
-    return added
+        suffixes.append(f" ({text})" if text else "")
+    return suffixes
 
 
 def _newest(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:

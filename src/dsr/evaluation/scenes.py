@@ -28,16 +28,17 @@ from dsr.data.scene_source import SceneSource
 from dsr.degradation.downsampling import Downsampling, Measured, make_sample
 from dsr.degradation.holes import Holes
 from dsr.degradation.noise import Noise
-from dsr.evaluation.store import iterations_path, load_errors, load_prediction, prediction_path, sample_path
+from dsr.evaluation.results import load_errors, load_prediction, prediction_path, sample_path
 from dsr.methods.base import Method, NoSolutionError, expect_some_depth
 from dsr.metrics.alignment import align_errors, align_map
 from dsr.metrics.catalogue import Metric, score_image
 from dsr.metrics.formats import HEADLINES
 from dsr.sample import DepthSample
 from dsr.utils.arrays import read_arrays
+from dsr.utils.configuration import ConfigError
 from dsr.utils.console import one_line
 from dsr.utils.files import replacing, write_text
-from dsr.utils.guards import parse_json, refusing_excess
+from dsr.utils.guards import parse_json, path_within, refusing_excess
 from dsr.utils.progress import SILENT, Progress
 from dsr.utils.ratios import round_ratio
 
@@ -48,34 +49,24 @@ SCORE_COLUMNS = (
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The evaluation of one method on one data set.
+    """The evaluation of one method on one data set."""
 
-    Args:
-        folder: directory of the run.
-        downsampling_name, method_name: as in ``scores.csv``.
-        config: settings that the predictions depend on besides the scene, as plain values; stored with each.
-        alignment: one of :data:`dsr.metrics.alignment.ALIGNMENTS`, of each prediction before it is scored and drawn.
-        label: displayed name of the method; empty for ``method_name``.
-        illustrate: function that draws a picture of a sample, the predicted depth and its worst-of-four scores.
-
-    """
-
-    folder: Path
+    folder: Path  # of the run
     source: SceneSource
     downsampling: Downsampling | Measured
-    downsampling_name: str
+    downsampling_name: str  # as in ``scores.csv``, like the method's
     scale: float
     method: Method
     method_name: str
     seed: int
-    config: Mapping[str, Any]
+    config: Mapping[str, Any]  # settings that the predictions depend on besides the scene, as plain values
     metrics: tuple[Metric, ...]
     device: torch.device = field(default=torch.device("cpu"))
     noise: Noise | None = None
     holes: Holes | None = None
-    alignment: str = "none"
-    label: str = ""
-    illustrate: Callable[[DepthSample, Tensor, Mapping[str, float]], None] = lambda *_: None
+    alignment: str = "none"  # of each prediction before it is scored and drawn
+    label: str = ""  # name in tables; empty for ``method_name``
+    illustrate: Callable[[DepthSample, Tensor, Mapping[str, float]], None] = lambda *_: None  # with the worst scores
 
     def sample(self, scene: str) -> DepthSample:
         """Return the method's input for a scene; a ValueError if a file of the scene is invalid."""
@@ -101,12 +92,12 @@ class SceneResult:
     reused: bool = False
     failure: str = ""
     unsolved: str = ""
-    rows: list[dict[str, Any]] = field(default_factory=list)
+    rows: list[tuple[Any, ...]] = field(default_factory=list)  # of ``scores.csv``
     notes: tuple[str, ...] = ()
     truth: str | None = ""  # identifies the ground truth; None for a scene without
 
 
-class StalePredictionError(ValueError):
+class StalePredictionError(ConfigError):
     """A stored prediction has other settings, and overwriting is not enabled."""
 
 
@@ -169,7 +160,7 @@ def _predict(study: Evaluation, scene: str, config: Mapping[str, Any], progress:
         raise ValueError(f"{scene}: {study.method_name} gave depth of shape {tuple(depth.shape)}, expected {expected}")
     expect_some_depth(depth, f"{scene}: {study.method_name}")
     if study.method.history is not None:
-        with replacing(iterations_path(study.folder, scene)) as temporary:
+        with replacing(path_within(study.folder, scene, f"{study.folder}: scene", "iterations/{}.csv")) as temporary:
             pd.DataFrame(study.method.history).to_csv(temporary, index=False)
     sample.save(sample_path(study.folder, scene))
     with replacing(prediction_path(study.folder, scene)) as temporary:
@@ -190,33 +181,32 @@ def _score(study: Evaluation, scene: str, result: SceneResult) -> None:
     sample, given = DepthSample.load(path), load_prediction(prediction_path(study.folder, scene))
     if sample.scene != scene:  # its name becomes that of pictures
         raise ValueError(f"{path}: expected the scene {scene}, got {sample.scene!r:.100}")
-    if sample.depth is not None and given.shape != sample.depth.shape:
-        came, expected = tuple(given.shape), tuple(sample.depth.shape)
+    truth = sample.depth
+    if truth is not None and given.shape != truth.shape:
+        came, expected = tuple(given.shape), tuple(truth.shape)
         raise ValueError(f"{scene}: expected a prediction of shape {expected}, got {came}")
-    depth = align_map(given, sample.depth, study.alignment)
+    depth = align_map(given, truth, study.alignment)
     errors = load_errors(prediction_path(study.folder, scene))
     errors = align_errors(errors, given, depth, study.alignment)
     result.notes = tuple(sample.notes)
-    result.truth = None if sample.depth is None else f"{zlib.crc32(sample.depth.numpy().tobytes()):08x}"
-    if sample.depth is not None:
-        truth = sample.depth.to(study.device, torch.float64)
-        regions = {name: region.to(study.device) for name, region in sample.regions.items()}
-        stated = None if errors is None else (errors[0].to(study.device), errors[1].to(study.device))
-        scores = score_image(
-            depth.to(study.device, torch.float64),
-            truth,
-            sample.camera.rays(device=study.device),
-            study.metrics,
-            sample.unit,
-            regions=regions,
-            errors=stated,
+    result.truth = None if truth is None else f"{zlib.crc32(truth.numpy().tobytes()):08x}"
+    headlines = {}
+    if truth is not None:
+        scores = list(
+            score_image(
+                depth.to(study.device, torch.float64),
+                truth.to(study.device, torch.float64),
+                sample.camera.rays(device=study.device),
+                study.metrics,
+                sample.unit,
+                regions={name: region.to(study.device) for name, region in sample.regions.items()},
+                errors=None if errors is None else (errors[0].to(study.device), errors[1].to(study.device)),
+            )
         )
         about = (sample.dataset, sample.scene, round_ratio(sample.scale), study.downsampling_name, study.method_name,
                  study.seed)  # fmt: skip
-        for each in scores:
-            values = (*about, each.metric, each.variant, each.value, each.valid_share)
-            result.rows.append(dict(zip(SCORE_COLUMNS, values, strict=True)))
-    headlines = {row["metric"]: row["value"] for row in result.rows if row["variant"] in HEADLINES}
+        result.rows = [(*about, each.metric, each.variant, each.value, each.valid_share) for each in scores]
+        headlines = {each.metric: each.value for each in scores if each.variant in HEADLINES}
     study.illustrate(sample, depth, headlines)
 
 

@@ -14,7 +14,7 @@ from matplotlib.colors import Normalize
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
-from dsr.evaluation.results import Run, formats_of, method_settings
+from dsr.evaluation.results import Run, method_settings
 from dsr.geometry import LIGHT_NAMES
 from dsr.geometry.surface import render
 from dsr.metrics.catalogue import KNOWN_FORMATS
@@ -56,7 +56,7 @@ def _write_scores(writer: SummaryWriter, run: Run) -> None:
     scored = list(run.scores["scene"].unique())
     means: dict[str, float] = {}
     more = {name: KNOWN_FORMATS[name] for name in LOOKS if (run.scores["metric"] == name).any()}
-    formats = formats_of([run]) | more
+    formats = Results((run,)).formats | more
     by_light: list[str] = []
     for name, each in formats.items():
         rows = run.scores[run.scores["metric"] == name]
@@ -97,9 +97,9 @@ def _write_pictures(
     if scene.depth is not None:
         shades.append(render(normals_seen_by(scene.camera, scene.depth))[0])
     rows = [torch.cat(list(reduced(each, _PANEL)), dim=-1) for each in shades]
-    grey = colours("gray")(np.ma.masked_invalid(torch.cat(rows, dim=-2).numpy()))[..., :3]  # holes in the hole colour
-    grey = (grey * 255).round().astype(np.uint8)
-    writer.add_image(f"renderings/{scene.scene}", grey, number, dataformats="HWC")
+    grey = colours("gray")(np.ma.masked_invalid(torch.cat(rows, dim=-2).numpy()))  # with holes in their colour
+    picture = (grey[..., :3] * 255).round().astype(np.uint8)
+    writer.add_image(f"renderings/{scene.scene}", picture, number, dataformats="HWC")
     reference = depth if scene.depth is None else scene.depth
     if scene.depth is not None:
         picture = _error(depth - scene.depth, reference)

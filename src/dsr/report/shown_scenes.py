@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from dsr.evaluation.results import BenchmarkSetting, Results, Run
-from dsr.evaluation.store import sample_path
+from dsr.evaluation.results import BenchmarkSetting, Results, Run, sample_path
 from dsr.geometry.camera import Camera
 from dsr.sample import DepthSample
 from dsr.utils.arrays import array_headers

@@ -8,7 +8,7 @@ from collections.abc import Callable, Generator, Sequence
 from typing import Any, TypeVar
 
 from dsr.evaluation.results import Results
-from dsr.utils.pool import Pool
+from dsr.utils.processes import Pool
 from dsr.utils.progress import SILENT
 
 _FEW = 24  # predictions below which the start of worker processes takes longer than they save

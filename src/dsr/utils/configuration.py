@@ -47,13 +47,9 @@ def expect_library(key: str, module: str, extra: str) -> None:
 
 
 def build(group: str, node: Any, given: Mapping[str, Any] | None = None, name: str | None = None) -> Any:
-    """Build the object that a node describes.
+    """Build the object that a node describes; its target gets those of the ``given`` values that its signature names.
 
-    Args:
-        group: the node's place in the configuration, for messages.
-        given: values of the whole run (scale, weights, device, ...); the target gets those that its signature names.
-        name: of the group's choice, for messages.
-
+    ``group`` is the node's place in the configuration and ``name`` that of the group's choice, for messages.
     """
     if isinstance(node, Mapping) and node.get(_PARTIAL):  # only the arguments of another node may be one
         raise ConfigError(f"{group}.{_PARTIAL}: expected an object, which a partial is not; leave it out")

@@ -4,24 +4,18 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 
 from dsr.utils.guards import decode_text
-
-
-def _whole(value: Any) -> Any:
-    """Return a whole float, such as 640.0, as int and anything else as it is."""
-    return int(value) if isinstance(value, float) and value.is_integer() else value
-
 
 # Numbers of a file: a finite one; a whole one that 64 bits hold, which may be written as 640.0. True and text are none.
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Whole = Annotated[
     int,
     Field(strict=True, ge=-(2**63), lt=2**63),
-    BeforeValidator(_whole),
+    BeforeValidator(lambda value: int(value) if isinstance(value, float) and value.is_integer() else value),
 ]
 Content = TypeVar("Content", bound=BaseModel)
 

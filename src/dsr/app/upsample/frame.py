@@ -37,7 +37,7 @@ from dsr.methods.base import MapNoise, Surface
 from dsr.methods.glass import NOTED
 from dsr.notes import CHECKS, Assumption, expect_no_warning
 from dsr.utils.guards import readable, refusing_excess
-from dsr.utils.locks import scene_lock
+from dsr.utils.processes import scene_lock
 from dsr.utils.progress import Progress, megabytes, show_length
 from dsr.utils.versions import package_versions
 

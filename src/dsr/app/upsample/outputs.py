@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from dsr.app.upsample.parts import ERRORS, FILES, METRES, PARTS
-from dsr.evaluation.store import load_errors
+from dsr.evaluation.results import load_errors
 from dsr.geometry.camera import Camera
 from dsr.io.depth_files import read_depth_file, storable
 from dsr.io.encoding import IN_METRES, Encoding

@@ -25,7 +25,7 @@ from dsr.io.scene_files import expect_poses
 from dsr.io.trajectories import USUAL_SIZE, read_poses
 from dsr.utils.console import ConsoleProgress, show
 from dsr.utils.files import expect_targets, write_text
-from dsr.utils.locks import at_work
+from dsr.utils.processes import at_work
 from dsr.utils.progress import clock, megabytes
 
 _UNPOSED = {

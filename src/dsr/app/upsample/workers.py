@@ -17,7 +17,7 @@ from dsr.io.pairs import Pair
 from dsr.io.reading import Reading
 from dsr.utils.console import one_line
 from dsr.utils.guards import refusing_excess
-from dsr.utils.pool import LOST, Pool
+from dsr.utils.processes import LOST, Pool
 from dsr.utils.progress import Progress, duration, megabytes
 
 _Job = tuple[Pair, Path]  # a picture and the folder of its results

@@ -1,25 +1,114 @@
-"""Worker processes: new interpreters that call functions of items; if one is killed, new ones take over, once."""
+"""Several processes at work: locks in the directory of a run, and worker processes.
+
+Locks lie in ``.locks``; the system releases them when their process ends, however it ends. Workers are new interpreters
+that call functions of items; if one is killed, new ones take over, once.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import gc
+import hashlib
 import multiprocessing
 import os
 import pickle
 import signal
+import socket
 import sys
+import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
 from typing import Any, Self, TypeVar
+
+from filelock import FileLock, Timeout
 
 from dsr.utils import interruption
 
 _Item = TypeVar("_Item")
 _Value = TypeVar("_Value")
+LOCKS = ".locks"
+_BETWEEN_LOOKS = 0.3
 _SECONDS_TO_END = 2.0  # in which a worker may remove its temporary files
 LOST = "worker processes were killed twice, perhaps for want of memory; fewer workers need less"
+
+
+class InUseError(ValueError):
+    """A command with other settings is at work in a directory."""
+
+    def __init__(self, folder: Path, owner: str) -> None:
+        super().__init__(f"{folder}: {owner} is at work there with other settings; wait for its end, or take another")
+        self.owner = owner
+
+
+@contextlib.contextmanager
+def at_work(folder: Path, settings: str) -> Iterator[None]:
+    """Within this context a directory, which is made if need be, belongs to commands with the same settings.
+
+    The last command that leaves removes the locks, and the directory if it was made for them and is empty. If a command
+    with other settings is at work there, this is an InUseError.
+    """
+    made = [each for each in (folder, *folder.parents) if not each.exists()]
+    place = folder / LOCKS
+    beginning = f"command-{_digest(settings)}-"
+    own = place / f"{beginning}{socket.gethostname()}-{os.getpid()}.lock"
+    lock = FileLock(own)
+    while not lock.is_locked:
+        place.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(FileNotFoundError):  # the last command has just removed the directory
+            lock.acquire()
+    try:
+        for other in place.glob("command-*"):
+            if not other.name.startswith(beginning) and _is_held(other):
+                host, _, process = other.stem.split("-", 2)[2].rpartition("-")
+                raise InUseError(folder, f"process {process} of {host}")
+        yield
+    finally:
+        lock.release()
+        own.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # the directory is not empty, or another command removes the locks
+            if not any(map(_is_held, place.glob("command-*"))):
+                for each in place.iterdir():
+                    each.unlink()
+            for each in (place, *made):
+                each.rmdir()
+
+
+def scene_lock(folder: Path, name: str) -> FileLock:
+    """Return the lock of a scene, or of another part of a run, for one process at a time."""
+    (folder / LOCKS).mkdir(parents=True, exist_ok=True)
+    return FileLock(folder / LOCKS / f"{_digest(name)}.lock")
+
+
+def free_first(folder: Path, scenes: Sequence[str], *, wait: bool = True) -> Iterator[str]:
+    """Yield each scene while its lock is held; those that other processes work on come last, or not if not ``wait``."""
+    waiting = list(scenes)
+    while waiting:
+        for scene in tuple(waiting):
+            try:
+                held = scene_lock(folder, scene).acquire(blocking=False)
+            except Timeout:
+                continue
+            with held:
+                waiting.remove(scene)
+                yield scene
+        if not wait:
+            return
+        if waiting:
+            time.sleep(_BETWEEN_LOOKS)
+
+
+def _is_held(path: Path) -> bool:
+    try:
+        with FileLock(path).acquire(blocking=False):
+            return False
+    except Timeout:
+        return True
+
+
+def _digest(name: str) -> str:
+    return hashlib.sha256(name.encode("utf-8", "surrogateescape")).hexdigest()[:24]
 
 
 class Pool:
@@ -108,7 +197,8 @@ def _begin(plan: bytes, threads: int | None) -> None:
     """Prepare a worker, which ends with its parent."""
     interruption.end_with(os.getppid())
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
-    _set_threads(threads)
+    if threads is not None:
+        _set_threads(threads, threads)
     prepare, arguments = pickle.loads(plan)  # noqa: S301 - of the parent
     if prepare is not None:
         prepare(*arguments)
@@ -124,26 +214,22 @@ def _call(function: Callable[[_Item], _Value], item: _Item) -> _Value:
 
 
 @contextlib.contextmanager
-def computing_threads(count: int | None) -> Iterator[None]:
-    """Set the number of threads that torch and OpenCV compute with within the context; None leaves it."""
+def computing_threads(count: int) -> Iterator[None]:
+    """Set the number of threads that torch and OpenCV compute with within the context."""
     import cv2  # noqa: PLC0415 - as below
     import torch  # noqa: PLC0415
 
     before = torch.get_num_threads(), cv2.getNumThreads()
-    _set_threads(count)
+    _set_threads(count, count)
     try:
         yield
     finally:
-        if count is not None:
-            torch.set_num_threads(before[0])
-            cv2.setNumThreads(before[1])
+        _set_threads(*before)
 
 
-def _set_threads(count: int | None) -> None:
-    """Set the number of threads that torch and OpenCV compute with; None leaves it."""
+def _set_threads(of_torch: int, of_opencv: int) -> None:
     import cv2  # noqa: PLC0415 - workers import them, and not before they have taken in what they get
     import torch  # noqa: PLC0415
 
-    if count is not None:
-        torch.set_num_threads(count)
-        cv2.setNumThreads(count)
+    torch.set_num_threads(of_torch)
+    cv2.setNumThreads(of_opencv)
