@@ -14,7 +14,7 @@ from matplotlib.colors import Normalize
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
-from dsr.evaluation.results import Run, method_settings
+from dsr.evaluation.results import Results, Run, method_settings
 from dsr.geometry import LIGHT_NAMES
 from dsr.geometry.surface import render
 from dsr.metrics.catalogue import KNOWN_FORMATS
