@@ -8,6 +8,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from dsr.app.schema import EvalConfig, MetricsConfig, TrainConfig
+from dsr.methods.networks.peers.peer import PEERS
 from dsr.training.module import SuperResolution
 from dsr.training.settings import PatchSettings
 from dsr.utils.configuration import load_target
@@ -25,6 +26,7 @@ DIFFERENT = {
     "model/msg": {"variant"},  # trained by the project; the class's is the published MSG-V
     "model/msg_v": {"variant"},
     "dataset/simgeo": {"root"},  # on the command line the folder of data is looked at for Lucy
+    **{f"method/{peer}": {"weights", "weights_files"} for peer in PEERS},  # none where a network is given
 }  # Files whose keys are what tells one choice from another of the same class, by the keys
 PRESET = OmegaConf.to_container(OmegaConf.load(CONF / "trainer" / "default.yaml"))
 

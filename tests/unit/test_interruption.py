@@ -98,7 +98,7 @@ def test_processes_started_as_workers_do_not_get_ctrl_c_but_their_parent_does() 
     def start() -> None:
         with interruption.starting_workers():
             assert subprocess.check_output([sys.executable, "-c", code], text=True) == "alive\n"
-            os.kill(os.getpid(), signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)  # of this thread alone
 
     with pytest.raises(KeyboardInterrupt):
         start()
