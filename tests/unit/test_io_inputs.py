@@ -8,9 +8,10 @@ import torch
 from PIL import Image
 
 from dsr.geometry.camera import Camera
+from dsr.io.encoding import encode
 from dsr.io.inputs import FolderUnits, read_picture
 from dsr.io.pairs import Pair
-from dsr.io.reading import CameraChoice, Reading
+from dsr.io.reading import CameraChoice, Reading, RigFiles
 
 OWN = {"width": 16, "height": 12, "fx": 15.0, "fy": 15.0, "cx": 7.5, "cy": 5.5}
 
@@ -110,6 +111,15 @@ def test_photo_is_cropped_to_the_part_covered_by_the_low_resolution_map(make):
     assert tuple(picture.rgb.shape) == (3, 12, 16)
     assert picture.camera == Camera(**OWN)
     assert "the photo is cut to the part that the depth map covers" in texts(picture)
+
+
+def test_disparity_of_a_depth_camera_beside_the_photos_is_written_with_its_baseline(make, tmp_path):
+    pair = make(np.full((12, 16), 3.0), "disparity.npy", fx=15.0)
+    (tmp_path / "ir.json").write_text(json.dumps({**OWN, "baseline": 0.05}))
+    np.savetxt(tmp_path / "motion.txt", np.eye(4))
+    picture = read(pair, rig=RigFiles(camera=tmp_path / "ir.json", extrinsics=tmp_path / "motion.txt"))
+    values, _ = encode(picture.depth_lr, picture.encoding, picture.camera)
+    assert np.nanmedian(values) == pytest.approx(3.0)
 
 
 def test_disparity_without_a_baseline_or_a_positive_value_is_refused(make):

@@ -171,7 +171,7 @@ def test_summary_and_pictures_have_the_worst_of_four_lights(tmp_path):
         assert means.pop(metric) == pytest.approx(sum(values) / 2, rel=1e-12)
     assert means == {}
     assert [sample.scene for sample, *_ in pictures] == ["a", "b"]
-    _, depth, scores = pictures[0]
+    _, depth, _, scores = pictures[0]
     assert scores == pytest.approx({row["metric"]: float(row["value"]) for row in worst if row["scene"] == "a"})
     assert torch.equal(depth, load_prediction(tmp_path / "predictions" / "a.npz"))
 
@@ -287,7 +287,7 @@ def test_valid_share_reflects_a_hole_in_the_truth(tmp_path):
 
 
 def test_picture_that_cannot_be_drawn_fails_its_scene_and_keeps_its_scores(tmp_path):
-    def refuse(sample, depth, scores):
+    def refuse(sample, depth, errors, scores):
         if sample.scene == "a":
             raise OSError(28, "No space left")
 
@@ -315,7 +315,7 @@ def test_scene_without_truth_is_predicted_and_drawn_but_not_scored(tmp_path):
     )  # fmt: skip
     _, scores = run(study)
     assert scores["scene"].unique().tolist() == ["seen"]
-    assert pictures[0][2] == {}
+    assert pictures[0][3] == {}
     assert bool((load_prediction(tmp_path / "predictions" / "blind.npz") == 2.0).all())
     content = summary(tmp_path)
     assert (content["without_truth"], list(content["truths"])) == (["blind"], ["seen"])

@@ -40,7 +40,7 @@ from dsr.degradation.downsampling import Downsampling, Measured
 from dsr.degradation.holes import Holes
 from dsr.degradation.noise import Noise
 from dsr.evaluation.results import Run as StoredRun
-from dsr.evaluation.results import load_errors, prediction_path
+from dsr.evaluation.results import prediction_path
 from dsr.evaluation.run_files import read_run
 from dsr.evaluation.scenes import (
     Evaluation,
@@ -346,14 +346,19 @@ def _seed(seed: int) -> None:
 
 
 def _illustrate(
-    folder: Path, label: str, formats: Formats, sample: DepthSample, depth: torch.Tensor, scores: Mapping[str, float]
+    folder: Path,
+    label: str,
+    formats: Formats,
+    sample: DepthSample,
+    depth: torch.Tensor,
+    errors: tuple[torch.Tensor, torch.Tensor] | None,
+    scores: Mapping[str, float],
 ) -> None:
     """Draw the result of a scene, and its expected errors if there are any."""
     from dsr.pictures.expected_errors import write_confidence  # noqa: PLC0415 - slow to import
     from dsr.pictures.panels import save_picture  # noqa: PLC0415
 
     save_picture(folder / "pictures" / f"{sample.scene}.png", sample, depth, scores, label, formats)
-    errors = load_errors(prediction_path(folder, sample.scene))
     if errors is not None:
         path = folder / "confidence" / f"{sample.scene}.png"
         write_confidence(path, depth, *errors, sample.depth, sample.camera)

@@ -36,7 +36,7 @@ _FROM_RUN = ("scale", "downsampling", "noise", "seed", "dataset")
 _NOT_WITH_RUN = ("method", "scale", "weights")
 # The nodes of the arguments that errors of a training's parts begin with.
 _NODES = dict.fromkeys((each.name for each in dataclasses.fields(PatchSettings)), "patches")
-_NODES |= {"depth_loss": "model.objective", "shading": "model.objective", "visual": "loss"}
+_NODES |= {"objective": "model", "depth_loss": "model.objective", "shading": "model.objective", "visual": "loss"}
 _LARGEST = 1 << 18  # bytes of a run's configuration
 _DEEPEST = 30  # nested keys and lists
 _GROUP_OF = {"validation": "dataset", "patches": "trainer"}  # whose files name the targets of a key

@@ -66,7 +66,9 @@ class Evaluation:
     holes: Holes | None = None
     alignment: str = "none"  # of each prediction before it is scored and drawn
     label: str = ""  # name in tables; empty for ``method_name``
-    illustrate: Callable[[DepthSample, Tensor, Mapping[str, float]], None] = lambda *_: None  # with the worst scores
+    illustrate: Callable[[DepthSample, Tensor, tuple[Tensor, Tensor] | None, Mapping[str, float]], None] = lambda *_: (
+        None
+    )  # of depth and its expected errors, if any, with the worst scores
 
     def sample(self, scene: str) -> DepthSample:
         """Return the method's input for a scene; a ValueError if a file of the scene is invalid."""
@@ -207,7 +209,7 @@ def _score(study: Evaluation, scene: str, result: SceneResult) -> None:
                  study.seed)  # fmt: skip
         result.rows = [(*about, each.metric, each.variant, each.value, each.valid_share) for each in scores]
         headlines = {each.metric: each.value for each in scores if each.variant in HEADLINES}
-    study.illustrate(sample, depth, headlines)
+    study.illustrate(sample, depth, errors, headlines)
 
 
 def write_tables(study: Evaluation, results: Mapping[str, SceneResult]) -> pd.DataFrame:

@@ -230,6 +230,8 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
         *doubts,
     )
     if rig is not None:
+        if range_type == "disparity" and camera.baseline is None:
+            camera = replace(camera, baseline=rig.camera.baseline)  # that of the result's disparities, too
         depth_lr, warped = _to_photo(pair, reading, depth_lr, rig, camera, rgb)
         all_assumptions, confidence = (*all_assumptions, *warped), None
     device_name = model_in_exif(pair.rgb) if pair.capture is None else pair.capture.app

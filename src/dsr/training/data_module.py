@@ -36,7 +36,7 @@ class Part:
 
 
 class WholeScenes(Dataset[Batch]):
-    """Batches of one whole scene in float64, as evaluation scores it; ``hinted`` adds the hints of ``eval.py``."""
+    """Batches of one whole scene in float64, as evaluation scores it; ``hinted`` adds hints, of sharp steps."""
 
     def __init__(
         self, scenes: Sequence[Scene], degradation: Degradation, seed: int = 0, *, hinted: bool = False

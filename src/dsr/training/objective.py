@@ -128,7 +128,8 @@ class DepthObjective(Objective):
         """Refuse a network that states its errors, and patches that are too small for the visual loss."""
         if net.states_errors:
             raise ValueError(
-                f"depth_loss: expected surface for {type(net).__name__}, which states its errors, got {self.depth_loss}"
+                f"objective: expected {SurfaceObjective.__name__} for {type(net).__name__}, which states its errors, "
+                f"got {type(self).__name__}"
             )
         self.visual.check_size(patch, patch)
 
@@ -193,9 +194,12 @@ class SurfaceObjective(Objective):
 
     def check(self, net: DisparityNetwork, patch: int, *, hinted: bool) -> None:
         """Refuse a network that does not state its errors, and maps without hints."""
-        name, choices = type(net).__name__, ", ".join(_DEPTH_LOSSES)
+        name = type(net).__name__
         if not net.states_errors:
-            raise ValueError(f"depth_loss: expected one of {choices} for {name}, which states no errors, got surface")
+            raise ValueError(
+                f"objective: expected {DepthObjective.__name__} for {name}, which states no errors, "
+                f"got {type(self).__name__}"
+            )
         if not hinted:
             raise ValueError(f"degradation: expected everything or another one with hints, for {name}, got plain")
 

@@ -35,7 +35,7 @@ class Done(NamedTuple):
 
 
 def work_through(request: UpsampleRequest, frames: Frames, reporter: Reporter, progress: Progress) -> Iterator[Done]:
-    """Upsample pictures, ``frames.workers`` at a time, each with its share of the cores; yield each once it is done.
+    """Upsample pictures in ``--workers`` processes, each with its share of the cores; yield each once it is done.
 
     Notes are shown in the order of the pictures, or as they come from several workers.
     """

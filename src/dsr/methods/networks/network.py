@@ -41,7 +41,7 @@ _UNKNOWN = torch.tensor(math.nan)
 class Answer:
     """The outputs of a network for a batch of images, all (B, 1, H, W); those of 16 bits become float32."""
 
-    disparity: Tensor  # in the unit of the input
+    disparity: Tensor  # in the unit of the input; of Facets without the offset ``doffs``
     spread: Tensor = _UNKNOWN  # expected absolute error of the logarithm of disparity, if the network predicts it
     angle: Tensor = _UNKNOWN  # expected error of the normal in radians, likewise
     stages: tuple[Tensor, ...] = ()  # disparities of intermediate stages, which a training compares with the truth, too

@@ -42,7 +42,7 @@ class Hits(NamedTuple):
     normals: Array  # (3, N), facing the camera
     rest: Array  # (3, N) the paint's coordinates, as in `dsr.synthetic.procedural.shape.Shape`
     chart: Array  # (3, N)
-    bulge: Array  # (N,) distance in metres from the triangle to the point along the normal
+    bulge: Array  # (N,) distance from the triangle to the point along the normal
 
 
 class Tracer:
@@ -113,13 +113,13 @@ def _unit(vectors: Array) -> Array:
 class Lighting:
     """The light in a scene."""
 
-    lamp: Array  # (_SETS, L, 3) sample points of the lamp in metres
+    lamp: Array  # (_SETS, L, 3) sample points of the lamp
     colour: Array  # (3,) colour and strength of the lamp
     cookie: Cookie  # from points (3, N) to the fraction of the lamp's light that arrives there, as through leaves
     ambient: Array  # (3,) colour of the light from all directions
     sky: Array  # (3,) colour of additional light from above
     directions: Array  # (_SETS, A, 3) unit vectors, cosine distributed about z, the normal
-    occlusion_distance: float  # metres within which surfaces occlude each other's ambient light
+    occlusion_distance: float  # distance within which surfaces occlude each other's ambient light
 
 
 def random_lighting(
@@ -206,8 +206,8 @@ def visibility(tracer: Tracer, lighting: Lighting, hits: Hits, which: Index, ext
 class Viewpoint:
     """The pose and the intrinsics of a camera in a layout."""
 
-    eye: Array  # (3,) position of the camera in metres, z up
-    target: Array  # (3,) point in the middle of the picture in metres
+    eye: Array  # (3,) position of the camera, z up
+    target: Array  # (3,) point in the middle of the picture
     focal: float  # focal length in image widths
     roll: float  # rotation about the viewing direction in degrees
     centre: Array  # (2,) principal point in image widths from the left and upper edge

@@ -32,7 +32,7 @@ class SceneLayout(NamedTuple):
     """Where the cameras and lamps of a scene may be; its bodies fill the view of every camera."""
 
     views: Callable[[np.random.Generator], Viewpoint]
-    low: Sequence[float]  # (3,) corners of the box in which lamps may hang, in metres
+    low: Sequence[float]  # (3,) corners of the box in which lamps may hang
     high: Sequence[float]
 
 
