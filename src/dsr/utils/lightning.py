@@ -27,7 +27,7 @@ from dsr.utils.progress import Progress, Task, ignore
 from dsr.utils.runs_table import SCORES, list_scores
 
 LOG_EVERY = 10  # steps between two values of a training in its log
-_UNITS = {"RMSE_d": " mm", "RMSE_v": "", "DSSIM_v": "", "LPIPS_v": ""}  # of the scores that are shown; the others are in thousandths
+_UNITS = {"RMSE_d": " mm", "RMSE_v": "", "DSSIM_v": "", "LPIPS_v": ""}  # of scores that are shown; "" for thousandths
 _SECONDS_BETWEEN_LOSSES = 0.2  # between two losses that are shown, each of which waits for the device
 
 
