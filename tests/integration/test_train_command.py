@@ -459,6 +459,7 @@ def test_network_that_fits_any_scale_starts_from_weights_of_another(smoke, tmp_p
     assert all(torch.allclose(one[name], other[name], atol=1e-6) for name in one)
     code, _, errors = within(*SMOKE, "scale=8", f"start.weights='{smoke[1]}/weights.safetensors'", "output_dir=other")
     assert code == 2
+    assert f"start.weights: {smoke[1]}/weights.safetensors: " in errors[0]
     assert errors[0].endswith("weights are for scale 4, the run is at scale 8, where MSGNet has other parameters")
 
 

@@ -420,7 +420,16 @@ def test_prediction_of_another_size_or_type_is_left_out_with_its_scores(runs, ch
     assert note.startswith(f"left out: {path}: expected")
 
 
-@pytest.mark.parametrize("values", [np.ones((4, 4), bool), np.ones((1, 4, 4)), np.array([{}, None])])
+@pytest.mark.parametrize(
+    "values",
+    [
+        np.ones((4, 4), bool),
+        np.ones((1, 4, 4)),
+        np.array([{}, None]),
+        np.ones((4, 4), np.longdouble),
+        np.ones((4, 4), ">f8"),
+    ],
+)
 def test_arrays_that_are_no_maps_of_floats_are_no_prediction(tmp_path, values):
     path = tmp_path / "a.npz"
     np.savez(path, depth=values, depth_error=values, angle_error=values)

@@ -11,7 +11,7 @@ from dsr.app.schema import EvalConfig, MetricsConfig, TrainConfig
 from dsr.methods.networks.peers.peer import PEERS
 from dsr.training.module import SuperResolution
 from dsr.training.settings import PatchSettings
-from dsr.utils.configuration import load_target
+from dsr.utils.configuration import load_object, load_target
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 GROUPS = ("method", "model", "noise", "holes", "downsampling", "dataset")
@@ -89,3 +89,14 @@ def test_command_in_conf_has_the_defaults_of_the_schema(command, schema):
     assert {
         key: vars(value) if key in ("loss", "start") else value for key, value in values.items() if key in own
     } == own
+
+
+@pytest.mark.parametrize(
+    ("earlier", "today"),
+    [
+        ("dsr.app.sweeps.CheckJobs", "dsr.app.entry.CheckJobs"),
+        ("dsr.metrics.visual_loss.make_visual_loss", "dsr.metrics.losses.make_visual_loss"),
+    ],
+)
+def test_targets_of_earlier_configurations_are_found(earlier, today):
+    assert load_object("key", earlier, "a target") is load_object("key", today, "a target")

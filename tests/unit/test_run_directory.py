@@ -144,10 +144,8 @@ def test_directory_of_another_run_is_refused_with_the_changed_keys_before_the_cl
     claim(tmp_path / "run", plain)
     before = (tmp_path / "run" / "config.yaml").read_bytes()
     keys = ["dataset.root", "scale", "weights_sha256"]
-    identity, message = (
-        identity_of(other, "abd", CPU),
-        f"run holds a run with another {', '.join(keys)}; .* overwrite=t",
-    )
+    identity = identity_of(other, "abd", CPU)
+    message = f"run holds a run with another {', '.join(keys)}; .* overwrite=true"
     with pytest.raises(ConfigError, match=message):
         expect_free(tmp_path / "run", plain, identity)
     with pytest.raises(ConfigError, match=message):
@@ -156,7 +154,7 @@ def test_directory_of_another_run_is_refused_with_the_changed_keys_before_the_cl
     assert expect_free(tmp_path / "run", plain, identity, keys) == keys
 
 
-def test_directory_in_which_another_run_begins_can_be_claim(tmp_path):
+def test_directory_in_which_another_run_begins_can_be_claimed(tmp_path):
     (tmp_path / ".versions-8f3k.json").touch()  # what replacing() writes before the record is there
     claim(tmp_path, config())
     assert (tmp_path / "versions.json").is_file()

@@ -6,6 +6,7 @@ import zipfile
 import lightning
 import pytest
 import torch
+from torch.utils.data import DataLoader
 
 from dsr.app.entry import run_command
 from dsr.data.download.fetching import unpack
@@ -71,3 +72,19 @@ def test_checkpoint_of_something_else_is_refused(tmp_path, content):
     with pytest.raises(ValueError, match=r"last\.ckpt: expected a checkpoint of this training") as refused:
         fit(trainer, OneWeight(), [torch.ones(1)], tmp_path / "last.ckpt")
     assert "\n" not in str(refused.value)
+
+
+class Defective(lightning.Callback):
+    def on_train_start(self, *_):
+        raise RuntimeError("defective")
+
+
+def test_defect_of_a_callback_is_not_taken_for_a_damaged_checkpoint(tmp_path):
+    given = {"logger": False, "default_root_dir": tmp_path}
+    trainer = make_trainer(torch.device("cpu"), 1, 1, callbacks=[], **given)
+    numbers = DataLoader(torch.ones(2, 1), batch_size=None)
+    fit(trainer, OneWeight(), numbers)
+    trainer.save_checkpoint(tmp_path / "last.ckpt")
+    trainer = make_trainer(torch.device("cpu"), 2, 1, callbacks=[Defective()], **given)
+    with pytest.raises(RuntimeError, match="defective"):
+        fit(trainer, OneWeight(), numbers, tmp_path / "last.ckpt")

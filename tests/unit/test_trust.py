@@ -74,9 +74,10 @@ def test_target_that_is_not_dsrs_is_refused_before_it_is_imported(evil, key, tar
     assert "\n" not in message
 
 
-def test_metrics_from_outside_are_refused(evil):
+@pytest.mark.parametrize("name", ["evil_targets.METRIC", "dsr.cli.main.x"])
+def test_metrics_from_outside_are_refused(evil, name):
     with pytest.raises(ConfigError, match=r"config\.yaml: metrics\.extra\.0: expected a target of"):
-        read_config(write(evil / "run", metrics__extra=["evil_targets.METRIC"]))
+        read_config(write(evil / "run", metrics__extra=[name]))
 
 
 def test_trust_in_the_file_itself_counts_for_nothing(evil):

@@ -106,7 +106,7 @@ def _write(
             with progress.task("figures") as task:
                 drawn.save(task)
             notes.extend(drawn.notes)
-        else:  # the page, which is last, as it links to the other parts' files
+        elif part == "page":  # which is last, as it links to the other parts' files
             with progress.task("scenes") as task:
                 notes += save_page(
                     folder / "index.html",

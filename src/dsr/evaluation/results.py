@@ -51,7 +51,11 @@ def sample_path(folder: Path, scene: str, source: str = "") -> Path:
 def load_errors(path: Path) -> tuple[Tensor, Tensor] | None:
     """Return the expected errors of a prediction, (1, H, W): depth in metres, normal in degrees; None without them."""
     maps = _read_maps(path, _ERRORS)
-    return (maps["depth_error"].float(), maps["angle_error"].float()) if len(maps) == len(_ERRORS) else None
+    if not maps:
+        return None
+    if len(maps) < len(_ERRORS):
+        raise ValueError(_DAMAGED.format(path))
+    return maps["depth_error"].float(), maps["angle_error"].float()
 
 
 def load_prediction(path: Path) -> Tensor:
@@ -65,14 +69,14 @@ def load_prediction(path: Path) -> Tensor:
 def _read_maps(path: Path, names: tuple[str, ...]) -> dict[str, Tensor]:
     """Return those of some maps of a prediction that there are, (1, H, W)."""
     try:
-        arrays = read_arrays(path, names)
+        maps = {name: torch.from_numpy(array)[None] for name, array in read_arrays(path, names).items()}
     except TooLargeError:
         raise
-    except (OSError, ValueError) as error:
+    except (OSError, TypeError, ValueError) as error:  # torch has no such dtype, among others
         raise ValueError(_DAMAGED.format(path)) from error
-    if any(array.ndim != 2 or array.dtype.kind != "f" for array in arrays.values()):
+    if any(each.ndim != 3 or not each.is_floating_point() for each in maps.values()):
         raise ValueError(_DAMAGED.format(path))
-    return {name: torch.from_numpy(array)[None] for name, array in arrays.items()}
+    return maps
 
 
 class BenchmarkSetting(NamedTuple):

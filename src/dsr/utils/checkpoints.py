@@ -95,7 +95,8 @@ class BestCheckpoint(ModelCheckpoint):
 
     def __init__(self, folder: Path, monitor: str) -> None:
         super().__init__(folder, "best", monitor=monitor, enable_version_counter=False, save_on_train_epoch_end=False)
-        self._last_global_step_saved = -1  # else Lightning keeps no weights of step 0
+        # with 0, ModelCheckpoint._should_skip_saving_checkpoint would leave out the weights of step 0
+        self._last_global_step_saved = -1
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Validate the initial weights without any effect on the steps; they may be the best ones."""
@@ -125,11 +126,10 @@ class Interruption(Checkpoint):
     def __init__(self, path: Path, seconds: float = 600.0) -> None:
         self._path, self._seconds, self._saved = path, seconds, time.monotonic()
         self._stack, self.signals = contextlib.ExitStack(), list[int]()
-        self.started = False  # and so what was to be restored is restored
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Only note signals from now on."""
-        self.started, self.signals = True, self._stack.enter_context(interruption.deferred())
+        self.signals = self._stack.enter_context(interruption.deferred())
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
         """Act once a step is complete that no validation follows; Lightning would skip that after an interruption."""

@@ -126,6 +126,11 @@ class LastValidation(Callback):
 
     def __init__(self, interval: int) -> None:
         self._interval = interval
+        self.started = False  # and so what was to be restored is restored
+
+    def on_train_start(self, *_: Any) -> None:
+        """Note that the training starts."""
+        self.started = True
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
         """Let Lightning stop, which runs a validation."""
@@ -152,7 +157,7 @@ def make_trainer(
     """
     given = {
         "accelerator": "gpu" if device.type == "cuda" else device.type,
-        "devices": devices if device == torch.device(device.type) else [device.index],
+        "devices": devices if device.type == "cpu" or device.index is None else [device.index],
         "max_steps": steps,
         "accumulate_grad_batches": accumulate,
         "val_check_interval": interval * accumulate,
@@ -191,7 +196,8 @@ def fit(
     except (OSError, FullDiskError, MemoryError, torch.OutOfMemoryError):
         raise
     except Exception as error:
-        if resume is None or (saving is not None and saving.started):
+        callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
+        if resume is None or any(isinstance(each, LastValidation) and each.started for each in callbacks):
             raise
         what = one_line(error).removeprefix(f"{resume}: ")
         raise ConfigError(

@@ -58,7 +58,7 @@ SILENT = Progress()
 
 
 class StepsProgress(Progress):
-    """Reports only the task ``steps``, to a function, at its end with all steps done; None for no report."""
+    """Passes the progress of the task ``steps`` on to a function, last with all steps done; None for nothing."""
 
     def __init__(self, steps: Steps | None) -> None:
         self._steps = steps

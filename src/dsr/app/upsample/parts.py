@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import importlib
 import importlib.util
 import math
 from collections.abc import Callable, Sequence
@@ -272,13 +271,30 @@ def _rgbd(folder: Path, result: Result) -> Output:
     return Output([f"rgbd/{name}" for name in RGBD], notes)
 
 
-def _write_all(module: str, name: str, path: Path, frames: Sequence[Frame]) -> list[Path]:
-    """Write all frames by a function of a module, which is imported for it."""
-    files: list[Path] = getattr(importlib.import_module(module), name)(path, frames)
-    return files
+def _open3d(path: Path, frames: Sequence[Frame]) -> list[Path]:
+    from dsr.io.open3d import write_open3d
+
+    return write_open3d(path, frames)
 
 
-_SCENES = "dsr.io.scene_files"
+def _nerfstudio(path: Path, frames: Sequence[Frame]) -> list[Path]:
+    from dsr.io.scene_files import write_transforms
+
+    return write_transforms(path, frames)
+
+
+def _gaussian(path: Path, frames: Sequence[Frame]) -> list[Path]:
+    from dsr.io.scene_files import write_splatting
+
+    return write_splatting(path, frames)
+
+
+def _rerun(path: Path, frames: Sequence[Frame]) -> list[Path]:
+    from dsr.io.scene_files import write_rerun
+
+    return write_rerun(path, frames)
+
+
 _OF_DEPTH = ("depth", "rgbd")
 PARTS: dict[str, Part] = {
     part.name: part
@@ -298,15 +314,12 @@ PARTS: dict[str, Part] = {
         Part("cloud", ("cloud.ply",), _cloud, usual=False, large=True, shape=True, errors=True,
               cost=Cost(27.0, 1.4)),
         Part("rgbd", ("rgbd/color.png", "rgbd/depth.png", "rgbd/intrinsic.json"), _rgbd, usual=False),
-        Part("open3d", ("open3d",), write_all=functools.partial(_write_all, "dsr.io.open3d", "write_open3d"),
-             needs=_OF_DEPTH, usual=False),
-        Part("nerfstudio", ("transforms.json", "nerfstudio"),
-             write_all=functools.partial(_write_all, _SCENES, "write_transforms"), needs=_OF_DEPTH, usual=False,
+        Part("open3d", ("open3d",), write_all=_open3d, needs=_OF_DEPTH, usual=False),
+        Part("nerfstudio", ("transforms.json", "nerfstudio"), write_all=_nerfstudio, needs=_OF_DEPTH, usual=False,
              poses=True),
-        Part("gaussian", ("gaussian",), write_all=functools.partial(_write_all, _SCENES, "write_splatting"),
-             needs=_OF_DEPTH, usual=False, poses=True),
-        Part("rerun", ("scene.rrd",), write_all=functools.partial(_write_all, _SCENES, "write_rerun"),
-             needs=_OF_DEPTH, usual=False, library=("rerun", "rerun-sdk", "rerun")),
+        Part("gaussian", ("gaussian",), write_all=_gaussian, needs=_OF_DEPTH, usual=False, poses=True),
+        Part("rerun", ("scene.rrd",), write_all=_rerun, needs=_OF_DEPTH, usual=False,
+             library=("rerun", "rerun-sdk", "rerun")),
     )
 }  # fmt: skip
 """All parts by their names, in the order in which they are listed."""

@@ -1,4 +1,4 @@
-"""The pictures of ``dsr upsample``, one after another, or several at a time in processes of their own."""
+"""The pictures of ``dsr upsample``, one after another or several at a time in processes of their own; its dry run."""
 
 from __future__ import annotations
 
@@ -84,7 +84,10 @@ def attempt(work: FrameWork, pair: Pair, target: Path, reporter: Messages, progr
 
 
 def preview(request: UpsampleRequest, frames: Frames, reporter: Messages, progress: Progress) -> Iterator[Done]:
-    """Report what :func:`dsr.app.upsample.workers.work_through` would do, and how long it would take."""
+    """Report what :func:`work_through` would do, and how long it would take.
+
+    One picture of each kind is read, of the others at most the headers.
+    """
     reading = request.reading
     targets = {pair.name: frames.target(request.results.output, pair) for pair in frames.found.pairs}
     work = FrameWork(request, frames)
