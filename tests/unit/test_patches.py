@@ -442,6 +442,7 @@ REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
         )
         for shares in ([0.0], [2.0, -1.0], [2.0, float("nan")], [2.0, float("inf")])
     },
+    "a share": (lambda: PatchData([Part(_Source([_scene()]), share=-1.0)], _settings(), X4), "^share of .*, got -1.0"),
     "too few scenes": (lambda: _data(validation_scenes=6), "^validation_scenes: expected fewer than the 6 scenes"),
     "a patch in 4": (lambda: _data(patch=30), "^patch: expected a size that scale=4 divides"),
     "a patch in 16": (lambda: _data(degradation=Degradation(16, BOX), patch=24), "^patch: .*scale=16 divides, got 24"),
