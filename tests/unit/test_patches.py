@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from dsr.data.scene_source import SceneSource
-from dsr.degradation.downsampling import Downsampling, Measured, make_sample
+from dsr.degradation.downsampling import Downsampling, Measured, encode_facts, make_sample
 from dsr.degradation.noise import GaussianMultiplicative, Kinect
 from dsr.degradation.random_degradation import Everything
 from dsr.geometry.camera import Camera
@@ -427,6 +427,12 @@ def test_measured_map_cannot_be_cropped() -> None:
     patches = Patches([[_scene()]], _settings(), Degradation(4, Measured()))  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="downsampling=measured expects a low-resolution map at x4"):
         patches[0]
+
+
+def test_measured_maps_to_validate_with_have_the_hints_of_the_assumed_model() -> None:
+    scene = replace(_scene(), measured={4: torch.ones(1, 11, 15)})
+    [batch] = WholeScenes([scene], Degradation(4, Measured("bicubic")), hinted=True)  # type: ignore[arg-type]
+    assert torch.equal(batch["facts"], encode_facts("bicubic", soft=False, noise=True)[None])
 
 
 REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
