@@ -33,8 +33,8 @@ class Break:
 
 BREAKS = (
     Break("sign in normals", "geometry/surface.py", "nx = fx * step_u * along_v", "nx = -fx * step_u * along_v"),
-    Break("wrong light", "geometry/__init__.py", "(0.0, -math.sqrt(2 / 3), -1 /", "(0.0, math.sqrt(2 / 3), -1 /"),
-    Break("frontal light tilted", "geometry/__init__.py", "(0.0, 0.0, -1.0)", "(0.0, 0.1, -0.99498743710662)"),
+    Break("wrong light", "geometry/lights.py", "(0.0, -math.sqrt(2 / 3), -1 /", "(0.0, math.sqrt(2 / 3), -1 /"),
+    Break("frontal light tilted", "geometry/lights.py", "(0.0, 0.0, -1.0)", "(0.0, 0.1, -0.99498743710662)"),
     Break("swapped mask", "metrics/functional.py", "torch.where(mask, values, 0)", "torch.where(mask, 0, values)"),
     Break("lost seed", "degradation/downsampling.py", "repr((seed, *names))", "repr(names)"),
     Break("camera half a pixel off", "geometry/camera.py", "cx=(self.cx + 0.5) * sx - 0.5", "cx=self.cx * sx"),

@@ -18,7 +18,7 @@ from pathlib import Path
 from captures import CAPTURES, Capture, run_method
 from panel_grid import EMPTY, Panel, rendering_of_input, repeat_pixels, save_panels
 
-from dsr.geometry import FIGURE_LIGHT
+from dsr.geometry.lights import FIGURE_LIGHT
 from dsr.methods.recipe import read_recipe
 from dsr.pictures.depth_views import rendering
 from dsr.utils.ratios import round_ratio

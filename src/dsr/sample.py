@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from fractions import Fraction
@@ -100,11 +101,13 @@ class Scene:
 
         A measured map is left out if the window does not consist of whole pixels of the map.
         """
+        top, left, height, width = map(operator.index, (top, left, height, width))
         window = (slice(None), slice(top, top + height), slice(left, left + width))
         measured = {}
         for ratio, depth_lr in self.measured.items():
-            down = across = Fraction(ratio)
-            if not isinstance(ratio, int):
+            if isinstance(ratio, int):
+                down = across = Fraction(ratio)
+            else:
                 rows, columns = depth_lr.shape[-2:]
                 down, across = Fraction(self.camera.height, rows), Fraction(self.camera.width, columns)
             ends = top / down, (top + height) / down, left / across, (left + width) / across

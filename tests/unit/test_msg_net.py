@@ -182,6 +182,16 @@ def test_disparity_that_is_not_positive_becomes_a_hole() -> None:
     assert bool(NetworkUpsampler(net)(_sample(4, 8, 8)).isnan().all())
 
 
+def test_weights_that_do_not_fit_are_refused_and_change_nothing() -> None:
+    net, first = MSGNet(4), MSGNet(8)
+    before = {name: value.clone() for name, value in net.state_dict().items()}
+    with pytest.raises(
+        ValueError, match=r"^weights are for scale 8, the run is at scale 4, where MSGNet has other parameters$"
+    ):
+        net.start_from(first)
+    assert all(torch.equal(value, before[name]) for name, value in net.state_dict().items())
+
+
 def test_other_scale_and_unknown_precision_are_refused() -> None:
     with pytest.raises(ValueError, match="scene: expected scale 4, the network's, got 2"):
         NetworkUpsampler(_net(4))(_sample(2, 8, 8))

@@ -105,6 +105,15 @@ def test_refused_or_measured_sample_draws_nothing(noise: Noise) -> None:
     assert torch.equal(generator.get_state(), before)
 
 
+def test_sensor_draws_the_same_numbers_for_all_settings() -> None:
+    states = []
+    for noise in (Kinect(), Kinect(**QUIET, nearest=None, farthest=None), Kinect(reach=3, dropout=1.0)):
+        generator = _generator(2)
+        noise(STEPS, generator)
+        states.append(generator.get_state())
+    assert all(torch.equal(state, states[0]) for state in states)
+
+
 @pytest.mark.parametrize(("name", "expected"), [("tof", TimeOfFlight()), ("kinect", Kinect())])
 def test_configuration_files_hold_the_defaults(name: str, expected: Noise) -> None:
     node = OmegaConf.to_container(OmegaConf.load(REPOSITORY / "conf" / "noise" / f"{name}.yaml"))

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from dsr.data.scene_source import SceneSource
-from dsr.degradation.downsampling import Downsampling, Measured, make_sample
+from dsr.degradation.downsampling import Downsampling, Measured, encode_facts, make_sample
 from dsr.degradation.noise import GaussianMultiplicative, Kinect
 from dsr.degradation.random_degradation import Everything
 from dsr.geometry.camera import Camera
@@ -429,6 +429,12 @@ def test_measured_map_cannot_be_cropped() -> None:
         patches[0]
 
 
+def test_measured_maps_to_validate_with_have_the_hints_of_the_assumed_model() -> None:
+    scene = replace(_scene(), measured={4: torch.ones(1, 11, 15)})
+    [batch] = WholeScenes([scene], Degradation(4, Measured("bicubic")), hinted=True)  # type: ignore[arg-type]
+    assert torch.equal(batch["facts"], encode_facts("bicubic", soft=False, noise=True)[None])
+
+
 REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
     **{
         f"{key}={value}": (lambda key=key, value=value: _settings(**{key: value}), f"^{key}: expected ")
@@ -442,6 +448,7 @@ REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
         )
         for shares in ([0.0], [2.0, -1.0], [2.0, float("nan")], [2.0, float("inf")])
     },
+    "a share": (lambda: PatchData([Part(_Source([_scene()]), share=-1.0)], _settings(), X4), "^share of .*, got -1.0"),
     "too few scenes": (lambda: _data(validation_scenes=6), "^validation_scenes: expected fewer than the 6 scenes"),
     "a patch in 4": (lambda: _data(patch=30), "^patch: expected a size that scale=4 divides"),
     "a patch in 16": (lambda: _data(degradation=Degradation(16, BOX), patch=24), "^patch: .*scale=16 divides, got 24"),

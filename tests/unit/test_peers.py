@@ -286,6 +286,10 @@ def test_missing_file_and_unknown_network_are_refused(tmp_path: Path) -> None:
         _build(tmp_path / "nowhere")
     with pytest.raises(ValueError, match=f"peer: expected one of {', '.join(PEERS)}, got 'svlr'"):
         Peer("svlr", tmp_path, 4, FILES)
+    with pytest.raises(ValueError, match=r"^weights: expected a file of svlrm's weights, got none$"):
+        Peer("svlrm")
+    with pytest.raises(ValueError, match=r"^weights: expected no file beside a network, got "):
+        Peer(Enlarged(), tmp_path)
 
 
 def test_directory_is_searched_for_the_authors_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

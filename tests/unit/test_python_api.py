@@ -18,7 +18,7 @@ from torch import Tensor
 import dsr
 from dsr.app.upsample.parts import PARTS
 from dsr.app.upsample.stored import find_results, read_result
-from dsr.geometry import LIGHT_NAMES, direction_of
+from dsr.geometry.lights import LIGHT_NAMES, direction_of
 from dsr.geometry.surface import depth_to_normals, render
 
 CAMERA = dsr.Camera.from_fov(60, width=64, height=48)

@@ -52,7 +52,7 @@ def test_crop_takes_the_window_of_every_map_and_of_the_camera() -> None:
     depth = torch.arange(1.0, 33.0).view(1, 4, 8)
     measured = {2: torch.arange(1.0, 9.0).view(1, 2, 4), 4: torch.ones(1, 1, 2)}
     scene = _scene(depth=depth, measured=measured, notes=("estimated",))
-    window = scene.crop(2, 4, 2, 4)
+    window = scene.crop(2, 4, torch.tensor(2), torch.tensor(4))  # type: ignore[arg-type]  # whole numbers of any kind
     assert torch.equal(window.rgb, scene.rgb[:, 2:, 4:])
     assert torch.equal(window.depth, depth[:, 2:, 4:])
     assert window.camera == CAMERA.crop(2, 4, 2, 4)

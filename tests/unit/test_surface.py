@@ -5,8 +5,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from dsr.geometry import LIGHT_NAMES
 from dsr.geometry.camera import Camera
+from dsr.geometry.lights import LIGHT_NAMES
 from dsr.geometry.surface import comparison, depth_to_normals, lights, normal_mask, render, render_for_viewing, shade
 
 CAMERA = Camera(width=11, height=7, fx=9.0, fy=12.0, cx=4.3, cy=3.9)

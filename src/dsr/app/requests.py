@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dsr.app.upsample.parts import EXPECTED_ERROR
-from dsr.geometry import FIGURE_LIGHT, LIGHT_CHOICES, LIGHT_NAMES
+from dsr.geometry.lights import FIGURE_LIGHT, LIGHT_CHOICES, LIGHT_NAMES
 from dsr.report.study import Choice
 from dsr.utils.configuration import config_directories, list_choices
 from dsr.utils.options import Options, Rule, at_least, group, one_of, option, positive, some_of

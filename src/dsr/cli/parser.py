@@ -17,7 +17,7 @@ from typing import Any, NoReturn
 from rich.console import Console
 
 from dsr.data.download.collections import CATALOGUE
-from dsr.geometry import LIGHT_NAMES
+from dsr.geometry.lights import LIGHT_NAMES
 from dsr.utils.configuration import config_directories, list_choices, list_groups
 from dsr.utils.console import printable
 from dsr.utils.guards import did_you_mean

@@ -272,16 +272,19 @@ def known_kernels(facts: Tensor) -> list[str | None]:
     return [KERNELS[each.index(max(each))] if any(each) else None for each in kernels]
 
 
-def relative_error(given: Tensor, result: Tensor) -> tuple[Tensor, Tensor]:  # (B, 1, h, w), (B, 1, H, W)
-    """Return the relative error, 0 in holes and of outliers, and the known pixels, 0 or 1, of maps of inverse depth."""
+def relative_error(given: Tensor, result: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the relative error, 0 in holes and of outliers, and the known pixels, 0 or 1, (B, 1, h, w) each.
+
+    ``given`` (B, 1, h, w) and ``result`` (B, 1, H, W) are inverse depth.
+    """
     scale = result.shape[-1] // given.shape[-1]
     error = given / functional.avg_pool2d(result, scale) - 1
     known = error.isfinite() & (error.abs() < _LARGEST)
     return torch.where(known, error, 0), known.to(given.dtype)
 
 
-def local_noise(given: Tensor, result: Tensor) -> Tensor:  # (B, 1, h, w), (B, 1, H, W)
-    """Return the root mean square of :func:`relative_error` around each pixel; 0 where nothing around is known."""
+def local_noise(given: Tensor, result: Tensor) -> Tensor:
+    """Return the root mean square of :func:`relative_error` around each pixel, (B, 1, h, w); 0 where none is known."""
     error, weight = relative_error(given, result)
     padding = (_WINDOW // 2,) * 4
     squares, weights = (

@@ -144,6 +144,7 @@ class Kinect:
     def __call__(self, values: Tensor, generator: torch.Generator) -> Tensor:
         """Return the sensor's reading in metres, NaN in holes, at dropouts and out of range."""
         draws = torch.randn(values.shape, generator=generator, dtype=torch.float64).to(values.device)
+        # drawn even where they are not used, so that all settings share the numbers
         chances = torch.rand(values.shape, generator=generator, dtype=torch.float64).to(values.device)
         disparity = _positive(self.stereo_constant / values.double()) + self.std * draws
         depth = self.stereo_constant / _positive((disparity / self.step).round() * self.step)

@@ -15,7 +15,6 @@ from dataclasses import FrozenInstanceError, dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -314,6 +313,8 @@ def undistort(picture: np.ndarray, camera: Camera, lens: Lens, hole: float | Non
     if picture.shape[:2] != (camera.height, camera.width) or max(picture.shape[:2]) > _MOST:
         got = f"{picture.shape[1]} x {picture.shape[0]}"
         raise ValueError(f"lens: expected {camera.width} x {camera.height} pixels, each at most {_MOST}, got {got}")
+    import cv2  # noqa: PLC0415 - only pictures of lenses need it
+
     x, y = _places(camera, lens)
     if hole is None:
         return cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -327,6 +328,8 @@ def undistort(picture: np.ndarray, camera: Camera, lens: Lens, hole: float | Non
 @functools.lru_cache(maxsize=2)  # the photo's and the depth map's
 def _places(camera: Camera, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
     """Return the columns and rows of a picture where the pixels of the pinhole camera lie, (h, w) float32 each."""
+    import cv2  # noqa: PLC0415 - only pictures of lenses need it
+
     matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], np.float64)
     numbers, size, kind = np.array(lens.coefficients, np.float64), (camera.width, camera.height), cv2.CV_32FC1
     if lens.model == "brown_conrady":

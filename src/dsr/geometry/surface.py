@@ -9,7 +9,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.geometry import LIGHT_NAMES, LIGHTS, VIEWING_LIGHT
+from dsr.geometry.lights import LIGHT_NAMES, LIGHTS, VIEWING_LIGHT
 
 # brightness of a surface that faces away from the light and of one that faces it, and the exponent between them
 VIEWING_TONES = (0.06, 0.9, 1.25)

@@ -18,8 +18,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.geometry import LIGHT_NAMES
 from dsr.geometry.camera import Camera
+from dsr.geometry.lights import LIGHT_NAMES
 from dsr.geometry.mesh import (
     QUADRIC,
     Mesh,

@@ -24,7 +24,7 @@ from torch import Tensor
 from dsr.geometry.surface import length
 from dsr.metrics.boundaries import depth_pro_scores
 from dsr.metrics.depth import covered
-from dsr.metrics.formats import column, of_parts, target_mask
+from dsr.metrics.formats import Metric, column, target_mask
 from dsr.metrics.functional import SurfacePair, once_per_pair
 from dsr.utils.compute_device import in_own_precision
 
@@ -35,10 +35,10 @@ CHUNK = 1 << 15  # how many points or pairs are worked on at a time
 STEEPEST = 1e-5  # sine of the angle between the two edges of a triangle below which it has no normal
 RATIO = 1.25**0.125
 NEAREST = 1e-4  # lower limit of aligned depth in metres and of aligned disparity in 1/m
-WEIGHTS = {"WKDR": 3.65, "beyond_disparity": 0.18, "beyond_depth": 0.01, "boundary": 0.20, "RelNormal": 1.94}
 MIN_SIZE = 2 * SCALES[-1] + 1  # of a map with a normal at the coarsest scale
 
 
+@once_per_pair
 def rel_normal(pair: SurfacePair) -> Tensor:
     """Return RelNormal, (B,) in radians, the mean error of the angle between two normals; lower is better.
 
@@ -102,6 +102,7 @@ def sobol_pairs(height: int, width: int, device: torch.device) -> list[Tensor]:
     return found
 
 
+@once_per_pair
 def wkdr(pair: SurfacePair) -> Tensor:
     """Return the fraction of ordered pairs (i, j) of true pixels that the prediction has in another order, (B,).
 
@@ -126,39 +127,29 @@ def wkdr(pair: SurfacePair) -> Tensor:
     return torch.tensor(errors, dtype=torch.float64, device=pair.target.device)
 
 
-def beyond(pair: SurfacePair, *, inverse: bool) -> Tensor:
-    """Return the fraction of pixels with a ratio to the true depth of 1.25^.125 or more, (B,).
-
-    Depth, or its ``inverse``, gets the factor and offset of least squares first, in 64 bits, and is clamped.
-    """
-    maps = (1 / pair.prediction, 1 / pair.target) if inverse else (pair.prediction, pair.target)
-    values, target = maps[0].double(), maps[1].double()
-    weights = pair.depth_mask.double()
-    count = weights.sum(dim=(2, 3), keepdim=True)
-    mean = (values * weights).sum(dim=(2, 3), keepdim=True) / count
-    true_mean = (target * weights).sum(dim=(2, 3), keepdim=True) / count
-    centred = (values - mean) * weights
-    square = (centred * centred).sum(dim=(2, 3), keepdim=True)
-    factor = (centred * (target - true_mean)).sum(dim=(2, 3), keepdim=True) / square.clamp(min=1e-300)
-    aligned = ((values - mean) * factor + true_mean).clamp(min=NEAREST)
-    aligned = 1 / aligned if inverse else aligned
-    ratio = torch.maximum(aligned / pair.target, pair.target / aligned)
-    within = ((ratio < RATIO) & pair.depth_mask).sum(dim=(1, 2, 3))
-    return 1 - within.double() / pair.target_mask.sum(dim=(1, 2, 3))
+@once_per_pair
+def beyond_disparity(pair: SurfacePair) -> Tensor:
+    """Return the fraction of pixels with a ratio to the true depth of 1.25^.125 or more, (B,), disparity fitted."""
+    return _beyond(pair, 1 / _aligned(pair, 1 / pair.prediction, 1 / pair.target))
 
 
 @once_per_pair
-def scores(pair: SurfacePair) -> dict[str, Tensor]:
-    """Return SAWA-H and its parts by name, (B,) each; lower is better."""
-    parts = {
-        "WKDR": wkdr(pair),
-        "beyond_disparity": beyond(pair, inverse=True),
-        "beyond_depth": beyond(pair, inverse=False),
-        "boundary": 1 - depth_pro_scores(pair)["F1"],
-        "RelNormal": rel_normal(pair),
-    }
-    sawa_h = torch.stack([WEIGHTS[name] * part.double() for name, part in parts.items()]).sum(dim=0)
-    return {**parts, "SAWA_H": sawa_h, "covered": covered(pair)}
+def beyond_depth(pair: SurfacePair) -> Tensor:
+    """Return the same as :func:`beyond_disparity`, (B,), with depth fitted."""
+    return _beyond(pair, _aligned(pair, pair.prediction, pair.target))
+
+
+def boundary_error(pair: SurfacePair) -> Tensor:
+    """Return 1 less the boundary F1 of Depth Pro, (B,)."""
+    return 1 - depth_pro_scores(pair)["F1"]
+
+
+WEIGHTS = {wkdr: 3.65, beyond_disparity: 0.18, beyond_depth: 0.01, boundary_error: 0.20, rel_normal: 1.94}
+
+
+def sawa_h(pair: SurfacePair) -> Tensor:
+    """Return SAWA-H, (B,), the sum of its parts by :data:`WEIGHTS`; lower is better."""
+    return torch.stack([weight * part(pair).double() for part, weight in WEIGHTS.items()]).sum(dim=0)
 
 
 def _taken(values: Tensor, source: Tensor) -> Tensor:
@@ -194,13 +185,33 @@ def _pair_error(rows: Tensor, first: Tensor, second: Tensor) -> Tensor:
     return total / count
 
 
-_formats = {
-    "SAWA_H": column("SAWA-H", "", digits=3),
-    "RelNormal": column("RelNormal", "rad", digits=3),
-    "WKDR": column("WKDR", "%", 1e2, 2),
-    "beyond_disparity": column("Beyond", "1.028 x, disparity fitted, %", 1e2),
-    "beyond_depth": column("Beyond", "1.028 x, depth fitted, %", 1e2),
-    "boundary": column("1 - F1", "Depth Pro, %", 1e2),
-    "covered": column("Covered", "%", 1e2, higher_is_better=True),
-}
-METRICS = tuple(of_parts("EvalMDE_", scores, target_mask, _formats, min_size=MIN_SIZE, whole=True))
+def _aligned(pair: SurfacePair, values: Tensor, target: Tensor) -> Tensor:
+    """Return values with the factor and offset of least squares to a target, clamped, (B, 1, H, W) in 64 bits."""
+    weights = pair.depth_mask.double()
+    count = weights.sum(dim=(2, 3), keepdim=True)
+    values, target = values.double(), target.double()
+    means = [(each * weights).sum(dim=(2, 3), keepdim=True) / count for each in (values, target)]
+    centred = (values - means[0]) * weights
+    square = (centred * centred).sum(dim=(2, 3), keepdim=True)
+    factor = (centred * (target - means[1])).sum(dim=(2, 3), keepdim=True) / square.clamp(min=1e-300)
+    return ((values - means[0]) * factor + means[1]).clamp(min=NEAREST)
+
+
+def _beyond(pair: SurfacePair, aligned: Tensor) -> Tensor:
+    ratio = torch.maximum(aligned / pair.target, pair.target / aligned)
+    within = ((ratio < RATIO) & pair.depth_mask).sum(dim=(1, 2, 3))
+    return 1 - within.double() / pair.target_mask.sum(dim=(1, 2, 3))
+
+
+METRICS: tuple[Metric, ...] = tuple(
+    Metric(f"EvalMDE_{name}", function, target_mask, shown, min_size=MIN_SIZE, whole=True)
+    for name, function, shown in (
+        ("SAWA_H", sawa_h, column("SAWA-H", "", digits=3)),
+        ("RelNormal", rel_normal, column("RelNormal", "rad", digits=3)),
+        ("WKDR", wkdr, column("WKDR", "%", 1e2, 2)),
+        ("beyond_disparity", beyond_disparity, column("Beyond", "1.028 x, disparity fitted, %", 1e2)),
+        ("beyond_depth", beyond_depth, column("Beyond", "1.028 x, depth fitted, %", 1e2)),
+        ("boundary", boundary_error, column("1 - F1", "Depth Pro, %", 1e2)),
+        ("covered", covered, column("Covered", "%", 1e2, higher_is_better=True)),
+    )
+)

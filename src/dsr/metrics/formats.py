@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dsr.geometry import LIGHT_NAMES
+from dsr.geometry.lights import LIGHT_NAMES
 from dsr.metrics.functional import SurfacePair
 from dsr.utils.compute_device import in_own_precision
 

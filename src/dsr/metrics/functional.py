@@ -47,13 +47,18 @@ def once_per_pair(function: Callable[[SurfacePair], _Derived]) -> Callable[[Surf
 class SurfacePair:
     """Two depth maps of the same pixels, and the quantities that metrics derive from them.
 
-    Prediction and target are (B, 1, H, W) orthogonal depth in metres; NaN is a hole, and so is a depth that is not
-    positive, which no camera sees. float16 and bfloat16 become float32. The rays, (B or 1, 3, H, W), have z = 1, see
-    :meth:`dsr.geometry.camera.Camera.rays`; ``mask``, (B, 1, H, W) bool, are the pixels to compare. ``regions`` are
-    parts of the images by name, (B, 1, H, W) uint8, 0 outside. ``depth_error`` and ``angle_error`` are the expected
-    absolute errors of the predicted depth in metres and of its normals in degrees, (B, 1, H, W), NaN where there is
-    none. ``image_dtype`` is that of normals and renderings, None for the depth's: float32 halves their computing time
-    and changes scores by about 1e-7; depths and their differences keep their own dtype.
+    Args:
+        prediction, target: (B, 1, H, W) orthogonal depth in metres; NaN is a hole, and so is a depth that is not
+            positive, which no camera sees. float16 and bfloat16 become float32.
+        rays: (B or 1, 3, H, W) rays with z = 1, see :meth:`dsr.geometry.camera.Camera.rays`.
+        mask: (B, 1, H, W) bool, the pixels to compare; None for all.
+        unit: unit of the metrics that are in the benchmark's own.
+        regions: parts of the images by name, (B, 1, H, W) uint8, 0 outside, see :class:`dsr.sample.Scene`.
+        depth_error, angle_error: (B, 1, H, W) expected absolute errors of the predicted depth in metres and of its
+            normals in degrees, NaN where there is none; None from a method that states none.
+        image_dtype: of normals and renderings, None for the depth's. float32 halves their computing time and changes
+            scores by about 1e-7; depths and their differences keep their own dtype.
+
     """
 
     def __init__(

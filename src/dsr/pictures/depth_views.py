@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.geometry import FIGURE_LIGHT, direction_of
 from dsr.geometry.camera import Camera
+from dsr.geometry.lights import FIGURE_LIGHT, direction_of
 from dsr.geometry.surface import depth_to_normals, shade
 
 

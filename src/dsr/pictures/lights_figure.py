@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from torch import Tensor
 
-from dsr.geometry import LIGHTS, Direction
+from dsr.geometry.lights import LIGHTS, Direction
 from dsr.geometry.surface import render
 from dsr.pictures.canvas import colours, save_both
 from dsr.pictures.depth_views import rendering

@@ -10,7 +10,7 @@ from matplotlib.image import AxesImage
 from matplotlib.transforms import Bbox
 from torch import Tensor
 
-from dsr.geometry import LIGHT_NAMES
+from dsr.geometry.lights import LIGHT_NAMES
 from dsr.geometry.surface import render
 from dsr.metrics.formats import Formats, describe_directions, in_tables
 from dsr.pictures.canvas import Canvas, fitted, without_collections, write_figure

@@ -18,8 +18,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from torch import Tensor
 
-from dsr.geometry import LIGHT_NAMES
 from dsr.geometry.camera import Camera
+from dsr.geometry.lights import LIGHT_NAMES
 from dsr.geometry.surface import render
 from dsr.pictures.canvas import HOLE_COLOUR, colours, write_figure
 from dsr.pictures.depth_views import limits_of, normals_seen_by, reduced

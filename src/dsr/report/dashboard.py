@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
 from dsr.evaluation.results import Results, Run, method_settings
-from dsr.geometry import LIGHT_NAMES
+from dsr.geometry.lights import LIGHT_NAMES
 from dsr.geometry.surface import render
 from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.metrics.formats import HEADLINES, LOOKS, looks_and_depth, main_first

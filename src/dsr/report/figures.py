@@ -22,7 +22,7 @@ from matplotlib.colors import Colormap, ListedColormap
 from torch import Tensor
 
 from dsr.evaluation.results import BenchmarkSetting, Results
-from dsr.geometry import FIGURE_LIGHT
+from dsr.geometry.lights import FIGURE_LIGHT
 from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.pictures.canvas import save_both
 from dsr.pictures.depth_views import Window, limits_of, rendering, strongest_window

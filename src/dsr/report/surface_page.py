@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from dsr.geometry import VIEWING_LIGHT
 from dsr.geometry.camera import Camera
+from dsr.geometry.lights import VIEWING_LIGHT
 from dsr.geometry.surface import VIEWING_TONES, render_for_viewing
 from dsr.io.exports import normal_strips
 from dsr.io.photos import data_url, to_jpeg

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import os
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,7 +25,7 @@ from dsr.training.settings import PatchSettings
 from dsr.utils import interruption
 from dsr.utils.guards import derived
 
-_EPOCH = 1000
+_EPOCH = 1000  # about how many batches an epoch has where the trainer has no number of steps
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,8 @@ class WholeScenes(Dataset[Batch]):
         self._samples = [degradation.sample(scene, seed) for scene in scenes]
         self._facts = None
         if hinted:
-            self._facts = encode_facts(degradation.downsampling.kernel, soft=False, noise=degradation.noise is None)
+            kernel = degradation.downsampling.assumed_model().kernel
+            self._facts = encode_facts(kernel, soft=False, noise=degradation.noise is None)
 
     def __len__(self) -> int:
         return len(self._samples)
@@ -90,9 +92,12 @@ class PatchData(lightning.LightningDataModule):
         self.patches, self._degradation, self._seed = settings, degradation, seed
         self._shares = [part.share for part in parts]
         self.trained: list[tuple[SceneSource, list[str]]] = []  # data sets and names of their scenes to train on
-        self.held_out: dict[str, tuple[SceneSource, list[str]]] = {}  # likewise to validate with, by validation set
+        # likewise to validate with, by validation set; scenes without a true depth leave it at ``setup``
+        self.held_out: dict[str, tuple[SceneSource, list[str]]] = {}
         held_out: list[tuple[str, SceneSource, list[str]]] = []
         for part in parts:
+            if not 0 <= part.share < math.inf:
+                raise ValueError(f"share of {part.source.name}: expected 0 or a positive number, got {part.share}")
             names, kept = _split(part.source, settings)
             self.trained.append((part.source, names))
             if kept:

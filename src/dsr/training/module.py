@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import functools
 import json
@@ -234,21 +233,15 @@ class SuperResolution(lightning.LightningModule):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Store the scores of bicubic interpolation, and of what the module is made, as plain values."""
         checkpoint["bicubic"] = self.bicubic
-        makers: dict[str, Any] = {
+        makers = {
             "net": functools.partial(self.net.__class__, **self.net.arguments()),
             "objective": functools.partial(self.objective.__class__, **self.objective.arguments()),
             "optimizer": self._make_optimizer,
+            "scheduler": self._make_scheduler,
         }
-        if self._make_scheduler is not None:
-            makers["scheduler"] = self._make_scheduler
-        stored: dict[str, Any] = {"average": self.decay, "validation_sets": list(self.sets)}
-        for name, make in makers.items():  # a class or a partial of one is stored, if its arguments are plain
-            made = functools.partial(make)
-            if isinstance(made.func, type) and not made.args:
-                with contextlib.suppress(TypeError, ValueError):
-                    json.dumps(made.keywords)
-                    stored[name] = {"_target_": f"{made.func.__module__}.{made.func.__qualname__}", **made.keywords}
-        checkpoint["hyper_parameters"] = stored
+        nodes = {name: _node_of(make) for name, make in makers.items() if make is not None}
+        plain = {"average": self.decay, "validation_sets": list(self.sets)}
+        checkpoint["hyper_parameters"] = plain | {name: node for name, node in nodes.items() if node is not None}
 
     @classmethod
     def load_from_checkpoint(  # type: ignore[override]  # Lightning's has arguments for another file of arguments
@@ -284,6 +277,18 @@ class SuperResolution(lightning.LightningModule):
 def _by_tag(scores: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
     """Return the scores of sets by the names that they are logged by."""
     return {f"{kind}/{name}": value for kind, each in scores.items() for name, value in each.items()}
+
+
+def _node_of(make: Any) -> dict[str, Any] | None:
+    """Return a class, or a partial of one, as ``_target_`` beside plain arguments; None for anything else."""
+    made = make if isinstance(make, functools.partial) else functools.partial(make)
+    if made.args or not isinstance(made.func, type):
+        return None
+    try:
+        json.dumps(made.keywords)
+    except (TypeError, ValueError):
+        return None
+    return {"_target_": f"{made.func.__module__}.{made.func.__qualname__}", **made.keywords}
 
 
 def _read_part(path: Path, name: str, node: Mapping[str, Any]) -> Any:

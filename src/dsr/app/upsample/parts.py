@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
-from dsr.geometry import LIGHT_NAMES
+from dsr.geometry.lights import LIGHT_NAMES
 from dsr.utils.guards import MOST_FACES, MOST_POINTS
 from dsr.utils.options import Options, Rule, at_least, one_of, option
 from dsr.utils.versions import how_to_install

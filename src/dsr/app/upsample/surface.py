@@ -20,8 +20,8 @@ from dsr.app.upsample.frame import Times, write_result
 from dsr.app.upsample.outputs import begin, expect_free, output_encoding, read_previous_run
 from dsr.app.upsample.parts import Result, Results
 from dsr.app.upsample.stored import write_scene
-from dsr.geometry import FIGURE_LIGHT, Direction, direction_of
 from dsr.geometry.camera import Camera
+from dsr.geometry.lights import FIGURE_LIGHT, Direction, direction_of
 from dsr.geometry.mesh import Mesh, triangulate, vertex_normals
 from dsr.geometry.surface import render_for_viewing, shade
 from dsr.inference import Plan

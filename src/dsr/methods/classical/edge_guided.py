@@ -159,6 +159,9 @@ class EdgeGuided(Method):
         mixed: weight of a low-resolution pixel with an edge through it, relative to others.
         fill_holes: whether holes of the low-resolution map are inpainted; otherwise they stay.
 
+    Attributes:
+        history: of the last call: iterations (over all stages), energy of the labels, largest change of a message.
+
     """
 
     abilities = Abilities(cost=Cost(1500, 12))

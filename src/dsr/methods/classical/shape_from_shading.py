@@ -8,8 +8,10 @@ Super-Resolution from Shading*, CVPR 2018, minimise
     shading = l_1 n_x + l_2 n_y + l_3 n_z + l_4,    n = m / |m|,    m = (p, q, -z - x p - y q),
 
 with z in pixels here (times the focal length, by the median depth), the slopes p = fx dz/du and q = fy dz/dv, and the
-ray (x, y, 1) of the pixel. The augmented Lagrangian is E with a copy theta of (p, q, z) in the nonlinear terms, plus
-penalty / 2 * (|(p, q, z) + u - theta|^2 - |u|^2) with the scaled multiplier u. Alternating steps lower it: the albedo
+ray (x, y, 1) of the pixel. The shading is Lambertian under first-order spherical harmonics; m faces the camera, and a
+pixel sees the area z |m| / (fx fy). With a copy theta of (p, q, z) and the scaled multiplier u, the augmented
+Lagrangian is E with theta in all terms but that of the data, plus
+penalty / 2 * (|(p, q, z) + u - theta|^2 - |u|^2). Alternating steps lower it: the albedo
 by region fusion (:mod:`dsr.methods.classical.potts`), the lighting by least squares, theta by Levenberg and Marquardt's
 method, z by conjugate gradients.
 

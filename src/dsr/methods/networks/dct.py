@@ -47,7 +47,7 @@ def idct2(coefficients: Tensor) -> Tensor:
 
 
 def laplacian_eigenvalues(height: int, width: int, like: Tensor) -> Tensor:
-    """Return the eigenvalues, none positive, of the four neighbours' Laplacian in the basis of :func:`dct2`."""
+    """Return the eigenvalues, none positive, of the five-point Laplacian in the basis of :func:`dct2`, (H, W)."""
     rows, columns = (
         torch.cos(math.pi / size * torch.arange(size, dtype=torch.float64, device=like.device))
         for size in (height, width)

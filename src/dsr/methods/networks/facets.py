@@ -205,7 +205,7 @@ def _in_a_row(block: Residual) -> Tensor:
     return torch.cat([each.flatten() for each in parameters]).float()
 
 
-class UNet(nn.Module):
+class CoarseUNet(nn.Module):
     """A U-net below the low resolution, which adds nothing at first; its coarsest level, an eighth, knows its mean."""
 
     def __init__(self, width: int, deep: int) -> None:

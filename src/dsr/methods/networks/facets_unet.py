@@ -26,9 +26,9 @@ from dsr.degradation.downsampling import FACTS, Downsampling, known_kernels
 from dsr.methods.images import exporting, inpaint, repeat_blocks, upsample_bicubic
 from dsr.methods.networks.facets import (
     HEAD,
+    CoarseUNet,
     Facets,
     MixedResidual,
-    UNet,
     look,
     make_pyramid,
     photo_input,
@@ -100,7 +100,7 @@ class FacetsUNet(DisparityNetwork):
             self.shares.weight[:, FACTS] = _SLOPE
             self.shares.bias.fill_(-_SLOPE * _ROUGH)
         self.trunk = nn.ModuleList(MixedResidual(width) for _ in range(blocks))
-        self.wide = UNet(width, deep)
+        self.wide = CoarseUNet(width, deep)
         self.planes = scale_down(nn.Conv2d(width, (1 + _LEVELS + 2 * (3 + _LEVELS) + 3) * facets, 3, padding=1))
         self.up, self.join = up, join
         self.choice = scale_down(nn.Conv2d(HEAD, NEIGHBOURS * facets, 3, padding=1))

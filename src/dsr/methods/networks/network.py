@@ -27,7 +27,7 @@ from dsr.methods.base import TILE, UNTILED, Abilities, Cost, InverseSample, Inve
 from dsr.methods.images import compute_min_max, inpaint
 from dsr.sample import DepthSample
 from dsr.utils.compute_device import widened
-from dsr.utils.guards import expect_one_of, refusing
+from dsr.utils.guards import expect_one_of
 from dsr.utils.progress import Steps
 
 Precision = Literal["float32", "bfloat16"]
@@ -77,9 +77,13 @@ class DisparityNetwork(nn.Module, abc.ABC):
                 f"expected weights of {type(self).__name__} {self.arguments()}, got those of {type(first).__name__} "
                 f"{first.arguments()}"
             )
-        scales = f"weights are for scale {first.scale}, the run is at scale {self.scale}"
-        with refusing(f"{scales}, where {type(self).__name__} has other parameters", RuntimeError):
-            self.load_state_dict(first.state_dict())
+        shapes = [{name: value.shape for name, value in net.state_dict().items()} for net in (self, first)]
+        if shapes[0] != shapes[1]:
+            raise ValueError(
+                f"weights are for scale {first.scale}, the run is at scale {self.scale}, where {type(self).__name__} "
+                "has other parameters"
+            )
+        self.load_state_dict(first.state_dict())
 
     def share(self, first: DisparityNetwork) -> None:
         """Take over layers that do not depend on the factor from a trained network, and do not train them."""

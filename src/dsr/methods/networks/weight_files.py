@@ -12,7 +12,7 @@ import json
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Final, Literal
 
 import safetensors
 import safetensors.torch
@@ -28,10 +28,12 @@ from dsr.utils.ratios import round_ratio
 SLACK = 1.05  # by how much a scale may exceed the factor of weights that are used for it
 _NODE = ("file", "files", "packaged", "path", "source")
 FORMAT = "dsr-network-1"
-_KEY, _SHARED = "dsr", "shared"
+_KEY = "dsr"
+_SHARED: Final = "shared"
 _DAMAGED = "expected a safetensors file, got a damaged one"
 _LARGEST_ARGUMENT = 4096  # largest whole number among the arguments of a network in a file of weights
-LINKS: Mapping[str, str] = MappingProxyType(
+Link = Literal["shared", "clean", "soft"]
+LINKS: Mapping[Link, str] = MappingProxyType(
     {
         _SHARED: "whose layers it shares",
         "clean": "for box means without noise",
@@ -199,7 +201,7 @@ def files_of_weights(path: Path) -> list[Path]:
     return [file for file in dict.fromkeys(found) if file is not None]
 
 
-def linked_weights(path: Path, key: str) -> Path | None:
+def linked_weights(path: Path, key: Link) -> Path | None:
     """Return the file that a file of weights names by a key of ``LINKS``, if any, in its own folder."""
     name = read_header(path).get(key)
     if name is None:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dsr.evaluation.results import BenchmarkSetting, Results
-from dsr.geometry import BASIS, LIGHTS, VIEWING_LIGHT
+from dsr.geometry.lights import BASIS, LIGHTS, VIEWING_LIGHT
 from dsr.pictures.canvas import HOLE_COLOUR
 from dsr.report.html_page import asset, block, fill, json_text, palette
 from dsr.report.page.content import links, metrics_data, problem_data, run_data, standings

@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from dsr.evaluation.results import BenchmarkSetting, Results, Run, one_per_method
-from dsr.geometry import BASIS
 from dsr.geometry.camera import Camera
+from dsr.geometry.lights import BASIS
 from dsr.geometry.surface import normal_mask, shade
 from dsr.metrics.calibration import error_ratios, measured_errors, squared_error_share
 from dsr.pictures.depth_views import limits_of, normals_seen_by

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dsr.geometry import LIGHT_CHOICES, LIGHT_NAMES, STUDY_LIGHT
+from dsr.geometry.lights import LIGHT_CHOICES, LIGHT_NAMES, STUDY_LIGHT
 from dsr.utils.options import Options, one_of, option
 
 

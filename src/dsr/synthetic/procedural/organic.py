@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from skimage.measure import marching_cubes
 
@@ -9,34 +11,41 @@ from dsr.synthetic.procedural.shape import Shape, grid, merge, place_on_ground, 
 from dsr.synthetic.raycast import Array
 
 
-def polygonise(rng: np.random.Generator, blobs: Array, ripples: tuple[Array, Array, Array], cells: int) -> Shape:
-    """Return the zero set of a field, the sum of Gaussian ``blobs`` - 0.5 + ``ripples``, on z = 0.
+class Blobs(NamedTuple):
+    """A field, the sum of B Gaussian blobs - 0.5 + K ripples, positive inside."""
 
-    Blobs are rows (B, 7): a centre, radii along the axes, and a weight, which is below 0 for a hollow. Ripples are wave
-    vectors (K, 3), phases and heights (K,); they are hills or, in half of the bodies, folds with sharp valleys.
-    Vertices and normals are exact. There are ``cells`` cells along the longest side.
-    """
-    centres, radii, weights = blobs[:, :3], blobs[:, 3:6], blobs[:, 6]
-    waves, phases, heights = ripples
-    ridged, soft = rng.random() < 0.5, 0.25 * np.abs(heights).sum() + 1e-9
+    centres: Array  # (B, 3)
+    radii: Array  # (B, 3) along the coordinate axes
+    weights: Array  # (B,) 1 for a blob, below 0 for a hollow
+    waves: Array  # (K, 3) wave vectors of the ripples
+    phases: Array  # (K,)
+    heights: Array  # (K,)
+    ridged: bool  # whether ripples are folds with sharp valleys instead of hills
 
-    def shape_ripples(swing: Array) -> tuple[Array, Array]:
-        """Return the ripples and their derivative for sums of waves."""
-        root = np.sqrt(swing**2 + soft**2)
-        return (root, swing / root) if ridged else (swing, np.ones_like(swing))
-
-    def evaluate(points: Array) -> tuple[Array, Array]:
+    def evaluate(self, points: Array) -> tuple[Array, Array]:
         """Return the field (N,) and its gradient (N, 3) at ``points`` (N, 3)."""
         total, gradient = np.full(len(points), -0.5), np.zeros(points.shape)
-        for centre, radius, weight in zip(centres, radii, weights, strict=True):
+        for centre, radius, weight in zip(self.centres, self.radii, self.weights, strict=True):
             off = (points - centre) / radius
             bell = weight * np.exp(-(off**2).sum(1))
             total += bell
             gradient -= 2 * bell[:, None] * off / radius
-        phase = points @ waves.T + phases
-        swing, slope = shape_ripples(np.sin(phase) @ heights)
-        return total + swing, gradient + slope[:, None] * ((np.cos(phase) * heights) @ waves)
+        phase = points @ self.waves.T + self.phases
+        swing, slope = self.shape_ripples(np.sin(phase) @ self.heights)
+        return total + swing, gradient + slope[:, None] * ((np.cos(phase) * self.heights) @ self.waves)
 
+    def shape_ripples(self, swing: Array) -> tuple[Array, Array]:
+        """Return the ripples and their derivative for sums of waves."""
+        if not self.ridged:
+            return swing, np.ones_like(swing)
+        soft = 0.25 * np.abs(self.heights).sum() + 1e-9
+        root = np.sqrt(swing**2 + soft**2)
+        return root, swing / root
+
+
+def polygonise(field: Blobs, cells: int) -> Shape:
+    """Return the zero set of a field on z = 0; vertices and normals are exact, ``cells`` are along the longest side."""
+    centres, radii, weights, waves, phases, heights, _ = field
     low, high = (centres - 1.9 * radii).min(0), (centres + 1.9 * radii).max(0)
     step = (high - low).max() / cells
     axes = [np.arange(low[i], high[i] + step, step) for i in range(3)]
@@ -44,20 +53,20 @@ def polygonise(rng: np.random.Generator, blobs: Array, ripples: tuple[Array, Arr
     bells = [np.exp(-(((axis - centres[:, i, None]) / radii[:, i, None]) ** 2)) for i, axis in enumerate(axes)]
     turns = [np.exp(1j * waves[:, i, None] * axis) for i, axis in enumerate(axes)]
     turns[0] = turns[0] * (heights * np.exp(1j * phases))[:, None]
-    flat = (weights[:, None] * bells[0]).T @ (bells[1][:, :, None] * bells[2][:, None, :]).reshape(len(blobs), -1)
+    flat = (weights[:, None] * bells[0]).T @ (bells[1][:, :, None] * bells[2][:, None, :]).reshape(len(centres), -1)
     swing = turns[0].T @ (turns[1][:, :, None] * turns[2][:, None, :]).reshape(len(heights), -1)
-    values = (flat - 0.5 + shape_ripples(swing.imag)[0]).reshape([len(axis) for axis in axes])
+    values = (flat - 0.5 + field.shape_ripples(swing.imag)[0]).reshape([len(axis) for axis in axes])
     for i in range(3):  # closed at the border
         np.moveaxis(values, i, 0)[[0, -1]] = -0.1
     vertices, faces, _, _ = marching_cubes(values, 0.0)
     points = low + step * vertices.astype(np.float64)
     for _ in range(3):
-        value, gradient = evaluate(points)
+        value, gradient = field.evaluate(points)
         move = value / np.maximum((gradient**2).sum(1), 1e-9)
         points -= np.clip(move[:, None] * gradient, -step, step)
     tone = np.clip(0.5 + np.sin(points @ waves.T + phases) @ heights / 0.15, 0, 1)
     chart = np.column_stack((points[:, 0] + 0.3 * points[:, 1], points[:, 2], tone))
-    return place_on_ground(Shape(points, faces.astype(np.intp), unit(evaluate(points)[1]), chart, points))
+    return place_on_ground(Shape(points, faces.astype(np.intp), unit(field.evaluate(points)[1]), chart, points))
 
 
 def _ripples(rng: np.random.Generator, cells: int) -> tuple[Array, Array, Array]:
@@ -82,8 +91,8 @@ def creature(rng: np.random.Generator, cells: int = 96) -> Shape:
             radii.append(thick[k] * rng.uniform(0.85, 1.2, 3))
             heading = unit(heading + 0.45 * rng.normal(size=3))
             start = start + 0.75 * thick[k] * heading
-    blobs = np.column_stack((centres, radii, np.ones(len(radii))))
-    return polygonise(rng, blobs, _ripples(rng, cells), cells)
+    blobs = np.array(centres), np.array(radii), np.ones(len(radii))
+    return polygonise(Blobs(*blobs, *_ripples(rng, cells), bool(rng.random() < 0.5)), cells)
 
 
 _FACE = np.array(
@@ -146,7 +155,8 @@ def figure(rng: np.random.Generator, cells: int = 120) -> Shape:
         blobs = np.concatenate((head, _body(rng)))
         waves, heights = rng.normal(size=(count, 3)) * [60, 40, 9], rng.uniform(0.005, 0.03, count)
     phases = rng.uniform(0, 6.28, count)
-    shape = polygonise(rng, blobs, (waves, phases, heights), cells)
+    field = Blobs(blobs[:, :3], blobs[:, 3:6], blobs[:, 6], waves, phases, heights, bool(rng.random() < 0.5))
+    shape = polygonise(field, cells)
     return shape.scale(1 / float(shape.vertices[:, 2].max()))
 
 
@@ -155,8 +165,8 @@ def pebble(rng: np.random.Generator, cells: int = 56) -> Shape:
     size = rng.uniform(0.3, 0.5, 3)
     rough = rng.uniform(0.0, 0.25) ** 1.3
     waves, phases, heights = _ripples(rng, cells)
-    blob = np.concatenate((np.zeros(3), size * 1.2, np.ones(1)))
-    return polygonise(rng, blob[None], (waves, phases, heights * rough * 4), cells)
+    blob = np.zeros((1, 3)), size[None] * 1.2, np.ones(1)
+    return polygonise(Blobs(*blob, waves, phases, heights * rough * 4, bool(rng.random() < 0.5)), cells)
 
 
 def leaf(rng: np.random.Generator, length: float, wide: float) -> Shape:

@@ -79,7 +79,7 @@ class Tracer:
         weights /= weights.sum(0)
         # the signed height of the curved patch above its triangle
         flat = sum(w * p for w, p in zip(weights, corners, strict=True))
-        normal = _unit(np.asarray(sum(w * row[3:6] for w, row in zip(weights, rows, strict=True))))
+        normal = _unit_columns(np.asarray(sum(w * row[3:6] for w, row in zip(weights, rows, strict=True))))
         bulge = np.zeros(face.shape)
         for w, p, row in zip(weights, corners, rows, strict=True):
             bulge += 0.5 * w * ((p - flat) * row[3:6]).sum(0) * (row[3:6] * normal).sum(0)
@@ -104,7 +104,7 @@ def _cross(a: Array, b: Array) -> Array:
     return np.stack((a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]))
 
 
-def _unit(vectors: Array) -> Array:
+def _unit_columns(vectors: Array) -> Array:
     """Return vectors (3, N) at length 1."""
     return vectors / np.maximum(np.sqrt((vectors**2).sum(0)), 1e-300)
 
@@ -190,7 +190,7 @@ def visibility(tracer: Tracer, lighting: Lighting, hits: Hits, which: Index, ext
     start, n = _lifted(hits, extent), hits.normals
     which = which[: n.shape[1]]
     side = np.where(np.abs(n[2]) < 0.9, np.stack((-n[1], n[0], 0 * n[2])), np.stack((0 * n[0], -n[2], n[1])))
-    side = _unit(side)
+    side = _unit_columns(side)
     up = _cross(n, side)
     seen = np.zeros((2, len(which)))
     for k in range(_SAMPLES_PER_SET):
@@ -303,7 +303,7 @@ def shade(bodies: Sequence[Body], hits: Hits, lighting: Lighting, eye: Array, se
     slope = np.maximum((toward * hits.normals).sum(0) / np.sqrt(square), 0.0)
     around = lighting.ambient[:, None] + (0.5 + 0.5 * hits.normals[2]) * lighting.sky[:, None]
     light = (0.15 + 0.85 * seen[1]) * around + direct * slope * lighting.colour[:, None]
-    half = _unit(_unit(toward) + _unit(eye[:, None] - hits.points))
+    half = _unit_columns(_unit_columns(toward) + _unit_columns(eye[:, None] - hits.points))
     mirror = np.maximum((half * hits.normals).sum(0), 0.0)
     out = np.empty_like(light)
     order = np.argsort(hits.body, kind="stable")

@@ -201,7 +201,7 @@ def backdrop(rng: np.random.Generator, scene: SceneBuilder, back: float, floor: 
     """Add a background that fills the view: wall and floor, a sweep, a curved wall, a curtain or a relief."""
     kind = rng.integers(5)
     scene.add(box([30, 30, 0.1]).translate(0, 0, floor - 0.101), "wood", 1.0)
-    if kind == 1:  # the sweep is the floor too
+    if kind == 1:  # a sweep is the floor, too; the ground is taken back, as its draws are part of a scene's numbers
         scene.bodies.pop()
     scene.add(quad([-25, back + 6, -10], [50, 0, 0], [0, 0, 40]), "wall", 2.0)
     if kind == 0:

@@ -1,7 +1,8 @@
 """Random scenes, one for each (seed, index): a layout, a camera, lights, a photo and its exact depth.
 
 Layouts are rooms, tables, clutter, statues, reliefs, landscapes, porticoes, floating shapes and shelves.
-Lengths have a unit of the layout's own, of which ``RandomScene.metres`` is the size; what is rendered is in metres.
+Lengths have a unit of the layout's own, of which ``RandomScene.metres`` is the size; only what is rendered is in
+metres.
 """
 
 from __future__ import annotations

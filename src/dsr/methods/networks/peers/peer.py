@@ -51,7 +51,7 @@ class Peer(Method):
 
     Args:
         peer: name of the network, a key of ``PEERS``; or a network, which is copied, in place of a file.
-        weights: the file.
+        weights: the file of a named network.
         scale: the upsampling factor of the run.
         weights_files: the trained factors of the authors' files by their names.
         range_type: the range type of the map that the network gets.
@@ -75,7 +75,7 @@ class Peer(Method):
     def __init__(
         self,
         peer: str | PeerNetwork,
-        weights: Path = Path(),
+        weights: Path | None = None,
         scale: float = 1,
         weights_files: Mapping[str, float] = MappingProxyType({}),
         range_type: RangeType = "disparity",
@@ -87,7 +87,12 @@ class Peer(Method):
         expect_one_of("range_type", range_type, RANGE_TYPES)
         expect_one_of("range", range, get_args(Range))
         expect_one_of("precision", precision, tuple(DTYPES))
-        net = _load(peer, Path(weights), scale, weights_files) if isinstance(peer, str) else peer
+        if isinstance(peer, str):
+            net = _load(peer, weights, scale, weights_files)
+        elif weights is None:
+            net = peer
+        else:
+            raise ValueError(f"weights: expected no file beside a network, got {weights}")
         if net.depth_range is not None and range == "truth":
             low, high = net.depth_range
             raise ValueError(
@@ -147,9 +152,12 @@ class Peer(Method):
         return blend_tiles(compute, rows, columns, multiple, progress)[..., :height, :width]
 
 
-def _load(peer: str, path: Path, scale: float, files: Mapping[str, float]) -> PeerNetwork:
+def _load(peer: str, weights: Path | None, scale: float, files: Mapping[str, float]) -> PeerNetwork:
     """Load a network of its authors' file, which has to suit the scale of the run."""
     expect_one_of("peer", peer, PEERS)
+    if weights is None:
+        raise ValueError(f"weights: expected a file of {peer}'s weights, got none")
+    path = Path(weights)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such weights file")
     named = (factor for name, factor in files.items() if path.as_posix().endswith(f"/{name}"))
