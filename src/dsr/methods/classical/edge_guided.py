@@ -12,7 +12,8 @@ What differs, besides the edge map and what docs/measurements/methods.md says: a
 through it mixes both sides, so its weight is multiplied by ``mixed``. Pixels on edges get the value that makes the mean
 of their block equal to the low-resolution value, starting from the bicubic map and staying between the two sides, which
 places an edge with subpixel accuracy; then each takes the reachable pixels of its most similar neighbour off the edge,
-only in the last stage. In the original they reach both sides. Where no pixel is reachable, the result is the bicubic map.
+only in the last stage. In the original they reach both sides. Where no pixel is reachable, the result is the bicubic
+map.
 """
 
 from __future__ import annotations
