@@ -1,4 +1,4 @@
-"""Write the tables of docs/comparison.md: every method on every data set, from runs of eval.py.
+"""Write the tables of docs/measurements/comparison.md: every method on every data set, from runs of eval.py.
 
     python benchmarks/comparison.py outputs/eval -o comparison [--crop simgeo statue 4 box 120 180 110]
 

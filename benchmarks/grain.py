@@ -4,7 +4,7 @@
         [--device cpu]
 
 Noise is normal, its standard deviation a fraction of the depth. Prints a Markdown table; metrics with _v but RMSE_v
-are of the worst of four lights. LPIPS_v needs AlexNet's weights, see docs/evaluate.md.
+are of the worst of four lights. LPIPS_v needs AlexNet's weights, see docs/metrics.md.
 """
 
 from __future__ import annotations

@@ -29,8 +29,8 @@ MOST = 60e6
 _WEIGHTS = REPOSITORY / "src" / "dsr" / "methods" / "weights"
 SUMS = "SHA256SUMS"
 _STATED = {
-    "src/dsr/__init__.py": '__version__ = "{}"', "CITATION.cff": "\nversion: {}\n", "docs/citation.md": "{}",
-    "CHANGELOG.md": "\n## [{}]",
+    "src/dsr/__init__.py": '__version__ = "{}"', "CITATION.cff": "\nversion: {}\n",
+    "docs/methods.md": "version = {{{}}}", "CHANGELOG.md": "\n## [{}]",
 }  # fmt: skip
 """Where the version stands beside pyproject.toml, and how."""
 

@@ -45,8 +45,8 @@ _HEAD_OPTIONS = """\
 # Options of dsr upsample
 
 This page is generated from the command; `dsr upsample --help` prints the same, with examples. What is not given is read
-from the files or [assumed](../assumptions.md). The pages of [holes](../holes.md), [noise](../noise.md),
-[folders](../folders.md) and [results](../results.md) explain what the options do.
+from the files or [assumed](../upsample.md#what-is-assumed). The pages of [folders](../upsample.md#a-folder-of-frames),
+[holes and noise](../holes.md) and [results](../results.md) explain what the options do.
 """
 _HEAD_CONFIGURATION = """\
 # Configuration reference

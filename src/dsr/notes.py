@@ -16,7 +16,7 @@ CHECKS = 4  # version of the checks: to be increased when a warning is added or 
 
 
 # By code: the value from which on a warning is given, or the command refuses or asks. What to do about each is in
-# docs/checks.md, what the values come from in docs/checks_measured.md. After a dot: another condition of a code.
+# docs/checks.md, what the values come from in docs/measurements/checks.md. After a dot: another condition of a code.
 LIMITS: dict[str, float] = {
     "cameras-damaged": 1,  # frames
     "edges-beside": 3.0,  # pixels of the photo, at most 800 on its longer side, between its edges and the depth map's

@@ -75,7 +75,7 @@ def test_pairs_have_their_published_rows(shared: Path, tmp_path: Path) -> None:
     command = (sys.executable, str(BENCHMARKS / "pairs.py"), "--shared", str(tmp_path), "--rendered", "8")
     done = subprocess.run([*command, "--workers", "1"], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    published = (BENCHMARKS.parent / "docs" / "checks_measured.md").read_text()
+    published = (BENCHMARKS.parent / "docs" / "measurements" / "checks.md").read_text()
     measured, expected = (
         {row[0]: [*row[1:9], row[10]] for line in text.splitlines() if len(row := line.strip("| ").split(" | ")) == 11}
         for text in (done.stdout, published)

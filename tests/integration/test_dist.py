@@ -42,7 +42,7 @@ def test_release_is_built_and_runs_alone(tmp_path):
 def test_versions_that_differ_are_refused(dist, monkeypatch, tmp_path):
     for name in ("pyproject.toml", "CITATION.cff", "CHANGELOG.md"):
         (tmp_path / name).write_bytes((REPOSITORY / name).read_bytes())
-    for name in ("src/dsr/__init__.py", "docs/citation.md"):
+    for name in ("src/dsr/__init__.py", "docs/methods.md"):
         (tmp_path / name).parent.mkdir(parents=True)
         (tmp_path / name).write_bytes((REPOSITORY / name).read_bytes())
     monkeypatch.setattr(dist, "REPOSITORY", tmp_path)

@@ -171,8 +171,3 @@ def test_photos_of_another_format_end_the_stream_of_a_realsense_in_a_line(tmp_pa
     environment = with_stand_ins(tmp_path) | {"KINDS": "yuyv yuyv"}
     ended = run_python(str(REPOSITORY / "examples" / "realsense_stream.py"), cwd=tmp_path, env=environment)
     assert (ended.returncode, ended.stderr.splitlines()) == (1, ["expected photos as RGB8 or BGR8, got yuyv"])
-
-
-def test_the_page_on_python_shows_the_program_for_a_camera():
-    program = (REPOSITORY / "examples" / "realsense_stream.py").read_text()
-    assert program.partition('"""\n\n')[2] in (REPOSITORY / "docs" / "python.md").read_text()

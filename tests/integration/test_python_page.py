@@ -14,7 +14,7 @@ import dsr
 from dsr.app.upsample.parts import METRES
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "python.md"
-ELSEWHERE = ("pyrealsense2", "import lightning", "from hydra", "from dsr.metrics.classes import DSSIMv")
+ELSEWHERE = ("onnxruntime", "import lightning", "from hydra", "from dsr.metrics.classes import DSSIMv")
 """What is in blocks that other tests run: of the examples, and of trainings and metrics in a notebook."""
 
 

@@ -442,7 +442,7 @@ def test_nobody_is_sent_to_the_dsr_of_pypi(monkeypatch):
 def test_make_benchmark_runs_the_scripts_that_need_no_arguments():
     root = Path(__file__).resolve().parents[2]
     [names] = re.findall(r"for name in ([\w ]+); do \$\(BIN\)/python benchmarks/", (root / "Makefile").read_text())
-    ratios = (root / "docs/speed.md").read_text().partition("## Ratios")[2].partition("\n## ")[0]
+    ratios = (root / "docs/measurements/speed.md").read_text().partition("## Ratios")[2].partition("\n## ")[0]
     assert set(names.split()) == set(re.findall(r"benchmarks/(\w+)_speed\.py", ratios))
     texts = [(root / f"benchmarks/{name}_speed.py").read_text() for name in names.split()]
     assert not any("required=True" in text for text in texts)

@@ -10,7 +10,7 @@ PAGES = Path(__file__).resolve().parents[2] / "docs"
 
 
 def test_documentation_shows_every_limit() -> None:
-    page = (PAGES / "checks_measured.md").read_text(encoding="utf-8")
+    page = (PAGES / "measurements" / "checks.md").read_text(encoding="utf-8")
     rows = [line.split(" | ") for line in page.splitlines() if line.startswith("| `")]
     shown = {row[0].strip("| `"): row[1] for row in rows}
     assert {code: shown.get(code) for code in LIMITS} == {code: f"{limit:g}" for code, limit in LIMITS.items()}

@@ -10,7 +10,7 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 
 
 def test_history_of_results_begins_with_todays_versions():
-    text = (REPOSITORY / "docs" / "results_versions.md").read_text()
+    text = (REPOSITORY / "docs" / "measurements" / "results_versions.md").read_text()
     newest = [
         re.search(rf"\| {name} \| since .*\n.*\n\| (\S+) \|", text)[1] for name in ("results", "scenes", "weights")
     ]

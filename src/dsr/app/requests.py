@@ -91,7 +91,7 @@ class FuseRequest(Options):
         "PERCENT",
         rule=EXPECTED_ERROR,
     )
-    score: bool = option(False, "say how far successive results differ under their poses, too; see docs/sequences.md")
+    score: bool = option(False, "say how far successive results differ under their poses, too; see docs/metrics.md")
 
 
 @dataclass(frozen=True, kw_only=True)

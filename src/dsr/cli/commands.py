@@ -176,7 +176,7 @@ APP = Command(
     description="""\
 Serve a page of this machine alone, and open it: drop a photo and a depth map, or a capture, and look at photo, input
 and result side by side. The libraries are an extra: pip install -e '.[app]' in a checkout. More in
-docs/app.md.""",
+docs/view.md.""",
     epilog="""\
 examples:
   dsr app
@@ -257,7 +257,7 @@ examples:
 
 Inputs: photo (1, 3, H, W) in 0..1, inverse_depth (1, 1, h, w) in 1 / metres, valid (1, 1, h, w) bool, with H = N h and
 W = N w. Output: inverse_depth_hr (1, 1, H, W); of facets also relative_error, that of the depth, and angle_error in
-degrees. docs/export.md has a program that runs such a file.
+degrees. docs/python.md has a program that runs such a file.
 """,
 )
 

@@ -48,7 +48,7 @@ def _weights(names: list[str]) -> Collection:
         "weights of networks for comparison, which a wheel leaves out",
         address or "a checkout has them in src/dsr/methods/weights",
         "Apache-2.0, as dsr.",
-        "As of dsr, see docs/citation.md.",
+        "As of dsr, see docs/methods.md.",
         (weights.FOLDER,),
         None,
         tuple(items),

@@ -3,7 +3,8 @@
 Facets and filters take any ratio of the sizes. Other networks are trained for fixed factors. A low-resolution depth map
 is not resized: the photo is resized to a multiple of its size, and the network's result to the photo's size
 (:mod:`dsr.geometry.resampling`). The factor is the smallest that reaches the photo's size; larger ratios than 8 take
-two steps, x8 and then x4 on the result averaged to a quarter of the photo's size. docs/facets.md has the figures.
+two steps, x8 and then x4 on the result averaged to a quarter of the photo's size. The figures are in
+docs/measurements/facets.md.
 """
 
 from __future__ import annotations

@@ -350,7 +350,7 @@ class Results(Options):
     )
     without: tuple[str, ...] = option((), "all but these", "PARTS", parse=_words, alone="parts", recorded=False)
     more: tuple[str, ...] = option(
-        (), f"also these: {','.join(_MORE)}; see docs/export.md", "PARTS", flags="--with", parse=_words, recorded=False
+        (), f"also these: {','.join(_MORE)}; see docs/results.md", "PARTS", flags="--with", parse=_words, recorded=False
     )
     keep: Literal["usual", "all"] = option(
         "usual", "all: also mesh.ply and cloud.ply, and a mesh of every pixel, ten times the size", recorded=False

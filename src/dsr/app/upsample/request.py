@@ -62,7 +62,7 @@ class FrameChoice(Options):
     confidence: tuple[Path, ...] = option((), "confidence maps, or a folder of them", "MAP", recorded=False)
     shard: Shard | None = option(
         None,
-        "only the K-th of N blocks of the frames, for an array job; see docs/folders.md",
+        "only the K-th of N blocks of the frames, for an array job; see docs/clusters.md",
         "K/N",
         parse=parse_shard,
         recorded=False,

@@ -186,7 +186,7 @@ class Surface(Generic[Array]):
         return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=normals, vertex_colors=colours, process=False)
 
     def save(self, folder: str | os.PathLike[str], parts: Sequence[str] | None = None, **options: Any) -> list[Path]:
-        """Write the files of ``dsr upsample``, for ``dsr view``, ``dsr fuse`` and other programs; see docs/export.md.
+        """Write the files of ``dsr upsample``, for ``dsr view``, ``dsr fuse`` and other programs; see docs/results.md.
 
         Args:
             folder: is made if need be. To a folder of this surface parts are added; any other is refused.

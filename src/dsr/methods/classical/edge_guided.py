@@ -8,11 +8,12 @@ Xie, Feris, Sun, *Edge-Guided Single Depth Image Super Resolution*, IEEE TIP 25(
 with f a Gaussian of the distance in low-resolution pixels, r = 1 if a 4-connected path from p to q within the
 neighbourhood touches no edge and 0 otherwise, and k_p the sum of the weights.
 
-What differs, besides the edge map and what docs/methods.md says: a low-resolution pixel with an edge through it mixes
-both sides, so its weight is multiplied by ``mixed``. Pixels on edges get the value that makes the mean of their block
-equal to the low-resolution value, starting from the bicubic map and staying between the two sides, which places an edge
-with subpixel accuracy; then each takes the reachable pixels of its most similar neighbour off the edge, only in the
-last stage. In the original they reach both sides. Where no pixel is reachable, the result is the bicubic map.
+What differs, besides the edge map and what docs/measurements/methods.md says: a low-resolution pixel with an edge
+through it mixes both sides, so its weight is multiplied by ``mixed``. Pixels on edges get the value that makes the mean
+of their block equal to the low-resolution value, starting from the bicubic map and staying between the two sides, which
+places an edge with subpixel accuracy; then each takes the reachable pixels of its most similar neighbour off the edge,
+only in the last stage. In the original they reach both sides. Where no pixel is reachable, the result is the bicubic
+map.
 """
 
 from __future__ import annotations
