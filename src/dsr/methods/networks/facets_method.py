@@ -19,6 +19,7 @@ from dsr.degradation.downsampling import Kernel, encode_facts, local_noise, rela
 from dsr.geometry.hole_size import degrees_per_pixel, distance_to_known
 from dsr.geometry.resampling import pad_inverse_depth, resize_inverse_depth
 from dsr.methods.base import Abilities, Cost, InverseSample, InverseSurface, MapNoise, Method, NoiseLaw, Surface
+from dsr.methods.images import pad_to_multiple
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.network import DTYPES, Answer, DisparityNetwork, Precision
 from dsr.methods.networks.trained import NETWORKS
@@ -139,7 +140,7 @@ class AnyMap(Method):
         rgb = _resize(sample.rgb.to(self._device).float()[None], (factor * rows, factor * columns)).clamp(0, 1)
         padded = inverse
         if factor == 1:  # in pairs
-            rgb = functional.pad(rgb, (0, columns % 2, 0, rows % 2), mode="replicate")
+            rgb = pad_to_multiple(rgb, 2)
             padded = pad_inverse_depth(inverse, 2)
         level = None if noise is None else (noise[0] * padded ** (1 - noise[1])).nan_to_num(0)
         if level is None and self._smooth != 1:

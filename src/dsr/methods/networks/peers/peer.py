@@ -18,11 +18,10 @@ from typing import Literal, get_args
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from dsr.geometry.camera import RANGE_TYPES, RangeType, from_range, to_range
 from dsr.methods.base import Abilities, Method
-from dsr.methods.images import compute_min_max, inpaint, normalise
+from dsr.methods.images import compute_min_max, inpaint, normalise, pad_to_multiple
 from dsr.methods.networks.network import DTYPES, Precision, blend_tiles, split_image
 from dsr.methods.networks.peers.dctnet import DCTNet
 from dsr.methods.networks.peers.dornet import DORNet
@@ -137,9 +136,8 @@ class Peer(Method):
         """Return a map in 0..1, (B, 1, h, w), enlarged to the photo's size and refined, in tiles if that is large."""
         multiple, radius = self.net.multiple, self.net.receptive_field_radius
         height, width = rgb.shape[-2:]
-        padding = (0, -width % multiple, 0, -height % multiple)
         enlarged = self.net.enlarge(values_lr.float(), (height, width))
-        rgb, enlarged = (functional.pad(each.float(), padding, mode="replicate") for each in (rgb, enlarged))
+        rgb, enlarged = (pad_to_multiple(each.float(), multiple) for each in (rgb, enlarged))
         margin = None if radius is None else math.ceil(radius / multiple)
         size, overlap = (rgb.shape[-2], rgb.shape[-1]), max(_OVERLAP // multiple, 2)
         rows, columns = split_image(size, multiple, margin, self._tile, overlap)
