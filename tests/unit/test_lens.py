@@ -14,7 +14,6 @@ from dsr.io.pairs import Pair
 from dsr.io.reading import CameraChoice, Reading
 
 CAMERA = Camera(160, 120, 130.0, 128.0, 81.0, 58.5)
-MATRIX = np.array([[130, 0, 81], [0, 128, 58.5], [0, 0, 1]])
 PRISM = (-0.06, 0.02, 0.002, -0.001, -0.01, 0.002, 0.003, -0.002)
 BROWN, FISHEYE = (-0.3, 0.12, 0.004, -0.003, -0.02), (-0.06, 0.02, -0.01, 0.002)
 LENSES = {
