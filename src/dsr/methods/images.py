@@ -164,7 +164,7 @@ def inpaint(x: Tensor, photo: Tensor | None = None) -> Tensor:
 
 @torch.jit.script_if_tracing
 def _fill_evenly(values: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Fill maps, (B, 1, h, w) with 0 where ``weight`` is 0, there with plain means; a graph keeps the loop."""
+    """Fill maps, (B, 1, h, w), which are 0 where ``weight`` is, with means of known values; a graph keeps the loop."""
     more = True
     while more:
         total = functional.avg_pool2d(values, [3, 3], [1, 1], [1, 1])
@@ -274,5 +274,5 @@ def _low_quantile(values: Tensor, stride: int, fraction: float) -> float:
 
 
 def normal_noise_deg(noise: float, camera: Camera) -> float:
-    """Return by how many degrees relative depth noise s tilts frontal normals: a slope of sqrt(2) s f."""
+    """Return a frontal normal's standard deviation in degrees under relative depth noise s: a slope of sqrt(2) s f."""
     return math.degrees(math.atan(math.sqrt(2) * noise * camera.fx))

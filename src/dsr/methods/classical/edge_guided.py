@@ -118,7 +118,7 @@ def _filter(planes: Tensor, reachable: Tensor, scale: int, sigma_space: float, s
 
 
 def _fill_edges(hr: Tensor, barrier: Tensor, lr: Tensor, smooth: Tensor, scale: int) -> Tensor:
-    """Return the map with the smooth map's values on edges, shifted to preserve block means, within those beside."""
+    """Return the map with smooth values on edges, shifted to preserve block means, clamped to the neighbours' range."""
     start = torch.where(barrier, smooth, hr)[None, None]
     fraction = box_mean(barrier[None, None].to(hr), scale)
     missing = repeat_blocks((lr - box_mean(start, scale)) / torch.where(fraction > 0, fraction, 1), scale)

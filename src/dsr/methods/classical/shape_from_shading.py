@@ -10,12 +10,12 @@ Super-Resolution from Shading*, CVPR 2018, minimise
 with z in pixels here (times the focal length, by the median depth), the slopes p = fx dz/du and q = fy dz/dv, and the
 ray (x, y, 1) of the pixel. The shading is Lambertian under first-order spherical harmonics; m faces the camera, and a
 pixel sees the area z |m| / (fx fy). With a copy theta of (p, q, z) and the scaled multiplier u, the augmented
-Lagrangian is E with theta in all terms but that of the data, plus
-penalty / 2 * (|(p, q, z) + u - theta|^2 - |u|^2). Alternating steps lower it: the albedo
-by region fusion (:mod:`dsr.methods.classical.potts`), the lighting by least squares, theta by Levenberg and Marquardt's
-method, z by conjugate gradients.
+Lagrangian is E with theta in all terms except for the data term, plus
+penalty / 2 * (|(p, q, z) + u - theta|^2 - |u|^2). Alternating steps lower it: the albedo by region fusion
+(:mod:`dsr.methods.classical.potts`), the lighting by least squares, theta by Levenberg and Marquardt's method, z by
+conjugate gradients.
 
-What differs, beside the weights (the original's: data 0.0015, area 1e-7, boundary 0.5 at x4 with a focal length of 500
+What differs, besides the weights (the original's: data 0.0015, area 1e-7, boundary 0.5 at x4 with a focal length of 500
 pixels): each channel has its own light; the penalty of the copy of z is weighted by 1 / scale^2, because with 1 a step
 spreads over a pixel, and blocks have several; theta's 3 x 3 systems are solved in closed form, not by BFGS; it starts
 from the bicubic map, not smoothed first, which stays unchanged outside the foreground. Holes have no data term.

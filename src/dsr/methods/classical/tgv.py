@@ -190,7 +190,8 @@ class TotalGeneralisedVariation(Method):
         return Tensors(1 - less * x * x, -less * x * y, 1 - less * y * y)
 
     def _step_sizes(self, g: Tensors) -> tuple[Tensor, Tensor, Tensor, float]:
-        """Return step sizes of u (B, 1, H, W), v (B, 2, H, W), p (B, 1, 1, H, W), q: inverse sums of the operator."""
+        """Return step sizes of u (B, 1, H, W), v (B, 2, H, W), p (B, 1, 1, H, W) and q."""
+        # inverse absolute column and row sums of the operator on (u, v / _SLOPE), and the root of the ratio
         root = self.step_ratio**0.5
         along_u, along_v = g.uu + g.uv.abs(), g.vv + g.uv.abs()
         inside = _zero_border(torch.stack((along_u, along_v), dim=1))

@@ -333,7 +333,7 @@ class SkipNet(nn.Module):
 
 
 def levels_for(height: int, width: int, most: int) -> int:
-    """Return the number of levels of a SkipNet, 1 to ``most``: the smallest has 2 x 2 pixels or more, for its norm."""
+    """Return the number of levels of a SkipNet, 1 to ``most``; batch norm needs 2 x 2 pixels in the smallest."""
     return max(1, min(most, (min(height, width) - 1).bit_length() - 1))
 
 

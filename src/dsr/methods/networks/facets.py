@@ -303,7 +303,7 @@ def _copy(net: Any, first: Any, named: dict[str, Tensor]) -> None:
     own = net.state_dict()
     for theirs, value in named.items():
         kind, number, *rest = theirs.split(".")
-        numbered = kind in ("up", "join")  # by resolution, of which there are others at another factor
+        numbered = kind in ("up", "join")  # one for each resolution, of which other factors have more or fewer
         name = ".".join((kind, str(int(number) + len(net.up) - len(first.up)), *rest)) if numbered else theirs
         if name not in own:
             continue

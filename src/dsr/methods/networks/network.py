@@ -211,7 +211,7 @@ class NetworkUpsampler(Method):
 
     @torch.inference_mode()
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
-        """Return the depth, (1, H, W) in metres, NaN beyond infinity and where the network has no pixels."""
+        """Return orthogonal depth, (1, H, W) in metres; NaN at or beyond infinity and in pixels it does not cover."""
         if sample.scale != self.net.scale:
             raise ValueError(f"{sample.scene}: expected scale {self.net.scale}, the network's, got {sample.scale}")
         # in pixels of sample.camera

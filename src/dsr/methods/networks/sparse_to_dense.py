@@ -104,7 +104,7 @@ class ResidualBlock(nn.Module):
 
 
 class UpProjection(nn.Module):
-    """An up-projection to the double size and half the channels: a 5 x 5 and a 3 x 3, and a 5 x 5 convolution alone.
+    """An up-projection to twice the size and half the channels: 5 x 5 and 3 x 3 convolutions, plus a 5 x 5 one alone.
 
     Zeros between the pixels and a 5 x 5 convolution are one transposed convolution, which takes a quarter of the time.
     """
