@@ -1,1 +1,1 @@
-"""What all rooms use: files and guards, configuration, options, progress, workers, Lightning."""
+"""What all packages use: files and guards, configuration, options, progress, workers, Lightning."""
