@@ -140,6 +140,7 @@ def test_quaternion_of_a_quarter_turn_about_z_maps_x_to_y():
         (np.eye(3), "3 x 4 or 4 x 4 numbers, got 3 x 3"),
         (np.full((4, 4), np.nan), "finite numbers, got nan"),
         (1.1 * np.eye(4)[:3], "rigid transform, got rows of length 1.1 1.1 1.1"),
+        (1.01 * np.eye(4)[:3], "rigid transform, got rows of length 1.01 1.01 1.01"),
         (np.diag([1.0, 1.0, -1.0, 1.0]), "mirrors"),
         (np.ones((4, 4)), "0 0 0 1 as the last row"),
         ([[1, 2], [3]], "something else"),

@@ -48,7 +48,7 @@ def judge_camera(camera: Camera, size_lr: tuple[int, int] | None = None) -> list
         if other is not None:
             return [*found, Remark("problem", *other, "other-picture", offset)]
     if offset > LIMITS["other-picture"]:
-        right, below = (camera.cx + 0.5) / camera.width - 0.5, (camera.cy + 0.5) / camera.height - 0.5
+        right, below = _from_middle(camera.cx, camera.cy, camera.width, camera.height)
         message = (
             f"principal point ({camera.cx:.4g}, {camera.cy:.4g}) px is {abs(right):.0%} of the width "
             f"{'right' if right > 0 else 'left'} of the centre and {abs(below):.0%} of the height "
@@ -100,12 +100,17 @@ def view_of(camera: Camera) -> float:
 
 def offset_of(camera: Camera) -> float:
     """Return how far the principal point is off the centre, as a fraction of the width or height, the larger one."""
-    return max(abs((camera.cx + 0.5) / camera.width - 0.5), abs((camera.cy + 0.5) / camera.height - 0.5))
+    return max(map(abs, _from_middle(camera.cx, camera.cy, camera.width, camera.height)))
 
 
 def may_be_of(cx: float, cy: float, width: int, height: int) -> bool:
     """Return whether a principal point may be that of a picture of this size."""
-    return max(abs((cx + 0.5) / width - 0.5), abs((cy + 0.5) / height - 0.5)) <= LIMITS["off-centre"]
+    return max(map(abs, _from_middle(cx, cy, width, height))) <= LIMITS["off-centre"]
+
+
+def _from_middle(cx: float, cy: float, width: int, height: int) -> tuple[float, float]:
+    """Return how far a principal point is right of and below the middle, as fractions of the width and height."""
+    return (cx + 0.5) / width - 0.5, (cy + 0.5) / height - 0.5
 
 
 def _other_picture(camera: Camera, size_lr: tuple[int, int] | None) -> tuple[str, str, str] | None:

@@ -168,7 +168,7 @@ _GAPS = (0, 1, 3, 10, 30)  # places of the frames of a group that are compared w
 _GROUPS = 4  # groups of frames of a sequence
 _TIE = 0.9  # readings whose evidence is at least this much of the best one's cannot be distinguished from it
 _MOST_NAMES = 3  # readings that a message names
-_TOLERANCE = 0.04  # difference of two depths over the farther one, up to which frames agree in a pixel
+_AGREEING = 0.04  # difference of two depths over the farther one, up to which frames agree in a pixel
 _OVERLAP = 0.3  # share of a frame's points in another one's view, below which the two are not compared
 _EXPLAINED = 0.7  # share of the pixels in which frames have to agree under another reading
 _LEAST = 0.5  # pairs of frames that disagree wholly without motion; fewer distinguish nothing
@@ -228,7 +228,7 @@ def _compare(frame: _Reduced, other: _Reduced) -> tuple[np.ndarray, np.ndarray]:
     rows, columns = (np.rint(np.where(inside, each, 0)).astype(np.intp) for each in (v, u))
     seen = np.where(inside, frame.depth[rows, columns], np.nan)
     count = np.isfinite(seen).sum(1)
-    agreeing = np.abs(seen - z) <= _TOLERANCE * np.maximum(seen, z)
+    agreeing = np.abs(seen - z) <= _AGREEING * np.maximum(seen, z)
     return count / max(z.shape[1], 1), agreeing.sum(1) / np.maximum(count, 1)
 
 

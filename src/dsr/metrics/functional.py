@@ -168,9 +168,14 @@ class SurfacePair:
         return first.clamp(0, 1), second.clamp(0, 1)
 
     @cached_property
+    def ray_lengths(self) -> Tensor:
+        """(B or 1, 1, H, W): the perspective depth of a point with orthogonal depth 1."""
+        return length(self.rays)
+
+    @cached_property
     def perspective_error(self) -> Tensor:
         """(B, 1, H, W) absolute difference of the perspective depths in metres; 0 where invalid."""
-        return (self.prediction - self.target).abs() * length(self.rays)
+        return (self.prediction - self.target).abs() * self.ray_lengths
 
     @cached_property
     def ssim_mask(self) -> Tensor:
@@ -197,7 +202,7 @@ def bad_pix_d(pair: SurfacePair, threshold: float, *, relative: bool = False) ->
 
     The threshold is in metres, or a fraction of the target if ``relative``.
     """
-    limit = pair.target * length(pair.rays) * threshold if relative else threshold
+    limit = pair.target * pair.ray_lengths * threshold if relative else threshold
     return masked_mean(pair.perspective_error > limit, pair.depth_mask).squeeze(1)
 
 

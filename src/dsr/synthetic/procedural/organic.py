@@ -44,7 +44,10 @@ class Blobs(NamedTuple):
 
 
 def polygonise(field: Blobs, cells: int) -> Shape:
-    """Return the zero set of a field on z = 0; vertices and normals are exact, ``cells`` are along the longest side."""
+    """Return the zero set of a field, standing on z = 0, with exact vertices and normals.
+
+    The longest side has about ``cells`` cells.
+    """
     centres, radii, weights, waves, phases, heights, _ = field
     low, high = (centres - 1.9 * radii).min(0), (centres + 1.9 * radii).max(0)
     step = (high - low).max() / cells

@@ -1,8 +1,8 @@
 """Random scenes, one for each (seed, index): a layout, a camera, lights, a photo and its exact depth.
 
 Layouts are rooms, tables, clutter, statues, reliefs, landscapes, porticoes, floating shapes and shelves.
-Lengths have a unit of the layout's own, of which ``RandomScene.metres`` is the size; only what is rendered is in
-metres.
+Shapes, paints, cameras and lamps are made in metres; rendered depth is then scaled by a random factor,
+``RandomScene.metres``.
 """
 
 from __future__ import annotations
@@ -267,7 +267,7 @@ class RandomScene:
     tracer: Tracer
     viewpoint: Viewpoint
     lighting: Lighting
-    metres: float  # metres per unit of length of the layout
+    metres: float  # factor of rendered depth, the final size of what was made as a metre
     seed: int  # of the camera's noise
 
 
@@ -300,7 +300,7 @@ def random_scene(rng: np.random.Generator, layout_name: str | None = None) -> Ra
             if seen.depth.min() > 0.17 * middle and high < 6.2 * low and varied:
                 lighting = random_lighting(rng, tracer, seen, layout.low, layout.high)
                 scale = min(np.exp(rng.normal(0, 0.3)), _MAX_MEDIAN_DEPTH / float(np.median(seen.depth)))
-                metres = float(max(scale, 1.5 * _MIN_DEPTH / float(seen.depth.min())))  # per unit, within the limits
+                metres = float(max(scale, 1.5 * _MIN_DEPTH / float(seen.depth.min())))  # within the limits
                 seed = int(rng.integers(1 << 31))
                 return RandomScene(builder.bodies, tracer, viewpoint, lighting, metres, seed)
     raise RuntimeError("no view of the scene was usable")  # pragma: no cover
