@@ -18,7 +18,6 @@ import torch
 from torch import Tensor
 
 from dsr.metrics.alignment import ALIGNMENTS, align_map
-from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.metrics.formats import HEADLINES, MetricFormat, complete_formats, in_tables
 from dsr.notes import LIMITS, Assumption
 from dsr.sample import DepthSample
@@ -202,6 +201,8 @@ class Results:
 
         Metrics that neither this installation nor a run describes show their raw values under their own names.
         """
+        from dsr.metrics.catalogue import KNOWN_FORMATS  # noqa: PLC0415 - which imports scipy.spatial; as above
+
         names = dict.fromkeys(str(name) for run in self.runs for name in run.scores["metric"].unique())
         return in_tables(complete_formats(names, KNOWN_FORMATS, *(run.formats for run in self.runs)))
 
