@@ -106,7 +106,7 @@ def default_directory(kind: str, config: Config, identity: Identity, overrides: 
 
 
 def _only_sweeps(experiment: str) -> bool:
-    """Return whether a file of ``conf/experiment`` lists jobs and choices alone, which their names have themselves."""
+    """Return whether an experiment has only ``hydra`` and ``defaults``, whose choices are in runs' names anyway."""
     files = (place / "experiment" / f"{experiment}.yaml" for place in config_directories(user_directories()))
     return any(file.is_file() and set(OmegaConf.load(file)) <= {"hydra", "defaults"} for file in files)
 

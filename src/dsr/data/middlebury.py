@@ -42,7 +42,6 @@ from dsr.io.images import read_levels, read_map
 from dsr.sample import Scene
 from dsr.utils.guards import naming, natural_key, numbers_in, read_limited
 
-YEARS = (2001, 2003, 2005, 2006)
 _MATRIX = re.compile(r"\[\s*(\S+)\s+0\s+(\S+)\s*;\s*0\s+(\S+)\s+(\S+)\s*;\s*0\s+0\s+1\s*\]")
 _FULL_HEIGHT, _FULL_FOCAL, _BASELINE = 1110, 3740.0, 0.16
 _ASSUMED_SHIFT = 200.0
@@ -261,8 +260,8 @@ class MiddleburyLevels(PreparedDataset):
         fill: Sequence[str] = (),
         smooth: bool = True,
     ) -> None:
-        if year not in YEARS:
-            raise ValueError(f"year: expected one of {', '.join(map(str, YEARS))}, got {year}")
+        if year not in SCENES:
+            raise ValueError(f"year: expected one of {', '.join(map(str, SCENES))}, got {year}")
         name = f"middlebury{year}"
         found = records_levels(Path(root).expanduser(), name, year, smooth=smooth)
         preparation = Preparation(size, crop, fill=tuple(fill))

@@ -51,11 +51,6 @@ def examine_machine() -> int:
     return USAGE_ERROR
 
 
-def check_machine() -> list[Finding]:
-    """Run all checks; a ``problem`` affects ``dsr upsample``, a ``note`` does not."""
-    return [finding for check in CHECKS for finding in check()]
-
-
 def check_python() -> list[Finding]:
     """Check the version of Python, and report those of dsr and its weights."""
     try:
@@ -179,3 +174,4 @@ def check_extras() -> list[Finding]:
 CHECKS: tuple[Callable[[], list[Finding]], ...] = (
     check_python, check_packages, check_weights, check_opencv, check_device, check_folders, check_browser, check_extras,
 )  # fmt: skip
+"""A ``problem`` of these affects ``dsr upsample``, a ``note`` does not."""

@@ -18,7 +18,6 @@ import torch
 from torch import Tensor
 
 from dsr.metrics.alignment import ALIGNMENTS, align_map
-from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.metrics.formats import HEADLINES, MetricFormat, complete_formats, in_tables
 from dsr.notes import LIMITS, Assumption
 from dsr.sample import DepthSample
@@ -39,7 +38,7 @@ _DAMAGED = "{}: expected a prediction, got a missing or damaged file"
 
 
 def prediction_path(folder: Path, scene: str, source: str = "") -> Path:
-    """Return where a run keeps the prediction of a scene, whose name is perhaps from a source to blame."""
+    """Return where a run keeps a scene's prediction; an error blames ``source``, where the scene's name was read."""
     return path_within(folder, scene, source or f"{folder}: scene", "predictions/{}.npz")
 
 
@@ -104,7 +103,7 @@ class Run:
     versions: Mapping[str, Any]  # of packages, Python and the project
     scenes: tuple[str, ...]  # with a prediction
     unsolved: Mapping[str, str] = field(default_factory=dict)  # why the method has no solution, by scene
-    formats: Mapping[str, MetricFormat] = field(default_factory=dict)  # of its metrics, that the run stores
+    formats: Mapping[str, MetricFormat] = field(default_factory=dict)  # of its metrics, as stored in the run
     notes: Mapping[str, Sequence[str]] = field(default_factory=dict)  # on the scores of a scene
     truths: Mapping[str, str] = field(default_factory=dict)  # identify the ground truths, by scene
     truth: str = ""  # identifies the ground truths if other runs have different ones, as in ``dataset``
@@ -202,6 +201,8 @@ class Results:
 
         Metrics that neither this installation nor a run describes show their raw values under their own names.
         """
+        from dsr.metrics.catalogue import KNOWN_FORMATS  # noqa: PLC0415 - which imports scipy.spatial; as above
+
         names = dict.fromkeys(str(name) for run in self.runs for name in run.scores["metric"].unique())
         return in_tables(complete_formats(names, KNOWN_FORMATS, *(run.formats for run in self.runs)))
 

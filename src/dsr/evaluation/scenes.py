@@ -45,6 +45,8 @@ from dsr.utils.ratios import round_ratio
 SCORE_COLUMNS = (
     "dataset", "scene", "scale", "downsampling", "method", "seed", "metric", "variant", "value", "valid_share",
 )  # fmt: skip
+# Draws a picture of a sample, the predicted depth with its expected errors, if any, and its worst-of-four scores
+Illustrate = Callable[[DepthSample, Tensor, tuple[Tensor, Tensor] | None, Mapping[str, float]], None]
 
 
 @dataclass(frozen=True)
@@ -66,9 +68,7 @@ class Evaluation:
     holes: Holes | None = None
     alignment: str = "none"  # of each prediction before it is scored and drawn
     label: str = ""  # name in tables; empty for ``method_name``
-    illustrate: Callable[[DepthSample, Tensor, tuple[Tensor, Tensor] | None, Mapping[str, float]], None] = lambda *_: (
-        None
-    )  # of depth and its expected errors, if any, with the worst scores
+    illustrate: Illustrate = lambda *_: None
 
     def sample(self, scene: str) -> DepthSample:
         """Return the method's input for a scene; a ValueError if a file of the scene is invalid."""

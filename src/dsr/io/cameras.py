@@ -1,6 +1,6 @@
 """The cameras of a photo, and of a depth map of another camera: from files, numbers or EXIF data, or assumed.
 
-A camera, a baseline or distances that are implausible by the rules of ``dsr doctor`` are warned of.
+Warnings of implausible cameras, baselines and distances follow the rules of ``dsr doctor``.
 """
 
 from __future__ import annotations

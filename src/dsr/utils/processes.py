@@ -31,7 +31,7 @@ _Value = TypeVar("_Value")
 LOCKS = ".locks"
 _BETWEEN_LOOKS = 0.3
 _SECONDS_TO_END = 2.0  # in which a worker may remove its temporary files
-LOST = "worker processes were killed twice, perhaps for want of memory; fewer workers need less"
+_LOST = "worker processes were killed twice, perhaps for want of memory; fewer workers need less"
 
 
 class InUseError(ValueError):
@@ -185,7 +185,7 @@ class Pool:
         """Replace a broken executor, unless that is done; the second one that breaks is an error."""
         if broken is self._executors[-1]:
             if len(self._executors) > 1:
-                raise ChildProcessError(LOST)
+                raise ChildProcessError(_LOST)
             self._say("a worker process was killed; others begin again what it left")
             self._executors.append(self._executor())
 

@@ -74,8 +74,6 @@ _OPTIONS: Mapping[str, tuple[str, re.Pattern[str]]] = {
 _MOST_JSON = 1 << 16
 _MOST_FRAMES = 10**9
 _TOKEN = "x-dsr-token"  # noqa: S105 - the name of a header
-_ENDING = 3.0
-"""Seconds that the server has to end."""
 _KEPT_SCRIPT = """\
 const token = sessionStorage.getItem("token");
 sessionStorage.removeItem("token");

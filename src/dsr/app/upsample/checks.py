@@ -1,7 +1,7 @@
-"""Checks of the pictures of ``dsr upsample``: of a sample of the frames together, and of photo and depth map each.
+"""Checks of the pictures of ``dsr upsample``: each photo against its depth map, and a sample of the frames together.
 
 Photo and depth map are compared by their edges (:func:`align`); with ``--register`` the depth map is moved to the
-photo's. What a sample of the frames shows is a warning of all similar ones (:func:`check_together`).
+photo's. Warnings about a sample of the frames apply to all similar frames (:func:`check_together`).
 """
 
 from __future__ import annotations

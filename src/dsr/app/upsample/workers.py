@@ -17,7 +17,7 @@ from dsr.io.pairs import Pair
 from dsr.io.reading import Reading
 from dsr.utils.console import one_line
 from dsr.utils.guards import refusing_excess
-from dsr.utils.processes import LOST, Pool
+from dsr.utils.processes import Pool
 from dsr.utils.progress import Progress, duration, megabytes
 
 _Job = tuple[Pair, Path]  # a picture and the folder of its results
@@ -57,8 +57,8 @@ def work_through(request: UpsampleRequest, frames: Frames, reporter: Reporter, p
                 left.remove(job)
                 record.replay(reporter)
                 yield done
-        except ChildProcessError:
-            yield from (Done(*job, "", LOST) for job in left)
+        except ChildProcessError as error:
+            yield from (Done(*job, "", str(error)) for job in left)
 
 
 def _begin(request: UpsampleRequest, frames: Frames) -> None:

@@ -578,7 +578,7 @@ def _adopted(item: Item, root: Path) -> Entry | None:
 def _misses(collection: Collection, root: Path, checksums: Checksums) -> Iterator[str]:
     """Yield what the user has not put in place, or has taken away."""
     folder = root / collection.folders[0]
-    by_hand = (collection.manual or "").format(folder=root / collection.folders[0])
+    by_hand = (collection.manual or "").format(folder=folder)
     advice = f"{by_hand}, then `dsr data verify {collection.name}`"
     for pattern in collection.patterns:
         if not any(_matches(collection, root, pattern)):

@@ -2,7 +2,7 @@
 
 The page computes renderings, colours and readouts itself from stored values:
 
-- Normals are stored as unclipped shadings under the orthonormal directions :data:`dsr.geometry.BASIS`, which
+- Normals are stored as unclipped shadings under the orthonormal directions :data:`dsr.geometry.lights.BASIS`, which
   determine those under any light. A value s in [-1, 1] is stored as 255 (s + 1) / 2; the three maps are side by side.
 - Depth is stored linearly between two limits.
 - The error is sign(q - 128) (q - 128)^2 / 127^2 times the largest error, so that small errors have small steps.
