@@ -38,6 +38,7 @@ from dsr.data.frame_files import (
 from dsr.data.preparation import FrameSet
 from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import ASSUMED_FOV, Camera
+from dsr.io.captures.arkit import find_intrinsics
 from dsr.io.images import read_levels, read_numbers
 from dsr.sample import Scene
 
@@ -62,7 +63,8 @@ def find_frames(root: Path, split: Split | None = None) -> dict[str, Files]:
             if split is None or ("Training" in place.resolve().parts) == (split == "training"):
                 confidence = place / "confidence" / photo.name
                 known = confidence if confidence.is_file() else None
-                found.setdefault(frame, (photo, truth, measured, known, _find_intrinsics(place, frame)))
+                intrinsics = find_intrinsics(place / "wide_intrinsics", frame)
+                found.setdefault(frame, (photo, truth, measured, known, intrinsics))
     return in_natural_order(found)
 
 
@@ -114,13 +116,6 @@ def read_intrinsics(path: Path) -> Camera:
     if (height, width) != _SIZE:
         raise ValueError(f"{path}: expected a camera of 1440 x 1920 pixels, got {height:g} x {width:g}")
     return given_camera(intrinsics, _SIZE, path)
-
-
-def _find_intrinsics(place: Path, frame: str) -> Path | None:
-    """Return the file of a frame's intrinsics, whose time may differ by a millisecond; None where there is none."""
-    video, _, time = frame.rpartition("_")
-    paths = (place / "wide_intrinsics" / f"{video}_{float(time) + shift:.3f}.pincam" for shift in (0.0, -1e-3, 1e-3))
-    return next((path for path in paths if path.is_file()), None)
 
 
 NOTE = f"there is no .pincam file: {ASSUMED_FOV:g} degrees of horizontal view are assumed"

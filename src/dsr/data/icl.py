@@ -26,7 +26,7 @@ from dsr.data.preparation import Frames, FrameSet, Preparation, rename_frames
 from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import from_range
 from dsr.io.depth_files import ICL_CAMERA as CAMERA
-from dsr.io.images import read_numbers
+from dsr.io.depth_files import read_depth_file
 from dsr.sample import Scene
 
 FARTHEST = 100.0  # largest depth in metres; longer rays have hit nothing
@@ -60,8 +60,7 @@ def find_frames(root: Path) -> dict[str, tuple[Path, Path]]:
 def read_depth(path: Path) -> Tensor:
     """Return a ``.depth`` or ``.png`` file as orthogonal depth, (1, 480, 640) float64 in metres, NaN in holes."""
     if path.suffix.lower() == ".depth":
-        centimetres = read_numbers(path, _SIZE[0] * _SIZE[1]).reshape(_SIZE)
-        return from_range(to_depth(path, centimetres / 100, FARTHEST), CAMERA, "perspective")
+        return from_range(to_depth(path, read_depth_file(path) / 100, FARTHEST), CAMERA, "perspective")
     levels = read_16bit(path)
     expect_size(path, levels, _SIZE)
     return to_depth(path, levels / LEVELS)
