@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 from torch import Tensor
 
@@ -35,7 +36,9 @@ from dsr.data.frame_files import (
 from dsr.data.preparation import Frames, FrameSet, Preparation, rename_frames
 from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera
+from dsr.io.encoding import turn_back_bits
 from dsr.io.images import read_numbers
+from dsr.io.reading import SUNRGBD_BITS
 from dsr.sample import Scene
 
 Intrinsics = tuple[float, float, float, float]  # (fx, fy, cx, cy) in pixels
@@ -54,8 +57,7 @@ def find_frames(root: Path) -> dict[str, tuple[Path]]:
 
 def read_depth(path: Path) -> Tensor:
     """Return a depth picture, (1, H, W) float64 in metres, NaN in holes."""
-    levels = read_16bit(path)
-    return to_depth(path, ((levels >> 3) | (levels << 13)) / 1000)
+    return to_depth(path, turn_back_bits(str(path), read_16bit(path), SUNRGBD_BITS) / 1000)
 
 
 def read_intrinsics(path: Path, size: tuple[int, int]) -> Camera:
@@ -141,7 +143,7 @@ class SunRGBD(FrameSet):
             found = find_frames(folder)
             return rename_frames(found, {name: _first_below(found, path) for name, path in frames.items()})
 
-        settings = {"refined": refined, "intrinsics": intrinsics and tuple(intrinsics)}
+        settings: dict[str, Any] = {"refined": refined, "intrinsics": intrinsics and tuple(intrinsics)}
         super().__init__("sunrgbd", root, find, load_frame, scenes, tuple(FRAMES), Preparation(size, crop), **settings)
 
 

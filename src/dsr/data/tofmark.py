@@ -17,6 +17,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -224,7 +225,7 @@ class ToFMark(FrameSet):
                 raise ValueError(f"{name}: expected {count} numbers, got {len(values)}")
         if intrinsics is None:
             self.note = "the benchmark has no camera: it is an estimate"
-        settings = {
+        settings: dict[str, Any] = {
             "intrinsics": tuple(intrinsics or ESTIMATED),
             "depth_range": depth_range and tuple(depth_range),
             "variables": variables and dict(variables),
