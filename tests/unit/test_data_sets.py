@@ -1,5 +1,6 @@
 """Data sets of files beside each other, of files of our own: values, names, splits, and every damage named."""
 
+import io
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,7 +14,10 @@ from small_files import written
 from dsr.data import hammer
 from dsr.data.ddrnet_frames import DDRNetFrames
 from dsr.data.hammer import Hammer
+from dsr.data.icl import ICL
+from dsr.data.nyu import NYU
 from dsr.data.rgbdd import RGBDD, find_frames
+from dsr.data.tartanair import TartanAir
 
 
 def ramp(height, width, start):
@@ -25,6 +29,12 @@ def ramp(height, width, start):
 
 def photo(height, width):
     return np.full((height, width, 3), 51, np.uint8)
+
+
+def npy(values):
+    content = io.BytesIO()
+    np.save(content, values)
+    return content.getvalue()
 
 
 @dataclass
@@ -65,9 +75,22 @@ SETS = {
         "RGB/20200509112638_RGB.jpg": JPG,
         "Depth/20200509112638_HR_gt.png": png(ramp(384, 512, 1000)),
     }, 1.040, (512 * SIXTY, 512 * SIXTY, 255.5, 191.5), {}, {"real": False}, {"real": True}, 405),
+    "icl": Set(ICL, "traj_0007", {
+        "traj/rgb/7.png": png(photo(480, 640)),
+        "traj/depth/7.png": png(ramp(480, 640, 1000)),
+    }, 0.208, (481.2, 480, 319.5, 239.5), {}, {"size": None}),
+    "tartanair": Set(TartanAir, "office_000000", {
+        "office/image_left/000000_left.png": png(photo(480, 640)),
+        "office/depth_left/000000_left_depth.npy": npy(ramp(480, 640, 1000).astype(np.float32) / 1024),
+    }, 1040 / 1024, (320, 320, 320, 240), {}, {"size": None}),
+    "nyu": Set(NYU, "1001", {
+        "DCTNet/RGB/1000.jpg": cv2.imencode(".jpg", photo(480, 640))[1].tobytes(),
+        "DCTNet/Depth/1000.npy": npy(ramp(480, 640, 1000).astype(np.float32) / 1024),
+    }, 1040 / 1024, (518.857901, 519.469611, 324.582449, 252.736166), {}, {"split": "test"}, {"split": "train"}, 449),
 }  # fmt: skip
 FOREIGN = {
     "empty": b"", "text": b"text", "8 bits": png(np.full((9, 9), 7, np.uint8)), "small": png(ramp(9, 9, 900)),
+    "small array": npy(ramp(9, 9, 900).astype(np.float32)),
 }  # fmt: skip
 
 
@@ -131,7 +154,8 @@ def test_damaged_or_foreign_file_is_refused_in_one_line_that_names_it(kind, tmp_
 
 def test_map_of_holes_is_refused(kind, tmp_path, capfd):
     path = tmp_path / list(kind.files)[1]
-    path.write_bytes(png(0 * cv2.imread(str(path), cv2.IMREAD_UNCHANGED)))
+    right = np.load(path) if path.suffix == ".npy" else cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    path.write_bytes((npy if path.suffix == ".npy" else png)(0 * right))
     data = opened(kind, tmp_path)
     assert "all are holes" in refused(lambda: data.load(kind.name), path, capfd)
 

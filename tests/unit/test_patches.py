@@ -66,7 +66,7 @@ def _same(first: Batch, second: Batch) -> bool:
     return all(torch.equal(first[name], second[name]) for name in first)
 
 
-class _Source:
+class _Source(SceneSource):
     """A data set of six scenes."""
 
     name = "set"

@@ -40,7 +40,7 @@ def files(tmp_path):
 
 def source(files, named=("a", "b"), wanted=None, preparation=None, **settings):
     records = make_records(files, frame, "things", **settings)
-    return PreparedDataset("things", "data/things", records, named, wanted, preparation or Preparation(48))
+    return PreparedDataset("things", "data/things", records, wanted, named, preparation or Preparation(48))
 
 
 def kept():
@@ -146,7 +146,7 @@ def test_notes_of_a_scene_are_kept_prepared_or_not(files):
     found = make_records(files, frame, "things")
     records = {name: replace(record, note="not metric") for name, record in found.items()}
     for preparation in (Preparation(48), Preparation(48), Preparation(None)):
-        data = PreparedDataset("things", "x", records, ["a"], None, preparation)
+        data = PreparedDataset("things", "x", records, None, ["a"], preparation)
         assert data.load("a").notes == ("not metric",)
     assert source(files).load("a").notes == ()
 
@@ -154,7 +154,7 @@ def test_notes_of_a_scene_are_kept_prepared_or_not(files):
 def test_folder_fingerprint_covers_all_files_and_large_ones_by_size_and_time(files, monkeypatch, tmp_path):
     folder = tmp_path / "set"
     data = PreparedDataset(
-        "things", folder, make_records({"all": (folder, 3)}, frame, "things"), ["all"], None, Preparation(48)
+        "things", folder, make_records({"all": (folder, 3)}, frame, "things"), None, ["all"], Preparation(48)
     )
     before = data.content("all")
     files["deep/c"][0].write_text("4")
@@ -182,7 +182,7 @@ def test_record_without_high_resolution_depth_cannot_be_resized(files):
         return Scene("things", "a", torch.zeros(3, 60, 90), Camera(90, 60, 80.0, 80.0, 44.5, 29.5), None,
                      {2: torch.ones(1, 30, 45)})  # fmt: skip
 
-    data = PreparedDataset("things", Path("x"), {"a": SceneRecord((), measured_only)}, ["a"], None, Preparation(48))
+    data = PreparedDataset("things", Path("x"), {"a": SceneRecord((), measured_only)}, None, ["a"], Preparation(48))
     with pytest.raises(
         ValueError, match=r"a: expected a high-resolution depth map to resize, there is none \(dataset\.size=null\)"
     ):

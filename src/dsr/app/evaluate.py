@@ -35,7 +35,7 @@ from dsr.app.schema import (
     runs_here,
     user_directories,
 )
-from dsr.data.scene_source import SceneSource, prepare_scenes, regions_of
+from dsr.data.scene_source import SceneSource, as_source, prepare_scenes
 from dsr.degradation.downsampling import Downsampling, Measured
 from dsr.degradation.holes import Holes
 from dsr.degradation.noise import Noise
@@ -133,7 +133,7 @@ def _prepare(
         if "parts" in settings.dataset:
             name = settings.names["dataset"]
             raise ConfigError(f"dataset={name}: several data sets are for training; name one of them")
-        source = settings.build("dataset")
+        source = as_source(settings.build("dataset"))
     scale = _scale(settings, source)
     recipe = Recipe(settings.names["method"], OmegaConf.create(node), user_directories(), plain)
     if "downsampling.assumed" in given_keys() and not recipe.abilities.assumes_downsampling:
@@ -211,7 +211,7 @@ def _method(prepared: _Prepared, progress: Progress) -> Method:
     """Build the method of a run."""
     settings, downsampling, known = prepared.settings, prepared.downsampling, Known()
     if isinstance(downsampling, Downsampling):  # nothing is known of the maps of a sensor
-        edges: Literal["soft", "sharp"] = "soft" if getattr(prepared.source, "soft_edges", False) else "sharp"
+        edges: Literal["soft", "sharp"] = "soft" if prepared.source.soft_edges else "sharp"
         known = Known(downsampling.assumed_model().kernel, edges, clean=settings.names["noise"] == "none")
     run = Run(
         device=prepared.device,
@@ -237,7 +237,7 @@ def _study(prepared: _Prepared, method: Method) -> Evaluation:
         label = method.name
     if method.flag:  # marks scores
         name, label = f"{name}_{method.flag}", f"{label} ({method.flag})"
-    metrics = chosen_metrics(settings.metrics, regions_of(prepared.source))
+    metrics = chosen_metrics(settings.metrics, prepared.source.regions)
     formats = {metric.name: metric.format for metric in metrics}
     return Evaluation(
         folder,

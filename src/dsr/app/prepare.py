@@ -12,7 +12,7 @@ from rich.console import Console
 from dsr.app.composition import compose
 from dsr.app.entry import explain
 from dsr.app.schema import EvalConfig, plain_config
-from dsr.data.scene_source import SceneSource, prepare_scenes
+from dsr.data.scene_source import SceneSource, as_source, prepare_scenes
 from dsr.pictures.sheets import save_contact_sheet
 from dsr.sample import Scene
 from dsr.utils.configuration import ConfigError
@@ -50,8 +50,7 @@ def _source(name: str, overrides: Sequence[str], config_dirs: Sequence[Path]) ->
     if "parts" in plain["dataset"]:
         parts = ", ".join(plain["dataset"]["parts"])
         raise ConfigError(f"dataset={name}: expected one data set, it has the parts {parts}")
-    source: SceneSource = EvalConfig.of(plain).build("dataset")
-    return source
+    return as_source(EvalConfig.of(plain).build("dataset"))
 
 
 def _loaded(source: SceneSource, names: Iterator[str], failures: dict[str, str]) -> Iterator[Scene]:

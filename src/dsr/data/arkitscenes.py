@@ -18,17 +18,27 @@ to the raw data; where there are none, 60 degrees of horizontal view are assumed
 
 from __future__ import annotations
 
+import functools
 import re
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
 
-from dsr.data.frame_files import expect_size, find_beside, given_camera, in_natural_order, read_frame, read_millimetres
-from dsr.data.preparation import Preparation, PreparedDataset, add_note, list_frames, make_records
+from dsr.data.frame_files import (
+    expect_choice,
+    expect_size,
+    find_beside,
+    given_camera,
+    in_natural_order,
+    read_frame,
+    read_millimetres,
+)
+from dsr.data.preparation import FrameSet
 from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import ASSUMED_FOV, Camera
+from dsr.io.captures.arkit import find_intrinsics
 from dsr.io.images import read_levels, read_numbers
 from dsr.sample import Scene
 
@@ -53,7 +63,8 @@ def find_frames(root: Path, split: Split | None = None) -> dict[str, Files]:
             if split is None or ("Training" in place.resolve().parts) == (split == "training"):
                 confidence = place / "confidence" / photo.name
                 known = confidence if confidence.is_file() else None
-                found.setdefault(frame, (photo, truth, measured, known, _find_intrinsics(place, frame)))
+                intrinsics = find_intrinsics(place / "wide_intrinsics", frame)
+                found.setdefault(frame, (photo, truth, measured, known, intrinsics))
     return in_natural_order(found)
 
 
@@ -107,37 +118,22 @@ def read_intrinsics(path: Path) -> Camera:
     return given_camera(intrinsics, _SIZE, path)
 
 
-def _find_intrinsics(place: Path, frame: str) -> Path | None:
-    """Return the file of a frame's intrinsics, whose time may differ by a millisecond; None where there is none."""
-    video, _, time = frame.rpartition("_")
-    paths = (place / "wide_intrinsics" / f"{video}_{float(time) + shift:.3f}.pincam" for shift in (0.0, -1e-3, 1e-3))
-    return next((path for path in paths if path.is_file()), None)
-
-
 NOTE = f"there is no .pincam file: {ASSUMED_FOV:g} degrees of horizontal view are assumed"
 
 
-class ARKitScenes(PreparedDataset):
-    """Frames of ARKitScenes for depth upsampling (Baruch et al., NeurIPS 2021) at their own size, 1920 x 1440.
-
-    Args:
-        root: directory of ``Training`` and ``Validation``.
-        split: ``validation``, to evaluate on, or ``training``, to train on.
-        scenes: names of the scenes to use, such as ``41069021_305.244``; None and ``found`` for all of the split in
-            ``root``.
-        min_confidence: lowest confidence of the lidar's pixels, 0 to 2; the others become holes.
-
-    """
+class ARKitScenes(FrameSet):
+    """Frames of ARKitScenes for depth upsampling (Baruch et al., NeurIPS 2021) at their own size, 1920 x 1440."""
 
     def __init__(
         self, root: str, split: Split = "validation", scenes: SceneSelection = None, min_confidence: int = 0
     ) -> None:
-        if split not in SPLITS:
-            raise ValueError(f"split: expected one of {', '.join(SPLITS)}, got {split}")
+        expect_choice("split", split, SPLITS)
         if min_confidence not in range(3):
             raise ValueError(f"min_confidence: expected 0, 1 or 2, got {min_confidence}")
-        frames = list_frames(find_frames, root, split)
-        records = make_records(frames, load_frame, "arkitscenes", min_confidence=min_confidence)
-        found = records | add_note({name: records[name] for name, files in frames.items() if files[-1] is None}, NOTE)
-        super().__init__("arkitscenes", root, found, None, scenes, Preparation(None))
+        find = functools.partial(find_frames, split=split)
+        super().__init__("arkitscenes", root, find, load_frame, scenes, min_confidence=min_confidence)
         self.evaluation = split == "validation"
+
+    def note_of(self, *files: Any) -> str:
+        """Return that the camera is assumed, where it is."""
+        return NOTE if files[-1] is None else ""

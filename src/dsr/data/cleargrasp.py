@@ -30,11 +30,12 @@ Regions of all are ``glass``, the mask of the objects, ``outside``, all the rest
 
 from __future__ import annotations
 
+import functools
 import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -42,6 +43,7 @@ import torch
 from torch import Tensor
 
 from dsr.data.frame_files import (
+    expect_choice,
     expect_size,
     given_camera,
     in_natural_order,
@@ -51,7 +53,7 @@ from dsr.data.frame_files import (
     to_depth,
     walk,
 )
-from dsr.data.preparation import Preparation, PreparedDataset, add_note, list_frames, make_records
+from dsr.data.preparation import FrameSet
 from dsr.data.reference_depth import smooth_levels
 from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera
@@ -173,25 +175,22 @@ def read_camera(path: Path) -> Camera:
     return given_camera(intrinsics, (round(height), round(width)), path)
 
 
-class ClearGrasp(PreparedDataset):
+class ClearGrasp(FrameSet):
     """Captures or renderings of ClearGrasp at their own size.
 
     Args:
-        root: directory of the data set, or one above it.
-        synthetic: whether to use the rendered scenes instead of the captures.
         split: ``val``, with the objects that the authors' networks were trained on; ``test``, with others; ``train``,
             rendered, to train on; None for what is in ``root``.
-        scenes: names of the scenes to use, such as ``real-val_d435_000000080``; None and ``found`` for all.
 
     """
 
-    regions: ClassVar[tuple[str, ...]] = ("glass", "outside", "edges")
+    note = NOTE
+    regions = ("glass", "outside", "edges")
 
     def __init__(self, root: str, synthetic: bool, split: Split | None = None, scenes: SceneSelection = None) -> None:
-        if split not in (None, *SPLITS):
-            raise ValueError(f"split: expected one of {', '.join(SPLITS)}, or null, got {split}")
-        name = "cleargrasp_synthetic" if synthetic else "cleargrasp"
-        frames = list_frames(find_renderings if synthetic else find_captures, root, split)
-        found = add_note(make_records(frames, load_rendering if synthetic else load_capture, name), NOTE)
-        super().__init__(name, root, found, None, scenes, Preparation(None))
+        if split is not None:
+            expect_choice("split", split, SPLITS, ", or null")
+        name, load = ("cleargrasp_synthetic", load_rendering) if synthetic else ("cleargrasp", load_capture)
+        find = functools.partial(find_renderings if synthetic else find_captures, split=split)
+        super().__init__(name, root, find, load, scenes)
         self.evaluation = split != "train"

@@ -16,7 +16,7 @@ import re
 from pathlib import Path
 
 from dsr.data.frame_files import find_beside, name_of, read_frame
-from dsr.data.preparation import Preparation, PreparedDataset, list_frames, make_records
+from dsr.data.preparation import FrameSet
 from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
@@ -43,15 +43,8 @@ def load_frame(rgb_path: Path, measured_path: Path, truth_path: Path, dataset: s
     return Scene(dataset, name, rgb, CAMERA, truth, {1: measured})
 
 
-class DDRNetFrames(PreparedDataset):
-    """Frames of Yan et al. (ECCV 2018) at their own size, the sensor's map as measured at x1.
-
-    Args:
-        root: directory of ``color_map``, ``depth_map`` and ``high_quality_depth``, or one above it.
-        scenes: names of the scenes to use; None and ``found`` for all in ``root``.
-
-    """
+class DDRNetFrames(FrameSet):
+    """Frames of Yan et al. (ECCV 2018) at their own size, the sensor's map as measured at x1."""
 
     def __init__(self, root: str, scenes: SceneSelection = None) -> None:
-        found = make_records(list_frames(find_frames, root), load_frame, "ddrnet")
-        super().__init__("ddrnet", root, found, None, scenes, Preparation(None))
+        super().__init__("ddrnet", root, find_frames, load_frame, scenes)

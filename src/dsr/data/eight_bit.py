@@ -15,17 +15,18 @@ Middlebury 1.3 m and 3.0 m, with the camera of 2005 and 2006, three levels to a 
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import ClassVar, Literal
+from typing import Literal
 
 import torch
 
-from dsr.data.frame_files import expect_size, find_beside, in_natural_order, read_picture
-from dsr.data.preparation import Preparation, PreparedDataset, add_note, list_frames, make_records
+from dsr.data.frame_files import expect_choice, expect_size, find_beside, in_natural_order, read_picture
+from dsr.data.preparation import FrameSet
 from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera, baseline_times_focal, from_range
 from dsr.io.images import read_levels
@@ -86,22 +87,13 @@ def load_frame(rgb_path: Path, levels_path: Path, dataset: str, name: str) -> Sc
 NOTE = "depth is not metric: the camera is invented, and levels are read as disparity"
 
 
-class EightBit(PreparedDataset):
-    """Six pairs of Lu et al. (CVPR 2014) or thirty of Middlebury 2001 to 2006, at their own size.
+class EightBit(FrameSet):
+    """Six pairs of Lu et al. (CVPR 2014) or thirty of Middlebury 2001 to 2006, at their own size."""
 
-    Args:
-        root: directory of ``RGB`` and ``Depth``, or one above it.
-        benchmark: ``lu`` or ``middlebury8``.
-        scenes: names of the scenes to use, such as ``RGBD_01`` or ``Middlebury_01``; None for all of the benchmark,
-            ``found`` for all in ``root``.
-
-    """
-
-    soft_edges: ClassVar[bool] = True  # pixels at depth steps are mixtures of both sides
+    note = NOTE
+    soft_edges = True
 
     def __init__(self, root: str, benchmark: Literal["lu", "middlebury8"], scenes: SceneSelection = None) -> None:
-        if benchmark not in BENCHMARKS:
-            raise ValueError(f"benchmark: expected one of {', '.join(BENCHMARKS)}, got {benchmark}")
-        frames = list_frames(find_frames, root, benchmark)
-        found = add_note(make_records(frames, load_frame, benchmark), NOTE)
-        super().__init__(benchmark, root, found, BENCHMARKS[benchmark].scenes, scenes, Preparation(None))
+        expect_choice("benchmark", benchmark, BENCHMARKS)
+        find = functools.partial(find_frames, dataset=benchmark)
+        super().__init__(benchmark, root, find, load_frame, scenes, BENCHMARKS[benchmark].scenes)

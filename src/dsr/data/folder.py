@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from dsr.data.frame_files import expect_size
-from dsr.data.scene_source import WITHOUT_OFFSET, SceneSelection, select_scenes
+from dsr.data.scene_source import WITHOUT_OFFSET, SceneSelection, SceneSource, select_scenes
 from dsr.geometry.camera import Camera, RangeType, from_range
 from dsr.io.images import MAP_SUFFIXES, CameraFile, read_camera, read_map, read_mask, read_rgb
 from dsr.sample import Scene, expect_distances
@@ -37,12 +37,10 @@ _QUANTITIES = ("depth", "disparity")
 _MEASURED = re.compile(r"(depth|disparity)_lr(\d*)")
 
 
-class Folder:
+class Folder(SceneSource):
     """The scenes of a directory.
 
     Args:
-        root: directory of the scenes.
-        scenes: names of the scenes to use; None for all.
         name: name in ``scores.csv``.
         without_offset: names of the scenes whose ``doffs`` in ``camera.json`` is replaced by 0, as the paper does with
             Vintage; see :class:`dsr.data.middlebury.Middlebury`.
@@ -73,7 +71,7 @@ class Folder:
         return list(self._scenes)
 
     def load(self, scene: str) -> Scene:
-        """Return one scene; see :class:`dsr.data.scene_source.SceneSource`."""
+        """Return one scene."""
         return load_scene(self._root / scene, self.name, offset=scene not in self._without_offset)
 
     def fingerprint(self, scene: str) -> str:

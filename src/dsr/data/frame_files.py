@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -117,14 +117,18 @@ def load_pair(rgb_path: Path, depth_path: Path, dataset: str, name: str) -> Scen
     return Scene(dataset, name, rgb, Camera.from_fov(ASSUMED_FOV, width, height), depth)
 
 
+def expect_choice(key: str, value: object, choices: Collection[object], others: str = "") -> None:
+    """Refuse a value of a setting that is none of its choices; ``others`` names those that are no texts."""
+    if value not in choices:
+        raise ValueError(f"{key}: expected one of {', '.join(map(str, choices))}{others}, got {value}")
+
+
 def walk(root: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
-    """Yield every folder of a directory in order, with the names of its folders and of its files.
+    """Yield every folder of a directory in order, with the names of its folders and of its files; of none, nothing.
 
     A name that the caller takes off the list of folders is not entered; hidden folders are not either. Links are,
     unless they lead back.
     """
-    if not root.is_dir():
-        raise ValueError(f"{root}: expected a directory, there is none")
     entered = set()
     for folder, below, files in os.walk(root, followlinks=True):
         entered.add(os.path.realpath(folder))
@@ -149,15 +153,9 @@ def find_beside(
 ) -> Iterator[tuple[Path, str, tuple[Path, ...]]]:
     """Yield the frames of a data set that has its photos in one folder and their maps in folders beside it.
 
-    Args:
-        root: directory of the data set; the folders lie at any depth.
-        photos: name of the folders of photos.
-        pattern: of a photo's file name; its first group identifies the frame.
-        others: the frame's other files, from the folder that ``photos`` lies in, with ``{}`` for the frame.
-
-    Yields:
-        The folder that ``photos`` lies in, the frame, and its files: the photo, then the others. A frame that lacks one
-        of them is left out.
+    These are the folder that ``photos`` lies in, at any depth, the frame, which is the first group of ``pattern`` in
+    the photo's name, and its files: the photo, then the ``others`` from that folder on, with ``{}`` for the frame. A
+    frame that lacks one of them is left out.
     """
     for place, below, _ in walk(root):
         if photos in below:

@@ -18,12 +18,13 @@ objects.
 
 from __future__ import annotations
 
+import functools
 import re
 from pathlib import Path
 from typing import Literal, get_args
 
-from dsr.data.frame_files import find_beside, in_natural_order, read_frame, to_camera
-from dsr.data.preparation import Preparation, PreparedDataset, list_frames, make_records
+from dsr.data.frame_files import expect_choice, find_beside, in_natural_order, read_frame, to_camera
+from dsr.data.preparation import FrameSet
 from dsr.data.scene_source import SceneSelection
 from dsr.io.images import read_numbers
 from dsr.sample import Scene
@@ -60,17 +61,8 @@ def load_frame(
     return Scene(dataset, name, rgb, camera, truth, {1: measured})
 
 
-class Hammer(PreparedDataset):
-    """Frames of HAMMER at their own size, a camera's map as measured at x1.
-
-    Args:
-        root: directory of the sequences, or one above it.
-        sensor: the camera that measured: ``d435``, ``tof`` or ``l515``.
-        split: ``test``, to evaluate on, or ``train``, to train on.
-        naked: whether to use the sequences without objects, instead of those with them.
-        scenes: names of the scenes to use, such as ``scene12_traj1_1_000000``; None and ``found`` for all of the split.
-
-    """
+class Hammer(FrameSet):
+    """Frames of HAMMER at their own size, a camera's map as measured at x1; ``naked`` are those without objects."""
 
     def __init__(
         self,
@@ -80,9 +72,8 @@ class Hammer(PreparedDataset):
         naked: bool = False,
         scenes: SceneSelection = None,
     ) -> None:
-        for name, value, choices in (("sensor", sensor, Sensor), ("split", split, Split)):
-            if value not in get_args(choices):
-                raise ValueError(f"{name}: expected one of {', '.join(get_args(choices))}, got {value}")
-        found = make_records(list_frames(find_frames, root, sensor, split, naked), load_frame, "hammer")
-        super().__init__("hammer", root, found, None, scenes, Preparation(None))
+        expect_choice("sensor", sensor, get_args(Sensor))
+        expect_choice("split", split, get_args(Split))
+        find = functools.partial(find_frames, sensor=sensor, split=split, naked=naked)
+        super().__init__("hammer", root, find, load_frame, scenes)
         self.evaluation = split == "test"

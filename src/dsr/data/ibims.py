@@ -22,7 +22,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -40,7 +39,7 @@ from dsr.data.frame_files import (
     walk,
 )
 from dsr.data.matlab import read_variables
-from dsr.data.preparation import Preparation, PreparedDataset, list_frames, make_records
+from dsr.data.preparation import PreparedDataset, make_records
 from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera
 from dsr.io.images import read_levels
@@ -139,17 +138,12 @@ def _scene(
 
 
 class IBims(PreparedDataset):
-    """Scenes of iBims-1 at their own size.
+    """Scenes of iBims-1 at their own size, of pictures or of MATLAB files."""
 
-    Args:
-        root: directory of the MATLAB files, or of the folders of pictures, or one above them.
-        scenes: names of the scenes to use, such as ``corridor_01``; None for all 100, ``found`` for those in ``root``.
-
-    """
-
-    regions: ClassVar[tuple[str, ...]] = ("planes", "edges")
+    regions = ("planes", "edges")
 
     def __init__(self, root: str, scenes: SceneSelection = None) -> None:
-        pictures = make_records(list_frames(find_pictures, root), load_pictures, "ibims")
-        found = pictures | make_records(list_frames(find_matrices, root), load_matrices, "ibims")
-        super().__init__("ibims", root, found, None, scenes, Preparation(None), count=COUNT)
+        folder = Path(root).expanduser()
+        found = make_records(find_pictures(folder), load_pictures, "ibims")
+        found |= make_records(find_matrices(folder), load_matrices, "ibims")
+        super().__init__("ibims", root, found, scenes, count=COUNT)

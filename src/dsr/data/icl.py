@@ -22,11 +22,11 @@ from types import MappingProxyType
 from torch import Tensor
 
 from dsr.data.frame_files import expect_size, name_of, read_16bit, read_picture, to_depth, walk
-from dsr.data.preparation import Preparation, PreparedDataset, list_frames, make_records, rename_records
+from dsr.data.preparation import Frames, FrameSet, Preparation, rename_frames
 from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import from_range
 from dsr.io.depth_files import ICL_CAMERA as CAMERA
-from dsr.io.images import read_numbers
+from dsr.io.depth_files import read_depth_file
 from dsr.sample import Scene
 
 FARTHEST = 100.0  # largest depth in metres; longer rays have hit nothing
@@ -60,8 +60,7 @@ def find_frames(root: Path) -> dict[str, tuple[Path, Path]]:
 def read_depth(path: Path) -> Tensor:
     """Return a ``.depth`` or ``.png`` file as orthogonal depth, (1, 480, 640) float64 in metres, NaN in holes."""
     if path.suffix.lower() == ".depth":
-        centimetres = read_numbers(path, _SIZE[0] * _SIZE[1]).reshape(_SIZE)
-        return from_range(to_depth(path, centimetres / 100, FARTHEST), CAMERA, "perspective")
+        return from_range(to_depth(path, read_depth_file(path) / 100, FARTHEST), CAMERA, "perspective")
     levels = read_16bit(path)
     expect_size(path, levels, _SIZE)
     return to_depth(path, levels / LEVELS)
@@ -91,17 +90,8 @@ FRAMES = MappingProxyType(
 )
 
 
-class ICL(PreparedDataset):
-    """Frames of ICL-NUIM.
-
-    Args:
-        root: directory of the folders of the trajectories.
-        scenes: names of the scenes to use; None for the paper's six, ``found`` for every frame in ``root``.
-        size: height and width in pixels; None for the original size.
-        crop: see :class:`dsr.data.preparation.Preparation`.
-        frames: frame of each of the paper's names.
-
-    """
+class ICL(FrameSet):
+    """Frames of ICL-NUIM; ``frames`` says which frame each of the paper's names stands for."""
 
     def __init__(
         self,
@@ -111,5 +101,7 @@ class ICL(PreparedDataset):
         crop: float = 0.5,
         frames: Mapping[str, str] = FRAMES,
     ) -> None:
-        found = rename_records(make_records(list_frames(find_frames, root), load_frame, "icl"), frames)
-        super().__init__("icl", root, found, tuple(FRAMES), scenes, Preparation(size, crop))
+        def find(folder: Path) -> Frames:
+            return rename_frames(find_frames(folder), frames)
+
+        super().__init__("icl", root, find, load_frame, scenes, tuple(FRAMES), Preparation(size, crop))

@@ -214,10 +214,6 @@ class Middlebury(PreparedDataset):
     """Scenes of Middlebury 2014.
 
     Args:
-        root: directory of folders such as ``Recycle-perfect`` or ``Recycle``.
-        scenes: names of the scenes to use; None for the paper's seven, ``found`` for all in ``root``.
-        size, crop: see :class:`dsr.data.preparation.Preparation`.
-        fill: names of the scenes whose holes are inpainted.
         without_offset: names of the scenes whose disparity offset is replaced by 0, which makes their depth wrong. The
             paper does so with Vintage, but not with Recycle and Playroom.
 
@@ -233,22 +229,11 @@ class Middlebury(PreparedDataset):
         without_offset: Sequence[str] = ("vintage",),
     ) -> None:
         found = records_2014(Path(root).expanduser(), "middlebury", without_offset)
-        super().__init__("middlebury", root, found, EVALUATION_2014, scenes, Preparation(size, crop, fill=tuple(fill)))
+        super().__init__("middlebury", root, found, scenes, EVALUATION_2014, Preparation(size, crop, fill=tuple(fill)))
 
 
 class MiddleburyLevels(PreparedDataset):
-    """Scenes of Middlebury 2001, 2003, 2005 or 2006, with disparities in 8 bits.
-
-    Args:
-        root: directory of the scenes.
-        year: year of the data set.
-        scenes: names of the scenes to use; None for all of the data set, ``found`` for all in ``root``.
-        size, crop: see :class:`dsr.data.preparation.Preparation`.
-        fill: names of the scenes whose holes are inpainted.
-        smooth: whether the steps that rounding to whole levels makes are smoothed; see
-            :mod:`dsr.data.reference_depth`.
-
-    """
+    """Scenes of Middlebury 2001, 2003, 2005 or 2006, with disparities in 8 bits, whose steps may be smoothed."""
 
     def __init__(
         self,
@@ -265,19 +250,11 @@ class MiddleburyLevels(PreparedDataset):
         name = f"middlebury{year}"
         found = records_levels(Path(root).expanduser(), name, year, smooth=smooth)
         preparation = Preparation(size, crop, fill=tuple(fill))
-        super().__init__(name, root, found, SCENES[year], scenes, preparation)
+        super().__init__(name, root, found, scenes, SCENES[year], preparation)
 
 
 class MiddleburyTrain(PreparedDataset):
-    """Scenes of Middlebury 2001, 2006 and 2014 without the evaluation scenes.
-
-    Args:
-        root: directory of the folders ``middlebury2001``, ``middlebury2006`` and ``middlebury2014``.
-        scenes: names of the scenes to use; None for all of the years, ``found`` for all in ``root``.
-        size: largest length of the shorter side in pixels; None for the original size.
-        years: years to use.
-
-    """
+    """Scenes of Middlebury 2001, 2006 and 2014 without the evaluation scenes, a folder ``middlebury2001`` for each."""
 
     evaluation = False
 
@@ -295,7 +272,7 @@ class MiddleburyTrain(PreparedDataset):
             found.pop(scene, None)
         named = [scene for year in years for scene in TRAINING[year]]
         preparation = Preparation(size, crop=None, enlarge=False)
-        super().__init__(name, root, found, named, scenes, preparation)
+        super().__init__(name, root, found, scenes, named, preparation)
 
 
 def records_2014(folder: Path, dataset: str, without_offset: Collection[str] = ()) -> dict[str, SceneRecord]:

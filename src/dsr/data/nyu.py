@@ -27,9 +27,9 @@ import h5py
 import numpy as np
 import torch
 
-from dsr.data.frame_files import expect_size, find_beside, in_natural_order, read_picture, to_depth
+from dsr.data.frame_files import expect_choice, expect_size, find_beside, in_natural_order, read_picture, to_depth
 from dsr.data.matlab import expect_own_values
-from dsr.data.preparation import Preparation, PreparedDataset, SceneRecord, list_frames, make_records
+from dsr.data.preparation import Preparation, PreparedDataset, make_records
 from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera
 from dsr.io.images import read_map
@@ -137,17 +137,8 @@ def _checked(path: Path, file: h5py.File, key: str) -> h5py.Dataset:
 class NYU(PreparedDataset):
     """Labelled frames of NYU Depth v2: indoor scenes of a Kinect (Silberman et al., ECCV 2012).
 
-    Args:
-        root: directory of ``nyu_depth_v2_labeled.mat``, or of the test images as files.
-        scenes: names of the scenes to use, ``0001`` to ``1449``; None and ``found`` for all. With a split, None for all
-            of it and ``found`` for those on disk.
-        size: height and width in pixels; None for the original size without the white border.
-        crop: see :class:`dsr.data.preparation.Preparation`.
-        filled: whether the authors' inpainted depth is the true depth, in place of the sensor's.
-        split: ``test``, the last 449 frames, to evaluate on, or ``train``, the first 1000, to train on, as in the
-            literature on guided depth super-resolution: 640 x 480 pixels with the border and the inpainted depth,
-            whatever ``size``, ``crop`` and ``filled`` are. None for all frames.
-
+    A ``split`` is as in the literature on guided depth super-resolution: 640 x 480 pixels with the border and the
+    inpainted depth, whatever ``size``, ``crop`` and ``filled`` are.
     """
 
     def __init__(
@@ -159,21 +150,16 @@ class NYU(PreparedDataset):
         filled: bool = False,
         split: Split | None = None,
     ) -> None:
+        folder = Path(root).expanduser()
+        labelled = folder / "nyu_depth_v2_labeled.mat"
+        frames = find_frames(labelled) if labelled.is_file() else {}
         if split is None:
-            found = _records(root, filled=filled)
-            super().__init__("nyu", root, found, None, scenes, Preparation(size, crop))
+            found = make_records(frames, load_frame, "nyu", filled=filled)
+            super().__init__("nyu", root, found, scenes, preparation=Preparation(size, crop))
             return
-        if split not in SPLITS:
-            raise ValueError(f"split: expected one of {', '.join(SPLITS)}, or null, got {split}")
+        expect_choice("split", split, SPLITS, ", or null")
+        found = make_records(frames, load_frame, "nyu", filled=True, crop=False)
+        found = found or make_records(find_files(folder), load_files, "nyu")
         named = [f"{number:04d}" for number in SPLITS[split]]
-        found = _records(root, filled=True, crop=False)
-        found = found or make_records(list_frames(find_files, root), load_files, "nyu")
-        found = {name: found[name] for name in named if name in found}
-        super().__init__("nyu", root, found, named, scenes, Preparation(None))
+        super().__init__("nyu", root, {name: found[name] for name in named if name in found}, scenes, named)
         self.evaluation = split == "test"
-
-
-def _records(root: str, **settings: bool) -> dict[str, SceneRecord]:
-    """Return the records of the frames of the labelled file; none where there is no such file."""
-    path = Path(root).expanduser() / "nyu_depth_v2_labeled.mat"
-    return make_records(find_frames(path) if path.is_file() else {}, load_frame, "nyu", **settings)

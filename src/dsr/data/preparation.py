@@ -20,7 +20,7 @@ from typing import Any
 import torch
 
 from dsr.data.reference_depth import fit, inpaint_depth
-from dsr.data.scene_source import SceneSelection, select_scenes
+from dsr.data.scene_source import SceneSelection, SceneSource, select_scenes
 from dsr.sample import Scene
 from dsr.synthetic.rendering import Rendering, cache_directory, expect_room_for, load_or_render
 from dsr.utils.progress import SILENT
@@ -29,6 +29,9 @@ from dsr.utils.versions import SCENES, file_hash
 _MIN_SIZE = 32
 _MAX_LISTED = 30
 _MAX_HASHED = 1 << 28  # largest size in bytes of files whose content is hashed
+
+
+Frames = Mapping[str, tuple[Any, ...]]  # arguments of a function that loads a frame, by the frame's name
 
 
 @dataclass(frozen=True)
@@ -42,16 +45,12 @@ class SceneRecord:
     note: str = ""  # for readers of the scene's scores
 
 
-def list_frames(
-    find: Callable[..., Mapping[str, tuple[Any, ...]]], root: str, *arguments: Any
-) -> Mapping[str, tuple[Any, ...]]:
-    """Return the frames that a reader finds in the directory ``root``; none where there is no such directory."""
-    folder = Path(root).expanduser()
-    return find(folder, *arguments) if folder.is_dir() else {}
-
-
 def make_records(
-    frames: Mapping[str, tuple[Any, ...]], load: Callable[..., Scene], dataset: str, **settings: Any
+    frames: Frames,
+    load: Callable[..., Scene],
+    dataset: str,
+    note_of: Callable[..., str] = lambda *_: "",
+    **settings: Any,
 ) -> dict[str, SceneRecord]:
     """Return the records of frames on disk, by their names with _ in place of /.
 
@@ -63,31 +62,22 @@ def make_records(
         files = tuple(path for path in arguments if isinstance(path, Path))
         which = json.dumps([each for each in arguments if not isinstance(each, Path)])
         read = functools.partial(load, *arguments, dataset, name, **settings)
-        records[name] = SceneRecord(files, read, which, json.dumps(settings))
+        records[name] = SceneRecord(files, read, which, json.dumps(settings), note_of(*arguments))
     return records
 
 
-def add_note(records: Mapping[str, SceneRecord], note: str) -> dict[str, SceneRecord]:
-    """Return records with a remark for readers of the scenes' scores."""
-    return {name: replace(record, note=note) for name, record in records.items()}
+def rename_frames(frames: Frames, names: Mapping[str, str]) -> Frames:
+    """Return the frames that are there of ``names``, new names with old ones, and then the others."""
+    old = {frame.replace("/", "_"): files for frame, files in frames.items()}
+    wanted = {name: frame.replace("/", "_") for name, frame in names.items()}
+    new = {name: old[frame] for name, frame in wanted.items() if frame in old}
+    replaced = new.keys() | set(wanted.values())
+    return new | {frame: files for frame, files in old.items() if frame not in replaced}
 
 
 def _files_of(path: Path) -> list[Path]:
     """Return a file, or the files of a folder and those below it."""
     return [path] if not path.is_dir() else sorted(file for file in path.rglob("*") if file.is_file())
-
-
-def rename_records(records: Mapping[str, SceneRecord], names: Mapping[str, str]) -> dict[str, SceneRecord]:
-    """Return the records, some of them under other names; frames that are not in ``records`` are left out."""
-    frames = {name: frame.replace("/", "_") for name, frame in names.items()}
-    new = {name: _with_scene_name(records[frame], name) for name, frame in frames.items() if frame in records}
-    replaced = new.keys() | set(frames.values())
-    return {**new, **{name: record for name, record in records.items() if name not in replaced}}
-
-
-def _with_scene_name(record: SceneRecord, name: str) -> SceneRecord:
-    """Return the record with another name for its scene."""
-    return replace(record, load=lambda: replace(record.load(), name=name))
 
 
 @dataclass(frozen=True)
@@ -125,17 +115,17 @@ class Preparation:
         return scene
 
 
-class PreparedDataset:
+class PreparedDataset(SceneSource):
     """A data set in its original format; the base class of those in this package.
 
     Args:
         name: name in ``scores.csv`` and in ``dsr data get``.
-        root: directory of the data set.
         found: records of the scenes on disk.
         named: names of the scenes that belong to the data set; None for all that are on disk.
         scenes: names of the scenes to use; None for those of ``named``, ``found`` for all that are on disk.
-        preparation: how scenes are resized, cropped and inpainted.
+        preparation: None for scenes as they are.
         count: number of scenes that belong to the data set, where their names are not known.
+
     """
 
     evaluation = True
@@ -145,12 +135,12 @@ class PreparedDataset:
         name: str,
         root: str,
         found: Mapping[str, SceneRecord],
-        named: Sequence[str] | None,
         scenes: SceneSelection,
-        preparation: Preparation,
+        named: Sequence[str] | None = None,
+        preparation: Preparation | None = None,
         count: int | None = None,
     ) -> None:
-        self.name = name
+        self.name, self._found, self._preparation = name, found, preparation or Preparation(None)
         folder, named = Path(root).expanduser(), tuple(found if named is None else named)
         remedy = f"get it with: dsr data get {name}; or say where it is: dataset.root=DIR"
         if not found:
@@ -167,17 +157,16 @@ class PreparedDataset:
                 )
             scenes = named
         self._scenes = select_scenes(list(found), scenes)
-        unknown = [scene for scene in preparation.fill if scene not in (*named, *found)]
+        unknown = [scene for scene in self._preparation.fill if scene not in (*named, *found)]
         if unknown:
             raise ValueError(f"fill: expected names of scenes, got {', '.join(unknown)}")
-        self._found, self._preparation = found, preparation
 
     def scenes(self) -> list[str]:
         """Return the names of the scenes, in order."""
         return list(self._scenes)
 
     def load(self, scene: str) -> Scene:
-        """Return one scene; see :class:`dsr.data.scene_source.SceneSource`."""
+        """Return one scene, prepared."""
         record = self._found[scene]
         notes = (record.note,) if record.note else ()
         if self._preparation.size is None and scene not in self._preparation.fill:
@@ -228,6 +217,31 @@ class PreparedDataset:
     def _path(self, scene: str) -> Path:
         key = hashlib.sha256(f"{self.fingerprint(scene)}{SCENES}".encode()).hexdigest()[:16]
         return Path("prepared", self.name, f"{scene.replace('/', '_')}-{key}.npz")
+
+
+class FrameSet(PreparedDataset):
+    """A data set of which one function finds the frames in a directory, and another one loads them."""
+
+    note = ""  # for readers of the scores
+
+    def __init__(
+        self,
+        name: str,
+        root: str,
+        find: Callable[[Path], Frames],
+        load: Callable[..., Scene],
+        scenes: SceneSelection,
+        named: Sequence[str] | None = None,
+        preparation: Preparation | None = None,
+        count: int | None = None,
+        **settings: Any,
+    ) -> None:
+        found = make_records(find(Path(root).expanduser()), load, name, self.note_of, **settings)
+        super().__init__(name, root, found, scenes, named, preparation, count)
+
+    def note_of(self, *_: Any) -> str:
+        """Return what readers of a frame's scores are to know, by its files."""
+        return self.note
 
 
 @functools.lru_cache(maxsize=4096)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from dsr.data.folder import Folder
-from dsr.data.scene_source import SceneSelection, select_scenes
+from dsr.data.scene_source import SceneSelection, SceneSource, select_scenes
 from dsr.sample import Scene
 from dsr.synthetic.procedural.random_scene import PROCEDURAL_VERSION, render_random_scene
 from dsr.synthetic.rendering import cache_directory, expect_room_for, load_or_render
@@ -23,12 +23,10 @@ from dsr.utils.progress import SILENT
 _WORTH_WORKERS = 5.0  # seconds of rendering from which worker processes are used; they take some seconds to start
 
 
-class Procedural:
+class Procedural(SceneSource):
     """Random scenes number 0 .. ``count`` - 1 of a seed, rendered once and kept in the cache.
 
     Args:
-        count: number of scenes.
-        size: height and width in pixels.
         seed: seed of the scenes; each is a pure function of seed, number and size.
 
     """
@@ -49,7 +47,7 @@ class Procedural:
         return [f"{index:05d}" for index in range(self._count)]
 
     def load(self, scene: str) -> Scene:
-        """Return one scene; see :class:`dsr.data.scene_source.SceneSource`."""
+        """Return one scene."""
         rendering = load_or_render(self._path(scene), lambda: render_random_scene(self._seed, int(scene), self._size))
         return rendering.scene(self.name, scene)
 
@@ -90,13 +88,11 @@ class Procedural:
         return Path(f"procedural-v{PROCEDURAL_VERSION}-{self._seed}-{self._size}", f"{scene}.npz")
 
 
-class SimGeo:
+class SimGeo(SceneSource):
     """The SimGeo scenes.
 
     Args:
         root: directory that may hold ``lucy``; without it the statue is used.
-        scenes: names of the scenes to use; None for all.
-        size: height and width in pixels, 512 in the paper.
 
     """
 
@@ -120,7 +116,7 @@ class SimGeo:
         return list(self._scenes)
 
     def load(self, scene: str) -> Scene:
-        """Return one scene; see :class:`dsr.data.scene_source.SceneSource`."""
+        """Return one scene."""
         if scene == "lucy" and self._lucy is not None:
             return self._lucy.load(scene)
         path = Path(f"simgeo-v{SCENES_VERSION}-{self._size}", f"{scene}.npz")

@@ -20,14 +20,16 @@ No camera is published; 60 degrees of horizontal view are assumed.
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 from dsr.data.frame_files import (
     NO_CAMERA,
+    expect_choice,
     expect_size,
     find_beside,
     in_natural_order,
@@ -35,7 +37,7 @@ from dsr.data.frame_files import (
     read_millimetres,
     walk,
 )
-from dsr.data.preparation import Preparation, PreparedDataset, add_note, list_frames, make_records
+from dsr.data.preparation import FrameSet
 from dsr.data.scene_source import SceneSelection
 from dsr.sample import Scene
 
@@ -82,25 +84,15 @@ def _find_owners_layout(root: Path, split: Split | None, *, measured: bool) -> I
                 yield folder.name, tuple(folder / name for name in wanted)
 
 
-class RGBDD(PreparedDataset):
-    """Images of RGB-D-D at their own size.
+class RGBDD(FrameSet):
+    """Images of RGB-D-D at their own size; ``real`` ones have the phone's depth as the measured map."""
 
-    Args:
-        root: directory of the data set, or one above it.
-        real: whether to use the images that have the phone's depth, as the measured map.
-        split: ``test``, to evaluate on, or ``train``, to train on.
-        scenes: names of the scenes to use, such as ``20200509112638``; None for all of the split, ``found`` for all in
-            ``root``.
-
-    """
-
-    soft_edges: ClassVar[bool] = True  # pixels at depth steps are mixtures of both sides
+    note = NO_CAMERA
+    soft_edges = True
 
     def __init__(self, root: str, real: bool, split: Split = "test", scenes: SceneSelection = None) -> None:
-        if split not in COUNTS:
-            raise ValueError(f"split: expected one of {', '.join(COUNTS)}, got {split}")
+        expect_choice("split", split, COUNTS)
         name, load = ("rgbdd_real", load_measured_frame) if real else ("rgbdd", load_pair)
-        frames = list_frames(find_frames, root, split, real)
-        found = add_note(make_records(frames, load, name), NO_CAMERA)
-        super().__init__(name, root, found, None, scenes, Preparation(None), count=COUNTS[split])
+        find = functools.partial(find_frames, split=split, measured=real)
+        super().__init__(name, root, find, load, scenes, count=COUNTS[split])
         self.evaluation = split == "test"

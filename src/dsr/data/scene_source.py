@@ -1,9 +1,9 @@
-"""The protocol of data sets."""
+"""The base class of data sets."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Literal, Protocol, runtime_checkable
+from typing import Any, Literal
 
 from dsr.sample import Scene
 from dsr.utils.guards import readable
@@ -17,75 +17,60 @@ WITHOUT_OFFSET = "depth is not metric: the disparity offset is left out, as in t
 _MAX_LISTED = 60
 
 
-class SceneSource(Protocol):
+class SceneSource:
     """A data set: named scenes that are loaded one at a time.
 
     Attributes:
         name: name in ``scores.csv``.
         evaluation: whether methods are compared on its scenes, so that none may be trained on them.
-
-    Where the true depth's steps are soft, it also has ``soft_edges``, true.
+        regions: names of the regions that its scenes may have, in the order of tables.
+        soft_edges: whether pixels at depth steps are mixtures of both sides.
 
     """
 
     name: str
     evaluation: bool
+    regions: tuple[str, ...] = ()
+    soft_edges: bool = False
 
     def scenes(self) -> list[str]:
         """Return the names of the scenes, in order."""
-        ...
+        raise NotImplementedError
 
     def load(self, scene: str) -> Scene:
         """Return one scene, or raise a ValueError that names a file that is missing or damaged."""
-        ...
+        raise NotImplementedError
 
     def fingerprint(self, scene: str) -> str:
         """Return a text that changes whenever the scene's content changes."""
-        ...
+        raise NotImplementedError
 
+    def content(self, scene: str) -> str:
+        """Return a text that is equal for two data sets' scenes of the same files."""
+        return self.fingerprint(scene)
 
-def content_key(source: SceneSource, scene: str) -> str:
-    """Return a text that is equal for two data sets' scenes of the same files; else the fingerprint."""
-    content: Callable[[str], str] = getattr(source, "content", source.fingerprint)
-    return content(scene)
+    def prepare(self, scenes: Sequence[str], say: Callable[[str], None]) -> Iterable[str] | None:
+        """Prepare scenes, several at a time, and yield the name of each that is ready; ``say`` shows a line of text.
 
-
-@runtime_checkable
-class Prepared(Protocol):
-    """A data set that prepares its scenes once, before they are loaded.
-
-    It may have a method ``unprepared``, which returns those of some scenes that are not ready.
-    """
-
-    def prepare(self, scenes: Sequence[str], say: Callable[[str], None], /) -> Iterable[str]:
-        """Prepare scenes, several at a time, and yield the name of each that is ready; ``say`` shows a line of text."""
-        ...
+        None where scenes need no preparation.
+        """
+        return None
 
 
 def prepare_scenes(source: SceneSource, names: Sequence[str], progress: Progress) -> None:
     """Have a data set that renders or resizes its scenes make some of them ready."""
-    if isinstance(source, Prepared):
-        for _ in progress.track(source.prepare(names, progress.say), "prepare", len(names)):
+    ready = source.prepare(names, progress.say)
+    if ready is not None:
+        for _ in progress.track(ready, "prepare", len(names)):
             pass
 
 
-def unprepared(source: SceneSource, names: Sequence[str]) -> list[str]:
-    """Return those of some scenes that are to be prepared before they are loaded, as far as the data set knows."""
-    return getattr(source, "unprepared", lambda _: [])(names)
-
-
-def regions_of(source: SceneSource) -> tuple[str, ...]:
-    """Return the names of the regions that a data set's scenes may have, in the order of tables: its ``regions``."""
-    return tuple(getattr(source, "regions", ()))
-
-
-class SceneSubset:
+class SceneSubset(SceneSource):
     """Some of the scenes of a data set."""
 
     def __init__(self, source: SceneSource, names: Sequence[str]) -> None:
         self.name, self.evaluation = source.name, source.evaluation
-        self.regions = regions_of(source)
-        self.soft_edges = bool(getattr(source, "soft_edges", False))
+        self.regions, self.soft_edges = source.regions, source.soft_edges
         self._source, self._names = source, list(names)
 
     def scenes(self) -> list[str]:
@@ -93,12 +78,27 @@ class SceneSubset:
         return list(self._names)
 
     def load(self, scene: str) -> Scene:
-        """Return one scene; see :class:`SceneSource`."""
+        """Return one scene."""
         return self._source.load(scene)
 
     def fingerprint(self, scene: str) -> str:
-        """Return a text that changes whenever the scene's content changes."""
+        """Return the fingerprint of the data set's scene."""
         return self._source.fingerprint(scene)
+
+
+class _Outside(SceneSource):
+    """A data set of others, which has members of :class:`SceneSource` and does not derive from it."""
+
+    def __init__(self, made: Any) -> None:
+        members = ("name", "evaluation", "regions", "soft_edges", "scenes", "load", "fingerprint", "content", "prepare")
+        for member in members:
+            if hasattr(made, member):
+                setattr(self, member, getattr(made, member))
+
+
+def as_source(made: Any) -> SceneSource:
+    """Return what a node of the configuration makes as a data set, with the defaults of what it leaves out."""
+    return made if isinstance(made, SceneSource) else _Outside(made)
 
 
 def select_scenes(available: Sequence[str], wanted: SceneSelection) -> list[str]:

@@ -15,6 +15,7 @@ Both binary files are little-endian and start with the number 202021.25 as a flo
 
 from __future__ import annotations
 
+import functools
 import struct
 from pathlib import Path
 from types import MappingProxyType
@@ -24,7 +25,7 @@ import numpy as np
 from torch import Tensor
 
 from dsr.data.frame_files import expect_size, read_bytes, read_picture, to_camera, to_depth
-from dsr.data.preparation import Preparation, PreparedDataset, list_frames, make_records
+from dsr.data.preparation import FrameSet, Preparation
 from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
@@ -48,8 +49,6 @@ def find_frames(root: Path, rendering: Literal["clean", "final"] = "final") -> d
 
     A name is ``SEQUENCE/frame_NNNN``. ``root`` holds ``training``, or is it. A frame that lacks a file is left out.
     """
-    if not root.is_dir():
-        raise ValueError(f"{root}: expected a directory, there is none")
     base = root / "training" if (root / "training").is_dir() else root
     found = {}
     for depth in sorted((base / "depth").glob("*/frame_*.dpt"), key=natural_key):
@@ -109,17 +108,8 @@ def sintel_frames() -> tuple[str, ...]:
     return tuple(frames)
 
 
-class Sintel(PreparedDataset):
-    """Frames of MPI Sintel (Butler et al., ECCV 2012).
-
-    Args:
-        root: directory of ``training``.
-        scenes: names of the scenes to use; None for 58, ``found`` for all that are there.
-        size: largest length of the shorter side in pixels; None for the original size.
-        rendering: ``clean``, or ``final`` with blur, fog and the like.
-        farthest: depth in metres beyond which pixels are sky, that is, missing.
-
-    """
+class Sintel(FrameSet):
+    """Frames of MPI Sintel (Butler et al., ECCV 2012); ``final`` renderings have blur, fog and the like."""
 
     evaluation = False
 
@@ -131,7 +121,6 @@ class Sintel(PreparedDataset):
         rendering: Literal["clean", "final"] = "clean",
         farthest: float = FARTHEST,
     ) -> None:
-        frames = list_frames(find_frames, root, rendering)
-        found = make_records(frames, load_frame, "sintel", farthest=farthest)
+        find = functools.partial(find_frames, rendering=rendering)
         preparation = Preparation(size, crop=None, enlarge=False)
-        super().__init__("sintel", root, found, sintel_frames(), scenes, preparation)
+        super().__init__("sintel", root, find, load_frame, scenes, sintel_frames(), preparation, farthest=farthest)

@@ -21,14 +21,13 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import ClassVar
 
 import cv2
 import numpy as np
 import torch
 
 from dsr.data.frame_files import find_beside, in_natural_order, read_frame
-from dsr.data.preparation import Preparation, PreparedDataset, list_frames, make_records
+from dsr.data.preparation import FrameSet
 from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera, Lens
 from dsr.sample import Scene
@@ -112,17 +111,10 @@ def plane_depth(board: Board) -> np.ndarray:
     return depth
 
 
-class StereoBoard(PreparedDataset):
-    """Five frames of a stereo camera before an exact plane, at their own size, its map as measured at x1.
+class StereoBoard(FrameSet):
+    """Five frames of a stereo camera before an exact plane, at their own size, its map as measured at x1."""
 
-    Args:
-        root: directory of ``color`` and ``depth``, or one above it.
-        scenes: names of the scenes to use, such as ``14``; None for all five, ``found`` for those in ``root``.
-
-    """
-
-    regions: ClassVar[tuple[str, ...]] = ("board", "border")
+    regions = ("board", "border")
 
     def __init__(self, root: str, scenes: SceneSelection = None) -> None:
-        found = make_records(list_frames(find_frames, root), load_frame, "stereo_board")
-        super().__init__("stereo_board", root, found, tuple(BOARDS), scenes, Preparation(None))
+        super().__init__("stereo_board", root, find_frames, load_frame, scenes, tuple(BOARDS))

@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 from torch import Tensor
 
@@ -32,10 +33,12 @@ from dsr.data.frame_files import (
     to_depth,
     walk,
 )
-from dsr.data.preparation import Preparation, PreparedDataset, SceneRecord, list_frames, make_records, rename_records
+from dsr.data.preparation import Frames, FrameSet, Preparation, rename_frames
 from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera
+from dsr.io.encoding import turn_back_bits
 from dsr.io.images import read_numbers
+from dsr.io.reading import SUNRGBD_BITS
 from dsr.sample import Scene
 
 Intrinsics = tuple[float, float, float, float]  # (fx, fy, cx, cy) in pixels
@@ -54,8 +57,7 @@ def find_frames(root: Path) -> dict[str, tuple[Path]]:
 
 def read_depth(path: Path) -> Tensor:
     """Return a depth picture, (1, H, W) float64 in metres, NaN in holes."""
-    levels = read_16bit(path)
-    return to_depth(path, ((levels >> 3) | (levels << 13)) / 1000)
+    return to_depth(path, turn_back_bits(str(path), read_16bit(path), SUNRGBD_BITS) / 1000)
 
 
 def read_intrinsics(path: Path, size: tuple[int, int]) -> Camera:
@@ -121,19 +123,8 @@ FRAMES = MappingProxyType(
 )
 
 
-class SunRGBD(PreparedDataset):
-    """Scenes of SUN RGB-D; the depth that the sensor measured, with its holes, is the true depth.
-
-    Args:
-        root: directory of the scenes' folders, at any depth.
-        scenes: names of the scenes to use; None for twelve, ``found`` for all in ``root``.
-        size: height and width in pixels; None for the original size.
-        crop: see :class:`dsr.data.preparation.Preparation`.
-        refined: whether the authors' refined depth without holes is the true depth.
-        frames: folder of each of the twelve names.
-        intrinsics: fx, fy, cx, cy in pixels for folders without ``intrinsics.txt``.
-
-    """
+class SunRGBD(FrameSet):
+    """Scenes of SUN RGB-D; the true depth is what the sensor measured, with its holes, or the authors' refined one."""
 
     def __init__(
         self,
@@ -147,13 +138,16 @@ class SunRGBD(PreparedDataset):
     ) -> None:
         if intrinsics is not None and len(intrinsics) != 4:
             raise ValueError(f"intrinsics: expected fx, fy, cx, cy, got {len(intrinsics)} numbers")
-        settings = {"refined": refined, "intrinsics": intrinsics and tuple(intrinsics)}
-        records = make_records(list_frames(find_frames, root), load_frame, "sunrgbd", **settings)
-        found = rename_records(records, {name: _first_below(records, path) for name, path in frames.items()})
-        super().__init__("sunrgbd", root, found, tuple(FRAMES), scenes, Preparation(size, crop))
+
+        def find(folder: Path) -> Frames:
+            found = find_frames(folder)
+            return rename_frames(found, {name: _first_below(found, path) for name, path in frames.items()})
+
+        settings: dict[str, Any] = {"refined": refined, "intrinsics": intrinsics and tuple(intrinsics)}
+        super().__init__("sunrgbd", root, find, load_frame, scenes, tuple(FRAMES), Preparation(size, crop), **settings)
 
 
-def _first_below(records: Mapping[str, SceneRecord], path: str) -> str:
+def _first_below(found: Frames, path: str) -> str:
     """Return the first scene whose name is or begins with a path, below ``SUNRGBD`` or not; the path where none is."""
-    beginnings = tuple(f"{above}{path.replace('/', '_')}_" for above in ("", "SUNRGBD_"))
-    return next((name for name in records if f"{name}_".startswith(beginnings)), path)
+    beginnings = tuple(f"{above}{path}/".replace("/", "_") for above in ("", "SUNRGBD/"))
+    return next((name for name in found if f"{name}_".replace("/", "_").startswith(beginnings)), path)

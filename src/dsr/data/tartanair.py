@@ -17,7 +17,7 @@ import numpy as np
 from torch import Tensor
 
 from dsr.data.frame_files import expect_size, name_of, read_picture, to_depth, walk
-from dsr.data.preparation import Preparation, PreparedDataset, list_frames, make_records
+from dsr.data.preparation import FrameSet, Preparation
 from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera
 from dsr.io.images import read_values
@@ -64,17 +64,8 @@ def load_frame(rgb_path: Path, depth_path: Path, dataset: str, name: str, *, far
     return Scene(dataset, name, rgb, CAMERA, read_depth(depth_path, farthest))
 
 
-class TartanAir(PreparedDataset):
-    """Frames of TartanAir: rendered outdoor and indoor scenes (Wang et al., IROS 2020).
-
-    Args:
-        root: directory of the trajectories.
-        scenes: names of the scenes to use; None and ``found`` for all in ``root``.
-        size: height and width in pixels; None for the original size.
-        crop: see :class:`dsr.data.preparation.Preparation`.
-        farthest: depth in metres beyond which pixels are sky, that is, missing.
-
-    """
+class TartanAir(FrameSet):
+    """Frames of TartanAir: rendered outdoor and indoor scenes (Wang et al., IROS 2020)."""
 
     def __init__(
         self,
@@ -84,6 +75,5 @@ class TartanAir(PreparedDataset):
         crop: float = 0.5,
         farthest: float = FARTHEST,
     ) -> None:
-        frames = list_frames(find_frames, root)
-        found = make_records(frames, load_frame, "tartanair", farthest=farthest)
-        super().__init__("tartanair", root, found, None, scenes, Preparation(size, crop))
+        preparation = Preparation(size, crop)
+        super().__init__("tartanair", root, find_frames, load_frame, scenes, preparation=preparation, farthest=farthest)

@@ -17,6 +17,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,7 +25,7 @@ from torch import Tensor
 
 from dsr.data.frame_files import expect_size, given_camera, in_natural_order, name_of, read_picture, to_depth, walk
 from dsr.data.matlab import read_variables
-from dsr.data.preparation import Preparation, PreparedDataset, add_note, list_frames, make_records
+from dsr.data.preparation import FrameSet
 from dsr.data.scene_source import SceneSelection
 from dsr.io.images import read_levels
 from dsr.sample import Scene
@@ -72,13 +73,9 @@ def load_frame(
 ) -> Scene:
     """Return one scene, with the samples as measured low-resolution maps; of pictures the true depth is not known.
 
-    Args:
-        path: the ``.mat`` file, or the intensity picture.
-        samples_path: ``*_depth.bmp``; None with a ``.mat`` file.
-        intrinsics: (fx, fy, cx, cy) in pixels, pixel centres at integers; needed, as the files hold none.
-        depth_range: metres of level 1 and of level 255 of ``samples_path``, which needs it.
-        variables: names in the ``.mat`` file of "intensity", "depth" and "samples"; the others are found.
-        factors: of the measured maps.
+    ``path`` is a ``.mat`` file, whose ``variables`` are found where they are not named, or the intensity picture beside
+    ``samples_path``, which needs ``depth_range``, metres of levels 1 and 255. ``intrinsics`` are needed, as the files
+    hold none.
     """
     if intrinsics is None:
         raise ValueError(
@@ -212,17 +209,8 @@ SCENES = ("books", "devil", "shark")
 ESTIMATED = (549.2, 549.2, 375.2, 334.3)  # fx, fy, cx, cy in pixels of the 610 x 810 photos
 
 
-class ToFMark(PreparedDataset):
-    """Scenes of ToFMark at their original size, with the samples as measured maps at x4 and x8.
-
-    Args:
-        root: directory of the ``.mat`` files or the pictures.
-        scenes: names of the scenes to use; None for the three, ``found`` for all in ``root``.
-        intrinsics: fx, fy, cx, cy in pixels; None for the estimated ones.
-        depth_range: depth in metres of levels 1 and 255 of the pictures, which hold no scale.
-        variables: names of ``intensity``, ``depth`` and ``samples`` in the ``.mat`` files, where they are not found.
-
-    """
+class ToFMark(FrameSet):
+    """Scenes of ToFMark at their original size, with the samples as measured maps at x4 and x8."""
 
     def __init__(
         self,
@@ -235,12 +223,11 @@ class ToFMark(PreparedDataset):
         for name, values, count in (("intrinsics", intrinsics, 4), ("depth_range", depth_range, 2)):
             if values is not None and len(values) != count:
                 raise ValueError(f"{name}: expected {count} numbers, got {len(values)}")
-        settings = {
+        if intrinsics is None:
+            self.note = "the benchmark has no camera: it is an estimate"
+        settings: dict[str, Any] = {
             "intrinsics": tuple(intrinsics or ESTIMATED),
             "depth_range": depth_range and tuple(depth_range),
             "variables": variables and dict(variables),
         }
-        found = make_records(list_frames(find_frames, root), load_frame, "tofmark", **settings)
-        if intrinsics is None:
-            found = add_note(found, "the benchmark has no camera: it is an estimate")
-        super().__init__("tofmark", root, found, SCENES, scenes, Preparation(None))
+        super().__init__("tofmark", root, find_frames, load_frame, scenes, SCENES, **settings)

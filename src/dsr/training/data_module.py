@@ -14,7 +14,7 @@ import lightning
 import torch
 from torch.utils.data import DataLoader, Dataset, default_collate
 
-from dsr.data.scene_source import SceneSource, content_key
+from dsr.data.scene_source import SceneSource, as_source
 from dsr.degradation.downsampling import encode_facts
 from dsr.degradation.random_degradation import Everything
 from dsr.methods.classical.interpolation import Interpolation
@@ -98,14 +98,15 @@ class PatchData(lightning.LightningDataModule):
         for part in parts:
             if not 0 <= part.share < math.inf:
                 raise ValueError(f"share of {part.source.name}: expected 0 or a positive number, got {part.share}")
-            names, kept = _split(part.source, settings)
-            self.trained.append((part.source, names))
+            source = as_source(part.source)
+            names, kept = _split(source, settings)
+            self.trained.append((source, names))
             if kept:
-                held_out.append((part.source.name, part.source, kept))
-        held_out += [(name, source, source.scenes()) for name, source in (validation or {}).items()]
+                held_out.append((source.name, source, kept))
+        held_out += [(name, as_source(source), source.scenes()) for name, source in (validation or {}).items()]
         if not held_out:
             raise ValueError("validation_scenes: expected a positive number where there is no other validation")
-        trained = {content_key(source, name) for source, names in self.trained for name in names}
+        trained = {source.content(name) for source, names in self.trained for name in names}
         for name, source, scenes in held_out:
             kind, number = name, 1
             while kind in self.held_out:
@@ -113,7 +114,7 @@ class PatchData(lightning.LightningDataModule):
                 kind = f"{name}_{number}"
             self.held_out[kind] = (source, scenes)
             for scene in scenes:
-                if content_key(source, scene) in trained:  # under whatever name
+                if source.content(scene) in trained:  # under whatever name
                     raise ValueError(f"validation.{kind}: expected scenes that are not trained on, got {scene}")
         self._validation: list[list[Scene]] = []
 

@@ -82,7 +82,7 @@ def find_arkitscenes(folder: Path) -> PairingResult | None:
     motions = _read_trajectory(folder / "lowres_wide.traj")
     pairs = []
     for stem in [stem for stem in photos if stem in depths]:
-        intrinsics, motion = _intrinsics(folder / f"{kind}_intrinsics", stem), _nearest(motions, stem)
+        intrinsics, motion = find_intrinsics(folder / f"{kind}_intrinsics", stem), _nearest(motions, stem)
         place = f"{folder / 'lowres_wide.traj'}: frame {stem}"
         geometry = functools.partial(_geometry, place, intrinsics, motion)
         described = (b"" if intrinsics is None else read_limited(intrinsics, _LARGEST_PINCAM)) + repr(motion).encode()
@@ -122,8 +122,8 @@ def _nearest(motions: dict[float, _Motion], stem: str) -> _Motion | None:
     return motions[float(times[int(gaps.argmin())])]
 
 
-def _intrinsics(folder: Path, stem: str) -> Path | None:
-    """Return the file of a frame's intrinsics."""
+def find_intrinsics(folder: Path, stem: str) -> Path | None:
+    """Return the file of a frame's intrinsics, whose time may differ by a millisecond; None where there is none."""
     video = stem.rpartition("_")[0]
     names = [f"{stem}.pincam", *(f"{video}_{_time(stem) + shift:.3f}.pincam" for shift in _SHIFTS)]
     return next((folder / name for name in names if (folder / name).is_file()), None)
