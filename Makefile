@@ -5,6 +5,7 @@
 # make fuzz  10,000 damaged, foreign and malicious files for every reader (ARGS="--cases 1000 --seed 1")
 # make chaos commands that are killed and run at once (ARGS="--kills 100 --seed 0")
 # make mistakes  inputs that can be computed with and are wrong: which are told (ARGS="--cases 500 --seed 0")
+# make benchmark  how many times as fast as a plain way dsr does what it does (ARGS="--json before.json")
 # make dist  what a release consists of, built and checked, in dist
 # make docs  the documentation as a site in outputs/site
 # All of them set everything up in .venv first; they need Python >= 3.11 and nothing else.
@@ -53,7 +54,7 @@ mistakes: $(VENV)/installed-dev
 	OMP_NUM_THREADS=1 PYTHONPATH=tests:benchmarks $(BIN)/python -m mistakes $(ARGS)
 
 benchmark: $(VENV)/installed-dev
-	for name in dip metrics msg peers prepare train; do $(BIN)/python benchmarks/$${name}_speed.py || exit 1; done
+	$(BIN)/python benchmarks/run.py speed $(ARGS)
 
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

@@ -122,7 +122,7 @@ def measured(source: SceneSource, name: str, windows: tuple[Window, ...]) -> Cap
 
 def at_own_size(scene: Scene, windows: tuple[Window, ...]) -> Capture:
     """Return a scene whose only map is a sensor's at the photo's size."""
-    assert scene.depth is not None  # noqa: S101 - for the type checker
+    assert scene.depth is not None
     return Capture(without_truth(scene.name, scene.rgb, scene.depth, scene.camera), windows)
 
 
@@ -166,7 +166,7 @@ def iphone_lidar(windows: tuple[Window, ...], shared: Path) -> Capture:
 def simulated_phone(windows: tuple[Window, ...], shared: Path) -> Capture:
     """Return the capture of ``simulate_phone.py``; its truth has a third of the photo's resolution."""
     with tempfile.TemporaryDirectory() as place:
-        subprocess.run([sys.executable, str(shared / "simulate_phone.py"), place], check=True)  # noqa: S603
+        subprocess.run([sys.executable, str(shared / "simulate_phone.py"), place], check=True)
         folder = Path(place)
         rgb, camera = read_picture(folder / "photo.jpg"), Camera(**json.loads((folder / "info.json").read_text()))
         depth, truth = (torch.from_numpy(np.load(folder / f"{each}.npy"))[None].double() for each in ("depth", "truth"))
@@ -179,7 +179,7 @@ def downsampled(name: str, kernel: Kernel, windows: tuple[Window, ...], shared: 
     """Return a scene with exact depth, downsampled to x4."""
     scene = Folder(str(shared / "scenes"), [name]).load(name)
     sample = make_sample(scene, 4, Downsampling(kernel), "disparity")
-    assert sample.depth is not None  # noqa: S101 - for the type checker
+    assert sample.depth is not None
     return Capture(sample, windows, Truth(sample.depth, sample.camera), noisy=False, measured=False)
 
 

@@ -123,9 +123,7 @@ def digests(name: str, command: list[str], folder: Path) -> dict[str, str]:
     """Run a job and return the digests of what it computed."""
     print(name, end=" ", flush=True)
     threads = {"OMP_NUM_THREADS": "1", "DSR_CACHE": str(folder / "cache")}
-    done = subprocess.run(  # noqa: S603
-        command, cwd=ROOT, env=os.environ | threads, capture_output=True, text=True, check=False
-    )
+    done = subprocess.run(command, cwd=ROOT, env=os.environ | threads, capture_output=True, text=True, check=False)
     print("ok" if done.returncode == 0 else f"exit {done.returncode}: {done.stderr.strip()[-300:]}", flush=True)
     found = {"exit": str(done.returncode)}
     for path in sorted(path for path in (folder / name).rglob("*") if path.is_file()):

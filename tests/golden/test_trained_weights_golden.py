@@ -1,5 +1,6 @@
 """The weights that come with dsr, on scenes that they were neither trained on nor chosen with."""
 
+import json
 import re
 from pathlib import Path
 
@@ -28,13 +29,15 @@ VISUAL = ("RMSE_v", "DSSIM_v", "BadPix_v_5", "Bumpiness_d", "LPIPS_v")
 @pytest.fixture(scope="module")
 def ratios(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> pd.DataFrame:
     """Ours / published MSG-V on Lucy and Plant at x4, one pass each, as the benchmark prints them."""
-    file = tmp_path_factory.mktemp("ratios") / "ratios.csv"
-    script = str(REPOSITORY / "benchmarks" / "against_published.py")
-    options = ("--scales", "4", "--ensemble", "1", "--shared", str(shared), "--csv", str(file))
+    file = tmp_path_factory.mktemp("ratios") / "ratios.json"
+    script = str(REPOSITORY / "benchmarks" / "run.py")
+    options = ("published", "--shared", str(shared), "--json", str(file), "--set", "scales=4", "ensemble=1")
     done = run_python(script, *options, cwd=REPOSITORY)
     assert done.returncode == 0, done.stderr
-    assert "average" in done.stdout
-    return pd.read_csv(file)
+    found = json.loads(file.read_text())["results"]["published"]
+    rows = [(*key.split(), value) for key, value in found.items()]
+    table = pd.DataFrame(rows, columns=["method", "scale", "scene", "metric", "ratio"])
+    return table.pivot_table("ratio", ["method", "scale", "scene"], "metric").reset_index()
 
 
 @pytest.mark.parametrize(("method", "rmse_v", "all_metrics"), [("msg_v", 0.85, 0.93), ("facets", 0.75, 0.80)])

@@ -1,5 +1,6 @@
 """The benchmarks run: small, for what they print, not for how fast."""
 
+import json
 import re
 import subprocess
 import sys
@@ -10,27 +11,36 @@ from commands import run_python
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 SMALL = {
-    "train_speed.py": (("--patch", "32", "--batch", "2", "--steps", "1"), 3),
-    "prepare_speed.py": (("--scenes", "2", "--height", "160", "--width", "240"), 2),
-    "dip_speed.py": (("--size", "64", "--steps", "1", "--quality-steps", "2"), 4),
-}  # Arguments, and how many ratios are printed
+    "train-step": (("patch=32", "batch=2", "turns=1"), 2),
+    "prepare": (("scenes=2", "height=160", "width=240"), 2),
+    "dip-step": (("size=64", "turns=1"), 2),
+}  # Settings, and how many ratios are printed
 
 pytestmark = pytest.mark.nightly
 
 
 @pytest.mark.parametrize("name", SMALL)
-def test_benchmark_prints_ratios(name: str) -> None:
-    arguments, ratios = SMALL[name]
-    done = run_python(str(BENCHMARKS / name), *arguments, cwd=BENCHMARKS.parent)
-    assert done.returncode == 0, done.stderr
-    assert len(re.findall(r"\d\.\d+ times as fast", done.stdout)) == ratios
+def test_benchmark_prints_ratios(name: str, tmp_path: Path) -> None:
+    settings, ratios = SMALL[name]
+    printed = run_benchmark("run.py", name, "--json", str(tmp_path / "ratios.json"), "--set", *settings)
+    found = json.loads((tmp_path / "ratios.json").read_text())["results"][name]
+    assert len(printed.splitlines()) == len(found) == ratios
+    assert min(found.values()) > 0
+    compared = run_benchmark("run.py", "compare", *2 * [str(tmp_path / "ratios.json")]).splitlines()
+    assert [line.split()[-1] for line in compared] == ["1.000"] * ratios
+
+
+def test_case_without_its_data_is_skipped(tmp_path: Path) -> None:
+    printed = run_benchmark("run.py", "published", "evaluation", "--shared", str(tmp_path)).splitlines()
+    assert [line.split(": ")[:2] for line in printed] == [["published", "skipped"], ["evaluation", "skipped"]]
 
 
 def test_method_cost_benchmark_measures(shared: Path) -> None:
-    command = (str(BENCHMARKS / "methods_cost.py"), "--scenes", str(shared / "scenes"))
-    done = run_python(*command, "--methods", "nearest", "--scale", "4", cwd=BENCHMARKS.parent)
-    assert done.returncode == 0, done.stderr
-    assert re.fullmatch(r"\| `nearest` \| - \| \d+\.\d\d \| \d+ \|", done.stdout.splitlines()[-1])
+    arguments = ("--shared", str(shared), "--set", "methods=nearest", "scales=4")
+    printed = run_benchmark("run.py", "methods", *arguments).splitlines()
+    assert [line.split()[:4] for line in printed] == [
+        ["methods", "nearest", "x4,", key] for key in ("s", "MB", "parameters")
+    ]
 
 
 def run_benchmark(name: str, *arguments: str) -> str:
@@ -41,20 +51,20 @@ def run_benchmark(name: str, *arguments: str) -> str:
 
 
 def test_flatness_is_the_published_one(shared: Path) -> None:
-    arguments = ("--floors", "depth_camera_0", "--methods", "", "--frames", "1")
-    raw, filtered = run_benchmark("flatness.py", "--shared", str(shared), *arguments).splitlines()[2:]
-    assert raw.startswith("| input | 36.8 |")
-    assert filtered.startswith("| bilateral filter of OpenCV | 15.8 |")
+    arguments = ("--shared", str(shared), "--set", "methods=", "filters=19/0.05/5")
+    printed = run_benchmark("run.py", "floors", *arguments).splitlines()
+    raw, filtered = (float(line.split()[-1]) for line in printed if "depth_camera_0" in line)
+    assert (raw, filtered) == (pytest.approx(36.8, abs=0.05), pytest.approx(15.8, abs=0.05))
 
 
 def test_benchmark_of_poses_counts_what_is_noticed() -> None:
-    lines = run_benchmark("poses.py", "--scenes", "1", "--size", "48", "--right").splitlines()
+    lines = run_benchmark("mistakes.py", "poses", "--scenes", "1", "--size", "48", "--right").splitlines()
     (row,) = [line for line in lines if line.startswith("| right |")]
     assert re.fullmatch(r"\| right( \| \d / \d / \d / \d){7} \|", row)
 
 
 def test_benchmark_of_encodings_counts_what_is_said() -> None:
-    printed = run_benchmark("depth_encodings.py", "--frames", "2", "--reduce", "2").splitlines()
+    printed = run_benchmark("mistakes.py", "encodings", "--frames", "2", "--reduce", "2").splitlines()
     (_, frames, *answers), _, *rows = [[cell.strip() for cell in line.split("|")[:-1]] for line in printed]
     assert (frames, answers) == ("2 frames", ["read rightly", "warned", "refused", "silent"])
     counts = {name: [int(cell) for cell in cells] for _, name, *cells in rows}
@@ -72,7 +82,7 @@ def test_pairs_have_their_published_rows(shared: Path, tmp_path: Path) -> None:
     ddrnet, camera = ("real/ddrnet/color_map", "real/ddrnet/depth_map"), "real/sunrgbd/open3d_sample"
     for name in (*ddrnet, "real/iphone_lidar", camera, "scenes/books"):
         (tmp_path / name).symlink_to(shared / name)
-    command = (sys.executable, str(BENCHMARKS / "pairs.py"), "--shared", str(tmp_path), "--rendered", "8")
+    command = (sys.executable, str(BENCHMARKS / "mistakes.py"), "pairs", "--shared", str(tmp_path), "--rendered", "8")
     done = subprocess.run([*command, "--workers", "1"], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     published = (BENCHMARKS.parent / "docs" / "measurements" / "checks.md").read_text()

@@ -439,13 +439,14 @@ def test_nobody_is_sent_to_the_dsr_of_pypi(monkeypatch):
     assert f"pip install '{name}[onnx]'" in versions.how_to_install("onnx")
 
 
-def test_make_benchmark_runs_the_scripts_that_need_no_arguments():
+def test_make_benchmark_runs_the_cases_that_the_page_has():
     root = Path(__file__).resolve().parents[2]
-    [names] = re.findall(r"for name in ([\w ]+); do \$\(BIN\)/python benchmarks/", (root / "Makefile").read_text())
-    ratios = (root / "docs/measurements/speed.md").read_text().partition("## Ratios")[2].partition("\n## ")[0]
-    assert set(names.split()) == set(re.findall(r"benchmarks/(\w+)_speed\.py", ratios))
-    texts = [(root / f"benchmarks/{name}_speed.py").read_text() for name in names.split()]
-    assert not any("required=True" in text for text in texts)
+    assert "$(BIN)/python benchmarks/run.py speed $(ARGS)\n" in (root / "Makefile").read_text()
+    pages = "".join(page.read_text() for page in (root / "docs").rglob("*.md"))
+    named = set(re.findall(r"benchmarks/run\.py speed ([a-z-]+)", pages))
+    assert {"train-step", "msg", "dip-step", "metrics", "prepare"} <= named
+    cases = re.findall(r"^def ([a-z_]+)\(\*,.*-> Scores:", (root / "benchmarks/speed.py").read_text(), re.MULTILINE)
+    assert named <= {name.replace("_", "-") for name in (*cases, "workers")}
 
 
 def test_doctor_knows_every_data_set_of_recorded_scenes(shared, tmp_path):

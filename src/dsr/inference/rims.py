@@ -6,7 +6,7 @@ measured pixels around it, up to three times as far as the rim, as in a joint bi
 that are nearest and most alike in colour stand for it. The pixel gets the farther depth if that surface explains its
 colour at least as well as the nearer one, and the nearer if that does clearly better. A pixel is left to the method,
 which knows slopes and its own errors, if filling from the rim gives the same surface. The probability that a pixel is
-of the other surface counts in its expected error. See ``benchmarks/holes.py`` for the figures.
+of the other surface counts in its expected error. See ``docs/measurements/scripts/holes.py`` for the figures.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from dsr.utils.configuration import ConfigError
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
-# What a CPU has where convolutions in bfloat16 are faster, also with gradients (benchmarks/train_speed.py).
+# What a CPU has where convolutions in bfloat16 are faster, also with gradients (benchmarks/run.py speed train-step).
 _FAST_ON_CPU = ("_is_avx512_bf16_supported", "_is_amx_tile_supported")
 
 

@@ -30,7 +30,7 @@ from dsr.utils.progress import Steps
 
 Edges = Literal["auto", "sharp", "soft"]
 _TOLERANCE = 0.02  # a map is taken for one of the photo's own size up to this relative difference
-CAUTION = 1.1  # measured errors over expected ones on held-out rendered scenes, see ``benchmarks/confidence.py``
+CAUTION = 1.1  # measured errors over expected ones on held-out rendered scenes, see ``benchmarks/run.py confidence``
 # of maps without noise, by kernel and depth steps: which further weights there may be, and ``CAUTION`` for them
 SPECIAL: Mapping[tuple[Kernel | None, Edges], tuple[Literal["clean", "soft"], float]] = MappingProxyType(
     {("box", "sharp"): ("clean", 0.85), ("bicubic", "soft"): ("soft", CAUTION)}

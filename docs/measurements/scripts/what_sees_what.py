@@ -1,3 +1,4 @@
+# Frozen: this measured once what the documentation says of it, from benchmarks/. It is not maintained.
 """Which metric sees which error: controlled distortions of true surfaces, all of the same depth error.
 
     python benchmarks/what_sees_what.py [--scenes DIR] [--lpips FILE] -o what_sees_what

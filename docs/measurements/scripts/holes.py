@@ -1,3 +1,4 @@
+# Frozen: this measured once what the documentation says of it, from benchmarks/. It is not maintained.
 """How holes are filled: today's filling, the farther depth of the rim, and what the colours say; sheets are counted.
 
     python benchmarks/holes.py [--shared DIR] [--ratio 4] [--method facets] [--rules NAME...] [--kinds NAME...]

@@ -1,3 +1,4 @@
+# Frozen: this measured once what the documentation says of it, from benchmarks/. It is not maintained.
 """Where a network's answer spends its time: how near its convolutions are to the fastest matrix products.
 
     python benchmarks/network_speed.py [--networks facets,facets_box,msg_v] [--scale 4] [--size 512] [--device cpu]

@@ -1,3 +1,4 @@
+# Frozen: this measured once what the documentation says of it, from benchmarks/. It is not maintained.
 """How much faster a training step of MSG-V is than in a plain float32 loop, data included; and where its time goes.
 
     python benchmarks/train_speed.py [--patch 96] [--batch 5] [--steps 9] [--device cuda]

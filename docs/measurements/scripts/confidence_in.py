@@ -1,3 +1,4 @@
+# Frozen: this measured once what the documentation says of it, from benchmarks/. It is not maintained.
 """Measure three uses of a confidence map: none, holes in place of unsure pixels, and the noise of each level given.
 
     python benchmarks/confidence_in.py [--scenes DIR] [--scale 8] [--seed 1]

@@ -1,3 +1,4 @@
+# Frozen: this measured once what the documentation says of it, from benchmarks/. It is not maintained.
 """Train facets for days: stages in turn, each a training of about an hour, and after each a row of all yardsticks.
 
     python benchmarks/long_training.py [PLAN] [-o DIR] [--shared DIR] [--stages N]

@@ -1,3 +1,4 @@
+# Frozen: this measured once what the documentation says of it, from benchmarks/. It is not maintained.
 """Frames a second of ``dsr upsample`` per core, with one and with two workers, and where the time goes.
 
     python benchmarks/throughput.py [--frames 24] [--rounds 3] [--rgb PHOTO --depth MAP] [--ratio 4]

@@ -1,3 +1,4 @@
+# Frozen: this measured once what the documentation says of it, from benchmarks/. It is not maintained.
 """How metrics agree on real methods: which ones rank the methods of a scene alike.
 
     python benchmarks/how_metrics_agree.py outputs/eval -o how_metrics_agree

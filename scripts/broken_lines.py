@@ -1,4 +1,4 @@
-"""Break one line of the package at a time, and show which unit test catches it: ``python benchmarks/broken_lines.py``.
+"""Break one line of the package at a time, and show which unit test catches it: ``python scripts/broken_lines.py``.
 
 Each break is a plausible mistake: a sign in the normals, a wrong light, a swapped mask, a lost seed, a camera half a
 pixel off. The unit tests of a copy of the checkout are run until the first failure. The exit code is 1 if a break is
@@ -82,7 +82,7 @@ def first_failure(checkout: Path) -> str | None:
         "PYTHONDONTWRITEBYTECODE": "1",
     }
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-m", "unit", "-p", "no:cacheprovider", "--tb=no", "-n", "2"]
-    done = subprocess.run(command, cwd=checkout, env=environment, capture_output=True, text=True, check=False)  # noqa: S603
+    done = subprocess.run(command, cwd=checkout, env=environment, capture_output=True, text=True, check=False)
     found = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
     return found[1] if found else None
 

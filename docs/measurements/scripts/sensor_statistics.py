@@ -1,3 +1,4 @@
+# Frozen: this measured once what the documentation says of it, from benchmarks/. It is not maintained.
 """Compare the statistics of real sensors' maps with those of the simulated sensors that a network is trained on.
 
     python benchmarks/sensor_statistics.py [--shared DIR] [--scenes 6] [--draws 4] [--sheet FILE] [--only KIND,...]

@@ -1,3 +1,4 @@
+# Frozen: this measured once what the documentation says of it, from benchmarks/. It is not maintained.
 """How much faster a step of DIP-V is than the plain way, and that nothing is lost by it.
 
     python benchmarks/dip_speed.py [--size 256] [--steps 5] [--threads N] [--quality-steps 0] [--device cpu]

@@ -1,3 +1,4 @@
+# Frozen: this measured once what the documentation says of it, from benchmarks/. It is not maintained.
 """Measure how metrics of renderings react to grain: white noise that is added to a method's depth.
 
     python benchmarks/grain.py --scenes DIR [--method facets] [--scale 4] [--levels 0,0.0001,0.0002,0.0005]

@@ -1,3 +1,4 @@
+# Frozen: this measured once what the documentation says of it, from benchmarks/. It is not maintained.
 """Measure how flat methods leave two floors that real sensors saw, and beside it how true they leave a person.
 
     python benchmarks/flatness.py --shared DIR [--methods facets,bilateral,...] [--device cpu]

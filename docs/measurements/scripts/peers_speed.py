@@ -1,3 +1,4 @@
+# Frozen: this measured once what the documentation says of it, from benchmarks/. It is not maintained.
 """How fast the published networks of the field run here, against their authors' own code on the same device.
 
 Both run on the same enlarged map and photo in one process, in turns; the ratios are of CPU seconds on one thread, or of
