@@ -1,1 +1,1 @@
-"""Commands that are killed, run out of space and run at once, and afterwards have the results of undisturbed ones."""
+"""Commands that are struck by signals or run at once, and what has to come of it: ``python -m chaos``."""

@@ -1,56 +1,31 @@
 """The commands of the campaign, each of a few seconds, and the files that they start from."""
 
-from __future__ import annotations
-
 import json
-import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from PIL import Image
 
-REPOSITORY = Path(__file__).resolve().parents[2]
-_PROGRAMS = {
-    "eval": (sys.executable, str(REPOSITORY / "eval.py")),
-    "train": (sys.executable, str(REPOSITORY / "train.py")),
-    "dsr": (sys.executable, "-m", "dsr"),
-    "python": (sys.executable,),
-}
+Origin = Callable[[Path], None] | tuple[str, str]
+"""What makes a path, or the scenario and the path in its results that it is copied from."""
 
 
-@dataclass(frozen=True)
-class Scenario:
-    """A command, or several that follow each other or run at once.
+class Scenario(NamedTuple):
+    """Commands and what they start from, by paths.
 
-    Args:
-        name: its name.
-        commands: arguments, the first one a key of ``_PROGRAMS``.
-        needs: what it starts from: paths in its folder, and what makes them, or the scenario and the path in its
-            results that they are copied from.
-        complete: message of a command that has nothing left to do and ends with exit code 2; empty if there is none.
-        rivals: what the commands would do alone, if they have one folder and different settings: one of them has to be
-            refused, and the results have to be those of the other.
-        kept: patterns of files that are never made again once they are there, ``info.json`` once it says ``complete``.
-
+    ``commands`` follow each other undisturbed; of a pair they run at once. ``rivals`` have different settings and one
+    folder: one of them is refused, and the results are those of the other.
     """
 
-    name: str
     commands: tuple[tuple[str, ...], ...]
-    needs: Mapping[str, Callable[[Path], None] | tuple[str, str]] = field(default_factory=dict)
-    complete: str = ""
-    rivals: tuple[Scenario, ...] = ()
-    kept: tuple[str, ...] = ("cache/**/*.npz", "**/predictions/*.npz", "out/*/info.json")
-
-    def arguments(self, number: int = 0) -> list[str]:
-        """Return a command as arguments of a process."""
-        program, *rest = self.commands[number]
-        return [*_PROGRAMS[program], *rest]
+    needs: Mapping[str, Origin] = {}
+    rivals: tuple[str, ...] = ()
 
 
 def make_frames(folder: Path) -> None:
-    """Write six photos and depth maps of a box before a wall, from cameras 4 cm apart."""
+    """Write six photos and depth maps of a box before a wall, from cameras 4 cm apart, and their poses beside."""
     for kind in ("rgb", "depth"):
         (folder / kind).mkdir(parents=True)
     rng = np.random.default_rng(0)
@@ -63,11 +38,8 @@ def make_frames(folder: Path) -> None:
         Image.fromarray(depth.round().astype(np.uint16)).save(folder / "depth" / f"{number:03}.png")
     camera = {"width": 64, "height": 48, "fx": 60.0, "fy": 60.0, "cx": 31.5, "cy": 23.5}
     (folder / "camera.json").write_text(json.dumps(camera))
-
-
-def make_poses(path: Path) -> None:
-    """Write the poses of the frames."""
-    path.write_text("".join(f"1 0 0 {0.04 * number} 0 1 0 0 0 0 1 0\n" for number in range(6)))
+    poses = "".join(f"1 0 0 {0.04 * number} 0 1 0 0 0 0 1 0\n" for number in range(6))
+    (folder.parent / "poses.txt").write_text(poses)
 
 
 def make_answers(folder: Path) -> None:
@@ -86,78 +58,65 @@ def make_answers(folder: Path) -> None:
         (folder / f"{person}.json").write_text(json.dumps(content))
 
 
-_SCENES = "dataset.scenes=[statue,cube_no_texture]"
-_EVAL = ("eval", "dataset=simgeo", "dataset.size=48", _SCENES, "metrics.lpips=false", "device=cpu")
+_EVAL = ("eval.py", "dataset=simgeo", "dataset.size=48", "dataset.scenes=[statue,cube_no_texture]",
+         "metrics.lpips=false", "device=cpu")  # fmt: skip
 _FACETS = (*_EVAL, "method=facets", "output_dir=runs/facets")
 _BICUBIC = (*_EVAL, "method=bicubic", "output_dir=runs/bicubic")
-_DIP = (
-    "eval", "dataset=simgeo", "dataset.size=48", "dataset.scenes=[statue,cube_no_texture]", "metrics.lpips=false",
-    "device=cpu", "method=dip_v", "method.steps=80", "method.widths=[8,16]", "method.skips=[2,2]",
-    "method.validate_every=10", "output_dir=out",
-)  # fmt: skip
-_TRAIN = (
-    "train", "trainer=smoke", "trainer.max_steps=12", "trainer.val_check_interval=3", "dataset=procedural",
-    "dataset.count=3", "dataset.size=48", "metrics.lpips=false", "device=cpu",
-)  # fmt: skip
-_UPSAMPLE = (
-    "dsr", "upsample", "frames", "-o", "out", "--poses", "poses.txt", "--depth-unit", "mm", "--method", "facets",
-    "--only", "depth,confidence,mesh,before_after", "--device", "cpu",
-)  # fmt: skip
+_DIP = (*_EVAL, "method=dip_v", "method.steps=80", "method.widths=[8,16]", "method.skips=[2,2]",
+        "method.validate_every=10", "output_dir=out")  # fmt: skip
+_TRAIN = ("train.py", "trainer=smoke", "trainer.max_steps=12", "trainer.val_check_interval=3", "dataset=procedural",
+          "dataset.count=3", "dataset.size=48", "metrics.lpips=false", "device=cpu", "output_dir=out")  # fmt: skip
+_UPSAMPLE = ("dsr", "upsample", "frames", "-o", "out", "--poses", "poses.txt", "--depth-unit", "mm", "--method",
+             "facets", "--only", "depth,confidence,mesh,before_after", "--device", "cpu")  # fmt: skip
 _REPORT = ("dsr", "report", "runs", "-o", "report")
 _STUDY = ("dsr", "study", "build", "runs", "-o", "study")
-_FRAMES: Mapping[str, Callable[[Path], None]] = {"frames": make_frames, "poses.txt": make_poses}
-_TRAINED = "is trained already"
-_TWO_RUNS = {"runs/facets": ("eval", "runs/facets"), "runs/bicubic": ("eval_bicubic", "runs/bicubic")}
-
-_TRAINING = Scenario("train", ((*_TRAIN, "output_dir=out"),), complete=_TRAINED)
-_EVALUATION = Scenario("eval", (_FACETS,))
-_UPSAMPLING = Scenario("upsample", (_UPSAMPLE,), _FRAMES)
-_OTHER_TRAINING = Scenario("train_x2", ((*_TRAIN, "output_dir=out", "scale=2", "logger=csv"),), complete=_TRAINED)
-_OTHER_EVALUATION = Scenario("eval_noise", ((*_FACETS, "noise=tof"),))
-_OTHER_UPSAMPLING = Scenario("upsample_fill", ((*_UPSAMPLE, "--fill", "all"),), _FRAMES)
+_PREPARE = ("dsr", "data", "prepare", "procedural", "dataset.count=5", "dataset.size=48")
+_FRAMES: Mapping[str, Origin] = {"frames": make_frames}
+_RUNS: Mapping[str, Origin] = {
+    "runs/facets": ("eval", "runs/facets"),
+    "runs/bicubic": ("eval_bicubic", "runs/bicubic"),
+}
 
 STRUCK = {
-    each.name: each
-    for each in (
-        _EVALUATION,
-        Scenario("dip", (_DIP,)),
-        _TRAINING,
-        Scenario("train_workers", ((*_TRAIN, "output_dir=out", "patches.workers=2"),), complete=_TRAINED),
-        _UPSAMPLING,
-        Scenario("upsample_workers", ((*_UPSAMPLE, "--workers", "2"),), _FRAMES),
-        Scenario("report", (_REPORT,), _TWO_RUNS),
-        Scenario("study_build", (_STUDY,), _TWO_RUNS),
-        Scenario("study_collect", (("dsr", "study", "collect", "study", "answers"),),
-                 {"study": ("study_build", "study"), "answers": make_answers}),
-        Scenario("fuse", (("dsr", "fuse", "out", "-o", "mesh.ply"),), {"out": ("upsample", "out")}),
-        Scenario("prepare", (("dsr", "data", "prepare", "procedural", "dataset.count=5", "dataset.size=48"),)),
-    )
-}  # fmt: skip
+    "eval": Scenario((_FACETS,)),
+    "dip": Scenario((_DIP,)),
+    "train": Scenario((_TRAIN,)),
+    "train_workers": Scenario(((*_TRAIN, "patches.workers=2"),)),
+    "upsample": Scenario((_UPSAMPLE,), _FRAMES),
+    "upsample_workers": Scenario(((*_UPSAMPLE, "--workers", "2"),), _FRAMES),
+    "report": Scenario((_REPORT,), _RUNS),
+    "study_build": Scenario((_STUDY,), _RUNS),
+    "study_collect": Scenario(
+        (("dsr", "study", "collect", "study", "answers"),),
+        {"study": ("study_build", "study"), "answers": make_answers},
+    ),
+    "fuse": Scenario((("dsr", "fuse", "out", "-o", "mesh.ply"),), {"out": ("upsample", "out")}),
+    "prepare": Scenario((_PREPARE,)),
+}
 """What is struck by signals."""
 
-PREPARING = {each.name: each for each in (Scenario("eval_bicubic", (_BICUBIC,)),)}  # What others start from
+OTHERS = {
+    "eval_bicubic": Scenario((_BICUBIC,)),
+    "eval_noise": Scenario(((*_FACETS, "noise=tof"),)),
+    "train_x2": Scenario(((*_TRAIN, "scale=2", "logger=csv"),)),
+    "upsample_fill": Scenario(((*_UPSAMPLE, "--fill", "all"),), _FRAMES),
+}
+"""What others start from, or rival with."""
 
 AT_ONCE = {
-    each.name: each
-    for each in (
-        Scenario("two_trainings_one_cache", ((*_TRAIN, "output_dir=one"), (*_TRAIN, "output_dir=two", "scale=2")),
-                 complete=_TRAINED),
-        Scenario("two_trainings_one_directory", ((*_TRAIN, "output_dir=out"),) * 2, complete=_TRAINED),
-        Scenario("two_evaluations", (_FACETS, _FACETS)),
-        Scenario("two_dips", (_DIP, _DIP)),
-        Scenario("two_upsamples", (_UPSAMPLE, _UPSAMPLE), _FRAMES),
-        Scenario("two_reports", (_REPORT, _REPORT), _TWO_RUNS),
-        Scenario("two_studies", (_STUDY, _STUDY), _TWO_RUNS),
-        Scenario("two_preparations", STRUCK["prepare"].commands * 2),
-        Scenario("rival_trainings", (_TRAINING.commands[0], _OTHER_TRAINING.commands[0]),
-                 rivals=(_TRAINING, _OTHER_TRAINING)),
-        Scenario("rival_evaluations", (_EVALUATION.commands[0], _OTHER_EVALUATION.commands[0]),
-                 rivals=(_EVALUATION, _OTHER_EVALUATION)),
-        Scenario("rival_upsamples", (_UPSAMPLING.commands[0], _OTHER_UPSAMPLING.commands[0]), _FRAMES,
-                 rivals=(_UPSAMPLING, _OTHER_UPSAMPLING)),
-        Scenario("report_while_evaluating", (_BICUBIC, _REPORT), {"runs/facets": ("eval", "runs/facets")}),
-    )
-}  # fmt: skip
-"""What runs at once; undisturbed, its commands follow each other."""
+    "two_trainings_one_cache": Scenario((_TRAIN, (*_TRAIN[:-1], "output_dir=two", "scale=2"))),
+    "two_trainings": Scenario((_TRAIN, _TRAIN)),
+    "two_evaluations": Scenario((_FACETS, _FACETS)),
+    "two_dips": Scenario((_DIP, _DIP)),
+    "two_upsamples": Scenario((_UPSAMPLE, _UPSAMPLE), _FRAMES),
+    "two_reports": Scenario((_REPORT, _REPORT), _RUNS),
+    "two_studies": Scenario((_STUDY, _STUDY), _RUNS),
+    "two_preparations": Scenario((_PREPARE, _PREPARE)),
+    "rival_trainings": Scenario((), rivals=("train", "train_x2")),
+    "rival_evaluations": Scenario((), rivals=("eval", "eval_noise")),
+    "rival_upsamples": Scenario((), _FRAMES, rivals=("upsample", "upsample_fill")),
+    "report_while_evaluating": Scenario((_BICUBIC, _REPORT), {"runs/facets": ("eval", "runs/facets")}),
+}
+"""What runs at once."""
 
-ALL = {**STRUCK, **PREPARING, **AT_ONCE}
+ALL = {**STRUCK, **OTHERS, **AT_ONCE}
