@@ -196,13 +196,13 @@ class Pool:
 def _begin(plan: bytes, threads: int | None) -> None:
     """Prepare a worker, which ends with its parent."""
     interruption.end_with(os.getppid())
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     if threads is not None:
         _set_threads(threads, threads)
     prepare, arguments = pickle.loads(plan)  # noqa: S301 - of the parent
     if prepare is not None:
         prepare(*arguments)
     gc.freeze()  # imported modules are not gone through again
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # until here it just ends this process
 
 
 def _call(function: Callable[[_Item], _Value], item: _Item) -> _Value:
