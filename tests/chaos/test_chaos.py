@@ -30,7 +30,7 @@ def make_study(folder):
 def campaign(tmp_path, monkeypatch):
     collect = ("dsr", "study", "collect", "study", "answers")
     monkeypatch.setitem(scenarios.ALL, "collect", Scenario((collect, collect), {"study": make_study}))
-    return Campaign(tmp_path)
+    return Campaign(tmp_path, grace=60)
 
 
 def test_signals_end_a_command_in_one_line_and_it_goes_on(campaign):
@@ -46,7 +46,7 @@ def test_sigterm_while_torch_is_imported_ends_an_evaluation_in_one_line(campaign
     campaign.begin("eval")
     command, strike = Command(scenarios.STRUCK["eval"].commands[0], campaign.work), Strike(signal.SIGTERM, 1.0, False)
     assert command.strike(strike, 0.7)
-    assert end_problems(command.end(5), strike) == []
+    assert end_problems(command.end(60), strike) == []
     assert list(campaign.work.iterdir()) == []
 
 
