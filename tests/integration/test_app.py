@@ -185,7 +185,7 @@ def test_page_takes_pairs_and_captures_and_asks_nobody_else(served, webgl_browse
     page.get_by_label("wrong.zip").wait_for(state="detached")
 
     give(".r3d", captures.record3d(place / "scan.r3d"))
-    page.get_by_label("Its frame").fill("2")
+    page.get_by_label("Frame of the capture").fill("2")
     compute.click()
     page.frame_locator("iframe").locator("#stage[data-shown]").wait_for()
     assert "frames 2 to 2 of 3" in said.input_value()

@@ -254,9 +254,8 @@ def make_page(work: Work) -> Any:
             with gr.Column(scale=1, min_width=320):
                 with gr.Row():
                     photo, depth = file("Photo", *PHOTO_SUFFIXES), file("Depth map", *READ_SUFFIXES)
-                with gr.Row():
-                    capture = file("or a capture: .r3d, .zip, ...", *CAPTURE_FILES)
-                    frame = gr.Number(1, precision=0, label="Its frame", scale=0, min_width=100)
+                capture = file("or a capture: .r3d, .zip, ...", *CAPTURE_FILES)
+                frame = gr.Number(1, precision=0, label="Frame of the capture")
                 with gr.Accordion("Camera file, mask", open=False), gr.Row():
                     camera, mask = file("Camera", ".json", ".txt"), file("Mask, 0 where depth is missing", ".png")
                 with gr.Row():
