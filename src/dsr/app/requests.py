@@ -112,7 +112,7 @@ class ViewRequest(Options):
 
 @dataclass(frozen=True, kw_only=True)
 class BrowserRequest(Options):
-    """Address of the page of ``dsr app``, and limits of its uploads and computations."""
+    """Port of the page of ``dsr app``, and limits of its uploads and computations."""
 
     port: int = option(
         8765,
@@ -120,12 +120,9 @@ class BrowserRequest(Options):
         "PORT",
         rule=Rule("0..65535", lambda port: 0 <= port <= _LAST_PORT),
     )
-    host: str = option(
-        "127.0.0.1", "another address: with the token in the address, others can use the page", "ADDRESS"
-    )
     open_page: bool = option(True, "only serve the page", flags="--no-open")
     max_upload: float = option(
-        512.0, "largest size of the files of an upload (512)", "MB", rule=positive("number of megabytes")
+        512.0, "largest size of an uploaded file (512)", "MB", rule=positive("number of megabytes")
     )
     max_seconds: float = option(300.0, "longest time of a computation (300)", "SECONDS", rule=positive("time"))
     max_memory: float | None = option(

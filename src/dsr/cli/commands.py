@@ -170,13 +170,12 @@ examples:
 
 APP = Command(
     "app",
-    "upsample in the browser: drop files, see the surfaces under one light",
+    "upsample in the browser: drop files, look at the surfaces, download the results",
     BrowserRequest,
-    _later("dsr.app.browser.server", "browse"),
+    _later("dsr.app.browser", "browse"),
     description="""\
-Serve a page of this machine alone, and open it: drop a photo and a depth map, or a capture, and look at photo, input
-and result side by side. The libraries are an extra: pip install -e '.[app]' in a checkout. More in
-docs/view.md.""",
+Serve a page of this machine alone, and open it: drop a photo and a depth map, or a capture, look at the surfaces, and
+download the results. The library is an extra: pip install -e '.[app]' in a checkout. More in docs/view.md.""",
     epilog="""\
 examples:
   dsr app
