@@ -68,4 +68,4 @@ def test_limit_examines_some_of_many_scenes(tmp_path, cube, capsys):
     assert "cube2: fine" in output
     assert output.endswith("2 scenes: 2 fine\n")
     assert main(["doctor", str(tmp_path), "--most", "0"]) == 2
-    assert capsys.readouterr().err == "error: --most: expected a positive number, got 0\n"
+    assert capsys.readouterr().err == "error: --most: expected at least 1, got 0\n"

@@ -10,7 +10,7 @@ from packaging.requirements import Requirement
 
 import dsr
 from dsr.cli import main, make_parser
-from dsr.cli.parser import words_at_end
+from dsr.cli.completion import words_at_end
 from dsr.doctor import machine
 from dsr.methods import weights
 

@@ -238,7 +238,12 @@ class Upsampling(Options):
 
 @dataclass(frozen=True, kw_only=True)
 class UpsampleRequest(Options):
-    """What to upsample, how, and which results to write."""
+    """Upsample the depth maps of your own photos to the photos' resolution.
+
+    Give --rgb and --depth, or folders that hold both. The depth map has to be registered to the photo: the same view,
+    the same field of view, any size up to the photo's. What is not given is read from the files or assumed, and
+    reported.
+    """
 
     frames: FrameChoice = group(FrameChoice, "what to work on")
     reading: Reading = group(
