@@ -9,9 +9,8 @@ from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
-from dsr.app.composition import compose
 from dsr.app.entry import explain
-from dsr.app.schema import EvalConfig, plain_config
+from dsr.app.schema import EvalConfig, compose, plain_config
 from dsr.data.scene_source import SceneSource, as_source, prepare_scenes
 from dsr.pictures.sheets import save_contact_sheet
 from dsr.sample import Scene

@@ -40,9 +40,7 @@ In a checkout of the project, `python eval.py` and `python train.py` are the sam
 def main(arguments: Sequence[str] | None = None, catalogue: Mapping[str, Collection] | None = None) -> int:
     """Run the command, and return its exit code: 0, 2 after an error, 130 or 143 when interrupted.
 
-    Args:
-        catalogue: the data sets to offer; None for :func:`dsr.cli.data_tasks.downloads`.
-
+    ``catalogue`` has the data sets to offer; None for :func:`dsr.cli.data_tasks.downloads`.
     """
     options = make_parser().parse_args(arguments)
     console = open_console()

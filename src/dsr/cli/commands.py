@@ -101,7 +101,7 @@ def examine(request: DoctorRequest, _: Console) -> int:
         from dsr.doctor.machine import examine_machine  # noqa: PLC0415 - it takes seconds to import
 
         return examine_machine()
-    from dsr.doctor.examine import examine_directory  # noqa: PLC0415
+    from dsr.doctor.scenes import examine_directory  # noqa: PLC0415
 
     return examine_directory(request.directory, request.most)
 
