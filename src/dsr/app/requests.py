@@ -78,7 +78,7 @@ class LeaderboardRequest(RunsRequest):
 
 @dataclass(frozen=True, kw_only=True)
 class FuseRequest(Options):
-    """Fuse the results of `dsr upsample` of a sequence with poses into one mesh, weighted by the expected errors."""
+    """Fuse the results of a sequence with poses into one mesh, weighted by the expected errors."""
 
     folders: tuple[Path, ...] = option(..., "folders of results of dsr upsample", "OUT", flags="folders")
     output: Path = option(
@@ -104,7 +104,7 @@ class FuseRequest(Options):
 
 @dataclass(frozen=True, kw_only=True)
 class ViewRequest(Options):
-    """Make one page of the results of `dsr upsample` and open it.
+    """Look at results of `dsr upsample` in the browser, on one page.
 
     It has the surface to turn, a light to drag, before and after, the photo and the expected errors as its colours. The
     page is a single file that needs no network and can be sent as it is.
@@ -124,10 +124,11 @@ class ViewRequest(Options):
 
 @dataclass(frozen=True, kw_only=True)
 class BrowserRequest(Options):
-    """Serve a page of this machine alone, and open it.
+    """Upsample in the browser: drop files, see the surfaces under one light.
 
-    Drop a photo and a depth map, or a capture, and look at photo, input and result side by side. The libraries are an
-    extra: pip install -e '.[app]' in a checkout. More in docs/view.md.
+    A page of this machine alone is served and opened: drop a photo and a depth map, or a capture, and look at photo,
+    input and result side by side. The libraries are an extra: pip install -e '.[app]' in a checkout. More in
+    docs/view.md.
     """
 
     port: int = option(

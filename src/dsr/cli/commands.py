@@ -38,10 +38,10 @@ class Command(NamedTuple):
     """A command."""
 
     name: str  # of two words within a group of commands
-    about: str  # what it does, in a line
-    record: type[Options] | None  # its options; None for a command of Hydra
+    record: type[Options] | None  # its options, whose docstring is its help; None for a command of Hydra
     run: str  # module:function, of a record and the console, returns problems or an exit code
     epilog: str | None = None  # text of its help after the options
+    about: str = ""  # what a command of Hydra does, in a line
 
     def answer(self, options: Namespace, console: Console, catalogue: Any) -> list[str] | int:
         """Run the command, those of ``dsr data`` on the data sets of a catalogue."""
@@ -75,8 +75,9 @@ def add_commands(parser: argparse.ArgumentParser) -> None:
             own.add_argument("arguments", nargs="*")
         else:
             text = cleandoc(command.record.__doc__ or "")
+            about = text.partition("\n")[0]
             own = commands[group].add_parser(
-                name, help=command.about, description=text, epilog=command.epilog, formatter_class=style
+                name, help=about, description=text, epilog=command.epilog, formatter_class=style
             )
             add_options(own, command.record)
         own.set_defaults(run=command.answer)
@@ -108,7 +109,7 @@ def examine(request: DoctorRequest, _: Console) -> int:
 
 GROUPS = {
     "study": (
-        "ask people which rendering looks most like the ground truth",
+        "Ask people which rendering looks most like the ground truth.",
         """\
 examples:
   dsr study build outputs/eval --scale 4 -o study     make study/index.html, to hand out, and study/key.json, to keep
@@ -116,7 +117,7 @@ examples:
 """,
     ),
     "data": (
-        "list, fetch and check data sets",
+        "List, fetch and check data sets.",
         """\
 examples:
   dsr data list
@@ -134,7 +135,6 @@ All data sets are below one directory: $DSR_DATA, or ./data.
 COMMANDS = (
     Command(
         "upsample",
-        "upsample the depth of your own photos",
         UpsampleRequest,
         "dsr.app.upsample.run:run",
         """\
@@ -161,7 +161,6 @@ to continue after an interruption. More in docs/upsample.md.
     ),
     Command(
         "view",
-        "look at results of `dsr upsample` in the browser",
         ViewRequest,
         "dsr.app.view:view",
         """\
@@ -173,7 +172,6 @@ examples:
     ),
     Command(
         "app",
-        "upsample in the browser: drop files, see the surfaces under one light",
         BrowserRequest,
         "dsr.app.browser.server:browse",
         """\
@@ -185,7 +183,6 @@ examples:
     ),
     Command(
         "fuse",
-        "one mesh of the results of a sequence",
         FuseRequest,
         "dsr.app.fuse:fuse",
         """\
@@ -197,19 +194,18 @@ examples:
     ),
     Command(
         "eval",
-        "evaluate a method on a data set: predictions, scores, pictures",
         None,
         "dsr.app.entry:run_eval",
+        about="Evaluate a method on a data set: predictions, scores, pictures.",
     ),
     Command(
         "train",
-        "train a network: weights, checkpoints, a TensorBoard log",
         None,
         "dsr.app.entry:run_train",
+        about="Train a network: weights, checkpoints, a TensorBoard log.",
     ),
     Command(
         "report",
-        "tables, figures and a page from runs of eval.py",
         ReportRequest,
         "dsr.app.report:make_report",
         """\
@@ -224,7 +220,6 @@ Open report/index.html in a browser. It needs no network and can be sent as it i
     ),
     Command(
         "leaderboard",
-        "a page with one row a method, from runs of eval.py",
         LeaderboardRequest,
         "dsr.app.report:make_leaderboard",
         """\
@@ -238,7 +233,6 @@ Open site/index.html in a browser, or publish the folder as it is.
     ),
     Command(
         "study build",
-        "make a page that needs no network, from runs of eval.py",
         StudyRequest,
         "dsr.cli.study:build_page",
         """\
@@ -252,28 +246,16 @@ Give people only index.html: key.json says which method made which picture.
     ),
     Command(
         "study collect",
-        "turn the files that people saved into a table",
         AnswersRequest,
         "dsr.cli.study:collect_answers",
         """\
 Join the table to a report: dsr report RUNS --study study/study.csv
 """,
     ),
-    Command(
-        "data list",
-        "all data sets, and which of them are on this machine",
-        DataListRequest,
-        "dsr.cli.data_tasks:list_data_sets",
-    ),
-    Command(
-        "data where",
-        "the directory of the data sets, or the folders of some",
-        DataWhereRequest,
-        "dsr.cli.data_tasks:show_folders",
-    ),
+    Command("data list", DataListRequest, "dsr.cli.data_tasks:list_data_sets"),
+    Command("data where", DataWhereRequest, "dsr.cli.data_tasks:show_folders"),
     Command(
         "data get",
-        "fetch what is missing",
         DataGetRequest,
         "dsr.cli.data_tasks:get_data_sets",
         """\
@@ -288,27 +270,11 @@ of its data set:
 An archive that you put there by hand is used instead of being downloaded, and kept.
 """,
     ),
-    Command(
-        "data verify",
-        "check every file against its recorded size and checksum",
-        DataVerifyRequest,
-        "dsr.cli.data_tasks:verify_data_sets",
-    ),
-    Command(
-        "data prepare",
-        "resize and keep the scenes of a data set, and draw a contact sheet",
-        DataPrepareRequest,
-        "dsr.cli.data_tasks:prepare_data_set",
-    ),
-    Command(
-        "formats",
-        "what is read of which device or program",
-        FormatsRequest,
-        "dsr.cli.commands:show_formats",
-    ),
+    Command("data verify", DataVerifyRequest, "dsr.cli.data_tasks:verify_data_sets"),
+    Command("data prepare", DataPrepareRequest, "dsr.cli.data_tasks:prepare_data_set"),
+    Command("formats", FormatsRequest, "dsr.cli.commands:show_formats"),
     Command(
         "doctor",
-        "check what is installed, or a directory of your own scenes",
         DoctorRequest,
         "dsr.cli.commands:examine",
         """\
@@ -319,7 +285,6 @@ examples:
     ),
     Command(
         "export",
-        "a network as a file for programs without PyTorch",
         ExportRequest,
         "dsr.app.export:export_onnx",
         """\
@@ -336,7 +301,6 @@ degrees. docs/python.md has a program that runs such a file.
     ),
     Command(
         "completion",
-        "what your shell completes after `dsr`",
         CompletionRequest,
         "dsr.cli.completion:complete",
         """\
