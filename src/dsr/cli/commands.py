@@ -44,17 +44,16 @@ class Command(NamedTuple):
     about: str = ""  # what a command of Hydra does, in a line
 
     def answer(self, options: Namespace, console: Console, catalogue: Any) -> list[str] | int:
-        """Run the command, those of ``dsr data`` on the data sets of a catalogue."""
+        """Run the command, those of downloads on the data sets of a catalogue."""
         request = None if self.record is None else build(self.record, options)
-        module, _, function = self.run.partition(":")
-        run = getattr(importlib.import_module(module), function)
+        place, _, function = self.run.partition(":")
+        module = importlib.import_module(place)
+        run = getattr(module, function)
         if request is None:
             run(options.arguments)  # exits the process after an error
             return 0
-        if self.name.startswith("data "):
-            from dsr.cli.data_tasks import downloads  # noqa: PLC0415 - it imports what downloads need
-
-            run = functools.partial(run, catalogue=downloads() if catalogue is None else catalogue)
+        if place == "dsr.cli.data_tasks":
+            run = functools.partial(run, catalogue=module.downloads() if catalogue is None else catalogue)
         problems: list[str] | int = run(request, console)
         return problems
 
@@ -271,7 +270,7 @@ An archive that you put there by hand is used instead of being downloaded, and k
 """,
     ),
     Command("data verify", DataVerifyRequest, "dsr.cli.data_tasks:verify_data_sets"),
-    Command("data prepare", DataPrepareRequest, "dsr.cli.data_tasks:prepare_data_set"),
+    Command("data prepare", DataPrepareRequest, "dsr.app.prepare:prepare_dataset"),
     Command("formats", FormatsRequest, "dsr.cli.commands:show_formats"),
     Command(
         "doctor",

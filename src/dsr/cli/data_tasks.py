@@ -13,7 +13,6 @@ from rich.table import Table
 from dsr.app.requests import (
     DataGetRequest,
     DataListRequest,
-    DataPrepareRequest,
     DataVerifyRequest,
     DataWhereRequest,
 )
@@ -141,11 +140,3 @@ def verify_data_sets(request: DataVerifyRequest, console: Console, catalogue: Ma
             show(console, f"{collection.name}: `dsr data get {collection.name}` fetches what is missing or damaged")
         problems += found
     return problems
-
-
-def prepare_data_set(request: DataPrepareRequest, console: Console, catalogue: object) -> list[str]:
-    """Resize and keep a data set's scenes, and draw its contact sheet."""
-    from dsr.app.prepare import prepare_dataset  # noqa: PLC0415 - it takes seconds to import
-
-    prepare_dataset(request.name, request.settings, console, [request.config_dir] if request.config_dir else [])
-    return []
