@@ -15,7 +15,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from dsr.app.composition import compose
+    from dsr.app.schema import compose
     from dsr.app.upsample.api import Upsampler, upsample
     from dsr.app.upsample.surface import Surface
     from dsr.geometry.camera import Camera
@@ -28,7 +28,7 @@ _HOMES = {
     "Camera": "dsr.geometry.camera",
     "Surface": "dsr.app.upsample.surface",
     "Upsampler": "dsr.app.upsample.api",
-    "compose": "dsr.app.composition",
+    "compose": "dsr.app.schema",
     "read": "dsr.io.files",
     "read_depth": "dsr.io.files",
     "upsample": "dsr.app.upsample.api",

@@ -67,5 +67,3 @@ def test_limit_examines_some_of_many_scenes(tmp_path, cube, capsys):
     assert output.startswith("2 of 5 scenes, at equal distances\ncube0: fine")
     assert "cube2: fine" in output
     assert output.endswith("2 scenes: 2 fine\n")
-    assert main(["doctor", str(tmp_path), "--most", "0"]) == 2
-    assert capsys.readouterr().err == "error: --most: expected a positive number, got 0\n"

@@ -21,15 +21,12 @@ def test_configuration_of_an_installed_package_comes_with_it(tmp_path, monkeypat
     assert config_directories() == (tmp_path / "conf",)
 
 
-def test_own_directories_are_searched_after_the_project(tmp_path):
-    assert config_directories([tmp_path]) == (CHECKOUT, tmp_path)
-
-
-def test_own_directories_add_choices_and_groups(tmp_path):
+def test_own_directories_are_searched_after_the_project_and_add_choices_and_groups(tmp_path):
     (tmp_path / "method").mkdir()
     (tmp_path / "method" / "mine.yaml").touch()
     (tmp_path / "own").mkdir()
     directories = config_directories([tmp_path])
+    assert directories == (CHECKOUT, tmp_path)
     assert {"bicubic", "mine"} <= set(list_choices("method", directories))
     assert {"method", "own"} <= set(list_groups(directories))
 

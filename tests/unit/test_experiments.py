@@ -7,8 +7,7 @@ from itertools import product
 import pytest
 from omegaconf import OmegaConf
 
-from dsr.app.composition import compose
-from dsr.app.schema import EvalConfig, TrainConfig, plain_config, register
+from dsr.app.schema import EvalConfig, TrainConfig, compose, plain_config, register
 from dsr.app.training_runs import training_data
 from dsr.methods.base import Method
 from dsr.methods.weights import packaged_names

@@ -10,7 +10,7 @@ from packaging.requirements import Requirement
 
 import dsr
 from dsr.cli import main, make_parser
-from dsr.cli.parser import words_at_end
+from dsr.cli.completion import words_at_end
 from dsr.doctor import machine
 from dsr.methods import weights
 
@@ -55,7 +55,7 @@ def test_doctor_says_that_all_is_here(capsys):
 
 
 def test_doctor_says_what_to_install(capsys, monkeypatch):
-    monkeypatch.setattr(machine, "requirements", lambda: [Requirement("dsr-no-such>=2"), Requirement("torch>=999")])
+    monkeypatch.setattr(machine, "requirements", lambda *_: [Requirement("dsr-no-such>=2"), Requirement("torch>=999")])
     assert main(["doctor"]) == 2
     assert capsys.readouterr().out.splitlines()[-1].endswith("pip install 'dsr-no-such>=2' 'torch>=999'")
 

@@ -9,9 +9,8 @@ import torch
 from omegaconf import OmegaConf
 
 from dsr.app import run_directory as rundir
-from dsr.app.composition import compose
 from dsr.app.run_directory import at_work, default_directory, expect_free, identity_of
-from dsr.app.schema import plain_config
+from dsr.app.schema import compose, plain_config
 from dsr.utils.configuration import ConfigError, config_directories
 
 CPU = torch.device("cpu")

@@ -13,12 +13,7 @@ from dsr.utils.progress import megabytes
 
 
 def export_onnx(request: ExportRequest, console: Console) -> list[str]:
-    """Write the file, check it, and show its inputs and outputs.
-
-    Raises:
-        ValueError: the method has no network, there are no weights for the factor, or a library is missing.
-
-    """
+    """Write the file, check it, and show its inputs and outputs."""
     net = read_recipe(request.method, None, request.directories).with_weights(request.weights).network(request.scale)
     graph = OnnxGraph(net, request.scale)
     facts = {"dsr": dsr.__version__, "method": request.method, "scale": request.scale, "network": type(net).__name__}

@@ -27,19 +27,12 @@ from dsr.utils.guards import natural_key
 from dsr.utils.progress import show_length
 
 _GREY = 190
-_SEEN = 2.0
-"""Distance between a point and a frame's depth, in voxels, up to which the frame sees it."""
-_LEAST_ERROR = 1e-4
-"""Smallest expected error in metres that a weight distinguishes."""
+_SEEN = 2.0  # voxels between a point and a frame's depth up to which the frame sees it
+_LEAST_ERROR = 1e-4  # smallest expected error in metres that a weight distinguishes
 
 
 def fuse(request: FuseRequest, console: Console) -> list[str]:
-    """Fuse the depth of results into a mesh, and return the problems, one line each.
-
-    Raises:
-        ValueError: there is no result with a pose, or no surface; or a warning, with ``--strict``.
-
-    """
+    """Fuse the depth of results into a mesh, and return the problems, one line each."""
     max_error = request.max_error / 100
     found = sorted({path.parent for folder in request.folders for path in folder.rglob(INFO)}, key=natural_key)
     frames: list[Path] = []
@@ -54,7 +47,12 @@ def fuse(request: FuseRequest, console: Console) -> list[str]:
         what = problems[0] if problems else f"{request.folders[0]}: found no {INFO}"
         raise ValueError(f"expected results of `dsr upsample` with poses; {what}")
 
-    warnings = _faults(frames, max_error)
+    def fault(folder: Path) -> Assumption | None:
+        recording = [frame for frame in frames if frame.parent == folder]
+        return check_poses(len(recording), lambda number: _load(recording[number], max_error))
+
+    parents = dict.fromkeys(frame.parent for frame in frames)
+    warnings = [each for each in dict.fromkeys(map(fault, parents)) if each is not None]
     if request.strict:
         expect_no_warning(str(request.folders[0]), warnings)
     for each in warnings:
@@ -116,13 +114,8 @@ def _colours(
 ) -> np.ndarray:
     """Return the mean colour that the photos of results have at points, (N, 3) uint8, grey where none sees them.
 
-    Args:
-        vertices: (N, 3) in the world's frame.
-        frames: the results.
-        max_error: expected error of the depth, relative to it, from which a pixel does not count.
-        near: metres between a point and the depth of a frame that sees it.
-        problems: gets a line for a photo that cannot be read.
-
+    A frame sees a point that is at most ``near`` metres from its depth. ``problems`` gets a line for a photo that
+    cannot be read.
     """
     total, weight = np.zeros(vertices.shape), np.zeros(len(vertices))
     for folder in frames:
@@ -156,15 +149,3 @@ def _photo(folder: Path) -> np.ndarray | None:
         return read_input(folder / INPUT)[0]
     path = folder / "rgbd" / RGBD[0]
     return read_pixels(path, cv2.IMREAD_COLOR)[..., ::-1] if path.is_file() else None
-
-
-def _faults(frames: Sequence[Path], max_error: float) -> list[Assumption]:
-    """Return what is wrong with the poses of results, by some of each folder, each once."""
-    recordings: dict[Path, list[Path]] = {}
-    for frame in frames:
-        recordings.setdefault(frame.parent, []).append(frame)
-
-    def fault(recording: Sequence[Path]) -> Assumption | None:
-        return check_poses(len(recording), lambda number: _load(recording[number], max_error))
-
-    return list(dict.fromkeys(each for each in map(fault, recordings.values()) if each is not None))

@@ -2,61 +2,51 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
-from dsr.app.composition import compose
 from dsr.app.entry import explain
-from dsr.app.schema import EvalConfig, plain_config
-from dsr.data.scene_source import SceneSource, as_source, prepare_scenes
+from dsr.app.requests import DataPrepareRequest
+from dsr.app.schema import EvalConfig, compose, plain_config
+from dsr.data.scene_source import as_source, prepare_scenes
 from dsr.pictures.sheets import save_contact_sheet
 from dsr.sample import Scene
 from dsr.utils.configuration import ConfigError
 from dsr.utils.console import ConsoleProgress, one_line, show
 
 
-def prepare_dataset(name: str, overrides: Sequence[str], console: Console, config_dirs: Sequence[Path] = ()) -> None:
-    """Prepare every scene of a data set and draw the contact sheet, ``outputs/data/NAME/sheet.png`` or its pages.
-
-    The overrides are those of the command line of ``eval.py``, such as ``dataset.size=256``.
-    """
-    source = _source(name, overrides, config_dirs)
-    progress = ConsoleProgress(console)
-    prepare_scenes(source, source.scenes(), progress)
-    failures: dict[str, str] = {}
-    scenes = _loaded(source, progress.track(source.scenes(), "draw"), failures)
-    folder = Path("outputs", "data", name)
-    before = set(folder.glob("sheet*.png"))
-    pages = save_contact_sheet(folder / "sheet.png", scenes, f"{name}, as prepared")
-    for path in before - set(pages):
-        path.unlink()
-    for path in pages:
-        show(console, f"contact sheet: {path}")
-    if failures:
-        lines = "; ".join(failures.values())
-        raise ConfigError(f"{len(failures)} of {len(source.scenes())} scenes cannot be read: {lines}")
-
-
-def _source(name: str, overrides: Sequence[str], config_dirs: Sequence[Path]) -> SceneSource:
-    """Build the data set that a configuration describes."""
+def prepare_dataset(request: DataPrepareRequest, console: Console) -> list[str]:
+    """Prepare every scene of a data set and draw the contact sheet, ``outputs/data/NAME/sheet.png`` or its pages."""
+    name, directories = request.name, [] if request.config_dir is None else [request.config_dir]
     try:
-        plain = plain_config(compose("eval", [f"dataset={name}", *overrides], config_dirs))
+        plain = plain_config(compose("eval", [f"dataset={name}", *request.settings], directories))
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(explain(error)) from error
     if "parts" in plain["dataset"]:
         parts = ", ".join(plain["dataset"]["parts"])
         raise ConfigError(f"dataset={name}: expected one data set, it has the parts {parts}")
-    return as_source(EvalConfig.of(plain).build("dataset"))
+    source = as_source(EvalConfig.of(plain).build("dataset"))
+    progress, failures = ConsoleProgress(console), list[str]()
+    prepare_scenes(source, source.scenes(), progress)
 
+    def loaded() -> Iterator[Scene]:
+        for scene in progress.track(source.scenes(), "draw"):
+            try:
+                yield source.load(scene)
+            except (ValueError, OSError) as error:
+                failures.append(one_line(error))
 
-def _loaded(source: SceneSource, names: Iterator[str], failures: dict[str, str]) -> Iterator[Scene]:
-    """Yield the scenes that can be read, and record the errors of the others in ``failures``."""
-    for name in names:
-        try:
-            yield source.load(name)
-        except (ValueError, OSError) as error:
-            failures[name] = one_line(error)
+    folder = Path("outputs", "data", name)
+    before = set(folder.glob("sheet*.png"))
+    pages = save_contact_sheet(folder / "sheet.png", loaded(), f"{name}, as prepared")
+    for path in before - set(pages):
+        path.unlink()
+    for path in pages:
+        show(console, f"contact sheet: {path}")
+    if failures:
+        raise ConfigError(f"{len(failures)} of {len(source.scenes())} scenes cannot be read: {'; '.join(failures)}")
+    return []

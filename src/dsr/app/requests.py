@@ -1,4 +1,7 @@
-"""Options of the commands, checked before the modules that carry them out are imported, which takes seconds."""
+"""Options of the commands, checked before the modules that carry them out are imported, which takes seconds.
+
+The docstring of a record is the text of its command's ``--help`` before the options.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ from dsr.report.study import Choice
 from dsr.utils.configuration import config_directories, list_choices
 from dsr.utils.options import Options, Rule, at_least, group, one_of, option, positive, some_of
 
+SHELLS = ("bash", "zsh", "fish")
 REPORT_PARTS = ("tables", "metrics", "figures", "page")
 _MOST_WORKERS = 256
 _LAST_PORT = 65535
@@ -29,11 +33,14 @@ class RunsRequest(Options):
 
 @dataclass(frozen=True, kw_only=True)
 class ReportRequest(RunsRequest):
-    """What a report contains."""
+    """Make tables, figures, the metric study and a page from runs of eval.py.
+
+    All runs in and below the directories are read; no other files are needed.
+    """
 
     study: Path | None = option(None, "what `dsr study collect` wrote", "CSV")
     light: str = option(
-        FIGURE_LIGHT, f"of the figures: {LIGHT_CHOICES}; {FIGURE_LIGHT}", "NAME", rule=one_of(LIGHT_NAMES, str)
+        FIGURE_LIGHT, f"of the figures: {LIGHT_CHOICES}; {FIGURE_LIGHT}", "NAME", rule=one_of(LIGHT_NAMES)
     )
     intervals: bool = option(False, "averages with 95 % intervals, and a test of the best against the second best")
     leaderboard: bool = option(False, "the page begins with one row a method, by mean rank")
@@ -47,7 +54,7 @@ class ReportRequest(RunsRequest):
         "these parts alone, of tables, metrics, figures, page",
         "A,B",
         flags="--only",
-        rule=some_of(REPORT_PARTS, str),
+        rule=some_of(REPORT_PARTS),
         parse=lambda text: tuple(part.strip() for part in text.split(",")),
     )
     workers: int | None = option(
@@ -60,14 +67,18 @@ class ReportRequest(RunsRequest):
 
 @dataclass(frozen=True, kw_only=True)
 class LeaderboardRequest(RunsRequest):
-    """Options of a leaderboard."""
+    """Make a static page that ranks the methods of all runs over all data sets, scales and metrics.
+
+    The runs are those in and below the directories. The page has their surfaces under any light, and a click on a
+    method shows it beside another.
+    """
 
     title: str = option("Depth super-resolution: leaderboard", "of the page")
 
 
 @dataclass(frozen=True, kw_only=True)
 class FuseRequest(Options):
-    """What to fuse."""
+    """Fuse the results of a sequence with poses into one mesh, weighted by the expected errors."""
 
     folders: tuple[Path, ...] = option(..., "folders of results of dsr upsample", "OUT", flags="folders")
     output: Path = option(
@@ -86,17 +97,18 @@ class FuseRequest(Options):
         rule=positive("number of metres"),
     )
     max_error: float = option(
-        2.0,
-        "leave pixels out whose depth is expected to be off by more (default: 2)",
-        "PERCENT",
-        rule=EXPECTED_ERROR,
+        2.0, "leave pixels out whose depth is expected to be off by more (default: 2)", "PERCENT", rule=EXPECTED_ERROR
     )
     score: bool = option(False, "say how far successive results differ under their poses, too; see docs/metrics.md")
 
 
 @dataclass(frozen=True, kw_only=True)
 class ViewRequest(Options):
-    """What to look at."""
+    """Look at results of `dsr upsample` in the browser, on one page.
+
+    It has the surface to turn, a light to drag, before and after, the photo and the expected errors as its colours. The
+    page is a single file that needs no network and can be sent as it is.
+    """
 
     output: Path = option(..., "a result of `dsr upsample`, or a folder of several", "OUT", flags="output")
     page: Path | None = option(None, "the page (default: OUT/view.html)", "FILE", flags="-o --page", writes="file")
@@ -112,7 +124,11 @@ class ViewRequest(Options):
 
 @dataclass(frozen=True, kw_only=True)
 class BrowserRequest(Options):
-    """Port of the page of ``dsr app``, and limits of its uploads and computations."""
+    """Upsample in the browser: drop files, look at the surfaces, download the results.
+
+    A page of this machine alone is served and opened. The library is an extra: pip install -e '.[app]' in a checkout.
+    More in docs/view.md.
+    """
 
     port: int = option(
         8765,
@@ -132,13 +148,15 @@ class BrowserRequest(Options):
 
 @dataclass(frozen=True, kw_only=True)
 class ExportRequest(Options):
-    """Which network to write, and where."""
+    """Write a method's network as an ONNX file, and check it with onnxruntime.
+
+    The file takes a photo and a depth map of any size. The libraries are an extra: pip install -e '.[onnx]' in a
+    checkout.
+    """
 
     path: Path = option(..., "the file to write", "FILE", flags="--onnx", writes="file")
     method: str = option("facets", "facets (default), msg_v, pdn, ddrnet, ...", "NAME")
-    scale: int = option(
-        4, "upsampling factor (default: 4)", "N", rule=Rule("a factor of 1 or more", lambda factor: factor >= 1)
-    )
+    scale: int = option(4, "upsampling factor (default: 4)", "N", rule=at_least(1))
     weights: Path | None = option(None, "of a training (default: those of the method)", "FILE")
     directories: tuple[Path, ...] = option(
         (),
@@ -155,40 +173,32 @@ class ExportRequest(Options):
 
 
 def check_method(method: str, directories: tuple[Path, ...]) -> None:
-    """Check the name of a method.
-
-    Raises:
-        OptionError: there is no such method in the project's or the user's directories.
-
-    """
+    """Raise OptionError if there is no such method in the project's or the user's directories."""
     one_of(list_choices("method", config_directories(directories))).expect("method", method)
 
 
 @dataclass(frozen=True, kw_only=True)
 class FormatsRequest(Options):
-    """Which formats to show."""
+    """Show what is read of which device or program."""
 
     names: tuple[str, ...] = option((), "those with one of these words; none for all", "WORD", flags="names")
 
 
 @dataclass(frozen=True, kw_only=True)
 class DoctorRequest(Options):
-    """What to examine."""
+    """Check what is installed, or a directory of your own scenes."""
 
     directory: Path | None = option(
         None, "a scene, or a directory of scenes; without one, what is installed is checked", "DIR", flags="directory"
     )
     most: int | None = option(
-        None,
-        "examine at most N scenes, taken at equal distances from all",
-        "N",
-        rule=Rule("a positive number", lambda count: count >= 1),
+        None, "examine at most N scenes, taken at equal distances from all", "N", rule=at_least(1)
     )
 
 
 @dataclass(frozen=True, kw_only=True)
 class StudyRequest(Options):
-    """The questions of a study, and where its page goes."""
+    """Make a page of questions that needs no network, from runs of eval.py."""
 
     runs: tuple[Path, ...] = option(..., "runs, or directories with runs below", "RUNS", flags="runs")
     output: Path = option(..., "where to", "DIR", flags="-o --output", writes="folder")
@@ -199,10 +209,63 @@ class StudyRequest(Options):
 
 @dataclass(frozen=True, kw_only=True)
 class AnswersRequest(Options):
-    """Which answers of a study to collect, and where their table goes."""
+    """Turn the files that people saved into a table.
+
+    Files that are damaged, incomplete or of another study are named and left out. If one person sent several files,
+    only the one finished first counts. The exit code is 2 if no file is left.
+    """
 
     study: Path = option(..., "the study's directory, with key.json", "DIR", flags="study")
     answers: tuple[Path, ...] = option(..., "files, or directories of them", "ANSWERS", flags="answers")
     output: Path | None = option(
         None, "the table; DIR/study.csv by default", "FILE", flags="-o --output", writes="file"
     )
+
+
+_NAME_OF_DATA = "a data set, as in `dsr data list`"
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataListRequest(Options):
+    """List all data sets, and which of them are on this machine."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataWhereRequest(Options):
+    """Print the directory of the data sets, or the folders of some."""
+
+    names: tuple[str, ...] = option((), _NAME_OF_DATA, "NAME", flags="names")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataVerifyRequest(Options):
+    """Check every file against its recorded size and checksum."""
+
+    names: tuple[str, ...] = option(..., _NAME_OF_DATA, "NAME", flags="names")
+    accept_changed: bool = option(False, "take files whose checksum differs from the recorded one")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataGetRequest(DataVerifyRequest):
+    """Fetch what is missing. Run the same command again to continue an interrupted download."""
+
+    mirror: str | None = option(None, "a server to try first, see below", "URL")
+    yes: bool = option(False, "do not ask", flags="--yes -y")
+    keep_archives: bool = option(False, "keep archives after unpacking")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataPrepareRequest(Options):
+    """Resize and keep the scenes of a data set, and draw a contact sheet."""
+
+    name: str = option(..., "a data set, as in `eval.py dataset=NAME`", "NAME", flags="name")
+    settings: tuple[str, ...] = option((), "as for eval.py, such as dataset.size=256", "KEY=VALUE", flags="settings")
+    config_dir: Path | None = option(None, "a directory of your own with dataset/NAME.yaml", "DIR")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompletionRequest(Options):
+    """Print what your shell runs at its start to complete the commands and options of `dsr`."""
+
+    shell: str = option(..., ", ".join(SHELLS), "SHELL", flags="shell", rule=one_of(SHELLS))
+    line: str | None = option(None, "print what may stand at the end of a line, instead of the script", "LINE")

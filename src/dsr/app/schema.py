@@ -1,19 +1,21 @@
-"""The structured schema of the configuration: what the keys are and which values they take."""
+"""The configuration: what its keys are, which values they take, and how it is composed."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any, Self
 
+import hydra
 from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf import MISSING, DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from dsr.utils.configuration import ConfigError, build
+from dsr.utils.configuration import ConfigError, build, config_directories
 from dsr.utils.console import note_once
 from dsr.utils.files import data_root
 from dsr.utils.guards import did_you_mean, is_number
@@ -285,6 +287,41 @@ def plain_config(config: DictConfig) -> dict[str, Any]:
         named |= {group: name for group, name in choices.items() if group in NAMED}
     given = {group: str(name) for group, name in (plain.get("names") or {}).items() if name is not None}
     return {**plain, "names": named | given}
+
+
+def compose(name: str, overrides: Sequence[str] = (), directories: Sequence[Path] = ()) -> DictConfig:
+    """Compose the configuration of a command, as in ``compose("train", ["model=msg_v", "scale=8"])``.
+
+    Args:
+        name: ``train`` or ``eval``.
+        overrides: as on the command line.
+        directories: of configuration files of your own.
+
+    Example:
+        >>> import dsr
+        >>> config = dsr.compose("eval", ["method=tgv", "scale=4"])
+        >>> config.method.iterations, config.scale
+        (1000, 4)
+
+    """
+    register()
+    project, *others = config_directories(directories)
+    places = ",".join(f'"file://{directory.resolve()}"' for directory in others)
+    more = [f"hydra.searchpath=[{places}]"] if places else []
+    running = GlobalHydra.instance().hydra
+    GlobalHydra.instance().clear()
+    try:
+        with hydra.initialize_config_dir(str(project), version_base="1.3"):
+            config = hydra.compose(name, [*overrides, *more], return_hydra_config=True)
+    finally:
+        if running is not None:
+            GlobalHydra.instance().initialize(running)
+    with open_dict(config):
+        choices = config.hydra.runtime.choices
+        given = {group: name for group, name in config.names.items() if name is not None}
+        config.names = {each: choices[each] for each in NAMED if each in choices} | given
+        del config["hydra"]
+    return config
 
 
 def register() -> None:

@@ -17,28 +17,19 @@ from dsr.utils.files import expect_target
 from dsr.utils.guards import refusing_excess
 from dsr.utils.progress import megabytes
 
-_WHOLE_PAGE = 6
-"""The page has at most this many times the vertices of one surface."""
-_PHOTO, _SMALL_PHOTO, _FEW = 2048, 1024, 4
-"""Longer side of the photos on a page of at most ``_FEW`` results, and of more, pixels."""
+_WHOLE_PAGE = 6  # the page has at most this many times the vertices of one surface
+_PHOTO, _SMALL_PHOTO, _FEW = 2048, 1024, 4  # pixels of the photos' longer side on pages of few results, and of more
 
 
 def view(request: ViewRequest, console: Console) -> list[str]:
-    """Write the page and open it.
-
-    Returns:
-        The problems, one line each; results that cannot be read are left out.
-
-    Raises:
-        ValueError: there is no result, none can be read, or the page would replace another file.
-
-    """
+    """Write the page and open it; return the problems of results that cannot be read, one line each."""
     page = request.page or request.output / "view.html"
     expect_target(page)
     if page.exists() and not (page.is_file() and is_view(page)):
         raise ValueError(f"{page}: is there already and no page of `dsr view`; take another -o")
     folders = find_results(request.output)
-    chosen = [folders[at] for at in _spread(len(folders), request.most)]
+    places = np.linspace(0, len(folders) - 1, min(len(folders), request.most)).round()
+    chosen = [folders[at] for at in np.unique(places.astype(int))]
     packed, problems = _pack(request, chosen, console)
     if not packed:
         raise ValueError("; ".join(problems))
@@ -51,7 +42,11 @@ def view(request: ViewRequest, console: Console) -> list[str]:
     save_view(page, packed, title=f"{name}: depth before and after", notes=notes)
     for note in notes:
         show(console, f"  {note}")
-    show(console, _summary(page, packed))
+    largest, factors = max(each.vertices for each in packed), sorted({each.about["after"]["factor"] for each in packed})
+    reduced = "" if factors == [1] else f", maps reduced by {' or '.join(map(str, factors))} each way"
+    count = "1 result" if len(packed) == 1 else f"{len(packed)} results"
+    size = megabytes(page.stat().st_size)
+    show(console, f"{count}, at most {largest:,} vertices each{reduced}, {size} -> {page}")
     if request.open_page and not webbrowser.open(page.resolve().as_uri()):
         show(console, "there is no browser to open it with; open it yourself, or copy it to where there is one")
     return problems
@@ -71,17 +66,3 @@ def _pack(request: ViewRequest, folders: Sequence[Path], console: Console) -> tu
         except (ValueError, OSError) as error:
             problems.append(one_line(error))
     return packed, problems
-
-
-def _spread(count: int, most: int) -> list[int]:
-    """Return at most ``most`` of the numbers below ``count``, at equal distances, the first and the last among them."""
-    return sorted({int(at) for at in np.linspace(0, count - 1, min(count, most)).round()})
-
-
-def _summary(page: Path, packed: Sequence[Packed]) -> str:
-    """Return what was written, and how surfaces were reduced."""
-    count = "1 result" if len(packed) == 1 else f"{len(packed)} results"
-    largest = max(each.vertices for each in packed)
-    factors = sorted({each.about["after"]["factor"] for each in packed})
-    reduced = "" if factors == [1] else f", maps reduced by {' or '.join(map(str, factors))} each way"
-    return f"{count}, at most {largest:,} vertices each{reduced}, {megabytes(page.stat().st_size)} -> {page}"

@@ -3,31 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Mapping, Sequence
-from typing import NoReturn
+from pathlib import Path
+from typing import Any, NoReturn
 
-from dsr.cli.commands import (
-    APP,
-    DOCTOR,
-    EXPORT,
-    FORMATS_COMMAND,
-    FUSE,
-    LEADERBOARD,
-    REPORT,
-    UPSAMPLE,
-    VIEW,
-    Command,
-    add_data_command,
-    add_hydra_commands,
-)
-from dsr.cli.parser import ABOUT, EPILOG, CompletionRequest, Parser, complete
-from dsr.cli.study import STUDY
+from dsr.cli.commands import add_commands
 from dsr.data.download.collections import Collection
 from dsr.doctor.about import version_lines
 from dsr.utils import interruption
-from dsr.utils.console import USAGE_ERROR, one_line, open_console, print_error, show
+from dsr.utils.console import USAGE_ERROR, one_line, open_console, print_error, printable, show
 from dsr.utils.files import FullDiskError
-from dsr.utils.guards import refusing_excess
+from dsr.utils.guards import did_you_mean, refusing_excess
 
 _EXAMPLES = """\
 examples:
@@ -48,21 +35,12 @@ examples:
 
 In a checkout of the project, `python eval.py` and `python train.py` are the same as `dsr eval` and `dsr train`.
 """
-_COMMANDS = (
-    *(command.add for command in (UPSAMPLE, VIEW, APP, FUSE)),
-    add_hydra_commands,
-    *(command.add for command in (REPORT, LEADERBOARD, STUDY)),
-    add_data_command,
-    *(command.add for command in (FORMATS_COMMAND, DOCTOR, EXPORT)),
-)
 
 
 def main(arguments: Sequence[str] | None = None, catalogue: Mapping[str, Collection] | None = None) -> int:
     """Run the command, and return its exit code: 0, 2 after an error, 130 or 143 when interrupted.
 
-    Args:
-        catalogue: the data sets to offer; None for :func:`dsr.cli.data_tasks.downloads`.
-
+    ``catalogue`` has the data sets to offer; None for :func:`dsr.cli.data_tasks.downloads`.
     """
     options = make_parser().parse_args(arguments)
     console = open_console()
@@ -78,6 +56,49 @@ def main(arguments: Sequence[str] | None = None, catalogue: Mapping[str, Collect
     for problem in problems:
         print_error(problem)
     return USAGE_ERROR if problems else 0
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser, and those of its commands, that refuses an empty text as a path: it would be the current directory."""
+
+    def __init__(self, *arguments: Any, **named: Any) -> None:
+        super().__init__(*arguments, **named)
+        self.register("type", Path, _path)
+
+    def error(self, message: str) -> NoReturn:
+        """Exit with the usage and the error, which repeats arguments, without an address's password."""
+        super().error(printable(message))
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse; an unknown option is reported before what is missing, which it may stand for."""
+        for each in sys.argv[1:] if args is None else args:
+            if each == "--" or "-" not in self.prefix_chars or (self.commands and not each.startswith("-")):
+                break  # what follows are values, or the command's own options
+            name = each.partition("=")[0]
+            known = self._option_string_actions
+            if name.startswith("--") and " " not in name and not any(flag.startswith(name) for flag in known):
+                self.error(f"unknown option {name}{did_you_mean(name, known)}")
+        return super().parse_known_args(args, namespace)
+
+    @property
+    def commands(self) -> dict[str, Parser]:
+        """The commands' parsers by their names; empty for a parser without."""
+        found = (each for each in self._actions if isinstance(each, argparse._SubParsersAction))
+        return next((dict(each.choices) for each in found), {})
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        """Refuse a value that is not one of an action's choices."""
+        if action.choices is not None and value not in action.choices:
+            choices = [str(each) for each in action.choices]
+            meant = did_you_mean(value, choices)
+            raise argparse.ArgumentError(action, f"expected one of {', '.join(choices)}, got {value!r}{meant}")
+
+
+def _path(text: str) -> Path:
+    """Return the path that an argument names."""
+    if not text.strip():
+        raise argparse.ArgumentTypeError("expected a path, got an empty text")
+    return Path(text)
 
 
 class _Version(argparse.Action):
@@ -99,10 +120,5 @@ def make_parser() -> Parser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="of dsr, Python, torch and the packaged weights")
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for add in _COMMANDS:
-        add(commands)
-    Command(
-        "completion", ABOUT, CompletionRequest, lambda request, console, _: complete(parser, request, console), EPILOG
-    ).add(commands)
+    add_commands(parser)
     return parser

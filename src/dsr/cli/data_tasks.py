@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 import textwrap
 from collections.abc import Mapping
@@ -11,6 +10,12 @@ from importlib.metadata import PackageNotFoundError, metadata
 from rich.console import Console
 from rich.table import Table
 
+from dsr.app.requests import (
+    DataGetRequest,
+    DataListRequest,
+    DataVerifyRequest,
+    DataWhereRequest,
+)
 from dsr.data.download.collections import CATALOGUE, Collection, Item, find
 from dsr.data.download.fetching import Server, absent, checksums_of, get, state, verify
 from dsr.methods import weights
@@ -55,7 +60,7 @@ def _weights(names: list[str]) -> Collection:
     )
 
 
-def list_data_sets(_: argparse.Namespace, console: Console, catalogue: Mapping[str, Collection]) -> list[str]:
+def list_data_sets(_: DataListRequest, console: Console, catalogue: Mapping[str, Collection]) -> list[str]:
     """Show a table of the data sets."""
     table = Table(box=None, pad_edge=False)
     for header in ("name", "what", "about", "here", "checksums"):
@@ -68,9 +73,9 @@ def list_data_sets(_: argparse.Namespace, console: Console, catalogue: Mapping[s
     return []
 
 
-def show_folders(options: argparse.Namespace, console: Console, catalogue: Mapping[str, Collection]) -> list[str]:
+def show_folders(request: DataWhereRequest, console: Console, catalogue: Mapping[str, Collection]) -> list[str]:
     """Show the directory of the data sets, and their folders."""
-    collections = find(options.names, catalogue)
+    collections = find(request.names, catalogue)
     if not collections:
         show(console, str(data_root().absolute()))
     for collection in collections or catalogue.values():
@@ -80,11 +85,11 @@ def show_folders(options: argparse.Namespace, console: Console, catalogue: Mappi
     return []
 
 
-def get_data_sets(options: argparse.Namespace, console: Console, catalogue: Mapping[str, Collection]) -> list[str]:
+def get_data_sets(request: DataGetRequest, console: Console, catalogue: Mapping[str, Collection]) -> list[str]:
     """Show what will be downloaded and its licence, ask for confirmation on a terminal, and download it."""
-    collections = find(options.names, catalogue)
-    if options.mirror is not None:
-        Server.of(options.mirror)  # is checked before anything is shown
+    collections = find(request.names, catalogue)
+    if request.mirror is not None:
+        Server.of(request.mirror)  # is checked before anything is shown
     root, progress = data_root(), ConsoleProgress(console)
     items = {item.path: item for collection in collections for item in collection.items}
     missing = len(absent(items.values(), root))
@@ -92,13 +97,13 @@ def get_data_sets(options: argparse.Namespace, console: Console, catalogue: Mapp
         _describe(collection, console)
     if items:
         show(console, f"{missing} of {len(items)} files are missing in {root.absolute()}")
-    if missing and not options.yes and sys.stdin.isatty() and console.is_terminal and not _agreed(console):
+    if missing and not request.yes and sys.stdin.isatty() and console.is_terminal and not _agreed(console):
         return []
-    given = {name: getattr(options, name) for name in ("mirror", "accept_changed", "keep_archives")}
+    given = {name: getattr(request, name) for name in ("mirror", "accept_changed", "keep_archives")}
     problems = get(items.values(), root, progress, **given) if items else []
     for collection in collections:
         if not collection.items:
-            problems += verify(collection, root, progress, accept_changed=options.accept_changed)
+            problems += verify(collection, root, progress, accept_changed=request.accept_changed)
     if not problems:
         show(console, f"{', '.join(collection.name for collection in collections)}: complete")
     return problems
@@ -124,31 +129,14 @@ def _agreed(console: Console) -> bool:
     return answer.strip().lower() in ("", "y", "yes")
 
 
-def verify_data_sets(options: argparse.Namespace, console: Console, catalogue: Mapping[str, Collection]) -> list[str]:
+def verify_data_sets(request: DataVerifyRequest, console: Console, catalogue: Mapping[str, Collection]) -> list[str]:
     """Check collections, and show which are complete."""
     problems, progress = [], ConsoleProgress(console)
-    for collection in find(options.names, catalogue):
-        found = verify(collection, data_root(), progress, accept_changed=options.accept_changed)
+    for collection in find(request.names, catalogue):
+        found = verify(collection, data_root(), progress, accept_changed=request.accept_changed)
         if not found:
             show(console, f"{collection.name}: complete, as recorded")
         elif collection.items:
             show(console, f"{collection.name}: `dsr data get {collection.name}` fetches what is missing or damaged")
         problems += found
     return problems
-
-
-def prepare_data_set(options: argparse.Namespace, console: Console, _: object) -> list[str]:
-    """Resize and keep a data set's scenes, and draw its contact sheet."""
-    from dsr.app.prepare import prepare_dataset  # noqa: PLC0415 - it takes seconds to import
-
-    prepare_dataset(options.name, options.settings, console, [options.config_dir] if options.config_dir else [])
-    return []
-
-
-TASKS = {
-    "list": list_data_sets,
-    "where": show_folders,
-    "get": get_data_sets,
-    "verify": verify_data_sets,
-    "prepare": prepare_data_set,
-}

@@ -5,36 +5,18 @@ from __future__ import annotations
 from rich.console import Console
 
 from dsr.app.requests import AnswersRequest, StudyRequest
-from dsr.cli.commands import Command, CommandGroup
+from dsr.evaluation.run_files import load_results
 from dsr.notes import expect_no_warning
+from dsr.report.study.answers import files_of, read_all
+from dsr.report.study.key import KEY_NAME, read_key
+from dsr.report.study.percentages import collect, remarks, tables_of
+from dsr.report.study.questionnaire import build_study
 from dsr.utils.console import ConsoleProgress, show
-
-_EXAMPLES = """\
-examples:
-  dsr study build outputs/eval --scale 4 -o study     make study/index.html, to hand out, and study/key.json, to keep
-  dsr study collect study answers/*.json              percentages with confidence intervals, and study/study.csv
-"""
-_BUILD_EXAMPLES = """\
-examples:
-  dsr study build outputs/eval -o study
-  dsr study build outputs/eval --scale 4 --methods bicubic msg_v facets --repeat 2 -o study
-  dsr study build outputs/eval --scenes-per-person 10 --send-to "Mail the file to study@example.org." -o study
-
-Give people only index.html: key.json says which method made which picture.
-"""
-_COLLECT_NOTES = """\
-Files that are damaged, incomplete or of another study are named and left out. If one person sent several files, only
-the one finished first counts. The exit code is 2 if no file is left.
-
-Join the table to a report: dsr report RUNS --study study/study.csv
-"""
+from dsr.utils.files import expect_target, write_text
 
 
-def _build(request: StudyRequest, console: Console, _: object) -> list[str]:
+def build_page(request: StudyRequest, console: Console) -> list[str]:
     """Make the page and its key."""
-    from dsr.evaluation.run_files import load_results  # noqa: PLC0415 - torch and pandas take seconds to import
-    from dsr.report.study.questionnaire import build_study  # noqa: PLC0415
-
     progress, results = ConsoleProgress(console), load_results(request.runs)
     if request.strict:
         expect_no_warning(", ".join(map(str, request.runs)), results.warnings)
@@ -53,13 +35,8 @@ def _build(request: StudyRequest, console: Console, _: object) -> list[str]:
     return []
 
 
-def _collect(request: AnswersRequest, console: Console, _: object) -> list[str]:
+def collect_answers(request: AnswersRequest, console: Console) -> list[str]:
     """Read answers, print and write the table."""
-    from dsr.report.study.answers import files_of, read_all  # noqa: PLC0415
-    from dsr.report.study.key import KEY_NAME, read_key  # noqa: PLC0415
-    from dsr.report.study.percentages import collect, remarks, tables_of  # noqa: PLC0415
-    from dsr.utils.files import expect_target, write_text  # noqa: PLC0415 - pandas takes a second to import
-
     path = request.output or request.study / "study.csv"
     expect_target(path)
     key = read_key(request.study / KEY_NAME)
@@ -78,20 +55,3 @@ def _collect(request: AnswersRequest, console: Console, _: object) -> list[str]:
     write_text(path, table.to_csv(index=False, float_format="%.6g"))
     show(console, f"{path}  {len(answers)} of {len(files)} files count{', see above' if left_out else ''}")
     return []
-
-
-STUDY = CommandGroup(
-    "study",
-    "ask people which rendering looks most like the ground truth",
-    (
-        Command(
-            "build",
-            "make a page that needs no network, from runs of eval.py",
-            StudyRequest,
-            _build,
-            _BUILD_EXAMPLES,
-        ),
-        Command("collect", "turn the files that people saved into a table", AnswersRequest, _collect, _COLLECT_NOTES),
-    ),
-    _EXAMPLES,
-)

@@ -13,13 +13,13 @@ from importlib.metadata import PackageNotFoundError, distribution, distributions
 from pathlib import Path
 
 import torch
+from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from rich.text import Text
 
 from dsr.data.download.collections import CATALOGUE
-from dsr.doctor.about import extras, graphics_cards, lack, processor, requirements, version_lines
-from dsr.doctor.depth_checks import Finding, Level
-from dsr.doctor.examine import FINE, show_findings
+from dsr.doctor.about import graphics_cards, processor, version_lines
+from dsr.doctor.findings import FINE, Finding, Level, show_findings
 from dsr.methods import weights
 from dsr.synthetic.rendering import cache_directory
 from dsr.utils.compute_device import fast_precision, pick_device
@@ -29,17 +29,23 @@ from dsr.utils.progress import megabytes
 from dsr.utils.versions import DISTRIBUTION, file_hash, how_to_install
 
 _OPENCV = "opencv-python-headless"
-_LITTLE = 1 << 30
-"""Free bytes of a disk below which results of large photos may not fit."""
+_LITTLE = 1 << 30  # free bytes of a disk below which results of large photos may not fit
+EXTRAS = {
+    "app": "`dsr app`, a page of this machine that upsamples what is dropped on it",
+    "captures": "recordings of cameras and apps, HEIC photos",
+    "cluster": "`-m` on Slurm and in several processes",
+    "mesh": "`dsr upsample` simplifies large meshes with more detail",
+    "mlflow": "trainings logged to MLflow",
+    "onnx": "`dsr export`, method=onnx and monocular",
+    "rerun": "`dsr upsample --with rerun`",
+    "transformers": "method=prompt_da",
+    "wandb": "trainings logged to Weights & Biases",
+}
+"""What each extra of pyproject.toml is for, without those of contributors."""
 
 
 def examine_machine() -> int:
-    """Print what is installed and whether it is in order.
-
-    Returns:
-        Exit status: 0 if everything that ``dsr upsample`` needs is there, else 2.
-
-    """
+    """Print what is installed and whether it is in order; return 0 if ``dsr upsample`` has all it needs, else 2."""
     console, findings = open_console(), [finding for check in CHECKS for finding in check()]
     show_findings(console, "this machine", findings, brief=False)
     missing = [each for each in findings if each.level == "problem"]
@@ -158,17 +164,38 @@ def check_browser() -> list[Finding]:
 
 
 def check_extras() -> list[Finding]:
-    """List the extras: which are there, and how to get the others."""
+    """List the extras for users: which are there, and how to get the others."""
     findings = []
     with contextlib.suppress(PackageNotFoundError):
-        for extra in extras():
-            text = f"{extra.name}: {extra.purpose}"
-            if extra.missing:
-                advice = how_to_install(extra.name)
-                findings.append(Finding("extra", "note", f"{text} ({', '.join(extra.missing)})", advice))
+        declared = distribution(DISTRIBUTION).metadata.get_all("Provides-Extra") or []
+        for name in sorted(set(declared) - {"dev", "docs"}):
+            text = f"{name}: {EXTRAS.get(name, '')}"
+            missing = [lacking for each in requirements(name) if (lacking := lack(each)) is not None]
+            if missing:
+                findings.append(Finding("extra", "note", f"{text} ({', '.join(missing)})", how_to_install(name)))
             else:
                 findings.append(Finding("extra", "ok", text))
     return findings
+
+
+def requirements(extra: str = "") -> list[Requirement]:
+    """Return the requirements of the installed package on this machine, or the additional ones of an extra."""
+    found = [Requirement(line) for line in distribution(DISTRIBUTION).requires or ()]
+    needed = [each for each in found if each.marker is None or each.marker.evaluate({"extra": ""})]
+    if not extra:
+        return needed
+    return [each for each in found if each not in needed and each.marker and each.marker.evaluate({"extra": extra})]
+
+
+def lack(requirement: Requirement) -> str | None:
+    """Return what is wrong with a required package, ``NAME is missing``; None if it is there."""
+    try:
+        version = distribution(requirement.name).version
+    except PackageNotFoundError:
+        return f"{requirement.name} is missing"
+    if requirement.specifier.contains(version, prereleases=True):
+        return None
+    return f"{requirement.name} is {version}, not {requirement.specifier}"
 
 
 CHECKS: tuple[Callable[[], list[Finding]], ...] = (

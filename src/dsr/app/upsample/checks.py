@@ -26,38 +26,29 @@ from dsr.geometry.agreement import (
     significances,
     working_size,
 )
-from dsr.geometry.planes import Array, inverse_votes, range_votes, thinned
-from dsr.geometry.registration import Displacement, find_displacement, undo
-from dsr.io.encoding import Encoding
+from dsr.geometry.planes import inverse_votes, range_votes, thinned
+from dsr.geometry.registration import find_displacement, undo
 from dsr.io.inputs import Picture
 from dsr.io.pairs import Pair
 from dsr.io.reading import Reading
 from dsr.notes import LIMITS, Assumption
 
-_SAMPLE = 12
-"""Number of frames that are looked at, in groups of two that follow each other."""
-_OF_PLANES = 4
-"""Largest number of them whose planes are looked at, which takes longer."""
-_HALF = 2**-10
-"""Relative step of floats of 16 bits."""
+_SAMPLE = 12  # frames that are looked at, in groups of two that follow each other
+_OF_PLANES = 4  # largest number of them whose planes are looked at, which takes longer
+_HALF = 2**-10  # relative step of floats of 16 bits
 
 
 def check_together(
     pairs: Sequence[Pair], reading: Reading, read: Callable[[Pair], Picture], sequence: FrameSequence
 ) -> dict[str, tuple[Assumption, ...]]:
-    """Return the warnings from checks of a sample of the frames, by the name of each frame that they apply to.
+    """Return the warnings from checks of a sample of all frames, by the name of each frame that they apply to.
 
     Frames of one folder are alike in what their values are, and their poses; a frame that is alone in its folder is
-    like those in other folders beside it.
-
-    Args:
-        pairs: all frames.
-        reading: what the user says about them.
-        read: reads one; those that it cannot read are left out, as they are reported when their turn comes.
-        sequence: the frames with their poses.
-
+    like those in other folders beside it. A frame that cannot be read is reported when its turn comes.
     """
-    order, posed = Order(), set[Path]()
+    compared: list[tuple[Pair, Outlines, Outlines]] = []
+    size: Size | None = None
+    posed: set[Path] = set()
     found: dict[str, list[Assumption]] = {pair.name: [] for pair in pairs}
     sampled = {pair.name for pair in _sample(pairs)} if len(pairs) > 1 else set[str]()
     for group in alike(pairs):
@@ -74,11 +65,14 @@ def check_together(
             if picture.pose is not None:
                 posed.add(pair.depth.parent)
             if pair.name in sampled:
-                order.add(pair, picture)
+                depth = picture.depth_lr[0].cpu().numpy()
+                size = size or working_size(depth, picture.rgb)
+                photo = photo_outlines(reduce_photo(picture.rgb, size), max(size) / max(depth.shape))
+                compared.append((pair, depth_outlines(depth, size), photo))
         common = _of_most(bent)
         for pair in group:
             found[pair.name] += common
-    in_order = order.warnings()
+    in_order = _check_order(compared)
     for folder, recording in sequence.recordings.items():
         fault = sequence.fault(recording) if folder in posed or sequence.given else None
         for pair in recording:
@@ -112,58 +106,38 @@ def _sample(pairs: Sequence[Pair]) -> list[Pair]:
 
 
 def check_planes(picture: Picture, pair: Pair, reading: Reading) -> list[Assumption]:
-    """Return a warning where the planes of a picture are flat only if its values are read in another way.
+    """Return a warning if the planes of a picture are flat only if its values are read in another way.
 
     What a capture's format or ``--range-type`` says is believed.
-
-    Args:
-        picture: as it was read.
-        pair: its files.
-        reading: what the user says about them.
-
     """
     if pair.capture is not None or reading.range_type is not None or reading.rig is not None:
         return []
     height, width = picture.depth_lr.shape[-2:]
     depth, camera = thinned(picture.depth_lr[0].double().numpy(), picture.camera.rescale(width, height))
-    falls = inverse_votes(depth)
-    encoding = picture.encoding
+    falls, encoding = inverse_votes(depth), picture.encoding
+    disparity = encoding.range_type == "disparity"
     if falls.verdict == "falls":
-        given = "disparities rise with distance, as depth does" if encoding.range_type == "disparity" else (
+        given = "disparities rise with distance, as depth does" if disparity else (
             "values fall with distance, as disparities do")  # fmt: skip
         detail = f"straight over {falls.falling} of {falls.falling + falls.rising} planes; --range-type sets it"
         return [Assumption(given, detail, "falls-with-distance", falls.ratio)]
-    votes = range_votes(depth, camera, _step(depth, encoding))
-    if votes.verdict not in ("ray", "reverse") or encoding.range_type == "disparity":
+    step = 0.0  # to which values are rounded, as a fraction of their median
+    if encoding.dtype == "float16":
+        step = _HALF
+    elif np.dtype(encoding.dtype).kind != "f" and not disparity:
+        step = float(encoding.unit / np.nanmedian(depth))
+    votes = range_votes(depth, camera, step)
+    if votes.verdict not in ("ray", "reverse") or disparity:
         return []
-    ray = votes.verdict == "ray"
-    text, other = (
-        ("depth looks like distance along the ray", "perspective")
-        if ray
-        else ("distances along the ray look like depth along the axis", "orthogonal")
-    )
-    support = votes.ray if ray else votes.reverse
+    text, support, other = "depth looks like distance along the ray", votes.ray, "perspective"
+    if votes.verdict == "reverse":
+        text, support, other = "distances along the ray look like depth along the axis", votes.reverse, "orthogonal"
     detail = f"{support} of {votes.windows} planes are flat then, {votes.flat} now; --range-type {other}"
     return [Assumption(text, detail, "along-the-ray", support / votes.windows)]
 
 
-def _step(depth: Array, encoding: Encoding) -> float:
-    """Return the step to which values are rounded, as a fraction of their median."""
-    if encoding.dtype == "float16":
-        return _HALF
-    if np.dtype(encoding.dtype).kind == "f" or encoding.range_type == "disparity":
-        return 0.0
-    return float(encoding.unit / np.nanmedian(depth))
-
-
 def align(picture: Picture, *, register: bool) -> Picture:
-    """Return a picture whose depth map is moved to the photo's edges, or with a note that it should be.
-
-    Args:
-        picture: the picture.
-        register: whether to move the depth map; otherwise it stays as it is.
-
-    """
+    """Return a picture whose depth map is moved to the photo's edges, or else with a note that it should be."""
     if min(picture.depth_lr.shape[-2:]) < 2:
         return picture
     verdict = judge(picture.depth_lr[0].cpu().numpy(), picture.rgb)
@@ -173,40 +147,33 @@ def align(picture: Picture, *, register: bool) -> Picture:
     certain = found is not None and found.certain
     notes = [] if certain or verdict is None else _doubts(verdict)
     if register:
+        done = Assumption("--register: the depth map is moved to the photo's edges", f"by {found}")
+        if not certain:
+            why = "there are not enough depth edges to compare" if found is None else "no displacement is certain"
+            done = Assumption(f"--register: {why}, the depth map stays where it is")
         depth_lr = undo(picture.depth_lr, found) if found is not None and certain else picture.depth_lr
-        return replace(picture, depth_lr=depth_lr, assumptions=(*picture.assumptions, _cure(found), *notes))
+        return replace(picture, depth_lr=depth_lr, assumptions=(*picture.assumptions, done, *notes))
     if found is not None and found.visible:
-        detail = f"{_where(found)}; --register moves the depth map"
+        sides = "to the right" if found.right > 0 else "to the left", "below" if found.down > 0 else "above"
+        shifts = zip((abs(found.right), abs(found.down)), sides, strict=True)
+        where = [f"{pixels:.1f} px {side}" for pixels, side in shifts if round(pixels, 1)]
+        where += [f"at {found.scale:.3f} times the size"] if found.scale != 1 else []
+        detail = f"{', '.join(where)}, in pixels of the depth map; --register moves the depth map"
         notes = [Assumption("the photo's edges lie beside the depth edges", detail, "edges-beside", found.moved)]
     return replace(picture, assumptions=(*picture.assumptions, *notes))
 
 
-class Order:
-    """Whether depth maps fit their own photos better than those of other pairs."""
-
-    def __init__(self) -> None:
-        self._pairs: list[Pair] = []
-        self._depths: list[Outlines] = []
-        self._photos: list[Outlines] = []
-        self._size: Size | None = None
-
-    def add(self, pair: Pair, picture: Picture) -> None:
-        """Add a pair."""
-        depth = picture.depth_lr[0].cpu().numpy()
-        if self._size is None:
-            self._size = working_size(depth, picture.rgb)
-        self._pairs.append(pair)
-        self._depths.append(depth_outlines(depth, self._size))
-        self._photos.append(photo_outlines(reduce_photo(picture.rgb, self._size), max(self._size) / max(depth.shape)))
-
-    def warnings(self) -> list[Assumption]:
-        """Return a warning if too many fit another photo better."""
-        found = find_misplaced(significances(self._depths, self._photos)) if len(self._pairs) > 1 else []
-        if len(found) < LIMITS["photo-order"]:
-            return []
-        text = f"of {len(self._pairs)} pairs {len(found)} fit another photo better: are the lists in the same order?"
-        own, other = (self._pairs[number] for number in found[0])
-        return [Assumption(text, f"such as {own.depth.name} with {other.rgb.name}", "photo-order", float(len(found)))]
+def _check_order(compared: Sequence[tuple[Pair, Outlines, Outlines]]) -> list[Assumption]:
+    """Return a warning if depth maps fit the photos of other pairs better; the outlines are of depth and photo."""
+    if len(compared) < 2:
+        return []
+    pairs, depths, photos = zip(*compared, strict=True)
+    found = find_misplaced(significances(depths, photos))
+    if len(found) < LIMITS["photo-order"]:
+        return []
+    text = f"of {len(pairs)} pairs {len(found)} fit another photo better: are the lists in the same order?"
+    own, other = (pairs[number] for number in found[0])
+    return [Assumption(text, f"such as {own.depth.name} with {other.rgb.name}", "photo-order", float(len(found)))]
 
 
 def _doubts(verdict: Verdict) -> list[Assumption]:
@@ -221,26 +188,3 @@ def _doubts(verdict: Verdict) -> list[Assumption]:
     }[verdict.code]
     score = "" if verdict.kind == "apart" else "agreement of edges "
     return [Assumption(verdict.statement, f"{score}{verdict.figures}; {cure}", verdict.code, verdict.value)]
-
-
-def _cure(found: Displacement | None) -> Assumption:
-    """Return what ``--register`` did."""
-    if found is None:
-        return Assumption("--register: there are not enough depth edges to compare, the depth map stays where it is")
-    if not found.certain:
-        return Assumption("--register: no displacement is certain, the depth map stays where it is")
-    return Assumption("--register: the depth map is moved to the photo's edges", f"by {found}")
-
-
-def _where(found: Displacement) -> str:
-    """Return where the photo's edges are."""
-    parts = [
-        f"{abs(pixels):.1f} px {side}"
-        for pixels, side in (
-            (found.right, "to the right" if found.right > 0 else "to the left"),
-            (found.down, "below" if found.down > 0 else "above"),
-        )
-        if round(abs(pixels), 1)
-    ]
-    scale = [f"at {found.scale:.3f} times the size"] if found.scale != 1 else []
-    return ", ".join([*parts, *scale]) + ", in pixels of the depth map"

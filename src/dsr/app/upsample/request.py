@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from dsr.io.frames import Record, Source
     from dsr.io.pairs import Pair
 
-SHORTCUTS = ("noise", "smooth")
-"""Arguments of the method that have an option of their own."""
+SHORTCUTS = ("noise", "smooth")  # arguments of the method that have an option of their own
 
 
 def _parse_settings(texts: list[str]) -> tuple[tuple[str, Any], ...]:
@@ -100,7 +99,7 @@ class FrameChoice(Options):
 
     @property
     def model(self) -> Path | None:
-        """The file of the images of a model of COLMAP, whose poses, cameras and lenses the frames have; or None."""
+        """The images of a model of COLMAP, whose poses, cameras and lenses the frames have; or None."""
         from dsr.io.captures.colmap import model_file  # noqa: PLC0415 - few commands have poses
 
         return None if self.poses is None else model_file(self.poses)
@@ -166,18 +165,14 @@ class Upsampling(Options):
         super().__post_init__()
         check_method(self.method, self.directories)
         for name, value in self.settings:
-            if name in self._shortcuts:
+            if name in SHORTCUTS and getattr(self, name) is not None:
                 raise OptionError(name, f"expected it once, got --set {name}={value}, too")
-
-    @property
-    def _shortcuts(self) -> dict[str, float]:
-        """Those of :data:`SHORTCUTS` that are given."""
-        return {name: value for name in SHORTCUTS if (value := getattr(self, name)) is not None}
 
     @property
     def arguments(self) -> dict[str, Any]:
         """Arguments of the method that are given."""
-        return dict(self.settings) | self._shortcuts
+        given = {name: getattr(self, name) for name in SHORTCUTS}
+        return dict(self.settings) | {name: value for name, value in given.items() if value is not None}
 
     @property
     def working_size(self) -> int | None:
@@ -185,14 +180,19 @@ class Upsampling(Options):
         return None if self.size == "auto" else int(self.size)
 
     def check_slowly(self) -> None:
-        """Run the checks that take seconds: that the method accepts its arguments, and the name of the sensor.
-
-        Raises:
-            ValueError: it does not, or there is no such sensor; the message begins with the option.
-
-        """
+        """Run the checks that take seconds: that the method accepts its arguments, and the name of the sensor."""
         if self.arguments or self.working_size is not None:
-            self._check_method()
+            run = replace(self, device="cpu").upsampler()
+            try:
+                run.check_working_size()
+            except ValueError as error:
+                raise ValueError(f"--working-size{str(error).removeprefix('working_size')}") from error
+            try:
+                run.first()
+            except ValueError as error:
+                key = str(error).partition(":")[0]
+                flag = "--" if key in SHORTCUTS else "--set "
+                raise ValueError(f"{flag}{error}" if key in self.arguments else str(error)) from error
         if self.sensor not in ("auto", "none"):
             from dsr.degradation.sensors import sensor_named  # noqa: PLC0415 - other values are refused without torch
 
@@ -202,12 +202,7 @@ class Upsampling(Options):
                 raise ValueError(f"--{error}") from error
 
     def upsampler(self) -> AnyRatio:
-        """Return the method, which loads its weights once.
-
-        Raises:
-            ValueError: there is no such device.
-
-        """
+        """Return the method, which loads its weights once; a ValueError if there is no such device."""
         from dsr.inference import upsampler  # noqa: PLC0415 - other values are refused without torch
 
         return upsampler(
@@ -221,24 +216,15 @@ class Upsampling(Options):
             working_size=self.working_size,
         )
 
-    def _check_method(self) -> None:
-        """Check that the method accepts its arguments."""
-        run = replace(self, device="cpu").upsampler()
-        try:
-            run.check_working_size()
-        except ValueError as error:
-            raise ValueError(f"--working-size{str(error).removeprefix('working_size')}") from error
-        try:
-            run.first()
-        except ValueError as error:
-            key = str(error).partition(":")[0]
-            option = f"--{error}" if key in SHORTCUTS else f"--set {error}"
-            raise ValueError(option if key in self.arguments else str(error)) from error
-
 
 @dataclass(frozen=True, kw_only=True)
 class UpsampleRequest(Options):
-    """What to upsample, how, and which results to write."""
+    """Upsample the depth maps of your own photos to the photos' resolution.
+
+    Give --rgb and --depth, or folders that hold both. The depth map has to be registered to the photo: the same view,
+    the same field of view, any size up to the photo's. What is not given is read from the files or assumed, and
+    reported.
+    """
 
     frames: FrameChoice = group(FrameChoice, "what to work on")
     reading: Reading = group(
@@ -273,30 +259,35 @@ class UpsampleRequest(Options):
 
 def files_of(pair: Pair, reading: Reading) -> dict[str, Path]:
     """Return the files that a result depends on."""
-    given = reading.camera.fov is not None or reading.camera.intrinsics is not None
-    camera = reading.camera.file or (None if given else pair.camera)
-    found = {"rgb": pair.rgb, "depth": pair.depth, "camera": camera, "mask": pair.mask}
-    if pair.confidence is not None and reading.min_confidence is not None:
-        found["confidence"] = pair.confidence.path
-    if reading.rig is not None:
-        found |= {"depth_camera": reading.rig.camera, "extrinsics": reading.rig.extrinsics}
-    return {name: path for name, path in found.items() if path is not None} | {
-        name: source.file for name, source in _sources(pair, reading).items()
-    }
+    return {name: each if isinstance(each, Path) else each.file for name, each in _inputs(pair, reading).items()}
 
 
 def inputs_of(pair: Pair, reading: Reading) -> dict[str, Record]:
     """Return the inputs and their hashes, as values for JSON."""
     inputs: dict[str, Record] = {}
-    sources = _sources(pair, reading)
-    for name, path in files_of(pair, reading).items():
-        if name in sources:
-            inputs[name] = sources[name].record()
-            continue
-        if not path.is_file():
-            raise ValueError(f"{path}: there is no such file")
-        inputs[name] = {"file": path.name, "sha256": file_hash(path)}
+    for name, each in _inputs(pair, reading).items():
+        if not isinstance(each, Path):
+            inputs[name] = each.record()
+        elif each.is_file():
+            inputs[name] = {"file": each.name, "sha256": file_hash(each)}
+        else:
+            raise ValueError(f"{each}: there is no such file")
     return inputs if pair.capture is None else {**inputs, "capture": pair.capture.record()}
+
+
+def _inputs(pair: Pair, reading: Reading) -> dict[str, Path | Source]:
+    """Return the inputs: files, or in captures what is no file of its own."""
+    given = reading.camera.fov is not None or reading.camera.intrinsics is not None
+    camera = reading.camera.file or (None if given else pair.camera)
+    found: dict[str, Path | Source | None] = {"rgb": pair.rgb, "depth": pair.depth, "camera": camera, "mask": pair.mask}
+    if pair.confidence is not None and reading.min_confidence is not None:
+        found["confidence"] = pair.confidence.source or pair.confidence.path
+    if reading.rig is not None:
+        found |= {"depth_camera": reading.rig.camera, "extrinsics": reading.rig.extrinsics}
+    if pair.capture is not None:
+        found["rgb"] = pair.capture.photo or pair.rgb
+        found["depth"] = pair.capture.depth or pair.depth
+    return {name: each for name, each in found.items() if each is not None}
 
 
 def inputs_with_neighbours(request: UpsampleRequest, pair: Pair, neighbours: Sequence[Pair]) -> dict[str, Record]:
@@ -308,13 +299,3 @@ def inputs_with_neighbours(request: UpsampleRequest, pair: Pair, neighbours: Seq
     if request.frames.poses is not None:
         inputs["poses"] = {"file": request.frames.poses.name, "sha256": file_hash(request.frames.poses)}
     return inputs
-
-
-def _sources(pair: Pair, reading: Reading) -> dict[str, Source]:
-    """Return the inputs of a capture that are no files of their own."""
-    found: dict[str, Source | None] = {}
-    if pair.capture is not None:
-        found = {"rgb": pair.capture.photo, "depth": pair.capture.depth}
-    if pair.confidence is not None and reading.min_confidence is not None:
-        found["confidence"] = pair.confidence.source
-    return {name: source for name, source in found.items() if source is not None}

@@ -1,4 +1,4 @@
-"""Checks of the values of a depth map: the unit, missing pixels and values that mark them, and rounding.
+"""Checks of scenes with ``dsr doctor DIR``: units, camera, registration, holes, rounding, range type and size.
 
 Rounded values are multiples of a unit, in depth, in inverse depth (as disparity) or in distance along the ray. Values
 may also be multiples of a unit by construction, such as those of the rows of a level floor. If they were rounded, the
@@ -9,97 +9,120 @@ longer multiples, but along a slope they are still exactly equal for some pixels
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal, NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy import ndimage
 from torch.nn import functional
 
+from dsr.data.detection import find_scenes
+from dsr.doctor.findings import FAULTY, FINE, Finding, Level, show_findings, worst
+from dsr.geometry.agreement import judge
 from dsr.geometry.camera import baseline_times_focal
-from dsr.geometry.plausible import implausible_distance, plausible_baseline
+from dsr.geometry.planes import range_votes
+from dsr.geometry.plausible import implausible_distance, judge_camera, offset_of, plausible_baseline, view_of
+from dsr.geometry.registration import SHIFT, WORKING_SIZE, find_displacement
 from dsr.notes import LIMITS
 from dsr.sample import Scene
+from dsr.utils.console import USAGE_ERROR, ConsoleProgress, one_line, open_console, print_error
 from dsr.utils.progress import show_length
 from dsr.utils.ratios import round_ratio
 
-_NEAR, _FAR = 0.1, 30.0
-"""Metres; a median below suggests macro photography, one above outdoors, or another unit."""
-_TYPICAL = (0.4, 8.0)
-"""Metres; range of the median depth of a room or a table."""
-_FACTORS: tuple[tuple[float, str], ...] = (
-    (1e-3, "millimetres read as metres"),
-    (1e3, "metres read as millimetres"),
-    (1e-2, "centimetres read as metres"),
-    (1e2, "metres read as centimetres"),
-    (1 / 5000, "values of 1/5000 m, as ICL-NUIM and TUM store them, read as metres"),
-    (1 / 5, "values of 1/5000 m read as millimetres"),
-    (1 / 8, "SUN RGB-D's values read without turning them by three bits"),
-    (1 / 256, "values of 1/256 m, as KITTI stores them, read as metres"),
-)
-"""Most likely first."""
-_AGREEMENT = 1.25
-"""Largest ratio of measured and high-resolution depth."""
-
-_MANY, _MOST = 0.10, 0.40
-"""Fractions of missing pixels."""
-_MIN_FRACTION = 0.02
-"""Fraction of the valid pixels that a suspicious value has at least."""
-_GAP = 1.5
-"""Ratio of an extreme value and the next one above which it counts as separate."""
-_TINY = 0.011
-"""Metres; smaller depths are treated as marks."""
+_MANY_SCENES = 8  # beyond which checks without a finding are not listed
+# units: metres
+_NEAR, _FAR = 0.1, 30.0  # a median below suggests macro photography, one above outdoors, or another unit
+_TYPICAL = (0.4, 8.0)  # range of the median depth of a room or a table
+_FACTORS = {  # most likely first
+    1e-3: "millimetres read as metres",
+    1e3: "metres read as millimetres",
+    1e-2: "centimetres read as metres",
+    1e2: "metres read as centimetres",
+    1 / 5000: "values of 1/5000 m, as ICL-NUIM and TUM store them, read as metres",
+    1 / 5: "values of 1/5000 m read as millimetres",
+    1 / 8: "SUN RGB-D's values read without turning them by three bits",
+    1 / 256: "values of 1/256 m, as KITTI stores them, read as metres",
+}
+_AGREEMENT = 1.25  # largest ratio of measured and high-resolution depth
+# holes
+_MANY, _MOST = 0.10, 0.40  # fractions of missing pixels
+_MIN_FRACTION = 0.02  # fraction of the valid pixels that a suspicious value has at least
+_GAP = 1.5  # ratio of an extreme value and the next one above which it counts as separate
+_TINY = 0.011  # metres; smaller depths are treated as marks
+# metres that usually mark missing or too distant depth: round ones, and the largest of 16 bits
 _MARKS = (*(10.0, 20.0, 25.0, 50.0, 80.0, 100.0, 255.0, 1e3, 1e4), *(65535 * 10.0**-p for p in range(6)), 65535 / 5000)
-"""Values in metres that usually mark missing or too distant depth: round ones, and the largest of 16 bits."""
 _DIGITS = 6
+# rounding
+_JUMP = 0.03  # relative difference of neighbouring pixels beyond which they are an edge
+_SAME = 3e-7  # largest relative error of a conversion in single precision
+_LEVELS, _MULTIPLES = 4, 0.95  # minimum number of gaps between values, and fraction of them that are multiples
+_JITTER, _OF_ALL = 0.01, 0.5  # minimum fractions, of smooth and of bent pixels, whose slope changes by a unit or two
+_TERRACED, _SPREAD = 0.2, 0.02  # minimum fractions of terraced pixels, of the slopes and of all smooth pixels
+_TILT, _STEEP = 3.0, 20.0  # degrees by which one step tilts a normal, visible in renderings, and dominating them
+_LEAST = 100  # minimum number of pixels
+_REPEATED = (8, 6, 5, 4, 3, 2)
+_DIVISOR = 8  # of the size, for the usual scales
 
 Quantity = Literal["depth", "inverse depth", "distance along the ray"]
-
-_JUMP = 0.03
-"""Relative difference of neighbouring pixels beyond which they are an edge."""
-_SAME = 3e-7
-"""Largest relative error of a conversion in single precision."""
-_LEVELS = 4
-"""Minimum number of gaps between values."""
-_MULTIPLES = 0.95
-"""Minimum fraction of the gaps between values that are multiples of the unit."""
-_JITTER, _OF_ALL = 0.01, 0.5
-"""Minimum fractions, of smooth pixels and of those whose slope changes, with a change of one or two units."""
-_TERRACED, _SPREAD = 0.2, 0.02
-"""Minimum fractions of terraced pixels, of the slopes and of all smooth pixels, if no unit is found."""
-_TILT, _STEEP = 3.0, 20.0
-"""Tilt of a normal by one step, in degrees, that becomes visible in renderings, and that dominates them."""
-_LEAST = 100
-"""Minimum number of pixels."""
-_REPEATED = (8, 6, 5, 4, 3, 2)
-Level = Literal["ok", "note", "warning", "problem"]
-LEVELS: tuple[Level, ...] = get_args(Level)
-"""From the best to the worst; ``warning`` and ``problem`` mean that the scene is probably wrong."""
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Finding:
-    """A finding of one check.
+class Rounding(NamedTuple):
+    """The rounding of a depth map."""
 
-    Args:
-        check: name of the check.
-        level: severity.
-        message: measured values, with units.
-        advice: recommended action; empty for none.
+    quantity: Quantity  # that was rounded
+    step: float  # metres, of inverse depth 1 / m
+    relative: float  # the step as a fraction of the median value
+    tilt: float  # degrees by which one step tilts a surface that faces the camera at the median depth
 
+
+def examine_directory(folder: Path, most: int | None = None) -> int:
+    """Print findings on at most so many scenes of a directory, taken at equal distances, and return the exit code.
+
+    It is 1 after a warning or a problem, and 2, with one line on stderr, if there is no scene.
     """
+    try:
+        scenes = list(find_scenes(folder)) if folder.is_dir() else []
+        if not scenes:
+            came = "no scene in it" if folder.is_dir() else "no such directory"
+            raise ValueError(f"{folder}: expected a scene or a directory of scenes, got {came}")
+    except (ValueError, OSError) as error:
+        print_error(str(error))
+        return USAGE_ERROR
+    console = open_console()
+    if most is not None and len(scenes) > most:
+        console.print(f"{most} of {len(scenes)} scenes, at equal distances", highlight=False)
+        scenes = [scenes[index * len(scenes) // most] for index in range(most)]
+    verdicts: Counter[Level] = Counter()
+    for name, load in ConsoleProgress(console).track(scenes, "examine", label=lambda scene: scene[0], lines=False):
+        title = name
+        try:
+            scene = load()
+        except (ValueError, OSError) as error:
+            message = f"cannot be read: {one_line(error)}"
+            findings = [Finding("files", "problem", message, "correct the file or its description")]
+        else:
+            title += "" if scene.depth is not None else f" (the map measured at x{round_ratio(min(scene.measured))})"
+            findings = examine(scene)
+        show_findings(console, title, findings, brief=len(scenes) > _MANY_SCENES)
+        verdicts[worst(findings)] += 1
+    fine = verdicts["ok"] + verdicts["note"]
+    parts = [f"{fine} fine"] if fine else []
+    parts += [f"{verdicts[level]} with {level}s" for level in ("warning", "problem") if verdicts[level]]
+    text = f"{len(scenes)} scene{'s' if len(scenes) > 1 else ''}: {', '.join(parts)}"
+    console.print(text, style="bold", highlight=False)
+    return FAULTY if verdicts["warning"] or verdicts["problem"] else FINE
 
-    check: str
-    level: Level
-    message: str
-    advice: str = ""
 
-
-def worst(findings: list[Finding]) -> Level:
-    """Return the worst level; ``ok`` without findings."""
-    return max((finding.level for finding in findings), key=LEVELS.index, default="ok")
+def examine(scene: Scene) -> list[Finding]:
+    """Run all checks on a scene and return their findings, in the order of :data:`CHECKS`."""
+    scene = with_depth(scene)
+    return [finding for check in CHECKS for finding in check(scene)]
 
 
 def with_depth(scene: Scene) -> Scene:
@@ -142,7 +165,7 @@ def check_units(scene: Scene) -> list[Finding]:
 
 def _advise(scene: Scene, middle: float) -> str:
     """Return the factors that make a median depth plausible."""
-    fitting = [(factor, why) for factor, why in _FACTORS if _TYPICAL[0] <= middle * factor <= _TYPICAL[1]]
+    fitting = [(factor, why) for factor, why in _FACTORS.items() if _TYPICAL[0] <= middle * factor <= _TYPICAL[1]]
     if not fitting:
         return "check the unit"
     texts = [
@@ -189,6 +212,45 @@ def _measured(scene: Scene, depth: Array) -> list[Finding]:
     return findings
 
 
+def check_intrinsics(scene: Scene) -> list[Finding]:
+    """Check the camera against the image."""
+    found = judge_camera(scene.camera)
+    if found:
+        return [Finding("intrinsics", each.level, each.message, each.advice) for each in found]
+    view, offset = view_of(scene.camera), offset_of(scene.camera)
+    return [Finding("intrinsics", "ok", f"{view:.0f} degrees across, principal point {offset:.1%} off the centre")]
+
+
+def check_registration(scene: Scene) -> list[Finding]:
+    """Check whether photo and depth map show the same scene, and whether their edges coincide."""
+    verdict = judge(metres(scene), scene.rgb)
+    if verdict is None:
+        return [Finding("registration", "note", "no edges in the depth map or in the photo for this check")]
+    text = f"{verdict.statement} ({verdict.figures})"
+    if verdict.kind == "turned":
+        return [Finding("registration", "problem", text, "flip, rotate or crop the photo or the depth")]
+    found = find_displacement(torch.from_numpy(metres(scene))[None], scene.rgb)
+    if found is not None and found.certain:
+        right, down = round(found.right), round(found.down)
+        scale = f", at {found.scale:.3f} times the size" if round(found.scale, 3) != 1 else ""
+        text = (
+            f"the photo's edges are {abs(right)} px {'left' if right < 0 else 'right'}, "
+            f"{abs(down)} px {'above' if down < 0 else 'below'} of the depth edges{scale}"
+        )
+        smallest = SHIFT * math.ceil(max(scene.rgb.shape[1:]) / WORKING_SIZE)  # of steps in which they are compared
+        if not found.visible or (max(abs(right), abs(down)) < smallest and not scale):
+            return [Finding("registration", "ok", text)]
+        advice = "shift one of them; check for a crop, a resize or a lens correction applied to only one of them"
+        return [Finding("registration", "warning", text, advice)]
+    level: Level = "note"
+    advice = "check that they belong together; few edges or noisy depth can have the same effect"
+    if verdict.kind == "fits":
+        level, text, advice = "ok", verdict.statement, ""
+    elif verdict.kind in ("apart", "other"):
+        level, advice = "warning", "check that photo and depth belong together"
+    return [Finding("registration", level, text, advice)]
+
+
 def check_holes(scene: Scene) -> list[Finding]:
     """Check the fraction of missing pixels, and whether a depth value seems to mark missing pixels."""
     depth = metres(scene)
@@ -196,10 +258,8 @@ def check_holes(scene: Scene) -> list[Finding]:
     text = f"{1 - missing:.1%} of the pixels are valid"
     level: Level
     if missing > _MOST:
-        level, advice = (
-            "warning",
-            "results are unreliable where most depth is missing; inpaint the holes, or crop to the valid part",
-        )
+        level = "warning"
+        advice = "results are unreliable where most depth is missing; inpaint the holes, or crop to the valid part"
     elif missing > _MANY:
         level, advice = "note", "scores ignore holes"
     else:
@@ -241,27 +301,8 @@ def _judge(where: np.ndarray, value: float, beside: float, fraction: float) -> l
         advice = 'if it marks holes, set "hole_value" in camera.json, in the unit of the file, or add a mask.png'
         return [Finding("holes", "warning", f"{message}, which looks like a mark of missing depth", advice)]
     message += f"; the next value is {beside:g} m"
-    return [
-        Finding("holes", "note", message, 'correct for a flat wall; if it marks holes, set "hole_value" in camera.json')
-    ]
-
-
-@dataclass(frozen=True)
-class Rounding:
-    """The rounding of a depth map.
-
-    Args:
-        quantity: quantity that was rounded.
-        step: rounding step in metres, of inverse depth in 1 / m.
-        relative: the step as a fraction of the median value.
-        tilt: tilt in degrees that one step causes on a surface that faces the camera at the median depth.
-
-    """
-
-    quantity: Quantity
-    step: float
-    relative: float
-    tilt: float
+    advice = 'correct for a flat wall; if it marks holes, set "hole_value" in camera.json'
+    return [Finding("holes", "note", message, advice)]
 
 
 def check_precision(scene: Scene) -> list[Finding]:
@@ -374,3 +415,37 @@ def _source(scene: Scene, depth: Array, rounding: Rounding) -> str:
     if scene.camera.baseline is None:
         return f"inverse depth comes in steps of {rounding.step:.2g} / m"
     return f"disparity comes in steps of {rounding.step * baseline_times_focal(scene.camera):.2g} px"
+
+
+def check_planes(scene: Scene) -> list[Finding]:
+    """Check whether planar surfaces are planar if the depth is orthogonal."""
+    rounding = find_rounding(scene)
+    votes = range_votes(metres(scene), scene.camera, 0.0 if rounding is None else rounding.relative)
+    if votes.verdict == "orthogonal":
+        return [Finding("planes", "ok", f"{votes.flat} of {votes.windows} planar windows support orthogonal depth")]
+    if votes.verdict is None:
+        counts = f"planar windows: {votes.flat} and {votes.ray}"
+        message = f"too few planes to distinguish orthogonal depth from distance along the ray ({counts})"
+        return [Finding("planes", "note", message)]
+    message, support, other = "depth looks like distance along the ray", votes.ray, "perspective"
+    if votes.verdict == "reverse":
+        message = "depth was read as distance along the ray but looks orthogonal in the file"
+        support, other = votes.reverse, "orthogonal"
+    message += f": {support} of {votes.windows} planar windows support this, {votes.flat} support the present type"
+    return [Finding("planes", "problem", message, f'set "range_type": "{other}" in camera.json')]
+
+
+def check_size(scene: Scene) -> list[Finding]:
+    """Check whether the usual scales divide the image size."""
+    height, width = scene.camera.height, scene.camera.width
+    text = f"{height} x {width} pixels (height x width)"
+    if height % _DIVISOR == 0 and width % _DIVISOR == 0:
+        return [Finding("size", "ok", text)]
+    inner = f"{height // _DIVISOR * _DIVISOR} x {width // _DIVISOR * _DIVISOR}"
+    message = f"{text}, not divisible by {_DIVISOR}: at x{_DIVISOR} the top left {inner} pixels are used"
+    return [Finding("size", "note", message, "crop the scene and its camera to choose another part")]
+
+
+CHECKS: tuple[Callable[[Scene], list[Finding]], ...] = (
+    check_units, check_intrinsics, check_registration, check_holes, check_precision, check_planes, check_size,
+)  # fmt: skip

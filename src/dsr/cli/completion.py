@@ -1,0 +1,98 @@
+"""``dsr completion``: what a shell completes of the command, its options, and values whose names are known.
+
+A shell's script asks ``dsr completion --line LINE`` for the words that may stand at the end of the line.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import shlex
+from collections.abc import Callable, Iterable
+
+from rich.console import Console
+
+from dsr.app.requests import SHELLS, CompletionRequest
+from dsr.cli import Parser, make_parser
+from dsr.data.download.collections import CATALOGUE
+from dsr.geometry.lights import LIGHT_NAMES
+from dsr.utils.configuration import config_directories, list_choices, list_groups
+
+_SCRIPTS = {
+    "bash": """\
+_dsr() { mapfile -t COMPREPLY < <(dsr completion bash --line "${COMP_LINE:0:COMP_POINT}" 2>/dev/null)
+[[ ${COMPREPLY[0]} == *= ]] && compopt -o nospace; }
+complete -o default -F _dsr dsr""",
+    "zsh": """\
+#compdef dsr
+_dsr() { local -a found
+found=(${(f)"$(dsr completion zsh --line "${(j: :)words[1,CURSOR-1]} $PREFIX" 2>/dev/null)"})
+(( $#found )) || { _files; return }
+compadd -S '' -- ${(M)found:#*=}
+compadd -- ${found:#*=} }
+compdef _dsr dsr""",
+    "fish": """\
+complete -c dsr -a '(dsr completion fish --line (commandline -cp | string collect) 2>/dev/null)'""",
+}
+"""What each shell runs at its start."""
+_NAMES: dict[str, Callable[[], Iterable[str]]] = {
+    "light": lambda: LIGHT_NAMES,
+    "method": lambda: list_choices("method", config_directories()),
+    "names": lambda: CATALOGUE,
+    "shell": lambda: SHELLS,
+}
+"""Names that may stand for the value of an option or an argument, by where argparse keeps it."""
+_HYDRA_FLAGS = ("--multirun", "--config-dir", "--cfg", "--help", "--info")
+
+
+def complete(request: CompletionRequest, console: Console) -> list[str]:
+    """Print a shell's script, or the words that may stand at the end of a line, one a line."""
+    found = [_SCRIPTS[request.shell]]
+    if request.line is not None:
+        last = _split(request.line)[-1]
+        found = [each for each in words_at_end(make_parser(), request.line) if each.startswith(last)]
+        if request.shell == "bash" and "=" in last:  # which begins a word of its own there
+            found = [each.rpartition("=")[2] for each in found]
+    for line in found:
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    return []
+
+
+def words_at_end(parser: Parser, line: str) -> list[str]:
+    """Return the completions of a line's last word: commands, options, or values where their names are known."""
+    *before, last = _split(line)[1:] or [""]
+    for word in before:
+        parser = parser.commands.get(word, parser)
+    if "-" not in parser.prefix_chars:  # Hydra's
+        return _overrides(last)
+    options = parser._option_string_actions
+    action = options.get(before[-1] if before else "")
+    if action is not None and action.nargs != 0:
+        return _names_of(action)
+    if last.startswith("-"):
+        return [*options]
+    arguments = [each for each in parser._actions if not each.option_strings]
+    return [*parser.commands] or [name for each in arguments for name in _names_of(each)]
+
+
+def _names_of(action: argparse.Action) -> list[str]:
+    """Return the known names that may stand for a value."""
+    return [str(name) for name in action.choices or _NAMES.get(action.dest, tuple)()]
+
+
+def _overrides(last: str) -> list[str]:
+    """Return what an argument of Hydra's may become: a group, or a choice of the group that it begins with."""
+    directories = config_directories()
+    key, equals, _ = last.partition("=")
+    if equals:
+        return [f"{key}={choice}" for choice in list_choices(key.lstrip("+"), directories)]
+    groups = [f"{group}=" for group in list_groups(directories)]
+    return [f"+{each}" if each == "experiment=" else each for each in groups] + [*_HYDRA_FLAGS]
+
+
+def _split(line: str) -> list[str]:
+    """Return the words of a line, of which the last one may be empty."""
+    words = line.split()
+    with contextlib.suppress(ValueError):  # a quote that is not closed yet
+        words = shlex.split(line)
+    return [*words, ""] if not words or line[-1:].isspace() else words
