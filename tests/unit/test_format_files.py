@@ -10,7 +10,8 @@ import pytest
 from refusals import refused
 from small_files import png_by_its_specification as png
 
-from dsr.io.images import read_camera, read_map, read_mask, read_rgb
+from dsr.io.cameras import read_camera
+from dsr.io.images import read_map, read_mask, read_rgb
 
 VALUES = np.array([[1.0, 2.5, 3.25], [4.5, 5.0, 60000.0]])  # Not symmetric under any flip, exact in float32
 WHOLE = np.array([[1, 256, 3], [40000, 5, 65535]])

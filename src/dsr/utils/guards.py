@@ -1,7 +1,7 @@
-"""Guards: limits of the memory that a file or a task takes, and checks of numbers, JSON and names of files.
+"""Guards: the memory of a command, files that strangers wrote, and checks of numbers, JSON and names of files.
 
-A few kilobytes of compressed zeros declare gigabytes. What is allowed grows with what can explain it: a map's size with
-its photo's, otherwise the unpacked size with the size of the file. Real photos and maps stay far below.
+A few kilobytes of compressed zeros unpack to gigabytes: :func:`limit_memory` ends that in one place. Sizes that a
+picture's header states are checked before it is decoded: a depth map may have 4 times the pixels of its photo.
 """
 
 from __future__ import annotations
@@ -79,16 +79,11 @@ def bytes_of_archive(size: int) -> int:
     return max(_UNPACKED, _RATIO * size)
 
 
-def array_bytes(shape: tuple[int, ...], itemsize: int) -> int:
-    """Return the size of an array, in Python's numbers, which do not overflow."""
-    return math.prod(map(int, shape)) * itemsize
-
-
 def read_limited(path: Path, most: int = MOST_TEXT) -> bytes:
     """Return the content of a file of at most ``most`` bytes."""
     with opened(path) as file:
         expect_bytes(path, path.stat().st_size, most)
-        return file.read(most)
+        return file.read()
 
 
 def read_text(path: Path, most: int = MOST_TABLE) -> str:
@@ -105,13 +100,15 @@ def decode_text(content: bytes) -> str:
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[BufferedReader]:
-    """Open a plain file for reading; a pipe or device is an OSError, and each OSError has the file's name."""
+    """Open a plain file for reading; a pipe or device is an OSError, and errors of the system have the file's name."""
     if not path.is_file():
         code = errno.EISDIR if path.is_dir() else errno.EINVAL if path.exists() else errno.ENOENT
         raise OSError(code, os.strerror(code), str(path))
     try:
         with path.open("rb") as file:
             yield file
+    except MemoryError as error:
+        raise OutOfMemoryError(f"{path}: expected a file that fits into the memory, got a larger one") from error
     except OSError as error:
         if error.errno is None or error.filename is not None:
             raise
@@ -150,6 +147,19 @@ def read_member(packed: zipfile.ZipFile, name: str) -> bytes:
 
 class OutOfMemoryError(ValueError):
     """There is not enough memory for the request."""
+
+
+def limit_memory() -> None:
+    """Limit this process, and each that it starts, to the memory that is free, or half of all if that is more.
+
+    Whatever takes more ends in a MemoryError, where the system knows such a limit (Linux).
+    """
+    with contextlib.suppress(ImportError, OSError, ValueError):
+        import resource  # noqa: PLC0415 - Windows has none
+
+        before = [each for each in resource.getrlimit(resource.RLIMIT_DATA) if each != resource.RLIM_INFINITY]
+        most = min(max(free_memory(), _meminfo("MemTotal:") // 2), *before, _NO_LIMIT)
+        resource.setrlimit(resource.RLIMIT_DATA, (most, resource.getrlimit(resource.RLIMIT_DATA)[1]))
 
 
 def free_memory() -> int:
