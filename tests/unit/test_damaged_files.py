@@ -7,6 +7,8 @@ import math
 import os
 import re
 import struct
+import subprocess
+import sys
 import tracemalloc
 import zipfile
 from pathlib import Path
@@ -141,6 +143,14 @@ def test_bomb_is_refused_in_one_line_and_little_memory(tmp_path, limited, writte
     assert "expected" in refusal(tmp_path / name, read, tmp_path / name)
 
 
+def test_command_limits_its_memory_to_that_of_the_machine():
+    pytest.importorskip("resource", reason="needs limits of memory")
+    code = "import resource; from dsr.utils import guards; guards.limit_memory(); print(resource.getrlimit({}))"
+    code = code.format("resource.RLIMIT_DATA")
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert 0 < int(said.strip("()\n").split(", ")[0]) <= os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
 def test_depth_map_may_not_be_much_larger_than_its_photo(tmp_path, limited, written):
     cv2.imwrite(str(tmp_path / "rgb.png"), np.zeros((64, 64, 3), np.uint8))
     (tmp_path / "d.png").hardlink_to(written(bombs.png_of_16_megapixels))
@@ -268,21 +278,6 @@ def replaced(text, key, value):
     return changed
 
 
-def camera(folder, key, value):
-    entries = {"width": 64, "height": 48, "fx": 60, "fy": 60, "cx": 31.5, "cy": 23.5, "baseline": 0.1}
-    path = folder / "camera.json"
-    path.write_text(replaced(json.dumps(entries), key, value))
-    return path, lambda: read_camera(path)
-
-
-def camera_of_open3d(folder, key, value):
-    path = folder / "camera.json"
-    entries = {"width": 64, "height": 48, "intrinsic_matrix": [60, 0, 0, 0, 60, 0, 31.5, 23.5, 1]}
-    value = value if key == "width" else f"[{value}, 0, 0, 0, 60, 0, 31.5, 23.5, 1]"
-    path.write_text(replaced(json.dumps(entries), key, value))
-    return path, lambda: read_any_camera(path)
-
-
 def transform(folder, _, value):
     path = folder / "ir_to_rgb.json"
     path.write_text(f"[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, {value}, 0]]")
@@ -312,8 +307,6 @@ def study(folder, key, value):
 
 
 JSON = [
-    *((camera, key) for key in ("width", "fx", "cy", "baseline")),
-    *((camera_of_open3d, key) for key in ("width", "intrinsic_matrix")),
     *((camera_of_polycam, key) for key in ("width", "fx", "t_12")),
     *((study, key) for key in ("repeat", "scale", "scenes_per_person", "page")),
     (transform, ""),
