@@ -11,8 +11,9 @@ import io
 import os
 import struct
 import threading
+from collections.abc import Callable
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -30,7 +31,7 @@ _ORIENTATION, _TAGS = 274, {254, 255, 256, 257, 258, 259, 262, 274, 330, 339, 42
 _TAG_TYPES = {1: "B", 2: "B", 3: "H", 4: "I", 13: "I", 16: "Q", 18: "Q"}
 _MOST_TAGS, _MOST_VALUES, _MOST_PAGES = 4096, 64, 64
 # Their classes, as Image.open warns of photos of 90 megapixels.
-_PILLOW = {
+_PILLOW: dict[bytes, Callable[[IO[bytes]], Any]] = {
     b"\xff\xd8": JpegImageFile, b"BM": BmpImageFile, b"RIFF": WebPImageFile,
     **dict.fromkeys((b"P1", b"P2", b"P3", b"P4", b"P5", b"P6"), PpmImageFile),
 }  # fmt: skip
