@@ -38,17 +38,6 @@ def npz(path: Path, size: int = 1 << 29, name: str = "depth") -> None:
         zeros(packed, f"{name}.npy", npy_head((size // 4 // side, side), "<f4"), size)
 
 
-def npz_long_header(path: Path) -> None:
-    """Write an archive with an array whose header is 600 MB long."""
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as packed:
-        zeros(packed, "depth.npy", b"\x93NUMPY\2\0" + struct.pack("<I", LARGE), LARGE)
-
-
-def npy(path: Path) -> None:
-    """Write the header of an array of 2^70 bytes, and a sparse file behind it."""
-    path.write_bytes(npy_head((1 << 34, 1 << 33), "<f4"))
-
-
 def npy_sparse(path: Path) -> None:
     """Write an array of 4 GB that takes no room on the disk."""
     with path.open("wb") as file:
@@ -56,27 +45,22 @@ def npy_sparse(path: Path) -> None:
         file.truncate(file.tell() + (4 << 30))
 
 
-def _png(width: int, height: int, rows: int, bits: int = 16) -> bytes:
+def _png(width: int, height: int, rows: int) -> bytes:
     """Return a grey PNG that has ``rows`` rows of zeros, whatever its header says."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
     packing = zlib.compressobj(1)
-    row = b"\0" * (1 + width * bits // 8) if rows else b""
+    row = b"\0" * (1 + 2 * width) if rows else b""
     data = b"".join(packing.compress(row) for _ in range(rows)) + packing.flush()
-    header = struct.pack(">IIBBBBB", width, height, bits, 0, 0, 0, 0)
+    header = struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0)
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
 
 
 def png(path: Path) -> None:
     """Write a PNG of 2^28 pixels."""
     path.write_bytes(_png(1 << 14, 1 << 14, 1 << 14))
-
-
-def png_huge_header(path: Path) -> None:
-    """Write a PNG that declares 2^62 pixels and has none."""
-    path.write_bytes(_png((1 << 31) - 1, (1 << 31) - 1, 0))
 
 
 def png_of_16_megapixels(path: Path) -> None:
@@ -90,50 +74,11 @@ def jpeg(path: Path) -> None:
     path.write_bytes(b"\xff\xd8\xff\xc2" + struct.pack(">H", 2 + len(frame)) + frame + b"\xff\xda")
 
 
-def bmp(path: Path) -> None:
-    """Write the header of a BMP of 40000 x 40000 pixels."""
-    header = struct.pack("<IiiHHIIiiII", 40, 40000, -40000, 1, 24, 0, 0, 0, 0, 0, 0)
-    path.write_bytes(b"BM" + struct.pack("<IHHI", 54, 0, 0, 54) + header + b"\0" * 1000)
-
-
-def webp(path: Path) -> None:
-    """Write the header of a lossless WebP of 16384 x 16384 pixels."""
-    content = b"\x2f" + struct.pack("<I", 0x3FFF | 0x3FFF << 14) + b"\0" * 50
-    chunk = b"WEBPVP8L" + struct.pack("<I", len(content)) + content
-    path.write_bytes(b"RIFF" + struct.pack("<I", len(chunk)) + chunk)
-
-
-def ppm(path: Path) -> None:
-    """Write the header of a portable map of 30000 x 30000 pixels."""
-    path.write_bytes(b"P6\n# none\n30000 30000\n255\n" + b"\0" * 1000)
-
-
-def tiff(
-    path: Path, size: tuple[int, int] = (1 << 15, 1 << 15), tile: tuple[int, int] | None = None, big: bool = False
-) -> None:
-    """Write a TIFF of floats that is empty behind its directory: of a size, and with tiles of another."""
-    tags = {256: size[1], 257: size[0], 258: 32, 259: 8, 262: 1, 277: 1, 339: 3}
-    tags |= {322: tile[1], 323: tile[0], 324: 8, 325: 8} if tile else {273: 8, 278: size[0], 279: 8}
-    entries = [struct.pack("<HHQQ" if big else "<HHII", tag, 4, 1, value) for tag, value in sorted(tags.items())]
-    head = b"II+\0\x08\0\0\0" + struct.pack("<Q", 16) if big else b"II*\0" + struct.pack("<I", 8)
-    path.write_bytes(head + struct.pack("<Q" if big else "<H", len(tags)) + b"".join(entries) + b"\0" * 64)
-
-
-def tiff_tiles(path: Path) -> None:
-    """Write a TIFF of 64 x 64 pixels in one tile of 16384 x 16384."""
-    tiff(path, (64, 64), (1 << 14, 1 << 14))
-
-
-def tiff_big(path: Path) -> None:
-    """Write a BigTIFF of 2^60 pixels."""
-    tiff(path, (1 << 30, 1 << 30), big=True)
-
-
-def pfm(path: Path) -> None:
-    """Write a sparse PFM of 3 GB."""
-    with path.open("wb") as file:
-        file.write(b"Pf\n30000 25000\n-1.0\n")
-        file.truncate(file.tell() + 4 * 30000 * 25000)
+def tiff(path: Path) -> None:
+    """Write the directory of a TIFF of 2^30 floats, and none of them."""
+    tags = {256: 1 << 15, 257: 1 << 15, 258: 32, 259: 8, 262: 1, 273: 8, 277: 1, 278: 1 << 15, 279: 8, 339: 3}
+    entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in sorted(tags.items()))
+    path.write_bytes(b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries + b"\0" * 64)
 
 
 def exr(path: Path) -> None:
@@ -161,14 +106,14 @@ def exr(path: Path) -> None:
 
 
 def mat5(path: Path) -> None:
-    """Write a MATLAB 5 file with five compressed variables of 200 MB of zeros each."""
+    """Write a MATLAB 5 file with three compressed variables of 200 MB of zeros each."""
 
     def element(kind: int, data: bytes) -> bytes:
         return struct.pack("<II", kind, len(data)) + data + b"\0" * (-len(data) % 8)
 
     count = 200 << 20
     parts = []
-    for number in range(5):
+    for number in range(3):
         head = element(6, struct.pack("<II", 6, 0)) + element(5, struct.pack("<2i", count // 8, 1))
         head += element(1, b"depth%d" % number) + struct.pack("<II", 9, count)
         packing = zlib.compressobj(1)
@@ -179,20 +124,10 @@ def mat5(path: Path) -> None:
     path.write_bytes(b"MATLAB 5.0 MAT-file".ljust(124) + b"\0\1IM" + b"".join(parts))
 
 
-def mat73(path: Path, chunks: tuple[int, int] | None = None) -> None:
-    """Write an HDF5 file with matrices that have 2^28 elements together, none of them stored."""
+def mat73(path: Path) -> None:
+    """Write an HDF5 file with a matrix of 2^28 elements, none of them stored."""
     with h5py.File(path, "w") as file:
-        for number in range(4):
-            shape = (1 << 13, 1 << 13)
-            file.create_dataset(f"depth{number}", shape, "f8", chunks=chunks or (1 << 10, 1 << 10), compression="gzip")
-
-
-def mat73_block(path: Path) -> None:
-    """Write an HDF5 file with a matrix in one block of 2^28 elements."""
-    with h5py.File(path, "w") as file:
-        file.create_dataset(
-            "depth", (64, 64), "f4", maxshape=(None, None), chunks=(1 << 14, 1 << 14), compression="gzip"
-        )
+        file.create_dataset("depth", (1 << 14, 1 << 14), "f8", chunks=(1 << 10, 1 << 10), compression="gzip")
 
 
 def r3d(path: Path) -> None:

@@ -124,8 +124,7 @@ def test_what_has_two_likely_readings_or_no_unit_is_asked_for_in_one_line(tmp_pa
 @pytest.mark.parametrize(
     ("picture", "expected"),
     [
-        (cv2.applyColorMap(np.uint8(255 * DEPTH / DEPTH.max()), cv2.COLORMAP_JET), "by the map jet"),
-        (cv2.applyColorMap(np.uint8(255 * DEPTH / DEPTH.max()), cv2.COLORMAP_VIRIDIS)[..., ::-1], "by the map viridis"),
+        (cv2.applyColorMap(np.uint8(255 * DEPTH / DEPTH.max()), cv2.COLORMAP_JET), "a picture in colour"),
         (np.dstack([np.uint8(255 * DEPTH / DEPTH.max())] * 3), "three equal channels"),
         (np.random.default_rng(3).integers(0, 256, (96, 128, 3), np.uint8), "a picture in colour"),
     ],

@@ -127,14 +127,6 @@ def test_commands_refuse_a_target_that_is_no_file_before_they_read_anything(take
     assert sorted(taken.parent.iterdir()) == before
 
 
-@pytest.mark.parametrize("target", ["/dev/stdout", "/dev/null"])
-def test_output_to_a_device_of_the_system_is_refused_in_one_line(target, capsys):
-    for command in COMMANDS.values():
-        assert main([*command, target]) == 2
-        [line] = capsys.readouterr().err.splitlines()
-        assert line.endswith(f": {target}")
-
-
 def test_folders_may_be_links_and_stay_links(tmp_path: Path) -> None:
     (tmp_path / "disk" / "outputs").mkdir(parents=True)
     (tmp_path / "outputs").symlink_to("disk/outputs")

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from dsr.geometry.camera import Camera
-from dsr.io.cameras import find_camera
+from dsr.io.cameras import find_camera, read_camera
 from dsr.io.photos import read_photo
 from dsr.io.reading import CameraChoice
 
@@ -149,3 +149,49 @@ def test_exif_rotation_is_applied_only_where_depth_fits_it_alone(tmp_path, orien
     assert upright.shape == expected.shape
     assert np.abs(upright - expected).max() <= 2
     assert "turned" in assumptions[0].text
+
+
+def camera_file(folder, **changes):
+    entries = {key: value for key, value in {**OWN, **changes}.items() if value != "absent"}
+    return written(folder, "camera.json", entries)
+
+
+def test_camera_file_is_read_in_pixels_and_metres(tmp_path):
+    path = camera_file(
+        tmp_path, range_type="disparity", baseline=160, baseline_unit="mm", doffs=2.5, depth_unit="mm", hole_value=0
+    )
+    described = read_camera(path)
+    camera = described.camera
+    assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (64, 48, 60, 61, 31, 24)
+    assert camera.baseline == pytest.approx(0.16, rel=1e-15)
+    assert camera.doffs == 2.5
+    assert (described.range_type, described.depth_unit, described.hole_value) == ("disparity", 0.001, 0.0)
+
+
+def test_camera_file_of_intrinsics_alone_is_enough(tmp_path):
+    described = read_camera(camera_file(tmp_path))
+    assert (described.camera.baseline, described.camera.doffs) == (None, 0)
+    assert (described.range_type, described.depth_unit, described.hole_value) == (None, None, None)
+
+
+@pytest.mark.parametrize(("unit", "metres"), [("m", 1.0), ("mm", 0.001), (0.0002, 0.0002), (5, 5.0)])
+def test_depth_unit_is_m_mm_or_a_number(tmp_path, unit, metres):
+    assert read_camera(camera_file(tmp_path, depth_unit=unit)).depth_unit == metres
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("width", "absent"), ("fx", "absent"), ("cy", "absent"), ("width", 3.5), ("width", 0), ("height", -2),
+        ("fx", 0), ("fx", "3"), ("fy", 0), ("cx", None), ("cx", True), ("fx", 10**400), ("width", 1e300),
+        ("range_type", "z"), ("range_type", ["depth"]), ("baseline", "0.2"), ("baseline", 0), ("baseline", -1),
+        ("baseline", float("inf")), ("doffs", None), ("doffs", float("nan")), ("hole_value", "0"),
+        ("hole_value", None), ("width", True), ("width", float("nan")), ("height", 10**400), ("depth_unit", 10**400),
+        ("depth_unit", "cm"), ("depth_unit", 0), ("depth_unit", -1), ("depth_unit", None), ("depth_unit", True),
+        ("depth_unit", float("nan")), ("basline", 0.2),
+    ],
+)  # fmt: skip
+def test_camera_file_with_an_invalid_value_is_refused_by_its_key(tmp_path, key, value):
+    with pytest.raises(ValueError, match=rf"camera\.json: (camera )?{key}: ") as caught:
+        read_camera(camera_file(tmp_path, **{key: value}))
+    assert "\n" not in str(caught.value)

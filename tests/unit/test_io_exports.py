@@ -12,7 +12,16 @@ import trimesh
 from dsr.geometry.camera import Camera
 from dsr.geometry.mesh import triangulate, vertex_normals
 from dsr.geometry.surface import depth_to_normals, render
-from dsr.io.exports import Written, write_cloud, write_mesh, write_normals, write_renderings
+from dsr.io.exports import (
+    LONGEST,
+    Written,
+    read_input,
+    write_cloud,
+    write_input,
+    write_mesh,
+    write_normals,
+    write_renderings,
+)
 from dsr.io.glb import write_glb
 
 CAMERA = Camera(24, 18, 30, 30, 11.5, 8.5)
@@ -203,3 +212,26 @@ def test_map_without_two_neighbours_is_refused_and_an_older_file_is_kept(tmp_pat
     assert (tmp_path / "m.glb").read_text() == "old"
     triangulate(depth, CAMERA, isolated=True)
     assert write_cloud(tmp_path / "c.ply", photo(), depth, CAMERA) == Written(1, 1)
+
+
+@pytest.fixture
+def stored(tmp_path):
+    v, u = np.mgrid[:48, :64]
+    rgb = torch.from_numpy(np.stack([u / 64, v / 48, 0 * u + 0.5])).float()
+    depth = torch.linspace(1, 4, 12 * 16).reshape(1, 12, 16)
+    depth[0, 3, 4] = torch.nan
+    write_input(tmp_path / "input.npz", rgb, depth)
+    return tmp_path / "input.npz", rgb, depth
+
+
+def test_input_is_read_back(stored):
+    path, rgb, depth = stored
+    photo, read = read_input(path)
+    np.testing.assert_array_equal(read, depth[0].numpy())
+    assert photo.shape == (48, 64, 3)
+    assert np.abs(photo - 255 * rgb.permute(1, 2, 0).numpy()).mean() < 2  # a JPEG, red first
+
+
+def test_large_photos_are_stored_smaller(tmp_path):
+    write_input(tmp_path / "input.npz", torch.rand(3, 30, 2 * LONGEST), torch.ones(1, 2, 2))
+    assert read_input(tmp_path / "input.npz")[0].shape == (15, LONGEST, 3)

@@ -13,7 +13,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
-from zipfile import BadZipFile
 
 import lightning
 import torch
@@ -62,7 +61,7 @@ from dsr.utils.guards import did_you_mean
 from dsr.utils.lightning import ScoreTables, StepProgress, fit, make_trainer, without_chatter
 from dsr.utils.progress import Progress
 from dsr.utils.runs_table import list_run
-from dsr.utils.torch_files import expect_stored, read_torch_file
+from dsr.utils.torch_files import read_torch_file
 
 MONITOR = "val/RMSE_v"
 _LARGEST_SEED = 2**32 - 1
@@ -161,10 +160,6 @@ def _read(config: DictConfig, *, here: bool = True) -> tuple[dict[str, Any], Tra
                 f"resume: continues with the run's own configuration; {', '.join(others)} cannot be changed"
             )
         before = read_config(folder, plain["trust"])
-        try:
-            expect_stored(folder / _LAST)
-        except (ValueError, OSError, BadZipFile) as error:
-            raise ConfigError(f"resume: {error}") from error
         device = {"device": plain["device"]} if "device" in given_keys() else {}
         plain = {**before, **device, "resume": None, "output_dir": str(folder), "overwrite": False, "trust": None}
     settings = TrainConfig.of(plain)

@@ -8,7 +8,7 @@
                                              of view, disparity in its own pixels
               depth_lr4.*, disparity_lr4.*   the same, whose size has to be that of the factor in its name, here 4
 
-Depth and disparity follow ``camera.json``; see :func:`dsr.io.images.read_camera` for its keys.
+Depth and disparity follow ``camera.json``; see :func:`dsr.io.cameras.read_camera` for its keys.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ from torch import Tensor
 from dsr.data.frame_files import expect_size
 from dsr.data.scene_source import WITHOUT_OFFSET, SceneSelection, SceneSource, select_scenes
 from dsr.geometry.camera import Camera, RangeType, from_range
-from dsr.io.images import MAP_SUFFIXES, CameraFile, read_camera, read_map, read_mask, read_rgb
+from dsr.io.cameras import CameraFile, read_camera
+from dsr.io.images import MAP_SUFFIXES, read_map, read_mask, read_rgb
 from dsr.sample import Scene, expect_distances
 from dsr.utils.guards import natural_key, opened, pixels_beside
 from dsr.utils.ratios import fits_ratio, round_ratio

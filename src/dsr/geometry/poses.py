@@ -68,9 +68,9 @@ def orthonormal_error(turn: np.ndarray) -> float:
         return float(np.abs(turn @ turn.T - np.eye(3)).max())
 
 
-def is_rotation(turn: np.ndarray, tolerance: float) -> bool:
-    """Return whether a matrix, (3, 3), is a rotation to within a tolerance of :func:`orthonormal_error`."""
-    return orthonormal_error(turn) <= tolerance and float(np.linalg.det(turn)) > 0
+def is_rotation(turn: np.ndarray) -> bool:
+    """Return whether a matrix, (3, 3), is a rotation, of the decimals that files have."""
+    return orthonormal_error(turn) <= _TOLERANCE and float(np.linalg.det(turn)) > 0
 
 
 def from_quaternion(translation: Sequence[float], quaternion: Sequence[float], name: str) -> Matrix:

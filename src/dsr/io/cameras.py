@@ -7,48 +7,58 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
-from pydantic import BaseModel, Field
+from pydantic import AliasChoices, BaseModel, BeforeValidator, Field
 from torch import Tensor
 
 from dsr.geometry.camera import ASSUMED_FOV, Camera, RangeType, expect_intrinsics
 from dsr.geometry.plausible import implausible_distance, judge_camera, may_be_of, plausible_baseline
 from dsr.geometry.resampling import registered_camera, warp_depth
 from dsr.io.frames import Rig
-from dsr.io.images import CameraFile, Pixels, pixels_in_header, read_camera
+from dsr.io.images import Pixels, pixels_in_header
 from dsr.io.photos import Size, focal_in_exif, orientation_of, same_aspect
 from dsr.io.reading import CameraChoice, RigFiles
 from dsr.io.trajectories import intrinsics_camera, read_transform
 from dsr.notes import Assumption
 from dsr.utils.guards import naming, numbers_in, parse_json, read_text, refusing, split_numbers
 from dsr.utils.progress import show_length
-from dsr.utils.validation import parse_model
+from dsr.utils.validation import Number, parse_model
 
-_FOCAL_OF_ONE = 20
-"""Focal length in widths of the picture, which no lens of a photo with depth has."""
-_FILM_DIAGONAL = math.hypot(36, 24)
-"""Diagonal of 35 mm film in millimetres, to which equivalent focal lengths refer (CIPA DCG-001)."""
-_SAMPLE = 100_000
-"""Largest number of pixels that percentiles are taken of."""
+_FOCAL_OF_ONE = 20  # focal length in widths of the picture, which no lens of a photo with depth has
+_FILM_DIAGONAL = math.hypot(
+    36, 24
+)  # of 35 mm film in millimetres, which equivalent focal lengths refer to (CIPA DCG-001)
+_SAMPLE = 100_000  # depths that percentiles are taken of
+_METRES = {"m": 1.0, "mm": 1e-3}
+
+
+@dataclass(frozen=True)
+class CameraFile:
+    """The content of a camera file.
+
+    Args:
+        camera: in pixels and metres.
+        range_type: how the maps beside it count; None if it is not stated.
+        depth_unit: metres per value in depth files; None if it is not stated.
+        hole_value: the value that stands for a hole in files that cannot hold NaN; None for none.
+
+    """
+
+    camera: Camera
+    range_type: RangeType | None = None
+    depth_unit: float | None = None
+    hole_value: float | None = None
 
 
 def find_camera(choice: CameraChoice, photo: Path, size: Size, size_lr: Size) -> tuple[CameraFile, list[Assumption]]:
     """Return the camera of a photo's pixels, with the depth encoding from its file, and the assumptions.
 
-    Args:
-        choice: what the user says about the camera.
-        photo: file of the photo, for its EXIF data.
-        size: size of the photo.
-        size_lr: size of the depth map, to which a matrix without an image size may belong.
-
-    Raises:
-        ValueError: the camera file is damaged, or its image has another aspect than the photo.
-
+    ``size_lr`` is the size of the depth map, to which a matrix without an image size may belong.
     """
     height, width = size
     if choice.file is not None:
@@ -73,14 +83,10 @@ def find_camera(choice: CameraChoice, photo: Path, size: Size, size_lr: Size) ->
 def read_any_camera(path: Path) -> CameraFile | np.ndarray:
     """Return the content of a camera file; for a matrix without an image size the matrix, (3, 3).
 
-    The formats are dsr's ``camera.json``; Open3D's JSON (``width``, ``height`` and ``intrinsic_matrix``, nine numbers
-    column by column, https://www.open3d.org/docs/release/python_api/open3d.camera.PinholeCameraIntrinsic.html);
-    MoGe's JSON (``fov_x`` and ``fov_y`` in degrees), a matrix for pictures of 1 x 1; YAML of OpenCV, ROS and RTAB-Map;
-    and text of 3 x 3 or 4 x 4 numbers, as SUN RGB-D and ScanNet have it, or of fx fy cx cy, as ETH3D has it.
-
-    Raises:
-        ValueError: the file has none of these formats.
-
+    The formats are those of :func:`read_camera`; Open3D's JSON (``width``, ``height`` and ``intrinsic_matrix``, nine
+    numbers column by column); MoGe's JSON (``fov_x`` and ``fov_y`` in degrees), a matrix for pictures of 1 x 1; YAML of
+    OpenCV, ROS and RTAB-Map; and text of 3 x 3 or 4 x 4 numbers, as SUN RGB-D and ScanNet have it, or of fx fy cx cy,
+    as ETH3D has it.
     """
     text = read_text(path)
     if "camera_matrix:" in text:
@@ -91,35 +97,109 @@ def read_any_camera(path: Path) -> CameraFile | np.ndarray:
         with refusing(f"{path}: expected fov_x and fov_y in degrees", ValueError, TypeError, KeyError, ArithmeticError):
             fx, fy = (0.5 / math.tan(math.radians(parse_json(text)[name]) / 2) for name in ("fov_x", "fov_y"))
             return expect_intrinsics(np.array([[fx, 0, 0.5], [0, fy, 0.5], [0, 0, 1]]))
-    return _open3d(path, text) if '"intrinsic_matrix"' in text else read_camera(path)
+    if '"intrinsic_matrix"' in text:
+        stored = parse_model(_Open3d, text, path)
+        with naming(path):
+            matrix = expect_intrinsics(np.array(stored.intrinsic_matrix).reshape(3, 3).T)
+            numbers = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
+            return CameraFile(Camera(stored.width, stored.height, *numbers))
+    return read_camera(path)
 
 
 def read_sized_camera(path: Path) -> Camera:
-    """Return the camera of a file that states the size of its image; see :func:`read_any_camera`.
-
-    Raises:
-        ValueError: the file has none of the formats, or is a matrix alone.
-
-    """
+    """Return the camera of a file that states the size of its image; see :func:`read_any_camera`."""
     content = read_any_camera(path)
     if isinstance(content, np.ndarray):
         raise ValueError(f"{path}: expected a camera with the size of its image, got a matrix: see Camera.from_matrix")
     return content.camera
 
 
+def read_camera(path: Path) -> CameraFile:
+    """Return the content of a ``camera.json`` of dsr, or a ``cam_params.json`` as NICE-SLAM's data sets have it."""
+    text = read_text(path)
+    if '"camera"' in text or any(f'"{name}"' in text for name in _SCALES):
+        params = (
+            parse_model(_NestedParams, text, path).camera if '"camera"' in text else parse_model(_Params, text, path)
+        )
+        with naming(path):
+            camera = Camera(params.w, params.h, params.fx, params.fy, params.cx, params.cy)
+        return CameraFile(camera, depth_unit=None if params.scale is None else 1 / params.scale)
+    entries = parse_model(_CameraJson, text, path).model_dump(exclude_unset=True, exclude_none=True)
+    if "baseline" in entries:
+        entries["baseline"] *= _METRES[entries.get("baseline_unit", "m")]
+    with naming(path):
+        camera = Camera(**{each.name: entries[each.name] for each in fields(Camera) if each.name in entries})
+    return CameraFile(camera, *map(entries.get, ("range_type", "depth_unit", "hole_value")))
+
+
+def _metres(unit: Any) -> Any:
+    """Return metres per value for the name of a unit, and anything else as it is."""
+    if not isinstance(unit, str):
+        return unit
+    if unit not in _METRES:
+        raise ValueError("m, mm or a positive number of metres per value")
+    return _METRES[unit]
+
+
+_Number = Annotated[Number, Field(ge=-1e12, le=1e12)]
+_SCALES = ("png_depth_scale", "scale")
+
+
+class _CameraJson(BaseModel, strict=True, extra="forbid"):
+    """A ``camera.json`` as it is stored; keys that it lacks do not get the defaults."""
+
+    width: Pixels
+    height: Pixels
+    fx: _Number
+    fy: _Number
+    cx: _Number
+    cy: _Number
+    range_type: RangeType | None = None
+    baseline: _Number | None = None
+    baseline_unit: Literal["m", "mm"] = "m"
+    doffs: _Number = 0.0
+    depth_unit: Annotated[_Number, Field(gt=0), BeforeValidator(_metres)] = 1.0
+    hole_value: _Number = 0.0
+
+
+class _Params(BaseModel, strict=True):
+    """NICE-SLAM's ``cam_params.json``; the scale is the number of values in a metre."""
+
+    w: Pixels = Field(validation_alias=AliasChoices("w", "W", "width"))
+    h: Pixels = Field(validation_alias=AliasChoices("h", "H", "height"))
+    fx: _Number
+    fy: _Number
+    cx: _Number
+    cy: _Number
+    scale: Annotated[_Number, Field(ge=1)] | None = Field(None, validation_alias=AliasChoices(*_SCALES))
+
+
+class _NestedParams(BaseModel, strict=True):
+    """The same under the key ``camera``."""
+
+    camera: _Params
+
+
+class _Open3d(BaseModel, strict=True):
+    """https://www.open3d.org/docs/release/python_api/open3d.camera.PinholeCameraIntrinsic.html."""
+
+    width: Pixels
+    height: Pixels
+    intrinsic_matrix: Annotated[list[float], Field(min_length=9, max_length=9)]
+
+
 def camera_only(camera: Camera) -> CameraFile:
     """Return a camera file that says nothing about depth."""
-    return CameraFile(camera, None, None, None)
+    return CameraFile(camera)
 
 
 def _fit_to_photo(
     path: Path, content: CameraFile | np.ndarray, size: Size, size_lr: Size, photo: Path
 ) -> tuple[CameraFile, list[Assumption]]:
     """Return the camera of a file for the pixels of the photo, and the assumptions."""
+    assumptions: list[Assumption] = []
     if isinstance(content, np.ndarray):
         content, assumptions = _camera_of_matrix(path, content, size, size_lr)
-    else:
-        assumptions = []
     camera, orientation = content.camera, 1
     across = not same_aspect((camera.height, camera.width), size) and same_aspect((camera.width, camera.height), size)
     if across and pixels_in_header(photo) != size:
@@ -135,16 +215,7 @@ def _fit_to_photo(
 
 
 def scale_to_photo(path: Path, content: CameraFile, size: Size) -> tuple[CameraFile, list[Assumption]]:
-    """Return a camera scaled to the photo's (height, width), and the assumptions.
-
-    Args:
-        path: file that the camera comes from, for the message.
-        size: of the photo.
-
-    Raises:
-        ValueError: the camera's image has another aspect than the photo.
-
-    """
+    """Return a camera scaled to the photo's (height, width), and the assumptions; ``path`` is for the message."""
     height, width = size
     camera = content.camera
     if (camera.height, camera.width) == size:
@@ -200,32 +271,10 @@ def _of_yaml(path: Path, text: str) -> CameraFile:
     return camera_only(intrinsics_camera(str(path), size, (fx, fy, cx, cy)))
 
 
-class _Open3d(BaseModel, strict=True):
-    """Open3D's JSON."""
-
-    width: Pixels
-    height: Pixels
-    intrinsic_matrix: Annotated[list[float], Field(min_length=9, max_length=9)]
-
-
-def _open3d(path: Path, text: str) -> CameraFile:
-    """Return the camera of Open3D's JSON."""
-    stored = parse_model(_Open3d, text, path)
-    with naming(path):
-        matrix = expect_intrinsics(np.array(stored.intrinsic_matrix).reshape(3, 3).T)
-    return camera_only(Camera(stored.width, stored.height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
-
-
 def read_rig(files: RigFiles, size_lr: Size, baseline: float | None) -> Rig:
-    """Read the description of a rig.
+    """Read the camera of a depth map of ``size_lr`` = (height, width), and its transform to the photo's camera.
 
-    Args:
-        size_lr: height and width of the depth map.
-        baseline: distance in metres between the two cameras of disparities, if the map has such.
-
-    Raises:
-        ValueError: a file is missing or damaged, or the camera is one of another aspect than the depth map.
-
+    ``baseline``: metres between the two cameras of disparities, if the map has such.
     """
     height, width = size_lr
     content = read_any_camera(files.camera)
@@ -239,12 +288,7 @@ def read_rig(files: RigFiles, size_lr: Size, baseline: float | None) -> Rig:
 
 
 def scale_to_depth(place: str, camera: Camera, size_lr: Size) -> Camera:
-    """Return a depth camera scaled to the depth map's (height, width).
-
-    Raises:
-        ValueError: it is one of another aspect; the message begins with ``place``.
-
-    """
+    """Return a depth camera scaled to the depth map's (height, width); a message begins with ``place``."""
     height, width = size_lr
     if not same_aspect((camera.height, camera.width), size_lr):
         raise ValueError(
@@ -255,20 +299,9 @@ def scale_to_depth(place: str, camera: Camera, size_lr: Size) -> Camera:
 
 
 def to_photo(depth_lr: Tensor, rig: Rig, photo: Camera, place: str) -> tuple[Tensor, Assumption]:
-    """Return a depth camera's map as the photo's camera sees it, and a note.
+    """Return a depth camera's map, (1, h, w) in metres, as the photo's camera sees it, (1, h', w'), and a note.
 
-    Args:
-        depth_lr: (1, h, w) orthogonal depth in metres, NaN in holes.
-        rig: the depth camera.
-        photo: the photo's camera.
-        place: what states the transform, with which the message begins.
-
-    Returns:
-        (1, h', w') as fine as the depth map is, in the photo's field of view.
-
-    Raises:
-        ValueError: the photo shows nothing of the map.
-
+    It is as fine as the depth map is, in the photo's field of view; a message begins with ``place``.
     """
     target = registered_camera(rig.camera, photo)
     warped = warp_depth(depth_lr[None], rig.camera, torch.from_numpy(rig.transform)[None], target)[0]
@@ -282,14 +315,7 @@ def to_photo(depth_lr: Tensor, rig: Rig, photo: Camera, place: str) -> tuple[Ten
 
 
 def doubt_camera(camera: Camera, whose: str, size_lr: tuple[int, int] | None = None) -> list[Assumption]:
-    """Return warnings of a camera.
-
-    Args:
-        camera: the camera.
-        whose: what it is, such as ``camera``.
-        size_lr: (height, width) of the depth map, whose intrinsics may have been given for the photo's.
-
-    """
+    """Return warnings of a camera, of the depth map's (height, width) if its intrinsics may have been given for it."""
     found = (each for each in judge_camera(camera, size_lr) if each.level != "note")
     return [
         Assumption(f"{whose}: {each.kind}", f"{each.message}; {each.advice}", each.code, each.value) for each in found
@@ -299,11 +325,8 @@ def doubt_camera(camera: Camera, whose: str, size_lr: tuple[int, int] | None = N
 def doubt_depth(depth_lr: Tensor, camera: Camera, range_type: RangeType) -> list[Assumption]:
     """Return warnings of distances that no room or table has, and of a baseline that no two cameras have.
 
-    Args:
-        depth_lr: (1, h, w) orthogonal depth in metres, NaN in holes.
-        camera: that of its pixels.
-        range_type: what it was read as; a strange baseline is right if disparities become plausible depth with it.
-
+    ``range_type``: what the map, (1, h, w) in metres, was read as. A strange baseline is right if disparities become
+    plausible depth with it.
     """
     known = depth_lr[depth_lr.isfinite()]
     known = known[:: -(-known.numel() // _SAMPLE)]

@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Mapping
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -19,38 +18,28 @@ from dsr.io.images import expect_depth_values, read_array, read_numbers
 from dsr.utils.arrays import array_headers, read_arrays
 from dsr.utils.decoding import QUIET_DECODERS
 from dsr.utils.files import replacing
-from dsr.utils.guards import MOST_PIXELS, bytes_of_archive, expect_bytes, expect_pixels, refusing
+from dsr.utils.guards import expect_pixels, refusing
 
-DEPTH_SUFFIXES = (".png", ".tiff", ".tif", ".npy", ".npz", ".pfm", ".exr")
-"""Of the formats that are read and written."""
+DEPTH_SUFFIXES = (".png", ".tiff", ".tif", ".npy", ".npz", ".pfm", ".exr")  # that are read and written
 ICL_CAMERA = Camera(640, 480, 481.2, -480.0, 319.5, 239.5)
-ICL_SUFFIX = ".depth"
-"""Of ICL-NUIM's text, distances along the rays in centimetres, :mod:`dsr.data.icl`."""
+ICL_SUFFIX = ".depth"  # of ICL-NUIM's text, distances along the rays in centimetres, :mod:`dsr.data.icl`
 READ_SUFFIXES = (*DEPTH_SUFFIXES, ICL_SUFFIX)
 _STORABLE = {
     ".png": ("uint16",),
     ".tiff": ("uint16", "int16", "int32", "uint32", "float32", "float64"),
     ".pfm": ("float32",),
     ".exr": ("float16", "float32", "uint32"),
-}
-"""Types of value by file format; NumPy's formats take any."""
+}  # types of value by file format; NumPy's formats take any
+# Tags of TIFF (Adobe, TIFF 6.0, section 14, and Technical Notes 2 and 3): the compression, 8 for Deflate, and what it
+# is applied to, differences of whole numbers (2) or of the bytes of floats, all first ones of a row before others (3).
 _COMPRESSION, _PREDICTOR = cv2.IMWRITE_TIFF_COMPRESSION, 317
-"""Tags of TIFF (Adobe, TIFF 6.0, section 14, and Technical Notes 2 and 3): the compression, 8 for Deflate, and what it
-is applied to, differences of whole numbers (2) or of the bytes of floats, all first ones of a row before others (3)."""
 
 
 def read_depth_file(path: Path, most: int | None = None) -> np.ndarray:
     """Return a map as it is stored, (H, W), floats or whole numbers of 16 bits or more in this machine's byte order.
 
     Of an OpenEXR file the channel named Z or depth is taken (of any layer), else Y, else the only one, else R; of an
-    ``.npz`` file the array named depth, else the only one.
-
-    Args:
-        most: largest number of pixels; None for what the size of the file explains.
-
-    Raises:
-        ValueError: it is missing, damaged, too large, of another format or shape, or has 8-bit values.
-
+    ``.npz`` file the array named depth, else the only one. ``most``: pixels it may have.
     """
     suffix = path.suffix.lower()
     if suffix not in READ_SUFFIXES:
@@ -68,27 +57,18 @@ def read_depth_file(path: Path, most: int | None = None) -> np.ndarray:
 
 
 def read_array_file(path: Path, most: int | None = None) -> np.ndarray:
-    """Return the array of an NPY, NPZ, PFM or OpenEXR file, of any type and shape; see :func:`read_depth_file`.
-
-    Raises:
-        ValueError: it is missing, damaged or too large.
-
-    """
+    """Return the array of an NPY, NPZ, PFM or OpenEXR file, or a picture, of any type and shape."""
     readers = {".exr": _read_exr, ".npz": _read_npz}
-    return readers.get(path.suffix.lower(), read_array)(path, most)
+    if path.suffix.lower() not in readers:
+        return read_array(path, most)
+    values = readers[path.suffix.lower()](path)
+    if most is not None and values.ndim > 1:
+        expect_pixels(path, values.shape[0], values.shape[1], most)
+    return values
 
 
 def write_depth_file(path: Path, values: np.ndarray) -> None:
-    """Write a map as it is, atomically, in the format that the suffix names.
-
-    Args:
-        path: with one of :data:`DEPTH_SUFFIXES`.
-        values: (H, W), of a type that :func:`can_hold` says the format has.
-
-    Raises:
-        ValueError: the format cannot hold values of this type.
-
-    """
+    """Write a map, (H, W), as it is, atomically, in the format that the suffix names, one of those above."""
     suffix = path.suffix.lower()
     if not can_hold(suffix, values.dtype):
         raise ValueError(f"{path}: expected {' or '.join(_STORABLE[_format(suffix)])} values, got {values.dtype}")
@@ -127,73 +107,55 @@ def _format(suffix: str) -> str:
     return ".tiff" if suffix == ".tif" else suffix
 
 
-def _read_npz(path: Path, most: int | None) -> np.ndarray:
+def _read_npz(path: Path) -> np.ndarray:
     """Return the array named depth, or the only one."""
     names = sorted(array_headers(path))
     if len(names) != 1 and "depth" not in names:
         raise ValueError(f"{path}: expected one array, or one named depth; got {', '.join(names) or 'none'}")
     name = names[0] if len(names) == 1 else "depth"
-    return read_arrays(path, (name,), None if most is None else 8 * most)[name]
+    return read_arrays(path, (name,))[name]
 
 
-def _read_exr(path: Path, most: int | None) -> np.ndarray:
+def _read_exr(path: Path) -> np.ndarray:
     """Return the depth channel of an OpenEXR file; see https://openexr.com/en/latest/StandardOptions.html."""
     import OpenEXR  # noqa: PLC0415 - only where somebody has such a file
 
-    def read(*, header: bool) -> list[Any]:
-        # damaged files raise RuntimeError, ValueError, MemoryError, ..., and print on both streams
-        with refusing(f"{path}: expected an OpenEXR file, got a damaged or foreign one", Exception):
-            quiet = contextlib.redirect_stdout(io.StringIO())
-            with QUIET_DECODERS, quiet, OpenEXR.File(str(path), separate_channels=True, header_only=header) as file:
-                if header:
-                    return [_exr_windows(part.header) for part in file.parts]
-                return [
-                    (name, (channel.pixels, number))
-                    for number in reversed(range(len(file.parts)))
-                    for name, channel in file.channels(number).items()
-                ]
-
-    most = MOST_PIXELS if most is None else most
-    parts = read(header=True)
-    for window, display, _ in parts:
-        for rows, columns in (window, display):
-            expect_pixels(path, len(rows), len(columns), most)
-    expect_bytes(path, sum(size for *_, size in parts), bytes_of_archive(path.stat().st_size))
-    channels = dict(read(header=False))
-    values, part = channels[_depth_channel(path, channels)]
-    (rows, columns), display, _ = parts[part]
-    if (rows, columns) == display or values.shape != (len(rows), len(columns)) or 0 in map(len, display):
+    channels, windows = {}, {}
+    # damaged files raise RuntimeError, ValueError, MemoryError, ..., and print on both streams
+    with refusing(f"{path}: expected an OpenEXR file, got a damaged or foreign one", Exception):
+        quiet = contextlib.redirect_stdout(io.StringIO())
+        with QUIET_DECODERS, quiet, OpenEXR.File(str(path), separate_channels=True) as file:
+            for number in reversed(range(len(file.parts))):
+                corners = (file.parts[number].header[name] for name in ("dataWindow", "displayWindow"))
+                ends = [(least.astype(int).tolist(), most.astype(int).tolist()) for least, most in corners]
+                for name, channel in file.channels(number).items():
+                    channels[name], windows[name] = channel.pixels, ends
+    chosen = _depth_channel(path, channels)
+    values = channels[chosen]
+    # rows and columns of the pixels that are stored, and of those that are shown
+    stored, shown = ([range(least[axis], most[axis] + 1) for axis in (1, 0)] for least, most in windows[chosen])
+    if stored == shown or values.shape != tuple(map(len, stored)) or 0 in map(len, shown):
         return values
-    shown = np.full([len(each) for each in display], np.nan if values.dtype.kind == "f" else 0, values.dtype)
-    inside = [np.isin(each, there) for each, there in zip(display, (rows, columns), strict=True)]
-    within = [np.isin(each, there) for each, there in zip((rows, columns), display, strict=True)]
-    shown[np.ix_(*inside)] = values[np.ix_(*within)]
-    return shown
+    expect_pixels(path, len(shown[0]), len(shown[1]))
+    whole = np.full([len(each) for each in shown], np.nan if values.dtype.kind == "f" else 0, values.dtype)
+    inside = [np.isin(each, there) for each, there in zip(shown, stored, strict=True)]
+    within = [np.isin(each, there) for each, there in zip(stored, shown, strict=True)]
+    whole[np.ix_(*inside)] = values[np.ix_(*within)]
+    return whole
 
 
-def _exr_windows(header: Mapping[str, Any]) -> tuple[tuple[range, range], tuple[range, range], int]:
-    """Return rows and columns of a part's data and display, and bytes of its channels, or of its tiles if larger."""
-    windows = []
-    for name in ("dataWindow", "displayWindow"):
-        (left, top), (right, bottom) = (corner.astype(int).tolist() for corner in header[name])
-        windows.append((range(top, bottom + 1), range(left, right + 1)))
-    tile = header.get("tiles")
-    pixels = max(len(windows[0][0]) * len(windows[0][1]), 0 if tile is None else int(tile.xSize) * int(tile.ySize))
-    return windows[0], windows[1], 4 * len(header["channels"]) * pixels
-
-
-def _depth_channel(path: Path, channels: Mapping[str, np.ndarray]) -> str:
+def _depth_channel(path: Path, channels: Iterable[str]) -> str:
     """Return which channel holds depth."""
     last = {name: name.rpartition(".")[2].lower() for name in sorted(channels)}
     for wanted in ("z", "depth", "y"):
         found = [name for name, short in last.items() if short == wanted]
         if found:
             return min(found, key=len)
-    if len(channels) == 1:
-        return next(iter(channels))
-    if "R" in channels:
+    if len(last) == 1:
+        return next(iter(last))
+    if "R" in last:
         return "R"
-    raise ValueError(f"{path}: expected a channel named Z, Y or R, got {', '.join(sorted(channels)) or 'none'}")
+    raise ValueError(f"{path}: expected a channel named Z, Y or R, got {', '.join(last) or 'none'}")
 
 
 def _write_exr(path: Path, values: np.ndarray) -> None:

@@ -13,13 +13,12 @@ from dsr.geometry.camera import Camera, RangeType, from_range, to_range
 from dsr.notes import Assumption
 from dsr.sample import FARTHEST, NEAREST
 
+# Whole numbers of 16 bits from the first on are a sensor's end, not a distance, if there are none from the second on up
+# to it.
 _FULL, _NEARLY_FULL = 65000, 50000
-"""Whole numbers of 16 bits from the first on are a sensor's end, not a distance, if there are none from the second on
-up to it."""
+# usual marks of holes and of a renderer's far plane, in steps of 1, 10, 100, 1000 or 5000 to the unit of a map
 _FAR_MARKS = (*(10**k - 1 for k in (4, 5, 6)), *(2**k - 1 for k in range(12, 17)), 65504)
-"""Usual marks of holes and of a renderer's far plane, in steps of 1, 10, 100, 1000 or 5000 to the unit of a map."""
-_MANY, _SHARE = 4, 1e-4
-"""Pixels, and share of the map, that at least have a mark, and have none."""
+_MANY, _SHARE = 4, 1e-4  # pixels, and share of the map, that at least have a mark, and have none
 
 
 @dataclass(frozen=True)
@@ -47,17 +46,7 @@ IN_METRES = Encoding(".tiff", "float32", 1.0, math.nan, "orthogonal")
 
 
 def turn_back_bits(name: str, values: np.ndarray, bits: int) -> np.ndarray:
-    """Return values of 16 bits that were turned to the left, turned back.
-
-    Args:
-        name: name of the file, for the error.
-        values: (h, w) uint16 as stored.
-        bits: how far they were turned.
-
-    Raises:
-        ValueError: they have not 16 bits.
-
-    """
+    """Return values (h, w) of 16 bits that were turned to the left, turned back; a message begins with ``name``."""
     if values.dtype != np.uint16:
         raise ValueError(f"{name}: expected 16-bit values for --depth-unit sunrgbd, got {values.dtype}")
     return (values >> bits) | (values << (16 - bits))
@@ -70,19 +59,15 @@ def find_holes(
 
     Whole numbers are holes at 0 and at the largest number of their type, those of 16 bits also from 65000 on if the
     next smaller one is below 50000, floats at 0, below 0, at NaN and at infinity, and both at ``hole_value`` and at
-    :func:`far_marks`.
-
-    Args:
-        values: (h, w) as stored.
-        hole_value: additional value of holes; None for none.
-        above: what far marks are larger than: the largest disparity, infinity for none.
-
+    :func:`far_marks` above the largest disparity, or infinity for none of them.
     """
     if values.dtype.kind in "iu":
         largest = np.iinfo(values.dtype).max
         kinds = {"0": values == 0, "below 0": values < 0, str(largest): values == largest}
         if values.dtype == np.uint16:
-            kinds[f"{_FULL} or more"] = _at_sensors_end(values)
+            full = (values >= _FULL) & (values < largest)
+            others = values[values < _FULL]
+            kinds[f"{_FULL} or more"] = full & bool(others.size and 0 < others.max() < _NEARLY_FULL)
     else:
         kinds = {
             "0": values == 0,
@@ -137,13 +122,6 @@ def expect_known(name: object, values: np.ndarray, holes: np.ndarray) -> None:
         raise ValueError(f"{name}: expected at least one known pixel, {what if negative else 'all are holes'}")
 
 
-def _at_sensors_end(values: np.ndarray) -> np.ndarray:
-    """Return where values of 16 bits, but for the largest, are beyond any distance that the map has."""
-    full = (values >= _FULL) & (values < np.iinfo(np.uint16).max)
-    others = values[values < _FULL]
-    return full & bool(others.size and 0 < others.max() < _NEARLY_FULL)
-
-
 def _mark(values: np.ndarray, found: dict[str, float], hole_value: float | None) -> float:
     """Return the value that most holes have."""
     if hole_value:
@@ -158,14 +136,7 @@ def decode(values: np.ndarray, holes: np.ndarray, encoding: Encoding, camera: Ca
     """Return orthogonal depth in metres, (1, h, w) float32, NaN in holes and where a distance is none.
 
     That is what lies beyond :data:`dsr.sample.NEAREST` and :data:`dsr.sample.FARTHEST`: the sky of renderings, which
-    Blender writes as 1e10 m, and disparities of 0.
-
-    Args:
-        values: (h, w) stored values.
-        holes: (h, w) bool, where depth is missing.
-        encoding: how the values are stored.
-        camera: camera of these pixels.
-
+    Blender writes as 1e10 m, and disparities of 0. ``values``: (h, w) as stored; ``camera``: of these pixels.
     """
     known = np.where(holes, np.nan, values.astype(np.float64)) * encoding.unit
     depth = from_range(torch.from_numpy(known)[None], camera, encoding.range_type)
@@ -175,13 +146,7 @@ def decode(values: np.ndarray, holes: np.ndarray, encoding: Encoding, camera: Ca
 def encode(depth: Tensor, encoding: Encoding, camera: Camera) -> tuple[np.ndarray, int]:
     """Return the values that a file stores, and the number of valid pixels outside their range, which become holes.
 
-    Whole numbers are rounded to the nearest.
-
-    Args:
-        depth: (1, H, W) orthogonal depth in metres, NaN in holes.
-        encoding: how the values are to be stored.
-        camera: camera of these pixels.
-
+    Whole numbers are rounded to the nearest. ``depth``: (1, H, W) orthogonal in metres, NaN in holes.
     """
     values = to_range(depth.double(), camera, encoding.range_type)[0].cpu().numpy() / encoding.unit
     dtype, known = np.dtype(encoding.dtype), np.isfinite(values)

@@ -1,10 +1,8 @@
 """What is written beside an upsampled depth map: renderings, normals, a cloud and a mesh, and the input.
 
 A PLY file has points in the camera frame: x right, y down, z forward. glTF has y up and +z towards the viewer (Khronos,
-glTF 2.0 specification, section 3.4), so y and z change their signs there, which is a rotation about x by 180 degrees.
-
-The input may be moved, and what was read of it (its unit, holes, registration) is not in the file alone. With a copy of
-the depth map as it was read, and of the photo, a result can be looked at anywhere.
+glTF 2.0 specification, section 3.4). The input, a copy of the depth map as it was read and of the photo, lets a result
+be looked at anywhere: its unit, holes and registration are not in the user's file alone.
 """
 
 from __future__ import annotations
@@ -22,7 +20,6 @@ from dsr.geometry.camera import Camera
 from dsr.geometry.lights import LIGHT_NAMES
 from dsr.geometry.mesh import (
     QUADRIC,
-    Mesh,
     project,
     select_points,
     simplify,
@@ -34,26 +31,17 @@ from dsr.geometry.surface import depth_to_normals, render
 from dsr.io.glb import write_glb
 from dsr.io.photos import to_jpeg, write_png
 from dsr.sample import expect_distances
-from dsr.utils.arrays import array_headers, read_arrays
+from dsr.utils.arrays import read_arrays
 from dsr.utils.decoding import decode_pixels
 from dsr.utils.files import replacing
 from dsr.utils.guards import MOST_FACES, MOST_POINTS
 from dsr.utils.versions import how_to_install
 
-FLAT = "large triangles where the surface is flat"
-"""What makes a mesh smaller without a limit, see :mod:`dsr.geometry.mesh`."""
+FLAT = "large triangles where the surface is flat"  # which makes a mesh smaller without a limit
 CAMERA_FRAME = "camera frame: x right, y down, z forward; metres"
-
-_STRIP = 1 << 20
-"""Pixels whose normals are held in memory at a time."""
-
 INPUT = "input.npz"
-LONGEST = 2048
-"""Longest side of the stored photo in pixels."""
-_QUALITY = 90
-_MOST_BYTES = 64 << 20
-"""Largest photo that is decoded."""
-_MOST_PIXELS = 1 << 28
+LONGEST = 2048  # pixels of the longer side of the stored photo
+_STRIP = 1 << 20  # pixels whose normals are held in memory at a time
 
 
 def world_comment(up: str) -> str:
@@ -71,16 +59,9 @@ def write_ply(
     filled: np.ndarray | None = None,
     frame: str = CAMERA_FRAME,
 ) -> None:
-    """Write a binary PLY file atomically.
+    """Write a binary PLY file of points (N, 3), their colours (N, 3) uint8 and normals (N, 3), and faces (M, 3).
 
-    Args:
-        points: (N, 3) in metres.
-        colours: (N, 3) uint8, sRGB.
-        normals: (N, 3) unit vectors; None to leave them out.
-        faces: (M, 3) indices, counterclockwise from outside; None for a cloud.
-        filled: (N,) bool, whether the points were not measured: a property of that name; None to leave it out.
-        frame: what the file says of the frame of the points, and of the unit.
-
+    ``filled``, (N,) bool, whether points were not measured, is a property of that name; ``frame`` is a comment.
     """
     import trimesh  # noqa: PLC0415 - half a second that most results save
     from trimesh.exchange.ply import export_ply  # noqa: PLC0415
@@ -127,20 +108,7 @@ def normal_strips(depth: Tensor, camera: Camera) -> Iterator[tuple[slice, Tensor
 
 
 def write_renderings(folder: Path, depth: Tensor, camera: Camera) -> list[Path]:
-    """Write the renderings under the four lights as ``e1.png`` to ``e4.png``, 8 bits of grey, holes transparent.
-
-    Args:
-        folder: is made if need be.
-        depth: (1, H, W) orthogonal depth in metres, NaN in holes.
-        camera: of these pixels.
-
-    Returns:
-        The files.
-
-    Raises:
-        ValueError: the map is less than 2 pixels high or wide.
-
-    """
+    """Write the renderings of a map, (1, H, W), as ``e1.png`` to ``e4.png``, 8 bits of grey, holes transparent."""
     shades = np.zeros((len(LIGHT_NAMES), camera.height, camera.width), np.uint8)
     known = np.zeros(shades.shape[1:], bool)
     for rows, normals in normal_strips(depth, camera):
@@ -157,15 +125,6 @@ def write_normals(path: Path, depth: Tensor, camera: Camera) -> None:
 
     Red is x to the right, green is y up, blue is towards the viewer, each from -1 at 0 to 1 at 255: a wall that faces
     the camera is (128, 128, 255), as in the normal maps of modelling programs.
-
-    Args:
-        path: a PNG.
-        depth: (1, H, W) orthogonal depth in metres, NaN in holes.
-        camera: of these pixels.
-
-    Raises:
-        ValueError: the map is less than 2 pixels high or wide.
-
     """
     picture = np.zeros((camera.height, camera.width, 3), np.uint8)
     known = np.zeros(picture.shape[:2], bool)
@@ -186,17 +145,8 @@ def write_cloud(
 ) -> Written:
     """Write the known pixels as a coloured PLY cloud with normals, in metres; x right, y down, z forward.
 
-    Args:
-        path: a PLY.
-        rgb: (3, H, W) in [0, 1].
-        depth: (1, H, W) orthogonal depth in metres, NaN in holes.
-        camera: of these pixels.
-        most: points; of more, those in rows and columns at equal distances are taken.
-        filled: (1, H, W) bool, depth that was not measured: a property of the points.
-
-    Returns:
-        The numbers of points.
-
+    Of more than ``most`` points, those in rows and columns at equal distances are taken. ``filled``, (1, H, W) bool,
+    depth that was not measured, is a property of the points.
     """
     mesh = triangulate(depth, camera, isolated=True)
     chosen, normals = select_points(mesh, most, camera), vertex_normals(mesh)
@@ -230,12 +180,6 @@ def write_mesh(
         tolerance: see :func:`dsr.geometry.mesh.triangulate`.
         filled: (1, H, W) bool, where depth was not measured; a GLB file has it as the attribute ``_FILLED``.
 
-    Returns:
-        The numbers of triangles.
-
-    Raises:
-        ValueError: a suffix is another, or no two neighbours are known, so that there is nothing to write.
-
     """
     paths = [paths] if isinstance(paths, Path) else list(paths)
     for path in paths:  # before anything is written
@@ -246,7 +190,11 @@ def write_mesh(
         raise ValueError(f"{paths[0]}: expected neighbours of known depth to make a surface of, got none")
     before, how = mesh.dense, FLAT if len(mesh.faces) < mesh.dense else ""
     if len(mesh.faces) > most:
-        mesh, how = _reduce(mesh, depth, camera, most)
+        try:
+            mesh, how = simplify(mesh, most, camera), QUADRIC
+        except ImportError:
+            mesh, stride = thin(depth, camera, most)
+            how = f"a stride of {stride} pixels; {how_to_install('mesh')} simplifies and keeps more detail"
     normals, missing = vertex_normals(mesh), _at(filled, mesh.pixels)
     for path in paths:
         if path.suffix.lower() == ".ply":
@@ -255,15 +203,6 @@ def write_mesh(
             places, photo = project(mesh.vertices, camera), _bytes(rgb).transpose(1, 2, 0).copy()
             write_glb(path, mesh.vertices, normals, mesh.faces, places, photo, missing)
     return Written(before, len(mesh.faces), how)
-
-
-def _reduce(mesh: Mesh, depth: Tensor, camera: Camera, most: int) -> tuple[Mesh, str]:
-    """Return a mesh of fewer triangles, and what made them fewer."""
-    try:
-        return simplify(mesh, most, camera), QUADRIC
-    except ImportError:
-        thinned, stride = thin(depth, camera, most)
-        return thinned, f"a stride of {stride} pixels; {how_to_install('mesh')} simplifies and keeps more detail"
 
 
 def _at(mask: Tensor | None, pixels: np.ndarray) -> np.ndarray | None:
@@ -282,38 +221,22 @@ def _bytes(values: Tensor) -> np.ndarray:
 
 
 def write_input(path: Path, rgb: Tensor, depth_lr: Tensor) -> None:
-    """Write the input atomically: ``depth_lr`` (h, w) float32 in metres, NaN in holes, and ``photo``, a JPEG's bytes.
-
-    Args:
-        path: an ``.npz`` file.
-        rgb: (3, H, W) in [0, 1]; stored with its longer side at most :data:`LONGEST` pixels.
-        depth_lr: (1, h, w) orthogonal depth in metres, NaN in holes.
-
-    """
+    """Write the input: ``depth_lr`` (h, w) float32 in metres, NaN in holes, and ``photo``, the bytes of a JPEG."""
     pixels = (255 * rgb).round().clamp(0, 255).byte().permute(1, 2, 0).cpu().numpy()
-    photo = np.frombuffer(to_jpeg(pixels, LONGEST, _QUALITY), np.uint8)
+    photo = np.frombuffer(to_jpeg(pixels, LONGEST, 90), np.uint8)
     with replacing(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, depth_lr=depth_lr[0].float().cpu().numpy(), photo=photo)
 
 
 def read_input(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return the photo, (H, W, 3) uint8, and the depth map, (h, w) float32 in metres, NaN in holes.
-
-    Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: the file is damaged, or something else, or a depth is out of range.
-
-    """
-    headers = array_headers(path)
-    dimensions = {name: len(shape) for name, (shape, _) in headers.items()}
-    types = {name: str(dtype) for name, (_, dtype) in headers.items()}
-    if dimensions != {"depth_lr": 2, "photo": 1} or types != {"depth_lr": "float32", "photo": "uint8"}:
-        raise ValueError(f"{path}: expected depth_lr (h, w) float32 and photo (n,) uint8, got {headers}")
-    (height, width), (length,) = headers["depth_lr"][0], headers["photo"][0]
-    if min(height, width) < 2 or height * width > _MOST_PIXELS or length > _MOST_BYTES:
-        raise ValueError(f"{path}: expected a depth map of 2 x 2 pixels or more and a photo, got {headers}")
+    """Return the photo, (H, W, 3) uint8, and the depth map, (h, w) float32 in metres, NaN in holes."""
     arrays = read_arrays(path)
+    kinds = {name: (str(array.dtype), array.ndim) for name, array in arrays.items()}
+    if kinds != {"depth_lr": ("float32", 2), "photo": ("uint8", 1)}:
+        raise ValueError(f"{path}: expected depth_lr (h, w) float32 and photo (n,) uint8, got {kinds}")
     depth = arrays["depth_lr"]
+    if min(depth.shape) < 2:
+        raise ValueError(f"{path}: expected a depth map of 2 x 2 pixels or more, got {depth.shape}")
     expect_distances(str(path), torch.from_numpy(depth[np.isfinite(depth)]))
     photo = decode_pixels(path, arrays["photo"].tobytes(), cv2.IMREAD_COLOR, LONGEST**2)
     if photo is None:

@@ -18,6 +18,7 @@ from dsr.geometry.camera import ASSUMED_FOV, Camera, Lens, RangeType, undistort
 from dsr.geometry.plausible import expect_possible
 from dsr.geometry.resampling import registered_camera, warp_depth
 from dsr.io.cameras import (
+    CameraFile,
     camera_only,
     doubt_camera,
     doubt_depth,
@@ -31,7 +32,7 @@ from dsr.io.cameras import (
 from dsr.io.depth_files import ICL_CAMERA, ICL_SUFFIX, read_depth_file
 from dsr.io.encoding import Encoding, decode, expect_known, find_holes, turn_back_bits
 from dsr.io.frames import SLACK, Geometry, Rig
-from dsr.io.images import CameraFile, pixels_in_header, read_mask
+from dsr.io.images import pixels_in_header, read_mask
 from dsr.io.pairs import Pair, find_camera_file, role_of_words, words_of
 from dsr.io.photos import Size, model_in_exif, read_photo, same_aspect
 from dsr.io.reading import SUNRGBD_BITS, CameraChoice, Reading

@@ -3,26 +3,19 @@
 https://www.open3d.org/docs/release/tutorial/reconstruction_system/system_overview.html; the trajectory:
 http://redwood-data.org/indoor/fileformat.html.
 
-    color/000012.jpg, depth/000012.png     (or image/, rgb/) photos, and depth in 16-bit millimetres
-    camera_intrinsic.json                  or camera_primesense.json, intrinsic.json: width, height, intrinsic_matrix
+    color/000012.jpg, depth/000012.png     (or image/, rgb/) photos, and depth in 16-bit millimetres, 0 in holes
+    camera_intrinsic.json                  or camera_primesense.json, intrinsic.json: width, height, and column by
+                                           column intrinsic_matrix, with pixel centres at integers
     scene/trajectory.log                   or trajectory.log: for each frame a line of three whole numbers, and the four
                                            rows of the pose from camera (x right, y down, z forward) to world
 
 The n-th pose, by the first of the three numbers, is that of the n-th photo, by the numbers in the names.
-
-Depth is 16-bit PNG in millimetres, 0 in holes, which ``open3d.geometry.RGBDImage.create_from_color_and_depth`` takes
-with its default ``depth_scale=1000``; its ``depth_trunc`` leaves out what is beyond 3 m by default.
-Intrinsics are those of ``open3d.io.read_pinhole_camera_intrinsic``: ``intrinsic_matrix`` column by column, with pixel
-centres at integers. ``trajectory.log`` has a line of three numbers and a camera-to-world matrix for each frame, of a
-camera with x right, y down, z forward, as in dsr (https://www.open3d.org/docs/release, file formats and the
-reconstruction system).
 """
 
 from __future__ import annotations
 
 import functools
 import json
-import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -37,7 +30,7 @@ from dsr.io.photos import write_png
 from dsr.io.scene_files import RGBD, Frame, one_camera, to_millimetres
 from dsr.io.trajectories import check_pose, order_of
 from dsr.notes import Assumption
-from dsr.utils.files import replacing, write_text
+from dsr.utils.files import write_text
 from dsr.utils.guards import numbers_in, read_text
 
 _APP = "Open3D"
@@ -86,17 +79,9 @@ def _geometry(place: str, rows: _Rows, _: tuple[int, int]) -> Geometry:
 
 
 def write_rgbd(folder: Path, rgb: Tensor, depth: Tensor, camera: Camera) -> list[Assumption]:
-    """Write colour, depth and intrinsics of one frame: ``color.png``, ``depth.png`` and ``intrinsic.json``.
+    """Write ``color.png``, ``depth.png`` and ``intrinsic.json`` of one frame; note pixels that are too far for 16 bits.
 
-    Args:
-        folder: is created if it is missing.
-        rgb: (3, H, W) in [0, 1].
-        depth: (1, H, W) orthogonal depth in metres, NaN in holes.
-        camera: of these pixels.
-
-    Returns:
-        A note on pixels that are too far for 16-bit millimetres, if there are any.
-
+    ``rgb``: (3, H, W) in [0, 1]. ``depth``: (1, H, W) in metres, NaN in holes.
     """
     millimetres, lost = to_millimetres(depth[0].cpu().numpy())
     pixels = (rgb * 255).round().clamp(0, 255).byte().permute(1, 2, 0).cpu().numpy()
@@ -109,41 +94,26 @@ def write_rgbd(folder: Path, rgb: Tensor, depth: Tensor, camera: Camera) -> list
 
 
 def write_open3d(folder: Path, frames: Sequence[Frame]) -> list[Path]:
-    """Write a folder as Open3D's reconstruction system expects it.
+    """Write a folder as Open3D expects it, with a PNG for each frame in ``color/`` and ``depth/``.
 
-    ``color/`` and ``depth/`` have a PNG for each frame, ``intrinsic.json`` is the camera, or ``intrinsics/`` that of
-    each frame if they differ. ``trajectory.log`` has the poses, if all frames have one.
-
-    Args:
-        folder: is created if it is missing.
-        frames: one at least.
-
-    Returns:
-        The files.
-
+    ``intrinsic.json`` is the camera, or ``intrinsics/`` that of each frame if they differ. ``trajectory.log`` has the
+    poses, if all frames have one.
     """
-    files = []
-    for frame in frames:
+    files, rows = list[Path](), list[str]()
+    for number, frame in enumerate(frames):
         files += [folder / "color" / f"{frame.stem}.png", folder / "depth" / f"{frame.stem}.png"]
-        with replacing(files[-2]) as temporary:
-            shutil.copyfile(frame.colour, temporary)
-        write_png(files[-1], to_millimetres(frame.read_depth())[0])
+        frame.copy_colour(files[-2])
+        frame.write_millimetres(files[-1])
+        rows.append(f"{number} {number} {number + 1}\n")
+        rows += (" ".join(f"{value:.12g}" for value in row) + "\n" for row in frame.matrix)
     camera = one_camera(frames)
-    named = {frame.stem: frame.camera for frame in frames} if camera is None else {}
-    intrinsics = {folder / "intrinsics" / f"{stem}.json": each for stem, each in named.items()}
-    if camera is not None:
-        intrinsics = {folder / RGBD[2]: camera}
-    for path, each in intrinsics.items():
-        _write_intrinsics(path, each)
-    files += intrinsics
+    cameras = {f"intrinsics/{frame.stem}.json": frame.camera for frame in frames}
+    for name, each in (cameras if camera is None else {RGBD[2]: camera}).items():
+        files.append(folder / name)
+        _write_intrinsics(files[-1], each)
     if all(frame.pose is not None for frame in frames):
         files.append(folder / "trajectory.log")
-        lines = []
-        for number, frame in enumerate(frames):
-            rows = [] if frame.pose is None else frame.pose.tolist()
-            lines.append(f"{number} {number} {number + 1}\n")
-            lines += (" ".join(f"{value:.12g}" for value in row) + "\n" for row in rows)
-        write_text(files[-1], "".join(lines))
+        write_text(files[-1], "".join(rows))
     return files
 
 

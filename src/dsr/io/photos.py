@@ -11,7 +11,7 @@ import contextlib
 import io
 import struct
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,26 +25,28 @@ from dsr.utils.files import replacing
 from dsr.utils.guards import MOST_FILE, expect_pixels, read_limited, refusing
 from dsr.utils.versions import how_to_install
 
+HEIC_SUFFIXES = (".heic", ".heif")
 _MODEL, _ORIENTATION, _EXIF_IFD, _EXIF_FOCAL_35 = 0x0110, 0x0112, 0x8769, 0xA405
 _ASPECT_TOLERANCE = 0.02
-HEIC_SUFFIXES = (".heic", ".heif")
-_TURNS: dict[int, Callable[[np.ndarray], np.ndarray]] = {
-    2: lambda pixels: pixels[:, ::-1],
-    3: lambda pixels: pixels[::-1, ::-1],
-    4: lambda pixels: pixels[::-1],
-    5: lambda pixels: pixels.transpose(1, 0, 2),
-    6: lambda pixels: pixels.transpose(1, 0, 2)[:, ::-1],
-    7: lambda pixels: pixels[::-1, ::-1].transpose(1, 0, 2),
-    8: lambda pixels: pixels.transpose(1, 0, 2)[::-1],
-}
-"""Operations that turn a photo upright, by EXIF orientation."""
-_LEVEL = 6
-"""Compression of PNG files."""
-_BACK = {6: 8, 8: 6}
-"""Orientations whose operation undoes that of another one; the others undo themselves."""
+# What turns a photo upright, by EXIF orientation: whether its axes are exchanged, then the steps of rows and columns.
+_TURNS = {
+    1: (False, 1, 1), 2: (False, 1, -1), 3: (False, -1, -1), 4: (False, -1, 1),
+    5: (True, 1, 1), 6: (True, 1, -1), 7: (True, -1, -1), 8: (True, -1, 1),
+}  # fmt: skip
+_BACK = {6: 8, 8: 6}  # orientations whose operation undoes that of another one; the others undo themselves
+_IN_HEIC = {turn: orientation for orientation, turn in _TURNS.items()}
+_LEVEL = 6  # of the compression of PNG files
+# What pillow-heif raises of damaged files.
+_DAMAGED = (ValueError, RuntimeError, SyntaxError, EOFError, OSError, IndexError, MemoryError)
 
 Size = tuple[int, int]
 """Height and width in pixels."""
+
+
+def _turn(pixels: np.ndarray, orientation: int) -> np.ndarray:
+    """Return a photo, (H, W, 3), turned as an EXIF orientation says."""
+    exchange, rows, columns = _TURNS[orientation]
+    return (pixels.transpose(1, 0, 2) if exchange else pixels)[::rows, ::columns]
 
 
 def read_photo(path: Path, size_lr: Size) -> tuple[np.ndarray, list[Assumption]]:
@@ -52,7 +54,7 @@ def read_photo(path: Path, size_lr: Size) -> tuple[np.ndarray, list[Assumption]]
     orientation, found = orientation_of(path), list[Assumption]()
     if path.suffix.lower() in HEIC_SUFFIXES:
         turned = 1 if orientation == 1 else turned_in_heic(path)
-        pixels = _TURNS.get(_BACK.get(turned, turned), np.asarray)(read_heic(path))
+        pixels = _turn(read_heic(path), _BACK.get(turned, turned))
     else:
         pixels, found = read_colours(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if orientation == 1:
@@ -60,18 +62,13 @@ def read_photo(path: Path, size_lr: Size) -> tuple[np.ndarray, list[Assumption]]
     size: Size = (pixels.shape[0], pixels.shape[1])
     if orientation >= 5 and not same_aspect(size, size_lr) and same_aspect(size[::-1], size_lr):
         found.append(Assumption("the photo is turned by its EXIF data, as the depth map is"))
-        return _TURNS[orientation](pixels), found
+        return _turn(pixels, orientation), found
     found.append(Assumption("the photo's EXIF orientation is ignored: the depth map is assumed to fit it as stored"))
     return pixels, found
 
 
 def read_heic(path: Path) -> np.ndarray:
-    """Return the photo of a HEIC file, (H, W, 3) uint8 RGB, turned as :func:`turned_in_heic` says.
-
-    Raises:
-        ValueError: it is missing, damaged or grey, or pillow-heif is missing.
-
-    """
+    """Return the photo of a HEIC file, (H, W, 3) uint8 RGB, turned as :func:`turned_in_heic` says."""
     image = open_heic(path)
     pixels = decode_heic(path, image)
     if pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
@@ -81,14 +78,14 @@ def read_heic(path: Path) -> np.ndarray:
 
 def turned_in_heic(path: Path) -> int:
     """Return the EXIF orientation that says how the decoder turns the photo of a HEIC file, 1 (not at all) to 8."""
-    probe = np.arange(6).reshape(2, 3, 1)
-    turned = probe
+    exchange, rows, columns = _TURNS[1]
     for kind, value in _properties(read_limited(path, MOST_FILE)):
         if kind == b"irot":
-            turned = np.rot90(turned, value & 3)
+            for _ in range(value & 3):  # a quarter to the left
+                exchange, rows, columns = not exchange, -columns, rows
         elif kind == b"imir":
-            turned = turned[:, ::-1] if value & 1 else turned[::-1]
-    return next(each for each in range(1, 9) if np.array_equal(_TURNS.get(each, np.asarray)(probe), turned))
+            rows, columns = (rows, -columns) if value & 1 else (-rows, columns)
+    return _IN_HEIC[exchange, rows, columns]
 
 
 def _properties(content: bytes) -> Iterator[tuple[bytes, int]]:
@@ -131,10 +128,6 @@ def open_heic(path: Path) -> Any:
         return file[file.primary_index]
 
 
-_DAMAGED = (ValueError, RuntimeError, SyntaxError, EOFError, OSError, IndexError, MemoryError)
-"""What pillow-heif raises."""
-
-
 def decode_heic(path: Path, image: Any) -> np.ndarray:
     """Return the decoded pixels of an image of a HEIC file; ValueError if it is damaged or too large."""
     width, height = image.size
@@ -162,8 +155,6 @@ def model_in_exif(photo: Path) -> str:
 
 def _exif(photo: Path) -> dict[int, Any]:
     """Return the EXIF data of the photo, empty where there are none."""
-    from PIL import Image  # noqa: PLC0415 - it takes its time to import
-
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of data that are damaged
@@ -185,15 +176,9 @@ def orientation_of(photo: Path) -> int:
 
 
 def write_png(path: Path, picture: np.ndarray, known: np.ndarray | None = None) -> None:
-    """Write a picture atomically.
+    """Write a picture, grey (H, W) or blue-green-red (H, W, 3), uint8 or uint16, atomically.
 
-    Args:
-        picture: grey (H, W) or blue-green-red (H, W, 3), uint8 or uint16.
-        known: (H, W) bool, an 8-bit picture is transparent elsewhere; None for everywhere.
-
-    Raises:
-        OSError: it cannot be encoded.
-
+    ``known``, (H, W) bool: an 8-bit picture is transparent elsewhere.
     """
     if known is not None and not known.all():
         picture = np.dstack((picture, np.where(known, 255, 0).astype(np.uint8)))

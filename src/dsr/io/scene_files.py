@@ -1,31 +1,7 @@
-"""Frames with one picture of colour and depth each, as other programs read them.
+"""Frames as other programs read them: nerfstudio's ``transforms.json``, 3D Gaussian Splatting, and rerun.
 
-``transforms.json`` with depth, as nerfstudio and the programs around instant-ngp read it.
-
-Axes of a camera are those of OpenGL, x right, y up, z backwards, so that the second and third column of dsr's
-camera-to-world transform change their signs. The world stays as it is, so ``applied_transform`` is the identity:
-nerfstudio turns it upright itself, and its versions differ in whether the points of ``ply_file_path`` are meant before
-or after that transform (nerfstudio-project/nerfstudio, nerfstudio/data/dataparsers/nerfstudio_dataparser.py). Names of
-files differ, as it finds reduced pictures by the name alone. The principal point is counted from the corner of the
-image, half a pixel more than dsr's. ``depth_file_path`` is a 16-bit PNG in millimetres, 0 in holes, its default unit;
-``depth_unit_scale_factor`` says so to other readers, as nerfstudio takes it from its own options.
-
-Inverse depth for 3D Gaussian Splatting, and its scene where the capture has poses.
-
-graphdeco's `train.py -d depths` reads ``depths/NAME.png`` of 16 bits beside ``images/NAME.*``, divides the values by
-65536, multiplies them by the ``scale`` of NAME in ``sparse/0/depth_params.json`` and adds its ``offset``; the result is
-compared with the rendered inverse depth, in the unit of the scene
-(https://github.com/graphdeco-inria/gaussian-splatting, "Depth regularization"). All frames have one scale here, since a
-frame whose scale is far from the others' is left out. The scene itself is COLMAP's text model
-(https://colmap.github.io/format.html): cameras, world-to-camera transforms with x right, y down, z forward, and points
-to start from. Its principal point is counted from the corner of the image.
-
-A recording for the viewer of rerun: colour, depth and poses on a timeline of frames.
-
-A camera's axes are x right, y down, z forward (``RDF`` in rerun). The world's are said as far as the capture says which
-one points up: ``RUB`` with y up, ``RFU`` with z up, else ``RDF``. Photos are JPEG, depth is 16-bit PNG in millimetres
-with ``meter``, the units of a metre (rerun-io/rerun, re_sdk_types/definitions/rerun/components/depth_meter.fbs). The
-library is the extra ``rerun``, https://rerun.io/docs.
+dsr's cameras have x right, y down, z forward, and pixel centres at integers; all three count the principal point from
+the corner of the image, half a pixel more. :mod:`dsr.io.open3d` has the fourth.
 """
 
 from __future__ import annotations
@@ -44,34 +20,19 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.poses import is_rotation, quaternion_of
+from dsr.geometry.poses import quaternion_of
 from dsr.io.depth_files import read_depth_file
 from dsr.io.exports import world_comment, write_ply
 from dsr.io.images import read_pixels
 from dsr.io.photos import encode_png, to_jpeg, write_png
+from dsr.io.trajectories import check_pose
 from dsr.utils.files import replacing, write_text
 from dsr.utils.guards import pixels_beside, refusing
 from dsr.utils.versions import how_to_install
 
 RGBD = ("color.png", "depth.png", "intrinsic.json")
-SCENE = "nerfstudio"
-"""Folder of what ``transforms.json`` names."""
-MILLIMETRES = 1000
-MOST_MILLIMETRES = 65535
-_RIGID = 1e-3
-"""Largest difference of R R' from the identity."""
-
-_DIVISOR = 65536
-_LARGEST = 65535
-_POINTS = 100_000
-"""Points of all frames together that the optimisation starts from."""
-
-_TIMELINE, _CLOCK = "frame", "time"
-_AXES = {"": "RDF", "y": "RUB", "z": "RFU"}
-"""Of the world in rerun, by what points up."""
-_EPOCH = 1e9
-"""Times from here on are seconds since 1970, smaller ones count from the start of a device or a recording."""
-_QUALITY = 95
+_MILLIMETRES, _STEPS = 1000, 65535  # of a metre, and of 16 bits
+_POINTS = 100_000  # of all frames together, from which an optimisation starts
 
 
 @dataclass(frozen=True)
@@ -81,8 +42,7 @@ class Frame:
     Args:
         name: the frame's, perhaps with folders: ``kitchen/000012``.
         camera: of the pixels.
-        pose: (4, 4) float64 camera-to-world transform in metres, of a camera with x right, y down, z forward; None if
-            it is not known.
+        pose: (4, 4) float64 camera-to-world transform in metres; None if it is not known.
         colour: an 8-bit PNG.
         depth: a file of (H, W) orthogonal depth in metres, NaN in holes.
         up: the axis of the world that points up, one of :data:`dsr.io.frames.UPS`.
@@ -103,13 +63,13 @@ class Frame:
         """The name as that of a file."""
         return self.name.replace("/", "_")
 
+    @property
+    def matrix(self) -> np.ndarray:
+        """The pose, (4, 4); a frame without one stands at the origin."""
+        return np.eye(4) if self.pose is None else self.pose.numpy()
+
     def read_depth(self) -> np.ndarray:
-        """Return the depth, (H, W) float32 in metres, NaN in holes.
-
-        Raises:
-            ValueError: the file is damaged, or not of the camera's size.
-
-        """
+        """Return the depth, (H, W) float32 in metres, NaN in holes."""
         values = read_depth_file(self.depth, pixels_beside(self.camera.height, self.camera.width))
         if values.shape != (self.camera.height, self.camera.width):
             size = f"{self.camera.height} x {self.camera.width}"
@@ -117,37 +77,26 @@ class Frame:
         return values.astype(np.float32)
 
     def read_colour(self) -> np.ndarray:
-        """Return the photo, (H, W, 3) uint8, red first.
-
-        Raises:
-            ValueError: the file is damaged.
-
-        """
+        """Return the photo, (H, W, 3) uint8, red first."""
         most = pixels_beside(self.camera.height, self.camera.width)
         return read_pixels(self.colour, cv2.IMREAD_COLOR, most)[..., ::-1]
 
+    def copy_colour(self, path: Path) -> None:
+        """Copy the photo, atomically."""
+        with replacing(path) as temporary:
+            shutil.copyfile(self.colour, temporary)
+
+    def write_millimetres(self, path: Path) -> None:
+        """Write the depth as a PNG of 16-bit millimetres, 0 in holes."""
+        write_png(path, to_millimetres(self.read_depth())[0])
+
 
 def parse_pose(where: str, value: object) -> Tensor | None:
-    """Return a camera-to-world transform, (4, 4) float64, that a file holds as a list of lists; None for none.
-
-    Args:
-        where: the file and the key, for the message.
-        value: what the file holds there.
-
-    Raises:
-        ValueError: it is no rigid transform.
-
-    """
+    """Return a camera-to-world transform, (4, 4) float64, that JSON holds as a list of lists; None for none."""
     if value is None:
         return None
-    try:
-        pose = torch.tensor(value, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError):
-        pose = torch.empty(0, dtype=torch.float64)
-    rigid = pose.shape == (4, 4) and bool(pose.isfinite().all()) and pose[3].tolist() == [0, 0, 0, 1]
-    if not rigid or not is_rotation(pose[:3, :3].numpy(), _RIGID):
-        raise ValueError(f"{where}: expected a rigid transform of 4 x 4 numbers, got {value}")
-    return pose
+    with refusing(f"{where}: expected a rigid transform of 4 x 4 numbers, got {value}", TypeError, ValueError):
+        return torch.from_numpy(check_pose(where, np.array(value, dtype=np.float64)))
 
 
 def one_camera(frames: Sequence[Frame]) -> Camera | None:
@@ -167,71 +116,58 @@ def to_millimetres(depth: np.ndarray) -> tuple[np.ndarray, int]:
 
     Depth of 65.535 m and more does not fit, and becomes a hole.
     """
-    values = np.rint(depth.astype(np.float64) * MILLIMETRES)
-    fits = (values > 0) & (values <= MOST_MILLIMETRES)
-    return np.where(fits, values, 0).astype(np.uint16), int((values > MOST_MILLIMETRES).sum())
-
-
-def write_transforms(path: Path, frames: Sequence[Frame]) -> list[Path]:
-    """Write ``transforms.json``, and beside it ``nerfstudio/`` with ``images/``, ``depths/`` and ``points.ply``.
-
-    Args:
-        path: the file.
-        frames: one at least; a single one without a pose stands at the origin.
-
-    Returns:
-        The files.
-
-    Raises:
-        ValueError: one of several frames has no pose.
-
-    """
-    expect_poses("nerfstudio", {frame.name: frame.pose is not None for frame in frames})
-    camera, folder = one_camera(frames), path.parent / SCENE
-    files = [folder / kind / f"{frame.stem}.png" for frame in frames for kind in ("images", "depths")]
-    for frame, photo, depth in zip(frames, files[::2], files[1::2], strict=True):
-        with replacing(photo) as temporary:
-            shutil.copyfile(frame.colour, temporary)
-        write_png(depth, to_millimetres(frame.read_depth())[0])
-    files.append(folder / "points.ply")
-    write_ply(files[-1], *_sparse(frames), frame=world_comment(common_up(frames)))
-    entries: dict[str, Any] = {"camera_model": "OPENCV", **({} if camera is None else _intrinsics(camera))}
-    entries["depth_unit_scale_factor"] = 1 / MILLIMETRES
-    entries["applied_transform"] = np.eye(4)[:3].tolist()
-    names = [file.relative_to(path.parent).as_posix() for file in files]
-    entries["ply_file_path"] = names[-1]
-    entries["frames"] = []
-    for frame, photo_name, depth_name in zip(frames, names[:-1:2], names[1:-1:2], strict=True):
-        pose = torch.eye(4, dtype=torch.float64) if frame.pose is None else frame.pose
-        entries["frames"].append(
-            {
-                "file_path": photo_name,
-                "depth_file_path": depth_name,
-                **({} if camera is not None else _intrinsics(frame.camera)),
-                "transform_matrix": (pose * pose.new_tensor([1, -1, -1, 1])).tolist(),  # of OpenGL's camera frame
-            }
-        )
-    write_text(path, json.dumps(entries, indent=2) + "\n")
-    return [path, *files]
+    values = np.rint(depth.astype(np.float64) * _MILLIMETRES)
+    fits = (values > 0) & (values <= _STEPS)
+    return np.where(fits, values, 0).astype(np.uint16), int((values > _STEPS).sum())
 
 
 def expect_poses(part: str, known: Mapping[str, bool]) -> None:
-    """Check that each frame has a pose; a single one needs none.
-
-    Args:
-        part: name of what needs them.
-        known: whether a frame has one, by its name.
-
-    Raises:
-        ValueError: one of several frames has none.
-
-    """
+    """Refuse frames, by name with whether they have a pose, of which one has none; a single one needs none."""
     missing = [name for name, has in known.items() if not has]
     if missing and len(known) > 1:
         raise ValueError(
             f"{part}: expected a pose of each frame, got none for {len(missing)} of {len(known)}, such as "
             f"{missing[0]}; --poses gives them"
         )
+
+
+def write_transforms(path: Path, frames: Sequence[Frame]) -> list[Path]:
+    """Write ``transforms.json``, and beside it ``nerfstudio/`` with ``images/``, ``depths/`` and ``points.ply``.
+
+    Its cameras have the axes of OpenGL, x right, y up, z backwards. The world stays as it is, so ``applied_transform``
+    is the identity: nerfstudio turns it upright itself, and its versions differ in whether the points of
+    ``ply_file_path`` are meant before or after that transform (nerfstudio/data/dataparsers/nerfstudio_dataparser.py).
+    Names of files differ, as it finds reduced pictures by the name alone. It takes the unit of depth from its options,
+    millimetres by default; ``depth_unit_scale_factor`` states it for other readers.
+    """
+    expect_poses("nerfstudio", {frame.name: frame.pose is not None for frame in frames})
+    camera, folder = one_camera(frames), path.parent / "nerfstudio"
+    points = folder / "points.ply"
+    write_ply(points, *_sparse(frames), frame=world_comment(common_up(frames)))
+    files, entries = list[Path](), list[dict[str, Any]]()
+    for frame in frames:
+        photo, depth = (folder / kind / f"{frame.stem}.png" for kind in ("images", "depths"))
+        frame.copy_colour(photo)
+        frame.write_millimetres(depth)
+        files += [photo, depth]
+        entries.append(
+            {
+                "file_path": photo.relative_to(path.parent).as_posix(),
+                "depth_file_path": depth.relative_to(path.parent).as_posix(),
+                **({} if camera is not None else _intrinsics(frame.camera)),
+                "transform_matrix": (frame.matrix * [1, -1, -1, 1]).tolist(),
+            }
+        )
+    content = {
+        "camera_model": "OPENCV",
+        **({} if camera is None else _intrinsics(camera)),
+        "depth_unit_scale_factor": 1 / _MILLIMETRES,
+        "applied_transform": np.eye(4)[:3].tolist(),
+        "ply_file_path": points.relative_to(path.parent).as_posix(),
+        "frames": entries,
+    }
+    write_text(path, json.dumps(content, indent=2) + "\n")
+    return [path, *files, points]
 
 
 def _intrinsics(camera: Camera) -> dict[str, float]:
@@ -248,70 +184,51 @@ def _intrinsics(camera: Camera) -> dict[str, float]:
 
 
 def write_splatting(folder: Path, frames: Sequence[Frame]) -> list[Path]:
-    """Write ``images/``, ``depths/`` and ``sparse/0/`` of a scene.
+    """Write ``images/``, ``depths/`` and ``sparse/0/`` of a scene for graphdeco's ``train.py -d depths``.
 
-    Of a single frame without a pose ``sparse/0/`` has ``depth_params.json`` alone, for a scene in metres.
-
-    Args:
-        folder: is created if it is missing.
-        frames: one at least.
-
-    Returns:
-        The files.
-
-    Raises:
-        ValueError: no frame has any depth, or one of several has no pose.
-
+    It divides the 16-bit values of ``depths/NAME.png`` by 65536, multiplies them by the ``scale`` of NAME in
+    ``sparse/0/depth_params.json`` and compares them with the rendered inverse depth
+    (https://github.com/graphdeco-inria/gaussian-splatting, "Depth regularization"). All frames have one scale, as a
+    frame whose scale is far from the others' is left out. The scene is COLMAP's text model
+    (https://colmap.github.io/format.html); a single frame without a pose has none.
     """
     expect_poses("gaussian", {frame.name: frame.pose is not None for frame in frames})
-    depths = (frame.read_depth() for frame in frames)
-    nearest = min((float(depth[np.isfinite(depth)].min(initial=np.inf)) for depth in depths), default=np.inf)
+    nearest = min(float(np.fmin.reduce(frame.read_depth(), axis=None, initial=np.inf)) for frame in frames)
     if not np.isfinite(nearest):
         raise ValueError("gaussian: expected some depth, got holes alone")
-    scale = _DIVISOR / _LARGEST / nearest
-    files = []
+    scale = 65536 / _STEPS / nearest
+    files = list[Path]()
     for frame in frames:
-        files += [folder / "images" / f"{frame.stem}.png", folder / "depths" / f"{frame.stem}.png"]
-        with replacing(files[-2]) as temporary:
-            shutil.copyfile(frame.colour, temporary)
-        inverse = _DIVISOR / (scale * frame.read_depth().astype(np.float64))
-        write_png(files[-1], np.nan_to_num(np.rint(inverse), nan=0, posinf=0).astype(np.uint16))
-    sparse = folder / "sparse" / "0"
+        photo, depth = (folder / kind / f"{frame.stem}.png" for kind in ("images", "depths"))
+        frame.copy_colour(photo)
+        inverse = 65536 / (scale * frame.read_depth().astype(np.float64))
+        write_png(depth, np.nan_to_num(np.rint(inverse), nan=0, posinf=0).astype(np.uint16))
+        files += [photo, depth]
     parameters = {frame.stem: {"scale": scale, "offset": 0.0} for frame in frames}
     texts = {"depth_params.json": json.dumps(parameters, indent=2) + "\n"}
     if all(frame.pose is not None for frame in frames):
-        texts |= {"cameras.txt": _cameras(frames), "images.txt": _images(frames), "points3D.txt": _points(frames)}
+        texts |= _colmap_model(frames)
     for name, text in texts.items():
-        write_text(sparse / name, text)
-    return [*files, *(sparse / name for name in texts)]
+        files.append(folder / "sparse" / "0" / name)
+        write_text(files[-1], text)
+    return files
 
 
-def _cameras(frames: Sequence[Frame]) -> str:
-    """Return ``cameras.txt``, a camera for each frame."""
-    lines = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"]
-    for number, camera in enumerate((frame.camera for frame in frames), 1):
-        values = (camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5)
-        lines.append(f"{number} PINHOLE {camera.width} {camera.height} " + _numbers(values))
-    return "\n".join(lines) + "\n"
-
-
-def _images(frames: Sequence[Frame]) -> str:
-    """Return ``images.txt``: for each frame its pose, and an empty line for the points that it sees."""
-    lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"]
+def _colmap_model(frames: Sequence[Frame]) -> dict[str, str]:
+    """Return the files of COLMAP's text model: a camera and an image for each frame, and points."""
+    cameras = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"]
+    images = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"]
+    points = ["# POINT3D_ID X Y Z R G B ERROR TRACK[]"]
     for number, frame in enumerate(frames, 1):
-        pose = _matrix(frame)
-        to_camera = pose[:3, :3].T
-        turn = quaternion_of(to_camera)[[3, 0, 1, 2]]
-        lines += [f"{number} {_numbers((*turn, *(-to_camera @ pose[:3, 3])))} {number} {frame.stem}.png", ""]
-    return "\n".join(lines) + "\n"
-
-
-def _points(frames: Sequence[Frame]) -> str:
-    """Return ``points3D.txt``."""
-    lines = ["# POINT3D_ID X Y Z R G B ERROR TRACK[]"]
+        camera, to_camera = frame.camera, frame.matrix[:3, :3].T
+        values = camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5
+        cameras.append(f"{number} PINHOLE {camera.width} {camera.height} {_numbers(values)}")
+        transform = *quaternion_of(to_camera)[[3, 0, 1, 2]], *(-to_camera @ frame.matrix[:3, 3])
+        images += [f"{number} {_numbers(transform)} {number} {frame.stem}.png", ""]  # an empty line: points it sees
     for number, (point, (red, green, blue)) in enumerate(zip(*_sparse(frames), strict=True), 1):
-        lines.append(f"{number} {_numbers(point)} {red} {green} {blue} 0")
-    return "\n".join(lines) + "\n"
+        points.append(f"{number} {_numbers(point)} {red} {green} {blue} 0")
+    lines = {"cameras.txt": cameras, "images.txt": images, "points3D.txt": points}
+    return {name: "\n".join(each) + "\n" for name, each in lines.items()}
 
 
 def _sparse(frames: Sequence[Frame]) -> tuple[np.ndarray, np.ndarray]:
@@ -323,15 +240,10 @@ def _sparse(frames: Sequence[Frame]) -> tuple[np.ndarray, np.ndarray]:
         rows, columns = (each.ravel() for each in np.mgrid[0 : camera.height : step, 0 : camera.width : step])
         z = depth[rows, columns].astype(np.float64)
         rays = np.stack(((columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones(len(z))), axis=1)
-        pose, known = _matrix(frame), np.isfinite(z)
+        pose, known = frame.matrix, np.isfinite(z)
         points.append((rays * z[:, None])[known] @ pose[:3, :3].T + pose[:3, 3])
         colours.append(frame.read_colour()[rows, columns][known])
     return np.concatenate(points), np.concatenate(colours)
-
-
-def _matrix(frame: Frame) -> np.ndarray:
-    """Return the pose of a frame that has one, (4, 4)."""
-    return np.eye(4) if frame.pose is None else frame.pose.numpy()
 
 
 def _numbers(values: Sequence[float] | np.ndarray) -> str:
@@ -342,41 +254,33 @@ def _numbers(values: Sequence[float] | np.ndarray) -> str:
 def write_rerun(path: Path, frames: Sequence[Frame]) -> list[Path]:
     """Write a recording ``.rrd``: for each frame the entities ``camera``, ``camera/rgb`` and ``camera/depth``.
 
-    They are on the timeline ``frame``, by number, and on ``time`` if all frames have one.
-
-    Args:
-        frames: one at least; those without a pose stand at the origin.
-
-    Returns:
-        The file.
-
-    Raises:
-        ValueError: the library is not installed.
-
+    They are on the timeline ``frame``, by number, and on ``time`` if all frames have one. Cameras have the axes RDF;
+    the world's are known as far as it is known which one points up. The library is the extra ``rerun``.
     """
     with refusing(f"rerun: expected the library rerun-sdk; {how_to_install('rerun')}", ImportError):
         rerun = importlib.import_module("rerun")
     recording = rerun.RecordingStream("dsr")
     with replacing(path) as temporary:
         recording.save(str(temporary))
-        recording.log("/", getattr(rerun.ViewCoordinates, _AXES[common_up(frames)]), static=True)
+        axes = {"": "RDF", "y": "RUB", "z": "RFU"}[common_up(frames)]
+        recording.log("/", getattr(rerun.ViewCoordinates, axes), static=True)
         timed = all(frame.time is not None for frame in frames)
         for number, frame in enumerate(frames):
             camera = frame.camera
-            recording.set_time(_TIMELINE, sequence=number)
+            recording.set_time("frame", sequence=number)
             if timed and frame.time is not None:
-                kind = "timestamp" if frame.time >= _EPOCH else "duration"
-                recording.set_time(_CLOCK, **{kind: frame.time})
-            pose = np.eye(4) if frame.pose is None else frame.pose.numpy()
+                kind = "timestamp" if frame.time >= 1e9 else "duration"  # seconds since 1970, or since a device's start
+                recording.set_time("time", **{kind: frame.time})
+            pose = frame.matrix
             recording.log("camera", rerun.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
             matrix = [[camera.fx, 0, camera.cx + 0.5], [0, camera.fy, camera.cy + 0.5], [0, 0, 1]]
             size = [camera.width, camera.height]
             view = rerun.Pinhole(image_from_camera=matrix, resolution=size, camera_xyz=rerun.ViewCoordinates.RDF)
             recording.log("camera", view)
-            photo = to_jpeg(frame.read_colour(), max(size), _QUALITY)
+            photo = to_jpeg(frame.read_colour(), max(size), 95)
             recording.log("camera/rgb", rerun.EncodedImage(contents=photo, media_type="image/jpeg"))
             depth = encode_png(to_millimetres(frame.read_depth())[0])
-            image = rerun.EncodedDepthImage(depth, media_type="image/png", meter=float(MILLIMETRES))
+            image = rerun.EncodedDepthImage(depth, media_type="image/png", meter=float(_MILLIMETRES))
             recording.log("camera/depth", image)
         recording.flush()
         recording.disconnect()

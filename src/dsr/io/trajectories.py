@@ -18,18 +18,10 @@ from dsr.notes import Assumption
 from dsr.utils.guards import naming, numbers_in, parse_json, read_text, refusing, split_numbers
 
 _LARGEST_FILE = 256 << 20
-_MAX_GAP = 0.02
-"""Largest time in seconds between a frame and its pose."""
-_MOST_BETWEEN = 10.0
-"""Largest plausible distance in metres between the two cameras of a rig; more is taken for millimetres."""
-
-USUAL_SIZE = (1440, 1920)
-"""Height and width of the photos of iPhones' captures, for photos that were made smaller."""
-
-_TOLERANCE = 1e-3
-"""Largest deviation of a rotation's entries, and of a quaternion's length, from those of a rigid motion."""
-_ARKIT_TO_DSR = np.diag([1.0, -1.0, -1.0, 1.0])
-"""ARKit's and OpenGL's camera looks along -z with y up; dsr's along z with y down."""
+_MAX_GAP = 0.02  # seconds between a frame and its pose
+_MOST_BETWEEN = 10.0  # metres between the two cameras of a rig; more is taken for millimetres
+USUAL_SIZE = (1440, 1920)  # height and width of iPhones' photos, for photos that were made smaller
+_ARKIT_TO_DSR = np.diag([1.0, -1.0, -1.0, 1.0])  # ARKit's and OpenGL's camera looks along -z with y up; dsr's along z
 
 
 @dataclass(frozen=True)
@@ -55,11 +47,6 @@ class Trajectory:
         Of a file with times, frames get the pose nearest to the time that their capture or a list of them states, or
         to that in their names, within 20 ms, or that of the number in which their names end: whichever suits more
         frames, the first of these if several do. Those of frames without times are else taken in order.
-
-        Raises:
-            ValueError: the poses are to be taken in order, and there are not as many as frames; or all frames have
-                times, of their own or in their names, and no frame has a pose.
-
         """
         if self.times is not None:
             named = _known([pair.named_time for pair in pairs])
@@ -103,12 +90,7 @@ class Trajectory:
 def read_transform(path: Path) -> Matrix:
     """Read a rigid transform from one camera to another, in metres.
 
-    Args:
-        path: text of 3 x 4 or 4 x 4 numbers; or JSON, nested lists of these, alone or as the only matrix of an object.
-
-    Raises:
-        ValueError: the file is missing or holds something else, or the transform is not rigid.
-
+    The file is text of 3 x 4 or 4 x 4 numbers; or JSON, nested lists of these, alone or as an object's only matrix.
     """
     text = read_text(path, _LARGEST_FILE)
     if path.suffix.lower() == ".json" or text.lstrip().startswith(("{", "[")):
@@ -135,11 +117,6 @@ def read_poses(path: Path) -> Trajectory:
     three whole numbers before each matrix number the poses. Lines that begin with ``#`` are comments.
 
     Poses with times or numbers that differ are returned in the order of these, others in that of the file.
-
-    Raises:
-        ValueError: the file is missing or holds something else, or a pose is not rigid; the message names the line or
-            the pose.
-
     """
     content = _numbers(path, read_text(path, _LARGEST_FILE))
     rows = [row for row in content if len(row) != 3]
@@ -224,56 +201,28 @@ def _number(pair: Pair) -> float | None:
 def pose_from_quaternion(
     source: str, quaternion: Sequence[float], position: Sequence[float], *, opengl: bool = False
 ) -> np.ndarray:
-    """Return the pose (4, 4) from camera to world, with the camera's axes x right, y down, z forward.
+    """Return the pose (4, 4) from camera to world of a quaternion x, y, z, w and a position in metres.
 
-    Args:
-        source: name of the file and the place in it, for the message.
-        quaternion: x, y, z, w of the rotation from camera to world.
-        position: of the camera, in metres.
-        opengl: whether the camera's axes are x right, y up, z backward, as ARKit and OpenGL have them.
-
-    Raises:
-        ValueError: a number is not finite, or the quaternion is not of length 1.
-
+    ``source`` is the file and the place in it. ``opengl``: the camera's axes are x right, y up, z backward, as ARKit
+    and OpenGL have them, in place of x right, y down, z forward.
     """
-    length = math.hypot(*quaternion)
-    if not math.isfinite(length) or abs(length - 1) > _TOLERANCE or not np.isfinite(position).all():
-        came = " ".join(f"{value:g}" for value in (*quaternion, *position))
-        raise ValueError(f"{source}: expected a rigid pose (a quaternion of length 1 and a position), got {came}")
-    pose = from_quaternion(position, quaternion, source)
+    came = " ".join(f"{value:g}" for value in (*quaternion, *position))
+    with refusing(f"{source}: expected a rigid pose (a quaternion of length 1 and a position), got {came}", ValueError):
+        pose = from_quaternion(position, quaternion, source)
     return pose @ _ARKIT_TO_DSR if opengl else pose
 
 
 def check_pose(source: str, matrix: np.ndarray, *, opengl: bool = False) -> np.ndarray:
-    """Return a matrix (4, 4) from camera to world with the camera's axes x right, y down, z forward.
-
-    Args:
-        source: name of the file and the place in it, for the message.
-        matrix: (4, 4), in metres.
-        opengl: see :func:`pose_from_quaternion`.
-
-    Raises:
-        ValueError: it is no rigid motion.
-
-    """
-    rigid = (
-        bool(np.isfinite(matrix).all())
-        and is_rotation(matrix[:3, :3], _TOLERANCE)
-        and np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6)
-    )
-    if not rigid:
+    """Return a rigid transform (4, 4) from camera to world as it is; see :func:`pose_from_quaternion`."""
+    finite = matrix.shape == (4, 4) and bool(np.isfinite(matrix).all())
+    if not finite or not is_rotation(matrix[:3, :3]) or not np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6):
         came = " ".join(f"{value:.4g}" for value in matrix.ravel())
         raise ValueError(f"{source}: expected a rigid pose (a rotation and a position), got {came}")
     return matrix @ _ARKIT_TO_DSR if opengl else matrix
 
 
 def intrinsics_camera(source: str, size: tuple[int, int], numbers: Sequence[float]) -> Camera:
-    """Return the camera of fx, fy, cx, cy in pixels of an image of (height, width).
-
-    Raises:
-        ValueError: they are those of no camera; the message begins with ``source``.
-
-    """
+    """Return the camera of fx, fy, cx, cy in pixels of an image of (height, width); messages begin with ``source``."""
     fx, fy, cx, cy = numbers
     with naming(source):
         if fy <= 0:
@@ -282,12 +231,7 @@ def intrinsics_camera(source: str, size: tuple[int, int], numbers: Sequence[floa
 
 
 def fitting_camera(source: str, sizes: Sequence[tuple[int, int]], numbers: Sequence[float]) -> Camera:
-    """Return the camera of fx, fy, cx, cy, of the first (height, width) that has its principal point near the middle.
-
-    Raises:
-        ValueError: none has, or they are those of no camera; the message begins with ``source``.
-
-    """
+    """Return the camera of fx, fy, cx, cy, of the first (height, width) with its principal point near the middle."""
     cx, cy = numbers[2:]
     for height, width in sizes:
         if may_be_of(cx, cy, width, height):
@@ -300,14 +244,7 @@ def fitting_camera(source: str, sizes: Sequence[tuple[int, int]], numbers: Seque
 
 
 def describe_capture(app: str, unit: str, pairs: Sequence[Pair], *, poses: bool) -> Assumption:
-    """Return a line for the user about the metadata of a capture.
-
-    Args:
-        app: what it is a capture of.
-        unit: of its depth maps.
-        poses: whether it has poses.
-
-    """
+    """Return a line for the user about the metadata of a capture of an app, with depth in a unit."""
     parts = ["intrinsics", *(["poses"] if poses else [])]
     parts += ["confidence"] if any(pair.confidence is not None for pair in pairs) else []
     return Assumption(f"{app}: depth in {unit}; from the capture: {', '.join(parts)}")

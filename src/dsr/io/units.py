@@ -7,8 +7,6 @@ different values shows nothing but its median.
 
 from __future__ import annotations
 
-import functools
-from dataclasses import dataclass
 from typing import NamedTuple, NoReturn
 
 import numpy as np
@@ -22,38 +20,29 @@ from dsr.utils.progress import show_length
 
 TURNED_BACK = f"bits are turned back by {SUNRGBD_BITS}, as SUN RGB-D turns them: millimetres, also in the result"
 _OVERRIDE = "--depth-unit overrides it"
+# metres of a plausible median; a unit that gives another one is not assumed
 _MIN_MEDIAN, _MAX_MEDIAN = (LIMITS[f"far-millimetres.{end}"] for end in ("least", "most"))
-"""Range of plausible medians in metres; a unit that gives another median is not assumed."""
+# units of whole numbers that cannot be millimetres, the most likely first
 _OTHER_UNITS = ((1e-4, "0.1 mm"), (1e-6, "micrometres"), (1e-2, "centimetres"))
-"""Units of whole numbers that cannot be millimetres, the most likely first."""
-_SPARSE_FRACTION, _SCATTERED = 0.6, 0.6
-"""Fraction of holes above which whole numbers may come from a laser scanner; and do, if fewer of the known pixels than
-the second have a known one below."""
-_FEWEST_LEVELS = 16
-"""Number of different values below which a map shows nothing but its median."""
-_SAMPLE = 200_000
-"""Largest number of values that are looked at."""
-_MOST = 0.99
-"""Share of the values that are multiples of a step; 0.9 where farther ones have other bits."""
+_SPARSE = 0.6  # share of holes from which on whole numbers may come from a laser scanner
+_SCATTERED = 0.6  # and do, if fewer of the known pixels have a known one below
+_FEWEST_LEVELS = 16  # different values below which a map shows nothing but its median
+_SAMPLE = 200_000  # values that are looked at
+_MOST = 0.99  # share of the values that are multiples of a step; 0.9 if farther ones have other bits
 _LEVELS = 256
-_ENDS = 4
-"""Largest number of pixels that have the smallest, and the largest, value of a normalised map."""
-
+_ENDS = 4  # pixels that have the smallest, and the largest, value of a normalised map
+# width, focal lengths, metres per value, and the data set whose published calibration that is
 _KNOWN_CAMERAS: tuple[tuple[int, float, float, float, str], ...] = (
     (640, 481.2, 480.0, 1 / 5000, "ICL-NUIM"),
     (640, 517.3, 516.5, 1 / 5000, "TUM RGB-D, freiburg1"),
     (640, 520.9, 521.0, 1 / 5000, "TUM RGB-D, freiburg2"),
     (640, 535.4, 539.2, 1 / 5000, "TUM RGB-D, freiburg3"),
 )
-"""Width, focal lengths, metres per value, and the data set whose published calibration that is."""
-_REPLICA = 1200, 680
-"""Width and height of Replica's renderings, which store 1/6553.5 m (NICE-SLAM, configs/Replica)."""
+_REPLICA = 1200, 680  # width and height of renderings that store 1/6553.5 m (NICE-SLAM, configs/Replica)
+# steps to a pixel in which disparities are stored, and by whom
 _FIXED_POINT = ((8, "OAK"), (16, "OpenCV's StereoSGBM"), (32, "OAK"), (256, "KITTI"))
-"""Steps to a pixel in which disparities are stored, and by whom."""
-_MOST_NARROW = 99.9
-"""Percentile of disparities in pixels that lies below the width of their map."""
-_KITTI_WIDTHS, _KITTI_HEIGHTS = range(1216, 1243), range(350, 377)
-"""Of KITTI's pictures, whose depth and disparity is stored in 1/256 (its devkit)."""
+_MOST_NARROW = 99.9  # percentile of disparities in pixels that lies below the width of their map
+_KITTI_WIDTHS, _KITTI_HEIGHTS = range(1216, 1243), range(350, 377)  # whose depth and disparity is in 1/256 (its devkit)
 
 
 class Meaning(NamedTuple):
@@ -72,61 +61,48 @@ class Meaning(NamedTuple):
 def interpret(
     name: str, values: np.ndarray, holes: np.ndarray, camera: Camera | None = None, *, may_fall: bool = True
 ) -> Meaning:
-    """Identify the unit and the range type of the stored values of a map.
+    """Identify the unit and the range type of the stored values of a map, (h, w), with holes, (h, w) bool.
+
+    An error begins with ``name``; if two readings are as likely, it names both, with the option for each.
 
     Args:
-        name: name of the file, for the error.
-        values: (h, w) as stored.
-        holes: (h, w) bool, where depth is missing.
+        name: name of the file.
+        values: as stored.
+        holes: where depth is missing.
         camera: of these pixels; None for an unknown one.
         may_fall: whether they may be disparities: nobody said that they are not.
 
-    Raises:
-        ValueError: no pixel is known, no usual unit makes the distances plausible, or two readings are as likely; the
-            message names both, with the option for each.
-
     """
     expect_known(name, values, holes)
-    clues = _Clues(name, values, holes, camera, may_fall)
-    return _interpret_floats(clues) if values.dtype.kind == "f" else _interpret_whole(clues)
+    known = values[~holes]
+    sample = known[:: -(-known.size // _SAMPLE)]
+    conclusive = np.unique(sample).size >= _FEWEST_LEVELS
+    votes = InverseVotes(0, 0)
+    if conclusive and may_fall:
+        votes = inverse_votes(np.where(holes, np.nan, values.astype(np.float64)))
+    middle, highest = float(np.median(known)), float(known.max())
+    seen = _Map(name, values, holes, camera, may_fall, sample, middle, highest, conclusive, votes)
+    return _interpret_floats(seen) if values.dtype.kind == "f" else _interpret_whole(seen)
 
 
-@dataclass(frozen=True)
-class _Clues:
-    """A map, and what is to be seen of it."""
+class _Map(NamedTuple):
+    """A map and what its values show."""
 
     name: str
     values: np.ndarray
     holes: np.ndarray
     camera: Camera | None
     may_fall: bool
+    known: np.ndarray  # values, or every n-th of them
+    middle: float  # the median
+    highest: float
+    conclusive: bool  # whether there are enough different values
+    votes: InverseVotes  # of the planes; none for what cannot be disparities
 
-    @functools.cached_property
-    def known(self) -> np.ndarray:
-        """The known values, or every n-th of them."""
-        known = self.values[~self.holes]
-        return known[:: -(-known.size // _SAMPLE)]
-
-    @functools.cached_property
-    def middle(self) -> float:
-        """The median."""
-        return float(np.median(self.values[~self.holes]))
-
-    @functools.cached_property
-    def highest(self) -> float:
-        """The largest known value."""
-        return float(self.values[~self.holes].max())
-
-    @functools.cached_property
-    def conclusive(self) -> bool:
-        """Whether there are enough different values."""
-        return np.unique(self.known).size >= _FEWEST_LEVELS
-
-    @functools.cached_property
-    def votes(self) -> InverseVotes:
-        """What the planes say."""
-        known = np.where(self.holes, np.nan, self.values.astype(np.float64))
-        return inverse_votes(known) if self.conclusive else InverseVotes(0, 0)
+    @property
+    def sparse(self) -> bool:
+        """Whether most pixels are missing."""
+        return bool(self.holes.mean() > _SPARSE)
 
     @property
     def scattered(self) -> bool:
@@ -135,29 +111,10 @@ class _Clues:
         return self.sparse and (known[1:] & known[:-1]).sum() < _SCATTERED * known.sum()
 
     @property
-    def compact(self) -> bool:
-        """Whether most known pixels have known pixels on all four sides, as of an object that was cut out."""
-        known = np.pad(~self.holes, 1)
-        sides = known[:-2, 1:-1] & known[2:, 1:-1] & known[1:-1, :-2] & known[1:-1, 2:]
-        return bool((sides & known[1:-1, 1:-1]).sum() > known.sum() / 2)
-
-    @property
-    def sparse(self) -> bool:
-        """Whether most pixels are missing."""
-        return bool(self.holes.mean() > _SPARSE_FRACTION)
-
-    @property
     def of_kitti(self) -> bool:
         """Whether the map has one of the sizes of KITTI."""
         height, width = self.values.shape
         return width in _KITTI_WIDTHS and height in _KITTI_HEIGHTS
-
-    def multiples(self, step: int, share: float = _MOST) -> bool:
-        """Return whether a share of the values are multiples of a step, and not of twice the step."""
-        values = self.known
-        if np.unique(values // step).size < _FEWEST_LEVELS:
-            return False
-        return bool((values % step == 0).mean() >= share and (values % (2 * step) == 0).mean() < _MOST * share)
 
     def metres(self, unit: float) -> str:
         """Return the median in a unit."""
@@ -169,184 +126,183 @@ class _Clues:
         raise ValueError(f"{self.name}: expected {readings}: {why}")
 
 
-def _interpret_whole(clues: _Clues) -> Meaning:
+def _compact(holes: np.ndarray) -> bool:
+    """Return whether most known pixels have known pixels on all four sides, as of an object that was cut out."""
+    known = np.pad(~holes, 1)
+    sides = known[:-2, 1:-1] & known[2:, 1:-1] & known[1:-1, :-2] & known[1:-1, 2:]
+    return bool((sides & known[1:-1, 1:-1]).sum() > known.sum() / 2)
+
+
+def _multiples(values: np.ndarray, step: int, share: float = _MOST) -> bool:
+    """Return whether a share of the values are multiples of a step, and not of twice the step."""
+    if np.unique(values // step).size < _FEWEST_LEVELS:
+        return False
+    return bool((values % step == 0).mean() >= share and (values % (2 * step) == 0).mean() < _MOST * share)
+
+
+def _interpret_whole(seen: _Map) -> Meaning:
     """Return what whole numbers mean."""
-    lowest = float(clues.values[~clues.holes].min())
-    if lowest < clues.highest < _LEVELS and not (clues.conclusive and clues.may_fall and clues.votes.verdict):
+    lowest = float(seen.values[~seen.holes].min())
+    if lowest < seen.highest < _LEVELS and not seen.votes.verdict:
         raise ValueError(
-            f"{clues.name}: expected --depth-unit cm (median {clues.metres(1e-2)}), or --range-type disparity with "
-            f"--baseline METRES: whole numbers up to {clues.highest:g} are too small for millimetres"
+            f"{seen.name}: expected --depth-unit cm (median {seen.metres(1e-2)}), or --range-type disparity with "
+            f"--baseline METRES: whole numbers up to {seen.highest:g} are too small for millimetres"
         )
-    if not clues.conclusive:
-        return _by_median(clues)
-    if clues.values.dtype == np.uint16 and clues.multiples(1 << SUNRGBD_BITS, 0.9):
+    if not seen.conclusive:
+        return _by_median(seen)
+    if seen.values.dtype == np.uint16 and _multiples(seen.known, 1 << SUNRGBD_BITS, 0.9):
         note = Assumption(f"values are multiples of 8: {TURNED_BACK}; {_OVERRIDE}")
         return Meaning(1e-3, (note,), bits=SUNRGBD_BITS)
-    falling = _interpret_falling(clues)
+    falling = _interpret_falling(seen)
     if falling is not None:
         return falling
     for step in (_LEVELS, _LEVELS + 1):
-        if clues.multiples(step):
+        if _multiples(seen.known, step):
             raise ValueError(
-                f"{clues.name}: expected depth, got multiples of {step}: a picture of 8 bits for viewing, widened to "
+                f"{seen.name}: expected depth, got multiples of {step}: a picture of 8 bits for viewing, widened to "
                 "16; --depth-unit METRES if its values are metric"
             )
-    return _by_data_set(clues) or _by_steps(clues) or _by_median(clues)
+    return _by_data_set(seen) or _by_steps(seen) or _by_median(seen)
 
 
-def _by_data_set(clues: _Clues) -> Meaning | None:
+def _by_data_set(seen: _Map) -> Meaning | None:
     """Return the unit of a data set with such a size or camera; None if there is none."""
-    height, width = clues.values.shape
-    camera = clues.camera
+    height, width = seen.values.shape
+    camera = seen.camera
     for known_width, fx, fy, unit, name in _KNOWN_CAMERAS:
         if camera is not None and camera.width == known_width and np.allclose((camera.fx, camera.fy), (fx, fy), 1e-4):
-            return Meaning(unit, (_whole(clues, "1/5000 m", unit, f"the camera is that of {name}"),))
-    if (width, height) == _REPLICA and clues.middle / 6553.5 > 0.5:
+            return Meaning(unit, (_whole(seen, "1/5000 m", unit, f"the camera is that of {name}"),))
+    if (width, height) == _REPLICA and seen.middle / 6553.5 > 0.5:
         return Meaning(
-            1 / 6553.5, (_whole(clues, "1/6553.5 m", 1 / 6553.5, "1200 x 680 is the size of Replica's maps"),)
+            1 / 6553.5, (_whole(seen, "1/6553.5 m", 1 / 6553.5, "1200 x 680 is the size of Replica's maps"),)
         )
-    if clues.of_kitti and clues.sparse:
-        return Meaning(1 / 256, (_whole(clues, "1/256 m", 1 / 256, "size and holes are those of KITTI's maps"),))
-    if clues.of_kitti:
-        clues.ask("KITTI's maps have this size, and store 1/256 m", ("1/256", 1 / 256), ("mm", 1e-3), ("cm", 1e-2))
-    if clues.scattered:
-        clues.ask(
+    if seen.of_kitti and seen.sparse:
+        return Meaning(1 / 256, (_whole(seen, "1/256 m", 1 / 256, "size and holes are those of KITTI's maps"),))
+    if seen.of_kitti:
+        seen.ask("KITTI's maps have this size, and store 1/256 m", ("1/256", 1 / 256), ("mm", 1e-3), ("cm", 1e-2))
+    if seen.scattered:
+        seen.ask(
             "single pixels, as of a laser scanner, which KITTI stores in 1/256 m", ("1/256", 1 / 256), ("mm", 1e-3)
         )
     return None
 
 
-def _by_steps(clues: _Clues) -> Meaning | None:
+def _by_steps(seen: _Map) -> Meaning | None:
     """Return the unit of millimetres that are stored more finely than they are; None where they are near then."""
     for step, name, unit in ((5, "1/5000", 1 / 5000), (10, "0.0001", 1e-4)):
-        if not clues.multiples(step):
+        if not _multiples(seen.known, step):
             continue
         nearest = LIMITS[f"far-millimetres.{step}"]
-        fine, coarse = nearest <= clues.middle * unit, clues.middle * 1e-3 <= LIMITS["far-millimetres"]
+        fine, coarse = nearest <= seen.middle * unit, seen.middle * 1e-3 <= LIMITS["far-millimetres"]
         why = f"values are multiples of {step}, as of millimetres stored in {name} m"
         if fine and not coarse:
-            return Meaning(unit, (_whole(clues, f"{name} m", unit, why),))
+            return Meaning(unit, (_whole(seen, f"{name} m", unit, why),))
         if not coarse or (fine and step == 5):  # sensors have steps of a centimetre, too
-            clues.ask(why, ("mm", 1e-3), (name, unit))
+            seen.ask(why, ("mm", 1e-3), (name, unit))
     return None
 
 
-def _whole(clues: _Clues, label: str, unit: float, why: str) -> Assumption:
+def _whole(seen: _Map, label: str, unit: float, why: str) -> Assumption:
     """Return the note on a unit of whole numbers."""
-    return Assumption(f"whole numbers are read as {label}: {why}; {_OVERRIDE}", f"median {clues.metres(unit)}")
+    return Assumption(f"whole numbers are read as {label}: {why}; {_OVERRIDE}", f"median {seen.metres(unit)}")
 
 
-def _by_median(clues: _Clues) -> Meaning:
+def _by_median(seen: _Map) -> Meaning:
     """Return the unit of whole numbers that makes their median a distance."""
-    middle = clues.middle
+    middle = seen.middle
     if _MIN_MEDIAN <= middle * 1e-3 <= _MAX_MEDIAN:
         others = "TUM RGB-D and ICL-NUIM store 1/5000 m"
-        if clues.conclusive and middle * 1e-3 > LIMITS["far-millimetres"]:
+        if seen.conclusive and middle * 1e-3 > LIMITS["far-millimetres"]:
             why = f"as millimetres that is far for a depth camera; {others}"
-            clues.ask(why, ("mm", 1e-3), ("1/5000", 1 / 5000))
-        found = [Assumption("whole numbers are read as millimetres", f"median {clues.metres(1e-3)}")]
+            seen.ask(why, ("mm", 1e-3), ("1/5000", 1 / 5000))
+        found = [Assumption("whole numbers are read as millimetres", f"median {seen.metres(1e-3)}")]
         if middle * 1e-3 > LIMITS["far-metres"]:
             found.append(Assumption(f"that is far for a sensor: {others} (--depth-unit), SUN RGB-D sunrgbd"))
-        near = float(np.percentile(clues.known, 99)) * 1e-3
-        if clues.conclusive and near < LIMITS["near-millimetres"]:
+        near = float(np.percentile(seen.known, 99)) * 1e-3
+        if seen.conclusive and near < LIMITS["near-millimetres"]:
             text = "everything is near if whole numbers are millimetres: are they centimetres? --depth-unit mm or cm"
             found.append(Assumption(text, f"99 % within {show_length(near, 2)}", "near-millimetres", near))
-        if clues.sparse and not clues.compact:
+        if seen.sparse and not _compact(seen.holes):
             text = "that is sparse, as of a laser scanner: KITTI stores 1/256 m (--depth-unit 1/256)"
             found.append(Assumption(text))
         return Meaning(1e-3, tuple(found))
     for unit, label in _OTHER_UNITS:
         if _MIN_MEDIAN <= middle * unit <= _MAX_MEDIAN:
-            why = f"as millimetres the median would be {clues.metres(1e-3)}, now {clues.metres(unit)}"
+            why = f"as millimetres the median would be {seen.metres(1e-3)}, now {seen.metres(unit)}"
             return Meaning(unit, (Assumption(f"whole numbers are read as {label}", why),))
     raise ValueError(
-        f"{clues.name}: no usual unit makes its median of {middle:g} a distance; give one with --depth-unit"
+        f"{seen.name}: no usual unit makes its median of {middle:g} a distance; give one with --depth-unit"
     )
 
 
-def _interpret_floats(clues: _Clues) -> Meaning:
+def _interpret_floats(seen: _Map) -> Meaning:
     """Return what floats mean."""
-    middle = clues.middle
-    if clues.conclusive:
-        _expect_metric(clues)
-        falling = _interpret_falling(clues)
+    middle = seen.middle
+    if seen.conclusive:
+        _expect_metric(seen)
+        falling = _interpret_falling(seen)
         if falling is not None:
             return falling
-        _expect_one_reading(clues)
-    whole = clues.conclusive and bool((clues.known == np.round(clues.known)).all())
-    sure = "float-millimetres.whole" if whole or not clues.conclusive else "float-millimetres"
+        _expect_one_reading(seen)
+    whole = seen.conclusive and bool((seen.known == np.round(seen.known)).all())
+    sure = "float-millimetres.whole" if whole or not seen.conclusive else "float-millimetres"
     if middle > LIMITS[sure]:
         return Meaning(1e-3, (Assumption("floats this large are read as millimetres", f"median {middle:.4g}"),))
-    found = [Assumption("floats are read as metres", f"median {clues.metres(1.0)}")]
+    found = [Assumption("floats are read as metres", f"median {seen.metres(1.0)}")]
     if middle < _MIN_MEDIAN:
         found.append(Assumption("the depth is nearer than 5 cm: is it in metres? --depth-unit gives another unit"))
     return Meaning(1.0, tuple(found))
 
 
-def _expect_metric(clues: _Clues) -> None:
-    """Check that floats are not normalised.
-
-    Raises:
-        ValueError: they are.
-
-    """
-    known, highest = clues.known.astype(np.float64), clues.highest
+def _expect_metric(seen: _Map) -> None:
+    """Refuse floats that are normalised."""
+    known, highest = seen.known.astype(np.float64), seen.highest
     if highest > 1:
-        ends = ((clues.values == end).sum() for end in (0, highest))
+        ends = ((seen.values == end).sum() for end in (0, highest))
         normalised = highest == round(highest) and all(0 < count <= _ENDS for count in ends)
     else:
         of_levels = any(
             np.allclose(known * most, np.round(known * most), 0, 1e-3 * most / 255) for most in (255, 65535)
         )
-        normalised = highest == 1 or of_levels or clues.middle < _MIN_MEDIAN
+        normalised = highest == 1 or of_levels or seen.middle < _MIN_MEDIAN
     if normalised and not (known == np.round(known)).all():
         raise ValueError(
-            f"{clues.name}: expected metric depth, got floats up to {highest:.4g} with a median of {clues.middle:.3g}, "
+            f"{seen.name}: expected metric depth, got floats up to {highest:.4g} with a median of {seen.middle:.3g}, "
             "as of normalised maps; --depth-unit METRES if they are metric, such as m"
         )
 
 
-def _expect_one_reading(clues: _Clues) -> None:
-    """Check that the median of floats has one likely reading.
-
-    Raises:
-        ValueError: it has two.
-
-    """
-    middle = clues.middle
-    whole = bool((clues.known == np.round(clues.known)).all())
-    likely_pixels = clues.may_fall and clues.votes.verdict != "rises" and not clues.scattered
+def _expect_one_reading(seen: _Map) -> None:
+    """Refuse floats whose median has two likely readings."""
+    middle = seen.middle
+    whole = bool((seen.known == np.round(seen.known)).all())
+    likely_pixels = seen.may_fall and seen.votes.verdict != "rises" and not seen.scattered
     if LIMITS["far-metres"] < middle <= LIMITS["far-floats"] and likely_pixels:
         raise ValueError(
-            f"{clues.name}: expected --depth-unit m (median {clues.metres(1.0)}), or --range-type disparity with "
+            f"{seen.name}: expected --depth-unit m (median {seen.metres(1.0)}), or --range-type disparity with "
             "--baseline METRES: floats of this size are as often pixels as metres, and there are too few planes to tell"
         )
     least = LIMITS["float-millimetres.whole"]
-    if LIMITS["far-floats"] < middle <= least and not clues.scattered:
-        clues.ask("floats of this size are as often centimetres as metres", ("cm", 1e-2), ("m", 1.0))
+    if LIMITS["far-floats"] < middle <= least and not seen.scattered:
+        seen.ask("floats of this size are as often centimetres as metres", ("cm", 1e-2), ("m", 1.0))
     if least < middle <= LIMITS["float-millimetres"] and not whole:
-        clues.ask("floats of this size are as often centimetres as millimetres", ("cm", 1e-2), ("mm", 1e-3))
+        seen.ask("floats of this size are as often centimetres as millimetres", ("cm", 1e-2), ("mm", 1e-3))
 
 
-def _interpret_falling(clues: _Clues) -> Meaning | None:
-    """Return what values that fall with distance are; None if they do not.
-
-    Raises:
-        ValueError: they do, and the distance of the two cameras is not known.
-
-    """
-    if not clues.may_fall or clues.votes.verdict != "falls":
+def _interpret_falling(seen: _Map) -> Meaning | None:
+    """Return what values that fall with distance are; None if they do not."""
+    if seen.votes.verdict != "falls":
         return None
-    votes = clues.votes
+    votes = seen.votes
     why = f"values fall with distance (straight over {votes.falling} of {votes.falling + votes.rising} planes)"
-    if clues.camera is None or clues.camera.baseline is None:
+    if seen.camera is None or seen.camera.baseline is None:
         raise ValueError(
-            f"{clues.name}: expected --range-type disparity with --baseline METRES, or --range-type orthogonal for "
+            f"{seen.name}: expected --range-type disparity with --baseline METRES, or --range-type orthogonal for "
             f"depth: {why}, as disparity and inverse depth do; inverse depth of a network has no metric unit"
         )
-    of_kitti = clues.of_kitti and clues.highest > clues.camera.width
+    of_kitti = seen.of_kitti and seen.highest > seen.camera.width
     if not of_kitti:
-        expect_narrow(clues.name, clues.known, clues.camera)
+        expect_narrow(seen.name, seen.known, seen.camera)
     label = "1/256 pixel" if of_kitti else "pixels"
     text = f"values are read as disparities in {label} of the depth map: {why}; --range-type overrides it"
     return Meaning(1 / 256 if of_kitti else 1.0, (Assumption(text),), "disparity")

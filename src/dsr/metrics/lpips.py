@@ -18,7 +18,6 @@ from torch.nn.utils import skip_init
 
 from dsr.metrics.functional import SurfacePair
 from dsr.utils.compute_device import in_own_precision
-from dsr.utils.torch_files import expect_stored
 
 TRUNK_FILE = "alexnet-owt-7be5be79.pth"
 TRUNK_URL = f"https://download.pytorch.org/models/{TRUNK_FILE}"
@@ -136,7 +135,6 @@ def load_lpips(configured: Path | None = None) -> LPIPS:
     """Return the LPIPS network with the trunk that :func:`find_trunk` finds."""
     path = find_trunk(configured)
     try:
-        expect_stored(path)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # on files that it then refuses
             trunk = torch.load(path, map_location="cpu", weights_only=True)

@@ -1,7 +1,7 @@
 """Pictures decoded by OpenCV: sizes are checked first, from the headers, and decoders say nothing of damaged ones.
 
-PNG: ISO/IEC 15948. JPEG: ITU-T T.81, B.2. TIFF: revision 6.0 of the specification, and BigTIFF. BMP: Microsoft's
-BITMAPINFOHEADER. WebP: RFC 9649. Portable maps: https://netpbm.sourceforge.net/doc/pnm.html.
+Pillow reads the headers; those of TIFF (revision 6.0 of the specification, and BigTIFF) are read here, for the pages
+behind the first one, and for tags that OpenCV ignores.
 """
 
 from __future__ import annotations
@@ -9,31 +9,32 @@ from __future__ import annotations
 import contextlib
 import io
 import os
-import re
 import struct
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import cv2
 import numpy as np
+from PIL.BmpImagePlugin import BmpImageFile
+from PIL.JpegImagePlugin import JpegImageFile
+from PIL.PpmImagePlugin import PpmImageFile
+from PIL.WebPImagePlugin import WebPImageFile
 
-from dsr.utils.guards import expect_bytes, expect_pixels, pixels_of_file
+from dsr.utils.guards import expect_pixels, pixels_of_file
 
-_BYTES_PER_PIXEL = 16  # in memory for each allowed pixel: four channels of float32
 # Photometric interpretations of TIFF: a mosaic of colours, and linear raw values; GDAL's tag, a number as text.
 _RAW, _GDAL_NODATA = (32803, 34892), 42113
-_GREY_AND_OPACITY = 4  # colour type of PNG
-_START_OF_FRAME = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
-_WITHOUT_LENGTH = {0x01, *range(0xD0, 0xD9)}
-_PNG_CHANNELS = {0: 1, 2: 3, 3: 4, 4: 4, 6: 4}
-_ORIENTATION, _TAGS = 274, {254, 255, 256, 257, 258, 259, 262, 274, 277, 322, 323, 330, 339, 42113}
+_PNG, _GREY_AND_OPACITY = b"\x89PNG\r\n\x1a\n", 4  # colour type of PNG
+_ORIENTATION, _TAGS = 274, {254, 255, 256, 257, 258, 259, 262, 274, 330, 339, 42113}
 _TAG_TYPES = {1: "B", 2: "B", 3: "H", 4: "I", 13: "I", 16: "Q", 18: "Q"}
-_MOST_SEGMENTS, _MOST_TAGS, _MOST_VALUES, _MOST_PAGES = 4096, 4096, 64, 64
-_LARGEST_PNM_HEADER = 1 << 12
-_PNM = re.compile(rb"P[1-6](?:\s+|#[^\n]*\n)+(\d{1,9})(?:\s+|#[^\n]*\n)+(\d{1,9})\s")
+_MOST_TAGS, _MOST_VALUES, _MOST_PAGES = 4096, 64, 64
+# Their classes, as Image.open warns of photos of 90 megapixels.
+_PILLOW: dict[bytes, Callable[[IO[bytes]], Any]] = {
+    b"\xff\xd8": JpegImageFile, b"BM": BmpImageFile, b"RIFF": WebPImageFile,
+    **dict.fromkeys((b"P1", b"P2", b"P3", b"P4", b"P5", b"P6"), PpmImageFile),
+}  # fmt: skip
 
 
 def decode_pixels(place: str | Path, content: bytes, flags: int, most: int | None = None) -> np.ndarray | None:
@@ -47,14 +48,10 @@ def decode_pixels(place: str | Path, content: bytes, flags: int, most: int | Non
         most: largest number of pixels; None for what its length explains.
 
     """
-    header = picture_size(io.BytesIO(content))
-    if header is None:
+    size = picture_size(io.BytesIO(content))
+    if size is None:
         return None
-    most = pixels_of_file(len(content)) if most is None else most
-    expect_pixels(place, header.height, header.width, most)
-    expect_bytes(
-        place, header.bytes_per_pixel * max(header.height * header.width, header.tile), _BYTES_PER_PIXEL * most
-    )
+    expect_pixels(place, *size, pixels_of_file(len(content)) if most is None else most)
     no_data = None
     if content[:2] in (b"II", b"MM"):
         content, no_data = _only_page(place, content, flags)
@@ -66,7 +63,7 @@ def decode_pixels(place: str | Path, content: bytes, flags: int, most: int | Non
     if flags == cv2.IMREAD_UNCHANGED and pixels is not None:
         if no_data is not None:
             pixels[pixels == no_data] = 0 if pixels.dtype.kind in "iu" else np.nan
-        if content[:4] == b"\x89PNG" and content[25] == _GREY_AND_OPACITY:  # which OpenCV makes four channels of
+        if content.startswith(_PNG) and content[25] == _GREY_AND_OPACITY:  # which OpenCV makes four channels of
             opaque = pixels[..., 3].min() == 256**pixels.itemsize - 1
             pixels = pixels[..., 0] if opaque else pixels[..., [0, 3]]
     return pixels
@@ -126,70 +123,23 @@ QUIET_DECODERS = _QuietStderr()
 """A context in which messages of decoders about damaged files are not shown."""
 
 
-@dataclass(frozen=True)
-class PictureSize:
-    """What a decoder will make of a picture."""
-
-    height: int
-    width: int
-    bytes_per_pixel: int  # at most
-    tile: int = 0  # pixels of a tile, which is decoded whole; 0 without tiles
-
-
-def picture_size(file: IO[bytes]) -> PictureSize | None:
-    """Return the size of the picture in an open file; None where it has no complete header of these formats."""
+def picture_size(file: IO[bytes]) -> tuple[int, int] | None:
+    """Return height and width of the picture in an open file; None without a complete header of these formats."""
     file.seek(0)
-    start = file.read(16)
-    for magic, read in _READERS.items():
-        if start.startswith(magic):
-            try:
-                found = read(file)
-            except (struct.error, ValueError, IndexError, OverflowError, OSError):
-                return None
-            return found if found is not None and min(found.height, found.width) > 0 else None
-    return None
-
-
-def _png(file: IO[bytes]) -> PictureSize | None:
-    file.seek(12)
-    kind, width, height, depth, colour = struct.unpack(">4sIIBB", file.read(14))
-    if kind != b"IHDR":
+    start = file.read(24)
+    try:
+        if start.startswith(_PNG):
+            width, height = struct.unpack(">II", start[16:])
+        elif start[:2] in (b"II", b"MM"):
+            tags = tiff_pages(file)[0].tags
+            width, height = tags[256][0], tags[257][0]
+        else:
+            [reader] = [each for magic, each in _PILLOW.items() if start.startswith(magic)]
+            file.seek(0)
+            width, height = reader(file).size
+    except Exception:  # Pillow names no set of errors for damaged files
         return None
-    return PictureSize(height, width, _PNG_CHANNELS.get(colour, 4) * (2 if depth > 8 else 1))
-
-
-def _jpeg(file: IO[bytes]) -> PictureSize | None:
-    """Follow the segments to the start of the frame."""
-    file.seek(2)
-    for _ in range(_MOST_SEGMENTS):
-        while (byte := file.read(1)) not in (b"\xff", b""):
-            pass
-        while (byte := file.read(1)) == b"\xff":
-            pass
-        if not byte or byte[0] in (0xD9, 0xDA):
-            return None
-        if byte[0] in _WITHOUT_LENGTH or byte[0] == 0:
-            continue
-        (length,) = struct.unpack(">H", file.read(2))
-        if byte[0] in _START_OF_FRAME:
-            _, height, width, channels = struct.unpack(">BHHB", file.read(6))
-            return PictureSize(height, width, max(3, channels))
-        file.seek(length - 2, 1)
-    return None
-
-
-def _bmp(file: IO[bytes]) -> PictureSize | None:
-    file.seek(14)
-    (length,) = struct.unpack("<I", file.read(4))
-    width, height = struct.unpack("<HH", file.read(4)) if length == 12 else struct.unpack("<ii", file.read(8))
-    return PictureSize(abs(height), abs(width), 4)
-
-
-def _tiff(file: IO[bytes]) -> PictureSize:
-    tags = tiff_pages(file)[0].tags
-    tile = tags.get(322, (0,))[0] * tags.get(323, (0,))[0]
-    sample = max(1, -(-tags.get(258, (1,))[0] // 8))
-    return PictureSize(tags[257][0], tags[256][0], sample * max(1, tags.get(277, (1,))[0]), tile)
+    return (height, width) if min(height, width) > 0 else None
 
 
 class TiffPage(NamedTuple):
@@ -239,40 +189,6 @@ def tiff_pages(file: IO[bytes]) -> list[TiffPage]:
     return [page for page in pages if not page.tags.get(254, (0,))[0] & ~2 and page.tags.get(255) != (2,)] or pages
 
 
-def _webp(file: IO[bytes]) -> PictureSize | None:
-    file.seek(8)
-    kind, chunk = file.read(4), file.read(4)
-    file.read(4)
-    content = file.read(10)
-    if kind != b"WEBP":
-        return None
-    if chunk == b"VP8X":
-        width, height = (int.from_bytes(content[at : at + 3], "little") + 1 for at in (4, 7))
-    elif chunk == b"VP8L":
-        (bits,) = struct.unpack_from("<I", content, 1)
-        width, height = (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
-    else:
-        width, height = (size & 0x3FFF for size in struct.unpack_from("<HH", content, 6))
-    return PictureSize(height, width, 4)
-
-
-def _pnm(file: IO[bytes]) -> PictureSize | None:
-    file.seek(0)
-    match = _PNM.match(file.read(_LARGEST_PNM_HEADER))
-    return None if match is None else PictureSize(int(match[2]), int(match[1]), 6)
-
-
-_READERS: dict[bytes, Callable[[IO[bytes]], PictureSize | None]] = {
-    b"\x89PNG\r\n\x1a\n": _png,
-    b"\xff\xd8": _jpeg,
-    b"BM": _bmp,
-    b"II*\0": _tiff,
-    b"MM\0*": _tiff,
-    b"II+\0": _tiff,
-    b"MM\0+": _tiff,
-    b"RIFF": _webp,
-    **dict.fromkeys((b"P1", b"P2", b"P3", b"P4", b"P5", b"P6"), _pnm),
-}
 _NOT_READ = {
     b"#?": "Radiance HDR", b"v/1\x01": "OpenEXR", b"\x93NUMPY": "a NumPy array", b"PK\3\4": "an archive", b"PF": "PFM",
     b"GIF8": "GIF", b"8BPS": "Photoshop", b"%PDF": "PDF", b"P7": "PAM", b"Pf": "PFM", b"\xff\x0a": "JPEG XL",

@@ -36,10 +36,7 @@ def data_root() -> Path:
 
 
 def obstacle(path: Path, *, folder: bool = False) -> str | None:
-    """Return the kind of thing in the place of a file or folder to be written, such as ``a device``; None for none.
-
-    A folder may be a link to one.
-    """
+    """Return the kind of thing in the place of a file or folder to be written, such as ``a device``; None for none."""
     try:
         mode = path.lstat().st_mode
     except (OSError, ValueError):  # reported by what writes
@@ -57,10 +54,7 @@ def expect_target(path: Path, *, folder: bool = False) -> None:
 
 
 def expect_targets(folder: Path, names: Iterable[str]) -> None:
-    """Check files that are to be written into a folder, or below it, before the work that they are made of.
-
-    The folder may be a link to one; what is in it may not lead out of it.
-    """
+    """Check files that are to be written into a folder, which may be a link; what is in it may not lead out of it."""
     expect_target(folder, folder=True)
     for name in names:
         path = folder / name
@@ -80,10 +74,7 @@ def expect_own(folder: Path) -> None:
 
 
 class FullDiskError(Exception):
-    """A file could not be written for want of space.
-
-    It is no OSError, so that it ends a run rather than being taken for a problem of one scene or picture.
-    """
+    """A file could not be written for want of space; no OSError, as it ends a run and not one scene or picture."""
 
     def __init__(self, path: Path, needed: float | None = None) -> None:
         space, left = "space" if needed is None else megabytes(needed), "a full device"
@@ -130,10 +121,7 @@ def temporary_folder(folder: Path, name: str) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside ``path`` that replaces it when the block ends without error.
-
-    The directory is created if it does not exist. After an error or an interruption the temporary file is deleted.
-    """
+    """Yield a temporary path beside ``path``, in a folder that is made, that replaces it if the block ends well."""
     expect_target(path)
     temporary = path.with_name(f".{path.stem}-{secrets.token_hex(4)}{path.suffix}")
     try:
@@ -149,10 +137,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def replacing_folder(path: Path) -> Iterator[Path]:
-    """Yield a temporary directory beside ``path`` that replaces it when the block ends without error.
-
-    Where ``path`` is a link to a directory, that one is replaced, and the link stays.
-    """
+    """Yield a temporary directory beside ``path`` that replaces it if the block ends well; a link stays one."""
     expect_target(path, folder=True)
     path = path.resolve()
     with temporary_folder(path.parent, path.name) as temporary, temporary_folder(path.parent, path.name) as old:

@@ -1,7 +1,7 @@
-"""Guards: limits of the memory that a file or a task takes, and checks of numbers, JSON and names of files.
+"""Guards: the memory of a command, files that strangers wrote, and checks of numbers, JSON and names of files.
 
-A few kilobytes of compressed zeros declare gigabytes. What is allowed grows with what can explain it: a map's size with
-its photo's, otherwise the unpacked size with the size of the file. Real photos and maps stay far below.
+A few kilobytes of compressed zeros unpack to gigabytes: :func:`limit_memory` ends that in one place. Sizes that a
+picture's header states are checked before it is decoded: a depth map may have 4 times the pixels of its photo.
 """
 
 from __future__ import annotations
@@ -67,10 +67,7 @@ def pixels_of_file(size: int) -> int:
 
 
 def pixels_beside(height: int, width: int) -> int:
-    """Return the largest number of pixels of a map that is read beside a photo or map of this size.
-
-    It allows more than fits, so that the message of a map that is too large can state both sizes.
-    """
+    """Return the largest number of pixels of a map that is read beside a photo: more than fits, to state both sizes."""
     return min(MOST_PIXELS, max(_FLOOR, _PER_PHOTO * height * width))
 
 
@@ -79,16 +76,11 @@ def bytes_of_archive(size: int) -> int:
     return max(_UNPACKED, _RATIO * size)
 
 
-def array_bytes(shape: tuple[int, ...], itemsize: int) -> int:
-    """Return the size of an array, in Python's numbers, which do not overflow."""
-    return math.prod(map(int, shape)) * itemsize
-
-
 def read_limited(path: Path, most: int = MOST_TEXT) -> bytes:
     """Return the content of a file of at most ``most`` bytes."""
     with opened(path) as file:
         expect_bytes(path, path.stat().st_size, most)
-        return file.read(most)
+        return file.read()
 
 
 def read_text(path: Path, most: int = MOST_TABLE) -> str:
@@ -105,13 +97,15 @@ def decode_text(content: bytes) -> str:
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[BufferedReader]:
-    """Open a plain file for reading; a pipe or device is an OSError, and each OSError has the file's name."""
+    """Open a plain file for reading; a pipe or device is an OSError, and errors of the system have the file's name."""
     if not path.is_file():
         code = errno.EISDIR if path.is_dir() else errno.EINVAL if path.exists() else errno.ENOENT
         raise OSError(code, os.strerror(code), str(path))
     try:
         with path.open("rb") as file:
             yield file
+    except MemoryError as error:
+        raise OutOfMemoryError(f"{path}: expected a file that fits into the memory, got a larger one") from error
     except OSError as error:
         if error.errno is None or error.filename is not None:
             raise
@@ -134,8 +128,8 @@ def files_in(packed: zipfile.ZipFile, archive: object) -> list[zipfile.ZipInfo]:
 def read_member(packed: zipfile.ZipFile, name: str) -> bytes:
     """Return a member of an archive, in no more memory than the size that the archive declares for it.
 
-    The caller checks that size. A member that unpacks to more, which :meth:`zipfile.ZipFile.read` unpacks whole before
-    it cuts it off, is damaged.
+    The caller checks that size. A member that unpacks to more, which :meth:`zipfile.ZipFile.read` would unpack whole
+    before it cuts it off, is damaged.
     """
     declared = packed.getinfo(name).file_size
     parts, length = [], 0
@@ -150,6 +144,19 @@ def read_member(packed: zipfile.ZipFile, name: str) -> bytes:
 
 class OutOfMemoryError(ValueError):
     """There is not enough memory for the request."""
+
+
+def limit_memory() -> None:
+    """Limit this process, and each that it starts, to the memory that is free, or half of all if that is more.
+
+    Whatever takes more ends in a MemoryError, where the system knows such a limit (Linux).
+    """
+    with contextlib.suppress(ImportError, OSError, ValueError):
+        import resource  # noqa: PLC0415 - Windows has none
+
+        before = [each for each in resource.getrlimit(resource.RLIMIT_DATA) if each != resource.RLIM_INFINITY]
+        most = min(max(free_memory(), _meminfo("MemTotal:") // 2), *before, _NO_LIMIT)
+        resource.setrlimit(resource.RLIMIT_DATA, (most, resource.getrlimit(resource.RLIMIT_DATA)[1]))
 
 
 def free_memory() -> int:
@@ -235,7 +242,8 @@ def refusing(message: str, *kinds: type[Exception]) -> Iterator[None]:
     try:
         yield
     except kinds as error:
-        raise ValueError(message) from error
+        little = ", or there is too little memory for it" if isinstance(error, MemoryError) else ""
+        raise ValueError(f"{message}{little}") from error
 
 
 def readable(name: str) -> str:
@@ -244,12 +252,7 @@ def readable(name: str) -> str:
 
 
 def parse_json(text: str | bytes, *, finite: bool = True) -> Any:
-    """Parse JSON strictly: without NaN and infinity, and without numbers that no float can hold.
-
-    Args:
-        finite: whether NaN and infinity, which Python writes and JSON does not have, are refused.
-
-    """
+    """Parse JSON strictly: without numbers that no float can hold, and if ``finite`` without NaN and infinity."""
 
     def refuse(text: str) -> NoReturn:
         raise ValueError(f"expected finite numbers, got {text[:20]}")
@@ -272,12 +275,10 @@ def did_you_mean(given: object, known: Iterable[str]) -> str:
     That is the only name with all words of the given one, such as ``--depth-unit`` for ``--unit``, or else the name of
     the most similar letters.
     """
-
-    def words_of(name: str) -> set[str]:
-        return {word.rstrip("s") for word in re.findall(r"[^\W_]+", name.lower())}
-
-    names, words = {name.lower(): name for name in known}, words_of(str(given))
-    near = [name for name in names if words and words <= words_of(name)]
+    names = {name.lower(): name for name in known}
+    words = {name: {word.rstrip("s") for word in re.findall(r"[^\W_]+", name)} for name in (*names, str(given).lower())}
+    asked = words[str(given).lower()]
+    near = [name for name in names if asked and asked <= words[name]]
     if len(near) != 1:
         near = get_close_matches(str(given).lower(), names, 1)
     return f"; did you mean {names[near[0]]}?" if near else ""
@@ -296,12 +297,8 @@ def leads_outside(name: str) -> bool:
 def path_within(folder: Path, name: str, source: object, form: str = "{}") -> Path:
     """Return the path of a file that another file names; OutsideError if it is not in a folder or below it.
 
-    The folder may be a link; links that the name leads through may not lead out of it.
-
-    Args:
-        source: what gives the name, such as ``FILE: line 3``, for the message.
-        form: the path that the name is a part of, from the folder on, with ``{}`` for the name.
-
+    The folder may be a link; links that the name leads through may not lead out of it. ``source`` gives the name, such
+    as ``FILE: line 3``. ``form`` is the path that the name is a part of, from the folder on, with ``{}`` for the name.
     """
     expected = f"{source}: expected a name within {folder}, got {name[:_LONGEST]!r}"
     if leads_outside(name):

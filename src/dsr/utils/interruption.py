@@ -21,6 +21,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
 
+from dsr.utils.guards import limit_memory
+
 MESSAGE = "interrupted; what is finished is kept, the same command continues from there"
 _BETWEEN_LOOKS = 0.5  # seconds between two looks of a worker after its parent
 _came: list[int] = []  # the signals that this process was interrupted by
@@ -38,6 +40,7 @@ def start(module: str, function: str) -> NoReturn:
     if getattr(sys.modules["__main__"], "__spec__", None) is not None and sys.path[:1] == [os.getcwd()]:  # noqa: PTH109
         del sys.path[0]  # where ``python -m`` puts it
     ignore_warnings_of_numbers()
+    limit_memory()
     try:
         code = getattr(importlib.import_module(module), function)()
         sys.stdout.flush()

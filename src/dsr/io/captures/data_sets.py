@@ -43,8 +43,9 @@ import numpy as np
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.poses import Matrix, as_rigid
+from dsr.io.cameras import read_camera
 from dsr.io.frames import CaptureFrame, Geometry
-from dsr.io.images import read_camera, read_numbers
+from dsr.io.images import read_numbers
 from dsr.io.pairs import (
     PHOTO_SUFFIXES,
     Pair,
