@@ -13,8 +13,9 @@ import pytest
 from dsr.evaluation.run_files import load_results
 from dsr.geometry.surface import lights, render, shade
 from dsr.pictures.depth_views import normals_seen_by
-from dsr.report.page import save_page
+from dsr.report.page import Pictures, save_page
 from dsr.report.table_layouts import write_tables
+from dsr.report.worker_pool import WorkerPool
 
 SPITEFUL = "<img src=x onerror=alert(1)>\"'&</script><script>alert(2)</script>"
 SIZE = 64
@@ -29,7 +30,7 @@ def made(make_run, folder):
         make_run(folder / label, method=label.lower(), label=label, scenes=SCENES, size=SIZE)
     make_run(folder / "x8", scale=8, scenes=SCENES[:1], size=SIZE)
     found = load_results([folder])
-    save_page(folder / "index.html", found, title="A report")
+    save_page(folder / "index.html", Pictures(WorkerPool(found)), title="A report")
     return found, (folder / "index.html").as_uri()
 
 
@@ -208,7 +209,7 @@ def sure(make_run, tmp_path):
     make_run(tmp_path / "plain", size=SIZE)
     make_run(tmp_path / "sure", method="sure", label="Sure", size=SIZE, confident=True)
     runs = load_results([tmp_path])
-    save_page(tmp_path / "index.html", runs)
+    save_page(tmp_path / "index.html", Pictures(WorkerPool(runs)))
     return runs, (tmp_path / "index.html").as_uri()
 
 
@@ -279,7 +280,8 @@ def test_names_in_the_files_of_a_run_are_shown_and_not_run(opened, make_run, tmp
     summary["metrics"] = {SPITEFUL: {"heading": SPITEFUL, "unit": SPITEFUL, "digits": 1}}
     (folder / "summary.json").write_text(json.dumps(summary))
     results = load_results([folder])
-    save_page(tmp_path / "index.html", results, tables=write_tables(tmp_path / "tables", results))
+    write_tables(tmp_path / "tables", results)
+    save_page(tmp_path / "index.html", Pictures(WorkerPool(results)))
     page = opened((tmp_path / "index.html").as_uri())
     assert SPITEFUL in page.inner_text("#tables")
     assert name in page.inner_text("body")

@@ -90,7 +90,7 @@ def _write(
     scored = any(not run.scores.empty for run in results.runs)
     scatter = pool.map(save_scatter_matrix, [folder / "metrics"] if "metrics" in request.parts and scored else [])
     drawn = Figures(folder / "figures", pool, request.light) if "figures" in request.parts else None
-    pictures = Pictures(pool) if "page" in request.parts else None
+    pictures = Pictures(pool, request.page_px) if "page" in request.parts else None
 
     todo = [part for part in REPORT_PARTS if part in request.parts]
     if not scored:
@@ -106,15 +106,13 @@ def _write(
             with progress.task("figures") as task:
                 drawn.save(task)
             notes.extend(drawn.notes)
-        elif part == "page":  # which is last, as it links to the other parts' files
+        elif pictures is not None and part == "page":  # which is last, as it links to the other parts' files
             with progress.task("scenes") as task:
                 notes += save_page(
                     folder / "index.html",
-                    results,
+                    pictures,
                     title=request.title,
-                    budget_mb=request.page_mb,
                     progress=task,
-                    pictures=pictures,
                     leaderboard=request.leaderboard,
                 )
-    return notes
+    return list(dict.fromkeys(notes))

@@ -21,16 +21,17 @@ import numpy as np
 from matplotlib.colors import Colormap, ListedColormap
 from torch import Tensor
 
-from dsr.evaluation.results import BenchmarkSetting, Results
+from dsr.evaluation.results import BenchmarkSetting, Results, Run, sample_path
 from dsr.geometry.lights import FIGURE_LIGHT
 from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.pictures.canvas import save_both
 from dsr.pictures.depth_views import Window, limits_of, rendering, strongest_window
 from dsr.pictures.grids import Cell, Row, draw_grid
 from dsr.pictures.lights_figure import save_lights_figure
-from dsr.report.shown_scenes import Shown, drawable_scenes, first_runs, shown_scenes
+from dsr.report.shown_scenes import results_of, stored_sample, views_of
 from dsr.report.worker_pool import WorkerPool
 from dsr.sample import DepthSample
+from dsr.utils.arrays import array_headers
 
 ROWS = 5
 """Maximum number of scenes on a page."""
@@ -110,6 +111,16 @@ class Page:
     light: str
 
 
+@dataclass(frozen=True)
+class Shown:
+    """A scene and its results."""
+
+    name: str
+    scene: DepthSample
+    depths: dict[str, Tensor | None]  # (1, H, W) in metres by method, None without a result
+    scores: dict[str, dict[str, float]]  # by method and metric, worst of four lights, raw units
+
+
 def pages_of(results: Results, kinds: Iterable[str], light: str, notes: list[str]) -> list[Page]:
     """Return the pages of some kinds of grids, from the names of the files alone.
 
@@ -121,17 +132,32 @@ def pages_of(results: Results, kinds: Iterable[str], light: str, notes: list[str
 
     """
     found = []
+    problems = results.problems()
     for kind in kinds:
-        for problem, name in zip(results.problems(), _names(results.problems()), strict=True):
-            scenes = drawable_scenes(results, problem, notes, with_truth=kind == "errors")
+        for problem, name in zip(problems, _names(problems), strict=True):
+            scenes = []
+            for view in views_of(results, problem):
+                stored = next((run for run in view.runs if run.has_sample(view.scene)), None)
+                if stored is None:
+                    stored_sample(view, notes)
+                elif kind != "errors" or _has_truth(stored, view.scene):
+                    scenes.append(view.scene)
             for number, start in enumerate(range(0, len(scenes), ROWS), start=1):
                 rows = tuple(scenes[start : start + ROWS])
                 found.append(Page(kind, problem, f"{kind}_{name}_{number}", rows, light))
     return found
 
 
+def _has_truth(run: Run, scene: str) -> bool:
+    """Return whether a stored scene has ground truth; a damaged one may have it elsewhere."""
+    try:
+        return "depth" in array_headers(sample_path(run.folder, scene))
+    except (ValueError, OSError):
+        return True
+
+
 def save_page(folder: Path, results: Results, page: Page, notes: list[str]) -> list[Path]:
-    """Draw a page, unless none of its scenes can be drawn.
+    """Draw a page, unless none of its scenes can be drawn, and return the paths of the PDF and the PNG.
 
     Args:
         folder: directory of the files.
@@ -139,19 +165,27 @@ def save_page(folder: Path, results: Results, page: Page, notes: list[str]) -> l
         page: one of :func:`pages_of`.
         notes: list to which one line is added per scene or result that could not be drawn.
 
-    Returns:
-        Paths of the PDF and the PNG.
-
-    Raises:
-        ValueError: there is no such light.
-
     """
     kind = _GRIDS[page.kind]
-    shown = shown_scenes(results, page.problem, notes, page.scenes)
-    rows = [row for row in (kind.row(each, page.light) for each in shown) if row]
+    methods = list(dict.fromkeys(run.label for run in results.of(page.problem)))
+    rows = []
+    for view in views_of(results, page.problem):
+        stored = stored_sample(view, notes) if view.scene in page.scenes else None
+        if stored is None:
+            continue
+        depths = {each.run.label: each.depth for each in results_of(view, stored, notes)}
+        scores = {run.label: run.headlines.get(view.scene, {}) for run in view.runs}
+        shown = Shown(
+            view.scene,
+            stored,
+            {label: depths.get(label) for label in methods},
+            {label: scores.get(label, {}) for label in methods},
+        )
+        if row := kind.row(shown, page.light):
+            rows.append(row)
     if not rows:
         return []
-    columns = (*kind.before, *first_runs(results, page.problem), *kind.after)
+    columns = (*kind.before, *methods, *kind.after)
     title = f"{page.problem.dataset}, x{page.problem.scale}, {page.problem.downsampling}"
     pictures = (cell.picture for row in rows for cell in row.cells if cell.picture is not None)
     holes = "; pink: holes" if any(not np.isfinite(picture).all() for picture in pictures) else ""
@@ -209,9 +243,9 @@ def depth_row(shown: Shown, _: str) -> Row:
 def error_row(shown: Shown, _: str) -> Row | None:
     """Build the row of a scene's errors, None without ground truth or without results."""
     truth = shown.scene.depth
-    if truth is None or not shown.existing():
+    if truth is None or not any(depth is not None for depth in shown.depths.values()):
         return None
-    errors = {name: None if depth is None else depth.double() - truth for name, depth in shown.depths.items()}
+    errors = {name: None if depth is None else depth - truth for name, depth in shown.depths.items()}
     valid = [error[error.isfinite()].abs().numpy() for error in errors.values() if error is not None]
     pooled = np.concatenate(valid)
     limit = max(float(np.percentile(pooled, 98)) if pooled.size else 0.0, _LEAST_ERROR)

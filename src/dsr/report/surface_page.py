@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import html
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +19,7 @@ from dsr.io.exports import normal_strips
 from dsr.io.photos import data_url, to_jpeg
 from dsr.pictures.canvas import HOLE_COLOUR
 from dsr.pictures.depth_views import reduced
-from dsr.report.html_page import asset, block, fill, json_text, palette, policy
+from dsr.report.html_page import asset, fill, json_text, palette, policy
 from dsr.report.surface_packing import (
     Grid,
     error_levels,
@@ -144,17 +143,14 @@ def save_view(path: Path, results: Sequence[Packed], *, title: str, notes: Seque
 
     """
     style, script = asset("view.css"), f'"use strict";\n{asset(*VIEWER, "view_page.js")}'
-    blocks = [block("content", json_text(content_of(results, title, notes)))]
-    blocks += [block(name, data, "text/plain") for name, data in data_of(results).items()]
     parts = {
-        "MARK": MARK,
         "POLICY": policy(style, script, "data: blob:"),
-        "TITLE": html.escape(title),
+        "TITLE": title,
         "STYLE": style,
-        "VIEWER": asset("viewer.html"),
         "SCRIPT": script,
-        "STATIC": "\n".join(_static(result) for result in results),
-        "DATA": "\n".join(blocks),
+        "RESULTS": results,
+        "CONTENT": json_text(content_of(results, title, notes)),
+        "DATA": data_of(results),
     }
     write_text(path, fill("view.html", parts))
 
@@ -180,19 +176,6 @@ def is_view(path: Path) -> bool:
     """Return whether a file is a page of this command."""
     with opened(path) as file:
         return MARK.encode() in file.read(1024)
-
-
-def _static(result: Packed) -> str:
-    """Return the pictures of a result for browsers without WebGL."""
-    name, holes = html.escape(result.about["name"]), "; holes are pink"
-    figures = []
-    for key, text in (("before", "before: the depth map as it came"), ("after", "after")):
-        if key in result.pictures:
-            pink = holes if result.about[key]["holes"] else ""
-            alt = f"{name}, {text}, as a grey surface lit from the upper left{pink}"
-            picture = f'<img src="{data_url(result.pictures[key])}" alt="{alt}">'
-            figures.append(f"<figure>{picture}<figcaption>{text}{pink}</figcaption></figure>")
-    return f'<section class="still"><h2>{name}</h2><div class="pair">{"".join(figures)}</div></section>'
 
 
 def _after(result: ViewedResult, vertices: int, limits: Mapping[str, tuple[float, ...]]) -> Grid:
