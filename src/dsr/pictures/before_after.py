@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from matplotlib.image import AxesImage
-from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from matplotlib.transforms import Bbox
 from torch import Tensor
 from torch.nn import functional
@@ -150,9 +149,7 @@ class _Sheet(Canvas):
     def colour_bar(self, image: AxesImage) -> None:
         """Draw the colour bar of the depth in the last row."""
         place = Bbox.from_bounds(_LEFT + 1.25 * self._pitch, 0.42, 1.5 * self._pitch - _GAP, 0.1)
-        bar = self.bar(image, place, orientation="horizontal", ticks=MaxNLocator(6),
-                       format=ScalarFormatter(useOffset=False))  # fmt: skip
-        bar.set_label("depth, m", fontsize=11, labelpad=1)
+        self.bar(image, place, most=6, orientation="horizontal").set_label("depth, m", fontsize=11, labelpad=1)
 
 
 def _cut(values: Tensor, part: _Part) -> tuple[Tensor, _Part]:

@@ -18,6 +18,7 @@ from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.patches import Rectangle
+from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from matplotlib.transforms import Bbox, TransformedBbox
 from PIL import Image
 
@@ -90,8 +91,10 @@ class Canvas:
             image.set_clip_box(TransformedBbox(within, self._pictures.transData))
         return image
 
-    def bar(self, image: AxesImage, place: Bbox, label: str = "", **style: Any) -> Colorbar:
-        """Draw the colour bar of a picture."""
+    def bar(self, image: AxesImage, place: Bbox, label: str = "", *, most: int | None = None, **style: Any) -> Colorbar:
+        """Draw the colour bar of a picture, with at most so many ticks."""
+        if most is not None:
+            style |= {"ticks": MaxNLocator(most), "format": ScalarFormatter(useOffset=False)}
         width, height = self.figure.get_size_inches()
         bounds = (place.x0 / width, place.y0 / height, place.width / width, place.height / height)
         return self.figure.colorbar(image, cax=self.figure.add_axes(bounds, label=label), **style)

@@ -42,7 +42,7 @@ def metric_matrix(results: Results) -> pd.DataFrame:
         0.5 m. Missing values are NaN.
 
     """
-    scores = pd.concat([run.scores.assign(dataset=run.dataset, label=run.label) for run in results.runs])
+    scores = results.scores
     variant = scores["variant"].fillna("")
     name = scores["metric"].where(variant.isin(HEADLINES), scores["metric"] + "[" + variant + "]")
     scores = scores.assign(name=name, value=scores["value"].where(np.isfinite(scores["value"])))

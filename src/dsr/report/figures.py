@@ -222,7 +222,7 @@ def rendering_row(shown: Shown, light: str) -> Row:
     details = details_of(
         [picture for picture in results.values() if picture is not None], truth, math.ceil(scene.scale)
     )
-    return Row(_label(shown), size[0] / size[1], cells, details, size)
+    return Row(_label(shown), size[0] / size[1], cells, details)
 
 
 def depth_row(shown: Shown, _: str) -> Row:

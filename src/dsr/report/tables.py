@@ -23,7 +23,6 @@ from dsr.evaluation.results import Results, Run, alignment_note
 from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.metrics.formats import (
     AFTER_THE_PAPER,
-    HEADLINES,
     LIGHTS_NOTE,
     PAPER,
     Formats,
@@ -296,12 +295,11 @@ def values_of(runs: Sequence[Run], formats: Formats) -> Values:
     """Collect the scores of the tables."""
     found: dict[str, dict[Place, dict[str, dict[int, float]]]] = {}
     for run in runs:
-        scores = run.scores
-        worst = scores[scores["variant"].fillna("").isin(HEADLINES) & scores["metric"].isin(list(formats))]
-        for scene, metric, value in zip(worst["scene"], worst["metric"], worst["value"], strict=True):
+        for scene, scores in run.headlines.items():
             by_metric = found.setdefault(run.label, {}).setdefault(Place(run.dataset, scene), {})
-            if math.isfinite(value):
-                by_metric.setdefault(metric, {})[run.seed] = formats[metric].factor * value
+            for metric, value in scores.items():
+                if metric in formats and math.isfinite(value):
+                    by_metric.setdefault(metric, {})[run.seed] = formats[metric].factor * value
     return found
 
 
@@ -311,8 +309,7 @@ def _truth_is_complete(results: Results) -> Callable[[Place], bool]:
     It has none where the scores of some method cover every pixel. Otherwise the stored scene decides; without it, the
     missing pixels are taken for holes of the truth.
     """
-    scores = pd.concat([run.scores.assign(dataset=run.dataset) for run in results.runs])
-    depth = scores[scores["metric"] == "RMSE_d"]
+    depth = results.scores.query("metric == 'RMSE_d'")
     shares = depth.groupby(["dataset", "scene"])["valid_share"].max()
 
     def complete(place: Place) -> bool:
@@ -432,17 +429,3 @@ def _notes(groups: Sequence[Group], columns: Formats) -> Iterator[str]:
         yield note
     if user:
         yield "User: percentage of answers with the method as most similar (1st), second most similar (2nd), or either."
-
-
-def in_shown_units(scores: pd.DataFrame, formats: Formats) -> pd.DataFrame:
-    """Return one run's scores as scene x metric, in the units of tables, worst of four lights.
-
-    Args:
-        scores: content of one ``scores.csv``.
-        formats: formats of its metrics.
-
-    """
-    worst = scores[scores["variant"].fillna("").isin(HEADLINES)]
-    wide = worst.pivot_table(index="scene", columns="metric", values="value", sort=False)
-    columns = {name: each for name, each in in_tables(formats).items() if name in wide}
-    return wide[list(columns)].mul(pd.Series({name: each.factor for name, each in columns.items()}, dtype=float))
