@@ -93,22 +93,13 @@ def _draw(folder: Path, results: Results, page: Page | None) -> tuple[list[Path]
 
 @dataclass(frozen=True)
 class Page:
-    """A page of a grid.
+    """A page of a grid."""
 
-    Args:
-        kind: ``renderings``, ``depth`` or ``errors``.
-        problem: benchmark setting.
-        name: name of the files, without suffix.
-        scenes: names of the scenes, at most :data:`ROWS`.
-        light: light of the renderings.
-
-    """
-
-    kind: str
+    kind: str  # renderings, depth or errors
     problem: BenchmarkSetting
-    name: str
-    scenes: tuple[str, ...]
-    light: str
+    name: str  # of the files, without suffix
+    scenes: tuple[str, ...]  # at most :data:`ROWS`
+    light: str  # of the renderings
 
 
 @dataclass(frozen=True)

@@ -142,21 +142,12 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True)
 class SceneSet:
-    """The scenes of a table row.
-
-    Args:
-        title: display title.
-        places: one or more scenes.
-        published: name of the paper's row for these scenes; "" if it has none, or if some of its scenes are missing or
-            not the paper's own.
-        average: whether the row is an average, possibly over one scene.
-
-    """
+    """The scenes of a table row."""
 
     title: str
-    places: tuple[Place, ...]
-    published: str = ""
-    average: bool = True
+    places: tuple[Place, ...]  # one or more scenes
+    published: str = ""  # the paper's name of them; empty if it has none, or some are missing or not the paper's own
+    average: bool = True  # whether the row is an average, possibly over one scene
 
 
 def sets_of_dataset(places: Sequence[Place]) -> list[SceneSet]:

@@ -49,51 +49,29 @@ _QUALITY = 85
 
 @dataclass(frozen=True)
 class ViewedResult:
-    """A result of `dsr upsample` to look at.
+    """A result of `dsr upsample` to look at."""
 
-    Args:
-        name: its name among those of the page.
-        depth: (H, W) orthogonal depth in metres, NaN in holes.
-        camera: of these pixels.
-        photo: (h, w, 3) uint8 of the same view and any size, None if there is none.
-        depth_lr: (h, w) the input's depth in metres, NaN in holes; None if there is none.
-        depth_error, angle_error: (H, W) expected errors in metres and degrees, both or none.
-        filled: (H, W) bool, where depth was not measured; None where that is not known.
-        max_error: expected error of the depth, as a fraction of it, from which a pixel is left out of the mesh.
-        facts: what is written below the surface, by heading.
-        notes: assumptions and remarks.
-
-    """
-
-    name: str
-    depth: np.ndarray
-    camera: Camera
-    photo: np.ndarray | None = None
-    depth_lr: np.ndarray | None = None
-    depth_error: np.ndarray | None = None
-    angle_error: np.ndarray | None = None
-    filled: np.ndarray | None = None
-    max_error: float = math.inf
-    facts: Mapping[str, str] | None = None
-    notes: Sequence[str] = ()
+    name: str  # among those of the page
+    depth: np.ndarray  # (H, W) orthogonal depth in metres, NaN in holes
+    camera: Camera  # of these pixels
+    photo: np.ndarray | None = None  # (h, w, 3) uint8 of the same view and any size
+    depth_lr: np.ndarray | None = None  # (h, w) the input's depth in metres, NaN in holes
+    depth_error: np.ndarray | None = None  # (H, W) expected error in metres, with that of the normal or not at all
+    angle_error: np.ndarray | None = None  # (H, W) expected error of the normal in degrees
+    filled: np.ndarray | None = None  # (H, W) bool, where depth was not measured; None where that is not known
+    max_error: float = math.inf  # expected error, as a fraction of the depth, from which the mesh leaves out a pixel
+    facts: Mapping[str, str] | None = None  # texts below the surface, by heading
+    notes: Sequence[str] = ()  # assumptions and remarks
 
 
 @dataclass(frozen=True)
 class Packed:
-    """A result as the page stores it.
+    """A result as the page stores it."""
 
-    Args:
-        about: what fits into JSON.
-        data: base64 texts by name: after, before, photo.
-        pictures: JPEGs by name: before, after, thumb.
-        vertices: number of vertices of the larger surface.
-
-    """
-
-    about: dict[str, Any]
-    data: dict[str, str]
-    pictures: dict[str, bytes]
-    vertices: int
+    about: dict[str, Any]  # what fits into JSON
+    data: dict[str, str]  # base64 texts by name: after, before, photo
+    pictures: dict[str, bytes]  # JPEGs by name: before, after, thumb
+    vertices: int  # of the larger surface
 
 
 def pack_result(result: ViewedResult, vertices: int, photo_side: int) -> Packed:

@@ -25,41 +25,24 @@ _LARGEST = 10_000_000
 
 @dataclass(frozen=True)
 class Answer:
-    """The choice of a participant for one scene.
+    """The choice of a participant for one scene."""
 
-    Args:
-        scene: id of the scene.
-        again: whether this participant saw the scene for the second time.
-        first, second: ids of the pictures chosen.
-        seconds: time taken.
-
-    """
-
-    scene: str
-    again: bool
-    first: str
+    scene: str  # its id
+    again: bool  # whether this participant saw the scene for the second time
+    first: str  # ids of the pictures chosen
     second: str
     seconds: float
 
 
 @dataclass(frozen=True)
 class Answers:
-    """A complete answer file.
-
-    Args:
-        file: path of the file.
-        participant: random id.
-        finished: time of the last answer.
-        content: trials as JSON; equal for two files with identical answers.
-        given: one answer per scene shown.
-
-    """
+    """A complete answer file."""
 
     file: Path
-    participant: str
+    participant: str  # random id
     finished: datetime
-    content: str
-    given: tuple[Answer, ...]
+    content: str  # trials as JSON; equal for two files with identical answers
+    given: tuple[Answer, ...]  # one per scene shown
 
 
 def files_of(paths: Iterable[Path]) -> list[Path]:

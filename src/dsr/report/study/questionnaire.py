@@ -44,18 +44,11 @@ class _Question:
 
 @dataclass(frozen=True)
 class Built:
-    """A study that was written.
-
-    Args:
-        page: path of the page.
-        key: content of the key file beside the page.
-        notes: omissions and remarks, one line each.
-
-    """
+    """A study that was written."""
 
     page: Path
-    key: Key
-    notes: tuple[str, ...] = field(default=())
+    key: Key  # content of the key file beside the page
+    notes: tuple[str, ...] = field(default=())  # omissions and remarks
 
 
 def build_study(

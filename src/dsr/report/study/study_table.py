@@ -23,18 +23,11 @@ _KEYS = (*_TEXTS, "scale")
 
 
 class Share(NamedTuple):
-    """A percentage of the answers.
+    """A percentage of the answers."""
 
-    Args:
-        mean: mean over scenes.
-        scenes: number of scenes.
-        interval: 95 % confidence interval, if the study gives one.
-
-    """
-
-    mean: float
-    scenes: int
-    interval: tuple[float, float] | None
+    mean: float  # over scenes
+    scenes: int  # number of scenes
+    interval: tuple[float, float] | None  # 95 % confidence interval, if the study gives one
 
 
 def read_study(path: Path) -> pd.DataFrame:
