@@ -38,10 +38,6 @@ def make_report(request: ReportRequest, console: Console) -> list[str]:
     """Write the tables, figures, correlations and page of some runs into a directory, whole or not at all.
 
     An earlier report in it is replaced.
-
-    Raises:
-        ValueError: there is no run, a choice does not exist, or the directory holds something else.
-
     """
     output = request.output
     if output.exists() and not (output.is_dir() and ((output / _MARK).is_file() or not any(output.iterdir()))):
@@ -68,12 +64,7 @@ def make_report(request: ReportRequest, console: Console) -> list[str]:
 
 
 def make_leaderboard(request: LeaderboardRequest, console: Console) -> list[str]:
-    """Write a page of runs that begins with one row a method, with the tables beside it.
-
-    Raises:
-        ValueError: as :func:`make_report`.
-
-    """
+    """Write a page of runs that begins with one row a method, with the tables beside it."""
     parts = ("tables", "page")
     return make_report(ReportRequest(**vars(request), leaderboard=True, intervals=True, parts=parts), console)
 

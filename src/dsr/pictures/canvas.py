@@ -43,14 +43,6 @@ class Canvas:
     """A figure with positions in inches from the lower left corner.
 
     All pictures are in one :class:`~matplotlib.axes.Axes` of the figure's size, as each further one takes long to make.
-
-    Args:
-        width: width of the figure, inches.
-        height: its height, inches.
-
-    Attributes:
-        figure: the figure.
-
     """
 
     def __init__(self, width: float, height: float) -> None:
@@ -163,12 +155,9 @@ def _write_png(path: Path, figure: Figure, dpi: int, few_colours: bool) -> None:
 
 
 def encode_row(panels: Sequence[np.ndarray]) -> bytes:
-    """Return panels in a row as a WebP, transparent between them.
+    """Return panels of one aspect in a row as a WebP, transparent between them.
 
-    Args:
-        panels: of one aspect and any sizes, (H, W) grey or (H, W, 3) RGB in [0, 1], NaN in holes. Pixels of small ones
-            are repeated, so that they are to be seen.
-
+    Panels are (H, W) grey or (H, W, 3) RGB in [0, 1] of any size, NaN in holes. Pixels of small ones are repeated.
     """
     height, width = panels[0].shape[:2]
     scale = min(_HEIGHT / height, _WIDTH / width)

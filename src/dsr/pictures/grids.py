@@ -54,14 +54,7 @@ class Row:
 
 
 def draw_grid(columns: Sequence[str], rows: Sequence[Row], texts: tuple[str, str]) -> Figure:
-    """Draw a page.
-
-    Args:
-        columns: column headings.
-        rows: rows from top to bottom, each with one cell per column.
-        texts: texts above and below the grid.
-
-    """
+    """Draw a page of rows, each with one cell per column heading, between a text above and one below."""
     right = _MARGIN + (_BAR + _BAR_TEXT if any(row.bar for row in rows) else 0)
     panel = min(max((_WIDTH - 0.3 - right) / len(columns) - _GAP, _LEAST_PANEL), _MOST_PANEL)
     boxes = [_boxes(row, panel) for row in rows]

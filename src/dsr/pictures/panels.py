@@ -28,17 +28,7 @@ _DPI = 160
 def save_picture(
     path: Path, sample: DepthSample, depth: Tensor, scores: Mapping[str, float], label: str, formats: Formats
 ) -> None:
-    """Draw a scene's result and write it atomically.
-
-    Args:
-        path: PNG file.
-        sample: input of the method.
-        depth: (1, H, W) result in metres, NaN in holes.
-        scores: worst-of-four scores in raw units, by metric; empty without ground truth.
-        label: name of the method.
-        formats: formats of the metrics.
-
-    """
+    """Draw a scene's result, (1, H, W) in metres, with its worst-of-four scores in raw units; write it atomically."""
     truth = sample.depth
     page = _Page(sample, 2 if truth is None else 3)
     height, width = depth.shape[-2:]

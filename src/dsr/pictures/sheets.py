@@ -57,22 +57,10 @@ class _Row:
 
 
 def save_contact_sheet(path: Path, scenes: Iterable[Scene], title: str) -> list[Path]:
-    """Draw the photo, depth, holes and renderings of scenes, a row each, and write the pages atomically.
+    """Draw the photo, depth, holes and renderings of scenes, a row each, write the pages atomically and return files.
 
     Scenes are read one by one, so they need not fit into memory together. A scene without high-resolution depth shows
-    its measured map of the lowest resolution.
-
-    Args:
-        path: PNG file; more than six scenes are written to ``NAME-1.png``, ``NAME-2.png``, ..., six per file.
-        scenes: one or more scenes.
-        title: heading of every page.
-
-    Returns:
-        The files, in order.
-
-    Raises:
-        ValueError: there is no scene.
-
+    its measured map of the lowest resolution. More than six scenes are written to ``NAME-1.png``, ``NAME-2.png``, ...
     """
     rows = map(_row, scenes)
     page, following = list(itertools.islice(rows, _ROWS)), next(rows, None)

@@ -47,14 +47,7 @@ _CANDIDATES = 8
 
 
 class Figures:
-    """All figures, which the workers of ``workers`` begin to draw at once.
-
-    Args:
-        folder: output directory; existing files are replaced.
-        workers: runs to draw, and what draws them.
-        light: light of the renderings.
-
-    """
+    """All figures of the runs of ``workers``, which begin to draw them at once; existing files are replaced."""
 
     def __init__(self, folder: Path, workers: WorkerPool, light: str = FIGURE_LIGHT) -> None:
         self.notes: list[str] = []
@@ -63,15 +56,7 @@ class Figures:
         self._drawn = workers.map(functools.partial(_draw, folder), self._pages)
 
     def save(self, progress: Callable[[int, int, str], None] | None = None) -> list[Path]:
-        """Return the paths of the files, a PDF and a PNG of each figure, once they are drawn.
-
-        Args:
-            progress: called before each figure with the number done, the number of all, and the name.
-
-        Raises:
-            ValueError: there is no such light.
-
-        """
+        """Return the files once they are drawn; ``progress`` is told the number done, of all, and the figure's name."""
         paths: list[Path] = []
         for done, page in enumerate(self._pages):
             if progress is not None:
@@ -113,15 +98,7 @@ class Shown:
 
 
 def pages_of(results: Results, kinds: Iterable[str], light: str, notes: list[str]) -> list[Page]:
-    """Return the pages of some kinds of grids, from the names of the files alone.
-
-    Args:
-        results: runs to draw.
-        kinds: some of renderings, depth, errors.
-        light: light of the renderings.
-        notes: list to which one line is added per scene that no run has stored.
-
-    """
+    """Return the pages of some kinds of grids, from the names of the files alone; ``notes`` takes what is left out."""
     found = []
     problems = results.problems()
     for kind in kinds:
@@ -148,15 +125,7 @@ def _has_truth(run: Run, scene: str) -> bool:
 
 
 def save_page(folder: Path, results: Results, page: Page, notes: list[str]) -> list[Path]:
-    """Draw a page, unless none of its scenes can be drawn, and return the paths of the PDF and the PNG.
-
-    Args:
-        folder: directory of the files.
-        results: runs to draw.
-        page: one of :func:`pages_of`.
-        notes: list to which one line is added per scene or result that could not be drawn.
-
-    """
+    """Draw a page, unless none of its scenes can be drawn, and return its PDF and PNG; ``notes`` takes the reasons."""
     kind = _GRIDS[page.kind]
     methods = list(dict.fromkeys(run.label for run in results.of(page.problem)))
     rows = []
@@ -341,12 +310,7 @@ def _score_text(scores: dict[str, float], metrics: tuple[str, ...]) -> str:
 def details_of(pictures: Sequence[np.ndarray], truth: np.ndarray | None, grain: int, count: int = 2) -> list[Window]:
     """Find square windows in which results differ most, on average, from the ground truth or else from their mean.
 
-    Args:
-        pictures: renderings of the results, (H, W), NaN where undefined.
-        truth: rendering of the ground truth, (H, W), NaN where undefined; None without one.
-        grain: pixels in a block; windows consist of whole blocks, at a whole scale factor of pixels of the input.
-        count: maximum number of windows, which do not overlap.
-
+    Renderings are (H, W), NaN where undefined. Windows do not overlap, and consist of whole blocks of ``grain`` pixels.
     """
     if not pictures:
         return []

@@ -67,16 +67,10 @@ def wilson(count: float, n: int) -> tuple[float, float]:
 def bootstrap_of_average(chosen: np.ndarray, asked: np.ndarray, seed: int = 0) -> tuple[float, float]:
     """Compute the 95 % interval of a fraction averaged over scenes by resampling participants.
 
-    The answers of one participant to several scenes are not independent, so participants are resampled (cluster
-    percentile bootstrap: Davison and Hinkley 1997, "Bootstrap Methods and their Application", ch. 2-3). If all
-    resamples agree, for example because all or no participants chose a method, the Wilson interval with one answer per
-    participant is returned.
-
-    Args:
-        chosen: (people, scenes) 1 where the participant chose the method, else 0.
-        asked: (people, scenes) 1 where the participant saw the method, else 0.
-        seed: seed of the resampling.
-
+    ``chosen`` and ``asked``, (people, scenes), are 1 where the participant chose and saw the method. The answers of one
+    participant are not independent, so participants are resampled (cluster percentile bootstrap: Davison and Hinkley
+    1997, "Bootstrap Methods and their Application", ch. 2-3). If all resamples agree, for example because all or no
+    participants chose a method, the Wilson interval with one answer per participant is returned.
     """
     people = len(asked)
     weights = np.random.default_rng(seed).multinomial(people, np.full(people, 1 / people), size=_RESAMPLES)
@@ -98,14 +92,9 @@ def average_fraction(chosen: np.ndarray, asked: np.ndarray) -> np.ndarray:
 def agreement(counts: np.ndarray) -> tuple[float, float]:
     """Compute the agreement of pairs of participants, and Fleiss' kappa (Fleiss 1971, Psychological Bulletin 76).
 
-    Args:
-        counts: (scenes, methods) number of first choices. Scenes with fewer than two answers are left out.
-
-    Returns:
-        The fraction of pairs of participants that agree, averaged over scenes, and kappa: 1 for full agreement, 0 for
-        agreement by chance given the overall frequency of each method. Both are NaN without pairs; kappa is also NaN if
-        all participants always chose the same method.
-
+    ``counts``, (scenes, methods), are the first choices; scenes with fewer than two are left out. The first value is
+    the fraction of pairs that agree, averaged over scenes. Kappa is 1 for full agreement, 0 for agreement by chance
+    given the overall frequency of each method, NaN if all always chose the same one; both are NaN without pairs.
     """
     counts = counts[counts.sum(1) >= 2]
     if not len(counts):

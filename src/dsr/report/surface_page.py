@@ -75,14 +75,7 @@ class Packed:
 
 
 def pack_result(result: ViewedResult, vertices: int, photo_side: int) -> Packed:
-    """Pack a result.
-
-    Args:
-        result: the result.
-        vertices: maximum number of vertices of a surface; larger maps are reduced by a whole factor.
-        photo_side: maximum longer side of the photo in pixels.
-
-    """
+    """Pack a result; maps of more ``vertices`` are reduced by a whole factor, the photo to ``photo_side`` pixels."""
     known = result.depth[np.isfinite(result.depth)]
     middle = float(np.median(known)) if known.size else 1.0
     limits = {"depth": tuple(share * middle for share in DEPTHS), "angle": ANGLES}
@@ -108,17 +101,10 @@ def pack_result(result: ViewedResult, vertices: int, photo_side: int) -> Packed:
 
 
 def save_view(path: Path, results: Sequence[Packed], *, title: str, notes: Sequence[str] = ()) -> None:
-    """Write the page atomically.
+    """Write the page of some results, at least one, atomically.
 
     A content security policy allows the page's own script, style and pictures alone, so that it cannot ask any server.
     All names are escaped, or shown as text by the script.
-
-    Args:
-        path: HTML file.
-        results: packed results; one at least.
-        title: title of the page.
-        notes: remarks on the page as a whole.
-
     """
     style, script = asset("view.css"), f'"use strict";\n{asset(*VIEWER, "view_page.js")}'
     parts = {

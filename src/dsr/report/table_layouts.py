@@ -46,20 +46,10 @@ _HEAD = r"""\documentclass{article}
 def write_tables(
     folder: Path, results: Results, study: pd.DataFrame | None = None, *, intervals: bool = False
 ) -> list[Path]:
-    """Write all tables of some runs.
+    """Write all tables of some runs, and return the files.
 
-    Args:
-        folder: output directory for ``NAME.md``, ``NAME.tex``, ``NAME_published.tex`` (if the paper has values) and
-            ``NAME.csv`` of each table, and for ``all.md`` and ``all.tex`` with all tables.
-        results: runs.
-        study, intervals: see :func:`dsr.report.tables.build_tables`.
-
-    Returns:
-        Paths of the files.
-
-    Raises:
-        ValueError: the table of the study is invalid.
-
+    They are ``NAME.md``, ``NAME.tex``, ``NAME_published.tex`` (if the paper has values) and ``NAME.csv`` of each table,
+    and ``all.md`` and ``all.tex`` with all tables.
     """
     tables = build_tables(results, study, intervals=intervals)
     texts = {"all.md": "\n".join(map(to_markdown, tables)), "all.tex": to_document(tables)}
@@ -169,12 +159,8 @@ def to_document(tables: Sequence[PaperTable]) -> str:
 def to_latex(table: PaperTable, *, published: bool = False) -> str:
     r"""Return a table as LaTeX for ``\input``; it needs the packages booktabs and graphicx, and the encoding T1.
 
-    A table is at most as wide as the text. A table too long for a page is split.
-
-    Args:
-        table: table to write.
-        published: whether to add the paper's values in parentheses, without spreads and intervals.
-
+    A table is at most as wide as the text. A table too long for a page is split. A ``published`` one has the paper's
+    values in parentheses, and no spreads and intervals.
     """
     groups = [list(_latex_rows(table, group, published=published)) for group in table.groups]
     pages = list(_pages([rows for rows in groups if rows]))
@@ -182,14 +168,7 @@ def to_latex(table: PaperTable, *, published: bool = False) -> str:
 
 
 def aligned(head: Sequence[str], rows: Sequence[Sequence[str]], texts: int) -> str:
-    """Format a Markdown table with aligned columns.
-
-    Args:
-        head: headings, escaped.
-        rows: cells, escaped.
-        texts: number of text columns from the left; the remaining columns are numbers, aligned to the right.
-
-    """
+    """Format a Markdown table of escaped texts with aligned columns, of which the first ``texts`` are to the left."""
     widths = [max(3, *map(len, column)) for column in zip(head, *rows, strict=True)]
     rule = ["-" * width if number < texts else "-" * (width - 1) + ":" for number, width in enumerate(widths)]
     lines = []

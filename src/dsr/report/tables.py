@@ -162,16 +162,8 @@ def shown(column: MetricFormat, value: float) -> str:
 def build_tables(results: Results, study: pd.DataFrame | None = None, *, intervals: bool = False) -> list[PaperTable]:
     """Build the tables of all runs: per scale and degradation a summary, then one table per data set.
 
-    Args:
-        results: runs.
-        study: table written by ``dsr study collect``: columns ``dataset, scene, scale, downsampling, label``, and
-            ``user_first, user_second, user_top2`` in percent with ``_low`` and ``_high`` of each.
-        intervals: whether averages have confidence intervals, and the best one is tested against the second best, see
-            :mod:`dsr.report.significance`.
-
-    Raises:
-        ValueError: the study lacks a column.
-
+    ``study`` is a table that ``dsr study collect`` wrote. With ``intervals``, averages have confidence intervals, and
+    the best one is tested against the second best, see :mod:`dsr.report.significance`.
     """
     if study is not None:
         check_study(study)
@@ -258,17 +250,7 @@ def rows_of(
     formats: Formats,
     study: pd.DataFrame | None = None,
 ) -> list[Row]:
-    """Build the rows of some methods for a scene or an average; a method without values has an empty row.
-
-    Args:
-        about: scenes.
-        labels: methods.
-        runs: runs of one scale and degradation.
-        values: their scores.
-        formats: metrics.
-        study: table of a user study.
-
-    """
+    """Build the rows of some methods for a scene or an average, from runs of one scale and degradation."""
     scale, downsampling = runs[0].scale, runs[0].downsampling
     scenes = [place.scene for place in about.places]
     cells = {key: cells_of(values, labels, about.places, key) for key in formats}
@@ -323,12 +305,7 @@ def _truth_is_complete(results: Results) -> Callable[[Place], bool]:
 
 
 def cells_of(values: Values, labels: Sequence[str], places: Sequence[Place], metric: str) -> dict[str, Cell]:
-    """Average a metric over seeds, then over the scenes of ``places`` that all methods with the metric there have.
-
-    Returns:
-        Cells by label, without the methods that have no value there.
-
-    """
+    """Average a metric over seeds, then over the scenes that all methods with the metric there have; cells by label."""
     found = {label: [values.get(label, {}).get(place, {}).get(metric, {}) for place in places] for label in labels}
     found = {label: scenes for label, scenes in found.items() if any(scenes)}
     shared = [number for number, scene in enumerate(zip(*found.values(), strict=True)) if all(scene)]

@@ -25,13 +25,7 @@ _SCRIPTS = ("core.js", "values.js", "tables.js", "scenes.js", "report.js")
 
 
 class Pictures:
-    """The pictures of all scenes and the agreement of their errors, which the workers begin at once.
-
-    Args:
-        workers: runs, and the processes that encode their pictures.
-        longest: maximum longer side of a picture, pixels.
-
-    """
+    """The pictures of all scenes and the agreement of their errors, which the workers begin at once."""
 
     def __init__(self, workers: WorkerPool, longest: int = LONGEST) -> None:
         self.results, self.longest = workers.results, longest
@@ -61,27 +55,16 @@ def save_page(
     progress: Steps | None = None,
     leaderboard: bool = False,
 ) -> list[str]:
-    """Write a page with the scores, renderings, errors, times and settings of runs, atomically.
+    """Write a page with the scores, renderings, errors, times and settings of runs, atomically; return notes on it.
 
     The page works as a local file, without a server, and links to the tables, figures and correlations beside it. It
     computes the renderings from 8-bit normals, so they differ from :func:`dsr.geometry.surface.render` by quantization
-    only.
-
-    Args:
-        path: HTML file.
-        pictures: the runs and their pictures.
-        title: title of the page.
-        progress: called with the number of finished scenes and of all.
-        leaderboard: whether the tables begin with the methods by mean rank.
-
-    Returns:
-        Notes on what could not be shown and how the pictures were stored.
-
+    only. The tables of a ``leaderboard`` begin with the methods by mean rank.
     """
     results = pictures.results
     problems = results.problems()
     store, notes = PictureStore(pictures.longest), list[str]()
-    shown, scenes = [], []
+    shown, scenes = list[dict[str, Any]](), list[str]()
     for done, ((problem, name), (scene, own, remarks)) in enumerate(zip(pictures.places, pictures.scenes, strict=True)):
         store.pictures |= own.pictures
         store.reduced |= own.reduced

@@ -120,17 +120,12 @@ def links(folder: Path) -> list[dict[str, str]]:
 
 
 def standings(results: Results) -> list[dict[str, Any]]:
-    """Return the methods by mean rank, the best first.
+    """Return the methods by mean rank, the best first, with the means of metrics over all settings, in table units.
 
     In each setting (data set, scale, degradation) the methods are ranked by the mean of each metric that all of them
     have, over the scenes that all of them have; equal displayed values share the mean of their places. Ranks are
     averaged within each family of metrics, then over the families, then over settings, so that neither many metrics of
-    one kind nor a data set with many scenes decides.
-
-    Returns:
-        For each method ``method``, ``rank``, the number of ``settings`` that it has, and ``values``: the mean over all
-        settings of each metric, in the unit of tables, for a method that has all of them.
-
+    one kind nor a data set with many scenes decides. A method without all settings has no means and stands last.
     """
     formats = results.formats
     ranks: dict[str, list[float]] = {label: [] for label in results.methods()}

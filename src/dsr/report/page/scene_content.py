@@ -104,17 +104,7 @@ def mask_picture(depth_valid: np.ndarray, normal_valid: np.ndarray) -> np.ndarra
 
 
 def scene_data(view: View, pool: PictureStore, notes: list[str]) -> dict[str, Any] | None:
-    """Return the data of a scene for the page, and add its pictures to the pool.
-
-    Args:
-        view: scene and its runs.
-        pool: pool to which the pictures are added.
-        notes: list to which omissions and their reasons are added.
-
-    Returns:
-        Values that JSON can represent; None if no run has stored the scene.
-
-    """
+    """Return the data of a scene for the page, None without a stored scene; its pictures are added to the pool."""
     stored = stored_sample(view, notes)
     if stored is None:
         return None
@@ -227,15 +217,9 @@ def _sizes(errors: Sequence[Tensor]) -> list[np.ndarray]:
 def calibration_data(results: Results, problem: BenchmarkSetting) -> list[dict[str, Any]]:
     """Return how the expected errors of each method that has them agree with the measured ones.
 
-    Args:
-        results: all runs.
-        problem: the setting. Its scenes without ground truth are left out.
-
-    Returns:
-        A row per method: ``method``; ``scenes``, the number of scenes that all of them have; ``depth`` and ``angle``,
-        each with the ``ratios`` of :func:`dsr.metrics.calibration.error_ratios`, the ``share`` of the squared error in
-        the most confident 80 % of the pixels, and the ``least`` possible one; None for a value that is undefined.
-
+    Each row has ``method``; ``scenes``, the number of scenes with ground truth that all of them have; ``depth`` and
+    ``angle``, each with the ``ratios`` of :func:`dsr.metrics.calibration.error_ratios`, the ``share`` of the squared
+    error in the most confident 80 % of the pixels, and the ``least`` possible one; None for an undefined value.
     """
     found: dict[str, dict[str, Tensor]] = {}
     step, views = 0, views_of(results, problem)

@@ -46,12 +46,7 @@ class Answers:
 
 
 def files_of(paths: Iterable[Path]) -> list[Path]:
-    """Return the given files and all ``*.json`` files below the given directories, without duplicates.
-
-    Raises:
-        ValueError: there is no file.
-
-    """
+    """Return the given files and all ``*.json`` files below the given directories, without duplicates."""
     found: dict[Path, Path] = {}
     for path in paths:
         for file in sorted(path.rglob("*.json"), key=natural_key) if path.is_dir() else [path]:
@@ -86,12 +81,7 @@ def read_all(files: Sequence[Path], key: Key) -> tuple[list[Answers], list[str]]
 
 
 def read_answers(file: Path, key: Key) -> Answers:
-    """Read one answer file.
-
-    Raises:
-        ValueError: the file is damaged, incomplete, of another study, or has answers that the page cannot produce.
-
-    """
+    """Read one answer file; refuse one that is damaged, incomplete, of another study, or that the page cannot make."""
     stored = _read(file, key)
     if stored.finished is None:
         raise ValueError(f"{file}: incomplete, it was saved before the last scene was answered")

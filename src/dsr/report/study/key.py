@@ -58,12 +58,7 @@ def write_key(path: Path, key: Key) -> None:
 
 
 def read_key(path: Path) -> Key:
-    """Read a key written by :func:`write_key`.
-
-    Raises:
-        ValueError: the file is missing, damaged, or of another version.
-
-    """
+    """Read a key written by :func:`write_key`; refuse a missing or damaged one, and another version."""
     try:
         key = TypeAdapter(Key).validate_json(read_limited(path), strict=True)
     except FileNotFoundError:

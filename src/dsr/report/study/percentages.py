@@ -30,11 +30,6 @@ def collect(answers: Sequence[Answers], key: Key) -> pd.DataFrame:
     Percentages of single scenes have Wilson intervals. Intervals of averages come from resampling participants, since
     the answers of one participant are not independent. In an average each scene that showed the method has the same
     weight. Scenes without answers have no rows.
-
-    Args:
-        answers: accepted answers, at least one.
-        key: key of the study.
-
     """
     rows = []
     for (scale, downsampling), of_setting in _ballots(answers, key).groupby(["scale", "downsampling"], sort=False):
@@ -112,12 +107,7 @@ def _consistency(answers: Sequence[Answers]) -> list[str]:
 
 
 def tables_of(collected: pd.DataFrame) -> Iterator[Table]:
-    """Yield a table per data set, scale and degradation, and one over all data sets if there are several.
-
-    Args:
-        collected: see :func:`collect`.
-
-    """
+    """Yield a table per data set, scale and degradation, and one over all data sets if there are several."""
     for place, rows in collected.groupby(["dataset", "scale", "downsampling"], sort=False):
         dataset, scale, downsampling = place
         others = collected[(collected["scale"] == scale) & (collected["downsampling"] == downsampling)]

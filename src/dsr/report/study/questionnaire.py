@@ -177,13 +177,7 @@ def _draw(view: View, light: str, notes: list[str]) -> _Question | None:
 
 
 def grey_png(shades: np.ndarray, valid: np.ndarray) -> bytes:
-    """Encode an 8-bit PNG: black is level 1, white is 255, and missing pixels are level 0 and transparent.
-
-    Args:
-        shades: (H, W) in [0, 1], NaN where undefined.
-        valid: (H, W) bool mask of the pixels to show.
-
-    """
+    """Encode (H, W) shades in [0, 1] as an 8-bit PNG: black is level 1, white 255, and not ``valid`` is transparent."""
     levels = np.where(valid & np.isfinite(shades), 1 + np.rint(254 * shades), 0)
     content = io.BytesIO()
     Image.fromarray(levels.astype(np.uint8)).save(content, "PNG", transparency=0, compress_level=9)
