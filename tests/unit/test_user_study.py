@@ -130,11 +130,6 @@ def test_averages_are_means_over_scenes_with_an_interval_around_them(tmp_path):
     assert row(table, ALL, AVERAGE, "MSG-V") | {"dataset": "simgeo"} == found
 
 
-def test_first_choices_of_all_methods_add_up_to_100_percent(tmp_path):
-    shares = collected(tmp_path, *FOUR).groupby(["dataset", "scene"])[["user_first", "user_second", "user_top2"]].sum()
-    assert shares.to_numpy() == pytest.approx(np.array([[100, 100, 200]] * len(shares)))
-
-
 def test_scene_counts_only_those_who_saw_it(tmp_path):
     key = Key(KEY.study, "e4", 1, 0, KEY.trials)
     parts = copy.deepcopy(FOUR)

@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 import matplotlib as mpl
 import numpy as np
 from matplotlib.colors import ListedColormap
-from torch import Tensor
 
 from dsr.evaluation.results import BenchmarkSetting, Results, Run, sample_path
 from dsr.geometry.camera import Camera
@@ -29,7 +28,7 @@ from dsr.pictures.canvas import save_both
 from dsr.pictures.depth_views import Window, limits_of, rendering, strongest_window
 from dsr.pictures.grids import Cell, Row, draw_grid
 from dsr.pictures.lights_figure import save_lights_figure
-from dsr.report.shown_scenes import results_of, stored_sample, views_of
+from dsr.report.shown_scenes import Shown, shown_of, stored_sample, views_of
 from dsr.report.worker_pool import WorkerPool
 from dsr.sample import DepthSample
 from dsr.utils.arrays import array_headers
@@ -88,16 +87,6 @@ class Page:
     light: str  # of the renderings
 
 
-@dataclass(frozen=True)
-class Shown:
-    """A scene and its results."""
-
-    name: str
-    scene: DepthSample
-    depths: dict[str, Tensor | None]  # (1, H, W) in metres by method, None without a result
-    scores: dict[str, dict[str, float]]  # by method and metric, worst of four lights, raw units
-
-
 def pages_of(results: Results, kinds: Iterable[str], light: str, notes: list[str]) -> list[Page]:
     """Return the pages of some kinds of grids, from the names of the files alone; ``notes`` takes what is left out."""
     found = []
@@ -131,18 +120,9 @@ def save_page(folder: Path, results: Results, page: Page, notes: list[str]) -> l
     methods = list(dict.fromkeys(run.label for run in results.of(page.problem)))
     rows = []
     for view in views_of(results, page.problem):
-        stored = stored_sample(view, notes) if view.scene in page.scenes else None
-        if stored is None:
-            continue
-        depths = {each.run.label: each.depth for each in results_of(view, stored, notes)}
-        scores = {run.label: run.headlines.get(view.scene, {}) for run in view.runs}
-        shown = Shown(
-            view.scene,
-            stored,
-            {label: depths.get(label) for label in methods},
-            {label: scores.get(label, {}) for label in methods},
-        )
-        if row := kind.row(shown, page.light):
+        shown = shown_of(view, methods, notes) if view.scene in page.scenes else None
+        row = None if shown is None else kind.row(shown, page.light)
+        if row is not None:
             rows.append(row)
     if not rows:
         return []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -67,3 +68,28 @@ def results_of(view: View, stored: DepthSample, notes: list[str]) -> list[Result
         expected = f"expected maps of the photo's {size[1]} x {size[2]} pixels"
         notes.append(f"{run.folder}: {view.scene}: {expected}, got {came}; not shown")
     return found
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A scene and its results by method."""
+
+    name: str
+    scene: DepthSample
+    depths: dict[str, Tensor | None]  # (1, H, W) in metres, None without a result
+    scores: dict[str, dict[str, float]]  # by metric, worst of four lights, raw units
+
+
+def shown_of(view: View, methods: Sequence[str], notes: list[str]) -> Shown | None:
+    """Return a scene with the results of some methods, None if no run has stored it; ``notes`` takes what it lacks."""
+    stored = stored_sample(view, notes)
+    if stored is None:
+        return None
+    depths = {each.run.label: each.depth for each in results_of(view, stored, notes)}
+    scores = {run.label: run.headlines.get(view.scene, {}) for run in view.runs}
+    return Shown(
+        view.scene,
+        stored,
+        {label: depths.get(label) for label in methods},
+        {label: scores.get(label, {}) for label in methods},
+    )
