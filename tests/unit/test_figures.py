@@ -6,13 +6,11 @@ import subprocess
 
 import numpy as np
 import pytest
-import torch
 
 from dsr.evaluation.run_files import load_results
 from dsr.geometry.surface import lights
 from dsr.pictures import canvas, lights_figure
 from dsr.pictures.depth_views import Window, strongest_window
-from dsr.pictures.lights_figure import sphere_normals
 from dsr.report import figures as figures_of_runs
 from dsr.report.figures import KINDS, Figures, details_of, pages_of, save_page
 from dsr.report.worker_pool import WorkerPool
@@ -162,16 +160,6 @@ def test_results_that_cannot_be_drawn_are_left_out_with_a_note(results, drawn, t
     assert any("expected maps of the photo's 24 x 24 pixels, got 7 x 24" in note for note in notes)
     assert any(str(tmp_path / "runs" / "b" / "predictions" / "one.npz") in note for note in notes)
     assert len(empty_panels(drawn["depth_simgeo_x4_box_1"], "one")) == 2
-
-
-def test_sphere_normals_are_unit_vectors_that_face_the_camera():
-    x, y, z = sphere_normals(101)
-    known = z.isfinite()
-    assert known.double().mean() == pytest.approx(torch.pi / 4, rel=0.03)
-    torch.testing.assert_close((x**2 + y**2 + z**2)[known], torch.ones(int(known.sum()), dtype=torch.float64))
-    assert (z[known] <= 0).all()
-    assert x[50, 75] == pytest.approx(0.5)
-    assert y[75, 50] == pytest.approx(0.5)
 
 
 def test_figure_of_lights_shows_their_closed_form(drawn, tmp_path):

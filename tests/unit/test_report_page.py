@@ -201,37 +201,6 @@ def test_reduced_values_are_averages_of_valid_pixels():
     assert known.tolist() == [[True, True], [False, True]]
 
 
-def test_page_has_mean_and_standard_deviation_of_several_seeds(make_run, tmp_path):
-    scenes = ("cube_no_texture", "statue")
-    for seed in range(3):
-        make_run(tmp_path / "runs" / str(seed), seed=seed, scenes=scenes)
-    results = load_results([tmp_path / "runs"])
-    _, data, scene = saved(tmp_path, results)
-    [problem] = data["problems"]
-    table = results.scores[results.scores["metric"] == "RMSE_d"]
-    own = table[table["scene"] == "statue"]["value"] * 1000
-    [row] = [row for row in problem["rows"] if row["scene"] == "statue"]
-    assert row["values"]["RMSE_d"] == pytest.approx([own.mean(), own.std()])
-    averages = table.groupby("seed")["value"].mean() * 1000
-    assert problem["means"][0]["values"]["RMSE_d"] == pytest.approx([averages.mean(), averages.std()])
-    assert problem["means"][0]["seeds"] == 3
-    assert [surface["text"] for surface in scene["surfaces"] if surface["kind"] == "method"] == ["seed 0"]
-
-
-def test_published_values_stand_with_the_papers_own_scenes_alone(make_run, tmp_path):
-    make_run(tmp_path / "runs" / "a", scenes=("lucy", "cube_no_texture"), size=512)
-    make_run(tmp_path / "runs" / "b", scenes=("lucy",), downsampling="nearest", size=512)
-    make_run(tmp_path / "runs" / "c", scenes=("lucy",), scale=8, size=64)
-    _, data, _ = saved(tmp_path, load_results([tmp_path / "runs"]))
-    papers = {
-        (problem["downsampling"], problem["scale"], row["scene"]): row["paper"]
-        for problem in data["problems"]
-        for row in problem["rows"]
-    }
-    assert papers.pop(("box", 4, "lucy"))["RMSE_d"] == 72
-    assert papers == {("box", 4, "cube_no_texture"): {}, ("nearest", 4, "lucy"): {}, ("box", 8, "lucy"): {}}
-
-
 def test_run_without_stored_scenes_has_tables_and_says_why_no_pictures(make_run, tmp_path):
     folder = make_run(tmp_path / "run")
     (folder / "scenes" / "cube_no_texture.npz").unlink()

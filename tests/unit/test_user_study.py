@@ -317,15 +317,6 @@ def test_page_reveals_no_method_scene_or_directory(tmp_path, runs):
     assert len(sizes) == 1
 
 
-def test_same_runs_give_the_same_study_and_others_another(tmp_path, runs):
-    results = load_results([runs])
-    first = build_study(results, tmp_path / "one")
-    second = build_study(results, tmp_path / "two", Choice(title="Other words"))
-    third = build_study(results, tmp_path / "three", Choice(light="e1"))
-    assert first.key == second.key
-    assert third.key.study != first.key.study
-
-
 def test_scene_of_one_method_alone_is_left_out_and_incomplete_ones_are_noted(tmp_path, runs, make_run):
     make_run(runs / "more", scenes=["alone"])
     built = build_study(load_results([runs]), tmp_path / "study")
