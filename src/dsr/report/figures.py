@@ -166,7 +166,10 @@ def rendering_row(shown: Shown, light: str) -> Row:
 def depth_row(shown: Shown, _: str) -> Row:
     """Build the row of a scene's depth maps."""
     scene = shown.scene
-    style = {"colour_map": "viridis", "limits": limits_of(scene.depth_lr if scene.depth is None else scene.depth)}
+    style: dict[str, Any] = {
+        "colour_map": "viridis",
+        "limits": limits_of(scene.depth_lr if scene.depth is None else scene.depth),
+    }
     scores = _captions(shown, "RMSE_d")
     pixels = {label: None if depth is None else depth[0].numpy() for label, depth in shown.depths.items()}
     cells = [
@@ -189,7 +192,7 @@ def error_row(shown: Shown, _: str) -> Row | None:
     factor, unit = (100, "cm") if limit >= _CENTIMETRE_LIMIT else (1000, "mm")
     # From blue over white to red, without the nearly black ends
     colour_map = ListedColormap(mpl.colormaps["RdBu_r"](np.linspace(0.1, 0.9, 255)), "errors")
-    style = {"colour_map": colour_map, "limits": (-factor * limit, factor * limit)}
+    style: dict[str, Any] = {"colour_map": colour_map, "limits": (-factor * limit, factor * limit)}
     scores = _captions(shown, "RMSE_d")
     cells = [_photo(shown.scene)]
     for label, error in errors.items():
