@@ -50,7 +50,7 @@ from dsr.methods.recipe import read_recipe
 from dsr.metrics.formats import HEADLINES
 from dsr.pictures.canvas import HOLE_COLOUR
 from dsr.pictures.depth_views import Window, rendering
-from dsr.report.shown_scenes import Shown, shown_scenes
+from dsr.report.shown_scenes import Shown, shown_of, views_of
 from dsr.sample import DepthSample
 from dsr.training.patches import soften
 from dsr.utils.files import replacing
@@ -295,7 +295,8 @@ def draw_crop(results: Results, path: Path, words: list[str]) -> None:
     dataset, name, scale, downsampling = words[:4]
     problem = BenchmarkSetting(dataset, float(scale), downsampling)
     notes: list[str] = []
-    shown = next((each for each in shown_scenes(results, problem, notes) if each.name == name), None)
+    views = (view for view in views_of(results, problem) if view.scene == name)
+    shown = next((shown_of(view, results.methods(), notes) for view in views), None)
     if shown is None:
         raise SystemExit(f"--crop: expected a scene of the runs, got {' '.join(words[:4])}")
     top, left, side = map(int, words[4:])

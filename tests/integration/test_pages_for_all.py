@@ -5,9 +5,10 @@ from small_results import waves, write_result
 
 from dsr.cli import main
 from dsr.evaluation.run_files import load_results
-from dsr.report.page import save_page
+from dsr.report.page import Pictures, save_page
 from dsr.report.study import Choice
 from dsr.report.study.questionnaire import build_study
+from dsr.report.worker_pool import WorkerPool
 
 PAGES = ("report", "leaderboard", "view", "study", "trial")
 NARROW, WIDE = {"width": 360, "height": 740}, {"width": 1280, "height": 900}
@@ -60,7 +61,7 @@ def addresses(make_run, tmp_path_factory):
             folder / "runs" / name, method=name, label=label, scenes=("a", "b"), size=64, confident=label == "MSG-V"
         )
     runs = load_results([folder / "runs"])
-    save_page(folder / "report.html", runs, title="A report")
+    save_page(folder / "report.html", Pictures(WorkerPool(runs)), title="A report")
     assert main(["leaderboard", str(folder / "runs"), "-o", str(folder / "leaderboard")]) == 0
     build_study(runs, folder / "study", Choice(repeat=1))
     write_result(folder / "view" / "a room with a name of its own")

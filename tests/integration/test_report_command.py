@@ -67,7 +67,7 @@ def test_workers_make_the_same_files_and_notes_as_the_command_alone(runs: Path, 
     assert files[0].keys() == files[1].keys()
     assert [name for name, content in files[0].items() if content != files[1][name]] == []
     assert notes[0] == notes[1]
-    assert any("no figures of statue" in note for note in notes[0])
+    assert any("simgeo/statue x4 box: no pictures" in note for note in notes[0])
 
 
 def test_interrupted_report_leaves_the_earlier_one_as_it_was(
@@ -129,7 +129,7 @@ def test_report_without_truth_has_pictures_and_no_tables(
         (["--scale", "8"], "scales: expected some of 4, got 8"),
         (["--only", "tables,graphs"], "--only: expected some of tables, metrics, figures, page, got graphs"),
         (["--light", "e5"], "--light: expected one of e1, e2, e3, e4, got e5"),
-        (["--page-mb", "0"], "--page-mb: expected a positive number, got 0"),
+        (["--page-px", "0"], "--page-px: expected at least 16, got 0"),
         (["--study", "absent.csv"], "absent.csv: "),
     ],
 )

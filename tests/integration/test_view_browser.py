@@ -98,11 +98,6 @@ def window(webgl_browser):
         assert each.wrong == []
 
 
-@pytest.fixture
-def shown(window, page_of_one):
-    return window().open(page_of_one)
-
-
 def at(picture, u, v, size=SIZE):
     """Return the colour at the middle of a pixel of the photo, which fills the height of the stage."""
     height, width = picture.shape[:2]
@@ -117,8 +112,10 @@ def magma(level):
     return bgr[::-1].astype(int)
 
 
-def test_surface_is_drawn_where_the_photo_has_it_and_as_bright_as_python_renders_it(shown):
-    picture = shown.press("3", "g").seen()
+def test_surface_is_the_results_own_in_every_light_and_from_every_side(window, page_of_one):
+    """One visit: rendering, holes, before and after, the mesh, light, turning and zoom."""
+    shown = window().open(page_of_one)
+    picture = first = shown.press("3", "g").seen()
     normals = normals_seen_by(CAMERA, torch.from_numpy(waves())[None].double())
     expected = 255 * render_for_viewing(normals)[0, 0].numpy()
     v, u = np.mgrid[6:36:3, 6:36:3]
@@ -126,28 +123,38 @@ def test_surface_is_drawn_where_the_photo_has_it_and_as_bright_as_python_renders
     assert np.ptp(expected[v, u]) > 30
     assert np.abs(found - expected[v, u][..., None]).mean() < 3  # normals of vertices, of pixels
 
-
-def test_holes_and_what_lies_beside_the_photo_are_the_background(shown):
-    picture = shown.press("3", "p").seen()
-    inside = at(picture, 15.5, 45.5)
+    picture = shown.press("p").seen()
     beside = picture[picture.shape[0] // 2, 5]
-    assert np.abs(inside - beside).max() < 40
-    assert inside.max() < 90
+    assert np.abs(at(picture, 15.5, 45.5) - beside).max() < 40
     assert at(picture, 12, 30)[0] > 120  # the photo is red there
     rows, columns = np.mgrid[HOLE[0].start + 1 : HOLE[0].stop - 1, HOLE[1].start + 1 : HOLE[1].stop - 1]
     assert at(picture, columns, rows).max() < 90
+    shown.press("g")
 
+    before, both, after = (shown.press(key).seen() for key in "123")
+    half = after.shape[1] // 2
+    assert np.abs(before - after).mean() > 1
+    assert np.abs(both[:, : half - 20] - before[:, : half - 20]).max() <= 1
+    assert np.abs(both[:, half + 20 :] - after[:, half + 20 :]).max() <= 1
 
-def test_number_of_triangles_is_that_of_dsrs_mesh(shown):
     depth = torch.from_numpy(waves())[None].double()
-    doubtful = torch.from_numpy(errors()) > 0.02 * depth
-    reported = lambda: shown.page.locator(".amounts").inner_text()  # noqa: E731
-    count = lambda depth: f"{len(triangulate(depth, CAMERA).faces):,} triangles"  # noqa: E731
-    certain = count(depth.masked_fill(doubtful, torch.nan))
-    assert f"After: 4,096 vertices (64 \u00d7 64, 4.7 % holes), {certain}" in reported()
-    shown.page.locator(".doubtful input").check()
-    assert count(depth) in reported()
-    assert count(depth) != certain
+    certain = depth.masked_fill(torch.from_numpy(errors()) > 0.02 * depth, torch.nan)
+    for each in (certain, depth):
+        count = f"{len(triangulate(each, CAMERA).faces):,} triangles"
+        assert f"After: 4,096 vertices (64 \u00d7 64, 4.7 % holes), {count}" in shown.page.inner_text(".amounts")
+        shown.page.locator(".doubtful input").check()
+    shown.page.locator(".doubtful input").uncheck()
+
+    ball = shown.page.locator(".ball").bounding_box()
+    shown.page.mouse.click(ball["x"] + 0.9 * ball["width"], ball["y"] + 0.5 * ball["height"])
+    lit = shown.seen()
+    assert np.abs(lit - first).mean() > 1.5
+    shown.page.locator("#stage").focus()
+    for keys in (["ArrowLeft"] * 4, ["Shift+ArrowRight"] * 4, ["+"] * 3):
+        assert np.abs(shown.press(*keys).seen() - lit).mean() > 2
+        shown.press("0")
+    assert np.abs(shown.drag((0.4, 0.5), (0.6, 0.5)).seen() - lit).mean() > 5
+    assert re.search(r"turned \d+\u00b0 to the right", shown.label())
 
 
 def errors():
@@ -155,41 +162,8 @@ def errors():
     return np.tile((0.002 * 30 ** np.linspace(0, 1, SIZE)).astype(np.float32), (1, SIZE, 1))
 
 
-def test_light_moves_by_the_sphere_by_shift_and_by_the_mode_of_dragging(shown):
-    first = shown.press("3").seen()
-    ball = shown.page.locator(".ball").bounding_box()
-    shown.page.mouse.click(ball["x"] + 0.9 * ball["width"], ball["y"] + 0.5 * ball["height"])
-    by_ball = shown.seen()
-    shown.page.keyboard.down("Shift")
-    by_shift = shown.drag((0.5, 0.5), (0.1, 0.9)).seen()
-    shown.page.keyboard.up("Shift")
-    shown.page.locator("[data-drag=light]").click()
-    by_mode = shown.drag((0.5, 0.5), (0.5, 0.05)).seen()
-    pictures = [first, by_ball, by_shift, by_mode]
-    for k, picture in enumerate(pictures):
-        for other in pictures[k + 1 :]:
-            assert np.abs(picture - other).mean() > 1.5
-    assert re.search(r"from where the photo was taken, lit from 6[45]\u00b0 up$", shown.label())
-    shown.page.locator(".ball").focus()
-    assert shown.press("ArrowLeft").label() != shown.press("ArrowLeft").label()
-
-
-def test_before_and_after_are_the_input_and_the_result(shown):
-    before, both, after = (shown.press(key).seen() for key in "123")
-    half = after.shape[1] // 2
-    assert np.abs(before - after).mean() > 1
-    assert np.abs(both[:, : half - 20] - before[:, : half - 20]).max() <= 1
-    assert np.abs(both[:, half + 20 :] - after[:, half + 20 :]).max() <= 1
-    shown.press("2").page.locator(".divider").focus()
-    assert np.abs(shown.press("Home").seen() - after).max() <= 1
-    assert np.abs(shown.press("End").seen() - before).max() <= 1
-    shown.press("2", "Home")
-    shown.drag((0.002, 0.5), (0.7, 0.5))
-    moved = shown.seen()
-    assert np.abs(moved[:, : int(0.65 * 2 * half)] - before[:, : int(0.65 * 2 * half)]).max() <= 1
-
-
-def test_errors_have_the_colours_of_the_legend(shown):
+def test_errors_have_the_colours_of_the_legend(window, page_of_one):
+    shown = window().open(page_of_one)
     picture = shown.press("3", "d").seen()
     middle = float(np.nanmedian(waves()))
     columns = np.array([4, 16, 28])  # beyond, the error is larger than the mesh allows
@@ -208,30 +182,6 @@ def test_errors_have_the_colours_of_the_legend(shown):
     assert np.abs(shown.seen() - picture).mean() > 3
     shown.press("g")
     assert shown.page.locator(".scale").is_hidden()
-
-
-def test_surface_turns_moves_and_zooms_by_mouse_and_keys_and_goes_back(shown):
-    first = shown.press("3").seen()
-    turned = shown.drag((0.4, 0.5), (0.6, 0.5)).seen()
-    assert np.abs(turned - first).mean() > 5
-    assert re.search(r"turned \d+\u00b0 to the right", shown.label())
-    assert np.abs(shown.press("0").seen() - first).max() <= 1
-    shown.page.locator("#stage").focus()
-    for keys in (["ArrowLeft"] * 4, ["ArrowUp"] * 4, ["Shift+ArrowRight"] * 4, ["+"] * 3, ["-"] * 3):
-        assert np.abs(shown.press(*keys).seen() - first).mean() > 2
-        assert np.abs(shown.press("0").seen() - first).max() <= 1
-    moved = shown.drag((0.4, 0.5), (0.6, 0.5), button="right").seen()
-    by = round(0.2 * first.shape[1])
-    apart = {s: np.abs(at_row(moved)[s + 150 : -150] - at_row(first)[150 : -150 - s]).mean() for s in range(2 * by)}
-    assert abs(min(apart, key=lambda shift: apart[shift]) - by) < 0.1 * by  # nearer than the middle, it moves by more
-    shown.press("0")
-    shown.page.mouse.wheel(0, -300)
-    assert np.abs(shown.seen() - first).mean() > 2
-
-
-def at_row(picture):
-    """Return the colours along a row above the middle."""
-    return picture[picture.shape[0] // 3]
 
 
 def test_results_are_chosen_by_list_strip_and_keys_and_names_are_text(window, page_of_two):

@@ -60,16 +60,3 @@ def test_holes_are_drawn(tmp_path):
 def test_prediction_of_holes_alone_is_drawn(tmp_path, truth):
     sample = toy_sample(truth=truth)
     drawn(tmp_path, sample, torch.full((1, 32, 32), torch.nan), {"RMSE_d": float("nan")})
-
-
-def test_existing_picture_is_replaced_and_kept_on_failure(tmp_path):
-    sample = toy_sample()
-    drawn(tmp_path, sample, sample.depth)
-    before = (tmp_path / "pictures" / "scene.png").read_bytes()
-    drawn(tmp_path, sample, sample.depth + 0.5)
-    after = (tmp_path / "pictures" / "scene.png").read_bytes()
-    assert before != after
-    with pytest.raises((ValueError, RuntimeError, TypeError)):
-        save_picture(tmp_path / "pictures" / "scene.png", sample, torch.ones(1, 7, 9), SCORES, "Toy", KNOWN_FORMATS)
-    assert (tmp_path / "pictures" / "scene.png").read_bytes() == after
-    assert len(list((tmp_path / "pictures").iterdir())) == 1

@@ -82,14 +82,6 @@ def test_aligned_scores_are_noted_and_not_beside_the_papers():
         assert any("affine_disparity" in note for note in found.notes) is not beside
 
 
-def test_values_are_in_the_papers_units_under_the_worst_of_four_lights():
-    table = tables(run("Bicubic", {"lucy": 70.4}))["simgeo_x4_box"]
-    assert cell_of(table, "lucy", "Bicubic").mean == pytest.approx(70.4)
-    assert cell_of(table, "lucy", "Bicubic", "DSSIM_v").mean == pytest.approx(704)
-    assert list(table.columns) == ["RMSE_d", "DSSIM_v"]
-    assert any(note.startswith("Not computed: BadPix_d_5cm") for note in table.notes)
-
-
 def test_seeds_are_averaged_first_and_their_averages_give_the_spread():
     values = {0: {"a": 10.0, "b": 40.0}, 1: {"a": 12.0, "b": 50.0}, 2: {"a": 17.0, "b": 30.0}}
     table = tables(*(run("DIP", each, seed=seed, dataset="mine") for seed, each in values.items()))["mine_x4_box"]

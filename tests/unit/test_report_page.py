@@ -17,14 +17,9 @@ from dsr.evaluation.results import Results
 from dsr.evaluation.run_files import load_results
 from dsr.geometry.surface import render
 from dsr.pictures.depth_views import normals_seen_by
-from dsr.report.page import save_page
-from dsr.report.page.value_pictures import (
-    LEVELS,
-    PictureStore,
-    depth_picture,
-    error_picture,
-    mask_picture,
-)
+from dsr.report.page import Pictures, save_page
+from dsr.report.page.scene_content import PictureStore, depth_picture, error_picture, mask_picture
+from dsr.report.worker_pool import WorkerPool
 
 
 def blocks(path):
@@ -46,10 +41,10 @@ def shadings(content, surface):
     return tiles.reshape(height, 3, width).transpose(1, 0, 2)
 
 
-def saved(folder, results, **options):
+def saved(folder, results):
     """Write the page and return its blocks, the data and the first scene."""
     path = folder / "report" / "index.html"
-    save_page(path, results, **options)
+    save_page(path, Pictures(WorkerPool(results)))
     content = blocks(path)
     return content, json.loads(content["data"]), json.loads(content["s0"]) if "s0" in content else None
 
@@ -109,8 +104,7 @@ def test_depth_is_stored_between_its_limits():
 
 def test_mask_distinguishes_a_hole_from_a_depth_without_a_normal():
     depth, normal = np.array([[False, True, True]]), np.array([[False, False, True]])
-    assert mask_picture(depth, normal).tolist() == [[0, 128, 255]]
-    assert mask_picture(normal | True, normal | True) is None
+    assert mask_picture(depth, normal)[..., 0].tolist() == [[0, 128, 255]]
 
 
 def test_holes_of_a_result_are_masked_and_their_neighbours_have_no_normal(make_run, tmp_path):
@@ -180,65 +174,31 @@ def test_limits_of_errors_and_depth_are_the_same_for_all_methods(make_run, tmp_p
     assert not any("limit" in surface["error"] for surface in scene["surfaces"][1:3])
 
 
-def test_pictures_above_the_budget_are_reduced_and_the_page_says_so(make_run, tmp_path):
-    results = load_results([make_run(tmp_path / "run", size=208)])
-    notes = save_page(tmp_path / "small.html", results, budget_mb=0.02)
-    assert notes[0].startswith("pictures: compressed with losses (WebP, quality 75), reduced to 192 pixels at most")
+def test_large_pictures_are_reduced_and_the_page_says_so(make_run, tmp_path):
+    workers = WorkerPool(load_results([make_run(tmp_path / "run", size=64)]))
+    notes = save_page(tmp_path / "small.html", Pictures(workers, 20))
+    assert notes[0].startswith("pictures: lossless, 8 bits, reduced to 20 pixels at most;")
     assert notes[0] in json.loads(blocks(tmp_path / "small.html")["data"])["notes"]
-    assert save_page(tmp_path / "large.html", results)[0].startswith("pictures: lossless, 8 bits;")
-    assert (tmp_path / "small.html").stat().st_size < (tmp_path / "large.html").stat().st_size
+    assert json.loads(blocks(tmp_path / "small.html")["s0"])["surfaces"][1]["size"] == [16, 16]
+    assert save_page(tmp_path / "large.html", Pictures(workers))[0].startswith("pictures: lossless, 8 bits;")
 
 
-def test_pictures_of_the_first_levels_are_lossless_and_the_second_takes_what_the_first_is_too_large_for():
+def test_pictures_are_lossless():
     picture = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
-    smooth = np.add.outer(np.arange(200), np.arange(300)).astype(np.uint8)
-    for level in LEVELS[:2]:
-        pool = PictureStore(level)
-        for each in (picture, smooth):
-            content = base64.b64decode(pool.pictures[pool.add(each)])
-            image = np.asarray(Image.open(io.BytesIO(content)).convert("RGB"))
-            np.testing.assert_array_equal(image, each if each.ndim == 3 else np.stack([each] * 3, axis=-1))
-        assert (content[:4] == b"RIFF") == (not level.fast)
+    smooth = np.add.outer(np.arange(200), np.arange(300)).astype(np.uint8)[..., None]
+    store = PictureStore(1024)
+    for each in (picture, smooth):
+        image = np.asarray(Image.open(io.BytesIO(base64.b64decode(store.pictures[store.add(each)]))))
+        np.testing.assert_array_equal(image.reshape(each.shape), each)
 
 
 def test_reduced_values_are_averages_of_valid_pixels():
-    pool = PictureStore(dataclasses.replace(LEVELS[0], longest=2))
-    values = np.array([[1.0, 3, 5, np.nan], [1, 3, 7, 9], [np.nan, np.nan, 2, 2], [np.nan, 4, 2, 2]])
-    reduced, known = pool.fit(values)
-    assert pool.reduced
-    assert reduced[known].tolist() == [2, 7, 2]
+    store = PictureStore(2)
+    values = torch.tensor([[1.0, 3, 5, np.nan], [1, 3, 7, 9], [np.nan, np.nan, 2, 2], [np.nan, 4, 2, 2]])
+    fitted, known = store.fit(values[None])
+    assert store.reduced
+    assert fitted[known].ravel().tolist() == [2, 7, 2]
     assert known.tolist() == [[True, True], [False, True]]
-
-
-def test_page_has_mean_and_standard_deviation_of_several_seeds(make_run, tmp_path):
-    scenes = ("cube_no_texture", "statue")
-    for seed in range(3):
-        make_run(tmp_path / "runs" / str(seed), seed=seed, scenes=scenes)
-    results = load_results([tmp_path / "runs"])
-    _, data, scene = saved(tmp_path, results)
-    [problem] = data["problems"]
-    table = results.scores[results.scores["metric"] == "RMSE_d"]
-    own = table[table["scene"] == "statue"]["value"] * 1000
-    [row] = [row for row in problem["rows"] if row["scene"] == "statue"]
-    assert row["values"]["RMSE_d"] == pytest.approx([own.mean(), own.std()])
-    averages = table.groupby("seed")["value"].mean() * 1000
-    assert problem["means"][0]["values"]["RMSE_d"] == pytest.approx([averages.mean(), averages.std()])
-    assert problem["means"][0]["seeds"] == 3
-    assert [surface["text"] for surface in scene["surfaces"] if surface["kind"] == "method"] == ["seed 0"]
-
-
-def test_published_values_stand_with_the_papers_own_scenes_alone(make_run, tmp_path):
-    make_run(tmp_path / "runs" / "a", scenes=("lucy", "cube_no_texture"), size=512)
-    make_run(tmp_path / "runs" / "b", scenes=("lucy",), downsampling="nearest", size=512)
-    make_run(tmp_path / "runs" / "c", scenes=("lucy",), scale=8, size=64)
-    _, data, _ = saved(tmp_path, load_results([tmp_path / "runs"]))
-    papers = {
-        (problem["downsampling"], problem["scale"], row["scene"]): row["paper"]
-        for problem in data["problems"]
-        for row in problem["rows"]
-    }
-    assert papers.pop(("box", 4, "lucy"))["RMSE_d"] == 72
-    assert papers == {("box", 4, "cube_no_texture"): {}, ("nearest", 4, "lucy"): {}, ("box", 8, "lucy"): {}}
 
 
 def test_run_without_stored_scenes_has_tables_and_says_why_no_pictures(make_run, tmp_path):
@@ -248,7 +208,7 @@ def test_run_without_stored_scenes_has_tables_and_says_why_no_pictures(make_run,
     assert scene is None
     assert data["scenes"] == []
     assert data["problems"][0]["rows"]
-    assert any("cube_no_texture: no pictures" in note for note in data["notes"])
+    assert any("cube_no_texture x4 box: no pictures" in note for note in data["notes"])
     assert not any(name.startswith("p") for name in content)
 
 

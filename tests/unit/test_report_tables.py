@@ -12,9 +12,9 @@ from rich.console import Console
 from dsr.evaluation.results import Run
 from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.metrics.formats import in_tables
-from dsr.report.paper import published, published_row
+from dsr.report.paper import Place, published, published_row
 from dsr.report.table_layouts import score_tables
-from dsr.report.tables import in_shown_units
+from dsr.report.tables import values_of
 
 RAW = {
     "RMSE_d": 0.0704, "BadPix_d_5cm": 0.0670, "BadPix_v_5": 0.495, "DSSIM_v": 0.354, "LPIPS_v": 0.424,
@@ -48,13 +48,16 @@ def scores(*scenes, raw=RAW, downsampling="box", scale=4):
     return pd.DataFrame(rows)
 
 
-def text(table, label="Bicubic", *, folder=Path("none"), range_type=None, **dataset):
+def run_of(table, label="Bicubic", *, folder=Path("none"), range_type=None, **dataset):
     first = table.iloc[0]
     settings = {"dataset": dataset, "downsampling": {"range_type": range_type}}
     about = (str(first["dataset"]), int(first["scale"]), str(first["downsampling"]), 0, label.lower(), label)
-    run = Run(folder, *about, table, {}, settings, {}, tuple(table["scene"].unique()))
+    return Run(folder, *about, table, {}, settings, {}, tuple(table["scene"].unique()))
+
+
+def text(table, **options):
     console = Console(width=120, file=io.StringIO())
-    console.print(*score_tables(run, KNOWN_FORMATS))
+    console.print(*score_tables(run_of(table, **options), KNOWN_FORMATS))
     return console.file.getvalue()
 
 
@@ -65,9 +68,9 @@ def row(printed, first, second):
 
 
 def test_raw_scores_become_millimetres_percents_and_thousandths():
-    table = in_shown_units(scores("lucy"), KNOWN_FORMATS)
-    assert list(table.columns) == list(in_tables(KNOWN_FORMATS))
-    assert table.loc["lucy"].to_dict() == pytest.approx(UNITS)
+    values = values_of([run_of(scores("lucy"))], KNOWN_FORMATS)["Bicubic"][Place("simgeo", "lucy")]
+    shown = {name: values[name][0] for name in in_tables(KNOWN_FORMATS)}
+    assert shown == pytest.approx(UNITS)
 
 
 def test_paper_has_an_rmse_d_of_72_mm_for_lucy_x4_bicubic():

@@ -4,11 +4,9 @@ import json
 import os
 
 import pytest
-import torch
 
-from dsr.evaluation.results import BenchmarkSetting, sample_path
+from dsr.evaluation.results import BenchmarkSetting
 from dsr.evaluation.run_files import load_results
-from dsr.sample import DepthSample
 
 
 def change(folder, name, **entries):
@@ -32,30 +30,6 @@ def test_run_is_read_with_its_scenes_predictions_and_scores(make_run, tmp_path):
     assert run.versions["python"] == "3.11.7"
     assert "identity" not in run.versions
     assert run.settings["method"]["name"] == "bicubic"
-
-
-def test_expected_errors_are_read_and_a_method_without_them_has_none(make_run, tmp_path):
-    make_run(tmp_path / "a", scenes=("b",))
-    make_run(tmp_path / "c", scenes=("b",), method="sure", label="Sure", confident=True)
-    plain, sure = load_results([tmp_path]).runs
-    assert plain.expected_errors("b") is None
-    depth, angle = sure.expected_errors("b")
-    assert depth.shape == angle.shape == (1, 32, 32)
-    assert depth.dtype == torch.float32
-    assert float(depth[0, 0, 16]) == pytest.approx(0.007, rel=1e-3)
-    assert float(angle[0, 16, 0]) == pytest.approx(15)
-
-
-def test_stored_scene_is_the_sample_that_the_method_was_given(make_run, tmp_path):
-    make_run(tmp_path / "a", scenes=("b",))
-    (run,) = load_results([tmp_path]).runs
-    scene = run.sample("b")
-    assert (scene.dataset, scene.scene, scene.scale) == ("simgeo", "b", 4)
-    assert scene.depth_lr.shape == (1, 8, 8)
-    blocks = scene.depth[0].unfold(0, 4, 4).unfold(1, 4, 4).mean(dim=(-1, -2))
-    assert torch.allclose(blocks, scene.depth_lr[0], atol=1e-6)
-    assert scene.camera_lr == scene.camera.downscale(4)
-    assert float(scene.rgb.max()) <= 1
 
 
 def test_methods_and_settings_come_in_the_order_of_the_paper(make_run, tmp_path):
@@ -124,35 +98,12 @@ def test_directory_without_runs_is_refused(tmp_path):
         load_results([tmp_path / "absent"])
 
 
-def test_scene_that_is_missing_or_damaged_is_refused_in_one_line(make_run, tmp_path):
-    make_run(tmp_path, scenes=("s",))
-    path = sample_path(tmp_path, "s")
-    path.write_bytes(path.read_bytes()[:100])
-    with pytest.raises(ValueError, match="got a damaged"):
-        DepthSample.load(path)
-    path.unlink()
-    (run,) = load_results([tmp_path]).runs
-    assert not run.has_sample("s")
-    with pytest.raises(ValueError, match="there is none"):
-        run.sample("s")
-
-
 def test_scene_without_prediction_is_left_out_of_the_run(make_run, tmp_path):
     make_run(tmp_path, scenes=("s", "t"))
     (tmp_path / "predictions" / "t.npz").unlink()
     (run,) = load_results([tmp_path]).runs
     assert run.scenes == ("s",)
     assert set(run.scores["scene"]) == {"s"}
-
-
-def test_scores_of_all_runs_name_their_method_and_run(make_run, tmp_path):
-    for label in ("Bicubic", "MSG"):
-        make_run(tmp_path / label, label=label, method=label, scenes=("s",))
-    scores = load_results([tmp_path]).scores
-    assert set(scores["label"]) == {"Bicubic", "MSG"}
-    assert set(scores["run"]) == {str(tmp_path / "Bicubic"), str(tmp_path / "MSG")}
-    assert (scores[scores["metric"] == "DSSIM_v"]["variant"].unique() == ["e1", "e2", "e3", "e4", "max", "avg"]).all()
-    assert (scores[scores["metric"] == "RMSE_d"]["variant"] == "").all()
 
 
 def test_runs_can_be_chosen_and_unknown_ones_are_refused(make_run, tmp_path):

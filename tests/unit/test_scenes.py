@@ -278,14 +278,6 @@ def test_depths_that_are_not_finite_and_positive_count_as_holes(tmp_path):
     pd.testing.assert_frame_equal(*scores)
 
 
-def test_valid_share_reflects_a_hole_in_the_truth(tmp_path):
-    holed = RAMP.clone()
-    holed[0, :4] = torch.nan
-    run(toy_study(tmp_path, ToySource(a=toy_scene("a", holed)), ToyMethod(a=RAMP)))
-    [row] = [row for row in rows(tmp_path) if row["metric"] == "RMSE_d"]
-    assert (float(row["valid_share"]), float(row["value"])) == (0.75, 0)
-
-
 def test_picture_that_cannot_be_drawn_fails_its_scene_and_keeps_its_scores(tmp_path):
     def refuse(sample, depth, errors, scores):
         if sample.scene == "a":

@@ -38,10 +38,6 @@ def make_report(request: ReportRequest, console: Console) -> list[str]:
     """Write the tables, figures, correlations and page of some runs into a directory, whole or not at all.
 
     An earlier report in it is replaced.
-
-    Raises:
-        ValueError: there is no run, a choice does not exist, or the directory holds something else.
-
     """
     output = request.output
     if output.exists() and not (output.is_dir() and ((output / _MARK).is_file() or not any(output.iterdir()))):
@@ -68,12 +64,7 @@ def make_report(request: ReportRequest, console: Console) -> list[str]:
 
 
 def make_leaderboard(request: LeaderboardRequest, console: Console) -> list[str]:
-    """Write a page of runs that begins with one row a method, with the tables beside it.
-
-    Raises:
-        ValueError: as :func:`make_report`.
-
-    """
+    """Write a page of runs that begins with one row a method, with the tables beside it."""
     parts = ("tables", "page")
     return make_report(ReportRequest(**vars(request), leaderboard=True, intervals=True, parts=parts), console)
 
@@ -90,7 +81,7 @@ def _write(
     scored = any(not run.scores.empty for run in results.runs)
     scatter = pool.map(save_scatter_matrix, [folder / "metrics"] if "metrics" in request.parts and scored else [])
     drawn = Figures(folder / "figures", pool, request.light) if "figures" in request.parts else None
-    pictures = Pictures(pool) if "page" in request.parts else None
+    pictures = Pictures(pool, request.page_px) if "page" in request.parts else None
 
     todo = [part for part in REPORT_PARTS if part in request.parts]
     if not scored:
@@ -106,15 +97,13 @@ def _write(
             with progress.task("figures") as task:
                 drawn.save(task)
             notes.extend(drawn.notes)
-        elif part == "page":  # which is last, as it links to the other parts' files
+        elif pictures is not None and part == "page":  # which is last, as it links to the other parts' files
             with progress.task("scenes") as task:
                 notes += save_page(
                     folder / "index.html",
-                    results,
+                    pictures,
                     title=request.title,
-                    budget_mb=request.page_mb,
                     progress=task,
-                    pictures=pictures,
                     leaderboard=request.leaderboard,
                 )
-    return notes
+    return list(dict.fromkeys(notes))

@@ -46,9 +46,7 @@ class ReportRequest(RunsRequest):
     leaderboard: bool = option(False, "the page begins with one row a method, by mean rank")
     strict: bool = option(False, "refuse runs with a warning; see docs/checks.md")
     title: str = option("Depth super-resolution", "of the page")
-    page_mb: float = option(
-        60.0, "maximum size of the page; 60", "MB", rule=Rule("a positive number", lambda size: size > 0)
-    )
+    page_px: int = option(1024, "maximum longer side of a picture of the page, pixels; 1024", "N", rule=at_least(16))
     parts: tuple[str, ...] = option(
         REPORT_PARTS,
         "these parts alone, of tables, metrics, figures, page",

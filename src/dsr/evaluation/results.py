@@ -189,10 +189,10 @@ class Results:
 
     @property
     def scores(self) -> pd.DataFrame:
-        """All scores in one table, with the columns ``label`` and ``run`` besides those of ``scores.csv``."""
+        """All scores in one table, with ``label`` and ``run`` besides the columns of ``scores.csv``."""
         import pandas as pd  # noqa: PLC0415 - dsr upsample, which reads expected errors, needs none
 
-        parts = [run.scores.assign(label=run.label, run=str(run.folder)) for run in self.runs]
+        parts = [run.scores.assign(dataset=run.dataset, label=run.label, run=str(run.folder)) for run in self.runs]
         return pd.concat(parts, ignore_index=True)
 
     @property

@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from matplotlib.image import AxesImage
-from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from matplotlib.transforms import Bbox
 from torch import Tensor
 from torch.nn import functional
@@ -50,21 +49,9 @@ _WHOLE = _Part(0, 1, 0, 1)
 def write_before_after(path: Path, rgb: Tensor, depth_lr: Tensor, depth: Tensor, camera: Camera, title: str) -> None:
     """Draw the photo, the input and the result, both as a surface lit from above and as depth.
 
-    The input is rendered at its own resolution, without interpolation, and both by
-    :func:`dsr.geometry.surface.render_for_viewing`. The detail is the window in which the two renderings differ most.
-    The picture is at most 2400 pixels wide.
-
-    Args:
-        path: PNG file, written atomically.
-        rgb: (3, H, W) in [0, 1].
-        depth_lr: (1, h, w) input of any size and the same field of view; orthogonal depth in metres, NaN in holes.
-        depth: (1, H, W) result; orthogonal depth in metres, NaN in holes.
-        camera: camera of the photo and the result.
-        title: heading.
-
-    Raises:
-        ValueError: a map is less than 2 pixels high or wide.
-
+    The input, (1, h, w) of any size and the same field of view, is rendered at its own resolution, without
+    interpolation, and both by :func:`dsr.geometry.surface.render_for_viewing`. The detail is the window in which both
+    renderings differ most. The PNG is at most 2400 pixels wide and written atomically.
     """
     normals = _normals(depth, camera)
     before = render_for_viewing(_normals(depth_lr, camera.rescale(depth_lr.shape[-1], depth_lr.shape[-2]))[None])[0]
@@ -150,9 +137,7 @@ class _Sheet(Canvas):
     def colour_bar(self, image: AxesImage) -> None:
         """Draw the colour bar of the depth in the last row."""
         place = Bbox.from_bounds(_LEFT + 1.25 * self._pitch, 0.42, 1.5 * self._pitch - _GAP, 0.1)
-        bar = self.bar(image, place, orientation="horizontal", ticks=MaxNLocator(6),
-                       format=ScalarFormatter(useOffset=False))  # fmt: skip
-        bar.set_label("depth, m", fontsize=11, labelpad=1)
+        self.bar(image, place, most=6, orientation="horizontal").set_label("depth, m", fontsize=11, labelpad=1)
 
 
 def _cut(values: Tensor, part: _Part) -> tuple[Tensor, _Part]:

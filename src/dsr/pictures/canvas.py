@@ -18,6 +18,7 @@ from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.patches import Rectangle
+from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from matplotlib.transforms import Bbox, TransformedBbox
 from PIL import Image
 
@@ -42,14 +43,6 @@ class Canvas:
     """A figure with positions in inches from the lower left corner.
 
     All pictures are in one :class:`~matplotlib.axes.Axes` of the figure's size, as each further one takes long to make.
-
-    Args:
-        width: width of the figure, inches.
-        height: its height, inches.
-
-    Attributes:
-        figure: the figure.
-
     """
 
     def __init__(self, width: float, height: float) -> None:
@@ -90,8 +83,10 @@ class Canvas:
             image.set_clip_box(TransformedBbox(within, self._pictures.transData))
         return image
 
-    def bar(self, image: AxesImage, place: Bbox, label: str = "", **style: Any) -> Colorbar:
-        """Draw the colour bar of a picture."""
+    def bar(self, image: AxesImage, place: Bbox, label: str = "", *, most: int | None = None, **style: Any) -> Colorbar:
+        """Draw the colour bar of a picture, with at most so many ticks."""
+        if most is not None:
+            style |= {"ticks": MaxNLocator(most), "format": ScalarFormatter(useOffset=False)}
         width, height = self.figure.get_size_inches()
         bounds = (place.x0 / width, place.y0 / height, place.width / width, place.height / height)
         return self.figure.colorbar(image, cax=self.figure.add_axes(bounds, label=label), **style)
@@ -160,12 +155,9 @@ def _write_png(path: Path, figure: Figure, dpi: int, few_colours: bool) -> None:
 
 
 def encode_row(panels: Sequence[np.ndarray]) -> bytes:
-    """Return panels in a row as a WebP, transparent between them.
+    """Return panels of one aspect in a row as a WebP, transparent between them.
 
-    Args:
-        panels: of one aspect and any sizes, (H, W) grey or (H, W, 3) RGB in [0, 1], NaN in holes. Pixels of small ones
-            are repeated, so that they are to be seen.
-
+    Panels are (H, W) grey or (H, W, 3) RGB in [0, 1] of any size, NaN in holes. Pixels of small ones are repeated.
     """
     height, width = panels[0].shape[:2]
     scale = min(_HEIGHT / height, _WIDTH / width)

@@ -28,12 +28,7 @@ def angles_between(camera: Camera, first: Tensor, second: Tensor) -> Tensor:
 
 
 def rendering(depth: Tensor, camera: Camera, light: str = FIGURE_LIGHT) -> np.ndarray:
-    """Render a depth map, (1, H, W), under one light: (H, W) in [0, 1], NaN where undefined.
-
-    Raises:
-        ValueError: there is no such light.
-
-    """
+    """Render a depth map, (1, H, W), under one light: (H, W) in [0, 1], NaN where undefined."""
     direction = torch.tensor([direction_of(light)], dtype=torch.float64)
     if min(depth.shape[-2:]) < 2:
         return np.full(tuple(depth.shape[-2:]), np.nan)
@@ -62,17 +57,9 @@ class Window(NamedTuple):
 
 
 def strongest_window(values: np.ndarray, height: int, width: int, taken: Sequence[Window] = ()) -> Window | None:
-    """Return the window with the largest mean that does not overlap others.
+    """Return the window with the largest mean of (H, W) non-negative values that does not overlap the ``taken`` ones.
 
-    Args:
-        values: (H, W) non-negative values; NaN counts as 0.
-        height: height of the window, pixels.
-        width: width of the window, pixels.
-        taken: windows that the result must not overlap.
-
-    Returns:
-        The first of the best windows in reading order; None if no window fits.
-
+    It is the first of the best windows in reading order, None if no window fits; NaN counts as 0.
     """
     if height > values.shape[0] or width > values.shape[1]:
         return None

@@ -29,16 +29,9 @@ def write_confidence(
     truth: Tensor | None = None,
     camera: Camera | None = None,
 ) -> None:
-    """Draw the expected errors of depth and normals, atomically; with a truth, the measured ones below them.
+    """Draw the expected errors of depth and normals, in metres and degrees; with a truth, the measured ones below them.
 
-    Args:
-        path: PNG file.
-        depth: (1, H, W) result in metres, NaN in holes.
-        depth_error: (1, H, W) its expected absolute error in metres.
-        angle_error: (1, H, W) that of the normal in degrees.
-        truth: (1, H, W) true depth in metres, NaN in holes.
-        camera: of these pixels; needed with a truth.
-
+    All maps are (1, H, W), NaN in holes; the camera of these pixels is needed with a truth.
     """
     rows = [[1e3 * depth_error, angle_error]]
     if truth is not None and camera is not None:

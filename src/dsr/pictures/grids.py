@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from matplotlib.transforms import Bbox
 
 from dsr.pictures.canvas import Canvas
@@ -33,18 +32,10 @@ _EMPTY = "#f2f2f2"
 
 @dataclass(frozen=True)
 class Cell:
-    """A panel.
+    """A panel."""
 
-    Args:
-        picture: (H, W), NaN in holes, or (H, W, 3) in [0, 1]; None for an empty panel.
-        caption: line below the panel, or text inside an empty panel.
-        bold: whether the caption is bold.
-        colour_map, limits: colours of an (H, W) picture.
-
-    """
-
-    picture: np.ndarray | None
-    caption: str = ""
+    picture: np.ndarray | None  # (H, W), NaN in holes, or (H, W, 3) in [0, 1]; None for an empty panel
+    caption: str = ""  # below the panel, or inside an empty one
     bold: bool = False
     colour_map: str | Colormap = "gray"
     limits: tuple[float, float] = (0.0, 1.0)
@@ -52,37 +43,18 @@ class Cell:
 
 @dataclass(frozen=True)
 class Row:
-    """The row of a scene.
-
-    Args:
-        label: name of the scene.
-        aspect: ratio of height to width of its pictures.
-        cells: one per column.
-        details: square windows shown enlarged, in pixels of a picture of ``size``.
-        size: height and width, pixels.
-        bar: label of the colour bar, which is that of the last (H, W) picture; empty for no bar.
-        extend: Matplotlib's ``extend`` of colour bars.
-
-    """
+    """The row of a scene."""
 
     label: str
-    aspect: float
-    cells: Sequence[Cell]
-    details: Sequence[Window] = ()
-    size: tuple[int, int] = (1, 1)
-    bar: str = ""
-    extend: str = "neither"
+    aspect: float  # ratio of height to width of its pictures
+    cells: Sequence[Cell]  # one per column
+    details: Sequence[Window] = ()  # square windows shown enlarged
+    bar: str = ""  # label of the colour bar, which is that of the last (H, W) picture; empty for no bar
+    extend: str = "neither"  # Matplotlib's ``extend`` of colour bars
 
 
 def draw_grid(columns: Sequence[str], rows: Sequence[Row], texts: tuple[str, str]) -> Figure:
-    """Draw a page.
-
-    Args:
-        columns: column headings.
-        rows: rows from top to bottom, each with one cell per column.
-        texts: texts above and below the grid.
-
-    """
+    """Draw a page of rows, each with one cell per column heading, between a text above and one below."""
     right = _MARGIN + (_BAR + _BAR_TEXT if any(row.bar for row in rows) else 0)
     panel = min(max((_WIDTH - 0.3 - right) / len(columns) - _GAP, _LEAST_PANEL), _MOST_PANEL)
     boxes = [_boxes(row, panel) for row in rows]
@@ -146,11 +118,10 @@ class _Page(Canvas):
         self._show(place, cell, cell.picture, f"{row.label}: panel")
         size = below - _SEAM
         for number, (window, colour) in enumerate(zip(row.details, FRAMES, strict=False)):
-            part = _scale_window(window, row.size, cell.picture.shape[:2])
-            frame = _part_of(place, part, cell.picture.shape[:2])
+            frame = _part_of(place, window, cell.picture.shape)
             self.frame(frame, f"{row.label}: frame", facecolor="none", edgecolor=colour, linewidth=0.9)
             inset = Bbox.from_bounds(left + number * (size + _SEAM), top - height - below, size, size)
-            self._show(inset, cell, cell.picture[part.slices], f"{row.label}: detail")
+            self._show(inset, cell, cell.picture[window.slices], f"{row.label}: detail")
             self.frame(inset, f"{row.label}: edge", facecolor="none", edgecolor=colour, linewidth=1.0)
         self.text(left + panel / 2, top - height - below - 0.02, cell.caption, ha="center", va="top",
                   weight="bold" if cell.bold else "normal")  # fmt: skip
@@ -162,8 +133,7 @@ class _Page(Canvas):
         if not mapped:
             return
         place = Bbox.from_bounds(left, top - height, _BAR, height)
-        bar = self.bar(mapped[-1], place, f"{row.label}: bar", extend=row.extend, ticks=MaxNLocator(5),
-                       format=ScalarFormatter(useOffset=False))  # fmt: skip
+        bar = self.bar(mapped[-1], place, f"{row.label}: bar", most=5, extend=row.extend)
         bar.outline.set_linewidth(0.4)
         bar.ax.tick_params(labelsize=_FONT - 1, length=2, width=0.4, pad=1.5)
         bar.set_label(row.bar, fontsize=_FONT, labelpad=1.5)
@@ -182,11 +152,3 @@ def _part_of(place: Bbox, window: Window, shape: tuple[int, ...]) -> Bbox:
         across * window.width,
         down * window.height,
     )
-
-
-def _scale_window(window: Window, size: tuple[int, int], shape: tuple[int, ...]) -> Window:
-    """Convert a window to a picture of another size, rounded to whole pixels, at least one."""
-    down, across = shape[0] / size[0], shape[1] / size[1]
-    top, left = int(window.top * down), int(window.left * across)
-    bottom, right = round((window.top + window.height) * down), round((window.left + window.width) * across)
-    return Window(top, left, max(bottom - top, 1), max(right - left, 1))

@@ -28,16 +28,7 @@ _HALF_WIDTH = 1.32
 
 
 def save_lights_figure(folder: Path, scene: DepthSample | None = None) -> list[Path]:
-    """Draw a sphere and the ground truth of a scene under the four lights, with arrows along the light.
-
-    Args:
-        folder: directory for ``lights.pdf`` and ``lights.png``.
-        scene: a scene with ground truth; None for the sphere alone.
-
-    Returns:
-        Paths of the files.
-
-    """
+    """Draw a sphere and the true surface of a scene under the four lights, with arrows along them; return files."""
     rows = 1 if scene is None else 2
     aspect = 1.0 if scene is None else min(scene.camera.height / scene.camera.width, 1.5)
     width = _MARGIN + _AXES + len(LIGHTS) * (_PANEL + _GAP)

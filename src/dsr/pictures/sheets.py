@@ -11,17 +11,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator, ScalarFormatter
+from matplotlib.transforms import Bbox
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.lights import LIGHT_NAMES
 from dsr.geometry.surface import render
-from dsr.pictures.canvas import HOLE_COLOUR, colours, write_figure
+from dsr.pictures.canvas import HOLE_COLOUR, Canvas, write_figure
 from dsr.pictures.depth_views import limits_of, normals_seen_by, reduced
 from dsr.sample import Scene
 from dsr.utils.ratios import round_ratio
@@ -60,22 +57,10 @@ class _Row:
 
 
 def save_contact_sheet(path: Path, scenes: Iterable[Scene], title: str) -> list[Path]:
-    """Draw the photo, depth, holes and renderings of scenes, a row each, and write the pages atomically.
+    """Draw the photo, depth, holes and renderings of scenes, a row each, write the pages atomically and return files.
 
     Scenes are read one by one, so they need not fit into memory together. A scene without high-resolution depth shows
-    its measured map of the lowest resolution.
-
-    Args:
-        path: PNG file; more than six scenes are written to ``NAME-1.png``, ``NAME-2.png``, ..., six per file.
-        scenes: one or more scenes.
-        title: heading of every page.
-
-    Returns:
-        The files, in order.
-
-    Raises:
-        ValueError: there is no scene.
-
+    its measured map of the lowest resolution. More than six scenes are written to ``NAME-1.png``, ``NAME-2.png``, ...
     """
     rows = map(_row, scenes)
     page, following = list(itertools.islice(rows, _ROWS)), next(rows, None)
@@ -161,19 +146,15 @@ def _save_page(path: Path, rows: list[_Row], title: str) -> None:
     sizes = [(max(width, _LEAST_PANEL), max(height, _LEAST_PANEL)) for height, width in sides]  # inches
     heights = [max(size[1] + _BELOW, (row.text.count("\n") + 2) * _LINE) for row, size in zip(rows, sizes, strict=True)]
     total = _ABOVE + sum(heights)
-    figure = Figure(figsize=(_MARGIN + _TEXT + 4 * (_PANEL + _GAP), total))
-    FigureCanvasAgg(figure)
-    figure.suptitle(f"{title} (pink: holes)", x=_MARGIN / figure.get_figwidth(), y=1 - 0.12 / total, ha="left",
-                    fontsize=14, parse_math=False)  # fmt: skip
+    page = Canvas(_MARGIN + _TEXT + 4 * (_PANEL + _GAP), total)
+    page.text(_MARGIN, total - 0.12, f"{title} (pink: holes)", fontsize=14, va="top")
+    for column, heading in enumerate(("photo", "depth, m", "holes", f"under {LIGHT_NAMES[0]} to {LIGHT_NAMES[-1]}")):
+        page.text(_left(column) + _PANEL / 2, total - _ABOVE + 0.08, heading, ha="center", fontsize=11)
     top = total - _ABOVE
     for row, size, height in zip(rows, sizes, heights, strict=True):
-        _draw_row(figure, row, top, size)
+        _draw_row(page, row, top, size)
         top -= height
-    headings = ("photo", "depth, m", "holes", f"under {LIGHT_NAMES[0]} to {LIGHT_NAMES[-1]}")
-    for column, heading in enumerate(headings):
-        x, y = (_left(column) + _PANEL / 2) / figure.get_figwidth(), (total - _ABOVE + 0.08) / total
-        figure.text(x, y, heading, ha="center", fontsize=11)
-    write_figure(path, figure, _DPI)
+    write_figure(path, page.figure, _DPI)
 
 
 def _left(column: int) -> float:
@@ -181,48 +162,32 @@ def _left(column: int) -> float:
     return _MARGIN + _TEXT + column * (_PANEL + _GAP)
 
 
-def _draw_row(figure: Figure, row: _Row, top: float, size: tuple[float, float]) -> None:
+def _draw_row(page: Canvas, row: _Row, top: float, size: tuple[float, float]) -> None:
     """Draw the text and panels of a scene with their upper edge ``top`` inches above the lower edge of the page."""
-    width, height = figure.get_size_inches()
     name, _, rest = row.text.partition("\n\n")
     lines = name.count("\n") + 1
-    for text, below, weight in ((name, 0.0, "bold"), (rest, 0.05 + _LINE * lines, "normal")):
-        figure.text(_MARGIN / width, (top - below) / height, text, va="top", fontsize=9, weight=weight,
-                    linespacing=1.25, parse_math=False)  # fmt: skip
-    lefts = (_left(column) + (_PANEL - size[0]) / 2 for column in range(3))
-    photo, depth, holes = (_axes(figure, left, top - size[1], *size, frame=False) for left in lefts)
-    photo.imshow(row.photo, aspect="auto")
+    style = {"va": "top", "fontsize": 9, "linespacing": 1.25}
+    page.text(_MARGIN, top, name, weight="bold", **style)
+    page.text(_MARGIN, top - 0.05 - _LINE * lines, rest, **style)
+    width, height = size
+    photo, depth, holes, lit = (
+        Bbox.from_bounds(_left(column) + (_PANEL - width) / 2, top - height, width, height) for column in range(4)
+    )
+    page.show(photo, row.photo)
     low, high = row.limits
-    high = max(high, 1.01 * low)  # so that the ticks of a constant depth differ
-    image = depth.imshow(row.depth, cmap=colours("viridis"), vmin=low, vmax=high, aspect="auto")
-    place = (_left(1) + 0.1 * _PANEL, top - size[1] - 0.14, 0.8 * _PANEL, 0.07)
-    bar = figure.colorbar(image, cax=_axes(figure, *place), orientation="horizontal", ticks=MaxNLocator(4),
-                          format=ScalarFormatter(useOffset=False))  # fmt: skip
+    limits = (low, max(high, 1.01 * low))  # so that the ticks of a constant depth differ
+    image = page.show(depth, row.depth, colour_map="viridis", limits=limits)
+    below = Bbox.from_bounds(_left(1) + 0.1 * _PANEL, top - height - 0.14, 0.8 * _PANEL, 0.07)
+    bar = page.bar(image, below, most=4, orientation="horizontal")
     bar.ax.tick_params(labelsize=8, pad=1.5, length=2)
     known, hole = (np.array(to_rgb(colour)) for colour in (_VALID_COLOUR, HOLE_COLOUR))
-    holes.imshow(known + row.missing[..., None] * (hole - known), aspect="auto")
+    page.show(holes, known + row.missing[..., None] * (hole - known))
     caption = f"{_percent(row.missing_fraction)} missing" if row.missing_fraction else "complete"
-    holes.text(0.5, -0.06 / size[1], caption, transform=holes.transAxes, ha="center", va="top", fontsize=9)
-    _draw_renderings(figure, row.renderings, top, size)
-
-
-def _draw_renderings(figure: Figure, renderings: np.ndarray, top: float, size: tuple[float, float]) -> None:
-    """Draw four renderings, (4, H, W), in a 2 x 2 grid in the last column."""
-    width, height = ((side - _SEAM) / 2 for side in size)
-    left = _left(3) + (_PANEL - size[0]) / 2
-    for number, (name, shades) in enumerate(zip(LIGHT_NAMES, renderings, strict=True)):
-        down, right = divmod(number, 2)
-        place = (left + right * (width + _SEAM), top - height - down * (height + _SEAM), width, height)
-        axes = _axes(figure, *place, frame=False)
-        axes.imshow(shades, cmap=colours("gray"), vmin=0, vmax=1, aspect="auto")
-        if min(width, height) > _LEAST_LABELLED:
-            axes.text(0.05 / width, 0.05 / height, name, transform=axes.transAxes, fontsize=7, bbox=_LABEL)
-
-
-def _axes(figure: Figure, left: float, bottom: float, width: float, height: float, *, frame: bool = True) -> Axes:
-    """Add axes at a position given in inches."""
-    page_width, page_height = figure.get_size_inches()
-    axes = figure.add_axes((left / page_width, bottom / page_height, width / page_width, height / page_height))
-    if not frame:
-        axes.set_axis_off()
-    return axes
+    page.text((holes.x0 + holes.x1) / 2, holes.y0 - 0.06, caption, ha="center", va="top", fontsize=9)
+    across, down = (width - _SEAM) / 2, (height - _SEAM) / 2
+    for number, (light, shades) in enumerate(zip(LIGHT_NAMES, row.renderings, strict=True)):
+        line, right = divmod(number, 2)
+        left, bottom = lit.x0 + right * (across + _SEAM), top - down - line * (down + _SEAM)
+        page.show(Bbox.from_bounds(left, bottom, across, down), shades)
+        if min(across, down) > _LEAST_LABELLED:
+            page.text(left + 0.05, bottom + 0.05, light, fontsize=7, bbox=_LABEL)

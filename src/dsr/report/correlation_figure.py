@@ -49,16 +49,7 @@ _GOLDEN = 0.618033988749895
 
 
 def save_scatter_matrix(results: Results, folder: Path) -> list[Path]:
-    """Draw the scatter matrix of the paper's metrics, and the correlations of all versions with LPIPS_v.
-
-    Args:
-        folder: directory for ``scatter_matrix`` and, if there is LPIPS_v, ``with_lpips``, each as PDF and PNG.
-        results: runs.
-
-    Returns:
-        Paths of the files.
-
-    """
+    """Draw the ``scatter_matrix`` and, if there is LPIPS_v, ``with_lpips``, each as PDF and PNG; return the files."""
     matrix = metric_matrix(results)
     labels = [label for label in results.methods() if label in matrix.index.get_level_values("label")]
     ranking = with_reference(matrix)
@@ -75,14 +66,7 @@ def save_scatter_matrix(results: Results, folder: Path) -> list[Path]:
 
 
 def scatter_matrix(matrix: pd.DataFrame, labels: list[str], formats: Formats) -> Figure:
-    """Draw the scatter matrix.
-
-    Args:
-        matrix: result of :func:`dsr.report.correlations.metric_matrix`.
-        labels: methods in the order of the legend.
-        formats: formats of the metrics to show, in order.
-
-    """
+    """Draw the scatter matrix of some metrics; ``labels`` are the methods in the order of the legend."""
     names = [name for name in formats if name in matrix and name != REFERENCE]
     names += [REFERENCE] if REFERENCE in matrix else []
     values = matrix[names] * [formats[name].factor for name in names]
@@ -168,13 +152,7 @@ def _densities(
 
 
 def density_of(values: np.ndarray, grid: np.ndarray) -> np.ndarray | None:
-    """Estimate the Gaussian kernel density on a grid (Scott's bandwidth); None for fewer than three distinct values.
-
-    Args:
-        values: (N,) finite values.
-        grid: (M,) points of the density.
-
-    """
+    """Estimate the Gaussian kernel density of (N,) values (Scott's bandwidth) on a grid; None for fewer than three."""
     from scipy.stats import gaussian_kde  # noqa: PLC0415 - it takes half a second to import
 
     if len(np.unique(values)) < 3:

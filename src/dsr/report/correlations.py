@@ -31,18 +31,12 @@ _LEAST = 3
 
 
 def metric_matrix(results: Results) -> pd.DataFrame:
-    """Return a table with one row per result and one column per version of a metric, in raw units.
+    """Return a table with one row per result and one column per version of a metric, in raw units, NaN where missing.
 
-    Args:
-        results: runs.
-
-    Returns:
-        Rows: ``dataset, scene, scale, downsampling, label, seed``. Columns: ``DSSIM_v`` for the worst of the four
-        lights, ``DSSIM_v[e1]`` to ``[e4]`` and ``[avg]``, metrics without lights by their name. RMSE_d is clipped at
-        0.5 m. Missing values are NaN.
-
+    Columns are ``DSSIM_v`` for the worst of the four lights, ``DSSIM_v[e1]`` to ``[e4]`` and ``[avg]``, metrics without
+    lights by their name. RMSE_d is clipped at 0.5 m.
     """
-    scores = pd.concat([run.scores.assign(dataset=run.dataset, label=run.label) for run in results.runs])
+    scores = results.scores
     variant = scores["variant"].fillna("")
     name = scores["metric"].where(variant.isin(HEADLINES), scores["metric"] + "[" + variant + "]")
     scores = scores.assign(name=name, value=scores["value"].where(np.isfinite(scores["value"])))
@@ -65,20 +59,7 @@ def published_matrix() -> pd.DataFrame:
 
 
 def correlate(matrix: pd.DataFrame, kind: Kind) -> pd.DataFrame:
-    """Compute the correlation of every pair of columns over the rows with both values.
-
-    A correlation is NaN for fewer than three such rows, or if a column is constant in them.
-
-    Args:
-        matrix: result of :func:`metric_matrix`.
-        kind: ``pearson``, or ``spearman`` for ranks, where equal values share a rank.
-
-    Raises:
-        ValueError: the kind is something else.
-
-    """
-    if kind not in KINDS:
-        raise ValueError(f"kind: expected pearson or spearman, got {kind}")
+    """Return the correlation of each pair of columns; NaN for a constant column or fewer than three rows with both."""
     return matrix.astype(float).corr(method=kind, min_periods=_LEAST)
 
 
@@ -89,13 +70,7 @@ def pairs(matrix: pd.DataFrame) -> pd.DataFrame:
 
 
 def with_reference(matrix: pd.DataFrame) -> pd.DataFrame:
-    """Correlate every version of a metric other than LPIPS_v with LPIPS_v.
-
-    Returns:
-        Columns ``metric, pearson, spearman, n``, the largest of ``spearman`` first, NaN last; empty without
-        LPIPS_v.
-
-    """
+    """Correlate every other version of a metric with LPIPS_v: ``metric, pearson, spearman, n``, the largest first."""
     names = [name for name in matrix if not str(name).startswith(REFERENCE)] if REFERENCE in matrix else []
     frame = pd.DataFrame({"metric": pd.Series(names, dtype=str)})
     for kind in KINDS:
@@ -107,16 +82,10 @@ def with_reference(matrix: pd.DataFrame) -> pd.DataFrame:
 
 
 def write_correlations(folder: Path, results: Results) -> list[Path]:
-    """Write the correlations of all versions of all metrics.
+    """Write the correlations of all versions of all metrics, and return the files.
 
-    Args:
-        folder: gets ``pearson.csv``, ``spearman.csv``, ``pairs.csv`` (number of results per pair),
-            ``with_lpips.csv`` and ``with_lpips.md``, both with the correlations in the paper's tables beside ours.
-        results: the runs.
-
-    Returns:
-        The files.
-
+    They are ``pearson.csv``, ``spearman.csv``, ``pairs.csv`` (number of results per pair), ``with_lpips.csv`` and
+    ``with_lpips.md``, both with the correlations in the paper's tables beside ours.
     """
     matrix = metric_matrix(results)
     paper = with_reference(published_matrix()).add_prefix("paper_").rename(columns={"paper_metric": "metric"})

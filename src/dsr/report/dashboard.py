@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 
 import numpy as np
+import pandas as pd
 import torch
 from matplotlib.colors import Normalize
 from torch import Tensor
@@ -18,7 +19,7 @@ from dsr.evaluation.results import Results, Run, method_settings
 from dsr.geometry.lights import LIGHT_NAMES
 from dsr.geometry.surface import render
 from dsr.metrics.catalogue import KNOWN_FORMATS
-from dsr.metrics.formats import HEADLINES, LOOKS, looks_and_depth, main_first
+from dsr.metrics.formats import LOOKS, looks_and_depth, main_first
 from dsr.pictures.canvas import colours
 from dsr.pictures.depth_views import normals_seen_by, reduced
 from dsr.sample import DepthSample
@@ -62,11 +63,11 @@ def _write_scores(writer: SummaryWriter, run: Run) -> None:
         rows = run.scores[run.scores["metric"] == name]
         if rows["variant"].isin(LIGHT_NAMES).any():
             by_light.append(name)
-        headline = rows[rows["variant"].isin(HEADLINES)].set_index("scene")["value"] * each.factor
-        means[name] = float(headline.mean())
-        for number, scene in enumerate(scored):
-            writer.add_scalar(f"scene/{name}/{run.dataset}", headline[scene], number)
-            writer.add_scalar(f"{name}/{scene}", headline[scene], 0)
+        headlines = {scene: each.factor * run.headlines[scene][name] for scene in scored}
+        means[name] = float(pd.Series(headlines).mean())
+        for number, (scene, value) in enumerate(headlines.items()):
+            writer.add_scalar(f"scene/{name}/{run.dataset}", value, number)
+            writer.add_scalar(f"{name}/{scene}", value, 0)
         for row in rows[rows["variant"].isin(LIGHT_NAMES)].itertuples():
             light = LIGHT_NAMES.index(row.variant) + 1
             writer.add_scalar(f"light/{name}/{row.scene}", row.value * each.factor, light)

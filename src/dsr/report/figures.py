@@ -14,23 +14,24 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.colors import Colormap, ListedColormap
-from torch import Tensor
+from matplotlib.colors import ListedColormap
 
-from dsr.evaluation.results import BenchmarkSetting, Results
+from dsr.evaluation.results import BenchmarkSetting, Results, Run, sample_path
+from dsr.geometry.camera import Camera
 from dsr.geometry.lights import FIGURE_LIGHT
 from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.pictures.canvas import save_both
 from dsr.pictures.depth_views import Window, limits_of, rendering, strongest_window
 from dsr.pictures.grids import Cell, Row, draw_grid
 from dsr.pictures.lights_figure import save_lights_figure
-from dsr.report.shown_scenes import Shown, drawable_scenes, first_runs, shown_scenes
+from dsr.report.shown_scenes import Shown, shown_of, stored_sample, views_of
 from dsr.report.worker_pool import WorkerPool
 from dsr.sample import DepthSample
+from dsr.utils.arrays import array_headers
 
 ROWS = 5
 """Maximum number of scenes on a page."""
@@ -46,14 +47,7 @@ _CANDIDATES = 8
 
 
 class Figures:
-    """All figures, which the workers of ``workers`` begin to draw at once.
-
-    Args:
-        folder: output directory; existing files are replaced.
-        workers: runs to draw, and what draws them.
-        light: light of the renderings.
-
-    """
+    """All figures of the runs of ``workers``, which begin to draw them at once; existing files are replaced."""
 
     def __init__(self, folder: Path, workers: WorkerPool, light: str = FIGURE_LIGHT) -> None:
         self.notes: list[str] = []
@@ -62,15 +56,7 @@ class Figures:
         self._drawn = workers.map(functools.partial(_draw, folder), self._pages)
 
     def save(self, progress: Callable[[int, int, str], None] | None = None) -> list[Path]:
-        """Return the paths of the files, a PDF and a PNG of each figure, once they are drawn.
-
-        Args:
-            progress: called before each figure with the number done, the number of all, and the name.
-
-        Raises:
-            ValueError: there is no such light.
-
-        """
+        """Return the files once they are drawn; ``progress`` is told the number done, of all, and the figure's name."""
         paths: list[Path] = []
         for done, page in enumerate(self._pages):
             if progress is not None:
@@ -92,66 +78,55 @@ def _draw(folder: Path, results: Results, page: Page | None) -> tuple[list[Path]
 
 @dataclass(frozen=True)
 class Page:
-    """A page of a grid.
+    """A page of a grid."""
 
-    Args:
-        kind: ``renderings``, ``depth`` or ``errors``.
-        problem: benchmark setting.
-        name: name of the files, without suffix.
-        scenes: names of the scenes, at most :data:`ROWS`.
-        light: light of the renderings.
-
-    """
-
-    kind: str
+    kind: str  # renderings, depth or errors
     problem: BenchmarkSetting
-    name: str
-    scenes: tuple[str, ...]
-    light: str
+    name: str  # of the files, without suffix
+    scenes: tuple[str, ...]  # at most :data:`ROWS`
+    light: str  # of the renderings
 
 
 def pages_of(results: Results, kinds: Iterable[str], light: str, notes: list[str]) -> list[Page]:
-    """Return the pages of some kinds of grids, from the names of the files alone.
-
-    Args:
-        results: runs to draw.
-        kinds: some of renderings, depth, errors.
-        light: light of the renderings.
-        notes: list to which one line is added per scene that no run has stored.
-
-    """
+    """Return the pages of some kinds of grids, from the names of the files alone; ``notes`` takes what is left out."""
     found = []
+    problems = results.problems()
     for kind in kinds:
-        for problem, name in zip(results.problems(), _names(results.problems()), strict=True):
-            scenes = drawable_scenes(results, problem, notes, with_truth=kind == "errors")
+        for problem, name in zip(problems, _names(problems), strict=True):
+            scenes = []
+            for view in views_of(results, problem):
+                stored = next((run for run in view.runs if run.has_sample(view.scene)), None)
+                if stored is None:
+                    stored_sample(view, notes)
+                elif kind != "errors" or _has_truth(stored, view.scene):
+                    scenes.append(view.scene)
             for number, start in enumerate(range(0, len(scenes), ROWS), start=1):
                 rows = tuple(scenes[start : start + ROWS])
                 found.append(Page(kind, problem, f"{kind}_{name}_{number}", rows, light))
     return found
 
 
+def _has_truth(run: Run, scene: str) -> bool:
+    """Return whether a stored scene has ground truth; a damaged one may have it elsewhere."""
+    try:
+        return "depth" in array_headers(sample_path(run.folder, scene))
+    except (ValueError, OSError):
+        return True
+
+
 def save_page(folder: Path, results: Results, page: Page, notes: list[str]) -> list[Path]:
-    """Draw a page, unless none of its scenes can be drawn.
-
-    Args:
-        folder: directory of the files.
-        results: runs to draw.
-        page: one of :func:`pages_of`.
-        notes: list to which one line is added per scene or result that could not be drawn.
-
-    Returns:
-        Paths of the PDF and the PNG.
-
-    Raises:
-        ValueError: there is no such light.
-
-    """
+    """Draw a page, unless none of its scenes can be drawn, and return its PDF and PNG; ``notes`` takes the reasons."""
     kind = _GRIDS[page.kind]
-    shown = shown_scenes(results, page.problem, notes, page.scenes)
-    rows = [row for row in (kind.row(each, page.light) for each in shown) if row]
+    methods = list(dict.fromkeys(run.label for run in results.of(page.problem)))
+    rows = []
+    for view in views_of(results, page.problem):
+        shown = shown_of(view, methods, notes) if view.scene in page.scenes else None
+        row = None if shown is None else kind.row(shown, page.light)
+        if row is not None:
+            rows.append(row)
     if not rows:
         return []
-    columns = (*kind.before, *first_runs(results, page.problem), *kind.after)
+    columns = (*kind.before, *methods, *kind.after)
     title = f"{page.problem.dataset}, x{page.problem.scale}, {page.problem.downsampling}"
     pictures = (cell.picture for row in rows for cell in row.cells if cell.picture is not None)
     holes = "; pink: holes" if any(not np.isfinite(picture).all() for picture in pictures) else ""
@@ -177,53 +152,52 @@ def rendering_row(shown: Shown, light: str) -> Row:
         label: None if depth is None else rendering(depth, scene.camera, light) for label, depth in shown.depths.items()
     }
     truth = None if scene.depth is None else rendering(scene.depth, scene.camera, light)
-    size = (scene.camera.height, scene.camera.width)
     scores = _captions(shown, "DSSIM_v", "RMSE_v")
     cells = [
-        _photo(shown),
-        Cell(_enlarge(rendering(scene.depth_lr, scene.camera_lr, light), size)),
+        _photo(scene),
+        Cell(_enlarge(rendering(scene.depth_lr, scene.camera_lr, light), scene.camera)),
         *(_panel(picture, scores[label]) for label, picture in results.items()),
         _panel(truth, missing="no truth"),
     ]
-    details = details_of(
-        [picture for picture in results.values() if picture is not None], truth, math.ceil(scene.scale)
-    )
-    return Row(_label(shown), size[0] / size[1], cells, details, size)
+    drawn = [picture for picture in results.values() if picture is not None]
+    return _row(shown, cells, details=details_of(drawn, truth, math.ceil(scene.scale)))
 
 
 def depth_row(shown: Shown, _: str) -> Row:
     """Build the row of a scene's depth maps."""
     scene = shown.scene
-    style = _Style("viridis", limits_of(scene.depth_lr if scene.depth is None else scene.depth))
-    size = (scene.camera.height, scene.camera.width)
+    style: dict[str, Any] = {
+        "colour_map": "viridis",
+        "limits": limits_of(scene.depth_lr if scene.depth is None else scene.depth),
+    }
     scores = _captions(shown, "RMSE_d")
+    pixels = {label: None if depth is None else depth[0].numpy() for label, depth in shown.depths.items()}
     cells = [
-        _photo(shown),
-        _panel(_enlarge(scene.depth_lr[0].numpy(), size), style=style),
-        *(_panel(_pixels(depth), scores[label], style=style) for label, depth in shown.depths.items()),
-        _panel(_pixels(scene.depth), missing="no truth", style=style),
+        _photo(scene),
+        Cell(_enlarge(scene.depth_lr[0].numpy(), scene.camera), **style),
+        *(_panel(picture, scores[label], **style) for label, picture in pixels.items()),
+        _panel(None if scene.depth is None else scene.depth[0].numpy(), missing="no truth", **style),
     ]
-    return Row(_label(shown), size[0] / size[1], cells, bar="depth, m", extend="both")
+    return _row(shown, cells, bar="depth, m", extend="both")
 
 
 def error_row(shown: Shown, _: str) -> Row | None:
     """Build the row of a scene's errors, None without ground truth or without results."""
     truth = shown.scene.depth
-    if truth is None or not shown.existing():
+    if truth is None or all(depth is None for depth in shown.depths.values()):
         return None
-    errors = {name: None if depth is None else depth.double() - truth for name, depth in shown.depths.items()}
-    valid = [error[error.isfinite()].abs().numpy() for error in errors.values() if error is not None]
-    pooled = np.concatenate(valid)
+    errors = {name: None if depth is None else (depth - truth)[0].numpy() for name, depth in shown.depths.items()}
+    pooled = np.concatenate([np.abs(error[np.isfinite(error)]) for error in errors.values() if error is not None])
     limit = max(float(np.percentile(pooled, 98)) if pooled.size else 0.0, _LEAST_ERROR)
     factor, unit = (100, "cm") if limit >= _CENTIMETRE_LIMIT else (1000, "mm")
     # From blue over white to red, without the nearly black ends
     colour_map = ListedColormap(mpl.colormaps["RdBu_r"](np.linspace(0.1, 0.9, 255)), "errors")
-    style, scores = _Style(colour_map, (-factor * limit, factor * limit)), _captions(shown, "RMSE_d")
-    cells = [_photo(shown)]
+    style: dict[str, Any] = {"colour_map": colour_map, "limits": (-factor * limit, factor * limit)}
+    scores = _captions(shown, "RMSE_d")
+    cells = [_photo(shown.scene)]
     for label, error in errors.items():
-        cells.append(_panel(None if error is None else factor * error[0].numpy(), scores[label], style=style))
-    aspect = shown.scene.camera.height / shown.scene.camera.width
-    return Row(_label(shown), aspect, cells, bar=f"result - truth, {unit}", extend="both")
+        cells.append(_panel(None if error is None else factor * error, scores[label], **style))
+    return _row(shown, cells, bar=f"result - truth, {unit}", extend="both")
 
 
 class _Grid(NamedTuple):
@@ -252,76 +226,53 @@ _GRIDS = {
 KINDS = tuple(_GRIDS)
 
 
-def _photo(shown: Shown) -> Cell:
-    return Cell(shown.scene.rgb.permute(1, 2, 0).clamp(0, 1).numpy())
+def _row(shown: Shown, cells: Sequence[Cell], **more: Any) -> Row:
+    """Build a row; the name of the scene has spaces, at which it can be wrapped."""
+    camera = shown.scene.camera
+    return Row(shown.name.replace("_", " "), camera.height / camera.width, cells, **more)
 
 
-class _Style(NamedTuple):
-    """Colours of a panel."""
-
-    colour_map: str | Colormap
-    limits: tuple[float, float]
-
-
-_GREY = _Style("gray", (0, 1))
+def _photo(scene: DepthSample) -> Cell:
+    return Cell(scene.rgb.permute(1, 2, 0).clamp(0, 1).numpy())
 
 
 def _panel(
-    picture: np.ndarray | None,
-    caption: tuple[str, bool] = ("", False),
-    *,
-    missing: str = "no result",
-    style: _Style = _GREY,
+    picture: np.ndarray | None, caption: tuple[str, bool] = ("", False), *, missing: str = "no result", **style: Any
 ) -> Cell:
     """Build a panel of (H, W) values, or a panel with the text ``missing``."""
-    return Cell(None, missing) if picture is None else Cell(picture, *caption, *style)
+    return Cell(None, missing) if picture is None else Cell(picture, *caption, **style)
 
 
-def _pixels(values: Tensor | None) -> np.ndarray | None:
-    """Return (1, H, W) as an array, (H, W)."""
-    return None if values is None else values[0].numpy()
-
-
-def _enlarge(picture: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Repeat pixels up to a height and width, so that viewers do not smooth a low-resolution picture."""
+def _enlarge(picture: np.ndarray, camera: Camera) -> np.ndarray:
+    """Repeat pixels up to the size of a view, so that viewers do not smooth a low-resolution picture."""
     rows, columns = (
-        ((np.arange(new) + 0.5) * old / new).astype(int) for old, new in zip(picture.shape, size, strict=True)
+        ((np.arange(new) + 0.5) * old / new).astype(int)
+        for old, new in zip(picture.shape, (camera.height, camera.width), strict=True)
     )
     return picture[rows[:, None], columns]
 
 
-def _label(shown: Shown) -> str:
-    """Return the name of a scene with spaces, at which it can be wrapped."""
-    return shown.name.replace("_", " ")
-
-
 def _captions(shown: Shown, *metrics: str) -> dict[str, tuple[str, bool]]:
     """Format the scores of each method in the paper's units, and determine whether the first is the best."""
-    first = {label: scores[metrics[0]] for label, scores in shown.scores.items() if metrics[0] in scores}
-    valid = [value for value in first.values() if np.isfinite(value)]
+    captions: dict[str, tuple[str, bool]] = {}
+    first = {label: scores.get(metrics[0], math.nan) for label, scores in shown.scores.items()}
+    valid = [value for value in first.values() if math.isfinite(value)]
     best = min(valid) if len(valid) > 1 else None
-    return {label: (_score_text(scores, metrics), first.get(label) == best) for label, scores in shown.scores.items()}
-
-
-def _score_text(scores: dict[str, float], metrics: tuple[str, ...]) -> str:
-    """Format scores with a dash for each missing one; empty if all are missing."""
-    texts = []
-    for name in metrics:
-        shown = KNOWN_FORMATS[name]
-        value = scores.get(name, np.nan)
-        texts.append(shown.text(shown.factor * value) if np.isfinite(value) else "-")
-    return "" if all(text == "-" for text in texts) else " / ".join(texts)
+    for label, scores in shown.scores.items():
+        values = [KNOWN_FORMATS[name].factor * scores.get(name, math.nan) for name in metrics]
+        texts = [
+            KNOWN_FORMATS[name].text(value) if math.isfinite(value) else "-"
+            for name, value in zip(metrics, values, strict=True)
+        ]
+        shown_text = "" if all(text == "-" for text in texts) else " / ".join(texts)
+        captions[label] = (shown_text, first[label] == best)
+    return captions
 
 
 def details_of(pictures: Sequence[np.ndarray], truth: np.ndarray | None, grain: int, count: int = 2) -> list[Window]:
     """Find square windows in which results differ most, on average, from the ground truth or else from their mean.
 
-    Args:
-        pictures: renderings of the results, (H, W), NaN where undefined.
-        truth: rendering of the ground truth, (H, W), NaN where undefined; None without one.
-        grain: pixels in a block; windows consist of whole blocks, at a whole scale factor of pixels of the input.
-        count: maximum number of windows, which do not overlap.
-
+    Renderings are (H, W), NaN where undefined. Windows do not overlap, and consist of whole blocks of ``grain`` pixels.
     """
     if not pictures:
         return []

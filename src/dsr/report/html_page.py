@@ -11,8 +11,11 @@ from collections.abc import Mapping
 from importlib import resources
 from typing import Any
 
+import jinja2
 import matplotlib as mpl
 import numpy as np
+
+from dsr.io.photos import data_url
 
 
 def asset(*names: str) -> str:
@@ -22,9 +25,17 @@ def asset(*names: str) -> str:
     return re.sub(r'@import "(\w+\.css)";', lambda found: asset(found[1]), text)
 
 
-def fill(template: str, parts: Mapping[str, str]) -> str:
-    """Return a template of the package with its ``{{NAME}}`` replaced."""
-    return re.sub(r"\{\{([A-Z_]+)\}\}", lambda found: parts[found.group(1)], asset(template))
+def fill(template: str, parts: Mapping[str, Any]) -> str:
+    """Return a Jinja template of the package with its parts, escaped unless the template calls them safe."""
+    pages = jinja2.Environment(
+        loader=jinja2.PackageLoader("dsr.report", "assets"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        keep_trailing_newline=True,
+    )
+    pages.filters["data_url"] = data_url
+    return pages.get_template(template).render(parts)
 
 
 def policy(style: str, script: str, images: str) -> str:

@@ -113,11 +113,7 @@ def paper_name(run: Run) -> str:
 def paper_row(name: str, runs: Sequence[Run], scenes: Iterable[str]) -> pd.Series | None:
     """Return the paper's values to stand beside those of some runs; None where it has none, or they do not apply.
 
-    Args:
-        name: scene, or average over scenes; empty for none of the paper's.
-        runs: runs of one method at one scale.
-        scenes: the scene or scenes.
-
+    ``name`` is a scene or an average over scenes, empty for none of the paper's; the runs are of one method and scale.
     """
     return published_row(name, paper_name(runs[0]), runs[0].scale) if name and runs and applies(runs, scenes) else None
 
@@ -142,21 +138,12 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True)
 class SceneSet:
-    """The scenes of a table row.
-
-    Args:
-        title: display title.
-        places: one or more scenes.
-        published: name of the paper's row for these scenes; "" if it has none, or if some of its scenes are missing or
-            not the paper's own.
-        average: whether the row is an average, possibly over one scene.
-
-    """
+    """The scenes of a table row."""
 
     title: str
-    places: tuple[Place, ...]
-    published: str = ""
-    average: bool = True
+    places: tuple[Place, ...]  # one or more scenes
+    published: str = ""  # the paper's name of them; empty if it has none, or some are missing or not the paper's own
+    average: bool = True  # whether the row is an average, possibly over one scene
 
 
 def sets_of_dataset(places: Sequence[Place]) -> list[SceneSet]:
@@ -171,11 +158,8 @@ def sets_of_summary(
 ) -> list[SceneSet]:
     """Return the averages over each data set, those of the paper's summary, and similar ones over other data sets.
 
-    Args:
-        places: all scenes.
-        complete: predicate, whether the ground truth of a scene has no holes; only called for scenes not in the paper.
-        apart: data sets that are not averaged with others: different truths of the same scenes.
-
+    ``complete`` says of a scene that is not the paper's whether its ground truth has no holes. Data sets in ``apart``,
+    whose runs have different truths of the same scenes, are not averaged with others.
     """
     datasets = list(dict.fromkeys(place.dataset for place in places))
     found = [each for name in datasets for each in _averages_of_dataset(name, _within(places, name))]

@@ -1,134 +1,95 @@
-"""Scenes of a benchmark setting with the results of all methods, as figures show them."""
+"""Scenes of a benchmark setting with one result per method, as figures, pages and studies show them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from torch import Tensor
 
-from dsr.evaluation.results import BenchmarkSetting, Results, Run, sample_path
-from dsr.geometry.camera import Camera
+from dsr.evaluation.results import BenchmarkSetting, Results, Run, one_per_method
 from dsr.sample import DepthSample
-from dsr.utils.arrays import array_headers
 
-_NOT_STORED = "no run has stored its photo and input"
+
+@dataclass(frozen=True)
+class View:
+    """A scene of a benchmark setting and its runs, of each method the one with the lowest seed."""
+
+    problem: BenchmarkSetting
+    scene: str
+    runs: tuple[Run, ...]
+
+    def __str__(self) -> str:
+        dataset, scale, downsampling = self.problem
+        return f"{dataset}/{self.scene} x{scale} {downsampling}"
+
+
+@dataclass(frozen=True)
+class Result:
+    """The prediction of a run."""
+
+    run: Run
+    depth: Tensor  # (1, H, W) float64, metres, NaN in holes
+    errors: tuple[Tensor, Tensor] | None  # expected ones of depth in metres and of normals in degrees, (1, H, W)
+
+
+def views_of(results: Results, problem: BenchmarkSetting) -> list[View]:
+    """Return the scenes of a setting that have predictions."""
+    return [View(problem, scene, one_per_method(runs)) for scene, runs in results.by_scene(problem).items()]
+
+
+def stored_sample(view: View, notes: list[str]) -> DepthSample | None:
+    """Return the scene from the first run that has stored it, None if none has; ``notes`` takes the reasons."""
+    for run in view.runs:
+        if run.has_sample(view.scene):
+            try:
+                return run.sample(view.scene)
+            except ValueError as error:
+                notes.append(str(error))
+    notes.append(f"{view}: no pictures, because no run has stored photo and input")
+    return None
+
+
+def results_of(view: View, stored: DepthSample, notes: list[str]) -> list[Result]:
+    """Return the predictions that have the size of the scene; ``notes`` takes the others."""
+    found = []
+    size = (1, stored.camera.height, stored.camera.width)
+    for run in view.runs:
+        try:
+            depth, errors = run.prediction(view.scene), run.expected_errors(view.scene)
+        except (ValueError, OSError) as error:
+            notes.append(str(error))
+            continue
+        maps = (depth, *(errors or ()))
+        if all(tuple(each.shape) == size for each in maps):
+            found.append(Result(run, depth.double(), errors))
+            continue
+        came = " and ".join(" x ".join(map(str, each.shape[1:])) for each in maps)
+        expected = f"expected maps of the photo's {size[1]} x {size[2]} pixels"
+        notes.append(f"{run.folder}: {view.scene}: {expected}, got {came}; not shown")
+    return found
 
 
 @dataclass(frozen=True)
 class Shown:
-    """A scene and its results.
-
-    Args:
-        name: name of the scene.
-        scene: input and ground truth.
-        depths: (1, H, W) results in metres by method, None without a result.
-        scores: scores by method and metric, worst of four lights, raw units.
-
-    """
+    """A scene and its results by method."""
 
     name: str
     scene: DepthSample
-    depths: dict[str, Tensor | None]
-    scores: dict[str, dict[str, float]]
-
-    def existing(self) -> list[Tensor]:
-        """Return the existing results."""
-        return [depth for depth in self.depths.values() if depth is not None]
+    depths: dict[str, Tensor | None]  # (1, H, W) in metres, None without a result
+    scores: dict[str, dict[str, float]]  # by metric, worst of four lights, raw units
 
 
-def first_runs(results: Results, problem: BenchmarkSetting) -> dict[str, list[Run]]:
-    """Return the runs of a benchmark setting by method, sorted by seed."""
-    runs: dict[str, list[Run]] = {}
-    for run in results.of(problem):
-        runs.setdefault(run.label, []).append(run)
-    return {label: sorted(each, key=lambda run: run.seed) for label, each in runs.items()}
-
-
-def drawable_scenes(
-    results: Results, problem: BenchmarkSetting, notes: list[str], *, with_truth: bool = False
-) -> list[str]:
-    """Return the scenes of a benchmark setting that a run has stored, without reading their pictures.
-
-    Args:
-        results: all runs.
-        problem: benchmark setting.
-        notes: list to which one line is added per scene left out because no run has stored it.
-        with_truth: whether scenes without ground truth are left out, too.
-
-    """
-    names = []
-    for name, runs in results.by_scene(problem).items():
-        stored = next((run for run in runs if run.has_sample(name)), None)
-        if stored is None:
-            _note(notes, f"no figures of {name}: {_NOT_STORED}")
-        elif not with_truth or _has_truth(stored, name):
-            names.append(name)
-    return names
-
-
-def _has_truth(run: Run, name: str) -> bool:
-    """Return whether a stored scene has ground truth; a damaged one may have it elsewhere."""
-    try:
-        return "depth" in array_headers(sample_path(run.folder, name))
-    except (ValueError, OSError):
-        return True
-
-
-def shown_scenes(
-    results: Results, problem: BenchmarkSetting, notes: list[str], names: Iterable[str] | None = None
-) -> Iterator[Shown]:
-    """Yield scenes of a benchmark setting one by one.
-
-    Args:
-        results: all runs.
-        problem: benchmark setting.
-        notes: list to which one line is added per scene or result left out.
-        names: names of the scenes; None for all.
-
-    """
-    runs = first_runs(results, problem)
-    by_scene = results.by_scene(problem)
-    for name in by_scene if names is None else names:
-        scene = _stored(name, by_scene.get(name, ()), notes)
-        if scene is None:
-            continue
-        depths: dict[str, Tensor | None] = {}
-        scores: dict[str, dict[str, float]] = {}
-        for label, each in runs.items():
-            run = next((run for run in each if name in run.scenes), None)
-            depths[label] = None if run is None else _prediction(run, name, scene.camera, notes)
-            scores[label] = {} if run is None else run.headlines.get(name, {})
-        yield Shown(name, scene, depths, scores)
-
-
-def _stored(name: str, runs: Sequence[Run], notes: list[str]) -> DepthSample | None:
-    """Return the scene from the first run that has stored it."""
-    reason = _NOT_STORED
-    for run in runs:
-        if run.has_sample(name):
-            try:
-                return run.sample(name)
-            except ValueError as error:
-                reason = str(error)
-    _note(notes, f"no figures of {name}: {reason}")
-    return None
-
-
-def _prediction(run: Run, name: str, camera: Camera, notes: list[str]) -> Tensor | None:
-    """Return a result, None if it cannot be drawn."""
-    try:
-        depth = run.prediction(name)
-    except ValueError as error:
-        _note(notes, str(error))
+def shown_of(view: View, methods: Sequence[str], notes: list[str]) -> Shown | None:
+    """Return a scene with the results of some methods, None if no run has stored it; ``notes`` takes what it lacks."""
+    stored = stored_sample(view, notes)
+    if stored is None:
         return None
-    if tuple(depth.shape) == (1, camera.height, camera.width):
-        return depth
-    expected, came = (f"{height} x {width}" for height, width in ((camera.height, camera.width), depth.shape[-2:]))
-    _note(notes, f"{run.folder}: {name}: expected a result of the photo's {expected} pixels, got {came}; not drawn")
-    return None
-
-
-def _note(notes: list[str], line: str) -> None:
-    if line not in notes:
-        notes.append(line)
+    depths = {each.run.label: each.depth for each in results_of(view, stored, notes)}
+    scores = {run.label: run.headlines.get(view.scene, {}) for run in view.runs}
+    return Shown(
+        view.scene,
+        stored,
+        {label: depths.get(label) for label in methods},
+        {label: scores.get(label, {}) for label in methods},
+    )

@@ -14,54 +14,38 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.stats import norm, t
+from scipy.stats import binomtest, bootstrap, norm, t
 
 LEAST = 5
 """Smallest number of scenes of an interval."""
 LEVEL = 0.05
+CONFIDENCE = 0.95
 _DRAWS = 10_000
 _EXACT = 13
 _ROUNDING = 1e-9
-CONFIDENCE = 0.95
-_Z = 1.959963984540054
-"""The 97.5th percentile of the normal distribution."""
 _RESAMPLES = 2000
 
 
 def interval_of_mean(values: Sequence[float]) -> tuple[float, float] | None:
-    """Return the 95 % interval of the mean over scenes; None for fewer than :data:`LEAST`.
-
-    Args:
-        values: one of each scene.
-
-    """
+    """Return the 95 % interval of the mean over scenes, one value each; None for fewer than :data:`LEAST`."""
     count = len(values)
     if count < LEAST:
         return None
     tail = float(norm.cdf(math.sqrt(count / (count - 1)) * t.ppf(LEVEL / 2, count - 1)))
-    low, high = np.quantile(_draws(count) @ np.asarray(values), [tail, 1 - tail])
+    drawn = bootstrap((values,), np.mean, n_resamples=_DRAWS, confidence_level=1 - 2 * tail, method="percentile", rng=0)
+    low, high = drawn.confidence_interval
     return float(low), float(high)
 
 
 def p_of_difference(first: Sequence[float], second: Sequence[float]) -> float:
-    """Return the two-sided p-value of a mean difference of 0 between two methods on the same scenes.
+    """Return the two-sided p-value of a mean difference of 0 between two methods on the same scenes in one order.
 
-    Args:
-        first, second: a value of each scene, in the same order.
-
-    Returns:
-        The share of all changes of sign with a mean difference at least as large; of random ones for many scenes.
-
+    It is the share of all changes of sign with a mean difference at least as large; of random ones for many scenes.
+    SciPy's ``permutation_test`` gives the same in a thousand times the time.
     """
-    difference = np.asarray(first, dtype=float) - np.asarray(second)
+    difference = np.subtract(first, second)
     sums = np.abs(_signs(len(difference)) @ difference)
     return float((sums >= abs(difference.sum()) * (1 - _ROUNDING)).mean())
-
-
-@functools.lru_cache(maxsize=16)
-def _draws(count: int) -> np.ndarray:
-    """Return the weights of scenes in each draw, (draws, count)."""
-    return np.random.default_rng(0).multinomial(count, np.full(count, 1 / count), size=_DRAWS) / count
 
 
 @functools.lru_cache(maxsize=16)
@@ -75,47 +59,23 @@ def _signs(count: int) -> np.ndarray:
 
 
 def wilson(count: float, n: int) -> tuple[float, float]:
-    """Compute the 95 % score interval of a fraction (Wilson 1927, "Probable inference", JASA 22).
-
-    Args:
-        count: number of positive answers, 0 to ``n``.
-        n: number of answers.
-
-    Returns:
-        Lower and upper bound in [0, 1]; (NaN, NaN) without answers.
-
-    """
-    if n == 0:
-        return math.nan, math.nan
-    fraction = count / n
-    centre = fraction + _Z**2 / (2 * n)
-    half = _Z * math.sqrt(fraction * (1 - fraction) / n + _Z**2 / (4 * n**2))
-    scale = 1 + _Z**2 / n
-    return max((centre - half) / scale, 0.0), min((centre + half) / scale, 1.0)
+    """Compute the 95 % score interval of ``count`` of ``n`` answers (Wilson 1927, "Probable inference", JASA 22)."""
+    low, high = binomtest(round(count), n).proportion_ci(CONFIDENCE, method="wilson")
+    return float(low), float(high)
 
 
 def bootstrap_of_average(chosen: np.ndarray, asked: np.ndarray, seed: int = 0) -> tuple[float, float]:
     """Compute the 95 % interval of a fraction averaged over scenes by resampling participants.
 
-    The answers of one participant to several scenes are not independent, so participants are resampled (cluster
-    percentile bootstrap: Davison and Hinkley 1997, "Bootstrap Methods and their Application", ch. 2-3). If all
-    resamples agree, for example because all or no participants chose a method, the Wilson interval with one answer per
-    participant is returned.
-
-    Args:
-        chosen: (people, scenes) 1 where the participant chose the method, else 0.
-        asked: (people, scenes) 1 where the participant saw the method, else 0.
-        seed: seed of the resampling.
-
-    Returns:
-        Lower and upper bound in [0, 1].
-
+    ``chosen`` and ``asked``, (people, scenes), are 1 where the participant chose and saw the method. The answers of one
+    participant are not independent, so participants are resampled (cluster percentile bootstrap: Davison and Hinkley
+    1997, "Bootstrap Methods and their Application", ch. 2-3). If all resamples agree, for example because all or no
+    participants chose a method, the Wilson interval with one answer per participant is returned.
     """
     people = len(asked)
     weights = np.random.default_rng(seed).multinomial(people, np.full(people, 1 / people), size=_RESAMPLES)
     fractions = average_fraction(weights @ chosen, weights @ asked)
-    fractions = fractions[np.isfinite(fractions)]
-    low, high = np.quantile(fractions, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    low, high = np.nanquantile(fractions, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
     if high - low > 1e-12:
         return float(low), float(high)
     return wilson(float(average_fraction(chosen.sum(0), asked.sum(0))) * people, people)
@@ -132,14 +92,9 @@ def average_fraction(chosen: np.ndarray, asked: np.ndarray) -> np.ndarray:
 def agreement(counts: np.ndarray) -> tuple[float, float]:
     """Compute the agreement of pairs of participants, and Fleiss' kappa (Fleiss 1971, Psychological Bulletin 76).
 
-    Args:
-        counts: (scenes, methods) number of first choices. Scenes with fewer than two answers are left out.
-
-    Returns:
-        The fraction of pairs of participants that agree, averaged over scenes, and kappa: 1 for full agreement, 0 for
-        agreement by chance given the overall frequency of each method. Both are NaN without pairs; kappa is also NaN if
-        all participants always chose the same method.
-
+    ``counts``, (scenes, methods), are the first choices; scenes with fewer than two are left out. The first value is
+    the fraction of pairs that agree, averaged over scenes. Kappa is 1 for full agreement, 0 for agreement by chance
+    given the overall frequency of each method, NaN if all always chose the same one; both are NaN without pairs.
     """
     counts = counts[counts.sum(1) >= 2]
     if not len(counts):

@@ -35,28 +35,16 @@ _STRIP = 1 << 20
 
 @dataclass(frozen=True)
 class Grid:
-    """A surface as a map, perhaps with fewer pixels than the one that it shows.
+    """A surface as a map, perhaps with fewer pixels than the one that it shows."""
 
-    Args:
-        depth: (h, w) orthogonal depth in metres, NaN in holes.
-        camera: of these pixels.
-        factor: pixels of the whole map side by side in one of these.
-        joints: of these pixels.
-        doubtful: (h, w) bool, pixels that the mesh leaves out.
-        certain: joints without doubtful pixels.
-        errors: levels of the expected errors by name, (h, w) uint8 each.
-        filled: (h, w) bool, pixels whose depth was not measured; None where that is not known.
-
-    """
-
-    depth: np.ndarray
-    camera: Camera
-    factor: int
-    joints: Joints
-    doubtful: np.ndarray
-    certain: Joints
-    errors: Mapping[str, np.ndarray]
-    filled: np.ndarray | None = None
+    depth: np.ndarray  # (h, w) orthogonal depth in metres, NaN in holes
+    camera: Camera  # of these pixels
+    factor: int  # pixels of the whole map side by side in one of these
+    joints: Joints  # of these pixels
+    doubtful: np.ndarray  # (h, w) bool, pixels that the mesh leaves out
+    certain: Joints  # joints without doubtful pixels
+    errors: Mapping[str, np.ndarray]  # levels of the expected errors by name, (h, w) uint8 each
+    filled: np.ndarray | None = None  # (h, w) bool, pixels whose depth was not measured; None where that is not known
 
 
 def factor_for(height: int, width: int, most: int) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import html
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +19,7 @@ from dsr.io.exports import normal_strips
 from dsr.io.photos import data_url, to_jpeg
 from dsr.pictures.canvas import HOLE_COLOUR
 from dsr.pictures.depth_views import reduced
-from dsr.report.html_page import asset, block, fill, json_text, palette, policy
+from dsr.report.html_page import asset, fill, json_text, palette, policy
 from dsr.report.surface_packing import (
     Grid,
     error_levels,
@@ -50,62 +49,33 @@ _QUALITY = 85
 
 @dataclass(frozen=True)
 class ViewedResult:
-    """A result of `dsr upsample` to look at.
+    """A result of `dsr upsample` to look at."""
 
-    Args:
-        name: its name among those of the page.
-        depth: (H, W) orthogonal depth in metres, NaN in holes.
-        camera: of these pixels.
-        photo: (h, w, 3) uint8 of the same view and any size, None if there is none.
-        depth_lr: (h, w) the input's depth in metres, NaN in holes; None if there is none.
-        depth_error, angle_error: (H, W) expected errors in metres and degrees, both or none.
-        filled: (H, W) bool, where depth was not measured; None where that is not known.
-        max_error: expected error of the depth, as a fraction of it, from which a pixel is left out of the mesh.
-        facts: what is written below the surface, by heading.
-        notes: assumptions and remarks.
-
-    """
-
-    name: str
-    depth: np.ndarray
-    camera: Camera
-    photo: np.ndarray | None = None
-    depth_lr: np.ndarray | None = None
-    depth_error: np.ndarray | None = None
-    angle_error: np.ndarray | None = None
-    filled: np.ndarray | None = None
-    max_error: float = math.inf
-    facts: Mapping[str, str] | None = None
-    notes: Sequence[str] = ()
+    name: str  # among those of the page
+    depth: np.ndarray  # (H, W) orthogonal depth in metres, NaN in holes
+    camera: Camera  # of these pixels
+    photo: np.ndarray | None = None  # (h, w, 3) uint8 of the same view and any size
+    depth_lr: np.ndarray | None = None  # (h, w) the input's depth in metres, NaN in holes
+    depth_error: np.ndarray | None = None  # (H, W) expected error in metres, with that of the normal or not at all
+    angle_error: np.ndarray | None = None  # (H, W) expected error of the normal in degrees
+    filled: np.ndarray | None = None  # (H, W) bool, where depth was not measured; None where that is not known
+    max_error: float = math.inf  # expected error, as a fraction of the depth, from which the mesh leaves out a pixel
+    facts: Mapping[str, str] | None = None  # texts below the surface, by heading
+    notes: Sequence[str] = ()  # assumptions and remarks
 
 
 @dataclass(frozen=True)
 class Packed:
-    """A result as the page stores it.
+    """A result as the page stores it."""
 
-    Args:
-        about: what fits into JSON.
-        data: base64 texts by name: after, before, photo.
-        pictures: JPEGs by name: before, after, thumb.
-        vertices: number of vertices of the larger surface.
-
-    """
-
-    about: dict[str, Any]
-    data: dict[str, str]
-    pictures: dict[str, bytes]
-    vertices: int
+    about: dict[str, Any]  # what fits into JSON
+    data: dict[str, str]  # base64 texts by name: after, before, photo
+    pictures: dict[str, bytes]  # JPEGs by name: before, after, thumb
+    vertices: int  # of the larger surface
 
 
 def pack_result(result: ViewedResult, vertices: int, photo_side: int) -> Packed:
-    """Pack a result.
-
-    Args:
-        result: the result.
-        vertices: maximum number of vertices of a surface; larger maps are reduced by a whole factor.
-        photo_side: maximum longer side of the photo in pixels.
-
-    """
+    """Pack a result; maps of more ``vertices`` are reduced by a whole factor, the photo to ``photo_side`` pixels."""
     known = result.depth[np.isfinite(result.depth)]
     middle = float(np.median(known)) if known.size else 1.0
     limits = {"depth": tuple(share * middle for share in DEPTHS), "angle": ANGLES}
@@ -131,30 +101,20 @@ def pack_result(result: ViewedResult, vertices: int, photo_side: int) -> Packed:
 
 
 def save_view(path: Path, results: Sequence[Packed], *, title: str, notes: Sequence[str] = ()) -> None:
-    """Write the page atomically.
+    """Write the page of some results, at least one, atomically.
 
     A content security policy allows the page's own script, style and pictures alone, so that it cannot ask any server.
     All names are escaped, or shown as text by the script.
-
-    Args:
-        path: HTML file.
-        results: packed results; one at least.
-        title: title of the page.
-        notes: remarks on the page as a whole.
-
     """
     style, script = asset("view.css"), f'"use strict";\n{asset(*VIEWER, "view_page.js")}'
-    blocks = [block("content", json_text(content_of(results, title, notes)))]
-    blocks += [block(name, data, "text/plain") for name, data in data_of(results).items()]
     parts = {
-        "MARK": MARK,
         "POLICY": policy(style, script, "data: blob:"),
-        "TITLE": html.escape(title),
+        "TITLE": title,
         "STYLE": style,
-        "VIEWER": asset("viewer.html"),
         "SCRIPT": script,
-        "STATIC": "\n".join(_static(result) for result in results),
-        "DATA": "\n".join(blocks),
+        "RESULTS": results,
+        "CONTENT": json_text(content_of(results, title, notes)),
+        "DATA": data_of(results),
     }
     write_text(path, fill("view.html", parts))
 
@@ -180,19 +140,6 @@ def is_view(path: Path) -> bool:
     """Return whether a file is a page of this command."""
     with opened(path) as file:
         return MARK.encode() in file.read(1024)
-
-
-def _static(result: Packed) -> str:
-    """Return the pictures of a result for browsers without WebGL."""
-    name, holes = html.escape(result.about["name"]), "; holes are pink"
-    figures = []
-    for key, text in (("before", "before: the depth map as it came"), ("after", "after")):
-        if key in result.pictures:
-            pink = holes if result.about[key]["holes"] else ""
-            alt = f"{name}, {text}, as a grey surface lit from the upper left{pink}"
-            picture = f'<img src="{data_url(result.pictures[key])}" alt="{alt}">'
-            figures.append(f"<figure>{picture}<figcaption>{text}{pink}</figcaption></figure>")
-    return f'<section class="still"><h2>{name}</h2><div class="pair">{"".join(figures)}</div></section>'
 
 
 def _after(result: ViewedResult, vertices: int, limits: Mapping[str, tuple[float, ...]]) -> Grid:

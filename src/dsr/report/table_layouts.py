@@ -16,16 +16,13 @@ from rich.table import Table
 from dsr.evaluation.results import Results, Run, alignment_note
 from dsr.metrics.formats import PAPER, Formats, MetricFormat, by_family, describe_directions, in_tables
 from dsr.report.paper import average_of, implementation_note, paper_name, paper_row
-from dsr.report.tables import FACTS, Cell, Fact, Group, PaperTable, Row, build_tables, in_shown_units, shown
+from dsr.report.tables import FACTS, Cell, Fact, Group, PaperTable, Row, build_tables, shown
 from dsr.utils.files import write_text
 
 MISSING = "\N{EN DASH}"
 _SPECIAL = re.compile(r"[\\`*\[\]<>|~&#]|(?<![A-Za-z0-9])_|_(?![A-Za-z0-9])")
-_END = "\\end{table}\n"
-_ROWS, _ROWS_TURNED = 42, 26
-"""Maximum rows of a portrait and of a landscape page."""
-_WIDE = 135
-"""Maximum characters of a row that is legible on a portrait page."""
+_ROWS = 26
+"""Maximum rows of a page, which is in landscape format."""
 _LATEX_SPECIAL = {
     "\\": "\\textbackslash{}", "{": "\\{", "}": "\\}", "$": "\\$", "&": "\\&", "#": "\\#", "%": "\\%", "_": "\\_",
     "~": "\\textasciitilde{}", "^": "\\textasciicircum{}", "<": "\\textless{}", ">": "\\textgreater{}",
@@ -39,8 +36,8 @@ _HEAD = r"""\documentclass{article}
 \usepackage[utf8]{inputenc}
 \IfFileExists{lmodern.sty}{\usepackage{lmodern}}{}
 \usepackage{textcomp}
-\usepackage[a4paper,margin=18mm]{geometry}
-\usepackage{booktabs,graphicx,pdflscape}
+\usepackage[a4paper,landscape,margin=18mm]{geometry}
+\usepackage{booktabs,graphicx}
 \setlength{\parindent}{0pt}
 \begin{document}
 """
@@ -49,20 +46,10 @@ _HEAD = r"""\documentclass{article}
 def write_tables(
     folder: Path, results: Results, study: pd.DataFrame | None = None, *, intervals: bool = False
 ) -> list[Path]:
-    """Write all tables of some runs.
+    """Write all tables of some runs, and return the files.
 
-    Args:
-        folder: output directory for ``NAME.md``, ``NAME.tex``, ``NAME_published.tex`` (if the paper has values) and
-            ``NAME.csv`` of each table, and for ``all.md`` and ``all.tex`` with all tables.
-        results: runs.
-        study, intervals: see :func:`dsr.report.tables.build_tables`.
-
-    Returns:
-        Paths of the files.
-
-    Raises:
-        ValueError: the table of the study is invalid.
-
+    They are ``NAME.md``, ``NAME.tex``, ``NAME_published.tex`` (if the paper has values) and ``NAME.csv`` of each table,
+    and ``all.md`` and ``all.tex`` with all tables.
     """
     tables = build_tables(results, study, intervals=intervals)
     texts = {"all.md": "\n".join(map(to_markdown, tables)), "all.tex": to_document(tables)}
@@ -78,25 +65,14 @@ def write_tables(
 
 @dataclass(frozen=True)
 class Style:
-    """Formatting of cells in a layout.
+    """Formatting of cells in a layout."""
 
-    Args:
-        escape: makes a text fit for the layout.
-        missing: text of a missing value.
-        marks: text before and after a value, by rank.
-        plus_minus: separator between a value and its spread.
-        seeds: format of the number of seeds, with ``{}``.
-        star: mark of a value that is better than the second best by a test.
-        number: formats a number.
-
-    """
-
-    escape: Callable[[str], str]
-    missing: str
-    marks: Mapping[int, tuple[str, str]]
-    plus_minus: str
-    seeds: str
-    star: str
+    escape: Callable[[str], str]  # makes a text fit for the layout
+    missing: str  # text of a missing value
+    marks: Mapping[int, tuple[str, str]]  # text before and after a value, by rank
+    plus_minus: str  # between a value and its spread
+    seeds: str  # format of the number of seeds, with ``{}``
+    star: str  # mark of a value that is better than the second best by a test
     number: Callable[[str], str] = str
 
     def text(self, column: MetricFormat, cell: Cell | None, seeds: int) -> str:
@@ -172,41 +148,27 @@ def to_csv(table: PaperTable) -> str:
 
 def to_document(tables: Sequence[PaperTable]) -> str:
     """Return a complete document with all tables, each also with the paper's values."""
-    parts = [_HEAD]
-    for table in tables:
-        for published in (False, True)[: 1 + table.has_published]:
-            text = to_latex(table, published=published)
-            text = text.replace(_END, f"{_END}\\clearpage\n")  # landscape does not turn pages of floats alone
-            turned = _width(table, published=published) > _WIDE
-            parts.append(f"\\begin{{landscape}}\n{text}\\end{{landscape}}\n" if turned else text)
-    return "\n".join([*parts, "\\end{document}\n"])
+    texts = [
+        to_latex(table, published=published)
+        for table in tables
+        for published in ((False, True) if table.has_published else (False,))
+    ]
+    return "\\clearpage\n".join([_HEAD, *texts, "\\end{document}\n"])
 
 
 def to_latex(table: PaperTable, *, published: bool = False) -> str:
     r"""Return a table as LaTeX for ``\input``; it needs the packages booktabs and graphicx, and the encoding T1.
 
-    A table is at most as wide as the text. A table too long for a page is split.
-
-    Args:
-        table: table to write.
-        published: whether to add the paper's values in parentheses, without spreads and intervals.
-
+    A table is at most as wide as the text. A table too long for a page is split. A ``published`` one has the paper's
+    values in parentheses, and no spreads and intervals.
     """
     groups = [list(_latex_rows(table, group, published=published)) for group in table.groups]
-    most = _ROWS_TURNED if _width(table, published=published) > _WIDE else _ROWS
-    pages = list(_pages([rows for rows in groups if rows], most))
+    pages = list(_pages([rows for rows in groups if rows]))
     return "\n".join(_page(table, page, number, published) for number, page in enumerate(pages))
 
 
 def aligned(head: Sequence[str], rows: Sequence[Sequence[str]], texts: int) -> str:
-    """Format a Markdown table with aligned columns.
-
-    Args:
-        head: headings, escaped.
-        rows: cells, escaped.
-        texts: number of text columns from the left; the remaining columns are numbers, aligned to the right.
-
-    """
+    """Format a Markdown table of escaped texts with aligned columns, of which the first ``texts`` are to the left."""
     widths = [max(3, *map(len, column)) for column in zip(head, *rows, strict=True)]
     rule = ["-" * width if number < texts else "-" * (width - 1) + ":" for number, width in enumerate(widths)]
     lines = []
@@ -249,7 +211,7 @@ def _family_table(run: Run, families: Mapping[str, Formats]) -> Table:
     for name in ("mean", "least", "most"):
         table.add_column(name, justify="right", no_wrap=True)
     for family, members in families.items():
-        ours = in_shown_units(run.scores, members)
+        ours = _in_shown_units(run, members)
         for number, (name, values) in enumerate(ours.items()):
             column = members[str(name)]
             texts = [column.text(value) for value in (values.mean(), values.min(), values.max())]
@@ -259,6 +221,13 @@ def _family_table(run: Run, families: Mapping[str, Formats]) -> Table:
     return table
 
 
+def _in_shown_units(run: Run, formats: Formats) -> pd.DataFrame:
+    """Return a run's scores as scene x metric, worst of four lights."""
+    wide = pd.DataFrame.from_dict(run.headlines, orient="index").dropna(axis=1, how="all")
+    columns = {name: each for name, each in in_tables(formats).items() if name in wide}
+    return wide[list(columns)] * [each.factor for each in columns.values()]
+
+
 def _about(run: Run) -> str:
     """Return a line on a run."""
     return f"{run.label} on {run.dataset}, x{run.scale}, {run.downsampling} downsampling"
@@ -266,7 +235,7 @@ def _about(run: Run) -> str:
 
 def _score_table(run: Run, formats: Formats) -> Table:
     """Build a terminal table: per scene our values and the paper's, then the mean."""
-    ours = in_shown_units(run.scores, formats)
+    ours = _in_shown_units(run, formats)
     columns = {str(name): formats[str(name)] for name in ours}
     title = f"{_about(run)} - {describe_directions(columns)}"
     table = Table(title=escape(title), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
@@ -348,13 +317,13 @@ def _against(key: str, column: MetricFormat, row: Row) -> tuple[str, str]:
     return text if text.startswith("-") else f"+{text}", MISSING if ratio is None else f"{ratio:.2f}"
 
 
-def _pages(groups: Sequence[list[str]], most: int) -> Iterator[list[list[str]]]:
-    """Yield the rows of each page by group, at most ``most``; a group that fits on one page is not split."""
+def _pages(groups: Sequence[list[str]]) -> Iterator[list[list[str]]]:
+    """Yield the rows of each page by group; a group that fits on one page is not split."""
     page: list[list[str]] = []
     for rows in groups:
-        for start in range(0, len(rows), most):
-            part = rows[start : start + most]
-            if page and sum(map(len, page)) + len(part) > most:
+        for start in range(0, len(rows), _ROWS):
+            part = rows[start : start + _ROWS]
+            if page and sum(map(len, page)) + len(part) > _ROWS:
                 yield page
                 page = []
             page.append(part)
@@ -395,7 +364,8 @@ def _page(table: PaperTable, groups: Sequence[Sequence[str]], number: int, publi
 \bottomrule
 \end{{tabular}}%
 }}
-{_END}"""
+\end{{table}}
+"""
 
 
 def _latex_rows(table: PaperTable, group: Group, *, published: bool) -> Iterator[str]:
@@ -422,22 +392,6 @@ def _beside(row: Row, facts: Sequence[Fact], columns: Formats, *, first: bool) -
     ours = _LATEX.row(replace(row, cells=cells, seeds=1), facts, columns, first=first)
     paper = _LATEX.paper(columns, row.published)
     return [*ours[: len(facts)], *(f"{own} ({its})" for own, its in zip(ours[len(facts) :], paper, strict=True))]
-
-
-def _width(table: PaperTable, *, published: bool) -> int:
-    """Return the number of characters of the longest row, without markup."""
-    facts, columns = _columns(table, published=published)
-    wide = 0
-    for group in table.groups:
-        every = [*group.rows, *group.paper_only]
-        words = [max(len(str(fact.value(row))) for row in every) for fact in facts
-                 if not (fact.number or (fact.name == "scene" and group.about.average))]  # fmt: skip
-        for row in group.rows:
-            cells = (_beside if published else _LATEX.row)(row, facts, columns, first=True)[len(facts) :]
-            plain = [text.replace("\\textbf", "").replace("\\underline", "").replace("$\\pm$", "+") for text in cells]
-            sizes = [max(len(text), len(each.heading)) + 2 for text, each in zip(plain, columns.values(), strict=True)]
-            wide = max(wide, sum(words) + sum(sizes))
-    return wide
 
 
 def _cells(values: pd.Series, columns: Formats) -> list[str]:

@@ -23,7 +23,6 @@ from dsr.evaluation.results import Results, Run, alignment_note
 from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.metrics.formats import (
     AFTER_THE_PAPER,
-    HEADLINES,
     LIGHTS_NOTE,
     PAPER,
     Formats,
@@ -51,29 +50,17 @@ from dsr.report.study.study_table import PERCENTAGES, check_study, study_cells
 
 @dataclass(frozen=True)
 class Cell:
-    """One value of a table, in its column's unit.
+    """One value of a table, in its column's unit."""
 
-    Args:
-        mean: mean over seeds, then over scenes; NaN if the methods have no scene in common.
-        spread: sample standard deviation over seeds; None for one seed.
-        seeds: number of seeds of the spread; 0 for values without seeds.
-        scenes, of: number of averaged scenes, and of all scenes of the row.
-        interval: 95 % confidence interval of a percentage of answers, or of a mean over scenes.
-        by_scene: value of each averaged scene.
-        significant: whether it is the best, and better than the second best, by a paired test over the scenes.
-        rank: 1 for the best displayed value, 2 for the second best; 0 for others.
-
-    """
-
-    mean: float
-    spread: float | None = None
-    seeds: int = 1
-    scenes: int = 1
-    of: int = 1
-    interval: tuple[float, float] | None = None
-    by_scene: tuple[float, ...] = field(default=(), repr=False)
-    significant: bool = False
-    rank: int = 0
+    mean: float  # over seeds, then over scenes; NaN if the methods have no scene in common
+    spread: float | None = None  # sample standard deviation over seeds; None for one seed
+    seeds: int = 1  # of the spread; 0 for values without seeds
+    scenes: int = 1  # averaged ones
+    of: int = 1  # all scenes of the row
+    interval: tuple[float, float] | None = None  # 95 %, of a percentage of answers or of a mean over scenes
+    by_scene: tuple[float, ...] = field(default=(), repr=False)  # value of each averaged scene
+    significant: bool = False  # whether it is the best, and better than the second best by a paired test
+    rank: int = 0  # 1 for the best displayed value, 2 for the second best; 0 for others
 
     def against(self, paper: float | None) -> tuple[float, float | None] | None:
         """Return the difference from the paper's value and the ratio to it; None if they are not comparable."""
@@ -89,63 +76,35 @@ class Cell:
 
 @dataclass(frozen=True)
 class Row:
-    """The values of a method.
-
-    Args:
-        label: name of the method.
-        about: scenes.
-        scale, downsampling: degradation of the runs.
-        seeds: maximum number of seeds of a cell; 0 for the paper's values alone.
-        runs: runs of the method; none for the paper's values alone.
-        cells: cells by column; missing values have none.
-        published: the paper's values by column, if any.
-
-    """
+    """The values of a method."""
 
     label: str
     about: SceneSet
     scale: float
     downsampling: str
-    seeds: int = 1
-    runs: Sequence[Run] = ()
-    cells: Mapping[str, Cell] = field(default_factory=dict)
-    published: Mapping[str, float] = field(default_factory=dict)
+    seeds: int = 1  # maximum number of seeds of a cell; 0 for the paper's values alone
+    cells: Mapping[str, Cell] = field(default_factory=dict)  # by column; missing values have none
+    published: Mapping[str, float] = field(default_factory=dict)  # the paper's values by column
 
 
 @dataclass(frozen=True)
 class Group:
-    """The rows of all methods for a scene or an average.
-
-    Args:
-        about: scenes.
-        rows: methods in order.
-        paper_only: the paper's values of methods that were not run.
-
-    """
+    """The rows of all methods for a scene or an average."""
 
     about: SceneSet
     rows: tuple[Row, ...]
-    paper_only: tuple[Row, ...]
+    paper_only: tuple[Row, ...]  # the paper's values of methods that were not run
 
 
 @dataclass(frozen=True)
 class PaperTable:
-    """A table like those of the paper.
+    """A table like those of the paper."""
 
-    Args:
-        name: file name without suffix: letters, digits, "_", "-" and "." only.
-        title: one line.
-        notes: remarks, one sentence each.
-        columns: columns with values, in order: metrics as in ``scores.csv``, and percentages of the user study.
-        groups: scenes, then averages.
-
-    """
-
-    name: str
+    name: str  # file name without suffix: letters, digits, "_", "-" and "." only
     title: str
-    notes: tuple[str, ...]
-    columns: Formats
-    groups: tuple[Group, ...]
+    notes: tuple[str, ...]  # one sentence each
+    columns: Formats  # metrics as in ``scores.csv``, and percentages of the user study
+    groups: tuple[Group, ...]  # scenes, then averages
 
     @property
     def rows(self) -> list[Row]:
@@ -168,20 +127,12 @@ class PaperTable:
 
 
 class Fact(NamedTuple):
-    """A column that identifies a row, before the columns of values. A CSV file has all of them.
-
-    Args:
-        name: of the column.
-        value: of a row; None for a missing one.
-        shown: whether tables for readers have it, by their rows; the page asks with all rows of a benchmark setting.
-        number: whether it is aligned like numbers; these are left out beside the paper's values.
-
-    """
+    """A column that identifies a row, before the columns of values. A CSV file has all of them."""
 
     name: str
     value: Callable[[Row], str | float | None]
-    shown: Callable[[Sequence[Row]], bool] = lambda _: False
-    number: bool = False
+    shown: Callable[[Sequence[Row]], bool] = lambda _: False  # whether tables for readers have it, by their rows
+    number: bool = False  # aligned like numbers, and left out beside the paper's values
 
 
 FACTS = (
@@ -198,6 +149,10 @@ _SHARES = {key: MetricFormat(heading, "%", digits=1, higher_is_better=True) for 
 """The columns of the user study."""
 
 
+Values = Mapping[str, Mapping[Place, Mapping[str, Mapping[int, float]]]]
+"""Scores by label, scene, metric and seed: worst of four lights, in the units of tables; only finite values."""
+
+
 def shown(column: MetricFormat, value: float) -> str:
     """Return a value in its column's unit as text, without a sign before zero."""
     text = column.text(value)
@@ -207,138 +162,126 @@ def shown(column: MetricFormat, value: float) -> str:
 def build_tables(results: Results, study: pd.DataFrame | None = None, *, intervals: bool = False) -> list[PaperTable]:
     """Build the tables of all runs: per scale and degradation a summary, then one table per data set.
 
-    Args:
-        results: runs.
-        study: table written by ``dsr study collect``: columns ``dataset, scene, scale, downsampling, label``, and
-            ``user_first, user_second, user_top2`` in percent with ``_low`` and ``_high`` of each.
-        intervals: whether averages have confidence intervals, and the best one is tested against the second best, see
-            :mod:`dsr.report.significance`.
-
-    Raises:
-        ValueError: the study lacks a column.
-
+    ``study`` is a table that ``dsr study collect`` wrote. With ``intervals``, averages have confidence intervals, and
+    the best one is tested against the second best, see :mod:`dsr.report.significance`.
     """
     if study is not None:
         check_study(study)
     complete = _truth_is_complete(results)
     tables: list[PaperTable] = []
+    names: set[str] = set()
     for scale, downsampling in dict.fromkeys((run.scale, run.downsampling) for run in results.runs):
         runs = [run for run in results.runs if (run.scale, run.downsampling) == (scale, downsampling)]
-        formats = results.formats
-        values = values_of(runs, formats)
-        make = _Maker(scale, downsampling, results.methods(), values, runs, study, formats, intervals)
-        places = list(dict.fromkeys(place for scenes in make.values.values() for place in scenes))
+        values = values_of(runs, results.formats)
+        places = list(dict.fromkeys(place for scenes in values.values() for place in scenes))
         if not places:
             continue
         apart = {run.dataset for run in runs if run.truth}
-        tables += make.tables("summary", "Averages", sets_of_summary(places, complete, apart))
+        kinds = [("summary", "Averages", sets_of_summary(places, complete, apart))]
         for dataset in dict.fromkeys(place.dataset for place in places):
             sets = sets_of_dataset([place for place in places if place.dataset == dataset])
-            tables += make.tables(dataset, TITLES.get(dataset, dataset), sets)
-    return _with_unique_names(tables)
+            kinds.append((dataset, TITLES.get(dataset, dataset), sets))
+        for name, title, sets in kinds:
+            shown_places = {place for each in sets for place in each.places}
+            labels = [label for label in results.methods() if not shown_places.isdisjoint(values.get(label, ()))]
+            for family, formats in by_family(results.formats).items():
+                paper = family == PAPER
+                groups = [_group(each, labels, runs, values, formats, study if paper else None) for each in sets]
+                if intervals:
+                    groups = [_tested(each) if each.about.average else each for each in groups]
+                stem, heading = (name, title) if paper else (f"{name}_{family}", f"{title}, {family}")
+                heading = f"{heading}, x{scale}, {downsampling} downsampling"
+                table = _table(heading, runs, groups, formats)
+                if paper or table.columns:
+                    tables.append(replace(table, name=_unique(f"{stem}_x{scale}_{downsampling}", names)))
+    return tables
 
 
-Values = Mapping[str, Mapping[Place, Mapping[str, Mapping[int, float]]]]
-"""Scores by label, scene, metric and seed: worst of four lights, in the units of tables; only finite values."""
+def _unique(stem: str, taken: set[str]) -> str:
+    """Return a name that is unique on any file system."""
+    slug = re.sub(r"[^A-Za-z0-9.-]+", "_", stem).strip("._-")
+    name, number = slug, 2
+    while name.casefold() in taken:
+        name, number = f"{slug}_{number}", number + 1
+    taken.add(name.casefold())
+    return name
 
 
-@dataclass(frozen=True)
-class _Maker:
-    """Builder of the tables of one scale and degradation.
+def _table(title: str, runs: Sequence[Run], groups: Sequence[Group], formats: Formats) -> PaperTable:
+    """Build a table, without its name, of the columns that have values."""
+    used = {key for group in groups for row in group.rows for key in row.cells}
+    columns = {key: each for key, each in {**formats, **_SHARES}.items() if key in used}
+    places = {place for group in groups for place in group.about.places}
+    datasets = {place.dataset for place in places}
+    here = [run for run in runs if run.dataset in datasets]
+    notes = [f"{each.text}." for each in Results(tuple(runs)).warnings if any(run.truth for run in here)]
+    notes += [note for note in [alignment_note(here)] if note]
+    return PaperTable("", title, (*notes, *_remarks(here, places), *_notes(groups, columns)), columns, tuple(groups))
 
-    Args:
-        scale, downsampling: degradation of the runs.
-        methods: all labels, in order.
-        values: scores.
-        runs: runs.
-        study: table of the user study.
-        formats: formats of the metrics, in column order.
-        intervals: whether averages are tested.
 
-    """
+def _group(
+    about: SceneSet,
+    labels: Sequence[str],
+    runs: Sequence[Run],
+    values: Values,
+    formats: Formats,
+    study: pd.DataFrame | None,
+) -> Group:
+    """Build the rows of some methods, and those of the paper alone."""
+    datasets = {place.dataset for place in about.places}
+    here = [run for run in runs if run.dataset in datasets]
+    rows = rows_of(about, labels, here, values, formats, study)
+    scale, downsampling = runs[0].scale, runs[0].downsampling
+    ran = {paper_name(run) for run in here if any(row.cells for row in rows if row.label == run.label)}
+    only = []
+    if about.published and applies(here, [place.scene for place in about.places]):
+        for name in map(str, published()["method"].unique()):
+            found = _columns_of(published_row(about.published, name, scale), formats)
+            if found and name not in ran:
+                only.append(Row(name, about, scale, downsampling, 0, published=found))
+    return Group(about, _ranked(rows, {**formats, **_SHARES}), tuple(only))
 
-    scale: float
-    downsampling: str
-    methods: Sequence[str]
-    values: Values
-    runs: Sequence[Run]
-    study: pd.DataFrame | None
-    formats: Formats
-    intervals: bool = False
 
-    @property
-    def columns(self) -> Formats:
-        """All columns: the metrics, then those of the user study."""
-        return {**self.formats, **_SHARES}
+def rows_of(
+    about: SceneSet,
+    labels: Sequence[str],
+    runs: Sequence[Run],
+    values: Values,
+    formats: Formats,
+    study: pd.DataFrame | None = None,
+) -> list[Row]:
+    """Build the rows of some methods for a scene or an average, from runs of one scale and degradation."""
+    scale, downsampling = runs[0].scale, runs[0].downsampling
+    scenes = [place.scene for place in about.places]
+    cells = {key: cells_of(values, labels, about.places, key) for key in formats}
+    rows = []
+    for label in labels:
+        own = {key: of[label] for key, of in cells.items() if label in of}
+        for key, (mean, count, interval) in study_cells(study, about.places, scale, downsampling, label).items():
+            own[key] = Cell(mean, None, 0, count, len(about.places), interval)
+        of_method = [run for run in runs if run.label == label]
+        paper = _columns_of(paper_row(about.published, of_method, scenes) if own else None, formats)
+        seeds = max([1, *(cell.seeds for cell in own.values())])
+        rows.append(Row(label, about, scale, downsampling, seeds, own, paper))
+    return rows
 
-    def tables(self, name: str, title: str, sets: Sequence[SceneSet]) -> Iterator[PaperTable]:
-        """Yield a table of some sets of scenes for each family of metrics that has a value there."""
-        for family, formats in by_family(self.formats).items():
-            make = replace(self, formats=formats, study=self.study if family == PAPER else None)
-            about = (name, title) if family == PAPER else (f"{name}_{family}", f"{title}, {family}")
-            table = make.table(*about, sets)
-            if family == PAPER or table.columns:
-                yield table
 
-    def table(self, name: str, title: str, sets: Sequence[SceneSet]) -> PaperTable:
-        """Build a table of some sets of scenes."""
-        places = {place for each in sets for place in each.places}
-        labels = [label for label in self.methods if not places.isdisjoint(self.values.get(label, ()))]
-        groups = tuple(_ranked(self._group(each, labels), self.columns) for each in sets)
-        if self.intervals:
-            groups = tuple(_tested(each) if each.about.average else each for each in groups)
-        used = {key for group in groups for row in group.rows for key in row.cells}
-        columns = {key: each for key, each in self.columns.items() if key in used}
-        slug = re.sub(r"[^A-Za-z0-9.-]+", "_", f"{name}_x{self.scale}_{self.downsampling}").strip("._-")
-        title = f"{title}, x{self.scale}, {self.downsampling} downsampling"
-        apart = any(run.truth and run.dataset in {place.dataset for place in places} for run in self.runs)
-        notes = [f"{each.text}." for each in Results(tuple(self.runs)).warnings if apart]
-        if note := alignment_note([run for run in self.runs if run.dataset in {place.dataset for place in places}]):
-            notes.append(note)
-        notes += _remarks([run for run in self.runs if run.dataset in {place.dataset for place in places}], places)
-        return PaperTable(slug, title, (*notes, *_notes(groups, columns)), columns, groups)
-
-    def _group(self, about: SceneSet, labels: Sequence[str]) -> Group:
-        """Build the rows of some methods; a method without values has an empty row."""
-        here = [run for run in self.runs if run.dataset in {place.dataset for place in about.places}]
-        scenes = [place.scene for place in about.places]
-        rows = []
-        degradation = (about, self.scale, self.downsampling)
-        cells = {key: cells_of(self.values, labels, about.places, key) for key in self.formats}
-        for label in labels:
-            runs = [run for run in here if run.label == label]
-            valid = {key: of[label] for key, of in cells.items() if label in of}
-            found = study_cells(self.study, about.places, self.scale, self.downsampling, label)
-            for key, (mean, count, interval) in found.items():
-                valid[key] = Cell(mean, None, 0, count, len(about.places), interval)
-            row = paper_row(about.published, runs, scenes) if valid else None
-            seeds = max([1, *(cell.seeds for cell in valid.values())])
-            rows.append(Row(label, *degradation, seeds, runs, valid, self._columns_of(row)))
-        ran = {paper_name(run) for run in here if any(row.cells for row in rows if row.label == run.label)}
-        others = published()["method"].unique() if about.published and applies(here, scenes) else []
-        only = {
-            str(name): self._columns_of(published_row(about.published, str(name), self.scale))
-            for name in others
-            if name not in ran
-        }
-        paper_only = [Row(name, *degradation, 0, published=values) for name, values in only.items() if values]
-        return Group(about, tuple(rows), tuple(paper_only))
-
-    def _columns_of(self, row: pd.Series | None) -> dict[str, float]:
-        """Return the paper's values by column."""
-        return {} if row is None else {key: float(row[key]) for key in self.columns if pd.notna(row.get(key))}
+def _columns_of(row: pd.Series | None, formats: Formats) -> dict[str, float]:
+    """Return the paper's values by column."""
+    if row is None:
+        return {}
+    return {key: float(row[key]) for key in (*formats, *_SHARES) if pd.notna(row.get(key))}
 
 
 def values_of(runs: Sequence[Run], formats: Formats) -> Values:
     """Collect the scores of the tables."""
     found: dict[str, dict[Place, dict[str, dict[int, float]]]] = {}
     for run in runs:
-        scores = run.scores
-        worst = scores[scores["variant"].fillna("").isin(HEADLINES) & scores["metric"].isin(list(formats))]
-        for scene, metric, value in zip(worst["scene"], worst["metric"], worst["value"], strict=True):
+        for scene, scores in run.headlines.items():
             by_metric = found.setdefault(run.label, {}).setdefault(Place(run.dataset, scene), {})
-            if math.isfinite(value):
-                by_metric.setdefault(metric, {})[run.seed] = formats[metric].factor * value
+            for metric, value in scores.items():
+                if metric in formats and math.isfinite(value):
+                    by_metric.setdefault(metric, {})[run.seed] = formats[metric].factor * value
     return found
 
 
@@ -348,8 +291,7 @@ def _truth_is_complete(results: Results) -> Callable[[Place], bool]:
     It has none where the scores of some method cover every pixel. Otherwise the stored scene decides; without it, the
     missing pixels are taken for holes of the truth.
     """
-    scores = pd.concat([run.scores.assign(dataset=run.dataset) for run in results.runs])
-    depth = scores[scores["metric"] == "RMSE_d"]
+    depth = results.scores.query("metric == 'RMSE_d'")
     shares = depth.groupby(["dataset", "scene"])["valid_share"].max()
 
     def complete(place: Place) -> bool:
@@ -363,12 +305,7 @@ def _truth_is_complete(results: Results) -> Callable[[Place], bool]:
 
 
 def cells_of(values: Values, labels: Sequence[str], places: Sequence[Place], metric: str) -> dict[str, Cell]:
-    """Average a metric over seeds, then over the scenes of ``places`` that all methods with the metric there have.
-
-    Returns:
-        Cells by label, without the methods that have no value there.
-
-    """
+    """Average a metric over seeds, then over the scenes that all methods with the metric there have; cells by label."""
     found = {label: [values.get(label, {}).get(place, {}).get(metric, {}) for place in places] for label in labels}
     found = {label: scenes for label, scenes in found.items() if any(scenes)}
     shared = [number for number, scene in enumerate(zip(*found.values(), strict=True)) if all(scene)]
@@ -386,24 +323,23 @@ def cells_of(values: Values, labels: Sequence[str], places: Sequence[Place], met
     return cells
 
 
-def _ranked(group: Group, columns: Formats) -> Group:
-    """Return the group with the best and second best marked.
+def _ranked(rows: Sequence[Row], columns: Formats) -> tuple[Row, ...]:
+    """Return the rows of a group with the best and second best values marked.
 
     Values are compared as displayed, so equal texts share a rank. A single value is not ranked, nor are percentages of
     the user study over fewer scenes than the others'.
     """
-    ranks: dict[tuple[str, str], int] = {}
+    ranked = [dict(row.cells) for row in rows]
     for name, column in columns.items():
-        cells = {row.label: row.cells[name] for row in group.rows if name in row.cells}
-        most = max([1, *(cell.scenes for cell in cells.values())])
-        values = {label: float(shown(column, cell.mean)) for label, cell in cells.items() if cell.scenes == most}
-        order = sorted(set(values.values()), reverse=column.higher_is_better)[:2] if len(values) > 1 else []
-        ranks |= {(label, name): order.index(value) + 1 for label, value in values.items() if value in order}
-    rows = [
-        replace(row, cells={key: replace(cell, rank=ranks.get((row.label, key), 0)) for key, cell in row.cells.items()})
-        for row in group.rows
-    ]
-    return replace(group, rows=tuple(rows))
+        most = max([1, *(cells[name].scenes for cells in ranked if name in cells)])
+        compared = [cells for cells in ranked if name in cells and cells[name].scenes == most]
+        if len(compared) > 1:
+            values = [float(shown(column, cells[name].mean)) for cells in compared]
+            order = sorted(set(values), reverse=column.higher_is_better)[:2]
+            for cells, value in zip(compared, values, strict=True):
+                if value in order:
+                    cells[name] = replace(cells[name], rank=order.index(value) + 1)
+    return tuple(replace(row, cells=cells) for row, cells in zip(rows, ranked, strict=True))
 
 
 def _tested(group: Group) -> Group:
@@ -470,30 +406,3 @@ def _notes(groups: Sequence[Group], columns: Formats) -> Iterator[str]:
         yield note
     if user:
         yield "User: percentage of answers with the method as most similar (1st), second most similar (2nd), or either."
-
-
-def _with_unique_names(tables: Sequence[PaperTable]) -> list[PaperTable]:
-    """Return the tables with names that are unique on any file system."""
-    taken: set[str] = set()
-    named = []
-    for table in tables:
-        name, number = table.name, 2
-        while name.casefold() in taken:
-            name, number = f"{table.name}_{number}", number + 1
-        taken.add(name.casefold())
-        named.append(replace(table, name=name))
-    return named
-
-
-def in_shown_units(scores: pd.DataFrame, formats: Formats) -> pd.DataFrame:
-    """Return one run's scores as scene x metric, in the units of tables, worst of four lights.
-
-    Args:
-        scores: content of one ``scores.csv``.
-        formats: formats of its metrics.
-
-    """
-    worst = scores[scores["variant"].fillna("").isin(HEADLINES)]
-    wide = worst.pivot_table(index="scene", columns="metric", values="value", sort=False)
-    columns = {name: each for name, each in in_tables(formats).items() if name in wide}
-    return wide[list(columns)].mul(pd.Series({name: each.factor for name, each in columns.items()}, dtype=float))

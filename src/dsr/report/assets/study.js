@@ -8,40 +8,24 @@ const LONGEST_ZOOM = 16;
 const HOLD_MS = 280;
 const at = (id) => document.getElementById(id);
 
-/* Chance: the same for one person whenever the page is opened, another for each person and purpose. */
+/* Chance: an order for each person, kept with the answers, so that a reload shows the same one. */
 
-function hashOf(text) { // FNV-1a, 32 bits
-  let hash = 0x811c9dc5;
-  for (const byte of new TextEncoder().encode(text)) hash = Math.imul(hash ^ byte, 0x01000193);
-  return hash >>> 0;
-}
-
-function mixed(value) { // the finaliser of MurmurHash3, 32 bits
-  let x = value >>> 0;
-  x = Math.imul(x ^ (x >>> 16), 0x85ebca6b);
-  x = Math.imul(x ^ (x >>> 13), 0xc2b2ae35);
-  return (x ^ (x >>> 16)) >>> 0;
-}
-
-function shuffled(items, seed) { // Fisher and Yates, with a SplitMix generator
+function shuffled(items) { // Fisher and Yates
   const result = [...items];
-  let state = mixed(hashOf(seed));
   for (let last = result.length - 1; last > 0; last -= 1) {
-    state = (state + 0x9e3779b9) >>> 0;
-    const other = Math.floor((mixed(state) / 2 ** 32) * (last + 1));
+    const other = Math.floor(Math.random() * (last + 1));
     [result[last], result[other]] = [result[other], result[last]];
   }
   return result;
 }
 
-function planFor(participant) {
-  const ids = STUDY.scenes.map((scene) => scene.id).sort();
-  const fresh = shuffled(ids, `${participant}/scenes`).slice(0, STUDY.perPerson);
-  const again = shuffled(fresh, `${participant}/again`).slice(0, STUDY.repeat);
+function plan() {
+  const fresh = shuffled(SCENES.keys()).slice(0, STUDY.perPerson);
+  const again = shuffled(fresh).slice(0, STUDY.repeat);
   const trial = (scene, repeated) => ({
     scene,
     again: repeated,
-    order: shuffled(Object.keys(SCENES.get(scene).images).sort(), `${participant}/${scene}/${repeated}`),
+    order: shuffled(Object.keys(SCENES.get(scene).images)),
     first: null,
     second: null,
     ms: 0,
@@ -54,7 +38,7 @@ function newPerson() {
   const bytes = crypto.getRandomValues(new Uint8Array(12));
   const participant = [...bytes].map((byte) => byte.toString(16).padStart(2, "0")).join("");
   return { study: STUDY.study, page: STUDY.page, participant, started: null, finished: null, index: 0,
-    saved: false, viewport: null, touch: false, trials: planFor(participant) };
+    saved: false, viewport: null, touch: false, trials: plan() };
 }
 
 /* Progress, kept in the browser. */
@@ -81,9 +65,8 @@ function load() {
 }
 
 function sound(kept) {
-  const plan = planFor(String(kept.participant));
-  const matches = (trial, i) => trial.scene === plan[i].scene && String(trial.order) === String(plan[i].order);
-  return kept.trials.length === plan.length && kept.trials.every(matches) && kept.index in plan;
+  const asked = (trial) => String([...trial.order].sort()) === String(Object.keys(SCENES.get(trial.scene).images).sort());
+  return kept.trials.length === STUDY.perPerson + STUDY.repeat && kept.trials.every(asked) && kept.index in kept.trials;
 }
 
 function keep() {

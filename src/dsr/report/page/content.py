@@ -12,8 +12,8 @@ import pandas as pd
 
 from dsr.evaluation.results import BenchmarkSetting, Results, Run
 from dsr.metrics.formats import Formats, by_family
-from dsr.report.paper import SceneSet, average_of, paper_row
-from dsr.report.tables import FACTS, Fact, Row, cells_of, values_of
+from dsr.report.paper import SceneSet, average_of
+from dsr.report.tables import FACTS, Fact, Row, cells_of, rows_of, values_of
 from dsr.utils.guards import natural_key
 
 _FOLDERS = {"tables": (".csv", ".md", ".tex"), "metrics": (".csv",), "figures": (".pdf",)}
@@ -31,31 +31,26 @@ def metrics_data(results: Results) -> list[dict[str, Any]]:
 
 def problem_data(results: Results, problem: BenchmarkSetting) -> dict[str, Any]:
     """Return the scores of a setting in the paper's units, per scene and on average, with the published values."""
-    runs = results.of(problem)
-    methods, formats = list(dict.fromkeys(run.label for run in runs)), results.formats
-    of_method = {method: [run for run in runs if run.label == method] for method in methods}
+    runs, formats = results.of(problem), results.formats
+    methods = list(dict.fromkeys(run.label for run in runs))
     scores = values_of(runs, formats)
     places = tuple(dict.fromkeys(place for method in methods for place in scores.get(method, ())))
     scenes = [place.scene for place in places]
-    sets = [SceneSet(place.scene, (place,), place.scene, average=False) for place in places]
     rows: list[Row] = []
-    for about in (*sets, SceneSet("mean", places, average_of(problem.dataset, scenes))):
-        cells = {key: cells_of(scores, methods, about.places, key) for key in formats}
-        for method, own in of_method.items():
-            if about.average or about.places[0] in scores.get(method, ()):
-                valid = {key: of[method] for key, of in cells.items() if method in of}
-                seeds = max([1, *(cell.seeds for cell in valid.values())])
-                rows.append(Row(method, about, *problem[1:], seeds, own, valid))
-    single = [row for row in rows if not row.about.average]
-    facts = [fact for fact in FACTS if fact.name != "seeds" and fact.shown(single)]
+    for place in places:
+        about = SceneSet(place.scene, (place,), place.scene, average=False)
+        having = [method for method in methods if place in scores.get(method, ())]
+        rows += rows_of(about, having, runs, scores, formats)
+    facts = [fact for fact in FACTS if fact.name != "seeds" and fact.shown(rows)]
+    mean = SceneSet("mean", places, average_of(problem.dataset, scenes))
     return {
         "dataset": problem.dataset,
         "scale": problem.scale,
         "downsampling": problem.downsampling,
         "methods": methods,
         "scenes": scenes,
-        "means": [_row(row, facts, formats) for row in rows if row.about.average],
-        "rows": [_row(row, facts, formats) for row in single],
+        "means": [_row(row, facts, formats) for row in rows_of(mean, methods, runs, scores, formats)],
+        "rows": [_row(row, facts, formats) for row in rows],
         "facts": [{"name": fact.name, "word": not fact.number} for fact in facts],
         "seconds": _seconds(runs, methods),
     }
@@ -70,14 +65,8 @@ def _row(row: Row, facts: Sequence[Fact], formats: Formats) -> dict[str, Any]:
         "seeds": row.seeds,
         "values": {key: [each for each in (cell.mean, cell.spread) if each is not None] for key, cell in cells.items()},
         "counts": counts,
-        "paper": {} if counts else _published(row, formats),
+        "paper": {} if counts else {key: value for key, value in row.published.items() if key in formats},
     }
-
-
-def _published(row: Row, formats: Formats) -> dict[str, float]:
-    """Return the paper's values by metric; empty where they do not apply."""
-    paper = paper_row(row.about.published, row.runs, [place.scene for place in row.about.places])
-    return {} if paper is None else {name: float(paper[name]) for name in formats if pd.notna(paper.get(name))}
 
 
 def _seconds(runs: Iterable[Run], methods: Iterable[str]) -> dict[str, dict[str, float]]:
@@ -119,32 +108,24 @@ def flat(values: Mapping[str, Any], above: str = "") -> dict[str, str]:
     return found
 
 
-def links(folder: Path, tables: Sequence[Path] | None) -> list[dict[str, str]]:
+def links(folder: Path) -> list[dict[str, str]]:
     """Return the existing files beside the page: name and relative address."""
-    paths = [
-        path
+    names = [
+        f"{name}/{path.name}"
         for name, suffixes in _FOLDERS.items()
-        if name != "tables" or tables is None
         for path in sorted((folder / name).glob("*"), key=natural_key)
         if path.suffix in suffixes and path.is_file()
     ]
-    named = [path for path in tables or () if path.is_file() and path.resolve().is_relative_to(folder.resolve())]
-    relative = [path.resolve().relative_to(folder.resolve()).as_posix() for path in [*named, *paths]]
-    return [{"name": name, "address": quote(name)} for name in dict.fromkeys(relative)]
+    return [{"name": name, "address": quote(name)} for name in names]
 
 
 def standings(results: Results) -> list[dict[str, Any]]:
-    """Return the methods by mean rank, the best first.
+    """Return the methods by mean rank, the best first, with the means of metrics over all settings, in table units.
 
     In each setting (data set, scale, degradation) the methods are ranked by the mean of each metric that all of them
     have, over the scenes that all of them have; equal displayed values share the mean of their places. Ranks are
     averaged within each family of metrics, then over the families, then over settings, so that neither many metrics of
-    one kind nor a data set with many scenes decides.
-
-    Returns:
-        For each method ``method``, ``rank``, the number of ``settings`` that it has, and ``values``: the mean over all
-        settings of each metric, in the unit of tables, for a method that has all of them.
-
+    one kind nor a data set with many scenes decides. A method without all settings has no means and stands last.
     """
     formats = results.formats
     ranks: dict[str, list[float]] = {label: [] for label in results.methods()}

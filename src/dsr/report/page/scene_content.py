@@ -1,33 +1,38 @@
-"""Scenes of a report page: photo, input, results and ground truth as pictures of values.
+"""Scenes of a report page: photo, input, results and ground truth as 8-bit pictures of values.
+
+The page computes renderings, colours and readouts itself from stored values:
+
+- Normals are stored as unclipped shadings under the orthonormal directions :data:`dsr.geometry.lights.BASIS`, which
+  determine those under any light. A value s in [-1, 1] is stored as 255 (s + 1) / 2; the three maps are side by side.
+- Depth is stored linearly between two limits.
+- The error is sign(q - 128) (q - 128)^2 / 127^2 times the largest error, so that small errors have small steps.
+- Expected errors, which have no sign, are q^2 / 255^2 times the largest one.
+- The valid mask is a separate picture.
 
 Over all scenes of a benchmark setting, the expected errors stand beside the measured ones.
 """
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.evaluation.results import BenchmarkSetting, Results, Run, one_per_method
+from dsr.evaluation.results import BenchmarkSetting, Results, Run
 from dsr.geometry.camera import Camera
 from dsr.geometry.lights import BASIS
 from dsr.geometry.surface import normal_mask, shade
 from dsr.metrics.calibration import error_ratios, measured_errors, squared_error_share
-from dsr.pictures.depth_views import limits_of, normals_seen_by
-from dsr.report.page.value_pictures import (
-    PictureStore,
-    depth_picture,
-    error_picture,
-    expected_picture,
-    mask_picture,
-    shading_picture,
-)
+from dsr.pictures.depth_views import limits_of, normals_seen_by, reduced
+from dsr.report.shown_scenes import Result, View, results_of, stored_sample, views_of
 from dsr.sample import DepthSample
 
 _LEAST_ERROR = 1e-4
@@ -36,62 +41,77 @@ _LEAST_ANGLE = 0.1
 """Minimum of the largest stored angle, degrees."""
 _MOST_PIXELS = 4_000_000
 """About how many pixels of a setting are compared with what was expected; of more, every second, third, and so on."""
+NOTHING_VALID, DEPTH_VALID, ALL_VALID = 0, 128, 255
+"""Values of a mask: missing; valid depth without a normal; valid depth and normal."""
+_PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
+"""A third of the time of zlib's level 6 for 8 % more bytes, a fifteenth of that of lossless WebP."""
 
 
-@dataclass(frozen=True)
-class View:
-    """A scene of a benchmark setting and its runs, one per method."""
-
-    problem: BenchmarkSetting
-    scene: str
-    runs: tuple[Run, ...]
-
-
-@dataclass(frozen=True)
-class Result:
-    """The prediction of a method.
+@dataclass
+class PictureStore:
+    """Pictures by name, each stored once, as lossless PNG in base64.
 
     Args:
-        label: name of the method.
-        seed: of the run.
-        depth: (1, H, W) in metres, NaN in holes.
-        errors: expected errors of depth in metres and of normals in degrees, (1, H, W); None without them.
+        longest: maximum longer side, pixels; larger pictures are reduced.
 
     """
 
-    label: str
-    seed: int | None
-    depth: Tensor
-    errors: tuple[Tensor, Tensor] | None
+    longest: int
+    pictures: dict[str, str] = field(default_factory=dict)
+    reduced: bool = False
+
+    def add(self, picture: np.ndarray) -> str:
+        """Encode an 8-bit picture, (H, W, 1) or (H, W, 3) RGB, and return its name."""
+        _, content = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]), _PNG)
+        name = "p" + hashlib.sha256(content.tobytes()).hexdigest()[:16]
+        self.pictures[name] = base64.b64encode(content.tobytes()).decode("ascii")
+        return name
+
+    def fit(self, values: Tensor) -> tuple[np.ndarray, np.ndarray]:
+        """Reduce (C, H, W) values by averaging valid ones; return (h, w, C), 0 where invalid, and the valid mask."""
+        fitted = reduced(values.double(), self.longest)
+        self.reduced |= fitted.shape != values.shape
+        valid = fitted.isfinite().all(dim=0)
+        return torch.where(valid, fitted, 0).permute(1, 2, 0).numpy(), valid.numpy()
 
 
-def views_of(results: Results, setting: BenchmarkSetting | None = None) -> list[View]:
-    """Return the scenes with predictions of a setting, or of all; of several seeds of a method the lowest is used."""
-    views: list[View] = []
-    for problem in results.problems() if setting is None else [setting]:
-        views += [View(problem, scene, one_per_method(runs)) for scene, runs in results.by_scene(problem).items()]
-    return views
+def shading_picture(shadings: np.ndarray) -> np.ndarray:
+    """Encode (H, W, 3) shadings in [-1, 1] as an (H, 3 W, 1) picture: the three side by side."""
+    levels = np.rint((np.clip(shadings, -1, 1) + 1) * 127.5).astype(np.uint8)
+    return np.concatenate(np.split(levels, 3, axis=-1), axis=1)
+
+
+def depth_picture(depth: np.ndarray, low: float, high: float) -> np.ndarray:
+    """Encode depth in metres as a picture: 0 at ``low`` and below, 255 at ``high`` and above."""
+    return np.rint(255 * np.clip((depth - low) / (high - low), 0, 1)).astype(np.uint8)
+
+
+def error_picture(error: np.ndarray, largest: float) -> np.ndarray:
+    """Encode signed errors as a picture: 128 is zero, 1 and 255 are -``largest`` and ``largest`` or beyond."""
+    relative = np.clip(error / largest, -1, 1)
+    return (128 + np.rint(127 * np.sign(relative) * np.sqrt(np.abs(relative)))).astype(np.uint8)
+
+
+def expected_picture(error: np.ndarray, largest: float) -> np.ndarray:
+    """Encode expected errors, 0 or more, as a picture: 255 is ``largest`` or beyond."""
+    return np.rint(255 * np.sqrt(np.clip(error / largest, 0, 1))).astype(np.uint8)
+
+
+def mask_picture(depth_valid: np.ndarray, normal_valid: np.ndarray) -> np.ndarray:
+    """Encode (H, W) valid masks as an (H, W, 1) picture."""
+    picture = np.where(normal_valid & depth_valid, ALL_VALID, DEPTH_VALID)
+    return np.where(depth_valid, picture, NOTHING_VALID).astype(np.uint8)[..., None]
 
 
 def scene_data(view: View, pool: PictureStore, notes: list[str]) -> dict[str, Any] | None:
-    """Return the data of a scene for the page, and add its pictures to the pool.
-
-    Args:
-        view: scene and its runs.
-        pool: pool to which the pictures are added.
-        notes: list to which omissions and their reasons are added.
-
-    Returns:
-        Values that JSON can represent; None if no run has stored the scene.
-
-    """
+    """Return the data of a scene for the page, None without a stored scene; its pictures are added to the pool."""
     stored = stored_sample(view, notes)
     if stored is None:
         return None
     predictions = results_of(view, stored, notes)
     reference = stored.depth if stored.depth is not None else (predictions[0].depth if predictions else stored.depth_lr)
     low, high = limits_of(reference)
-    photo, _ = pool.fit(stored.rgb.permute(1, 2, 0).double().numpy())
+    photo, _ = pool.fit(stored.rgb)
     data: dict[str, Any] = {
         "scene": view.scene,
         "size": [stored.camera.width, stored.camera.height],
@@ -121,73 +141,39 @@ def scene_data(view: View, pool: PictureStore, notes: list[str]) -> dict[str, An
             surface["error"] = _error(each.depth - stored.depth, largest, pool)
         if each.errors is not None:
             surface["expected"] = _expected(each.depth, each.errors, data["expected"], pool)
-        text = "" if each.seed is None else f"seed {each.seed}"
-        surfaces.append({"label": each.label, "kind": "method", "text": text, **surface})
+        surfaces.append({"label": each.run.label, "kind": "method", "text": f"seed {each.run.seed}", **surface})
     if stored.depth is not None:
         surfaces.append({"label": "truth", "kind": "truth", **_surface(stored.depth, stored.camera, data, pool)})
     return {**data, "surfaces": surfaces}
 
 
-def stored_sample(view: View, notes: list[str]) -> DepthSample | None:
-    """Return the scene from the first run that has stored it, None if none has; ``notes`` takes the reasons."""
-    for run in view.runs:
-        if run.has_sample(view.scene):
-            try:
-                return run.sample(view.scene)
-            except ValueError as error:
-                notes.append(str(error))
-    dataset, scale, downsampling = view.problem
-    notes.append(
-        f"{dataset} x{scale} {downsampling}, {view.scene}: no pictures, because no run has stored photo and input"
-    )
-    return None
-
-
-def results_of(view: View, stored: DepthSample, notes: list[str]) -> list[Result]:
-    """Return the predictions that have the size of the scene; ``notes`` takes the others."""
-    found = []
-    for run in view.runs:
-        try:
-            depth, errors = run.prediction(view.scene), run.expected_errors(view.scene)
-        except (ValueError, OSError) as error:
-            notes.append(str(error))
-            continue
-        size = (1, stored.camera.height, stored.camera.width)
-        if tuple(depth.shape) != size:
-            notes.append(f"{run.folder.name}: {view.scene}: expected a prediction of {size}, got {tuple(depth.shape)}")
-            continue
-        if errors is not None and not all(tuple(each.shape) == size for each in errors):
-            shapes = " and ".join(str(tuple(each.shape)) for each in errors)
-            notes.append(f"{run.folder.name}: {view.scene}: expected errors of {size}, got {shapes}")
-            errors = None
-        found.append(Result(run.label, run.seed, depth.double(), errors))
-    return found
-
-
 def _surface(depth: Tensor, camera: Camera, data: dict[str, Any], pool: PictureStore) -> dict[str, Any]:
     """Store the normals and depth of a map, (1, H, W) in metres."""
     basis = torch.tensor(BASIS, dtype=torch.float64)
-    if min(depth.shape[-2:]) < 2:
-        shadings = np.full((*depth.shape[-2:], 3), np.nan)
-    else:
-        shadings = shade(normals_seen_by(camera, depth), basis)[0].permute(1, 2, 0).numpy()
+    shadings = torch.full((3, *depth.shape[-2:]), torch.nan)
+    if min(depth.shape[-2:]) > 1:
+        shadings = shade(normals_seen_by(camera, depth), basis)[0]
     fitted, normal_valid = pool.fit(shadings)
-    metres, depth_valid = pool.fit(depth[0].double().numpy())
+    metres, depth_valid = pool.fit(depth)
     surface = {
         "size": [fitted.shape[1], fitted.shape[0]],
         "normals": pool.add(shading_picture(fitted)),
         "depth": pool.add(depth_picture(metres, *data["depth"])),
     }
-    mask = mask_picture(depth_valid, normal_valid)
-    return surface if mask is None else {**surface, "mask": pool.add(mask, exact=True)}
+    return surface | _mask(depth_valid, normal_valid, pool)
+
+
+def _mask(depth_valid: np.ndarray, normal_valid: np.ndarray, pool: PictureStore) -> dict[str, str]:
+    """Store the mask of a picture, if some of its pixels are invalid."""
+    if depth_valid.all() and normal_valid.all():
+        return {}
+    return {"mask": pool.add(mask_picture(depth_valid, normal_valid))}
 
 
 def _error(difference: Tensor, largest: float, pool: PictureStore) -> dict[str, str]:
     """Store a signed error, (1, H, W) in metres."""
-    values, valid = pool.fit(difference[0].numpy())
-    stored = {"values": pool.add(error_picture(values, largest))}
-    mask = mask_picture(valid, valid)
-    return stored if mask is None else {**stored, "mask": pool.add(mask, exact=True)}
+    values, valid = pool.fit(difference)
+    return {"values": pool.add(error_picture(values, largest))} | _mask(valid, valid, pool)
 
 
 def _expected(
@@ -195,14 +181,14 @@ def _expected(
 ) -> dict[str, str]:
     """Store the expected errors, (1, H, W) in metres and degrees, where the depth and its normals are known."""
     known = depth.isfinite()
-    valid = {"depth": known, "angle": normal_mask(known) if min(known.shape[-2:]) > 1 else torch.zeros_like(known)}
-    stored, fitted = {}, []
-    for (name, where), error in zip(valid.items(), errors, strict=True):
-        values, inside = pool.fit(error[0].double().numpy(), (where & error.isfinite())[0].numpy())
-        stored[name] = pool.add(expected_picture(values, largest[name]))
-        fitted.append(inside)
-    mask = mask_picture(*fitted)
-    return stored if mask is None else {**stored, "mask": pool.add(mask, exact=True)}
+    normals_known = normal_mask(known) if min(known.shape[-2:]) > 1 else torch.zeros_like(known)
+    depth_error, depth_valid = pool.fit(torch.where(known, errors[0], torch.nan))
+    angle_error, angle_valid = pool.fit(torch.where(normals_known, errors[1], torch.nan))
+    stored = {
+        "depth": pool.add(expected_picture(depth_error, largest["depth"])),
+        "angle": pool.add(expected_picture(angle_error, largest["angle"])),
+    }
+    return stored | _mask(depth_valid, angle_valid, pool)
 
 
 def _error_limits(differences: Sequence[Tensor]) -> tuple[float, dict[str, float]]:
@@ -231,15 +217,9 @@ def _sizes(errors: Sequence[Tensor]) -> list[np.ndarray]:
 def calibration_data(results: Results, problem: BenchmarkSetting) -> list[dict[str, Any]]:
     """Return how the expected errors of each method that has them agree with the measured ones.
 
-    Args:
-        results: all runs.
-        problem: the setting. Its scenes without ground truth are left out.
-
-    Returns:
-        A row per method: ``method``; ``scenes``, the number of scenes that all of them have; ``depth`` and ``angle``,
-        each with the ``ratios`` of :func:`dsr.metrics.calibration.error_ratios`, the ``share`` of the squared error in
-        the most confident 80 % of the pixels, and the ``least`` possible one; None for a value that is undefined.
-
+    Each row has ``method``; ``scenes``, the number of scenes with ground truth that all of them have; ``depth`` and
+    ``angle``, each with the ``ratios`` of :func:`dsr.metrics.calibration.error_ratios`, the ``share`` of the squared
+    error in the most confident 80 % of the pixels, and the ``least`` possible one; None for an undefined value.
     """
     found: dict[str, dict[str, Tensor]] = {}
     step, views = 0, views_of(results, problem)
@@ -252,7 +232,7 @@ def calibration_data(results: Results, problem: BenchmarkSetting) -> list[dict[s
         for result in results_of(confident, stored, []):
             if result.errors is not None:
                 errors = _errors(result, result.errors, stored, stored.depth, step)
-                found.setdefault(result.label, {})[view.scene] = errors
+                found.setdefault(result.run.label, {})[view.scene] = errors
     shared = [scene for scene in next(iter(found.values()), ()) if all(scene in of for of in found.values())]
     return [
         {"method": label, "scenes": len(shared), **_agreement(torch.cat([of[scene] for scene in shared], dim=1))}

@@ -25,50 +25,28 @@ _LARGEST = 10_000_000
 
 @dataclass(frozen=True)
 class Answer:
-    """The choice of a participant for one scene.
+    """The choice of a participant for one scene."""
 
-    Args:
-        scene: id of the scene.
-        again: whether this participant saw the scene for the second time.
-        first, second: ids of the pictures chosen.
-        seconds: time taken.
-
-    """
-
-    scene: str
-    again: bool
-    first: str
+    scene: str  # its id
+    again: bool  # whether this participant saw the scene for the second time
+    first: str  # ids of the pictures chosen
     second: str
     seconds: float
 
 
 @dataclass(frozen=True)
 class Answers:
-    """A complete answer file.
-
-    Args:
-        file: path of the file.
-        participant: random id.
-        finished: time of the last answer.
-        content: trials as JSON; equal for two files with identical answers.
-        given: one answer per scene shown.
-
-    """
+    """A complete answer file."""
 
     file: Path
-    participant: str
+    participant: str  # random id
     finished: datetime
-    content: str
-    given: tuple[Answer, ...]
+    content: str  # trials as JSON; equal for two files with identical answers
+    given: tuple[Answer, ...]  # one per scene shown
 
 
 def files_of(paths: Iterable[Path]) -> list[Path]:
-    """Return the given files and all ``*.json`` files below the given directories, without duplicates.
-
-    Raises:
-        ValueError: there is no file.
-
-    """
+    """Return the given files and all ``*.json`` files below the given directories, without duplicates."""
     found: dict[Path, Path] = {}
     for path in paths:
         for file in sorted(path.rglob("*.json"), key=natural_key) if path.is_dir() else [path]:
@@ -103,12 +81,7 @@ def read_all(files: Sequence[Path], key: Key) -> tuple[list[Answers], list[str]]
 
 
 def read_answers(file: Path, key: Key) -> Answers:
-    """Read one answer file.
-
-    Raises:
-        ValueError: the file is damaged, incomplete, of another study, or has answers that the page cannot produce.
-
-    """
+    """Read one answer file; refuse one that is damaged, incomplete, of another study, or that the page cannot make."""
     stored = _read(file, key)
     if stored.finished is None:
         raise ValueError(f"{file}: incomplete, it was saved before the last scene was answered")

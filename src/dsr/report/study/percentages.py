@@ -7,8 +7,7 @@ User 2nd as second most similar, Top 2 as either (Voynov et al., "Perceptual Dee
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from statistics import median
 from typing import Any
 
@@ -19,26 +18,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from dsr.report.significance import agreement, average_fraction, bootstrap_of_average, wilson
-from dsr.report.study.answers import Answer, Answers
-from dsr.report.study.key import Candidate, Key, Trial
+from dsr.report.study.answers import Answers
+from dsr.report.study.key import Key
 from dsr.report.study.study_table import ALL, AVERAGE, COLUMNS, PERCENTAGES, PLACE
 from dsr.utils.ratios import as_ratio
-
-
-@dataclass(frozen=True)
-class _Votes:
-    """Votes for one method.
-
-    Args:
-        candidate: the method.
-        asked: (people, scenes) 1 where the participant saw the method.
-        chosen: (people, scenes) for each column in ``PERCENTAGES``, 1 where the participant chose the method.
-
-    """
-
-    candidate: Candidate
-    asked: np.ndarray
-    chosen: tuple[np.ndarray, ...]
 
 
 def collect(answers: Sequence[Answers], key: Key) -> pd.DataFrame:
@@ -47,23 +30,14 @@ def collect(answers: Sequence[Answers], key: Key) -> pd.DataFrame:
     Percentages of single scenes have Wilson intervals. Intervals of averages come from resampling participants, since
     the answers of one participant are not independent. In an average each scene that showed the method has the same
     weight. Scenes without answers have no rows.
-
-    Args:
-        answers: accepted answers, at least one.
-        key: key of the study.
-
     """
-    groups: dict[tuple[float, str], dict[str, list[str]]] = {}
-    for name in _seen(answers, key):
-        trial = key.trials[name]
-        groups.setdefault((trial.scale, trial.downsampling), {}).setdefault(trial.dataset, []).append(name)
     rows = []
-    for datasets in groups.values():
-        for dataset, scenes in datasets.items():
-            for scene in scenes:
-                rows += _rows(answers, key, [scene], dataset)
-            rows += _rows(answers, key, scenes, dataset, AVERAGE)
-        rows += _rows(answers, key, [scene for scenes in datasets.values() for scene in scenes], ALL, AVERAGE)
+    for (scale, downsampling), of_setting in _ballots(answers, key).groupby(["scale", "downsampling"], sort=False):
+        for dataset, of_dataset in of_setting.groupby("dataset", sort=False):
+            for _, of_scene in of_dataset.groupby("id", observed=True):
+                rows += _rows(of_scene, (dataset, of_scene["scene"].iloc[0], scale, downsampling))
+            rows += _rows(of_dataset, (dataset, AVERAGE, scale, downsampling))
+        rows += _rows(of_setting, (ALL, AVERAGE, scale, downsampling))
     return pd.DataFrame(rows, columns=list(COLUMNS))
 
 
@@ -72,79 +46,51 @@ def remarks(answers: Sequence[Answers], key: Key) -> list[str]:
     times = [sum(answer.seconds for answer in each.given) / 60 for each in answers]
     people = len(answers)
     lines = [f"{people} {'person' if people == 1 else 'people'}, {median(times):.1f} minutes each (median)"]
-    counts, labels = _first_choices(answers, key)
+    ballots = _ballots(answers, key)
+    counts = ballots.pivot_table("user_first", "id", "label", "sum", fill_value=0, observed=True).to_numpy()
     same, kappa = agreement(counts)
     if math.isfinite(same):
-        chance = float(np.mean([1 / len(key.trials[name].candidates) for name in _seen(answers, key)]))
+        chance = float(np.mean([1 / len(key.trials[name].candidates) for name in ballots["id"].unique()]))
         text = f"two people choose the same picture first in {100 * same:.0f} % of the cases ({100 * chance:.0f} % by "
         text += "guessing)"
-        lines.append(text + (f"; Fleiss' kappa {kappa:.2f}" if math.isfinite(kappa) and len(labels) > 1 else ""))
+        lines.append(text + (f"; Fleiss' kappa {kappa:.2f}" if math.isfinite(kappa) and counts.shape[1] > 1 else ""))
     return [*lines, *_consistency(answers)]
 
 
-def _seen(answers: Iterable[Answers], key: Key) -> list[str]:
-    """Return the scenes with answers, in the order of the key."""
-    asked = {answer.scene for each in answers for answer in each.given}
-    return [name for name in key.trials if name in asked]
+def _ballots(answers: Sequence[Answers], key: Key) -> pd.DataFrame:
+    """Return a row per participant, scene and method shown, in the key's order: whether it was chosen; no repetitions.
 
-
-def _rows(
-    answers: Sequence[Answers], key: Key, scenes: Sequence[str], dataset: str, name: str | None = None
-) -> list[dict[str, Any]]:
-    """Return the rows of all methods for one scene, or for a named average over several."""
-    trials = [key.trials[scene] for scene in scenes]
-    place = (dataset, name or trials[0].scene, trials[0].scale, trials[0].downsampling)
+    Columns: ``id`` of the scene, ``person``, those that say which scene and method it is, and the percentages' own.
+    """
     rows = []
-    for label in dict.fromkeys(candidate.label for trial in trials for candidate in trial.candidates.values()):
-        votes = _votes(answers, scenes, trials, label)
-        people = int(votes.asked.any(axis=1).sum())
-        method = (votes.candidate.method, label)
-        row: dict[str, Any] = {**dict(zip(PLACE, (*place, *method), strict=True)), "n": people}
-        for column, chosen in zip(PERCENTAGES, votes.chosen, strict=True):
-            fraction = float(average_fraction(chosen.sum(0), votes.asked.sum(0)))
-            bounds = bootstrap_of_average(chosen, votes.asked) if name else wilson(chosen.sum(), people)
+    for person, given in enumerate(answers):
+        for answer in given.given:
+            trial = key.trials[answer.scene]
+            for picture, method in trial.candidates.items() if not answer.again else ():
+                about = (trial.dataset, trial.scene, trial.scale, trial.downsampling, method.method, method.label)
+                first, second = int(answer.first == picture), int(answer.second == picture)
+                rows.append((answer.scene, person, *about, first, second, first + second))
+    ballots = pd.DataFrame(rows, columns=["id", "person", *PLACE, *PERCENTAGES])
+    ballots["id"] = pd.Categorical(ballots["id"], list(key.trials))
+    return ballots.sort_values(["id", "person"], kind="stable", ignore_index=True)
+
+
+def _rows(ballots: pd.DataFrame, place: tuple[Any, ...]) -> list[dict[str, Any]]:
+    """Return the rows of all methods for one scene, or for an average over several."""
+    rows = []
+    for label, votes in ballots.groupby("label", sort=False):
+        table = votes.pivot(index="person", columns="id", values=list(PERCENTAGES))
+        asked = table["user_first"].notna().to_numpy(int)
+        people = len(asked)
+        values = (*place, votes["method"].iloc[-1], label)
+        row: dict[str, Any] = {**dict(zip(PLACE, values, strict=True)), "n": people}
+        for column in PERCENTAGES:
+            chosen = table[column].fillna(0).to_numpy(int)
+            fraction = float(average_fraction(chosen.sum(0), asked.sum(0)))
+            bounds = bootstrap_of_average(chosen, asked) if place[1] == AVERAGE else wilson(chosen.sum(), people)
             row |= {column: 100 * fraction, f"{column}_low": 100 * bounds[0], f"{column}_high": 100 * bounds[1]}
         rows.append(row)
     return rows
-
-
-def _votes(answers: Sequence[Answers], scenes: Sequence[str], trials: Sequence[Trial], label: str) -> _Votes:
-    """Count the votes for one method in some scenes; participants who saw none of them are left out."""
-    first, second, asked = (np.zeros((len(answers), len(scenes)), int) for _ in range(3))
-    candidate = None
-    for column, (scene, trial) in enumerate(zip(scenes, trials, strict=True)):
-        for picture, each in trial.candidates.items():
-            if each.label == label:
-                candidate = each
-                for row, answer in _answers_to(answers, scene):
-                    asked[row, column] = 1
-                    first[row, column] = answer.first == picture
-                    second[row, column] = answer.second == picture
-    if candidate is None:
-        raise ValueError(f"{label}: expected a method of the scenes {', '.join(scenes)}")
-    present = asked.any(axis=1)
-    return _Votes(candidate, asked[present], (first[present], second[present], (first + second)[present]))
-
-
-def _answers_to(answers: Sequence[Answers], scene: str) -> list[tuple[int, Answer]]:
-    """Return the index of each participant who saw a scene, and the first answer."""
-    return [
-        (number, answer)
-        for number, each in enumerate(answers)
-        for answer in each.given
-        if answer.scene == scene and not answer.again
-    ]
-
-
-def _first_choices(answers: Sequence[Answers], key: Key) -> tuple[np.ndarray, list[str]]:
-    """Count the first choices of each method, (scenes, methods); return the counts and the methods."""
-    scenes = _seen(answers, key)
-    labels = sorted({candidate.label for name in scenes for candidate in key.trials[name].candidates.values()})
-    counts = np.zeros((len(scenes), len(labels)), int)
-    for row, name in enumerate(scenes):
-        for _, answer in _answers_to(answers, name):
-            counts[row, labels.index(key.trials[name].candidates[answer.first].label)] += 1
-    return counts, labels
 
 
 def _consistency(answers: Sequence[Answers]) -> list[str]:
@@ -161,12 +107,7 @@ def _consistency(answers: Sequence[Answers]) -> list[str]:
 
 
 def tables_of(collected: pd.DataFrame) -> Iterator[Table]:
-    """Yield a table per data set, scale and degradation, and one over all data sets if there are several.
-
-    Args:
-        collected: see :func:`collect`.
-
-    """
+    """Yield a table per data set, scale and degradation, and one over all data sets if there are several."""
     for place, rows in collected.groupby(["dataset", "scale", "downsampling"], sort=False):
         dataset, scale, downsampling = place
         others = collected[(collected["scale"] == scale) & (collected["downsampling"] == downsampling)]

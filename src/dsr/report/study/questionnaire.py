@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import html
 import io
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,9 +14,10 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from dsr.evaluation.results import BenchmarkSetting, Results, Run, one_per_method
+from dsr.evaluation.results import Results, Run
 from dsr.pictures.depth_views import rendering
 from dsr.report.html_page import asset, fill, json_text, policy
+from dsr.report.shown_scenes import View, results_of, stored_sample, views_of
 from dsr.report.study import Choice
 from dsr.report.study.key import KEY_NAME, PAGE_VERSION, Candidate, Key, Trial, read_key, write_key
 from dsr.utils.files import expect_targets, write_text
@@ -32,39 +32,23 @@ _FEWEST = 2
 
 
 @dataclass(frozen=True)
-class Question:
-    """A scene and the runs to compare on it, in the order of the results."""
+class _Question:
+    """A scene with its pictures as PNG: that of the ground truth, and one of each result."""
 
-    problem: BenchmarkSetting
-    scene: str
+    view: View
     runs: tuple[Run, ...]
-
-
-@dataclass(frozen=True)
-class _Drawn:
-    """The pictures of a question: PNGs of the ground truth and of each run in order, their width and height."""
-
-    question: Question
-    truth: bytes = b""
-    pictures: tuple[bytes, ...] = ()
-    size: tuple[int, int] = (0, 0)
-    notes: tuple[str, ...] = ()
+    truth: bytes
+    pictures: tuple[bytes, ...]
+    size: tuple[int, int]  # width and height
 
 
 @dataclass(frozen=True)
 class Built:
-    """A study that was written.
-
-    Args:
-        page: path of the page.
-        key: content of the key file beside the page.
-        notes: omissions and remarks, one line each.
-
-    """
+    """A study that was written."""
 
     page: Path
-    key: Key
-    notes: tuple[str, ...] = field(default=())
+    key: Key  # content of the key file beside the page
+    notes: tuple[str, ...] = field(default=())  # omissions and remarks
 
 
 def build_study(
@@ -92,17 +76,24 @@ def build_study(
     """
     choice = choice or Choice()
     expect_targets(folder, (KEY_NAME, PAGE_NAME))
-    questions, notes = _questions(results, choice)
-    labels = {run.label for question in questions for run in question.runs}
-    _expect_blind(choice, labels)
-    drawn = [
-        _draw(question, choice.light)
-        for question in progress.track(questions, "draw", label=lambda question: question.scene)
-    ]
-    notes += [note for each in drawn for note in each.notes]
-    scenes, trials = _with_ids([each for each in drawn if each.pictures])
-    if not scenes:
-        raise ValueError(f"study: expected a scene with its ground truth, found none; {notes[-1]}")
+    _expect_existing(results, choice)
+    selected = Results(tuple(run for run in results.runs if _is_selected(run, choice)))
+    _expect_blind(choice, selected.methods())
+    views = [view for problem in selected.problems() for view in views_of(selected, problem)]
+    views = [view for view in views if not choice.scenes or view.scene in choice.scenes]
+    notes = list(results.notes)
+    questions = []
+    for view in progress.track(views, "draw", label=lambda view: view.scene):
+        question = _draw(view, choice.light, notes)
+        if question is not None:
+            questions.append(question)
+            shown = {run.label for run in question.runs}
+            missing = sorted({run.label for run in selected.of(view.problem)} - shown)
+            notes += [f"{view}: without {', '.join(missing)}, which has no prediction of it"] if missing else []
+    if not questions:
+        detail = f"; {notes[-1]}" if notes else ""
+        raise ValueError(f"study: expected a scene with its ground truth and {_FEWEST} methods, found none{detail}")
+    scenes, trials = _with_ids(questions)
     per_person = _within("scenes per person", choice.scenes_per_person, 1, len(scenes), len(scenes))
     repeat = _within("repeat", choice.repeat, 0, per_person, 0)
     asked: dict[str, Any] = {"perPerson": per_person, "repeat": repeat, "scenes": scenes}
@@ -112,36 +103,18 @@ def build_study(
     if not overwrite and path.exists() and read_key(path).study != study:
         where = "take another directory or --overwrite"
         raise ValueError(f"{path}: expected no other study, whose answers need this key, got one; {where}")
-    content = {"study": study, "page": PAGE_VERSION, **asked}
     write_key(path, key)
-    write_text(folder / PAGE_NAME, _page_of(content, choice))
+    style, script = asset("study.css"), asset("study.js")
+    parts = {
+        "POLICY": policy(style, script, "data:"),
+        "TITLE": choice.title,
+        "SEND_TO": choice.send_to,
+        "STYLE": style,
+        "SCRIPT": script,
+        "DATA": json_text({"study": study, "page": PAGE_VERSION, **asked}),
+    }
+    write_text(folder / PAGE_NAME, fill("study.html", parts))
     return Built(folder / PAGE_NAME, key, tuple(notes))
-
-
-def _questions(results: Results, choice: Choice) -> tuple[list[Question], list[str]]:
-    """Return the questions, and notes on the scenes left out."""
-    _expect_existing(results, choice)
-    notes = list(results.notes)
-    selected = Results(tuple(run for run in results.runs if _is_selected(run, choice)))
-    questions = []
-    for problem in selected.problems():
-        all_labels = {run.label for run in selected.of(problem)}
-        for scene, runs in selected.by_scene(problem).items():
-            if choice.scenes and scene not in choice.scenes:
-                continue
-            place = f"{problem.dataset}/{scene} x{problem.scale} {problem.downsampling}"
-            shown = one_per_method(runs)
-            reason = _reason_to_skip(shown, scene)
-            if reason:
-                notes.append(f"left out: {place}: {reason}")
-                continue
-            missing = sorted(all_labels - {run.label for run in shown})
-            notes += [f"{place}: without {', '.join(missing)}, which has no prediction of it"] if missing else []
-            questions.append(Question(problem, scene, shown))
-    if not questions:
-        detail = f"; {notes[-1]}" if notes else ""
-        raise ValueError(f"study: expected a scene with its ground truth and {_FEWEST} methods, found none{detail}")
-    return questions, notes
 
 
 def _is_selected(run: Run, choice: Choice) -> bool:
@@ -167,15 +140,6 @@ def _expect_existing(results: Results, choice: Choice) -> None:
                 raise ValueError(f"{what}: expected one of {', '.join(map(str, sorted(existing)))}, got {name!r}")
 
 
-def _reason_to_skip(runs: Sequence[Run], scene: str) -> str | None:
-    """Return the reason to leave out a scene, None if it can be shown."""
-    if len(runs) < _FEWEST:
-        return f"only {', '.join(run.label for run in runs)} has a prediction of it"
-    if not any(run.has_sample(scene) for run in runs):
-        return "no run has kept the scene itself; a newer dsr keeps it, with overwrite=true"
-    return None
-
-
 def _expect_blind(choice: Choice, labels: Iterable[str]) -> None:
     """Check that the texts of the page do not contain the name of a method."""
     for name, text in (("title", choice.title), ("send-to", choice.send_to)):
@@ -184,82 +148,68 @@ def _expect_blind(choice: Choice, labels: Iterable[str]) -> None:
                 raise ValueError(f"{name}: expected words without the methods' names, got {label!r} in {text!r}")
 
 
-def _draw(question: Question, light: str) -> _Drawn:
-    """Draw the pictures of a question; none for a scene without ground truth."""
-    problem = question.problem
-    place = f"{problem.dataset}/{question.scene} x{problem.scale} {problem.downsampling}"
-    scene = next(run for run in question.runs if run.has_sample(question.scene)).sample(question.scene)
+def _draw(view: View, light: str, notes: list[str]) -> _Question | None:
+    """Draw the pictures of a question; None for a scene that cannot be one, for which ``notes`` takes the reason."""
+    if len(view.runs) < _FEWEST:
+        notes.append(f"left out: {view}: only {view.runs[0].label} has a prediction of it")
+        return None
+    scene = stored_sample(view, notes)
+    if scene is None:
+        return None
     if scene.depth is None:
-        return _Drawn(question, notes=(f"left out: {place}: no ground truth",))
+        notes.append(f"left out: {view}: no ground truth")
+        return None
     truth = rendering(scene.depth, scene.camera, light)
     valid = np.isfinite(truth)
-    pictures: dict[bytes, str] = {}
-    notes = []
-    shown = []
-    for run in question.runs:
-        depth = run.prediction(question.scene)
-        if depth.shape != scene.depth.shape:
-            sizes = [" x ".join(map(str, reversed(each.shape[-2:]))) for each in (scene.depth, depth)]
-            raise ValueError(
-                f"{run.folder}: prediction of {question.scene}: expected {sizes[0]} pixels, got {sizes[1]}"
-            )
-        picture = grey_png(rendering(depth, scene.camera, light), valid)
-        if pictures.setdefault(picture, run.label) != run.label:
-            notes.append(f"{place}: {pictures[picture]} and {run.label} look exactly the same")
-        shown.append(picture)
-    return _Drawn(question, grey_png(truth, valid), tuple(shown), (valid.shape[1], valid.shape[0]), tuple(notes))
+    labels: dict[bytes, str] = {}
+    pictures = []
+    results = results_of(view, scene, notes)
+    for result in results:
+        picture = grey_png(rendering(result.depth, scene.camera, light), valid)
+        label = result.run.label
+        if labels.setdefault(picture, label) != label:
+            notes.append(f"{view}: {labels[picture]} and {label} look exactly the same")
+        pictures.append(picture)
+    if len(pictures) < _FEWEST:
+        return None
+    runs = tuple(result.run for result in results)
+    return _Question(view, runs, grey_png(truth, valid), tuple(pictures), (valid.shape[1], valid.shape[0]))
 
 
 def grey_png(shades: np.ndarray, valid: np.ndarray) -> bytes:
-    """Encode an 8-bit PNG: black is level 1, white is 255, and missing pixels are level 0 and transparent.
-
-    Args:
-        shades: (H, W) in [0, 1], NaN where undefined.
-        valid: (H, W) bool mask of the pixels to show.
-
-    """
+    """Encode (H, W) shades in [0, 1] as an 8-bit PNG: black is level 1, white 255, and not ``valid`` is transparent."""
     levels = np.where(valid & np.isfinite(shades), 1 + np.rint(254 * shades), 0)
     content = io.BytesIO()
     Image.fromarray(levels.astype(np.uint8)).save(content, "PNG", transparency=0, compress_level=9)
     return content.getvalue()
 
 
-def _with_ids(drawn: Sequence[_Drawn]) -> tuple[list[dict[str, Any]], dict[str, Trial]]:
+def _with_ids(questions: Sequence[_Question]) -> tuple[list[dict[str, Any]], dict[str, Trial]]:
     """Return the scenes of the page, ordered by id, and the trials of the key.
 
     Ids are hashes of pictures, so neither the ids nor the order on the page reveal a name.
     """
     scenes, trials = [], {}
-    for number, each in enumerate(drawn):
+    for number, each in enumerate(questions):
         scene_id = _hash(str(number).encode(), each.truth, *sorted(each.pictures))
         ids = [_hash(scene_id.encode(), picture, str(i).encode()) for i, picture in enumerate(each.pictures)]
         images = {name: _text(picture) for name, picture in zip(ids, each.pictures, strict=True)}
         width, height = each.size
-        truth = _text(each.truth)
         scenes.append(
-            {"id": scene_id, "width": width, "height": height, "truth": truth, "images": dict(sorted(images.items()))}
+            {
+                "id": scene_id,
+                "width": width,
+                "height": height,
+                "truth": _text(each.truth),
+                "images": dict(sorted(images.items())),
+            }
         )
         named = {
-            name: Candidate(run.label, run.method, str(run.folder))
-            for name, run in zip(ids, each.question.runs, strict=True)
+            name: Candidate(run.label, run.method, str(run.folder)) for name, run in zip(ids, each.runs, strict=True)
         }
-        problem = each.question.problem
-        trials[scene_id] = Trial(problem.dataset, each.question.scene, problem.scale, problem.downsampling, named)
+        dataset, scale, downsampling = each.view.problem
+        trials[scene_id] = Trial(dataset, each.view.scene, scale, downsampling, named)
     return sorted(scenes, key=lambda scene: str(scene["id"])), trials
-
-
-def _page_of(content: Mapping[str, Any], choice: Choice) -> str:
-    """Return the page's HTML, with the data of ``study.js``: study id, scenes per participant, scenes and pictures."""
-    style, script = asset("study.css"), asset("study.js")
-    parts = {
-        "POLICY": policy(style, script, "data:"),
-        "TITLE": html.escape(choice.title),
-        "SEND_TO": html.escape(choice.send_to),
-        "STYLE": style,
-        "SCRIPT": script,
-        "DATA": json_text(content),
-    }
-    return fill("study.html", parts)
 
 
 def _hash(*parts: bytes) -> str:

@@ -23,27 +23,15 @@ _KEYS = (*_TEXTS, "scale")
 
 
 class Share(NamedTuple):
-    """A percentage of the answers.
+    """A percentage of the answers."""
 
-    Args:
-        mean: mean over scenes.
-        scenes: number of scenes.
-        interval: 95 % confidence interval, if the study gives one.
-
-    """
-
-    mean: float
-    scenes: int
-    interval: tuple[float, float] | None
+    mean: float  # over scenes
+    scenes: int  # number of scenes
+    interval: tuple[float, float] | None  # 95 % confidence interval, if the study gives one
 
 
 def read_study(path: Path) -> pd.DataFrame:
-    """Read a table written by ``dsr study collect``.
-
-    Raises:
-        ValueError: the file is not such a table.
-
-    """
+    """Read a table written by ``dsr study collect``."""
     try:
         study = pd.read_csv(
             io.BytesIO(read_limited(path, MOST_TABLE)),
@@ -59,12 +47,7 @@ def read_study(path: Path) -> pd.DataFrame:
 
 
 def check_study(study: pd.DataFrame, name: str = "study") -> None:
-    """Check that a table is that of a study.
-
-    Raises:
-        ValueError: a column is missing or not numeric.
-
-    """
+    """Check that a table is that of a study."""
     missing = [column for column in (*_KEYS, *PERCENTAGES) if column not in study]
     if missing:
         raise ValueError(f"{name}: expected the table of dsr study collect, got one without {', '.join(missing)}")
@@ -81,14 +64,6 @@ def study_cells(
 
     An average over scenes is the study's own row for exactly these scenes if there is one, otherwise the mean over the
     scenes, as in the paper. Only the study's own row has a confidence interval, which needs the individual answers.
-
-    Args:
-        study: table of the study; see :func:`dsr.report.tables.build_tables`.
-        places: data sets and scenes.
-        scale: scale factor of the rows to use.
-        downsampling: downsampling of the rows to use.
-        label: label of the method.
-
     """
     if study is None:
         return {}
