@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.degradation.downsampling import Downsampling, make_sample
+from dsr.degradation.downsampling import Downsampling, Kernel, make_sample
 from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.sample import DepthSample, Scene
 from dsr.synthetic.raycast import rotation
@@ -12,13 +12,15 @@ from dsr.synthetic.raycast import rotation
 BALLS = [(-0.7, -0.4, 2.6, 0.4), (0.6, 0.3, 2.2, 0.35), (0.1, -0.7, 3.0, 0.3), (-0.5, 0.6, 2.4, 0.3)]
 
 
-def sample_of(disparity: Tensor, rgb: Tensor | None = None, scale: int = 4, doffs: float = 0.0) -> DepthSample:
+def sample_of(
+    disparity: Tensor, rgb: Tensor | None = None, scale: int = 4, doffs: float = 0.0, kernel: Kernel = "box"
+) -> DepthSample:
     """Return the problem of a scene with these disparities, (H, W)."""
     height, width = disparity.shape
     camera = Camera(width, height, 60.0, 55.0, 0.45 * width, 0.55 * height, doffs=doffs)
     rgb = torch.zeros(3, height, width) if rgb is None else rgb
     scene = Scene("set", "hall", rgb, camera, from_range(disparity[None], camera, "disparity"))
-    return make_sample(scene, scale, Downsampling("box"), "disparity")
+    return make_sample(scene, scale, Downsampling(kernel), "disparity")
 
 
 def plane(height: int = 32, width: int = 48) -> Tensor:

@@ -19,7 +19,7 @@ from dsr.methods.networks.dynamic_guidance import (
 SCALES = (2, 4, 8, 16)
 
 
-def _net(scale: int = 4, *, stages: int = 2, filters: int = 5, size: int = 5, noise: float = 0.2) -> DynamicGuidance:
+def _net(scale=4, *, stages=2, filters=5, size=5, noise=0.2):
     """Return a small network with weights far from those that it starts with."""
     torch.manual_seed(scale)
     net = DynamicGuidance(scale, stages, filters, size).requires_grad_(False)
@@ -28,7 +28,7 @@ def _net(scale: int = 4, *, stages: int = 2, filters: int = 5, size: int = 5, no
     return net
 
 
-def _stage(*, filters: int = 5, size: int = 5) -> Stage:
+def _stage(*, filters=5, size=5):
     net = _net(stages=1, filters=filters, size=size).double()
     stage = net.stages[0]
     if not isinstance(stage, Stage):
@@ -36,7 +36,7 @@ def _stage(*, filters: int = 5, size: int = 5) -> Stage:
     return stage
 
 
-def _penalty(z: Tensor, heights: Tensor) -> Tensor:
+def _penalty(z, heights):
     """Return rho(z) of the responses of L filters, (B, L, H, W), for the heights of their penalties, (L, 6)."""
     total = torch.zeros_like(z)
     for height, width in zip(heights.T, WIDTHS, strict=True):
@@ -45,7 +45,7 @@ def _penalty(z: Tensor, heights: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("size", [3, 4, 7])
-def test_filters_are_orthonormal_and_blind_to_what_the_first_ones_see(size: int) -> None:
+def test_filters_are_orthonormal_and_blind_to_what_the_first_ones_see(size):
     v, u = torch.meshgrid(torch.arange(size).double(), torch.arange(size).double(), indexing="ij")
     basis = polynomial_filters(size)
     flat = basis.flatten(1)
@@ -54,7 +54,7 @@ def test_filters_are_orthonormal_and_blind_to_what_the_first_ones_see(size: int)
         assert float((blind * each).sum(dim=(1, 2)).abs().max()) < 1e-11
 
 
-def test_influence_is_the_derivative_of_the_penalty() -> None:
+def test_influence_is_the_derivative_of_the_penalty():
     z = torch.tensor([-2.0, -0.3, -4e-3, 0.0, 1e-3, 0.02, 0.7], dtype=torch.float64).view(1, 1, 1, 7)
     heights = torch.tensor([[1.0, -0.5, 0.3, 2.0, -1.0, 0.1]], dtype=torch.float64)
     z.requires_grad_()
@@ -64,7 +64,7 @@ def test_influence_is_the_derivative_of_the_penalty() -> None:
     assert float(influence(z, heights)[0, 0, 0, 5].detach()) == pytest.approx(0.02 * one, rel=1e-12)
 
 
-def test_stage_is_a_gradient_step_on_its_energy_and_one_towards_the_low_resolution_map() -> None:
+def test_stage_is_a_gradient_step_on_its_energy_and_one_towards_the_low_resolution_map():
     stage, rgb = _stage(), photos(16, 20, 2).double()
     coarse = maps(4, 5, 2) / 30
     x = repeat_blocks(coarse, 4) + 0.1 * maps(16, 20, 2)
@@ -75,7 +75,7 @@ def test_stage_is_a_gradient_step_on_its_energy_and_one_towards_the_low_resoluti
     torch.testing.assert_close(stage(x, coarse, rgb), y.detach() - gradient, rtol=0, atol=1e-13)
 
 
-def test_stage_equals_plain_loops() -> None:
+def test_stage_equals_plain_loops():
     stage, rgb = _stage(filters=3), photos(16, 16).double()
     coarse = maps(4, 4) / 30
     x = repeat_blocks(coarse, 4) + 0.1 * maps(16, 16)
@@ -98,12 +98,12 @@ def test_stage_equals_plain_loops() -> None:
     np.testing.assert_allclose(result, expected, rtol=0, atol=1e-12)
 
 
-def test_gradients_reach_every_parameter_and_agree_with_finite_differences() -> None:
+def test_gradients_reach_every_parameter_and_agree_with_finite_differences():
     net = _net(2, filters=2, size=3).double().requires_grad_()
     rgb, coarse = photos(8, 6).double(), maps(4, 3) / 30
     names, parameters = zip(*net.named_parameters(), strict=True)
 
-    def answer(*values: Tensor) -> Tensor:
+    def answer(*values):
         result = torch.func.functional_call(net, dict(zip(names, values, strict=True)), (rgb, coarse))
         return result if isinstance(result, Tensor) else torch.empty(0)
 
@@ -113,27 +113,27 @@ def test_gradients_reach_every_parameter_and_agree_with_finite_differences() -> 
 
 
 @pytest.mark.parametrize("scale", SCALES)
-def test_plane_is_reproduced_for_any_weights_and_photo(scale: int) -> None:
+def test_plane_is_reproduced_for_any_weights_and_photo(scale):
     fine = plane_map(5 * scale, 6 * scale)
     net, rgb, coarse = _net(scale), photos(5 * scale, 6 * scale), functional.avg_pool2d(fine, scale)
     torch.testing.assert_close(net.upsample(rgb, coarse), fine, rtol=0, atol=1e-5 * float(fine.max() - fine.min()))
     torch.testing.assert_close(net.double().upsample(rgb, coarse), fine, rtol=0, atol=1e-12 * 30 * scale)
 
 
-def test_plane_is_reproduced_with_half_precision_weights() -> None:
+def test_plane_is_reproduced_with_half_precision_weights():
     fine = plane_map(24, 28)
     result = _net().bfloat16().upsample(photos(24, 28), functional.avg_pool2d(fine, 4))
     torch.testing.assert_close(result, fine, rtol=0, atol=1e-4)
 
 
-def test_mixed_precision_training_computes_in_float32() -> None:
+def test_mixed_precision_training_computes_in_float32():
     net, rgb, coarse = _net(), photos(24, 28), maps(6, 7)
     with torch.autocast("cpu", torch.bfloat16):
         mixed = net.upsample(rgb, coarse)
     torch.testing.assert_close(mixed, net.upsample(rgb, coarse), rtol=0, atol=0)
 
 
-def test_map_may_break_at_a_photo_edge_and_a_flat_photo_has_no_influence() -> None:
+def test_map_may_break_at_a_photo_edge_and_a_flat_photo_has_no_influence():
     stage = _stage()
     edge = torch.zeros(1, 3, 16, 16, dtype=torch.float64)
     edge[..., 8:] = 1.0

@@ -1,11 +1,10 @@
 """Facets with context: planes at every factor, units, holes, hints, confidence, and what it starts from."""
 
 import itertools
-from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import nn
 from torch.nn import functional
 
 from dsr.degradation.downsampling import FACTS, KERNELS, Downsampling, encode_facts
@@ -13,14 +12,13 @@ from dsr.methods.networks import facets_planes, facets_unet
 from dsr.methods.networks.facets import Facets, enlarge_and_join
 from dsr.methods.networks.facets_planes import NEIGHBOURS, average_planes, mix_planes
 from dsr.methods.networks.facets_unet import FacetsUNet
-from dsr.methods.networks.network import Answer
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, save_network
 
 SCALES = (1, 2, 4, 8, 16)
 
 
-def _net(scale: int = 4, width: int = 8, deep: int = 12) -> FacetsUNet:
+def _net(scale=4, width=8, deep=12):
     """Return a small network with random weights, also in the layers that begin small."""
     torch.manual_seed(3)
     net = FacetsUNet(scale, width, deep, 4).eval()
@@ -30,11 +28,11 @@ def _net(scale: int = 4, width: int = 8, deep: int = 12) -> FacetsUNet:
     return net
 
 
-def _maps(answer: Answer) -> tuple[Tensor, Tensor, Tensor]:
+def _maps(answer):
     return answer.disparity, answer.spread, answer.angle
 
 
-def _inputs(scale: int, height: int = 12, width: int = 10) -> tuple[Tensor, Tensor]:
+def _inputs(scale, height=12, width=10):
     """Return a photo and a rough map whose median is 1 or so."""
     generator = torch.Generator().manual_seed(scale)
     if scale == 1:
@@ -43,14 +41,14 @@ def _inputs(scale: int, height: int = 12, width: int = 10) -> tuple[Tensor, Tens
     return rgb, 1 + 0.1 * torch.rand((1, 1, height, width), generator=generator).double()
 
 
-def _plane(height: int, width: int, scale: int) -> Tensor:
+def _plane(height, width, scale):
     """Return a plane at the centres of the pixels of a map of a factor, (1, 1, height, width)."""
     v, u = ((scale * (torch.arange(n, dtype=torch.float64) + 0.5)) for n in (height, width))
     return (2 + 0.003 * u - 0.002 * v[:, None])[None, None]
 
 
 @pytest.mark.parametrize("scale", SCALES)
-def test_planes_are_reproduced_by_any_weights(scale: int) -> None:
+def test_planes_are_reproduced_by_any_weights(scale):
     rgb, values = _inputs(scale)
     height, width = values.shape[-2:]
     found = _net(scale).upsample(rgb, _plane(height, width, scale))
@@ -58,7 +56,7 @@ def test_planes_are_reproduced_by_any_weights(scale: int) -> None:
 
 
 @pytest.mark.parametrize("scale", SCALES)
-def test_result_scales_with_the_map(scale: int) -> None:
+def test_result_scales_with_the_map(scale):
     rgb, values = _inputs(scale)
     net = _net(scale)
     once, thrice = (net.answer(rgb, factor * values) for factor in (1, 3))
@@ -68,7 +66,7 @@ def test_result_scales_with_the_map(scale: int) -> None:
 
 
 @pytest.mark.parametrize("scale", SCALES)
-def test_bands_change_nothing(scale: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bands_change_nothing(scale, monkeypatch):
     rgb, values = _inputs(scale, 40, 6)
     net, steps = _net(scale), []
     whole = net.answer(rgb, values)
@@ -80,7 +78,7 @@ def test_bands_change_nothing(scale: int, monkeypatch: pytest.MonkeyPatch) -> No
 
 
 @pytest.mark.parametrize("scale", [1, 4])
-def test_holes_are_filled(scale: int) -> None:
+def test_holes_are_filled(scale):
     rgb, values = _inputs(scale)
     values[..., 3:7, 2:6] = torch.nan
     for each in _maps(_net(scale).answer(rgb, values)):
@@ -88,7 +86,7 @@ def test_holes_are_filled(scale: int) -> None:
         assert bool((each > 0).all())
 
 
-def test_hints_and_noise_change_the_result() -> None:
+def test_hints_and_noise_change_the_result():
     rgb, values = _inputs(4)
     net = _net()
     nothing = net.answer(rgb, values).disparity
@@ -103,18 +101,18 @@ def test_hints_and_noise_change_the_result() -> None:
 
 
 @pytest.mark.parametrize("scale", [2, 4, 8, 16])
-def test_every_parameter_serves(scale: int) -> None:
+def test_every_parameter_serves(scale):
     net = _net(scale).train()
     for factor in (1, 2) if scale == 2 else (scale,):
         rgb, values = _inputs(factor)
         answer = net.answer(rgb, values.float(), None, torch.ones(1, FACTS))
-        sum(each.square().mean() for each in _maps(answer)).backward()  # type: ignore[union-attr]
+        sum(each.square().mean() for each in _maps(answer)).backward()
     for name, parameter in net.named_parameters():
         assert parameter.grad is not None, name
         assert bool(parameter.grad.any()), name
 
 
-def test_weights_of_factor_2_serve_maps_of_the_photos_size(tmp_path: Path) -> None:
+def test_weights_of_factor_2_serve_maps_of_the_photos_size(tmp_path):
     net = _net(2)
     save_network(tmp_path / "weights", net, "facets")
     for scale in (1, 2):
@@ -127,7 +125,7 @@ def test_weights_of_factor_2_serve_maps_of_the_photos_size(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("scale", [2, 4, 8, 16])
-def test_it_starts_near_facets(scale: int) -> None:
+def test_it_starts_near_facets(scale):
     torch.manual_seed(1)
     first = Facets(4 if scale < 8 else 8, width=8, blocks=4).eval()
     net = FacetsUNet(scale, 8, 12, 4)
@@ -145,7 +143,7 @@ def test_it_starts_near_facets(scale: int) -> None:
 
 
 @pytest.mark.parametrize("scale", [2, 4, 8, 16])
-def test_it_starts_from_another_factor_near_what_that_one_does(scale: int) -> None:
+def test_it_starts_from_another_factor_near_what_that_one_does(scale):
     torch.manual_seed(1)
     first = FacetsUNet(4, 8, 12, 4)
     first.start_from(Facets(4, width=8, blocks=4))
@@ -164,7 +162,7 @@ def test_it_starts_from_another_factor_near_what_that_one_does(scale: int) -> No
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_an_open_gate_reproduces_what_was_measured(kernel: str) -> None:
+def test_an_open_gate_reproduces_what_was_measured(kernel):
     rgb, values = _inputs(4)
     net, hints = _net(), torch.zeros(1, FACTS)
     hints[0, KERNELS.index(kernel)] = 1
@@ -183,7 +181,7 @@ def test_an_open_gate_reproduces_what_was_measured(kernel: str) -> None:
 
 
 @pytest.mark.parametrize("reach", [1, 2, 16])
-def test_planes_are_averaged_with_those_around_extended_to_the_pixel(reach: int) -> None:
+def test_planes_are_averaged_with_those_around_extended_to_the_pixel(reach):
     generator = torch.Generator().manual_seed(reach)
     planes = torch.randn((1, 1, 3, 5, 7), generator=generator, dtype=torch.float64)
     weights = torch.rand((1, 1, NEIGHBOURS, 5, 7), generator=generator, dtype=torch.float64)
@@ -199,14 +197,14 @@ def test_planes_are_averaged_with_those_around_extended_to_the_pixel(reach: int)
 
 
 @pytest.mark.parametrize("reach", [1, 4])
-def test_gradients_of_averaged_planes_are_those_of_differences(reach: int) -> None:
+def test_gradients_of_averaged_planes_are_those_of_differences(reach):
     generator = torch.Generator().manual_seed(reach)
     planes = torch.randn((1, 1, 3, 3, 4), generator=generator, dtype=torch.float64, requires_grad=True)
     weights = torch.rand((1, 1, NEIGHBOURS, 3, 4), generator=generator, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda *given: average_planes(*given, reach), (planes, weights), fast_mode=True)
 
 
-def test_gradients_of_mixed_planes_are_those_of_differences(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gradients_of_mixed_planes_are_those_of_differences(monkeypatch):
     monkeypatch.setattr(facets_planes, "_CHUNK", 5 * 9 * 4)  # several parts, the last one smaller
     generator = torch.Generator().manual_seed(0)
     planes = torch.randn((1, 1, 3, 3, 4), generator=generator, dtype=torch.float64, requires_grad=True)
@@ -215,10 +213,10 @@ def test_gradients_of_mixed_planes_are_those_of_differences(monkeypatch: pytest.
     torch.testing.assert_close(mix_planes(planes, found, 2)[1], found[:, NEIGHBOURS:])
 
 
-def test_two_convolutions_and_the_shuffle_between_them_are_one() -> None:
+def test_two_convolutions_and_the_shuffle_between_them_are_one():
     generator = torch.Generator().manual_seed(1)
     up, join = nn.Conv2d(3, 12, 1), nn.Conv2d(3 + 2, 4, 3, padding=1)
-    up, join = (each.double().to(memory_format=torch.channels_last) for each in (up, join))  # type: ignore[call-overload]
+    up, join = (each.double().to(memory_format=torch.channels_last) for each in (up, join))
     x, features = (
         torch.randn(shape, generator=generator, dtype=torch.float64, requires_grad=True)
         for shape in ((2, 3, 4, 5), (2, 2, 8, 10))
@@ -232,12 +230,11 @@ def test_two_convolutions_and_the_shuffle_between_them_are_one() -> None:
     (found * factors).sum().backward()
     for each, gradient in zip(inputs, expected_gradients, strict=True):
         torch.testing.assert_close(each.grad, gradient)
-        assert each.grad is not None
         assert each.grad.stride() == each.stride()  # which several devices expect
 
 
 @pytest.mark.parametrize("width", [1, 4])
-def test_mixing_in_single_precision_keeps_planes_and_logits(width: int) -> None:
+def test_mixing_in_single_precision_keeps_planes_and_logits(width):
     generator = torch.Generator().manual_seed(2)
     planes = torch.zeros((1, 2, 3, 3, width), dtype=torch.float64)  # all of them are of one
     planes[:, :, 2] = 0.5
@@ -250,7 +247,7 @@ def test_mixing_in_single_precision_keeps_planes_and_logits(width: int) -> None:
     assert torch.equal(found, before)
 
 
-def test_mixed_planes_are_planes_at_each_pixel_weighted_by_a_softmax() -> None:
+def test_mixed_planes_are_planes_at_each_pixel_weighted_by_a_softmax():
     generator = torch.Generator().manual_seed(1)
     planes = torch.randn((1, 2, 3, 3, 4), generator=generator, dtype=torch.float64)
     choice = torch.randn((1, 2 * NEIGHBOURS, 6, 8), generator=generator, dtype=torch.float64)
@@ -276,12 +273,12 @@ def test_mixed_planes_are_planes_at_each_pixel_weighted_by_a_softmax() -> None:
     ("sizes", "message"),
     [((3,), "scale: expected 1, 2, 4, 8 or 16, got 3"), ((4, 0), "got width 0"), ((4, 8, 8, 2), "got .* blocks 2")],
 )
-def test_sizes_are_checked(sizes: tuple[int, ...], message: str) -> None:
+def test_sizes_are_checked(sizes, message):
     with pytest.raises(ValueError, match=message):
         FacetsUNet(*sizes)
 
 
-def test_prepared_patches_have_the_answer_of_the_maps_and_the_hints() -> None:
+def test_prepared_patches_have_the_answer_of_the_maps_and_the_hints():
     net, generator = _net(), torch.Generator().manual_seed(5)
     rgb, values = torch.rand((2, 3, 48, 40), generator=generator), 1 + torch.rand((2, 1, 12, 10), generator=generator)
     values[1, :, 3:6, 2:5] = torch.nan
@@ -295,7 +292,7 @@ def test_prepared_patches_have_the_answer_of_the_maps_and_the_hints() -> None:
         assert torch.equal(one, other)
 
 
-def test_images_of_a_batch_do_not_see_each_other() -> None:
+def test_images_of_a_batch_do_not_see_each_other():
     """With kernels of their own, one of them unknown, and holes in one."""
     net = _net()
     rgb = torch.rand((3, 3, 48, 40), generator=torch.Generator().manual_seed(5))
@@ -311,7 +308,7 @@ def test_images_of_a_batch_do_not_see_each_other() -> None:
                 torch.testing.assert_close(one, all_of_them[i : i + 1], rtol=1e-4, atol=1e-6)
 
 
-def test_photos_of_another_size_and_other_networks_are_refused() -> None:
+def test_photos_of_another_size_and_other_networks_are_refused():
     rgb, values = _inputs(4)
     with pytest.raises(ValueError, match="rgb: expected"):
         _net(8).answer(rgb, values)
@@ -320,7 +317,7 @@ def test_photos_of_another_size_and_other_networks_are_refused() -> None:
             _net().start_from(first)
 
 
-def test_a_unet_of_another_width_starts_from_nothing() -> None:
+def test_a_unet_of_another_width_starts_from_nothing():
     """Neither a part of its weights nor a bias of them is taken over."""
     first, net = _net(8), FacetsUNet(16, 8, 10, 4)
     fresh = {name: value.clone() for name, value in net.state_dict().items() if name.startswith("wide.")}
@@ -328,7 +325,7 @@ def test_a_unet_of_another_width_starts_from_nothing() -> None:
     assert all(torch.equal(net.state_dict()[name], value) for name, value in fresh.items())
 
 
-def test_layers_at_the_low_resolution_are_shared_and_not_trained(tmp_path: Path) -> None:
+def test_layers_at_the_low_resolution_are_shared_and_not_trained(tmp_path):
     first, net = _net(4), _net(8)
     with torch.no_grad():
         for parameter in first.parameters():

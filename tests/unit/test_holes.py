@@ -12,17 +12,17 @@ from dsr.sample import Scene
 CAMERA = Camera(width=40, height=30, fx=50.0, fy=50.0, cx=19.5, cy=14.5)
 
 
-def _generator(seed: int = 0) -> torch.Generator:
+def _generator(seed=0):
     return torch.Generator().manual_seed(seed)
 
 
-def _edges(mask: torch.Tensor) -> int:
+def _edges(mask):
     """How many neighbouring pixels differ."""
     return int((mask[..., 1:] != mask[..., :-1]).sum() + (mask[..., 1:, :] != mask[..., :-1, :]).sum())
 
 
 @pytest.mark.parametrize("share", [0.05, 0.2])
-def test_blobs_have_the_requested_fraction_and_are_connected(share: float) -> None:
+def test_blobs_have_the_requested_fraction_and_are_connected(share):
     depth = torch.ones(1, 60, 80)
     fine, coarse = (Blobs(share, size)(depth, CAMERA, _generator()) for size in (8, 24))
     assert int(fine.sum()) == int(coarse.sum()) == round(share * 4800)
@@ -30,7 +30,7 @@ def test_blobs_have_the_requested_fraction_and_are_connected(share: float) -> No
     assert _edges(coarse) < _edges(fine) < 0.6 * _edges(scattered)
 
 
-def test_blobs_depend_on_the_generator_alone() -> None:
+def test_blobs_depend_on_the_generator_alone():
     depth = torch.ones(1, 30, 40)
     masks = [Blobs()(depth * scale, CAMERA, _generator(seed)) for seed, scale in ((1, 1), (1, 2), (2, 1))]
     assert torch.equal(masks[0], masks[1])
@@ -38,7 +38,7 @@ def test_blobs_depend_on_the_generator_alone() -> None:
 
 
 @pytest.mark.parametrize("baseline", [0.2, -0.2])
-def test_shadow_is_as_wide_as_the_disparities_differ(baseline: float) -> None:
+def test_shadow_is_as_wide_as_the_disparities_differ(baseline):
     depth = torch.full((1, 30, 40), 4.0)
     depth[:, 10:20, 15:25] = 1.0
     mask = Shadows(baseline)(depth, CAMERA, _generator())
@@ -51,7 +51,7 @@ def test_shadow_is_as_wide_as_the_disparities_differ(baseline: float) -> None:
     assert torch.equal(mask, expected)
 
 
-def test_plane_with_missing_parts_has_no_shadows() -> None:
+def test_plane_with_missing_parts_has_no_shadows():
     slope = torch.linspace(2, 3, 40).expand(1, 30, 40).clone()
     slope[:, 5:9, 10:20] = torch.nan
     assert not bool(Shadows(0.1)(slope, CAMERA, _generator()).any())
@@ -59,12 +59,12 @@ def test_plane_with_missing_parts_has_no_shadows() -> None:
 
 @pytest.mark.parametrize("make", [lambda: Blobs(0.0), lambda: Blobs(1.0), lambda: Blobs(0.1, 0.5), lambda: Shadows(0.0),
                                   lambda: Shadows(float("nan"))])  # fmt: skip
-def test_values_out_of_range_are_refused(make: object) -> None:
+def test_values_out_of_range_are_refused(make):
     with pytest.raises(ValueError, match=r"^(share|size|baseline): expected"):
-        make()  # type: ignore[operator]
+        make()
 
 
-def test_sample_with_holes_has_the_same_values_elsewhere() -> None:
+def test_sample_with_holes_has_the_same_values_elsewhere():
     depth = 2 + torch.rand(1, 32, 40)
     scene = Scene("set", "hall", torch.rand(3, 32, 40), CAMERA.crop(0, 0, 30, 40).rescale(40, 32), depth)
     given = (scene, 2, Downsampling("box"), "orthogonal", GaussianMultiplicative(0.01), 7)
@@ -77,7 +77,7 @@ def test_sample_with_holes_has_the_same_values_elsewhere() -> None:
     assert torch.equal(again.depth_lr.isnan(), holes)
 
 
-def test_measured_map_gets_holes_too() -> None:
+def test_measured_map_gets_holes_too():
     coarse = 2 + torch.rand(1, 8, 10)
     scene = Scene("set", "hall", torch.rand(3, 32, 40), CAMERA.rescale(40, 32), None, {4: coarse})
     sample = make_sample(scene, 4, Measured(), "orthogonal", holes=Blobs(0.25, 3))

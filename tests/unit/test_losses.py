@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from pathlib import Path
 from typing import get_args
 
 import numpy as np
@@ -16,29 +15,29 @@ from dsr.geometry.camera import Camera
 from dsr.methods.networks.network import Answer
 from dsr.metrics.functional import SurfacePair, dssim_v, mse_v
 from dsr.metrics.losses import VisualLoss, VisualLossName, l1, lap1, make_visual_loss, match_weight, mse
-from dsr.metrics.lpips import LPIPS, lpips_v
-from dsr.sample import DepthSample, Scene
-from dsr.training.degradation import Batch, to_tensors
-from dsr.training.objective import DepthLoss, DepthObjective, balance_weight
+from dsr.metrics.lpips import lpips_v
+from dsr.sample import Scene
+from dsr.training.degradation import to_tensors
+from dsr.training.objective import DepthObjective, balance_weight
 
 Loss = Callable[..., Tensor]
-LOSSES: dict[str, Loss] = {"l1": l1, "mse": mse, "lap1": lap1}
+LOSSES = {"l1": l1, "mse": mse, "lap1": lap1}
 TAPS = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
 
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def _map(seed: int, height: int = 13, width: int = 18, batch: int = 1) -> Tensor:
+def _map(seed, height=13, width=18, batch=1):
     return torch.from_numpy(np.random.default_rng(seed).normal(size=(batch, 1, height, width)))
 
 
-def _with_holes(values: Tensor, seed: int, share: float = 0.2) -> Tensor:
+def _with_holes(values, seed, share=0.2):
     holes = torch.from_numpy(np.random.default_rng(seed).random(tuple(values.shape)) < share)
     return values.masked_fill(holes, torch.nan)
 
 
-def _slow_reduce(x: np.ndarray) -> np.ndarray:
+def _slow_reduce(x):
     """Blur and keep every second pixel; beyond the border the edge pixel repeats."""
     height, width = x.shape
     coarse = np.zeros((math.ceil(height / 2), math.ceil(width / 2)))
@@ -49,7 +48,7 @@ def _slow_reduce(x: np.ndarray) -> np.ndarray:
     return coarse
 
 
-def _slow_expand(coarse: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+def _slow_expand(coarse, shape):
     """Interpolate: low-resolution pixel (i, j) sits at high-resolution pixel (2 i, 2 j); weights are normalised."""
     fine = np.zeros(shape)
     for row, column in np.ndindex(*shape):
@@ -63,7 +62,7 @@ def _slow_expand(coarse: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     return fine
 
 
-def _slow_lap1(x: np.ndarray, y: np.ndarray, levels: int) -> float:
+def _slow_lap1(x, y, levels):
     """Bojanowski et al. 2018, eq. 2, of two pyramids, over the number of pixels; a level's norm is a weighted mean."""
     known = np.isfinite(x) & np.isfinite(y)
     x, y, weight = np.where(known, x, 0), np.where(known, y, 0), known.astype(float)
@@ -78,20 +77,20 @@ def _slow_lap1(x: np.ndarray, y: np.ndarray, levels: int) -> float:
 
 @pytest.mark.parametrize("levels", [1, 2, 3])
 @pytest.mark.parametrize("size", [(12, 12), (13, 18), (16, 15)])
-def test_lap1_equals_a_plain_pyramid(size: tuple[int, int], levels: int) -> None:
+def test_lap1_equals_a_plain_pyramid(size, levels):
     x, y = _map(0, *size), _map(1, *size)
     expected = _slow_lap1(x[0, 0].numpy(), y[0, 0].numpy(), levels)
     assert lap1(x, y, levels=levels).item() == pytest.approx(expected, rel=1e-12)
 
 
-def test_lap1_with_holes_weights_pixels_by_their_valid_fraction() -> None:
+def test_lap1_with_holes_weights_pixels_by_their_valid_fraction():
     x, y = _with_holes(_map(0), 2), _with_holes(_map(1), 3)
     expected = _slow_lap1(x[0, 0].numpy(), y[0, 0].numpy(), 3)
     assert lap1(x, y).item() == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.parametrize("holes", [0.0, 0.3])
-def test_l1_and_mse_are_means_over_valid_pixels(holes: float) -> None:
+def test_l1_and_mse_are_means_over_valid_pixels(holes):
     x, y = _with_holes(_map(0), 2, holes), _map(1)
     difference = (x - y).numpy()
     assert l1(x, y).item() == pytest.approx(np.nanmean(np.abs(difference)), rel=1e-13)
@@ -100,7 +99,7 @@ def test_l1_and_mse_are_means_over_valid_pixels(holes: float) -> None:
 
 @pytest.mark.parametrize("c", [-2.5, 0.1, 3.0])
 @pytest.mark.parametrize("size", [(12, 12), (17, 14)])
-def test_constant_offset_gives_its_absolute_value(size: tuple[int, int], c: float) -> None:
+def test_constant_offset_gives_its_absolute_value(size, c):
     x = _map(0, *size)
     assert lap1(x + c, x).item() == pytest.approx(abs(c), rel=1e-13)
     assert l1(x + c, x).item() == pytest.approx(abs(c), rel=1e-13)
@@ -108,7 +107,7 @@ def test_constant_offset_gives_its_absolute_value(size: tuple[int, int], c: floa
 
 
 @pytest.mark.parametrize("name", LOSSES)
-def test_losses_are_symmetric_zero_at_the_target_and_positive_elsewhere(name: str) -> None:
+def test_losses_are_symmetric_zero_at_the_target_and_positive_elsewhere(name):
     x, y = _with_holes(_map(0), 2), _with_holes(_map(1), 3)
     loss = LOSSES[name]
     assert loss(x, y).item() == pytest.approx(loss(y, x).item(), rel=1e-14)
@@ -118,7 +117,7 @@ def test_losses_are_symmetric_zero_at_the_target_and_positive_elsewhere(name: st
 
 @pytest.mark.parametrize("name", LOSSES)
 @pytest.mark.parametrize("garbage", [1e30, -7.0, math.inf, math.nan])
-def test_pixels_under_holes_do_not_matter(name: str, garbage: float) -> None:
+def test_pixels_under_holes_do_not_matter(name, garbage):
     x, y = _map(0), _map(1)
     holes = torch.from_numpy(np.random.default_rng(4).random((1, 1, 13, 18)) > 0.7)
     expected = LOSSES[name](x, y.masked_fill(holes, torch.nan)).item()
@@ -128,7 +127,7 @@ def test_pixels_under_holes_do_not_matter(name: str, garbage: float) -> None:
 
 
 @pytest.mark.parametrize("name", LOSSES)
-def test_image_without_a_valid_pixel_has_loss_nan_and_leaves_the_others_unchanged(name: str) -> None:
+def test_image_without_a_valid_pixel_has_loss_nan_and_leaves_the_others_unchanged(name):
     x, y = _with_holes(_map(0, batch=2), 2), _map(1, batch=2)
     y[0] = torch.nan
     values = LOSSES[name](x, y)
@@ -138,11 +137,10 @@ def test_image_without_a_valid_pixel_has_loss_nan_and_leaves_the_others_unchange
 
 
 @pytest.mark.parametrize("name", LOSSES)
-def test_gradients_are_finite_and_zero_in_holes(name: str) -> None:
+def test_gradients_are_finite_and_zero_in_holes(name):
     x, y = _map(0, batch=2).requires_grad_(), _with_holes(_map(1, batch=2), 3)
     y[0] = torch.nan
     LOSSES[name](x, y).nanmean().backward()
-    assert x.grad is not None
     assert bool(x.grad.isfinite().all())
     assert bool((x.grad[y.isnan()] == 0).all())
     assert bool(x.grad[1].any())
@@ -150,7 +148,7 @@ def test_gradients_are_finite_and_zero_in_holes(name: str) -> None:
 
 @pytest.mark.parametrize("name", LOSSES)
 @pytest.mark.parametrize("holes", [0.0, 0.25])
-def test_gradient_of_a_loss_is_that_of_its_value(name: str, holes: float) -> None:
+def test_gradient_of_a_loss_is_that_of_its_value(name, holes):
     size = (12, 13) if name == "lap1" else (3, 4)
     x, y = _map(0, *size), _with_holes(_map(1, *size), 3, holes)
     assert torch.autograd.gradcheck(lambda x: LOSSES[name](x, y), x.requires_grad_())
@@ -158,7 +156,7 @@ def test_gradient_of_a_loss_is_that_of_its_value(name: str, holes: float) -> Non
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("name", LOSSES)
-def test_losses_keep_the_precision(name: str, dtype: torch.dtype) -> None:
+def test_losses_keep_the_precision(name, dtype):
     assert LOSSES[name](_map(0).to(dtype), _with_holes(_map(1), 2).to(dtype)).dtype == dtype
 
 
@@ -170,7 +168,7 @@ CAMERAS = (
 )
 
 
-def _batch(*, holes: float = 0.0) -> Batch:
+def _batch(*, holes=0.0):
     depth = 2 + 0.3 * torch.tanh(_map(5, 12, 14, batch=2))
     depth = _with_holes(depth, 6, holes)
     stereo = torch.tensor([[c.fx * (c.baseline or 0)] for c in CAMERAS], dtype=torch.float64)[:, :, None, None]
@@ -181,7 +179,7 @@ def _batch(*, holes: float = 0.0) -> Batch:
     return {"depth": depth, "rays": rays, "bf": stereo, "doffs": doffs, "disparity_lr": coarse}
 
 
-def _guess(batch: Batch) -> Tensor:
+def _guess(batch):
     """Return disparities near the true ones, and finite."""
     truth = (batch["bf"] / batch["depth"] - batch["doffs"]).nan_to_num(1.0)
     return truth + 0.05 * _map(7, 12, 14, batch=2)
@@ -190,7 +188,7 @@ def _guess(batch: Batch) -> Tensor:
 @pytest.mark.slow
 @pytest.mark.parametrize("holes", [0.0, 0.15])
 @pytest.mark.parametrize("depth_loss", LOSSES)
-def test_gradient_of_the_objective_is_that_of_its_value(depth_loss: DepthLoss, holes: float) -> None:
+def test_gradient_of_the_objective_is_that_of_its_value(depth_loss, holes):
     batch, objective = _batch(holes=holes), DepthObjective(depth_loss, 0.7)
     assert torch.autograd.gradcheck(
         lambda guess: objective(Answer(guess), batch)["loss"], _guess(batch).requires_grad_()
@@ -198,7 +196,7 @@ def test_gradient_of_the_objective_is_that_of_its_value(depth_loss: DepthLoss, h
 
 
 @pytest.mark.parametrize("holes", [0.0, 0.15])
-def test_objective_of_a_batch_is_the_mean_of_its_samples(holes: float) -> None:
+def test_objective_of_a_batch_is_the_mean_of_its_samples(holes):
     batch, objective = _batch(holes=holes), DepthObjective("lap1", 0.7)
     guess = _guess(batch)
     singles = [
@@ -209,7 +207,7 @@ def test_objective_of_a_batch_is_the_mean_of_its_samples(holes: float) -> None:
     assert objective(Answer(guess), batch)["loss"].item() == pytest.approx(sum(singles).item() / 2, rel=1e-13)
 
 
-def test_objective_has_finite_gradients_at_the_truth_and_beyond_infinity() -> None:
+def test_objective_has_finite_gradients_at_the_truth_and_beyond_infinity():
     batch = _batch(holes=0.15)
     truth = (batch["bf"] / batch["depth"] - batch["doffs"]).nan_to_num(1.0)
     behind = truth.clone()
@@ -217,7 +215,6 @@ def test_objective_has_finite_gradients_at_the_truth_and_beyond_infinity() -> No
     for start in (truth, behind, torch.full_like(truth, -5)):
         guess = start.clone().requires_grad_()
         DepthObjective("lap1", 0.7)(Answer(guess), batch)["loss"].backward()
-        assert guess.grad is not None
         assert bool(guess.grad.isfinite().all())
 
 
@@ -225,19 +222,19 @@ def test_objective_has_finite_gradients_at_the_truth_and_beyond_infinity() -> No
 
 SIZE = 32
 CAMERA = Camera(SIZE, SIZE, 40.0, 40.0, 15.5, 15.5)
-VISUAL: tuple[VisualLossName, ...] = get_args(VisualLossName)
+VISUAL = get_args(VisualLossName)
 
 
 @pytest.fixture(scope="module")
-def network() -> LPIPS:
+def network():
     return random_lpips()
 
 
-def _loss(name: VisualLossName, network: LPIPS) -> VisualLoss:
+def _loss(name, network):
     return VisualLoss(name, network if name == "lpips" else None)
 
 
-def _surface(seed: int, size: int = SIZE) -> Tensor:
+def _surface(seed, size=SIZE):
     """Return a wavy surface, (1, 1, size, size) float64."""
     random = torch.Generator().manual_seed(seed)
     x = torch.arange(size, dtype=torch.float64)
@@ -246,13 +243,13 @@ def _surface(seed: int, size: int = SIZE) -> Tensor:
     return 2 + 0.02 * waves[None, None]
 
 
-def _sample(size: int = SIZE, scale: int = 2) -> DepthSample:
+def _sample(size=SIZE, scale=2):
     camera = Camera(size, size, 1.2 * size, 1.2 * size, (size - 1) / 2, (size - 1) / 2)
     scene = Scene("set", "waves", torch.full((3, size, size), 0.5), camera, _surface(3, size)[0])
     return make_sample(scene, scale, Downsampling("box"), "disparity")
 
 
-def test_a_visual_loss_is_the_metric_averaged_over_the_lights(network: LPIPS) -> None:
+def test_a_visual_loss_is_the_metric_averaged_over_the_lights(network):
     pair = SurfacePair(
         torch.cat((_surface(0), _surface(1))), torch.cat((_surface(2), _surface(3))), CAMERA.rays()[None]
     )
@@ -263,7 +260,7 @@ def test_a_visual_loss_is_the_metric_averaged_over_the_lights(network: LPIPS) ->
 
 @pytest.mark.parametrize("holes", [False, True])
 @pytest.mark.parametrize("name", VISUAL)
-def test_gradient_of_a_visual_loss_is_that_of_its_value(name: VisualLossName, holes: bool, network: LPIPS) -> None:
+def test_gradient_of_a_visual_loss_is_that_of_its_value(name, holes, network):
     loss, target, rays = _loss(name, network), _surface(2), CAMERA.rays()[None]
     if holes:
         target[..., 5:9, 20:23] = torch.nan
@@ -271,12 +268,11 @@ def test_gradient_of_a_visual_loss_is_that_of_its_value(name: VisualLossName, ho
         loss.network.double()
     start = _surface(0)
 
-    def value(surface: Tensor) -> Tensor:
+    def value(surface):
         return loss(SurfacePair(surface, target, rays)).sum()
 
     surface = start.clone().requires_grad_()
     value(surface).backward()
-    assert surface.grad is not None
     for seed in range(3):  # along random directions
         random = torch.Generator().manual_seed(seed)
         step = 1e-9 * torch.randn(start.shape, generator=random, dtype=torch.float64)
@@ -286,22 +282,21 @@ def test_gradient_of_a_visual_loss_is_that_of_its_value(name: VisualLossName, ho
 
 
 @pytest.mark.parametrize("name", VISUAL)
-def test_image_without_a_valid_pixel_has_no_loss_and_no_gradient(name: VisualLossName, network: LPIPS) -> None:
+def test_image_without_a_valid_pixel_has_no_loss_and_no_gradient(name, network):
     prediction = torch.cat((_surface(0), _surface(1))).float().requires_grad_()
     target = torch.cat((_surface(2), torch.full_like(_surface(2), torch.nan))).float()
     loss = _loss(name, network.float())(SurfacePair(prediction, target, CAMERA.rays(dtype=torch.float32)[None]))
     assert loss.isfinite().tolist() == [True, False]
     loss.nanmean().backward()
-    assert prediction.grad is not None
     assert bool(prediction.grad.isfinite().all())
     assert float(prediction.grad[0].abs().max()) > 0
     assert float(prediction.grad[1].abs().max()) == 0
 
 
 @pytest.mark.parametrize("name", VISUAL)
-def test_objectives_have_the_visual_loss_as_a_term(name: VisualLossName, network: LPIPS) -> None:
+def test_objectives_have_the_visual_loss_as_a_term(name, network):
     loss, sample = _loss(name, network.float()), _sample(64)
-    batch: Batch = {key: value[None] for key, value in to_tensors(sample).items()}
+    batch = {key: value[None] for key, value in to_tensors(sample).items()}
     disparity = 1.02 * batch["bf"] / batch["depth"] + 0.02 * torch.sin(torch.arange(64.0))
     terms = DepthObjective("l1", 0.3, visual=loss)(Answer(disparity), batch)
     assert terms.keys() == {"loss", "l1", name}
@@ -310,7 +305,7 @@ def test_objectives_have_the_visual_loss_as_a_term(name: VisualLossName, network
     assert terms[name].item() == pytest.approx(expected.item(), rel=1e-6)
 
 
-def test_automatic_weight_makes_a_loss_as_large_as_mse_v_for_interpolation() -> None:
+def test_automatic_weight_makes_a_loss_as_large_as_mse_v_for_interpolation():
     patches = [to_tensors(_sample(size)) for size in (32, 40, 48)]
     w, other = balance_weight(patches), balance_weight(patches, VisualLoss("dssim"))
     ratios = []
@@ -326,7 +321,7 @@ def test_automatic_weight_makes_a_loss_as_large_as_mse_v_for_interpolation() -> 
     assert match_weight(VisualLoss("dssim"), [pair]) == match_weight(VisualLoss("dssim"), []) == 1
 
 
-def test_lpips_without_its_weights_is_one_line_that_says_what_to_do(tmp_path: Path) -> None:
+def test_lpips_without_its_weights_is_one_line_that_says_what_to_do(tmp_path):
     with pytest.raises(ValueError, match=r"set metrics\.lpips_trunk=FILE or") as caught:
         make_visual_loss("lpips", tmp_path / "none.pth")
     assert "\n" not in str(caught.value)
@@ -335,6 +330,6 @@ def test_lpips_without_its_weights_is_one_line_that_says_what_to_do(tmp_path: Pa
     with pytest.raises(ValueError, match=r"^visual: lpips needs AlexNet's weights: .*damaged\.pth"):
         make_visual_loss("lpips", damaged)
     with pytest.raises(ValueError, match=r"^visual: expected one of mse_v, dssim, lpips, got 'ssim'$"):
-        make_visual_loss("ssim")  # type: ignore[arg-type]
+        make_visual_loss("ssim")
     with pytest.raises(ValueError, match=r"^visual: expected a network for lpips, got none$"):
         VisualLoss("lpips")

@@ -1,12 +1,9 @@
 """Alignment to the truth, against its authors' codes, numpy's least squares and scipy's linear programming."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
 from scipy.optimize import linprog
-from torch import Tensor
 
 from dsr.geometry.camera import Camera
 from dsr.metrics import depth
@@ -21,7 +18,7 @@ RAYS = Camera(width=24, height=20, fx=30.0, fy=30.0, cx=11.5, cy=9.5).rays()[Non
 WAYS = [how for how in ALIGNMENTS if how != "none"]
 
 
-def _batch(*maps: Any) -> Tensor:
+def _batch(*maps):
     return torch.stack([torch.as_tensor(each, dtype=torch.float64)[None] for each in maps])
 
 
@@ -32,19 +29,19 @@ def _batch(*maps: Any) -> Tensor:
         ("affine_disparity", PREDICTION + 3, 2.0267468267470394, 0.1369982371288428),
     ],
 )
-def test_least_squares_are_those_of_evalmde(how: str, prediction: Any, mean: float, error: float) -> None:
+def test_least_squares_are_those_of_evalmde(how, prediction, mean, error):
     aligned = align(_batch(prediction), _batch(TRUTH), None, how)
     assert aligned.mean().item() == pytest.approx(mean, rel=1e-12)
     assert (aligned - _batch(TRUTH)).abs().mean().item() == pytest.approx(error, rel=1e-12)
 
 
-def _with_outliers() -> Any:
+def _with_outliers():
     prediction = PREDICTION.copy()
     prediction[::5, ::3] *= 3
     return prediction
 
 
-def test_robust_alignment_has_the_least_relative_deviations() -> None:
+def test_robust_alignment_has_the_least_relative_deviations():
     prediction = _with_outliers()
     aligned = align(_batch(prediction), _batch(TRUTH), None, "robust")
     found = (aligned - _batch(TRUTH)).abs().div(_batch(TRUTH)).mean().item()
@@ -59,7 +56,7 @@ def test_robust_alignment_has_the_least_relative_deviations() -> None:
     assert (aligned.flatten().numpy() - y).__abs__() @ cost[2:] == pytest.approx(solved.fun, rel=1e-4)
 
 
-def test_median_scaling_is_numpys() -> None:
+def test_median_scaling_is_numpys():
     aligned = align(_batch(PREDICTION + 2), _batch(TRUTH), None, "scale")
     expected = (PREDICTION + 2) * np.median(TRUTH) / np.median(PREDICTION + 2)
     np.testing.assert_allclose(aligned[0, 0], expected, rtol=1e-14)
@@ -74,12 +71,12 @@ def test_median_scaling_is_numpys() -> None:
         ("robust", 0.3 * TRUTH + 0.7),
     ],
 )
-def test_what_an_alignment_leaves_open_is_undone_exactly(how: str, prediction: Any) -> None:
+def test_what_an_alignment_leaves_open_is_undone_exactly(how, prediction):
     np.testing.assert_allclose(align(_batch(prediction), _batch(TRUTH), None, how)[0, 0], TRUTH, rtol=1e-9)
 
 
 @pytest.mark.parametrize("how", WAYS)
-def test_holes_and_masked_pixels_are_not_fitted_and_images_do_not_mix(how: str) -> None:
+def test_holes_and_masked_pixels_are_not_fitted_and_images_do_not_mix(how):
     prediction, truth = _batch(_with_outliers() + 3, PREDICTION + 2), _batch(TRUTH, TRUTH)
     mask = torch.ones_like(truth, dtype=torch.bool)
     prediction[0, 0, 3:5], truth[0, 0, 8, :7] = torch.nan, torch.nan
@@ -99,19 +96,19 @@ def test_holes_and_masked_pixels_are_not_fitted_and_images_do_not_mix(how: str) 
 
 
 @pytest.mark.parametrize("how", ["affine", "affine_disparity", "robust"])
-def test_constant_prediction_becomes_a_constant(how: str) -> None:
+def test_constant_prediction_becomes_a_constant(how):
     aligned = align(torch.full((1, 1, 20, 24), 0.3), _batch(TRUTH), None, how)
     assert aligned.amax() - aligned.amin() < 1e-6
     assert 1 < aligned.mean() < 3
 
 
 @pytest.mark.parametrize("how", WAYS)
-def test_image_without_a_pixel_to_fit_has_no_score(how: str) -> None:
+def test_image_without_a_pixel_to_fit_has_no_score(how):
     pair = SurfacePair(_batch(PREDICTION + 2), torch.full((1, 1, 20, 24), torch.nan, dtype=torch.float64), RAYS)
     assert depth.depth_errors(align_pair(pair, how))["AbsRel"].isnan().all()
 
 
-def test_collection_aligns_each_pair_and_gradients_of_none_are_kept() -> None:
+def test_collection_aligns_each_pair_and_gradients_of_none_are_kept():
     metrics = visual_metrics(protocols=("depth",), alignment="affine")
     metrics.update(_batch(5 * TRUTH + 2, 0.1 * TRUTH + 3), _batch(TRUTH, TRUTH), RAYS)
     assert compute_means(metrics)["Depth_AbsRel"].item() == pytest.approx(0, abs=1e-9)
@@ -119,6 +116,6 @@ def test_collection_aligns_each_pair_and_gradients_of_none_are_kept() -> None:
     assert align_pair(pair, "none") is pair
 
 
-def test_unknown_alignment_is_refused() -> None:
+def test_unknown_alignment_is_refused():
     with pytest.raises(ValueError, match=r"^alignment: expected one of none, scale, affine.*got 'median'$"):
         align(_batch(TRUTH), _batch(TRUTH), None, "median")

@@ -1,37 +1,31 @@
 """Networks of ONNX files: each declaration gives what it says, and what does not fit is refused."""
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import pytest
 import torch
 from small_scenes import plane, random_scene, sample_of
-from torch import Tensor, nn
+from torch import nn
 from torch.nn import functional
 
 from dsr.geometry.camera import to_range
-from dsr.methods.base import Method
 from dsr.methods.images import resize_bicubic
 from dsr.methods.networks.msg_net import MSGNet
 from dsr.methods.networks.network import NetworkUpsampler
 from dsr.methods.networks.network_file import NetworkFile, OnnxGraph, write_onnx
-from dsr.sample import DepthSample
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # of the exporter
 pytest.importorskip("onnxruntime", reason="pip install -e '.[onnx]'")
 
 
 @pytest.fixture
-def sample() -> DepthSample:
+def sample():
     return sample_of(plane() + 3 * (plane() > 6.5), random_scene(32, 48)[1], scale=4)
 
 
-def network(folder: Path, function: Callable[..., Any], *inputs: str, size: tuple[int, int] | None = None) -> str:
+def network(folder, function, *inputs, size=None):
     """Write a function of a photo, 12 x 16 or of a fixed size, and of a map of a quarter of it, as an ONNX file."""
 
     class Module(nn.Module):
-        def forward(self, *given: Tensor) -> Any:
+        def forward(self, *given):
             return function(*given)
 
     path, (height, width) = folder / "mine.onnx", size or (12, 16)
@@ -45,15 +39,15 @@ def network(folder: Path, function: Callable[..., Any], *inputs: str, size: tupl
     return str(path)
 
 
-def second(rgb: Tensor, depth: Tensor) -> Tensor:
+def second(rgb, depth):
     return depth + 0 * rgb.mean()
 
 
-def nothing(rgb: Tensor, depth: Tensor) -> Tensor:
+def nothing(rgb, depth):
     return 0 * depth + 0 * rgb.mean()
 
 
-def enlarged(sample: DepthSample, quantity: str) -> Tensor:
+def enlarged(sample, quantity):
     """Return the map of a quantity, enlarged by the kernel of the field's benchmarks."""
     if quantity == "disparity":
         return resize_bicubic(sample.disparity_lr()[None], (32, 48))
@@ -64,9 +58,7 @@ def enlarged(sample: DepthSample, quantity: str) -> Tensor:
 @pytest.mark.parametrize("quantity", ["disparity", "orthogonal", "inverse"])
 @pytest.mark.parametrize("value_range", ["measured", None, [0.0, 3.0]])
 @pytest.mark.parametrize("output", ["same", "residual"])
-def test_enlarged_map_returns_as_it_came(
-    sample: DepthSample, tmp_path: Path, quantity: str, value_range: Any, output: str
-) -> None:
+def test_enlarged_map_returns_as_it_came(sample, tmp_path, quantity, value_range, output):
     path = network(tmp_path, second if output == "same" else nothing, "rgb", "depth")
     inputs = {"rgb": "image", "depth": "up"}
     depth = NetworkFile(path, inputs, range_type=quantity, range=value_range, output=output)(sample)
@@ -75,7 +67,7 @@ def test_enlarged_map_returns_as_it_came(
     torch.testing.assert_close(got[quantity], expected, rtol=1e-4, atol=1e-5)
 
 
-def test_photo_alone_and_a_quantity_of_its_own(sample: DepthSample, tmp_path: Path) -> None:
+def test_photo_alone_and_a_quantity_of_its_own(sample, tmp_path):
     path = network(tmp_path, lambda rgb: (rgb[:, :1] + 1, rgb), "rgb")
     torch.testing.assert_close(
         NetworkFile(path, {"rgb": "image"}, output="orthogonal")(sample)[0], sample.rgb[0].to(torch.float64) + 1
@@ -86,7 +78,7 @@ def test_photo_alone_and_a_quantity_of_its_own(sample: DepthSample, tmp_path: Pa
     torch.testing.assert_close(method(sample)[0].float(), 255 * sample.rgb[0] + luma + 1, rtol=1e-3, atol=0)
 
 
-def test_pictures_are_continued_to_a_multiple(sample: DepthSample, tmp_path: Path) -> None:
+def test_pictures_are_continued_to_a_multiple(sample, tmp_path):
     larger = lambda rgb, depth: functional.interpolate(depth, scale_factor=4, mode="nearest") + 0 * rgb  # noqa: E731
     path = network(tmp_path, lambda *given: larger(*given)[:, :1], "rgb", "depth", size=(40, 60))
     method = NetworkFile(path, {"rgb": "image", "depth": "lr"}, range=None, multiple=20)
@@ -94,14 +86,14 @@ def test_pictures_are_continued_to_a_multiple(sample: DepthSample, tmp_path: Pat
     torch.testing.assert_close(to_range(method(sample), sample.camera, "disparity"), expected, rtol=1e-5, atol=0)
 
 
-def test_graph_that_dsr_exports_gives_what_the_network_does(tmp_path: Path) -> None:
+def test_graph_that_dsr_exports_gives_what_the_network_does(tmp_path):
     torch.manual_seed(0)
     net = MSGNet(4)
     write_onnx(tmp_path / "msg.onnx", OnnxGraph(net, 4), {})
     problem = sample_of(plane(), random_scene(32, 48)[1], scale=4)
     problem.depth_lr[:, 2:4, 3:5] = torch.nan
     inputs = {"photo": "image", "inverse_depth": "lr", "valid": "valid"}
-    method: Method = NetworkFile(str(tmp_path / "msg.onnx"), inputs, range_type="inverse", range=None)
+    method = NetworkFile(str(tmp_path / "msg.onnx"), inputs, range_type="inverse", range=None)
     expected = NetworkUpsampler(net)(problem)
     torch.testing.assert_close(method(problem), expected.to(torch.float64), rtol=1e-4, atol=0)
     assert (method.name, len(method.content("set", "hall", 4) or "")) == ("msg", 64)
@@ -129,18 +121,15 @@ def test_graph_that_dsr_exports_gives_what_the_network_does(tmp_path: Path) -> N
         ({"result": "depth"}, "result: expected one of"),
     ],
 )
-def test_declaration_is_checked(tmp_path: Path, settings: dict[str, Any], message: str) -> None:
+def test_declaration_is_checked(tmp_path, settings, message):
     given = {"path": network(tmp_path, second, "rgb", "depth"), "inputs": {"rgb": "image", "depth": "up"}}
     with pytest.raises(ValueError, match=message):
         NetworkFile(**{**given, **settings})
 
 
 @pytest.mark.parametrize("output", ["inverse", "disparity"])
-def test_relative_result_is_fitted_to_the_coarse_map_without_the_truth(
-    sample: DepthSample, tmp_path: Path, output: str
-) -> None:
+def test_relative_result_is_fitted_to_the_coarse_map_without_the_truth(sample, tmp_path, output):
     path = network(tmp_path, lambda rgb: 7 * rgb[:, 0] - 0.5, "rgb")
-    assert sample.depth is not None
     disparity = to_range(sample.depth, sample.camera, "disparity")[0]
     problem = sample_of(disparity, (disparity / 20).float().expand(3, 32, 48), scale=4)
     object.__setattr__(problem, "depth", None)
@@ -151,7 +140,7 @@ def test_relative_result_is_fitted_to_the_coarse_map_without_the_truth(
         NetworkFile(path, {"rgb": "image"}, output="orthogonal", fit="affine")(problem)
 
 
-def test_photo_is_resized_for_a_network_that_sees_it_alone(tmp_path: Path) -> None:
+def test_photo_is_resized_for_a_network_that_sees_it_alone(tmp_path):
     ramp = torch.linspace(0.2, 0.8, 48).expand(3, 32, 48)
     path, inputs = network(tmp_path, lambda rgb: 4 + rgb[:, :1], "rgb", size=(24, 40)), {"rgb": "image"}
     for output, factor in (("orthogonal", 1), ("disparity", 48 / 40)):
@@ -163,7 +152,7 @@ def test_photo_is_resized_for_a_network_that_sees_it_alone(tmp_path: Path) -> No
         torch.testing.assert_close(found[inner], factor * (4 + ramp[:1].double())[inner], rtol=0, atol=1e-3)
 
 
-def test_content_follows_weights_that_lie_beside_the_graph(tmp_path: Path) -> None:
+def test_content_follows_weights_that_lie_beside_the_graph(tmp_path):
     onnx = pytest.importorskip("onnx")
     path, beside = tmp_path / "net.onnx", tmp_path / "net.data"
     inputs, found = {"photo": "image", "inverse_depth": "lr", "valid": "valid"}, []
@@ -185,7 +174,7 @@ def test_content_follows_weights_that_lie_beside_the_graph(tmp_path: Path) -> No
         NetworkFile(str(path), inputs)
 
 
-def test_network_that_returns_no_map_or_fails_is_named(sample: DepthSample, tmp_path: Path) -> None:
+def test_network_that_returns_no_map_or_fails_is_named(sample, tmp_path):
     inputs = {"rgb": "image", "depth": "up"}
     path = network(tmp_path, lambda rgb, depth: depth[:, :, ::2] + 0 * rgb.mean(), "rgb", "depth")
     with pytest.raises(ValueError, match=r"mine.onnx: expected a map of 32 x 48, got \(1, 1, 16, 48\)"):

@@ -6,18 +6,17 @@ import numpy as np
 import pytest
 import torch
 from small_scenes import plane_map
-from torch import Tensor
 from torch.nn import functional
 
 from dsr.methods.networks.network import NetworkUpsampler
 from dsr.methods.networks.pdn import PrimalDualNetwork, UnrolledHuber, half_window, pair_differences, pair_sums
 
 
-def _random(*shape: int, seed: int = 0) -> Tensor:
+def _random(*shape, seed=0):
     return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def _problem(size: int, window: int, count: int = 1) -> tuple[Tensor, Tensor]:
+def _problem(size, window, count=1):
     """Return a map with steps, continued beyond the border, and weights whose pairs are partly across the steps."""
     r, n = window // 2, len(half_window(window))
     first = _random(count, 1, size + 2 * r, size + 4 * r, seed=1) * 0.02
@@ -25,7 +24,7 @@ def _problem(size: int, window: int, count: int = 1) -> tuple[Tensor, Tensor]:
     return first, (_random(count, n, size, size, seed=2) + 0.01) / n
 
 
-def _net(scale: int = 4, *, noise: float = 0.05, window: int = 3, **arguments: int) -> PrimalDualNetwork:
+def _net(scale=4, *, noise=0.05, window=3, **arguments):
     """Return a small network with weights far from those that it starts with."""
     torch.manual_seed(scale)
     sizes = {"width": 6, "layers": 3, "iterations": 3, **arguments}
@@ -35,28 +34,28 @@ def _net(scale: int = 4, *, noise: float = 0.05, window: int = 3, **arguments: i
     return net
 
 
-def _photo(height: int, width: int, count: int = 1) -> Tensor:
+def _photo(height, width, count=1):
     return _random(count, 3, height, width, seed=3).float()
 
 
-def _map(height: int, width: int, count: int = 1) -> Tensor:
+def _map(height, width, count=1):
     return 20 + 9 * _random(count, 1, height, width, seed=4)
 
 
 @pytest.mark.parametrize("window", [1, 4, -3])
-def test_even_window_size_is_refused_in_one_line(window: int) -> None:
+def test_even_window_size_is_refused_in_one_line(window):
     with pytest.raises(ValueError, match=rf"^window: expected an odd number of at least 3, got {window}$"):
         UnrolledHuber(window)
 
 
-def test_window_sums_are_the_adjoint_of_zero_padded_differences() -> None:
+def test_window_sums_are_the_adjoint_of_zero_padded_differences():
     x, p = _random(2, 1, 6, 7), _random(2, 12, 8, 11, seed=1)
     padded = functional.pad(x, (4, 4, 2, 2))
     left = (pair_differences(padded, 5) * p).sum()
     torch.testing.assert_close(left, (x * pair_sums(p, 5)).sum())
 
 
-def test_unrolled_stage_equals_a_plain_loop() -> None:
+def test_unrolled_stage_equals_a_plain_loop():
     window, size, data, huber = 5, 16, 7.0, 0.4
     first, weights = _problem(size, window)
     stage = UnrolledHuber(window, 4, data, huber).double().requires_grad_(False)
@@ -67,7 +66,7 @@ def test_unrolled_stage_equals_a_plain_loop() -> None:
     np.testing.assert_allclose(result[0, 0].numpy(), expected, rtol=0, atol=1e-7)  # the parameters are float32's
 
 
-def _loop(f: np.ndarray, w: np.ndarray, steps: list[list[float]], data: float, huber: float, window: int) -> np.ndarray:
+def _loop(f, w, steps, data, huber, window):
     """Return u - f, pair by pair and pixel by pixel, on a map with r rows and 2 r columns around the image."""
     r, (height, width) = window // 2, w.shape[1:]
     inside = [(y, x) for y in range(height) for x in range(width)]
@@ -94,7 +93,7 @@ def _loop(f: np.ndarray, w: np.ndarray, steps: list[list[float]], data: float, h
     return (u - f)[r : r + height, 2 * r : 2 * r + width]
 
 
-def _energy(moved: Tensor, first: Tensor, weights: Tensor, data: float, huber: float, window: int) -> Tensor:
+def _energy(moved, first, weights, data, huber, window):
     """Return E by its definition: the Huber function of each pair, with the image's pixels alone free to move."""
     r = window // 2
     x = pair_differences(first + functional.pad(moved, (2 * r, 2 * r, r, r)), window)
@@ -104,7 +103,7 @@ def _energy(moved: Tensor, first: Tensor, weights: Tensor, data: float, huber: f
     return pairs.sum() + data / 2 * moved.square().sum()
 
 
-def test_many_steps_reach_the_minimum_that_another_optimiser_finds() -> None:
+def test_many_steps_reach_the_minimum_that_another_optimiser_finds():
     window, data, huber = 3, 2.0, 0.3
     first, weights = _problem(8, window)
     stage = UnrolledHuber(window, 200, data, huber).double().requires_grad_(False)
@@ -116,7 +115,7 @@ def test_many_steps_reach_the_minimum_that_another_optimiser_finds() -> None:
         [other], max_iter=500, tolerance_grad=1e-12, tolerance_change=0, line_search_fn="strong_wolfe"
     )
 
-    def closure() -> Tensor:
+    def closure():
         optimiser.zero_grad()
         energy = _energy(other, first, weights, data, huber, window)
         energy.backward()
@@ -130,20 +129,20 @@ def test_many_steps_reach_the_minimum_that_another_optimiser_finds() -> None:
     torch.testing.assert_close(found, other, rtol=0, atol=1e-6)
 
 
-def test_gradients_of_maps_weights_and_parameters_agree_with_finite_differences() -> None:
+def test_gradients_of_maps_weights_and_parameters_agree_with_finite_differences():
     window = 3
     first, weights = _problem(4, window)
     stage = UnrolledHuber(window, 2, 3.0, 0.5).double()
     names, parameters = zip(*stage.named_parameters(), strict=True)
 
-    def answer(first: Tensor, weights: Tensor, *values: Tensor) -> Tensor:
+    def answer(first, weights, *values):
         return torch.func.functional_call(stage, dict(zip(names, values, strict=True)), (first, weights))
 
     assert torch.autograd.gradcheck(answer, [first.requires_grad_(), weights.requires_grad_(), *parameters])
 
 
 @pytest.mark.parametrize("scale", [2, 4, 8, 16])
-def test_untrained_pdn_reproduces_a_plane_up_to_the_border(scale: int) -> None:
+def test_untrained_pdn_reproduces_a_plane_up_to_the_border(scale):
     torch.manual_seed(0)
     net = PrimalDualNetwork(scale, width=6, layers=3).requires_grad_(False)
     fine = plane_map(6 * scale, 7 * scale, 0.1, -0.07)
@@ -152,7 +151,7 @@ def test_untrained_pdn_reproduces_a_plane_up_to_the_border(scale: int) -> None:
     torch.testing.assert_close(result, fine, rtol=0, atol=1e-6)
 
 
-def test_plane_is_reproduced_for_any_weights_where_it_is_not_too_steep_for_epsilon() -> None:
+def test_plane_is_reproduced_for_any_weights_where_it_is_not_too_steep_for_epsilon():
     net, fine = _net(noise=0.3), plane_map(80, 84)
     with torch.no_grad():
         net.stage.log_huber.fill_(3.0)  # e^3 times weights of about 1/4 is far above the slopes
@@ -161,7 +160,7 @@ def test_plane_is_reproduced_for_any_weights_where_it_is_not_too_steep_for_epsil
     torch.testing.assert_close(result, fine, rtol=0, atol=1e-6)
 
 
-def test_convolutions_may_run_in_bfloat16() -> None:
+def test_convolutions_may_run_in_bfloat16():
     net, rgb, coarse = _net(), _photo(24, 28), _map(6, 7)
     exact = net.upsample(rgb, coarse)
     with torch.autocast("cpu", torch.bfloat16):
@@ -176,6 +175,6 @@ def test_convolutions_may_run_in_bfloat16() -> None:
     "arguments", [{"scale": 3}, {"scale": 4, "width": 0}, {"scale": 4, "layers": 1}, {"scale": 4, "window": 4},
                   {"scale": 4, "iterations": 0}],
 )  # fmt: skip
-def test_arguments_out_of_range_are_refused(arguments: dict[str, int]) -> None:
+def test_arguments_out_of_range_are_refused(arguments):
     with pytest.raises(ValueError, match=r"^(scale|model|window|iterations): expected [^\n]*$"):
         PrimalDualNetwork(**arguments)

@@ -1,7 +1,6 @@
 """What all published networks of the field share: how they are fed, and how their authors' files are read."""
 
 import pickle
-from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -9,7 +8,7 @@ import pytest
 import torch
 from bombs import Trap
 from PIL import Image
-from torch import Tensor, nn
+from torch import nn
 
 from dsr.geometry.camera import Camera, from_range
 from dsr.methods.base import Cost
@@ -33,14 +32,14 @@ class Enlarged(PeerNetwork):
     multiple: ClassVar[int] = 4
     cost: ClassVar[Cost] = Cost(1, 1)
 
-    def __init__(self, scale: float = 4) -> None:
+    def __init__(self, scale=4):
         super().__init__(scale)
-        self.seen: list[Tensor] = []
+        self.seen = []
 
-    def enlarge(self, values_lr: Tensor, size: tuple[int, int]) -> Tensor:
+    def enlarge(self, values_lr, size):
         return resize_bicubic(values_lr, size)
 
-    def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
+    def forward(self, rgb, values):
         assert not any(n % self.multiple for n in values.shape[-2:])
         assert rgb.shape[-2:] == values.shape[-2:]
         self.seen.append(values)
@@ -52,16 +51,16 @@ class Smoothed(Enlarged):
 
     receptive_field_radius: ClassVar[int | None] = 4
 
-    def __init__(self, scale: float = 4) -> None:
+    def __init__(self, scale=4):
         super().__init__(scale)
         torch.manual_seed(0)
         self.layers = nn.Sequential(nn.Conv2d(4, 8, 5, padding=2), nn.ReLU(), nn.Conv2d(8, 1, 5, padding=2))
 
-    def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
+    def forward(self, rgb, values):
         return values + self.layers(torch.cat((rgb, values), dim=1))
 
 
-def _sample(size_lr: tuple[int, int] = (6, 9), scale: float = 4, doffs: float = 0.0) -> DepthSample:
+def _sample(size_lr=(6, 9), scale=4, doffs=0.0):
     """Return a sample whose true disparity goes beyond the low-resolution one."""
     generator = torch.Generator().manual_seed(3)
     height, width = (round(scale * n) for n in size_lr)
@@ -76,14 +75,14 @@ def _sample(size_lr: tuple[int, int] = (6, 9), scale: float = 4, doffs: float = 
     )
 
 
-def _pillow(values: Tensor, size: tuple[int, int]) -> Tensor:
+def _pillow(values, size):
     image = Image.fromarray(values.numpy().astype(np.float32))
     return torch.from_numpy(np.array(image.resize((size[1], size[0]), Image.Resampling.BICUBIC))).double()
 
 
 @pytest.mark.parametrize(("size_lr", "scale"), [((6, 9), 4), ((9, 12), 8 / 3), ((5, 7), 3), ((10, 11), 1)])
 @pytest.mark.parametrize("range_type", ["disparity", "orthogonal"])
-def test_map_of_any_ratio_is_fed_in_its_range_type(size_lr, scale, range_type) -> None:
+def test_map_of_any_ratio_is_fed_in_its_range_type(size_lr, scale, range_type):
     sample = _sample(size_lr, scale, doffs=3.0)
     depth = Peer(Enlarged(), range_type=range_type)(sample)
     size = (sample.camera.height, sample.camera.width)
@@ -93,7 +92,7 @@ def test_map_of_any_ratio_is_fed_in_its_range_type(size_lr, scale, range_type) -
     torch.testing.assert_close(depth, expected, rtol=1e-5, atol=0)
 
 
-def test_range_is_that_of_the_low_resolution_map() -> None:
+def test_range_is_that_of_the_low_resolution_map():
     upsampler, sample = Peer(Enlarged()), _sample(scale=1)
     upsampler(sample)
     [values] = upsampler.net.seen
@@ -101,7 +100,7 @@ def test_range_is_that_of_the_low_resolution_map() -> None:
     assert upsampler.flag == ""
 
 
-def test_weights_trained_on_a_range_of_depth_get_depth_normalised_by_it() -> None:
+def test_weights_trained_on_a_range_of_depth_get_depth_normalised_by_it():
     class Metric(Enlarged):
         depth_range = (1.0, 9.0)
 
@@ -115,14 +114,14 @@ def test_weights_trained_on_a_range_of_depth_get_depth_normalised_by_it() -> Non
         Peer(Metric(), range="truth")
 
 
-def test_other_factor_than_that_of_the_weights_is_noted() -> None:
+def test_other_factor_than_that_of_the_weights_is_noted():
     upsampler = Peer(Enlarged(8))
     assert upsampler.describe(_sample(scale=8)) == ""
     assert upsampler.describe(_sample(scale=4)) == "weights trained for x8"
     assert Peer(Enlarged(8 / 3)).describe(_sample(scale=4)) == "weights trained for x2.67"
 
 
-def test_true_range_is_flagged_and_needs_the_truth() -> None:
+def test_true_range_is_flagged_and_needs_the_truth():
     upsampler, sample = Peer(Enlarged(), range="truth"), _sample(scale=1)
     depth = upsampler(sample)
     assert upsampler.flag == "true-range"
@@ -136,7 +135,7 @@ def test_true_range_is_flagged_and_needs_the_truth() -> None:
         upsampler(unknown)
 
 
-def test_holes_are_inpainted_before_the_range_is_taken() -> None:
+def test_holes_are_inpainted_before_the_range_is_taken():
     sample = _sample(scale=1)
     holes = sample.depth_lr.clone()
     holes[0, 2:4, 3:6] = torch.nan
@@ -146,14 +145,14 @@ def test_holes_are_inpainted_before_the_range_is_taken() -> None:
     torch.testing.assert_close(depth, expected, rtol=1e-5, atol=0)
 
 
-def test_constant_map_stays_constant() -> None:
+def test_constant_map_stays_constant():
     sample = _sample()
     flat = torch.full_like(sample.depth_lr, 2.5)
     depth = Peer(Enlarged())(DepthSample("t", "s", sample.rgb, flat, sample.camera, sample.camera_lr, 4))
     torch.testing.assert_close(depth, torch.full_like(depth, 2.5))
 
 
-def test_tiles_change_rounding_errors_only() -> None:
+def test_tiles_change_rounding_errors_only():
     sample, steps = _sample((17, 23), 4), []
     whole = Peer(Smoothed())(sample)
     tiled = Peer(Smoothed(), tile=24)(sample, lambda *step: steps.append(step))
@@ -161,7 +160,7 @@ def test_tiles_change_rounding_errors_only() -> None:
     assert steps == [(i + 1, 12) for i in range(12)]
 
 
-def test_bfloat16_changes_the_result_a_little() -> None:
+def test_bfloat16_changes_the_result_a_little():
     exact, rounded = (Peer(Smoothed(), precision=each)(_sample()) for each in ("float32", "bfloat16"))
     assert 1e-7 < float((rounded / exact - 1).abs().max()) < 0.02
 
@@ -174,12 +173,12 @@ def test_bfloat16_changes_the_result_a_little() -> None:
         ({"precision": "float16"}, "precision: expected one of float32, bfloat16, got 'float16'"),
     ],
 )
-def test_unsupported_value_is_refused(arguments: dict[str, str], message: str) -> None:
+def test_unsupported_value_is_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         Peer(Enlarged(), **arguments)
 
 
-def test_folded_batch_normalisation_gives_the_same_result() -> None:
+def test_folded_batch_normalisation_gives_the_same_result():
     torch.manual_seed(1)
     conv, norm = nn.Conv2d(3, 5, 3), nn.BatchNorm2d(5)
     for part in (norm.weight, norm.bias, norm.running_mean, norm.running_var):
@@ -193,7 +192,7 @@ def test_folded_batch_normalisation_gives_the_same_result() -> None:
     torch.testing.assert_close(nn.functional.conv2d(x, tensors["a.weight"], tensors["a.bias"]), expected)
 
 
-def test_batch_normalisation_that_does_not_fit_is_left_in_place() -> None:
+def test_batch_normalisation_that_does_not_fit_is_left_in_place():
     tensors = {"a.weight": torch.ones(2, 1, 3, 3), "a.bias": torch.ones(2)}
     tensors |= {f"b.{name}": torch.ones(3) for name in ("weight", "bias", "running_mean", "running_var")}
     before = dict(tensors)
@@ -202,36 +201,36 @@ def test_batch_normalisation_that_does_not_fit_is_left_in_place() -> None:
     assert tensors == before
 
 
-def test_weights_are_those_of_the_next_larger_factor_and_a_sensors_of_its_own_alone() -> None:
+def test_weights_are_those_of_the_next_larger_factor_and_a_sensors_of_its_own_alone():
     for scale, trained in ((1, 4), (8 / 3, 4), (4, 4), (4.5, 8), (8, 8), (32, 8)):
         assert nearest_scale(FILES.values(), scale) == trained
     for scale, trained in ((1, 4), (2, 4), (8 / 3, 8 / 3), (3, 4)):
         assert nearest_scale([8 / 3, *FILES.values()], scale) == trained
 
 
-def _state(prefix: str = "") -> dict[str, Tensor]:
+def _state(prefix=""):
     torch.manual_seed(0)
     return {prefix + name: value for name, value in SVLRM(4).state_dict().items()}
 
 
-def _build(path: Path, scale: float = 4) -> Peer:
+def _build(path, scale=4):
     return Peer("svlrm", path, scale, FILES)
 
 
-def _save(path: Path, content: object) -> Path:
+def _save(path, content):
     path.parent.mkdir(parents=True, exist_ok=True)
     torch.save(content, path)
     return path
 
 
 @pytest.mark.parametrize("prefix", ["", "module."])
-def test_authors_file_gives_its_network(tmp_path: Path, prefix: str) -> None:
+def test_authors_file_gives_its_network(tmp_path, prefix):
     net = load_peer(_save(tmp_path / "net.pth", _state(prefix)), SVLRM, 8)
     assert net.scale == 8
     assert all(torch.equal(value, _state()[name]) for name, value in net.state_dict().items())
 
 
-def test_scale_is_read_from_the_name_where_the_content_is_unknown(tmp_path: Path) -> None:
+def test_scale_is_read_from_the_name_where_the_content_is_unknown(tmp_path):
     for name in ("SVLRM_X8.pth", "X8/model.pth"):
         path = _save(tmp_path / name, _state())
         assert _build(path, 8).net.scale == 8
@@ -242,7 +241,7 @@ def test_scale_is_read_from_the_name_where_the_content_is_unknown(tmp_path: Path
     assert _build(tmp_path / "renamed.pth", 2).net.scale == 4
 
 
-def test_scale_is_recognised_by_the_content_before_the_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scale_is_recognised_by_the_content_before_the_name(tmp_path, monkeypatch):
     path = _save(tmp_path / "SVLRM_X4.pth", _state())
     monkeypatch.setattr(SVLRM, "checksums", {file_hash(path)[:16]: 8})
     assert _build(path, 8).net.scale == 8
@@ -250,13 +249,13 @@ def test_scale_is_recognised_by_the_content_before_the_name(tmp_path: Path, monk
         _build(path)
 
 
-def test_bad_file_is_refused_in_one_line_and_runs_nothing(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
+def test_bad_file_is_refused_in_one_line_and_runs_nothing(tmp_path, recwarn):
     whole = _save(tmp_path / "whole.pth", _state()).read_bytes()
     damaged = "expected a torch file of plain tensors, got one that is damaged or holds other Python objects"
     expected, tensor = "expected the tensors of SVLRM, but ", "final_layer.bias"
     infinite = _state()
     infinite[tensor][0] = torch.nan
-    cases: list[tuple[object, str]] = [
+    cases = [
         (whole[: len(whole) // 2], damaged),
         (b"no weights", damaged),
         (pickle.dumps(Trap(tmp_path / "sprung")), damaged),
@@ -281,7 +280,7 @@ def test_bad_file_is_refused_in_one_line_and_runs_nothing(tmp_path: Path, recwar
     assert not recwarn.list
 
 
-def test_missing_file_and_unknown_network_are_refused(tmp_path: Path) -> None:
+def test_missing_file_and_unknown_network_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match="nowhere: no such weights file"):
         _build(tmp_path / "nowhere")
     with pytest.raises(ValueError, match=f"peer: expected one of {', '.join(PEERS)}, got 'svlr'"):
@@ -292,7 +291,7 @@ def test_missing_file_and_unknown_network_are_refused(tmp_path: Path) -> None:
         Peer(Enlarged(), tmp_path)
 
 
-def test_directory_is_searched_for_the_authors_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_directory_is_searched_for_the_authors_names(tmp_path, monkeypatch):
     monkeypatch.delenv("DSR_WEIGHTS", raising=False)
     recipe = read_recipe("svlrm")
     assert not has_weights(recipe.at(8)["weights"], 8)

@@ -34,13 +34,13 @@ def random(*shape, seed=0, dtype=torch.float64):
 @pytest.mark.parametrize(
     ("network", "published"), [(SVLRM, 371_650), (FDKN, 693_856), (PGSR, 728_737), (DCTNet, 482_865)]
 )
-def test_network_has_the_published_number_of_parameters(network, published: int) -> None:
+def test_network_has_the_published_number_of_parameters(network, published):
     parameters = sum(value.numel() for value in network(8).parameters())
     assert parameters + _FOLDED[network] + _UNUSED[network] == published
 
 
 @pytest.mark.parametrize("network", [SVLRM, FDKN, PGSR, DCTNet, DORNet])
-def test_each_image_of_a_batch_is_computed_by_itself(network) -> None:
+def test_each_image_of_a_batch_is_computed_by_itself(network):
     torch.manual_seed(2)
     net, rgb, values = network(4).eval(), torch.rand(2, 3, 16, 24), torch.rand(2, 1, 16, 24)
     with torch.inference_mode():
@@ -50,7 +50,7 @@ def test_each_image_of_a_batch_is_computed_by_itself(network) -> None:
 
 
 @pytest.mark.parametrize("scale", [4, 8])
-def test_svlrm_is_fed_the_map_shifted_by_the_authors_sampling(scale: int) -> None:
+def test_svlrm_is_fed_the_map_shifted_by_the_authors_sampling(scale):
     values = np.random.default_rng(0).random((5, 7), dtype=np.float32)
     shift = (scale - 1) / 2
     rows, columns = ((np.arange(scale * n) + 0.5 + shift) / scale - 0.5 for n in values.shape)
@@ -60,7 +60,7 @@ def test_svlrm_is_fed_the_map_shifted_by_the_authors_sampling(scale: int) -> Non
     np.testing.assert_allclose(found[0, 0].numpy(), expected, atol=2e-6)
 
 
-def test_svlrm_is_linear_in_the_grey_photo() -> None:
+def test_svlrm_is_linear_in_the_grey_photo():
     net = SVLRM(4)
     net.final_layer.weight.data.zero_()
     net.final_layer.bias.data = torch.tensor([2.0, 0.25])
@@ -69,7 +69,7 @@ def test_svlrm_is_linear_in_the_grey_photo() -> None:
     torch.testing.assert_close(net(rgb, torch.rand(1, 1, 8, 8)), 2 * grey + 0.25)
 
 
-def test_fdkn_sums_the_map_at_deformed_positions_of_a_window() -> None:
+def test_fdkn_sums_the_map_at_deformed_positions_of_a_window():
     torch.manual_seed(0)
     height, width, side = 9, 11, 15
     values, weights = torch.rand(1, 1, height, width), torch.rand(1, 9, height, width)
@@ -88,14 +88,14 @@ def test_fdkn_sums_the_map_at_deformed_positions_of_a_window() -> None:
     torch.testing.assert_close(local_filters._sample(values, weights, offsets)[0, 0], expected, rtol=1e-4, atol=1e-4)
 
 
-def test_fdkn_changes_a_constant_map_by_a_constant_at_the_border_only() -> None:
+def test_fdkn_changes_a_constant_map_by_a_constant_at_the_border_only():
     torch.manual_seed(0)
     net = FDKN(8).eval()
     found = net(torch.rand(1, 3, 40, 40), torch.full((1, 1, 40, 40), 0.5))
     torch.testing.assert_close(found[..., 12:-12, 12:-12], torch.full((1, 1, 16, 16), 0.5), rtol=0, atol=1e-5)
 
 
-def test_pgsr_plane_with_a_fixed_normal_has_the_depth_of_its_distance() -> None:
+def test_pgsr_plane_with_a_fixed_normal_has_the_depth_of_its_distance():
     planes = torch.tensor([0.0, 0.0, 3.0, 4.0]).view(1, 4, 1, 1).expand(1, 4, 5, 6)
     normalised = pgsr._normalise(planes)
     torch.testing.assert_close(normalised[:, 2], torch.ones(1, 5, 6))
@@ -104,7 +104,7 @@ def test_pgsr_plane_with_a_fixed_normal_has_the_depth_of_its_distance() -> None:
     torch.testing.assert_close(behind, torch.ones(1, 1, 5, 6))  # no farther than 1
 
 
-def test_pgsr_planes_have_the_authors_coordinates() -> None:
+def test_pgsr_planes_have_the_authors_coordinates():
     planes = torch.rand(1, 4, 5, 8) + 0.1
     p, q, r, s = planes[0].double().numpy()
     u, v = ((np.arange(n) - (n - 1) / 2) / 8 / (n - 1) for n in (8, 5))
@@ -112,7 +112,7 @@ def test_pgsr_planes_have_the_authors_coordinates() -> None:
     np.testing.assert_allclose(pgsr._evaluate(planes)[0, 0].numpy(), 1 / np.maximum(inverse, 1), rtol=1e-5)
 
 
-def test_pgsr_strips_change_rounding_errors_only(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pgsr_strips_change_rounding_errors_only(monkeypatch):
     torch.manual_seed(0)
     net, rgb, values = PGSR(4).eval(), torch.rand(1, 3, 44, 16), torch.rand(1, 1, 44, 16)
     whole = net(rgb, values)
@@ -120,7 +120,7 @@ def test_pgsr_strips_change_rounding_errors_only(monkeypatch: pytest.MonkeyPatch
     torch.testing.assert_close(net(rgb, values), whole, rtol=1e-5, atol=1e-6)
 
 
-def test_pgsr_has_the_authors_names_and_drops_those_of_its_training() -> None:
+def test_pgsr_has_the_authors_names_and_drops_those_of_its_training():
     mine = "feature_extraction_rgb.1.body.0.body.0.weight"
     assert mine in PGSR(4).state_dict()
     dropped = ("conv_depth_mapping2.weight", "PAI_2.upconv1.weight", "PAI_1.fusion2Depth.bias")
@@ -128,7 +128,7 @@ def test_pgsr_has_the_authors_names_and_drops_those_of_its_training() -> None:
     assert list(PGSR.convert(tensors)) == [mine, "PGR.other.bias"]
 
 
-def test_pgsr_runs_in_bfloat16() -> None:
+def test_pgsr_runs_in_bfloat16():
     torch.manual_seed(0)
     net, rgb, values = PGSR(4).eval(), torch.rand(1, 3, 16, 24), torch.rand(1, 1, 16, 24)
     exact = net(rgb, values)
@@ -137,13 +137,13 @@ def test_pgsr_runs_in_bfloat16() -> None:
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_dct2_and_idct2_are_scipys_transforms(size) -> None:
+def test_dct2_and_idct2_are_scipys_transforms(size):
     x = random(2, 3, *size)
     np.testing.assert_allclose(dct2(x).numpy(), scipy.fft.dctn(x.numpy(), axes=(-2, -1)), atol=1e-13)
     np.testing.assert_allclose(idct2(x).numpy(), scipy.fft.idctn(x.numpy(), axes=(-2, -1)), atol=1e-13)
 
 
-def test_dct2_of_float32_is_float32_and_accurate() -> None:
+def test_dct2_of_float32_is_float32_and_accurate():
     x = random(2, 48, 50, dtype=torch.float32)
     coefficients = dct2(x)
     assert coefficients.dtype == torch.float32
@@ -153,13 +153,13 @@ def test_dct2_of_float32_is_float32_and_accurate() -> None:
 
 
 @pytest.mark.parametrize("size", [(3, 4), (4, 3)])
-def test_dct2_and_idct2_have_the_right_gradients(size) -> None:
+def test_dct2_and_idct2_have_the_right_gradients(size):
     x = random(*size).requires_grad_()
     assert torch.autograd.gradcheck(dct2, (x,), fast_mode=True)
     assert torch.autograd.gradcheck(idct2, (x,), fast_mode=True)
 
 
-def test_laplacian_is_scipys_convolution_with_a_mirrored_border() -> None:
+def test_laplacian_is_scipys_convolution_with_a_mirrored_border():
     x = random(2, 3, 5, 4)
     kernel = np.ones((3, 3))
     kernel[1, 1] = -8
@@ -167,7 +167,7 @@ def test_laplacian_is_scipys_convolution_with_a_mirrored_border() -> None:
     np.testing.assert_allclose(laplacian(x).numpy(), expected, atol=1e-14)
 
 
-def test_transfer_edges_solves_the_linear_system() -> None:
+def test_transfer_edges_solves_the_linear_system():
     height, width = 5, 6
     depth, guide, weight = (random(2, 3, height, width, seed=seed) for seed in range(3))
     strength = torch.tensor([0.1, 1.0, 30.0], dtype=torch.float64).view(1, 3, 1, 1)
@@ -182,7 +182,7 @@ def test_transfer_edges_solves_the_linear_system() -> None:
         np.testing.assert_allclose(solved[:, channel].reshape(2, -1).numpy(), expected, atol=1e-12)
 
 
-def test_transfer_edges_does_not_depend_on_the_chunks(monkeypatch) -> None:
+def test_transfer_edges_does_not_depend_on_the_chunks(monkeypatch):
     inputs = [random(2, 5, 4, 6, seed=seed) for seed in range(3)]
     strength = random(1, 5, 1, 1, seed=3).exp()
     whole = transfer_edges(*inputs, strength)
@@ -221,26 +221,26 @@ def convolve_in_loops(x, offsets, mask, weight):
     return result
 
 
-def test_deformable_conv3x3_equals_plain_loops() -> None:
+def test_deformable_conv3x3_equals_plain_loops():
     inputs = make_inputs()
     expected = convolve_in_loops(*(each.numpy() for each in inputs))
     np.testing.assert_allclose(deformable_conv3x3(*inputs).numpy(), expected, atol=1e-12)
 
 
-def test_deformable_conv3x3_without_offsets_is_a_convolution() -> None:
+def test_deformable_conv3x3_without_offsets_is_a_convolution():
     x, offsets, mask, weight = make_inputs(batch=1)
     result = deformable_conv3x3(x, 0 * offsets, torch.ones_like(mask), weight)
     torch.testing.assert_close(result, functional.conv2d(x, weight[0], padding=1))
 
 
-def test_deformable_conv3x3_does_not_depend_on_the_chunks(monkeypatch) -> None:
+def test_deformable_conv3x3_does_not_depend_on_the_chunks(monkeypatch):
     inputs = make_inputs()
     whole = deformable_conv3x3(*inputs)
     monkeypatch.setattr(dornet, "_CHUNK", 1)
     torch.testing.assert_close(deformable_conv3x3(*inputs), whole)
 
 
-def test_dornet_folds_batch_normalisation_into_convolutions_with_and_without_a_bias() -> None:
+def test_dornet_folds_batch_normalisation_into_convolutions_with_and_without_a_bias():
     generator = torch.Generator().manual_seed(0)
     x = torch.randn(1, 24, 8, 8, generator=generator)
     for conv, norm, has_bias in (
@@ -261,6 +261,6 @@ def test_dornet_folds_batch_normalisation_into_convolutions_with_and_without_a_b
         torch.testing.assert_close(folded, expected, atol=1e-4, rtol=1e-4)
 
 
-def test_dornet_has_a_range_of_depth_with_the_weights_for_a_phone_alone() -> None:
+def test_dornet_has_a_range_of_depth_with_the_weights_for_a_phone_alone():
     assert DORNet(8 / 3).depth_range == (0, 5)
     assert DORNet(4).depth_range is None

@@ -1,8 +1,6 @@
 """The readers of the authors' weight files: what they take, and what they refuse without running it."""
 
 import pickle
-from collections.abc import Iterable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +14,7 @@ from dsr.methods.networks.trained import TrainedNetwork, load_msg_weights
 Layer = tuple[str, str, list[Tensor]]
 
 
-def _varint(value: int) -> bytes:
+def _varint(value):
     head = b""
     while value > 0x7F:
         head += bytes([value & 0x7F | 0x80])
@@ -24,11 +22,11 @@ def _varint(value: int) -> bytes:
     return head + bytes([value])
 
 
-def _field(number: int, content: bytes) -> bytes:
+def _field(number, content):
     return _varint(number << 3 | 2) + _varint(len(content)) + content
 
 
-def _blob(values: Tensor, *, packed: bool) -> bytes:
+def _blob(values, *, packed):
     """Return a BlobProto; numbers one after the other, or each with its own key as proto2 writes them by default."""
     floats, sizes = values.numpy().astype("<f4").tobytes(), values.shape
     if packed:
@@ -37,9 +35,9 @@ def _blob(values: Tensor, *, packed: bool) -> bytes:
     return singly + _field(7, b"".join(_varint(1 << 3) + _varint(size) for size in sizes))
 
 
-def _caffe_layers(net: MSGNet) -> list[Layer]:
+def _caffe_layers(net):
     """Return the network's layers as Caffe keeps them: a convolution with two blobs, then a PReLU with one."""
-    layers: list[Layer] = []
+    layers = []
     for name, value in net.state_dict().items():
         layer, part = name.rsplit(".", 1)
         kind = "PReLU" if "activation" in name else "Deconvolution" if ".up." in name else "Convolution"
@@ -50,7 +48,7 @@ def _caffe_layers(net: MSGNet) -> list[Layer]:
     return layers
 
 
-def _caffemodel(layers: Iterable[Layer], *, packed: bool = True) -> bytes:
+def _caffemodel(layers, *, packed=True):
     """Return a NetParameter: its name, an input layer without parameters, a number field, the layers."""
     content = _field(1, b"a test") + _varint(5 << 3) + b"\x01"
     content += _field(100, _field(1, b"data") + _field(2, b"HDF5Data"))
@@ -60,7 +58,7 @@ def _caffemodel(layers: Iterable[Layer], *, packed: bool = True) -> bytes:
     return content
 
 
-def _author_state(net: MSGNet) -> dict[str, Tensor]:
+def _author_state(net):
     """Return the parameters under Voynov et al.'s names at x4, which the network's description lists."""
     names = {
         "guidance.0": "feature_extraction_Y.0",
@@ -83,19 +81,19 @@ def _author_state(net: MSGNet) -> dict[str, Tensor]:
     return state
 
 
-def _write(path: Path, content: bytes) -> Path:
+def _write(path, content):
     path.write_bytes(content)
     return path
 
 
-def _save(path: Path, content: object) -> Path:
+def _save(path, content):
     torch.save(content, path)
     return path
 
 
 @pytest.mark.parametrize("packed", [True, False])
 @pytest.mark.parametrize("scale", [2, 8])
-def test_caffe_model_round_trips_its_parameters(tmp_path: Path, scale: int, packed: bool) -> None:
+def test_caffe_model_round_trips_its_parameters(tmp_path, scale, packed):
     net = MSGNet(scale, "hui")
     path = _write(tmp_path / "net.caffemodel", _caffemodel(_caffe_layers(net), packed=packed))
     loaded = load_msg_weights(path, scale)
@@ -103,7 +101,7 @@ def test_caffe_model_round_trips_its_parameters(tmp_path: Path, scale: int, pack
     torch.testing.assert_close(dict(loaded.state_dict()), dict(net.state_dict()), rtol=0, atol=0)
 
 
-def test_torch_file_round_trips_its_parameters(tmp_path: Path) -> None:
+def test_torch_file_round_trips_its_parameters(tmp_path):
     net = MSGNet(4)
     path, before = _save(tmp_path / "net.pth", {"model_state_dict": _author_state(net)}), torch.get_rng_state()
     loaded = load_msg_weights(path, 4, "voynov")
@@ -112,23 +110,23 @@ def test_torch_file_round_trips_its_parameters(tmp_path: Path) -> None:
     torch.testing.assert_close(dict(loaded.state_dict()), dict(net.state_dict()), rtol=0, atol=0)
 
 
-def test_published_networks_default_to_their_published_settings(tmp_path: Path) -> None:
+def test_published_networks_default_to_their_published_settings(tmp_path):
     path = _save(tmp_path / "net.pth", {"model_state_dict": _author_state(MSGNet(4))})
     assert TrainedNetwork(path, 4, "msg_v", "voynov").ensemble == 1
     assert TrainedNetwork(path, 4, "msg_v", "voynov", ensemble=8).ensemble == 8
 
 
-def _refusal(path: Path, scale: int = 4, variant: str | None = None) -> str:
+def _refusal(path, scale=4, variant=None):
     """Return the message with which the file is refused: one line that names it."""
     with pytest.raises(ValueError, match=r"expected|weights are for") as caught:
-        load_msg_weights(path, scale, variant)  # type: ignore[arg-type]
+        load_msg_weights(path, scale, variant)
     message = str(caught.value)
     assert message.startswith(f"{path}: ")
     assert "\n" not in message
     return message
 
 
-def test_missing_file_and_weights_of_another_scale_are_refused(tmp_path: Path) -> None:
+def test_missing_file_and_weights_of_another_scale_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"nowhere\.pth: no such weights file"):
         load_msg_weights(tmp_path / "nowhere.pth", 4)
     caffe = _write(tmp_path / "net.caffemodel", _caffemodel(_caffe_layers(MSGNet(8, "hui"))))
@@ -137,7 +135,7 @@ def test_missing_file_and_weights_of_another_scale_are_refused(tmp_path: Path) -
     assert "weights are for scale 4, the run is at scale 2" in _refusal(path, 2)
 
 
-def test_code_in_a_file_is_not_run(tmp_path: Path) -> None:
+def test_code_in_a_file_is_not_run(tmp_path):
     mark = tmp_path / "trapped"
     for protocol in (0, 2, 4):
         _refusal(_write(tmp_path / "net.pth", pickle.dumps({"model_state_dict": Trap(mark)}, protocol)))
@@ -146,7 +144,7 @@ def test_code_in_a_file_is_not_run(tmp_path: Path) -> None:
     assert not mark.exists()
 
 
-def test_damaged_and_foreign_files_are_refused(tmp_path: Path) -> None:
+def test_damaged_and_foreign_files_are_refused(tmp_path):
     whole = _save(tmp_path / "whole.pth", {"model_state_dict": _author_state(MSGNet(4))}).read_bytes()
     noise = np.random.default_rng(0).bytes(10_000)
     foreign = (b"", noise, b"\x80" + noise, b"PK\x03\x04" + noise, b"\x89PNG\r\n\x1a\n")
@@ -161,11 +159,11 @@ def test_damaged_and_foreign_files_are_refused(tmp_path: Path) -> None:
     "content",
     [b"\xff" * 11, b"\xa2\x06\xff\xff\xff\xff\x0f\x00", b"\x0b", b"\xa0\x06\x01", _field(1, b"name")],
 )
-def test_what_is_no_protobuf_or_no_network_is_refused(tmp_path: Path, content: bytes) -> None:
+def test_what_is_no_protobuf_or_no_network_is_refused(tmp_path, content):
     assert "expected a torch or Caffe model" in _refusal(_write(tmp_path / "net.caffemodel", content))
 
 
-def test_missing_unexpected_and_misshapen_tensors_are_named(tmp_path: Path) -> None:
+def test_missing_unexpected_and_misshapen_tensors_are_named(tmp_path):
     path, state = tmp_path / "net.pth", _author_state(MSGNet(4))
     bias = state.pop("upsampling_X.5.conv.bias")
     assert "levels.1.refine.conv.bias is missing" in _refusal(_save(path, {"model_state_dict": state}))

@@ -111,7 +111,6 @@ def test_values_of_a_stereo_camera_give_its_constant(constant, step, unit):
     depth = as_stored(constant / disparity, unit)
     depth[:, 100:150] = torch.nan
     found = recognise_values(depth)
-    assert found is not None
     assert found.constant == pytest.approx(constant / step, rel=1e-3)
     assert 0.85 < found.confidence <= 1
 
@@ -146,7 +145,6 @@ def test_values_of_real_cameras_give_their_constants(shared, file, unit, constan
     stored = cv2.imread(str(shared / "real" / file), cv2.IMREAD_UNCHANGED)
     depth = torch.from_numpy(stored.astype(np.float64) * unit)[None].float()
     found = recognise_values(depth.masked_fill(depth == 0, torch.nan))
-    assert found is not None
     assert found.constant == pytest.approx(constant, rel=0.003)
 
 

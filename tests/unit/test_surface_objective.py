@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor
 
 from dsr.degradation.downsampling import Downsampling
 from dsr.geometry.camera import Camera
@@ -13,14 +12,14 @@ from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.network import Answer
 from dsr.metrics.functional import SurfacePair
 from dsr.sample import Scene
-from dsr.training.degradation import Batch, Degradation, to_tensors
+from dsr.training.degradation import Degradation, to_tensors
 from dsr.training.module import SuperResolution
 from dsr.training.objective import SurfaceObjective
 
 CAMERA = Camera(width=16, height=12, fx=20.0, fy=20.0, cx=7.5, cy=5.5, baseline=0.2)
 
 
-def _batch(camera: Camera = CAMERA, *, soft: float = 0.0) -> Batch:
+def _batch(camera=CAMERA, *, soft=0.0):
     """Return a slope, downsampled by 4, without hints."""
     across = torch.linspace(2, 3, camera.width, dtype=torch.float64)
     depth = across.expand(1, camera.height, camera.width).contiguous()
@@ -30,15 +29,15 @@ def _batch(camera: Camera = CAMERA, *, soft: float = 0.0) -> Batch:
     return {name: value[None] for name, value in (tensors | hints).items()}
 
 
-def _answer(batch: Batch, disparity: Tensor, spread: float = 0.1, angle: float = 0.1) -> Answer:
+def _answer(batch, disparity, spread=0.1, angle=0.1):
     return Answer(disparity, torch.full_like(disparity, spread), torch.full_like(disparity, angle))
 
 
-def _inverse(batch: Batch) -> Tensor:
+def _inverse(batch):
     return batch["bf"] / batch["depth"]
 
 
-def test_a_perfect_answer_has_no_loss_but_its_doubts() -> None:
+def test_a_perfect_answer_has_no_loss_but_its_doubts():
     batch = _batch()
     terms = SurfaceObjective()(_answer(batch, _inverse(batch), 0.01, 0.02), batch)
     assert float(terms["lap1"]) == pytest.approx(0, abs=1e-7)
@@ -48,7 +47,7 @@ def test_a_perfect_answer_has_no_loss_but_its_doubts() -> None:
     assert float(terms["angle"]) == pytest.approx(math.log(0.02), rel=1e-6)
 
 
-def test_the_terms_are_added_with_their_weights() -> None:
+def test_the_terms_are_added_with_their_weights():
     batch = _batch(soft=1.0)
     objective = SurfaceObjective(depth=3.0, soft=5.0, sharp=1.5, errors=0.1)
     terms = objective(_answer(batch, 1.02 * _inverse(batch)), batch)
@@ -65,7 +64,7 @@ def test_the_terms_are_added_with_their_weights() -> None:
     assert objective.formula == formula
 
 
-def test_the_likelihood_is_best_where_the_expected_error_is_the_mean_error() -> None:
+def test_the_likelihood_is_best_where_the_expected_error_is_the_mean_error():
     batch = _batch()
     ripple = 1 + 0.01 * torch.sin(torch.arange(16.0, dtype=torch.float64))
     disparity = _inverse(batch) * ripple
@@ -81,7 +80,7 @@ def test_the_likelihood_is_best_where_the_expected_error_is_the_mean_error() -> 
         assert found[1] < min(found[0], found[2]), name
 
 
-def test_holes_of_the_truth_and_results_behind_infinity_count_for_nothing() -> None:
+def test_holes_of_the_truth_and_results_behind_infinity_count_for_nothing():
     batch = _batch(soft=1.0)
     disparity = (1.01 * _inverse(batch)).requires_grad_()
     holes = {**batch, "depth": batch["depth"].clone()}
@@ -92,7 +91,6 @@ def test_holes_of_the_truth_and_results_behind_infinity_count_for_nothing() -> N
     assert all(bool(value.isfinite()) for value in terms.values())
     terms["loss"].backward()
     gradient = disparity.grad
-    assert gradient is not None
     assert bool(gradient.isfinite().all())
     assert not bool(gradient[..., 5:7, 5:7].any())
 
@@ -100,13 +98,13 @@ def test_holes_of_the_truth_and_results_behind_infinity_count_for_nothing() -> N
 class Remembering(FacetsUNet):
     """A small network that remembers the maps that it got."""
 
-    def answer(self, rgb: Tensor, disparity: Tensor, *arguments: Tensor, **others: None) -> Answer:  # type: ignore[override]
+    def answer(self, rgb, disparity, *arguments, **others):
         self.seen = disparity
         return super().answer(rgb, disparity, *arguments, **others)
 
 
 @pytest.mark.parametrize("doffs", [0.0, 3.0])
-def test_networks_of_inverse_depth_get_it_where_disparity_has_an_offset(doffs: float) -> None:
+def test_networks_of_inverse_depth_get_it_where_disparity_has_an_offset(doffs):
     torch.manual_seed(0)
     batch = _batch(replace(CAMERA, doffs=doffs))
     net = Remembering(4, 8, 8, 3)

@@ -1,17 +1,13 @@
 """Files of our own networks' weights: what they give back, and what is refused."""
 
 import json
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from safetensors.torch import save_file
-from torch import Tensor
 
 from dsr.methods.networks.facets import Facets
 from dsr.methods.networks.msg_net import MSGNet
-from dsr.methods.networks.network import DisparityNetwork
 from dsr.methods.networks.sparse_to_dense import SparseToDense
 from dsr.methods.networks.trained import NETWORKS, TrainedNetwork
 from dsr.methods.networks.weight_files import is_dsr_weights, load_network, read_header, save_network
@@ -27,9 +23,9 @@ NETS = {
 
 
 @pytest.mark.parametrize("case", NETS)
-def test_file_restores_the_saved_network(tmp_path: Path, case: str) -> None:
+def test_file_restores_the_saved_network(tmp_path, case):
     net = NETS[case]()
-    net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # as training has it
+    net.to(memory_format=torch.channels_last)  # as training has it
     save_network(tmp_path / "w.safetensors", net, "mine")
     before = torch.get_rng_state()
     loaded = load_network(tmp_path / "w.safetensors", NETWORKS, net.scale, "mine").train(net.training)
@@ -42,7 +38,7 @@ def test_file_restores_the_saved_network(tmp_path: Path, case: str) -> None:
         torch.testing.assert_close(loaded.upsample(rgb, disparity), net.upsample(rgb, disparity), rtol=1e-4, atol=1e-5)
 
 
-def test_half_precision_halves_the_kernels_and_is_loaded_as_float32(tmp_path: Path) -> None:
+def test_half_precision_halves_the_kernels_and_is_loaded_as_float32(tmp_path):
     net = SparseToDense(4, width=16).eval()
     save_network(tmp_path / "whole", net, "mine")
     save_network(tmp_path / "half", net, "mine", half=True)
@@ -54,7 +50,7 @@ def test_half_precision_halves_the_kernels_and_is_loaded_as_float32(tmp_path: Pa
         assert torch.equal(loaded[name], expected), name
 
 
-def test_equal_networks_give_equal_bytes_and_the_facts_are_restored(tmp_path: Path) -> None:
+def test_equal_networks_give_equal_bytes_and_the_facts_are_restored(tmp_path):
     net, facts = MSGNet(4, "dsr"), {"steps": 12, "loss": "lap1", "nested": {"b": 1, "a": [2]}}
     for name in ("a", "b"):
         save_network(tmp_path / name, net, "msg_v", facts)
@@ -64,7 +60,7 @@ def test_equal_networks_give_equal_bytes_and_the_facts_are_restored(tmp_path: Pa
     assert (head["network"], head["model"], head["arguments"]) == ("MSGNet", "msg_v", {"scale": 4, "variant": "dsr"})
 
 
-def test_file_is_distinguished_from_a_published_one_by_its_content(tmp_path: Path) -> None:
+def test_file_is_distinguished_from_a_published_one_by_its_content(tmp_path):
     save_network(tmp_path / "w.pth", MSGNet(4, "dsr"), "msg_v")
     torch.save({"model_state_dict": {}}, tmp_path / "w.caffemodel")
     assert is_dsr_weights(tmp_path / "w.pth")
@@ -74,13 +70,13 @@ def test_file_is_distinguished_from_a_published_one_by_its_content(tmp_path: Pat
         TrainedNetwork(tmp_path / "w.caffemodel", 4, "msg_v", "voynov")
 
 
-def test_trained_networks_default_to_averaging_over_quarter_turns(tmp_path: Path) -> None:
+def test_trained_networks_default_to_averaging_over_quarter_turns(tmp_path):
     save_network(tmp_path / "w", MSGNet(2, "dsr"), "msg_v")
     assert TrainedNetwork(tmp_path / "w", 2, "msg_v", "voynov").ensemble == 4
     assert TrainedNetwork(tmp_path / "w", 2, "msg_v", "voynov", ensemble=1).ensemble == 1
 
 
-def _file(path: Path, changes: dict[str, Any] | None = None, tensors: dict[str, Tensor] | None = None) -> Path:
+def _file(path, changes=None, tensors=None):
     """Write a file like ours with some facts other, and perhaps other tensors."""
     head = {"format": "dsr-network-1", "network": "MSGNet", "arguments": {"scale": 4, "variant": "dsr"}}
     head |= {"model": "msg_v", "facts": {}, **(changes or {})}
@@ -89,7 +85,7 @@ def _file(path: Path, changes: dict[str, Any] | None = None, tensors: dict[str, 
     return path
 
 
-def _refusal(path: Path, scale: int | None = 4, model: str | None = None) -> str:
+def _refusal(path, scale=4, model=None):
     """Return the message with which the file is refused: one line that names it."""
     with pytest.raises(ValueError, match=r"expected|weights are for") as caught:
         load_network(path, NETWORKS, scale, model)
@@ -99,7 +95,7 @@ def _refusal(path: Path, scale: int | None = 4, model: str | None = None) -> str
     return message.removeprefix(f"{path}: ")
 
 
-def test_missing_file_and_weights_of_another_model_or_scale_are_refused(tmp_path: Path) -> None:
+def test_missing_file_and_weights_of_another_model_or_scale_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"nowhere: no such weights file"):
         load_network(tmp_path / "nowhere", NETWORKS)
     path = _file(tmp_path / "w")
@@ -109,7 +105,7 @@ def test_missing_file_and_weights_of_another_model_or_scale_are_refused(tmp_path
         TrainedNetwork(path, 4, "facets")
 
 
-def test_file_truncated_or_changed_anywhere_is_refused(tmp_path: Path) -> None:
+def test_file_truncated_or_changed_anywhere_is_refused(tmp_path):
     path = _file(tmp_path / "w")
     whole = path.read_bytes()
     header = 8 + int.from_bytes(whole[:8], "little")
@@ -133,13 +129,13 @@ def test_file_truncated_or_changed_anywhere_is_refused(tmp_path: Path) -> None:
         ({"arguments": [4]}, "expected one of the networks MSGNet, "),
     ],
 )
-def test_foreign_header_is_refused(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+def test_foreign_header_is_refused(tmp_path, changes, message):
     assert _refusal(_file(tmp_path / "w", changes)).startswith(message)
     save_file({"a": torch.ones(2)}, tmp_path / "w")
     assert _refusal(tmp_path / "w").startswith("expected weights that train.py wrote")
 
 
-def test_other_tensors_are_refused(tmp_path: Path) -> None:
+def test_other_tensors_are_refused(tmp_path):
     state = {**MSGNet(4, "dsr").state_dict()}
     bias = state.pop("smooth.conv.bias")
     assert "but smooth.conv.bias is missing" in _refusal(_file(tmp_path / "w", tensors=state))
@@ -149,12 +145,11 @@ def test_other_tensors_are_refused(tmp_path: Path) -> None:
     assert "smooth.conv.bias holds values other than finite" in _refusal(_file(tmp_path / "w", tensors=state))
 
 
-def test_packaged_files_load_as_the_model_and_scale_of_their_names() -> None:
+def test_packaged_files_load_as_the_model_and_scale_of_their_names():
     for name in packaged_names():
         path = packaged_weights(name)
-        assert path is not None
         model, _, rest = name.partition("_x")
-        net: DisparityNetwork = load_network(path, NETWORKS, int(rest.split("_")[0]), model)
+        net = load_network(path, NETWORKS, int(rest.split("_")[0]), model)
         assert net.covers
         assert read_header(path)["facts"]["steps"] > 0
     assert packaged_weights("msg_v_x3") is None

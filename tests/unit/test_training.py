@@ -5,8 +5,6 @@ import functools
 import math
 import re
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import lightning
 import numpy as np
@@ -17,7 +15,6 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from small_lpips import random_lpips
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.custom_scalar import layout_pb2
-from torch import Tensor
 from torch.utils.data import DataLoader
 
 from dsr.degradation.downsampling import Downsampling, make_sample
@@ -31,11 +28,10 @@ from dsr.methods.recipe import read_recipe
 from dsr.metrics import functional as scores
 from dsr.metrics.classes import visual_metrics
 from dsr.metrics.functional import SurfacePair
-from dsr.metrics.lpips import LPIPS
 from dsr.sample import CENTIMETRES, Scene, Unit
 from dsr.training.callbacks import log_layout
 from dsr.training.data_module import WholeScenes
-from dsr.training.degradation import Batch, Degradation, to_tensors
+from dsr.training.degradation import Degradation, to_tensors
 from dsr.training.module import SuperResolution, WarmupCosine
 from dsr.training.objective import DepthObjective, SurfaceObjective, balance_weight, shading_loss, to_depth
 from dsr.training.patches import Patches
@@ -54,11 +50,11 @@ pytestmark = [
 ]
 
 
-def _four(value: float) -> Tensor:
+def _four(value):
     return torch.full((1, 1, 1, 1), value, dtype=torch.float64)
 
 
-def _batch(depth: Tensor, camera: Camera, coarse: tuple[float, float]) -> Batch:
+def _batch(depth, camera, coarse):
     """Return a batch of one map whose low-resolution disparities span ``coarse``."""
     return {
         "depth": depth[None],
@@ -72,18 +68,18 @@ def _batch(depth: Tensor, camera: Camera, coarse: tuple[float, float]) -> Batch:
 STEREO = Camera(width=13, height=12, fx=20.0, fy=25.0, cx=4.0, cy=7.0, baseline=0.5, doffs=1.0)
 
 
-def _wall() -> Batch:
+def _wall():
     """Return a wall at 2 m whose disparity is 0.5 * 20 / 2 - 1 = 4 pixels, of low-resolution ones from 3 to 5."""
     return _batch(torch.full((1, 12, 13), 2.0, dtype=torch.float64), STEREO, (3.0, 5.0))
 
 
-def _ramp(slope: float, height: float = 4.0) -> Tensor:
+def _ramp(slope, height=4.0):
     """Return a disparity that grows by ``slope`` per column."""
     return (height + slope * torch.arange(13, dtype=torch.float64)).expand(1, 1, 12, 13)
 
 
 @pytest.mark.parametrize("depth_loss", ["lap1", "l1", "mse"])
-def test_loss_is_zero_at_the_truth(depth_loss: Any) -> None:
+def test_loss_is_zero_at_the_truth(depth_loss):
     depth = torch.from_numpy(np.random.default_rng(0).uniform(1, 3, (1, 12, 13)))
     batch = _batch(depth, STEREO, (3.0, 5.0))
     terms = DepthObjective(depth_loss, 2.0)(Answer(0.5 * 20 / depth[None] - 1), batch)
@@ -92,14 +88,14 @@ def test_loss_is_zero_at_the_truth(depth_loss: Any) -> None:
 
 
 @pytest.mark.parametrize(("depth_loss", "expected"), [("l1", 0.25), ("lap1", 0.25), ("mse", 0.0625)])
-def test_offset_counts_as_its_fraction_of_the_low_resolution_range(depth_loss: Any, expected: float) -> None:
+def test_offset_counts_as_its_fraction_of_the_low_resolution_range(depth_loss, expected):
     terms = DepthObjective(depth_loss, 3.0)(Answer(torch.full((1, 1, 12, 13), 4.5, dtype=torch.float64)), _wall())
     assert float(terms[depth_loss]) == pytest.approx(expected, rel=1e-13)
     assert float(terms["mse_v"]) == pytest.approx(0, abs=1e-25)  # a wall elsewhere looks the same
     assert float(terms["loss"]) == pytest.approx(expected, rel=1e-13)
 
 
-def test_visual_term_is_that_of_the_angle_between_two_planes() -> None:
+def test_visual_term_is_that_of_the_angle_between_two_planes():
     """d + doffs = a u + b is the plane a fx X + (a cx + b) Z = baseline fx; the wall's normal is the optical axis."""
     slope = 0.3
     along, axis = slope * 20, slope * 4 + 5
@@ -110,14 +106,14 @@ def test_visual_term_is_that_of_the_angle_between_two_planes() -> None:
     assert float(terms["loss"]) == pytest.approx(slope * 3 + 0.5 * expected, rel=1e-12)
 
 
-def test_intermediate_stages_get_the_depth_loss_too() -> None:
+def test_intermediate_stages_get_the_depth_loss_too():
     terms = DepthObjective("l1", 2.0)(Answer(_ramp(0, 4.0), stages=(_ramp(0, 4.5), _ramp(0, 6.0))), _wall())
     assert {name: float(value) for name, value in terms.items()} == pytest.approx(
         {"loss": 1.25, "l1": 0, "l1_stage1": 0.25, "l1_stage2": 1.0, "mse_v": 0}, abs=1e-13
     )
 
 
-def test_shading_term_is_that_of_the_surface_and_the_photo() -> None:
+def test_shading_term_is_that_of_the_surface_and_the_photo():
     batch = {**_wall(), "rgb": torch.rand((1, 3, 12, 13), generator=torch.Generator().manual_seed(0)).double()}
     disparity = _ramp(0.3)
     expected = shading_loss(SurfacePair(to_depth(disparity, batch), batch["depth"], batch["rays"]), batch["rgb"])
@@ -127,13 +123,13 @@ def test_shading_term_is_that_of_the_surface_and_the_photo() -> None:
     assert float(terms["loss"]) == pytest.approx(float(terms["l1"]) + 0.5 * float(expected), rel=1e-12)
 
 
-def test_flat_low_resolution_map_has_a_nonzero_range() -> None:
+def test_flat_low_resolution_map_has_a_nonzero_range():
     batch = {**_wall(), "disparity_lr": torch.full((1, 1, 1, 2), 4.0, dtype=torch.float64)}
     terms = DepthObjective("l1")(Answer(_ramp(0, 4.001)), batch)
     assert float(terms["loss"]) == pytest.approx(0.001 / 0.004, rel=1e-9)
 
 
-def test_holes_of_the_low_resolution_map_do_not_widen_its_range() -> None:
+def test_holes_of_the_low_resolution_map_do_not_widen_its_range():
     batch = _wall()
     batch["disparity_lr"] = torch.tensor([3.0, torch.nan, 5.0], dtype=torch.float64).view(1, 1, 1, 3)
     assert float(DepthObjective("l1")(Answer(_ramp(0, 4.5)), batch)["loss"]) == pytest.approx(0.25, rel=1e-13)
@@ -147,12 +143,12 @@ def test_holes_of_the_low_resolution_map_do_not_widen_its_range() -> None:
         ({"depth_loss": "ssim"}, "depth_loss: expected one of lap1, l1, mse, got 'ssim'"),
     ],
 )
-def test_setting_of_the_loss_out_of_range_is_refused(wrong: dict[str, Any], message: str) -> None:
+def test_setting_of_the_loss_out_of_range_is_refused(wrong, message):
     with pytest.raises(ValueError, match=f"^{message}"):
         DepthObjective(**wrong)
 
 
-def test_disparity_at_or_beyond_infinity_has_no_depth() -> None:
+def test_disparity_at_or_beyond_infinity_has_no_depth():
     disparity = torch.tensor([[[[-1.5, -1.0, -0.5]]]], dtype=torch.float64)
     assert to_depth(disparity, _wall())[0, 0, 0].isnan().tolist() == [True, True, False]
     assert to_depth(disparity, _wall())[0, 0, 0, 2] == pytest.approx(20)
@@ -161,7 +157,7 @@ def test_disparity_at_or_beyond_infinity_has_no_depth() -> None:
 # The balanced weight
 
 
-def _plane(baseline: float | None = None, doffs: float = 0.0, slope: float = 0.02, fx: float = 80.0) -> Batch:
+def _plane(baseline=None, doffs=0.0, slope=0.02, fx=80.0):
     """Return the tensors of the plane with d + doffs = slope u + 3, 100 columns wide."""
     camera = Camera(width=100, height=4, fx=fx, fy=70.0, cx=40.0, cy=2.0, baseline=baseline, doffs=doffs)
     depth = (baseline or 0.2) * fx / (3 + slope * torch.arange(100, dtype=torch.float64)).expand(1, 4, 100)
@@ -171,7 +167,7 @@ def _plane(baseline: float | None = None, doffs: float = 0.0, slope: float = 0.0
 
 
 @pytest.mark.parametrize(("baseline", "doffs", "fx"), [(None, 0.0, 80.0), (0.12, 0.0, 80.0), (0.12, 1.5, 123.0)])
-def test_balanced_weight_of_a_plane_is_its_closed_form(baseline: float | None, doffs: float, fx: float) -> None:
+def test_balanced_weight_of_a_plane_is_its_closed_form(baseline, doffs, fx):
     stereo = (baseline or 0.2) * fx
     middle, spread = stereo / (3 + 0.02 * 50), 0.02 * 96  # the median's column; coarse centres from 1.5 to 97.5
     tilt = math.asin(5 / 255)
@@ -180,7 +176,7 @@ def test_balanced_weight_of_a_plane_is_its_closed_form(baseline: float | None, d
     assert balance_weight([_plane(baseline, doffs, fx=fx)]) == pytest.approx(expected, rel=2e-6)
 
 
-def test_balanced_weight_balances_a_tilt_between_neighbours() -> None:
+def test_balanced_weight_balances_a_tilt_between_neighbours():
     """On a wall whose every second column stands out by tan(1.1 degrees) of a pixel's width, both terms weigh alike."""
     camera = Camera(width=100, height=16, fx=80.0, fy=80.0, cx=49.5, cy=7.5)
     wall = torch.full((1, 16, 100), 2.0, dtype=torch.float64)
@@ -195,12 +191,12 @@ def test_balanced_weight_balances_a_tilt_between_neighbours() -> None:
     assert float(2 * terms["l1"]) == pytest.approx(float(w * terms["mse_v"]), rel=0.05)
 
 
-def test_balanced_weight_is_the_median_over_the_patches() -> None:
+def test_balanced_weight_is_the_median_over_the_patches():
     patches = [_plane(slope=slope) for slope in (0.01, 0.05, 0.03)]
     assert balance_weight(patches) == balance_weight(patches[2:])
 
 
-def test_balanced_weight_of_nothing_is_refused() -> None:
+def test_balanced_weight_of_nothing_is_refused():
     with pytest.raises(ValueError, match=r"^patches: expected one or more to compute w from, got none"):
         balance_weight([])
 
@@ -208,7 +204,7 @@ def test_balanced_weight_of_nothing_is_refused() -> None:
 # The schedule
 
 
-def _rates(steps: int, warmup: int, count: int) -> list[float]:
+def _rates(steps, warmup, count):
     """Return the learning rates of a schedule as fractions of the highest."""
     optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=1.0)
     schedule, rates = WarmupCosine(optimizer, steps, warmup), []
@@ -219,7 +215,7 @@ def _rates(steps: int, warmup: int, count: int) -> list[float]:
     return rates
 
 
-def test_learning_rate_warms_up_linearly_and_falls_as_a_cosine_to_zero() -> None:
+def test_learning_rate_warms_up_linearly_and_falls_as_a_cosine_to_zero():
     rates = _rates(20, 4, 26)
     assert rates[:5] == pytest.approx([0.25, 0.5, 0.75, 1, 1])
     assert rates[12] == pytest.approx(0.5)  # halfway down
@@ -227,7 +223,7 @@ def test_learning_rate_warms_up_linearly_and_falls_as_a_cosine_to_zero() -> None
     assert rates[20] == rates[25] == pytest.approx(0, abs=1e-15)
 
 
-def test_negative_warm_up_is_refused() -> None:
+def test_negative_warm_up_is_refused():
     with pytest.raises(ValueError, match=r"^warmup: expected 0 or more, got -1"):
         _rates(10, -1, 1)
 
@@ -235,7 +231,7 @@ def test_negative_warm_up_is_refused() -> None:
 # The module
 
 
-def _scene(seed: int, holes: float = 0.0) -> Scene:
+def _scene(seed, holes=0.0):
     """Return a wavy surface with a photo that shows its waves."""
     random = np.random.default_rng(seed)
     v, u = np.mgrid[:36, :40]
@@ -246,14 +242,14 @@ def _scene(seed: int, holes: float = 0.0) -> Scene:
     return Scene("set", f"s{seed}", rgb, CAMERA, depth)
 
 
-def _module(network: LPIPS | None = None, *, scale: int = 2, **settings: Any) -> SuperResolution:
+def _module(network=None, *, scale=2, **settings):
     torch.manual_seed(0)
     metrics = functools.partial(visual_metrics, network)
     return SuperResolution(MSGNet(scale, "dsr"), DepthObjective("lap1", 0.1), metrics=metrics, **settings)
 
 
-def _trainer(folder: Path, **settings: Any) -> lightning.Trainer:
-    quiet: dict[str, Any] = dict.fromkeys(("logger", "enable_progress_bar", "enable_model_summary"), False)
+def _trainer(folder, **settings):
+    quiet = dict.fromkeys(("logger", "enable_progress_bar", "enable_model_summary"), False)
     return lightning.Trainer(
         accelerator="cpu", default_root_dir=folder, enable_checkpointing=False, **{**quiet, **settings}
     )
@@ -262,20 +258,20 @@ def _trainer(folder: Path, **settings: Any) -> lightning.Trainer:
 class _Losses(Callback):
     """What every training step returned."""
 
-    def __init__(self) -> None:
-        self.values: list[float] = []
+    def __init__(self):
+        self.values = []
 
-    def on_train_batch_end(self, trainer: Any, pl_module: Any, outputs: Any, *_: Any) -> None:
+    def on_train_batch_end(self, trainer, pl_module, outputs, *_):
         self.values.append(float(outputs["loss"]))
 
 
-def _one_batch() -> DataLoader[Batch]:
+def _one_batch():
     patches = Patches([[_scene(0), _scene(1)]], PatchSettings(patch=32, batch=2), X2)
-    return DataLoader([patches[0], patches[1]], batch_size=2)  # type: ignore[arg-type]
+    return DataLoader([patches[0], patches[1]], batch_size=2)
 
 
 @pytest.mark.parametrize("mixed", [False, True])
-def test_training_loss_is_the_objective_of_the_networks_output_in_full_precision(tmp_path: Path, mixed: bool) -> None:
+def test_training_loss_is_the_objective_of_the_networks_output_in_full_precision(tmp_path, mixed):
     losses, module = _Losses(), _module()
     [batch] = _one_batch()
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=mixed):
@@ -286,11 +282,11 @@ def test_training_loss_is_the_objective_of_the_networks_output_in_full_precision
     assert losses.values == pytest.approx([expected], rel=2e-5)
 
 
-def test_weight_average_follows_the_weights_with_its_decay(tmp_path: Path) -> None:
-    seen: list[Tensor] = []
+def test_weight_average_follows_the_weights_with_its_decay(tmp_path):
+    seen = []
 
     class _Watch(Callback):
-        def on_train_batch_end(self, trainer: Any, pl_module: Any, *_: Any) -> None:
+        def on_train_batch_end(self, trainer, pl_module, *_):
             seen.append(pl_module.net.stem.conv.weight.detach().clone())
 
     module = _module(average=0.3)
@@ -305,7 +301,7 @@ def test_weight_average_follows_the_weights_with_its_decay(tmp_path: Path) -> No
     assert not any(parameter.requires_grad for parameter in module.average.parameters())
 
 
-def test_average_has_the_statistics_of_batch_normalisation(tmp_path: Path) -> None:
+def test_average_has_the_statistics_of_batch_normalisation(tmp_path):
     torch.manual_seed(0)
     module = SuperResolution(SparseToDense(2, width=8), DepthObjective("l1"))  # with 4, torch crashes where AVX2 is all
     _trainer(tmp_path, max_epochs=2).fit(module, _one_batch())
@@ -313,7 +309,7 @@ def test_average_has_the_statistics_of_batch_normalisation(tmp_path: Path) -> No
     assert all(bool(mean.any()) for name, mean in module.average.named_buffers() if name.endswith("mean"))
 
 
-def test_gradients_add_up_over_accumulated_batches(tmp_path: Path) -> None:
+def test_gradients_add_up_over_accumulated_batches(tmp_path):
     module = _module()
     before = module.average.stem.conv.weight.clone()
     trainer = _trainer(tmp_path, max_epochs=3, accumulate_grad_batches=3)  # one batch an epoch: a step per epoch's end
@@ -330,14 +326,12 @@ def test_gradients_add_up_over_accumulated_batches(tmp_path: Path) -> None:
         ({"gradient_clip_val": 1e-3, "gradient_clip_algorithm": "value"}, "value"),
     ],
 )
-def test_gradient_is_clipped_as_the_trainer_says_and_its_norm_logged(
-    clipping: dict[str, Any], largest: str | None, tmp_path: Path
-) -> None:
-    grads: list[Tensor] = []
-    logged: list[float] = []
+def test_gradient_is_clipped_as_the_trainer_says_and_its_norm_logged(clipping, largest, tmp_path):
+    grads = []
+    logged = []
 
     class _Gradient(Callback):
-        def on_before_zero_grad(self, trainer: Any, pl_module: Any, *_: Any) -> None:
+        def on_before_zero_grad(self, trainer, pl_module, *_):
             each = [p.grad.flatten() for p in pl_module.net.parameters() if p.grad is not None]
             if each:  # of the step before
                 grads.append(torch.cat(each))
@@ -354,7 +348,7 @@ def test_gradient_is_clipped_as_the_trainer_says_and_its_norm_logged(
 
 
 @pytest.mark.parametrize("fused", [False, True])
-def test_non_finite_gradient_changes_nothing(tmp_path: Path, fused: bool) -> None:
+def test_non_finite_gradient_changes_nothing(tmp_path, fused):
     module = _module(optimizer=functools.partial(torch.optim.AdamW, weight_decay=0.1, fused=fused))
     before = copy.deepcopy(module.net.state_dict())
     [batch] = _one_batch()
@@ -367,16 +361,16 @@ def test_non_finite_gradient_changes_nothing(tmp_path: Path, fused: bool) -> Non
 
 
 @pytest.mark.parametrize("average", [1.0, math.nan])
-def test_invalid_average_is_refused(average: float) -> None:
+def test_invalid_average_is_refused(average):
     with pytest.raises(ValueError, match=r"^average: expected "):
         _module(average=average)
 
 
-def _loader(scenes: WholeScenes) -> DataLoader[Batch]:
+def _loader(scenes):
     return DataLoader(scenes, batch_size=None)
 
 
-def test_validation_is_in_the_unit_of_its_benchmark(tmp_path: Path) -> None:
+def test_validation_is_in_the_unit_of_its_benchmark(tmp_path):
     levels = Unit("levels", inverse=True, factor=8.0, limits=(0, 255))
     module = SuperResolution(
         MSGNet(2, "dsr"),
@@ -393,12 +387,12 @@ def test_validation_is_in_the_unit_of_its_benchmark(tmp_path: Path) -> None:
     assert in_levels["val/RMSE_levels"] == in_levels["val_a/RMSE_levels"] > 0
 
 
-def test_validation_logs_the_mean_over_the_scenes_in_the_units_of_tables(tmp_path: Path) -> None:
+def test_validation_logs_the_mean_over_the_scenes_in_the_units_of_tables(tmp_path):
     module, scenes = _module(), WholeScenes([_scene(3), _scene(4, holes=0.05), _scene(5)], X2)
     trainer = _trainer(tmp_path, precision="bf16-mixed")  # of the training alone
     [logged] = trainer.validate(module, _loader(scenes), verbose=False)
     factors = {"RMSE_d": 1000, "RMSE_v": 1000, "RMSE_v1": 1000, "DSSIM_v": 1000, "BadPix_v_5": 100, "Bumpiness_d": 1}
-    values: dict[str, list[float]] = {name: [] for name in factors}
+    values = {name: [] for name in factors}
     for i in range(3):
         batch = scenes[i]
         with torch.no_grad():
@@ -416,7 +410,7 @@ def test_validation_logs_the_mean_over_the_scenes_in_the_units_of_tables(tmp_pat
         assert module.validation_scores["val"][name] == pytest.approx(np.mean(each), rel=1e-4), name
 
 
-def test_a_network_that_takes_hints_is_validated_as_it_is_evaluated(tmp_path: Path) -> None:
+def test_a_network_that_takes_hints_is_validated_as_it_is_evaluated(tmp_path):
     """That is, the kernel, sharp steps, and that there is no noise."""
     torch.manual_seed(0)
     net = FacetsUNet(2, 8, 8, 4)
@@ -426,24 +420,22 @@ def test_a_network_that_takes_hints_is_validated_as_it_is_evaluated(tmp_path: Pa
     module = SuperResolution(copy.deepcopy(net), SurfaceObjective(), validation_sets=("a",))
     [logged] = _trainer(tmp_path).validate(module, _loader(WholeScenes([_scene(3)], X2, hinted=True)), verbose=False)
     sample = X2.sample(_scene(3))
-    assert sample.depth is not None
 
-    def rmse(**hinted: Any) -> float:
+    def rmse(**hinted):
         depth = AnyMap(net.eval(), **hinted)(sample)
-        return float(scores.rmse_v(SurfacePair(depth[None], sample.depth[None], CAMERA.rays()[None])))  # type: ignore[index]
+        return float(scores.rmse_v(SurfacePair(depth[None], sample.depth[None], CAMERA.rays()[None])))
 
     assert logged["val/RMSE_v"] == pytest.approx(1000 * rmse(kernel="box", edges="sharp", clean=True), rel=1e-4)
     assert logged["val/RMSE_v"] != pytest.approx(1000 * rmse(), rel=1e-3)
 
 
-def test_validation_scores_bicubic_interpolation_of_the_same_maps_as_the_method_does(tmp_path: Path) -> None:
+def test_validation_scores_bicubic_interpolation_of_the_same_maps_as_the_method_does(tmp_path):
     scenes = [_scene(3), _scene(4, holes=0.05)]
     module = _module()
     [logged] = _trainer(tmp_path).validate(module, _loader(WholeScenes(scenes, X2)), verbose=False)
     method, expected = read_recipe("bicubic").build(2), []
     for scene in scenes:
         sample = X2.sample(scene)
-        assert sample.depth is not None
         pair = SurfacePair(method(sample)[None].double(), sample.depth[None].double(), CAMERA.rays()[None])
         expected.append((float(scores.rmse_v(pair)), float(scores.rmse_d(pair))))
     found = logged["bicubic/RMSE_v"], logged["bicubic/RMSE_d"]
@@ -451,7 +443,7 @@ def test_validation_scores_bicubic_interpolation_of_the_same_maps_as_the_method_
     assert module.validation_scores.keys() == {"val", "bicubic"}
 
 
-def test_validation_starts_anew_each_time(tmp_path: Path) -> None:
+def test_validation_starts_anew_each_time(tmp_path):
     module, trainer = _module(), _trainer(tmp_path)
     first, other = (_loader(WholeScenes([_scene(seed)], X2)) for seed in (3, 4))
     [before] = trainer.validate(module, first, verbose=False)
@@ -460,7 +452,7 @@ def test_validation_starts_anew_each_time(tmp_path: Path) -> None:
     assert before == after != between
 
 
-def test_checkpoint_holds_the_networks_tensors_alone_and_loads_as_plain_data(tmp_path: Path) -> None:
+def test_checkpoint_holds_the_networks_tensors_alone_and_loads_as_plain_data(tmp_path):
     module, trainer = _module(random_lpips()), _trainer(tmp_path, max_steps=1)
     loader = _loader(WholeScenes([_scene(3)], X2))
     trainer.fit(module, _one_batch(), loader)
@@ -474,12 +466,12 @@ def test_checkpoint_holds_the_networks_tensors_alone_and_loads_as_plain_data(tmp
     assert (tmp_path / "a.ckpt").stat().st_size < 4 * 4 * size + 200_000  # weights, their average, AdamW's two moments
 
 
-def test_network_that_leaves_out_pixels_is_refused() -> None:
+def test_network_that_leaves_out_pixels_is_refused():
     with pytest.raises(ValueError, match=r"model: expected a network that covers the whole image"):
         SuperResolution(MSGNet(4, "hui"), DepthObjective())
 
 
-def test_layout_of_tensorboard_begins_with_looks(tmp_path: Path) -> None:
+def test_layout_of_tensorboard_begins_with_looks(tmp_path):
     logger = TensorBoardLogger(tmp_path, name=None, version="tensorboard")
     names = ("BadPix_v_5", "RMSE_d", "LPIPS_v", "RMSE_v1", "DSSIM_v", "RMSE_v")
     log_layout(logger, {name: f"{name}, title" for name in names})
