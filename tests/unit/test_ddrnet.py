@@ -59,8 +59,3 @@ def test_photo_counts_by_its_luma() -> None:
     net, values, rgb = _net(), maps(6, 7), photos(24, 28)
     grey = (0.299 * rgb[:, :1] + 0.587 * rgb[:, 1:2] + 0.114 * rgb[:, 2:]).expand(-1, 3, -1, -1)
     torch.testing.assert_close(net.upsample(grey, values), net.upsample(rgb, values), rtol=1e-6, atol=0)
-
-
-def test_sizes_that_do_not_halve_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"^model: expected denoising of at least 1 and refinement a positive"):
-        DDRNet(4, refinement=6)

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from small_scenes import maps, photos, plane_map
-from torch import Tensor
+from small_scenes import maps, photos
 from torch.nn import functional
 
 from dsr.methods.images import box_mean, repeat_blocks, upsample_linear_border
@@ -15,8 +14,6 @@ from dsr.methods.networks.dynamic_guidance import (
     influence,
     polynomial_filters,
 )
-
-SCALES = (2, 4, 8, 16)
 
 
 def _net(scale=4, *, stages=2, filters=5, size=5, noise=0.2):
@@ -98,32 +95,15 @@ def test_stage_equals_plain_loops():
     np.testing.assert_allclose(result, expected, rtol=0, atol=1e-12)
 
 
-def test_gradients_reach_every_parameter_and_agree_with_finite_differences():
+def test_gradients_agree_with_finite_differences():
     net = _net(2, filters=2, size=3).double().requires_grad_()
     rgb, coarse = photos(8, 6).double(), maps(4, 3) / 30
     names, parameters = zip(*net.named_parameters(), strict=True)
 
     def answer(*values):
-        result = torch.func.functional_call(net, dict(zip(names, values, strict=True)), (rgb, coarse))
-        return result if isinstance(result, Tensor) else torch.empty(0)
+        return torch.func.functional_call(net, dict(zip(names, values, strict=True)), (rgb, coarse))
 
-    answer(*parameters).square().mean().backward()
-    assert all(parameter.grad is not None and bool((parameter.grad != 0).any()) for parameter in parameters)
     assert torch.autograd.gradcheck(answer, parameters, eps=1e-7, atol=1e-4, fast_mode=True)
-
-
-@pytest.mark.parametrize("scale", SCALES)
-def test_plane_is_reproduced_for_any_weights_and_photo(scale):
-    fine = plane_map(5 * scale, 6 * scale)
-    net, rgb, coarse = _net(scale), photos(5 * scale, 6 * scale), functional.avg_pool2d(fine, scale)
-    torch.testing.assert_close(net.upsample(rgb, coarse), fine, rtol=0, atol=1e-5 * float(fine.max() - fine.min()))
-    torch.testing.assert_close(net.double().upsample(rgb, coarse), fine, rtol=0, atol=1e-12 * 30 * scale)
-
-
-def test_plane_is_reproduced_with_half_precision_weights():
-    fine = plane_map(24, 28)
-    result = _net().bfloat16().upsample(photos(24, 28), functional.avg_pool2d(fine, 4))
-    torch.testing.assert_close(result, fine, rtol=0, atol=1e-4)
 
 
 def test_mixed_precision_training_computes_in_float32():

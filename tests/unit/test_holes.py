@@ -1,4 +1,4 @@
-"""Holes of low-resolution maps."""
+"""Holes of low-resolution maps: how they are made, their width, and the distance to known pixels."""
 
 import pytest
 import torch
@@ -7,6 +7,7 @@ from dsr.degradation.downsampling import Downsampling, Measured, make_sample
 from dsr.degradation.holes import Blobs, Shadows
 from dsr.degradation.noise import GaussianMultiplicative
 from dsr.geometry.camera import Camera
+from dsr.geometry.hole_size import distance_to_known, wide_holes
 from dsr.sample import Scene
 
 CAMERA = Camera(width=40, height=30, fx=50.0, fy=50.0, cx=19.5, cy=14.5)
@@ -57,13 +58,6 @@ def test_plane_with_missing_parts_has_no_shadows():
     assert not bool(Shadows(0.1)(slope, CAMERA, _generator()).any())
 
 
-@pytest.mark.parametrize("make", [lambda: Blobs(0.0), lambda: Blobs(1.0), lambda: Blobs(0.1, 0.5), lambda: Shadows(0.0),
-                                  lambda: Shadows(float("nan"))])  # fmt: skip
-def test_values_out_of_range_are_refused(make):
-    with pytest.raises(ValueError, match=r"^(share|size|baseline): expected"):
-        make()
-
-
 def test_sample_with_holes_has_the_same_values_elsewhere():
     depth = 2 + torch.rand(1, 32, 40)
     scene = Scene("set", "hall", torch.rand(3, 32, 40), CAMERA.crop(0, 0, 30, 40).rescale(40, 32), depth)
@@ -83,3 +77,43 @@ def test_measured_map_gets_holes_too():
     sample = make_sample(scene, 4, Measured(), "orthogonal", holes=Blobs(0.25, 3))
     assert int(sample.depth_lr.isnan().sum()) == 20
     assert not bool(coarse.isnan().any())
+
+
+def test_distance_is_that_of_the_nearest_known_pixel():
+    known = torch.rand((1, 23, 31), generator=torch.Generator().manual_seed(0)) < 0.05
+    rows, columns = torch.meshgrid(torch.arange(23.0), torch.arange(31.0), indexing="ij")
+    y, x = known[0].nonzero().T
+    expected = torch.hypot(rows[..., None] - y, columns[..., None] - x).amin(-1)
+    torch.testing.assert_close(distance_to_known(known)[0], expected, rtol=1e-4, atol=1e-4)
+
+
+def test_without_known_pixels_the_distance_is_infinite():
+    known = torch.zeros((1, 4, 5), dtype=torch.bool)
+    assert bool(distance_to_known(known).isinf().all())
+    assert bool(wide_holes(known, 6).all())
+
+
+def test_narrow_parts_of_wide_holes_are_not_wide():
+    known = torch.ones((1, 60, 80), dtype=torch.bool)
+    known[:, 10:40, 10:40] = False  # 30 pixels wide
+    known[:, 20:26, 40:70] = False  # a channel of 6 pixels
+    wide = wide_holes(known, 12)
+    assert not bool((wide & known).any())
+    assert bool(wide[:, 14:36, 14:36].all())
+    assert not bool(wide[:, :, 45:].any())
+    assert 0.9 * 900 < int(wide[:, :, :40].sum()) <= 900  # but for the corners
+    assert not bool(wide_holes(known, 32).any())
+
+
+def test_holes_at_the_border_are_wide_from_half_of_the_width_on():
+    known = torch.ones((1, 40, 50), dtype=torch.bool)
+    known[:, :, :8] = False
+    assert bool(wide_holes(known, 14)[:, :, :7].all())
+    assert not bool(wide_holes(known, 16).any())
+
+
+@pytest.mark.parametrize("size", [1, 3, 5])
+def test_holes_of_a_few_pixels_are_never_wide(size):
+    known = torch.ones((1, 16, 16), dtype=torch.bool)
+    known[:, 5 : 5 + size, 5 : 5 + size] = False
+    assert not bool(wide_holes(known, 0.1).any())

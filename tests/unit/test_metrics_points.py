@@ -92,13 +92,6 @@ def test_only_points_in_the_void_between_surfaces_fly():
     assert _scores(np.where(U == 24, 1.04, STEP), np.where(U < 24, 1.0, 1.045))["Points_flying"] == 0  # no edge
 
 
-def test_smeared_edge_has_more_flying_pixels_the_wider_it_is():
-    shares = [_scores(np.clip(1.5 + (U - 23.5) / width, 1, 2), STEP)["Points_flying"] for width in (1, 4, 8, 16)]
-    assert shares[0] == 0
-    assert shares == sorted(shares)
-    assert shares[-1] == pytest.approx(16 / 48, abs=2 / 48)
-
-
 def test_hole_does_not_win():
     prediction = np.where(U == 24, 1.5, STEP)
     without = np.where(np.abs(U - 24) < 4, np.nan, STEP)

@@ -142,9 +142,8 @@ def test_folder_and_factor_that_the_network_does_not_serve_are_refused(tmp_path)
         OnnxGraph(random_network("dg")[0], 2)
 
 
-@pytest.mark.parametrize("library", ["onnx", "onnxruntime"])
-def test_missing_library_is_named_with_its_extra(library, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, library, None)
-    with pytest.raises(ValueError, match=rf"^--onnx: expected the library {library}; pip install .*\[onnx\]'"):
+def test_missing_library_is_named_with_its_extra(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(ValueError, match=r"onnxruntime; pip install .*\[onnx\]"):
         write_onnx(tmp_path / "net.onnx", OnnxGraph(*random_network("dg")), {})
     assert list(tmp_path.iterdir()) == []

@@ -202,15 +202,6 @@ def test_unit_converts_depth():
     torch.testing.assert_close(levels.convert(depth), torch.tensor([86, math.nan, 36.0]), equal_nan=True)
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [({"factor": 0.0}, "factor: expected a positive number"), ({"offset": 1.0}, "offset: expected 0 for depth")],
-)
-def test_unit_refuses(settings, message):
-    with pytest.raises(ValueError, match=message):
-        Unit("cm", **settings)
-
-
 @pytest.mark.parametrize("content", [b"", b"text", None])
 def test_file_that_is_no_sample_is_refused_by_its_name(tmp_path, content):
     path = tmp_path / "hall.npz"

@@ -1,4 +1,4 @@
-"""Super-resolution from shading, and its regions of one colour: closed forms, dense references, exhaustive search, steps that lower the energy."""
+"""Shape from shading and its regions of one colour: closed forms, dense references, exhaustive search."""
 
 import itertools
 import math

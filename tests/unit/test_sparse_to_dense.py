@@ -94,9 +94,3 @@ def test_holes_are_inpainted_before_the_samples_are_placed():
     inpainted = values.clone()
     inpainted[..., 4, 4] = (values[..., 3:6, 3:6].nansum() / 8).item()
     torch.testing.assert_close(net.upsample(rgb, values), net.upsample(rgb, inpainted), rtol=1e-9, atol=0)
-
-
-def test_width_that_the_decoder_cannot_halve_is_refused():
-    for width in (0, 6):
-        with pytest.raises(ValueError, match=rf"^width: expected a positive multiple of 4, got {width}"):
-            SparseToDense(4, width)

@@ -1,15 +1,19 @@
-"""Files of our own networks' weights: what they give back, and what is refused."""
+"""Files of weights, ours and their authors': what they give back, and what is refused without running it."""
 
 import json
+import pickle
 
+import numpy as np
 import pytest
 import torch
+from bombs import Trap
 from safetensors.torch import save_file
+from torch import Tensor
 
 from dsr.methods.networks.facets import Facets
 from dsr.methods.networks.msg_net import MSGNet
 from dsr.methods.networks.sparse_to_dense import SparseToDense
-from dsr.methods.networks.trained import NETWORKS, TrainedNetwork
+from dsr.methods.networks.trained import NETWORKS, TrainedNetwork, load_msg_weights
 from dsr.methods.networks.weight_files import is_dsr_weights, load_network, read_header, save_network
 from dsr.methods.weights import packaged_names, packaged_weights
 
@@ -70,10 +74,12 @@ def test_file_is_distinguished_from_a_published_one_by_its_content(tmp_path):
         TrainedNetwork(tmp_path / "w.caffemodel", 4, "msg_v", "voynov")
 
 
-def test_trained_networks_default_to_averaging_over_quarter_turns(tmp_path):
-    save_network(tmp_path / "w", MSGNet(2, "dsr"), "msg_v")
-    assert TrainedNetwork(tmp_path / "w", 2, "msg_v", "voynov").ensemble == 4
-    assert TrainedNetwork(tmp_path / "w", 2, "msg_v", "voynov", ensemble=1).ensemble == 1
+def test_trained_networks_default_to_averaging_over_quarter_turns_and_published_ones_to_none(tmp_path):
+    save_network(tmp_path / "w", MSGNet(4, "dsr"), "msg_v")
+    torch.save({"model_state_dict": _author_state(MSGNet(4))}, tmp_path / "net.pth")
+    for path, default in ((tmp_path / "w", 4), (tmp_path / "net.pth", 1)):
+        assert TrainedNetwork(path, 4, "msg_v", "voynov").ensemble == default
+        assert TrainedNetwork(path, 4, "msg_v", "voynov", ensemble=8).ensemble == 8
 
 
 def _file(path, changes=None, tensors=None):
@@ -85,22 +91,26 @@ def _file(path, changes=None, tensors=None):
     return path
 
 
-def _refusal(path, scale=4, model=None):
-    """Return the message with which the file is refused: one line that names it."""
+def refusal(path, load):
+    """Return the message with which a file is refused, without its name: one line that begins with it."""
     with pytest.raises(ValueError, match=r"expected|weights are for") as caught:
-        load_network(path, NETWORKS, scale, model)
+        load()
     message = str(caught.value)
     assert message.startswith(f"{path}: ")
     assert "\n" not in message
     return message.removeprefix(f"{path}: ")
 
 
+def _own_refusal(path, scale=4, model=None):
+    return refusal(path, lambda: load_network(path, NETWORKS, scale, model))
+
+
 def test_missing_file_and_weights_of_another_model_or_scale_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"nowhere: no such weights file"):
         load_network(tmp_path / "nowhere", NETWORKS)
     path = _file(tmp_path / "w")
-    assert _refusal(path, model="msg") == "expected weights of model msg, got those of msg_v"
-    assert _refusal(path, 8) == "weights are for scale 4, the run is at scale 8"
+    assert _own_refusal(path, model="msg") == "expected weights of model msg, got those of msg_v"
+    assert _own_refusal(path, 8) == "weights are for scale 4, the run is at scale 8"
     with pytest.raises(ValueError, match=r"expected weights of model facets, got those of msg_v"):
         TrainedNetwork(path, 4, "facets")
 
@@ -115,7 +125,7 @@ def test_file_truncated_or_changed_anywhere_is_refused(tmp_path):
     ]
     for content in damaged:
         path.write_bytes(content)
-        assert "expected a safetensors file, got a damaged one" in _refusal(path)
+        assert "expected a safetensors file, got a damaged one" in _own_refusal(path)
 
 
 @pytest.mark.parametrize(
@@ -130,19 +140,19 @@ def test_file_truncated_or_changed_anywhere_is_refused(tmp_path):
     ],
 )
 def test_foreign_header_is_refused(tmp_path, changes, message):
-    assert _refusal(_file(tmp_path / "w", changes)).startswith(message)
+    assert _own_refusal(_file(tmp_path / "w", changes)).startswith(message)
     save_file({"a": torch.ones(2)}, tmp_path / "w")
-    assert _refusal(tmp_path / "w").startswith("expected weights that train.py wrote")
+    assert _own_refusal(tmp_path / "w").startswith("expected weights that train.py wrote")
 
 
 def test_other_tensors_are_refused(tmp_path):
     state = {**MSGNet(4, "dsr").state_dict()}
     bias = state.pop("smooth.conv.bias")
-    assert "but smooth.conv.bias is missing" in _refusal(_file(tmp_path / "w", tensors=state))
+    assert "but smooth.conv.bias is missing" in _own_refusal(_file(tmp_path / "w", tensors=state))
     extra = {**state, "smooth.conv.bias": bias, "extra": bias.clone()}
-    assert "but 'extra' is unexpected" in _refusal(_file(tmp_path / "w", tensors=extra))
+    assert "but 'extra' is unexpected" in _own_refusal(_file(tmp_path / "w", tensors=extra))
     state["smooth.conv.bias"] = torch.full_like(bias, torch.nan)
-    assert "smooth.conv.bias holds values other than finite" in _refusal(_file(tmp_path / "w", tensors=state))
+    assert "smooth.conv.bias holds values other than finite" in _own_refusal(_file(tmp_path / "w", tensors=state))
 
 
 def test_packaged_files_load_as_the_model_and_scale_of_their_names():
@@ -153,3 +163,151 @@ def test_packaged_files_load_as_the_model_and_scale_of_their_names():
         assert net.covers
         assert read_header(path)["facts"]["steps"] > 0
     assert packaged_weights("msg_v_x3") is None
+
+
+Layer = tuple[str, str, list[Tensor]]
+
+
+def _varint(value):
+    head = b""
+    while value > 0x7F:
+        head += bytes([value & 0x7F | 0x80])
+        value >>= 7
+    return head + bytes([value])
+
+
+def _field(number, content):
+    return _varint(number << 3 | 2) + _varint(len(content)) + content
+
+
+def _blob(values, *, packed):
+    """Return a BlobProto; numbers one after the other, or each with its own key as proto2 writes them by default."""
+    floats, sizes = values.numpy().astype("<f4").tobytes(), values.shape
+    if packed:
+        return _field(7, _field(1, b"".join(map(_varint, sizes)))) + _field(5, floats)
+    singly = b"".join(_varint(5 << 3 | 5) + floats[i : i + 4] for i in range(0, len(floats), 4))
+    return singly + _field(7, b"".join(_varint(1 << 3) + _varint(size) for size in sizes))
+
+
+def _caffe_layers(net):
+    """Return the network's layers as Caffe keeps them: a convolution with two blobs, then a PReLU with one."""
+    layers = []
+    for name, value in net.state_dict().items():
+        layer, part = name.rsplit(".", 1)
+        kind = "PReLU" if "activation" in name else "Deconvolution" if ".up." in name else "Convolution"
+        if part == "bias":
+            layers[-1][2].append(value)
+        else:
+            layers.append((layer, kind, [value]))
+    return layers
+
+
+def _caffemodel(layers, *, packed=True):
+    """Return a NetParameter: its name, an input layer without parameters, a number field, the layers."""
+    content = _field(1, b"a test") + _varint(5 << 3) + b"\x01"
+    content += _field(100, _field(1, b"data") + _field(2, b"HDF5Data"))
+    for name, kind, blobs in layers:
+        parts = b"".join(_field(7, _blob(blob, packed=packed)) for blob in blobs)
+        content += _field(100, _field(1, name.encode()) + _field(2, kind.encode()) + parts)
+    return content
+
+
+def _author_state(net):
+    """Return the parameters under Voynov et al.'s names at x4, which the network's description lists."""
+    names = {
+        "guidance.0": "feature_extraction_Y.0",
+        "guidance.1": "feature_extraction_Y.1",
+        "guidance.2": "feature_extraction_Y.2",
+        "stem": "feature_extraction_X",
+        "levels.0.up": "upsampling_X.0",
+        "levels.0.fuse": "upsampling_X.1",
+        "levels.0.refine": "upsampling_X.2",
+        "levels.1.up": "upsampling_X.3",
+        "levels.1.fuse": "upsampling_X.4",
+        "levels.1.refine": "upsampling_X.5",
+        "smooth": "upsampling_X.6",
+        "reconstruct": "upsampling_X.7",
+    }
+    state = {}
+    for name, value in net.state_dict().items():
+        layer, conv, part = name.rsplit(".", 2)
+        state[f"{names[layer]}.{conv}.{part}"] = value
+    return state
+
+
+def _write(path, content):
+    path.write_bytes(content)
+    return path
+
+
+def _save(path, content):
+    torch.save(content, path)
+    return path
+
+
+@pytest.mark.parametrize("packed", [True, False])
+@pytest.mark.parametrize("scale", [2, 8])
+def test_caffe_model_round_trips_its_parameters(tmp_path, scale, packed):
+    net = MSGNet(scale, "hui")
+    path = _write(tmp_path / "net.caffemodel", _caffemodel(_caffe_layers(net), packed=packed))
+    loaded = load_msg_weights(path, scale)
+    assert loaded.variant == "hui"
+    torch.testing.assert_close(dict(loaded.state_dict()), dict(net.state_dict()), rtol=0, atol=0)
+
+
+def test_torch_file_round_trips_its_parameters(tmp_path):
+    net = MSGNet(4)
+    path, before = _save(tmp_path / "net.pth", {"model_state_dict": _author_state(net)}), torch.get_rng_state()
+    loaded = load_msg_weights(path, 4, "voynov")
+    assert torch.equal(torch.get_rng_state(), before)
+    assert loaded.variant == "voynov"
+    torch.testing.assert_close(dict(loaded.state_dict()), dict(net.state_dict()), rtol=0, atol=0)
+
+
+def _refusal(path, scale=4):
+    """Return the message with which the file is refused."""
+    return refusal(path, lambda: load_msg_weights(path, scale))
+
+
+def test_missing_file_and_weights_of_another_scale_are_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"nowhere\.pth: no such weights file"):
+        load_msg_weights(tmp_path / "nowhere.pth", 4)
+    caffe = _write(tmp_path / "net.caffemodel", _caffemodel(_caffe_layers(MSGNet(8, "hui"))))
+    assert "weights are for scale 8, the run is at scale 4" in _refusal(caffe, 4)
+    path = _save(tmp_path / "net.pth", {"model_state_dict": _author_state(MSGNet(4))})
+    assert "weights are for scale 4, the run is at scale 2" in _refusal(path, 2)
+
+
+def test_code_in_a_file_is_not_run(tmp_path):
+    mark = tmp_path / "trapped"
+    for protocol in (0, 2, 4):
+        _refusal(_write(tmp_path / "net.pth", pickle.dumps({"model_state_dict": Trap(mark)}, protocol)))
+    message = _refusal(_save(tmp_path / "net.pth", {"model_state_dict": _author_state(MSGNet(4)), "x": Trap(mark)}))
+    assert "which are never loaded" in message
+    assert not mark.exists()
+
+
+def test_damaged_and_foreign_files_are_refused(tmp_path):
+    whole = _save(tmp_path / "whole.pth", {"model_state_dict": _author_state(MSGNet(4))}).read_bytes()
+    noise = np.random.default_rng(0).bytes(10_000)
+    foreign = (b"", noise, b"\x80" + noise, b"PK\x03\x04" + noise, b"\x89PNG\r\n\x1a\n")
+    for content in (whole[:5000], whole[:-30], *foreign):
+        assert "expected a torch" in _refusal(_write(tmp_path / "net.pth", content))
+    for content in (b"\xff" * 11, b"\xa2\x06\xff\xff\xff\xff\x0f\x00", b"\x0b", b"\xa0\x06\x01", _field(1, b"name")):
+        assert "expected a torch or Caffe model" in _refusal(_write(tmp_path / "net.caffemodel", content))
+    whole = _caffemodel(_caffe_layers(MSGNet(2, "hui")))
+    for length in np.random.default_rng(0).integers(1, len(whole), 40).tolist():
+        assert "expected" in _refusal(_write(tmp_path / "net.caffemodel", whole[:length]), 2)
+
+
+def test_missing_unexpected_and_misshapen_tensors_are_named(tmp_path):
+    path, state = tmp_path / "net.pth", _author_state(MSGNet(4))
+    bias = state.pop("upsampling_X.5.conv.bias")
+    assert "levels.1.refine.conv.bias is missing" in _refusal(_save(path, {"model_state_dict": state}))
+    state |= {"upsampling_X.5.conv.bias": bias, "extra": bias}
+    assert "'extra' is unexpected" in _refusal(_save(path, {"model_state_dict": state}))
+    del state["extra"]
+    state["feature_extraction_X.conv.bias"] = bias
+    assert "stem.conv.bias has shape (32,) instead of (64,)" in _refusal(_save(path, {"model_state_dict": state}))
+    state["feature_extraction_X.conv.bias"] = torch.full((64,), torch.nan)
+    assert "stem.conv.bias holds values other than finite" in _refusal(_save(path, {"model_state_dict": state}))

@@ -135,19 +135,6 @@ def test_holes_of_the_low_resolution_map_do_not_widen_its_range():
     assert float(DepthObjective("l1")(Answer(_ramp(0, 4.5)), batch)["loss"]) == pytest.approx(0.25, rel=1e-13)
 
 
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        *(({"shading": weight}, "shading: expected 0 or a positive number") for weight in (-0.1, math.nan, math.inf)),
-        *(({"w": weight}, "w: expected auto or a number") for weight in (-0.1, math.nan)),
-        ({"depth_loss": "ssim"}, "depth_loss: expected one of lap1, l1, mse, got 'ssim'"),
-    ],
-)
-def test_setting_of_the_loss_out_of_range_is_refused(wrong, message):
-    with pytest.raises(ValueError, match=f"^{message}"):
-        DepthObjective(**wrong)
-
-
 def test_disparity_at_or_beyond_infinity_has_no_depth():
     disparity = torch.tensor([[[[-1.5, -1.0, -0.5]]]], dtype=torch.float64)
     assert to_depth(disparity, _wall())[0, 0, 0].isnan().tolist() == [True, True, False]

