@@ -1,6 +1,5 @@
 """Deep image priors: the method, its loss and its network."""
 
-import functools
 import re
 
 import pytest
@@ -88,28 +87,15 @@ def test_oracle_is_the_best_validation_and_flagged():
     assert (prior.flag, _prior().flag) == ("oracle", "")
 
 
-@functools.cache
-def _fitted(*, visual):
-    """Return a result after enough steps, and its sample."""
-    sample = _sample()
-    return _prior(**ENOUGH, **({} if visual else {"data_loss": "mse", "w": 0.0}))(sample), sample
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("visual", [False, True])
-def test_dip_approximates_two_planes(visual):
-    depth, sample = _fitted(visual=visual)
-    flat = torch.full_like(depth, float(sample.depth_lr.mean()))
-    assert _error(depth, sample) < 0.25 * _error(flat, sample)
-
-
-@pytest.mark.slow
-def test_visual_loss_gives_better_normals():
-    errors = {}
-    for visual in (True, False):
-        depth, sample = _fitted(visual=visual)
-        errors[visual] = float(rmse_v(SurfacePair(depth[None], sample.depth[None], CAMERA.rays()[None])))
-    assert errors[True] < 0.8 * errors[False]
+def test_dip_approximates_two_planes_and_the_visual_loss_gives_better_normals():
+    sample, errors = _sample(), []
+    for settings in ({}, {"data_loss": "mse", "w": 0.0}):
+        depth = _prior(**ENOUGH, **settings)(sample)
+        flat = torch.full_like(depth, float(sample.depth_lr.mean()))
+        assert _error(depth, sample) < 0.25 * _error(flat, sample)
+        errors.append(float(rmse_v(SurfacePair(depth[None], sample.depth[None], CAMERA.rays()[None]))))
+    assert errors[0] < 0.8 * errors[1]
 
 
 @pytest.mark.slow
@@ -189,25 +175,17 @@ def test_automatic_weight_makes_a_loss_as_large_as_mse_v_for_a_smoothed_input():
 @pytest.mark.parametrize("loss", [{"data_loss": "mse", "w": 0.0}, {"data_loss": "lap1"}])
 def test_depth_under_a_hole_does_not_matter(loss):
     sample = _sample()
-    depth_lr = sample.depth_lr.clone()
-    depth_lr[:, 4:9, 6:14] = torch.nan
-    depth = _depth().requires_grad_()
-    module = _module(_changed(sample, depth_lr=depth_lr), w_intensity=0.0, **loss)
-    module.loss_terms(depth, torch.rand(1, 1, 32, 48))["loss"].backward()
-    gradient = depth.grad
-    assert bool(gradient.isfinite().all())
-    assert float(gradient[..., 8:18, 12:28].abs().max()) == 0
-    assert float(gradient[..., 20:, :].abs().min()) > 0
-
-
-def test_loss_is_finite_where_no_two_neighbours_are_valid():
-    depth_lr = torch.full((1, 16, 24), torch.nan, dtype=torch.float64)
-    depth_lr[:, ::3, ::3] = 2.5
-    depth = _depth().requires_grad_()
-    terms = _module(_changed(_sample(), depth_lr=depth_lr)).loss_terms(depth, torch.rand(1, 1, 32, 48))
-    terms["loss"].backward()
-    assert bool(terms["loss"].isfinite())
-    assert bool(depth.grad.isfinite().all())
+    pierced, sparse = sample.depth_lr.clone(), torch.full_like(sample.depth_lr, torch.nan)
+    pierced[:, 4:9, 6:14] = torch.nan
+    sparse[:, ::3, ::3] = 2.5  # no two neighbours are valid
+    for depth_lr in (pierced, sparse):
+        depth = _depth().requires_grad_()
+        module = _module(_changed(sample, depth_lr=depth_lr), w_intensity=0.0, **loss)
+        module.loss_terms(depth, torch.rand(1, 1, 32, 48))["loss"].backward()
+        assert bool(depth.grad.isfinite().all())
+        if depth_lr is pierced:
+            assert float(depth.grad[..., 8:18, 12:28].abs().max()) == 0
+            assert float(depth.grad[..., 20:, :].abs().min()) > 0
 
 
 @pytest.mark.parametrize("shape", [(1, 3, 1, 1), (2, 3, 4, 5), (1, 1, 7, 1)])
@@ -222,12 +200,6 @@ def test_doubling_is_bilinear_interpolation(shape, layout):
 def test_gradient_of_doubling_agrees_with_finite_differences(size):
     x = torch.rand(1, 2, *size, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(upsample_2x, x)
-
-
-@pytest.mark.parametrize(("height", "width"), [(32, 48), (37, 50)])
-def test_output_has_the_size_of_the_input(height, width):
-    net = SkipNet(5, 2, (4, 6, 8), (2, 2, 2))
-    assert net(torch.rand(1, 5, height, width)).shape == (1, 2, height, width)
 
 
 def test_network_is_the_hourglass_of_ulyanov_et_al():
@@ -267,8 +239,8 @@ def test_output_is_finer_than_bfloat16_even_if_the_convolutions_are_not():
 
 
 @pytest.mark.parametrize(
-    ("height", "width", "most", "levels"),
-    [(512, 512, 5, 5), (32, 512, 5, 4), (4, 4, 5, 1), (2, 2, 5, 1), (64, 64, 2, 2)],
+    ("height", "width", "most", "levels"), [(512, 512, 5, 5), (32, 512, 5, 4), (2, 2, 5, 1), (64, 64, 2, 2)]
 )
 def test_small_image_has_fewer_levels(height, width, most, levels):
     assert levels_for(height, width, most) == levels
+    assert SkipNet(5, 2, (4, 6, 8), (2, 2, 2))(torch.rand(1, 5, 37, 50)).shape == (1, 2, 37, 50)

@@ -1,8 +1,9 @@
-"""The objective, the schedule and the Lightning module, against numbers worked out by hand."""
+"""The objective, schedule, module, divergence and processes of a training, against numbers worked out by hand."""
 
 import copy
 import functools
 import math
+import os
 import re
 from dataclasses import replace
 
@@ -10,13 +11,16 @@ import lightning
 import numpy as np
 import pytest
 import torch
-from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.plugins.environments import LightningEnvironment, SLURMEnvironment
+from lightning.pytorch.utilities import rank_zero_only
 from small_lpips import random_lpips
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.custom_scalar import layout_pb2
 from torch.utils.data import DataLoader
 
+from dsr.app.train import find_processes
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera
 from dsr.methods.networks.facets_method import AnyMap
@@ -36,6 +40,9 @@ from dsr.training.module import SuperResolution, WarmupCosine
 from dsr.training.objective import DepthObjective, SurfaceObjective, balance_weight, shading_loss, to_depth
 from dsr.training.patches import Patches
 from dsr.training.settings import PatchSettings
+from dsr.utils.checkpoints import Divergence, DivergenceError
+from dsr.utils.configuration import ConfigError
+from dsr.utils.lightning import fit, make_trainer
 
 BOX = Downsampling("box")
 X2 = Degradation(2, BOX)
@@ -123,16 +130,10 @@ def test_shading_term_is_that_of_the_surface_and_the_photo():
     assert float(terms["loss"]) == pytest.approx(float(terms["l1"]) + 0.5 * float(expected), rel=1e-12)
 
 
-def test_flat_low_resolution_map_has_a_nonzero_range():
-    batch = {**_wall(), "disparity_lr": torch.full((1, 1, 1, 2), 4.0, dtype=torch.float64)}
-    terms = DepthObjective("l1")(Answer(_ramp(0, 4.001)), batch)
-    assert float(terms["loss"]) == pytest.approx(0.001 / 0.004, rel=1e-9)
-
-
-def test_holes_of_the_low_resolution_map_do_not_widen_its_range():
-    batch = _wall()
-    batch["disparity_lr"] = torch.tensor([3.0, torch.nan, 5.0], dtype=torch.float64).view(1, 1, 1, 3)
-    assert float(DepthObjective("l1")(Answer(_ramp(0, 4.5)), batch)["loss"]) == pytest.approx(0.25, rel=1e-13)
+@pytest.mark.parametrize(("coarse", "expected"), [((4.0, 4.0), 0.5 / 0.004), ((3.0, 5.0, math.nan), 0.25)])
+def test_range_is_that_of_the_known_low_resolution_pixels_and_never_zero(coarse, expected):
+    batch = {**_wall(), "disparity_lr": torch.tensor(coarse, dtype=torch.float64).view(1, 1, 1, -1)}
+    assert float(DepthObjective("l1")(Answer(_ramp(0, 4.5)), batch)["loss"]) == pytest.approx(expected, rel=1e-9)
 
 
 def test_disparity_at_or_beyond_infinity_has_no_depth():
@@ -183,11 +184,6 @@ def test_balanced_weight_is_the_median_over_the_patches():
     assert balance_weight(patches) == balance_weight(patches[2:])
 
 
-def test_balanced_weight_of_nothing_is_refused():
-    with pytest.raises(ValueError, match=r"^patches: expected one or more to compute w from, got none"):
-        balance_weight([])
-
-
 # The schedule
 
 
@@ -208,11 +204,6 @@ def test_learning_rate_warms_up_linearly_and_falls_as_a_cosine_to_zero():
     assert rates[12] == pytest.approx(0.5)  # halfway down
     assert rates[8] == pytest.approx((1 + math.sqrt(0.5)) / 2)
     assert rates[20] == rates[25] == pytest.approx(0, abs=1e-15)
-
-
-def test_negative_warm_up_is_refused():
-    with pytest.raises(ValueError, match=r"^warmup: expected 0 or more, got -1"):
-        _rates(10, -1, 1)
 
 
 # The module
@@ -305,33 +296,22 @@ def test_gradients_add_up_over_accumulated_batches(tmp_path):
     assert not torch.equal(before, module.average.stem.conv.weight)
 
 
-@pytest.mark.parametrize(
-    ("clipping", "largest"),
-    [
-        ({}, None),
-        ({"gradient_clip_val": 1e-3}, "norm"),
-        ({"gradient_clip_val": 1e-3, "gradient_clip_algorithm": "value"}, "value"),
-    ],
-)
-def test_gradient_is_clipped_as_the_trainer_says_and_its_norm_logged(clipping, largest, tmp_path):
-    grads = []
-    logged = []
+@pytest.mark.parametrize("algorithm", [None, "norm", "value"])
+def test_gradient_is_clipped_as_the_trainer_says_and_its_norm_logged(algorithm, tmp_path):
+    found = []
 
     class _Gradient(Callback):
         def on_before_zero_grad(self, trainer, pl_module, *_):
-            each = [p.grad.flatten() for p in pl_module.net.parameters() if p.grad is not None]
-            if each:  # of the step before
-                grads.append(torch.cat(each))
-                logged.append(float(trainer.callback_metrics["train/gradient_norm"]))
+            grads = [p.grad.flatten() for p in pl_module.net.parameters() if p.grad is not None]
+            if grads:  # of the step before
+                found.append((torch.cat(grads), float(trainer.callback_metrics["train/gradient_norm"])))
 
-    trainer = _trainer(tmp_path, max_epochs=2, callbacks=[_Gradient()], **clipping)
-    trainer.fit(_module(), _one_batch())
-    assert logged[-1] > 1e-2
-    if largest is None:
-        assert float(grads[-1].norm()) == pytest.approx(logged[-1], rel=1e-5)
-    else:
-        found = grads[-1].norm() if largest == "norm" else grads[-1].abs().max()
-        assert float(found) == pytest.approx(1e-3, rel=1e-3)
+    clipping = {} if algorithm is None else {"gradient_clip_val": 1e-3, "gradient_clip_algorithm": algorithm}
+    _trainer(tmp_path, max_epochs=2, callbacks=[_Gradient()], **clipping).fit(_module(), _one_batch())
+    gradient, logged = found[-1]
+    assert logged > 1e-2
+    size = gradient.abs().max() if algorithm == "value" else gradient.norm()
+    assert float(size) == pytest.approx(1e-3 if algorithm else logged, rel=1e-3)
 
 
 @pytest.mark.parametrize("fused", [False, True])
@@ -345,12 +325,6 @@ def test_non_finite_gradient_changes_nothing(tmp_path, fused):
     assert all(torch.equal(before[name], value) for name, value in module.net.state_dict().items())
     _trainer(tmp_path, max_epochs=1).fit(module, DataLoader([bad, batch], batch_size=None))
     assert not all(torch.equal(before[name], value) for name, value in module.net.state_dict().items())
-
-
-@pytest.mark.parametrize("average", [1.0, math.nan])
-def test_invalid_average_is_refused(average):
-    with pytest.raises(ValueError, match=r"^average: expected "):
-        _module(average=average)
 
 
 def _loader(scenes):
@@ -378,23 +352,24 @@ def test_validation_logs_the_mean_over_the_scenes_in_the_units_of_tables(tmp_pat
     module, scenes = _module(), WholeScenes([_scene(3), _scene(4, holes=0.05), _scene(5)], X2)
     trainer = _trainer(tmp_path, precision="bf16-mixed")  # of the training alone
     [logged] = trainer.validate(module, _loader(scenes), verbose=False)
-    factors = {"RMSE_d": 1000, "RMSE_v": 1000, "RMSE_v1": 1000, "DSSIM_v": 1000, "BadPix_v_5": 100, "Bumpiness_d": 1}
-    values = {name: [] for name in factors}
-    for i in range(3):
-        batch = scenes[i]
+    metrics = {
+        "RMSE_d": (scores.rmse_d, 1000),
+        "RMSE_v": (scores.rmse_v, 1000),
+        "RMSE_v1": (scores.rmse_v1, 1000),
+        "DSSIM_v": (scores.dssim_v, 1000),
+        "BadPix_v_5": (lambda pair: scores.bad_pix_v(pair, 5), 100),
+        "Bumpiness_d": (scores.bumpiness_d, 1),
+    }
+    pairs = []
+    for batch in (scenes[i] for i in range(3)):
         with torch.no_grad():
             disparity = module.average.upsample(batch["rgb"], batch["disparity_lr"])
         assert bool((disparity > 0).all())
-        pair = SurfacePair(40 * 0.2 / disparity, batch["depth"], CAMERA.rays()[None])
-        values["RMSE_d"].append(float(scores.rmse_d(pair)))
-        values["RMSE_v"].append(float(scores.rmse_v(pair)))
-        values["RMSE_v1"].append(float(scores.rmse_v1(pair).amax()))
-        values["DSSIM_v"].append(float(scores.dssim_v(pair).amax()))
-        values["BadPix_v_5"].append(float(scores.bad_pix_v(pair, 5).amax()))
-        values["Bumpiness_d"].append(float(scores.bumpiness_d(pair)))
-    for name, each in values.items():
-        assert logged[f"val/{name}"] == pytest.approx(factors[name] * np.mean(each), rel=1e-4), name
-        assert module.validation_scores["val"][name] == pytest.approx(np.mean(each), rel=1e-4), name
+        pairs.append(SurfacePair(40 * 0.2 / disparity, batch["depth"], CAMERA.rays()[None]))
+    for name, (metric, factor) in metrics.items():
+        mean = np.mean([float(metric(pair).amax()) for pair in pairs])
+        assert logged[f"val/{name}"] == pytest.approx(factor * mean, rel=1e-4), name
+        assert module.validation_scores["val"][name] == pytest.approx(mean, rel=1e-4), name
 
 
 def test_a_network_that_takes_hints_is_validated_as_it_is_evaluated(tmp_path):
@@ -453,9 +428,19 @@ def test_checkpoint_holds_the_networks_tensors_alone_and_loads_as_plain_data(tmp
     assert (tmp_path / "a.ckpt").stat().st_size < 4 * 4 * size + 200_000  # weights, their average, AdamW's two moments
 
 
-def test_network_that_leaves_out_pixels_is_refused():
-    with pytest.raises(ValueError, match=r"model: expected a network that covers the whole image"):
-        SuperResolution(MSGNet(4, "hui"), DepthObjective())
+@pytest.mark.parametrize(
+    ("act", "message"),
+    [
+        (lambda: balance_weight([]), "^patches: expected one or more"),
+        (lambda: _rates(10, -1, 1), "^warmup: expected 0 or more, got -1"),
+        (lambda: _module(average=1.0), "^average: expected "),
+        (lambda: _module(average=math.nan), "^average: expected "),
+        (lambda: SuperResolution(MSGNet(4, "hui"), DepthObjective()), "model: expected a network that covers"),
+    ],
+)
+def test_training_that_cannot_be_is_refused(act, message):
+    with pytest.raises(ValueError, match=message):
+        act()
 
 
 def test_layout_of_tensorboard_begins_with_looks(tmp_path):
@@ -473,3 +458,118 @@ def test_layout_of_tensorboard_begins_with_looks(tmp_path):
     shown = ("val/RMSE_v", "bicubic/RMSE_v", "val_a/RMSE_v", "bicubic_a/RMSE_v")
     assert all(re.match(tag, name) for name in shown)
     assert not any(re.match(tag, name) for name in ("val/RMSE_v1", "bicubic/RMSE_d"))
+
+
+NAN = math.nan
+
+
+class Scripted(lightning.LightningModule):
+    """A network of one weight whose losses, gradients, scores and weights are as written down."""
+
+    def __init__(self, losses, norms=None, scores=None, weights=None):
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.ones(1))
+        self.losses, self.norms, self.scores, self.weights = losses, norms or {}, scores or {}, weights or {}
+        self.validation_scores = {}
+
+    def training_step(self, _, index):
+        step = index + 1
+        loss = self.weight.sum() * 0 + self.losses.get(step, 0.5)
+        self.log_dict({"train/loss": loss.detach(), "train/gradient_norm": self.norms.get(step, 1.0)}, batch_size=1)
+        return loss
+
+    def on_train_batch_end(self, *_):
+        self.weight.data.fill_(self.weights.get(self.global_step, 1.0))
+
+    def validation_step(self, *_):
+        self.log("val/RMSE_d", self.scores.get(self.global_step, 0.1), batch_size=1)
+
+    def configure_optimizers(self):
+        return torch.optim.SGD(self.parameters(), lr=0.25)
+
+
+def train(folder, module, steps=8, interval=2, callbacks=(), patience=3, accumulate=1):
+    """Train with a checkpoint after each validation; return the trainer."""
+    last = ModelCheckpoint(folder, "last", enable_version_counter=False, save_on_train_epoch_end=False)
+    trainer = make_trainer(
+        torch.device("cpu"), steps, interval, callbacks=[Divergence(patience), last, *callbacks], logger=False,
+        accumulate=accumulate,
+    )  # fmt: skip
+    loader = DataLoader(range(steps * accumulate), batch_size=None)
+    fit(trainer, module, loader, val_dataloaders=DataLoader(range(1), batch_size=None))
+    return trainer
+
+
+def last_step(folder):
+    return torch.load(folder / "last.ckpt", weights_only=True)["global_step"]
+
+
+ROW = "the loss or its gradient is not finite from there on"
+DIVERGED = {
+    "losses": ({"losses": {4: NAN, 5: math.inf, 6: NAN}}, f"4: {ROW}", 4),
+    "gradients": ({"losses": {}, "norms": dict.fromkeys((4, 5, 6), math.inf)}, f"4: {ROW}", 4),
+    "score": ({"losses": {}, "scores": {4: NAN}}, "4: the validation's RMSE_d is nan", 2),
+    "weights": ({"losses": {}, "weights": {6: math.inf}}, "6: the weights weight are not finite", 4),
+}
+
+
+@pytest.mark.parametrize("case", DIVERGED)
+def test_diverged_training_stops_at_its_step_and_keeps_the_last_good_checkpoint(tmp_path, case):
+    script, what, kept = DIVERGED[case]
+    with pytest.raises(DivergenceError) as caught:
+        train(tmp_path, Scripted(**script))
+    assert str(caught.value) == f"diverged at step {what}, at a learning rate of 0.25"
+    assert last_step(tmp_path) == kept
+
+
+def test_few_steps_without_a_finite_loss_are_tolerated(tmp_path):
+    trainer = train(tmp_path, Scripted({2: NAN, 3: NAN, 5: NAN, 6: NAN}))
+    assert trainer.global_step == last_step(tmp_path) == 8
+
+
+def test_steps_count_rather_than_the_batches_of_a_step(tmp_path):
+    trainer = train(tmp_path, Scripted(dict.fromkeys(range(3, 8), NAN)), steps=6, accumulate=2)
+    assert trainer.global_step == 6
+
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(autouse=True)
+def _alone(monkeypatch):
+    for name in os.environ:
+        if name.startswith("SLURM_") or name in ("LOCAL_RANK", "RANK", "WORLD_SIZE", "TORCHELASTIC_RUN_ID"):
+            monkeypatch.delenv(name)
+
+
+def test_processes_are_lightnings_on_a_machine_and_those_of_a_slurm_step_elsewhere(monkeypatch):
+    for devices, count in (("auto", 1), (1, 1), (2, 2)):
+        found = find_processes(CPU, devices)
+        assert (found.count, found.rank) == (count, 0)
+        assert isinstance(found.environment, LightningEnvironment)
+    monkeypatch.setenv("SLURM_NTASKS", "4")  # as in a job's script, which no srun has started
+    assert isinstance(find_processes(CPU, 1).environment, LightningEnvironment)
+    for name in ("STEP_NUM_TASKS", "NTASKS", "PROCID", "LOCALID", "JOB_ID"):
+        monkeypatch.setenv(f"SLURM_{name}", "2" if "TASKS" in name else "1")
+    found = find_processes(CPU, 2)
+    assert (found.count, found.rank, type(found.environment)) == (2, 1, SLURMEnvironment)
+    assert not found.environment.auto_requeue
+    with pytest.raises(ConfigError, match=r"^trainer\.devices: expected 2, "):
+        find_processes(CPU, 1)
+
+
+def test_more_devices_than_there_are_are_refused(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    assert find_processes(torch.device("cuda"), "auto").count == 2
+    for device, most in (("cuda", 2), ("cuda:1", 1)):
+        with pytest.raises(ConfigError, match=rf"^trainer\.devices: expected at most {most} "):
+            find_processes(torch.device(device), 3)
+
+
+def test_environment_is_as_before_when_the_processes_have_ended(monkeypatch):
+    monkeypatch.setenv("MASTER_PORT", "5")
+    monkeypatch.setattr(rank_zero_only, "rank", 0)
+    before = dict(os.environ)
+    with find_processes(CPU, 1).running():
+        os.environ.update(LOCAL_RANK="0", MASTER_PORT="6")
+    assert dict(os.environ) == before
