@@ -26,7 +26,7 @@ from dsr.methods.networks.msg_net import MSGNet
 from dsr.methods.networks.pdn import PrimalDualNetwork
 from dsr.methods.networks.peers.peer import PEERS
 from dsr.methods.recipe import Run, read_recipe
-from dsr.metrics import losses
+from dsr.metrics import evalmde, losses
 from dsr.metrics.catalogue import PROTOCOLS, catalogue, score_image
 from dsr.metrics.classes import compute_means, visual_metrics
 from dsr.metrics.functional import SurfacePair
@@ -151,7 +151,9 @@ def _pair(device):
     return SurfacePair(prediction.to(device), target.to(device), sample.camera.rays(device=device)[None])
 
 
-def test_metrics_have_the_values_of_the_cpu(gpu):
+def test_metrics_have_the_values_of_the_cpu(gpu, monkeypatch):
+    monkeypatch.setattr(evalmde, "PAIRS", 10**4)  # whose drawing takes most of the time
+    monkeypatch.setattr(evalmde, "sobol_pairs", evalmde.sobol_pairs.__wrapped__)  # so few are not kept for others
     network, found = random_lpips(), []
     for device in (CPU, gpu):
         pair, metrics = _pair(device), catalogue(network.to(device), (), tuple(PROTOCOLS))

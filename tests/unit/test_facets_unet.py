@@ -396,15 +396,11 @@ def test_photos_of_another_size_and_other_networks_are_refused():
     with pytest.raises(ValueError, match="rgb: expected"):
         _net(8).answer(rgb, values)
     for first in (FacetsUNet(4, 12, 12, 4), Facets(4, width=8, blocks=5)):
-        with pytest.raises(ValueError, match=r"expected weights of Facets or FacetsUNet with {'width': 8, 'blocks': 4"):
+        with pytest.raises(ValueError, match=r"expected weights of Facets or FacetsUNet with .*'width': 8"):
             _net().start_from(first)
-
-
-def test_a_unet_of_another_width_starts_from_nothing():
-    """Neither a part of its weights nor a bias of them is taken over."""
-    first, net = _net(8), FacetsUNet(16, 8, 10, 4)
+    net = FacetsUNet(16, 8, 10, 4)  # of another width in its depth: neither a part of those weights nor a bias is taken
     fresh = {name: value.clone() for name, value in net.state_dict().items() if name.startswith("wide.")}
-    net.start_from(first)
+    net.start_from(_net(8))
     assert all(torch.equal(net.state_dict()[name], value) for name, value in fresh.items())
 
 

@@ -106,19 +106,14 @@ def test_step_of_three_percent_is_cut_and_one_of_one_percent_is_not(step, cut, t
     assert (spans(mesh, depth) < 1e-6) == cut
 
 
-def test_step_smeared_over_three_pixels_leaves_no_connecting_faces():
-    depth = wall()
-    depth[0, :, 18:20] = torch.tensor([2.35, 2.7])
-    depth[0, :, 20:] = 3
-    mesh = triangulate(depth, CAMERA)
-    assert spans(mesh, depth) < 1e-6
+def test_step_smeared_over_three_pixels_and_a_pole_of_one_leave_no_connecting_faces():
+    smeared, pole = wall(), wall()
+    smeared[0, :, 18:20] = torch.tensor([2.35, 2.7])
+    smeared[0, :, 20:], pole[0, :, 20] = 3, 1.5
+    mesh = triangulate(smeared, CAMERA)
+    assert spans(mesh, smeared) < 1e-6
     assert set(np.unique(mesh.vertices[:, 2])) == {2.0, 3.0}
-
-
-def test_pole_of_one_pixel_is_cut_free_and_dropped():
-    depth = wall()
-    depth[0, :, 20] = 1.5
-    mesh = triangulate(depth, CAMERA)
+    mesh = triangulate(pole, CAMERA)
     assert (mesh.vertices[:, 2] == 2).all()
     assert len(mesh.faces) == 2 * 29 * 37
 

@@ -169,13 +169,16 @@ def test_metrics_of_a_region_are_those_of_its_pixels_alone():
     assert metrics[-1].format.unit.startswith("edges")
 
 
+def _half_planes():
+    """Return a wall that recedes to the right, and its upper and lower half as planes 1 and 2."""
+    v, u = torch.meshgrid(torch.arange(40).double(), torch.arange(48).double(), indexing="ij")
+    return 1 / (0.5 + 0.002 * (u - CAMERA.cx))[None], (1 + (v >= 20))[None].to(torch.uint8), u.remainder(2) - 0.5
+
+
 def test_planes_of_a_region_have_a_planarity_error():
     metrics = catalogue(protocols=["boundaries"])
-    v, u = torch.meshgrid(torch.arange(40).double(), torch.arange(48).double(), indexing="ij")
-    target = 1 / (0.5 + 0.002 * (u - CAMERA.cx))[None]
-    planes = (1 + (v > 20))[None].to(torch.uint8)
-    wavy = target * (1 + 0.01 * (u.remainder(2) - 0.5))
-    for prediction, flat in ((2 * target, True), (wavy, False)):
+    target, planes, wave = _half_planes()
+    for prediction, flat in ((2 * target, True), (target * (1 + 0.01 * wave), False)):
         rows = score_image(prediction, target, CAMERA.rays(), metrics, regions={"planes": planes})
         error = {row.metric: row.value for row in rows}
         assert (error["PE_flatness"] < 1e-6) == flat
@@ -185,10 +188,8 @@ def test_planes_of_a_region_have_a_planarity_error():
 
 
 def test_holes_neither_hide_a_bad_plane_nor_a_bad_region():
-    v, u = torch.meshgrid(torch.arange(40).double(), torch.arange(48).double(), indexing="ij")
-    target = 1 / (0.5 + 0.002 * (u - CAMERA.cx))[None]
-    planes = (1 + (v >= 20))[None].to(torch.uint8)
-    prediction = target * (1 + 0.02 * (planes == 2) * (u.remainder(2) - 0.5))
+    target, planes, wave = _half_planes()
+    prediction = target * (1 + 0.02 * (planes == 2) * wave)
     holed = prediction.masked_fill(planes == 2, torch.nan)
     glass = (planes == 2).to(torch.uint8)
     metrics = catalogue(protocols=["boundaries", "depth", "normals"], regions=["glass"])

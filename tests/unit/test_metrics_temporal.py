@@ -151,21 +151,15 @@ def test_temporal_gradients_know_no_offset_and_have_the_size_of_a_jump():
 
 
 @pytest.mark.parametrize(
-    ("call", "message"),
+    ("key", "call"),
     [
-        (
-            lambda: flicker(_maps(STILL[None])),
-            r"^depths: expected shape \(T, 1, H, W\) of two .* got \(1, 1, 20, 24\)$",
-        ),
-        (
-            lambda: flicker(_maps(_noisy(0)), torch.ones(1, 20, 24) > 0),
-            r"^static: expected shape \(1, 1, 20, 24\), got",
-        ),
-        (lambda: opw(_maps(_noisy(0)), CAMERA, _poses((0, 0, 0))), r"^poses, photos: .* 9 depth maps, got 1 poses"),
-        (lambda: opw(_maps(_noisy(0, 2)), CAMERA, 2 * _poses((0, 0, 0), (0, 0, 0))), r"^poses: 0: expected "),
-        (lambda: tgm(_maps(_noisy(0, 2)), _maps(_noisy(0, 3))), r"^target: expected shape \(2, 1, 20, 24\), got"),
+        ("depths", lambda: flicker(_maps(STILL[None]))),
+        ("static", lambda: flicker(_maps(_noisy(0)), torch.ones(1, 20, 24) > 0)),
+        ("poses, photos", lambda: opw(_maps(_noisy(0)), CAMERA, _poses((0, 0, 0)))),
+        ("poses: 0", lambda: opw(_maps(_noisy(0, 2)), CAMERA, 2 * _poses((0, 0, 0), (0, 0, 0)))),
+        ("target", lambda: tgm(_maps(_noisy(0, 2)), _maps(_noisy(0, 3)))),
     ],
 )
-def test_sequences_that_do_not_fit_together_are_refused(call, message):
-    with pytest.raises(ValueError, match=message):
+def test_sequences_that_do_not_fit_together_are_refused(key, call):
+    with pytest.raises(ValueError, match=f"^{key}: expected "):
         call()

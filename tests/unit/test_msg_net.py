@@ -50,12 +50,6 @@ def test_voynov_network_covers_every_pixel_and_the_hui_network_all_but_the_last(
     assert _net(scale, "hui").upsample(rgb, disparity).shape == (2, 1, rows - 1, columns - 1)
 
 
-def test_hui_network_sizes_are_caffes_511_255_127():
-    net = _net(8, "hui")
-    with torch.inference_mode():
-        assert net(torch.zeros(1, 1, 511, 39), torch.zeros(1, 1, 64, 5)).shape == (1, 1, 511, 39)
-
-
 @pytest.mark.parametrize("variant", get_args(VariantName))
 def test_constant_map_stays_constant_and_an_empty_map_becomes_holes(variant):
     rgb, disparity = torch.full((2, 3, 64, 64), 0.3), torch.full((2, 1, 16, 16), 7.0, dtype=torch.float64)
@@ -104,11 +98,7 @@ def test_drift_is_the_mean_of_the_output_for_a_probe_of_one_half(scale, height, 
     rows, columns = (slice(n // 16, n // 4 - n // 16) for n in (height, width))
     expected = output[..., rows, columns].mean((-2, -1), keepdim=True).double()
     torch.testing.assert_close(drift, expected, rtol=0, atol=1e-6)
-
-
-def test_drift_is_0_where_its_region_is_empty():
-    net, (rgb, disparity) = _net(4), _scene(4, 3, 40)
-    assert net.drift(guidance_map(rgb, net.variant), normalise(disparity).values).tolist() == [[[[0.0]]]]
+    assert net.drift(guidance[..., : 2 * scale, :], probe[..., :2, :]).count_nonzero() == 0  # of no rows
 
 
 @pytest.mark.parametrize("scale", SCALES)
