@@ -23,9 +23,19 @@ def sample_of(
     return make_sample(scene, scale, Downsampling(kernel), "disparity")
 
 
+def seeded(seed: int = 0) -> torch.Generator:
+    """Return a generator of its own."""
+    return torch.Generator().manual_seed(seed)
+
+
+def grid(height: int, width: int) -> tuple[Tensor, ...]:
+    """Return the row and the column of each pixel, (H, W) each."""
+    return torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
+
+
 def plane(height: int = 32, width: int = 48) -> Tensor:
     """Return disparities of a plane, (H, W)."""
-    v, u = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
+    v, u = grid(height, width)
     return 6 + 0.05 * u - 0.03 * v
 
 
@@ -59,7 +69,7 @@ def maps(height: int, width: int, count: int = 1) -> Tensor:
 
 def plane_map(height: int, width: int, along_u: float = 0.3, along_v: float = -0.2) -> Tensor:
     """Return disparities of a plane, (1, 1, H, W)."""
-    v, u = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
+    v, u = grid(height, width)
     return (30 + along_u * u + along_v * v)[None, None]
 
 

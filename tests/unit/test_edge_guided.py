@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from scipy import ndimage
-from small_scenes import disparity_of, sample_of
+from small_scenes import disparity_of, grid, sample_of
 
 from dsr.methods.base import NoSolutionError
 from dsr.methods.classical.edge_guided import EdgeGuided, bilateral_filter, find_reachable
@@ -29,14 +29,9 @@ from dsr.methods.classical.guided_filter import estimate_slopes
 from dsr.methods.classical.interpolation import Interpolation
 
 
-def _grid(height, width):
-    v, u = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
-    return v, u
-
-
 def _step(size, degrees):
     """Return a map that is 5 left of a line and 9 right of it, and how many columns are left of it in each row."""
-    v, u = _grid(size, size)
+    v, u = grid(size, size)
     slant = math.tan(math.radians(degrees))
     where = size / 2 + 0.37 - (v[:, 0] - size / 2) * slant
     return torch.where(u < where[:, None], 5.0, 9.0).double(), where + 0.5
@@ -100,14 +95,6 @@ def test_filter_is_a_mean_over_the_pixels_connected_by_a_path(radius):
     np.testing.assert_array_equal(seen, reach & ~barrier)
 
 
-def test_filter_does_not_mix_the_sides_of_an_edge():
-    coarse = torch.where(torch.arange(8) < 4, 5.0, 9.0).double().expand(8, 8)
-    barrier = torch.zeros(16, 16, dtype=torch.bool)
-    barrier[:, 8] = True
-    fine = bilateral_filter(coarse, barrier, 2, 1, 0.5, 0.01)
-    torch.testing.assert_close(fine, torch.where(torch.arange(16) < 8, 5.0, 9.0).double().expand(16, 16))
-
-
 def test_map_too_small_for_patches_has_no_solution():
     with pytest.raises(NoSolutionError, match="map of 8 x 8 pixels"):
         EdgeGuided()(sample_of(_step(32, 0.0)[0]))
@@ -137,15 +124,6 @@ def test_belief_propagation_finds_the_minimum_on_a_tree(seed):
     labels, history = label(*field)
     assert history[-1]["moved"] <= 1e-3
     assert energy(labels, *field) == pytest.approx(_least(*field), abs=1e-12)
-
-
-def test_belief_propagation_equals_viterbi_on_a_chain():
-    unary, pairs, costs = _field(40, [(i, i + 1) for i in range(39)], labels=5)
-    best = unary[0]
-    for i in range(39):
-        best = (best[:, None] + costs[i]).amin(dim=0) + unary[i + 1]
-    labels, _ = label(unary, pairs, costs, 300, 1e-9)
-    assert energy(labels, unary, pairs, costs) == pytest.approx(float(best.min()), abs=1e-9)
 
 
 def test_distances_equal_scipy_and_overlaps_equal_a_loop():
@@ -184,7 +162,7 @@ def test_thinning_reduces_a_bar_to_a_line_and_keeps_a_line():
 
 
 def test_edges_lie_at_steps_and_not_on_steep_planes():
-    v, u = _grid(16, 20)
+    v, u = grid(16, 20)
     assert not bool(detect_edges(3 * u - 2 * v, 2, 0.1).any())
     assert not bool(predict_edge_map(3 * u - 2 * v, 2, 0.1)[0].any())
     found = detect_edges(torch.where(u < 10, 0.0, 1.0).double(), 2, 0.1)

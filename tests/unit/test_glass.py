@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import safetensors.torch
 import torch
+from small_scenes import seeded
 
 from dsr.data.rendered import Procedural
 from dsr.degradation.glass import KINDS, Pose, add_glass, ball
@@ -21,14 +22,10 @@ from dsr.sample import AllHolesError, Scene
 SIZE = 96
 
 
-def _generator(seed=0):
-    return torch.Generator().manual_seed(seed)
-
-
 def _scene(slope=0.5, size=SIZE):
     """Return a floor of 2 m and nearer below, or a wall at 2 m."""
     depth = (2 - slope * torch.linspace(-0.5, 1, size, dtype=torch.float64))[:, None].repeat(1, 1, size)
-    rgb = torch.rand((3, size, size), generator=_generator(1))
+    rgb = torch.rand((3, size, size), generator=seeded(1))
     return Scene("test", "room", rgb, Camera.from_fov(60, size, size), depth)
 
 
@@ -41,7 +38,7 @@ def _changed(scene, other):
 def test_nothing_changes_beside_an_object_and_the_truth_is_nearer_inside(kind):
     scene, found = _scene(), 0
     for seed in range(25):
-        other, seen = add_glass(scene, _generator(seed), {kind: 1})
+        other, seen = add_glass(scene, seeded(seed), {kind: 1})
         inside = _changed(scene, other)
         found += bool(inside.any())
         assert torch.equal(other.rgb[:, ~inside], scene.rgb[:, ~inside])
@@ -56,21 +53,21 @@ def test_nothing_changes_beside_an_object_and_the_truth_is_nearer_inside(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_object_is_a_function_of_the_generator(kind):
-    (one, seen), (other, again) = (add_glass(_scene(), _generator(7), {kind: 1}) for _ in range(2))
+    (one, seen), (other, again) = (add_glass(_scene(), seeded(7), {kind: 1}) for _ in range(2))
     assert torch.equal(one.rgb, other.rgb)
     assert torch.equal(one.depth, other.depth)
     torch.testing.assert_close(seen, again, rtol=0, atol=0, equal_nan=True)
-    assert not torch.equal(one.rgb, add_glass(_scene(), _generator(8), {kind: 1})[0].rgb)
+    assert not torch.equal(one.rgb, add_glass(_scene(), seeded(8), {kind: 1})[0].rgb)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_holes_of_the_truth_are_no_depth_to_a_sensor(kind):
     scene = _scene()
-    holes = torch.rand((1, SIZE, SIZE), generator=_generator()) < 0.7
+    holes = torch.rand((1, SIZE, SIZE), generator=seeded()) < 0.7
     holes[..., : SIZE // 2] = True
     scene = replace(scene, depth=scene.depth.masked_fill(holes, torch.nan))
     for seed in range(10):
-        other, seen = add_glass(scene, _generator(seed), {kind: 1})
+        other, seen = add_glass(scene, seeded(seed), {kind: 1})
         assert bool((other.depth.isfinite() | scene.depth.isnan()).all())
         assert bool((seen.isnan() | (seen > 0)).all())
         assert bool(((seen >= other.depth * 0.5) | seen.isnan()).all())
@@ -99,7 +96,7 @@ def test_a_ball_is_round():
 def test_a_mirror_shows_the_virtual_image_or_nothing():
     scene, shown, lost = _scene(slope=0), 0, 0
     for seed in range(30):
-        other, seen = add_glass(scene, _generator(seed), {"mirror": 1})
+        other, seen = add_glass(scene, seeded(seed), {"mirror": 1})
         behind = (seen - other.depth)[0][_changed(scene, other)]
         known = behind[behind.isfinite()]
         assert bool(((known.abs() < 1e-6) | ((known - 2).abs() < 1e-6)).all())  # a wall 2 m before the mirror
@@ -112,14 +109,14 @@ def test_a_mirror_shows_the_virtual_image_or_nothing():
 def test_clear_objects_are_seen_through_missed_or_seen_and_opaque_ones_are_right():
     scene, through, missed, right, opaque = _scene(slope=0), 0.0, 0.0, 0.0, 0.0
     for seed in range(40):
-        other, seen = add_glass(scene, _generator(seed), {"vessel": 1})
+        other, seen = add_glass(scene, seeded(seed), {"vessel": 1})
         inside = _changed(scene, other)
         if int(inside.sum()) > 50:
             error = (seen / other.depth - 1)[0][inside]
             through += float((error > 0.03).double().mean()) / 40
             missed += float(error.isnan().double().mean()) / 40
             right += float((error.abs() < 0.01).double().mean()) / 40
-        other, seen = add_glass(scene, _generator(seed), {"gloss": 1})
+        other, seen = add_glass(scene, seeded(seed), {"gloss": 1})
         inside = _changed(scene, other)
         opaque += float(torch.equal(seen[:, ~inside], scene.depth[:, ~inside]))
         error = (seen / other.depth - 1)[0][inside]
@@ -128,7 +125,7 @@ def test_clear_objects_are_seen_through_missed_or_seen_and_opaque_ones_are_right
 
 
 def _sample(everything, seed, *, soft=False):
-    generator = _generator(seed)
+    generator = seeded(seed)
     sample, hints = everything(_scene(), 2, generator, soft=soft)
     return sample, hints.noise, generator.get_state()
 

@@ -152,16 +152,13 @@ def test_result_is_positive_depth_even_where_far_and_near_meet(method):
     assert float(fine.max()) <= 4 * float(sample.depth_lr.max()) + 1e-9
 
 
-def test_slope_is_the_smaller_difference_without_the_pixel_that_mixes_a_step():
+def test_slope_is_the_smaller_difference_without_a_pixel_that_mixes_a_step_or_is_a_hole():
     values = torch.tensor([[0.0, 1.0, 2.0, 6.0, 10.0, 11.0, 12.0, 11.0, 10.0]]).double()
     expected = torch.tensor([[1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0, -1.0, -1.0]]).double()
     torch.testing.assert_close(estimate_slopes(values, 1), expected)
     torch.testing.assert_close(estimate_slopes(values.T, 0), expected.T)
-
-
-def test_slope_beside_a_hole_is_the_remaining_difference():
-    values = torch.tensor([0.0, 2.0, 4.0, torch.nan, 9.0, 12.0, 15.0]).double()
-    torch.testing.assert_close(estimate_slopes(values, 0), torch.tensor([2.0, 2.0, 2.0, 2.0, 3.0, 3.0, 3.0]).double())
+    pierced = torch.tensor([0.0, 2.0, 4.0, torch.nan, 9.0, 12.0, 15.0]).double()
+    torch.testing.assert_close(estimate_slopes(pierced, 0), torch.tensor([2.0, 2.0, 2.0, 2.0, 3.0, 3.0, 3.0]).double())
 
 
 def _by_regression(guide, values, radius, epsilon, weight):
@@ -195,25 +192,6 @@ def test_guided_filter_is_the_mean_of_each_windows_ridge_regression(radius, hole
         weight[3:12, 4:14] = 0
     result = guided_filter(guide, values[None], radius, 1e-3, weight)[0]
     np.testing.assert_allclose(result, _by_regression(guide, values, radius, 1e-3, weight), rtol=0, atol=1e-9)
-
-
-def test_guided_filter_under_a_constant_photo_is_the_box_filter_twice():
-    impulse = torch.zeros(1, 15, 15).double()
-    impulse[0, 7, 7] = 1
-    tent = torch.tensor([1.0, 2.0, 3.0, 2.0, 1.0]).double() / 9
-    result = guided_filter(torch.full((3, 15, 15), 0.4).double(), impulse, 1, 1e-3, torch.ones(15, 15).double())[0]
-    torch.testing.assert_close(result[5:10, 5:10], tent[:, None] * tent, rtol=0, atol=1e-15)
-
-
-def test_blurred_step_along_a_photo_edge_becomes_sharp():
-    """Half of it, as the windows that straddle the edge disagree."""
-    columns = torch.arange(64).double().expand(64, 64)
-    rgb = torch.where(columns < 32, 0.2, 0.8).expand(3, 64, 64).contiguous()
-    blurred = ((columns - 27.5) / 8).clamp(0, 1)
-    sharp = guided_filter(rgb, blurred[None], 8, 1e-4, torch.ones_like(blurred))[0]
-    before, after = ((each[:, 32] - each[:, 31]) for each in (blurred, sharp))
-    torch.testing.assert_close(before, torch.full_like(before, 1 / 8))
-    assert float(after.min()) > 0.5
 
 
 @pytest.mark.parametrize("method", [JointBilateral, FastGlobalSmoother])

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from small_scenes import seeded
 
 from dsr.degradation.downsampling import Downsampling, Measured, make_sample
 from dsr.degradation.holes import Blobs, Shadows
@@ -13,10 +14,6 @@ from dsr.sample import Scene
 CAMERA = Camera(width=40, height=30, fx=50.0, fy=50.0, cx=19.5, cy=14.5)
 
 
-def _generator(seed=0):
-    return torch.Generator().manual_seed(seed)
-
-
 def _edges(mask):
     """How many neighbouring pixels differ."""
     return int((mask[..., 1:] != mask[..., :-1]).sum() + (mask[..., 1:, :] != mask[..., :-1, :]).sum())
@@ -25,7 +22,7 @@ def _edges(mask):
 @pytest.mark.parametrize("share", [0.05, 0.2])
 def test_blobs_have_the_requested_fraction_and_are_connected(share):
     depth = torch.ones(1, 60, 80)
-    fine, coarse = (Blobs(share, size)(depth, CAMERA, _generator()) for size in (8, 24))
+    fine, coarse = (Blobs(share, size)(depth, CAMERA, seeded()) for size in (8, 24))
     assert int(fine.sum()) == int(coarse.sum()) == round(share * 4800)
     scattered = torch.rand(1, 60, 80) < share
     assert _edges(coarse) < _edges(fine) < 0.6 * _edges(scattered)
@@ -33,7 +30,7 @@ def test_blobs_have_the_requested_fraction_and_are_connected(share):
 
 def test_blobs_depend_on_the_generator_alone():
     depth = torch.ones(1, 30, 40)
-    masks = [Blobs()(depth * scale, CAMERA, _generator(seed)) for seed, scale in ((1, 1), (1, 2), (2, 1))]
+    masks = [Blobs()(depth * scale, CAMERA, seeded(seed)) for seed, scale in ((1, 1), (1, 2), (2, 1))]
     assert torch.equal(masks[0], masks[1])
     assert not torch.equal(masks[0], masks[2])
 
@@ -42,7 +39,7 @@ def test_blobs_depend_on_the_generator_alone():
 def test_shadow_is_as_wide_as_the_disparities_differ(baseline):
     depth = torch.full((1, 30, 40), 4.0)
     depth[:, 10:20, 15:25] = 1.0
-    mask = Shadows(baseline)(depth, CAMERA, _generator())
+    mask = Shadows(baseline)(depth, CAMERA, seeded())
     width = 7  # 0.2 m x 50 px x (1 / 1 m - 1 / 4 m) = 7.5 px: pixels 1 to 7 away are nearer than that
     expected = torch.zeros_like(mask)
     if baseline > 0:
@@ -55,7 +52,7 @@ def test_shadow_is_as_wide_as_the_disparities_differ(baseline):
 def test_plane_with_missing_parts_has_no_shadows():
     slope = torch.linspace(2, 3, 40).expand(1, 30, 40).clone()
     slope[:, 5:9, 10:20] = torch.nan
-    assert not bool(Shadows(0.1)(slope, CAMERA, _generator()).any())
+    assert not bool(Shadows(0.1)(slope, CAMERA, seeded()).any())
 
 
 def test_sample_with_holes_has_the_same_values_elsewhere():

@@ -11,6 +11,7 @@ import torch
 from scipy import sparse
 from scipy.sparse import linalg
 from small_lpips import random_lpips
+from small_scenes import grid
 from torch import Tensor
 from torch.nn import functional
 
@@ -343,7 +344,7 @@ LIGHT = torch.tensor([0.5, -0.1, -0.2, 0.1, 0.03, 0.02, 0.01, -0.03, 0.02], dtyp
 
 def _bumps(amplitude=0.1, phase=0.0):
     """Return a bumpy surface, (1, 1, 16, 18)."""
-    v, u = torch.meshgrid(torch.arange(16).double(), torch.arange(18).double(), indexing="ij")
+    v, u = grid(16, 18)
     return (2 + amplitude * torch.sin(0.4 * u + phase) * torch.cos(0.3 * v))[None, None]
 
 

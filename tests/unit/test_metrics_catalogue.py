@@ -7,6 +7,7 @@ import pytest
 import torch
 from depth_steps import holed, pair_of, steps
 from small_lpips import random_lpips
+from small_scenes import grid
 
 from dsr.geometry.camera import Camera
 from dsr.metrics import functional
@@ -171,7 +172,7 @@ def test_metrics_of_a_region_are_those_of_its_pixels_alone():
 
 def _half_planes():
     """Return a wall that recedes to the right, and its upper and lower half as planes 1 and 2."""
-    v, u = torch.meshgrid(torch.arange(40).double(), torch.arange(48).double(), indexing="ij")
+    v, u = grid(40, 48)
     return 1 / (0.5 + 0.002 * (u - CAMERA.cx))[None], (1 + (v >= 20))[None].to(torch.uint8), u.remainder(2) - 0.5
 
 

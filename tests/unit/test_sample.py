@@ -42,8 +42,10 @@ def _with(shape, value):
 def test_valid_records_are_accepted_with_holes_and_without_truth():
     _scene(depth=_with((1, 4, 8), torch.nan))
     _scene(depth=None, measured={2: torch.ones(1, 2, 4), 4: torch.ones(1, 1, 2).double()})
-    sample = _sample(depth=None, depth_lr=_with((1, 2, 4), torch.nan))
+    sample = _sample(depth=None, depth_lr=_with((1, 2, 4), torch.nan), scale=2.0)
     assert sample.notes == ()
+    assert isinstance(sample.scale, int)
+    assert isinstance(*_scene(measured={2.0: torch.ones(1, 2, 4)}).measured, int)
 
 
 def test_crop_takes_the_window_of_every_map_and_of_the_camera():
@@ -73,28 +75,29 @@ def test_photo_with_values_out_of_range_is_refused(make, value):
         make(rgb=torch.full((3, 4, 8), value))
 
 
+POSITIVE = "expected positive depth, and NaN where a pixel is a hole; got"
 BAD_DEPTHS = [
     (lambda shape: torch.ones(shape[1:]), "expected shape"),
     (lambda shape: torch.ones(1, shape[2], shape[1]), "expected shape"),
     (lambda shape: torch.ones(shape, dtype=torch.int32), "expected floating point metres, got torch.int32"),
-    (lambda shape: _with(shape, 0.0), "expected positive depth, and NaN where a pixel is a hole; got 0$"),
-    (lambda shape: _with(shape, -1.5), "expected positive depth, and NaN where a pixel is a hole; got -1.5$"),
-    (lambda shape: _with(shape, torch.inf), "expected positive depth, and NaN where a pixel is a hole; got inf$"),
-    (lambda shape: _with(shape, -torch.inf), "expected positive depth, and NaN where a pixel is a hole; got "),
-    (lambda shape: torch.full(shape, torch.nan), "expected at least one known pixel, all are holes$"),
+    (lambda shape: _with(shape, 0.0), f"{POSITIVE} 0$"),
+    (lambda shape: _with(shape, -1.5), f"{POSITIVE} -1.5$"),
+    (lambda shape: _with(shape, torch.inf), f"{POSITIVE} inf$"),
+    (lambda shape: torch.full(shape, torch.nan), "expected at least one known pixel"),
 ]
 
 
 @pytest.mark.parametrize(("bad", "message"), BAD_DEPTHS)
 def test_invalid_depth_map_is_refused_by_name(bad, message):
-    with pytest.raises(ValueError, match=f"^hall: depth: {message}"):
-        _scene(depth=bad((1, 4, 8)))
-    with pytest.raises(ValueError, match=f"^hall: measured depth at x2: {message}"):
-        _scene(measured={2: bad((1, 2, 4))})
-    with pytest.raises(ValueError, match=f"^hall: depth: {message}"):
-        _sample(depth=bad((1, 4, 8)))
-    with pytest.raises(ValueError, match=f"^hall: depth_lr: {message}"):
-        _sample(depth_lr=bad((1, 2, 4)))
+    fine, coarse = (1, 4, 8), (1, 2, 4)
+    for name, make in (
+        ("depth", lambda: _scene(depth=bad(fine))),
+        ("measured depth at x2", lambda: _scene(measured={2: bad(coarse)})),
+        ("depth", lambda: _sample(depth=bad(fine))),
+        ("depth_lr", lambda: _sample(depth_lr=bad(coarse))),
+    ):
+        with pytest.raises(ValueError, match=f"^hall: {name}: {message}"):
+            make()
 
 
 def test_scene_without_any_depth_is_refused():
@@ -103,12 +106,10 @@ def test_scene_without_any_depth_is_refused():
 
 
 def test_low_and_high_resolution_sizes_must_differ_by_the_scale():
-    with pytest.raises(
-        ValueError, match=r"^hall: depth_lr: expected 1 x 2 \(the photo's 4 x 8 at scale 4\), got 2 x 4"
-    ):
-        _sample(scale=4)
-    with pytest.raises(ValueError, match=r"^hall: depth_lr: expected 2 x 4 .* got 2 x 3"):
-        _sample(camera_lr=CAMERA.rescale(3, 2), depth_lr=torch.ones(1, 2, 3))
+    wide = {"camera_lr": CAMERA.rescale(3, 2), "depth_lr": torch.ones(1, 2, 3)}
+    for changes, got in (({"scale": 4}, "expected 1 x 2 .* got 2 x 4"), (wide, "expected 2 x 4 .* got 2 x 3")):
+        with pytest.raises(ValueError, match=f"^hall: depth_lr: {got}"):
+            _sample(**changes)
 
 
 @pytest.mark.parametrize("scale", [0, -2, 0.5, math.nan, math.inf])
@@ -117,12 +118,6 @@ def test_scale_below_1_is_refused(scale):
         _scene(measured={scale: torch.ones(1, 2, 4)})
     with pytest.raises(ValueError, match=f"^hall: scale: expected a number of 1 or more, got {scale}"):
         _sample(scale=scale)
-
-
-def test_ratios_are_whole_numbers_where_they_can_be():
-    assert isinstance(_sample(scale=2.0).scale, int)
-    (ratio,) = _scene(measured={2.0: torch.ones(1, 2, 4)}).measured
-    assert isinstance(ratio, int)
 
 
 def test_map_at_a_ratio_that_is_not_whole_may_miss_the_photo_by_a_pixel():
@@ -171,16 +166,12 @@ def test_sample_is_read_with_the_same_bits(tmp_path, dtype, levels):
         assert stored["rgb"].dtype == {255: np.uint8, 65535: np.uint16}.get(levels or 0, str(dtype)[6:])
 
 
-def test_sample_at_a_ratio_that_is_not_whole_is_read_as_it_was_written(tmp_path):
+def test_sample_without_truth_and_at_any_ratio_is_read_as_it_was_written(tmp_path):
     camera = Camera(width=16, height=11, fx=9.0, fy=9.0, cx=7.5, cy=5.0)
     maps = {"rgb": torch.zeros(3, 11, 16), "depth": None, "depth_lr": torch.ones(1, 4, 6)}
     _sample(**maps, camera=camera, camera_lr=camera.rescale(6, 4), scale=16 / 6).save(tmp_path / "hall.npz")
-    assert DepthSample.load(tmp_path / "hall.npz").scale == 16 / 6
-
-
-def test_sample_without_truth_is_read_without_truth(tmp_path):
-    _sample(depth=None).save(tmp_path / "hall.npz")
-    assert DepthSample.load(tmp_path / "hall.npz").depth is None
+    read = DepthSample.load(tmp_path / "hall.npz")
+    assert (read.scale, read.depth) == (16 / 6, None)
 
 
 def test_regions_are_cropped_handed_on_and_read(tmp_path):

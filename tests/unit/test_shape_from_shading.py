@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from small_scenes import grid
 from torch.nn import functional
 
 from dsr.degradation.downsampling import Downsampling, make_sample
@@ -114,11 +115,6 @@ def _camera(height, width, focal=None):
     return Camera(width, height, focal, 1.1 * focal, 0.45 * width, 0.55 * height)
 
 
-def _grid(height, width):
-    v, u = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
-    return v, u
-
-
 def _sample(depth, rgb=None, scale=4, name="hall", focal=None):
     """Return the problem of a scene with this depth, (H, W)."""
     camera = _camera(*depth.shape, focal)
@@ -143,7 +139,7 @@ def _sphere(size):
 
 
 def _bumps(size):
-    v, u = _grid(size, size)
+    v, u = grid(size, size)
     hill = torch.exp(-((u - size / 2) ** 2 + (v - size / 2) ** 2) / (2 * (size / 5) ** 2))
     return 2 - 0.25 * hill + 0.02 * torch.sin(2 * math.pi * u / 9) * torch.sin(2 * math.pi * v / 11)
 
@@ -169,7 +165,7 @@ def _solver(*, holes=False, mask=False):
         sample.depth_lr[:, 1:3, 2] = torch.nan
     solver, _ = ShapeFromShading().prepare(sample)
     if mask:
-        v, u = _grid(16, 16)
+        v, u = grid(16, 16)
         inside = ((u - 7) ** 2 + (v - 8) ** 2 < 40)[None, None]
         solver = ShadingSolver(solver.problem._replace(inside=inside), solver.z, solver.penalty)
     rng = np.random.default_rng(1)
@@ -259,25 +255,16 @@ def test_gradient_in_theta_is_that_of_the_energy_and_vanishes_after_some_steps(m
     assert float(last.square().mean()) < 1e-3 * float(first.square().mean())
 
 
-@pytest.mark.parametrize("scale", [2, 4, 8])
-def test_slanted_plane_of_one_colour_is_reproduced_to_a_hundredth_of_its_depth(scale):
-    v, u = _grid(32, 48)
-    camera = _camera(32, 48, 400.0)
-    truth = from_range((40 + 0.05 * u - 0.03 * v)[None], camera, "disparity")[0]
+@pytest.mark.parametrize(("scale", "holes"), [(2, False), (4, True), (8, False)])
+def test_slanted_plane_of_one_colour_is_reproduced_to_a_hundredth_of_its_depth(scale, holes):
+    v, u = grid(32, 48)
+    truth = from_range((40 + 0.05 * u - 0.03 * v)[None], _camera(32, 48, 400.0), "disparity")[0]
     sample = _sample(truth, None, scale, focal=400.0)
+    if holes:
+        sample.depth_lr[:, 3:5, 4:6] = torch.nan
     fine = ShapeFromShading(iterations=10)(sample)[0]
     assert float((fine / truth - 1).abs().max()) < 1e-2
     assert float((fine / truth - 1).square().mean().sqrt()) < 1e-3
-
-
-def test_holes_are_filled_and_have_no_influence():
-    depth, rgb = _random(16, 24)
-    sample = _sample(depth, rgb)
-    sample.depth_lr[:, 1:3, 2:4] = torch.nan
-    fine = ShapeFromShading(iterations=5)(sample)
-    assert fine.shape == (1, 16, 24)
-    assert bool(fine.isfinite().all())
-    assert float(fine.min()) > 1.0
 
 
 def test_batch_equals_its_problems_one_at_a_time():
@@ -310,7 +297,7 @@ def test_iteration_stops_at_convergence_and_reports_progress():
 def test_background_keeps_the_initial_map(tmp_path):
     truth = _bumps(32)
     sample = _sample(truth, _lit(truth), name="bumps")
-    v, u = _grid(32, 32)
+    v, u = grid(32, 32)
     inside = (u - 15) ** 2 + (v - 17) ** 2 < 90
     cv2.imwrite(str(tmp_path / "bumps.png"), 255 * inside.numpy().astype(np.uint8))
     method = ShapeFromShading(iterations=5, foreground=str(tmp_path))
