@@ -136,7 +136,7 @@ def test_gradient_of_downsampling_is_that_of_its_value(kernel, holes):
 
 
 def test_size_that_the_scale_does_not_divide_is_refused():
-    with pytest.raises(ValueError, match="downsampling: expected a size divisible by 4, got 8 x 10"):
+    with pytest.raises(ValueError, match="downsampling: expected"):
         BOX(_values(8, 10), 4)
 
 
@@ -245,7 +245,7 @@ def test_measured_map_at_any_ratio_covers_the_whole_photo(scale):
     ("measured", "message"), [({1: _values(32, 48), 4: _values(8, 12)}, "the scene has x1, x4"), ({}, "there is none")]
 )
 def test_native_scale_needs_exactly_one_measured_map(measured, message):
-    with pytest.raises(ValueError, match=f"^hall: .*scale=native expects .* exactly one, {message}"):
+    with pytest.raises(ValueError, match=f"^hall: .*scale=native expects .*{message}"):
         make_sample(_scene(None if measured else _values(32, 48), measured=measured), "native", Measured(), "disparity")
 
 

