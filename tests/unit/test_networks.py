@@ -240,6 +240,16 @@ def test_pixels_beyond_the_receptive_field_do_not_matter(name):
         assert 0 < int(distance.max()) <= net.receptive_field_radius
 
 
+def test_large_photo_is_tiled_automatically(monkeypatch):
+    method, sample, parts = _method("facets"), _sample(4, 12, 12), []
+    whole = method(sample, lambda done, total: parts.append(total))
+    monkeypatch.setattr("dsr.methods.networks.network.UNTILED", 1000)
+    monkeypatch.setattr("dsr.methods.networks.network.TILE", 24)
+    tiled = method(sample, lambda done, total: parts.append(total))
+    assert parts == [1, *[4] * 4]
+    torch.testing.assert_close(tiled, whole, rtol=1e-5, atol=0)
+
+
 @pytest.mark.parametrize("index", range(8))
 def test_dihedral_transforms_are_distinct_and_invertible(index):
     x = torch.rand(2, 3, 5, 5)

@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from dsr.degradation.downsampling import FACTS, KERNELS, Downsampling, encode_facts, local_noise
 from dsr.degradation.noise import NOISES
-from dsr.degradation.random_degradation import Everything, displace
+from dsr.degradation.random_degradation import Everything, add_folds, displace
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
 from dsr.training.patches import soften
@@ -115,6 +115,28 @@ def test_displacement_is_a_shift_or_a_magnification():
         assert bool((moves.diff().abs() <= 1).all())
     assert shifts > 5
     assert magnified > 5
+
+
+def test_noisy_maps_are_displaced_as_often_as_stated(monkeypatch):
+    quiet = {**NOISES, "white": lambda clean, *_: clean}
+    monkeypatch.setattr("dsr.degradation.random_degradation.NOISES", quiet)
+    scene = _scene(step=False)
+    for share in (0.0, 1.0):
+        everything = replace(CLEAN, noises={"white": 1}, kernels={"box": 1}, displaced=share)
+        for seed in range(4):
+            sample, _ = everything(scene, 8, seeded(seed))
+            assert (_averaged(scene.true_depth, sample.depth_lr, 8) is None) == bool(share)
+
+
+def test_folds_keep_holes_and_shade_their_surroundings():
+    scene = _scene(64)
+    depth = scene.depth.clone()
+    depth[:, 30:40, 10:20] = torch.nan
+    for seed in range(5):
+        folded = add_folds(replace(scene, depth=depth), seeded(seed))
+        assert torch.equal(folded.depth.isnan(), depth.isnan())
+        assert bool(folded.rgb.isfinite().all())
+        assert float(folded.depth.nan_to_num(1).min()) > 0
 
 
 def test_soft_scenes_have_half_the_size_and_mixed_values_at_steps():
